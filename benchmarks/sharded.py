@@ -106,7 +106,7 @@ def work(folder: Path, kind: str, splats: int, iterations: int, out: Path) -> No
     """Train in this process, alone or with others, and write what it took."""
     torch.set_num_threads(1)
     with connected("cpu") as found:
-        scene = load_scene(folder, GENERIC)
+        scene = load_scene(folder)
         together: OneProcess = Counting(found.place) if kind == "sharded" else found
         before = resident()
         init = scattered(folder, splats) if found.leads else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -14,6 +14,7 @@ _COLORS = ("#3f86d6", "#e0893a", "#46a56b", "#c6509f", "#8a74d8", "#b9a02d", "#5
 _STEP_KINDS = ("step", "progress")
 _CHANGES = ("mean", "covariance", "opacity", "sh")
 _AREA_NAMES = ("mean_area", "mean_k_a", "mean_Ka")
+MOST = 1e30  # that is drawn: axes are worked out in numbers that end at 1e308
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,9 @@ def read_history(events: Sequence[Mapping[str, Any]]) -> History:
         total += lengths[stage]
     points: dict[str, list[tuple[float, float]]] = {}
     for event in events:
-        if _kind(event) in (*_STEP_KINDS, "changes") and event.get("stage") in starts and "iteration" in event:
+        stage = event.get("stage")
+        known = isinstance(stage, str) and stage in starts
+        if _kind(event) in (*_STEP_KINDS, "changes") and known and "iteration" in event:
             iteration = starts[event["stage"]] + _whole(event["iteration"])
             for name, value in _figures(event).items():
                 points.setdefault(name, []).append((iteration, value))
@@ -74,22 +77,25 @@ def _kind(event: Mapping[str, Any]) -> str:
 
 
 def _whole(value: Any) -> int:
-    return int(value) if isinstance(value, int | float) else 0
+    return int(value) if _is_number(value) else 0
+
+
+def _is_number(value: Any) -> TypeGuard[float]:
+    """Whether this can be drawn: the log may have been changed by hand."""
+    return isinstance(value, int | float) and abs(value) < MOST  # not NaN
 
 
 def _figures(event: Mapping[str, Any]) -> dict[str, float]:
     """Return the numbers of one step, or of what changed after it, that are finite."""
     if _kind(event) == "changes":
         changes = {f"change/{name}": event.get(name) for name in _CHANGES}
-        return {name: float(v) for name, v in changes.items() if isinstance(v, int | float) and np.isfinite(v)}
+        return {name: float(v) for name, v in changes.items() if _is_number(v)}
     named: dict[str, Any] = {name: event.get(name) for name in ("psnr", "splats", "mean_opacity")}
     named["mean_area"] = next((event[name] for name in _AREA_NAMES if name in event), None)
     losses = event.get("losses")
     for term, value in losses.items() if isinstance(losses, Mapping) else ():
         named[f"loss/{term}"] = value
-    return {
-        name: float(value) for name, value in named.items() if isinstance(value, int | float) and np.isfinite(value)
-    }
+    return {name: float(value) for name, value in named.items() if _is_number(value)}
 
 
 def smoothed(values: np.ndarray, count: int = 9) -> np.ndarray:

@@ -121,7 +121,8 @@ def _is_view(entry: Any) -> bool:
         return False
     limits = entry.get("depth_limits")
     known = limits is None or (_are(limits, lambda value: isinstance(value, int | float)) and len(limits) == 2)
-    return known and isinstance(entry.get("file", ""), str) and isinstance(entry.get("camera", {}), dict)
+    words = all(isinstance(entry.get(name, ""), str) for name in ("file", "split"))
+    return known and words and isinstance(entry.get("camera", {}), dict)
 
 
 def hero(renders: Path) -> Markup:
