@@ -9,13 +9,10 @@ of them: numbers of rows, rankings, draws. So one code does both, and a training
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from gs2d.training.state import TrainState
 
 
 class Whole:
@@ -48,8 +45,8 @@ class Whole:
         """
         return torch.randn(sum(pieces), columns, generator=generator, dtype=dtype)
 
-    def settle(self, state: TrainState, pieces: Sequence[int]) -> None:
-        """Put rows in their order after some went and ``pieces`` of others were appended; give each process a share."""
+    def settle(self, state: Any, pieces: Sequence[int]) -> None:
+        """Put the rows of a TrainState in their order after some went, and ``pieces`` of others were appended."""
 
 
 WHOLE = Whole()

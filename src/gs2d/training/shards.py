@@ -31,12 +31,23 @@ GO_ON, WHOLE_STATE = 0, 1  # what process 0 says to those that attend
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """How rows move between the processes: ``order`` [n] of those that are sent, and where the received ones go."""
+    """How rows move between the processes.
 
-    sent: list[int]
-    received: list[int]
-    order: Tensor
+    Attributes
+    ----------
+    sources : Tensor [n]
+        For each row that this process will have, which of its own it is; 0 where another process has it.
+    places : Tensor [k]
+        Where the rows go that come from others, ``received`` from each.
+    leaving : Tensor [m]
+        Own rows for others, ``sent`` to each.
+    """
+
+    sources: Tensor
     places: Tensor
+    received: list[int]
+    leaving: Tensor
+    sent: list[int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,22 +127,29 @@ class Shards(ManyProcesses, Whole):
     # -- rows that move ------------------------------------------------------------------------------------------------
     def _plan(self, lengths: Tensor, ends: Sequence[int]) -> Plan:
         """Return how rows move, of which each process has some of each piece [W, P], to where they end in each."""
-        own = zip(self._starts(lengths), lengths[self.place.rank].tolist(), strict=True)
+        rank, begins = self.place.rank, [0, *ends]
+        own = zip(self._starts(lengths), lengths[rank].tolist(), strict=True)
         places = torch.cat([torch.arange(start, start + length) for start, length in own])
         goal = torch.searchsorted(torch.tensor(ends), places, right=True)
-        order = torch.sort(goal, stable=True).indices
-        sent = torch.bincount(goal, minlength=self.size)
-        received = torch.empty_like(sent)
-        with self.contact():
-            self._group.all_to_all_single(received, sent)
-        plan = Plan(sent.tolist(), received.tolist(), order, torch.arange(int(received.sum())))
-        return replace(plan, places=torch.argsort(self._moved(places, plan)))
+        leaving = torch.sort(goal, stable=True).indices
+        leaving = leaving[goal[leaving] != rank]
+        given = [places[leaving[goal[leaving] == other]] for other in range(self.size)]
+        coming, received = self.delivered(given)
+        sources = torch.zeros(ends[rank] - begins[rank], dtype=torch.int64)
+        staying = (goal == rank).nonzero().squeeze(1)
+        sources[places[staying] - begins[rank]] = staying
+        return Plan(sources, coming - begins[rank], received, leaving, [len(rows) for rows in given])
 
     def _moved(self, tensor: Tensor, plan: Plan) -> Tensor:
         """Return the rows of a tensor that this process has when all have moved."""
         here = tensor.device
-        sent = tensor[plan.order.to(here)].contiguous()
-        return self.exchanged(sent, plan.sent, plan.received)[plan.places.to(here)]
+        coming = self.exchanged(tensor[plan.leaving.to(here)], plan.sent, plan.received)
+        if len(tensor):
+            result = torch.index_select(tensor, 0, plan.sources.to(here))
+        else:
+            result = tensor.new_zeros(len(plan.sources), *tensor.shape[1:])
+        result[plan.places.to(here)] = coming
+        return result
 
     def delivered(self, given: Sequence[Tensor]) -> tuple[Tensor, list[int]]:
         """Return the rows that the processes send to this one, which gives each a tensor, and how many each sent."""

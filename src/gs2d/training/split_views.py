@@ -93,7 +93,7 @@ class SplitViews:
             if view.records.requires_grad:
                 torch.autograd.backward([view.records], [values[:, :NUMBERS]])
         trained = {name: tensor for name, tensor in leaves.items() if name in stage.train}
-        mean = {k: torch.zeros_like(t) if t.grad is None else t.grad / len(turns) for k, t in trained.items()}
+        mean = {k: torch.zeros_like(t) if t.grad is None else t.grad.div_(len(turns)) for k, t in trained.items()}
         seen = tuple(_seen(view.rows, values, columns) for view, values in zip(sent, returned, strict=True))
         if state.poses is not None:
             of_view |= self._of_colors(state, sent, camera, of_view)
