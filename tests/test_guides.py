@@ -66,8 +66,9 @@ def test_the_program_of_the_quickstart_runs(tmp_path: Path, monkeypatch: pytest.
     write_capture(tmp_path / "capture")
     page = tmp_path / "quickstart.md"
     text = (DOCS / "quickstart.md").read_text(encoding="utf-8")
-    assert "schedule_scale=0.1)" in text
-    page.write_text(text.replace("schedule_scale=0.1)", "schedule_scale=0.001)"), encoding="utf-8")  # seconds
+    assert "downscale=4), schedule_scale=0.1)" in text
+    text = text.replace("downscale=4), schedule_scale=0.1)", "downscale=1), schedule_scale=0.001)")  # seconds
+    page.write_text(text, encoding="utf-8")
     run_blocks(page, 1)
     assert (tmp_path / "splats.ply").is_file()
 
@@ -77,8 +78,9 @@ def test_the_program_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.Monk
     write_capture(tmp_path / "capture")
     page = tmp_path / "README.md"
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert "schedule_scale=0.1)" in text
-    page.write_text(text.replace("schedule_scale=0.1)", "schedule_scale=0.001)"), encoding="utf-8")  # seconds
+    assert "downscale=4), schedule_scale=0.1)" in text
+    text = text.replace("downscale=4), schedule_scale=0.1)", "downscale=1), schedule_scale=0.001)")  # seconds
+    page.write_text(text, encoding="utf-8")
     run_blocks(page, 1)
     assert len(gs2d.read_splats(tmp_path / "splats.ply")) > 0
 

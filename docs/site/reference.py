@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import gs2d
 from gs2d.cli.catalogue import Option, about, options_of
@@ -47,12 +47,17 @@ def _command(name: str, shared: set[type]) -> list[str]:
     needed = sorted((o for o in options if o.required or not o.flags), key=lambda o: bool(o.flags))
     usage = " ".join(o.usage if o.required else f"[{o.usage}]" for o in needed)
     lines = [f"### gs2d {name}", "", "```text", f"gs2d {name} {usage} [OPTIONS]".replace("  ", " "), "```", ""]
-    lines += [_plain(about(NAMES[name])), "", *_explained([o for o in options if o.group not in shared])]
+    lines += [_plain(about(NAMES[name])), "", *_explained(_arguments_first(options, shared))]
     others = list(dict.fromkeys(o.group for o in options if o.group in shared))
     if others:
         links = ", ".join(f"[{_heading(group)}](#{_anchor(_heading(group))})" for group in others)
         lines += [f"Also: {links}.", ""]
     return lines
+
+
+def _arguments_first(options: Iterable[Option], shared: set[type]) -> list[Option]:
+    """Return a command's own options, what stands alone on a command line before what has a name."""
+    return sorted((o for o in options if o.group not in shared), key=lambda o: bool(o.flags))
 
 
 def _explained(options: list[Option]) -> list[str]:

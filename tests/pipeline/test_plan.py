@@ -58,7 +58,7 @@ def test_a_plan_counts_photographs_and_pixels_and_bounds_the_rest_and_writes_not
     assert found.temporary == 8 * found.trained_pixels
     lines = found.lines()
     assert [line.partition(":")[0] for line in lines] == ["photographs", "splats", "memory", "disk", "time"]
-    assert lines[0] == "photographs: 12, 0 megapixels, trained on at 0, in memory"
+    assert lines[0] == "photographs: 12 with 0.0369 megapixels together, in memory"
     assert sorted(path.name for path in capture.rglob("*")) == before
 
 

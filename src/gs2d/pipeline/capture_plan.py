@@ -112,14 +112,14 @@ class CapturePlan:
 
     def lines(self) -> list[str]:
         """Return the plan for people."""
-        side = f" (--downscale {self.downscale})" if self.downscale > 1 else ""
+        shrunk = f"{self.trained_pixels / 1e6:.3g} as they are trained on (--downscale {self.downscale}), "
         where = "prepared on the disk" if self.prepared else "in memory"
         of = "" if self.allowed is None else f" of {self.allowed / 2**30:.3g} GiB allowed"
         budget = "" if self.max_splats is None else f"; only with a budget: {budget_option(self.max_splats)}"
         memory, splats, seconds = self.memory.scaled(2.0**-30), self.splats, self.seconds
         return [
-            f"photographs: {self.photographs:,}, {self.pixels / 1e6:,.0f} megapixels, trained on at "
-            f"{self.trained_pixels / 1e6:,.0f}{side}, {where}",
+            f"photographs: {self.photographs:,} with {self.pixels / 1e6:.3g} megapixels together, "
+            f"{shrunk if self.downscale > 1 else ''}{where}",
             f"splats: {rounded(splats.expected):,} ({rounded(splats.least):,} to {rounded(splats.most):,}), from "
             f"{rounded(self.start):,}{budget}",
             f"memory: {memory.expected:.2g} GiB ({memory.least:.2g} to {memory.most:.2g}){of}",

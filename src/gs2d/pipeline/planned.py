@@ -92,6 +92,7 @@ def command_of(options: PlanOptions, found: CapturePlan) -> str:
     return shlex.join(words)
 
 
-def plan_notices(job: Job, prepare: str) -> list[Notice]:
-    """Return what is said before a training begins."""
-    return [Notice(line) for line in planned_of(job, prepare).lines()]
+def plan_notices(job: Job, prepare: str, *, timed: bool) -> list[Notice]:
+    """Return what is said before a training begins; how long it takes too, unless that is going to be measured."""
+    lines = planned_of(job, prepare).lines()
+    return [Notice(line) for line in lines if timed or not line.startswith("time: ")]

@@ -123,7 +123,7 @@ def _train(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> Ru
         job = lead(job, options, together, on_event)
         start = choose_start(run, job, options, on_event)
         if start.state is None and _is_planned(options, len(job.scene.views)):
-            for line in plan_notices(job, options.prepare):
+            for line in plan_notices(job, options.prepare, timed=not options.estimate):
                 on_event(line)
         if options.estimate and start.state is None:
             for event in pretraining_notices(job):
