@@ -15,6 +15,7 @@ from types import ModuleType
 import pytest
 
 import gs2d
+from browser import browser, require_browser
 from gs2d.cli.catalogue import options_of
 from gs2d.cli.usage import NAMES
 
@@ -124,15 +125,35 @@ def test_generated_pages_say_where_the_generated_part_goes(page: str) -> None:
     assert (ROOT / page).read_text(encoding="utf-8").count("<!-- generated -->") == 1
 
 
-@pytest.mark.slow
-def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, as `make docs` builds it: a warning is an error."""
     for name in ("sphinx", "myst_parser", "furo"):
         pytest.importorskip(name, reason="the extra `docs` is not installed: make docs")
+    home = tmp_path_factory.mktemp("docs")
     command = [sys.executable, "-m", "sphinx", "-E", "-W", "--keep-going", "-q", "-b", "html", "-c", str(SITE)]
-    done = subprocess.run([*command, "-d", str(tmp_path / "trees"), str(ROOT), str(tmp_path / "site")],
+    done = subprocess.run([*command, "-d", str(home / "trees"), str(ROOT), str(home / "site")],
                           capture_output=True, text=True, check=False)  # fmt: skip
     assert done.returncode == 0, done.stderr
+    return home / "site"
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_a_warning(site: Path) -> None:
     for page in PAGES:
-        html = (tmp_path / "site" / page).with_suffix(".html").read_text(encoding="utf-8")
+        html = (site / page).with_suffix(".html").read_text(encoding="utf-8")
         for target in re.findall(r'<a class="reference internal" href="([^"#]+)', html):
-            assert (tmp_path / "site" / page).parent.joinpath(target).exists(), f"{page}: {target}"
+            assert (site / page).parent.joinpath(target).exists(), f"{page}: {target}"
+
+
+@pytest.mark.slow
+def test_no_page_is_wider_than_its_window(site: Path) -> None:
+    require_browser()
+    with browser("--allow-file-access-from-files") as tab:
+        for width in (1600, 1400, 1200, 800, 390):  # with both sidebars, with one, with none, a phone
+            tab.size(width, 900, phone=width < 600)
+            for page in ("README.md", "docs/results.md", "docs/reference/python.md", "docs/tutorials/own-loss.md"):
+                tab.open((site / page).with_suffix(".html").as_uri())
+                wide, room = tab.ask("[document.documentElement.scrollWidth, document.documentElement.clientWidth]")
+                assert wide <= room, f"{page} is {wide} px wide in a window of {width}"
+        assert tab.errors == []
