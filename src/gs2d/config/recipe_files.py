@@ -57,7 +57,8 @@ def read_recipe_file(name: str) -> Recipe:
     if not colon:
         raise RecipeError(f"{path} needs the name of a recipe: --recipe {path}:NAME, one of {', '.join(own)}")
     if not hasattr(module, wanted):
-        raise RecipeError(f"{path} has no recipe {wanted!r}{did_you_mean(wanted, own)}; it has {', '.join(own)}")
+        meant = did_you_mean(wanted, own) or f"; it has {', '.join(own)}"
+        raise RecipeError(f"{path} has no recipe {wanted!r}{meant}")
     return made_recipe(getattr(module, wanted), name)
 
 
