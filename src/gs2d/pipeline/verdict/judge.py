@@ -161,8 +161,8 @@ def _why_low(measures: Measures) -> str:
     train = _psnr(measures, "train")
     if train is not None and grades.TRAIN_PSNR.grade(train) != GOOD:
         return (
-            f"Training views have {train:.1f} dB only: train longer or on larger pictures (--quality of gs2d "
-            "reconstruct, --schedule-scale and --downscale of gs2d train), unless something moved or the light changed "
+            f"Training views have {train:.1f} dB only: train longer or on larger pictures (--quality, or "
+            "--schedule-scale and --downscale), unless something moved or the light changed "
             "while you photographed."
         )
     return "Training views are good: more photographs of what new views show will help, more training will not."
