@@ -7,17 +7,30 @@ numbers, those nodes alone. The end of its input is its own end.
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 from ray.cluster_utils import Cluster
 
 SMALL = {"object_store_memory": 80_000_000}
+TRIES = 5  # of a node to come, on a machine with other work
+
+
+def another_node(cluster: Cluster) -> Any:
+    """Return a node that has come to the cluster; Ray gives up waiting for it early."""
+    for left in reversed(range(TRIES)):
+        try:
+            return cluster.add_node(num_cpus=1, num_gpus=0, **SMALL)
+        except Exception:
+            if not left:
+                raise
+    raise AssertionError
 
 
 def main() -> None:
     cluster = Cluster(
         initialize_head=True, head_node_args={"num_cpus": 0, "num_gpus": 0, "include_dashboard": False, **SMALL}
     )
-    workers = [cluster.add_node(num_cpus=1, num_gpus=0, **SMALL) for _ in range(int(sys.argv[1]))]
+    workers = [another_node(cluster) for _ in range(int(sys.argv[1]))]
     print(cluster.address, flush=True)
     for line in sys.stdin:
         word, *which = line.split()
@@ -26,7 +39,7 @@ def main() -> None:
             for number in lost:
                 cluster.remove_node(workers[number], allow_graceful=False)
             for number in lost:
-                workers[number] = cluster.add_node(num_cpus=1, num_gpus=0, **SMALL)
+                workers[number] = another_node(cluster)
             print("lost", flush=True)
     cluster.shutdown()
 

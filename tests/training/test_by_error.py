@@ -14,7 +14,8 @@ from gs2d.config.recipe import GradDensify, Recipe
 from gs2d.data.scene import Scene, View
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
-from gs2d.training.densify.by_error import MultiViewErrorDensifier, blended_sums
+from gs2d.training.blended_sums import blended_sums
+from gs2d.training.densify.by_error import MultiViewErrorDensifier
 from gs2d.training.densify.gradient import densify_and_prune
 from gs2d.training.objective import ViewResidual
 from gs2d.training.trainer import Trainer
@@ -90,10 +91,7 @@ def test_who_is_drawn_where_pictures_are_wrong_is_asked_first(scene: Scene, back
     trainer._downscale = 0
     trainer._look_at(1)
     wrong = densifier.urgency(trainer.state, 3)
-    seen = [
-        blended_sums(trainer.splats, densifier.surroundings.compare(trainer.state, 3, i), trainer.backend)
-        for i in range(VIEWS)
-    ]
+    seen = [densifier.surroundings.blame(trainer.state, 3, i) for i in range(VIEWS)]
     drawn_on_it = torch.stack([weighted / weights.clamp(min=1e-6) for weighted, weights in seen]).mean(dim=0)
     order = drawn_on_it.argsort()
     assert wrong[order[-20:]].mean() > 3 * wrong[order[:20]].mean()

@@ -12,14 +12,15 @@ from gs2d.config.protocols import GENERIC
 from gs2d.core.processes import Place
 from gs2d.data.scene import Scene
 from gs2d.errors import RecipeError
+from gs2d.training.densify.gradient import GradientDensifier
 from gs2d.training.parallel import ONE_PROCESS
 from gs2d.training.shards import Shards
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
-from together import RECIPES, SHARDED, Batch, by_error, together_in, trained
+from together import RECIPES, SHARDED, Batch, together_in, trained
 from train_toys import random_splats, short
 
-CASES = [case for case in RECIPES if case != "by_error"]
+CASES = list(RECIPES)
 CLOSE = 1e-5  # of the largest number of a tensor
 
 
@@ -128,9 +129,16 @@ class Alone(Shards):
         return make()
 
 
-def test_a_densifier_that_renders_by_itself_is_refused(scene: Scene) -> None:
-    with pytest.raises(RecipeError, match=r"got MultiViewErrorDensifier, which looks at all \(Densifier.splits_rows\)"):
-        Trainer(scene, by_error(), GENERIC, backend="reference", processes=Alone())
+class Greedy(GradientDensifier):
+    """Of a package that knows of no parts."""
+
+    splits_rows = False
+
+
+def test_a_densifier_that_looks_at_all_splats_is_refused(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gs2d.training.trainer.densifier_of", lambda densify, around: densify and Greedy(around))
+    with pytest.raises(RecipeError, match=r"got Greedy, which looks at all \(Densifier.splits_rows\)"):
+        Trainer(scene, short(), GENERIC, backend="reference", processes=Alone())
 
 
 def test_frozen_splats_are_refused(scene: Scene) -> None:

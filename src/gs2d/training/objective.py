@@ -24,7 +24,7 @@ from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backends import Backend
 from gs2d.render.exposure import identity
 from gs2d.render.photometry import Shading, photograph
-from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.render.types import PLAIN_COLORS, RasterSettings, RenderOutput
 from gs2d.training.dropout import dropout_rate, dropped_out, kept_splats
 from gs2d.training.exposure import apply_exposure
 from gs2d.training.multiview import PATCH_BYTES, ImageFiles, Turn, draw_turn, find_neighbours, is_compared
@@ -208,11 +208,18 @@ class FullRender:
         return torch.cat([own, own.new_zeros(len(self.frozen))])
 
     @torch.no_grad()
-    def residual(self, state: TrainState, stage: Stage, iteration: int, index: int) -> ViewResidual:
-        """Render view ``index`` as it is trained on at an iteration (from 1), beside its photograph."""
+    def residual(
+        self, state: TrainState, stage: Stage, iteration: int, index: int, plain: Splats | None = None
+    ) -> ViewResidual:
+        """Render view ``index`` as it is trained on at an iteration (from 1), beside its photograph.
+
+        ``plain`` are splats in plain colours, that are rendered instead of those of the state.
+        """
         camera, target = self.camera(state, index), self.targets[index]
         settings = replace(self.settings(stage, iteration), with_distortion=False)
-        color = rasterize(self.drawn(state.splats), camera, settings, backend=self.backend).color
+        settings = settings if plain is None else replace(settings, sh_degree=PLAIN_COLORS)
+        drawn = self.drawn(state.splats) if plain is None else plain
+        color = rasterize(drawn, camera, settings, backend=self.backend).color
         if state.exposures is not None or state.photometries is not None:
             given = (self._transform(state, index, color), target.silhouette, self._background)
             shading = self._shading(state, index, camera, color)

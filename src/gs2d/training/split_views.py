@@ -23,6 +23,7 @@ from gs2d.render.api import rasterize
 from gs2d.render.culling import may_be_seen
 from gs2d.render.pose_gradient import pose_gradient
 from gs2d.render.types import PLAIN_COLORS, RasterSettings
+from gs2d.training.blended_sums import blended_sums
 from gs2d.training.dropout import dropped_out, kept_splats
 from gs2d.training.objective import FullRender, diverged, first_not_finite, is_async, learning_rows
 from gs2d.training.parallel import Turn
@@ -125,6 +126,26 @@ class SplitViews:
             returned = self._shards.exchanged(errors, of, rows + [0] * (size - len(indices))).split(rows)
             for found, own in zip(visible, returned, strict=True):
                 yield spread(own, found, len(state.splats))
+
+    def blame(self, state: TrainState, stage: Stage, iteration: int, index: int) -> tuple[Tensor, Tensor]:
+        """Return how much of a view's error this process's splats are drawn on [n], and their blending weights [n].
+
+        All processes ask about the same view, which one of them renders.
+        """
+        whole, shards = self._whole, self._shards
+        renders, camera, settings = index % shards.size, whole.camera(state, index), whole.settings(stage, iteration)
+        rows = may_be_seen(state.splats, camera, settings).nonzero().squeeze(1)
+        with torch.no_grad():
+            records = _records(state.splats, rows, settings.sh_degree, _center(camera, state.splats.means))
+        given = [records if process == renders else records[:0] for process in range(shards.size)]
+        received, of = shards.delivered(given)
+        back = received.new_zeros(len(received), 2)
+        if shards.place.rank == renders:
+            splats = _splats(received)
+            found = whole.residual(state, stage, iteration, index, splats)
+            back = torch.stack(blended_sums(splats, found, whole.backend), dim=1)
+        sums = spread(shards.exchanged(back, of, [len(tensor) for tensor in given]), rows, len(state.splats))
+        return sums[:, 0], sums[:, 1]
 
     def _to_all(self, given: list[Tensor]) -> list[Tensor]:
         """Return what each process gets: those without a view get nothing."""

@@ -27,6 +27,7 @@ from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events, per_image
 from gs2d.training.adam import adam_step, begin_stage, lr_at
+from gs2d.training.blended_sums import blended_sums
 from gs2d.training.cached_objective import choose_objective
 from gs2d.training.densify.densifier import Densifier, Surroundings, densifier_of
 from gs2d.training.initialize import initial_splats, splats_as_start
@@ -34,7 +35,6 @@ from gs2d.training.objective import (
     FullRender,
     Objective,
     StepResult,
-    ViewResidual,
     check_losses,
     diverged,
     first_not_finite,
@@ -414,10 +414,13 @@ class Trainer:
     def _surroundings(self, stage: Stage) -> Surroundings:
         """Where the densifier of a stage works."""
 
-        def compare(state: TrainState, iteration: int, index: int) -> ViewResidual:
-            return self._whole.residual(state, stage, iteration, index)
+        def blame(state: TrainState, iteration: int, index: int) -> tuple[Tensor, Tensor]:
+            if isinstance(self.processes, Shards):
+                return SplitViews(self._whole, self.processes).blame(state, stage, iteration, index)
+            found = self._whole.residual(state, stage, iteration, index)
+            return blended_sums(state.splats, found, self._learner)
 
-        around = (stage.name, self.scene, self.settings, self.protocol.white, self._learner, compare)
+        around = (stage.name, self.scene, self.settings, self.protocol.white, self._learner, blame)
         return Surroundings(*around, processes=self.processes)
 
     def _check_sizes(self) -> None:

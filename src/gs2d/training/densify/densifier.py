@@ -19,7 +19,7 @@ from gs2d.training.parallel import ONE_PROCESS, OneProcess
 from gs2d.training.state import TrainState
 
 if TYPE_CHECKING:
-    from gs2d.training.objective import StepResult, ViewResidual
+    from gs2d.training.objective import StepResult
 
 __all__ = ["Densifier", "Surroundings", "densifier_of"]
 
@@ -40,9 +40,10 @@ class Surroundings:
         Whether the background is white.
     backend : Backend
         That of the training: see ``assign`` and ``accumulate`` there.
-    compare : callable
-        ``compare(state, iteration, index)`` renders training view ``index`` as the stage trains on it now, and returns
-        how it differs from its photograph.
+    blame : callable
+        ``blame(state, iteration, index)`` renders training view ``index`` as the stage trains on it now, and returns of
+        each splat [N] the sum over pixels of its blending weight times how the pixel differs from the photograph, and
+        that of its blending weight.
     processes : OneProcess
         Those that train together: what a densifier gathers of views goes through ``gather``, or ``part`` and ``sum``.
     """
@@ -52,7 +53,7 @@ class Surroundings:
     settings: RasterSettings
     white: bool
     backend: Backend
-    compare: Callable[[TrainState, int, int], ViewResidual]
+    blame: Callable[[TrainState, int, int], tuple[Tensor, Tensor]]
     processes: OneProcess = ONE_PROCESS
 
 
@@ -75,8 +76,8 @@ class Densifier:
         Whether it may train in several processes, where an iteration has a view in each: it takes what ``output`` says
         of the view (``losses``, ``signal``, ``radii``) through ``surroundings.processes`` alone, or not at all.
     splits_rows : bool
-        Whether it may train where each process has a part of the splats: it renders nothing, and what it asks of all
-        splats goes through ``state.parts`` (``training.parts``).
+        Whether it may train where each process has a part of the splats: it renders by ``surroundings.blame`` alone,
+        and what it asks of all splats goes through ``state.parts`` (``training.parts``).
     """
 
     shares_views = False
