@@ -156,6 +156,13 @@ def trained(
     return trainer.state, heard
 
 
+def flat(value: Any, at: str = "") -> dict[str, Tensor]:
+    """Every tensor and number of a state, by where it is."""
+    if isinstance(value, dict):
+        return {k: v for name, inner in value.items() for k, v in flat(inner, f"{at}/{name}").items()}
+    return {at: value if isinstance(value, Tensor) else torch.as_tensor(value)} if value is not None else {}
+
+
 def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

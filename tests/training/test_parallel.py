@@ -22,17 +22,10 @@ from gs2d.training.densify.densifier import Densifier
 from gs2d.training.parallel import ONE_PROCESS
 from gs2d.training.state import Moments, TrainState
 from gs2d.training.trainer import Trainer
-from together import RECIPES, Batch, together_in, trained
+from together import RECIPES, Batch, flat, together_in, trained
 from train_toys import random_splats, short
 
 CASES = [*RECIPES, "resumed", "differing"]
-
-
-def flat(value: Any, at: str = "") -> dict[str, torch.Tensor]:
-    """Every tensor and number of a state, by where it is."""
-    if isinstance(value, dict):
-        return {k: v for name, inner in value.items() for k, v in flat(inner, f"{at}/{name}").items()}
-    return {at: value if isinstance(value, torch.Tensor) else torch.as_tensor(value)} if value is not None else {}
 
 
 def differing(a: Any, b: Any) -> list[str]:

@@ -17,18 +17,11 @@ from gs2d.training.parallel import ONE_PROCESS
 from gs2d.training.shards import Shards
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
-from together import RECIPES, SHARDED, Batch, together_in, trained
+from together import RECIPES, SHARDED, Batch, flat, together_in, trained
 from train_toys import random_splats, short
 
 CASES = list(RECIPES)
 CLOSE = 1e-5  # of the largest number of a tensor
-
-
-def flat(value: Any, at: str = "") -> dict[str, torch.Tensor]:
-    """Every tensor and number of a state, by where it is."""
-    if isinstance(value, dict):
-        return {k: v for name, inner in value.items() for k, v in flat(inner, f"{at}/{name}").items()}
-    return {at: value if isinstance(value, torch.Tensor) else torch.as_tensor(value)} if value is not None else {}
 
 
 def differing(a: Any, b: Any) -> list[str]:
