@@ -11,7 +11,7 @@ from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Exposure, GradDensify, Recipe
 from gs2d.core.splats import Splats
 from gs2d.errors import RecipeError
-from gs2d.training.densify.by_error import blended_sums
+from gs2d.training.blended_sums import blended_sums
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
 from gs2d.training.whole_steps import WholeSteps
