@@ -6,6 +6,8 @@ As a program (``python together.py CASE,CASE FOLDER``), each process does the ca
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import os
 import socket
 import subprocess
@@ -164,10 +166,16 @@ def flat(value: Any, at: str = "") -> dict[str, Tensor]:
 
 
 def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-    return port
+    """A port that nothing listens at: none that connections are given (from 32768 on), or other workers look at."""
+    first = 15_000 + os.getpid() * 37 % 15_000 + next(_PORTS)
+    for port in range(first, 32_768):
+        with socket.socket() as probe, contextlib.suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
+    raise OSError("no port is free")
+
+
+_PORTS = itertools.count()
 
 
 def environment(rank: int, size: int, port: int) -> dict[str, str]:
