@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
 from pathlib import Path
 
@@ -97,8 +98,8 @@ def test_masks_of_another_shape_all_black_ones_and_a_folder_without_any_are_told
 
 
 def features(database: Path) -> np.ndarray:
-    """All places of features, px."""
-    with sqlite3.connect(database) as connection:
+    """All places of features, px; read as the product does, so that COLMAP, which opens the file now, can."""
+    with contextlib.closing(sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True)) as connection:
         rows = connection.execute("SELECT cols, data FROM keypoints WHERE rows > 0").fetchall()
     return np.concatenate([np.frombuffer(data, np.float32).reshape(-1, cols)[:, :2] for cols, data in rows])
 
