@@ -240,6 +240,11 @@ def do(case: str, many: Any) -> Any:
     if case in RECIPES:
         state, heard = trained(RECIPES[case](), many)
         return {"state": state.state_dict(), "losses": heard["losses"]}
+    if case == "dropped":  # by a mask that process 0 makes, of all splats
+        trainer = Trainer(make_scene(), short(), GENERIC, backend=backends()[-1], processes=many)
+        trainer._stop_telling()
+        dropped = trainer._robust._drop(trainer.state, lambda splats: splats.means[:, 0] > 0.1)
+        return {"dropped": dropped, "here": len(trainer.state.splats), "state": many.end(trainer.state).state_dict()}
     if case == "resumed":  # in the middle of a stage: the state of process 0 counts, the others have none
         whole, heard = trained(short(), many)
         kept = many.tell(heard["states"][3]) if many.leads else many.tell(None)

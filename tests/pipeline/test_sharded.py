@@ -77,10 +77,10 @@ def test_a_killed_rank_ends_the_run_which_goes_on_to_the_same_bytes(
 
 @pytest.mark.slow
 def test_a_run_goes_on_with_another_number_of_processes_and_without_shards(capture: Path, tmp_path: Path) -> None:
-    """Four, three, two without shards, one."""
+    """Four, of which one is killed after the first checkpoint; then three, two without shards, one."""
     out = tmp_path / "run"
-    stop = int(signal.SIGTERM)
-    in_processes(4, words(capture, out, "--sharded"), f"signal=0:1:{stop}")
+    stop, kill = int(signal.SIGTERM), int(signal.SIGKILL)
+    in_processes(4, words(capture, out, "--sharded"), f"signal=2:2:{kill}")
     in_processes(3, words(capture, out, "--sharded", "--resume"), f"signal=2:1:{stop}")
     in_processes(2, words(capture, out, "--resume"), f"signal=0:1:{stop}")
     assert in_processes(1, words(capture, out, "--resume")) == [(0, "")]

@@ -53,6 +53,22 @@ def test_what_cannot_be_seen_has_no_radius_and_no_errors(policy: str, seed: int)
     torch.testing.assert_close(of_these.color, output.color)
 
 
+def test_far_from_the_origin_nothing_is_lost_to_rounding() -> None:
+    """Places of a map's coordinates, rounded to some centimetres in float32, before a lens of a few degrees."""
+    splats = scattered(4000, 1)
+    far = np.array([412_345.0, 5_712_345.0, 87.0])
+    splats.means = 0.3 * splats.means + torch.from_numpy(far).float()
+    splats.log_scales = splats.log_scales - 5
+    up = np.array([0.0, 0.0, 1.0])
+    camera = look_at(far - [41.0, 37.0, -23.0], far, up, width=60, height=40, fx=9000.0)
+    seen = may_be_seen(splats, camera, RasterSettings())
+    for dtype in (torch.float32, torch.float64):  # by whichever arithmetic
+        with torch.no_grad():
+            radii = rasterize(splats.to(dtype=dtype), camera, RasterSettings(), backend="reference").radii
+        assert not bool((radii[~seen] > 0).any())
+        assert 10 < int((radii > 0).sum()) <= int(seen.sum())
+
+
 def test_broken_splats_are_not_sent() -> None:
     splats = scattered(4, 0)
     splats.means[0, 0], splats.log_scales[1, 0] = float("nan"), float("nan")

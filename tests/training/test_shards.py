@@ -43,7 +43,7 @@ def differing(a: Any, b: Any) -> list[str]:
 @pytest.fixture(scope="module")
 def two(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
     """All cases, done by two processes that have a part each."""
-    cases = [SHARDED + case for case in [*CASES, "resumed"]]
+    cases = [SHARDED + case for case in [*CASES, "resumed", "dropped"]]
     return together_in(2, cases, tmp_path_factory.mktemp("two"))
 
 
@@ -86,10 +86,20 @@ def test_a_run_goes_on_from_the_whole_state_of_process_0(two: dict[str, list[Any
         assert torch.equal(tensor, flat(found["whole"])[name]), name
 
 
+def test_what_process_0_finds_of_all_splats_goes_in_each(two: dict[str, list[Any]], scene: Scene) -> None:
+    first, second = two[f"{SHARDED}dropped"]
+    state = Trainer(scene, short(), GENERIC, backend="reference").state
+    goes = state.splats.means[:, 0] > 0.1
+    assert first["dropped"] == second["dropped"] == int(goes.sum()) > 0
+    assert abs(first["here"] - second["here"]) <= 1
+    assert torch.equal(first["state"]["splats"]["means"], state.splats.means[~goes])
+    assert torch.equal(first["state"]["splats"]["sh0"], state.splats.sh0[~goes])
+
+
 @pytest.mark.slow
 def test_four_processes_train_what_one_does_with_batches_of_four(tmp_path: Path) -> None:
     """Iterations of fewer views leave processes without one, which have their splats in the others' views."""
-    cases = ["short", "learning", "relocating", "compared", "dropping"]
+    cases = ["short", "learning", "relocating", "compared", "dropping", "by_error"]
     for case, found in together_in(4, [SHARDED + case for case in cases], tmp_path).items():
         state, _ = trained(RECIPES[case.removeprefix(SHARDED)](), Batch(4))
         assert differing(state.state_dict(), found[0]["state"]) == [], case

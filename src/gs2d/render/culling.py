@@ -11,7 +11,8 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.render.types import RasterSettings
 
-SLACK = 1e-3  # of a reach, and of a depth: what float32 may be off by
+SLACK = 1e-3  # of a reach, and of a depth: far more than float32 is off by
+ROUNDING = 1e-6  # of where the camera is: places are rounded to it
 
 
 @torch.no_grad()
@@ -25,14 +26,16 @@ def may_be_seen(splats: Splats, camera: Camera, settings: RasterSettings) -> Ten
     """
     farthest = max(math.sqrt(-2 * math.log(settings.alpha_min)), settings.error_cutoff)
     pose = torch.as_tensor(camera.T_cam_world).detach().to(splats.means)
-    x, y, z = (splats.means @ pose[:3, :3].T + pose[:3, 3]).unbind(dim=1)
-    reach = farthest * splats.log_scales.amax(dim=1).exp() * (1 + SLACK) + SLACK * z.abs()
+    center = torch.as_tensor(camera.center).to(splats.means)
+    x, y, z = ((splats.means - center) @ pose[:3, :3].T).unbind(dim=1)
+    off = SLACK * z.abs() + ROUNDING * center.abs().max()
+    reach = farthest * splats.log_scales.amax(dim=1).exp() * (1 + SLACK) + off
     margin = farthest * settings.lowpass_px + 1.0  # px
     inside = torch.ones_like(z, dtype=torch.bool)
-    for across, focal, center, size in (
+    for across, focal, middle, size in (
         (x, camera.fx, camera.cx, camera.width),
         (y, camera.fy, camera.cy, camera.height),
     ):
-        for sign, offset in ((1.0, center + margin), (-1.0, size - center + margin)):
+        for sign, offset in ((1.0, middle + margin), (-1.0, size - middle + margin)):
             inside &= (sign * focal * across + offset * z) / math.hypot(focal, offset) >= -reach
-    return (z > settings.near * (1 - SLACK)) & (inside | (z <= reach))
+    return (z + off > settings.near) & (inside | (z <= reach))

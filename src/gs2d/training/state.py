@@ -47,7 +47,7 @@ class Moments:
 
 @dataclass(eq=False)
 class TrainState:
-    """Mutable state of a training run. Only ``rows.keep_rows`` and ``rows.append_rows`` change N.
+    """Mutable state of a training run. Only the functions of ``training.rows`` change N.
 
     Attributes
     ----------

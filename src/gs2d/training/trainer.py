@@ -361,9 +361,9 @@ class Trainer:
         self, objective: Objective, stage: Stage, turns: Sequence[Turn], probe: Tensor | None
     ) -> tuple[StepResult, Sequence[Mapping[str, Tensor]]]:
         """Gradients of the mean loss of some views, and those of each view."""
-        state = self.state
-        if isinstance(self.processes, Shards):
-            return SplitViews(self._whole, self.processes).evaluate(state, stage, turns, probe)
+        state, split = self.state, self._split
+        if split is not None:
+            return split.evaluate(state, stage, turns, probe)
         return self.processes.evaluate(
             turns,
             lambda turn: objective.evaluate(state, stage, turn.iteration, turn.index, probe),
@@ -371,6 +371,11 @@ class Trainer:
             rows=objective.rows,
             of_views=bool(state.of_views()),
         )
+
+    @property
+    def _split(self) -> SplitViews | None:
+        """How views are rendered where each process has a part of the splats; None: where all have all."""
+        return SplitViews(self._whole, self.processes) if isinstance(self.processes, Shards) else None
 
     def _learn_at_once(self, stage: Stage, turns: Sequence[Turn], densifier: Densifier | None) -> bool:
         """Let the backend do an iteration of one process in one piece, if it is of a kind that it does."""
@@ -415,8 +420,8 @@ class Trainer:
         """Where the densifier of a stage works."""
 
         def blame(state: TrainState, iteration: int, index: int) -> tuple[Tensor, Tensor]:
-            if isinstance(self.processes, Shards):
-                return SplitViews(self._whole, self.processes).blame(state, stage, iteration, index)
+            if self._split is not None:
+                return self._split.blame(state, stage, iteration, index)
             found = self._whole.residual(state, stage, iteration, index)
             return blended_sums(state.splats, found, self._learner)
 
@@ -512,9 +517,8 @@ class Trainer:
 
     def _errors_by_view(self, occlusion: bool) -> Iterator[Tensor]:
         """Yield the inner sum of E_i [N] for each training view that this process looks at."""
-        if isinstance(self.processes, Shards):
-            views = SplitViews(self._whole, self.processes)
-            yield from views.errors(self.state, self.settings, occlusion=occlusion)
+        if self._split is not None:
+            yield from self._split.errors(self.state, self.settings, occlusion=occlusion)
             return
         for index in self.processes.part(range(len(self.scene.train))):
             found = self._whole.errors(self.state, index, self.drawn, self.settings, occlusion=occlusion)

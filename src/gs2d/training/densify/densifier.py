@@ -45,7 +45,8 @@ class Surroundings:
         each splat [N] the sum over pixels of its blending weight times how the pixel differs from the photograph, and
         that of its blending weight.
     processes : OneProcess
-        Those that train together: what a densifier gathers of views goes through ``gather``, or ``part`` and ``sum``.
+        Those that train together: what a densifier gathers of views goes through ``gather``, or ``part`` and
+        ``sum_views``.
     """
 
     stage: str
