@@ -1,9 +1,10 @@
-"""Fixtures for all tests: where the real captures are, and one torch thread."""
+"""Fixtures for all tests: where the real captures are, one torch thread, and what saves minutes of the whole."""
 
 from __future__ import annotations
 
+import gc
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,25 @@ import torch
 
 from gs2d.errors import BackendError
 from gs2d.kernels.library import load
+from gs2d.report import plots
+
+CURVES_ARE_LOOKED_AT = ("report", "experiments/test_figures.py")
+
+
+def pytest_collection_finish() -> None:
+    """What collection left is never garbage: each of the collections that training asks for took half a second."""
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def curves(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Draw the curves of a report only where a test looks at them: they are half of the time of a run of seconds."""
+    name = request.path.relative_to(Path(__file__).parent).as_posix()
+    with pytest.MonkeyPatch.context() as patch:
+        if not name.startswith(CURVES_ARE_LOOKED_AT):
+            patch.setattr(plots, "_figure", lambda *_, **__: "<svg></svg>")
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

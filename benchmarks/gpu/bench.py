@@ -9,7 +9,6 @@ import signal
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -203,16 +202,14 @@ def opened(dry: bool, minutes: float = math.inf) -> Iterator[Bench]:
     sys.path.insert(0, str(ROOT / "tests" / "helpers"))
     from emulate import Emulator
 
-    with tempfile.TemporaryDirectory() as folder:
-        emulator = Emulator(Path(folder))
-        backend = EmulatedBackend()
-        before = launch.launcher_for, BACKENDS._things["cuda"]
-        launch.launcher_for = lambda device: emulator
-        BACKENDS._things["cuda"] = lambda: backend
-        try:
-            yield Bench(backend, emulator, True, end)
-        finally:
-            launch.launcher_for, BACKENDS._things["cuda"] = before
+    emulator, backend = Emulator(), EmulatedBackend()
+    before = launch.launcher_for, BACKENDS._things["cuda"]
+    launch.launcher_for = lambda device: emulator
+    BACKENDS._things["cuda"] = lambda: backend
+    try:
+        yield Bench(backend, emulator, True, end)
+    finally:
+        launch.launcher_for, BACKENDS._things["cuda"] = before
 
 
 def facts(bench: Bench) -> dict[str, Any]:

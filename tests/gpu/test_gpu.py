@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -70,10 +69,10 @@ def test_every_kernel_loads(gpu: Backend) -> None:
             launcher._load(name)
 
 
-def test_the_gpu_gives_what_the_emulator_gives(gpu: Backend, tmp_path: Path) -> None:
+def test_the_gpu_gives_what_the_emulator_gives(gpu: Backend) -> None:
     """The same sources: images differ by approximate instructions and flipped decisions only."""
     splats, camera = scene(300, (70, 45))
-    low = cuda.rasterize_with(Emulator(tmp_path), splats, camera, SETTINGS)
+    low = cuda.rasterize_with(Emulator(), splats, camera, SETTINGS)
     high = rasterize(splats.to("cuda"), camera, SETTINGS, backend="cuda")
     for name in ("color", "alpha", "normal"):
         difference = (getattr(low, name) - getattr(high, name).cpu()).abs()

@@ -1,11 +1,19 @@
-"""Compile CUDA sources for the CPU (emulator.h) and call their kernels on tensors in host memory."""
+"""Compile CUDA sources for the CPU (emulator.h) and call their kernels on tensors in host memory.
+
+Libraries are kept in build/emulated under a digest of all that goes into them, for the other workers and processes of
+the tests and for the next time.
+"""
 
 from __future__ import annotations
 
 import ctypes
+import functools
+import hashlib
+import os
 import re
 import shutil
 import subprocess
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,10 +21,12 @@ from pathlib import Path
 import pytest
 
 import gs2d.kernels
+from gs2d.core.locks import try_lock
 from gs2d.kernels.cuda.launch import OneByOne
 
 HERE = Path(__file__).parent
 KERNELS = Path(gs2d.kernels.__file__).parent
+KEPT = HERE.parents[1] / "build" / "emulated"
 # As the GPU build: no contraction, and every fused multiply-add written out. -march only makes fmaf fast.
 FLAGS = (
     "-std=c++17",
@@ -66,54 +76,85 @@ class EmulatedKernels:
 def build(
     sources: Sequence[Path],
     include: Path,
-    folder: Path,
-    name: str,
     *,
     approximate: bool = False,
     addresses: bool = False,
     undefined: bool = False,
     wave: int = 0,
 ) -> EmulatedKernels:
-    """Compile; the compiler gets two minutes. ``folder`` receives a wrapper and the library. Skips without g++.
+    """Compile, unless that was done; the compiler gets two minutes. Skips without g++.
 
     ``approximate``: with the largest errors of the approximate instructions. ``addresses``: with AddressSanitizer;
     ``undefined``: undefined behaviour ends the process. ``wave``: 32 or 64, as for AMD's GPUs with waves of so many.
     """
     if shutil.which("g++") is None:
         pytest.skip("no g++ here, which runs the CUDA kernels on the CPU; install one")
-    names = [kernel for source in sources for kernel in KERNEL.findall(source.read_text())]
-    wrapper = folder / f"{name}.cpp"
+    chosen = ["-DEMULATE_APPROXIMATIONS"] if approximate else []
+    chosen += ADDRESSES if addresses else []
+    chosen += UNDEFINED if undefined else []
+    chosen += [f"-DGS2D_WAVE={wave}", "-DGS2D_EMULATED"] if wave else []
+    command = ["g++", *FLAGS, *chosen, f"-I{include}"]
+    wrapper = wrapper_of(sources, wave)
+    digest = hashlib.sha256("\0".join([compiler(), *command, wrapper]).encode())
+    for path in (*sources, *sorted(HERE.glob("*.h")), *sorted(include.rglob("*.h"))):
+        digest.update(path.read_bytes() + b"\0")
+    library = KEPT / f"{sources[0].stem}-{digest.hexdigest()[:24]}.so"
+    KEPT.mkdir(parents=True, exist_ok=True)
+    with library.with_suffix(".lock").open("w") as lock:
+        while not try_lock(lock.fileno()):  # another worker is at it
+            time.sleep(0.2)
+        if not library.exists():
+            compile_into(library, command, wrapper)
+            forget_old()
+    os.utime(library)
+    return EmulatedKernels(library)
+
+
+def wrapper_of(sources: Sequence[Path], wave: int) -> str:
+    """Return the source of a library: the sources, and a function for each of their kernels."""
     headers = [HERE / "emulator.h", *([KERNELS / "cuda" / "amd.h"] if wave else [])]
     lines = [f'#include "{path}"' for path in headers]
     lines.append("namespace gs2d {}\nusing namespace gs2d;")  # where our kernels live
     lines += [f'#include "{path}"' for path in sources]
     signature = "(unsigned x, unsigned y, unsigned block, int order, const void* a)"
-    for kernel in names:
+    for kernel in [kernel for source in sources for kernel in KERNEL.findall(source.read_text())]:
         body = f"return emulator::launch({kernel}, x, y, block, order, a);"
         lines.append(f'extern "C" const char* launch_{kernel}{signature} {{ {body} }}')
-    wrapper.write_text("\n".join(lines) + "\n")
-    library = folder / f"{name}.so"
-    chosen = ["-DEMULATE_APPROXIMATIONS"] if approximate else []
-    chosen += ADDRESSES if addresses else []
-    chosen += UNDEFINED if undefined else []
-    chosen += [f"-DGS2D_WAVE={wave}", "-DGS2D_EMULATED"] if wave else []
-    command = ["g++", *FLAGS, *chosen, f"-I{include}", str(wrapper), "-o", str(library)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    return "\n".join(lines) + "\n"
+
+
+@functools.cache
+def compiler() -> str:
+    """Return which g++ this is."""
+    return subprocess.run(["g++", "--version"], capture_output=True, text=True, check=True).stdout
+
+
+def compile_into(library: Path, command: Sequence[str], wrapper: str) -> None:
+    """Compile; the library has its name when it is whole."""
+    source, made = library.with_suffix(".cpp"), library.with_suffix(".tmp")
+    source.write_text(wrapper)
+    words = [*command, str(source), "-o", str(made)]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
     if done.returncode != 0:
-        raise RuntimeError(f"g++ failed on {', '.join(s.name for s in sources)}:\n{done.stderr[-4000:]}")
-    return EmulatedKernels(library)
+        raise RuntimeError(f"g++ failed on {library.stem.partition('-')[0]}:\n{done.stderr[-4000:]}")
+    made.rename(library)
+
+
+def forget_old() -> None:
+    """Remove what no test has wanted for a week: each change of a header makes all of them anew."""
+    for path in KEPT.iterdir():
+        if time.time() - path.stat().st_mtime > 7 * 24 * 3600 and path.suffix == ".so":
+            for suffix in (".so", ".cpp", ".lock"):
+                path.with_suffix(suffix).unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)
 class Emulator(OneByOne):
     """A launcher (``gs2d.kernels.cuda.launch``) that runs the package's kernels on tensors in host memory.
 
-    A source file is compiled, into ``folder``, when one of its kernels is first wanted; with ``reuse`` what is there
-    already, from another process of the same tests, is taken.
+    A source file is compiled when one of its kernels is first wanted.
     """
 
-    folder: Path
-    reuse: bool = False
     descending: bool = False
     seed: int = 0
     approximate: bool = False
@@ -128,12 +169,7 @@ class Emulator(OneByOne):
             return
         if name not in self._built:
             source = next(s for s in sorted((KERNELS / "cuda").glob("*.cu")) if name in KERNEL.findall(s.read_text()))
-            there = self.folder / f"{source.stem}.so"
-            if self.reuse and there.exists():
-                built = EmulatedKernels(there)
-            else:
-                sanitizers = {"addresses": self.addresses, "undefined": self.undefined}
-                options = {"approximate": self.approximate, "wave": self.wave, **sanitizers}
-                built = build([source], KERNELS, self.folder, source.stem, **options)
+            sanitizers = {"addresses": self.addresses, "undefined": self.undefined}
+            built = build([source], KERNELS, approximate=self.approximate, wave=self.wave, **sanitizers)
             self._built.update(dict.fromkeys(KERNEL.findall(source.read_text()), built))
         self._built[name].launch(name, (blocks, 1), threads, arguments, descending=self.descending, seed=self.seed)

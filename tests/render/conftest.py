@@ -44,9 +44,9 @@ def native(request: pytest.FixtureRequest) -> Backend:
 
 
 @pytest.fixture(scope="session")
-def emulator(tmp_path_factory: pytest.TempPathFactory) -> emulate.Emulator:
+def emulator() -> emulate.Emulator:
     """A launcher that runs the CUDA kernels on the CPU."""
-    return emulate.Emulator(tmp_path_factory.mktemp("kernels"))
+    return emulate.Emulator()
 
 
 def _available(name: str) -> Backend:

@@ -121,12 +121,12 @@ def trained(scene: Scene, settings: DenseStart) -> tuple[float, int]:
     made = scale_schedule(two_dgs(), 60 / 30_000)
     stage = replace(made.stages[0], densify=None, sh_interval=0)
     recipe: Recipe = replace(made, stages=(stage,), sh_degree=0, dense_start=settings)
-    trainer = Trainer(scene, recipe, GENERIC, backend="reference")
+    trainer = Trainer(scene, recipe, GENERIC, backend="auto")
     count = len(trainer.splats)
     trainer.run()
     view = scene.train[2]
     with torch.no_grad():
-        color = rasterize(trainer.splats, view.camera, trainer.settings, backend="reference").color
+        color = rasterize(trainer.splats, view.camera, trainer.settings, backend="auto").color
     target = torch.from_numpy(view.target((0.0, 0.0, 0.0)))
     bare = (target - 128 / 255).abs().amax(dim=2) < 1e-3
     assert 0.1 < bare.double().mean() < 0.5

@@ -19,9 +19,9 @@ from gs2d.kernels.cuda import launch
 
 
 @pytest.fixture(scope="session", params=[0, pytest.param(64, marks=pytest.mark.slow)], ids=["warps", "waves"])
-def emulator(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> emulate.Emulator:
+def emulator(request: pytest.FixtureRequest) -> emulate.Emulator:
     """A launcher that runs the package's kernels on the CPU: in warps, and as AMD's GPUs do in waves of 64."""
-    return emulate.Emulator(tmp_path_factory.mktemp("kernels"), wave=request.param)
+    return emulate.Emulator(wave=request.param)
 
 
 @pytest.fixture(scope="session")

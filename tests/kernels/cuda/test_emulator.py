@@ -22,15 +22,14 @@ HELPERS = Path(__file__).resolve().parents[2] / "helpers"
 
 
 @pytest.fixture(scope="module")
-def cases(tmp_path_factory: pytest.TempPathFactory) -> emulate.EmulatedKernels:
-    return emulate.build([HELPERS / "emulator_cases.cu"], HELPERS, tmp_path_factory.mktemp("emulator"), "cases")
+def cases() -> emulate.EmulatedKernels:
+    return emulate.build([HELPERS / "emulator_cases.cu"], HELPERS)
 
 
 @pytest.fixture(scope="module", params=[0, 32, 64], ids=["warps", "waves of 32", "waves of 64"])
-def lanes(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> emulate.EmulatedKernels:
+def lanes(request: pytest.FixtureRequest) -> emulate.EmulatedKernels:
     """The same, also as on AMD's GPUs, through cuda/amd.h."""
-    folder = tmp_path_factory.mktemp("emulator")
-    return emulate.build([HELPERS / "emulator_cases.cu"], HELPERS, folder, "cases", wave=request.param)
+    return emulate.build([HELPERS / "emulator_cases.cu"], HELPERS, wave=request.param)
 
 
 def run(
@@ -146,4 +145,4 @@ def test_a_source_that_does_not_compile_is_reported(tmp_path: Path) -> None:
     source = tmp_path / "broken.cu"
     source.write_text('extern "C" __global__ void broken(int a) { this is not C++; }')
     with pytest.raises(RuntimeError, match=r"broken\.cu"):
-        emulate.build([source], tmp_path, tmp_path, "broken")
+        emulate.build([source], tmp_path)

@@ -21,13 +21,13 @@ COMMON = """
 import sys
 from pathlib import Path
 
-guard, kernels, helpers, folder = sys.argv[1], *map(Path, sys.argv[2:5])
+guard, helpers, folder = sys.argv[1], *map(Path, sys.argv[2:4])
 sys.path.insert(0, str(helpers))
 import fake_gpu
 import torch
 from emulate import Emulator
 
-emulator = Emulator(kernels, reuse=True, wave=int(sys.argv[5]))
+emulator = Emulator(wave=int(sys.argv[4]))
 """
 
 RULES = """
@@ -106,7 +106,7 @@ print(render_run(folder / "run", orbit=1)["images"])
 
 def said(script: str, guard: Path, emulator: emulate.Emulator, folder: Path) -> list[str]:
     """What a script prints in a process of its own; kernels that these tests have compiled already are taken."""
-    given = [str(guard), str(emulator.folder), str(Path(__file__).resolve().parents[2] / "helpers"), str(folder)]
+    given = [str(guard), str(Path(__file__).resolve().parents[2] / "helpers"), str(folder)]
     command = [sys.executable, "-c", COMMON + script, *given, str(emulator.wave)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=270, check=False, env=dict(os.environ))
     assert done.returncode == 0, done.stderr[-3000:]

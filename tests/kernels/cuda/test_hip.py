@@ -117,10 +117,8 @@ def test_a_library_without_a_function_is_one_line(tmp_path: Path) -> None:
         HipDriver(ctypes.CDLL(None))
 
 
-def test_a_scene_by_way_of_hip_in_waves_of_64_is_what_warps_make_of_it(
-    fake_hip: FakeHip, emulator: Emulator, tmp_path: Path
-) -> None:
-    fake_hip.run_by(Emulator(tmp_path, wave=64))
+def test_a_scene_by_way_of_hip_in_waves_of_64_is_what_warps_make_of_it(fake_hip: FakeHip, emulator: Emulator) -> None:
+    fake_hip.run_by(Emulator(wave=64))
     rng = np.random.default_rng(3)
     camera = random_camera(rng)
     splats = random_splats(rng, camera, 40).to(dtype=torch.float32)

@@ -18,14 +18,13 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 COMMON = """
 import sys
-from pathlib import Path
 
 sys.path.insert(0, sys.argv[1])
 import numpy as np
 import torch
 from emulate import Emulator
 
-emulator = Emulator(Path(sys.argv[2]), wave=int(sys.argv[3]), **{sys.argv[4]: True})
+emulator = Emulator(wave=int(sys.argv[2]), **{sys.argv[3]: True})
 """
 
 BEYOND = """
@@ -53,7 +52,7 @@ emulator.launch("clear_words", 1, 256, ClearArguments(words=words.data_ptr() + 4
 SANITIZERS = {"addresses": "libasan.so", "undefined": "libubsan.so"}
 
 
-def run(script: str, folder: Path, kind: str = "addresses", wave: int = 0) -> subprocess.CompletedProcess[str]:
+def run(script: str, kind: str = "addresses", wave: int = 0) -> subprocess.CompletedProcess[str]:
     """The script under a sanitizer."""
     if shutil.which("g++") is None:
         pytest.skip("no g++ here")
@@ -64,19 +63,19 @@ def run(script: str, folder: Path, kind: str = "addresses", wave: int = 0) -> su
     # Fibers have stacks of their own, which it does not follow; the rest is about other libraries.
     options = "detect_leaks=0:detect_stack_use_after_return=0:alloc_dealloc_mismatch=0:detect_odr_violation=0"
     settings = {**os.environ, "LD_PRELOAD": str(library), "ASAN_OPTIONS": options, "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", COMMON + script, str(HELPERS), str(folder), str(wave), kind]
+    command = [sys.executable, "-c", COMMON + script, str(HELPERS), str(wave), kind]
     return subprocess.run(command, env=settings, capture_output=True, text=True, timeout=800, check=False)
 
 
-def test_a_read_beyond_a_tensor_is_found_with_its_line(tmp_path: Path) -> None:
-    done = run(BEYOND, tmp_path)
+def test_a_read_beyond_a_tensor_is_found_with_its_line() -> None:
+    done = run(BEYOND)
     assert done.returncode != 0
     assert "heap-buffer-overflow" in done.stderr
     assert "photometric.cu" in done.stderr
 
 
-def test_words_that_do_not_lie_on_their_boundary_are_found_with_their_line(tmp_path: Path) -> None:
-    done = run(MISPLACED, tmp_path, "undefined")
+def test_words_that_do_not_lie_on_their_boundary_are_found_with_their_line() -> None:
+    done = run(MISPLACED, "undefined")
     assert done.returncode != 0
     assert "misaligned address" in done.stderr
     assert "sort.cu" in done.stderr
@@ -84,9 +83,7 @@ def test_words_that_do_not_lie_on_their_boundary_are_found_with_their_line(tmp_p
 
 @pytest.mark.parametrize("wave", [0, 64], ids=["warps", "waves"])
 @pytest.mark.parametrize("kind", list(SANITIZERS))
-def test_no_kernel_reads_or_writes_beyond_a_tensor_or_does_what_is_undefined(
-    tmp_path: Path, kind: str, wave: int
-) -> None:
-    done = run(EVERYTHING, tmp_path, kind, wave)
+def test_no_kernel_reads_or_writes_beyond_a_tensor_or_does_what_is_undefined(kind: str, wave: int) -> None:
+    done = run(EVERYTHING, kind, wave)
     assert done.returncode == 0, done.stderr[-3000:]
     assert done.stdout == "all done\n"

@@ -28,9 +28,9 @@ def warps(emulator: emulate.Emulator) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.parametrize("wave", [64, pytest.param(32, marks=pytest.mark.slow)])
-def test_every_kernel_leaves_the_same_bits_in_waves(warps: dict[str, torch.Tensor], tmp_path: Path, wave: int) -> None:
+def test_every_kernel_leaves_the_same_bits_in_waves(warps: dict[str, torch.Tensor], wave: int) -> None:
     """Sums by atomics too: where no order is asked for, warps go from one collective to the next together."""
-    waves = emulate.Emulator(tmp_path, wave=wave)
+    waves = emulate.Emulator(wave=wave)
     found = every_kernel.everything(waves)
     different = [name for name in warps if not torch.equal(warps[name], found[name])]
     assert not different
@@ -42,9 +42,9 @@ def test_every_kernel_leaves_the_same_bits_in_waves(warps: dict[str, torch.Tenso
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 9])
 def test_waves_whose_warps_part_anywhere_change_what_only_the_order_of_atomics_may(
-    warps: dict[str, torch.Tensor], tmp_path: Path, seed: int
+    warps: dict[str, torch.Tensor], seed: int
 ) -> None:
-    found = every_kernel.everything(emulate.Emulator(tmp_path, wave=64, seed=seed))
+    found = every_kernel.everything(emulate.Emulator(wave=64, seed=seed))
     summed = ("all False", "colours False", "by transmittance", "whole")  # by atomics
     for name, tensor in warps.items():
         if name.startswith(summed) and not name.endswith("color"):
@@ -64,6 +64,6 @@ def test_a_ballot_that_takes_the_whole_wave_for_a_warp_is_found(
     assert "wave >> (threadIdx.x & 32u)" in text
     header.write_text(text.replace("wave >> (threadIdx.x & 32u)", "wave"))
     monkeypatch.setattr(emulate, "KERNELS", package)
-    broken = emulate.Emulator(tmp_path, wave=64)
+    broken = emulate.Emulator(wave=64)
     cut = every_kernel.whole_steps(broken, every_kernel.many_tiles())
     assert any(not torch.equal(tensor, warps[name]) for name, tensor in cut.items())

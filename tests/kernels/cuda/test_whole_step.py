@@ -175,7 +175,7 @@ def test_memory_of_before_and_the_order_of_threads_change_nothing(
         return done
 
     monkeypatch.setattr(cuda_step.Stepper, "run", poisoned)
-    shuffled = Emulator(emulator.folder, reuse=True, wave=emulator.wave, seed=seed)
+    shuffled = Emulator(wave=emulator.wave, seed=seed)
     parts, _ = trained(shuffled, scene, train_toys.short(), "autograd")
     whole, some = trained(shuffled, scene, train_toys.short(), "launches")
     assert some == checked["extras"] >= 11
@@ -238,11 +238,11 @@ def test_a_driver_without_graphs_launches_one_by_one(emulator: Emulator, scene: 
 @pytest.mark.slow
 @pytest.mark.parametrize("chosen", ["launches", "graph"])
 def test_training_by_way_of_hip_in_waves_of_64_has_the_bits_of_warps(
-    fake_hip: FakeHip, emulator: Emulator, scene: Scene, tmp_path: Path, chosen: str, monkeypatch: pytest.MonkeyPatch
+    fake_hip: FakeHip, emulator: Emulator, scene: Scene, chosen: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recipe = brief()
     expected, some = trained(emulator, scene, recipe, "launches")
-    fake_hip.run_by(Emulator(tmp_path, wave=64))
+    fake_hip.run_by(Emulator(wave=64))
     monkeypatch.setenv(launch.STEP_VARIABLE, chosen)
     found, as_many = trained(fake_hip.launcher(), scene, recipe, chosen)
     assert some == as_many == 6
