@@ -64,7 +64,7 @@ def test_names_of_windows_and_of_macos_are_understood(tmp_path: Path) -> None:
         file.writestr("shots/B\u00e4ume.txt", b"trees")
     # Python says that it wrote UTF-8; macOS does not say so: clear the flag in both headers.
     header = rb"(PK\x03\x04..|PK\x01\x02....)\x00\x08"
-    data, count = re.subn(header, rb"\1\x00\x00", path.read_bytes(), flags=re.DOTALL)
+    data, count = re.subn(header, b"\\1\x00\x00", path.read_bytes(), flags=re.DOTALL)
     assert count == 2
     path.write_bytes(data)
     root = unpacked(path, tmp_path / "out")
