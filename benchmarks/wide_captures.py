@@ -3,11 +3,13 @@
 ::
 
     python -m benchmarks.wide_captures panorama FOLDER [--count 10] [--width 1024] [--tilt 3]
-    python -m benchmarks.wide_captures fisheye FOLDER [--angle 180] ...
+    python -m benchmarks.wide_captures fisheye FOLDER [--angle 180] [--across width] [--off 0] [--camera-model auto] ...
 
-Somebody walks through a closed room of 4 x 3.2 x 2.4 m with mottled walls, turns as it comes, and holds the camera
-level up to ``--tilt`` degrees (one sigma about each axis). ``FOLDER/photos`` has the photographs, which tell nothing of
-their lens, ``FOLDER/truth.json`` their poses (world to camera). Then ``gs2d poses`` finds the cameras
+Somebody walks through a closed room of 4 x 3.2 x 2.4 m with mottled walls (and three boxes, for fisheyes), turns as it
+comes, and holds the camera level up to ``--tilt`` degrees (one sigma about each axis). The circle of a fisheye fits
+into the ``--across`` height (round pictures), the width (dark corners), or the diagonal of a picture (all of it is
+shown), and its middle may be ``--off`` that of the picture. ``FOLDER/photos`` has the photographs, which tell nothing
+of their lens, ``FOLDER/truth.json`` their poses (world to camera). Then ``gs2d poses`` finds the cameras
 (``FOLDER/capture``), and it is printed how far they are from the truth after the best similarity.
 """
 
@@ -29,12 +31,21 @@ from gs2d.core.json_files import write_json
 from gs2d.core.similarity import apply, similarity_scale, umeyama
 from gs2d.data.readers.colmap import read_images
 from gs2d.errors import Gs2dError
+from gs2d.pipeline.events import Notice
 from gs2d.pipeline.options import PosesOptions
-from gs2d.pipeline.sfm import find_poses
+from gs2d.pipeline.sfm import CAMERA_MODELS, find_poses
 
 LOW, HIGH = np.array([-2.0, -1.6, 0.0]), np.array([2.0, 1.6, 2.4])  # m, of the room
 CELLS, METRES = 256, 4.0  # of a wall's pattern, and what it covers
 BENT = (0.02, -0.006, 0.001, 0.0)  # of the fisheye: r = f (t + k1 t^3 + ...), as OPENCV_FISHEYE has it
+NO_BOXES = np.zeros((0, 2, 3))
+BOXES = np.array(  # m: a shelf, a chest, a stool
+    [
+        [[-1.5, 1.0, 0.0], [-0.9, 1.4, 1.3]],
+        [[0.3, 0.8, 0.0], [1.3, 1.3, 0.6]],
+        [[-0.4, 0.7, 0.0], [-0.1, 1.0, 0.45]],
+    ]
+)
 LEVEL = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # x right, y down, z ahead of who looks along the world's y
 Rays = Callable[[np.ndarray, np.ndarray], np.ndarray]  # columns and rows, px -> rays of the camera; zeros: nothing
 
@@ -49,20 +60,39 @@ def walls(seed: int = 0) -> np.ndarray:
     return np.asarray(255 * (made - made.min()) / (made.max() - made.min()))
 
 
-def colours(patterns: np.ndarray, eye: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Colours [..., 3] that rays of the world [..., 3] see from within the room; black for zeros."""
-    found, nearest = np.zeros(rays.shape), np.full(rays.shape[:-1], np.inf)
-    for axis in range(3):
-        others = [other for other in range(3) if other != axis]
-        for side, wall in enumerate((LOW[axis], HIGH[axis])):
-            with np.errstate(divide="ignore", invalid="ignore"):
-                distance = (wall - eye[axis]) / rays[..., axis]
-            hit = (distance > 0) & (distance < nearest)
-            points = eye[others] + np.where(hit, distance, 0.0)[..., None] * rays[..., others]
-            cell = np.floor(points * (CELLS / METRES)).astype(int) % CELLS
-            found = np.where(hit[..., None], patterns[2 * axis + side][cell[..., 0], cell[..., 1]], found)
-            nearest = np.where(hit, distance, nearest)
-    return np.where(np.isfinite(nearest)[..., None], found, 0.0)
+def colours(patterns: np.ndarray, eye: np.ndarray, rays: np.ndarray, boxes: np.ndarray = NO_BOXES) -> np.ndarray:
+    """Colours [..., 3] that rays of the world [..., 3] see from within the room; black for zeros.
+
+    ``boxes`` [B, 2, 3] have their corners there, m; nobody is in one.
+    """
+    flat = rays.reshape(-1, 3)
+    seen = np.flatnonzero(flat.any(axis=1))
+    d = flat[seen]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        walls_at = (np.where(d > 0, HIGH, LOW) - eye) / d
+        walls_at[~(d != 0)] = np.inf
+        axis = walls_at.argmin(axis=1)
+        nearest = walls_at[np.arange(len(d)), axis]
+        shown = _painted(patterns, 2 * axis + (d[np.arange(len(d)), axis] > 0), eye + nearest[:, None] * d, axis)
+        for number, (low, high) in enumerate(boxes):
+            one, other = (low - eye) / d, (high - eye) / d
+            enter, leave = np.fmin(one, other), np.fmax(one, other)
+            axis, distance = enter.argmax(axis=1), enter.max(axis=1)
+            hit = np.flatnonzero((distance > 0) & (distance < leave.min(axis=1)) & (distance < nearest))
+            nearest[hit] = distance[hit]
+            points = 3 * (eye + distance[hit, None] * d[hit])
+            mottled = _painted(patterns, np.full(len(hit), number), points, axis[hit])
+            shown[hit] = 0.4 * mottled + 0.6 * 230 * np.eye(3)[number]
+    found = np.zeros(flat.shape)
+    found[seen] = shown
+    return found.reshape(rays.shape)
+
+
+def _painted(patterns: np.ndarray, which: np.ndarray, points: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Colours [P, 3] of points [P, 3] on planes across these axes of the world [P], in these patterns [P]."""
+    others = np.array([[1, 2], [0, 2], [0, 1]])[axis]
+    cell = np.floor(np.take_along_axis(points, others, axis=1) * (CELLS / METRES)).astype(int) % CELLS
+    return np.asarray(patterns[which, cell[:, 0], cell[:, 1]])
 
 
 def panorama_rays(width: int) -> Rays:
@@ -75,19 +105,30 @@ def panorama_rays(width: int) -> Rays:
     return rays
 
 
-def fisheye_focal(width: int, angle: float) -> float:
+def fisheye_focal(width: float, angle: float) -> float:
     """Return the focal length, px, at which a circle of ``width`` px shows ``angle`` degrees."""
     t = np.radians(angle / 2)
     return float(width / 2 / (t + sum(k * t ** (2 * i + 3) for i, k in enumerate(BENT))))
 
 
-def fisheye_rays(width: int, height: int, angle: float) -> Rays:
-    """Return the rays of a fisheye in whose width fit ``angle`` degrees; zeros beyond the circle."""
-    f, t = fisheye_focal(width, angle), np.linspace(0, np.radians(angle / 2), 4000)
+def across(size: tuple[int, int], what: str) -> float:
+    """Return the "width", "height" or "diagonal" of a picture, px."""
+    return {"width": size[0], "height": size[1], "diagonal": float(np.hypot(*size))}[what]
+
+
+def fisheye_rays(
+    width: int, height: int, angle: float, *, circle: float | None = None, off: tuple[float, float] = (0.0, 0.0)
+) -> Rays:
+    """Return the rays of a fisheye; zeros beyond its circle of ``angle`` degrees.
+
+    The circle is ``circle`` px across (the width of the picture), its middle ``off`` px from that of the picture.
+    """
+    circle = float(width) if circle is None else circle
+    f, t = fisheye_focal(circle, angle), np.linspace(0, np.radians(angle / 2), 4000)
     reach = f * (t + sum(k * t ** (2 * i + 3) for i, k in enumerate(BENT)))
 
     def rays(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        x, y = u - width / 2, v - height / 2
+        x, y = u - width / 2 - off[0], v - height / 2 - off[1]
         r = np.hypot(x, y)
         at = np.interp(r, reach, t)
         side = np.sin(at) / np.maximum(r, 1e-9)
@@ -97,12 +138,14 @@ def fisheye_rays(width: int, height: int, angle: float) -> Rays:
     return rays
 
 
-def photograph(patterns: np.ndarray, pose: np.ndarray, rays: Rays, size: tuple[int, int]) -> np.ndarray:
+def photograph(
+    patterns: np.ndarray, pose: np.ndarray, rays: Rays, size: tuple[int, int], boxes: np.ndarray = NO_BOXES
+) -> np.ndarray:
     """uint8 [H, W, 3] from a pose T_cam_world [4, 4]; four rays a pixel."""
     width, height = size
     v, u = (np.mgrid[: height * 2, : width * 2] + 0.5) / 2
     eye = -pose[:3, :3].T @ pose[:3, 3]
-    seen = colours(patterns, eye, rays(u, v) @ pose[:3, :3])
+    seen = colours(patterns, eye, rays(u, v) @ pose[:3, :3], boxes)
     return np.rint(seen.reshape(height, 2, width, 2, 3).mean(axis=(1, 3))).astype(np.uint8)
 
 
@@ -122,16 +165,29 @@ def walk(count: int, *, tilt: float, turn: float, seed: int = 0) -> list[np.ndar
 
 
 def write_photographs(
-    folder: Path, kind: str, *, count: int = 10, width: int = 1024, angle: float = 180.0, tilt: float = 3.0
+    folder: Path,
+    kind: str,
+    *,
+    count: int = 10,
+    width: int = 1024,
+    angle: float = 180.0,
+    fits: str = "width",
+    off: tuple[float, float] = (0.0, 0.0),
+    tilt: float = 3.0,
 ) -> dict[str, np.ndarray]:
-    """Write ``000.jpg`` ... of a "panorama" or "fisheye" (4:3); returns their poses."""
+    """Write ``000.jpg`` ... of a "panorama" or "fisheye" (4:3); returns their poses.
+
+    The circle of a fisheye, of ``angle`` degrees, ``fits`` the width, the height or the diagonal.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    size = (width, width // 2 if kind == "panorama" else 3 * width // 4)
-    rays = panorama_rays(width) if kind == "panorama" else fisheye_rays(*size, angle)
+    size, rays, boxes = (width, width // 2), panorama_rays(width), NO_BOXES
+    if kind == "fisheye":
+        size, boxes = (width, 3 * width // 4), BOXES
+        rays = fisheye_rays(*size, angle, circle=across(size, fits), off=off)
     patterns, poses = walls(), walk(count, tilt=tilt, turn=180.0 if kind == "panorama" else 25.0)
     names = [f"{i:03}.jpg" for i in range(count)]
     for name, pose in zip(names, poses, strict=True):
-        Image.fromarray(photograph(patterns, pose, rays, size)).save(folder / name, quality=95)
+        Image.fromarray(photograph(patterns, pose, rays, size, boxes)).save(folder / name, quality=95)
     return dict(zip(names, poses, strict=True))
 
 
@@ -161,19 +217,36 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--count", type=int, default=10)
     parser.add_argument("--width", type=int, default=1024, help="px")
-    parser.add_argument("--angle", type=float, default=180.0, help="degrees in the width of a fisheye")
+    parser.add_argument("--angle", type=float, default=180.0, help="degrees across the circle of a fisheye")
+    parser.add_argument("--across", choices=("width", "height", "diagonal"), default="width", help="that it fits into")
+    parser.add_argument("--off", type=float, default=0.0, help="px, of its middle to the right and down")
+    parser.add_argument("--camera-model", choices=("auto", *CAMERA_MODELS), default="auto", help="for gs2d poses")
     parser.add_argument("--tilt", type=float, default=3.0, help="degrees, one sigma")
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args(arguments)
     photos = args.folder / "photos"
     try:
         truth = write_photographs(
-            photos, args.kind, count=args.count, width=args.width, angle=args.angle, tilt=args.tilt
+            photos,
+            args.kind,
+            count=args.count,
+            width=args.width,
+            angle=args.angle,
+            fits=args.across,
+            off=(args.off, args.off),
+            tilt=args.tilt,
         )
         write_json(args.folder / "truth.json", {name: pose.tolist() for name, pose in truth.items()})
         began = time.monotonic()
         made: dict[str, Any] = find_poses(
-            PosesOptions(photos=photos, out=args.folder / "capture", overwrite=True, threads=args.threads)
+            PosesOptions(
+                photos=photos,
+                out=args.folder / "capture",
+                overwrite=True,
+                threads=args.threads,
+                camera_model=args.camera_model,
+            ),
+            lambda event: print(event.text, file=sys.stderr) if isinstance(event, Notice) else None,
         )
         found = errors(args.folder / "capture", truth)
     except (Gs2dError, OSError) as error:

@@ -28,12 +28,14 @@ from gs2d.pipeline.options import PosesOptions
 from gs2d.pipeline.photo_places import Places, places_of
 from gs2d.pipeline.plan import PLACED
 from gs2d.sfm.colmap import Facts, Group, Request, Solved, check_installed, layers, read_facts, solve
+from gs2d.sfm.fisheye import Circle
 from gs2d.sfm.image_copies import copy_images
 from gs2d.sfm.images import (
     FEWEST,
     Photo,
     camera_groups,
     find_photos,
+    fisheye_hints,
     in_order_taken,
     panorama_groups,
     read_photos,
@@ -107,12 +109,12 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
             masks = _masks_of(options, photos, video is not None, on_event)
             made_of |= {"masks": [_stamp(mask) for mask in masks if mask is not None]} if any(masks) else {}
             request = _request(options, work, photos, threads, on_event)
-            capture = work / STAGED
-            if any(masks) and not options.match_masked:
+            capture, circles = work / STAGED, _circles(request)
+            if (any(masks) or circles) and not options.match_masked:
                 request = replace(request, masks=str(capture / FOLDER))
             if line := go_on(work, {"photographs": made_of, **layers(request)}, ours=(STAGED,)):
                 on_event(Notice(line))
-            copy_masks(photos, masks, capture / FOLDER, options.max_size)
+            copy_masks(photos, masks, capture / FOLDER, options.max_size, circles)
             staged = _stage(photos, capture / IMAGES, options, threads, on_event, ours=video is not None)
             solved = solve(request, _progress(on_event), lambda line: on_event(Notice(line)))
             try:
@@ -308,7 +310,8 @@ def _request(options: PosesOptions, work: Path, photos: Sequence[Photo], threads
     sizes = [photo.size_within(options.max_size) for photo in photos]
     groups = camera_groups(photos, sizes, options.cameras)
     panoramas, lines = panorama_groups(photos, groups, options.camera_model)
-    for line in lines:
+    hints, more = fisheye_hints(photos, groups, panoramas, options.camera_model)
+    for line in (*lines, *more):
         on_event(Notice(line))
     lens = START if options.camera_model == "auto" else options.camera_model
     order, ordered_by = in_order_taken(photos)
@@ -322,8 +325,10 @@ def _request(options: PosesOptions, work: Path, photos: Sequence[Photo], threads
                 PANORAMA if is_panorama else lens,
                 sizes[group[0]],
                 str(photos[group[0]].source.resolve()),
+                hint,
+                (circle.x, circle.y, circle.radius) if circle else None,
             )
-            for group, is_panorama in zip(groups, panoramas, strict=True)
+            for group, is_panorama, (hint, circle) in zip(groups, panoramas, hints, strict=True)
         ),
         in_order=tuple(photos[i].name for i in order),
         ordered_by=ordered_by,
@@ -338,6 +343,11 @@ def _request(options: PosesOptions, work: Path, photos: Sequence[Photo], threads
         seed=options.seed,
         asked_lens=None if options.camera_model == "auto" else options.camera_model,
     )
+
+
+def _circles(request: Request) -> dict[str, Circle]:
+    """Return the circles of round photographs, by their names."""
+    return {name: Circle(*group.circle) for group in request.groups if group.circle for name in group.names}
 
 
 def _matching(options: PosesOptions, count: int, places: Places) -> str:
@@ -418,7 +428,7 @@ def _result(
                 "params": list(best.cameras[number].params),
                 "focal_px": focal_length(best.cameras[number]),
                 "photos": count,
-                "about": camera_line(best.cameras[number], count),
+                "about": camera_line(best.cameras[number], count, _circle_of(best, number, request)),
             }
             for number, count in sorted(per_camera.items())
         ],
@@ -442,6 +452,12 @@ def _result(
         },
         "created": now(),
     }
+
+
+def _circle_of(model: SfmModel, number: int, request: Request) -> Circle | None:
+    """Return the circle of a camera's photographs, which share it."""
+    circles = _circles(request)
+    return next((circles.get(image.name) for image in model.images if image.camera_id == number), None)
 
 
 def placed_line(result: dict[str, Any]) -> str:

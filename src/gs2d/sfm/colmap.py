@@ -28,11 +28,13 @@ POLL_SECONDS = 0.5
 _LITTLE_SPACE = 64 << 20  # bytes; what SQLite could not write is given back when it gives up
 # Modules are looked for where this process does: `-m` would first take a random.py of the folder one is in.
 _WORKER = "import sys; sys.path[:] = sys.argv[2:]; from gs2d.sfm.colmap_worker import main; main(sys.argv[1])"
-_COUNTED = {"features": "keypoints", "matching": "two_view_geometries", "again": "two_view_geometries"}  # a row a step
+_PAIRS = "two_view_geometries"
+_COUNTED = {"features": "keypoints", "matching": _PAIRS, "verifying": _PAIRS, "again": _PAIRS}  # a row a step
 _PHASES = {
     "features": "finding features",
     "comparing": "finding similar photographs",
     "matching": "matching pairs",
+    "verifying": "matching as fisheyes",
     "cameras": "placing cameras",
     "lenses": "comparing lenses",
     "again": "matching pairs once more",
@@ -42,12 +44,29 @@ _PHASES = {
 
 @dataclass(frozen=True)
 class Group:
-    """Photographs of one camera: their names, its COLMAP model, its picture size, and an original with EXIF."""
+    """Photographs of one camera.
+
+    Attributes
+    ----------
+    names : tuple of str
+    camera_model : str
+        COLMAP's.
+    size : (int, int)
+        Of its pictures, px.
+    original : str
+        A photograph with EXIF.
+    hint : "circle", "name", "asked" or ""
+        What tells of a fisheye (``as_fisheye``).
+    circle : (float, float, float) or None
+        Of a round picture (``fisheye.Circle``): its middle of width and height, its radius of the longer side.
+    """
 
     names: tuple[str, ...]
     camera_model: str
     size: tuple[int, int]
     original: str
+    hint: str = ""
+    circle: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -205,7 +224,7 @@ def _follow(
         if "phase" in message:
             phase, total = message["phase"], message["total"]
             before = 0
-            if phase == "again":  # those of the first time do not count
+            if phase in ("again", "verifying"):  # those of the first time do not count
                 before = _rows(database, _COUNTED[phase]) - message.get("done", 0)
             on_progress(_PHASES[phase], message.get("done", 0), total)
         elif "done" in message:

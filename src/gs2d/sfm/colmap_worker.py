@@ -21,11 +21,23 @@ from typing import Any
 import numpy as np
 
 from gs2d.core.similarity import rotation_to_z
+from gs2d.sfm import as_fisheye
 from gs2d.sfm import second_round as second
 from gs2d.sfm.assemble import merged, mount
 from gs2d.sfm.compare import find_features, likeness, match
 from gs2d.sfm.grow import grow_all, grow_on
-from gs2d.sfm.lens import START, adjust, apply, choose, doubts, drop_outliers, models_to_try, try_lenses
+from gs2d.sfm.lens import (
+    BENT,
+    START,
+    adjust,
+    apply,
+    choose,
+    doubts,
+    drop_outliers,
+    is_tied,
+    models_to_try,
+    try_lenses,
+)
 from gs2d.sfm.panoramas import PANORAMA
 from gs2d.sfm.place_all import place_all
 from gs2d.sfm.search import MAPPING
@@ -44,6 +56,8 @@ ATTEMPTS: dict[str, dict[str, float]] = {
 AT_ONCE = "all at once"  # the global mapper, which also places a camera that only turned
 ENOUGH = 0.5  # of the photographs in one model: no other way is tried
 CLEARLY = 1.5  # times as many photographs must an easier way place, or the stricter one is believed
+AS_FISHEYES = "as fisheyes, "  # before the name of a way: cameras that were first placed as other lenses
+FISHEYES = "fisheyes"  # step: what was found of the cameras that were looked at
 
 
 def main(request_path: str) -> None:
@@ -75,6 +89,8 @@ def map_(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say) -> dict
         ``models``: what was done to each, the largest first; ``lens``: what was decided about it; ``refused``: the
         reason for each photograph that the second round placed and took out again.
     """
+    if steps.facts(as_fisheye.HINTED) is None:
+        as_fisheye.settle_hinted(pycolmap, request, steps, say)
     if steps.facts("first") is None:
         _first_round(pycolmap, request, steps, say)
     if steps.facts("joined") is None:
@@ -116,6 +132,22 @@ def _names(piece: Any) -> set[str]:
 def _first_round(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say) -> None:
     """Models from nothing: step "first" names them, the largest first.
 
+    Where they leave a doubt whether a camera is a fisheye, and its photographs tell of one, they are made once more.
+    """
+    names, _ = _tried(pycolmap, request, steps, say, "")
+    looked_at = steps.facts(as_fisheye.HINTED) or []
+    if (found := steps.facts(as_fisheye.SUSPECTED)) is None:
+        found = as_fisheye.suspects(pycolmap, request, steps.read(pycolmap, names[0]) if names else None)
+        steps.finish(as_fisheye.SUSPECTED, found)
+    if found:
+        names, found = _as_fisheyes(pycolmap, request, steps, say, names, found)
+    steps.finish(FISHEYES, [*looked_at, *found])
+    steps.finish("first", names)
+
+
+def _tried(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say, before: str) -> tuple[list[str], int]:
+    """Return the models of the first way that places enough, and how many photographs the largest of them has.
+
     Where COLMAP's own demands on the first two cameras leave most photographs without a place, easier ones are tried.
     """
     total = len(request["in_order"])
@@ -123,19 +155,39 @@ def _first_round(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say)
     names, most = [], 0
     attempts = (AT_ONCE,) if request["mapper"] == "global" else tuple(ATTEMPTS)
     for attempt in attempts:
-        if (sizes := steps.facts(f"tried {attempt}")) is None:
-            sizes = _attempt(pycolmap, request, steps, say, attempt)
-            steps.finish(f"tried {attempt}", sizes)
+        if (sizes := steps.facts(f"tried {before}{attempt}")) is None:
+            sizes = _attempt(pycolmap, request, steps, say, attempt, f"{before}{attempt}")
+            steps.finish(f"tried {before}{attempt}", sizes)
         if (placed := max(sizes.values(), default=0)) > CLEARLY * most:
             if attempt != attempts[0]:
                 say(note=f"cameras were placed {attempt}: {placed} photographs, {most} by stricter rules")
             names, most = list(sizes), placed
         if most >= ENOUGH * total:
             break
-    steps.finish("first", names)
+    return names, most
 
 
-def _attempt(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say, attempt: str) -> dict[str, int]:
+def _as_fisheyes(
+    pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say, names: list[str], found: list[dict[str, Any]]
+) -> tuple[list[str], list[dict[str, Any]]]:
+    """Return the models with cameras as fisheyes, and what was found of these; those of before, if better."""
+    before = steps.facts("as they were")
+    if before is None:
+        cameras = as_fisheye.cameras_of(pycolmap, request, [row["camera"] for row in found])
+        before = [[camera.model.name, list(camera.params), camera.has_prior_focal_length] for camera in cameras]
+        steps.finish("as they were", before)
+    if steps.facts(as_fisheye.VERIFIED) is None:
+        as_fisheye.verify_anew(pycolmap, request, steps, as_fisheye.fisheyes(pycolmap, request, found), say)
+        steps.finish(as_fisheye.VERIFIED, True)
+    theirs, _ = _tried(pycolmap, request, steps, say, AS_FISHEYES)
+    largest = steps.read(pycolmap, theirs[0]) if theirs else None
+    if largest is not None and as_fisheye.is_better(largest, steps.read(pycolmap, names[0]) if names else None):
+        return theirs, found
+    as_fisheye.put_back(pycolmap, request, steps, found, before, say)
+    return names, [{**row, "params": None} for row in found]
+
+
+def _attempt(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say, attempt: str, name: str) -> dict[str, int]:
     """Return how many photographs each model has that one way of placing cameras makes, by name, the largest first."""
     total, placed = len(request["in_order"]), 0
 
@@ -146,20 +198,20 @@ def _attempt(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say, att
 
     say(done=0)
     if attempt == AT_ONCE:
-        place_all(pycolmap, request, steps, attempt, threads=_threads(request))
+        place_all(pycolmap, request, steps, name, threads=_threads(request))
     else:
         options, often = _options(pycolmap, request), total > REPEATABLE
-        for name, value in ATTEMPTS[attempt].items():
-            setattr(options.mapper, name, value)
-        grow_all(pycolmap, request["database"], options, steps, attempt, count, often=often)
-    found = [f"{attempt}-{i}" for i in itertools.takewhile(lambda i: steps.has(f"{attempt}-{i}"), itertools.count())]
-    pieces = {name: steps.read(pycolmap, name) for name in found}
+        for demand, value in ATTEMPTS[attempt].items():
+            setattr(options.mapper, demand, value)
+        grow_all(pycolmap, request["database"], options, steps, name, count, often=often)
+    found = [f"{name}-{i}" for i in itertools.takewhile(lambda i: steps.has(f"{name}-{i}"), itertools.count())]
+    pieces = {each: steps.read(pycolmap, each) for each in found}
     sizes = {
-        name: (piece.num_reg_images(), piece.num_points3D())
-        for name, piece in pieces.items()
+        each: (piece.num_reg_images(), piece.num_points3D())
+        for each, piece in pieces.items()
         if piece.num_reg_images() >= SMALLEST_MODEL and piece.num_points3D()
     }
-    return {name: sizes[name][0] for name in sorted(sizes, key=lambda name: sizes[name], reverse=True)}
+    return {each: sizes[each][0] for each in sorted(sizes, key=lambda each: sizes[each], reverse=True)}
 
 
 def _join_pieces(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say) -> None:
@@ -188,7 +240,7 @@ def _write_pieces(steps: Steps, name: str, pieces: list[Any]) -> list[str]:
 
 def _settle_lens(pycolmap: Any, request: dict[str, Any], piece: Any, steps: Steps, say: Say) -> None:
     """Step "lens": the model with the lens that is best, and what was decided."""
-    facts = _lens_of(pycolmap, request, piece, say)
+    facts = {**_lens_of(pycolmap, request, piece, say), "fisheyes": steps.facts(FISHEYES) or []}
     steps.write("lens", piece)
     steps.finish("lens", facts)
 
@@ -209,7 +261,7 @@ def _lens_of(pycolmap: Any, request: dict[str, Any], piece: Any, say: Say) -> di
     else:
         best = choose(trials)
         chosen = best.model
-        if chosen != START:
+        if chosen not in (START, BENT[START]):
             apply(pycolmap, piece, best, threads=_threads(request))
     return {
         "chosen": chosen,
@@ -248,7 +300,7 @@ def _second_chance(
         steps.finish("matched again", True)
     say(phase="cameras again", total=len(lost))
     options = second.relax(_options(pycolmap, request))
-    if lens["chosen"] == "OPENCV" and not lens["asked"]:  # one focal length for both axes
+    if is_tied(lens["chosen"]) and not lens["asked"]:  # one focal length for both axes
         options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = False
     more = -len(placed)
 

@@ -9,9 +9,10 @@ import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 from PIL import Image, features
 
 from gs2d.core import exr
@@ -21,6 +22,7 @@ from gs2d.core.images import is_twice_as_wide, natural_key, read_image
 from gs2d.core.missing import where_it_ends
 from gs2d.data.masks import ENDING, FOLDER
 from gs2d.errors import DataError
+from gs2d.sfm.fisheye import Circle, circle_of, named_fisheye, small_if_dark
 from gs2d.sfm.panoramas import PANORAMA, meets_itself
 from gs2d.sfm.video_frames import VIDEOS
 
@@ -46,6 +48,7 @@ _KINDS = {
     for kind, suffixes in (("raw", RAWS), ("video", VIDEOS), ("photo", JPEG + PNG + CONVERTED))
     for suffix in suffixes
 }
+FISHEYE = "OPENCV_FISHEYE"  # the model of --camera-model
 FEWEST = 3  # two photographs give no point that a third confirms
 _HIDDEN = (".", "__MACOSX")
 _ORIENTATIONS = {  # EXIF 2.32, tag 0x0112: what makes the stored pixels upright
@@ -77,6 +80,8 @@ class Photo:
         What the file says of how it was taken; its orientation is what is left to be turned.
     is_sphere : bool
         Its picture looks like that of a whole sphere (``panoramas.meets_itself``).
+    dark : ndarray float32 [h, w] or None
+        Its picture, small and upright, where its corners are dark (``fisheye.small_if_dark``).
     """
 
     source: Path
@@ -85,6 +90,7 @@ class Photo:
     size: tuple[int, int]
     taken: Taken
     is_sphere: bool = False
+    dark: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     @property
     def orientation(self) -> int:
@@ -198,7 +204,10 @@ def _read(path: Path, root: Path, name: str) -> Photo:
     orientation = 1 if path.suffix.lower() in (".tif", ".tiff") else taken.orientation  # which Pillow has turned
     size = (height, width) if orientation >= 5 else (width, height)
     taken = replace(taken, orientation=orientation)
-    return Photo(path, path.relative_to(root).as_posix(), name, size, taken, meets_itself(image))
+    dark = small_if_dark(image)
+    if dark is not None:
+        dark = np.asarray(turn(Image.fromarray(dark), orientation))
+    return Photo(path, path.relative_to(root).as_posix(), name, size, taken, meets_itself(image), dark)
 
 
 def _names(labels: Sequence[str]) -> list[str]:
@@ -287,6 +296,38 @@ def panorama_groups(
             f"(--camera-model {PANORAMA} if they are panoramas)"
         )
     return found, lines
+
+
+def fisheye_hints(
+    photos: Sequence[Photo], groups: Sequence[Sequence[int]], panoramas: Sequence[bool], camera_model: str
+) -> tuple[list[tuple[str, Circle | None]], list[str]]:
+    """Return what tells that each group of photographs of one camera is a fisheye's, with its circle; lines for people.
+
+    Parameters
+    ----------
+    panoramas : sequence of bool
+        Which groups are panoramas.
+    camera_model : str
+        As the user asks: "auto" looks, "OPENCV_FISHEYE" says that all are, another one that none is.
+
+    Returns
+    -------
+    list of (str, Circle or None)
+        The first is a hint as of :class:`gs2d.sfm.colmap.Group`.
+    list of str
+    """
+    if camera_model not in ("auto", FISHEYE):
+        return [("", None)] * len(groups), []
+    hints: list[tuple[str, Circle | None]] = []
+    round_ones = 0
+    for group, is_panorama in zip(groups, panoramas, strict=True):
+        circle = None if is_panorama else circle_of([photos[i].dark for i in group])
+        named = not is_panorama and named_fisheye(photos[group[0]].taken.made_by)
+        hint = "asked" if camera_model == FISHEYE else "circle" if circle else "name" if named else ""
+        hints.append((hint, circle))
+        round_ones += len(group) if circle else 0
+    line = f"{round_ones} photographs are round: what is beyond their circle is masked, and teaches nothing"
+    return hints, [line] if round_ones else []
 
 
 def _not_whole(photo: Photo, why: str) -> DataError:

@@ -15,9 +15,24 @@ import numpy as np
 
 from gs2d.sfm.panoramas import PANORAMA
 
-PARAMETERS = {"SIMPLE_PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 5}  # that are learnt, the fewest first
-MODELS = tuple(PARAMETERS)
+MODELS = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")  # of ordinary lenses, the fewest parameters first
+BENT = {  # the fisheye of as many
+    "SIMPLE_PINHOLE": "SIMPLE_FISHEYE",
+    "SIMPLE_RADIAL": "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL": "RADIAL_FISHEYE",
+    "OPENCV": "OPENCV_FISHEYE",
+}
+_LEARNT = dict(zip(MODELS, (1, 2, 3, 5), strict=True))
+PARAMETERS = _LEARNT | {BENT[model]: number for model, number in _LEARNT.items()}  # that are learnt
 START = "SIMPLE_RADIAL"  # what cameras are placed with before lenses are compared
+CIRCLE, NAME, ASKED = "circle", "name", "asked"  # what tells of a fisheye before a photograph has a place
+DOUBT = "doubt"  # and of a camera that was placed as another lens
+_WHY = {
+    CIRCLE: "they are round",
+    NAME: "their camera or lens is called so",
+    ASKED: "--camera-model says so",
+    DOUBT: "other lenses left a doubt",
+}
 ENOUGH = 8  # photographs of one camera that tell more than its focal length and one distortion
 WORTH = 0.01  # of the held-out error, that each further parameter must save to be there
 HELD_OUT = 0.2  # of the points that are long enough lose one observation each
@@ -25,6 +40,7 @@ LONG = 4  # observations of a point, of which one can be held out
 FARTHEST = 4.0  # px; COLMAP's own limit: an error beyond it is a wrong match
 NARROWEST = 1.5  # degrees between the rays to a point; COLMAP's own limit
 MAX_PHOTOGRAPHS = 100  # that are compared on: more cost time and change nothing
+_AHEAD = 1.55  # rad; nearly 90 degrees from the axis
 ITERATIONS = 30  # of a bundle adjustment that compares: it starts from cameras that fit
 
 
@@ -38,6 +54,8 @@ class Believable:
         |fx / fy - 1|: pixels of photographs are square; 2 % is more than scanning and resizing make.
     focal : (float, float)
         Of the longer side: from 118 degrees, which no lens without fisheye has, to 6 degrees.
+    focal_bent : (float, float)
+        Likewise, of a fisheye: from a circle of 250 degrees in the height of a 16:9 picture.
     centre : float
         Of the size: how far the principal point may be from the middle.
     bend : float
@@ -48,6 +66,7 @@ class Believable:
 
     aspect: float = 0.02
     focal: tuple[float, float] = (0.3, 10.0)
+    focal_bent: tuple[float, float] = (0.125, 10.0)
     centre: float = 0.1
     bend: float = 0.5
     tangential: float = 0.01
@@ -70,7 +89,8 @@ def doubts(camera: Any, limits: Believable = Believable()) -> list[str]:
     if abs(fx / fy - 1) > limits.aspect:
         found.append(f"fx / fy is {fx / fy:.3f}, where pixels are square")
     focal = camera.mean_focal_length() / max(width, height)
-    if not limits.focal[0] <= focal <= limits.focal[1]:
+    least, most = limits.focal_bent if is_bent(camera) else limits.focal
+    if not least <= focal <= most:
         found.append(f"its focal length is {focal:.2f} of the longer side")
     off = max(abs(camera.principal_point_x / width - 0.5), abs(camera.principal_point_y / height - 0.5))
     if off > limits.centre:
@@ -85,19 +105,41 @@ def _bends(camera: Any, limits: Believable) -> list[str]:
     if name == "OPENCV" and max(map(abs, camera.params[6:8])) > limits.tangential:
         p = max(camera.params[6:8], key=abs)
         found.append(f"its tangential distortion is {p:.4f}")
+    ideal, seen = _along_corner(camera)
+    if not (np.diff(seen) > 0).all():
+        found.append("its distortion folds the picture back before the corner")
+    elif name != "FOV" and abs(bend := float(seen[-1] / ideal[-1]) - 1) > limits.bend:
+        found.append(f"its distortion moves the corner by {100 * bend:.0f} %")
+    return found
+
+
+def corner_bend(camera: Any) -> float:
+    """Return how far distortion moves the farthest corner outwards, of its distance; NaN where it shows nothing."""
+    ideal, seen = _along_corner(camera)
+    return float(seen[-1] / ideal[-1]) - 1
+
+
+def _along_corner(camera: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Distances [50] from the axis to the farthest corner, px / f: without distortion, and with it.
+
+    Of a fisheye the first are angles, and end short of 90 degrees, beyond which COLMAP projects nothing.
+    """
     center = np.array([camera.principal_point_x, camera.principal_point_y])
     corners = np.array([[x, y] for x in (0, camera.width) for y in (0, camera.height)], dtype=float) - center
     corner = corners[np.argmax((corners**2).sum(axis=1))] / (camera.focal_length_x, camera.focal_length_y)
-    steps = np.linspace(0.02, 1, 50)
-    ideal = np.hstack([steps[:, None] * corner, np.ones((50, 1))])
-    seen = np.asarray([np.full(2, np.nan) if p is None else p for p in map(camera.img_from_cam, ideal)])
-    radius = np.linalg.norm((seen - center) / (camera.focal_length_x, camera.focal_length_y), axis=1)
-    bend = float(radius[-1] / np.linalg.norm(corner)) - 1
-    if not (np.diff(radius) > 0).all():
-        found.append("its distortion folds the picture back before the corner")
-    elif "FISHEYE" not in name and name != "FOV" and abs(bend) > limits.bend:
-        found.append(f"its distortion moves the corner by {100 * bend:.0f} %")
-    return found
+    reach = float(np.linalg.norm(corner))
+    if is_bent(camera):
+        reach = min(reach, _AHEAD)
+    ideal = np.linspace(0.02, 1, 50) * reach
+    to_side, ahead = (np.sin(ideal), np.cos(ideal)) if is_bent(camera) else (ideal, np.ones(50))
+    rays = np.hstack([to_side[:, None] * corner / np.linalg.norm(corner), ahead[:, None]])
+    seen = np.asarray([np.full(2, np.nan) if p is None else p for p in map(camera.img_from_cam, rays)])
+    return ideal, np.linalg.norm((seen - center) / (camera.focal_length_x, camera.focal_length_y), axis=1)
+
+
+def is_bent(camera: Any) -> bool:
+    """Whether a camera is a fisheye."""
+    return "FISHEYE" in camera.model.name
 
 
 @dataclass(frozen=True)
@@ -139,11 +181,13 @@ def lens_line(lens: Mapping[str, Any]) -> str:
     Parameters
     ----------
     lens : mapping
-        ``lens`` of poses.json: ``chosen``, ``asked`` or None, ``trials`` with ``model``, ``error_px``, ``doubts``.
+        ``lens`` of poses.json: ``chosen``, ``asked`` or None, ``trials`` with ``model``, ``error_px``, ``doubts``, and
+        ``fisheyes``, what was found of each camera that could be one (``as_fisheye``).
     """
+    bent = "; ".join(map(_fisheye_line, lens.get("fisheyes", [])))
     trials = lens.get("trials", [])
     if not trials:
-        return ""
+        return f"lens: {bent}" if bent else ""
     error = {trial["model"]: trial["error_px"] for trial in trials}
     others = ", ".join(f"{model} {error[model]:.3f}" for model in error if model != lens["chosen"])
     found = f"{lens['chosen']} {error[lens['chosen']]:.3f} px on observations held out; {others}"
@@ -151,7 +195,18 @@ def lens_line(lens: Mapping[str, Any]) -> str:
     doubted_line = f"; doubted: {'; '.join(doubted)}" if doubted else ""
     if lens.get("asked"):
         return f"the lens that was asked for is doubtful (--camera-model auto would compare): {found}{doubted_line}"
-    return f"lens: {found}{doubted_line}; each further parameter must save {100 * WORTH:.0f} %"
+    bent = f"; {bent}" if bent else ""
+    return f"lens: {found}{doubted_line}; each further parameter must save {100 * WORTH:.0f} %{bent}"
+
+
+def _fisheye_line(row: Mapping[str, Any]) -> str:
+    """Return what was found of one camera that could be a fisheye."""
+    taken = "are taken for a fisheye's" if row["params"] else "are not taken for a fisheye's, though"
+    line = f"{row['photographs']} photographs {taken} ({_WHY[row['why']]})"
+    if row["bent"] is None:
+        return f"{line}, too few of which match to tell"
+    shares = f"{100 * row['bent']:.1f} % of matches agree through one of {row['probed']:.0f} px"
+    return f"{line}: {shares}, {100 * row['plain']:.1f} % through a pinhole"
 
 
 def try_lenses(
@@ -160,6 +215,7 @@ def try_lenses(
     """Adjust copies of a model with each lens, without some observations, and measure these.
 
     All have one focal length; OPENCV takes that of RADIAL and keeps it, as two could not be kept equal otherwise.
+    A camera that was placed as a fisheye is compared as the fisheyes of as many parameters.
 
     Parameters
     ----------
@@ -173,17 +229,20 @@ def try_lenses(
     held = _hold_out(base, seed)
     before = _lenses(base)
     images = _images(piece)
+    bent = {number for number, camera in piece.cameras.items() if is_bent(camera)}
     trials = []
     for done, model in enumerate(models_to_try(asked), start=1):
         copy = pycolmap.Reconstruction(base)
         for number in before if model != asked else ():
             rich = images.get(number, 0) >= ENOUGH or PARAMETERS.get(model, 0) <= PARAMETERS[START]
-            _set_model(pycolmap, copy.camera(number), model if rich else START, before[number])
+            kind = model if rich else START
+            _set_model(pycolmap, copy.camera(number), BENT[kind] if number in bent else kind, before[number])
         adjust(pycolmap, copy, tied=model == "OPENCV" and model != asked, threads=threads)
         found = sorted({doubt for camera in copy.cameras.values() for doubt in doubts(camera)})
         numbers = {number: [float(p) for p in camera.params] for number, camera in copy.cameras.items()}
         kinds = {number: camera.model.name for number, camera in copy.cameras.items()}
-        trials.append(Trial(model, _error(copy, held), tuple(found), numbers, kinds))
+        name = BENT[model] if before.keys() == bent else model
+        trials.append(Trial(name, _error(copy, held), tuple(found), numbers, kinds))
         if model == "RADIAL":
             before = _lenses(copy)
         on_done(done)
@@ -197,12 +256,17 @@ def models_to_try(asked: str | None) -> list[str]:
     return [model for model in MODELS if model not in ("OPENCV", asked)] + [asked]
 
 
+def is_tied(model: str) -> bool:
+    """Whether a lens that was chosen has two focal lengths, which are kept equal."""
+    return model in ("OPENCV", BENT["OPENCV"])
+
+
 def apply(pycolmap: Any, piece: Any, trial: Trial, *, threads: int) -> None:
     """Give a model the cameras of a trial and adjust all of it."""
     for number, params in trial.cameras.items():
         camera = piece.camera(number)
         _replace(pycolmap, camera, trial.models[number], params)
-    adjust(pycolmap, piece, tied=trial.model == "OPENCV", threads=threads)
+    adjust(pycolmap, piece, tied=is_tied(trial.model), threads=threads)
     drop_outliers(pycolmap, piece)
 
 
@@ -267,8 +331,8 @@ def _lenses(piece: Any) -> dict[int, tuple[float, float, float, list[float]]]:
 def _set_model(pycolmap: Any, camera: Any, model: str, plain: tuple[float, float, float, list[float]]) -> None:
     """Make a camera one of another model, that shows nearly the same."""
     f, cx, cy, extra = plain
-    two = (f, f) if model == "OPENCV" else (f,)
-    room = {"SIMPLE_PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4}[model]  # for distortion
+    two = (f, f) if is_tied(model) else (f,)
+    room = PARAMETERS[model] - 1  # for distortion
     _replace(pycolmap, camera, model, [*two, cx, cy, *[*extra, 0.0, 0.0, 0.0, 0.0][:room]])
 
 

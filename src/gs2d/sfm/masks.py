@@ -6,8 +6,9 @@ finds them in the capture as those of any other.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from PIL import Image
@@ -16,8 +17,10 @@ from gs2d.core.files import disk_error
 from gs2d.core.images import image_size, read_mask, write_image
 from gs2d.data.masks import FOLDER, Masks, find_mask, find_masks
 from gs2d.errors import DataError
+from gs2d.sfm.fisheye import Circle
 from gs2d.sfm.images import Photo, turn
 
+_NONE: Mapping[str, Circle] = MappingProxyType({})
 _ASPECT = 0.01  # by which a mask of another size may differ from its photograph
 
 
@@ -45,8 +48,19 @@ def masks_of(photos: Sequence[Photo], root: Path, folder: Path | None) -> tuple[
     return find_masks(names, images, beside, [root, root.resolve().parent], Masks(folder))
 
 
-def copy_masks(photos: Sequence[Photo], masks: Sequence[Path | None], folder: Path, max_size: int | None) -> int:
+def copy_masks(
+    photos: Sequence[Photo],
+    masks: Sequence[Path | None],
+    folder: Path,
+    max_size: int | None,
+    circles: Mapping[str, Circle] = _NONE,
+) -> int:
     """Write the masks of photographs as ``folder/NAME.png``, in the size of their copies; how many there are.
+
+    Parameters
+    ----------
+    circles : dict of str to Circle
+        Of round photographs, by name: what is beyond is masked too.
 
     Raises
     ------
@@ -56,7 +70,8 @@ def copy_masks(photos: Sequence[Photo], masks: Sequence[Path | None], folder: Pa
     """
     count, kept = 0, False
     for photo, path in zip(photos, masks, strict=True):
-        if path is None:
+        circle = circles.get(photo.name)
+        if path is None and circle is None:
             continue
         target = folder / f"{photo.name}.png"
         if target.exists():  # of a search that was interrupted
@@ -66,11 +81,10 @@ def copy_masks(photos: Sequence[Photo], masks: Sequence[Path | None], folder: Pa
             target.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise disk_error(target.parent, error) from error
-        mask = _upright(photo, path)
         size = photo.size_within(max_size)
-        if (mask.shape[1], mask.shape[0]) != size:
-            grey = Image.fromarray(mask.astype(np.uint8) * np.uint8(255)).resize(size, Image.Resampling.BOX)
-            mask = np.asarray(grey) == 255
+        mask = np.ones(size[::-1], bool) if path is None else _resized(_upright(photo, path), size)
+        if circle is not None:
+            mask = mask & circle.inside(*size)
         write_image(target, mask)
         count, kept = count + 1, kept or bool(mask.any())
     if count == len(photos) and not kept:
@@ -78,6 +92,14 @@ def copy_masks(photos: Sequence[Photo], masks: Sequence[Path | None], folder: Pa
             f"masks must keep a pixel of some photograph, got {count} black ones; white = keep: invert them"
         )
     return count
+
+
+def _resized(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Return a mask bool [H, W] in another size (width, height): True where all of a pixel is."""
+    if (mask.shape[1], mask.shape[0]) == size:
+        return mask
+    grey = Image.fromarray(mask.astype(np.uint8) * np.uint8(255)).resize(size, Image.Resampling.BOX)
+    return np.asarray(grey) == 255
 
 
 def _upright(photo: Photo, path: Path) -> np.ndarray:

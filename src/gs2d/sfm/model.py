@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
+from gs2d.data.faces import field_of_view
 from gs2d.data.readers.colmap import (
     ColmapCamera,
     ColmapImage,
@@ -19,8 +20,10 @@ from gs2d.data.readers.colmap import (
     read_images,
     read_points,
 )
+from gs2d.data.undistort import colmap_intrinsics
 from gs2d.errors import DataError
 from gs2d.sfm.colmap import Facts
+from gs2d.sfm.fisheye import Circle
 from gs2d.sfm.panoramas import PANORAMA
 
 _MAX_ANGLES = 2000
@@ -159,12 +162,17 @@ def _first(names: Mapping[str, int]) -> str:
     return ", ".join(listed[:2]) + (" ..." if len(listed) > 2 else "")
 
 
-def camera_line(camera: ColmapCamera, images: int) -> str:
-    """One line about an estimated camera: model, focal length, field of view."""
+def camera_line(camera: ColmapCamera, images: int, circle: Circle | None = None) -> str:
+    """One line about an estimated camera: model, focal length, field of view (of a round picture, its circle)."""
     if camera.model == PANORAMA:
         return f"{camera.model} of {images} photographs, {camera.width}x{camera.height} (360 degrees wide)"
     focal = focal_length(camera)
-    angle = np.degrees(2 * np.arctan(camera.width / (2 * focal)))
+    k = colmap_intrinsics(camera.model, camera.model, camera.width, camera.height, camera.params)
+    if circle is not None and k.lens is not None and k.lens.kind == "fisheye":
+        across = round(2 * circle.radius * max(k.width, k.height))
+        if across < k.width:  # the picture goes on where the lens shows nothing
+            k = replace(k, width=across, cx=across / 2)
+    angle = field_of_view(k)
     return (
         f"{camera.model} of {images} photographs, {camera.width}x{camera.height}, f = {focal:.0f} px "
         f"({angle:.0f} degrees wide)"

@@ -20,9 +20,10 @@ from gs2d.errors import DataError
 SEARCH = "search.json"
 LAYERS = ("photographs", "features", "pairs", "mapping")
 DATABASE, MAPPING = "database.db", "mapping"
-_PAIRS = ("pairs.txt", "pairs_again.txt", "alike.json")
+_PAIRS = ("pairs.txt", "pairs_again.txt", "pairs_anew.txt", "alike.json")
 DAMAGED = (sqlite3.Error, UnicodeDecodeError)  # of a database, whose words need not be text
-_AGAIN = "pairs again.json"  # of the mapping: from here on pairs are compared by looser rules
+CALIBRATED_ANEW = "calibrated anew"  # step of the mapping: from here on pairs are verified with other cameras
+_AGAIN = ("pairs again.json", f"{CALIBRATED_ANEW}.json")  # likewise, or compared by looser rules
 
 
 def is_of(work: Path, layer: str, wanted: Any) -> bool:
@@ -47,7 +48,7 @@ def go_on(work: Path, wanted: Mapping[str, Any], *, ours: Sequence[str]) -> str:
     """
     before, wanted = _read(work), _plain(wanted)
     first = next((i for i, layer in enumerate(LAYERS) if before.get(layer) != wanted[layer]), len(LAYERS))
-    if first < len(LAYERS) and (work / MAPPING / _AGAIN).exists():
+    if first < len(LAYERS) and any((work / MAPPING / name).exists() for name in _AGAIN):
         first = min(first, LAYERS.index("pairs"))
     kept = _kept(work, first) if before and first else ""
     for layer in reversed(LAYERS[first:]):  # the last first: what is left is always whole
