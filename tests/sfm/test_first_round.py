@@ -51,7 +51,13 @@ class _Placing:
             (steps.folder / f"{name}-{i}").mkdir(exist_ok=True)
 
     def run(self, photographs: int, mapper: str = "incremental") -> list[str]:
-        request = {"in_order": ["a"] * photographs, "mapper": mapper, "database": "", "threads": 1}
+        request = {
+            "in_order": ["a"] * photographs,
+            "mapper": mapper,
+            "database": "",
+            "threads": 1,
+            "asked_lens": "OPENCV",
+        }
         colmap_worker._first_round(None, request, self.steps, self._say)
         names = self.steps.facts("first")
         assert isinstance(names, list)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -17,7 +19,7 @@ from gs2d.core.images import image_size, read_image, read_mask
 from gs2d.core.transforms import camera_extent
 from gs2d.data.bounds import scene_bounds
 from gs2d.data.cache import DecodedImage, ImageCache
-from gs2d.data.faces import Face, face_name, face_positions, faces_of, wrapped
+from gs2d.data.faces import GLANCE, LEAST_SHOWN, Face, face_name, face_positions, faces_of, wrapped
 from gs2d.data.masks import EMPTY, Masks, find_masks
 from gs2d.data.priors import (
     DEPTH_SUFFIXES,
@@ -358,6 +360,7 @@ def _cut(frames: Sequence[PosedImage]) -> tuple[list[PosedImage], tuple[str, ...
     faces = {k: faces_of(k) for k in dict.fromkeys(frame.intrinsics for frame in frames)}
     found: list[PosedImage] = []
     kinds: dict[str, int] = {}
+    shown: dict[Any, bool] = {}
     for frame in frames:
         lens, parts = frame.intrinsics.lens, faces[frame.intrinsics]
         if lens is None or not parts:
@@ -365,6 +368,8 @@ def _cut(frames: Sequence[PosedImage]) -> tuple[list[PosedImage], tuple[str, ...
             continue
         kinds[lens.kind] = kinds.get(lens.kind, 0) + 1
         for face in parts:
+            if not _mask_leaves(frame, face, shown):
+                continue
             T = frame.T_cam_world.copy()
             T[:3] = face.rotation @ T[:3]
             found.append(replace(frame, name=face_name(frame.name, face), T_cam_world=T, face=face, maps=None))
@@ -375,6 +380,24 @@ def _cut(frames: Sequence[PosedImage]) -> tuple[list[PosedImage], tuple[str, ...
     maps = any(frame.maps is not None for frame in frames)
     note = f"{what} are cut into {number} pinhole faces of 90 degrees, so that nothing is lost"
     return found, (note + ("; their depth and normal maps are not used" if maps else ""),)
+
+
+def _mask_leaves(frame: PosedImage, face: Face, known: dict[Any, bool]) -> bool:
+    """Whether the mask of a fisheye leaves enough of a face: a round picture shows nothing beyond its circle.
+
+    ``known`` is filled with what was found: most photographs of a camera have one mask.
+    """
+    k = frame.intrinsics
+    if frame.mask is None or frame.mask_is_alpha or k.lens is None or k.lens.kind != "fisheye":
+        return True
+    key = (k, face.name, hashlib.sha256(frame.mask.read_bytes()).digest())
+    if key not in known:
+        mask = read_mask(frame.mask)
+        positions, valid = face_positions(k, replace(face, side=GLANCE))
+        u, v = (positions * (mask.shape[1] / k.width, mask.shape[0] / k.height)).astype(int).reshape(-1, 2).T
+        left = valid & mask[v.clip(max=len(mask) - 1), u.clip(max=mask.shape[1] - 1)].reshape(valid.shape)
+        known[key] = bool(left.mean() >= LEAST_SHOWN)
+    return known[key]
 
 
 def _observed(capture: Capture, frames: Sequence[PosedImage]) -> Callable[[], ObservedPoints] | None:

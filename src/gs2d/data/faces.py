@@ -23,7 +23,7 @@ from gs2d.errors import DataError
 PANORAMA = "equirectangular"
 WIDEST = 120.0  # degrees: a wider fisheye is cut; in a pinhole image of it the rim would be stretched fourfold
 LEAST_SHOWN = 0.02  # of a face's pixels that the photograph must show; a sliver teaches nothing
-_GLANCE = 64  # px of a face, to see how much of it is shown
+GLANCE = 64  # px of a face, to see how much of it is shown
 _TURNS = {  # degrees to the right, then up
     "front": (0, 0),
     "right": (90, 0),
@@ -113,7 +113,7 @@ def faces_of(k: Intrinsics) -> tuple[Face, ...]:
     if k.lens is None or k.lens.kind not in (PANORAMA, "fisheye") or field_of_view(k) <= WIDEST:
         return ()
     every = [Face(name, 2 * max(1, round(k.fx))) for name in FACES]  # 90 degrees at this focal length
-    return tuple(face for face in every if face_positions(k, replace(face, side=_GLANCE))[1].mean() >= LEAST_SHOWN)
+    return tuple(face for face in every if face_positions(k, replace(face, side=GLANCE))[1].mean() >= LEAST_SHOWN)
 
 
 def face_positions(k: Intrinsics, face: Face) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,358 @@
+"""Fisheyes of unknown lens: which photographs are some, by their circle, by names, and by what their matches tell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from benchmarks.wide_captures import errors, write_photographs
+from PIL import Image
+
+from gs2d.core.camera import look_at
+from gs2d.core.images import read_mask
+from gs2d.core.json_files import read_json
+from gs2d.data import load_scene
+from gs2d.data.readers.colmap import ColmapCamera, read_cameras, read_images
+from gs2d.pipeline.events import Event, Notice
+from gs2d.pipeline.options import PosesOptions
+from gs2d.pipeline.sfm import find_poses
+from gs2d.sfm import as_fisheye, colmap_worker
+from gs2d.sfm.fisheye import Circle, circle_of, named_fisheye, small_if_dark
+from gs2d.sfm.images import Photo, camera_groups, find_photos, fisheye_hints, read_photos
+from gs2d.sfm.lens import ASKED, CIRCLE, NAME, lens_line
+from gs2d.sfm.lens_probe import probe
+from gs2d.sfm.masks import copy_masks
+from gs2d.sfm.model import camera_line
+from gs2d.sfm.steps import Steps
+
+SIZE = (400, 300)
+F = 150.0
+
+
+# -- the circle --------------------------------------------------------------------------------------------------------
+def mottled(size: tuple[int, int] = SIZE, seed: int = 0) -> np.ndarray:
+    """A photograph without darkness, uint8 [H, W, 3]."""
+    return np.random.default_rng(seed).integers(40, 255, (size[1], size[0], 3)).astype(np.uint8)
+
+
+def round_picture(x: float, y: float, radius: float, size: tuple[int, int] = SIZE, seed: int = 0) -> np.ndarray:
+    """A photograph of a fisheye: noise within a circle, px, and what stray light leaves beyond it."""
+    v, u = np.mgrid[: size[1], : size[0]] + 0.5
+    light = np.clip(radius - np.hypot(u - x, v - y) + 0.5, 0, 1)[..., None]
+    stray = np.random.default_rng(seed + 1).integers(0, 8, (size[1], size[0], 3))
+    return np.rint(light * mottled(size, seed) + (1 - light) * stray).astype(np.uint8)
+
+
+def found(*pictures: np.ndarray) -> Circle | None:
+    return circle_of([small_if_dark(picture) for picture in pictures])
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "radius"),
+    [(200, 150, 149), (200, 150, 200), (215, 142, 130), (195, 153, 212)],
+    ids=["in the height", "in the width", "off the middle", "beyond the width"],
+)
+def test_the_circle_of_round_photographs_is_found(x: float, y: float, radius: float) -> None:
+    circle = found(*(round_picture(x, y, radius, seed=seed) for seed in range(3)))
+    assert circle is not None
+    assert (circle.x * 400, circle.y * 300, circle.radius * 400) == pytest.approx((x, y, radius), abs=2)
+    inside = circle.inside(*SIZE)
+    v, u = np.mgrid[:300, :400] + 0.5
+    assert not inside[np.hypot(u - x, v - y) > radius].any()
+    assert inside[np.hypot(u - x, v - y) < 0.95 * radius].all()
+
+
+def test_photographs_that_show_all_of_their_corners_have_no_circle() -> None:
+    assert small_if_dark(mottled()) is None
+    assert found(mottled(), mottled(seed=1)) is None
+
+
+def test_darkness_of_another_shape_is_no_circle() -> None:
+    """A frame, a statue that turns before black velvet, a round plate that is smaller than any fisheye's circle."""
+    framed = np.zeros((300, 400, 3), np.uint8)
+    framed[40:-40, 60:-60] = mottled()[40:-40, 60:-60]
+    statues = []
+    for seed in range(4):
+        statue = np.zeros((300, 400, 3), np.uint8)
+        statue[30:290, 150 - 10 * seed : 230 + 5 * seed] = 120
+        statue[60:120, 120:260] = 90
+        statues.append(statue)
+    assert found(framed) is None
+    assert found(*statues) is None
+    assert found(round_picture(200, 150, 90)) is None
+
+
+def test_a_dark_scene_is_seen_through_the_circle_by_those_that_show_some_of_it_bright() -> None:
+    """Each photograph has a dark half; together they have the circle."""
+    left, right = (round_picture(200, 150, 149, seed=seed) for seed in (0, 1))
+    left[:, 200:] = right[:, :200] = 0
+    assert found(left) is None
+    assert found(left, right) is not None
+
+
+def test_a_few_photographs_with_bright_corners_take_the_circle_from_all() -> None:
+    assert found(*(round_picture(200, 150, 149, seed=seed) for seed in range(4)), mottled()) is None
+
+
+# -- names and hints ---------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("names", "is_one"),
+    [
+        (("GoPro", "HERO9 Black", "", "3", "15"), True),
+        (("Canon", "Canon EOS R5", "EF8-15mm f/4L FISHEYE USM", "8", ""), True),
+        (("Arashi Vision", "Insta360 ONE RS", "", "", ""), True),
+        (("DJI", "OsmoAction4", "", "", ""), True),
+        (("Apple", "iPhone 15 Pro", "iPhone 15 Pro back triple camera 6.765mm f/1.78", "6.765", "24"), False),
+        (("DJI", "FC6310", "", "8.8", "24"), False),
+        (("", "", "", "", ""), False),
+    ],
+)
+def test_cameras_and_lenses_that_are_called_fisheyes(names: tuple[str, ...], is_one: bool) -> None:
+    assert named_fisheye(names) is is_one
+
+
+def photos_of(root: Path, images: dict[str, np.ndarray]) -> list[Photo]:
+    for name, image in images.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(image).save(root / name)
+    return list(read_photos(find_photos(root)[0], root, threads=1))
+
+
+def test_each_camera_has_its_own_hint(tmp_path: Path) -> None:
+    photos = photos_of(
+        tmp_path,
+        {**{f"a/{i}.png": round_picture(200, 150, 149, seed=i) for i in range(2)}, "b/0.png": mottled(),
+         "c/0.png": mottled(seed=1)},
+    )  # fmt: skip
+    photos[3] = replace(photos[3], taken=replace(photos[3].taken, made_by=("GoPro", "HERO9 Black", "", "", "")))
+    groups = camera_groups(photos, [photo.size for photo in photos], "auto")
+    hints, lines = fisheye_hints(photos, groups, [False] * 3, "auto")
+    assert [hint for hint, _ in hints] == [CIRCLE, "", NAME]
+    assert hints[0][1] is not None
+    assert lines == ["2 photographs are round: what is beyond their circle is masked, and teaches nothing"]
+    asked, _ = fisheye_hints(photos, groups, [False] * 3, "OPENCV_FISHEYE")
+    assert [(hint, circle is not None) for hint, circle in asked] == [(ASKED, True), (ASKED, False), (ASKED, False)]
+    assert fisheye_hints(photos, groups, [False] * 3, "OPENCV") == ([("", None)] * 3, [])
+
+
+def test_what_is_beyond_the_circle_is_masked_beside_what_the_user_masks(tmp_path: Path) -> None:
+    photos = photos_of(tmp_path / "photos", {f"{i}.png": round_picture(200, 150, 149, seed=i) for i in range(3)})
+    own = np.full((300, 400), 255, np.uint8)
+    own[150:] = 0
+    Image.fromarray(own).save(tmp_path / "own.png")
+    circle = Circle(0.5, 0.5, 149 / 400)
+    circles = {"0.png": circle, "1.png": circle}
+    assert copy_masks(photos, [tmp_path / "own.png", None, None], tmp_path / "masks", 200, circles) == 2
+    both, alone = (read_mask(tmp_path / "masks" / f"{i}.png.png") for i in range(2))
+    assert both.shape == alone.shape == (150, 200)
+    assert (alone == circle.inside(200, 150)).all()
+    assert (both == alone & (np.arange(150) < 75)[:, None]).all()
+
+
+# -- what matches tell -------------------------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def pycolmap(colmap: None) -> Any:
+    import pycolmap
+
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+    return pycolmap
+
+
+class _Database:
+    """Matches of photographs of random points through a lens, 0.3 px off, and every tenth of them wrong."""
+
+    def __init__(self, pycolmap: Any, model: str, params: tuple[float, ...], *, count: int = 4) -> None:
+        rng = np.random.default_rng(0)
+        lens = pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=list(params))
+        points = rng.normal(size=(900, 3))
+        points *= rng.uniform(2, 5, (900, 1)) / np.linalg.norm(points, axis=1, keepdims=True)
+        self._seen, self._pycolmap = [], pycolmap
+        for i in range(count):
+            eye = np.array([0.8 * i - 1.2, 0.3 * np.sin(2 * i), 0.2 * i])
+            ahead = eye + np.array([0.3 * i - 0.4, 3.0, 0.0])
+            T = look_at(eye, ahead, np.array([0, 0, 1.0]), width=8, height=8, fx=8).T_cam_world
+            at = [lens.img_from_cam(T[:3, :3] @ p + T[:3, 3]) for p in points]
+            places = np.array([np.full(2, np.nan) if p is None else p for p in at]) + rng.normal(0, 0.3, (900, 2))
+            inside = ((places > 0) & (places < SIZE)).all(axis=1)
+            self._seen.append(np.where(inside[:, None], places, np.nan))
+        self._rng = rng
+
+    def read_all_images(self) -> list[Any]:
+        return [SimpleNamespace(image_id=i + 1, camera_id=1) for i in range(len(self._seen))]
+
+    def read_two_view_geometry_num_inliers(self) -> tuple[list[int], list[int]]:
+        pairs = [(i, j) for j in range(len(self._seen)) for i in range(j)]
+        numbers = [self._pycolmap.image_pair_to_pair_id(i + 1, j + 1) for i, j in pairs]
+        return numbers, [len(self.read_matches(i + 1, j + 1)) for i, j in pairs]
+
+    def read_matches(self, first: int, second: int) -> np.ndarray:
+        both = np.flatnonzero(np.isfinite(self._seen[first - 1] + self._seen[second - 1]).all(axis=1))
+        other = both.copy()
+        other[::10] = np.roll(both, 7)[::10]
+        return np.stack([both, other], axis=1).astype(np.uint32)
+
+    def read_keypoints(self, image: int) -> np.ndarray:
+        return np.nan_to_num(self._seen[image - 1]).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "focal"),
+    [
+        ("SIMPLE_RADIAL_FISHEYE", (F, 200, 150, 0.02), F),  # 153 degrees from left to right
+        ("SIMPLE_FISHEYE", (240.0, 200, 150), 240.0),  # 119 degrees from corner to corner
+        ("SIMPLE_PINHOLE", (300.0, 200, 150), None),
+        ("SIMPLE_RADIAL", (330.0, 200, 150, -0.1), None),  # a telephone's
+    ],
+)
+def test_matches_tell_a_fisheye_and_its_focal_length(
+    pycolmap: Any, model: str, params: tuple[float, ...], focal: float | None
+) -> None:
+    camera = pycolmap.Camera(model="SIMPLE_FISHEYE", width=SIZE[0], height=SIZE[1], params=[F, 200, 150], camera_id=1)
+    told = probe(pycolmap, _Database(pycolmap, model, params), camera, reach=250.0, seed=0)
+    assert told is not None
+    assert 0.5 < told.plain <= 0.95
+    assert told.is_fisheye is (focal is not None)
+    if focal is not None:
+        assert told.focal == pytest.approx(focal, rel=0.12)
+        assert told.bent > 0.85
+
+
+def test_too_few_matches_tell_nothing(pycolmap: Any) -> None:
+    camera = pycolmap.Camera(model="SIMPLE_FISHEYE", width=SIZE[0], height=SIZE[1], params=[F, 200, 150], camera_id=1)
+    alone = _Database(pycolmap, "SIMPLE_PINHOLE", (300.0, 200, 150), count=1)
+    assert probe(pycolmap, alone, camera, reach=250.0, seed=0) is None
+
+
+# -- which model is believed -------------------------------------------------------------------------------------------
+def model_of(photographs: int, observations: int, *, lens: Any) -> Any:
+    return SimpleNamespace(
+        num_reg_images=lambda: photographs, compute_num_observations=lambda: observations, cameras={1: lens}
+    )
+
+
+def test_a_model_of_fisheyes_is_believed_where_it_explains_as_much(pycolmap: Any) -> None:
+    lens = pycolmap.Camera(model="SIMPLE_RADIAL_FISHEYE", width=400, height=300, params=[F, 200, 150, 0.02])
+    folds = pycolmap.Camera(model="SIMPLE_RADIAL_FISHEYE", width=400, height=300, params=[F, 200, 150, -0.4])
+    before = model_of(10, 5000, lens=lens)
+    assert as_fisheye.is_better(model_of(9, 5000, lens=lens), before)
+    assert not as_fisheye.is_better(model_of(8, 9000, lens=lens), before)
+    assert not as_fisheye.is_better(model_of(10, 4900, lens=lens), before)
+    assert not as_fisheye.is_better(model_of(10, 9000, lens=folds), before)
+    assert as_fisheye.is_better(model_of(3, 100, lens=lens), None)
+
+
+def row(params: list[float] | None, *, why: str = "doubt") -> dict[str, Any]:
+    """What ``as_fisheye`` finds of a camera."""
+    found = {"camera": 1, "photographs": 16, "why": why, "plain": 0.842, "bent": 0.988, "probed": 382.0}
+    return {**found, "focal": 382.0, "model": "SIMPLE_RADIAL_FISHEYE", "params": params}
+
+
+@pytest.mark.parametrize("better", [True, False])
+def test_cameras_are_placed_once_more_as_fisheyes_and_the_better_model_stays(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, better: bool
+) -> None:
+    done: list[str] = []
+    steps, suspected = Steps(tmp_path), [row([382.0, 200, 150, 0])]
+    before = SimpleNamespace(
+        camera_id=1, model=SimpleNamespace(name="SIMPLE_RADIAL"), params=[1], has_prior_focal_length=0
+    )
+
+    def tried(_p: Any, _r: Any, _s: Any, _say: Any, name: str) -> tuple[list[str], int]:
+        done.append(f"placed {name}")
+        return [f"{name}-0"], 3
+
+    monkeypatch.setattr(colmap_worker, "_tried", tried)
+    monkeypatch.setattr(Steps, "read", lambda _s, _p, name: name)
+    monkeypatch.setattr(as_fisheye, "suspects", lambda *_: suspected)
+    monkeypatch.setattr(as_fisheye, "cameras_of", lambda *_: [before])
+    monkeypatch.setattr(as_fisheye, "fisheyes", lambda *_: [])
+    monkeypatch.setattr(as_fisheye, "verify_anew", lambda *_: done.append("verified"))
+    monkeypatch.setattr(as_fisheye, "is_better", lambda *_: better)
+    monkeypatch.setattr(as_fisheye, "put_back", lambda *_: done.append("put back"))
+    colmap_worker._first_round(None, {}, steps, lambda **_: None)
+    assert done == ["placed ", "verified", "placed as fisheyes, ", *([] if better else ["put back"])]
+    assert steps.facts("first") == ["as fisheyes, -0" if better else "-0"]
+    (told,) = steps.facts("fisheyes") or ()
+    assert told["params"] == (suspected[0]["params"] if better else None)
+    done.clear()
+    (tmp_path / "first.json").unlink()  # as if it had been ended here
+    colmap_worker._first_round(None, {}, steps, lambda **_: None)
+    assert "verified" not in done
+
+
+def test_what_was_found_is_said_with_its_numbers() -> None:
+    lens = {"chosen": "RADIAL_FISHEYE", "asked": None, "trials": [], "fisheyes": [row([1.0])]}
+    shares = "98.8 % of matches agree through one of 382 px, 84.2 % through a pinhole"
+    assert lens_line(lens) == f"lens: 16 photographs are taken for a fisheye's (other lenses left a doubt): {shares}"
+    named = {**lens, "fisheyes": [row(None, why=NAME)]}
+    assert lens_line(named) == (
+        f"lens: 16 photographs are not taken for a fisheye's, though (their camera or lens is called so): {shares}"
+    )
+    unknown = {**lens, "fisheyes": [{**row([1.0], why=CIRCLE), "bent": None, "plain": None, "probed": None}]}
+    assert lens_line(unknown).endswith("fisheye's (they are round), too few of which match to tell")
+    trials = [{"model": "RADIAL_FISHEYE", "error_px": 0.4, "doubts": []}]
+    assert lens_line({**lens, "trials": trials}).endswith(f"must save 1 %; {lens_line(lens)[6:]}")
+
+
+def test_the_line_of_a_fisheye_says_how_much_it_shows() -> None:
+    camera = ColmapCamera("SIMPLE_FISHEYE", 400, 300, (150.0, 200.0, 150.0))
+    assert camera_line(camera, 3).endswith("f = 150 px (153 degrees wide)")
+    assert camera_line(camera, 3, Circle(0.5, 0.5, 0.375)).endswith("f = 150 px (115 degrees wide)")
+    assert camera_line(ColmapCamera("SIMPLE_PINHOLE", 400, 300, (200.0, 200.0, 150.0)), 3).endswith("(90 degrees wide)")
+
+
+# -- whole searches ----------------------------------------------------------------------------------------------------
+def searched(root: Path, **options: Any) -> tuple[dict[str, Any], list[str]]:
+    said: list[str] = []
+
+    def note(event: Event) -> None:
+        said.extend([event.text] if isinstance(event, Notice) else [])
+
+    poses = PosesOptions(photos=root / "photos", out=root / "capture", threads=2, feature_size=320, **options)
+    return find_poses(poses, note), said
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_round_photographs_of_185_degrees_are_placed_masked_and_cut_into_faces(colmap: None, tmp_path: Path) -> None:
+    """Measured with 16 of 800 px: 0.4 mm of a room of 4 m; before, 27 cm and no doubt was said."""
+    truth = write_photographs(tmp_path / "photos", "fisheye", count=8, width=480, angle=185, fits="height", off=(8, -6))
+    made, said = searched(tmp_path)
+    off = errors(tmp_path / "capture", truth)
+    assert off["placed"] == 8
+    assert off["centres_worst_m"] < 0.01
+    assert off["turned_worst_degrees"] < 0.3
+    assert made["lens"]["chosen"].endswith("_FISHEYE")
+    assert made["lens"]["fisheyes"][0]["why"] == "circle"
+    assert read_json(tmp_path / "capture/poses.json")["lens"] == made["lens"]
+    assert any("(they are round)" in line for line in said)
+    (camera,) = read_cameras(tmp_path / "capture/sparse/0", "bin").values()
+    assert camera.params[1:3] == pytest.approx((248, 174), abs=1.5)
+    for image in read_images(tmp_path / "capture/sparse/0", "bin", observations=True):
+        assert image.observations is not None
+        assert np.hypot(*(image.observations - camera.params[1:3]).T).max() < 180
+    scene = load_scene(tmp_path / "capture", test_every=0)
+    assert {view.name.split("_")[1] for view in scene.views} == {
+        f"{f}.jpg" for f in ("front", "right", "left", "up", "down")
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("camera_model", ["auto", "OPENCV_FISHEYE"])
+def test_photographs_that_a_fisheye_fills_are_known_by_what_they_show(
+    colmap: None, tmp_path: Path, camera_model: str
+) -> None:
+    truth = write_photographs(tmp_path / "photos", "fisheye", count=8, width=480, angle=150, fits="diagonal")
+    made, _ = searched(tmp_path, camera_model=camera_model)
+    off = errors(tmp_path / "capture", truth)
+    assert off["placed"] == 8
+    assert off["centres_worst_m"] < 0.01
+    assert off["turned_worst_degrees"] < 0.3
+    assert made["lens"]["fisheyes"][0]["why"] == ("doubt" if camera_model == "auto" else "asked")
+    assert made["cameras"][0]["focal_px"] == pytest.approx(224, rel=0.02)
+    assert not (tmp_path / "capture/masks").exists()
