@@ -32,6 +32,7 @@ from gs2d.sfm.fisheye import Circle
 from gs2d.sfm.image_copies import copy_images
 from gs2d.sfm.images import (
     FEWEST,
+    FISHEYE,
     Photo,
     camera_groups,
     find_photos,
@@ -313,7 +314,8 @@ def _request(options: PosesOptions, work: Path, photos: Sequence[Photo], threads
     hints, more = fisheye_hints(photos, groups, panoramas, options.camera_model)
     for line in (*lines, *more):
         on_event(Notice(line))
-    lens = START if options.camera_model == "auto" else options.camera_model
+    # Cameras that are asked to be fisheyes become some later: COLMAP verifies no pair of those of unknown focal length.
+    lens = START if options.camera_model in ("auto", FISHEYE) else options.camera_model
     order, ordered_by = in_order_taken(photos)
     return Request(
         images=str(work / STAGED / IMAGES),
