@@ -233,6 +233,22 @@ def test_a_wide_fisheye_is_cut_and_its_rim_is_kept_and_a_narrow_one_undistorted(
     assert len(load_scene(tmp_path / "narrow").views) == 9
 
 
+def test_faces_that_the_mask_of_a_round_fisheye_hides_are_left_out(tmp_path: Path) -> None:
+    """The picture goes on beyond the circle, as far as the ray behind; one of nine photographs has no mask."""
+    k = Intrinsics(320, 200, 45.0, 45.0, 160.0, 100.0, Lens("fisheye", FISHEYE))
+    write_fisheyes(tmp_path, k, FISHEYE)
+    v, u = np.mgrid[:400, :640] + 0.5
+    circle = np.hypot(u - 320, v - 200) < 160  # of twice the size, 102 degrees from the axis
+    (tmp_path / "masks").mkdir()
+    for index in range(8):
+        Image.fromarray(circle.astype(np.uint8) * np.uint8(255)).save(tmp_path / "masks" / f"{index}.png")
+    scene = load_scene(tmp_path, test_every=0)
+    behind = [view.name for view in scene.views if view.name.endswith("_back.png")]
+    assert behind == ["8_back.png"]
+    assert len(scene.views) == 8 * 5 + 6
+    assert len([view for view in load_scene(tmp_path, test_every=0, masked="off").views if "_back" in view.name]) == 9
+
+
 def test_rays_are_seen_where_colmap_says(tmp_path: Path) -> None:
     if importlib.util.find_spec("pycolmap") is None:
         pytest.skip("no pycolmap")

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from gs2d.sfm.lens import MODELS, Trial, apply, choose, doubts, lens_line, models_to_try, try_lenses
+from gs2d.sfm.lens import BENT, MODELS, Trial, apply, choose, doubts, lens_line, models_to_try, try_lenses
 from synthetic_model import HEIGHT, WIDTH, synthetic_model
 
 F, CX, CY = 520.0, 320.0, 240.0
@@ -31,6 +31,9 @@ def pycolmap(colmap: None) -> Any:
         ("OPENCV_FISHEYE", (300.0, 300.0, CX, CY, 0.02, 0.0, 0.0, 0.0), []),
         ("OPENCV", (1298.8, 1447.9, CX, CY, 0, 0, 0, 0), ["fx / fy is 0.897, where pixels are square"]),
         ("OPENCV", (F, F, CX, CY, 0, 0, -0.0175, 0), ["its tangential distortion is -0.0175"]),
+        ("SIMPLE_RADIAL_FISHEYE", (150.0, CX, CY, 0.01), []),  # 214 degrees from corner to corner
+        ("SIMPLE_FISHEYE", (60.0, CX, CY), ["its focal length is 0.09 of the longer side"]),
+        ("SIMPLE_RADIAL_FISHEYE", (200.0, CX, CY, -0.3), ["its distortion folds the picture back before the corner"]),
         ("SIMPLE_PINHOLE", (F, CX + 80, CY), ["its principal point is 12 % of the size off the middle"]),
         ("SIMPLE_PINHOLE", (100.0, CX, CY), ["its focal length is 0.16 of the longer side"]),
         ("SIMPLE_PINHOLE", (9000.0, CX, CY), ["its focal length is 14.06 of the longer side"]),
@@ -90,6 +93,30 @@ def test_the_lens_that_took_the_photographs_is_found(pycolmap: Any, model: str, 
     assert camera.model.name == model
     assert camera.focal_length_x == camera.focal_length_y == pytest.approx(F, rel=0.01)
     assert piece.num_reg_images() == 12
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_FISHEYE", (280.0, CX, CY)),
+        ("SIMPLE_RADIAL_FISHEYE", (280.0, CX, CY, -0.12)),
+    ],
+)
+def test_the_fisheye_that_took_the_photographs_is_found(pycolmap: Any, model: str, params: tuple[float, ...]) -> None:
+    """From cameras that were placed as SIMPLE_RADIAL_FISHEYE: fisheyes are compared with each other."""
+    piece = synthetic_model(pycolmap, model, params)
+    first = [280.0, CX, CY, 0.0]
+    apply(pycolmap, piece, Trial("SIMPLE_RADIAL_FISHEYE", 0, (), {1: first}, {1: "SIMPLE_RADIAL_FISHEYE"}), threads=1)
+    trials = try_lenses(pycolmap, piece, seed=0, threads=1, on_done=lambda _: None)
+    assert [trial.model for trial in trials] == [BENT[model] for model in MODELS]
+    best = choose(trials)
+    assert best.model == model
+    assert not best.doubts
+    assert best.error < 0.6
+    apply(pycolmap, piece, trials[-1], threads=1)  # OPENCV_FISHEYE keeps one focal length
+    camera = piece.camera(1)
+    assert camera.model.name == "OPENCV_FISHEYE"
+    assert camera.focal_length_x == camera.focal_length_y == pytest.approx(280, rel=0.02)
 
 
 def test_a_camera_of_few_photographs_gets_no_rich_lens(pycolmap: Any) -> None:
