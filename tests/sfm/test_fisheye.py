@@ -24,7 +24,7 @@ from gs2d.sfm import as_fisheye, colmap_worker
 from gs2d.sfm.fisheye import Circle, circle_of, named_fisheye, small_if_dark
 from gs2d.sfm.images import Photo, camera_groups, find_photos, fisheye_hints, read_photos
 from gs2d.sfm.lens import ASKED, CIRCLE, NAME, lens_line
-from gs2d.sfm.lens_probe import probe
+from gs2d.sfm.lens_probe import Probe, probe
 from gs2d.sfm.masks import copy_masks
 from gs2d.sfm.model import camera_line
 from gs2d.sfm.steps import Steps
@@ -227,6 +227,61 @@ def test_too_few_matches_tell_nothing(pycolmap: Any) -> None:
     assert probe(pycolmap, alone, camera, reach=250.0, seed=0) is None
 
 
+@pytest.mark.parametrize(
+    ("model", "params", "placed", "error", "is_doubted"),
+    [
+        (
+            "SIMPLE_RADIAL",
+            (330.0, 200, 150, -0.05),
+            10,
+            0.6,
+            False,
+        ),  # an ordinary camera: nothing is asked, no time lost
+        ("SIMPLE_RADIAL", (330.0, 200, 150, 0.1), 5, 0.6, False),
+        ("SIMPLE_RADIAL", (330.0, 200, 150, -0.05), 4, 0.6, True),
+        ("SIMPLE_RADIAL", (330.0, 200, 150, -0.05), 10, 1.1, True),
+        ("SIMPLE_RADIAL", (330.0, 200, 150, -0.2), 10, 0.6, True),  # the corner is moved by 11 %
+        ("SIMPLE_RADIAL", (90.0, 200, 150, -0.01), 10, 0.6, True),  # 132 degrees
+    ],
+)
+def test_a_camera_is_doubted_by_what_its_photographs_made_of_it(
+    pycolmap: Any, model: str, params: tuple[float, ...], placed: int, error: float, is_doubted: bool
+) -> None:
+    lens = pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=list(params), camera_id=1)
+    piece = SimpleNamespace(
+        cameras={1: lens},
+        camera={1: lens}.__getitem__,
+        images={i: SimpleNamespace(has_pose=i < placed, camera_id=1) for i in range(10)},
+        compute_mean_reprojection_error=lambda: error,
+    )
+    assert as_fisheye._is_doubted(piece, 1, 10) is is_doubted
+    assert as_fisheye._is_doubted(piece, 2, 10)
+    assert as_fisheye._is_doubted(None, 1, 10)
+
+
+@pytest.mark.parametrize(
+    ("told", "why", "expected"),
+    [
+        (Probe(0.8, 0.9, 140.0), "doubt", 140.0),
+        (Probe(0.9, 0.91, 140.0), "doubt", None),
+        (Probe(0.9, 0.91, 140.0), NAME, None),  # an action camera that stretched its pictures itself
+        (Probe(0.9, 0.9, 140.0), CIRCLE, 140.0),
+        (Probe(0.9, 0.8, 140.0), CIRCLE, None),
+        (None, CIRCLE, 100 / np.radians(90)),
+        (None, "doubt", None),
+        (Probe(0.9, 0.91, 140.0), ASKED, 111.0),  # EXIF's
+    ],
+)
+def test_the_focal_length_to_begin_with(told: Probe | None, why: str, expected: float | None) -> None:
+    known = SimpleNamespace(has_prior_focal_length=True, mean_focal_length=lambda: 111.0)
+    assert as_fisheye._focal(told, why, 100.0, known) == expected
+
+
+def test_a_fisheye_that_is_asked_for_and_tells_nothing_begins_at_150_degrees() -> None:
+    known = SimpleNamespace(has_prior_focal_length=False)
+    assert as_fisheye._focal(None, ASKED, 100.0, known) == pytest.approx(100 / np.radians(75))
+
+
 # -- which model is believed -------------------------------------------------------------------------------------------
 def model_of(photographs: int, observations: int, *, lens: Any) -> Any:
     return SimpleNamespace(
@@ -330,6 +385,8 @@ def test_round_photographs_of_185_degrees_are_placed_masked_and_cut_into_faces(c
     assert made["lens"]["fisheyes"][0]["why"] == "circle"
     assert read_json(tmp_path / "capture/poses.json")["lens"] == made["lens"]
     assert any("(they are round)" in line for line in said)
+    assert made["masks"] == 8  # which this command may replace
+    assert searched(tmp_path, overwrite=True)[0]["lens"] == made["lens"]
     (camera,) = read_cameras(tmp_path / "capture/sparse/0", "bin").values()
     assert camera.params[1:3] == pytest.approx((248, 174), abs=1.5)
     for image in read_images(tmp_path / "capture/sparse/0", "bin", observations=True):

@@ -115,11 +115,11 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
                 request = replace(request, masks=str(capture / FOLDER))
             if line := go_on(work, {"photographs": made_of, **layers(request)}, ours=(STAGED,)):
                 on_event(Notice(line))
-            copy_masks(photos, masks, capture / FOLDER, options.max_size, circles)
+            masked = copy_masks(photos, masks, capture / FOLDER, options.max_size, circles)
             staged = _stage(photos, capture / IMAGES, options, threads, on_event, ours=video is not None)
             solved = solve(request, _progress(on_event), lambda line: on_event(Notice(line)))
             try:
-                result = _finish(options, request, photos, staged, solved, started, on_event, masks=masks)
+                result = _finish(options, request, photos, staged, solved, started, on_event, masked=masked)
             except DataError:
                 forget(work)  # it would end so again
                 raise
@@ -175,7 +175,7 @@ def _finish(
     started: float,
     on_event: OnEvent,
     *,
-    masks: Sequence[Path | None] = (),
+    masked: int = 0,
 ) -> dict[str, Any]:
     """Write what the capture needs beside the models, and look at it as training does; what ``poses.json`` holds.
 
@@ -189,7 +189,7 @@ def _finish(
     facts = read_facts(Path(request.database))
     check_any(pieces, facts, options.photos)
     result = _result(options, request, photos, staged, pieces, facts, solved)
-    result |= {"masks": len(masks) - masks.count(None)} if any(masks) else {}
+    result |= {"masks": masked} if masked else {}
     result["seconds"] = round(time.monotonic() - started, 1)
     on_event(Phase("checking the capture", 0))
     with attempted(POSES_PNG, "", on_event):
