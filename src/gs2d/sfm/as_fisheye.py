@@ -15,11 +15,11 @@ from typing import Any
 
 from gs2d.sfm.lens import ASKED, BENT, CIRCLE, DOUBT, START, corner_bend, doubts, is_bent
 from gs2d.sfm.lens_probe import Probe, probe
-from gs2d.sfm.search import CALIBRATED_ANEW
+from gs2d.sfm.search import CALIBRATED_ANEW, HINTED
 from gs2d.sfm.steps import Steps
 
 Say = Callable[..., None]
-HINTED, SUSPECTED, VERIFIED = "hinted", "suspected", "suspected verified"  # steps
+SUSPECTED, VERIFIED = "suspected", "suspected verified"  # steps
 USUAL, ROUND = 75.0, 90.0  # degrees from the axis to the corner, or to the rim, where no photograph tells
 NEARLY = 0.98  # of the matches that a pinhole explains must agree with the fisheye of a round picture
 BEND = 0.1  # how far the corner is moved inwards, of its distance, from where on a fisheye is looked for

@@ -40,7 +40,7 @@ from gs2d.sfm.lens import (
 )
 from gs2d.sfm.panoramas import PANORAMA
 from gs2d.sfm.place_all import place_all
-from gs2d.sfm.search import MAPPING
+from gs2d.sfm.search import HINTED, MAPPING
 from gs2d.sfm.steps import Steps
 from gs2d.sfm.upright import up_direction
 
@@ -89,7 +89,7 @@ def map_(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say) -> dict
         ``models``: what was done to each, the largest first; ``lens``: what was decided about it; ``refused``: the
         reason for each photograph that the second round placed and took out again.
     """
-    if steps.facts(as_fisheye.HINTED) is None:
+    if steps.facts(HINTED) is None:
         as_fisheye.settle_hinted(pycolmap, request, steps, say)
     if steps.facts("first") is None:
         _first_round(pycolmap, request, steps, say)
@@ -135,7 +135,7 @@ def _first_round(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say)
     Where they leave a doubt whether a camera is a fisheye, and its photographs tell of one, they are made once more.
     """
     names, _ = _tried(pycolmap, request, steps, say, "")
-    looked_at = steps.facts(as_fisheye.HINTED) or []
+    looked_at = steps.facts(HINTED) or []
     if (found := steps.facts(as_fisheye.SUSPECTED)) is None:
         found = as_fisheye.suspects(pycolmap, request, steps.read(pycolmap, names[0]) if names else None)
         steps.finish(as_fisheye.SUSPECTED, found)

@@ -22,6 +22,7 @@ LAYERS = ("photographs", "features", "pairs", "mapping")
 DATABASE, MAPPING = "database.db", "mapping"
 _PAIRS = ("pairs.txt", "pairs_again.txt", "pairs_anew.txt", "alike.json")
 DAMAGED = (sqlite3.Error, UnicodeDecodeError)  # of a database, whose words need not be text
+HINTED = "hinted"  # step of the mapping, before a camera is placed: which of them could be fisheyes
 CALIBRATED_ANEW = "calibrated anew"  # step of the mapping: from here on pairs are verified with other cameras
 _AGAIN = ("pairs again.json", f"{CALIBRATED_ANEW}.json")  # likewise, or compared by looser rules
 
@@ -113,7 +114,7 @@ def _kept(work: Path, layers: int) -> str:
         if layers > LAYERS.index("pairs"):
             said.append(f"{_count(connection, 'two_view_geometries'):,} pairs")
     if layers > LAYERS.index("mapping") and (work / MAPPING).is_dir():
-        steps = sorted(path.stem for path in (work / MAPPING).iterdir())
+        steps = {path.stem for path in (work / MAPPING).iterdir()} - {HINTED, CALIBRATED_ANEW}
         said += ["cameras that were placed"] if steps else []
     return f"going on with the search that was interrupted: {', '.join(said) or 'copies of photographs'}"
 
