@@ -9,7 +9,9 @@ import tomllib
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scripts.compare_machines import IMAGES, compare
 
 import gs2d
 
@@ -55,3 +57,25 @@ def test_the_conda_recipe_needs_what_pyproject_needs() -> None:
     wanted = {re.sub(r"^[\w-]+", lambda name: names.get(name[0], name[0]), line) for line in project["dependencies"]}
     assert listed == wanted | {f"python{project['requires-python']}"}
     assert f'version: "{gs2d.__version__}"' in recipe
+
+
+def test_what_two_processors_draw_may_differ_by_rounding_and_not_by_more(tmp_path: Path) -> None:
+    """The judge of `scripts/check_aarch64.sh`, on results made up by hand."""
+    rng = np.random.default_rng(0)
+    here = {f"image {name}": rng.random((20, 30, 3), dtype=np.float32) for name in IMAGES}
+    here |= {"gradient means": rng.random((50, 3), dtype=np.float32)}
+    here |= {"training psnr": np.array(20.0), "training splats": np.array(1000)}
+    np.savez(tmp_path / "here.npz", **here)
+
+    def faults(**changed: np.ndarray) -> int:
+        np.savez(
+            tmp_path / "there.npz", **(here | {name.replace("_", " ", 1): value for name, value in changed.items()})
+        )
+        return compare(tmp_path / "here.npz", tmp_path / "there.npz")
+
+    rounding = np.float32(1 + 1e-6)
+    assert faults(image_color=here["image color"] * rounding, gradient_means=here["gradient means"] * rounding) == 0
+    assert faults(image_color=here["image color"] * np.float32(1.001)) == 1
+    assert faults(gradient_means=here["gradient means"] * np.float32(1.01)) == 1
+    assert faults(training_psnr=np.array(19.5), training_splats=np.array(1200)) == 2
+    assert faults(image_alpha=here["image alpha"] * np.float32(np.nan)) == 1

@@ -1,0 +1,45 @@
+#!/bin/sh
+# Installs the wheel of 64-bit Arm with a Python of that processor under QEMU, runs `gs2d doctor` from it, and compares
+# with this machine what it draws, its gradients and a short training (scripts/compare_machines.py).
+# Usage: scripts/check_aarch64.sh WHEEL PYTHON
+#        (Debian, as root, on x86-64: apt install qemu-user-static debootstrap; PYTHON has gs2d of the same sources,
+#        installed or by PYTHONPATH)
+#
+# Nothing of this machine is set for it, and no program of Arm is run but by QEMU by name: Debian's packages are
+# unpacked into a temporary folder, not configured. torch is 2.10.0, whose wheel for Arm on the package index is without
+# CUDA (that of 2.13.0 wants its libraries).
+set -eu
+[ $# = 2 ] || { sed -n "s/^# *//; 4,6p" "$0" >&2; exit 2; }
+wheel=$(cd "$(dirname "$1")" && pwd)/$(basename "$1")
+case $wheel in *_aarch64.whl) ;; *) echo "error: needs a wheel of aarch64, got $1" >&2; exit 2 ;; esac
+here=$2
+scripts=$(cd "$(dirname "$0")" && pwd)
+for program in qemu-aarch64-static debootstrap; do
+    command -v $program >/dev/null ||
+        { echo "error: needs $program; on Debian: apt install qemu-user-static debootstrap" >&2; exit 2; }
+done
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+root="$work/root"
+# Its first stage downloads all packages and unpacks those that every Debian has; the rest is unpacked here.
+debootstrap --foreign --arch=arm64 --variant=minbase --include=python3,python3-pip-whl,ca-certificates \
+    bookworm "$root" >"$work/log" 2>&1 || { tail "$work/log" >&2; exit 1; }
+for package in "$root"/var/cache/apt/archives/*.deb; do
+    dpkg-deb --fsys-tarfile "$package" | tar -x --keep-directory-symlink -C "$root"
+done
+site="$work/site"
+arm() {    # a Python of Arm, with what was installed
+    PYTHONPATH="$site" PYTHONDONTWRITEBYTECODE=1 OMP_NUM_THREADS=1 \
+        qemu-aarch64-static -L "$root" "$root/usr/bin/python3" "$@"
+}
+cd "$work"    # nothing of a checkout is importable
+pip=$(echo "$root"/usr/share/python-wheels/pip-*.whl)
+# pip itself runs there: it asks the processor and the C library of Debian for the tags of wheels that fit.
+arm "$pip/pip" --disable-pip-version-check -q install --only-binary :all: --no-compile --target "$site" \
+    torch==2.10.0 "$wheel"
+arm -m gs2d --version
+arm -m gs2d doctor | tee doctor
+grep -q 'yes  cpu: portable' doctor || { echo "error: the wheel must bring the native kernels" >&2; exit 1; }
+OMP_NUM_THREADS=1 GS2D_CPU_VARIANT=portable "$here" "$scripts/compare_machines.py" make here.npz --capture capture
+arm "$scripts/compare_machines.py" make arm.npz --capture capture
+"$here" "$scripts/compare_machines.py" compare here.npz arm.npz

@@ -1,0 +1,41 @@
+"""Renders the conda recipe for each platform, as rattler-build would before it builds; no conda channel is asked.
+
+    python -m venv build/recipe-tools && build/recipe-tools/bin/pip install py-rattler-build==0.73.0
+    build/recipe-tools/bin/python scripts/check_recipe.py
+
+A mistake in the recipe or its variants is an error of rattler-build's, and exit code 1.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import rattler_build as rb
+
+RECIPE = Path(__file__).parents[1] / "packaging" / "conda" / "recipe.yaml"
+PLATFORMS = ("linux-64", "linux-aarch64", "osx-arm64", "win-64")
+
+
+def rendered(platform: str) -> list[rb.RenderedVariant]:
+    """The recipe for a platform, a variant for each Python."""
+    config = rb.PlatformConfig(target_platform=platform)
+    variants = rb.VariantConfig.from_file_with_context(RECIPE.parent / "variants.yaml", rb.JinjaConfig(platform=config))
+    return rb.Stage0Recipe.from_file(RECIPE).render(variants, rb.RenderConfig(config))
+
+
+def main() -> int:
+    """Render for all platforms, and say what each is built with."""
+    for platform in PLATFORMS:
+        variants = rendered(platform)
+        pythons = [variant.variant["python"] for variant in variants]
+        if len(pythons) < 2:
+            print(f"error: {platform} must have a variant for each Python, got {pythons}", file=sys.stderr)
+            return 1
+        tools = variants[0].recipe.to_dict()["requirements"]["build"]
+        print(f"{platform}: Python {', '.join(pythons)}; built with {', '.join(tools)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
