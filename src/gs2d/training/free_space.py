@@ -20,6 +20,7 @@ from gs2d.core.memory_limit import cache_bytes
 from gs2d.core.spill import Spilled
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
+from gs2d.kernels.free_space import look_at_free_space
 from gs2d.training.plane_sweep import SWEEP_BYTES, Sweep
 
 _UNKNOWN = float("inf")
@@ -67,19 +68,15 @@ class FreeSpaceMaps:
         is much. So a place is free where more of them see through it than see a surface there.
         """
         ends = self._ends(splats)
+        reach = (ends - ends[0]).norm(dim=2).amax(dim=0)
         against = torch.zeros(len(splats), dtype=torch.int32, device=splats.device)
         support = torch.zeros_like(against)
         for kept in self._views:
-            view = kept.to(self._device)
-            free = (ends[0] - _center(view)).norm(dim=1) < view.radius
-            for places in ends:
-                free |= _is_free(view, places)
-            against += free
-            support += _is_shown(view, ends[0], 1 - self._settings.nearer)
+            _look(kept.to(self._device), ends, reach, 1 - self._settings.nearer, against, support)
         return (against >= self._settings.views) & (against > support)
 
-    def _ends(self, splats: Splats) -> list[Tensor]:
-        """Places [N, 3] at which a splat is looked at: its centre, and its ends along both axes."""
+    def _ends(self, splats: Splats) -> Tensor:
+        """Places [P, N, 3] at which a splat is looked at: its centre, and its ends along both axes."""
         reach = self._settings.spread * splats.scales
         axes = quats_to_matrices(splats.quats)
         ends = [splats.means]
@@ -87,7 +84,7 @@ class FreeSpaceMaps:
             for axis in (0, 1):
                 offset = axes[:, :, axis] * reach[:, axis : axis + 1]
                 ends += [splats.means + offset, splats.means - offset]
-        return ends
+        return torch.stack(ends)
 
 
 def _free_view(sweep: Sweep, index: int, settings: FreeSpace) -> FreeView:
@@ -104,8 +101,41 @@ def _free_view(sweep: Sweep, index: int, settings: FreeSpace) -> FreeView:
     return FreeView(limit.float(), torch.from_numpy(known).float(), radius, *tensors)
 
 
+def _look(view: FreeView, ends: Tensor, reach: Tensor, fraction: float, against: Tensor, support: Tensor) -> None:
+    """Add one photograph to what is counted of each splat [N]: natively where that can be, else in torch."""
+    done = look_at_free_space(
+        ends,
+        reach,
+        _projection(view),
+        _center(view),
+        radius=view.radius,
+        limit=view.limit,
+        known=view.known,
+        fraction=fraction,
+        against=against,
+        support=support,
+    )
+    if not done:
+        look_at_free_space_reference(view, ends, fraction, against, support)
+
+
+def look_at_free_space_reference(
+    view: FreeView, ends: Tensor, fraction: float, against: Tensor, support: Tensor
+) -> None:
+    """Add one photograph to what is counted of each splat [N], in torch."""
+    free = (ends[0] - _center(view)).norm(dim=1) < view.radius
+    for places in ends:
+        free |= _is_free(view, places)
+    against += free
+    support += _is_shown(view, ends[0], fraction)
+
+
 def _center(view: FreeView) -> Tensor:
     return -view.T[:3, :3].T @ view.T[:3, 3]
+
+
+def _projection(view: FreeView) -> Tensor:
+    return view.K @ view.T[:3]
 
 
 def _is_free(view: FreeView, places: Tensor) -> Tensor:
@@ -123,7 +153,8 @@ def _is_shown(view: FreeView, places: Tensor, fraction: float) -> Tensor:
 
 def _seen(view: FreeView, places: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Depth of places [N, 3] in a photograph, whether they are inside, and their rows and columns (clipped)."""
-    seen = places @ (view.K @ view.T[:3, :3]).T + view.K @ view.T[:3, 3]  # (x z, y z, z)
+    project = _projection(view)
+    seen = places @ project[:, :3].T + project[:, 3]  # (x z, y z, z)
     z = seen[:, 2]
     front = z.clamp_min(1e-12)
     x, y = seen[:, 0] / front, seen[:, 1] / front

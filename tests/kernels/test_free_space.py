@@ -1,0 +1,102 @@
+"""Splats in free space, natively, against what torch counts."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+import torch
+from torch import Tensor
+
+from gs2d.config.robust import DenseStart, FreeSpace
+from gs2d.core.splats import Splats
+from gs2d.kernels import free_space as native
+from gs2d.training import free_space
+from gs2d.training.free_space import FreeSpaceMaps
+from gs2d.training.plane_sweep import sweep_views
+from train_toys import random_splats
+from wall_scene import WALL, wall
+
+pytestmark = pytest.mark.usefixtures("native")
+
+
+@pytest.fixture(scope="module")
+def maps() -> FreeSpaceMaps:
+    return FreeSpaceMaps(sweep_views(wall(), DenseStart(side=48, planes=16, min_angle=1.0)), FreeSpace())
+
+
+def scattered(count: int, seed: int = 0) -> Splats:
+    """Splats before the wall, in it, behind it, beside all pictures and behind all cameras; from tiny to huge."""
+    splats = random_splats(count, seed=seed)
+    generator = torch.Generator().manual_seed(seed)
+    splats.means.copy_((torch.rand(count, 3, generator=generator) - 0.5) * torch.tensor([10.0, 8.0, 3.0 * WALL]))
+    splats.log_scales.copy_(torch.rand(count, 2, generator=generator) * 6 - 5)
+    return splats
+
+
+def counted(maps: FreeSpaceMaps, splats: Splats, *, reference: bool) -> tuple[Tensor, Tensor]:
+    ends = maps._ends(splats)
+    reach = (ends - ends[0]).norm(dim=2).amax(dim=0)
+    against, support = (torch.zeros(len(splats), dtype=torch.int32) for _ in range(2))
+    for view in maps._views:
+        if reference:
+            free_space.look_at_free_space_reference(view, ends, 0.05, against, support)
+        else:
+            free_space._look(view, ends, reach, 0.05, against, support)
+    return against, support
+
+
+def test_it_counts_what_torch_counts(maps: FreeSpaceMaps, monkeypatch: pytest.MonkeyPatch) -> None:
+    splats = scattered(20_000)
+    found, true = (counted(maps, splats, reference=reference) for reference in (False, True))
+    assert 0.02 < (true[0] > 1).float().mean() < 0.9
+    assert 0.001 < (true[1] > 0).float().mean() < 0.9
+    for ours, theirs in zip(found, true, strict=True):
+        assert int((ours != theirs).sum()) <= 10  # places on the border of two pixels
+        assert int((ours - theirs).abs().max()) <= 1
+    inside = maps.inside(splats)
+    monkeypatch.setattr(free_space, "look_at_free_space", lambda *_, **__: False)
+    assert int((maps.inside(splats) != inside).sum()) <= 10
+    assert 0 < int(inside.sum()) < len(splats)
+
+
+def test_places_that_are_no_numbers_or_very_far_are_nowhere(maps: FreeSpaceMaps) -> None:
+    splats = scattered(6)
+    splats.means[0] = float("nan")
+    splats.means[1] = float("inf")
+    splats.means[2] = 1e30
+    splats.means[3, 2] = -1e30
+    splats.log_scales[4] = 80.0
+    found, true = (counted(maps, splats, reference=reference) for reference in (False, True))
+    assert all(torch.equal(ours, theirs) for ours, theirs in zip(found, true, strict=True))
+    assert not found[0][:4].any()
+
+
+def test_the_result_is_the_same_for_any_number_of_threads(maps: FreeSpaceMaps) -> None:
+    splats, results = scattered(10_000, seed=1), []
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            results.append(counted(maps, splats, reference=False))
+    finally:
+        torch.set_num_threads(1)
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def test_what_it_cannot_read_it_leaves(maps: FreeSpaceMaps) -> None:
+    view, counts = maps._views[0], [torch.zeros(3, dtype=torch.int32) for _ in range(2)]
+    ends = torch.zeros(1, 3, 3, dtype=torch.float64)
+    limits = {"limit": view.limit, "known": view.known, "against": counts[0], "support": counts[1]}
+    rows = (torch.zeros(3), torch.zeros(3, 4), torch.zeros(3))
+    assert not native.look_at_free_space(ends, *rows, radius=9.0, fraction=0.1, **limits)
+    assert not counts[0].any()
+
+
+def test_it_is_faster(maps: FreeSpaceMaps) -> None:
+    splats, seconds = scattered(100_000), []
+    for reference in (False, True):
+        counted(maps, splats, reference=reference)
+        begun = time.process_time()
+        counted(maps, splats, reference=reference)
+        seconds.append(time.process_time() - begun)
+    assert seconds[0] < seconds[1], seconds
