@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import pytest
 import torch
 from torch import Tensor
@@ -90,13 +88,3 @@ def test_what_it_cannot_read_it_leaves(maps: FreeSpaceMaps) -> None:
     rows = (torch.zeros(3), torch.zeros(3, 4), torch.zeros(3))
     assert not native.look_at_free_space(ends, *rows, radius=9.0, fraction=0.1, **limits)
     assert not counts[0].any()
-
-
-def test_it_is_faster(maps: FreeSpaceMaps) -> None:
-    splats, seconds = scattered(100_000), []
-    for reference in (False, True):
-        counted(maps, splats, reference=reference)
-        begun = time.process_time()
-        counted(maps, splats, reference=reference)
-        seconds.append(time.process_time() - begun)
-    assert seconds[0] < seconds[1], seconds

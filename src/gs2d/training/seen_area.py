@@ -19,7 +19,6 @@ from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
-from gs2d.render.culling import may_be_seen
 from gs2d.render.types import RasterSettings
 
 PLACES = 7
@@ -41,28 +40,16 @@ def mostly_unseen(
     -------
     Tensor [N] bool
     """
-    views = [shrunk(camera, settings.side) for camera in cameras]
-    rows = _large(splats, views, settings.size).nonzero().squeeze(1)
-    large = splats.rows(rows)
-    most = torch.zeros(len(rows), dtype=splats.dtype, device=splats.device)
-    for camera in views:
-        asked = most < settings.least
-        if bool((asked & may_be_seen(large, camera, raster)).any()):  # the picture decides of one more
-            shown = shown_weights(splats, camera, raster, backend)[rows]
-            most = torch.maximum(most, shown / whole_weights(large, camera).clamp_min(1e-6))
-    rows = rows[most < settings.least]
-    found = torch.zeros(len(splats), dtype=torch.bool, device=splats.device)
-    found[rows] = inside_fraction(splats.rows(rows), cameras) < settings.inside
-    return found
-
-
-@torch.no_grad()
-def _large(splats: Splats, cameras: Sequence[Camera], size: float) -> Tensor:
-    """Find the splats [N] bool that would cover more than this part of any picture."""
-    normals, areas = _normals_and_areas(splats)
-    found = torch.zeros(len(splats), dtype=torch.bool, device=splats.device)
+    most = torch.zeros(len(splats), dtype=splats.dtype, device=splats.device)
+    large = torch.zeros(len(splats), dtype=torch.bool, device=splats.device)
     for camera in cameras:
-        found |= _whole_weights(splats.means, normals, areas, camera) > size * camera.width * camera.height
+        small = shrunk(camera, settings.side)
+        whole = whole_weights(splats, small)
+        large |= whole > settings.size * small.width * small.height
+        most = torch.maximum(most, shown_weights(splats, small, raster, backend) / whole.clamp_min(1e-6))
+    found = large & (most < settings.least)
+    rows = found.nonzero().squeeze(1)
+    found[rows] = inside_fraction(splats.rows(rows), cameras) < settings.inside
     return found
 
 
@@ -111,19 +98,10 @@ def whole_weights(splats: Splats, camera: Camera) -> Tensor:
 
     The integral of its Gaussian over the image plane, to first order; 0 behind the camera.
     """
-    return _whole_weights(splats.means, *_normals_and_areas(splats), camera)
-
-
-def _normals_and_areas(splats: Splats) -> tuple[Tensor, Tensor]:
-    """Return normals [N, 3], and the integral [N] of each Gaussian over its plane times its opacity."""
-    area = 2 * torch.pi * splats.scales.prod(dim=1)
-    return quats_to_matrices(splats.quats)[:, :, 2], splats.opacities.reshape(-1) * area
-
-
-def _whole_weights(means: Tensor, normals: Tensor, areas: Tensor, camera: Camera) -> Tensor:
-    pose = torch.as_tensor(camera.T_cam_world, dtype=means.dtype, device=means.device)
-    seen = means @ pose[:3, :3].T + pose[:3, 3]
+    pose = torch.as_tensor(camera.T_cam_world, dtype=splats.dtype, device=splats.device)
+    seen = splats.means @ pose[:3, :3].T + pose[:3, 3]
+    normals = quats_to_matrices(splats.quats)[:, :, 2] @ pose[:3, :3].T
     z = seen[:, 2].clamp_min(1e-9)
-    facing = areas * (seen * (normals @ pose[:3, :3].T)).sum(dim=1).abs() / z  # the image plane
-    weight = facing * (camera.fx * camera.fy) / z.square()
+    area = 2 * torch.pi * splats.scales.prod(dim=1) * (seen * normals).sum(dim=1).abs() / z  # facing the image plane
+    weight = splats.opacities.reshape(-1) * area * (camera.fx * camera.fy) / z.square()
     return torch.where(seen[:, 2] > 0, weight, torch.zeros_like(weight))

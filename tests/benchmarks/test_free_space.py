@@ -1,0 +1,31 @@
+"""The benchmark of looks at free space, gone through on a toy capture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from benchmarks.free_space import main
+
+from gs2d.synthetic.flight import Flight, write_flight
+from gs2d.training import free_space
+
+
+@pytest.mark.usefixtures("native")
+def test_it_tells_of_each_capture_what_a_look_takes_both_ways(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_flight(tmp_path / "flown", Flight(12, width=64, height=48, points=3000, seed=1))
+    before = free_space.look_at_free_space
+    assert main([f"{tmp_path / 'flown'}:1", "--repeat", "1"]) == 0
+    cells = capsys.readouterr().out.splitlines()[-1].strip("| ").split(" | ")
+    assert cells[:2] == ["flown", "10"]  # two are for testing
+    assert int(cells[2].replace(",", "")) > 500
+    assert float(cells[3]) < float(cells[4])
+    assert int(cells[6]) <= 5
+    assert free_space.look_at_free_space is before
+
+
+def test_a_capture_that_is_not_there_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["/nowhere"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
