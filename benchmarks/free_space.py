@@ -34,16 +34,18 @@ def look(scene: Scene, repeat: int) -> tuple[int, list[float], int]:
     assert maps is not None
     found, seconds = [], []
     native = free_space.look_at_free_space
-    for way in (native, lambda *_, **__: False):
-        free_space.look_at_free_space = way
-        taken = []
-        for _ in range(repeat):
-            begun = time.process_time()
-            inside = maps.inside(splats)
-            taken.append(time.process_time() - begun)
-        found.append(inside)
-        seconds.append(min(taken))
-    free_space.look_at_free_space = native
+    try:
+        for way in (native, lambda *_, **__: False):
+            free_space.look_at_free_space = way
+            taken = []
+            for _ in range(repeat):
+                begun = time.process_time()
+                inside = maps.inside(splats)
+                taken.append(time.process_time() - begun)
+            found.append(inside)
+            seconds.append(min(taken))
+    finally:
+        free_space.look_at_free_space = native
     return len(splats), seconds, int((found[0] != found[1]).sum())
 
 
