@@ -7,6 +7,7 @@ import math
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,14 +15,18 @@ import torch
 
 from gs2d.cli.app import run as main
 from gs2d.config.presets import get_recipe
+from gs2d.config.robust import FreeSpace, SeenArea
+from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import apply_overrides
 from gs2d.core import memory_limit
+from gs2d.core.splats import Splats
 from gs2d.errors import DataError, RecipeError
 from gs2d.pipeline import capture_plan
-from gs2d.pipeline.capture_plan import PROGRAM_BYTES, crowded, expected_splats, fitting_downscale, rounded
+from gs2d.pipeline.capture_plan import PROGRAM_BYTES, expected_splats, fitting_downscale, looks_of, rounded
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.options import PlanOptions, TrainOptions
 from gs2d.pipeline.planned import command_of, plan
+from gs2d.pipeline.probe import Cost, Probe, cost_of, crowded
 from gs2d.pipeline.train import train
 from gs2d.synthetic.flight import Flight, write_flight
 from train_toys import random_splats
@@ -168,3 +173,36 @@ def test_figures_for_people_have_two_digits() -> None:
 def test_a_memory_that_is_none_is_refused(capture: Path) -> None:
     with pytest.raises(RecipeError, match=r"--memory must be 0.5 GiB or more, got 0"):
         plan(planned(capture, memory=0.0))
+
+
+def test_what_a_splat_adds_is_told_apart_for_those_that_are_seen_and_those_that_are_not() -> None:
+    splats = random_splats(20, seed=1)
+
+    def seconds(some: Splats) -> float:
+        far = int((some.means.norm(dim=1) > 100).sum())
+        return 1.0 + 0.02 * (len(some) - far) + 0.005 * far
+
+    found = cost_of(splats, 1.0, seconds)
+    assert (found.base, found.seen, found.unseen) == pytest.approx((1.0, 0.02, 0.005))
+    assert found.of(1000, 0.25) == pytest.approx(1 + 5 + 3.75)
+
+
+def test_looks_of_robust_training_are_counted_as_training_makes_them() -> None:
+    recipe = scale_schedule(get_recipe("best"), 0.01)
+    assert looks_of(recipe) == (0, 0)
+    looking = replace(recipe, free_space=FreeSpace(every=50), seen_area=SeenArea(times=3))
+    assert looks_of(looking) == (sum(stage.iterations // 50 for stage in recipe.stages), 3 * len(recipe.stages))
+
+
+def test_the_plan_of_a_robust_training_takes_longer_by_its_looks(
+    capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried = Probe(1000, 0.0, 0.0, 1.0, Cost(0.01, 0.0, 0.0), Cost(0.5, 0.0, 0.0), Cost(1.0, 0.0, 0.0), 0.0, 1.0, None)
+    monkeypatch.setattr(capture_plan, "probe", lambda *_: tried)
+    seconds = {}
+    for robust in ("on", "off"):
+        overrides = () if robust == "on" else ("free_space=null", "seen_area=null")
+        found = plan(planned(capture, recipe="best", overrides=overrides))
+        seconds[robust] = found.seconds.expected
+    recipe_looks = seconds["on"] - seconds["off"]
+    assert recipe_looks == pytest.approx(10 * (0.5 * (200 // 50) + 1.0 * 5), rel=0.3)

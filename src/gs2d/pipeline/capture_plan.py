@@ -6,37 +6,27 @@ with what was met in finished runs (docs/scale.md). All of it is told with bound
 
 from __future__ import annotations
 
-import io
 import math
-import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
-import numpy as np
 import torch
-from PIL import Image
 
 from gs2d.config.protocols import Protocol
-from gs2d.config.recipe import GradDensify, Recipe
+from gs2d.config.recipe import Recipe
 from gs2d.core.memory_limit import memory_budget
-from gs2d.core.splats import Splats
-from gs2d.data import Scene, View
+from gs2d.data import Scene
 from gs2d.data.prepared import decoded_bytes
-from gs2d.data.scene import PointCloud
-from gs2d.errors import DataError, Gs2dError
-from gs2d.pipeline.estimate import full_iterations, seconds_of
+from gs2d.errors import DataError
+from gs2d.pipeline.estimate import full_iterations
 from gs2d.pipeline.events import duration
-from gs2d.pipeline.growth import Growth, densifications, extrapolated, moved_away, seen_fraction, try_growth
+from gs2d.pipeline.growth import Growth
 from gs2d.pipeline.memory import DECODING_BYTES, ITERATION_BYTES, MAX_DOWNSCALE
 from gs2d.pipeline.photographs import fits
+from gs2d.pipeline.probe import Probe, probe
 from gs2d.render.backends import Backend
-from gs2d.training.plane_sweep import start_points, sweep_views
-from gs2d.training.trainer import Trainer
+from gs2d.training.robust import looks_at_free_space, looks_at_seen_area
 
-PROBED_VIEWS, DECODED_VIEWS = 12, 4
-CROWD = 4  # times as many splats, by which it is tried what one more takes
-FAR = 1000.0  # extents, where no photograph shows a splat
 PROGRAM_BYTES = 400 << 20  # torch, the kernels, the scene
 SPLAT_BYTES = 1200  # parameters, moments, gradients and what the rasterizer holds of a splat (docs/performance.md)
 FUSION_BYTES = 220 << 20  # a slab, the surface of a default mesh and what cleans it: by ten runs (docs/scale.md)
@@ -140,147 +130,6 @@ def rounded(number: float) -> int:
     return 0 if number < 1 else int(round(number, 1 - math.floor(math.log10(number))))
 
 
-@dataclass(frozen=True)
-class Probe:
-    """What seconds of trying told.
-
-    Attributes
-    ----------
-    start : int or None
-        Splats that training starts from; None: from the sparse points.
-    sweep, decode : float
-        Seconds of a photograph.
-    packed : float
-        Bytes of a prepared pixel.
-    base, seen, unseen : float
-        Seconds of an iteration without splats, and of each splat more that the photograph shows, and does not show.
-    shown : float
-        How much less often the whole capture shows a splat than the photographs that were tried do.
-    growth : Growth or None
-        Splats at the end over those at the start; None: it was not to be tried.
-    """
-
-    start: int | None
-    sweep: float
-    decode: float
-    packed: float
-    base: float
-    seen: float
-    unseen: float
-    shown: float
-    growth: Growth | None
-
-
-def middle_views(views: Sequence[View], count: int) -> list[View]:
-    """Return so many views that stand nearest to the one in the middle of all."""
-    centers = np.array([view.camera.center for view in views])
-    middle = centers[np.argmin(np.linalg.norm(centers - np.median(centers, axis=0), axis=1))]
-    return [views[i] for i in np.sort(np.argsort(np.linalg.norm(centers - middle, axis=1), kind="stable")[:count])]
-
-
-def swept_views(scene: Scene, recipe: Recipe) -> list[View]:
-    """Return the training views that a dense start chooses to sweep: all, or as many as it takes of many."""
-    views, most = list(scene.train), len(scene.train)
-    if recipe.dense_start is not None:
-        most = min(most, recipe.dense_start.max_views)
-    return [views[int(i)] for i in np.unique(np.linspace(0, len(views) - 1, most).round())]
-
-
-def dense_start_of(part: Scene, scene: Scene, recipe: Recipe) -> int | None:
-    """Return how many splats the dense start of a whole capture makes, from that of a part; None: none can be made.
-
-    The part's are taken as many times as the swept photographs show sparse points for one that the part shows; the
-    points that none of them shows come on top.
-    """
-    assert recipe.dense_start is not None
-    cloud, times, rest = None, len(scene.train) / len(part.train), 0
-    if scene.observe is not None and scene.points is not None:
-        observed = scene.observe()
-        here, swept, everywhere = (
-            np.unique(np.concatenate([observed.seen.get(view.name, np.zeros(0, np.int32)) for view in views]))
-            for views in (part.train, swept_views(scene, recipe), scene.train)
-        )
-        if len(here):
-            cloud, times = PointCloud(observed.points[here]), len(swept) / len(here)
-            rest = len(everywhere) - len(swept)
-    try:
-        sweep = sweep_views(part, recipe.dense_start)
-        return rest + round(times * len(start_points(replace(part, points=cloud), sweep, recipe.dense_start)))
-    except DataError:
-        return None  # training itself says what is done then
-
-
-def probe(scene: Scene, recipe: Recipe, protocol: Protocol, backend: Backend) -> Probe:
-    """Try a few photographs from the middle of the capture: seconds.
-
-    Raises
-    ------
-    Gs2dError
-        The recipe cannot begin on them.
-    """
-    views = middle_views(scene.train, PROBED_VIEWS)
-    begun = time.perf_counter()
-    pictures = [view.image() for view in views[:DECODED_VIEWS]]
-    decode = (time.perf_counter() - begun) / len(pictures)
-    sizes = []
-    for picture in pictures:
-        packed = io.BytesIO()
-        Image.fromarray(picture).save(packed, format="PNG", compress_level=1)
-        sizes.append(packed.tell() / (picture.shape[0] * picture.shape[1]))
-    part = replace(scene, train=tuple(views), test=())
-    start, sweep = None, 0.0
-    if recipe.dense_start is not None:
-        begun = time.perf_counter()
-        start = dense_start_of(part, scene, recipe)
-        sweep = (time.perf_counter() - begun) / len(views)
-    splats, times = _iteration(part, recipe, protocol, backend)
-    shown = min(1.0, seen_fraction(splats, scene.train) / seen_fraction(splats, part.train))
-    growth, densify = None, recipe.stages[0].densify
-    if isinstance(densify, GradDensify):
-        growth = extrapolated(try_growth(part, recipe, protocol, backend, shown), densifications(densify))
-    return Probe(start, sweep, decode, float(np.mean(sizes)), *times, shown, growth)
-
-
-def _iteration(
-    part: Scene, recipe: Recipe, protocol: Protocol, backend: Backend
-) -> tuple[Splats, tuple[float, float, float]]:
-    """Return splats on a part of a capture, and seconds of an iteration: of none, and of each one seen, and unseen."""
-    first, *rest = recipe.stages
-    bare = replace(
-        recipe,
-        stages=(replace(first, downscale=1, halve_at=()), *rest),
-        dense_start=None,
-        free_space=None,
-        seen_area=None,
-    )
-    trainer = Trainer(part, bare, protocol, backend=backend, progress_every=1)
-    start = trainer.splats.to("cpu")
-    found: list[float] = []
-    for splats in (start, crowded(start), moved_away(start, FAR * part.extent)):
-        again = Trainer(part, bare, protocol, backend=backend, init=splats, progress_every=1)
-        again.enter(0)
-        seconds = seconds_of(again, first.iterations)
-        if seconds is None:
-            raise DataError("too few iterations to measure; plan a longer schedule")
-        found.append(seconds)
-    count, (once, crowd, beside) = len(start), found
-    seen = max(crowd - once, 0.0) / (count * (CROWD - 1))
-    unseen = min(max(beside - once, 0.0) / count, seen)
-    return start, (max(once - seen * count, 0.2 * once), seen, unseen)
-
-
-def crowded(splats: Splats, times: int = CROWD) -> Splats:
-    """Return so many times the splats on the same surface: each has as much less area."""
-    generator = torch.Generator().manual_seed(0)
-    rows = splats.rows(torch.arange(len(splats)).repeat_interleave(times))
-    shift = torch.randn(rows.means.shape, generator=generator, dtype=rows.means.dtype)
-    return replace(
-        rows,
-        means=rows.means + shift * rows.scales.mean(dim=1, keepdim=True) / 2,
-        log_scales=rows.log_scales - math.log(times) / 2,
-    )
-
-
 def plan_capture(
     scene: Scene, recipe: Recipe, protocol: Protocol, backend: Backend, *, downscale: int = 1, prepare: str = "auto"
 ) -> CapturePlan:
@@ -300,7 +149,6 @@ def plan_capture(
     shrink = (downscale / chosen) ** 2
     trained = sum(view.camera.width * view.camera.height for view in scene.views) * shrink
     sparse = 0 if scene.points is None else len(scene.points)
-    swept = 0 if recipe.dense_start is None else min(len(scene.train), recipe.dense_start.max_views)
     start = max(2, sparse if tried.start is None else tried.start)
     splats, budget = expected_splats(recipe, start, tried.growth), None
     prepared = prepare == "always" or (prepare == "auto" and not fits(scene))
@@ -333,7 +181,7 @@ def plan_capture(
         prepared=prepared,
         disk=packed + splats.expected * (2 * CHECKPOINT_BYTES + FILE_BYTES),
         temporary=trained * 8,
-        seconds=_seconds(tried, recipe, scene, start, splats, swept, shrink),
+        seconds=_seconds(tried, recipe, scene, start, splats, shrink),
     )
 
 
@@ -373,17 +221,25 @@ def _memory(fixed: float, splats: Range) -> Range:
     return Range(*of)
 
 
-def _seconds(tried: Probe, recipe: Recipe, scene: Scene, start: int, splats: Range, swept: int, shrink: float) -> Range:
-    """Return seconds of everything: each iteration by how many splats there are by then."""
-    threads = max(1, torch.get_num_threads())
-    fixed = FIXED_SECONDS + len(scene.views) * tried.decode * 2 / min(threads, 2) + swept * tried.sweep
+def _seconds(tried: Probe, recipe: Recipe, scene: Scene, start: int, splats: Range, shrink: float) -> Range:
+    """Return seconds of everything: each iteration, and each look, by how many splats there are by then."""
+    threads, views = max(1, torch.get_num_threads()), len(scene.train)
+    swept = 0 if recipe.dense_start is None else min(views, recipe.dense_start.max_views)
+    fixed = FIXED_SECONDS + len(scene.views) * tried.decode * 2 / min(threads, 2)
+    fixed += swept * (tried.sweep + tried.fit * start)
+    iterations = full_iterations(recipe) + 1.2 * len(scene.views)  # scored, fused
+    free_looks, seen_looks = looks_of(recipe)
     found = []
     for count in asdict(splats).values():
         mean = (start + 3 * count) / 4  # most splats come in the first half
-        of_splat = tried.seen * tried.shown + tried.unseen * (1 - tried.shown)
-        iteration = (tried.base + of_splat * mean) * shrink
-        found.append(fixed + iteration * (full_iterations(recipe) + 1.2 * len(scene.views)))  # scored, fused
+        trained = tried.iteration.of(mean, tried.shown) * shrink * iterations
+        looked = swept * free_looks * tried.free_look.of(mean, tried.shown)
+        looked += views * seen_looks * tried.seen_look.of(mean, tried.shown)
+        found.append(fixed + trained + looked)
     return Range(found[0] / DOUBT, found[1], found[2] * DOUBT)
 
 
-__all__ = ["CapturePlan", "Gs2dError", "Probe", "Range", "plan_capture", "probe"]
+def looks_of(recipe: Recipe) -> tuple[int, int]:
+    """Return how often robust training looks at free space and at the seen area, at all photographs each time."""
+    each = [(stage, i) for stage in recipe.stages for i in range(1, stage.iterations + 1)]
+    return sum(looks_at_free_space(recipe, *at) for at in each), sum(looks_at_seen_area(recipe, *at) for at in each)

@@ -112,17 +112,17 @@ class Robustness:
 
     def prunes(self, stage: Stage, iteration: int) -> bool:
         """Whether splats may be pruned at the end of an iteration (1-based) of a stage."""
-        return self._looks_at_free_space(stage, iteration) or self._looks_at_seen_area(stage, iteration)
+        return looks_at_free_space(self._recipe, stage, iteration) or looks_at_seen_area(self._recipe, stage, iteration)
 
     def prune(self, state: TrainState, stage: Stage, iteration: int) -> list[events.Event]:
         """Prune the splats in free space, and those of which little is photographed, where that is due."""
         happened: list[events.Event] = []
-        if self._looks_at_free_space(stage, iteration):
+        if looks_at_free_space(self._recipe, stage, iteration):
             pruned = self._drop(state, self._in_free_space)
             if pruned:
                 happened.append(events.FreeSpacePruned(stage.name, iteration, pruned, state.count))
         settings = self._recipe.seen_area
-        if settings is not None and self._looks_at_seen_area(stage, iteration):
+        if settings is not None and looks_at_seen_area(self._recipe, stage, iteration):
             pruned = self._drop(state, partial(self._unseen, state, settings))
             if pruned:
                 happened.append(events.UnseenPruned(stage.name, iteration, pruned, state.count))
@@ -145,16 +145,6 @@ class Robustness:
         keep_rows(state, ~found)
         return dropped
 
-    def _looks_at_free_space(self, stage: Stage, iteration: int) -> bool:
-        settings = self._recipe.free_space
-        return settings is not None and stage.moves_all and iteration % settings.every == 0
-
-    def _looks_at_seen_area(self, stage: Stage, iteration: int) -> bool:
-        settings = self._recipe.seen_area
-        if settings is None or not stage.moves_all:
-            return False
-        return iteration * settings.times // stage.iterations > (iteration - 1) * settings.times // stage.iterations
-
     def _like_backdrop(self, splats: Splats, within: float) -> Tensor:
         """Find the splats [N] of the colour that is drawn where there is none."""
         backdrop = rgb_to_sh0(splats.sh0.new_tensor([self._raster.background]))
@@ -174,3 +164,17 @@ class Robustness:
             kept = torch.where(like, 1 - settings.backdrop_rate, kept).reshape(logits.shape)
         faded = torch.logit(torch.sigmoid(logits) * kept).clamp_min(least)
         backend.assign(logits, torch.where(logits > least, faded, logits))
+
+
+def looks_at_free_space(recipe: Recipe, stage: Stage, iteration: int) -> bool:
+    """Whether splats are pruned from free space at the end of an iteration (1-based) of a stage."""
+    settings = recipe.free_space
+    return settings is not None and stage.moves_all and iteration % settings.every == 0
+
+
+def looks_at_seen_area(recipe: Recipe, stage: Stage, iteration: int) -> bool:
+    """Whether splats of which little is photographed are pruned at the end of an iteration (1-based) of a stage."""
+    settings = recipe.seen_area
+    if settings is None or not stage.moves_all:
+        return False
+    return iteration * settings.times // stage.iterations > (iteration - 1) * settings.times // stage.iterations
