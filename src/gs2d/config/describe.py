@@ -32,7 +32,8 @@ def describe_recipe(recipe: Recipe) -> Iterator[str]:
         )
     if recipe.intrinsics is not None:
         i = recipe.intrinsics
-        what = "focal length and principal point" if i.principal_point else "focal length"
+        learned = ["focal length", *["principal point"] * i.principal_point, *["lens"] * i.distortion]
+        what = " and ".join(filter(None, (", ".join(learned[:-1]), learned[-1])))
         yield (
             f"intrinsics: the {what} of each camera after iteration {i.start:,}, rate {i.rate:g} to {i.rate_final:g} "
             f"over {i.decay_steps:,} iterations, with the poses"

@@ -387,13 +387,13 @@ def with_poses(recipe: Recipe, *, name: str | None = None) -> Recipe:
 
 
 def with_intrinsics(recipe: Recipe, *, name: str | None = None) -> Recipe:
-    """Return the recipe with refined poses and focal lengths (``NAME-cameras``); itself if it has them.
+    """Return the recipe with refined poses, focal lengths and lenses (``NAME-cameras``); itself if it has them.
 
     Not in the paper. For cameras whose focal length is off by a few per mille to per cent (docs/guides/poses.md).
     """
     if recipe.intrinsics is not None:
         return recipe
-    refined = replace(with_poses(recipe), intrinsics=IntrinsicsRefinement())
+    refined = replace(with_poses(recipe), intrinsics=IntrinsicsRefinement(distortion=True))
     return replace(refined, name=name or f"{recipe.name.removesuffix('-poses')}-cameras")
 
 

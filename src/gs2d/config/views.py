@@ -86,7 +86,7 @@ class PoseRefinement(_OfCameras):
 
 @dataclass(frozen=True)
 class IntrinsicsRefinement(_OfCameras):
-    """The focal length of each camera, learned with the splats and the poses (``training/zooms.py``).
+    """Focal length and lens of each camera, learned with the splats and the poses (``training/zooms.py``).
 
     It learns in the stages in which poses do. Photographs whose files have the same intrinsics share a camera.
 
@@ -99,6 +99,9 @@ class IntrinsicsRefinement(_OfCameras):
         Learned when iteration of the run > start, as poses.
     principal_point : bool
         Whether the principal point moves, too. A turn of the camera looks nearly the same.
+    distortion : bool
+        Whether what is left of the lens is learned, too: two radial coefficients, at the same rate, as a share of the
+        distance from the picture's middle to its corner. ``--refine-cameras`` learns it.
     beta1, beta2, eps : float
         Adam's.
     """
@@ -108,6 +111,7 @@ class IntrinsicsRefinement(_OfCameras):
     decay_steps: int = 30_000
     start: int = 500
     principal_point: bool = False
+    distortion: bool = False
     beta1: float = 0.9
     beta2: float = 0.999
     eps: float = 1e-15
@@ -169,8 +173,9 @@ def check_exposure(where: str, exposure: Exposure) -> None:
 
 def check_intrinsics(where: str, intrinsics: IntrinsicsRefinement) -> None:
     """Raise RecipeError for numbers that make no focal lengths."""
-    boolean = isinstance(intrinsics.principal_point, bool)
-    require(boolean, f"{where}.principal_point must be true or false, got {intrinsics.principal_point!r}")
+    for name in ("principal_point", "distortion"):
+        value = getattr(intrinsics, name)
+        require(isinstance(value, bool), f"{where}.{name} must be true or false, got {value!r}")
     _check_rates(where, intrinsics, "intrinsics=null leaves focal lengths alone", "shares of the focal length")
 
 

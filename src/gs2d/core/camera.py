@@ -16,12 +16,20 @@ if TYPE_CHECKING:
 class Zoom(NamedTuple):
     """What intrinsics become: focal lengths ``scale`` times as long, the principal point moved by focal lengths.
 
-    Free of the image's size, so that it holds for a photograph at any downscale.
+    ``k1`` and ``k2`` are what is left of the lens (``core/residual_lens.py``). Free of the image's size, so that it
+    holds for a photograph at any downscale.
     """
 
     scale: float = 1.0
     right: float = 0.0
     down: float = 0.0
+    k1: float = 0.0
+    k2: float = 0.0
+
+    @property
+    def lens(self) -> tuple[float, float] | None:
+        """k1 and k2, or None where nothing bends."""
+        return (self.k1, self.k2) if self.k1 or self.k2 else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,8 +152,8 @@ class Camera:
         return self._with(width, height, (self.fx / f, self.fy / f, self.cx / f, self.cy / f), (1 / f,) * 4)
 
     def zoomed(self, zoom: Zoom) -> Camera:
-        """Return the same camera with other intrinsics; those that learn are let go."""
-        scale, right, down = zoom
+        """Return the same camera with other intrinsics; those that learn are let go, and the lens is no part of it."""
+        scale, right, down, *_ = zoom
         cx, cy = self.cx + self.fx * right, self.cy + self.fy * down
         return replace(self, fx=self.fx * scale, fy=self.fy * scale, cx=cx, cy=cy, intrinsics=None)
 

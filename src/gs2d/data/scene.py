@@ -19,6 +19,7 @@ from gs2d.core.photometry import CameraPhotometry
 from gs2d.data.cache import DecodedImage, ImageCache
 from gs2d.data.masks import Masks
 from gs2d.data.priors import ObservedPoints, PriorMaps
+from gs2d.data.straighten import straightened_picture
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
 
@@ -78,12 +79,17 @@ class View:
     def at(self, T_cam_world: np.ndarray, zoom: Zoom | None = None) -> View:
         """Return the same photograph, taken from elsewhere; its picture stays in the cache of this one.
 
-        With ``zoom`` its camera gets other intrinsics, too.
+        With ``zoom`` its camera gets other intrinsics, too, and its picture is straightened each time it is asked for,
+        where that says that something of the lens is left.
         """
         camera = replace(self.camera, T_cam_world=T_cam_world)
-        camera = camera if zoom is None else camera.zoomed(zoom)
-        zoom = self.zoom if zoom is None else zoom
-        return self._sharing(camera=camera, zoom=zoom)
+        if zoom is None:
+            return self._sharing(camera=camera)
+        now, lens = camera.zoomed(zoom), zoom.lens
+        seen = self._sharing(camera=now, zoom=zoom)
+        if lens is None:
+            return seen
+        return replace(seen, decode=lambda: straightened_picture(self._image(), now, lens))
 
     def through(self, photometry: CameraPhotometry) -> View:
         """Return the same photograph, with what is known of its camera's light."""

@@ -53,7 +53,9 @@ ABOUT = (
     "cameras of the training photographs as refined, then those of the test photographs as given, in the layout of "
     "nerfstudio's transforms.json (OpenGL camera to world), for pictures of size w x h without distortion; "
     "T_cam_world: the same for OpenCV, world to camera; moved: from the given pose, shift as a share of the extent; "
-    "zoom: what became of the given focal lengths (a factor) and principal point (moved right and down, focal lengths)"
+    "zoom: what became of the given focal lengths (a factor) and principal point (moved right and down, focal "
+    "lengths), then k1 and k2 of what is left of the lens, as in docs/math.md; the frame's own k1 and k2 are "
+    "the way back from it"
 )
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 GRID = 5  # points along each side of a picture, whose motion is measured
@@ -99,12 +101,14 @@ def write_poses(run: RunFolder, scene: Scene, poses: FoundPoses, on_event: OnEve
 
 
 def zoom_line(zooms: Sequence[Zoom]) -> str:
-    """Return a line on what became of the focal lengths of training views."""
+    """Return a line on what became of the focal lengths and lenses of training views."""
     scales = sorted({zoom.scale for zoom in zooms})
     factor = f"{scales[0]:.4f}" if len(scales) == 1 else f"{scales[0]:.4f} to {scales[-1]:.4f} ({len(scales)} cameras)"
     moved = max(max(abs(zoom.right), abs(zoom.down)) for zoom in zooms)
     also = f", principal points moved by up to {moved:.4f} focal lengths" if moved else ""
-    return f"focal lengths became {factor} times those of the capture{also}"
+    bends = max((zoom.lens for zoom in zooms if zoom.lens), default=None, key=lambda lens: abs(lens[0]))
+    left = "" if bends is None else f", of the lens is left k1 {bends[0]:+.4f}, k2 {bends[1]:+.4f}"
+    return f"focal lengths became {factor} times those of the capture{also}{left}"
 
 
 def _frame(view: View, root: Path | None) -> dict[str, Any]:
@@ -119,8 +123,19 @@ def _frame(view: View, root: Path | None) -> dict[str, Any]:
         "T_cam_world": camera.T_cam_world.tolist(),
         **{"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy},
         **{"cx": camera.cx, "cy": camera.cy},
-        **({} if view.zoom is None else {"zoom": list(view.zoom)}),
+        **({} if view.zoom is None else _refined(view.zoom)),
     }
+
+
+def _refined(zoom: Zoom) -> dict[str, Any]:
+    """Return what became of the intrinsics; of a lens the coefficients that nerfstudio has, from pinhole to photograph.
+
+    These are the inverse to the fourth power of the radius.
+    """
+    if zoom.lens is None:
+        return {"zoom": list(zoom[:3])}
+    k1, k2 = zoom.lens
+    return {"zoom": list(zoom), "camera_model": "OPENCV", "k1": -k1, "k2": 3 * k1 * k1 - k2, "p1": 0.0, "p2": 0.0}
 
 
 def how_far(given: Camera, now: Camera, middle: np.ndarray, extent: float) -> dict[str, float]:

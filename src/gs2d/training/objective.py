@@ -14,6 +14,7 @@ from gs2d.config.multiview import MULTIVIEW_KINDS
 from gs2d.config.protocols import Protocol
 from gs2d.config.recipe import Recipe, Stage
 from gs2d.core.camera import Camera
+from gs2d.core.residual_lens import straightened, through_lens
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DivergedError
@@ -31,7 +32,9 @@ from gs2d.training.multiview import PATCH_BYTES, ImageFiles, Turn, draw_turn, fi
 from gs2d.training.poses import pose_rate
 from gs2d.training.state import TrainState
 from gs2d.training.targets import Target, TargetSource
-from gs2d.training.zooms import zoom_rate
+from gs2d.training.zooms import Zooms, zoom_rate
+
+_ALL = 0.999  # of the pixels that a sample is made of count, or it does not
 
 
 def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> RasterSettings:
@@ -69,7 +72,7 @@ class StepResult:
     gradients : mapping of attribute to Tensor
         Like the attributes; only of ``rows``, in their order, where those are given. Where exposures are learned also
         "exposure" [3, 4], of the photograph's transform; where poses are, "pose" [6], of the camera's motion; where
-        focal lengths are, "zoom" [3]; where vignetting and response are, "photometry" [4], of its camera.
+        focal lengths are, "zoom" [5]; where vignetting and response are, "photometry" [4], of its camera.
     signal : Tensor [N, 2] or [N, 4], or None
     radii : Tensor [N] px or None
         None where nothing was projected.
@@ -181,6 +184,24 @@ class FullRender:
             camera = state.zooms.camera(index, camera, learns=learns)
         return camera if state.poses is None else state.poses.camera(index, camera, learns=learns)
 
+    def _lens(self, zooms: Zooms, index: int, camera: Camera) -> Tensor | None:
+        """Return the lens through which a rendering is to be seen; None where there is none."""
+        settings = self.recipe.intrinsics
+        return None if settings is None or not settings.distortion else zooms.lens(index, camera)
+
+    def _straight(self, state: TrainState, index: int, camera: Camera) -> Target:
+        """Return the photograph of a view without what training has found to be left of its lens."""
+        target, lens = self.targets[index], None if state.zooms is None else state.zooms.zoom(index).lens
+        if lens is None:
+            return target
+        image, mask = straightened(target.image, camera, lens)
+        silhouette = target.silhouette
+        if target.mask is not None:
+            mask = mask & (straightened(target.mask[..., None].to(image), camera, lens)[0][..., 0] > _ALL)
+        if silhouette is not None:
+            silhouette = straightened(silhouette[..., None], camera, lens)[0][..., 0]
+        return Target(image, mask, None, silhouette)
+
     def evaluate(
         self, state: TrainState, stage: Stage, iteration: int, index: int, probe: Tensor | None = None
     ) -> StepResult:
@@ -215,7 +236,8 @@ class FullRender:
 
         ``plain`` are splats in plain colours, that are rendered instead of those of the state.
         """
-        camera, target = self.camera(state, index), self.targets[index]
+        camera = self.camera(state, index)
+        target = self._straight(state, index, camera)
         settings = replace(self.settings(stage, iteration), with_distortion=False)
         settings = settings if plain is None else replace(settings, sh_degree=PLAIN_COLORS)
         drawn = self.drawn(state.splats) if plain is None else plain
@@ -233,7 +255,8 @@ class FullRender:
         self, state: TrainState, index: int, splats: Splats, settings: RasterSettings, *, occlusion: bool
     ) -> Tensor:
         """Return the inner sum of E_i of splats [N] in training view ``index``, in the colours that it shows."""
-        camera, target = self.camera(state, index), self.targets[index]
+        camera = self.camera(state, index)
+        target = self._straight(state, index, camera)
         splats, settings = self.photographed(state, index, splats, camera, settings)
         given = {"backend": self.backend, "mask": target.mask, "occlusion": occlusion}
         return splat_errors(splats, camera, target.image, settings, **given)  # type: ignore[arg-type]
@@ -326,6 +349,10 @@ class FullRender:
             trainer looks at losses and parameters together, before anything is reported or saved.
         """
         target = self.targets[index]
+        lens = None if state.zooms is None else self._lens(state.zooms, index, camera)
+        if lens is not None:
+            seen_through, inside = through_lens(output.color, camera, lens)
+            output = replace(output, color=seen_through)
         transform = None if state.exposures is None else state.exposures.transform(index).requires_grad_()
         shading = self._shading(state, index, camera, output.color, learns=True)
         if transform is not None or shading is not None:
@@ -333,6 +360,8 @@ class FullRender:
             given = (seen, target.silhouette, self._background)
             color = photograph(output.color, *given, clipped=clipped_pixels(target), shading=shading)
             output = replace(output, color=color)
+        if lens is not None:  # what the rendering does not reach teaches nothing
+            output = replace(output, color=torch.where(inside[..., None], output.color, target.image))
         terms = compute_losses(
             output,
             target.image,
@@ -375,7 +404,7 @@ class FullRender:
             gradients["pose"] = state.poses.gradient(camera)  # in the host's memory, on a GPU too
             broken = broken if finite(gradients["pose"]) else "pose"
         if state.zooms is not None and camera.intrinsics is not None:
-            gradients["zoom"] = state.zooms.gradient(camera, self.scene.train[index].camera)
+            gradients["zoom"] = state.zooms.gradient(camera, self.scene.train[index].camera, lens)
             broken = broken if finite(gradients["zoom"]) else "focal length"
         if broken is not None:
             raise diverged(stage, iteration, f"the gradient of {broken}")

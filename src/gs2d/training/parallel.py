@@ -31,7 +31,7 @@ from gs2d.training.state import TrainState
 T = TypeVar("T")
 Statistics = Mapping[str, Tensor]
 # Gradients that are of one view, and are not averaged.
-OF_A_VIEW = {"exposure": (3, 4), "pose": (6,), "zoom": (3,), "photometry": (4,)}
+OF_A_VIEW = {"exposure": (3, 4), "pose": (6,), "zoom": (5,), "photometry": (4,)}
 FAILED = "gs2d/failed"  # key of the store: a process has said why it ended
 
 
