@@ -47,7 +47,7 @@ INSIDE = {
         "checks growth light locks extras memory memory_limit missing processes spill text": 0,
         "exr files float_tiff georeference similarity": 1,
         "arrays json_files camera images mesh sh splats": 2,
-        "exif photometry transforms": 3,
+        "exif photometry residual_lens transforms": 3,
     },
     "data": {
         "archive": 9,
@@ -58,7 +58,7 @@ INSIDE = {
         "build": 4,
         "bounds reach": 3,
         "scene": 2,
-        "priors faces": 1,
+        "priors faces straighten": 1,
         "cache masks undistort": 0,
     },
     "render": {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -76,6 +77,7 @@ def test_the_report_says_it(run: RunFolder) -> None:
     shown = poses_section(run.file(POSES), {})
     assert "Focal lengths became" in shown
     assert "times those of the capture" in shown
+    assert re.search(r"Of the lens is left, .*k1 [+-]0\.\d{4}, k2 [+-]\d\.\d{4};", shown)
 
 
 def test_a_file_without_focal_lengths_is_refused(run: RunFolder, tmp_path: Path) -> None:

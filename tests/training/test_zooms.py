@@ -297,7 +297,8 @@ def residual_of(trainer: Trainer, state: TrainState, stage: Stage) -> float:
 
 @needs_cpu
 @pytest.mark.slow
-def test_a_lens_is_found_with_the_scene_and_new_views_gain() -> None:
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_lens_is_found_with_the_scene_and_new_views_gain(seed: int) -> None:
     truth, scene = seen_through_a_lens()
     lr = LearningRates(means_decay_steps=1500, means=8e-4, means_final=8e-5)
     stage = replace(surface(), iterations=1500, densify=None, sh_interval=300, lr=lr)
@@ -307,7 +308,8 @@ def test_a_lens_is_found_with_the_scene_and_new_views_gain() -> None:
         intrinsics = IntrinsicsRefinement(
             rate=3e-3, rate_final=1.5e-4, start=20, decay_steps=1500, distortion=distortion
         )
-        trainer = Trainer(scene, Recipe("one", (stage,), poses=poses, intrinsics=intrinsics), GENERIC, init=truth)
+        recipe = Recipe("one", (stage,), seed=seed, poses=poses, intrinsics=intrinsics)
+        trainer = Trainer(scene, recipe, GENERIC, init=truth)
         splats = trainer.run()
         errors = []
         for view in per_image.scene_now(trainer.state, scene).test:
@@ -317,7 +319,7 @@ def test_a_lens_is_found_with_the_scene_and_new_views_gain() -> None:
             error = (color - torch.from_numpy(view.target((0.0, 0.0, 0.0)))).square().mean(dim=2)
             errors.append(float(error.mean() if valid is None else error[torch.from_numpy(valid)].mean()))
         psnr.append(-10 * math.log10(np.mean(errors)))
-    assert psnr[1] > psnr[0] + 1.0, psnr
+    assert psnr[1] > psnr[0] + 2.0, psnr
 
 
 def test_photographs_of_a_lens_that_was_found_are_straightened_wherever_they_are_asked_for() -> None:

@@ -94,7 +94,7 @@ class Training:
     refine_poses: bool = False
     """Learn where each photograph was taken from, beginning where the capture says: for poses that are a little off."""
     refine_cameras: bool = False
-    """Learn focal lengths, too: --refine-poses, and one focal length for all photographs of a camera."""
+    """Learn focal lengths and lenses, too: --refine-poses, and both once for all photographs of a camera."""
     depth_prior: Literal["auto", "sparse", "sensor", "relative"] | None = None
     """Train with known depths: of sparse points, or of maps in depths/, a sensor's or relative; auto: what is there."""
     normal_prior: bool = False

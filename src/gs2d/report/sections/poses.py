@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
+from gs2d.core.camera import Zoom
 from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
 from gs2d.report.html import missing, render
@@ -40,7 +41,8 @@ def poses_section(path: Path, last_stage: Mapping[str, Any]) -> Markup:
         has_test=bool(last_stage.get("test")),
         aligned=_aligned(last_stage),
         plot=_plot(far[:, 0]),
-        zooms=[] if zooms is None else [f"{scale:.4f}" for scale in sorted({zooms.min(), zooms.max()})],
+        zooms=[] if zooms is None else [f"{scale:.4f}" for scale in sorted({zooms[:, 0].min(), zooms[:, 0].max()})],
+        lenses=[] if zooms is None else [f"k1 {k1:+.4f}, k2 {k2:+.4f}" for k1, k2 in _bent(zooms)],
     )
 
 
@@ -55,19 +57,30 @@ def _aligned(stage: Mapping[str, Any]) -> dict[str, float] | None:
 def _moved(path: Path) -> tuple[list[str], np.ndarray, np.ndarray | None]:
     """Names of the training views, and what each has moved by [V, 3]: pixels, degrees, share of the extent.
 
-    And what became of their focal lengths [V], as factors, where those were refined.
+    And what became of their focal lengths, as factors, and their lenses [V, 3] where those were refined.
     """
     try:
         frames = [entry for entry in read_json(path)["frames"] if entry["split"] == "train"]
         names = [str(entry["name"]) for entry in frames]
         far = np.array([[entry["moved"][name] for name in MEASURES] for entry in frames], dtype=np.float64)
         refined = bool(frames) and "zoom" in frames[0]
-        zooms = np.array([float(entry["zoom"][0]) for entry in frames]) if refined else None
+        zooms = np.array([_zoom(entry["zoom"]) for entry in frames]) if refined else None
     except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise DataError(f"{path} must hold name and motion of each photograph, got another entry ({error})") from error
     if not names or not np.isfinite(far).all():
         raise DataError(f"{path} must hold finite numbers of one photograph or more, got others")
     return names, far, zooms
+
+
+def _zoom(numbers: Sequence[float]) -> list[float]:
+    """Return factor, k1 and k2; runs that learned no lens have three numbers."""
+    zoom = Zoom(*map(float, numbers))
+    return [zoom.scale, zoom.k1, zoom.k2]
+
+
+def _bent(zooms: np.ndarray) -> list[tuple[float, float]]:
+    """Return k1 and k2 of each camera of which something of the lens is left."""
+    return sorted({(float(k1), float(k2)) for _, k1, k2 in zooms if k1 or k2})
 
 
 def _plot(pixels: np.ndarray) -> str:
