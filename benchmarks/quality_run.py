@@ -21,12 +21,14 @@ from typing import Any
 import torch
 
 from gs2d.core.json_files import write_json
+from gs2d.core.splats import Splats
 from gs2d.errors import Gs2dError
 from gs2d.pipeline.events import ignore
 from gs2d.pipeline.job import Job, prepare_job
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.threads import use_threads
 from gs2d.training import events
+from gs2d.training.exposure import Exposures
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
 
@@ -158,15 +160,20 @@ def _save(file: Path, state: TrainState, spent: Spent, course: list[dict[str, An
 
 def score(job: Job, state: TrainState) -> dict[str, Any]:
     """Return the scores of the test views (of the training views where there are none), and the size of the scene."""
+    return score_splats(job, state.splats, state.exposures)
+
+
+def score_splats(job: Job, splats: Splats, learned: Exposures | None = None) -> dict[str, Any]:
+    """Return what :func:`score` does, of splats with the exposures that were learned with them."""
     # Here, while the clocks stand still: a training does not need them.
     from benchmarks.street_runs import summary_of
     from gs2d.pipeline.exposure import named
     from gs2d.pipeline.predicted_exposure import metered, with_predicted
     from gs2d.pipeline.scoring import score_views
 
-    views, splats = job.scene.test or job.scene.train, state.splats
+    views = job.scene.test or job.scene.train
     brightness = metered(splats, job.settings, job.backend)
-    exposures = with_predicted(named(job.scene.train, state.exposures), job.scene, brightness)
+    exposures = with_predicted(named(job.scene.train, learned), job.scene, brightness)
     scores = score_views(
         splats, views, job.settings, job.backend, name="", on_event=ignore, exposures=exposures, split="test"
     )
