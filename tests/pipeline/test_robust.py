@@ -107,6 +107,13 @@ def test_what_was_decided_is_said() -> None:
         "no dense start and no known free space: the capture does not say which points are seen where",
         f"no dense start and no known free space: {LACKS}",
     ]
+    faces = replace(BLIND, train=tuple(replace(view, is_face=True) for view in BLIND.train))
+    fit_recipe(options(refine_cameras=True, robust="off"), faces, GENERIC, said.append)
+    fit_recipe(options(refine_cameras=True, vignetting=True, robust="off"), faces, GENERIC, said.append)
+    assert [event.text for event in said[-2:] if isinstance(event, Notice)] == [
+        f"{COUNT} faces of panoramas or fisheyes: of their lenses nothing is learned",
+        f"{COUNT} faces of panoramas or fisheyes: of their lenses and vignetting nothing is learned",
+    ]
     with pytest.raises(DataError, match=LACKS):
         fit_recipe(options(robust="on"), EMPTY, GENERIC, said.append)
 

@@ -63,6 +63,18 @@ def test_photographs_of_one_camera_share_its_light_and_the_first_step_is_the_rat
     assert made.steps == [1, 0]
 
 
+def test_of_faces_of_a_panorama_the_response_alone_is_learned(scene: Scene) -> None:
+    views = seen_through(scene.train, 2)
+    for is_face in (False, True):
+        seen = replace(scene, train=tuple(replace(view, is_face=is_face) for view in views))
+        trainer = Trainer(seen, quick(), GENERIC, backend="reference")
+        trainer.run()
+        state = trainer.state
+        assert state.photometries is not None
+        assert bool(state.photometries.offsets[:, :3].any()) is not is_face
+        assert bool(state.photometries.offsets[:, 3].all())
+
+
 def test_only_what_the_recipe_learns_moves_and_within_limits(scene: Scene) -> None:
     made = Photometries.start(scene.train)
     recipe = replace(short(), photometry=Photometry(response=False))

@@ -105,6 +105,18 @@ def test_photographs_of_one_camera_share_a_focal_length_and_the_first_step_is_th
     assert made.steps == [1, 1]
 
 
+def test_faces_of_a_panorama_keep_their_intrinsics_while_their_poses_learn(scene: Scene) -> None:
+    faces = replace(scene, train=tuple(replace(view, is_face=True) for view in scene.train))
+    for views, stays in ((faces, True), (scene, False)):
+        trainer = Trainer(views, quick(distortion=True), GENERIC, backend="reference")
+        trainer.run()
+        state = trainer.state
+        assert state.zooms is not None
+        assert state.poses is not None
+        assert bool((state.zooms.offsets == 0).all()) is stays
+        assert bool(state.poses.offsets.any())
+
+
 def test_the_camera_s_numbers_are_those_of_its_size(scene: Scene) -> None:
     camera = replace(scene.train[0].camera, width=40, height=30, cx=19.0, cy=16.0, fx=50.0, fy=51.0)
     now = camera.zoomed(Zoom(1.1, 0.02, -0.01))

@@ -352,7 +352,8 @@ def _view(frame: PosedImage, factor: int, cache: ImageCache, lens_maps: LensMaps
     except ShapeError as error:
         raise DataError(f"view {frame.name}: {error}") from error
     maps = None if frame.maps is None else PriorMaps(frame.maps, k, camera, lens_maps)
-    return View(frame.name, camera, Decoder(frame, factor, lens_maps), cache, frame.path, maps, seen)
+    is_face = frame.face is not None
+    return View(frame.name, camera, Decoder(frame, factor, lens_maps), cache, frame.path, maps, seen, is_face=is_face)
 
 
 def _cut(frames: Sequence[PosedImage]) -> tuple[list[PosedImage], tuple[str, ...]]:

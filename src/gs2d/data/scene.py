@@ -48,6 +48,8 @@ class View:
         What training has made of the intrinsics of ``camera`` since they were read; None: nothing.
     photometry : CameraPhotometry or None
         What training has found of the vignetting and the response of its camera; None: nothing.
+    is_face : bool
+        Whether it was cut out of a panorama or a wide fisheye (``data/faces.py``): its axis is not that of a lens.
     """
 
     name: str
@@ -59,6 +61,7 @@ class View:
     intrinsics: Intrinsics | None = None
     zoom: Zoom | None = None
     photometry: CameraPhotometry | None = None
+    is_face: bool = False
 
     @classmethod
     def from_arrays(

@@ -327,6 +327,12 @@ def fit_recipe(options: TrainOptions, scene: Scene, protocol: Protocol, on_event
         on_event(Notice(f"exposures of the photographs: {least:.2f} to {most:.2f} times their mean; {what}"))
     if options.response and len(Photometries.start(scene.train).reach) == 1:
         on_event(Notice("--response learns by what cameras differ: of one camera, as here, it learns nothing"))
+    faces = sum(view.is_face for view in scene.train)
+    if faces and (options.refine_cameras or options.vignetting):
+        what = " and ".join(
+            name for name, wanted in (("lenses", options.refine_cameras), ("vignetting", options.vignetting)) if wanted
+        )
+        on_event(Notice(f"{faces} faces of panoramas or fisheyes: of their {what} nothing is learned"))
     return _recipe_of(options, robust=robust, exposure=exposure)
 
 

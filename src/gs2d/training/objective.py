@@ -181,7 +181,7 @@ class FullRender:
         """Return the camera of training view ``index`` where it is now; with ``learns`` it gets a gradient."""
         camera = self.scene.train[index].camera
         if state.zooms is not None:
-            camera = state.zooms.camera(index, camera, learns=learns)
+            camera = state.zooms.camera(index, camera, learns=learns and not self.scene.train[index].is_face)
         return camera if state.poses is None else state.poses.camera(index, camera, learns=learns)
 
     def _lens(self, zooms: Zooms, index: int, camera: Camera) -> Tensor | None:
@@ -398,7 +398,8 @@ class FullRender:
             gradients["exposure"] = _gradient(transform)
         broken = first_not_finite(gradients, self.backend) if watched else None
         if state.photometries is not None and shading is not None:
-            gradients["photometry"] = state.photometries.gradient(index, shading)  # in the host's memory, as a pose's
+            # In the host's memory, as a pose's.
+            gradients["photometry"] = state.photometries.gradient(index, shading, self.scene.train[index])
             broken = broken if finite(gradients["photometry"]) else "the vignetting or the response of a camera"
         if state.poses is not None and camera.pose is not None:
             gradients["pose"] = state.poses.gradient(camera)  # in the host's memory, on a GPU too

@@ -82,12 +82,16 @@ class Photometries:
         numbers = torch.tensor([*now.falloff, now.shift], dtype=torch.float64).to(like)
         return Shading(numbers.requires_grad_(learns), squares_of(camera, now.reach, like))
 
-    def gradient(self, index: int, shading: Shading) -> Tensor:
-        """Return that of a, b, c and s [4] of a view's camera, from that of its numbers."""
+    def gradient(self, index: int, shading: Shading, view: View) -> Tensor:
+        """Return that of a, b, c and s [4] of the camera of ``view``, the training view ``index``.
+
+        A face has no falloff of its own: the light of its photograph falls off from elsewhere.
+        """
         found = shading.numbers.grad
         if found is None:  # nothing is in the picture
             return torch.zeros(4, dtype=torch.float64)
         gradient, number = found.double().cpu(), self.group[index]
+        gradient[:CENTRAL] *= not view.is_face
         gradient[CENTRAL] *= 1 - self.group.count(number) / len(self.group)  # its share of the mean
         return gradient
 
