@@ -9,13 +9,16 @@ blocks together have as many iterations as the one training, or each block has `
 on the views that are held out (mean PSNR; and that of all pixels which show the land within ``--near`` of a seam) and
 against the true surface (F at ``--within``, overall and near seams). Seconds are of training. Pictures of the views
 with the most seam go to ``FOLDER/JOB-seam-*.png``: photograph, whole, blocks, and the seam on the photograph. The table
-goes to standard output, figures to ``FOLDER/JOB-figures.json``. JOB is ``blocks``, or ``blocks-N`` with
-``--block-iterations N``, so that both fit in one folder, beside one training.
+goes to standard output, figures to ``FOLDER/JOB-figures.json``; then PSNR by distance from a seam, of one training and
+of the blocks before and after what lies at seams learned once more. JOB is ``blocks``, or ``blocks-N`` with
+``--block-iterations N``, so that both fit in one folder, beside one training; ``--job`` is another name, for another
+``--partition FIELD=VALUE``.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import sys
@@ -28,17 +31,22 @@ from PIL import Image
 from gs2d.config.partition import make_partition
 from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
+from gs2d.core.splats import Splats
 from gs2d.data.scene import View
 from gs2d.errors import Gs2dError
 from gs2d.evaluation.surface import evaluate_surface
 from gs2d.experiments.blocks import blocks
 from gs2d.experiments.options import BlocksOptions
 from gs2d.io.meshes import read_mesh
+from gs2d.io.run_dir import SPLATS
+from gs2d.io.splat_ply import read_splats
 from gs2d.meshing.raycast import cast_camera
 from gs2d.pipeline.blocks.cells import Cells
+from gs2d.pipeline.blocks.merged import MERGED
 from gs2d.pipeline.blocks.split import read_split
 from gs2d.pipeline.events import Notice
 from gs2d.pipeline.finished import open_job
+from gs2d.pipeline.job import Job
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.train import train
 from gs2d.render.api import rasterize
@@ -46,11 +54,13 @@ from gs2d.synthetic.flight import Flight, write_flight
 
 ALL_OF = {"2dgs": 30_000, "best": 20_000}  # iterations of the recipes
 ZOOM = 6  # of the pictures of seams
+FROM = (0, 1, 2, 4, 8, 16, 32, 64)  # m from a seam
 
 
 def job_folder(folder: Path, args: argparse.Namespace) -> Path:
     """Return where the blocks are: another job for another number of iterations."""
-    return folder / ("blocks" if args.block_iterations is None else f"blocks-{args.block_iterations}")
+    own = "blocks" if args.block_iterations is None else f"blocks-{args.block_iterations}"
+    return folder / (args.job or own)
 
 
 def train_both(folder: Path, args: argparse.Namespace) -> None:
@@ -61,7 +71,7 @@ def train_both(folder: Path, args: argparse.Namespace) -> None:
         write_flight(capture, flight)
     changes = (f"min_views={args.min_views}", f"margin={args.margin}", f"extent={args.extent}")
     changes += (f"coarse.side={args.coarse_side}", f"coarse.schedule={args.coarse_schedule}")
-    changes += (f"coarse.max_splats={args.coarse_splats}",)
+    changes += (f"coarse.max_splats={args.coarse_splats}", *args.partition)
     partition = make_partition(args.grid, changes)
     parts = partition.blocks + args.coarse_schedule + partition.seam_schedule
     scale = args.iterations / ALL_OF[args.recipe]
@@ -110,6 +120,34 @@ def psnr(squares: list[np.ndarray]) -> float:
     return -10 * math.log10(float(np.concatenate(squares).mean()))
 
 
+def shown(job: Job, splats: Splats, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """Return a rendering of a view [H, W, 3] in [0, 1], and its mean squared error in each pixel [H, W]."""
+    with torch.no_grad():
+        color = rasterize(splats, view.camera, job.settings, backend=job.backend).color.clamp(0, 1).numpy()
+    return color, ((color - view.target(job.settings.background)) ** 2).mean(axis=2)
+
+
+def by_distance(folder: Path, args: argparse.Namespace) -> str:
+    """Return the PSNR of what lies how far from a seam, of one training and of blocks before and after their seams."""
+    job_of_blocks = job_folder(folder, args)
+    cells, truth = read_split(job_of_blocks / "partition").cells, read_mesh(folder / "capture/mesh_gt.ply")
+    _, job, whole = open_job(folder / "whole", args.threads, lambda _event: None)
+    views = job.scene.test
+    distances = np.concatenate([seam_distances(view.camera, truth, cells).ravel() for view in views])
+    ranges = [(low, high) for low, high in itertools.pairwise(FROM) if ((distances >= low) & (distances < high)).any()]
+    lines = ["| PSNR, dB | " + " | ".join(f"{low} to {high} m" for low, high in ranges) + " |"]
+    lines.append("|---" * (len(ranges) + 1) + "|")
+    files = {"before seams": job_of_blocks / MERGED, "blocks": job_of_blocks / SPLATS}
+    for name, splats in {"whole": whole, **{name: read_splats(path) for name, path in files.items()}}.items():
+        squares = []
+        for view in views:
+            squares.append(shown(job, splats, view)[1].ravel())
+        every = np.concatenate(squares)
+        cells_of = [f"{psnr([every[(distances >= low) & (distances < high)]]):.2f}" for low, high in ranges]
+        lines.append(f"| {name} | " + " | ".join(cells_of) + " |")
+    return "\n".join(lines)
+
+
 def measured(folder: Path, args: argparse.Namespace) -> dict[str, dict[str, float]]:
     """Score both runs, overall and near seams, and draw the views with the most seam."""
     job_of_blocks = job_folder(folder, args)
@@ -118,15 +156,13 @@ def measured(folder: Path, args: argparse.Namespace) -> dict[str, dict[str, floa
     runs = {name: open_job(path, args.threads, lambda _event: None) for name, path in folders.items()}
     views = runs["whole"][1].scene.test
     distances = {view.name: seam_distances(view.camera, truth, cells) for view in views}
-    shown = sorted(views, key=lambda view: -float((distances[view.name] < args.near / 4).mean()))[:3]
+    drawn = sorted(views, key=lambda view: -float((distances[view.name] < args.near / 4).mean()))[:3]
     found: dict[str, dict[str, float]] = {}
-    colors: dict[str, dict[str, np.ndarray]] = {view.name: {} for view in shown}
+    colors: dict[str, dict[str, np.ndarray]] = {view.name: {} for view in drawn}
     for name, (run, job, splats) in runs.items():
         pixels, near = 0, []
         for view in views:
-            with torch.no_grad():
-                color = rasterize(splats, view.camera, job.settings, backend=job.backend).color.clamp(0, 1).numpy()
-            square = ((color - view.target(job.settings.background)) ** 2).mean(axis=2)
+            color, square = shown(job, splats, view)
             pixels += square.size
             near.append(square[distances[view.name] < args.near])
             if view.name in colors:
@@ -146,7 +182,7 @@ def measured(folder: Path, args: argparse.Namespace) -> dict[str, dict[str, floa
             "f": score.scores[0].f_score,
             "f_near_seams": 2 * precision * recall / max(precision + recall, 1e-12),
         }
-    for number, view in enumerate(shown):
+    for number, view in enumerate(drawn):
         draw(
             folder / f"{job_of_blocks.name}-seam-{number}.png", view, colors[view.name], distances[view.name], args.near
         )
@@ -192,6 +228,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--coarse-splats", type=int, default=15_000)
     parser.add_argument("--coarse-side", type=int, default=48, help="px")
     parser.add_argument("--coarse-schedule", type=float, default=0.5)
+    parser.add_argument("--partition", nargs="*", default=[], metavar="FIELD=VALUE", help="changes beside these")
+    parser.add_argument("--job", help="name of the job folder")
     parser.add_argument("--min-views", type=int, default=20)
     parser.add_argument("--margin", type=float, default=0.2)
     parser.add_argument("--extent", choices=("scene", "block"), default="scene")
@@ -203,11 +241,11 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         args.folder.mkdir(parents=True, exist_ok=True)
         train_both(args.folder, args)
-        found = measured(args.folder, args)
+        found, courses = measured(args.folder, args), by_distance(args.folder, args)
     except (Gs2dError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    print(table(found))
+    print(table(found), courses, sep="\n\n")
     (args.folder / f"{job_folder(args.folder, args).name}-figures.json").write_text(json.dumps(found, indent=1) + "\n")
     return 0
 

@@ -7,8 +7,10 @@
 For each number a flown capture (``benchmarks.flown_capture``), which is made where it is not there, is trained on from
 so many splats on its true surface, with photographs prepared on the disk; then it is meshed whole and its report is
 written, each by a command of its own. Memory is the largest sum of what a command and its children have resident,
-looked at twenty times a second. Where ``--compare`` names numbers, those are trained on with all in memory, too, and
-must give the same bytes. The table goes to standard output, figures to ``FOLDER/scale.json``.
+looked at twenty times a second. A hundred photographs show less of the land's rim than thousands, and a larger surface
+takes more memory: ``--bbox`` meshes a part that all show, too. Where ``--compare`` names numbers, those are trained on
+with all in memory, too, and must give the same bytes. The table goes to standard output, figures to
+``FOLDER/scale.json``.
 """
 
 from __future__ import annotations
@@ -128,6 +130,10 @@ def run_one(folder: Path, photographs: int, args: argparse.Namespace) -> list[Me
         measure(photographs, "mesh", ["mesh", str(run), "--scene", "--threads", str(args.threads), *limits], log),
         measure(photographs, "report", ["report", str(run), *limits], log),
     ]
+    if args.bbox:
+        words = ["mesh", str(run), "--out", str(folder / f"part-{photographs}.ply"), "--threads", str(args.threads)]
+        words += ["--bbox", *map(str, args.bbox), *limits]
+        found.append(measure(photographs, "mesh of a part", words, log))
     if photographs in args.compare:
         other = folder / f"run-{photographs}-in-memory"
         shutil.rmtree(other, ignore_errors=True)
@@ -158,6 +164,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--side", type=float, default=200.0, help="m of land, the same for any number of photographs")
     parser.add_argument("--splats", type=int, default=20_000)
+    parser.add_argument("--bbox", type=float, nargs=6, help="also mesh this part, of which any number shows the same")
     parser.add_argument("--iterations", type=int, default=150)
     parser.add_argument("--memory", type=float, default=2.0, help="GiB, as of gs2d train")
     parser.add_argument("--threads", type=int, default=2)

@@ -57,6 +57,18 @@ def test_rates_at_the_end_are_constant_and_leave_the_others() -> None:
     half = LearningRates(means=1e-4, means_final=1e-6, means_decay_steps=100).at_end(50)
     assert half.means == half.means_final == pytest.approx(1e-5)
     assert half.means_at(1) == pytest.approx(1e-5)
+    settling = LearningRates(settle_start=10, settle_steps=10, settle_factor=0.1).at_end(20)
+    assert settling.settled_at(1) == settling.settled_at(20) == 1.0
+    assert settling.sh0 == pytest.approx(0.1 * LearningRates().sh0)
+
+
+def test_rates_over_again_go_through_what_they_were() -> None:
+    rates = LearningRates(means_decay_steps=100, settle_start=60, settle_steps=40, settle_factor=0.1)
+    again = rates.over_again(80, 100, 50)
+    for step in (0, 5, 20):
+        assert again.means_at(round(2.5 * step)) == pytest.approx(rates.means_at(80 + step), rel=0.03)
+    for now, before in ((0, 80), (25, 90), (50, 100)):
+        assert again.quats * again.settled_at(now) == pytest.approx(rates.quats * rates.settled_at(before))
 
 
 def test_official_densification_runs_at_600_to_14900_every_100() -> None:

@@ -15,6 +15,7 @@ import torch
 
 from flown import digest, tiny_blocks, write_tiny_flight
 from gs2d.cli import run
+from gs2d.config.partition import Partition
 from gs2d.errors import DataError, Gs2dError, RecipeError, RunError
 from gs2d.experiments import blocks as module
 from gs2d.experiments.blocks import blocks
@@ -42,7 +43,7 @@ def test_the_job_is_a_run_of_all_blocks(straight: Path) -> None:
     run_folder = open_run(straight)
     (stage,) = run_folder.metrics()["stages"]
     assert stage["name"] == "blocks"
-    assert stage["iterations"] == 9 + 4 * 18 + 2  # coarse, blocks, seams
+    assert stage["iterations"] == 9 + 4 * 18 + 4  # coarse, blocks, seams
     assert stage["splats"] == len(read_splats(straight / "splats.ply"))
     assert stage["train"]["psnr"] > 6
     assert stage["test"]["psnr"] > 6
@@ -88,7 +89,7 @@ def test_what_lies_at_seams_learns_once_more_and_nothing_else(straight: Path) ->
     rows, _ = read_start(straight / "partition/seams.npz")
     own = torch.from_numpy(rows == OWN)
     assert 0 < own.sum() < len(merged) / 2
-    assert (split.cells.distance_to_seam(merged.means.numpy()[own]) < 0.03 * split.cells.side).all()
+    assert (split.cells.distance_to_seam(merged.means.numpy()[own]) < Partition().seam * split.cells.side).all()
     rest = int((~own).sum())
     assert torch.equal(end.means[:rest], merged.means[~own])
     assert torch.equal(end.shN[:rest], merged.shN[~own])

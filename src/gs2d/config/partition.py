@@ -74,7 +74,8 @@ class Partition:
         After the merge, splats within this fraction of a cell's mean side of a seam learn once more, with all others
         frozen: what is left of two blocks at a seam was never drawn together.
     seam_schedule : float
-        Fraction of the recipe's iterations for that, at its last steps, without coming or going; 0: not done.
+        How often a photograph of a seam is looked at for that, in the looks of a block at its own; by a block's last
+        rates, without coming or going, and for no more iterations than a block has. 0: not done.
     start : "dense" or "coarse"
         What a block begins with: the recipe's dense start, where it has one, of the block's own photographs, or the
         coarse model's splats. Where photographs are large the coarse model knows a fraction of what they show.
@@ -92,8 +93,8 @@ class Partition:
     splats: int = 3_000_000
     photographs: int = 600
     flat: float = 0.5
-    seam: float = 0.03
-    seam_schedule: float = 0.1
+    seam: float = 0.05
+    seam_schedule: float = 0.2
     start: str = "dense"
     ownership: str = "center"
     extent: str = "scene"

@@ -201,7 +201,8 @@ class SeamsTask(BlocksTask):
         if views:
             start = start_file(partition_folder(out), SEAMS)
             part = Part(views=views, splats=out / MERGED, start=start, prepared=out)
-            recipe = seam_recipe(settled.recipe, partition)
+            trained = [len(block.views) for block in read_split(partition_folder(out)).blocks if not block.skipped]
+            recipe = seam_recipe(settled.recipe, partition, len(views) * len(trained) / max(1, sum(trained)))
             train(self.training(recipe=recipe, out=seam_folder(out), part=part), on_event)
         return {"splats": write_result(settled, self.options, partition, on_event)}
 

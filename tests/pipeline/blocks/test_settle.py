@@ -81,12 +81,33 @@ def test_a_capture_is_known_by_its_cameras_points_and_split() -> None:
     assert capture_digest(replace(SCENE, points=None)) != one
 
 
-def test_seams_learn_by_the_last_steps_and_nothing_comes_or_goes() -> None:
+def test_seams_learn_by_the_last_rates_of_a_block_and_nothing_comes_or_goes() -> None:
     recipe = get_recipe("2dgs-r")
-    (stage,) = seam_recipe(recipe, Partition(seam_schedule=0.1)).stages
+    block = recipe.stages[0]
+    (stage,) = seam_recipe(recipe, Partition(seam_schedule=0.1), 1.0).stages
     assert stage.iterations == 3_000
     assert stage.densify is None
-    assert stage.lr.means_at(1) == pytest.approx(recipe.stages[0].lr.means_final)
-    assert stage.lr.means_at(3_000) == pytest.approx(recipe.stages[0].lr.means_final)
+    assert stage.lr.means_at(0) == pytest.approx(block.lr.means_at(21_000))
+    assert stage.lr.means_at(3_000) == pytest.approx(block.lr.means_final)
+    assert stage.lr.settled_at(1) == stage.lr.settled_at(3_000) == 1.0
+    assert stage.lr.opacity_logits == block.lr.opacity_logits
     assert set(stage.train.values()) == {"all"}
     assert all(term.start == 0 for term in stage.losses)
+
+
+def test_seams_settle_as_a_block_does() -> None:
+    recipe = get_recipe("best")
+    block = recipe.stages[0]
+    (stage,) = seam_recipe(recipe, Partition(seam_schedule=0.1), 1.0).stages
+    assert stage.lr.settled_at(0) == block.lr.settled_at(14_000) == 1.0
+    assert stage.lr.settled_at(1_000) == pytest.approx(block.lr.settled_at(17_000))
+    assert stage.lr.settled_at(2_000) == pytest.approx(block.lr.settled_at(20_000)) == 0.1
+    assert stage.lr.sh0 == block.lr.sh0
+
+
+@pytest.mark.parametrize(("photographs", "iterations"), [(0.5, 2_000), (1.0, 2_000), (3.0, 6_000), (50.0, 20_000)])
+def test_each_photograph_of_a_seam_is_looked_at_as_often_until_that_is_a_block(
+    photographs: float, iterations: int
+) -> None:
+    (stage,) = seam_recipe(get_recipe("best"), Partition(seam_schedule=0.1), photographs).stages
+    assert stage.iterations == iterations

@@ -35,6 +35,7 @@ from gs2d.pipeline.options import TrainOptions
 from gs2d.render.backends import Backend
 
 FORMAT = 1
+SEAM_RATES = 0.3  # of a block's iterations, its last: by their rates seams learn. Full ones undo more than they mend
 COARSE_PART = 3  # of the splats that fit, at least, are the blocks': the coarse model has a third at most
 
 
@@ -251,15 +252,21 @@ def block_recipe(recipe: Recipe, partition: Partition, block: Block) -> Recipe:
     return validate(with_budget(value, max(2, most)))
 
 
-def seam_recipe(recipe: Recipe, partition: Partition) -> Recipe:
-    """Return the recipe by which splats at seams learn once more: the last steps of all of them, none comes or goes."""
-    stage = scale_schedule(recipe, partition.seam_schedule).stages[0]
+def seam_recipe(recipe: Recipe, partition: Partition, photographs: float) -> Recipe:
+    """Return the recipe by which splats at seams learn once more: by the last rates of a block; none comes or goes.
+
+    ``photographs`` is how many show a seam, in those of a mean block: each is looked at as often, whatever it is, until
+    the seams have as many iterations as a block.
+    """
+    part = min(1.0, partition.seam_schedule * max(1.0, photographs))
+    block, stage = recipe.stages[0], scale_schedule(recipe, part).stages[0]
+    start = round((1 - SEAM_RATES) * block.iterations)
     stage = replace(
         stage,
         name="seams",
         train=dict.fromkeys(ALL, "all"),
         losses=tuple(replace(term, start=0) for term in stage.losses),
-        lr=stage.lr.at_end(recipe.stages[0].iterations),
+        lr=block.lr.over_again(start, block.iterations, stage.iterations),
         densify=None,
         on_enter=(),
         sh_interval=0,
