@@ -22,7 +22,15 @@ from gs2d.core import memory_limit
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError, RecipeError
 from gs2d.pipeline import capture_plan
-from gs2d.pipeline.capture_plan import PROGRAM_BYTES, expected_splats, fitting_downscale, looks_of, rounded
+from gs2d.pipeline.capture_plan import (
+    PLACE_BYTES,
+    PROGRAM_BYTES,
+    SPLAT_BYTES,
+    expected_splats,
+    fitting_downscale,
+    looks_of,
+    rounded,
+)
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.options import PlanOptions, TrainOptions
 from gs2d.pipeline.planned import command_of, plan
@@ -206,3 +214,20 @@ def test_the_plan_of_a_robust_training_takes_longer_by_its_looks(
         seconds[robust] = found.seconds.expected
     recipe_looks = seconds["on"] - seconds["off"]
     assert recipe_looks == pytest.approx(10 * (0.5 * (200 // 50) + 1.0 * 5), rel=0.3)
+
+
+def test_memory_of_the_mesh_goes_with_the_places_of_a_dense_start_up_to_a_slab(
+    capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The upper bound, by which is refused, has all of it; a start from sparse points says nothing of the surface."""
+    free = Cost(0.0, 0.0, 0.0)
+    found = {}
+    for start in (None, 2, 2_000, 1_000_000):
+        tried = Probe(start, 0.0, 0.0, 1.0, Cost(0.01, 0.0, 0.0), free, free, 0.0, 1.0, None)
+        monkeypatch.setattr(capture_plan, "probe", lambda *_, tried=tried: tried)
+        fixed = ("surface.densify=null",)
+        told = plan(planned(capture, overrides=fixed))
+        found[start] = told.memory.expected - told.splats.expected * SPLAT_BYTES
+        assert told.memory.most - told.splats.most * SPLAT_BYTES == pytest.approx(found[None])
+    assert found[2_000] - found[2] == pytest.approx(1_998 * PLACE_BYTES)
+    assert found[1_000_000] == found[None]

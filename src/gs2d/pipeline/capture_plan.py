@@ -30,6 +30,7 @@ from gs2d.training.robust import looks_at_free_space, looks_at_seen_area
 PROGRAM_BYTES = 400 << 20  # torch, the kernels, the scene
 SPLAT_BYTES = 1200  # parameters, moments, gradients and what the rasterizer holds of a splat (docs/performance.md)
 FUSION_BYTES = 220 << 20  # a slab, the surface of a default mesh and what cleans it: by ten runs (docs/scale.md)
+PLACE_BYTES = 15_000  # of that for a place of the dense start, about three pixels of surface, where it is less
 CHECKPOINT_BYTES = 59 * 3 * 4  # of a splat; two checkpoints are kept
 FILE_BYTES = 4 * 61 + 80 + 40  # of a splat: splats.ply, scene.html, the mesh
 GROWTH = Growth(1.0, 4.0, 9.0)  # of splats in finished runs, where it cannot be tried
@@ -154,7 +155,8 @@ def plan_capture(
     prepared = prepare == "always" or (prepare == "auto" and not fits(scene))
     pictures = 0.0 if prepared else decoded_bytes(scene) * shrink
     fixed = PROGRAM_BYTES + pictures + largest / chosen**2 * ITERATION_BYTES * on_host + largest * DECODING_BYTES
-    memory = _memory(fixed, splats)
+    meshing = FUSION_BYTES if tried.start is None else min(FUSION_BYTES, tried.start * PLACE_BYTES)
+    memory = _memory(fixed, meshing, splats)
     if allowed is not None and memory.most > allowed:
         budget = int((allowed - fixed - FUSION_BYTES) / SPLAT_BYTES)
         if budget < start:
@@ -164,7 +166,7 @@ def plan_capture(
                 f"{allowed / 2**30:.2g} GiB to keep to; allow more --memory, or train on a part of the capture"
             )
         splats = Range(min(splats.least, budget), min(splats.expected, budget), min(splats.most, budget))
-        memory = _memory(fixed, splats)
+        memory = _memory(fixed, meshing, splats)
         budget = None if splats.most < budget else rounded(0.95 * budget)
     packed = trained * tried.packed if prepared else 0.0
     return CapturePlan(
@@ -215,10 +217,10 @@ def expected_splats(recipe: Recipe, start: int, growth: Growth | None = None) ->
     return Range(least, expected, largest)
 
 
-def _memory(fixed: float, splats: Range) -> Range:
+def _memory(fixed: float, meshing: float, splats: Range) -> Range:
     """Return bytes; what the mesh takes comes when training has given its gradients back, with as much again."""
-    of = [fixed + FUSION_BYTES + count * SPLAT_BYTES for count in asdict(splats).values()]
-    return Range(*of)
+    least, expected, most = (fixed + count * SPLAT_BYTES for count in asdict(splats).values())
+    return Range(least + meshing, expected + meshing, most + FUSION_BYTES)
 
 
 def _seconds(tried: Probe, recipe: Recipe, scene: Scene, start: int, splats: Range, shrink: float) -> Range:
