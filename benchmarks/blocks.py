@@ -137,12 +137,9 @@ def by_distance(folder: Path, args: argparse.Namespace) -> str:
     ranges = [(low, high) for low, high in itertools.pairwise(FROM) if ((distances >= low) & (distances < high)).any()]
     lines = ["| PSNR, dB | " + " | ".join(f"{low} to {high} m" for low, high in ranges) + " |"]
     lines.append("|---" * (len(ranges) + 1) + "|")
-    files = {"before seams": job_of_blocks / MERGED, "blocks": job_of_blocks / SPLATS}
-    for name, splats in {"whole": whole, **{name: read_splats(path) for name, path in files.items()}}.items():
-        squares = []
-        for view in views:
-            squares.append(shown(job, splats, view)[1].ravel())
-        every = np.concatenate(squares)
+    before, after = (read_splats(job_of_blocks / name) for name in (MERGED, SPLATS))
+    for name, splats in {"whole": whole, "before seams": before, "blocks": after}.items():
+        every = np.concatenate([shown(job, splats, view)[1].ravel() for view in views])
         cells_of = [f"{psnr([every[(distances >= low) & (distances < high)]]):.2f}" for low, high in ranges]
         lines.append(f"| {name} | " + " | ".join(cells_of) + " |")
     return "\n".join(lines)
