@@ -20,15 +20,18 @@ from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import apply_overrides
 from gs2d.core import memory_limit
 from gs2d.core.splats import Splats
+from gs2d.data import load_scene
 from gs2d.errors import DataError, RecipeError
 from gs2d.pipeline import capture_plan
 from gs2d.pipeline.capture_plan import (
+    FUSION_BYTES,
     PLACE_BYTES,
     PROGRAM_BYTES,
     SPLAT_BYTES,
     expected_splats,
     fitting_downscale,
     looks_of,
+    meshing_bytes,
     rounded,
 )
 from gs2d.pipeline.events import Event, Notice
@@ -231,3 +234,13 @@ def test_memory_of_the_mesh_goes_with_the_places_of_a_dense_start_up_to_a_slab(
         assert told.memory.most - told.splats.most * SPLAT_BYTES == pytest.approx(found[None])
     assert found[2_000] - found[2] == pytest.approx(1_998 * PLACE_BYTES)
     assert found[1_000_000] == found[None]
+
+
+def test_a_place_is_as_many_pixels_as_the_photographs_have_for_one_that_was_swept(capture: Path) -> None:
+    scene, recipe = load_scene(capture), get_recipe("best")
+    assert recipe.dense_start is not None
+    assert meshing_bytes(scene, recipe, 100) == 100 * PLACE_BYTES
+    halved = replace(recipe, dense_start=replace(recipe.dense_start, side=32))  # of 64 px
+    assert meshing_bytes(scene, halved, 100) == 400 * PLACE_BYTES
+    assert meshing_bytes(scene, halved, 100, shrink=0.25) == 100 * PLACE_BYTES
+    assert meshing_bytes(scene, get_recipe("2dgs"), 100) == meshing_bytes(scene, recipe, None) == FUSION_BYTES

@@ -25,12 +25,13 @@ from gs2d.pipeline.memory import DECODING_BYTES, ITERATION_BYTES, MAX_DOWNSCALE
 from gs2d.pipeline.photographs import fits
 from gs2d.pipeline.probe import Probe, probe
 from gs2d.render.backends import Backend
+from gs2d.training.plane_sweep import sweep_downscale
 from gs2d.training.robust import looks_at_free_space, looks_at_seen_area
 
 PROGRAM_BYTES = 400 << 20  # torch, the kernels, the scene
 SPLAT_BYTES = 1200  # parameters, moments, gradients and what the rasterizer holds of a splat (docs/performance.md)
 FUSION_BYTES = 220 << 20  # a slab, the surface of a default mesh and what cleans it: by ten runs (docs/scale.md)
-PLACE_BYTES = 15_000  # of that for a place of the dense start, about three pixels of surface, where it is less
+PLACE_BYTES = 15_000  # of that for a place of the dense start, three pixels of what was swept, where it is less
 CHECKPOINT_BYTES = 59 * 3 * 4  # of a splat; two checkpoints are kept
 FILE_BYTES = 4 * 61 + 80 + 40  # of a splat: splats.ply, scene.html, the mesh
 GROWTH = Growth(1.0, 4.0, 9.0)  # of splats in finished runs, where it cannot be tried
@@ -155,7 +156,7 @@ def plan_capture(
     prepared = prepare == "always" or (prepare == "auto" and not fits(scene))
     pictures = 0.0 if prepared else decoded_bytes(scene) * shrink
     fixed = PROGRAM_BYTES + pictures + largest / chosen**2 * ITERATION_BYTES * on_host + largest * DECODING_BYTES
-    meshing = FUSION_BYTES if tried.start is None else min(FUSION_BYTES, tried.start * PLACE_BYTES)
+    meshing = meshing_bytes(scene, recipe, tried.start, shrink)
     memory = _memory(fixed, meshing, splats)
     if allowed is not None and memory.most > allowed:
         budget = int((allowed - fixed - FUSION_BYTES) / SPLAT_BYTES)
@@ -215,6 +216,18 @@ def expected_splats(recipe: Recipe, start: int, growth: Growth | None = None) ->
     most = max((budget for budget in budgets if budget is not None), default=None)
     least, expected, largest = (value if most is None else min(value, max(most, start)) for value in grown)
     return Range(least, expected, largest)
+
+
+def meshing_bytes(scene: Scene, recipe: Recipe, start: int | None, shrink: float = 1.0) -> float:
+    """Return what meshing takes: it goes with the pixels that show surface, up to a slab of the volume.
+
+    A dense start has a place for about three such pixels of the photographs as they were swept; sparse points tell
+    nothing of the surface.
+    """
+    if start is None or recipe.dense_start is None:
+        return FUSION_BYTES
+    pixels = sweep_downscale(scene, recipe.dense_start) ** 2 * shrink
+    return min(FUSION_BYTES, start * PLACE_BYTES * pixels)
 
 
 def _memory(fixed: float, meshing: float, splats: Range) -> Range:

@@ -127,14 +127,18 @@ def sweep_views(scene: Scene, settings: DenseStart) -> Sweep:
     DataError
         The capture says nothing of depths: no sparse points that photographs show, no places that two of them see.
     """
-    known = sweep_range(scene)
-    longest = max(max(view.camera.width, view.camera.height) for view in scene.train)
-    factor = max(1, round(longest / settings.side))
+    known, factor = sweep_range(scene), sweep_downscale(scene, settings)
     limit = 0 if scene.ahead else cache_bytes(SWEEP_BYTES)
     views = Spilled(_trimming(_shrunk(view, known, factor) for view in scene.train), limit)
     neighbours = _neighbours(scene, views, known.observed, settings)
     found = Spilled(_trimming(_depths(views, index, neighbours[index], settings) for index in range(len(views))), limit)
     return Sweep(views, neighbours, found.column(0), found.column(1))
+
+
+def sweep_downscale(scene: Scene, settings: DenseStart) -> int:
+    """Return by how much the training views of a scene are shrunk before they are swept."""
+    longest = max(max(view.camera.width, view.camera.height) for view in scene.train)
+    return max(1, round(longest / settings.side))
 
 
 def _trimming(results: Iterable[T]) -> Iterator[T]:
