@@ -8,7 +8,8 @@ For each number a flown capture (``benchmarks.flown_capture``), which is made wh
 so many splats on its true surface, with photographs prepared on the disk; then it is meshed whole and its report is
 written, each by a command of its own. Memory is the largest sum of what a command and its children have resident,
 looked at twenty times a second. A hundred photographs show less of the land's rim than thousands, and a larger surface
-takes more memory: ``--bbox`` meshes a part that all show, too. Where ``--compare`` names numbers, those are trained on
+takes more memory: ``--land`` ends the land within what is flown over, so that any number shows all of it, and
+``--bbox`` meshes a part that all show, too. Where ``--compare`` names numbers, those are trained on
 with all in memory, too, and must give the same bytes. The table goes to standard output, figures to
 ``FOLDER/scale.json``.
 """
@@ -118,7 +119,7 @@ def run_one(folder: Path, photographs: int, args: argparse.Namespace) -> list[Me
     """Make a capture, train, mesh and report."""
     capture, run = folder / f"capture-{photographs}", folder / f"run-{photographs}"
     if not (capture / "sparse/0/cameras.bin").exists():
-        flight = Flight(photographs, args.size, args.size * 3 // 4, points=args.splats, side=args.side)
+        flight = Flight(photographs, args.size, args.size * 3 // 4, points=args.splats, side=args.side, land=args.land)
         write_flight(capture, flight)
     if not (capture / "start.ply").exists():
         write_splats(capture / "start.ply", surface_splats(capture, args.splats))
@@ -163,6 +164,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--compare", type=int, nargs="*", default=[100])
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--side", type=float, default=200.0, help="m of land, the same for any number of photographs")
+    parser.add_argument("--land", type=float, help="side of the land, m, where it is to end within what is flown over")
     parser.add_argument("--splats", type=int, default=20_000)
     parser.add_argument("--bbox", type=float, nargs=6, help="also mesh this part, of which any number shows the same")
     parser.add_argument("--iterations", type=int, default=150)

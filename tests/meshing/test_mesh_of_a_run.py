@@ -141,7 +141,6 @@ def test_a_run_is_fused_by_its_own_backend_and_says_so(
 
     job, splats = reload_job(RunFolder(run), lambda _event: None), finished_splats(RunFolder(run))
     monkeypatch.setattr("gs2d.meshing.tsdf.integrator", recorded)
-    monkeypatch.setattr("gs2d.meshing.unbounded.integrator", recorded)
     for backend in ("reference", *(["cpu"] if available_variants() else [])):
         options = MeshOptions(unbounded=unbounded, voxel=0.05)
         result = extract_mesh(

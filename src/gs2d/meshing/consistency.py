@@ -14,7 +14,7 @@ import numpy as np
 
 from gs2d.meshing.bounds import MAX_VOXELS_PER_TRUNCATION, DepthSample, FusionBounds
 from gs2d.meshing.depth_maps import DepthMap
-from gs2d.meshing.sampling import UNSEEN, make_sampler
+from gs2d.meshing.sampling import make_sampler
 
 NEIGHBOURS = 8  # views compared with each
 PERCENTILE = 75.0  # of the positive residuals
@@ -50,9 +50,8 @@ def depth_noise(maps: Iterable[DepthMap], samples: Sequence[DepthSample], limits
             projected = projected[projected[:, 2] > 0]
             z = projected[:, 2].copy()
             farther, _ = view.signed_distance(projected[:, 0] / z, projected[:, 1] / z, z)
-            residuals.append(farther[farther > UNSEEN / 2])
-    everything = np.concatenate(residuals)
-    positive = everything[everything > 0]
+            residuals.append(farther[farther > 0])  # where unseen it is hugely negative
+    positive = np.concatenate(residuals)
     return float(np.percentile(positive, PERCENTILE)) if len(positive) >= _ENOUGH else None
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gs2d.core.camera import Camera
+from gs2d.core.memory import trim
 from gs2d.core.mesh import Mesh
 from gs2d.meshing.depth_maps import DepthMap
 from gs2d.meshing.marching_cubes import components, select_faces
@@ -187,6 +188,7 @@ def clean(mesh: Mesh, maps: Iterable[DepthMap], count: int, tolerance: float) ->
     left.append(float(areas(mesh).sum()))
     found = pixels(mesh, evidence)
     del evidence
+    trim()  # what views were looked up in: another process comes beside this one
     parts = [area / max(left[0], 1e-300) for area in left[1:]]
     return Cleaned(simplified_to(mesh, int(FACES_A_PIXEL * found)), found, 1 - parts[0], parts[0] - parts[1])
 

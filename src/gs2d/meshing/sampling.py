@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gs2d.core.camera import Camera
 from gs2d.meshing.bounds import FusionBounds
 from gs2d.meshing.depth_maps import DepthMap
 
@@ -114,6 +115,17 @@ def _pyramid(depth: np.ndarray) -> tuple[np.ndarray, ...]:
         if height == 1 and width == 1:
             return tuple(levels)
         size *= 2
+
+
+def may_see(camera: Camera, corners: np.ndarray) -> bool:
+    """Whether a camera could see some of what lies between corners [8, 3]; False only where it sees none of it.
+
+    All corners lie behind the camera, or beyond one side of its image, widened by the sampler's border.
+    """
+    x, y, z = (corners @ camera.rotation.T + camera.T_cam_world[:3, 3]).T
+    across, down = camera.fx * x + camera.cx * z, camera.fy * y + camera.cy * z  # px times z, which may be negative
+    beyond = (z <= 0, across < -z, across > (camera.width + 1) * z, down < -z, down > (camera.height + 1) * z)
+    return not any(side.all() for side in beyond)
 
 
 def block_visibility(view: DepthSampler, centers: np.ndarray, radius: float, truncation: float) -> np.ndarray:

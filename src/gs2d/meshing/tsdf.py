@@ -22,16 +22,13 @@ from gs2d.errors import ProtocolError
 from gs2d.kernels.tsdf import FusionOnHost
 from gs2d.meshing.bounds import FusionBounds, backproject
 from gs2d.meshing.depth_maps import DepthMap
-from gs2d.meshing.sampling import DepthSampler, block_visibility, make_sampler
+from gs2d.meshing.sampling import DepthSampler, block_visibility, make_sampler, may_see
 from gs2d.render.backends import Backend, get_backend
 
 if TYPE_CHECKING:
     import torch
 
     from gs2d.kernels.cuda.launch import Launcher
-    from gs2d.kernels.library import Library
-
-if TYPE_CHECKING:
     from gs2d.kernels.library import Library
 
 
@@ -498,10 +495,31 @@ def fuse_blocks(
 ) -> Volume:
     """Fuse depth maps into these blocks; parameters as of ``fuse``."""
     volume = invalid_volume(limits, blocks.dims, blocks.keys, colored=blocks.colored, frames=blocks.frames)
-    with integrator([volume], backend, threads) as add:
-        for item in frames:
-            add(make_sampler(item, limits))
+    add_all([volume], frames, lambda item: make_sampler(item, limits), threads=threads, backend=backend)
     return volume
+
+
+def add_all(
+    volumes: Sequence[Volume],
+    frames: Iterable[DepthMap],
+    prepare: Callable[[DepthMap], DepthSampler],
+    *,
+    threads: int | None,
+    backend: str | Backend,
+) -> None:
+    """Add depth maps to volumes, in place; those that see nothing of them are not prepared, which takes most time."""
+    boxes = [box_corners(volume) for volume in volumes if len(volume.keys)]
+    with integrator(volumes, backend, threads) as add:
+        for item in frames:
+            if any(may_see(item.camera, box) for box in boxes):
+                add(prepare(item))
+
+
+def box_corners(volume: Volume) -> np.ndarray:
+    """Return the corners [8, 3], world units, of the box that the voxels of a volume lie in."""
+    blocks, size = volume.blocks, BLOCK * volume.limits.voxel
+    box = np.array([blocks.min(axis=0) * size, (blocks.max(axis=0) + 1) * size]) + np.asarray(volume.limits.lower)
+    return np.array([[box[c >> axis & 1, axis] for axis in range(3)] for c in range(8)])
 
 
 def min_blocks(item: DepthMap, limits: FusionBounds) -> int:

@@ -31,7 +31,7 @@ from gs2d.meshing.bounds import (
 )
 from gs2d.meshing.depth_maps import DepthMap
 from gs2d.meshing.marching_cubes import CORNERS, EDGES, case_table, cell_surface, mixed_colors, near_plane_policy
-from gs2d.meshing.sampling import make_sampler
+from gs2d.meshing.sampling import DepthSampler, make_sampler
 from gs2d.meshing.slabs import SLAB_BYTES, slabs
 from gs2d.meshing.tsdf import (
     BLOCK,
@@ -39,9 +39,9 @@ from gs2d.meshing.tsdf import (
     Blocks,
     Budget,
     Volume,
+    add_all,
     block_finder,
     check_truncation,
-    integrator,
     invalid_volume,
     merged,
     min_blocks,
@@ -279,9 +279,11 @@ def _fuse_into(
     backend: str | Backend,
 ) -> None:
     """Add all views to volumes of any levels."""
-    with integrator(volumes, backend, threads) as add:
-        for item in frames:
-            add(make_sampler(item, cascade.levels[0], truncation=_truncations(item, cascade)))
+
+    def prepare(item: DepthMap) -> DepthSampler:
+        return make_sampler(item, cascade.levels[0], truncation=_truncations(item, cascade))
+
+    add_all(volumes, frames, prepare, threads=threads, backend=backend)
 
 
 def _distances(item: DepthMap, cascade: TsdfCascade) -> np.ndarray:

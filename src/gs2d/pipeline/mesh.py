@@ -58,6 +58,7 @@ KEPT = (  # of what is said of a mesh, in metrics.json
     *("pixels", "faces_per_pixel", "area_unsupported", "area_apart"),
 )
 VOLUME_BYTES = 4 << 30  # of the fused volume, where it is not known how much memory there is
+LEAST_SLAB_BYTES = 32 << 20  # less, and preparing views again for each slab takes most of the time
 MOSTLY_CUT = 0.5  # part of the depth left out from which the user is told
 COARSER = 3  # times that larger voxels are tried: the size that fits is a guess
 
@@ -300,7 +301,7 @@ def _volume_bytes(options: MeshOptions) -> int:
 def _slab_bytes() -> int:
     """Return how much of it may be in memory at a time."""
     budget = memory_budget()
-    return SLAB_BYTES if budget is None else min(SLAB_BYTES, budget // 8)
+    return SLAB_BYTES if budget is None else min(SLAB_BYTES, max(LEAST_SLAB_BYTES, budget // 32))
 
 
 def _frames(job: RenderedScene, splats: Splats, depth: str, on_event: OnEvent) -> Iterator[RenderedView]:

@@ -42,8 +42,11 @@ class Flight:
     points : int or None
         Sparse points, before those that fewer than three photographs see are left out; None: 40 a photograph.
     side : float or None, m
-        Of the land that is flown over, about; None: it grows with the photographs, which overlap by 80 % ahead and
+        Of what is flown over, about; None: it grows with the photographs, which overlap by 80 % ahead and
         70 % to the side.
+    land : float or None, m
+        Side of the land, at least; None: it reaches beyond what the photographs show. Land smaller than what is flown
+        over is shown whole by any number of photographs.
     seed : int
     latitude, longitude, altitude : float
         Degrees and m, of the origin.
@@ -56,6 +59,7 @@ class Flight:
     height: int = 240
     points: int | None = None
     side: float | None = None
+    land: float | None = None
     seed: int = 0
     latitude: float = 47.05
     longitude: float = 8.3
@@ -127,7 +131,7 @@ def write_flight(
         except OSError as error:
             raise disk_error(part, error) from error
     cameras = flown_cameras(flight)
-    land = build_land(_side(cameras), flight.pixel, flight.seed)
+    land = build_land(flight.land or _side(cameras), flight.pixel, flight.seed)
     points = sparse_points(land, cameras, flight)
     seen = _photograph(root / "images", land, cameras, points, flight, on_progress, threads)
     vertices, faces = land.mesh()
