@@ -3,24 +3,29 @@
 ::
 
     python -m benchmarks.evidence DATA FOLDER [--scale 1] [--seed 0] [--captures lego bottle] [--recipes 2dgs ...]
+        [--results FILE]
 
 DATA holds the captures. Runs are those of ``gs2d train ... --cache``, so that the first 30,000 iterations are trained
 once; a run that is finished is not done again, one that was cut off goes on. Seconds are of the clock, summed over a
-recipe's stages, whoever trained them. Figures go to ``FOLDER/evidence.json`` and a table to standard output.
+recipe's stages, whoever trained them. Figures go to ``FOLDER/evidence.json`` and a table to standard output. A full
+schedule takes longer than most machines are had for: ``--results`` puts the rows beside those of other days in FILE,
+each with the commit and the machine that it is of, so check the same commit out again before going on.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import subprocess
 from pathlib import Path
 from typing import Any
 
 from benchmarks.quality_run import score_splats
 from benchmarks.results import Case, Method, run_case
 from gs2d.core.json_files import write_json
-from gs2d.io.run_dir import SPLATS, RunFolder
+from gs2d.io.run_dir import SPLATS, RunFolder, machine, now, versions
 from gs2d.io.splat_ply import read_splats
+from gs2d.kernels.library import describe_library
 from gs2d.pipeline.events import ignore
 from gs2d.pipeline.job import reload_job
 
@@ -32,6 +37,7 @@ RECIPES = (
     *("2dgs", "2dgs-60k", "2dgs-r", "2dgs-60k-restart", "2dgs-r-restart", "2dgs-no-nc", "2dgs-r-no-clone"),
     *("2dgs-60k-no-nc-late", "best", "2dgs-60k-edges-camera"),
 )
+KEY = ("capture", "recipe", "seed", "scale")  # of a row
 
 
 def row_of(case: Case, recipe: str, args: argparse.Namespace) -> dict[str, Any]:
@@ -51,6 +57,25 @@ def row_of(case: Case, recipe: str, args: argparse.Namespace) -> dict[str, Any]:
         "f_scores": [] if surface is None else [row["f_score"] for row in surface["thresholds"]],
         "chamfer": None if surface is None else surface["chamfer"],
     }
+
+
+def made_by() -> dict[str, Any]:
+    """Return what the rows of now are of: the commit of this checkout, date, machine, its kernels and versions."""
+    words = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    commit = subprocess.run(words, capture_output=True, text=True).stdout.strip()
+    facts = {"date": now(), "machine": machine(), "kernels": describe_library(), "versions": versions()}
+    return {"commit": commit or None, **facts}
+
+
+def merge_rows(file: Path, rows: list[dict[str, Any]], made: dict[str, Any]) -> None:
+    """Put rows into a file of rows, those with the same capture, recipe, seed and scale in place of what was there."""
+    kept = json.loads(file.read_text())["rows"] if file.exists() else []
+    found = {tuple(row[name] for name in KEY): row for row in kept}
+    for row in rows:
+        old = found.get(tuple(row[name] for name in KEY))
+        if old is None or any(old[name] != value for name, value in row.items()):
+            found[tuple(row[name] for name in KEY)] = {**row, "made": made}
+    write_json(file, {"format": 1, "rows": list(found.values())})
 
 
 def line_of(row: dict[str, Any]) -> str:
@@ -73,6 +98,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--captures", nargs="+", choices=list(CASES), default=list(CASES))
     parser.add_argument("--recipes", nargs="+", default=list(RECIPES))
+    parser.add_argument("--results", type=Path, help="file of rows of several days, to put these into")
     args = parser.parse_args(arguments)
     args.folder.mkdir(parents=True, exist_ok=True)
     names = ("scene", "recipe", "iterations", "PSNR", "worst view", "training views", "F 0.25 %", "Chamfer", "splats")
@@ -87,6 +113,8 @@ def main(arguments: list[str] | None = None) -> None:
                 found = row_of(CASES[name], recipe, args)
                 rows.append(found)
                 write_json(kept, rows)
+            if args.results:
+                merge_rows(args.results, [found], made_by())
             print(line_of(found), flush=True)
 
 

@@ -26,7 +26,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--photographs", type=int, default=400)
     parser.add_argument("--size", type=int, default=320, help="width, px; the height is three quarters of it")
     parser.add_argument("--points", type=int, help="sparse points, about (default: 40 a photograph)")
-    parser.add_argument("--side", type=float, help="m of land, about (default: it grows with the photographs)")
+    parser.add_argument("--side", type=float, help="m flown over, about (default: it grows with the photographs)")
+    parser.add_argument("--land", type=float, help="side of the land, m (default: it reaches beyond all pictures)")
     parser.add_argument("--gps-noise", type=float, default=1.5, help="m, along each axis")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int)
@@ -37,6 +38,7 @@ def main(arguments: list[str] | None = None) -> int:
         height=args.size * 3 // 4,
         points=args.points,
         side=args.side,
+        land=args.land,
         seed=args.seed,
         gps_noise=args.gps_noise,
     )

@@ -7,7 +7,7 @@
 For each number a flown capture (``benchmarks.flown_capture``), which is made where it is not there, is trained on from
 so many splats on its true surface, with photographs prepared on the disk; then it is meshed whole and its report is
 written, each by a command of its own. Memory is the largest sum of what a command and its children have resident,
-looked at twenty times a second. A hundred photographs show less of the land's rim than thousands, and a larger surface
+looked at fifty times a second. A hundred photographs show less of the land's rim than thousands, and a larger surface
 takes more memory: ``--land`` ends the land within what is flown over, so that any number shows all of it, and
 ``--bbox`` meshes a part that all show, too. Where ``--compare`` names numbers, those are trained on
 with all in memory, too, and must give the same bytes. The table goes to standard output, figures to
@@ -38,7 +38,7 @@ from gs2d.io.splat_ply import write_splats
 from gs2d.synthetic.flight import Flight, write_flight
 from gs2d.training.initialize import initial_splats
 
-EVERY = 0.05  # s, between looks at memory
+EVERY = 0.02  # s, between looks at memory
 ITERATIONS_OF_ALL = 30_000  # of the recipe 2dgs
 
 
@@ -163,7 +163,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--photographs", type=int, nargs="+", default=[100, 400, 1600, 6400])
     parser.add_argument("--compare", type=int, nargs="*", default=[100])
     parser.add_argument("--size", type=int, default=96)
-    parser.add_argument("--side", type=float, default=200.0, help="m of land, the same for any number of photographs")
+    parser.add_argument(
+        "--side", type=float, default=200.0, help="m flown over, the same for any number of photographs"
+    )
     parser.add_argument("--land", type=float, help="side of the land, m, where it is to end within what is flown over")
     parser.add_argument("--splats", type=int, default=20_000)
     parser.add_argument("--bbox", type=float, nargs=6, help="also mesh this part, of which any number shows the same")

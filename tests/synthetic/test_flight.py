@@ -116,3 +116,16 @@ def test_too_few_photographs_are_refused_in_one_line(tmp_path: Path, capsys: pyt
     assert main([str(tmp_path / "one"), "--photographs", "1", "--size", "64"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "one").exists()
+
+
+def test_land_that_ends_within_what_is_flown_over_is_the_same_for_any_number_of_photographs(tmp_path: Path) -> None:
+    surfaces = []
+    for count in (4, 9):
+        flight = Flight(count, width=32, height=24, points=2000, side=80.0, land=96.0)
+        write_flight(tmp_path / str(count), flight, threads=1)
+        surfaces.append((tmp_path / str(count) / "mesh_gt.ply").read_bytes())
+    assert surfaces[0] == surfaces[1]
+    assert np.abs(read_mesh(tmp_path / "4/mesh_gt.ply").vertices[:, :2]).max() == 48.0
+    wide = Flight(4, width=32, height=24, points=2000, side=80.0)
+    write_flight(tmp_path / "wide", wide, threads=1)
+    assert np.abs(read_mesh(tmp_path / "wide/mesh_gt.ply").vertices[:, :2]).max() > 96.0

@@ -32,7 +32,7 @@ class Zoom(NamedTuple):
         return (self.k1, self.k2) if self.k1 or self.k2 else None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Camera:
     """A pinhole camera in the OpenCV convention: x right, y down, z forward.
 

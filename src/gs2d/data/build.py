@@ -111,7 +111,7 @@ class Capture:
     finds_masks: bool = True
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Decoder:
     """Reads one photograph: decode, undistort, downscale; with its masks."""
 

@@ -38,22 +38,27 @@ _OF_PILLOW = (SyntaxError, RecursionError, OverflowError, Image.DecompressionBom
 _LEVEL = 1  # of zlib: higher ones take three times as long for a tenth
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Stored:
     """Reads one prepared picture; makes it anew where its file is gone or damaged since.
 
     Attributes
     ----------
-    file : Path
+    folder : Path
     key : str
         Of what it was made of.
     original : callable
         Makes the picture from the photograph.
     """
 
-    file: Path
+    folder: Path  # of all: a path for each photograph would be 500 bytes more
     key: str
     original: Callable[[], DecodedImage]
+
+    @property
+    def file(self) -> Path:
+        """Where the picture lies."""
+        return file_of(self.folder, self.key)
 
     def __call__(self) -> DecodedImage:
         """Return the picture."""
@@ -192,7 +197,7 @@ def prepared_scene(scene: Scene, folder: Path) -> Scene:
         key = key_of(view)
         if key is None:
             return view
-        return replace(view, decode=Stored(file_of(folder, key), key, view.decode), cache=cache)
+        return replace(view, decode=Stored(folder, key, view.decode), cache=cache)
 
     train, test = (tuple(stored(view) for view in views) for views in (scene.train, scene.test))
     return replace(scene, train=train, test=test, ahead=AHEAD)

@@ -24,7 +24,7 @@ from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class View:
     """One posed photograph, decoded when asked for.
 

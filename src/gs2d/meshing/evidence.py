@@ -8,13 +8,12 @@ many as the pixels that saw the surface best, not as the voxels that it was cut 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from gs2d.core.camera import Camera
-from gs2d.core.memory import trim
 from gs2d.core.mesh import Mesh
 from gs2d.meshing.depth_maps import DepthMap
 from gs2d.meshing.marching_cubes import components, select_faces
@@ -171,7 +170,7 @@ class Cleaned:
 
 
 def clean(mesh: Mesh, maps: Iterable[DepthMap], count: int, tolerance: float) -> Cleaned:
-    """Leave of a mesh what the views saw, in as many faces as they carry.
+    """Leave of a mesh what the views saw.
 
     Parameters
     ----------
@@ -187,10 +186,13 @@ def clean(mesh: Mesh, maps: Iterable[DepthMap], count: int, tolerance: float) ->
     mesh, evidence = large_components(mesh, evidence)
     left.append(float(areas(mesh).sum()))
     found = pixels(mesh, evidence)
-    del evidence
-    trim()  # what views were looked up in: another process comes beside this one
     parts = [area / max(left[0], 1e-300) for area in left[1:]]
-    return Cleaned(simplified_to(mesh, int(FACES_A_PIXEL * found)), found, 1 - parts[0], parts[0] - parts[1])
+    return Cleaned(mesh, found, 1 - parts[0], parts[0] - parts[1])
+
+
+def simplified(cleaned: Cleaned) -> Cleaned:
+    """Return a mesh in as many faces as the pixels of its surface carry."""
+    return replace(cleaned, mesh=simplified_to(cleaned.mesh, int(FACES_A_PIXEL * cleaned.pixels)))
 
 
 def supported(mesh: Mesh, evidence: Evidence, views: int) -> tuple[Mesh, Evidence]:

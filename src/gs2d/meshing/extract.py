@@ -13,7 +13,7 @@ from gs2d.core.mesh import Mesh
 from gs2d.meshing.bounds import DepthSample, FusionBounds, derive_limits, sample_depths, widen_truncation
 from gs2d.meshing.consistency import depth_noise
 from gs2d.meshing.depth_maps import RenderedView, Spool
-from gs2d.meshing.evidence import Cleaned, clean
+from gs2d.meshing.evidence import Cleaned, clean, simplified
 from gs2d.meshing.marching_cubes import components, inside_box, keep_components
 from gs2d.meshing.slabs import SLAB_BYTES, fused_surface
 from gs2d.meshing.tsdf import Blocks, find_blocks, fusion_backend
@@ -141,6 +141,8 @@ def extract(
             return found
         del whole
         cleaned = clean(found.mesh, spool, len(spool), limits.truncation)
+        found = replace(found, mesh=cleaned.mesh)  # the other is let go before the collapse, which takes most
+        cleaned = simplified(cleaned)
         return replace(found, mesh=cleaned.mesh, cleaned=cleaned)
 
 

@@ -7,12 +7,18 @@ and a report to write yet.
 from __future__ import annotations
 
 import io
+import os
 import subprocess
 import sys
 from typing import Any
 
 import numpy as np
 
+from gs2d.core.memory import trim
+
+# Of glibc. Its vectors double as they grow, beyond 2^18 faces to 46 MB; what they leave then goes back at once, which
+# spares a mesh just above 20 MB.
+_MAPPED_BYTES = "131072"
 OWN_PROCESS_FACES = 100_000  # from which a process of its own (a fifth of a second) is worth what it gives back
 _PROGRAM = """
 import io, sys
@@ -51,9 +57,14 @@ def _elsewhere(points: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.nd
     """Collapse in another process; None where none can be had, or it came to grief."""
     packed = io.BytesIO()
     np.savez(packed, points=points, faces=faces, count=count)
+    trim()  # the other process comes beside this one, which looked views up until now
     try:
         done = subprocess.run(
-            [sys.executable, "-P", "-c", _PROGRAM], input=packed.getbuffer(), capture_output=True, check=True
+            [sys.executable, "-P", "-c", _PROGRAM],
+            input=packed.getbuffer(),
+            capture_output=True,
+            check=True,
+            env={**os.environ, "MALLOC_MMAP_THRESHOLD_": _MAPPED_BYTES},
         )
         with np.load(io.BytesIO(done.stdout)) as data:
             return data["points"], data["faces"]
