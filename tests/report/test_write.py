@@ -378,6 +378,21 @@ def test_the_mesh_is_shaded_by_its_faces_and_coloured_by_its_vertices() -> None:
     np.testing.assert_allclose(shown.shape[10, 2], 1.0)  # beside it: white
 
 
+def test_a_mesh_is_shaded_the_same_in_any_number_of_rows_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    vertices = np.random.default_rng(0).uniform(-1, 1, (60, 3)) + np.array([0, 0, 3.0])
+    colors = np.random.default_rng(1).integers(0, 256, (60, 3), np.uint8)
+    mesh = Mesh(vertices, np.arange(60, dtype=np.int32).reshape(20, 3), colors)
+    camera = Camera(40, 50, 40.0, 40.0, 20.0, 25.0, np.eye(4))
+    whole = report_mesh.mesh_images(mesh, [camera], width=40)[0]
+    monkeypatch.setattr(report_mesh, "_ROWS_AT_ONCE", 6)
+    parts = report_mesh.mesh_images(mesh, [camera], width=40)[0]
+    np.testing.assert_allclose(parts.shape, whole.shape, atol=1e-6)
+    assert whole.color is not None
+    assert parts.color is not None
+    np.testing.assert_array_equal(parts.color, whole.color)
+    assert len(np.unique(whole.color.reshape(-1, 3), axis=0)) > 500
+
+
 def test_the_capture_s_cameras_show_the_mesh_where_they_are_given(tmp_path: Path) -> None:
     run = fabricate(tmp_path / "run", size=16)
     assert "taking the third axis as up" in write_report(run).read_text()

@@ -231,13 +231,13 @@ def _hits(nearest: np.ndarray, edges: np.ndarray, directions_x: np.ndarray, dire
     face[hit] = (nearest[hit] & np.uint64(0xFFFFFFFF)).astype(np.int32)
     depth = np.zeros(width * height, dtype=np.float32)
     depth[hit] = (nearest[hit] >> np.uint64(32)).astype(np.uint32).view(np.float32)
-    rays = np.flatnonzero(hit)
-    directions = np.stack(
-        [directions_x[rays % width], directions_y[rays // width], np.ones(len(rays))], axis=1
-    )  # [hits, 3]
-    e = np.einsum("rki,ri->rk", edges[face[rays]], directions)
     weights = np.zeros((width * height, 3), dtype=np.float32)
-    weights[rays] = e / e.sum(axis=1, keepdims=True)
+    every = np.flatnonzero(hit)
+    for start in range(0, len(every), _PAIRS_PER_CHUNK):
+        rays = every[start : start + _PAIRS_PER_CHUNK]
+        directions = np.stack([directions_x[rays % width], directions_y[rays // width], np.ones(len(rays))], axis=1)
+        e = np.einsum("rki,ri->rk", edges[face[rays]], directions)
+        weights[rays] = e / e.sum(axis=1, keepdims=True)
     return Hits(face.reshape(height, width), depth.reshape(height, width), weights.reshape(height, width, 3))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from gs2d.core.files import is_full
+from gs2d.core.memory import trim
 from gs2d.report.html import missing
 
 OnFailure = Callable[[str, Exception], None]
@@ -34,3 +35,5 @@ class Guard:
                 self._on_failure(name, error)
             why = " ".join(str(error).split()) or type(error).__name__
             return missing(f"The {name} could not be made: {why}")
+        finally:
+            trim()  # pictures were decoded and meshes drawn

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from gs2d.meshing.raycast import Hits, cast_camera
 _CLAY = np.array([0.86, 0.86, 0.88])
 _LAMP = np.array([-0.45, -0.65, -1.0]) / np.linalg.norm([-0.45, -0.65, -1.0])  # camera axes: left, up, towards the eye
 _SAMPLES = 2  # rays per pixel along each axis
+_ROWS_AT_ONCE = 64 * _SAMPLES
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,14 +55,14 @@ def mesh_images(mesh: Mesh, cameras: Sequence[Camera], *, width: int = 420) -> l
     for camera in cameras:
         resized = camera.resized(width, max(round(width * camera.height / camera.width), 1))
         hits = cast_camera(mesh.vertices.astype(np.float64), mesh.faces, resized, samples=_SAMPLES)
-        shape = _average(_clay(mesh, hits, resized), hits)
-        color = None if mesh.colors is None else _average(_vertex_colors(mesh, hits), hits)
+        shape = _average(hits, partial(_clay, mesh, resized))
+        color = None if mesh.colors is None else _average(hits, partial(_vertex_colors, mesh))
         images.append(MeshImage(shape, color))
     return images
 
 
-def _clay(mesh: Mesh, hits: Hits, camera: Camera) -> np.ndarray:
-    """Clay [hits, 3]: a lamp that travels with the camera, faces seen from both sides."""
+def _clay(mesh: Mesh, camera: Camera, hits: Hits, top: int) -> np.ndarray:
+    """Clay [hits, 3] of rows of rays from ``top``: a lamp that travels with the camera, faces seen from both sides."""
     hit = hits.face >= 0
     a, b, c = (mesh.vertices[mesh.faces[hits.face[hit], k]].astype(np.float64) for k in range(3))
     normal = np.cross(b - a, c - a) @ camera.rotation.T
@@ -69,7 +71,7 @@ def _clay(mesh: Mesh, hits: Hits, camera: Camera) -> np.ndarray:
     ray = np.stack(
         [
             ((x + 0.5) / _SAMPLES - camera.cx) / camera.fx,
-            ((y + 0.5) / _SAMPLES - camera.cy) / camera.fy,
+            ((y + top + 0.5) / _SAMPLES - camera.cy) / camera.fy,
             np.ones(len(x)),
         ],
         axis=1,
@@ -78,7 +80,7 @@ def _clay(mesh: Mesh, hits: Hits, camera: Camera) -> np.ndarray:
     return np.asarray((0.22 + 0.78 * np.maximum(normal @ _LAMP, 0.0))[:, None] * _CLAY)
 
 
-def _vertex_colors(mesh: Mesh, hits: Hits) -> np.ndarray:
+def _vertex_colors(mesh: Mesh, hits: Hits, _top: int) -> np.ndarray:
     """Interpolated vertex colours [hits, 3] in [0, 1]."""
     assert mesh.colors is not None
     hit = hits.face >= 0
@@ -86,10 +88,18 @@ def _vertex_colors(mesh: Mesh, hits: Hits) -> np.ndarray:
     return np.einsum("hk,hkc->hc", hits.weights[hit].astype(np.float64), corners)
 
 
-def _average(colors: np.ndarray, hits: Hits) -> np.ndarray:
-    """Pixels [H, W, 3]: the mean over the rays of each, white where they hit nothing."""
-    rays = np.ones((*hits.face.shape, 3))
-    rays[hits.face >= 0] = colors
+def _average(hits: Hits, paint: Callable[[Hits, int], np.ndarray]) -> np.ndarray:
+    """Pixels [H, W, 3]: the mean over the rays of each, white where they hit nothing.
+
+    ``paint`` gives the colours of the hits of some rows of rays, and is told the first row: those of all rays, in
+    doubles, were most of what a report took.
+    """
     height, width = hits.face.shape
-    blocks = rays.reshape(height // _SAMPLES, _SAMPLES, width // _SAMPLES, _SAMPLES, 3)
-    return np.asarray(blocks.mean(axis=(1, 3)), dtype=np.float32)
+    pixels = np.empty((height // _SAMPLES, width // _SAMPLES, 3), np.float32)
+    for top in range(0, height, _ROWS_AT_ONCE):
+        part = Hits(*(values[top : top + _ROWS_AT_ONCE] for values in (hits.face, hits.depth, hits.weights)))
+        rays = np.ones((*part.face.shape, 3))
+        rays[part.face >= 0] = paint(part, top)
+        blocks = rays.reshape(-1, _SAMPLES, width // _SAMPLES, _SAMPLES, 3)
+        pixels[top // _SAMPLES : (top + len(rays)) // _SAMPLES] = blocks.mean(axis=(1, 3))
+    return pixels
