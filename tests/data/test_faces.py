@@ -228,6 +228,9 @@ def test_a_wide_fisheye_is_cut_and_its_rim_is_kept_and_a_narrow_one_undistorted(
     assert names == {f"{index}_front.png" for index in range(9)}  # they look at the point
     assert len(in_front.depth) == int(scene.train[0].name.endswith("front.png"))
     assert {name for name in observed.seen if "_" in name and len(observed.seen[name])} == names
+    assert scene.observe() is observed
+    scene.forget()
+    assert scene.observe() is not observed
     narrow = Intrinsics(200, 200, 120.0, 120.0, 100.0, 100.0, Lens("fisheye", FISHEYE))
     assert field_of_view(narrow) < 120
     write_fisheyes(tmp_path / "narrow", narrow, FISHEYE)

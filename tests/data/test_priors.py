@@ -271,6 +271,20 @@ def test_points_are_known_by_the_photographs_that_were_found_to_show_them(tmp_pa
     assert observed.seen[names[2]].tolist() == []
 
 
+def test_what_photographs_show_is_read_once_until_it_is_forgotten(tmp_path: Path) -> None:
+    small_colmap(tmp_path)
+    scene = load_scene(tmp_path, test_every=0)
+    first = scene.observe()
+    assert scene.observe() is first
+    scene.forget()
+    again = scene.observe()
+    assert again is not first
+    np.testing.assert_array_equal(again.points, first.points)
+    assert {name: rows.tolist() for name, rows in again.seen.items()} == {
+        name: rows.tolist() for name, rows in first.seen.items()
+    }
+
+
 def test_a_model_without_points_cannot_say_which_are_seen(tmp_path: Path) -> None:
     small_colmap(tmp_path, points=[])
     scene = load_scene(tmp_path)

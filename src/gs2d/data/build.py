@@ -405,11 +405,11 @@ def _observed(capture: Capture, frames: Sequence[PosedImage]) -> Callable[[], Ob
     """Return what reads which points the views show: a face those of its photograph that lie in it."""
     if capture.observe is None:
         return None
-    observe = functools.cache(capture.observe)  # asked for by view after view
+    observe = capture.observe
     wholes = {frame.path: frame.name for frame in capture.frames}
     parts = [frame for frame in frames if frame.face is not None]
     if not parts:
-        return observe
+        return functools.cache(observe)  # asked for by view after view
 
     def by_face() -> ObservedPoints:
         found = observe()

@@ -312,9 +312,12 @@ class Scene:
         return self.train + self.test
 
     def forget(self) -> None:
-        """Drop decoded pictures from memory; a view that is asked for one decodes it again."""
+        """Drop decoded pictures and which points they show from memory; whoever asks for one has it read again."""
         for cache in {id(view.cache): view.cache for view in self.views}.values():
             cache.clear()
+        clear = getattr(self.observe, "cache_clear", None)  # of functools.cache
+        if clear is not None:
+            clear()
 
     def preload(self, threads: int = 2) -> Iterator[View]:
         """Decode every picture once, yielding each view when its picture is good.
