@@ -28,7 +28,7 @@ from gs2d.render.backends import Backend
 from gs2d.training.plane_sweep import sweep_downscale
 from gs2d.training.robust import looks_at_free_space, looks_at_seen_area
 
-PROGRAM_BYTES = 400 << 20  # torch, the kernels, the scene
+PROGRAM_BYTES = 384 << 20  # torch, the kernels, the scene
 SPLAT_BYTES = 1200  # parameters, moments, gradients and what the rasterizer holds of a splat (docs/performance.md)
 FUSION_BYTES = 220 << 20  # a slab, the surface of a default mesh and what cleans it: by ten runs (docs/scale.md)
 PLACE_BYTES = 15_000  # of that for a place of the dense start, three pixels of what was swept, where it is less
