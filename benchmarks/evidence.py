@@ -23,7 +23,7 @@ from typing import Any
 from benchmarks.quality_run import score_splats
 from benchmarks.results import Case, Method, run_case
 from gs2d.core.json_files import write_json
-from gs2d.io.run_dir import SPLATS, RunFolder, machine, now, versions
+from gs2d.io.run_dir import SPLATS, RunFolder
 from gs2d.io.splat_ply import read_splats
 from gs2d.kernels.library import describe_library
 from gs2d.pipeline.events import ignore
@@ -56,25 +56,23 @@ def row_of(case: Case, recipe: str, args: argparse.Namespace) -> dict[str, Any]:
         **score_splats(reload_job(run, ignore), read_splats(run.file(SPLATS))),
         "f_scores": [] if surface is None else [row["f_score"] for row in surface["thresholds"]],
         "chamfer": None if surface is None else surface["chamfer"],
+        "made": made_by(run.definition()),
     }
 
 
-def made_by() -> dict[str, Any]:
-    """Return what the rows of now are of: the commit of this checkout, date, machine, its kernels and versions."""
+def made_by(definition: dict[str, Any]) -> dict[str, Any]:
+    """Return what a run is of: its own date, machine and versions, and the commit and the kernels that score it."""
     words = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
     commit = subprocess.run(words, capture_output=True, text=True).stdout.strip()
-    facts = {"date": now(), "machine": machine(), "kernels": describe_library(), "versions": versions()}
-    return {"commit": commit or None, **facts}
+    facts = {name: definition[key] for name, key in (("date", "created"), ("machine", "machine"))}
+    return {"commit": commit or None, **facts, "kernels": describe_library(), "versions": definition["versions"]}
 
 
-def merge_rows(file: Path, rows: list[dict[str, Any]], made: dict[str, Any]) -> None:
-    """Put rows into a file of rows, those with the same capture, recipe, seed and scale in place of what was there."""
+def merge_row(file: Path, row: dict[str, Any]) -> None:
+    """Put a row into a file of rows, in place of the one with the same capture, recipe, seed and scale."""
     kept = json.loads(file.read_text())["rows"] if file.exists() else []
-    found = {tuple(row[name] for name in KEY): row for row in kept}
-    for row in rows:
-        old = found.get(tuple(row[name] for name in KEY))
-        if old is None or any(old[name] != value for name, value in row.items()):
-            found[tuple(row[name] for name in KEY)] = {**row, "made": made}
+    found = {tuple(other[name] for name in KEY): other for other in kept}
+    found[tuple(row[name] for name in KEY)] = row
     write_json(file, {"format": 1, "rows": list(found.values())})
 
 
@@ -114,7 +112,7 @@ def main(arguments: list[str] | None = None) -> None:
                 rows.append(found)
                 write_json(kept, rows)
             if args.results:
-                merge_rows(args.results, [found], made_by())
+                merge_row(args.results, found)
             print(line_of(found), flush=True)
 
 
