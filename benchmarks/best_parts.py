@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gs2d.config.presets import best, with_silhouette
+from gs2d.config.presets import SURFACE_NC, best, with_silhouette
 from gs2d.config.recipe import NORMAL_KINDS, GradDensify, LearningRates, LossTerm, Recipe, Stage
 
 
@@ -65,6 +65,7 @@ VARIANTS: dict[str, Recipe] = {
     "with_resets": _densify(reset_every=3_000, scale_cull_start=0),
     "normals_of_the_image": _normals(where="image"),
     "no_normals": _normals(weight=0.0),
+    "normals_as_2dgs": _normals(weight=SURFACE_NC),
     "median": replace(best(), fused_depth="median"),
     # Tried, and not in it.
     "size_cull": _densify(scale_cull_start=0),

@@ -8,9 +8,11 @@ import pytest
 
 from gs2d.config.describe import describe_recipe
 from gs2d.config.presets import (
+    BEST_NC,
     DEFAULT_RECIPE,
     OFFICIAL_ITERATIONS,
     RECIPES,
+    SURFACE_NC,
     get_recipe,
     with_fading_backdrop,
     with_robustness,
@@ -63,7 +65,10 @@ def test_best_surface_compares_views_in_its_last_fifth_alone() -> None:
     terms = {term.kind: (term.weight, term.start, term.every) for term in stage.losses if "multiview" in term.kind}
     assert terms == {"multiview_photometric": (0.6, 16_000, 2), "multiview_geometric": (0.04, 16_000, 2)}
     plain = tuple(term for term in stage.losses if "multiview" not in term.kind)
-    assert replace(stage, losses=plain) == get_recipe("best").stages[0]
+    (consistency,) = (term for term in plain if term.kind == "normal_consistency")
+    lighter = tuple(replace(term, weight=BEST_NC) if term is consistency else term for term in plain)
+    assert consistency.weight == SURFACE_NC > BEST_NC
+    assert replace(stage, losses=lighter) == get_recipe("best").stages[0]
 
 
 def test_rates_that_grow_by_themselves_do_not_grow_twice() -> None:

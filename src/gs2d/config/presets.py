@@ -46,6 +46,7 @@ DEPTH_WEIGHT, NORMAL_WEIGHT = 0.2, 0.05  # docs/decisions/priors.md
 DEFAULT_RECIPE = "best"  # of `gs2d train`, `reconstruct` and `demo`
 OFFICIAL_ITERATIONS = 30_000  # of 2DGS, for which its rates were chosen
 BEST_ITERATIONS, FAST_ITERATIONS = 20_000, 6_600
+BEST_NC, SURFACE_NC = 0.02, 0.05  # weight of normal consistency in best and in best-surface: docs/decisions/losses.md
 BACKDROP_RATE = 0.3  # docs/decisions/fog.md
 SETTLING, SETTLED = 0.3, 0.1  # of the iterations, at the end, in which rates fall, and to what: decisions/training.md
 DENSE_START = DenseStart(side=256, neighbours=3, fit=StartFit())  # docs/decisions/training.md
@@ -311,19 +312,19 @@ def with_dense_start(recipe: Recipe, *, still: bool = False, name: str | None = 
     return replace(recipe, name=name or f"{recipe.name}-dense", stages=(first, *rest), dense_start=DENSE_START)
 
 
-def best(iterations: int = BEST_ITERATIONS, *, name: str = "best") -> Recipe:
+def best(iterations: int = BEST_ITERATIONS, nc: float = BEST_NC, *, name: str = "best") -> Recipe:
     """Return the recipe for the best pictures and surface per minute: 2DGS from a fitted dense start, in one stage.
 
     Not in the paper. A scene that begins near its end needs no opacity resets, and half the iterations with rates that
     make up for it; large splats stay, which are what surroundings are made of; the mesh is of a depth in which no splat
-    decides alone (docs/recipes/best.md).
+    decides alone (docs/recipes/best.md). ``nc`` is the weight of normal consistency.
     """
     part = iterations / OFFICIAL_ITERATIONS
-    nc = LossTerm("normal_consistency", 0.05, round(NC_START * part), where="object")
+    consistency = LossTerm("normal_consistency", nc, round(NC_START * part), where="object")
     stage = Stage(
         "surface",
         iterations,
-        losses=(*PHOTOMETRIC, nc),
+        losses=(*PHOTOMETRIC, consistency),
         lr=_best_rates(iterations),
         densify=GradDensify(
             start=round(500 * part), stop=round(15_000 * part), reset_every=0, scale_cull_start=iterations
@@ -350,7 +351,7 @@ def _best_rates(iterations: int) -> LearningRates:
 def best_surface(*, name: str = "best-surface") -> Recipe:
     """Return ``best`` with neighbouring photographs compared in its last fifth: Chamfer before dB."""
     compared = MultiView(depth_downscale=2)
-    return with_multiview(best(), 0.6, 0.04, every=2, last=0.2, multiview=compared, name=name)
+    return with_multiview(best(nc=SURFACE_NC), 0.6, 0.04, every=2, last=0.2, multiview=compared, name=name)
 
 
 def _in_stages(recipe: Recipe, term: LossTerm) -> Recipe:
