@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gs2d.config.presets import SURFACE_NC, best, with_silhouette
+from gs2d.config.presets import SH_FASTER, SURFACE_NC, best, with_silhouette
 from gs2d.config.recipe import NORMAL_KINDS, GradDensify, LearningRates, LossTerm, Recipe, Stage
 
 
@@ -45,6 +45,10 @@ def _rates(stage: Stage) -> Stage:
     return replace(stage, lr=LearningRates(means_decay_steps=stage.iterations))
 
 
+def _sh_as_2dgs(stage: Stage) -> Stage:
+    return replace(stage, lr=replace(stage.lr, shN=stage.lr.shN / SH_FASTER))
+
+
 def _without_start() -> Recipe:
     """The official start of random or sparse points, and its resets."""
     changed = _densify(reset_every=3_000)
@@ -62,6 +66,7 @@ VARIANTS: dict[str, Recipe] = {
     "no_dense_start": _without_start(),
     "start_not_fitted": _unfitted(),
     "official_rates": _stage(_rates),
+    "sh_as_2dgs": _stage(_sh_as_2dgs),
     "with_resets": _densify(reset_every=3_000, scale_cull_start=0),
     "normals_of_the_image": _normals(where="image"),
     "no_normals": _normals(weight=0.0),

@@ -12,9 +12,11 @@ from gs2d.config.presets import (
     DEFAULT_RECIPE,
     OFFICIAL_ITERATIONS,
     RECIPES,
+    SH_FASTER,
     SURFACE_NC,
     get_recipe,
     with_fading_backdrop,
+    with_few_views,
     with_robustness,
 )
 from gs2d.config.recipe import GradDensify, LearningRates, Recipe, validate
@@ -58,6 +60,24 @@ def test_all_rates_are_low_at_the_end(name: str, scale: float) -> None:
     end = stage.iterations
     assert (stage.lr.settled_at(round(0.69 * end)), stage.lr.settled_at(end)) == (1.0, pytest.approx(0.1))
     assert stage.lr.means_at(end) == pytest.approx(stage.lr.means_final)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("scale", [1.0, 0.1])
+def test_colours_by_direction_learn_faster_but_from_few_photographs(name: str, scale: float) -> None:
+    recipe = with_robustness(scale_schedule(get_recipe(name), scale))
+    (stage,), (slow,) = recipe.stages, with_few_views(recipe).stages
+    assert stage.lr.shN == pytest.approx(SH_FASTER * stage.lr.sh0 / 20)
+    assert slow.lr.shN == pytest.approx(stage.lr.sh0 / 20)
+    assert replace(slow, lr=replace(slow.lr, shN=stage.lr.shN)) == stage
+    assert any("SH beyond degree 0 at 2.5 times" in line for line in describe_recipe(recipe))
+    assert not any("SH beyond" in line for line in describe_recipe(with_few_views(recipe)))
+
+
+def test_rates_of_another_s_choice_stay() -> None:
+    chosen = apply_overrides(get_recipe("best"), ["surface.lr.shN=0.001"])
+    assert with_few_views(chosen) == chosen
+    assert with_few_views(get_recipe("2dgs-r")) == get_recipe("2dgs-r")
 
 
 def test_best_surface_compares_views_in_its_last_fifth_alone() -> None:

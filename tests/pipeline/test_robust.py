@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d.config.presets import with_fading_backdrop, with_robustness
+from gs2d.config.presets import SH_FASTER, with_fading_backdrop, with_robustness
 from gs2d.config.protocols import DTU, GENERIC
 from gs2d.config.recipe import LearningRates
-from gs2d.config.robust import SplatDropout
+from gs2d.config.robust import FEW_VIEWS, SplatDropout
 from gs2d.config.serialize import to_json
 from gs2d.core.camera import look_at
 from gs2d.data.priors import ObservedPoints
@@ -298,3 +298,11 @@ def test_splats_of_an_even_backdrop_fade_and_that_is_said(
     assert protocol.background == pytest.approx((0.5, 0.5, 0.5), abs=0.02 if not varied else 0.1)
     (line,) = [event.text for event in heard if isinstance(event, Notice) and event.text.startswith("background")]
     assert line.endswith("splats of that colour fade") == said
+
+
+@pytest.mark.parametrize(("views", "times"), [(FEW_VIEWS, 1.0), (FEW_VIEWS + 1, SH_FASTER)])
+@pytest.mark.parametrize("robust", ["on", "off"])
+def test_few_photographs_teach_colours_by_direction_slowly(views: int, times: float, robust: str) -> None:
+    asked = options(recipe="best", robust=robust)
+    (stage,) = settled(asked, ring(np.ones(views)), GENERIC, lambda _: None)[0].stages
+    assert stage.lr.shN == pytest.approx(times * stage.lr.sh0 / 20)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 from gs2d.config.densify import Densify
-from gs2d.config.recipe import ALL, CloneInPlace, GradDensify, LossTerm, RankByError, Recipe, Stage
+from gs2d.config.recipe import ALL, CloneInPlace, GradDensify, LearningRates, LossTerm, RankByError, Recipe, Stage
 
 
 def describe_recipe(recipe: Recipe) -> Iterator[str]:
@@ -90,6 +91,10 @@ def _describe_stage(stage: Stage) -> Iterator[str]:
         groups.setdefault(rows, []).append(attribute)
     for rows, attributes in groups.items():
         yield f"trains {', '.join(attributes)} of {'all splats' if rows == 'all' else repr(rows)}"
+    official = LearningRates()
+    times = stage.lr.shN / stage.lr.sh0 / (official.shN / official.sh0) if stage.lr.sh0 else 1.0
+    if "shN" in stage.train and not math.isclose(times, 1.0):
+        yield f"SH beyond degree 0 at {times:g} times their rate in 2DGS, next to degree 0"
     if stage.lr.settle_steps:
         falls = f"to {stage.lr.settle_factor:g} of themselves over {stage.lr.settle_steps:,} iterations"
         yield f"rates but that of the means fall after iteration {stage.lr.settle_start:,}, {falls}"

@@ -6,6 +6,7 @@ paper's. Scenes are unknown here: what depends on the data set is the protocol's
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
@@ -48,6 +49,7 @@ OFFICIAL_ITERATIONS = 30_000  # of 2DGS, for which its rates were chosen
 BEST_ITERATIONS, FAST_ITERATIONS = 20_000, 6_600
 BEST_NC, SURFACE_NC = 0.02, 0.05  # weight of normal consistency in best and in best-surface: docs/decisions/losses.md
 BACKDROP_RATE = 0.3  # docs/decisions/fog.md
+SH_FASTER = 2.5  # times the official rate of SH beyond the first: docs/decisions/training.md
 SETTLING, SETTLED = 0.3, 0.1  # of the iterations, at the end, in which rates fall, and to what: decisions/training.md
 DENSE_START = DenseStart(side=256, neighbours=3, fit=StartFit())  # docs/decisions/training.md
 STREET_START = DenseStart(sphere=BackgroundSphere())  # docs/decisions/fog.md
@@ -317,7 +319,8 @@ def best(iterations: int = BEST_ITERATIONS, nc: float = BEST_NC, *, name: str = 
 
     Not in the paper. A scene that begins near its end needs no opacity resets, and half the iterations with rates that
     make up for it; large splats stay, which are what surroundings are made of; the mesh is of a depth in which no splat
-    decides alone (docs/recipes/best.md). ``nc`` is the weight of normal consistency.
+    decides alone (docs/recipes/best.md). ``nc`` is the weight of normal consistency. Colours that depend on direction
+    learn faster than in 2DGS, but where photographs are few (:func:`with_few_views`).
     """
     part = iterations / OFFICIAL_ITERATIONS
     consistency = LossTerm("normal_consistency", nc, round(NC_START * part), where="object")
@@ -336,16 +339,34 @@ def best(iterations: int = BEST_ITERATIONS, nc: float = BEST_NC, *, name: str = 
 
 
 def _best_rates(iterations: int) -> LearningRates:
-    """Return official rates made longer for fewer iterations, which settle at the end."""
+    """Return official rates made longer for fewer iterations, which settle at the end; those of SH beyond 0 faster."""
     times = (iterations / OFFICIAL_ITERATIONS) ** -LONGER
     start = round((1 - SETTLING) * iterations)
+    official = LearningRates(means_decay_steps=iterations)
     return replace(
-        LearningRates(means_decay_steps=iterations).times(times),
+        replace(official, shN=SH_FASTER * official.shN).times(times),
         stretch=LONGER,
         settle_start=start,
         settle_steps=iterations - start,
         settle_factor=SETTLED,
     )
+
+
+def with_few_views(recipe: Recipe) -> Recipe:
+    """Return the recipe for at most ``FEW_VIEWS`` training photographs: SH beyond degree 0 learn as in 2DGS.
+
+    Of directions that a photograph or two show alone, faster SH learn those by heart (docs/decisions/training.md).
+    Rates of another's choice stay.
+    """
+
+    def slower(stage: Stage) -> Stage:
+        official, lr = LearningRates(), stage.lr
+        share = official.shN / official.sh0
+        if not math.isclose(lr.shN, SH_FASTER * share * lr.sh0):
+            return stage
+        return replace(stage, lr=replace(lr, shN=share * lr.sh0))
+
+    return replace(recipe, stages=tuple(map(slower, recipe.stages)))
 
 
 def best_surface(*, name: str = "best-surface") -> Recipe:

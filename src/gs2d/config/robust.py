@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 
 from gs2d.config.validate import integer, number, require
 
+FEW_VIEWS = 24  # training photographs, or less: what shows in one of them alone is learned by heart (fog.md)
+
 
 @dataclass(frozen=True)
 class StartFit:
@@ -218,7 +220,7 @@ class SplatDropout:
     """
 
     rate: float = 0.1
-    max_views: int = 24
+    max_views: int = FEW_VIEWS
 
 
 def check_robust(

@@ -18,6 +18,7 @@ from gs2d.config.presets import (
     with_depth_prior,
     with_exposure,
     with_fading_backdrop,
+    with_few_views,
     with_intrinsics,
     with_normal_prior,
     with_photometry,
@@ -26,6 +27,7 @@ from gs2d.config.presets import (
 )
 from gs2d.config.protocols import BLACK, GENERIC, Protocol, get_protocol, protocol_for
 from gs2d.config.recipe import Recipe, validate
+from gs2d.config.robust import FEW_VIEWS
 from gs2d.config.schedule import longer_steps, scale_schedule
 from gs2d.config.serialize import apply_overrides, decode, from_json, to_json
 from gs2d.core.splats import Splats
@@ -417,6 +419,7 @@ def settled(options: TrainOptions, scene: Scene, protocol: Protocol, on_event: O
     RecipeError, DataError
     """
     recipe, protocol = with_backdrop(fit_recipe(options, scene, protocol, on_event), protocol, scene, on_event)
+    recipe = with_few_views(recipe) if len(scene.train) <= FEW_VIEWS else recipe
     return recipe, with_fused_depth(protocol, recipe)
 
 
