@@ -303,6 +303,9 @@ def test_splats_of_an_even_backdrop_fade_and_that_is_said(
 @pytest.mark.parametrize(("views", "times"), [(FEW_VIEWS, 1.0), (FEW_VIEWS + 1, SH_FASTER)])
 @pytest.mark.parametrize("robust", ["on", "off"])
 def test_few_photographs_teach_colours_by_direction_slowly(views: int, times: float, robust: str) -> None:
+    heard: list[Event] = []
     asked = options(recipe="best", robust=robust)
-    (stage,) = settled(asked, ring(np.ones(views)), GENERIC, lambda _: None)[0].stages
+    (stage,) = settled(asked, ring(np.ones(views)), GENERIC, heard.append)[0].stages
     assert stage.lr.shN == pytest.approx(times * stage.lr.sh0 / 20)
+    said = [event.text for event in heard if isinstance(event, Notice) and "SH beyond" in event.text]
+    assert said == ["24 training photographs: SH beyond degree 0 learn as in 2DGS, not faster"] * (times == 1.0)

@@ -49,7 +49,7 @@ OFFICIAL_ITERATIONS = 30_000  # of 2DGS, for which its rates were chosen
 BEST_ITERATIONS, FAST_ITERATIONS = 20_000, 6_600
 BEST_NC, SURFACE_NC = 0.02, 0.05  # weight of normal consistency in best and in best-surface: docs/decisions/losses.md
 BACKDROP_RATE = 0.3  # docs/decisions/fog.md
-SH_FASTER = 2.5  # times the official rate of SH beyond the first: docs/decisions/training.md
+SH_FASTER = 2.5  # times the official rate of SH beyond degree 0: docs/decisions/training.md
 SETTLING, SETTLED = 0.3, 0.1  # of the iterations, at the end, in which rates fall, and to what: decisions/training.md
 DENSE_START = DenseStart(side=256, neighbours=3, fit=StartFit())  # docs/decisions/training.md
 STREET_START = DenseStart(sphere=BackgroundSphere())  # docs/decisions/fog.md

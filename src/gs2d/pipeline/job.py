@@ -419,7 +419,9 @@ def settled(options: TrainOptions, scene: Scene, protocol: Protocol, on_event: O
     RecipeError, DataError
     """
     recipe, protocol = with_backdrop(fit_recipe(options, scene, protocol, on_event), protocol, scene, on_event)
-    recipe = with_few_views(recipe) if len(scene.train) <= FEW_VIEWS else recipe
+    if len(scene.train) <= FEW_VIEWS and (slower := with_few_views(recipe)) != recipe:
+        recipe = slower
+        on_event(Notice(f"{len(scene.train)} training photographs: SH beyond degree 0 learn as in 2DGS, not faster"))
     return recipe, with_fused_depth(protocol, recipe)
 
 
