@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gs2d.config.presets import SH_FASTER, SURFACE_NC, best, with_silhouette
+from gs2d.config.presets import SH_FASTER, SURFACE_NC, best
 from gs2d.config.recipe import NORMAL_KINDS, GradDensify, LearningRates, LossTerm, Recipe, Stage
 
 
@@ -45,6 +45,10 @@ def _rates(stage: Stage) -> Stage:
     return replace(stage, lr=LearningRates(means_decay_steps=stage.iterations))
 
 
+def _without_silhouette(stage: Stage) -> Stage:
+    return replace(stage, losses=tuple(term for term in stage.losses if term.kind != "silhouette"))
+
+
 def _sh_as_2dgs(stage: Stage) -> Stage:
     return replace(stage, lr=replace(stage.lr, shN=stage.lr.shN / SH_FASTER))
 
@@ -71,10 +75,10 @@ VARIANTS: dict[str, Recipe] = {
     "normals_of_the_image": _normals(where="image"),
     "no_normals": _normals(weight=0.0),
     "normals_as_2dgs": _normals(weight=SURFACE_NC),
+    "no_silhouette": _stage(_without_silhouette),
     "median": replace(best(), fused_depth="median"),
     # Tried, and not in it.
     "size_cull": _densify(scale_cull_start=0),
-    "silhouette": with_silhouette(best(), name="best"),
     "by_error": _densify(absolute=True, error_views=8, max_splats=40_000),
     "normals_by_edges": _normals(edge_power=2.0),
     "normals_of_transmittance": _normals(depth="transmittance"),

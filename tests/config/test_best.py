@@ -9,6 +9,7 @@ import pytest
 from gs2d.config.describe import describe_recipe
 from gs2d.config.presets import (
     BEST_NC,
+    BEST_SILHOUETTE,
     DEFAULT_RECIPE,
     OFFICIAL_ITERATIONS,
     RECIPES,
@@ -89,6 +90,15 @@ def test_best_surface_compares_views_in_its_last_fifth_alone() -> None:
     lighter = tuple(replace(term, weight=BEST_NC) if term is consistency else term for term in plain)
     assert consistency.weight == SURFACE_NC > BEST_NC
     assert replace(stage, losses=lighter) == get_recipe("best").stages[0]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_alpha_is_that_of_photographs_that_have_one(name: str) -> None:
+    recipe = get_recipe(name)
+    (term,) = (term for term in recipe.stages[0].losses if term.kind == "silhouette")
+    assert (term.weight, term.start, term.required) == (BEST_SILHOUETTE, 0, False)
+    assert from_json(to_json(recipe)) == recipe
+    assert "loss silhouette: 0.3, where photographs have an alpha channel" in "\n".join(describe_recipe(recipe))
 
 
 def test_rates_that_grow_by_themselves_do_not_grow_twice() -> None:

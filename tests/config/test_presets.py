@@ -17,6 +17,7 @@ from gs2d.config.presets import (
     with_edges,
     with_multiview,
     with_normal_prior,
+    with_silhouette,
 )
 from gs2d.config.priors import DepthPrior, NormalPrior
 from gs2d.config.recipe import ALL, CloneInPlace, Exposure, GradDensify, LossTerm, RankByError, Recipe, Stage, validate
@@ -213,6 +214,8 @@ def test_silhouettes_are_kept_wherever_opacity_or_geometry_learns() -> None:
     assert weights(surface) == weights(plain[0]) | {"silhouette": (0.1, 0)}
     assert appearance == plain[1]  # colours alone: alpha cannot change, and views can be cached
     assert weights(refine) == weights(plain[2]) | {"silhouette": (0.1, 0)}
+    again = with_silhouette(get_recipe("2dgs-r-silhouette"), 0.3, name="more")
+    assert weights(again.stages[0]) == weights(plain[0]) | {"silhouette": (0.3, 0)}
 
 
 @pytest.mark.parametrize("base", ["2dgs", "2dgs-60k", "2dgs-r"])

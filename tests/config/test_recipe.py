@@ -150,6 +150,10 @@ def test_photographs_are_twice_as_large_after_each_iteration_that_says_so() -> N
         (one(losses=(*L1, LossTerm("ssim", 1.0, where="object"))), "loss 'ssim' takes no where; only normal_consist"),
         (one(losses=(*L1, LossTerm("ssim", 1.0, edge_power=1.0))), "loss 'ssim' takes no edge_power; only normal"),
         (
+            one(losses=(*L1, LossTerm("ssim", 1.0, required=False))),
+            "required of loss 'ssim' cannot be left out where photographs lack something; only silhouette can",
+        ),
+        (
             one(losses=(*L1, LossTerm("normal_consistency", 1.0, where="alpha"))),
             "where of loss 'normal_consistency' must be one of image, object; got 'alpha'",
         ),

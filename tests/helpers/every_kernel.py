@@ -134,7 +134,8 @@ def whole_steps(emulator: Emulator, case: Case) -> dict[str, Tensor]:
             mask=torch.rand(height, width, generator=g) < 0.8,
             valid=height * width,
             background=(0.1, 0.5, 0.2),
-            weights={"l1": 0.8, "ssim": 0.2, "normal_consistency": 0.05},
+            weights={"l1": 0.8, "ssim": 0.2, "normal_consistency": 0.05}
+            | ({"silhouette": 0.1} if channels == 4 else {}),
             depth="mean",
             at_camera=False,
             of_object=True,

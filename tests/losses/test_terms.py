@@ -326,10 +326,13 @@ def test_the_fused_kinds_are_some_of_gs2ds_own() -> None:
     assert set(FUSED) < set(LOSS_KINDS)
 
 
-def test_a_silhouette_term_without_an_alpha_channel_says_so() -> None:
-    output, camera = make_output(5, 6), make_camera(6, 5)
-    term = [LossTerm("silhouette", 0.1)]
+def test_a_silhouette_term_without_an_alpha_channel_says_so_or_is_left_out_where_none_is_required() -> None:
+    output, camera, alpha = make_output(5, 6), make_camera(6, 5), torch.rand(5, 6)
+    given = (output, torch.rand(5, 6, 3), None, camera)
+    choices: dict[str, Any] = {"iteration": 1, "depth_kind": "mean", "backend": "reference"}
     with pytest.raises(RecipeError, match="alpha channel, got one without"):
-        compute_losses(
-            output, torch.rand(5, 6, 3), None, camera, term, iteration=1, depth_kind="mean", backend="reference"
-        )
+        compute_losses(*given, [LossTerm("silhouette", 0.1)], **choices)
+    terms = [LossTerm("l1", 1.0), LossTerm("silhouette", 0.1, required=False)]
+    assert set(compute_losses(*given, terms, **choices)) == {"l1"}
+    found = compute_losses(*given, terms, **choices, silhouette=alpha)
+    torch.testing.assert_close(found["silhouette"], 0.1 * (output.alpha - alpha).abs().mean())

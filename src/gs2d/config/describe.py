@@ -119,6 +119,7 @@ def _describe_choices(term: LossTerm) -> str:
     said += ["of the object alone"] if term.where == "object" else []
     said += ["empty pixels at the camera's centre"] if term.edges == "camera" else []
     said += [f"by (1 - image gradient)^{term.edge_power:g}"] if term.edge_power else []
+    said += ["where photographs have an alpha channel"] if not term.required else []
     return "".join(f", {words}" for words in said)
 
 

@@ -47,6 +47,8 @@ DEPTH_WEIGHT, NORMAL_WEIGHT = 0.2, 0.05  # docs/decisions/priors.md
 DEFAULT_RECIPE = "best"  # of `gs2d train`, `reconstruct` and `demo`
 OFFICIAL_ITERATIONS = 30_000  # of 2DGS, for which its rates were chosen
 BEST_ITERATIONS, FAST_ITERATIONS = 20_000, 6_600
+# weights of the silhouette loss in *-silhouette and in best: docs/decisions/losses.md
+SILHOUETTE, BEST_SILHOUETTE = 0.1, 0.3
 BEST_NC, SURFACE_NC = 0.02, 0.05  # weight of normal consistency in best and in best-surface: docs/decisions/losses.md
 BACKDROP_RATE = 0.3  # docs/decisions/fog.md
 SH_FASTER = 2.5  # times the official rate of SH beyond degree 0: docs/decisions/training.md
@@ -149,16 +151,18 @@ def two_dgs_r(*, name: str = "2dgs-r", stage_2: Stage | None = None, stage_3: St
     return Recipe(name, (surface(), stage_2 or appearance(), stage_3 or refine()))
 
 
-def with_silhouette(recipe: Recipe, weight: float = 0.1, *, name: str) -> Recipe:
+def with_silhouette(recipe: Recipe, weight: float = SILHOUETTE, *, name: str) -> Recipe:
     """Add a silhouette loss wherever opacity or geometry is trained; photographs need an alpha channel.
 
     Not in the paper. Colour cannot see splats that have the background's colour, and the official normal consistency
     rewards their coverage: they grow without bound (docs/results.md).
     """
-    stages = (
-        replace(stage, losses=(*stage.losses, LossTerm("silhouette", weight))) if set(stage.train) - set(SH) else stage
-        for stage in recipe.stages
-    )
+
+    def extended(stage: Stage) -> Stage:
+        others = (term for term in stage.losses if term.kind != "silhouette")
+        return replace(stage, losses=(*others, LossTerm("silhouette", weight)))
+
+    stages = (extended(stage) if set(stage.train) - set(SH) else stage for stage in recipe.stages)
     return replace(recipe, name=name, stages=tuple(stages))
 
 
@@ -318,16 +322,18 @@ def best(iterations: int = BEST_ITERATIONS, nc: float = BEST_NC, *, name: str = 
     """Return the recipe for the best pictures and surface per minute: 2DGS from a fitted dense start, in one stage.
 
     Not in the paper. A scene that begins near its end needs no opacity resets, and half the iterations with rates that
-    make up for it; large splats stay, which are what surroundings are made of; the mesh is of a depth in which no splat
-    decides alone (docs/recipes/best.md). ``nc`` is the weight of normal consistency. Colours that depend on direction
+    make up for it; large splats stay, which are what surroundings are made of; alpha is that of the photographs which
+    have one; the mesh is of a depth in which no splat decides alone (docs/recipes/best.md). ``nc`` is the weight of
+    normal consistency. Colours that depend on direction
     learn faster than in 2DGS, but where photographs are few (:func:`with_few_views`).
     """
     part = iterations / OFFICIAL_ITERATIONS
     consistency = LossTerm("normal_consistency", nc, round(NC_START * part), where="object")
+    silhouette = LossTerm("silhouette", BEST_SILHOUETTE, required=False)
     stage = Stage(
         "surface",
         iterations,
-        losses=(*PHOTOMETRIC, consistency),
+        losses=(*PHOTOMETRIC, consistency, silhouette),
         lr=_best_rates(iterations),
         densify=GradDensify(
             start=round(500 * part), stop=round(15_000 * part), reset_every=0, scale_cull_start=iterations

@@ -43,7 +43,7 @@ class LossTerm:
     ----------
     kind : str
         "l1", "ssim" (1 - SSIM), "normal_consistency", "normal_consistency_per_splat" (the paper's Eq. 7 form),
-        "distortion", "silhouette" (alpha against that of the photographs, which must have one), or, in a recipe with
+        "distortion", "silhouette" (alpha against that of the photographs: see ``required``), or, in a recipe with
         ``multiview``, "multiview_photometric" (1 - NCC of warped patches), "multiview_geometric" (round trip, px); with
         ``depth_prior`` "depth_prior" (relative error of depth), with ``normal_prior`` "normal_prior" (1 - cosine); or
         one that a package or a program has registered (docs/extending.md).
@@ -68,6 +68,8 @@ class LossTerm:
     every : int
         Iterations of which one has this term (those that it divides); the others cost nothing for it. The weight is as
         written, not multiplied by ``every``.
+    required : bool
+        Of silhouette: whether photographs must have an alpha channel; if not, those without do without the term.
     """
 
     kind: str
@@ -79,6 +81,7 @@ class LossTerm:
     where: str = field(default="image", metadata={"omit_empty": True})
     edge_power: float = field(default=0.0, metadata={"omit_empty": True})
     every: int = field(default=1, metadata={"omit_empty": True})
+    required: bool = field(default=True, metadata={"omit_empty": True})
 
     def is_active(self, iteration: int) -> bool:
         """Whether an iteration (from 1) of the stage has this term."""
@@ -517,6 +520,8 @@ def _check_losses(where: str, stage: Stage, to_train: bool) -> None:
             plain = getattr(term, name) == getattr(LossTerm, name)
             message = f"loss {term.kind!r} takes no {name}; only {' and '.join(NORMAL_KINDS)} do"
             require(plain or term.kind in NORMAL_KINDS, f"{where}: {message}")
+        message = f"loss {term.kind!r} cannot be left out where photographs lack something; only silhouette can"
+        require(term.required or term.kind == "silhouette", f"{where}: required of {message}")
     compared = {term.depth or "the protocol's" for term in stage.losses if term.kind in MULTIVIEW_KINDS}
     require(
         len(compared) <= 1,

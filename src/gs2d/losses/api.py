@@ -436,7 +436,9 @@ def compute_losses(
 def _value(
     term: LossTerm, output: RenderOutput, view: LossView, functions: Mapping[tuple[str, str], LossFunction]
 ) -> Tensor | None:
-    """Return the unweighted value of a term."""
+    """Return the unweighted value of a term; None where this photograph does without."""
+    if not term.required and view.silhouette is None:
+        return None
     if view.fused is not None and term.kind in FUSED:
         return FUSED[term.kind](output, view, view.fused)
     function = functions.get(loss_of(term)) if functions else None

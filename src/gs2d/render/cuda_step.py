@@ -166,6 +166,7 @@ def _key(step: WholeStep) -> tuple[object, ...]:
         len(splats),
         step.photograph.shape[2],
         "normal_consistency" in step.weights,
+        "silhouette" in step.weights,
         step.depth,
         step.at_camera,
         step.of_object,
@@ -226,11 +227,17 @@ class _Plan:
         planes |= {"maps": 9, "g_color": 3}
         if self._has_normals:
             planes |= {"g_normal": 3, "g_depth": 1}
+        if self._has_silhouette:
+            planes |= {"g_alpha": 1}
         self._pixels = {name: self._arena.get(name, n * pixels) for name, n in planes.items()}
 
     @property
     def _has_normals(self) -> bool:
         return "normal_consistency" in self._step.weights and not self._only_colors
+
+    @property
+    def _has_silhouette(self) -> bool:
+        return "silhouette" in self._step.weights and not self._only_colors
 
     def _sums(self) -> None:
         """Of gradients: rows of the splats, which the last reader clears."""
@@ -429,6 +436,12 @@ class _Plan:
             tiles = -(-self._width // NORMAL_W) * -(-self._height // NORMAL_H)
             works.append(Work("normal_consistency_vjp", tiles, THREADS, normals))
             self._normals = normals
+        self._silhouette: structures.SilhouetteArguments | None = None
+        if self._has_silhouette:
+            silhouette = structures.SilhouetteArguments(pixels=self._height * self._width)
+            structures.fill(silhouette, alpha=self._pixels["alpha"], g_alpha=self._pixels["g_alpha"])
+            works.append(Work("silhouette_vjp", -(-silhouette.pixels // THREADS), THREADS, silhouette))
+            self._silhouette = silhouette
         return works
 
     def _gradients(self) -> list[Work]:
@@ -446,6 +459,8 @@ class _Plan:
         if self._has_normals:
             structures.fill(blend, g_normal=self._pixels["g_normal"])
             structures.fill(blend, **{f"g_depth_{step.depth}": self._pixels["g_depth"]})
+        if self._has_silhouette:
+            structures.fill(blend, g_alpha=self._pixels["g_alpha"])
         structures.fill(blend, gradients=self._gradient_rows, extras=self._extras, learns=step.rows)
         project = structures.ProjectVjpArguments(count=n, sh_rest=step.splats.shN.shape[1], clears=1)
         structures.fill(project, **dict(step.splats.items()))
@@ -530,3 +545,6 @@ class _Plan:
             normals.rotation = view.R
             weight = np.float32(step.weights["normal_consistency"])
             normals.scale = weight * np.float32(1 / max(step.valid, 1))
+        if self._silhouette is not None:
+            self._silhouette.mask, self._silhouette.object = mask, photograph
+            self._silhouette.scale = np.float32(step.weights["silhouette"]) / np.float32(max(step.valid, 1))

@@ -17,12 +17,12 @@ from gs2d.training.state import TrainState
 
 __all__ = ["WholeSteps"]
 
-KINDS = frozenset({"l1", "ssim", "normal_consistency"})
+KINDS = frozenset({"l1", "ssim", "normal_consistency", "silhouette"})
 NOTHING: Mapping[str, Tensor] = MappingProxyType({})
 
 
 class WholeSteps:
-    """The iterations of a stage whose losses are a photograph's L1 and SSIM and normal consistency.
+    """The iterations of a stage whose losses are a photograph's L1 and SSIM, normal consistency and silhouettes.
 
     Weights of pixels but those of the object, a second view, or anything that is learned of photographs and cameras
     are not for here: :class:`~gs2d.training.objective.FullRender` does all of it.
@@ -53,6 +53,10 @@ class WholeSteps:
         photograph = self._whole.targets.photograph(index)
         if photograph is None:
             return False
+        if photograph.image.shape[2] == 3:  # no alpha
+            active = [term for term in active if term.required]
+            if any(term.kind == "silhouette" for term in active):
+                return False
         stage, whole = self._stage, self._whole
         learned = self._learned(state, iteration)
         normals = next((term for term in active if term.kind == "normal_consistency"), None)

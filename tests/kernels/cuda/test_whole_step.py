@@ -20,10 +20,11 @@ from emulate import Emulator
 from fake_backends import cuda_on_host
 from fake_driver import FakeDriver, Result
 from fake_hip import FakeHip
+from gs2d.config.presets import with_silhouette
 from gs2d.config.protocols import GENERIC, Protocol
-from gs2d.config.recipe import GradDensify, PoseRefinement, Recipe
+from gs2d.config.recipe import GradDensify, LossTerm, PoseRefinement, Recipe
 from gs2d.data.scene import Scene, View
-from gs2d.errors import BackendError
+from gs2d.errors import BackendError, RecipeError
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.launch import GpuLauncher, Launcher
 from gs2d.render import cuda_step, pair_budget
@@ -120,6 +121,12 @@ def of_object(recipe: Recipe) -> Recipe:
     return replace(recipe, stages=tuple(stages))
 
 
+def with_silhouettes(recipe: Recipe) -> Recipe:
+    """Alpha of the photographs that have one kept, as in ``best``."""
+    term = LossTerm("silhouette", 0.1, required=False)
+    return replace(recipe, stages=tuple(replace(stage, losses=(*stage.losses, term)) for stage in recipe.stages))
+
+
 QUIET = GradDensify(every=100, start=500, stop=900, reset_every=0, opacity_cull=0.005)
 
 
@@ -133,6 +140,7 @@ VARIANTS = {
     "plain": (lambda scene: scene, train_toys.short(), GENERIC),
     "absolute": (two_sizes, train_toys.short(absgs=True), replace(GENERIC, depth="median")),
     "object": (masked, of_object(train_toys.short()), replace(GENERIC, depth="median")),
+    "silhouettes": (masked, with_silhouettes(of_object(train_toys.short())), GENERIC),
     "masks": (masked, at_camera(train_toys.short()), replace(GENERIC, background=(0.2, 1.0, 0.7))),
 }
 
@@ -290,6 +298,23 @@ def test_normals_of_the_object_alone_have_the_bits_of_those_that_go_through_torc
     assert some == 6
     assert same(parts, whole)
     assert not same(whole, trained(emulator, some_alpha, recipe, "launches")[0])
+
+
+def test_silhouettes_have_the_bits_of_those_that_go_through_torch(emulator: Emulator, scene: Scene) -> None:
+    """With masks; of photographs without alpha nothing is asked, unless they must have one."""
+    recipe, some_alpha = with_silhouettes(of_object(brief())), masked(scene)
+    parts, _ = trained(emulator, some_alpha, recipe, "autograd")
+    whole, some = trained(emulator, some_alpha, recipe, "launches")
+    assert some == 6
+    assert same(parts, whole)
+    without = trained(emulator, some_alpha, of_object(brief()), "launches")[0]
+    assert not same(whole, without)
+    assert same(
+        trained(emulator, scene, recipe, "launches")[0], trained(emulator, scene, of_object(brief()), "launches")[0]
+    )
+    strict = with_silhouette(brief(), name="strict")
+    with pytest.raises(RecipeError, match="alpha channel, got one without"):
+        trained(emulator, scene, strict, "launches")
 
 
 def test_iterations_that_compare_no_views_are_done_in_one_piece(emulator: Emulator, scene: Scene) -> None:

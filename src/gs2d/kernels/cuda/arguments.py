@@ -251,6 +251,12 @@ class NormalArguments(ctypes.Structure):
     )
 
 
+class SilhouetteArguments(ctypes.Structure):
+    """Of losses.cu."""
+
+    _fields_ = (("pixels", ctypes.c_int64), *_pointers("alpha", "object", "mask", "g_alpha"), ("scale", ctypes.c_float))
+
+
 class ClearArguments(ctypes.Structure):
     """Of sort.cu."""
 

@@ -1,4 +1,4 @@
-// Normal consistency, means over valid pixels, and the last step of every mean.
+// Normal consistency, silhouettes, means over valid pixels, and the last step of every mean.
 //
 // Two forms of normal consistency: the official mean(1 - alpha <n, N>) with alpha detached, and the paper's per-splat
 // mean(alpha - <n, N>) with nothing detached. N comes from the depths of the four neighbours, so a depth's gradient is
@@ -25,6 +25,15 @@ struct NormalArguments {
     float *g_normal, *g_depth, *g_alpha;  // null where not wanted
     float scale;                          // cotangent / valid pixels
     const uchar* object;                  // instead of weights: bytes of a photograph [H, W, 4], 1 where its alpha is above 1/2
+};
+
+struct SilhouetteArguments {
+    int64 pixels;
+    const float* alpha;   // [H, W], rendered
+    const uchar* object;  // bytes of a photograph [H, W, 4]
+    const uchar* mask;    // or null
+    float* g_alpha;       // [H, W]
+    float scale;          // cotangent / valid pixels
 };
 
 struct MeanArguments {
@@ -135,6 +144,15 @@ extern "C" __global__ void __launch_bounds__(128) normal_consistency_vjp(NormalA
         const float gradient = (from_left - from_right) + (from_above - from_below);
         a.g_depth[(top + dy) * a.width + left + dx] = keep(was_hit(depth[dy + 2][dx + 2]), gradient);
     }
+}
+
+// Of the mean |alpha - the photograph's| over valid pixels; 0 where they are the same.
+extern "C" __global__ void __launch_bounds__(128) silhouette_vjp(SilhouetteArguments a) {
+    const int64 at = int64(blockIdx.x) * MEAN_THREADS + threadIdx.x;
+    if (at >= a.pixels) return;
+    const float over = a.alpha[at] - float(a.object[4 * at + 3]) / 255.f;
+    const float sign = over > 0.f ? 1.f : over < 0.f ? -1.f : 0.f;
+    a.g_alpha[at] = a.mask && !a.mask[at] ? 0.f : a.scale * sign;
 }
 
 extern "C" __global__ void __launch_bounds__(128) masked_mean(MeanArguments a) {
