@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d.config.presets import SH_FASTER, with_fading_backdrop, with_robustness
+from gs2d.config.presets import SH_FASTER, get_recipe, with_fading_backdrop, with_robustness, without_optional_losses
 from gs2d.config.protocols import DTU, GENERIC
 from gs2d.config.recipe import LearningRates
 from gs2d.config.robust import FEW_VIEWS, SplatDropout
@@ -242,6 +242,18 @@ def test_a_run_of_before_the_sphere_goes_on_as_it_began(undisturbed: RunFolder, 
     data["recipe"] = to_json(robust)
     run.file("run.json").write_text(json.dumps(data))
     assert as_begun(run, replace(job, recipe=robust)).recipe == robust
+
+
+def test_a_run_of_before_alpha_was_compared_goes_on_as_it_began(undisturbed: RunFolder, tmp_path: Path) -> None:
+    run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
+    job, recipe = reload_job(run, lambda _: None), get_recipe("best")
+    before = without_optional_losses(recipe)
+    assert [term.kind for term in before.stages[0].losses] == ["l1", "ssim", "normal_consistency"]
+    data = json.loads(run.file("run.json").read_text())
+    for begun in (before, recipe):
+        data["recipe"] = to_json(begun)
+        run.file("run.json").write_text(json.dumps(data))
+        assert as_begun(run, replace(job, recipe=recipe)).recipe == begun
 
 
 def test_dropout_makes_another_stage_and_another_run(undisturbed: RunFolder, tmp_path: Path) -> None:

@@ -166,6 +166,15 @@ def with_silhouette(recipe: Recipe, weight: float = SILHOUETTE, *, name: str) ->
     return replace(recipe, name=name, stages=tuple(stages))
 
 
+def without_optional_losses(recipe: Recipe) -> Recipe:
+    """Return the recipe without the losses that some photographs do without."""
+
+    def required(stage: Stage) -> Stage:
+        return replace(stage, losses=tuple(term for term in stage.losses if term.required))
+
+    return replace(recipe, stages=tuple(map(required, recipe.stages)))
+
+
 def with_edges(recipe: Recipe, edges: str, *, name: str) -> Recipe:
     """Return the recipe with the other reading of normal consistency beside empty pixels (``LossTerm.edges``)."""
 
@@ -324,8 +333,8 @@ def best(iterations: int = BEST_ITERATIONS, nc: float = BEST_NC, *, name: str = 
     Not in the paper. A scene that begins near its end needs no opacity resets, and half the iterations with rates that
     make up for it; large splats stay, which are what surroundings are made of; alpha is that of the photographs which
     have one; the mesh is of a depth in which no splat decides alone (docs/recipes/best.md). ``nc`` is the weight of
-    normal consistency. Colours that depend on direction
-    learn faster than in 2DGS, but where photographs are few (:func:`with_few_views`).
+    normal consistency. Colours that depend on direction learn faster than in 2DGS, but where photographs are few
+    (:func:`with_few_views`).
     """
     part = iterations / OFFICIAL_ITERATIONS
     consistency = LossTerm("normal_consistency", nc, round(NC_START * part), where="object")

@@ -6,7 +6,7 @@ import json
 from dataclasses import replace
 from typing import Any
 
-from gs2d.config.presets import without_fading_backdrop
+from gs2d.config.presets import without_fading_backdrop, without_optional_losses
 from gs2d.errors import RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.job import LATER_FIELDS, Job, training_facts
@@ -25,6 +25,8 @@ def as_begun(run: RunFolder, job: Job) -> Job:
     decay = before.get("opacity_decay")
     if isinstance(decay, dict) and "backdrop_rate" not in decay:
         recipe = without_fading_backdrop(recipe)
+    if not any(term.get("kind") == "silhouette" for stage in before.get("stages", ()) for term in stage["losses"]):
+        recipe = without_optional_losses(recipe)
     return replace(job, recipe=recipe)
 
 
