@@ -9,11 +9,11 @@ import pytest
 from gs2d.config.describe import describe_recipe
 from gs2d.config.presets import (
     BEST_NC,
-    BEST_SILHOUETTE,
     DEFAULT_RECIPE,
     OFFICIAL_ITERATIONS,
     RECIPES,
     SH_FASTER,
+    SILHOUETTE,
     SURFACE_NC,
     get_recipe,
     with_fading_backdrop,
@@ -96,9 +96,9 @@ def test_best_surface_compares_views_in_its_last_fifth_alone() -> None:
 def test_alpha_is_that_of_photographs_that_have_one(name: str) -> None:
     recipe = get_recipe(name)
     (term,) = (term for term in recipe.stages[0].losses if term.kind == "silhouette")
-    assert (term.weight, term.start, term.required) == (BEST_SILHOUETTE, 0, False)
+    assert (term.weight, term.start, term.required) == (SILHOUETTE, 0, False)
     assert from_json(to_json(recipe)) == recipe
-    assert "loss silhouette: 0.3, where photographs have an alpha channel" in "\n".join(describe_recipe(recipe))
+    assert "loss silhouette: 0.1, where photographs have an alpha channel" in "\n".join(describe_recipe(recipe))
 
 
 def test_rates_that_grow_by_themselves_do_not_grow_twice() -> None:

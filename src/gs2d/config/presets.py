@@ -47,8 +47,7 @@ DEPTH_WEIGHT, NORMAL_WEIGHT = 0.2, 0.05  # docs/decisions/priors.md
 DEFAULT_RECIPE = "best"  # of `gs2d train`, `reconstruct` and `demo`
 OFFICIAL_ITERATIONS = 30_000  # of 2DGS, for which its rates were chosen
 BEST_ITERATIONS, FAST_ITERATIONS = 20_000, 6_600
-# weights of the silhouette loss in *-silhouette and in best: docs/decisions/losses.md
-SILHOUETTE, BEST_SILHOUETTE = 0.1, 0.3
+SILHOUETTE = 0.1  # weight of the silhouette loss: docs/decisions/losses.md
 BEST_NC, SURFACE_NC = 0.02, 0.05  # weight of normal consistency in best and in best-surface: docs/decisions/losses.md
 BACKDROP_RATE = 0.3  # docs/decisions/fog.md
 SH_FASTER = 2.5  # times the official rate of SH beyond degree 0: docs/decisions/training.md
@@ -338,7 +337,7 @@ def best(iterations: int = BEST_ITERATIONS, nc: float = BEST_NC, *, name: str = 
     """
     part = iterations / OFFICIAL_ITERATIONS
     consistency = LossTerm("normal_consistency", nc, round(NC_START * part), where="object")
-    silhouette = LossTerm("silhouette", BEST_SILHOUETTE, required=False)
+    silhouette = LossTerm("silhouette", SILHOUETTE, required=False)
     stage = Stage(
         "surface",
         iterations,
