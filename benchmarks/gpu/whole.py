@@ -49,7 +49,7 @@ def _step(bench: Bench, splats: Splats, camera: Camera, channels: int) -> None:
         mask=None,
         valid=camera.height * camera.width,
         background=(0.0, 0.0, 0.0),
-        weights={"l1": 0.8, "ssim": 0.2, "normal_consistency": 0.05},
+        weights={"l1": 0.8, "ssim": 0.2, "normal_consistency": 0.05} | ({"silhouette": 0.1} if channels == 4 else {}),
         depth="mean",
         at_camera=False,
         of_object=True,
