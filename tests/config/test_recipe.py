@@ -151,7 +151,7 @@ def test_photographs_are_twice_as_large_after_each_iteration_that_says_so() -> N
         (one(losses=(*L1, LossTerm("ssim", 1.0, edge_power=1.0))), "loss 'ssim' takes no edge_power; only normal"),
         (
             one(losses=(*L1, LossTerm("ssim", 1.0, required=False))),
-            "required of loss 'ssim' cannot be left out where photographs lack something; only silhouette can",
+            "required of loss 'ssim' must be true, got false; only silhouette may be left out",
         ),
         (
             one(losses=(*L1, LossTerm("normal_consistency", 1.0, where="alpha"))),

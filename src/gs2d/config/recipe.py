@@ -520,8 +520,8 @@ def _check_losses(where: str, stage: Stage, to_train: bool) -> None:
             plain = getattr(term, name) == getattr(LossTerm, name)
             message = f"loss {term.kind!r} takes no {name}; only {' and '.join(NORMAL_KINDS)} do"
             require(plain or term.kind in NORMAL_KINDS, f"{where}: {message}")
-        message = f"loss {term.kind!r} cannot be left out where photographs lack something; only silhouette can"
-        require(term.required or term.kind == "silhouette", f"{where}: required of {message}")
+        message = f"required of loss {term.kind!r} must be true, got false; only silhouette may be left out"
+        require(term.required or term.kind == "silhouette", f"{where}: {message}")
     compared = {term.depth or "the protocol's" for term in stage.losses if term.kind in MULTIVIEW_KINDS}
     require(
         len(compared) <= 1,
