@@ -25,7 +25,8 @@ def as_begun(run: RunFolder, job: Job) -> Job:
     decay = before.get("opacity_decay")
     if isinstance(decay, dict) and "backdrop_rate" not in decay:
         recipe = without_fading_backdrop(recipe)
-    if not any(term.get("kind") == "silhouette" for stage in before.get("stages", ()) for term in stage["losses"]):
+    terms = (term for stage in before.get("stages", ()) for term in stage.get("losses", ()))
+    if not any(term.get("kind") == "silhouette" for term in terms):
         recipe = without_optional_losses(recipe)
     return replace(job, recipe=recipe)
 
