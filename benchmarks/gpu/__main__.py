@@ -6,6 +6,8 @@
     python -m benchmarks.gpu host        [--out FILE.json]
     python -m benchmarks.gpu correctness [--out FILE.json] [--dry-run] [--only parity memcheck ...]
     python -m benchmarks.gpu kernels     [--out FILE.json] [--dry-run] [--only 1000000 ...]
+    python -m benchmarks.gpu real        [--out FILE.json] [--dry-run] --capture FOLDER ... [--recipe best]
+                                         [--schedule-scale 1.0] [--downscale 1]
     python -m benchmarks.gpu training    [--out FILE.json] [--dry-run] --capture FOLDER ... [--schedule-scale 1.0]
                                          [--downscale 1] [--runs FOLDER] [--synthetic]
 
@@ -51,12 +53,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.gpu", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("command", choices=("first", "correctness", "kernels", "training", "exercise", "host"))
+    parser.add_argument("command", choices=("first", "correctness", "kernels", "training", "real", "exercise", "host"))
     parser.add_argument("--out", type=Path)
     parser.add_argument("--dry-run", action="store_true")
     parser.add_argument("--only", nargs="+", default=[], help="parts or scenes whose name contains one of these")
     parser.add_argument("--capture", type=Path, nargs="*", default=[])
     parser.add_argument("--synthetic", action="store_true", help="train on a capture that is made here, too")
+    parser.add_argument("--recipe", default="best", help="of real")
     parser.add_argument("--schedule-scale", type=float, default=1.0)
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--runs", type=Path, help="keep the run folders here")
@@ -64,6 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     if args.command == "training" and not args.capture and not args.dry_run and not args.synthetic:
         parser.error("training needs --capture FOLDER or --synthetic")
+    if args.command == "real" and not args.capture:
+        parser.error("real needs --capture FOLDER")
     reason = unfit()
     if reason:
         print(f"error: {reason}", file=sys.stderr)
@@ -120,6 +125,11 @@ def run(args: argparse.Namespace, bench: Bench, out: Path) -> int:
         results, module = correctness.run(bench, args.only, progress), correctness
     elif args.command == "kernels":
         results, module = kernels.run(bench, args.only, progress), kernels
+    elif args.command == "real":
+        from benchmarks.gpu import real
+
+        given = (args.capture, args.recipe, args.schedule_scale, args.downscale)
+        results, module = real.run(bench, *given, progress), real
     else:
         from benchmarks.gpu.without_tyro import stand_in
 

@@ -71,13 +71,15 @@ def speed(bench: Bench, count: int, width: int, height: int) -> dict[str, Any]:
         trainer.enter(index)
         for _ in range(1 if bench.dry else WARMUP):
             trainer.step()
-        found[stage.name] = {**_timed(bench, trainer), **traced(bench, trainer, f"{scene.name}-{stage.name}")}
+        found[stage.name] = {
+            **timed(bench, trainer, 2 if bench.dry else ITERATIONS),
+            **traced(bench, trainer, f"{scene.name}-{stage.name}"),
+        }
     return found
 
 
-def _timed(bench: Bench, trainer: Any) -> dict[str, float]:
+def timed(bench: Bench, trainer: Any, repeats: int) -> dict[str, float]:
     """Of all iterations together, and of the calls alone, which wait for the number of pairs of the one before."""
-    repeats = 2 if bench.dry else ITERATIONS
     bench.wait()
     begun, cpu = time.perf_counter(), time.thread_time()
     for _ in range(repeats):

@@ -22,7 +22,7 @@ from gs2d.render.whole_step import Learned, WholeStep
 from gs2d.training import objective, trainer
 
 WAYS = ("autograd", "launches", "graph")
-ROOM = 1 << 14  # pairs
+ROOM = 1 << 20  # pairs
 
 
 def run_kernels(bench: Bench, splats: Splats, camera: Camera) -> None:

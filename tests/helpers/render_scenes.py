@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 
 import numpy as np
@@ -12,6 +14,7 @@ from torch.testing import assert_close
 
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
+from gs2d.render.backends import Backend
 from gs2d.render.types import RenderOutput
 
 IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
@@ -24,6 +27,16 @@ def equal(actual: Tensor | float | list[float], expected: Tensor | float | list[
     """Equal up to float32 rounding."""
     actual, expected = torch.as_tensor(actual).detach().double(), torch.as_tensor(expected).double()
     assert_close(actual, expected, rtol=2e-5, atol=2e-6)
+
+
+@contextmanager
+def repeatable(backend: Backend) -> Iterator[None]:
+    """Renderings have gradients of the same bits each time: on a GPU only by torch's switch, sums are atomics'."""
+    torch.use_deterministic_algorithms(backend.name == "cuda")
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(False)
 
 
 def front_camera(width: int = 9, height: int = 9, focal: float = 10.0, **change: float) -> Camera:

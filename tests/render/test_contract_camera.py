@@ -28,7 +28,16 @@ from gs2d.render import reference
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings, RenderOutput
-from render_scenes import IMAGES, contraction, random_camera, random_cotangents, random_splats, requiring_grad, splat
+from render_scenes import (
+    IMAGES,
+    contraction,
+    random_camera,
+    random_cotangents,
+    random_splats,
+    repeatable,
+    requiring_grad,
+    splat,
+)
 
 SMOOTH = ("plain", "opaque", "huge")  # kinds of splats without decisions near by
 
@@ -131,8 +140,9 @@ def test_20_images_and_all_other_gradients_keep_their_bits(backend: Backend) -> 
     found = []
     for lens in (camera, learning(camera)[0]):
         leaves, probe = requiring_grad(splats), torch.zeros(len(splats), 4, requires_grad=True)
-        output = rasterize(leaves, lens, backend=backend, screen_probe=probe)
-        contraction(output, cotangents).backward()
+        with repeatable(backend):
+            output = rasterize(leaves, lens, backend=backend, screen_probe=probe)
+            contraction(output, cotangents).backward()
         found.append([getattr(output, name) for name in IMAGES] + [t.grad for _, t in leaves.items()] + [probe.grad])
     for before, after in zip(*found, strict=True):
         assert torch.equal(before, after)

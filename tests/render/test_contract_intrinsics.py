@@ -16,7 +16,16 @@ from gs2d.errors import ShapeError
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
-from render_scenes import IMAGES, contraction, random_camera, random_cotangents, random_splats, requiring_grad, splat
+from render_scenes import (
+    IMAGES,
+    contraction,
+    random_camera,
+    random_cotangents,
+    random_splats,
+    repeatable,
+    requiring_grad,
+    splat,
+)
 
 SMOOTH = ("plain", "opaque", "huge")  # kinds of splats without decisions near by
 
@@ -103,8 +112,9 @@ def test_21_images_and_all_other_gradients_keep_their_bits(backend: Backend) -> 
     for lens in (camera, learning(camera)[0]):
         pose = torch.tensor(camera.T_cam_world, requires_grad=True)
         leaves, probe = requiring_grad(splats), torch.zeros(len(splats), 4, requires_grad=True)
-        output = rasterize(leaves, replace(lens, T_cam_world=pose), backend=backend, screen_probe=probe)
-        contraction(output, cotangents).backward()
+        with repeatable(backend):
+            output = rasterize(leaves, replace(lens, T_cam_world=pose), backend=backend, screen_probe=probe)
+            contraction(output, cotangents).backward()
         grads = [t.grad for _, t in leaves.items()] + [probe.grad, pose.grad]
         found.append([getattr(output, name) for name in IMAGES] + grads)
     for before, after in zip(*found, strict=True):

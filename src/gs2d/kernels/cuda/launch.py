@@ -287,8 +287,9 @@ def grow_in_place() -> bool:
     """
     if torch.version.cuda is None or any(os.environ.get(name) for name in ALLOCATOR_VARIABLES):
         return False
-    try:
-        torch.cuda.memory._set_allocator_settings("expandable_segments:True")
+    try:  # under its newer name first: the older one warns
+        setting = getattr(torch._C, "_accelerator_setAllocatorSettings", None)
+        (setting or torch.cuda.memory._set_allocator_settings)("expandable_segments:True")
     except (AttributeError, RuntimeError):  # not of this version or platform: slower, no worse
         return False
     return True

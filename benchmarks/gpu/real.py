@@ -1,0 +1,111 @@
+"""Where iterations of real trainings spend their time: made scenes have short lists in all tiles, photographs do not.
+
+A capture is trained by a recipe; at some parts of its schedule: milliseconds of an iteration, the share of them in which
+the GPU works, microseconds of each kernel, and how long the lists of tiles are.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.gpu.bench import Bench, rounded
+from benchmarks.gpu.first import TRACED, timed
+from gs2d.config.presets import get_recipe
+from gs2d.config.protocols import protocol_for
+from gs2d.config.schedule import scale_schedule
+from gs2d.data import load_scene
+from gs2d.render import cuda_passes
+from gs2d.training.trainer import Trainer
+
+PARTS = (0.1, 0.5, 0.9)  # of the schedule
+MEASURED = 100  # iterations
+
+
+def run(bench: Bench, captures: list[Path], recipe: str, scale: float, downscale: int, progress: Any) -> dict[str, Any]:
+    """Every capture; ``progress`` gets the document so far after each part of each."""
+    found: dict[str, Any] = {}
+    for capture in captures:
+        rows: dict[str, Any] = found.setdefault(capture.resolve().name, {})
+        told = partial(progress, found)
+        work = partial(of_capture, bench, capture, (recipe, scale, downscale), rows, told)
+        rows |= bench.attempt(capture.name, work)
+        told()
+    return found
+
+
+def of_capture(
+    bench: Bench, capture: Path, asked: tuple[str, float, int], rows: dict[str, Any], told: Any
+) -> dict[str, Any]:
+    """Train the recipe's first stage, and look at it on the way."""
+    (recipe, scale, downscale), begun = asked, time.perf_counter()
+    scene = load_scene(capture, downscale=downscale)
+    steps = scale_schedule(get_recipe(recipe), scale)
+    trainer = Trainer(scene, steps, protocol_for(scene.format), backend=bench.backend, progress_every=50)
+    trainer.enter(0)
+    bench.wait()
+    rows["seconds_until_training"] = round(time.perf_counter() - begun, 2)
+    rows["size"] = [scene.train[0].camera.width, scene.train[0].camera.height]
+    stage, begun = steps.stages[0], time.perf_counter()
+    for part in PARTS:
+        while trainer.state.step < round(part * stage.iterations):
+            trainer.step()
+        bench.wait()
+        seconds = time.perf_counter() - begun
+        row = {"iteration": trainer.state.step, "seconds": round(seconds, 2), "splats": len(trainer.splats)}
+        row |= timed(bench, trainer, 1 if bench.dry else MEASURED) | kernels(bench, trainer)
+        rows[f"{part:g}"] = row | lists(bench, trainer)
+        told()
+        begun = time.perf_counter() - seconds
+    return {}
+
+
+def kernels(bench: Bench, trainer: Trainer) -> dict[str, Any]:
+    """Microseconds of each kernel in an iteration, by torch's profiler."""
+    if bench.dry:
+        return {}
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
+        for _ in range(TRACED):
+            trainer.step()
+        bench.wait()
+    spans: dict[str, float] = defaultdict(float)
+    for event in profile.events() or ():
+        if event.device_type == torch.autograd.DeviceType.CUDA:
+            spans[event.name[:60]] += event.time_range.elapsed_us() / TRACED
+    return {"kernels_us": rounded(dict(sorted(spans.items(), key=lambda item: -item[1])), 1)}
+
+
+def lists(bench: Bench, trainer: Trainer) -> dict[str, Any]:
+    """How many pairs some views have, and how long the lists of tiles are."""
+    pairs, longest, spread = [], [], []
+    for view in trainer.scene.train[:: max(1, len(trainer.scene.train) // 4)]:
+        parameters = [tensor.detach().contiguous() for _, tensor in trainer.splats.items()]
+        given = cuda_passes.view_of(view.camera, trainer.settings)
+        ranges = cuda_passes.forward(bench.launcher, given, parameters, distortion=False).ranges.cpu().numpy()
+        lengths = (ranges[..., 1] - ranges[..., 0]).ravel()[:-1]
+        pairs.append(int(lengths.sum()))
+        longest.append(int(lengths.max()))
+        spread.append(np.quantile(lengths, (0.5, 0.9, 0.99)))
+    return {"pairs": pairs, "longest_list": longest, "lists_50_90_99": np.mean(spread, axis=0).round().tolist()}
+
+
+def table(found: dict[str, Any]) -> list[str]:
+    """A line for each part of each capture."""
+    lines = []
+    for name, rows in found.items():
+        for part, row in rows.items():
+            if isinstance(row, dict):
+                most = list(row.get("kernels_us", {}).items())[:6]
+                lines.append(
+                    f"{name} {part}: {row.get('iteration_ms')} ms, {row['splats']} splats, {most}, "
+                    f"lists {row['lists_50_90_99']}, longest {max(row['longest_list'])}"
+                )
+        if "failed" in rows:
+            lines.append(f"{name}: {rows['failed']}")
+    return lines
