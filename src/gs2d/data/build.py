@@ -129,12 +129,14 @@ class Decoder:
                 "did the file change since the scene was loaded?"
             )
         mask = self._read_mask(frame.mask, need=0.5 if frame.mask_is_alpha else 1.0)
-        if frame.mask_is_alpha:
-            image, mask = cut_out(image, mask), None
         object_mask = self._read_mask(frame.object_mask, need=0.5)
         if frame.alpha_is_silhouette and image.shape[2] == 4:
             object_mask = image[:, :, 3] >= 128 if object_mask is None else object_mask
             image = image[:, :, :3]
+        if frame.mask_is_alpha:
+            if mask is not None and object_mask is not None:
+                object_mask = object_mask & mask
+            image, mask = cut_out(image, mask), None
         valid = None
         if k.lens is not None:
             positions, inside = self.lens_maps(k) if frame.face is None else face_positions(k, frame.face)
@@ -427,7 +429,11 @@ def _with_masks(capture: Capture, root: Path, masks: Masks) -> tuple[list[PosedI
     """Return the frames with their masks, a note about them, and how many there are."""
     frames = list(capture.frames)
     if not capture.finds_masks and masks.folder is None:
-        return frames, (), masks
+        said = (
+            f"masks: --masked {masks.masked} changes nothing: format {capture.format} has silhouettes, which limit the "
+            "surface alone (--masks DIR names masks)"
+        )
+        return frames, (said,) if masks.masked is not None else (), masks
     homes = [home for home in (capture.home, *capture.mask_homes, root) if home is not None]
     named, names, images = ([getattr(frame, what) for frame in frames] for what in ("mask", "name", "path"))
     found, note = find_masks(names, images, named, homes, masks)

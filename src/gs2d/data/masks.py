@@ -125,7 +125,9 @@ def find_masks(
             f"{Path(names[0]).with_suffix('.png')} or {Path(names[0]).stem}{ENDING}.png was looked for"
         )
     if not count:
-        return found, f"masks: none of {len(names)} views has one in {FOLDER} (a/b.jpg.png for a/b.jpg)" * bool(folders)
+        vain = "" if masks.masked is None else f": --masked {masks.masked} changes nothing"
+        line = f"masks: none of {len(names)} views has one in {FOLDER} (a/b.jpg.png for a/b.jpg){vain}"
+        return found, line if folders or vain else ""
     in_what = " and ".join(where for where, number in places.items() if number)
     rest = f"; the other {len(names) - count} are whole" if count < len(names) else ""
     meaning = ", the rest is empty" if masks.masked == EMPTY else ", the rest is ignored" if masks.asked_for else ""

@@ -78,7 +78,7 @@ def key_of(view: View) -> str | None:
     if frame.face is not None:
         facts.append(repr(frame.face))
     if frame.mask_is_alpha:
-        facts.append("mask is alpha")
+        facts.append("mask is alpha, not the silhouette" if frame.alpha_is_silhouette else "mask is alpha")
     for path in (frame.path, frame.mask, frame.object_mask):
         if path is None:
             facts.append(None)
