@@ -1,7 +1,7 @@
 """Where iterations of real trainings spend their time: made scenes have short lists in all tiles, photographs do not.
 
-A capture is trained by a recipe; at some parts of its schedule: milliseconds of an iteration, the share of them in which
-the GPU works, microseconds of each kernel, and how long the lists of tiles are.
+A capture is trained by a recipe; at some parts of its schedule: milliseconds of an iteration and of the host in it,
+microseconds of each kernel, and how long the lists of tiles are.
 """
 
 from __future__ import annotations

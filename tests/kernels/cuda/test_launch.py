@@ -292,19 +292,28 @@ def test_the_real_bindings_errors_are_one_line_too(tmp_path: Path) -> None:
     assert said.count("\n") == 1
 
 
-def test_torchs_memory_grows_in_place_in_training_unless_the_user_has_said_how(monkeypatch: pytest.MonkeyPatch) -> None:
+NEWER = "_accelerator_setAllocatorSettings"  # of later versions of torch
+
+
+@pytest.mark.parametrize("newer", [True, False])
+def test_torchs_memory_grows_in_place_in_training_unless_the_user_has_said_how(
+    monkeypatch: pytest.MonkeyPatch, newer: bool
+) -> None:
     told: list[str] = []
     monkeypatch.setattr(torch.version, "cuda", "13.0")
-    monkeypatch.setattr(torch.cuda.memory, "_set_allocator_settings", told.append)
-    for name in launch.ALLOCATOR_VARIABLES:
-        monkeypatch.delenv(name, raising=False)
+    monkeypatch.delattr(torch._C, NEWER, raising=False)
+    place, name = (torch._C, NEWER) if newer else (torch.cuda.memory, "_set_allocator_settings")
+    monkeypatch.setattr(place, name, told.append, raising=False)
+    for variable in launch.ALLOCATOR_VARIABLES:
+        monkeypatch.delenv(variable, raising=False)
     CudaBackend().for_training()
     assert told == ["expandable_segments:True"]
     monkeypatch.setenv("PYTORCH_ALLOC_CONF", "max_split_size_mb:64")
     CudaBackend().for_training()
     assert len(told) == 1
     monkeypatch.delenv("PYTORCH_ALLOC_CONF")
-    monkeypatch.delattr(torch.cuda.memory, "_set_allocator_settings")
+    monkeypatch.delattr(place, name)
+    monkeypatch.delattr(torch.cuda.memory, "_set_allocator_settings", raising=False)
     assert not launch.grow_in_place()
 
 
