@@ -184,6 +184,20 @@ class TimingLauncher(OneByOne):
         )
 
 
+def kernel_times(bench: Bench, work: Callable[[], object], repeats: int) -> dict[str, float]:
+    """Microseconds of each kernel in one ``work``, the most first, by torch's profiler: those in graphs, too."""
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
+        for _ in range(repeats):
+            work()
+        bench.wait()
+    spans: dict[str, float] = {}
+    for event in profile.events() or ():
+        if event.device_type == torch.autograd.DeviceType.CUDA:
+            name = event.name[:60]
+            spans[name] = spans.get(name, 0.0) + event.time_range.elapsed_us() / repeats
+    return rounded(dict(sorted(spans.items(), key=lambda item: -item[1])), 1)
+
+
 class EmulatedBackend(CudaBackend):
     """The backend "cuda" on the CPU's memory."""
 

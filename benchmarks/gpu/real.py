@@ -7,15 +7,14 @@ microseconds of each kernel, and how long the lists of tiles are.
 from __future__ import annotations
 
 import time
-from collections import defaultdict
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from benchmarks.gpu.bench import Bench, rounded
+from benchmarks.gpu.bench import Bench, kernel_times
 from benchmarks.gpu.first import TRACED, timed
 from gs2d.config.presets import get_recipe
 from gs2d.config.protocols import protocol_for
@@ -47,6 +46,7 @@ def of_capture(
     (recipe, scale, downscale), begun = asked, time.perf_counter()
     scene = load_scene(capture, downscale=downscale)
     steps = scale_schedule(get_recipe(recipe), scale)
+    steps = replace(steps, init_points=60, dense_start=None) if bench.dry else steps
     trainer = Trainer(scene, steps, protocol_for(scene.format), backend=bench.backend, progress_every=50)
     trainer.enter(0)
     bench.wait()
@@ -59,26 +59,12 @@ def of_capture(
         bench.wait()
         seconds = time.perf_counter() - begun
         row = {"iteration": trainer.state.step, "seconds": round(seconds, 2), "splats": len(trainer.splats)}
-        row |= timed(bench, trainer, 1 if bench.dry else MEASURED) | kernels(bench, trainer)
+        row |= timed(bench, trainer, 1 if bench.dry else MEASURED)
+        row |= {} if bench.dry else {"kernels_us": kernel_times(bench, trainer.step, TRACED)}
         rows[f"{part:g}"] = row | lists(bench, trainer)
         told()
         begun = time.perf_counter() - seconds
     return {}
-
-
-def kernels(bench: Bench, trainer: Trainer) -> dict[str, Any]:
-    """Microseconds of each kernel in an iteration, by torch's profiler."""
-    if bench.dry:
-        return {}
-    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
-        for _ in range(TRACED):
-            trainer.step()
-        bench.wait()
-    spans: dict[str, float] = defaultdict(float)
-    for event in profile.events() or ():
-        if event.device_type == torch.autograd.DeviceType.CUDA:
-            spans[event.name[:60]] += event.time_range.elapsed_us() / TRACED
-    return {"kernels_us": rounded(dict(sorted(spans.items(), key=lambda item: -item[1])), 1)}
 
 
 def lists(bench: Bench, trainer: Trainer) -> dict[str, Any]:

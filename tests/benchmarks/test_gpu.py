@@ -19,6 +19,7 @@ from benchmarks.gpu import correctness, kernels
 from benchmarks.gpu.peers import activated
 from benchmarks.gpu.scenes import gpu_scene
 
+import tiny
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.compile import KERNEL, compile_text
 
@@ -65,6 +66,17 @@ def test_training_goes_the_whole_way_and_reports_each_stage(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
+def test_a_real_capture_is_looked_at_in_the_course_of_its_training(tmp_path: Path) -> None:
+    capture = tiny.write_capture(tmp_path / "ball")
+    (rows,) = dry("real", tmp_path, "--capture", str(capture), "--schedule-scale", "0.0005").values()
+    assert rows["size"] == [24, 24]
+    parts = [rows[part] for part in ("0.1", "0.5", "0.9")]
+    assert [row["iteration"] for row in parts] == [1, 5, 9]
+    for row in parts:
+        assert row["iteration_ms"] > 0
+        assert all(longest <= pairs for longest, pairs in zip(row["longest_list"], row["pairs"], strict=True))
+
+
 def test_correctness_compares_with_the_reference_and_says_what_each_tool_found(tmp_path: Path) -> None:
     results = dry("correctness", tmp_path)
     assert results["parity"]["images"]["color"]["median"] < 1e-6
