@@ -76,7 +76,7 @@ def make_frame(size: int) -> Frame:
 
 def photometric_step(frame: Frame, mask: Tensor | None = None, mean: Tensor | None = None) -> None:
     """0.8 L1 - 0.2 SSIM, native, forward and backward."""
-    l1, ssim = ops.photometric(frame.rendered, frame.target, mask, mean)
+    l1, ssim, _ = ops.photometric(frame.rendered, frame.target, mask, mean)
     torch.autograd.grad(0.8 * l1 - 0.2 * ssim, frame.rendered)
 
 

@@ -156,11 +156,11 @@ def _render_all_ways(bench: Bench) -> None:
 
 
 def _all_losses(bench: Bench) -> None:
-    """L1 and SSIM with the target's mean at hand, and the mean of a map; training runs the others."""
+    """L1, SSIM and L2 with the target's mean at hand, and the mean of a map; training runs the others."""
     launcher = launch.launcher_for(bench.device)
     image, target = (torch.rand(45, 70, 3, device=bench.device, requires_grad=k == 0) for k in range(2))
-    l1, ssim = ops.photometric(image, target, target_mean=ops.blur(target, launcher=launcher), launcher=launcher)
-    (l1 + ssim + ops.masked_mean(image[..., 0], target[..., 0] > 0.5, launcher=launcher)).backward()
+    l1, ssim, l2 = ops.photometric(image, target, target_mean=ops.blur(target, launcher=launcher), launcher=launcher)
+    (l1 + ssim + l2 + ops.masked_mean(image[..., 0], target[..., 0] > 0.5, launcher=launcher)).backward()
 
 
 def _three_stages(bench: Bench) -> None:

@@ -131,7 +131,7 @@ def test_photographs_are_twice_as_large_after_each_iteration_that_says_so() -> N
         (replace(one(), sh_degree=4), "sh_degree"),
         (replace(one(), init_points=2**31), "init_points must be at most 2^31 - 1"),
         (one(iterations=-1), "stage 's': iterations must be an integer >= 0, got -1"),
-        (one(losses=(LossTerm("l2", 1.0),)), "stage 's': loss must be one of l1, ssim"),
+        (one(losses=(LossTerm("l3", 1.0),)), "stage 's': loss must be one of l1, ssim, l2"),
         (one(losses=()), "no loss is active"),
         (one(losses=(LossTerm("l1", 1.0, start=5),)), "no loss is active"),
         (one(losses=(LossTerm("l1", -1.0),)), "weight of loss 'l1'"),

@@ -68,8 +68,8 @@ def losses(emulator: Emulator, case: Case) -> dict[str, Tensor]:
         x, m = x.requires_grad_(), m > 0.4
         depth = torch.rand(*size, generator=g).add(1).requires_grad_()
         alpha = torch.rand(*size, generator=g).requires_grad_()
-        l1, ssim = ops.photometric(x, y, m, ops.blur(y, launcher=emulator), launcher=emulator)
-        l1_too, ssim_too = ops.photometric(x, y, launcher=emulator)
+        known = ops.photometric(x, y, m, ops.blur(y, launcher=emulator), launcher=emulator)
+        values = ops.photometric(x, y, launcher=emulator)
         camera = case.camera.resized(size[1], size[0])
         normals = sum(
             ops.normal_consistency(
@@ -85,10 +85,10 @@ def losses(emulator: Emulator, case: Case) -> dict[str, Tensor]:
             )
             for form, edges in ((False, "undefined"), (True, "camera"))
         )
-        total = l1 + ssim + l1_too + ssim_too + normals + ops.masked_mean(depth, m, launcher=emulator)
+        total = sum(known) + sum(values) + normals + ops.masked_mean(depth, m, launcher=emulator)
         total.backward()
-        values = {"value": total.detach(), "x": x.grad, "depth": depth.grad, "alpha": alpha.grad}
-        found |= {f"losses {size}.{name}": value for name, value in values.items() if value is not None}
+        results = {"value": total.detach(), "x": x.grad, "depth": depth.grad, "alpha": alpha.grad}
+        found |= {f"losses {size}.{name}": value for name, value in results.items() if value is not None}
     pair = two_views.scenario(settings=MultiView(patches=61, radius=3, texture=0.03, occluded=4.0), masked=True)
     leaves = pair.depth.requires_grad_(), pair.normal.requires_grad_(), torch.zeros(6, requires_grad=True)
     both = sum(pair.views(*leaves).compared(partial(compare_views, launcher=emulator)))
@@ -135,7 +135,7 @@ def whole_steps(emulator: Emulator, case: Case) -> dict[str, Tensor]:
             valid=height * width,
             background=(0.1, 0.5, 0.2),
             weights={"l1": 0.8, "ssim": 0.2, "normal_consistency": 0.05}
-            | ({"silhouette": 0.1} if channels == 4 else {}),
+            | ({"silhouette": 0.1, "l2": 10.0} if channels == 4 else {}),
             depth="mean",
             at_camera=False,
             of_object=True,

@@ -75,20 +75,21 @@ def relative_error(found: Tensor, expected: Tensor) -> float:
 
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("size", SIZES)
-def test_l1_and_ssim_and_their_gradient_are_those_of_the_reference(
+def test_l1_ssim_l2_and_their_gradient_are_those_of_the_reference(
     library: Library, size: tuple[int, int], masked: bool
 ) -> None:
     rendered, target, mask = photographs(*size)
     valid = mask if masked else None
     x, y = rendered.float().requires_grad_(), target.float()
     exact, exact_y = x.detach().double().requires_grad_(), y.double()  # the very numbers that the native op sees
-    l1, ssim = ops.photometric(x, y, valid, library=library)
-    expected_l1, expected_ssim = reference.l1(exact, exact_y, valid), reference.ssim(exact, exact_y, valid)
-    assert l1.item() == pytest.approx(expected_l1.item(), abs=1e-7)
-    assert ssim.item() == pytest.approx(expected_ssim.item(), abs=1e-6)
-    for weights in [(0.8, -0.2), (0.0, 1.0), (1.0, 0.0), (-0.3, 2.0)]:  # the first is what the op prepared for
-        (found,) = torch.autograd.grad((l1, ssim), x, tuple(map(torch.tensor, weights)), retain_graph=True)
-        total = weights[0] * expected_l1 + weights[1] * expected_ssim
+    values = ops.photometric(x, y, valid, library=library)
+    exact_values = [value(exact, exact_y, valid) for value in (reference.l1, reference.ssim, reference.l2)]
+    for value, exact_value, atol in zip(values, exact_values, (1e-7, 1e-6, 1e-7), strict=True):
+        assert value.item() == pytest.approx(exact_value.item(), abs=atol)
+    # the first is what the op prepared for
+    for weights in [(0.8, -0.2, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (-0.3, 2.0, 10.0)]:
+        (found,) = torch.autograd.grad(values, x, tuple(map(torch.tensor, weights)), retain_graph=True)
+        total = sum(weight * value for weight, value in zip(weights, exact_values, strict=True))
         (expected,) = torch.autograd.grad(total, exact, retain_graph=True)
         assert relative_error(found, expected) < 1e-5
 
@@ -174,10 +175,12 @@ def test_the_native_formulas_pass_a_float64_gradient_check(double: Library, mask
 def test_in_float64_native_and_reference_agree_to_rounding(double: Library) -> None:
     rendered, target, mask = photographs(33, 47, seed=5)
     x, y = rendered.clone().requires_grad_(), rendered.clone().requires_grad_()
-    l1, ssim = ops.photometric(x, target, mask, library=double)
+    l1, ssim, l2 = ops.photometric(x, target, mask, library=double)
     expected = 0.8 * reference.l1(y, target, mask) - 0.2 * reference.ssim(y, target, mask)
-    assert (0.8 * l1 - 0.2 * ssim).item() == pytest.approx(expected.item(), rel=1e-14)
-    (found,), (wanted,) = torch.autograd.grad(0.8 * l1 - 0.2 * ssim, x), torch.autograd.grad(expected, y)
+    expected = expected + 10 * reference.l2(y, target, mask)
+    total = 0.8 * l1 - 0.2 * ssim + 10 * l2
+    assert total.item() == pytest.approx(expected.item(), rel=1e-14)
+    (found,), (wanted,) = torch.autograd.grad(total, x), torch.autograd.grad(expected, y)
     assert relative_error(found, wanted) < 1e-13
 
 
@@ -214,8 +217,8 @@ def test_a_cached_target_mean_changes_no_bit(library: Library, masked: bool) -> 
     x, y, valid = rendered.float().requires_grad_(), target.float(), mask if masked else None
     results = []
     for mean in (None, ops.blur(y, library=library)):
-        l1, ssim = ops.photometric(x, y, valid, mean, library=library)
-        results.append((l1, ssim, *torch.autograd.grad(0.8 * l1 - 0.2 * ssim, x)))
+        l1, ssim, l2 = ops.photometric(x, y, valid, mean, library=library)
+        results.append((l1, ssim, l2, *torch.autograd.grad(0.8 * l1 - 0.2 * ssim + l2, x)))
     for found, wanted in zip(*results, strict=True):
         assert torch.equal(found, wanted)
 
@@ -266,7 +269,7 @@ def test_nan_at_a_valid_pixel_reaches_the_loss(library: Library) -> None:
 def test_an_equal_pixel_has_no_l1_gradient(library: Library) -> None:
     y = torch.rand(6, 6, 3)
     x = y.clone().requires_grad_()
-    l1, _ = ops.photometric(x, y, expected=(1.0, 0.0), library=library)
+    l1, *_ = ops.photometric(x, y, expected=(1.0, 0.0, 0.0), library=library)
     assert l1.item() == 0
     assert (torch.autograd.grad(l1, x)[0] == 0).all()
 
@@ -283,7 +286,7 @@ def test_without_gradients_nothing_is_kept(library: Library) -> None:
 def test_a_target_changed_before_backward_is_an_error_not_a_wrong_gradient(library: Library) -> None:
     rendered, target, _ = photographs(9, 9)
     x, y = rendered.float().requires_grad_(), target.float().contiguous()
-    l1, _ = ops.photometric(x, y, library=library)
+    l1, *_ = ops.photometric(x, y, library=library)
     y.zero_()
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         l1.backward()

@@ -10,7 +10,7 @@ from gs2d.config.registry import Registry
 from gs2d.errors import RecipeError
 
 LOSS_KINDS = (
-    *("l1", "ssim", "normal_consistency", "normal_consistency_per_splat", "distortion", "silhouette"),
+    *("l1", "ssim", "l2", "normal_consistency", "normal_consistency_per_splat", "distortion", "silhouette"),
     *MULTIVIEW_KINDS,
 )
 LOSSES: Registry[Any] = Registry(

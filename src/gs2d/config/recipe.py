@@ -42,11 +42,12 @@ class LossTerm:
     Attributes
     ----------
     kind : str
-        "l1", "ssim" (1 - SSIM), "normal_consistency", "normal_consistency_per_splat" (the paper's Eq. 7 form),
-        "distortion", "silhouette" (alpha against that of the photographs: see ``required``), or, in a recipe with
-        ``multiview``, "multiview_photometric" (1 - NCC of warped patches), "multiview_geometric" (round trip, px); with
-        ``depth_prior`` "depth_prior" (relative error of depth), with ``normal_prior`` "normal_prior" (1 - cosine); or
-        one that a package or a program has registered (docs/extending.md).
+        "l1", "ssim" (1 - SSIM), "l2" (the mean squared difference), "normal_consistency",
+        "normal_consistency_per_splat" (the paper's Eq. 7 form), "distortion", "silhouette" (alpha against that of the
+        photographs: see ``required``), or, in a recipe with ``multiview``, "multiview_photometric" (1 - NCC of warped
+        patches), "multiview_geometric" (round trip, px); with ``depth_prior`` "depth_prior" (relative error of depth),
+        with ``normal_prior`` "normal_prior" (1 - cosine); or one that a package or a program has registered
+        (docs/extending.md).
     weight : float or None
         None, for "distortion" only: the protocol's weight (Table 1 of the paper writes it 100/10).
     start : int

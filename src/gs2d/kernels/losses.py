@@ -23,7 +23,7 @@ from gs2d.kernels.library import Library, ready_library
 
 POINTER, INT64, DOUBLE, INT = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double, ctypes.c_int
 SIGNATURES: dict[str, list[Any]] = {
-    "gs2d_photometric": [POINTER] * 4 + [INT64] * 2 + [DOUBLE] * 2 + [POINTER] * 2,
+    "gs2d_photometric": [POINTER] * 4 + [INT64] * 2 + [DOUBLE] * 3 + [POINTER] * 2,
     "gs2d_blur": [POINTER] + [INT64] * 2 + [POINTER],
     "gs2d_masked_mean": [POINTER] * 2 + [INT64] * 2 + [POINTER],
     "gs2d_normal_consistency": [POINTER] * 7 + [INT64] * 2 + [INT, INT, DOUBLE] + [POINTER] * 4,
@@ -43,7 +43,7 @@ class LossOperations:
         ``kernels.multiview.compare_views``; None: the losses of two views are worked out in torch.
     """
 
-    photometric: Callable[..., tuple[Tensor, Tensor]]
+    photometric: Callable[..., tuple[Tensor, Tensor, Tensor]]
     normal_consistency: Callable[..., Tensor]
     masked_mean: Callable[..., Tensor]
     blur: Callable[[Tensor], Tensor] | None = None
@@ -107,26 +107,26 @@ class _Photometric(torch.autograd.Function):
         target: Tensor,
         mask: Tensor | None,
         mean: Tensor | None,
-        expected: tuple[float, float],
+        expected: tuple[float, float, float],
         wanted: bool,
         library: Library,
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor]:
         ctx.library = library
         ctx.expected = torch.tensor(expected, dtype=torch.float64).to(rendered.dtype)  # rounded as the cotangents are
         gradient = torch.empty_like(rendered) if wanted else None
         values = _photometric(rendered, target, mask, mean, library, expected, gradient)
         ctx.save_for_backward(gradient, rendered, target, mask, mean)
-        return values[0], values[1]
+        return values[0], values[1], values[2]
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, l1_cotangent: Tensor, ssim_cotangent: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *given: Tensor) -> tuple[Tensor | None, ...]:
         gradient, rendered, target, mask, mean = ctx.saved_tensors
-        cotangents = torch.stack([l1_cotangent, ssim_cotangent])
+        cotangents = torch.stack(given)
         if not torch.equal(cotangents, ctx.expected):
             gradient = torch.empty_like(gradient)
-            l1, ssim = cotangents.tolist()
-            _photometric(rendered, target, mask, mean, ctx.library, (l1, ssim), gradient)
+            l1, ssim, l2 = cotangents.tolist()
+            _photometric(rendered, target, mask, mean, ctx.library, (l1, ssim, l2), gradient)
         return gradient, None, None, None, None, None, None
 
 
@@ -136,10 +136,10 @@ def _photometric(
     mask: Tensor | None,
     mean: Tensor | None,
     library: Library,
-    cotangents: tuple[float, float],
+    cotangents: tuple[float, float, float],
     gradient: Tensor | None,
 ) -> Tensor:
-    values = torch.empty(2, dtype=torch.float64)
+    values = torch.empty(3, dtype=torch.float64)
     height, width = rendered.shape[:2]
     _call(library, "gs2d_photometric", rendered, target, mask, mean, height, width, *cotangents, gradient, values)
     return values.to(rendered.dtype)
@@ -151,10 +151,10 @@ def photometric(
     mask: Tensor | None = None,
     target_mean: Tensor | None = None,
     *,
-    expected: tuple[float, float] = (0.8, -0.2),
+    expected: tuple[float, float, float] = (0.8, -0.2, 0.0),
     library: Library | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Mean L1 and mean SSIM of an image, both differentiable in ``rendered``, in one fused pass.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean L1, SSIM and L2 of an image, all differentiable in ``rendered``, in one fused pass.
 
     Parameters
     ----------
@@ -164,15 +164,15 @@ def photometric(
         False = ignore this pixel.
     target_mean : Tensor [H, W, 3], optional
         ``blur(target)``, if at hand. Changes no bit of the result.
-    expected : (float, float)
-        Cotangents of the two values that the backward pass will probably see; any other costs a second pass.
+    expected : (float, float, float)
+        Cotangents of the values that the backward pass will probably see; any other costs a second pass.
     library : Library, optional
         By default this machine's best, on as many threads as torch uses.
 
     Returns
     -------
-    l1, ssim : Tensor []
-        Means over valid pixels and channels; 0 when no pixel is valid.
+    l1, ssim, l2 : Tensor []
+        Means over valid pixels and channels; 0 when no pixel is valid. L2 is of the squared difference.
 
     Raises
     ------
@@ -192,8 +192,8 @@ def photometric(
         (target_mean,) = _arrays(library, target_mean=target_mean)
     wanted = _wanted(rendered)
     arguments = (target, _mask_bytes(mask), target_mean, expected, wanted, library)
-    l1, ssim = _Photometric.apply(rendered.contiguous(), *arguments)
-    return l1, ssim
+    l1, ssim, l2 = _Photometric.apply(rendered.contiguous(), *arguments)
+    return l1, ssim, l2
 
 
 class _NormalConsistency(torch.autograd.Function):

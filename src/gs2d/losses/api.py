@@ -148,7 +148,7 @@ class LossView:
     fused: LossOperations | None = None
     _compared: dict[str, ViewPair] = field(default_factory=dict)
     _fused_views: dict[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
-    _photometric: tuple[Tensor, Tensor] | None = None
+    _photometric: tuple[Tensor, Tensor, Tensor] | None = None
 
     def two_views(self, output: RenderOutput) -> ViewPair:
         """Return the view beside its neighbour, by one kind of depth; shared by the losses that ask."""
@@ -169,10 +169,10 @@ class LossView:
             self._fused_views[self.depth_kind] = self.two_views(output).compared(compare)
         return self._fused_views[self.depth_kind]
 
-    def photometric(self, output: RenderOutput, operations: LossOperations) -> tuple[Tensor, Tensor]:
-        """Return (L1, SSIM) by one fused pass, shared by both terms."""
+    def photometric(self, output: RenderOutput, operations: LossOperations) -> tuple[Tensor, Tensor, Tensor]:
+        """Return (L1, SSIM, L2) by one fused pass, shared by their terms."""
         if self._photometric is None:
-            expected = (self.weights.get("l1", 0.0), -self.weights.get("ssim", 0.0))
+            expected = (self.weights.get("l1", 0.0), -self.weights.get("ssim", 0.0), self.weights.get("l2", 0.0))
             given = (output.color, self.target, self.mask, self.target_mean)
             self._photometric = operations.photometric(*given, expected=expected)
         return self._photometric
@@ -259,6 +259,11 @@ def _l1(output: RenderOutput, view: LossView) -> Tensor:
     return reference.l1(output.color, view.target, view.mask)
 
 
+@register_loss("l2")
+def _l2(output: RenderOutput, view: LossView) -> Tensor:
+    return reference.l2(output.color, view.target, view.mask)
+
+
 @register_loss("ssim")
 def _ssim(output: RenderOutput, view: LossView) -> Tensor:
     return 1 - reference.ssim(output.color, view.target, view.mask)
@@ -320,6 +325,7 @@ FUSED: Mapping[str, Callable[[RenderOutput, LossView, LossOperations], Tensor]] 
     {
         "l1": lambda output, view, fused: view.photometric(output, fused)[0],
         "ssim": lambda output, view, fused: 1 - view.photometric(output, fused)[1],
+        "l2": lambda output, view, fused: view.photometric(output, fused)[2],
         "normal_consistency": partial(_fused_normals, kind="normal_consistency"),
         "normal_consistency_per_splat": partial(_fused_normals, kind="normal_consistency_per_splat"),
         "distortion": lambda output, view, fused: fused.masked_mean(output.distortion, view.mask),

@@ -41,6 +41,11 @@ def l1(rendered: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     return masked_mean((fill_ignored(rendered, target, mask) - target).abs(), mask)
 
 
+def l2(rendered: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Mean squared difference over valid pixels and channels."""
+    return masked_mean((fill_ignored(rendered, target, mask) - target).square(), mask)
+
+
 def gaussian_window(dtype: torch.dtype = torch.float64, device: torch.device | None = None) -> Tensor:
     """Return the 11 normalised weights of the SSIM window: exp(-k^2 / (2 sigma^2)), k = -5..5."""
     k = torch.arange(-WINDOW_RADIUS, WINDOW_RADIUS + 1, dtype=torch.float64)

@@ -408,7 +408,7 @@ class _Plan:
         return Work("blend_forward", self._tiles, THREADS, arguments)
 
     def _losses(self) -> list[Work]:
-        """L1 and SSIM, whose values nobody asks for, and the gradients of all losses."""
+        """L1, SSIM and L2, whose values nobody asks for, and the gradients of all losses."""
         channels, blocks = self._step.photograph.shape[2], strips(self._height, self._width)
         kind = "rgb" if channels == 3 else "rgba"
         first = structures.PhotometricArguments(self._height, self._width)
@@ -537,6 +537,7 @@ class _Plan:
         second = self._comparing[1]
         second.l1_scale = np.float32(step.weights.get("l1", 0.0)) * one
         second.ssim_scale = -np.float32(step.weights.get("ssim", 0.0)) * one
+        second.l2_scale = np.float32(step.weights.get("l2", 0.0)) * one
         if self._normals is not None:
             normals = self._normals
             normals.mask = mask

@@ -55,7 +55,7 @@ class WholeStep:
         Pixels that count.
     background : 3 floats
     weights : mapping of kind to float
-        Of "l1", "ssim", "normal_consistency" and, of photographs with alpha, "silhouette": those that are active.
+        Of "l1", "ssim", "l2", "normal_consistency" and, of photographs with alpha, "silhouette": those that are active.
     depth : "mean" or "median"
         That normals come from, and ``at_camera``: see ``LossTerm.edges``.
     at_camera : bool

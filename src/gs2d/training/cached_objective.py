@@ -17,7 +17,7 @@ from gs2d.training.objective import FullRender, Objective, StepResult
 from gs2d.training.state import TrainState
 
 COLORS = frozenset({"sh0", "shN"})
-OF_COLOR = frozenset({"l1", "ssim"})  # losses that see nothing but the colour image
+OF_COLOR = frozenset({"l1", "ssim", "l2"})  # losses that see nothing but the colour image
 MIN_FRACTION = 0.5  # of the views: a cache for fewer saves little of a stage, and takes its memory all the same
 WORTH = 2  # visits per view from which filling, about two forward passes, is repaid
 

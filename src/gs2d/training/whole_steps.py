@@ -17,12 +17,12 @@ from gs2d.training.state import TrainState
 
 __all__ = ["WholeSteps"]
 
-KINDS = frozenset({"l1", "ssim", "normal_consistency", "silhouette"})
+KINDS = frozenset({"l1", "ssim", "l2", "normal_consistency", "silhouette"})
 NOTHING: Mapping[str, Tensor] = MappingProxyType({})
 
 
 class WholeSteps:
-    """The iterations of a stage whose losses are a photograph's L1 and SSIM, normal consistency and silhouettes.
+    """The iterations of a stage whose losses are a photograph's L1, SSIM and L2, normal consistency, silhouettes.
 
     Weights of pixels but those of the object, a second view, or anything that is learned of photographs and cameras
     are not for here: :class:`~gs2d.training.objective.FullRender` does all of it.

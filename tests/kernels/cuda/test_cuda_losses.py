@@ -53,21 +53,20 @@ def relative_error(found: Tensor, expected: Tensor) -> float:
 
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("size", SIZES)
-def test_l1_and_ssim_and_their_gradient_are_those_of_the_reference(
+def test_l1_ssim_l2_and_their_gradient_are_those_of_the_reference(
     emulator: emulate.Emulator, size: tuple[int, int], masked: bool
 ) -> None:
     x, y, mask = photographs(*size)
     x.requires_grad_()
     valid = mask if masked else None
     exact = x.detach().double().requires_grad_()
-    l1, ssim = ops.photometric(x, y, valid, launcher=emulator)
-    expected_l1 = reference.l1(exact, y.double(), valid)
-    expected_ssim = reference.ssim(exact, y.double(), valid)
-    assert l1.item() == pytest.approx(expected_l1.item(), abs=1e-6)
-    assert ssim.item() == pytest.approx(expected_ssim.item(), abs=2e-6)
-    for weights in [(0.8, -0.2), (0.0, 1.0), (1.0, 0.0)]:
-        (found,) = torch.autograd.grad((l1, ssim), x, tuple(map(torch.tensor, weights)), retain_graph=True)
-        total = weights[0] * expected_l1 + weights[1] * expected_ssim
+    values = ops.photometric(x, y, valid, launcher=emulator)
+    exact_values = [value(exact, y.double(), valid) for value in (reference.l1, reference.ssim, reference.l2)]
+    for value, exact_value, atol in zip(values, exact_values, (1e-6, 2e-6, 1e-6), strict=True):
+        assert value.item() == pytest.approx(exact_value.item(), abs=atol)
+    for weights in [(0.8, -0.2, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.8, -0.2, 10.0)]:
+        (found,) = torch.autograd.grad(values, x, tuple(map(torch.tensor, weights)), retain_graph=True)
+        total = sum(weight * value for weight, value in zip(weights, exact_values, strict=True))
         (expected,) = torch.autograd.grad(total, exact, retain_graph=True)
         assert relative_error(found, expected) < 2e-5
 
@@ -77,7 +76,8 @@ def test_one_value_alone_has_its_own_gradient(emulator: emulate.Emulator) -> Non
     x, y, _ = photographs(9, 7)
     x.requires_grad_()
     exact = x.detach().double().requires_grad_()
-    for which, expected in enumerate((reference.l1(exact, y.double()), reference.ssim(exact, y.double()))):
+    for which, value in enumerate((reference.l1, reference.ssim, reference.l2)):
+        expected = value(exact, y.double())
         (found,) = torch.autograd.grad(ops.photometric(x, y, launcher=emulator)[which], x)
         assert relative_error(found, torch.autograd.grad(expected, exact)[0]) < 2e-5
 
@@ -99,10 +99,10 @@ def test_ignored_pixels_have_no_influence_and_no_gradient(emulator: emulate.Emul
     results = []
     for filler in (0.5, float("nan")):
         z = torch.where(mask[..., None], x, torch.tensor(filler)).requires_grad_()
-        l1, ssim = ops.photometric(z, y, mask, launcher=emulator)
-        results.append((l1, ssim, *torch.autograd.grad(l1 + ssim, z)))
+        values = ops.photometric(z, y, mask, launcher=emulator)
+        results.append((*values, *torch.autograd.grad(sum(values), z)))
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
-    gradient = results[0][2]
+    gradient = results[0][-1]
     assert not gradient[~mask].any()
     assert bool(gradient[mask].any())
 
@@ -122,12 +122,12 @@ def test_without_a_valid_pixel_values_and_gradients_are_0(emulator: emulate.Emul
     x, y, _ = photographs(7, 6)
     nothing = torch.zeros(7, 6, dtype=torch.bool)
     x.requires_grad_()
-    l1, ssim = ops.photometric(x, y, nothing, launcher=emulator)
+    l1, ssim, l2 = ops.photometric(x, y, nothing, launcher=emulator)
     normal, depth, alpha, _ = geometry(7, 6)
     mean = ops.masked_mean(x[..., 0], nothing, launcher=emulator)
     consistency = ops.normal_consistency(normal, depth, alpha, make_camera(7, 6), nothing, launcher=emulator)
-    assert [l1.item(), ssim.item(), mean.item(), consistency.item()] == [0.0] * 4
-    (gradient,) = torch.autograd.grad(l1 + ssim + mean, x)
+    assert [l1.item(), ssim.item(), l2.item(), mean.item(), consistency.item()] == [0.0] * 5
+    (gradient,) = torch.autograd.grad(l1 + ssim + l2 + mean, x)
     assert not gradient.any()
 
 
@@ -186,10 +186,10 @@ def test_values_and_gradients_do_not_depend_on_the_order_of_threads(emulator: em
         replace(emulator, seed=2),
     ):
         z, depth = x.clone().requires_grad_(), images[1].clone().requires_grad_()
-        l1, ssim = ops.photometric(z, y, mask, launcher=launcher)
+        values = ops.photometric(z, y, mask, launcher=launcher)
         consistency = ops.normal_consistency(images[0], depth, images[2], make_camera(37, 44), mask, launcher=launcher)
         mean = ops.masked_mean(x[..., 0], mask, launcher=launcher)
-        results.append((l1, ssim, consistency, mean, *torch.autograd.grad(l1 + ssim + consistency, (z, depth))))
+        results.append((*values, consistency, mean, *torch.autograd.grad(sum(values) + consistency, (z, depth))))
     for others in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], others, strict=True))
 

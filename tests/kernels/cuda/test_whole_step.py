@@ -123,7 +123,16 @@ def of_object(recipe: Recipe) -> Recipe:
 
 def with_silhouettes(recipe: Recipe) -> Recipe:
     """Alpha of the photographs that have one kept, as in ``best``."""
-    term = LossTerm("silhouette", 0.1, required=False)
+    return with_term(recipe, LossTerm("silhouette", 0.1, required=False))
+
+
+def with_squares(recipe: Recipe) -> Recipe:
+    """Squares of differences after the first iterations, as in ``best``."""
+    return with_term(recipe, LossTerm("l2", 10.0, start=3))
+
+
+def with_term(recipe: Recipe, term: LossTerm) -> Recipe:
+    """A term more in all stages."""
     return replace(recipe, stages=tuple(replace(stage, losses=(*stage.losses, term)) for stage in recipe.stages))
 
 
@@ -141,6 +150,7 @@ VARIANTS = {
     "absolute": (two_sizes, train_toys.short(absgs=True), replace(GENERIC, depth="median")),
     "object": (masked, of_object(train_toys.short()), replace(GENERIC, depth="median")),
     "silhouettes": (masked, with_silhouettes(of_object(train_toys.short())), GENERIC),
+    "squares": (masked, with_squares(train_toys.short()), GENERIC),
     "masks": (masked, at_camera(train_toys.short()), replace(GENERIC, background=(0.2, 1.0, 0.7))),
 }
 
@@ -300,6 +310,17 @@ def test_normals_of_the_object_alone_have_the_bits_of_those_that_go_through_torc
     assert not same(whole, trained(emulator, some_alpha, recipe, "launches")[0])
 
 
+def test_squares_that_come_later_have_the_bits_of_those_that_go_through_torch(
+    emulator: Emulator, scene: Scene
+) -> None:
+    recipe = with_squares(brief())
+    parts, _ = trained(emulator, scene, recipe, "autograd")
+    whole, some = trained(emulator, scene, recipe, "launches")
+    assert some == 6
+    assert same(parts, whole)
+    assert not same(whole, trained(emulator, scene, brief(), "launches")[0])
+
+
 def test_silhouettes_have_the_bits_of_those_that_go_through_torch(emulator: Emulator, scene: Scene) -> None:
     """With masks; of photographs without alpha nothing is asked, unless they must have one."""
     recipe, some_alpha = with_silhouettes(of_object(brief())), masked(scene)
@@ -355,19 +376,19 @@ def test_photographs_in_the_hosts_memory_come_to_the_same_place_each_time(emulat
 
 
 def test_a_byte_is_the_same_number_as_by_a_division(emulator: Emulator) -> None:
-    """All 256: a row of them, against a target of floats, is an L1 of exactly 0."""
+    """All 256: a row of them, against a target of floats, is an L1 and an L2 of exactly 0."""
     from gs2d.kernels.cuda.arguments import PhotometricArguments, fill
     from gs2d.kernels.cuda.losses import THREADS, strips
 
     width = 86  # 258 reals
     values = torch.arange(3 * width) % 256
     rendered = (values.to(torch.float32) / 255).view(1, width, 3).contiguous()
-    partials = torch.full((3, strips(1, width)), torch.nan)
+    partials = torch.full((4, strips(1, width)), torch.nan)  # valid reals, L1, SSIM, L2
     arguments, pixels = PhotometricArguments(1, width), values.to(torch.uint8)
     fill(arguments, rendered=rendered, partials=partials)
     arguments.photograph.bytes = pixels.data_ptr()
     emulator.launch("photometric_forward_rgb", strips(1, width), THREADS, arguments)
-    assert float(partials[1].sum()) == 0
+    assert float(partials[1].sum()) == float(partials[3].sum()) == 0
     assert float(partials[0].sum()) == 3 * width
 
 

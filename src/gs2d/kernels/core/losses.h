@@ -43,6 +43,9 @@ template <class V> GS2D_HD V l1_sign(V x, V y) {
     return select(x > y, one, select(x < y, -one, zero));
 }
 
+// d(x - y)^2 / dx.
+template <class V> GS2D_HD V l2_slope(V x, V y) { return V(2.0f) * (x - y); }
+
 // The surface normal of a pixel from the z-depths of its four neighbours, not normalised, in the camera frame:
 // (P_down - P_up) x (P_right - P_left) is proportional to
 //     n = (fx gx, fy gy, -(1 + (px - cx) gx + (py - cy) gy)),  gx = (zr - zl)/(zr + zl),  gy = (zd - zu)/(zd + zu)

@@ -1,4 +1,4 @@
-// L1 and SSIM of an image [H, W, 3], with the gradient of any weighted sum of both, in one pass over the rows.
+// L1, SSIM and L2 of an image [H, W, 3], with the gradient of any weighted sum of them, in one pass over the rows.
 //
 // A row of W interleaved pixels is 3 W reals; the window's taps are 3 reals apart, so that channels need no planes. Each
 // piece of rows runs down the image with two rings of horizontally blurred rows: of the moments x, x^2 + y^2, x y (and
@@ -76,9 +76,9 @@ struct Images {
     const real *rendered, *target, *target_mean;
     const uint8_t* mask;
     int64_t height, width;
-    double l1_scale, ssim_scale;  // of the gradient: cotangent / (valid pixels * 3)
+    double l1_scale, ssim_scale, l2_scale;  // of the gradient: cotangent / (valid pixels * 3)
     real* gradient;
-    double *l1_rows, *ssim_rows;  // sums of each row
+    double *l1_rows, *ssim_rows, *l2_rows;  // sums of each row
 };
 
 enum Moment { MEAN, SQUARES, PRODUCT, TARGET_MEAN, MOMENTS };
@@ -146,7 +146,7 @@ class Piece {
     void input_row(int64_t y) {
         if (!inside(y)) return moments.clear(y, length);
         const Row x = rendered_row(y), target = row_of(im.target, y);
-        V l1 = V(real(0));
+        V l1 = V(real(0)), l2 = l1;
         for (int64_t i = 0; i < length; i += LANES) {
             const V u = x.load(i), v = target.load(i);
             store(products + MEAN * stride + i, u);
@@ -154,8 +154,9 @@ class Piece {
             store(products + PRODUCT * stride + i, u * v);
             if (!known) store(products + TARGET_MEAN * stride + i, v);
             l1 += abs(u - v);
+            l2 = fma(u - v, u - v, l2);
         }
-        if (mine(y)) im.l1_rows[y] = double(sum(l1));
+        if (mine(y)) im.l1_rows[y] = double(sum(l1)), im.l2_rows[y] = double(sum(l2));
         for (int m = 0; m < maps; ++m) blur_row(products + m * stride, moments.row(y, m), length);
     }
 
@@ -202,16 +203,18 @@ class Piece {
     void gradient_row(int64_t y, int r) {
         const Row x = rendered_row(y), target = row_of(im.target, y);
         const V l1_scale = V(real(im.l1_scale)), ssim_scale = V(real(im.ssim_scale)), two = V(real(2));
+        const V l2_scale = V(real(im.l2_scale));
         real* out = im.gradient + y * n;
         for (int64_t i = 0; i < n; i += LANES) {
             const V u = x.load(i), v = target.load(i);
             const V ssim = fma(two * u, blurred_at(D_SQUARES, r, i),
                                fma(v, blurred_at(D_PRODUCT, r, i), blurred_at(D_MEAN, r, i)));
-            const V both = load(validity + i) * fma(ssim_scale, ssim, l1_scale * l1_sign(u, v));
+            const V by_pixel = fma(l2_scale, l2_slope(u, v), l1_scale * l1_sign(u, v));
+            const V all = load(validity + i) * fma(ssim_scale, ssim, by_pixel);
             if (n - i >= LANES) {
-                store(out + i, both);
+                store(out + i, all);
             } else {
-                store_first(out + i, both, static_cast<int>(n - i));
+                store_first(out + i, all, static_cast<int>(n - i));
             }
         }
     }
@@ -237,20 +240,31 @@ double ordered_sum(const double* values, int64_t n) {
 
 using namespace gs2d;
 
-// values = (mean L1, mean SSIM) over valid pixels and channels; gradient (or null) = l1_cotangent dL1/drendered +
-// ssim_cotangent dSSIM/drendered. `mask` (bytes, 0 = ignore) and `target_mean` (of gs2d_blur) may be null.
+// values = (mean L1, mean SSIM, mean L2) over valid pixels and channels; gradient (or null) = l1_cotangent dL1/drendered
+// + ssim_cotangent dSSIM/drendered + l2_cotangent dL2/drendered. `mask` (bytes, 0 = ignore) and `target_mean` (of
+// gs2d_blur) may be null.
 // Returns 0, or 1 when there is no memory.
 GS2D_EXPORT int gs2d_photometric(const real* rendered, const real* target, const uint8_t* mask, const real* target_mean,
                                  int64_t height, int64_t width, double l1_cotangent, double ssim_cotangent,
-                                 real* gradient, double* values) {
-    values[0] = values[1] = 0;
-    auto* rows = static_cast<double*>(std::malloc(static_cast<size_t>(2 * height + 1) * sizeof(double)));
+                                 double l2_cotangent, real* gradient, double* values) {
+    values[0] = values[1] = values[2] = 0;
+    auto* rows = static_cast<double*>(std::malloc(static_cast<size_t>(3 * height + 1) * sizeof(double)));
     if (rows == nullptr) return 1;
     const int64_t valid = count_valid(mask, height * width);
     const double scale = 1.0 / static_cast<double>(valid > 0 ? 3 * valid : 1);
-    const Images images{rendered, target, target_mean,          mask,
-                        height,   width,  l1_cotangent * scale, ssim_cotangent * scale,
-                        gradient, rows,   rows + height};
+    const Images images{rendered,
+                        target,
+                        target_mean,
+                        mask,
+                        height,
+                        width,
+                        l1_cotangent * scale,
+                        ssim_cotangent * scale,
+                        l2_cotangent * scale,
+                        gradient,
+                        rows,
+                        rows + height,
+                        rows + 2 * height};
     int failed = 0;
     parallel_ranges(height, rows_per_piece(height, 2 * RADIUS), [&](int64_t begin, int64_t end) {
         if (!Piece(images, begin, end).run()) __atomic_store_n(&failed, 1, __ATOMIC_RELAXED);
@@ -258,6 +272,7 @@ GS2D_EXPORT int gs2d_photometric(const real* rendered, const real* target, const
     if (!failed) {
         values[0] = ordered_sum(images.l1_rows, height) * scale;
         values[1] = ordered_sum(images.ssim_rows, height) * scale;
+        values[2] = ordered_sum(images.l2_rows, height) * scale;
     }
     std::free(rows);
     return failed;

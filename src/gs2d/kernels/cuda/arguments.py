@@ -224,9 +224,9 @@ class PhotometricVjpArguments(ctypes.Structure):
 
     _fields_ = (
         *_all(ctypes.c_int64, "height", "width"),
-        *_pointers("rendered", "target", "mask", "maps", "means", "g_l1", "g_ssim", "gradient"),
+        *_pointers("rendered", "target", "mask", "maps", "means", "g_l1", "g_ssim", "g_l2", "gradient"),
         ("photograph", Photograph),
-        *_all(ctypes.c_float, "l1_scale", "ssim_scale"),
+        *_all(ctypes.c_float, "l1_scale", "ssim_scale", "l2_scale"),
     )
 
 

@@ -112,10 +112,10 @@ class _Photometric(torch.autograd.Function):
         mean: Tensor | None,
         wanted: bool,
         launcher: Launcher,
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor]:
         height, width = rendered.shape[:2]
         blocks = strips(height, width)
-        partials = rendered.new_empty(3, blocks)
+        partials = rendered.new_empty(4, blocks)
         maps = rendered.new_empty(3, height, width, 3) if wanted else None
         if blocks > 0:
             arguments = PhotometricArguments(height, width)
@@ -127,18 +127,18 @@ class _Photometric(torch.autograd.Function):
         ctx.launcher = launcher
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(rendered, target, mask, maps, means)
-        return means[1].clone(), means[2].clone()
+        return means[1].clone(), means[2].clone(), means[3].clone()
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, g_l1: Tensor | None, g_ssim: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *given: Tensor | None) -> tuple[Tensor | None, ...]:
         rendered, target, mask, maps, means = ctx.saved_tensors
         gradient = torch.empty_like(rendered)
         height, width = rendered.shape[:2]
         if gradient.numel() > 0:
             arguments = PhotometricVjpArguments(height, width)
             fill(arguments, rendered=rendered, target=target, mask=mask, maps=maps, means=means, gradient=gradient)
-            cotangents = {"g_l1": _cotangent(g_l1), "g_ssim": _cotangent(g_ssim)}
+            cotangents = dict(zip(("g_l1", "g_ssim", "g_l2"), map(_cotangent, given), strict=True))
             fill(arguments, **cotangents)
             ctx.launcher.launch("photometric_vjp", strips(height, width), THREADS, arguments)
         return gradient, None, None, None, None, None
@@ -150,10 +150,10 @@ def photometric(
     mask: Tensor | None = None,
     target_mean: Tensor | None = None,
     *,
-    expected: tuple[float, float] = (0.8, -0.2),
+    expected: tuple[float, float, float] = (0.8, -0.2, 0.0),
     launcher: Launcher,
-) -> tuple[Tensor, Tensor]:
-    """Mean L1 and mean SSIM of an image, both differentiable in ``rendered``.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean L1, SSIM and L2 of an image, all differentiable in ``rendered``.
 
     Parameters
     ----------
@@ -163,15 +163,15 @@ def photometric(
         False = ignore this pixel.
     target_mean : Tensor [H, W, 3], optional
         ``blur(target)``, if at hand. Changes no bit of the result.
-    expected : (float, float)
+    expected : (float, float, float)
         Not needed here; any cotangents cost the same.
     launcher : Launcher
         Of the tensors' device.
 
     Returns
     -------
-    l1, ssim : Tensor []
-        Means over valid pixels and channels; 0 when no pixel is valid.
+    l1, ssim, l2 : Tensor []
+        Means over valid pixels and channels; 0 when no pixel is valid. L2 is of the squared difference.
 
     Raises
     ------
@@ -187,8 +187,8 @@ def photometric(
     _, target, *known = ready(**images)
     mask = _mask_of(mask, rendered.device)
     mean = known[0] if known else None
-    l1, ssim = _Photometric.apply(rendered.contiguous(), target, mask, mean, _wanted(rendered), launcher)
-    return l1, ssim
+    l1, ssim, l2 = _Photometric.apply(rendered.contiguous(), target, mask, mean, _wanted(rendered), launcher)
+    return l1, ssim, l2
 
 
 def _normal_arguments(

@@ -1,4 +1,4 @@
-// L1 and SSIM of an image [H, W, 3], and their gradient: two passes with a map of three derivatives between them.
+// L1, SSIM and L2 of an image [H, W, 3], and their gradient: two passes with a map of three derivatives between them.
 //
 // A row of W interleaved pixels is 3 W reals, and the window's taps are 3 reals apart: channels need no planes. A block
 // runs down a strip of 128 reals; each row passes through shared memory once, is blurred horizontally, and enters 11
@@ -23,7 +23,7 @@ struct PhotometricArguments {
     const uchar* mask;               // [H, W], 0 = ignore; or null
     const float* target_mean;        // [H, W, 3]: blur_image of the target; of the variant `known`
     float* maps;                     // [3, H, W, 3]: derivatives of SSIM by the blurred moments; or null
-    float* partials;                 // [3, blocks]: valid reals, L1, SSIM; or null
+    float* partials;                 // [4, blocks]: valid reals, L1, SSIM, L2; or null
     Photograph photograph;
 };
 
@@ -32,10 +32,10 @@ struct PhotometricVjpArguments {
     const float *rendered, *target;
     const uchar* mask;
     const float *maps, *means;   // means[0] = 1 / valid reals; null where the scales below are given
-    const float *g_l1, *g_ssim;  // cotangents of both values, or null
-    float* gradient;             // [H, W, 3]
+    const float *g_l1, *g_ssim, *g_l2;  // cotangents of the values, or null
+    float* gradient;                    // [H, W, 3]
     Photograph photograph;
-    float l1_scale, ssim_scale;  // cotangents / valid reals
+    float l1_scale, ssim_scale, l2_scale;  // cotangents / valid reals
 };
 
 struct BlurArguments {
@@ -141,7 +141,7 @@ template <bool KNOWN, int CHANNELS = 0> __device__ __forceinline__ void photomet
     };
     RunningBlur mean, squares, product, target_mean;
     Staging<2> next;
-    float sums[3] = {0.f, 0.f, 0.f};  // valid reals, L1, SSIM
+    float sums[4] = {0.f, 0.f, 0.f, 0.f};  // valid reals, L1, SSIM, L2
     next.load(s, s.begin - SSIM_RADIUS, read(s.begin - SSIM_RADIUS));
     for (int64 y = s.begin - SSIM_RADIUS; y < s.end + SSIM_RADIUS; ++y) {
         float (*row)[STAGED] = rows[y & 1];
@@ -158,7 +158,7 @@ template <bool KNOWN, int CHANNELS = 0> __device__ __forceinline__ void photomet
         mean.add(m), squares.add(q), product.add(p);
         if constexpr (!KNOWN) target_mean.add(blur_row(row[1]));
         const float u = row[0][threadIdx.x + SIDE], v = row[1][threadIdx.x + SIDE];
-        if (s.mine() && y >= s.begin && y < s.end) sums[1] = sums[1] + abs(u - v);
+        if (s.mine() && y >= s.begin && y < s.end) sums[1] = sums[1] + abs(u - v), sums[3] = fma(u - v, u - v, sums[3]);
         const int64 out = y - SSIM_RADIUS, at = out * s.n + s.column;
         if (out < s.begin || !s.mine()) continue;
         const float b = KNOWN ? a.target_mean[at] : target_mean.done();
@@ -185,13 +185,16 @@ extern "C" __global__ void __launch_bounds__(128) photometric_forward_rgba(Photo
     photometric<false, 4>(a);
 }
 
-// dL/dx = B(d_mean) + 2 x B(d_squares) + y B(d_product) for SSIM, the sign of x - y for L1.
+// dL/dx = B(d_mean) + 2 x B(d_squares) + y B(d_product) for SSIM, the sign of x - y for L1, 2 (x - y) for L2.
 template <int CHANNELS> __device__ __forceinline__ void gradient_of(const PhotometricVjpArguments& a) {
     __shared__ float rows[2][3][STAGED];
     const Strip s(a.height, a.width);
     const int64 plane = s.height * s.n;
-    float l1_scale = a.l1_scale, ssim_scale = a.ssim_scale;
-    if (a.means) l1_scale = a.g_l1 ? *a.g_l1 * a.means[0] : 0.f, ssim_scale = a.g_ssim ? *a.g_ssim * a.means[0] : 0.f;
+    float l1_scale = a.l1_scale, ssim_scale = a.ssim_scale, l2_scale = a.l2_scale;
+    if (a.means) {
+        const auto scale = [&a](const float* cotangent) { return cotangent ? *cotangent * a.means[0] : 0.f; };
+        l1_scale = scale(a.g_l1), ssim_scale = scale(a.g_ssim), l2_scale = scale(a.g_l2);
+    }
     const auto read = [&](int64 y) {
         return [&a, &s, plane, y](int64 column, float* value) {
             for (int m = 0; m < 3; ++m) value[m] = a.maps[m * plane + y * s.n + column];
@@ -213,7 +216,7 @@ template <int CHANNELS> __device__ __forceinline__ void gradient_of(const Photom
         if (is_valid(a.mask, out, a.width, s.column)) {
             const float u = a.rendered[at], v = target_of<CHANNELS>(a, out, s.column);
             const float ssim = fma(2.f * u, blurred[1].done(), fma(v, blurred[2].done(), blurred[0].done()));
-            g = fma(ssim_scale, ssim, l1_scale * l1_sign(u, v));
+            g = fma(ssim_scale, ssim, fma(l2_scale, l2_slope(u, v), l1_scale * l1_sign(u, v)));
         }
         a.gradient[at] = g;
     }
