@@ -14,6 +14,7 @@ from gs2d.config.presets import (
     RECIPES,
     SH_FASTER,
     SILHOUETTE,
+    SQUARES,
     SURFACE_NC,
     get_recipe,
     with_fading_backdrop,
@@ -70,13 +71,14 @@ def test_colours_by_direction_learn_faster_but_from_few_photographs(name: str, s
     (stage,), (slow,) = recipe.stages, with_few_views(recipe).stages
     assert stage.lr.shN == pytest.approx(SH_FASTER * stage.lr.sh0 / 20)
     assert slow.lr.shN == pytest.approx(stage.lr.sh0 / 20)
-    assert replace(slow, lr=replace(slow.lr, shN=stage.lr.shN)) == stage
+    assert replace(slow, lr=replace(slow.lr, shN=stage.lr.shN), losses=stage.losses) == stage
+    assert slow.losses == tuple(term for term in stage.losses if term.kind != "l2")
     assert any("SH beyond degree 0 at 2.5 times" in line for line in describe_recipe(recipe))
     assert not any("SH beyond" in line for line in describe_recipe(with_few_views(recipe)))
 
 
-def test_rates_of_another_s_choice_stay() -> None:
-    chosen = apply_overrides(get_recipe("best"), ["surface.lr.shN=0.001"])
+def test_rates_and_weights_of_another_s_choice_stay() -> None:
+    chosen = apply_overrides(get_recipe("best"), ["surface.lr.shN=0.001", "surface.losses.l2.weight=5"])
     assert with_few_views(chosen) == chosen
     assert with_few_views(get_recipe("2dgs-r")) == get_recipe("2dgs-r")
 
@@ -89,7 +91,19 @@ def test_best_surface_compares_views_in_its_last_fifth_alone() -> None:
     (consistency,) = (term for term in plain if term.kind == "normal_consistency")
     lighter = tuple(replace(term, weight=BEST_NC) if term is consistency else term for term in plain)
     assert consistency.weight == SURFACE_NC > BEST_NC
-    assert replace(stage, losses=lighter) == get_recipe("best").stages[0]
+    best = get_recipe("best").stages[0]
+    assert replace(stage, losses=lighter) == replace(best, losses=tuple(t for t in best.losses if t.kind != "l2"))
+
+
+@pytest.mark.parametrize("name", ["best", "best-fast"])
+@pytest.mark.parametrize("scale", [1.0, 0.1])
+def test_squares_count_once_nothing_is_densified(name: str, scale: float) -> None:
+    (stage,) = scale_schedule(get_recipe(name), scale).stages
+    (term,) = (term for term in stage.losses if term.kind == "l2")
+    assert isinstance(stage.densify, GradDensify)
+    assert term.weight == SQUARES
+    assert stage.densify.stop <= term.start + 1
+    assert term.start == pytest.approx(stage.iterations / 2, abs=1)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -11,7 +11,14 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d.config.presets import SH_FASTER, get_recipe, with_fading_backdrop, with_robustness, without_optional_losses
+from gs2d.config.presets import (
+    SH_FASTER,
+    get_recipe,
+    with_fading_backdrop,
+    with_robustness,
+    without_optional_losses,
+    without_squares,
+)
 from gs2d.config.protocols import DTU, GENERIC
 from gs2d.config.recipe import LearningRates
 from gs2d.config.robust import FEW_VIEWS, SplatDropout
@@ -244,13 +251,17 @@ def test_a_run_of_before_the_sphere_goes_on_as_it_began(undisturbed: RunFolder, 
     assert as_begun(run, replace(job, recipe=robust)).recipe == robust
 
 
-def test_a_run_of_before_alpha_was_compared_goes_on_as_it_began(undisturbed: RunFolder, tmp_path: Path) -> None:
+def test_a_run_of_before_alpha_was_compared_or_squares_counted_goes_on_as_it_began(
+    undisturbed: RunFolder, tmp_path: Path
+) -> None:
     run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
     job, recipe = reload_job(run, lambda _: None), get_recipe("best")
-    before = without_optional_losses(recipe)
-    assert [term.kind for term in before.stages[0].losses] == ["l1", "ssim", "normal_consistency"]
+    with_alpha = without_squares(recipe)
+    before = without_optional_losses(with_alpha)
+    losses = [(term.kind, term.weight) for term in before.stages[0].losses]
+    assert losses == [("l1", 0.8), ("ssim", 0.2), ("normal_consistency", 0.02)]
     data = json.loads(run.file("run.json").read_text())
-    for begun in (before, recipe):
+    for begun in (before, with_alpha, recipe):
         data["recipe"] = to_json(begun)
         run.file("run.json").write_text(json.dumps(data))
         assert as_begun(run, replace(job, recipe=recipe)).recipe == begun
@@ -320,4 +331,6 @@ def test_few_photographs_teach_colours_by_direction_slowly(views: int, times: fl
     (stage,) = settled(asked, ring(np.ones(views)), GENERIC, heard.append)[0].stages
     assert stage.lr.shN == pytest.approx(times * stage.lr.sh0 / 20)
     said = [event.text for event in heard if isinstance(event, Notice) and "SH beyond" in event.text]
-    assert said == ["24 training photographs: SH beyond degree 0 learn as in 2DGS, not faster"] * (times == 1.0)
+    few = "24 training photographs: SH beyond degree 0 learn as in 2DGS, not faster, and L2 is left out"
+    assert said == [few] * (times == 1.0)
+    assert any(term.kind == "l2" for term in stage.losses) == (times != 1.0)

@@ -48,7 +48,9 @@ DEFAULT_RECIPE = "best"  # of `gs2d train`, `reconstruct` and `demo`
 OFFICIAL_ITERATIONS = 30_000  # of 2DGS, for which its rates were chosen
 BEST_ITERATIONS, FAST_ITERATIONS = 20_000, 6_600
 SILHOUETTE = 0.1  # weight of the silhouette loss: docs/decisions/losses.md
-BEST_NC, SURFACE_NC = 0.02, 0.05  # weight of normal consistency in best and in best-surface: docs/decisions/losses.md
+# Weight of normal consistency in best, in best-surface, and in best before it had L2: docs/decisions/losses.md
+BEST_NC, SURFACE_NC, NC_BEFORE_SQUARES = 0.035, 0.05, 0.02
+SQUARES, SQUARES_START = 10.0, 0.5  # weight of L2 in best, and from which part of its iterations on: the same page
 BACKDROP_RATE = 0.3  # docs/decisions/fog.md
 SH_FASTER = 2.5  # times the official rate of SH beyond degree 0: docs/decisions/training.md
 SETTLING, SETTLED = 0.3, 0.1  # of the iterations, at the end, in which rates fall, and to what: decisions/training.md
@@ -172,6 +174,27 @@ def without_optional_losses(recipe: Recipe) -> Recipe:
         return replace(stage, losses=tuple(term for term in stage.losses if term.required))
 
     return replace(recipe, stages=tuple(map(required, recipe.stages)))
+
+
+def without_squares(recipe: Recipe) -> Recipe:
+    """Return ``best`` or a relative as it was before it had L2; weights of another's choice stay."""
+
+    def before(stage: Stage) -> Stage:
+        kept = _without_squares(stage.losses)
+        if kept == stage.losses:
+            return stage
+        lighter = (replace(t, weight=NC_BEFORE_SQUARES) if _is(t, "normal_consistency", BEST_NC) else t for t in kept)
+        return replace(stage, losses=tuple(lighter))
+
+    return replace(recipe, stages=tuple(map(before, recipe.stages)))
+
+
+def _without_squares(terms: tuple[LossTerm, ...]) -> tuple[LossTerm, ...]:
+    return tuple(term for term in terms if not _is(term, "l2", SQUARES))
+
+
+def _is(term: LossTerm, kind: str, weight: float) -> bool:
+    return term.kind == kind and term.weight == weight
 
 
 def with_edges(recipe: Recipe, edges: str, *, name: str) -> Recipe:
@@ -326,22 +349,26 @@ def with_dense_start(recipe: Recipe, *, still: bool = False, name: str | None = 
     return replace(recipe, name=name or f"{recipe.name}-dense", stages=(first, *rest), dense_start=DENSE_START)
 
 
-def best(iterations: int = BEST_ITERATIONS, nc: float = BEST_NC, *, name: str = "best") -> Recipe:
+def best(
+    iterations: int = BEST_ITERATIONS, nc: float = BEST_NC, squares: float = SQUARES, *, name: str = "best"
+) -> Recipe:
     """Return the recipe for the best pictures and surface per minute: 2DGS from a fitted dense start, in one stage.
 
     Not in the paper. A scene that begins near its end needs no opacity resets, and half the iterations with rates that
     make up for it; large splats stay, which are what surroundings are made of; alpha is that of the photographs which
-    have one; the mesh is of a depth in which no splat decides alone (docs/recipes/best.md). ``nc`` is the weight of
-    normal consistency. Colours that depend on direction learn faster than in 2DGS, but where photographs are few
+    have one; squares of differences count from the end of densification on; the mesh is of a depth in which no splat
+    decides alone (docs/recipes/best.md). ``nc`` is the weight of normal consistency, ``squares`` that of L2 (0: it is
+    not there). Colours that depend on direction learn faster than in 2DGS, but where photographs are few
     (:func:`with_few_views`).
     """
     part = iterations / OFFICIAL_ITERATIONS
     consistency = LossTerm("normal_consistency", nc, round(NC_START * part), where="object")
     silhouette = LossTerm("silhouette", SILHOUETTE, required=False)
+    l2 = (LossTerm("l2", squares, round(SQUARES_START * iterations)),) if squares > 0 else ()
     stage = Stage(
         "surface",
         iterations,
-        losses=(*PHOTOMETRIC, consistency, silhouette),
+        losses=(*PHOTOMETRIC, *l2, consistency, silhouette),
         lr=_best_rates(iterations),
         densify=GradDensify(
             start=round(500 * part), stop=round(15_000 * part), reset_every=0, scale_cull_start=iterations
@@ -367,26 +394,26 @@ def _best_rates(iterations: int) -> LearningRates:
 
 
 def with_few_views(recipe: Recipe) -> Recipe:
-    """Return the recipe for at most ``FEW_VIEWS`` training photographs: SH beyond degree 0 learn as in 2DGS.
+    """Return the recipe for at most ``FEW_VIEWS`` training photographs: SH beyond degree 0 learn as in 2DGS, no L2.
 
-    Of directions that a photograph or two show alone, faster SH learn those by heart (docs/decisions/training.md).
-    Rates of another's choice stay.
+    Of directions that a photograph or two show alone, faster SH learn those by heart (docs/decisions/training.md), and
+    squares help with it (docs/decisions/losses.md). Rates and weights of another's choice stay.
     """
 
     def slower(stage: Stage) -> Stage:
         official, lr = LearningRates(), stage.lr
         share = official.shN / official.sh0
-        if not math.isclose(lr.shN, SH_FASTER * share * lr.sh0):
-            return stage
-        return replace(stage, lr=replace(lr, shN=share * lr.sh0))
+        if math.isclose(lr.shN, SH_FASTER * share * lr.sh0):
+            lr = replace(lr, shN=share * lr.sh0)
+        return replace(stage, lr=lr, losses=_without_squares(stage.losses))
 
     return replace(recipe, stages=tuple(map(slower, recipe.stages)))
 
 
 def best_surface(*, name: str = "best-surface") -> Recipe:
-    """Return ``best`` with neighbouring photographs compared in its last fifth: Chamfer before dB."""
+    """Return ``best`` with neighbouring photographs compared in its last fifth, and no L2: Chamfer before dB."""
     compared = MultiView(depth_downscale=2)
-    return with_multiview(best(nc=SURFACE_NC), 0.6, 0.04, every=2, last=0.2, multiview=compared, name=name)
+    return with_multiview(best(nc=SURFACE_NC, squares=0.0), 0.6, 0.04, every=2, last=0.2, multiview=compared, name=name)
 
 
 def _in_stages(recipe: Recipe, term: LossTerm) -> Recipe:

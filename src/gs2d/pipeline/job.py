@@ -421,7 +421,8 @@ def settled(options: TrainOptions, scene: Scene, protocol: Protocol, on_event: O
     recipe, protocol = with_backdrop(fit_recipe(options, scene, protocol, on_event), protocol, scene, on_event)
     if len(scene.train) <= FEW_VIEWS and (slower := with_few_views(recipe)) != recipe:
         recipe = slower
-        on_event(Notice(f"{len(scene.train)} training photographs: SH beyond degree 0 learn as in 2DGS, not faster"))
+        few = f"{len(scene.train)} training photographs"
+        on_event(Notice(f"{few}: SH beyond degree 0 learn as in 2DGS, not faster, and L2 is left out"))
     return recipe, with_fused_depth(protocol, recipe)
 
 

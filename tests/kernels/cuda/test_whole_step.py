@@ -310,9 +310,7 @@ def test_normals_of_the_object_alone_have_the_bits_of_those_that_go_through_torc
     assert not same(whole, trained(emulator, some_alpha, recipe, "launches")[0])
 
 
-def test_squares_that_come_later_have_the_bits_of_those_that_go_through_torch(
-    emulator: Emulator, scene: Scene
-) -> None:
+def test_squares_that_come_later_have_the_bits_of_those_that_go_through_torch(emulator: Emulator, scene: Scene) -> None:
     recipe = with_squares(brief())
     parts, _ = trained(emulator, scene, recipe, "autograd")
     whole, some = trained(emulator, scene, recipe, "launches")
