@@ -16,8 +16,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gs2d.config.presets import SH_FASTER, SURFACE_NC, best
-from gs2d.config.recipe import NORMAL_KINDS, GradDensify, LearningRates, LossTerm, Recipe, Stage
+from gs2d.config.presets import SH_FASTER, SILHOUETTE, SQUARES, SURFACE_NC, best
+from gs2d.config.recipe import GradDensify, LearningRates, Recipe, Stage
 
 
 def _stage(change: Callable[[Stage], Stage]) -> Recipe:
@@ -33,20 +33,22 @@ def _densify(**changes: Any) -> Recipe:
     return _stage(changed)
 
 
-def _normals(**changes: Any) -> Recipe:
-    def changed(term: LossTerm) -> LossTerm:
-        return replace(term, **changes) if term.kind in NORMAL_KINDS else term
-
-    return _stage(lambda stage: replace(stage, losses=tuple(map(changed, stage.losses))))
-
-
 def _rates(stage: Stage) -> Stage:
     """Official rates, whatever the length."""
     return replace(stage, lr=LearningRates(means_decay_steps=stage.iterations))
 
 
-def _without_silhouette(stage: Stage) -> Stage:
-    return replace(stage, losses=tuple(term for term in stage.losses if term.kind != "silhouette"))
+def _term(kind: str, **changes: Any) -> Recipe:
+    """A loss with other values."""
+
+    def changed(stage: Stage) -> Stage:
+        return replace(stage, losses=tuple(replace(t, **changes) if t.kind == kind else t for t in stage.losses))
+
+    return _stage(changed)
+
+
+def _without(kind: str) -> Recipe:
+    return _stage(lambda stage: replace(stage, losses=tuple(t for t in stage.losses if t.kind != kind)))
 
 
 def _sh_as_2dgs(stage: Stage) -> Stage:
@@ -72,16 +74,21 @@ VARIANTS: dict[str, Recipe] = {
     "official_rates": _stage(_rates),
     "sh_as_2dgs": _stage(_sh_as_2dgs),
     "with_resets": _densify(reset_every=3_000, scale_cull_start=0),
-    "normals_of_the_image": _normals(where="image"),
-    "no_normals": _normals(weight=0.0),
-    "normals_as_2dgs": _normals(weight=SURFACE_NC),
-    "no_silhouette": _stage(_without_silhouette),
+    "normals_of_the_image": _term("normal_consistency", where="image"),
+    "no_normals": _term("normal_consistency", weight=0.0),
+    "normals_as_2dgs": _term("normal_consistency", weight=SURFACE_NC),
+    "no_silhouette": _without("silhouette"),
+    "no_squares": _without("l2"),
     "median": replace(best(), fused_depth="median"),
     # Tried, and not in it.
+    "squares_twice": _term("l2", weight=2 * SQUARES),
+    "squares_always": _term("l2", start=0),
+    "silhouette_thrice": _term("silhouette", weight=3 * SILHOUETTE),
+    "short_memory": _stage(lambda stage: replace(stage, lr=replace(stage.lr, beta2=0.99))),
     "size_cull": _densify(scale_cull_start=0),
     "by_error": _densify(absolute=True, error_views=8, max_splats=40_000),
-    "normals_by_edges": _normals(edge_power=2.0),
-    "normals_of_transmittance": _normals(depth="transmittance"),
+    "normals_by_edges": _term("normal_consistency", edge_power=2.0),
+    "normals_of_transmittance": _term("normal_consistency", depth="transmittance"),
     "half_size_first": _stage(lambda stage: replace(stage, downscale=2, halve_at=(round(0.3 * stage.iterations),))),
 }
 globals().update({name: replace(recipe, name=name.replace("_", "-")) for name, recipe in VARIANTS.items()})
