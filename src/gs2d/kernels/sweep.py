@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from gs2d.kernels.library import library_for
@@ -80,9 +81,9 @@ def sweep_planes(
     if library is None or library.dtype != torch.float32:
         return None
     height, width = image.shape
-    images = [tensor.contiguous() for tensor in others]
+    images = [F.pad(tensor[None], (0, 1, 0, 1), mode="replicate")[0].contiguous() for tensor in others]
     inputs = [tensor.contiguous() for tensor in (image, wanted.to(torch.uint8), turned, moved, depths)]
-    sizes = torch.tensor([list(tensor.shape) for tensor in images], dtype=torch.int64)
+    sizes = torch.tensor([list(tensor.shape) for tensor in others], dtype=torch.int64)
     addresses = torch.tensor([tensor.data_ptr() for tensor in images], dtype=torch.int64)
     best, before, after = (torch.full((height, width), -1.0) for _ in range(3))
     plane = torch.zeros(height, width, dtype=torch.int32)

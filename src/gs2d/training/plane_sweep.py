@@ -105,12 +105,13 @@ class Sweep:
     def agreeing(self, index: int, fraction: float) -> np.ndarray:
         """Return how many neighbours have, where a pixel's place appears in them, the same depth: int [H, W]."""
         view, depth = self.views[index], self.depths[index]
-        places = unproject(view, depth)
         votes = np.zeros(depth.shape, dtype=np.int64)
+        known = depth > 0
+        places = unproject(view, depth)[known]
         for other in self.neighbours[index]:
             z, column, row, inside = project(self.views[other], places)
             there = self.depths[other][row, column]
-            votes += inside & (depth > 0) & (there > 0) & (np.abs(there - z) <= fraction * z)
+            votes[known] += inside & (there > 0) & (np.abs(there - z) <= fraction * z)
         return votes
 
 

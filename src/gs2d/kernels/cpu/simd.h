@@ -23,7 +23,7 @@
 //   unzip_planes(p, a, b, c)  the slopes in x and in y and the constants of a splat's planes, repeated
 //   with_bits(i, m, bits)     the LaneInts i, with more bits where m; shifted<N>(i) to the left; store(p, i): LANES of them
 //   ints_of(v)                LaneInts of what is whole and fits 31 bits; row_major(j, width, i): j width + i
-//   gather(p, i)              p[i] of each lane
+//   gather(p, i)              p[i] of each lane; gather_pairs(p, i, a, b): p[i] and p[i + 1]
 //   load_packed<K>(p, v)      LANES rows of K reals to K vectors, and store_packed<K> back
 #pragma once
 

@@ -122,6 +122,16 @@ GS2D_HD LaneInts row_major(LaneInts j, int width, LaneInts i) {
     return _mm256_add_epi32(_mm256_mullo_epi32(j, _mm256_set1_epi32(width)), i);
 }
 GS2D_HD V gather(const float* p, LaneInts i) { return _mm256_i32gather_ps(p, i, 4); }
+GS2D_HD void gather_pairs(const float* p, LaneInts i, V& a, V& b) {
+    const double* pairs = reinterpret_cast<const double*>(p);
+    const __m256 low = _mm256_castpd_ps(_mm256_i32gather_pd(pairs, _mm256_castsi256_si128(i), 4));
+    const __m256 high = _mm256_castpd_ps(_mm256_i32gather_pd(pairs, _mm256_extracti128_si256(i, 1), 4));
+    const auto in_order = [](__m256 x) {  // of 0, 1, 4, 5 and 2, 3, 6, 7
+        return _mm256_castpd_ps(_mm256_permute4x64_pd(_mm256_castps_pd(x), 0xd8));
+    };
+    a = in_order(_mm256_shuffle_ps(low, high, 0x88));
+    b = in_order(_mm256_shuffle_ps(low, high, 0xdd));
+}
 
 #define GS2D_OWN_INDICES
 // Writes STRIDE times the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.

@@ -138,6 +138,13 @@ GS2D_HD LaneInts row_major(LaneInts j, int width, LaneInts i) {
     return _mm512_add_epi32(_mm512_mullo_epi32(j, _mm512_set1_epi32(width)), i);
 }
 GS2D_HD V gather(const float* p, LaneInts i) { return _mm512_i32gather_ps(i, p, 4); }
+GS2D_HD void gather_pairs(const float* p, LaneInts i, V& a, V& b) {
+    const __m512 low = _mm512_castpd_ps(_mm512_i32gather_pd(_mm512_castsi512_si256(i), p, 4));
+    const __m512 high = _mm512_castpd_ps(_mm512_i32gather_pd(_mm512_extracti64x4_epi64(i, 1), p, 4));
+    const __m512i even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+    a = _mm512_permutex2var_ps(low, even, high);
+    b = _mm512_permutex2var_ps(low, _mm512_or_epi32(even, _mm512_set1_epi32(1)), high);
+}
 
 #define GS2D_OWN_INDICES
 // Writes STRIDE times the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.

@@ -187,6 +187,7 @@ GS2D_HD LaneInts row_major(LaneInts j, int width, LaneInts i) {
 GS2D_HD V gather(const real* p, LaneInts n) {
     return per_lane([&](int i) { return p[n.of[i / WIDE][i % WIDE]]; });
 }
+GS2D_HD void gather_pairs(const real* p, LaneInts n, V& a, V& b) { a = gather(p, n), b = gather(p + 1, n); }
 
 GS2D_HD V load(const real* p) {
     V r;

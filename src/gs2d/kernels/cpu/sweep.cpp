@@ -30,7 +30,7 @@ struct SweepArguments {
     int64_t height, width, planes, neighbours, radius;
     const real* image;       // [height, width], grey
     const uint8_t* wanted;   // [height, width]: 0 = nothing is asked of this pixel
-    const real* const* others;  // [neighbours] images
+    const real* const* others;  // [neighbours] images, each [height + 1, width + 1]: the last row and column twice
     const int64_t* sizes;    // [neighbours, 2]: height, width
     const real* turned;      // [neighbours, 3, 3]: other K R K^-1
     const real* moved;       // [neighbours, 3]: other K t
@@ -50,97 +50,115 @@ int64_t mirrored(int64_t i, int64_t size) {
     return std::clamp<int64_t>(i, 0, size - 1);
 }
 
-// Means over (2 radius + 1)^2 pixels, `rows` of them, of an image [rows + 2 radius, width] whose columns are mirrored at
-// its ends; only columns [left, right) are made. `sums` is [rows + 2 radius, width] of room.
-void box(const real* from, int64_t rows, int64_t width, int64_t left, int64_t right, int64_t radius, real* sums,
-         real* to) {
-    const int64_t inner_left = std::max(left, radius), inner_right = std::max(inner_left, std::min(right, width - radius));
-    const auto at_edge = [&](const real* row, int64_t x) {
-        real sum = 0;
-        for (int64_t k = -radius; k <= radius; ++k) sum += row[mirrored(x + k, width)];
-        return sum;
-    };
-    for (int64_t y = 0; y < rows + 2 * radius; ++y) {
-        const real* row = from + y * width;
-        real* out = sums + y * width;
-        for (int64_t x = left; x < std::min(right, inner_left); ++x) out[x] = at_edge(row, x);
-        for (int64_t x = inner_left; x < inner_right; ++x) out[x] = row[x - radius];
-        for (int64_t k = 1 - radius; k <= radius; ++k) {
-            for (int64_t x = inner_left; x < inner_right; ++x) out[x] += row[x + k];
-        }
-        for (int64_t x = std::max(inner_right, left); x < right; ++x) out[x] = at_edge(row, x);
-    }
-    const real share = real(1) / real((2 * radius + 1) * (2 * radius + 1));
-    for (int64_t y = 0; y < rows; ++y) {
-        real* out = to + y * width;
-        std::copy(sums + y * width + left, sums + y * width + right, out + left);
-        for (int64_t k = 1; k <= 2 * radius; ++k) {
-            const real* row = sums + (y + k) * width;
-            for (int64_t x = left; x < right; ++x) out[x] += row[x];
-        }
-        for (int64_t x = left; x < right; ++x) out[x] *= share;
+// Mirrors a row beyond both ends, for patches that reach there. So far as patches do, the row has been made.
+void mirror_ends(real* row, int64_t width, int64_t radius) {
+    for (int64_t k = 1; k <= radius; ++k) {
+        row[-k] = row[mirrored(-k, width)];
+        row[width - 1 + k] = row[mirrored(width - 1 + k, width)];
     }
 }
 
 // One row of the image, columns [left, right), as another shows it at a depth; `inside` where it does.
-void fetch(const SweepArguments& a, int64_t n, int64_t y, real depth, int64_t left, int64_t right, real* __restrict out,
-           real* __restrict inside) {
-    const real *t = a.turned + 9 * n, *m = a.moved + 3 * n;
-    const real* __restrict other = a.others[n];
-    const int64_t rows = a.sizes[2 * n], columns = a.sizes[2 * n + 1];
-    const int32_t stride = int32_t(columns), last_column = int32_t(columns - 1), last_row = int32_t(rows - 1);
-    const real high_x = real(last_column), high_y = real(last_row), v = real(y) + real(0.5);
-    const real x0 = (t[1] * v + t[2]) * depth + m[0], dx = t[0] * depth;
-    const real y0 = (t[4] * v + t[5]) * depth + m[1], dy = t[3] * depth;
-    const real z0 = (t[7] * v + t[8]) * depth + m[2], dz = t[6] * depth;
-    GS2D_APART
-    for (int32_t x = int32_t(left); x < int32_t(right); ++x) {
-        const real u = real(x) + real(0.5), z = z0 + dz * u, front = z > real(1e-9) ? z : real(1e-9);
-        const real over = real(1) / front, px = (x0 + dx * u) * over, py = (y0 + dy * u) * over;
-        const bool shown = z > 0 && px > 0 && py > 0 && px < real(columns) && py < real(rows);
-        inside[x] = shown ? real(1) : real(0);
-        real cx = px - real(0.5), cy = py - real(0.5);
-        cx = cx > 0 ? cx : 0, cy = cy > 0 ? cy : 0;
-        cx = cx < high_x ? cx : high_x, cy = cy < high_y ? cy : high_y;
-        const int32_t i = int32_t(cx), j = int32_t(cy);
-        const int32_t right_of = i < last_column ? i + 1 : i, below = j < last_row ? j + 1 : j;
-        const real fx = cx - real(i), fy = cy - real(j);
-        const real top = other[j * stride + i] * (1 - fx) + other[j * stride + right_of] * fx;
-        const real bottom = other[below * stride + i] * (1 - fx) + other[below * stride + right_of] * fx;
-        out[x] = top * (1 - fy) + bottom * fy;
+void fetch(const SweepArguments& a, int64_t n, int64_t y, real depth, int64_t left, int64_t right, real* out,
+           real* inside) {
+    const real *t = a.turned + 9 * n, *m = a.moved + 3 * n, *other = a.others[n];
+    const int64_t rows = a.sizes[2 * n], columns = a.sizes[2 * n + 1], stride = columns + 1;
+    const real v = real(y) + real(0.5);
+    const V x0 = V((t[1] * v + t[2]) * depth + m[0]), dx = V(t[0] * depth), none = V(real(0)), one = V(real(1));
+    const V y0 = V((t[4] * v + t[5]) * depth + m[1]), dy = V(t[3] * depth), half = V(real(0.5));
+    const V z0 = V((t[7] * v + t[8]) * depth + m[2]), dz = V(t[6] * depth), least = V(real(1e-9));
+    const V width = V(real(columns)), height = V(real(rows)), last_x = width - one, last_y = height - one;
+    for (int64_t x = left; x < right; x += LANES) {
+        const V u = (V(real(x)) + iota()) + half, z = z0 + dz * u, over = one / max(z, least);
+        const V px = (x0 + dx * u) * over, py = (y0 + dy * u) * over;
+        const M shown = (z > none) & (px > none) & (py > none) & (px < width) & (py < height);
+        store(inside + x, keep(shown, one));
+        const V cx = min(max(px - half, none), last_x), cy = min(max(py - half, none), last_y);
+        const V i = whole(cx), j = whole(cy), fx = cx - i, fy = cy - j;
+        const LaneInts at = row_major(ints_of(j), static_cast<int>(stride), ints_of(i));
+        V top, right_of_top, bottom, right_of_bottom;
+        gather_pairs(other, at, top, right_of_top);
+        gather_pairs(other + stride, at, bottom, right_of_bottom);
+        top = top * (one - fx) + right_of_top * fx;
+        bottom = bottom * (one - fx) + right_of_bottom * fx;
+        store(out + x, top * (one - fy) + bottom * fy);
     }
 }
 
-// Room for a band: arrays of its rows with those beside them, and of its rows alone.
+// Room for a band, its rows with `radius` more columns on both sides: arrays with the rows beside it, and of its own.
+// Vectors reach beyond the last column that is wanted: what is there is anything, and nobody looks.
 struct Band {
-    real *fetched, *squared, *crossed, *inside, *sums, *own;
-    real *mean, *square, *cross, *own_mean, *variance, *first, *second, *last;
-
-    Band(int64_t tall, int64_t rows) : room(static_cast<real*>(std::malloc(size_t(6 * tall + 8 * rows) * sizeof(real)))) {
-        real* next = room;
-        for (real** of : {&fetched, &squared, &crossed, &inside, &sums, &own}) *of = next, next += tall;
-        for (real** of : {&mean, &square, &cross, &own_mean, &variance, &first, &second, &last}) *of = next, next += rows;
+    Band(int64_t width, int64_t rows, int64_t radius)
+        : radius(radius),
+          stride(width + 2 * radius + LANES),
+          room(static_cast<real*>(std::calloc(size_t(stride * (6 * (rows + 2 * radius) + 5 * rows)), sizeof(real)))) {
+        real* next = room == nullptr ? nullptr : room + radius;
+        if (next == nullptr) return;
+        for (real** of : {&fetched, &inside, &own, &means, &squares, &products})
+            *of = next, next += (rows + 2 * radius) * stride;
+        for (real** of : {&own_mean, &variance, &first, &second, &last}) *of = next, next += rows * stride;
     }
     ~Band() { std::free(room); }
     Band(const Band&) = delete;
 
+    const int64_t radius, stride;
+    real *fetched, *inside, *own;       // of column 0
+    real *means, *squares, *products;  // sums over the columns of patches
+    real *own_mean, *variance, *first, *second, *last;
+
+    bool failed() const { return room == nullptr; }
+
+  private:
     real* const room;
 };
 
-// Scores with one image, columns [left, right) of the row at `row` (at `tall` in arrays with the rows beside a band): the
-// best two so far.
-void add_scores(const SweepArguments& a, const Band& b, int64_t row, int64_t tall, int64_t left, int64_t right) {
-    const real *inside = b.inside + tall, *mean = b.mean + row, *square = b.square + row, *cross = b.cross + row;
-    const real *own_mean = b.own_mean + row, *variance = b.variance + row, noise = a.noise;
-    real *first = b.first + row, *second = b.second + row;
-    GS2D_APART
-    for (int64_t x = left; x < right; ++x) {
-        const real over = square[x] - mean[x] * mean[x], spread = (over > 0 ? over : 0) + noise;
-        const real ncc = (cross[x] - mean[x] * own_mean[x]) / sqrt(spread * variance[x]);
-        const real score = inside[x] > 0 ? ncc : real(-1), best = first[x], next = second[x];
-        const real less = score < best ? score : best;
-        second[x] = less > next ? less : next;
-        first[x] = score > best ? score : best;
+// Sums over the columns of patches, of a row at `at`: of an image, of its square, and of its product with the own one.
+void sum_columns(const Band& b, const real* image, int64_t at, int64_t left, int64_t right) {
+    const real *row = image + at - b.radius, *own = b.own + at - b.radius;
+    for (int64_t x = left; x < right; x += LANES) {
+        V u = load(row + x), mean = u, square = u * u, product = u * load(own + x);
+        for (int64_t k = 1; k <= 2 * b.radius; ++k) {
+            u = load(row + x + k);
+            mean = mean + u, square = square + u * u, product = product + u * load(own + x + k);
+        }
+        store(b.means + at + x, mean), store(b.squares + at + x, square), store(b.products + at + x, product);
+    }
+}
+
+// The mean over the rows of patches that begin at `from`.
+GS2D_HD V mean_of_rows(const Band& b, const real* from, V share) {
+    V sum = load(from);
+    for (int64_t k = 1; k <= 2 * b.radius; ++k) sum = sum + load(from + k * b.stride);
+    return sum * share;
+}
+
+GS2D_HD V variance_of(V square, V mean, V noise) { return max(square - mean * mean, V(real(0))) + noise; }
+
+V share_of(const Band& b) { return V(real(1) / real((2 * b.radius + 1) * (2 * b.radius + 1))); }
+
+// The image's own patches of a row of the band.
+void keep_own(const SweepArguments& a, const Band& b, int64_t row, int64_t left, int64_t right) {
+    const V share = share_of(b), noise = V(a.noise);
+    for (int64_t x = left; x < right; x += LANES) {
+        const V mean = mean_of_rows(b, b.means + row + x, share);
+        store(b.own_mean + row + x, mean);
+        store(b.variance + row + x, variance_of(mean_of_rows(b, b.squares + row + x, share), mean, noise));
+    }
+}
+
+// Scores of a row of the band with one image: the best two so far. Patches begin at that row of the sums.
+void add_scores(const SweepArguments& a, const Band& b, int64_t row, int64_t left, int64_t right) {
+    const V share = share_of(b), noise = V(a.noise), none = V(real(-1));
+    const real* inside = b.inside + row + b.radius * b.stride;
+    for (int64_t x = left; x < right; x += LANES) {
+        const int64_t at = row + x;
+        const V mean = mean_of_rows(b, b.means + at, share), square = mean_of_rows(b, b.squares + at, share);
+        const V common = mean_of_rows(b, b.products + at, share) - mean * load(b.own_mean + at);
+        const V ncc = common / sqrt(variance_of(square, mean, noise) * load(b.variance + at));
+        const V score = select(load(inside + x) > V(real(0)), ncc, none);
+        const V best = load(b.first + at), less = select(score < best, score, best), next = load(b.second + at);
+        store(b.second + at, select(less > next, less, next));
+        store(b.first + at, select(score > best, score, best));
     }
 }
 
@@ -174,40 +192,30 @@ bool sweep_band(const SweepArguments& a, int64_t begin, int64_t end) {
     std::fill(a.plane + begin * W, a.plane + end * W, 0);
     if (left >= right) return true;
     const int64_t wide_left = std::max<int64_t>(0, left - r), wide_right = std::min(W, right + r);
-    const Band b(tall * W, rows * W);
-    if (!b.room) return false;
+    const Band b(W, rows, r);
+    if (b.failed()) return false;
     for (int64_t y = 0; y < tall; ++y) {
         const real* row = a.image + mirrored(begin + y - r, H) * W;
-        for (int64_t x = 0; x < W; ++x) b.own[y * W + x] = row[x], b.squared[y * W + x] = row[x] * row[x];
+        std::copy(row, row + W, b.own + y * b.stride);
+        mirror_ends(b.own + y * b.stride, W, r);
+        sum_columns(b, b.own, y * b.stride, left, right);
     }
-    box(b.own, rows, W, left, right, r, b.sums, b.own_mean);
-    box(b.squared, rows, W, left, right, r, b.sums, b.variance);
     for (int64_t y = 0; y < rows; ++y) {
-        for (int64_t x = left; x < right; ++x) {
-            const int64_t i = y * W + x;
-            const real spread = b.variance[i] - b.own_mean[i] * b.own_mean[i];
-            b.variance[i] = (spread > 0 ? spread : 0) + a.noise;
-        }
+        keep_own(a, b, y * b.stride, left, right);
+        std::fill_n(b.last + y * b.stride, W, real(-1));
     }
-    std::fill(b.last, b.last + rows * W, real(-1));
     for (int64_t d = 0; d < a.planes; ++d) {
-        std::fill(b.first, b.first + rows * W, real(-1));
-        std::fill(b.second, b.second + rows * W, real(-1));
+        for (real* scores : {b.first, b.second}) std::fill_n(scores, (rows - 1) * b.stride + W, real(-1));
         for (int64_t n = 0; n < a.neighbours; ++n) {
             for (int64_t y = 0; y < tall; ++y) {
-                const int64_t at = y * W;
-                fetch(a, n, mirrored(begin + y - r, H), a.depths[d], wide_left, wide_right, &b.fetched[at], &b.inside[at]);
-                for (int64_t x = wide_left; x < wide_right; ++x) {
-                    b.squared[at + x] = b.fetched[at + x] * b.fetched[at + x];
-                    b.crossed[at + x] = b.fetched[at + x] * b.own[at + x];
-                }
+                const int64_t at = y * b.stride;
+                fetch(a, n, mirrored(begin + y - r, H), a.depths[d], wide_left, wide_right, b.fetched + at, b.inside + at);
+                mirror_ends(b.fetched + at, W, r);
+                sum_columns(b, b.fetched, at, left, right);
             }
-            box(b.fetched, rows, W, left, right, r, b.sums, b.mean);
-            box(b.squared, rows, W, left, right, r, b.sums, b.square);
-            box(b.crossed, rows, W, left, right, r, b.sums, b.cross);
-            for (int64_t y = 0; y < rows; ++y) add_scores(a, b, y * W, (y + r) * W, left, right);
+            for (int64_t y = 0; y < rows; ++y) add_scores(a, b, y * b.stride, left, right);
         }
-        for (int64_t y = 0; y < rows; ++y) keep_best(a, b, d, y * W, (begin + y) * W, left, right);
+        for (int64_t y = 0; y < rows; ++y) keep_best(a, b, d, y * b.stride, (begin + y) * W, left, right);
     }
     return true;
 }
