@@ -16,8 +16,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gs2d.config.presets import SH_FASTER, SILHOUETTE, SQUARES, SURFACE_NC, best
-from gs2d.config.recipe import GradDensify, LearningRates, Recipe, Stage
+from gs2d.config.presets import SH_FASTER, SILHOUETTE, SQUARES, SQUARES_START, SURFACE_NC, best, get_recipe
+from gs2d.config.recipe import GradDensify, LearningRates, LossTerm, Recipe, Stage
 
 
 def _stage(change: Callable[[Stage], Stage]) -> Recipe:
@@ -61,6 +61,13 @@ def _without_start() -> Recipe:
     return replace(changed, dense_start=None)
 
 
+def _squares_in_2dgs() -> Recipe:
+    recipe = get_recipe("2dgs")
+    stage = recipe.stages[0]
+    term = LossTerm("l2", SQUARES, round(SQUARES_START * stage.iterations))
+    return replace(recipe, stages=(replace(stage, losses=(*stage.losses, term)),))
+
+
 def _unfitted() -> Recipe:
     recipe = best()
     assert recipe.dense_start is not None
@@ -89,6 +96,7 @@ VARIANTS: dict[str, Recipe] = {
     "by_error": _densify(absolute=True, error_views=8, max_splats=40_000),
     "normals_by_edges": _term("normal_consistency", edge_power=2.0),
     "normals_of_transmittance": _term("normal_consistency", depth="transmittance"),
+    "squares_in_2dgs": _squares_in_2dgs(),
     "half_size_first": _stage(lambda stage: replace(stage, downscale=2, halve_at=(round(0.3 * stage.iterations),))),
 }
 globals().update({name: replace(recipe, name=name.replace("_", "-")) for name, recipe in VARIANTS.items()})
