@@ -1,0 +1,53 @@
+"""Meshes of some runs of one capture side by side with the true surface, in clay (docs/recipes/best.md).
+
+::
+
+    python -m benchmarks.mesh_gallery OUT.png TRUTH.ply RUN [RUN ...] [--views 1 6] [--size 300]
+
+A row for each of the views (numbers of test views), a column for each run, named by its recipe.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from gs2d.core.camera import Camera
+from gs2d.core.images import write_image
+from gs2d.core.mesh import Mesh
+from gs2d.io.meshes import read_mesh
+from gs2d.io.run_dir import MESH, RunFolder
+from gs2d.pipeline.events import ignore
+from gs2d.pipeline.job import reload_job
+from gs2d.report.mesh_images import mesh_images
+
+
+def column(name: str, mesh: Mesh, cameras: list[Camera], size: int) -> np.ndarray:
+    """Draw a mesh from each camera, one under the other, with its name above: uint8 [H, size, 3]."""
+    clay = [(image.shape * 255).round().astype(np.uint8) for image in mesh_images(mesh, cameras, width=size)]
+    image = Image.fromarray(np.concatenate(clay, axis=0))
+    ImageDraw.Draw(image).text((8, 8), name, fill=(20, 20, 20))
+    return np.asarray(image)
+
+
+def main() -> None:
+    """Draw the columns and put them beside one another."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("truth", type=Path)
+    parser.add_argument("runs", type=Path, nargs="+")
+    parser.add_argument("--views", type=int, nargs="+", default=[1, 6])
+    parser.add_argument("--size", type=int, default=300)
+    args = parser.parse_args()
+    jobs = [reload_job(RunFolder(run), ignore) for run in args.runs]
+    cameras = [jobs[0].scene.test[view].camera for view in args.views]
+    named = [(job.recipe.name, read_mesh(run / MESH)) for job, run in zip(jobs, args.runs, strict=True)]
+    named.append(("truth", read_mesh(args.truth)))
+    write_image(args.out, np.concatenate([column(*one, cameras, args.size) for one in named], axis=1))
+
+
+if __name__ == "__main__":
+    main()
