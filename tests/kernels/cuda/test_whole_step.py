@@ -374,7 +374,7 @@ def test_photographs_in_the_hosts_memory_come_to_the_same_place_each_time(emulat
 
 
 def test_a_byte_is_the_same_number_as_by_a_division(emulator: Emulator) -> None:
-    """All 256: a row of them, against a target of floats, is an L1 and an L2 of exactly 0."""
+    """All 256: a row of them, against a target of floats, is an L1 of exactly 0."""
     from gs2d.kernels.cuda.arguments import PhotometricArguments, fill
     from gs2d.kernels.cuda.losses import THREADS, strips
 
@@ -386,7 +386,7 @@ def test_a_byte_is_the_same_number_as_by_a_division(emulator: Emulator) -> None:
     fill(arguments, rendered=rendered, partials=partials)
     arguments.photograph.bytes = pixels.data_ptr()
     emulator.launch("photometric_forward_rgb", strips(1, width), THREADS, arguments)
-    assert float(partials[1].sum()) == float(partials[3].sum()) == 0
+    assert float(partials[1].sum()) == 0
     assert float(partials[0].sum()) == 3 * width
 
 

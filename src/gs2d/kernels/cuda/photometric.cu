@@ -158,7 +158,10 @@ template <bool KNOWN, int CHANNELS = 0> __device__ __forceinline__ void photomet
         mean.add(m), squares.add(q), product.add(p);
         if constexpr (!KNOWN) target_mean.add(blur_row(row[1]));
         const float u = row[0][threadIdx.x + SIDE], v = row[1][threadIdx.x + SIDE];
-        if (s.mine() && y >= s.begin && y < s.end) sums[1] = sums[1] + abs(u - v), sums[3] = fma(u - v, u - v, sums[3]);
+        if (s.mine() && y >= s.begin && y < s.end) {
+            sums[1] = sums[1] + abs(u - v);
+            if constexpr (CHANNELS == 0) sums[3] = fma(u - v, u - v, sums[3]);  // of bytes nobody asks for it
+        }
         const int64 out = y - SSIM_RADIUS, at = out * s.n + s.column;
         if (out < s.begin || !s.mine()) continue;
         const float b = KNOWN ? a.target_mean[at] : target_mean.done();
