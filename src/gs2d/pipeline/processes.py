@@ -7,6 +7,7 @@ with the last iteration: they write nothing, and say nothing but why they fail.
 from __future__ import annotations
 
 import contextlib
+import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -71,6 +72,7 @@ def connected(backend: str, *, sharded: bool = False) -> Iterator[OneProcess]:
         if isinstance(error, Gs2dError) and not place.leads:
             error.args = (f"process {place.rank} of {place.size}: {error}", *error.args[1:])
         raise
+    gc.collect()  # work that cycles keep would end with the interpreter, on threads of gloo, which then abort
     torch.distributed.destroy_process_group()
 
 
