@@ -9,13 +9,20 @@ import pytest
 import torch
 
 from gs2d.config.robust import DenseStart
-from gs2d.kernels import sweep as native
+from gs2d.kernels import sweep as kernel
+from gs2d.kernels.library import Library, available_variants, library_for
 from gs2d.training import plane_sweep
 from gs2d.training.plane_sweep import SmallView, best_planes, best_planes_reference, sweep_views
 from wall_scene import WALL, wall
 
-pytestmark = pytest.mark.usefixtures("native")
 Z = 1 / torch.linspace(1 / 7.0, 1 / 2.5, 23)
+
+
+@pytest.fixture(autouse=True)
+def variant(native: Library, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Each library in turn is the one that a sweep takes."""
+    monkeypatch.setenv("GS2D_CPU_VARIANT", native.variant)
+    return native.variant
 
 
 @pytest.fixture(scope="module")
@@ -83,8 +90,21 @@ def test_the_result_is_the_same_for_any_number_of_threads(views: list[SmallView]
     assert torch.equal(results[0].plane, results[1].plane)
 
 
+def test_every_library_finds_the_same_bits(
+    views: list[SmallView], variant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    library = library_for(views[2].grey)
+    assert library is not None
+    assert library.variant == variant
+    found = best_planes(views[2], views[3:], Z, 3)
+    monkeypatch.setenv("GS2D_CPU_VARIANT", available_variants()[-1])
+    other = best_planes(views[2], views[3:], Z, 3)
+    for name in ("score", "plane", "before", "after"):
+        assert torch.equal(getattr(found, name), getattr(other, name))
+
+
 def test_without_the_library_torch_does_it(views: list[SmallView], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(native, "library_for", lambda tensor: None)
+    monkeypatch.setattr(kernel, "library_for", lambda tensor: None)
     used = []
     monkeypatch.setattr(plane_sweep, "best_planes_reference", lambda *a: used.append(1) or best_planes_reference(*a))
     best_planes(views[2], views[3:], Z, 2)

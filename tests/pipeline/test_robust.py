@@ -15,6 +15,7 @@ from gs2d.config.presets import (
     SH_FASTER,
     get_recipe,
     with_fading_backdrop,
+    with_few_views,
     with_robustness,
     without_optional_losses,
     without_squares,
@@ -261,10 +262,12 @@ def test_a_run_of_before_alpha_was_compared_or_squares_counted_goes_on_as_it_beg
     losses = [(term.kind, term.weight) for term in before.stages[0].losses]
     assert losses == [("l1", 0.8), ("ssim", 0.2), ("normal_consistency", 0.02)]
     data = json.loads(run.file("run.json").read_text())
-    for begun in (before, with_alpha, recipe):
+    few = with_few_views(recipe)  # has no L2 either
+    assert without_squares(few) != few
+    for begun, now in [*((r, recipe) for r in (before, with_alpha, recipe)), (few, few), (without_squares(few), few)]:
         data["recipe"] = to_json(begun)
         run.file("run.json").write_text(json.dumps(data))
-        assert as_begun(run, replace(job, recipe=recipe)).recipe == begun
+        assert as_begun(run, replace(job, recipe=now)).recipe == begun
 
 
 def test_dropout_makes_another_stage_and_another_run(undisturbed: RunFolder, tmp_path: Path) -> None:

@@ -176,17 +176,17 @@ def without_optional_losses(recipe: Recipe) -> Recipe:
     return replace(recipe, stages=tuple(map(required, recipe.stages)))
 
 
-def without_squares(recipe: Recipe) -> Recipe:
-    """Return ``best`` or a relative as it was before it had L2; weights of another's choice stay."""
+def without_squares(recipe: Recipe, nc: float = NC_BEFORE_SQUARES) -> Recipe:
+    """Return ``best`` or a relative as it was before it had L2, with that weight of normal consistency.
 
-    def before(stage: Stage) -> Stage:
-        kept = _without_squares(stage.losses)
-        if kept == stage.losses:
-            return stage
-        lighter = (replace(t, weight=NC_BEFORE_SQUARES) if _is(t, "normal_consistency", BEST_NC) else t for t in kept)
-        return replace(stage, losses=tuple(lighter))
+    Weights of another's choice stay.
+    """
 
-    return replace(recipe, stages=tuple(map(before, recipe.stages)))
+    def before(term: LossTerm) -> LossTerm:
+        return replace(term, weight=nc) if _is(term, "normal_consistency", BEST_NC) else term
+
+    stages = (replace(s, losses=tuple(map(before, _without_squares(s.losses)))) for s in recipe.stages)
+    return replace(recipe, stages=tuple(stages))
 
 
 def _without_squares(terms: tuple[LossTerm, ...]) -> tuple[LossTerm, ...]:

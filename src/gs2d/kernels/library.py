@@ -19,7 +19,8 @@ import torch
 from gs2d.errors import BackendError
 from gs2d.kernels.buffer_pool import BufferPool
 
-ABI_VERSION = 9
+ABI_VERSION = 10  # of what the functions take: a library of another one is not called
+RESULTS_VERSION = 9  # of what they compute: a run goes on with the same bits, or not at all
 VARIANTS = {"v4": 4, "v3": 3, "portable": 0}  # name -> processor level it needs, best first
 LANGUAGE = {"v4": "AVX-512 (x86-64-v4)", "v3": "AVX2 (x86-64-v3)", "portable": "portable", "f64": "portable, float64"}
 FOLDER = Path(__file__).parent / "lib"

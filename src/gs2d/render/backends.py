@@ -330,7 +330,7 @@ class CpuBackend(Backend):
     def facts(self) -> dict[str, Any]:
         """Return its name, instruction set and version."""
         native = library.load()
-        return {"name": self.name, "instruction_set": native.instruction_set, "kernels": library.ABI_VERSION}
+        return {"name": self.name, "instruction_set": native.instruction_set, "kernels": library.RESULTS_VERSION}
 
     @classmethod
     def status(cls) -> BackendStatus:

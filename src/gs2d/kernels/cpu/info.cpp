@@ -19,4 +19,4 @@ GS2D_EXPORT int gs2d_cpu_level() {
 
 GS2D_EXPORT int gs2d_lanes() { return gs2d::LANES; }
 GS2D_EXPORT int gs2d_real_bytes() { return sizeof(gs2d::real); }
-GS2D_EXPORT int gs2d_abi_version() { return 9; }
+GS2D_EXPORT int gs2d_abi_version() { return 10; }
