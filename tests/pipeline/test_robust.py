@@ -263,8 +263,7 @@ def test_a_run_of_before_alpha_was_compared_or_squares_counted_goes_on_as_it_beg
     assert losses == [("l1", 0.8), ("ssim", 0.2), ("normal_consistency", 0.02)]
     data = json.loads(run.file("run.json").read_text())
     few = with_few_views(recipe)  # has no L2 either
-    assert without_squares(few) != few
-    for begun, now in [*((r, recipe) for r in (before, with_alpha, recipe)), (few, few), (without_squares(few), few)]:
+    for begun, now in [*((r, recipe) for r in (before, with_alpha, recipe)), (few, few)]:
         data["recipe"] = to_json(begun)
         run.file("run.json").write_text(json.dumps(data))
         assert as_begun(run, replace(job, recipe=now)).recipe == begun

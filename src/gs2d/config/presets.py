@@ -48,8 +48,8 @@ DEFAULT_RECIPE = "best"  # of `gs2d train`, `reconstruct` and `demo`
 OFFICIAL_ITERATIONS = 30_000  # of 2DGS, for which its rates were chosen
 BEST_ITERATIONS, FAST_ITERATIONS = 20_000, 6_600
 SILHOUETTE = 0.1  # weight of the silhouette loss: docs/decisions/losses.md
-# Weight of normal consistency in best, in best-surface, and in best before it had L2: docs/decisions/losses.md
-BEST_NC, SURFACE_NC, NC_BEFORE_SQUARES = 0.035, 0.05, 0.02
+# Weight of normal consistency in best, in best-surface, and in best where it has no L2: docs/decisions/losses.md
+BEST_NC, SURFACE_NC, NC_WITHOUT_SQUARES = 0.035, 0.05, 0.02
 SQUARES, SQUARES_START = 10.0, 0.5  # weight of L2 in best, and from which part of its iterations on: the same page
 BACKDROP_RATE = 0.3  # docs/decisions/fog.md
 SH_FASTER = 2.5  # times the official rate of SH beyond degree 0: docs/decisions/training.md
@@ -176,21 +176,20 @@ def without_optional_losses(recipe: Recipe) -> Recipe:
     return replace(recipe, stages=tuple(map(required, recipe.stages)))
 
 
-def without_squares(recipe: Recipe, nc: float = NC_BEFORE_SQUARES) -> Recipe:
-    """Return ``best`` or a relative as it was before it had L2, with that weight of normal consistency.
+def without_squares(recipe: Recipe) -> Recipe:
+    """Return ``best`` or a relative without L2, and with the normal consistency that suits that: as it was before L2.
 
     Weights of another's choice stay.
     """
 
-    def before(term: LossTerm) -> LossTerm:
-        return replace(term, weight=nc) if _is(term, "normal_consistency", BEST_NC) else term
+    def lighter(term: LossTerm) -> LossTerm:
+        return replace(term, weight=NC_WITHOUT_SQUARES) if _is(term, "normal_consistency", BEST_NC) else term
 
-    stages = (replace(s, losses=tuple(map(before, _without_squares(s.losses)))) for s in recipe.stages)
-    return replace(recipe, stages=tuple(stages))
+    def plain(stage: Stage) -> Stage:
+        kept = tuple(term for term in stage.losses if not _is(term, "l2", SQUARES))
+        return replace(stage, losses=tuple(map(lighter, kept))) if kept != stage.losses else stage
 
-
-def _without_squares(terms: tuple[LossTerm, ...]) -> tuple[LossTerm, ...]:
-    return tuple(term for term in terms if not _is(term, "l2", SQUARES))
+    return replace(recipe, stages=tuple(map(plain, recipe.stages)))
 
 
 def _is(term: LossTerm, kind: str, weight: float) -> bool:
@@ -403,11 +402,11 @@ def with_few_views(recipe: Recipe) -> Recipe:
     def slower(stage: Stage) -> Stage:
         official, lr = LearningRates(), stage.lr
         share = official.shN / official.sh0
-        if math.isclose(lr.shN, SH_FASTER * share * lr.sh0):
-            lr = replace(lr, shN=share * lr.sh0)
-        return replace(stage, lr=lr, losses=_without_squares(stage.losses))
+        if not math.isclose(lr.shN, SH_FASTER * share * lr.sh0):
+            return stage
+        return replace(stage, lr=replace(lr, shN=share * lr.sh0))
 
-    return replace(recipe, stages=tuple(map(slower, recipe.stages)))
+    return without_squares(replace(recipe, stages=tuple(map(slower, recipe.stages))))
 
 
 def best_surface(*, name: str = "best-surface") -> Recipe:

@@ -6,7 +6,7 @@ import json
 from dataclasses import replace
 from typing import Any
 
-from gs2d.config.presets import BEST_NC, without_fading_backdrop, without_optional_losses, without_squares
+from gs2d.config.presets import without_fading_backdrop, without_optional_losses, without_squares
 from gs2d.errors import RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.job import LATER_FIELDS, Job, training_facts
@@ -25,12 +25,11 @@ def as_begun(run: RunFolder, job: Job) -> Job:
     decay = before.get("opacity_decay")
     if isinstance(decay, dict) and "backdrop_rate" not in decay:
         recipe = without_fading_backdrop(recipe)
-    weights = {t.get("kind"): t.get("weight") for stage in before.get("stages", ()) for t in stage.get("losses", ())}
-    if "silhouette" not in weights:
+    kinds = {term.get("kind") for stage in before.get("stages", ()) for term in stage.get("losses", ())}
+    if "silhouette" not in kinds:
         recipe = without_optional_losses(recipe)
-    if "l2" not in weights:  # as it is of few photographs, whose normal consistency then has today's weight
-        today = weights.get("normal_consistency") == BEST_NC
-        recipe = without_squares(recipe, BEST_NC) if today else without_squares(recipe)
+    if "l2" not in kinds:
+        recipe = without_squares(recipe)
     return replace(job, recipe=recipe)
 
 
