@@ -153,7 +153,7 @@ def test_the_figures_of_a_run_count_shared_stages_and_the_protocols_views(tmp_pa
     options: Any = {"scene": "a", "data_set": DTU, "seed": 0, "record": {"state": "done"}}
     cell = read_cell(tmp_path, test_on="test", **options)
     assert (cell.figures["psnr"], cell.figures["seconds"], cell.figures["bytes"]) == (30.0, 7.0, 10)
-    assert (cell.figures["fscore"], cell.figures["chamfer"]) == (0.2, 0.5)  # the middle threshold
+    assert (cell.figures["fscore"], cell.figures["chamfer"]) == (0.1, 0.5)  # the first threshold
     assert cell.reasons == {"lpips": "no weights"}
     assert read_cell(tmp_path, test_on="train", **options).figures["psnr"] == 40.0
     failed = {**options, "record": {"state": "failed", "reason": "no photographs"}}

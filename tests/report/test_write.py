@@ -175,9 +175,9 @@ def test_the_verdict_states_gain_and_price() -> None:
     assert "0.85 dB more than after its first stage (surface), for +1.0 % storage and +65 % training time." in text
 
 
-def test_the_verdict_takes_the_middle_threshold_of_the_surface() -> None:
+def test_the_verdict_takes_the_first_threshold_of_the_surface() -> None:
     rows = [{"threshold": t, "f_score": f} for t, f in ((0.01, 0.4), (0.02, 0.7), (0.04, 0.9))]
-    assert "an F-score of 0.700 within 0.02 (units of the truth)" in verdict(record(surface={"thresholds": rows}))
+    assert "an F-score of 0.400 within 0.01 (units of the truth)" in verdict(record(surface={"thresholds": rows}))
 
 
 def test_the_verdict_does_not_hide_a_loss_or_an_unfinished_run() -> None:

@@ -17,7 +17,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -248,7 +247,6 @@ def _panel(points: np.ndarray, colors: np.ndarray, axis: int, low: np.ndarray, s
 
 
 # -- the score ---------------------------------------------------------------------------------------------------------
-_T = TypeVar("_T")
 _Counts = Callable[[np.ndarray, Mesh], np.ndarray]  # in how many views points [P, 3] of a mesh are visible
 FRACTIONS = VISIBLE_SURFACE.fractions  # of the truth's bounding-box diagonal
 SEEN_TOLERANCE = VISIBLE_SURFACE.seen_tolerance  # of the same diagonal: how far behind the depth buffer one sees
@@ -284,7 +282,7 @@ class SurfaceScore:
         Part of the area (of the points, for a cloud) that did not count because cameras do not see it.
     reason : str or None
     clouds : ScoredClouds or None
-        The points that counted with their distances, in the mesh's frame and units; tau is the headline threshold.
+        The points that counted with their distances, in the mesh's frame and units; tau is the first threshold.
     """
 
     accuracy: float | None
@@ -388,15 +386,8 @@ def evaluate_surface(
         truth_points=len(theirs.points),
         mesh_hidden=ours.hidden,
         truth_hidden=theirs.hidden,
-        clouds=ScoredClouds(
-            ours.points, accuracy / scale, theirs.points, completeness / scale, headline(tau, thresholds) / scale
-        ),
+        clouds=ScoredClouds(ours.points, accuracy / scale, theirs.points, completeness / scale, tau[0] / scale),
     )
-
-
-def headline(rows: Sequence[_T], thresholds: Sequence[float] | None) -> _T:
-    """Return what stands at the headline threshold: the protocol's, or the middle one of those that were asked for."""
-    return rows[len(rows) // 2 if thresholds else VISIBLE_SURFACE.headline]
 
 
 def _threshold_score(accuracy: np.ndarray, completeness: np.ndarray, threshold: float) -> ThresholdScore:

@@ -263,12 +263,12 @@ def _scores(stage: dict[str, Any], test_on: str) -> dict[str, Any]:
 
 
 def surface_figures(surface: dict[str, Any] | None, data_set: str) -> dict[str, float | None]:
-    """F-score at the middle threshold, and Chamfer distance, from the ``surface`` entry of ``metrics.json``."""
+    """F-score at the first threshold, and Chamfer distance, from the ``surface`` entry of ``metrics.json``."""
     if not surface:
         return {"fscore": None, "chamfer": None}
     scores = surface.get("thresholds") or []
-    middle = scores[len(scores) // 2]["f_score"] if scores else None
-    return {"fscore": surface.get("f_score", middle), "chamfer": surface.get("chamfer")}
+    first = scores[0]["f_score"] if scores else None
+    return {"fscore": surface.get("f_score", first), "chamfer": surface.get("chamfer")}
 
 
 # -- claims ----------------------------------------------------------------------------------------------------------

@@ -394,7 +394,8 @@ class EvaluateOptions:
     ground_truth: Annotated[Path | None, arg(metavar="MESH_OR_POINTS")] = None
     """True surface (PLY, OBJ) in the capture's frame (DTU: mm), or the official folder of DTU or Tanks and Temples."""
     thresholds: tuple[float, ...] = ()
-    """Distances at which precision and recall are taken, world units (default: 0.25, 0.5, 1 % of its size)."""
+    """Distances at which precision and recall are taken, world units, the headline's first (default: 0.25, 0.5, 1 % of
+    its size)."""
     lpips_weights: Path | None = None
     """VGG-16 and LPIPS weights for the LPIPS metric."""
     match_exposure: bool = False

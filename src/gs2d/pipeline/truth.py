@@ -16,7 +16,7 @@ from gs2d.core.arrays import read_npy
 from gs2d.core.mesh import Mesh
 from gs2d.data.benchmarks import MESH_TRUTHS, find_truth, recognise
 from gs2d.errors import DataError
-from gs2d.evaluation.surface import SurfaceScore, evaluate_surface, headline, write_clouds
+from gs2d.evaluation.surface import SurfaceScore, evaluate_surface, write_clouds
 from gs2d.io.meshes import FOREIGN, read_mesh, read_points
 from gs2d.io.run_dir import make_folder
 from gs2d.io.splat_ply import ply_kind
@@ -171,7 +171,6 @@ def _score_visible(
     facts = asdict(replace(score, clouds=None))
     facts.pop("clouds")
     rows = list(facts.pop("scores"))
-    first = headline(rows, options.thresholds)
     files = {}
     if score.clouds is not None:
         make_folder(folder)
@@ -183,7 +182,7 @@ def _score_visible(
         "evaluator": "visible-surface",
         "unit": "world units" if np.array_equal(job.scene.T_metric_scene, np.eye(4)) else "mm",  # the scale_mat of DTU
         "ground_truth": str(truth.path),
-        **{name: first[name] for name in ("threshold", "precision", "recall", "f_score")},
+        **{name: rows[0][name] for name in ("threshold", "precision", "recall", "f_score")},
         **facts,
         "thresholds": rows,
         "self_check": check,

@@ -211,7 +211,7 @@ def verdict(record: RunRecord) -> Markup:
             "first": first["name"],
             "gain": None if first is last else last[split]["psnr"] - first[split]["psnr"],
             "price": _price(first, last, record.stages),
-            "surface": _middle_score(record.surface),
+            "surface": _first_score(record.surface),
             "unfinished": _unfinished(record),
         }
     return render("summary.html", **values)
@@ -228,10 +228,10 @@ def _price(first: Mapping[str, Any], last: Mapping[str, Any], stages: Sequence[M
     return parts
 
 
-def _middle_score(surface: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
-    """Return the row of scores at the threshold that is neither the strictest nor the kindest."""
+def _first_score(surface: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+    """Return the row of scores at the first threshold, that of the headline."""
     rows = [row for row in (surface or {}).get("thresholds") or [] if isinstance(row.get("f_score"), int | float)]
-    return rows[len(rows) // 2] if rows else None
+    return rows[0] if rows else None
 
 
 def _unfinished(record: RunRecord) -> list[str]:
