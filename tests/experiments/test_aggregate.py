@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 
 from gs2d.cli.app import parse
-from gs2d.cli.commands import Train
+from gs2d.cli.commands import Paper, Train
 from gs2d.config.protocols import MetricConventions
 from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.experiments.aggregate import Cell, Results, check_claim, read_cell
 from gs2d.experiments.deviations import deviations_of, opacity_resets
-from gs2d.experiments.options import PaperOptions, parse_seeds
+from gs2d.experiments.options import PaperOptions, SweepOptions, parse_seeds
 from gs2d.experiments.paper import check_folder, paper
 from gs2d.experiments.plan import commands_of, make_plan, paper_command
 from gs2d.experiments.scenes import find_scenes
@@ -216,6 +216,24 @@ def test_the_command_on_the_page_has_the_seeds_that_were_run(seeds: tuple[int, .
     given = words[words.index("--seeds") + 1] if "--seeds" in words else "0"
     assert parse_seeds((given,)) == seeds
     assert words[words.index("--data") + 1] == "a b"
+
+
+def test_the_command_on_the_page_is_one_that_the_program_takes_whatever_it_was_to_print() -> None:
+    given = parse(
+        ["paper", "k", "--data", "a b", "--out", "out", "--scenes", "c", "--downscale", "2", "--quiet", "--json"]
+    )
+    assert isinstance(given, Paper)
+    told = parse(shlex.split(paper_command(given))[1:])
+    assert told == replace(given, quiet=False, json=False)
+
+
+def test_rows_of_the_paper_have_nothing_of_robust_training(tmp_path: Path) -> None:
+    """What `auto` makes of photographs of no data set would be called 2DGS here."""
+    write_capture(tmp_path / "ball", train=2, test=1, size=8)
+    shared: Any = {"data": tmp_path / "ball", "out": tmp_path / "out"}
+    (row,) = {job.train.robust for job in make_plan(PaperOptions(table="freeze", **shared)).jobs}
+    (own,) = {job.train.robust for job in make_plan(SweepOptions(recipes=("2dgs",), **shared)).jobs}
+    assert (row, own) == ("off", "auto")
 
 
 @pytest.mark.parametrize("name", ["downscale", "threads", "slots"])

@@ -116,6 +116,7 @@ def make_job(options: TableOptions, scene: FoundScene, name: str, recipe: Recipe
         out=options.out / "runs" / f"{scene.name}-{short_name(name)}-s{seed}",
         recipe=name,
         protocol=scene.protocol.name if options.protocol == "auto" else options.protocol,
+        robust="auto" if isinstance(options, SweepOptions) else "off",  # the paper has none of it
         backend=options.backend,
         format=scene.format,
         downscale=downscale,
@@ -153,7 +154,8 @@ def _wanted(scene: FoundScene, options: TableOptions) -> Iterator[str]:
 def paper_command(options: PaperOptions | SweepOptions) -> str:
     """Return the command that makes a table."""
     words = ["sweep", *options.recipes] if isinstance(options, SweepOptions) else ["paper", options.table]
-    return _command(words, options, ("table", "recipes", "slots", "threads", "cluster", "train"))
+    said = ("table", "recipes", "slots", "threads", "cluster", "train", "quiet", "json", "debug")
+    return _command(words, options, said)
 
 
 def commands_of(job: Job) -> list[str]:

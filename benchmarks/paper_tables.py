@@ -1,0 +1,95 @@
+"""The tables of docs/paper-tables.md: `gs2d paper` for every table of the paper and every group of captures.
+
+::
+
+    python -m benchmarks.paper_tables --data CAPTURES --out runs/paper [--tables modules k] [--groups bottle-lego]
+        [--slots 2] [--seeds 3]
+
+``CAPTURES`` holds the captures under the names of ``GROUPS``. `gs2d paper` writes whole pages, with the paper's
+figures, the deviations and every command; this prints what a reader compares, in the form of the page: a table for each
+capture, and which of the paper's orders hold. Finished runs stay, so the command can be stopped and started again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import textwrap
+from dataclasses import dataclass
+from pathlib import Path
+
+TABLES = ("modules", "freeze", "k", "benchmark", "absgs", "regularisation")
+SCALE = "0.1"
+
+
+@dataclass(frozen=True)
+class Group:
+    """Captures of one table: small enough for two cores."""
+
+    name: str
+    scenes: tuple[str, ...]
+    downscale: int
+
+
+GROUPS = (
+    Group("bottle-lego", ("rendered_bottle", "nerf_synthetic_lego"), downscale=2),
+    Group("scan24", ("dtu_scan24",), downscale=8),
+    Group("fox", ("fox_instant_ngp",), downscale=4),
+)
+CALLED = {  # by `gs2d paper`: here
+    "other (nerf-synthetic)": "Bottle",
+    "NeRF-Synthetic": "Lego",
+    "DTU": "DTU scan 24 (training views)",
+    "other (generic)": "Fox",
+}
+
+
+def make_table(table: str, group: Group, args: argparse.Namespace) -> str:
+    """Run `gs2d paper`, and return what it wrote as Markdown."""
+    out = args.out / f"{group.name}-{table}"
+    words = ["paper", table, "--data", str(args.data), "--scenes", *group.scenes, "--out", str(out)]
+    words += ["--cache", str(args.out / "cache"), "--schedule-scale", SCALE, "--downscale", str(group.downscale)]
+    words += ["--seeds", str(args.seeds), *(["--slots", str(args.slots)] if args.slots else [])]
+    print("$ gs2d", " ".join(words), flush=True)
+    subprocess.run([sys.executable, "-m", "gs2d", *words, "--quiet"], check=True)
+    return (out / "table.md").read_text()
+
+
+def shorten(page: str) -> list[str]:
+    """Return the lines of a page that are compared: the tables of what was trained, and the orders that are known."""
+    lines = []
+    for section in page.split("\n## ")[1:]:
+        title, _, text = section.partition("\n")
+        if title in CALLED:
+            lines += [f"{CALLED[title]}:", "", *text.strip().splitlines(), ""]
+        elif title.startswith("Do the paper's claims"):
+            told = [line for line in text.strip().splitlines() if not line.startswith("- **unknown**")]
+            for line in told:
+                for name, ours in CALLED.items():
+                    line = line.replace(f"({name}):", f"({ours.split(' (')[0]}):")
+                lines += textwrap.wrap(line, 120, subsequent_indent="  ", break_on_hyphens=False)
+    return lines
+
+
+def main() -> None:
+    """Run what is missing and print the tables as Markdown."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--out", type=Path, default=Path("runs/paper"))
+    parser.add_argument("--tables", nargs="+", choices=TABLES, default=list(TABLES))
+    parser.add_argument("--groups", nargs="+", choices=[group.name for group in GROUPS], default=["bottle-lego"])
+    parser.add_argument("--seeds", type=int, default=1, help="how many")
+    parser.add_argument("--slots", type=int, default=0, help="runs at a time")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    for group in (group for group in GROUPS if group.name in args.groups):
+        pages: list[str] = []
+        for table in args.tables:
+            pages += [f"## {table}: {group.name}", "", *shorten(make_table(table, group, args)), ""]
+            (args.out / f"tables-{group.name}.md").write_text("\n".join(pages))
+        print("\n".join(pages))
+
+
+if __name__ == "__main__":
+    main()
