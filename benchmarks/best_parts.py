@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gs2d.config.presets import SH_FASTER, SILHOUETTE, SQUARES, SQUARES_START, SURFACE_NC, best, get_recipe
+from gs2d.config.presets import SH_FASTER, SILHOUETTE, SQUARES, SQUARES_START, best, get_recipe
 from gs2d.config.recipe import GradDensify, LearningRates, LossTerm, Recipe, Stage
 
 
@@ -83,7 +83,7 @@ VARIANTS: dict[str, Recipe] = {
     "with_resets": _densify(reset_every=3_000, scale_cull_start=0),
     "normals_of_the_image": _term("normal_consistency", where="image"),
     "no_normals": _term("normal_consistency", weight=0.0),
-    "normals_as_2dgs": _term("normal_consistency", weight=SURFACE_NC),
+    "normals_as_2dgs": _term("normal_consistency", weight=0.05),
     "no_silhouette": _without("silhouette"),
     "no_squares": _without("l2"),
     "median": replace(best(), fused_depth="median"),

@@ -8,7 +8,6 @@ import pytest
 
 from gs2d.config.describe import describe_recipe
 from gs2d.config.presets import (
-    BEST_NC,
     DEFAULT_RECIPE,
     NC_WITHOUT_SQUARES,
     OFFICIAL_ITERATIONS,
@@ -16,7 +15,6 @@ from gs2d.config.presets import (
     SH_FASTER,
     SILHOUETTE,
     SQUARES,
-    SURFACE_NC,
     get_recipe,
     with_fading_backdrop,
     with_few_views,
@@ -74,8 +72,7 @@ def test_colours_by_direction_learn_faster_but_from_few_photographs(name: str, s
     assert slow.lr.shN == pytest.approx(stage.lr.sh0 / 20)
     assert replace(slow, lr=replace(slow.lr, shN=stage.lr.shN), losses=stage.losses) == stage
     weights = {term.kind: term.weight for term in stage.losses if term.kind != "l2"}
-    if name != "best-surface":
-        weights["normal_consistency"] = NC_WITHOUT_SQUARES
+    weights["normal_consistency"] = NC_WITHOUT_SQUARES
     assert {term.kind: term.weight for term in slow.losses} == weights
     assert any("SH beyond degree 0 at 2.5 times" in line for line in describe_recipe(recipe))
     assert not any("SH beyond" in line for line in describe_recipe(with_few_views(recipe)))
@@ -87,19 +84,19 @@ def test_rates_and_weights_of_another_s_choice_stay() -> None:
     assert with_few_views(get_recipe("2dgs-r")) == get_recipe("2dgs-r")
 
 
-def test_best_surface_compares_views_in_its_last_fifth_alone() -> None:
-    stage = get_recipe("best-surface").stages[0]
+def test_best_surface_is_best_but_for_views_compared_in_its_last_fifth_and_a_start_that_is_not_fitted() -> None:
+    recipe, best = get_recipe("best-surface"), get_recipe("best")
+    stage = recipe.stages[0]
     terms = {term.kind: (term.weight, term.start, term.every) for term in stage.losses if "multiview" in term.kind}
     assert terms == {"multiview_photometric": (0.6, 16_000, 2), "multiview_geometric": (0.04, 16_000, 2)}
     plain = tuple(term for term in stage.losses if "multiview" not in term.kind)
-    (consistency,) = (term for term in plain if term.kind == "normal_consistency")
-    lighter = tuple(replace(term, weight=BEST_NC) if term is consistency else term for term in plain)
-    assert consistency.weight == SURFACE_NC > BEST_NC
-    best = get_recipe("best").stages[0]
-    assert replace(stage, losses=lighter) == replace(best, losses=tuple(t for t in best.losses if t.kind != "l2"))
+    assert best.dense_start is not None
+    assert best.dense_start.fit is not None
+    swept = replace(best, dense_start=replace(best.dense_start, fit=None))
+    assert replace(recipe, name="best", multiview=best.multiview, stages=(replace(stage, losses=plain),)) == swept
 
 
-@pytest.mark.parametrize("name", ["best", "best-fast"])
+@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("scale", [1.0, 0.1])
 def test_squares_count_once_nothing_is_densified(name: str, scale: float) -> None:
     (stage,) = scale_schedule(get_recipe(name), scale).stages
@@ -131,7 +128,8 @@ def test_they_are_written_read_and_described(name: str) -> None:
     assert from_json(to_json(recipe)) == recipe
     said = "\n".join(describe_recipe(recipe))
     assert "the mesh is of the transmittance depth" in said
-    assert "dense start: a sweep over photographs of about 256 px, its splats fitted to them, and 500 on a" in said
+    fitted = "" if name == "best-surface" else ", its splats fitted to them"
+    assert f"dense start: a sweep over photographs of about 256 px{fitted}, and 500 on a" in said
     assert "on a sphere around, if needed; without where they agree on nothing" in said
     assert "rates but that of the means fall after iteration" in said
 

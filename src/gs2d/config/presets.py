@@ -48,8 +48,8 @@ DEFAULT_RECIPE = "best"  # of `gs2d train`, `reconstruct` and `demo`
 OFFICIAL_ITERATIONS = 30_000  # of 2DGS, for which its rates were chosen
 BEST_ITERATIONS, FAST_ITERATIONS = 20_000, 6_600
 SILHOUETTE = 0.1  # weight of the silhouette loss: docs/decisions/losses.md
-# Weight of normal consistency in best, in best-surface, and in best where it has no L2: docs/decisions/losses.md
-BEST_NC, SURFACE_NC, NC_WITHOUT_SQUARES = 0.035, 0.05, 0.02
+# Weight of normal consistency in best, and in best where it has no L2: docs/decisions/losses.md
+BEST_NC, NC_WITHOUT_SQUARES = 0.035, 0.02
 SQUARES, SQUARES_START = 10.0, 0.5  # weight of L2 in best, and from which part of its iterations on: the same page
 BACKDROP_RATE = 0.3  # docs/decisions/fog.md
 SH_FASTER = 2.5  # times the official rate of SH beyond degree 0: docs/decisions/training.md
@@ -68,7 +68,7 @@ ABSGS_DEFAULT = GradDensify(
     reset_at_start_on_white=False,  # stage 3 starts from a trained scene, not from random points
 )
 # "A": "more sensitive thresholds for size and positional gradient"; the paper gives no numbers. Half of D's for the
-# gradient is what the sweep chose on lego (`python -m benchmarks.absgs`, docs/results.md); size decided nothing there.
+# gradient is what the sweep chose on lego (`python -m benchmarks.absgs`, docs/paper-tables.md); size decided nothing.
 ABSGS_ADJUSTED = replace(ABSGS_DEFAULT, grad_threshold=1e-4, abs_threshold=2e-4, percent_dense=0.0005)
 
 
@@ -410,9 +410,14 @@ def with_few_views(recipe: Recipe) -> Recipe:
 
 
 def best_surface(*, name: str = "best-surface") -> Recipe:
-    """Return ``best`` with neighbouring photographs compared in its last fifth, and no L2: Chamfer before dB."""
-    compared = MultiView(depth_downscale=2)
-    return with_multiview(best(nc=SURFACE_NC, squares=0.0), 0.6, 0.04, every=2, last=0.2, multiview=compared, name=name)
+    """Return ``best`` with neighbouring photographs compared in its last fifth, and a start that is not fitted.
+
+    Chamfer before dB: what a fit finds for colours, it finds with splats that lie a little off (docs/recipes/best.md).
+    """
+    recipe = best()
+    assert recipe.dense_start is not None
+    swept = replace(recipe, dense_start=replace(recipe.dense_start, fit=None))
+    return with_multiview(swept, 0.6, 0.04, every=2, last=0.2, multiview=MultiView(depth_downscale=2), name=name)
 
 
 def _in_stages(recipe: Recipe, term: LossTerm) -> Recipe:
