@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +76,18 @@ def test_stages_before_the_last_are_scored_on_some_training_views_and_say_so(
     assert stages[2]["train"] == whole[2]["train"]
     assert [stage["test"] for stage in stages] == [stage["test"] for stage in whole]
     assert few.file("splats.ply").read_bytes() == undisturbed.file("splats.ply").read_bytes()
+
+
+def test_where_training_views_are_compared_all_of_them_score_every_stage(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a stage after the first would look better or worse for being scored on other views."""
+    monkeypatch.setattr(recorder, "EARLY_VIEWS", 2)
+    run = train(replace(options(capture, tmp_path / "run"), protocol="dtu"))
+    stages = run.metrics()["stages"]
+    assert len(stages) == 3
+    assert all("views" not in stage["train"] for stage in stages)
+    assert "views" not in stages[2]["after_clone"]["train"]
 
 
 def test_the_mesh_of_what_was_rendered_for_the_scores_is_that_of_rendering_again(

@@ -50,7 +50,7 @@ from gs2d.training.trainer import Trainer
 LOG_LINES = 300  # step lines a stage
 PROBES = 30  # times a stage at which the probe views are scored for the PSNR curve
 PROBE_VIEWS = 4
-EARLY_VIEWS = 16  # training views that score a stage before the last; of test views all do, they are what is compared
+EARLY_VIEWS = 16  # training views that score a stage before the last, where stages are compared by test views
 REPORTS = {"cpu": 10, "cuda": 50}  # iterations between progress events, by device: for each the host waits for a GPU
 
 
@@ -329,9 +329,14 @@ class RunLogger:
         self._on_event(StageDone(entry))
 
     def _scored(self, *, last: bool) -> list[tuple[str, Sequence[View]]]:
-        """Return the views that score a stage: of the training views all after the last stage, some before it."""
+        """Return the views that score a stage: all, but before the last stage some of the training views.
+
+        Where training views are what stages are compared by (DTU, captures without test views) all of them do.
+        """
         scene = self._job.scene
-        return [("train", scene.train if last else evenly(scene.train, EARLY_VIEWS)), ("test", scene.test)]
+        compared = self._job.protocol.test_on == "train" or not scene.test
+        train = scene.train if last or compared else evenly(scene.train, EARLY_VIEWS)
+        return [("train", train), ("test", scene.test)]
 
     def _score(self, split: str, views: Sequence[View], name: str, visitors: Sequence[Visitor] = ()) -> Any:
         return score_views(
