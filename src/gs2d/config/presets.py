@@ -412,7 +412,8 @@ def with_few_views(recipe: Recipe) -> Recipe:
 def best_surface(*, name: str = "best-surface") -> Recipe:
     """Return ``best`` with neighbouring photographs compared in its last fifth, and a start that is not fitted.
 
-    Chamfer before dB: what a fit finds for colours, it finds with splats that lie a little off (docs/recipes/best.md).
+    Chamfer before dB: a fitted start has better colours, and more splats that lie a little off
+    (docs/recipes/best-surface.md).
     """
     recipe = best()
     assert recipe.dense_start is not None
