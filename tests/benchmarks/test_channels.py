@@ -12,10 +12,10 @@ def test_every_way_has_a_ratio_to_one_view_of_three_channels(monkeypatch: pytest
     monkeypatch.setattr(channels, "CHANNELS", (3, 12))
     threads = torch.get_num_threads()
     try:
-        rows = {name: median for name, median, _, _ in channels.measure(400, 40, 7)}
+        rows = {name: median for name, median, _, _ in channels.measure(4000, 160, 5)}  # less, and the calls are timed
     finally:
         torch.set_num_threads(threads)
     assert rows.pop("rasterize, 3 channels") == 1.0
     assert list(rows)[:2] == ["3 channels", "12 channels"]
-    assert rows["12 channels"] > rows["3 channels"]  # four renderings; by how much longer depends on who else works
+    assert rows["12 channels"] > 1.5 * rows["3 channels"]  # four renderings
     assert all(median > 0 for median in rows.values())
