@@ -13,11 +13,11 @@ capture, and which of the paper's orders hold. Finished runs stay, so the comman
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
 import textwrap
 from dataclasses import dataclass
 from pathlib import Path
+
+from benchmarks.results import execute
 
 TABLES = ("modules", "freeze", "k", "benchmark", "absgs", "regularisation")
 SCALE = "0.1"
@@ -48,11 +48,10 @@ CALLED = {  # by `gs2d paper`: here
 def make_table(table: str, group: Group, args: argparse.Namespace) -> str:
     """Run `gs2d paper`, and return what it wrote as Markdown."""
     out = args.out / f"{group.name}-{table}"
-    words = ["paper", table, "--data", str(args.data), "--scenes", *group.scenes, "--out", str(out)]
+    words = ["gs2d", "paper", table, "--data", str(args.data), "--scenes", *group.scenes, "--out", str(out)]
     words += ["--cache", str(args.out / "cache"), "--schedule-scale", SCALE, "--downscale", str(group.downscale)]
     words += ["--seeds", str(args.seeds), *(["--slots", str(args.slots)] if args.slots else [])]
-    print("$ gs2d", " ".join(words), flush=True)
-    subprocess.run([sys.executable, "-m", "gs2d", *words, "--quiet"], check=True)
+    execute(words)
     return (out / "table.md").read_text()
 
 
@@ -61,9 +60,11 @@ def shorten(page: str) -> list[str]:
     lines = []
     for section in page.split("\n## ")[1:]:
         title, _, text = section.partition("\n")
-        if title in CALLED:
-            lines += [f"{CALLED[title]}:", "", *text.strip().splitlines(), ""]
-        elif title.startswith("Do the paper's claims"):
+        if title.startswith(("The paper's figures", "How this differs", "Commands")):
+            continue
+        if not title.startswith("Do the paper's claims"):
+            lines += [f"{CALLED.get(title, title)}:", "", *text.strip().splitlines(), ""]
+        else:
             told = [line for line in text.strip().splitlines() if not line.startswith("- **unknown**")]
             for line in told:
                 for name, ours in CALLED.items():
@@ -82,7 +83,6 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, help="how many")
     parser.add_argument("--slots", type=int, default=0, help="runs at a time")
     args = parser.parse_args()
-    args.out.mkdir(parents=True, exist_ok=True)
     for group in (group for group in GROUPS if group.name in args.groups):
         pages: list[str] = []
         for table in args.tables:

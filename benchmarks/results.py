@@ -79,9 +79,11 @@ def train_command(case: Case, method: Method, data: str, out: Path, scale: float
 
 
 def execute(words: list[str]) -> None:
-    """Run a gs2d command with the interpreter of this process."""
+    """Run a gs2d command with the interpreter of this process; one that fails has said why, and ends this one too."""
     print("$", " ".join(words), flush=True)
-    subprocess.run([sys.executable, "-m", "gs2d", *words[1:], "--quiet"], check=True)
+    code = subprocess.run([sys.executable, "-m", "gs2d", *words[1:], "--quiet"]).returncode
+    if code:
+        sys.exit(code)
 
 
 def run_case(case: Case, method: Method, data: str, out: Path, scale: float, seed: int) -> dict:
