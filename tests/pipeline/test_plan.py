@@ -14,7 +14,9 @@ import pytest
 import torch
 
 from gs2d.cli.app import run as main
+from gs2d.config.densify import Densify
 from gs2d.config.presets import get_recipe
+from gs2d.config.recipe import Stage
 from gs2d.config.robust import FreeSpace, SeenArea
 from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import apply_overrides
@@ -28,6 +30,7 @@ from gs2d.pipeline.capture_plan import (
     PLACE_BYTES,
     PROGRAM_BYTES,
     SPLAT_BYTES,
+    budget_overrides,
     expected_splats,
     fitting_downscale,
     looks_of,
@@ -99,6 +102,19 @@ def test_splats_at_the_end_are_those_at_the_start_times_growth_but_for_a_budget(
     assert (frozen.least, frozen.most) == (1000, 1000)
 
 
+def test_a_budget_is_set_in_each_stage_that_takes_one_whatever_it_is_called() -> None:
+    first, *rest = get_recipe("2dgs-r-absgs-d").stages
+    moving = Stage("move", 100, losses=first.losses, densify=Densify("relocation", {"max_splats": 9, "stop": 50}))
+    recipe = replace(get_recipe("2dgs"), stages=(replace(first, name="coarse"), *rest, moving))
+    overrides = budget_overrides(recipe, 700)
+    limits = [getattr(stage.densify, "max_splats", None) for stage in apply_overrides(recipe, overrides).stages]
+    assert limits[:3] == [700, None, 700]
+    assert apply_overrides(recipe, overrides).stages[-1].densify == Densify(
+        "relocation", {"max_splats": 700, "stop": 50}
+    )
+    assert budget_overrides(replace(recipe, stages=(replace(first, densify=None),)), 700) == ()
+
+
 def test_the_downscale_is_the_first_at_which_an_iteration_fits() -> None:
     allowed = PROGRAM_BYTES + 24 * MEGA * (216 // 4 + 12)  # of 24 megapixels at half their size
     assert fitting_downscale(24 * MEGA, 1, allowed, on_host=True) == 2
@@ -119,6 +135,7 @@ def test_a_budget_of_splats_is_named_where_as_many_as_may_come_do_not_fit(
     assert found.start < found.max_splats < 1700
     assert found.memory.most <= 2 << 30
     assert f"--set surface.densify.max_splats={found.max_splats} --memory 2" in command_of(options, found)
+    assert f"only with --set surface.densify.max_splats={found.max_splats}" in found.lines()[1]
     monkeypatch.setattr(capture_plan, "SPLAT_BYTES", 1 << 24)
     with pytest.raises(DataError, match=r"12 photographs start from about .* splats, which need .* got 2 GiB to keep"):
         plan(options)

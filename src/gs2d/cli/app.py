@@ -224,7 +224,7 @@ def _report(error: Exception, debug: bool) -> int:
             return _fail(f"out of memory: the address space is limited to {limit / 2**30:.2f} GiB; raise ulimit -v")
         if no_thread:
             return _fail("no more threads or processes may be begun here; raise ulimit -u, or use fewer --threads")
-        return _fail("out of memory; use a larger --downscale, or fewer splats (--set surface.densify.max_splats=N)")
+        return _fail("out of memory; use a larger --downscale, or fewer splats (--set STAGE.densify.max_splats=N)")
     text = " ".join(str(error).split()) or "no message"
     hint = "" if debug else "; run again with --debug and report it with the traceback"
     _complain(f"fault in gs2d: {type(error).__name__}: {text[:500]}{hint}")

@@ -26,7 +26,7 @@ class DepthPrior:
         "sparse": points of the reconstruction that found the cameras; "sensor": depth maps in units of the capture
         times a factor; "relative": depth maps of unknown scale and shift, one of each a view; "auto": by what the
         capture has.
-    final_factor, horizon : float, int
+    final_factor, decay_steps : float, int
         The weight of the loss falls log-linearly to this share of itself over so many iterations of the run, all
         stages counted: photographs know better in the end.
     opacity : float
@@ -77,7 +77,7 @@ class NormalPrior:
     axes : str
         Of the maps, in the camera's frame: "opencv" (x right, y down, z forward), "opengl" (x right, y up, z back), or
         "auto": in which a surface that is seen faces the camera.
-    final_factor, horizon : float, int
+    final_factor, decay_steps : float, int
         As of :class:`DepthPrior`.
     """
 

@@ -484,8 +484,10 @@ def _check_stage(where: str, stage: Stage, groups: list[str], to_train: bool) ->
         stage.lr.means > 0 and stage.lr.means_final > 0 and stage.lr.eps > 0,
         f"{where}: lr.means, lr.means_final and lr.eps must be positive (to freeze, leave out of train)",
     )
-    integer(f"{where}: rates.means_horizon", stage.lr.means_decay_steps, low=1)
-    require(max(stage.lr.beta1, stage.lr.beta2) < 1, f"{where}: rates.beta1 and rates.beta2 must be below 1")
+    integer(f"{where}: lr.means_decay_steps", stage.lr.means_decay_steps, low=1)
+    for name in ("beta1", "beta2"):
+        value = getattr(stage.lr, name)
+        require(value < 1, f"{where}: lr.{name} must be below 1, got {value}")
     for name in ("settle_start", "settle_steps"):
         integer(f"{where}: lr.{name}", getattr(stage.lr, name), low=0)
     require(stage.lr.settle_factor <= 1, f"{where}: lr.settle_factor must be at most 1, got {stage.lr.settle_factor}")

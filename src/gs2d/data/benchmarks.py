@@ -191,7 +191,7 @@ class SceneFolder:
     truth : mapping of str to Path
         The pieces of the ground truth that are there: "scan", "mask", "plane" (DTU), "scan", "crop", "transform", "log"
         (Tanks and Temples), "mesh" (NeRF-Synthetic).
-    missing : tuple of Missing
+    missing : tuple of MissingFile
         Of the capture and of the ground truth.
     """
 

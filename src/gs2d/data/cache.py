@@ -29,7 +29,7 @@ class DecodedImage:
         False = ignore this pixel.
     object_mask : ndarray bool [H, W] or None
         True = the object.
-    known : ndarray bool [H, W] or None
+    valid : ndarray bool [H, W] or None
         False = the photograph does not reach so far: undistortion left the pixel black. None: all are known.
     """
 

@@ -149,7 +149,7 @@ class View:
         Parameters
         ----------
         masks : bool
-            True: ``mask()``, which leaves out unknown pixels too; False: ``known()``.
+            True: ``mask()``, which leaves out unknown pixels too; False: ``valid()``.
         """
         return self.mask() if masks else self.valid()
 

@@ -66,7 +66,7 @@ class IcpResult:
     Attributes
     ----------
     T_target_source : ndarray [4, 4]
-    fraction_before, share : float
+    fraction_before, fraction : float
         Part of the source with a target within the threshold, at the start and at the end.
     rms_before, rms : float or None
         Of the distances of those; None where there are none.

@@ -93,7 +93,7 @@ class Neighbour:
 
     Attributes
     ----------
-    reference, source : Photograph
+    reference, source : PatchImage
         Of the view that is learned from, and of its neighbour.
     camera : Camera
         The neighbour's.

@@ -26,7 +26,7 @@ def bare_pixels(image: np.ndarray, points: np.ndarray, valid: np.ndarray | None 
     image : ndarray [H, W, 3] float in [0, 1]
     points : ndarray [M, 2] px
         Sparse points in the picture, whether the photograph was found to show them or not.
-    known : ndarray [H, W] bool, optional
+    valid : ndarray [H, W] bool, optional
         Where it shows anything: undistortion may leave wedges. What touches those is at the rim.
 
     Returns

@@ -30,7 +30,7 @@ def depth_noise(maps: Iterable[DepthMap], samples: Sequence[DepthSample], limits
     maps : iterable of DepthMap
     samples : sequence of DepthSample
         One for each map, in order.
-    limits : FusionLimits
+    limits : FusionBounds
         Steeper slopes than its largest truncation in a pixel are depth edges; deeper pixels than its limit are unseen.
 
     Returns

@@ -65,9 +65,9 @@ def extract(
 
     Parameters
     ----------
-    frames : iterable of Frame, or Spool
+    frames : iterable of RenderedView, or Spool
         Read once (a generator is fine) and kept in a temporary file; a spool is one, and stays open.
-    limits : FusionLimits, optional
+    limits : FusionBounds, optional
         Default: ``derive_limits`` from the frames, with ``resolution``, ``bbox``, ``voxel``, ``truncation``,
         ``depth_limit`` and ``points`` as it takes them (they may not be given together with ``limits``); a truncation
         that is not given grows with the disagreement of the depth maps (``consistency.depth_noise``). With ``bbox`` no
@@ -86,7 +86,7 @@ def extract(
     by_evidence : bool
         Leave only what enough views saw, in no more faces than their pixels carry (``evidence.clean``).
     with_bare : bool
-        Take the depth of pixels that show nothing which could be matched (``Frame.bare``).
+        Take the depth of pixels that show nothing which could be matched (``RenderedView.bare``).
     slab_bytes : int
         Of the volume that are in memory at a time; the mesh does not depend on it.
 
@@ -168,11 +168,11 @@ def extract_unbounded(
 
     Parameters
     ----------
-    frames : iterable of Frame
+    frames : iterable of RenderedView, or Spool
         As for ``extract``.
     resolution, bbox, voxel, truncation, depth_limit
-        See ``nest.derive_nest``; ``bbox``, ``voxel`` and ``truncation`` are those of the innermost level. A truncation
-        that is not given grows with the disagreement of the depth maps, as in ``extract``.
+        See ``unbounded.derive_cascade``; ``bbox``, ``voxel`` and ``truncation`` are those of the innermost level. A
+        truncation that is not given grows with the disagreement of the depth maps, as in ``extract``.
     min_weight : float
         See ``marching_cubes``.
     far_views : float

@@ -37,7 +37,7 @@ def fused_surface(
     ----------
     frames : iterable of DepthMap
         Read once for each slab: a sequence or a ``Spool``.
-    limits : FusionLimits
+    limits : FusionBounds
     blocks : Blocks
         Those that the frames touch, as ``find_blocks`` finds them.
     min_weight : float

@@ -262,7 +262,7 @@ def bake(
     Parameters
     ----------
     atlas : Atlas
-    photographs : iterable of Photograph
+    images : iterable of ColorSource
         Read once, one at a time.
     size : int
         Side of the texture, texels. Memory: about 70 bytes for each texel on the surface.

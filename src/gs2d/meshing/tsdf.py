@@ -44,7 +44,7 @@ class Volume:
 
     Attributes
     ----------
-    limits : FusionLimits
+    limits : FusionBounds
     dims : tuple of 3 ints
         Blocks that the box would hold along x, y, z.
     keys : ndarray [M] int64
@@ -408,7 +408,7 @@ def fuse(
     ----------
     frames : iterable of DepthMap
         Read twice, one at a time: a sequence or a ``Spool``, not a generator.
-    limits : FusionLimits
+    limits : FusionBounds
     max_bytes : int
         The volume will not grow beyond this.
     threads : int, optional

@@ -68,7 +68,7 @@ class TsdfCascade:
 
     Attributes
     ----------
-    levels : tuple of FusionLimits
+    levels : tuple of FusionBounds
         ``lower`` of a level is its first voxel, half a voxel inside its cube.
     voxels : int
         Along a side of every level, a multiple of ``STEP``.
@@ -216,7 +216,7 @@ def fuse_cascade(
     ----------
     frames : iterable of DepthMap
         Read twice, one at a time: a sequence or a ``Spool``, not a generator.
-    nest : Nest
+    cascade : TsdfCascade
     max_bytes : int
         The volumes together will not grow beyond this.
     threads : int, optional

@@ -7,13 +7,15 @@ with what was met in finished runs (docs/scale.md). All of it is told with bound
 from __future__ import annotations
 
 import math
+import shlex
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
 
 from gs2d.config.protocols import Protocol
-from gs2d.config.recipe import Recipe
+from gs2d.config.recipe import GradDensify, Recipe
 from gs2d.core.memory_limit import memory_budget
 from gs2d.data import Scene
 from gs2d.data.prepared import decoded_bytes
@@ -81,6 +83,8 @@ class CapturePlan:
         Bytes in the run folder, and ``temporary`` in the temporary folder, for depth maps.
     temporary : float
     seconds : Range
+    budget : tuple of str
+        Overrides that keep the recipe to ``max_splats``.
     """
 
     photographs: int
@@ -97,6 +101,7 @@ class CapturePlan:
     disk: float
     temporary: float
     seconds: Range
+    budget: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values."""
@@ -107,7 +112,8 @@ class CapturePlan:
         shrunk = f"{self.trained_pixels / 1e6:.3g} as they are trained on (--downscale {self.downscale}), "
         where = "prepared on the disk" if self.prepared else "in memory"
         of = "" if self.allowed is None else f" of {self.allowed / 2**30:.3g} GiB allowed"
-        budget = "" if self.max_splats is None else f"; only with a budget: {budget_option(self.max_splats)}"
+        limited = shlex.join(set_words(self.budget)) or "more --memory"  # not every densifier takes a limit
+        budget = "" if self.max_splats is None else f"; only with {limited}"
         memory, splats, seconds = self.memory.scaled(2.0**-30), self.splats, self.seconds
         return [
             f"photographs: {self.photographs:,} with {self.pixels / 1e6:.3g} megapixels together, "
@@ -122,9 +128,20 @@ class CapturePlan:
         ]
 
 
-def budget_option(splats: int) -> str:
-    """Return how a budget of splats is asked for."""
-    return f"--set surface.densify.max_splats={splats}"
+def budget_overrides(recipe: Recipe, splats: int) -> tuple[str, ...]:
+    """Return the overrides that limit the splats of a recipe: one for each stage whose densifier takes a limit."""
+    found = []
+    for stage in recipe.stages:
+        if isinstance(stage.densify, GradDensify):
+            found.append(f"{stage.name}.densify.max_splats={splats}")
+        elif stage.densify is not None and "max_splats" in stage.densify.options:
+            found.append(f"{stage.name}.densify.options.max_splats={splats}")
+    return tuple(found)
+
+
+def set_words(overrides: Sequence[str]) -> list[str]:
+    """Return overrides as words of a command line."""
+    return [word for override in overrides for word in ("--set", override)]
 
 
 def rounded(number: float) -> int:
@@ -185,6 +202,7 @@ def plan_capture(
         disk=packed + splats.expected * (2 * CHECKPOINT_BYTES + FILE_BYTES),
         temporary=trained * 8,
         seconds=_seconds(tried, recipe, scene, start, splats, shrink),
+        budget=() if budget is None else budget_overrides(recipe, budget),
     )
 
 

@@ -104,7 +104,7 @@ class Training:
     cache: Annotated[Path | None, arg(metavar="DIR")] = None
     """Keep finished stages here, and take them from here when scene, settings and stages are the same."""
     overrides: Overrides = ()
-    """Change the recipe, e.g. --set refine.iterations=2000; may be repeated."""
+    """Change the recipe, e.g. --set surface.iterations=2000; may be repeated."""
     checkpoint_every: int = 10_000
     """Iterations between checkpoints."""
     checkpoint_seconds: float = 120.0

@@ -6,7 +6,7 @@ import shlex
 
 from gs2d.data import detect_format
 from gs2d.errors import DataError, RecipeError
-from gs2d.pipeline.capture_plan import CapturePlan, budget_option, plan_capture
+from gs2d.pipeline.capture_plan import CapturePlan, plan_capture, set_words
 from gs2d.pipeline.events import Notice, OnEvent, Phase, ignore
 from gs2d.pipeline.job import (
     Job,
@@ -85,8 +85,7 @@ def command_of(options: PlanOptions, found: CapturePlan) -> str:
     words += ["--downscale", str(found.downscale)] if found.downscale > 1 else []
     words += ["--recipe", str(options.recipe)] if options.recipe != PlanOptions.recipe else []
     words += ["--schedule-scale", f"{options.schedule_scale:g}"] if options.schedule_scale != 1 else []
-    words += [word for override in options.overrides for word in ("--set", override)]
-    words += budget_option(found.max_splats).split() if found.max_splats is not None else []
+    words += set_words((*options.overrides, *found.budget))
     words += ["--memory", f"{options.memory:g}"] if options.memory is not None else []
     words += ["--disk", f"{options.disk:g}"] if options.disk is not None else []
     return shlex.join(words)

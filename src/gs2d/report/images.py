@@ -118,18 +118,18 @@ def error_image(color: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = 
 
 
 def valid_image(photo: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
-    """Return a photograph hatched where it says nothing (``known`` is False), which undistortion left black.
+    """Return a photograph hatched where it says nothing (``valid`` is False), which undistortion left black.
 
     Parameters
     ----------
     photo : ndarray [H, W, 3 or 4]
         uint8, or floats in [0, 1]; as it is returned.
-    known : ndarray bool [H, W] or None
+    valid : ndarray bool [H, W] or None
         None: all of it.
     """
     if valid is None:
         return photo
-    check_shapes({"photo": (photo, "H W C"), "known": (valid, "H W")})
+    check_shapes({"photo": (photo, "H W C"), "valid": (valid, "H W")})
     rows, columns = np.indices(valid.shape)
     stripes = ((rows + columns) // HATCH % 2 == 0)[..., None]
     opaque = np.where(stripes, (*IGNORED, 1.0), (*HATCHED, 1.0))[..., : photo.shape[2]]

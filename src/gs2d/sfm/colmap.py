@@ -84,8 +84,8 @@ class Request:
         All names, in the order in which they were taken.
     ordered_by : "time" or "name"
         What tells the order.
-    places : tuple of Place or None
-        Metres, of each name in ``in_order``; None: nobody knows.
+    places : tuple of (x, y, z) or None
+        Metres, of each name in ``in_order``; None for those without a position.
     matching : "exhaustive", "sequential", "similar" or "spatial"
     overlap, neighbours : int
         Next photographs, and similar ones, that each is matched with where not all pairs are; fewer near ones do.

@@ -52,7 +52,7 @@ def adam_step(
     stage : Stage
     gradients : mapping of attribute to Tensor
         Like the attributes; rows outside a row group are not read. With ``rows``, only of those, in their order.
-    rates : mapping of attribute to float
+    lr : mapping of attribute to float
     backend : Backend
         Does it; by default plain torch.
     skip : attributes that are left alone this time

@@ -72,7 +72,7 @@ class Progress:
     loss : their sum
     mean_opacity : mean of o
     mean_k_a : mean of K_a = s_u s_v (the paper's Eq. 7), world units^2
-    rates : learning rate of each trained attribute (means: world units)
+    lr : learning rate of each trained attribute (means: world units)
     sh_degree : degree in training
     """
 

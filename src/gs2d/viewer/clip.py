@@ -25,7 +25,7 @@ class ClipBox:
     Parameters
     ----------
     server : viser.ViserServer
-    frame : Frame
+    frame : ViewerFrame
     box : ndarray [2, 3] world units
         At first.
     source : str

@@ -118,7 +118,7 @@ class Viewer:
     host : str
     port : int or None
         None: the first free one from 8080 on.
-    frame : Frame
+    frame : ViewerFrame
         Which part of the world is the viewer's: its camera, its depths and its numbers are made for scenes of size 1.
     up : ndarray [3]
     """
