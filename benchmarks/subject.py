@@ -26,7 +26,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
 from gs2d.data import View
 from gs2d.data.build import Decoder
-from gs2d.data.masks import find_mask
+from gs2d.data.masks import find_masks_in
 from gs2d.errors import DataError, Gs2dError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, open_run
@@ -90,9 +90,8 @@ def fraction_inside(mesh: Mesh, masks: Iterable[tuple[Camera, np.ndarray]]) -> F
 def masks_of(views: Iterable[View], folder: Path) -> list[tuple[Camera, np.ndarray]]:
     """Return the cameras of the photographs that have a mask in a folder, and these masks bool [H, W] as they see."""
     found = []
-    for view in views:
-        path = (folder / view.name).with_name(f"{Path(view.name).stem}_mask.png")
-        file = path if path.is_file() else find_mask(folder, view.name)
+    views = list(views)
+    for view, file in zip(views, find_masks_in([folder], [view.name for view in views]), strict=True):
         if file is None or not isinstance(view.decode, Decoder):
             continue
         masked = replace(view.decode, frame=replace(view.decode.frame, object_mask=file))()

@@ -14,7 +14,7 @@ from PIL import Image
 from capture_writers import small_blender, small_colmap, small_dtu, small_nerfstudio
 from foreign_writers import small_alicevision, small_metashape, small_opensfm
 from gs2d.data import Scene, load_scene
-from gs2d.data.masks import find_mask
+from gs2d.data.masks import find_masks_in
 from gs2d.errors import DataError
 
 HALF = np.where(np.arange(40) < 20, 255, 0).astype(np.uint8)[None].repeat(30, axis=0)  # the left half is kept
@@ -190,7 +190,7 @@ def test_the_longest_name_is_looked_for_first(tmp_path: Path) -> None:
     for name in ("a/b.jpg.png", "a/b.png", "a/b_mask.png"):
         write(tmp_path / name)
     order = []
-    while (found := find_mask(tmp_path, "a/b.jpg")) is not None:
+    while (found := find_masks_in([tmp_path], ["a/b.jpg"])[0]) is not None:
         order.append(found.name)
         found.unlink()
     assert order == ["b.jpg.png", "b.png", "b_mask.png"]

@@ -20,6 +20,7 @@ from gs2d.core.transforms import camera_extent
 from gs2d.data.bounds import scene_bounds
 from gs2d.data.cache import DecodedImage, ImageCache
 from gs2d.data.faces import GLANCE, LEAST_SHOWN, Face, face_name, face_positions, faces_of, wrapped
+from gs2d.data.file_names import subfolder
 from gs2d.data.masks import EMPTY, Masks, find_masks
 from gs2d.data.priors import (
     DEPTH_SUFFIXES,
@@ -29,7 +30,7 @@ from gs2d.data.priors import (
     MapFiles,
     ObservedPoints,
     PriorMaps,
-    find_map,
+    find_maps,
 )
 from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.data.undistort import Intrinsics, source_positions, undistort_image, undistort_mask
@@ -447,8 +448,8 @@ def _with_maps(frames: list[PosedImage], home: Path) -> tuple[list[PosedImage], 
     """Return the frames with the maps that lie in ``depths`` and ``normals``, and a note for each such folder."""
     found: dict[str, list[Path | None]] = {}
     for what, folder, suffixes in (("depth", DEPTHS, DEPTH_SUFFIXES), ("normal", NORMALS, NORMAL_SUFFIXES)):
-        if (home / folder).is_dir():
-            found[what] = [find_map(home / folder, frame.name, suffixes) for frame in frames]
+        if (at := subfolder(home, folder)).is_dir():
+            found[what] = find_maps(at, [frame.name for frame in frames], suffixes)
     for what, paths in found.items():
         for index, path in enumerate(paths):
             maps = frames[index].maps or MapFiles()

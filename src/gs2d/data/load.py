@@ -13,9 +13,9 @@ from gs2d.core.memory_limit import cache_bytes as room_for_cache
 from gs2d.core.missing import where_it_ends
 from gs2d.data.benchmarks import missing_lines
 from gs2d.data.build import Capture, build_scene
-from gs2d.data.masks import Masks
+from gs2d.data.file_names import IMAGES
+from gs2d.data.masks import Masks, without_masks
 from gs2d.data.readers.colmap import MODEL_FOLDERS, model_folder, read_colmap
-from gs2d.data.readers.common import SUFFIXES
 from gs2d.data.readers.dtu import CAMERA_FILES, read_dtu
 from gs2d.data.readers.meshroom import read_alicevision, scene_file
 from gs2d.data.readers.metashape import camera_file, read_metashape
@@ -114,7 +114,8 @@ def detect_format(path: str | os.PathLike[str]) -> str:
 
 def _images(folder: Path) -> int:
     """Files of a folder that are photographs by their names."""
-    return sum(path.suffix.lower() in SUFFIXES for path in folder.iterdir()) if folder.is_dir() else 0
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in IMAGES] if folder.is_dir() else []
+    return len(without_masks(paths))
 
 
 def _folder(path: str | os.PathLike[str]) -> Path:

@@ -8,19 +8,21 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gs2d.data.file_names import Files, folded, subfolder
 from gs2d.errors import DataError
 
 IGNORE, EMPTY, OFF = "ignore", "empty", "off"
 MASKED = (IGNORE, EMPTY, OFF)
 FOLDER = "masks"
-ENDING = "_mask"  # of a mask that lies with the photographs (Metashape's own template, and others)
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif")
-_NAMED = "the file of cameras"
+ENDING = "_mask"  # a_mask.png for a.jpg: Metashape's own template, and others
+LAYER = ".mask.png"  # a.jpg.mask.png for a.jpg: layers of RealityCapture
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+_NAMED, _BESIDE = "the file of cameras", "the photographs' folder"
 
 
 @dataclass(frozen=True)
@@ -56,27 +58,38 @@ class Masks:
         return self.masked == IGNORE or (self.masked is None and self.folder is not None)
 
 
-def find_mask(folder: Path, name: str) -> Path | None:
-    """Return the mask of the image ``name`` in ``folder``.
+def _spellings(name: str) -> list[str]:
+    """Return the names that the mask of ``a/b.jpg`` may have in a folder of masks, most likely first.
 
-    Of ``a/b.jpg``: ``a/b.jpg.png`` (COLMAP), ``a/b.png``, ``a/b_mask.png`` (Metashape), ``a/b.jpg``.
+    ``a/b.jpg.png`` (COLMAP), ``a/b.png``, those of ``_beside``, and ``a/b.jpg``.
     """
-    return next((path for path in _candidates(folder, name) if path.is_file()), None)
+    stem = os.path.splitext(name)[0]
+    return [f"{name}.png", f"{stem}.png", *_beside(name), name, *(f"{stem}{suffix}" for suffix in _SUFFIXES[1:])]
 
 
-def _candidates(folder: Path, name: str) -> Iterator[Path]:
-    image = folder / name
-    yield folder / f"{name}.png"
-    yield image.with_suffix(".png")
-    yield from (image.with_name(f"{image.stem}{ENDING}{suffix}") for suffix in _SUFFIXES)
-    yield image
-    yield from (image.with_suffix(suffix) for suffix in _SUFFIXES[1:])
+def _beside(name: str) -> list[str]:
+    """Return the names that the mask of ``b.jpg`` may have in the same folder: ``b_mask.png``, ``b.jpg.mask.png``."""
+    return [*(f"{os.path.splitext(name)[0]}{ENDING}{suffix}" for suffix in _SUFFIXES), f"{name}{LAYER}"]
 
 
-def mask_beside(image: Path) -> Path | None:
-    """Return the mask that lies with a photograph: ``b_mask.png`` beside ``b.jpg``, or None."""
-    beside = (image.with_name(f"{image.stem}{ENDING}{suffix}") for suffix in _SUFFIXES)
-    return next((path for path in beside if path != image and path.is_file()), None)
+def without_masks(paths: Sequence[Path]) -> list[Path]:
+    """Return the images that are not the mask of another one in the same folder."""
+    masks = {(path.parent, folded(mask)) for path in paths for mask in _beside(path.name)}
+    return [path for path in paths if (path.parent, folded(path.name)) not in masks]
+
+
+def find_masks_in(folders: Sequence[Path], names: Sequence[str]) -> list[Path | None]:
+    """Return the mask of each image below some folders, or None."""
+    return [match.path for match in Files(folders).match([_spellings(name) for name in names], moved=False)]
+
+
+def _masks_beside(images: Sequence[Path]) -> list[Path | None]:
+    """Return the mask of each photograph in its folder, or None."""
+    parents: dict[Path, dict[str, Path]] = {image.parent: {} for image in images}
+    for parent, files in parents.items():
+        files.update((folded(entry.name), Path(entry.path)) for entry in os.scandir(parent) if entry.is_file())
+    masks = [[parents[image.parent].get(folded(mask)) for mask in _beside(image.name)] for image in images]
+    return [next((path for path in paths if path is not None), None) for paths in masks]
 
 
 def find_masks(
@@ -103,22 +116,20 @@ def find_masks(
     """
     if masks.masked == OFF:
         return [None] * len(names), "masks are not used (--masked off)" if any(named) else ""
-    folders = [masks.folder] if masks.folder is not None else [home / FOLDER for home in homes]
-    folders = [folder for folder in dict.fromkeys(folders) if folder.is_dir()]
-    shared = _shared_folder(names)
-    found: list[Path | None] = []
-    places: Counter[str] = Counter()
-    for name, image, own in zip(names, images, named, strict=True):
-        where, path = _NAMED, own if masks.folder is None else None
-        if path is None:
-            spellings = (name, name[len(shared) :])
-            path = next((p for folder in folders for word in spellings if (p := find_mask(folder, word))), None)
-            where = FOLDER if masks.folder is None else str(masks.folder)
-        if path is None and masks.folder is None:
-            path, where = mask_beside(image), "the photographs' folder"
-        found.append(path)
-        places[where] += path is not None
-    count = len(found) - found.count(None)
+    if masks.folder is not None:
+        folders = [masks.folder]
+        places: dict[str, Sequence[Path | None]] = {str(masks.folder): find_masks_in(folders, names)}
+    else:
+        folders = [folder for home in dict.fromkeys(homes) if (folder := subfolder(home, FOLDER)).is_dir()]
+        places = {_NAMED: named, FOLDER: find_masks_in(folders, names), _BESIDE: _masks_beside(images)}
+    found: list[Path | None] = [None] * len(names)
+    counts: Counter[str] = Counter()
+    for where, paths in places.items():
+        for index, path in enumerate(paths):
+            if path is not None and found[index] is None:
+                found[index] = path
+                counts[where] += 1
+    count = counts.total()
     if masks.folder is not None and not count:
         raise DataError(
             f"{masks.folder} must hold masks of the photographs, got none of {len(names)}: {names[0]}.png, "
@@ -128,16 +139,7 @@ def find_masks(
         vain = "" if masks.masked is None else f": --masked {masks.masked} changes nothing"
         line = f"masks: none of {len(names)} views has one in {FOLDER} (a/b.jpg.png for a/b.jpg){vain}"
         return found, line if folders or vain else ""
-    in_what = " and ".join(where for where, number in places.items() if number)
+    in_what = " and ".join(counts)
     rest = f"; the other {len(names) - count} are whole" if count < len(names) else ""
     meaning = ", the rest is empty" if masks.masked == EMPTY else ", the rest is ignored" if masks.asked_for else ""
     return found, f"masks: {count} of {len(names)} views have one in {in_what} (white = keep{meaning}){rest}"
-
-
-def _shared_folder(names: Sequence[str]) -> str:
-    """Return the folder that all names begin with, with a ``/`` at its end; "" without one."""
-    try:
-        folder = os.path.commonpath([os.path.dirname(name) for name in names]) if names else ""
-    except ValueError:  # some are absolute
-        folder = ""
-    return f"{folder}/" if folder else ""

@@ -8,7 +8,7 @@ of its known readings; where it is smaller, neighbours are interpolated only if 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +17,7 @@ import numpy as np
 from gs2d.core.arrays import read_npy
 from gs2d.core.camera import Camera
 from gs2d.core.images import image_size, read_grey, read_image
+from gs2d.data.file_names import Files
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
 
@@ -192,10 +193,10 @@ class PriorMaps:
         return positions * (np.array((width, height)) / sides), valid
 
 
-def find_map(folder: Path, name: str, suffixes: tuple[str, ...]) -> Path | None:
-    """Find the map of the photograph ``name``: its name with one of the suffixes for its own, or after it."""
-    places = [path for s in suffixes for path in ((folder / name).with_suffix(s), folder / f"{name}{s}")]
-    return next((path for path in places if path.is_file()), None)
+def find_maps(folder: Path, names: Sequence[str], suffixes: Sequence[str]) -> list[Path | None]:
+    """Return the map of each photograph: its name with one of the suffixes for its own, or after it; None without."""
+    spellings = [[word + s for s in suffixes for word in (os.path.splitext(name)[0], name)] for name in names]
+    return [match.path for match in Files([folder]).match(spellings, moved=False)]
 
 
 def read_depth(path: str | os.PathLike[str]) -> np.ndarray:

@@ -20,7 +20,7 @@ from gs2d.core.exif import Taken, read_taken
 from gs2d.core.extras import install
 from gs2d.core.images import is_twice_as_wide, natural_key, read_image
 from gs2d.core.missing import where_it_ends
-from gs2d.data.masks import ENDING, FOLDER
+from gs2d.data.masks import FOLDER, without_masks
 from gs2d.errors import DataError
 from gs2d.sfm.fisheye import Circle, circle_of, named_fisheye, small_if_dark
 from gs2d.sfm.panoramas import PANORAMA, meets_itself
@@ -128,9 +128,11 @@ def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...]]:
         kind = _KINDS.get(path.suffix.lower(), "other")
         if path.exists() and not path.is_file():  # a pipe, which would be waited for
             kind = "other"
-        sorted_out["mask" if FOLDER in path.relative_to(root).parts[:-1] else kind].append(path)
+        sorted_out["mask" if FOLDER in path.relative_to(root).parent.as_posix().lower().split("/") else kind].append(
+            path
+        )
     photos, videos, raws, _, others = sorted_out.values()
-    photos = _without_masks(photos)
+    photos = without_masks(photos)
     notes = [f"{_some(raws, root)} not read: {_raw_remedy(raws[0])}"] if raws else []
     if videos:
         notes.append(f"{_some(videos, root)} not read: a video; give it alone, or put frames of it here")
@@ -141,13 +143,6 @@ def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...]]:
         why = f"; {notes[0]}" if notes else ""
         raise DataError(f"{root} must hold {FEWEST} or more photographs, got {got}{why or '; ' + _SHOOTING}")
     return photos, tuple(notes)
-
-
-def _without_masks(photos: Sequence[Path]) -> list[Path]:
-    """Return the photographs but those that are the mask of another one: ``a_mask.png`` beside ``a.jpg``."""
-    stems = {path.with_suffix("") for path in photos}
-    masks = {path for path in photos if path.stem.endswith(ENDING)}
-    return [path for path in photos if path not in masks or path.with_name(path.stem[: -len(ENDING)]) not in stems]
 
 
 def _files(root: Path) -> Iterator[Path]:

@@ -15,7 +15,8 @@ from PIL import Image
 
 from gs2d.core.files import disk_error
 from gs2d.core.images import image_size, read_mask, write_image
-from gs2d.data.masks import FOLDER, Masks, find_mask, find_masks
+from gs2d.data.file_names import subfolder
+from gs2d.data.masks import FOLDER, Masks, find_masks, find_masks_in
 from gs2d.errors import DataError
 from gs2d.sfm.fisheye import Circle
 from gs2d.sfm.images import Photo, turn
@@ -32,7 +33,7 @@ def masks_of(photos: Sequence[Photo], root: Path, folder: Path | None) -> tuple[
     photos : sequence of Photo
     root : Path
         Folder of the photographs: masks are in ``masks`` in it, beside it or in its sub-folders, or are called
-        ``NAME_mask.png``.
+        ``STEM_mask.png`` or ``NAME.mask.png``.
     folder : Path or None
         Where they are instead, as the user says.
 
@@ -44,8 +45,13 @@ def masks_of(photos: Sequence[Photo], root: Path, folder: Path | None) -> tuple[
     if folder is not None and not folder.is_dir():
         raise DataError(f"--masks must be a folder of masks, got {folder}, which is none")
     names, images = [photo.label for photo in photos], [photo.source for photo in photos]
-    beside = [None if folder is not None else find_mask(image.parent / FOLDER, image.name) for image in images]
-    return find_masks(names, images, beside, [root, root.resolve().parent], Masks(folder))
+    own: dict[Path, Path | None] = {}
+    for parent in dict.fromkeys(image.parent for image in images) if folder is None else ():
+        inside = [image for image in images if image.parent == parent]
+        own.update(
+            zip(inside, find_masks_in([subfolder(parent, FOLDER)], [image.name for image in inside]), strict=True)
+        )
+    return find_masks(names, images, [own.get(image) for image in images], [root, root.resolve().parent], Masks(folder))
 
 
 def copy_masks(

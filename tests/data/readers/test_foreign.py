@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from foreign_writers import (
     BENT,
+    CHUNK,
     HEIGHT,
     OFF_CENTRE,
     WIDTH,
@@ -294,16 +296,84 @@ def test_views_that_meshroom_did_not_place_are_skipped_and_named(tmp_path: Path)
     small_alicevision(tmp_path)
     data = alicevision_scene(OFF_CENTRE, (1, 2, 8))
     data["poses"] = data["poses"][1:]
-    data["views"][1] |= {"rigId": "3", "subPoseId": "0"}
+    data["views"][1] |= {"rigId": "3", "subPoseId": "0", "isPoseIndependant": "false"}
     (tmp_path / "cameras.sfm").write_text(json.dumps(data))
     (tmp_path / "images" / "a_2.jpg").unlink()
     scene = load_scene(tmp_path)
     assert len(scene.views) == 6
     assert scene.skipped == (
         "a_0.jpg: not placed by Meshroom",
-        "a_1.jpg: of a rig, which is not read",
+        "a_1.jpg: its camera has no pose in the rig",
         "a_2.jpg: listed in cameras.sfm, but there is no such file",
     )
+
+
+@pytest.mark.parametrize("marked", [True, False])
+def test_views_of_a_rig_of_meshroom_have_its_pose_and_that_of_their_camera(tmp_path: Path, marked: bool) -> None:
+    """The rig is turned by 30 degrees about its x axis and stands 0.2 beside the first camera of each pair."""
+    write_images(tmp_path / "images", poses(8))
+    data = alicevision_scene(OFF_CENTRE, (1, 2, 8), structure=False)
+    T_rig_cam = [np.eye(4), np.eye(4)]
+    T_rig_cam[0][:3, :3], T_rig_cam[0][:3, 3] = Rotation.from_euler("x", 30, degrees=True).as_matrix(), (0.2, 0, 0)
+    T_rig_cam[1][:3, :3], T_rig_cam[1][:3, 3] = Rotation.from_euler("y", -8, degrees=True).as_matrix(), (0.35, 0, 0.1)
+    transforms = [
+        {"rotation": [repr(float(v)) for v in T[:3, :3].reshape(-1)], "center": [repr(float(v)) for v in T[:3, 3]]}
+        for T in T_rig_cam  # camera to rig row by row is rig to camera column by column
+    ]
+    data["rigs"] = [{"rigId": "3", "subPoses": [{"status": "estimated", "pose": pose} for pose in transforms]}]
+    data["views"], data["poses"] = data["views"][:8], data["poses"][:4]
+    for i, view in enumerate(data["views"]):
+        view |= {"poseId": str(200 + i // 2), "rigId": "3", "subPoseId": str(i % 2)}
+        view |= {"isPoseIndependant": "false"} if marked else {}
+    (tmp_path / "cameras.sfm").write_text(json.dumps(data))
+    scene = load_scene(tmp_path)
+    assert (len(scene.views), scene.skipped) == (8, ())
+    rig_poses = list(poses().values())
+    for view in scene.views:
+        i = int(view.name[2])
+        T_world_cam = np.linalg.inv(rig_poses[i // 2]) @ T_rig_cam[i % 2]
+        np.testing.assert_allclose(np.linalg.inv(view.camera.T_cam_world), T_world_cam, atol=1e-12)
+
+
+def rig_of_metashape(root: Path, sensor: str) -> None:
+    """Eight moments of two cameras: the first have a transform, the second a master."""
+    moments = poses(8)
+    write_images(root / "images" / "left", moments)
+    write_images(root / "images" / "right", {f"r{name}": T for name, T in moments.items()})
+    cameras = "".join(
+        f"<camera id='{i}' sensor_id='0' component_id='0' label='{name}'><transform>{metashape_transform(T)}"
+        f"</transform></camera><camera id='{20 + i}' sensor_id='1' label='r{name}' master_id='{i}'/>"
+        for i, (name, T) in enumerate(moments.items())
+    )
+    calibration = metashape_calibration(OFF_CENTRE)
+    second = f"</sensor><sensor id='1' type='frame' master_id='0'>{calibration}{sensor}</sensor></sensors>"
+    text = metashape_document(calibration, cameras).replace("</sensor></sensors>", second)
+    (root / "cameras.xml").write_text(text)
+
+
+def test_the_second_camera_of_a_rig_of_metashape_is_placed_by_the_first(tmp_path: Path) -> None:
+    R, t = Rotation.from_euler("y", -8, degrees=True).as_matrix(), np.array([0.35, -0.1, 0.2])
+    numbers = " ".join(repr(float(v)) for v in R.reshape(-1))
+    rig_of_metashape(tmp_path, f"<rotation>{numbers}</rotation><location>{t[0]} {t[1]} {t[2]}</location>")
+    scene = load_scene(tmp_path)
+    assert (len(scene.views), scene.skipped) == (16, ())
+    T_left_right = np.eye(4)
+    T_left_right[:3, :3], T_left_right[:3, 3] = R, t * CHUNK[0]  # lengths are the chunk's
+    for view in scene.views:
+        T_world_cam = np.linalg.inv(poses(8)[Path(view.name).name.removeprefix("r")])
+        if view.name.startswith("right/"):
+            T_world_cam = T_world_cam @ T_left_right
+        np.testing.assert_allclose(np.linalg.inv(view.camera.T_cam_world), T_world_cam, atol=1e-9)
+
+
+def test_a_camera_of_a_rig_whose_mounting_is_not_in_the_file_is_skipped_with_that_reason(tmp_path: Path) -> None:
+    rig_of_metashape(tmp_path, "")
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 8
+    assert scene.skipped[0] == "ra_0.jpg: its sensor has no rotation and location in its multi-camera system"
+    text = (tmp_path / "cameras.xml").read_text()
+    (tmp_path / "cameras.xml").write_text(text.replace("master_id='0'/>", "master_id='77'/>"))
+    assert load_scene(tmp_path).skipped[0] == "ra_0.jpg: not aligned in Metashape"
 
 
 def test_meshroom_s_photographs_are_found_where_the_file_says_they_are(tmp_path: Path) -> None:

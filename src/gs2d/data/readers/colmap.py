@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,9 @@ from gs2d.core.images import image_size
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.data.build import Capture, PosedImage
 from gs2d.data.faces import panorama
+from gs2d.data.file_names import subfolder
 from gs2d.data.priors import ObservedPoints
+from gs2d.data.readers.common import Photograph, find_photographs
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, colmap_intrinsics
 from gs2d.errors import DataError
@@ -423,30 +425,30 @@ def read_colmap(root: Path, downscale: int) -> Capture:
     folder, kind = found
     cameras = read_cameras(folder, kind)
     images = read_images(folder, kind)
-    home, image_folder = _image_folder(root, folder, images)
+    home, photographs = _photographs(root, folder, kind, images)
     notes: list[str] = _other_models(folder)
     scaled = home / f"images_{downscale}"
     factor = 1
     if downscale > 1 and scaled.is_dir():
-        if any((scaled / image.name).is_file() for image in images):
-            image_folder, factor = scaled, downscale
+        smaller = _found(images, [scaled], folder / f"images.{kind}")
+        if any(photo.path is not None for photo in smaller.values()):
+            photographs, factor = smaller, downscale
             notes.append(f"photographs of 1/{downscale} size are read from {scaled.name}")
         else:
             notes.append(f"{scaled.name} holds none of the model's photographs and is not used")
     frames, skipped = [], []
     intrinsics: dict[int, Intrinsics] = {}
     for image in images:
-        name = image.name.replace("\\", "/")
-        path = image_folder / name
-        if not path.is_file():
-            skipped.append(f"{name}: no such file in {image_folder.name}")
+        photo = photographs[image.name]
+        if photo.path is None:
+            skipped.append(f"{image.name}: {photo.reason}")
             continue
         if image.camera_id not in intrinsics:
             intrinsics[image.camera_id] = _intrinsics(folder / f"cameras.{kind}", cameras, image)
         k = intrinsics[image.camera_id]
         if factor > 1:
-            _check_factor(path, k, factor)
-        frames.append(PosedImage(name, path, k, image.T_cam_world))
+            _check_factor(photo.path, k, factor)
+        frames.append(PosedImage(photo.name, photo.path, k, image.T_cam_world))
     return Capture(
         "colmap",
         tuple(frames),
@@ -455,12 +457,19 @@ def read_colmap(root: Path, downscale: int) -> Capture:
         skipped=tuple(skipped),
         notes=tuple(notes),
         home=home,
-        observe=partial(observed_points, folder, kind),
+        observe=partial(observed_points, folder, kind, {name: photo.name for name, photo in photographs.items()}),
     )
 
 
-def observed_points(folder: Path, kind: str) -> ObservedPoints:
+def observed_points(folder: Path, kind: str, names: Mapping[str, str] | None = None) -> ObservedPoints:
     """Which points of a model each of its images was found to show.
+
+    Parameters
+    ----------
+    folder : Path
+    kind : str
+    names : mapping of str to str, optional
+        The views of the images, by name in the model; the same name if left out.
 
     Raises
     ------
@@ -478,7 +487,7 @@ def observed_points(folder: Path, kind: str) -> ObservedPoints:
         ids = np.unique(image.point_ids[image.point_ids >= 0])
         at = order[np.searchsorted(points.ids, ids, sorter=order).clip(max=len(order) - 1)]
         rows = at[points.ids[at] == ids]
-        seen[image.name.replace("\\", "/")] = rows.astype(np.int32)
+        seen[image.name if names is None else names.get(image.name, image.name)] = rows.astype(np.int32)
         track[rows] += 1
     return ObservedPoints(points.xyz, points.error, track, seen)
 
@@ -504,19 +513,27 @@ def _intrinsics(path: Path, cameras: dict[int, ColmapCamera], image: ColmapImage
     return colmap_intrinsics(where, camera.model, camera.width, camera.height, camera.params)
 
 
-def _image_folder(root: Path, model: Path, images: list[ColmapImage]) -> tuple[Path, Path]:
-    """Return (the folder that holds images, masks and sparse; the folder of the images)."""
-    homes = dict.fromkeys([root, model.parent, model.parent.parent])
+def _photographs(root: Path, model: Path, kind: str, images: list[ColmapImage]) -> tuple[Path, dict[str, Photograph]]:
+    """Return the folder that holds images, masks and sparse, and the photographs by name in the model."""
+    homes = list(dict.fromkeys([root, model.parent, model.parent.parent]))
+    listing = model / f"images.{kind}"
     for home in homes:
-        if (home / "images").is_dir():
-            return home, home / "images"
-    for home in homes:
-        if any((home / image.name).is_file() for image in images):
-            return home, home
+        if (at := subfolder(home, "images")).is_dir():
+            return home, _found(images, [at], listing)
+    exact = (home for home in homes if any((home / image.name).is_file() for image in images))
+    home = next(exact, root)  # folders above root are not searched
+    photographs = _found(images, [home], listing)
+    if any(photo.path is not None for photo in photographs.values()):
+        return home, photographs
     raise DataError(
         f"{root} must have its photographs in the folder images, got no such folder; put the folder that COLMAP was "
         f"given there, under that name"
     )
+
+
+def _found(images: list[ColmapImage], folders: list[Path], listing: Path) -> dict[str, Photograph]:
+    reason = f"no such file in {folders[0].name}"
+    return find_photographs([image.name for image in images], folders, listing, reason=reason)
 
 
 def _other_models(folder: Path) -> list[str]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gs2d.data.build import PosedImage
+from gs2d.data.file_names import IMAGES, NO_PHOTOGRAPHS, Files, name_below
 from gs2d.data.scene import PointCloud
 from gs2d.errors import DataError
 from gs2d.io.meshes import read_points
@@ -97,77 +99,83 @@ def required(entry: Mapping[str, Any], key: str, where: str) -> Any:
     return entry[key]
 
 
-# -- images by their names ---------------------------------------------------------------------------------------------
-SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".avif", ".heic", ".exr")
-_NO_IMAGES = {"mask", "masks", "depths", "normals", "depthmaps", "undistorted", "thumbnails"}  # of the same names
+# -- photographs by their names ----------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class Photograph:
+    """What a name of a camera file stands for: a file and its name in the scene, or the reason why there is none."""
+
+    path: Path | None
+    name: str = ""
+    reason: str = ""
 
 
-class ImageFiles:
-    """Finds photographs by what a camera file calls them: a path of another machine, a name, a name without its ending.
+def find_photographs(
+    names: Sequence[str],
+    folders: Sequence[Path],
+    where: Path,
+    *,
+    base: Path | None = None,
+    homes: Sequence[Path] = (),
+    reason: str = "",
+) -> dict[str, Photograph]:
+    """Return the photograph of each name in a camera file, which may lack its extension (``Files`` has the rules).
 
     Parameters
     ----------
+    names : sequence of str
     folders : sequence of Path
-        Where they may be, most likely first; sub-folders count too. Folders that do not exist are passed over.
+        Where photographs may be, most likely first.
+    where : Path
+        The camera file.
+    base : Path, optional
+        Folder that relative paths are relative to.
+    homes : sequence of Path, optional
+        Folders below which a photograph's path is its name in the scene; ``folders`` if left out.
+    reason : str, optional
+        Why a photograph is left out if there is no such file; names the camera file if left out.
+
+    Raises
+    ------
+    DataError
+        Several files fit a name equally well.
     """
-
-    def __init__(self, folders: Sequence[Path]) -> None:
-        self._folders = [folder for folder in dict.fromkeys(folders) if folder.is_dir()]
-        self._known: dict[Path, dict[str, list[Path]]] = {}
-
-    def find(self, name: str, where: str) -> tuple[str, Path] | None:
-        """(path below the folder of photographs with ``/``, file) of a photograph, or None.
-
-        Of several files of that name the one whose folders agree with those of ``name``.
-
-        Raises
-        ------
-        DataError
-            Two files fit equally well.
-        """
-        parts = [part.lower() for part in name.replace("\\", "/").split("/") if part not in ("", ".")]
-        if not parts:
-            return None
-        for folder in self._folders:
-            known = self._index(folder)
-            found = known.get(parts[-1]) or [p for end in SUFFIXES for p in known.get(parts[-1] + end, ())]
-            if not found:
-                continue
-            fit = [_agreement(path.relative_to(folder), parts) for path in found]
-            best = [path for path, agreed in zip(found, fit, strict=True) if agreed == max(fit)]
-            if len(best) > 1:
-                raise DataError(
-                    f"{where} must name one photograph, got {name}, which may be {best[0]} or {best[1]}; "
-                    "keep only one of them below the capture, or let the camera's name tell its folder"
-                )
-            return best[0].relative_to(folder).as_posix(), best[0]
-        return None
-
-    def _index(self, folder: Path) -> dict[str, list[Path]]:
-        """Photographs below a folder by their names in lower case."""
-        if folder not in self._known:
-            names: dict[str, list[Path]] = {}
-            for path in sorted(_below(folder)):
-                names.setdefault(path.name.lower(), []).append(path)
-            self._known[folder] = names
-        return self._known[folder]
+    files = Files(folders, base)
+    names = list(dict.fromkeys(names))
+    matches = files.match([_spellings(name) for name in names], not_in=NO_PHOTOGRAPHS)
+    homes = homes or folders
+    paths = [match.path for match in matches if match.path is not None]
+    if not any(path.is_relative_to(home) for path in paths for home in homes):
+        homes = _shared(paths)
+    found = {}
+    for name, match in zip(names, matches, strict=True):
+        if match.several:
+            raise DataError(
+                f"{where} must name one photograph, got {name}, which may be {match.several[0]} or {match.several[1]}; "
+                "keep only one of them below the capture, or let the camera's name tell its folder"
+            )
+        if match.path is None:
+            why = reason or f"listed in {where.name}, but there is no such file"
+            other = files.of_stem(name, IMAGES, NO_PHOTOGRAPHS)
+            if other is not None:
+                why += f"; {other.parent.name}/{other.name} is there: list it under its own extension"
+            found[name] = Photograph(None, reason=why)
+        else:
+            found[name] = Photograph(match.path, name_below(match.path, homes))
+    return found
 
 
-def _below(folder: Path) -> Iterator[Path]:
-    for at, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith(".") and name.lower() not in _NO_IMAGES]
-        yield from (Path(at, name) for name in files if os.path.splitext(name)[1].lower() in SUFFIXES)
+def _shared(paths: Sequence[Path]) -> list[Path]:
+    """Return the folder that holds all files; none if there is no such folder."""
+    try:
+        return [Path(os.path.commonpath([path.parent for path in paths]))]
+    except ValueError:  # no files, or on several drives
+        return []
 
 
-def _agreement(path: Path, parts: Sequence[str]) -> int:
-    """Folders above the file that both have, counted from the file upwards; the file as it was named is more."""
-    own = [part.lower() for part in path.parts]
-    agreed = 0
-    for a, b in zip(reversed(own[:-1]), reversed(parts[:-1]), strict=False):
-        if a != b:
-            break
-        agreed += 1
-    return agreed
+def _spellings(name: str) -> list[str]:
+    if os.path.splitext(name)[1].lower() in IMAGES:
+        return [name]
+    return [name, *(name + suffix for suffix in IMAGES)]
 
 
 # -- points beside -----------------------------------------------------------------------------------------------------

@@ -1,7 +1,8 @@
 """Captures of Meshroom (AliceVision): its scene as JSON (``cameras.sfm``, ``sfm.json``) and the photographs.
 
 Conventions (AliceVision's sfmDataIO and camera modules, and its own export to COLMAP): ``rotation`` is the world-to-
-camera matrix column by column, ``center`` the place of the camera; x right, y down, z ahead. What a number means
+camera matrix column by column, ``center`` the place of the camera; x right, y down, z ahead. Views of a rig share a
+pose, and the sub-poses of the rig are those of its cameras in the frame of that pose. What a number means
 depends on the version of the file: the principal point is relative to the middle of the image from 1.2.1 on and to its
 corner before; the focal length is in pixels before 1.2.2 and in millimetres of a sensor of ``sensorWidth`` since;
 ``pixelRatio`` is fx / fy before 1.2.5 and fy / fx since. Numbers are written as text.
@@ -10,6 +11,7 @@ corner before; the focal length is in pixels before 1.2.2 and in millimetres of 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,8 @@ import numpy as np
 
 from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world
-from gs2d.data.readers.common import ImageFiles, entries, head, points_beside, real, reals, required, whole
+from gs2d.data.file_names import subfolder
+from gs2d.data.readers.common import entries, find_photographs, head, points_beside, real, reals, required, whole
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.errors import DataError
@@ -52,9 +55,9 @@ def _is_scene(path: Path) -> bool:
 
 
 def read_alicevision(root: Path) -> Capture:
-    """Read the views that have a pose; the others, and views of rigs, are skipped and named.
+    """Read the views that have a pose, also those of rigs; the others are skipped and named.
 
-    Photographs are at the paths that the file names, else found by name in ``images`` or elsewhere below the folder.
+    Photographs are at the paths in the file, else found by name in ``images`` or elsewhere below the folder.
     Points are those of the file (``structure``), else of a PLY file beside.
 
     Raises
@@ -76,25 +79,31 @@ def read_alicevision(root: Path) -> Capture:
             f"{path} must hold poses, got none; take the file of the node StructureFromMotion (cameras.sfm), or of "
             "ConvertSfMFormat with SfM File Format json"
         )
-    images = ImageFiles([root / "images", root])
     frames: list[PosedImage] = []
     skipped: list[str] = []
-    for index, view in enumerate(_list(data, "views", path)):
+    rigs = {str(rig.get("rigId")): _list(rig, "subPoses", path) for rig in _list(data, "rigs", path)}
+    placed = []
+    views = _list(data, "views", path)
+    shared = Counter(_pose_id(view) for view in views)
+    for index, view in enumerate(views):
         written = str(required(view, "path", f"{path}: view {index}"))
-        where, label = f"{path}: view {written}", written.replace("\\", "/").rsplit("/", 1)[-1]
-        pose = poses.get(str(view.get("poseId", view.get("viewId"))))
-        if pose is None or "rigId" in view:
-            skipped.append(f"{label}: " + ("of a rig, which is not read" if pose else "not placed by Meshroom"))
-            continue
-        found = _image(written, images, where)
-        if found is None:
-            skipped.append(f"{label}: listed in {path.name}, but there is no such file")
+        in_rig = "rigId" in view and not _is_independent(view, shared[_pose_id(view)])
+        T = _pose(view, poses, rigs if in_rig else None, f"{path}: view {written}")
+        if isinstance(T, str):
+            skipped.append(f"{_label(written)}: {T}")
+        else:
+            placed.append((view, written, T))
+    photographs = find_photographs([written for _, written, _ in placed], [subfolder(root, "images"), root], path)
+    for view, written, T in placed:
+        photo = photographs[written]
+        if photo.path is None:
+            skipped.append(f"{_label(written)}: {photo.reason}")
             continue
         key = str(view.get("intrinsicId"))
         if key not in cameras:
-            raise DataError(f"{path}: intrinsics must hold {key} of view {label}, got {sorted(cameras)[:9]}")
+            raise DataError(f"{path}: intrinsics must hold {key} of view {_label(written)}, got {sorted(cameras)[:9]}")
         k = _intrinsics(cameras[key], version, f"{path}: intrinsic {key}")
-        frames.append(PosedImage(found[0], found[1], k, _pose(pose, where)))
+        frames.append(PosedImage(photo.name, photo.path, k, T))
     points, notes = _points(data, path), list[str]()
     if points is None:
         points, notes = points_beside(root, frames)
@@ -116,18 +125,42 @@ def _list(data: Mapping[str, Any], key: str, path: Path) -> Sequence[Mapping[str
     return [entries(item, f"{path}: {key} {index}") for index, item in enumerate(value)]
 
 
-def _image(written: str, images: ImageFiles, where: str) -> tuple[str, Path] | None:
-    """By its name below the capture, else where the file says it is: the same machine."""
-    found = images.find(written, where)
-    if found is None and Path(written).is_absolute() and Path(written).is_file():
-        return Path(written).name, Path(written)
-    return found
+def _label(written: str) -> str:
+    return written.replace("\\", "/").rsplit("/", 1)[-1]
 
 
-def _pose(pose: Mapping[str, Any], where: str) -> np.ndarray:
-    """T_cam_world [4, 4]."""
-    inner = entries(required(pose, "pose", where), f"{where}: pose")
-    transform = entries(required(inner, "transform", where), f"{where}: transform")
+def _pose_id(view: Mapping[str, Any]) -> str:
+    return str(view.get("poseId", view.get("viewId")))
+
+
+def _is_independent(view: Mapping[str, Any], views_of_pose: int) -> bool:
+    """Whether the pose of a view in a rig is the view's own; if the file does not say so, whether no view shares it."""
+    return str(view.get("isPoseIndependant", views_of_pose < 2)).lower() in ("true", "1")  # Meshroom's spelling
+
+
+def _pose(
+    view: Mapping[str, Any],
+    poses: Mapping[str, Mapping[str, Any]],
+    rigs: Mapping[str, Sequence[Mapping[str, Any]]] | None,
+    where: str,
+) -> np.ndarray | str:
+    """Return T_cam_world [4, 4] of a view, or the reason why it has no pose; ``rigs`` if it is in one."""
+    key = _pose_id(view)
+    if key not in poses:
+        return "not placed by Meshroom"
+    inner = entries(required(poses[key], "pose", where), f"{where}: pose")
+    T = _rigid(entries(required(inner, "transform", where), f"{where}: transform"), where)
+    if rigs is None:
+        return T
+    mounted, index = rigs.get(str(view["rigId"]), ()), whole(view.get("subPoseId", 0), f"{where}: subPoseId")
+    if index >= len(mounted) or mounted[index].get("status") == "uninitialized":
+        return "its camera has no pose in the rig"
+    inner = entries(required(mounted[index], "pose", where), f"{where}: pose in the rig")
+    return np.asarray(_rigid(inner, f"{where}: pose in the rig") @ T)
+
+
+def _rigid(transform: Mapping[str, Any], where: str) -> np.ndarray:
+    """T_cam_world [4, 4] of a rotation and a centre."""
     # Column by column, so that rows are the columns: the camera-to-world rotation.
     columns = reals(required(transform, "rotation", where), 9, f"{where}: rotation").reshape(3, 3)
     center = reals(required(transform, "center", where), 3, f"{where}: center")

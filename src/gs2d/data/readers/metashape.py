@@ -2,7 +2,9 @@
 
 Conventions (Metashape's manual, appendix "Camera models"; its support on ``camera.transform``): a camera's transform
 takes camera to chunk coordinates, with x right, y down, z ahead; the transform of its component (or chunk) is a
-similarity that takes those to the world. Pixels have their origin in the corner of the image. Of (x, y) = (X/Z, Y/Z),
+similarity that takes those to the world. In a multi-camera system (Metashape's manual, "Multi-camera system") only
+the cameras of the master sensor have a transform; T_world_camera of another is T_world_master [R t] with the rotation R
+and the location t of its sensor. Pixels have their origin in the corner of the image. Of (x, y) = (X/Z, Y/Z),
 for a fisheye (x, y) t / r with t = atan(r):
 
 x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + p1 (r^2 + 2 x^2) + 2 p2 x y     (p1 and p2 are OpenCV's p2 and p1)
@@ -24,7 +26,8 @@ import numpy as np
 
 from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world
 from gs2d.data.faces import panorama
-from gs2d.data.readers.common import ImageFiles, head, points_beside, real, reals, whole
+from gs2d.data.file_names import subfolder
+from gs2d.data.readers.common import find_photographs, head, points_beside, real, reals, whole
 from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.errors import DataError
 
@@ -68,30 +71,26 @@ def read_metashape(root: Path) -> Capture:
         raise DataError(f"{root} must hold cameras.xml of Metashape (File > Export > Export Cameras), got no such file")
     chunk, notes = _chunk(path)
     sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors/sensor")}
-    images = ImageFiles([root / "images", root])
     listed = [camera for group in chunk.iterfind("cameras") for camera in group.iter("camera")]
-    placed, skipped = _placed(listed)
+    placed, skipped = _placed(listed, sensors, path)
     component, more = _component(placed)
-    frames, lost = [], [*skipped, *more]
     world = _world(chunk, component, path)
-    poses = [
-        (camera, label, _camera_to_world(camera, world, f"{path}: camera {label}"))
-        for camera, label in placed
-        if camera.get("component_id") == component
-    ]
+    poses = [(pose.camera, pose.label, _to_world(pose.M, world)) for pose in placed if pose.component == component]
     poses, moved = _off_the_globe(poses)
+    photographs = find_photographs([label for _, label, _ in poses], [subfolder(root, "images"), root], path)
+    frames, lost = [], [*skipped, *more]
     for camera, label, M in poses:
         where = f"{path}: camera {label}"
-        found = images.find(label, where)
-        if found is None:
-            lost.append(f"{label}: listed in {path.name}, but there is no such file")
+        photo = photographs[label]
+        if photo.path is None:
+            lost.append(f"{label}: {photo.reason}")
             continue
         key = camera.get("sensor_id", "")
         if key not in sensors:
             raise DataError(f"{path} must hold sensor {key!r} of camera {label}, got {sorted(sensors)[:9]}")
         k = _intrinsics(sensors[key], f"{path}: sensor {key}")
         T = pose_from_camera_to_world(M, f"{where}: transform", opengl=False)
-        frames.append(PosedImage(found[0], found[1], k, T))
+        frames.append(PosedImage(photo.name, photo.path, k, T))
     points, said = points_beside(root, frames)
     return Capture("metashape", tuple(frames), points, skipped=tuple(lost), notes=(*notes, *moved, *said))
 
@@ -117,28 +116,67 @@ def _chunk(path: Path) -> tuple[ElementTree.Element, list[str]]:
     return chunks[best], [f"{path.name} holds {len(chunks)} chunks: the one of {counts[best]} cameras is read"]
 
 
-def _placed(listed: Sequence[ElementTree.Element]) -> tuple[list[tuple[ElementTree.Element, str]], list[str]]:
-    """(cameras that are on and have a place, with their labels; sentences about the others)."""
+@dataclass(frozen=True)
+class _Placed:
+    """A camera with its pose in the chunk: ``M`` [4, 4] takes camera to chunk coordinates."""
+
+    camera: ElementTree.Element
+    label: str
+    component: str | None
+    M: np.ndarray
+
+
+def _placed(
+    listed: Sequence[ElementTree.Element], sensors: Mapping[str, ElementTree.Element], path: Path
+) -> tuple[list[_Placed], list[str]]:
+    """Return the cameras that are enabled and have a pose, and why each of the others is left out.
+
+    In a multi-camera system only the camera of the master sensor has a transform. The sensors of the others have a
+    rotation and a location: their pose in the frame of the master.
+    """
     placed, skipped = [], []
+    cameras = {camera.get("id"): camera for camera in listed}
     for camera in listed:
         label = camera.get("label") or camera.get("id") or "without a label"
+        master = camera if camera.find("transform") is not None else cameras.get(camera.get("master_id"))
+        where = f"{path}: camera {label}"
         if camera.get("enabled", "true").lower() in ("false", "0"):
             skipped.append(f"{label}: switched off in Metashape")
-        elif camera.find("transform") is None:
+        elif master is None or master.find("transform") is None:
             skipped.append(f"{label}: not aligned in Metashape")
         else:
-            placed.append((camera, label))
+            M = reals(master.findtext("transform") or "", 16, f"{where}: transform").reshape(4, 4)
+            if master is not camera:
+                mounted = _in_master(sensors.get(camera.get("sensor_id", "")), where)
+                if mounted is None:
+                    skipped.append(f"{label}: its sensor has no rotation and location in its multi-camera system")
+                    continue
+                M = M @ mounted
+            component = camera.get("component_id") or master.get("component_id")
+            placed.append(_Placed(camera, label, component, M))
     return placed, skipped
 
 
-def _component(placed: Sequence[tuple[ElementTree.Element, str]]) -> tuple[str | None, list[str]]:
+def _in_master(sensor: ElementTree.Element | None, where: str) -> np.ndarray | None:
+    """[4, 4]: takes coordinates of a camera to those of the master of its multi-camera system; None if not stated."""
+    texts = [None if sensor is None else sensor.findtext(name) for name in ("rotation", "location")]
+    if all(text is None for text in texts):
+        return None
+    M = np.eye(4)
+    if texts[0] is not None:
+        M[:3, :3] = reals(texts[0], 9, f"{where}: rotation of its sensor").reshape(3, 3)
+    if texts[1] is not None:
+        M[:3, 3] = reals(texts[1], 3, f"{where}: location of its sensor")
+    return M
+
+
+def _component(placed: Sequence[_Placed]) -> tuple[str | None, list[str]]:
     """Return the component with most cameras: others have no known place relative to it."""
-    counts = Counter(camera.get("component_id") for camera, _ in placed)
+    counts = Counter(pose.component for pose in placed)
     if not counts:
         return None, []
     best = counts.most_common(1)[0][0]
-    others = [f"{label}: in another component" for camera, label in placed if camera.get("component_id") != best]
-    return best, others
+    return best, [f"{pose.label}: in another component" for pose in placed if pose.component != best]
 
 
 def _world(chunk: ElementTree.Element, component: str | None, path: Path) -> Similarity:
@@ -164,9 +202,8 @@ def _world(chunk: ElementTree.Element, component: str | None, path: Path) -> Sim
     )
 
 
-def _camera_to_world(camera: ElementTree.Element, world: Similarity, where: str) -> np.ndarray:
+def _to_world(M: np.ndarray, world: Similarity) -> np.ndarray:
     """[4, 4]: a rotation and a place; the similarity's scale moves the place only."""
-    M = reals(camera.findtext("transform") or "", 16, f"{where}: transform").reshape(4, 4)
     moved = np.eye(4)
     moved[:3, :3] = world.R @ M[:3, :3]
     moved[:3, 3] = world.scale * world.R @ M[:3, 3] + world.t

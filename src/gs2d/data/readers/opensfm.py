@@ -19,7 +19,8 @@ from gs2d.core.images import image_size
 from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage
 from gs2d.data.faces import panorama
-from gs2d.data.readers.common import ImageFiles, entries, real, reals, required, whole
+from gs2d.data.file_names import subfolder
+from gs2d.data.readers.common import entries, find_photographs, real, reals, required, whole
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.errors import DataError
@@ -58,24 +59,24 @@ def read_opensfm(root: Path) -> Capture:
         raise DataError(f"{root} must hold {' or '.join(FILES)} (OpenSfM), got neither")
     reconstruction, notes = _largest(path)
     homes = dict.fromkeys((path.parent, root, root.parent if root.name == "opensfm" else root))
-    images = ImageFiles([*(home / "images" for home in homes), root])
     cameras = entries(required(reconstruction, "cameras", str(path)), f"{path}: cameras")
     shots = entries(required(reconstruction, "shots", str(path)), f"{path}: shots")
     frames: list[PosedImage] = []
     skipped: list[str] = []
+    photographs = find_photographs(list(shots), [*(subfolder(home, "images") for home in homes), root], path)
     for name, shot in shots.items():
         where = f"{path}: shot {name}"
         shot = entries(shot, where)
         T = _pose(shot, where)
-        found = images.find(name, where)
-        if found is None:
-            skipped.append(f"{name}: listed in {path.name}, but there is no such file")
+        photo = photographs[name]
+        if photo.path is None:
+            skipped.append(f"{name}: {photo.reason}")
             continue
         key = str(required(shot, "camera", where))
         if key not in cameras:
             raise DataError(f"{path}: cameras must hold {key!r} of shot {name}, got {sorted(cameras)[:9]}")
-        k = _intrinsics(entries(cameras[key], f"{path}: camera {key}"), found[1], f"{path}: camera {key}")
-        frames.append(PosedImage(found[0], found[1], k, T))
+        k = _intrinsics(entries(cameras[key], f"{path}: camera {key}"), photo.path, f"{path}: camera {key}")
+        frames.append(PosedImage(photo.name, photo.path, k, T))
     points = _points(reconstruction.get("points"), path)
     return Capture(
         "opensfm", tuple(frames), points, skipped=tuple(skipped), notes=tuple(notes), mask_homes=tuple(homes)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +15,21 @@ from gs2d.core.images import image_size
 from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world
 from gs2d.data.faces import panorama
-from gs2d.data.priors import MapFiles
+from gs2d.data.file_names import Files, subfolder
+from gs2d.data.masks import FOLDER
+from gs2d.data.priors import DEPTHS, NORMALS, MapFiles
+from gs2d.data.readers.common import Photograph, find_photographs
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.errors import DataError
 from gs2d.io.meshes import read_points
 
 _LARGEST = 1e300  # JSON has whole numbers of any size
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 _FISHEYE = {"OPENCV_FISHEYE", "FISHEYE"}
 _PANORAMA = "EQUIRECTANGULAR"
+_NAMED = {"mask_path": FOLDER, "depth_file_path": DEPTHS, "normal_file_path": NORMALS}  # with the usual folders
+_WHAT = {"mask_path": "mask", "depth_file_path": "depth map", "normal_file_path": "normal map"}
 
 
 def read_blender(root: Path) -> Capture:
@@ -37,12 +42,12 @@ def read_blender(root: Path) -> Capture:
     DataError
         A broken or incomplete JSON file; names the file, the frame and the key.
     """
-    frames, skipped, notes = _read_frames(root / "transforms_train.json", "train")
-    if (root / "transforms_test.json").is_file():
-        test_frames, test_skipped, _ = _read_frames(root / "transforms_test.json", "test")
-        frames, skipped = frames + test_frames, skipped + test_skipped
+    train, test = (root / f"transforms_{split}.json" for split in ("train", "test"))
+    if test.is_file():
+        entries = [*_entries(train, _read_meta(train), "train"), *_entries(test, _read_meta(test), "test")]
     else:
-        frames = [replace(frame, split=None) for frame in frames]
+        entries = _entries(train, _read_meta(train), None)
+    frames, skipped, notes = _read_frames(entries, train)
     return Capture("blender", tuple(frames), skipped=tuple(skipped), notes=tuple(notes))
 
 
@@ -61,14 +66,15 @@ def read_nerfstudio(root: Path) -> Capture:
     """
     path = root / "transforms.json"
     meta = _read_meta(path)
-    frames, skipped, notes = _read_frames(path, None, meta)
+    frames, skipped, notes = _read_frames(_entries(path, meta, None), path)
     frames, unlisted = _named_split(path, meta, frames)
     if "applied_transform" in meta:
         notes.append("the file says applied_transform: poses and results are in the file's frame, not the original's")
     points = None
     if meta.get("ply_file_path") is not None:
-        ply = root / _relative(meta["ply_file_path"], f"{path}: ply_file_path")
-        if ply.is_file():
+        name = _relative(meta["ply_file_path"], f"{path}: ply_file_path")
+        ply = Files([root]).match([[name]])[0].path
+        if ply is not None:
             cloud = read_points(ply)
             points = PointCloud(np.asarray(cloud.points, dtype=np.float64), cloud.colors)
         else:
@@ -84,52 +90,78 @@ def _read_meta(path: Path) -> dict[str, Any]:
     return meta
 
 
-def _read_frames(
-    path: Path, split: str | None, meta: dict[str, Any] | None = None
-) -> tuple[list[PosedImage], list[str], list[str]]:
-    """(frames whose file exists, sentences about those whose does not, notes)."""
-    meta = _read_meta(path) if meta is None else meta
+@dataclass(frozen=True)
+class _Entry:
+    """A frame of a file, with the values that all frames share."""
+
+    where: str
+    name: str
+    frame: Mapping[str, Any]
+    both: Mapping[str, Any]
+    split: str | None
+
+
+def _read_frames(entries: Sequence[_Entry], path: Path) -> tuple[list[PosedImage], list[str], list[str]]:
+    """Return the frames whose file exists, why the others are left out, and notes; ``path`` names the file."""
     root = path.parent
+    photographs = _photographs([entry.name for entry in entries], path)
+    taken = {photo.path for photo in photographs.values() if photo.path is not None}
+    files = Files([root])
+    masks, depths, normals = (_named(entries, key, files, taken) for key in _NAMED)
     frames: list[PosedImage] = []
     skipped: list[str] = []
-    missing_masks = 0
-    for index, entry in enumerate(meta["frames"]):
-        where = f"{path} frame {index}"
-        if not isinstance(entry, dict):
-            raise DataError(f"{where} must be an object, got {type(entry).__name__}")
-        name = _relative(_required(entry, "file_path", where), f"{where}: file_path")
-        image = _find_image(root, name)
-        if image is None:
-            skipped.append(f"{name}: listed in {path.name}, but there is no such file")
+    lost: Counter[str] = Counter()
+    for index, entry in enumerate(entries):
+        photo = photographs[entry.name]
+        if photo.path is None:
+            skipped.append(f"{entry.name}: {photo.reason}")
             continue
-        mask = None
-        if entry.get("mask_path") is not None:
-            mask = root / _relative(entry["mask_path"], f"{where}: mask_path")
-            if not mask.is_file():
-                mask, missing_masks = None, missing_masks + 1
+        for key, found in zip(_NAMED, (masks, depths, normals), strict=True):
+            lost[_WHAT[key]] += entry.frame.get(key) is not None and found[index] is None
         pose = pose_from_camera_to_world(
-            _required(entry, "transform_matrix", where), f"{where} ({name}): transform_matrix", opengl=True
+            _required(entry.frame, "transform_matrix", entry.where),
+            f"{entry.where} ({entry.name}): transform_matrix",
+            opengl=True,
         )
-        intrinsics = frame_intrinsics({**meta, **entry}, image, f"{where} ({name})")
-        maps = _maps_of({**meta, **entry}, entry, root, where)
-        inside = image.relative_to(root) if image.is_relative_to(root) else Path(*image.parts[1:])  # of another folder
-        frames.append(PosedImage(inside.as_posix(), image, intrinsics, pose, split, mask=mask, maps=maps))
-    notes = [f"{missing_masks} masks named in {path.name} do not exist"] if missing_masks else []
+        intrinsics = frame_intrinsics(entry.both, photo.path, f"{entry.where} ({entry.name})")
+        maps = _maps_of(entry, depths[index], normals[index])
+        frames.append(PosedImage(photo.name, photo.path, intrinsics, pose, entry.split, mask=masks[index], maps=maps))
+    notes = [f"{count} {what}s named in {path.name} do not exist" for what, count in lost.items() if count]
     return frames, skipped, notes
 
 
-def _maps_of(both: Mapping[str, Any], entry: Mapping[str, Any], root: Path, where: str) -> MapFiles | None:
-    """Return the maps that a frame names (``depth_file_path``, ``normal_file_path``), as far as they exist."""
-    paths = {}
-    for what in ("depth", "normal"):
-        if entry.get(f"{what}_file_path") is not None:
-            path = root / _relative(entry[f"{what}_file_path"], f"{where}: {what}_file_path")
-            if path.is_file():
-                paths[what] = path
-    unit = both.get("depth_unit_scale_factor")
+def _photographs(names: Sequence[str], path: Path) -> dict[str, Photograph]:
+    root = path.parent
+    return find_photographs(names, [subfolder(root, "images"), root], path, base=root, homes=[root])
+
+
+def _entries(path: Path, meta: Mapping[str, Any], split: str | None) -> list[_Entry]:
+    entries = []
+    for index, frame in enumerate(meta["frames"]):
+        where = f"{path} frame {index}"
+        if not isinstance(frame, dict):
+            raise DataError(f"{where} must be an object, got {type(frame).__name__}")
+        name = _relative(_required(frame, "file_path", where), f"{where}: file_path")
+        entries.append(_Entry(where, name, frame, {**meta, **frame}, split))
+    return entries
+
+
+def _named(entries: Sequence[_Entry], key: str, files: Files, taken: Collection[Path]) -> list[Path | None]:
+    """Return the file that each frame names as its mask or map; None where it names none or there is no such file."""
+    names = [
+        None if entry.frame.get(key) is None else _relative(entry.frame[key], f"{entry.where}: {key}")
+        for entry in entries
+    ]
+    others = set(_NAMED.values()) - {_NAMED[key]}
+    found = iter(files.match([[name] for name in names if name is not None], not_in=others, taken=taken))
+    return [None if name is None else next(found).path for name in names]
+
+
+def _maps_of(entry: _Entry, depth: Path | None, normal: Path | None) -> MapFiles | None:
+    unit = entry.both.get("depth_unit_scale_factor")
     if unit is not None and (isinstance(unit, bool) or not isinstance(unit, int | float) or not 0 < unit < _LARGEST):
-        raise DataError(f"{where}: depth_unit_scale_factor must be a positive number, got {str(unit)[:40]!r}")
-    return MapFiles(**paths, unit=unit, metric="depth" in paths) if paths else None
+        raise DataError(f"{entry.where}: depth_unit_scale_factor must be a positive number, got {str(unit)[:40]!r}")
+    return MapFiles(depth, normal, unit, metric=depth is not None) if depth or normal else None
 
 
 def _required(entry: Mapping[str, Any], key: str, where: str) -> Any:
@@ -143,13 +175,6 @@ def _relative(value: Any, where: str) -> str:
     if not isinstance(value, str) or not value:
         raise DataError(f"{where} must be a path, got {value!r}")
     return Path(value.replace("\\", "/")).as_posix()
-
-
-def _find_image(root: Path, name: str) -> Path | None:
-    """Return the file ``name``, which may come without its extension (NeRF-Synthetic)."""
-    if (root / name).is_file():
-        return root / name
-    return next((root / (name + suffix) for suffix in _SUFFIXES if (root / (name + suffix)).is_file()), None)
 
 
 def frame_intrinsics(entry: Mapping[str, Any], image: Path, where: str) -> Intrinsics:
@@ -228,23 +253,24 @@ def _lens(entry: Mapping[str, Any], value: Mapping[str, float], where: str) -> L
 
 def _named_split(path: Path, meta: dict[str, Any], frames: list[PosedImage]) -> tuple[list[PosedImage], list[str]]:
     """Return the frames with the split that the file names, and sentences about frames that it does not name."""
-    lists: dict[str, set[str]] = {}
+    written: dict[str, list[str]] = {}
     for key in ("train", "val", "test"):
         names = meta.get(f"{key}_filenames")
         if names is None:
             continue
         if not isinstance(names, list):
             raise DataError(f"{path}: {key}_filenames must be a list of paths, got {type(names).__name__}")
-        lists[key] = {_relative(name, f"{path}: {key}_filenames") for name in names}
+        written[key] = [_relative(name, f"{path}: {key}_filenames") for name in names]
+    photographs = _photographs([name for names in written.values() for name in names], path)
+    lists = {key: {photographs[name].name for name in names} for key, names in written.items()}
     if "train" not in lists:
         return frames, []
     test = lists.get("test") or lists.get("val") or set()
     split, unlisted = [], []
     for frame in frames:
-        names_of = {frame.name, Path(frame.name).with_suffix("").as_posix()}
-        if names_of & lists["train"]:
+        if frame.name in lists["train"]:
             split.append(replace(frame, split="train"))
-        elif names_of & test:
+        elif frame.name in test:
             split.append(replace(frame, split="test"))
         else:
             unlisted.append(f"{frame.name}: in none of the lists of {path.name} that are used")
