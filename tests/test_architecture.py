@@ -58,8 +58,8 @@ INSIDE = {
         "build": 4,
         "bounds reach": 3,
         "scene": 2,
-        "priors faces straighten": 1,
-        "cache masks undistort": 0,
+        "priors faces straighten masks": 1,
+        "cache file_names undistort": 0,
     },
     "render": {
         "tensor_api": 7,
