@@ -29,6 +29,10 @@ class DataError(Gs2dError):
     """A data set, image, mesh or PLY file is missing, broken or of another kind."""
 
 
+class UnusableViewError(DataError):
+    """The pose or the camera of one image is no number; readers skip that image and report it."""
+
+
 class RecipeError(Gs2dError):
     """A recipe, stage or override that cannot be trained as written."""
 

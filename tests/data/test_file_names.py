@@ -15,7 +15,7 @@ from PIL import Image
 from capture_writers import small_blender, small_colmap, small_nerfstudio
 from foreign_writers import small_alicevision, small_metashape, small_opensfm
 from gs2d.data import file_names, load_scene
-from gs2d.data.file_names import Files, subfolder
+from gs2d.data.file_names import Files, in_any_case
 from gs2d.data.priors import find_maps
 from gs2d.errors import DataError
 
@@ -88,11 +88,11 @@ def test_each_folder_is_listed_once_for_thousands_of_names(tmp_path: Path, monke
 
 def test_a_folder_in_other_letters_is_found_if_it_is_the_only_one(tmp_path: Path) -> None:
     (tmp_path / "Masks").mkdir()
-    assert subfolder(tmp_path, "masks") == tmp_path / "Masks"
+    assert in_any_case(tmp_path, "masks") == tmp_path / "Masks"
     (tmp_path / "MASKS").mkdir()
-    assert subfolder(tmp_path, "masks") == tmp_path / "masks"
+    assert in_any_case(tmp_path, "masks") == tmp_path / "masks"
     (tmp_path / "masks").mkdir()
-    assert subfolder(tmp_path, "masks") == tmp_path / "masks"
+    assert in_any_case(tmp_path, "masks") == tmp_path / "masks"
 
 
 def renamed(name: str) -> str:

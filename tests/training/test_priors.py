@@ -145,9 +145,9 @@ def test_a_sensor_s_unit_is_fitted_to_the_points_where_cameras_come_from_photogr
     assert plan_depths(replace(made, observe=None), DepthPrior()).unit is None
     few = replace(made, train=made.train[:1])
     assert few.observe is not None
-    nothing = replace(few.observe(), seen={})
-    with pytest.raises(DataError, match="needs 10 sparse points .*, got 0; say it: --set depth_prior.unit"):
-        plan_depths(replace(few, observe=lambda: nothing), DepthPrior("sensor"))
+    two = replace(few.observe(), seen={few.train[0].name: np.arange(2)})
+    with pytest.raises(DataError, match="needs 10 sparse points .*, got [012]; say it: --set depth_prior.unit"):
+        plan_depths(replace(few, observe=lambda: two), DepthPrior("sensor"))
 
 
 @pytest.mark.parametrize("space", ["disparity", "depth"])

@@ -294,7 +294,7 @@ def with_robustness(recipe: Recipe, *, name: str | None = None) -> Recipe:
 
     Not in the paper: a dense start, free space that is kept free, opacity that decays, no large splat that is
     hardly photographed, and splats left out at random where photographs are few (docs/decisions/fog.md). The
-    capture must say which sparse points its photographs show. A dense start that is not required gives way to the
+    capture must have sparse points. A dense start that is not required gives way to the
     one that was tried with the rest; and where no resets delay the prune by size there is none, which would take
     sky and ground.
     """

@@ -70,8 +70,8 @@ class BackgroundSphere:
 class DenseStart:
     """Splats to start from where a plane sweep over neighbouring photographs agrees (``training/plane_sweep.py``).
 
-    Where a capture says which sparse points its photographs show, those give the depths to try, else the scene's bounds
-    do (``training/sweep_range.py``): inside the silhouettes of all photographs, where they have an alpha channel.
+    Where a capture has sparse points, those give the depths to try, else the scene's bounds do
+    (``training/sweep_range.py``): inside the silhouettes of all photographs, where they have an alpha channel.
 
     Attributes
     ----------

@@ -6,7 +6,8 @@ import functools
 import hashlib
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,13 +21,14 @@ from gs2d.core.transforms import camera_extent
 from gs2d.data.bounds import scene_bounds
 from gs2d.data.cache import DecodedImage, ImageCache
 from gs2d.data.faces import GLANCE, LEAST_SHOWN, Face, face_name, face_positions, faces_of, wrapped
-from gs2d.data.file_names import subfolder
+from gs2d.data.file_names import in_any_case
 from gs2d.data.masks import EMPTY, Masks, find_masks
 from gs2d.data.priors import (
     DEPTH_SUFFIXES,
     DEPTHS,
     NORMAL_SUFFIXES,
     NORMALS,
+    UNOBSERVED,
     MapFiles,
     ObservedPoints,
     PriorMaps,
@@ -34,7 +36,7 @@ from gs2d.data.priors import (
 )
 from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.data.undistort import Intrinsics, source_positions, undistort_image, undistort_mask
-from gs2d.errors import DataError, ShapeError
+from gs2d.errors import DataError, ShapeError, UnusableViewError
 
 # An image may differ from its camera's size by a factor; each axis may then be off by rounding.
 _ASPECT_TOLERANCE = 0.01
@@ -166,6 +168,15 @@ class Decoder:
         return np.asarray(grey.resize((k.width, k.height), Image.Resampling.BOX)) >= 255 * need
 
 
+@contextmanager
+def skipping(name: str, skipped: list[str]) -> Iterator[None]:
+    """Add the image ``name`` to ``skipped``, with the reason, where its pose or camera is not finite."""
+    try:
+        yield
+    except UnusableViewError as error:
+        skipped.append(f"{name}: {error}")
+
+
 def pose_from_camera_to_world(matrix: object, where: str, *, opengl: bool) -> np.ndarray:
     """T_cam_world of a camera-to-world matrix [3 or 4, 4], as nested lists; rotations are cleaned of rounding.
 
@@ -173,19 +184,21 @@ def pose_from_camera_to_world(matrix: object, where: str, *, opengl: bool) -> np
 
     Raises
     ------
+    UnusableViewError
+        NaN or infinity.
     DataError
-        Not a matrix, NaN, or not a rigid motion.
+        Not a matrix, or not a rigid motion.
     """
     try:
         M = np.asarray(matrix, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise DataError(f"{where} must be a 4x4 matrix of numbers, got {str(matrix)[:60]}") from error
     except OverflowError as error:
-        raise DataError(f"{where} must be finite, got a number beyond all floats; remove this frame") from error
+        raise UnusableViewError(f"{where} must be finite, got a number beyond all floats") from error
     if M.shape not in ((4, 4), (3, 4)):
         raise DataError(f"{where} must be a 4x4 matrix, got shape {list(M.shape)}")
     if not np.isfinite(M).all():
-        raise DataError(f"{where} must be finite, got NaN or infinity; remove this frame")
+        raise UnusableViewError(f"{where} must be finite, got NaN or infinity")
     R = M[:3, :3]
     with np.errstate(all="ignore"):  # numbers so large that they overflow are no rotation either
         is_rotation = np.abs(R.T @ R - np.eye(3)).max() <= 1e-2 and np.linalg.det(R) > 0
@@ -264,8 +277,7 @@ def build_scene(
         No view, no training view, twice the same name, or cameras that all stand at one point.
     """
     if not capture.frames:
-        first = f", first: {capture.skipped[0]}" if capture.skipped else ""
-        raise DataError(f"{root} must have at least one view, got none ({len(capture.skipped)} skipped{first})")
+        raise DataError(f"{root} must have at least one view, got none{_explained(capture)}")
     if downscale < 1 or (test_every is not None and test_every < 0):
         raise DataError(f"downscale must be >= 1 and test_every >= 0, got {downscale} and {test_every}")
     factor = max(1, downscale // capture.downscaled_by)
@@ -280,9 +292,12 @@ def build_scene(
         raise DataError(f"{root} must name each view once, got {twice} more than once")
     frames, map_notes = (frames, ()) if cut else _with_maps(frames, capture.home or root)
     views = [_view(frame, factor, cache, lens_maps) for frame in frames]
-    train, test = _split(frames, views, capture.default_test_every, test_every, root)
-    cameras = [view.camera for view in train]
-    extent, place_notes = _measured_extent(cameras, root)
+    try:
+        train, test = _split(frames, views, capture.default_test_every, test_every, root)
+        cameras = [view.camera for view in train]
+        extent, place_notes = _measured_extent(cameras, root)
+    except DataError as error:
+        raise DataError(f"{error}{_explained(capture)}") from error
     points, point_notes = _finite_points(capture.points)
     bounds, bound_notes = scene_bounds(cameras, points, blender=capture.format == "blender")
     return Scene(
@@ -305,8 +320,15 @@ def build_scene(
         + bound_notes,
         root=root,
         masks=masks,
-        observe=_observed(capture, frames),
+        observe=_observed(capture, frames, points, {view.name: view.camera for view in views}),
     )
+
+
+def _explained(capture: Capture) -> str:
+    """Return what the reader reported of a capture with too few views, to end an error with; "" for nothing."""
+    skipped = f"{len(capture.skipped)} skipped, first: {capture.skipped[0]}" if capture.skipped else ""
+    told = [*capture.notes, *([skipped] if skipped else [])]
+    return f" ({'; '.join(told)})" if told else ""
 
 
 def _measured_extent(cameras: Sequence[Camera], root: Path) -> tuple[float, tuple[str, ...]]:
@@ -404,18 +426,27 @@ def _mask_leaves(frame: PosedImage, face: Face, known: dict[Any, bool]) -> bool:
     return known[key]
 
 
-def _observed(capture: Capture, frames: Sequence[PosedImage]) -> Callable[[], ObservedPoints] | None:
-    """Return what reads which points the views show: a face those of its photograph that lie in it."""
-    if capture.observe is None:
+def _observed(
+    capture: Capture, frames: Sequence[PosedImage], points: PointCloud | None, cameras: Mapping[str, Camera]
+) -> Callable[[], ObservedPoints] | None:
+    """Return what reads which points the views show: a face those of its photograph that lie in it.
+
+    Where the capture does not say it, or its observations are broken, the points are projected.
+    """
+    if capture.observe is None and points is None:
         return None
-    observe = capture.observe
     wholes = {frame.path: frame.name for frame in capture.frames}
     parts = [frame for frame in frames if frame.face is not None]
-    if not parts:
-        return functools.cache(observe)  # asked for by view after view
 
-    def by_face() -> ObservedPoints:
-        found = observe()
+    def read() -> ObservedPoints:
+        found, why = None, UNOBSERVED
+        if capture.observe is not None:
+            try:
+                found = capture.observe()
+            except DataError as error:
+                why = str(error)
+        if found is None or not any(map(len, found.seen.values())):
+            return ObservedPoints.projected(None if points is None else points.points, cameras, why)
         seen = dict(found.seen)
         for part in parts:
             if (rows := found.seen.get(wholes[part.path])) is not None:
@@ -423,7 +454,7 @@ def _observed(capture: Capture, frames: Sequence[PosedImage]) -> Callable[[], Ob
                 seen[part.name] = rows[np.maximum(abs(x), abs(y)) < z]
         return replace(found, seen=seen)
 
-    return functools.cache(by_face)
+    return functools.cache(read)  # asked for by view after view
 
 
 def _with_masks(capture: Capture, root: Path, masks: Masks) -> tuple[list[PosedImage], tuple[str, ...], Masks]:
@@ -448,7 +479,7 @@ def _with_maps(frames: list[PosedImage], home: Path) -> tuple[list[PosedImage], 
     """Return the frames with the maps that lie in ``depths`` and ``normals``, and a note for each such folder."""
     found: dict[str, list[Path | None]] = {}
     for what, folder, suffixes in (("depth", DEPTHS, DEPTH_SUFFIXES), ("normal", NORMALS, NORMAL_SUFFIXES)):
-        if (at := subfolder(home, folder)).is_dir():
+        if (at := in_any_case(home, folder)).is_dir():
             found[what] = find_maps(at, [frame.name for frame in frames], suffixes)
     for what, paths in found.items():
         for index, path in enumerate(paths):

@@ -160,12 +160,22 @@ def folded(name: str) -> str:
     return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
 
 
-def subfolder(home: Path, name: str) -> Path:
-    """Return a folder in ``home``, which may be in other letters (``Masks``) if it is the only one."""
-    if (home / name).is_dir() or not home.is_dir():
-        return home / name
-    alike = [path for path in home.iterdir() if folded(path.name) == folded(name) and path.is_dir()]
-    return alike[0] if len(alike) == 1 else home / name
+def in_any_case(home: Path, name: str) -> Path:
+    """Return the file or folder ``name`` below ``home``; its parts may be in other letters (``Masks``) on the disk.
+
+    An exact match is preferred. If there is none, and not just one that differs in case, this is ``home / name``.
+    """
+    for part in Path(name).parts:
+        if not (home / part).exists() and home.is_dir():
+            alike = [entry for entry in os.listdir(home) if folded(entry) == folded(part)]
+            part = alike[0] if len(alike) == 1 else part
+        home = home / part
+    return home
+
+
+def files_ending(folder: Path, ending: str) -> list[Path]:
+    """Return the entries of a folder whose names end in ``ending``, in any case, sorted by name."""
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() == ending)
 
 
 def name_below(path: Path, folders: Sequence[Path]) -> str:

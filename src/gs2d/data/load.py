@@ -13,15 +13,15 @@ from gs2d.core.memory_limit import cache_bytes as room_for_cache
 from gs2d.core.missing import where_it_ends
 from gs2d.data.benchmarks import missing_lines
 from gs2d.data.build import Capture, build_scene
-from gs2d.data.file_names import IMAGES
+from gs2d.data.file_names import IMAGES, in_any_case
 from gs2d.data.masks import Masks, without_masks
 from gs2d.data.readers.colmap import MODEL_FOLDERS, model_folder, read_colmap
-from gs2d.data.readers.dtu import CAMERA_FILES, read_dtu
+from gs2d.data.readers.dtu import CAMERA_FILES, camera_archives, read_dtu
 from gs2d.data.readers.meshroom import read_alicevision, scene_file
 from gs2d.data.readers.metashape import camera_file, read_metashape
 from gs2d.data.readers.opensfm import read_opensfm, reconstruction_file
 from gs2d.data.readers.registry import READERS, Reader, register_reader
-from gs2d.data.readers.transforms import read_blender, read_nerfstudio
+from gs2d.data.readers.transforms import CAMERAS, TRAIN, read_blender, read_nerfstudio
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
 
@@ -58,9 +58,9 @@ def _register(name: str, holds: Callable[[Path], object], make: Callable[[Path],
     register_reader(name)(made)
 
 
-_register("blender", lambda root: (root / "transforms_train.json").is_file(), read_blender)
-_register("nerfstudio", lambda root: (root / "transforms.json").is_file(), read_nerfstudio)
-_register("dtu", lambda root: any((root / name).is_file() for name in CAMERA_FILES), read_dtu)
+_register("blender", lambda root: in_any_case(root, TRAIN).is_file(), read_blender)
+_register("nerfstudio", lambda root: in_any_case(root, CAMERAS).is_file(), read_nerfstudio)
+_register("dtu", camera_archives, read_dtu)
 register_reader("colmap")(_Colmap)
 _register("opensfm", reconstruction_file, read_opensfm)
 _register("metashape", camera_file, read_metashape)
@@ -97,7 +97,7 @@ def detect_format(path: str | os.PathLike[str]) -> str:
         raise DataError(f"{root} must hold cameras that are written in the open, got {project}: {remedy}")
     lacking = missing_lines(root)
     hint = f"; as a scene of a known data set: {lacking[0]}" if lacking else ""
-    images = next((folder for folder in (root, root / "images") if _images(folder)), None)
+    images = next((folder for folder in (root, in_any_case(root, "images")) if _images(folder)), None)
     if images is not None and not lacking:
         raise DataError(
             f"{root} must hold cameras, got {_images(images)} photographs without any; find them first: "

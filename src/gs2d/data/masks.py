@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gs2d.data.file_names import Files, folded, subfolder
+from gs2d.data.file_names import Files, folded, in_any_case
 from gs2d.errors import DataError
 
 IGNORE, EMPTY, OFF = "ignore", "empty", "off"
@@ -120,7 +120,7 @@ def find_masks(
         folders = [masks.folder]
         places: dict[str, Sequence[Path | None]] = {str(masks.folder): find_masks_in(folders, names)}
     else:
-        folders = [folder for home in dict.fromkeys(homes) if (folder := subfolder(home, FOLDER)).is_dir()]
+        folders = [folder for home in dict.fromkeys(homes) if (folder := in_any_case(home, FOLDER)).is_dir()]
         places = {_NAMED: named, FOLDER: find_masks_in(folders, names), _BESIDE: _masks_beside(images)}
     found: list[Path | None] = [None] * len(names)
     counts: Counter[str] = Counter()

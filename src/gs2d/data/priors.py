@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import minimum_filter
 
 from gs2d.core.arrays import read_npy
 from gs2d.core.camera import Camera
@@ -26,6 +27,10 @@ DEPTH_SUFFIXES = (".npy", ".png", ".tif", ".tiff", ".exr")
 NORMAL_SUFFIXES = (".npy", ".png", ".jpg", ".jpeg", ".webp")
 AGREE = 0.05  # neighbours that differ by more, as a share of the largest, are an edge
 UNIT_LENGTH = (0.8, 1.2)  # a normal of another length is none
+UNOBSERVED = "the capture does not say which points its images show"
+MAX_PROJECTED = 100_000  # points: more would not tell more of depths
+HIDING_CELLS = 48  # along the longer side of an image, in which points hide those behind them
+HIDDEN = 1.25  # times the depth of a point in the same or a neighbouring cell, behind which others are hidden
 _ASPECT = 0.02  # maps of networks have sides that are multiples of 14 or 32
 
 LensMaps = Callable[[Intrinsics], tuple[np.ndarray, np.ndarray]]
@@ -68,12 +73,34 @@ class ObservedPoints:
         Photographs in which it was found.
     seen : mapping of view name to ndarray [M] int32 or int64
         Rows of the points found in a view.
+    guessed : str
+        Why the capture does not say in which photographs its points were found; ``seen`` is then a guess, made by
+        projecting them. Empty where it does.
     """
 
     points: np.ndarray
     error: np.ndarray
     track: np.ndarray
     seen: Mapping[str, np.ndarray]
+    guessed: str = ""
+
+    @classmethod
+    def projected(cls, points: np.ndarray | None, cameras: Mapping[str, Camera], why: str) -> ObservedPoints:
+        """Return points with the views in whose images they lie, as far as no other point hides them there.
+
+        Parameters
+        ----------
+        points : ndarray [P, 3] world units, or None
+            Of many, some are taken, evenly; the others are in no view.
+        cameras : mapping of view name to Camera
+        why : str
+            Reason for ``guessed``.
+        """
+        points = np.zeros((0, 3)) if points is None else np.asarray(points, dtype=np.float64)
+        some = np.arange(0, len(points), max(1, -(-len(points) // MAX_PROJECTED)), dtype=np.int32)
+        seen = {name: some[_unhidden(points[some], camera)] for name, camera in cameras.items()}
+        track = np.bincount(np.concatenate([*seen.values(), some[:0]]), minlength=len(points))
+        return cls(points, np.zeros(len(points)), track, seen, why)
 
     def in_view(self, name: str, camera: Camera, *, min_track: int = 3, max_error: float = 2.0) -> PointsInView:
         """Return the points found in one view, inside its outer pixel centres and in front of it.
@@ -102,6 +129,18 @@ class ObservedPoints:
         inside = (pixels >= 0.5).all(axis=1) & (pixels < (camera.width - 0.5, camera.height - 0.5)).all(axis=1)
         inside &= depth > 0
         return PointsInView(pixels[inside], depth[inside])
+
+
+def _unhidden(points: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return which points [P] bool lie in an image and not far behind another point in the same part of it."""
+    pixels, depth = camera.project(points)
+    size = np.array((camera.width, camera.height))
+    inside = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(axis=1)
+    cells = np.floor(np.where(inside[:, None], pixels, 0) / (size.max() / HIDING_CELLS)).astype(np.int64)
+    nearest = np.full((HIDING_CELLS, HIDING_CELLS), np.inf)
+    np.minimum.at(nearest, (cells[inside, 1], cells[inside, 0]), depth[inside])
+    around = minimum_filter(nearest, size=3, mode="nearest")
+    return np.asarray(inside & (depth <= HIDDEN * around[cells[:, 1], cells[:, 0]]))
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from gs2d.core.memory import trim
 from gs2d.core.photometry import CameraPhotometry
 from gs2d.data.cache import DecodedImage, ImageCache
 from gs2d.data.masks import Masks
-from gs2d.data.priors import ObservedPoints, PriorMaps
+from gs2d.data.priors import UNOBSERVED, ObservedPoints, PriorMaps
 from gs2d.data.straighten import straightened_picture
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
@@ -253,7 +253,7 @@ class Scene:
     root : Path or None
         The folder it came from.
     observe : callable or None
-        Reads which sparse points each photograph was found to show, where the capture says so.
+        Reads which sparse points each photograph was found to show; :meth:`observed` calls it.
     ahead : int
         Pictures that whoever goes through the views asks for before they are needed, because they come from the disk
         each time (``gs2d.data.prepared``); 0: they are to stay in memory.
@@ -310,6 +310,29 @@ class Scene:
     def views(self) -> tuple[View, ...]:
         """Training views, then test views."""
         return self.train + self.test
+
+    def observed(self, *, guessed: bool = True) -> ObservedPoints | None:
+        """Return which sparse points each photograph shows, or None where that is not known.
+
+        Parameters
+        ----------
+        guessed : bool
+            Whether points that were projected, because the capture does not say it, count.
+        """
+        if self.observe is None or (self.unobserved() and not guessed):
+            return None
+        try:
+            found = self.observe()
+        except DataError:  # of a reader that is not ours
+            return None
+        return found if any(map(len, found.seen.values())) else None
+
+    def unobserved(self) -> str:
+        """Return why the capture does not say which points its photographs show; "" where it does."""
+        try:
+            return UNOBSERVED if self.observe is None else self.observe().guessed
+        except DataError as error:
+            return str(error)
 
     def forget(self) -> None:
         """Drop decoded pictures and which points they show from memory; whoever asks for one has it read again."""

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from scipy.optimize import brentq
 
-from gs2d.errors import DataError
+from gs2d.errors import DataError, UnusableViewError
 
 _NEWTON = 20  # steps at the most, from the bent point to the ideal one
 
@@ -212,6 +212,8 @@ def colmap_intrinsics(camera: str, model: str, width: int, height: int, params: 
 
     Raises
     ------
+    UnusableViewError
+        Parameters that are NaN or infinite.
     DataError
         A model that we do not undistort, another number of parameters, or values that are no camera.
     """
@@ -228,11 +230,10 @@ def colmap_intrinsics(camera: str, model: str, width: int, height: int, params: 
     if len(params) != expected:
         raise DataError(f"{camera}: the model {model} must have {expected} parameters, got {len(params)}")
     fx, fy, cx, cy = (params[0], *params[:3]) if single else params[:4]
-    if not (all(map(math.isfinite, params)) and fx > 0 and fy > 0 and width > 0 and height > 0):
-        raise DataError(
-            f"{camera} must have a positive size and focal length and finite parameters, "
-            f"got {width}x{height} and {list(params)}"
-        )
+    if not all(map(math.isfinite, params)):
+        raise UnusableViewError(f"{camera} must have finite parameters, got {list(params)}")
+    if not (fx > 0 and fy > 0 and width > 0 and height > 0):
+        raise DataError(f"{camera} must have a positive size and focal length, got {width}x{height} and {list(params)}")
     value = dict(zip(words, params[3 if single else 4 :], strict=True))
     lens = None
     if kind == "fov":

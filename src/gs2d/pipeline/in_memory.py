@@ -104,7 +104,7 @@ def train(
         ``stage.field=value``, applied after the schedule is scaled.
     seed : int
     robust : str
-        "auto", "on" or "off": help for captures that say which points their images show (``gs2d train --robust``).
+        "auto", "on" or "off": help for captures that have sparse points (``gs2d train --robust``).
     exposure : bool, optional
         Learn an exposure for each image; None: where the images differ.
     on_event : callable

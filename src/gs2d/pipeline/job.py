@@ -56,6 +56,7 @@ from gs2d.training.backdrop import find_backdrop
 from gs2d.training.cached_objective import is_cacheable
 from gs2d.training.photometry import Photometries
 from gs2d.training.point_gains import point_gains
+from gs2d.training.robust import check_free_space
 from gs2d.training.trainer import raster_settings
 
 DECODE_THREADS = 2
@@ -306,8 +307,8 @@ def _recipe_of(options: TrainOptions, *, robust: bool, exposure: bool) -> Recipe
 def fit_recipe(options: TrainOptions, scene: Scene, protocol: Protocol, on_event: OnEvent) -> Recipe:
     """Return the recipe as this capture needs it, and say what was decided.
 
-    Where ``options.robust`` is "auto" it is made robust under a protocol that says so, if the capture tells which
-    sparse points its photographs show; where ``options.learns_exposure`` is None, exposures are learned if those
+    Where ``options.robust`` is "auto" it is made robust under a protocol that says so, if the capture has sparse
+    points that its photographs show; where ``options.learns_exposure`` is None, exposures are learned if those
     points say that the photographs differ.
 
     Raises
@@ -315,8 +316,10 @@ def fit_recipe(options: TrainOptions, scene: Scene, protocol: Protocol, on_event
     RecipeError, DataError
     """
     robust = options.robust == "on" or (options.robust == "auto" and protocol.robust)
-    lacks = _lacks_points(scene) if robust and options.robust == "auto" else None
-    if lacks is not None:
+    lacks = scene.unobserved() if robust else ""
+    if lacks and scene.observed() is not None:
+        on_event(Notice(f"sparse points are projected into the images: {lacks}"))
+    elif lacks and options.robust == "auto":
         robust = False
         own = recipe_of(options.recipe).dense_start is not None
         what = "no known free space" if own else "no dense start and no known free space"
@@ -336,17 +339,6 @@ def fit_recipe(options: TrainOptions, scene: Scene, protocol: Protocol, on_event
         )
         on_event(Notice(f"{faces} faces of panoramas or fisheyes: of their {what} nothing is learned"))
     return _recipe_of(options, robust=robust, exposure=exposure)
-
-
-def _lacks_points(scene: Scene) -> str | None:
-    """Why it is not known which sparse points the photographs show; None where it is."""
-    if scene.observe is None:
-        return "the capture does not say which points are seen where"
-    try:
-        scene.observe()
-    except DataError as error:
-        return str(error)
-    return None
 
 
 def with_backdrop(recipe: Recipe, protocol: Protocol, scene: Scene, on_event: OnEvent) -> tuple[Recipe, Protocol]:
@@ -418,7 +410,9 @@ def settled(options: TrainOptions, scene: Scene, protocol: Protocol, on_event: O
     ------
     RecipeError, DataError
     """
-    recipe, protocol = with_backdrop(fit_recipe(options, scene, protocol, on_event), protocol, scene, on_event)
+    recipe = fit_recipe(options, scene, protocol, on_event)
+    check_free_space(scene, recipe)
+    recipe, protocol = with_backdrop(recipe, protocol, scene, on_event)
     if len(scene.train) <= FEW_VIEWS and (slower := with_few_views(recipe)) != recipe:
         recipe = slower
         few = f"{len(scene.train)} training photographs"

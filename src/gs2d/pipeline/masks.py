@@ -10,7 +10,6 @@ from gs2d.config.protocols import Protocol
 from gs2d.data import Scene
 from gs2d.data.masks import EMPTY
 from gs2d.data.scene import PointCloud, View
-from gs2d.errors import DataError
 from gs2d.pipeline.events import Notice, OnEvent
 
 
@@ -28,18 +27,15 @@ def with_masks(protocol: Protocol, scene: Scene, on_event: OnEvent) -> Protocol:
 def without_masked_points(scene: Scene, protocol: Protocol, on_event: OnEvent) -> Scene:
     """Return the scene without the sparse points that training photographs show in masked pixels alone.
 
-    Only where the capture says which points its photographs show: nothing would ever move such splats, or prune them.
+    Nothing would ever move or prune splats there.
     """
     points, masks = scene.points, scene.masks
-    if not masks.found or points is None or scene.observe is None:
+    if not masks.found or points is None:
         return scene
     if masks.masked != EMPTY and not protocol.use_mask_in_training:
         return scene
-    try:
-        observed = scene.observe()
-    except DataError:
-        return scene
-    if len(observed.points) != len(points):
+    observed = scene.observed()
+    if observed is None or len(observed.points) != len(points):
         return scene
     masked, kept = np.zeros((2, len(points)), dtype=np.int64)
     for view in scene.train:

@@ -341,9 +341,9 @@ def bare_of(job: RenderedScene, view: View) -> np.ndarray | None:
     where the capture does not say enough of which points its photographs show.
     """
     scene = job.scene
-    if not job.protocol.fusion.subject or scene.observe is None or view.alpha() is not None:
+    if not job.protocol.fusion.subject or view.alpha() is not None or (observed := scene.observed()) is None:
         return None
-    points = scene.observe().inside(view.camera, min_track=2).pixels
+    points = observed.inside(view.camera, min_track=2).pixels
     if len(points) < MIN_POINTS:
         return None
     return bare_pixels(view.target(job.settings.background), points, view.valid())

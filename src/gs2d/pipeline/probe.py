@@ -115,8 +115,7 @@ def dense_start_of(part: Scene, scene: Scene, recipe: Recipe) -> tuple[Sweep | N
     """
     assert recipe.dense_start is not None
     cloud, times, rest = None, len(scene.train) / len(part.train), 0
-    if scene.observe is not None and scene.points is not None:
-        observed = scene.observe()
+    if scene.points is not None and (observed := scene.observed()) is not None:
         here, swept, everywhere = (
             np.unique(np.concatenate([observed.seen.get(view.name, np.zeros(0, np.int32)) for view in views]))
             for views in (part.train, swept_views(scene, recipe), scene.train)

@@ -15,7 +15,7 @@ from PIL import Image
 
 from gs2d.core.files import disk_error
 from gs2d.core.images import image_size, read_mask, write_image
-from gs2d.data.file_names import subfolder
+from gs2d.data.file_names import in_any_case
 from gs2d.data.masks import FOLDER, Masks, find_masks, find_masks_in
 from gs2d.errors import DataError
 from gs2d.sfm.fisheye import Circle
@@ -49,7 +49,7 @@ def masks_of(photos: Sequence[Photo], root: Path, folder: Path | None) -> tuple[
     for parent in dict.fromkeys(image.parent for image in images) if folder is None else ():
         inside = [image for image in images if image.parent == parent]
         own.update(
-            zip(inside, find_masks_in([subfolder(parent, FOLDER)], [image.name for image in inside]), strict=True)
+            zip(inside, find_masks_in([in_any_case(parent, FOLDER)], [image.name for image in inside]), strict=True)
         )
     return find_masks(names, images, [own.get(image) for image in images], [root, root.resolve().parent], Masks(folder))
 

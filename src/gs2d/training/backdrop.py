@@ -45,12 +45,12 @@ class Backdrop:
 def find_backdrop(scene: Scene) -> Backdrop | None:
     """Look at the pixels of training views that are far from every sparse point.
 
-    None where photographs have an alpha channel, which says what is empty, or the capture does not say which points
-    they show, or no pixel is bare.
+    None where photographs have an alpha channel, which says what is empty, or there are no sparse points, or no pixel
+    is bare.
     """
-    if scene.observe is None or scene.train[0].alpha() is not None:
+    observed = None if scene.train[0].alpha() is not None else scene.observed()
+    if observed is None:
         return None
-    observed = scene.observe()
     found = []
     for view in scene.train[:: max(1, -(-len(scene.train) // MAX_VIEWS))]:
         bare = np.ones((view.camera.height, view.camera.width), dtype=bool)

@@ -58,8 +58,10 @@ class SmallView:
         Intrinsics at this size; T_cam_world.
     near, far : float, world units
         Where the sweep begins and ends; 0 where the view shows too few points.
+    middle : float, world units
+        Median depth of the sparse points that it shows; 0 as above.
     pixels, depth : ndarray [M, 2] px, [M] world units
-        The sparse points that it shows.
+        Those points, where the capture says that it shows them; empty where that is a guess.
     nearest : float, world units
         Nearest depth of all sparse points in its picture, whether it was found to show them or not (2nd percentile).
     """
@@ -71,6 +73,7 @@ class SmallView:
     T: np.ndarray
     near: float
     far: float
+    middle: float
     pixels: np.ndarray
     depth: np.ndarray
     nearest: float
@@ -298,12 +301,14 @@ def _shrunk(view: View, known: SweepRange, factor: int) -> SmallView:
     enough = len(shown.depth) >= MIN_POINTS
     near, far = np.percentile(shown.depth, (1, 99)) * (NEAR_MARGIN, FAR_MARGIN) if enough else (0.0, 0.0)
     near, far = known.limits.get(view.name, (near, far))
-    pixels = np.minimum(shown.pixels / factor, np.array((width // factor, height // factor)) - 0.5)
+    middle = float(np.median(shown.depth)) if len(shown.depth) else 0.0
+    certain = slice(0) if observed.guessed else slice(None)
+    pixels = np.minimum(shown.pixels[certain] / factor, np.array((width // factor, height // factor)) - 0.5)
     grey = (small * torch.tensor(GREY)[:, None, None]).sum(dim=1, keepdim=True)
     T = np.asarray(camera.T_cam_world, dtype=np.float64)
     everywhere = observed.inside(camera).depth  # smooth things have few points, and a photograph finds some of them
     nearest = float(np.percentile(everywhere, NEAREST)) if enough else 0.0
-    return SmallView(small[0], grey, left, K, T, float(near), float(far), pixels, shown.depth, nearest)
+    return SmallView(small[0], grey, left, K, T, float(near), float(far), middle, pixels, shown.depth[certain], nearest)
 
 
 def _neighbours(
@@ -323,7 +328,7 @@ def _neighbours(
         view, small = scene.train[index], views[index]
         if small.far == 0:
             return ()
-        target = view.camera.center + view.camera.forward * float(np.median(small.depth))
+        target = view.camera.center + view.camera.forward * small.middle
         mine, theirs = view.camera.center - target, centers - target
         lengths = np.maximum(np.linalg.norm(theirs, axis=1) * np.linalg.norm(mine), 1e-12)
         angle = np.degrees(np.arccos(np.clip(theirs @ mine / lengths, -1, 1)))

@@ -42,9 +42,9 @@ class PointGains:
 
 def point_gains(scene: Scene) -> PointGains | None:
     """Return the gains of the training photographs; None where the capture does not say which points they show."""
-    if scene.observe is None:
+    observed = scene.observed(guessed=False)
+    if observed is None:
         return None
-    observed = scene.observe()
     views, points, values = [], [], []
     for index, view in enumerate(scene.train):
         rows, colors = _colors(view, observed)

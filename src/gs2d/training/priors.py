@@ -64,12 +64,12 @@ def plan_depths(scene: Scene, settings: DepthPrior) -> DepthPlan:
         metric = any(view.maps is not None and view.maps.files.metric for view in mapped)
         source = "sensor" if metric else "relative" if mapped else "sparse"
     if source == "sparse":
-        if scene.observe is None:
+        found = scene.observed(guessed=False)
+        if found is None:
             raise DataError(
                 f"{scene.name} must say which sparse points its photographs show (COLMAP does), or have depth maps in "
                 "depths/ or depth_file_path, for known depths; got neither: train without --depth-prior"
             )
-        found = scene.observe()
         if not any(len(points_in(view, found, settings).depth) for view in scene.train):
             raise DataError(
                 f"no training view of {scene.name} shows a sparse point of {settings.min_track} photographs or more "
@@ -82,7 +82,7 @@ def plan_depths(scene: Scene, settings: DepthPrior) -> DepthPlan:
             "photographs (16-bit PNG or .npy), or name them as depth_file_path in transforms.json"
         )
     asks = settings.unit is None if source == "sensor" else settings.align == "points"
-    observed = scene.observe() if asks and scene.observe is not None else None
+    observed = scene.observed(guessed=False) if asks else None
     if source == "sensor":
         return DepthPlan(source, observed, settings.unit or _fitted_unit(mapped, observed, settings))
     space = settings.space if settings.space != "auto" else _fitted_space(mapped, observed, settings)

@@ -30,6 +30,15 @@ from gs2d.training.start_fit import fit_start
 from gs2d.training.state import TrainState
 
 
+def check_free_space(scene: Scene, recipe: Recipe) -> None:
+    """Raise DataError where free space is to be kept, and no sparse points say where it is."""
+    if recipe.free_space is not None and scene.observed() is None:
+        raise DataError(
+            f"{scene.name} must say which sparse points its photographs show (COLMAP does) for free space; "
+            f"train with --robust off ({scene.unobserved()})"
+        )
+
+
 class Robustness:
     """The dense start, pruning and opacity decay of a recipe on a scene; nothing where it has none of them.
 
@@ -53,8 +62,8 @@ class Robustness:
     Raises
     ------
     DataError
-        From the constructor: free space is to be kept, and the capture does not say which sparse points its photographs
-        show; or a plane sweep finds nothing to start from, and the recipe requires that.
+        From the constructor: free space is to be kept, and the capture has no sparse points that its photographs show;
+        or a plane sweep finds nothing to start from, and the recipe requires that.
     """
 
     def __init__(
@@ -73,11 +82,7 @@ class Robustness:
         self.lacks = ""
         if (recipe.dense_start is None and recipe.free_space is None) or not processes.leads:
             return
-        if scene.observe is None and recipe.free_space is not None:
-            raise DataError(
-                f"{scene.name} must say which sparse points its photographs show (COLMAP does) for free space; "
-                "train with --robust off"
-            )
+        check_free_space(scene, recipe)
         start = recipe.dense_start
         try:
             sweep = sweep_views(scene, start or DenseStart())

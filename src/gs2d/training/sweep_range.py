@@ -1,6 +1,6 @@
 """Between which depths a photograph is swept, and what its neighbours share with it.
 
-Sparse points say both where the capture tells which of them each photograph shows. Without, the scene's bounds do: a
+Sparse points say both where there are any. Without, the scene's bounds do: a
 grid of places in that box, those that two photographs see and, where photographs have an alpha channel, those that
 lie in the silhouettes of all (the visual hull).
 """
@@ -47,7 +47,8 @@ def sweep_range(scene: Scene) -> SweepRange:
     DataError
         No two training views see a place in the scene's bounds.
     """
-    return _range_of_bounds(scene) if scene.observe is None else SweepRange(scene.observe())
+    observed = scene.observed()
+    return _range_of_bounds(scene) if observed is None else SweepRange(observed)
 
 
 def _range_of_bounds(scene: Scene) -> SweepRange:
@@ -82,7 +83,7 @@ def _range_of_bounds(scene: Scene) -> SweepRange:
     chosen, inside = places[::step], inside[:, ::step]
     seen = {view.name: np.flatnonzero(inside[index]) for index, view in enumerate(scene.train)}
     track = np.full(len(chosen), TRACK)
-    return SweepRange(ObservedPoints(chosen, np.zeros(len(chosen)), track, seen), limits)
+    return SweepRange(ObservedPoints(chosen, np.zeros(len(chosen)), track, seen, "places of the bounds"), limits)
 
 
 def _shows(view: View, places: np.ndarray, half: float) -> tuple[np.ndarray, np.ndarray]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -57,14 +59,45 @@ def test_a_binary_model_is_preferred_to_a_text_model_beside_it(tmp_path: Path) -
     assert len(load_scene(tmp_path).views) == 9
 
 
-def test_rigs_and_frames_files_are_ignored_and_other_models_are_reported(tmp_path: Path) -> None:
-    model = small_colmap(tmp_path)
+def test_rigs_and_frames_files_are_ignored(tmp_path: Path) -> None:
+    small_colmap(tmp_path)
     for name in ("rigs.bin", "frames.bin"):
         (tmp_path / "sparse/0" / name).write_bytes(b"\x01 not ours")
-    model.write(tmp_path / "sparse/1")
+    assert len(load_scene(tmp_path).views) == 9
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+def test_the_largest_model_is_read_and_a_note_gives_the_sizes_of_the_others(tmp_path: Path, kind: str) -> None:
+    model = small_colmap(tmp_path, kind=kind)
+    replace(model, images=model.images[:2]).write(tmp_path / "sparse/10", kind)
+    model.write(tmp_path / "sparse/2", kind)
+    replace(model, images=model.images[:2]).write(tmp_path / "sparse/0", kind)
     scene = load_scene(tmp_path)
     assert len(scene.views) == 9
-    assert any("others are there: 1" in note for note in scene.notes)
+    first = f"gs2d train {tmp_path / 'sparse/0'}"
+    assert scene.notes[0] == (
+        f"the model sparse/2 is read, which has 9 images; 0 has 2, 10 has 2. Read another one by its folder: {first}"
+    )
+    with pytest.raises(DataError, match=r"got 1 at one place.*0 is read, which has 2 images; 2 has 9, 10 has 2\. Read"):
+        load_scene(tmp_path / "sparse/0")
+    model.write(tmp_path / "sparse/0", kind)  # of two that are as large the first
+    assert "the model sparse/0 is read" in load_scene(tmp_path).notes[0]
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+def test_files_and_folders_of_a_model_may_be_called_by_other_cases(tmp_path: Path, kind: str) -> None:
+    small_colmap(tmp_path, kind=kind)
+    model = tmp_path / "sparse/0"
+    for old, new in (("cameras", "Cameras"), ("images", "IMAGES"), ("points3D", "points3d")):
+        (model / f"{old}.{kind}").rename(model / f"{new}.{kind}")
+    for old, new in (("sparse", "Sparse"), ("images", "Images")):
+        (tmp_path / old).rename(tmp_path / new)
+    for name in ("Masks", "Depths"):
+        write_image_of(tmp_path / name / "3.png")
+    scene = load_scene(tmp_path)
+    assert scene.points is not None
+    assert (len(scene.views), len(scene.points), scene.masks.found) == (9, 20, 1)
+    assert any(note.startswith("depth maps: 1 of 9") for note in scene.notes)
 
 
 def test_images_in_sub_folders_keep_their_whole_name(tmp_path: Path) -> None:
@@ -266,12 +299,84 @@ def test_a_wrong_line_of_a_text_model_is_named(tmp_path: Path, name: str, line: 
         load_scene(tmp_path)
 
 
-def test_a_pose_of_nan_is_an_error_that_names_the_image(tmp_path: Path) -> None:
+@pytest.mark.parametrize("drop", [slice(None), slice(-1, None), slice(1, 6, 2), slice(2, 3)])
+def test_images_txt_may_lack_the_empty_lines_of_images_without_points(tmp_path: Path, drop: slice) -> None:
     model = small_colmap(tmp_path, kind="txt")
     path = tmp_path / "sparse/0/images.txt"
-    path.write_text(path.read_text().replace(repr(float(model.images[0][1][0, 3])), "nan"))
-    with pytest.raises(DataError, match=r"image 8\.png must have a finite pose"):
-        load_scene(tmp_path)
+    head, *lines = path.read_text().splitlines()
+    empty = [index for index in range(1, len(lines), 2) if not lines[index]]
+    assert len(empty) == 3
+    gone = set(empty[drop])
+    path.write_text("\n".join([head, *(line for index, line in enumerate(lines) if index not in gone)]))
+    images = read_images(path.parent, "txt", observations=True)
+    assert [image.name for image in images] == [image[3] for image in model.images]
+    assert [len(image.observations) for image in images] == [len(image[4]) for image in model.images]  # type: ignore[arg-type]
+    assert len(load_scene(tmp_path).views) == 9
+
+
+def test_a_wrong_line_of_2_d_points_is_named(tmp_path: Path) -> None:
+    small_colmap(tmp_path, kind="txt")
+    path = tmp_path / "sparse/0/images.txt"
+    path.write_text(path.read_text().replace("1.5 2.5 -1\n", "1.5 2.5\n", 1))
+    assert len(load_scene(tmp_path).views) == 9
+    with pytest.raises(DataError, match=r"images\.txt line 5 must be `X Y POINT3D_ID, for each 2-D point"):
+        read_images(path.parent, "txt", observations=True)
+
+
+@pytest.mark.parametrize("written", ["nan", "-nan(ind)", "1.#QNAN", "-1.#IND", "inf"])
+@pytest.mark.parametrize("what", ["pose", "camera"])
+def test_an_image_whose_pose_or_camera_is_not_finite_is_skipped_and_named(
+    tmp_path: Path, what: str, written: str
+) -> None:
+    small_colmap(tmp_path, kind="txt")
+    images, cameras = (tmp_path / "sparse/0" / name for name in ("images.txt", "cameras.txt"))
+    if what == "pose":
+        images.write_text(re.sub(r"\S+ 7 8\.png", lambda _: f"{written} 7 8.png", images.read_text()))
+    else:
+        cameras.write_text(cameras.read_text() + f"9 PINHOLE 40 30 {written} 36 18.5 16.25\n")
+        images.write_text(images.read_text().replace(" 7 8.png", " 9 8.png"))
+    scene = load_scene(tmp_path)
+    assert [view.name for view in scene.views if view.name == "8.png"] == []
+    assert len(scene.views) == 8
+    assert len(scene.skipped) == 1
+    assert scene.skipped[0].startswith("8.png: ")
+    assert "finite" in scene.skipped[0]
+    if what == "pose":
+        with pytest.raises(DataError, match=r"image 8\.png must have a finite pose"):
+            read_images(images.parent, "txt")
+
+
+def test_a_model_without_observations_has_its_points_projected_into_the_images(tmp_path: Path) -> None:
+    model = small_colmap(tmp_path)
+    scene = load_scene(tmp_path)
+    assert "the capture does not say" in scene.unobserved()
+    assert scene.observed(guessed=False) is None
+    observed = scene.observed()
+    assert observed is not None
+    inside = [view.camera.project(observed.points)[0] for view in scene.views]
+    near = [((uv > 0) & (uv < (40, 30))).all(axis=1) for uv in inside]
+    for view, fits in zip(scene.views, near, strict=True):
+        rows = observed.seen[view.name]
+        assert 0 < len(rows) <= fits.sum()
+        assert fits[rows].all()
+    model.images[0] = (*model.images[0][:4], [(1.0, 2.0, 3)])
+    model.write(tmp_path / "sparse/0")
+    scene = load_scene(tmp_path)
+    assert scene.unobserved() == ""
+    assert scene.observed(guessed=False).seen["8.png"].tolist() == [2]  # type: ignore[union-attr]
+
+
+def test_broken_observations_and_a_lack_of_points_are_reasons_and_no_errors(tmp_path: Path) -> None:
+    small_colmap(tmp_path, kind="txt")
+    path = tmp_path / "sparse/0/images.txt"
+    path.write_text(path.read_text().replace("1.5 2.5 -1\n", "1.5 2.5\n", 1))
+    scene = load_scene(tmp_path)
+    assert "images.txt line 5" in scene.unobserved()
+    assert scene.observed() is not None
+    (tmp_path / "sparse/0/points3D.txt").unlink()
+    scene = load_scene(tmp_path)
+    assert "must hold sparse points in points3D.txt, got none" in scene.unobserved()
+    assert scene.observed() is None
 
 
 def test_a_camera_model_that_cannot_be_undistorted_names_camera_model_and_remedy(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -179,6 +180,38 @@ def test_distorted_frames_are_undistorted_and_reported(tmp_path: Path) -> None:
     assert any("9 of 9 views are undistorted" in note for note in load_scene(tmp_path).notes)
 
 
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda frame: frame["transform_matrix"][0].__setitem__(3, 10**400), "beyond all floats"),
+        (lambda frame: frame["transform_matrix"][0].__setitem__(3, math.nan), "frame 1: transform_matrix .* NaN"),
+        (lambda frame: frame.update(fl_x=math.inf), "frame 1: fl_x must be a finite number, got 'inf'"),
+    ],
+)
+def test_a_frame_whose_pose_or_camera_is_not_finite_is_skipped_and_named(
+    tmp_path: Path, change: Any, reason: str
+) -> None:
+    small_nerfstudio(tmp_path)
+    edit(tmp_path / "transforms.json", lambda meta: change(meta["frames"][1]))
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 8
+    assert len(scene.skipped) == 1
+    assert re.match(f"images/f_01.png: .*{reason}", scene.skipped[0])
+
+
+def test_transforms_json_and_what_it_names_may_be_written_in_other_cases(tmp_path: Path) -> None:
+    small_nerfstudio(tmp_path, meta={"ply_file_path": "points.ply"}, frame={"mask_path": "mask.png"})
+    (tmp_path / "transforms.json").rename(tmp_path / "Transforms.JSON")
+    (tmp_path / "Points.PLY").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+        "1 2 3\n"
+    )
+    Image.fromarray(np.full((30, 40), 255, np.uint8)).save(tmp_path / "Mask.png")
+    scene = load_scene(tmp_path)
+    assert scene.points is not None
+    assert (len(scene.views), len(scene.points), scene.masks.found) == (9, 1, 9)
+
+
 def _drop(*path: Any) -> Any:
     def change(meta: dict[str, Any]) -> None:
         for key in path[:-1]:
@@ -202,8 +235,6 @@ def _drop(*path: Any) -> Any:
         (lambda m: m.update(fl_x=-35.0), "positive size and focal length"),
         (lambda m: m.update(fl_x=10**400), "fl_x must be a finite number, got '1000"),
         (lambda m: m.update(fl_x=1e12), r"a focal length of 0.01 to 100000 times .* got 1e.12, 36 px for 40x30"),
-        (lambda m: m["frames"][1]["transform_matrix"][0].__setitem__(3, 10**400), "beyond all floats"),
-        (lambda m: m["frames"][1]["transform_matrix"][0].__setitem__(3, math.nan), "f_01.png.*finite"),
         (lambda m: m["frames"][1]["transform_matrix"].pop(), None),
         (lambda m: m["frames"][1].update(transform_matrix=[[1, 2], [3]]), "must be a 4x4 matrix"),
         (lambda m: m["frames"][1].update(transform_matrix=(2 * np.eye(4)).tolist()), "remove scale or mirroring"),

@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import math
 import os
+import shlex
 import struct
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from gs2d.core.images import image_size
+from gs2d.core.images import image_size, is_number, natural_key
 from gs2d.core.transforms import quats_to_matrices
-from gs2d.data.build import Capture, PosedImage
+from gs2d.data.build import Capture, PosedImage, skipping
 from gs2d.data.faces import panorama
-from gs2d.data.file_names import subfolder
+from gs2d.data.file_names import in_any_case
 from gs2d.data.priors import ObservedPoints
-from gs2d.data.readers.common import Photograph, find_photographs
+from gs2d.data.readers.common import Photograph, find_photographs, parsed
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, colmap_intrinsics
-from gs2d.errors import DataError
+from gs2d.errors import DataError, UnusableViewError
 
 # -- the files of a model ----------------------------------------------------------------------------------------------
 # The layouts are those of COLMAP's documentation (https://colmap.github.io/format.html). ``rigs`` and ``frames`` files,
@@ -72,6 +73,7 @@ class ColmapImage:
     name : str
         Relative to the image folder.
     T_cam_world : ndarray [4, 4] float64
+        NaN where the file has no valid pose.
     observations : ndarray [M, 2] px and point_ids : ndarray [M] int64 (-1 = none), or None if they were not asked for
     """
 
@@ -96,14 +98,19 @@ class ColmapPoints:
 def find_model(folder: Path) -> str | None:
     """Return "bin" or "txt" if ``folder`` holds a COLMAP model of that kind (binary is preferred), else None."""
     for kind in ("bin", "txt"):
-        if (folder / f"cameras.{kind}").is_file() and (folder / f"images.{kind}").is_file():
+        if all(_file(folder, name, kind).is_file() for name in ("cameras", "images")):
             return kind
     return None
 
 
+def _file(folder: Path, name: str, kind: str) -> Path:
+    """Return a file of a model, which some programs begin with a capital (``Cameras.txt``, ``points3d.txt``)."""
+    return in_any_case(folder, f"{name}.{kind}")
+
+
 def read_cameras(folder: Path, kind: str) -> dict[int, ColmapCamera]:
     """All cameras of a model, by id. Raises DataError for a file that is cut short or not a camera list."""
-    path = folder / f"cameras.{kind}"
+    path = _file(folder, "cameras", kind)
     return dict(_cameras_bin(path) if kind == "bin" else _cameras_txt(path))
 
 
@@ -115,23 +122,27 @@ def read_images(folder: Path, kind: str, *, observations: bool = False) -> list[
     DataError
         A file that is cut short or not an image list, or a pose that is not a pose.
     """
-    return list(_each_image(folder, kind, observations))
+    images = list(_each_image(folder, kind, observations))
+    for image in images:
+        _check_pose(image, _file(folder, "images", kind))
+    return images
 
 
 def _each_image(folder: Path, kind: str, observations: bool) -> Iterator[ColmapImage]:
-    """Yield the images of ``read_images`` one by one."""
-    path = folder / f"images.{kind}"
+    """Yield the images of ``read_images`` one by one, those without a valid pose too."""
+    path = _file(folder, "images", kind)
     return _images_bin(path, observations) if kind == "bin" else _images_txt(path, observations)
 
 
 def read_points(folder: Path, kind: str) -> ColmapPoints | None:
     """Return the sparse points, or None if the model has no such file. Raises DataError as the others."""
-    path = folder / f"points3D.{kind}"
+    path = _file(folder, "points3D", kind)
     if not path.is_file():
         return None
     return _points_bin(path) if kind == "bin" else _points_txt(path)
 
 
+_IMAGE_BYTES = 64 + 1 + 8  # of an image without a name and 2-D points
 _CHUNK = 1 << 22  # bytes of points at a time
 
 
@@ -233,7 +244,7 @@ def _cameras_bin(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
 
 def _images_bin(path: Path, observations: bool) -> Iterator[ColmapImage]:
     with _Bytes(path) as file:
-        count = file.count("images", 64 + 1 + 8)
+        count = file.count("images", _IMAGE_BYTES)
         for number in range(1, count + 1):
             what = f"image {number} of {count}"
             image_id, *pose, camera_id = file.unpack("I7dI", what)
@@ -246,8 +257,7 @@ def _images_bin(path: Path, observations: bool) -> Iterator[ColmapImage]:
                 xys, ids = np.stack([table["f0"], table["f1"]], axis=1), table["f2"].astype(np.int64)
             else:
                 file.skip(24 * num_points, points)
-            T = pose_matrix(pose[:4], pose[4:], f"{path}: image {name}")
-            yield ColmapImage(int(image_id), int(camera_id), name, T, xys, ids)
+            yield ColmapImage(int(image_id), int(camera_id), name, pose_matrix(pose[:4], pose[4:]), xys, ids)
         file.finish("image")
 
 
@@ -310,7 +320,7 @@ def _cameras_txt(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
             continue
         try:
             camera_id = int(words[0])
-            camera = ColmapCamera(words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:])))
+            camera = ColmapCamera(words[1], int(words[2]), int(words[3]), tuple(map(parsed, words[4:])))
         except (ValueError, IndexError) as error:
             raise _wrong_line(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS...", error) from error
         yield camera_id, camera
@@ -318,33 +328,49 @@ def _cameras_txt(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
 
 def _images_txt(path: Path, observations: bool) -> Iterator[ColmapImage]:
     lines = _lines(path)
-    while lines and not lines[-1][1]:
-        lines.pop()
     at = 0
     while at < len(lines):
         number, line = lines[at]
+        at += 1
         if not line:  # a blank line between records
-            at += 1
             continue
-        points = lines[at + 1][1] if at + 1 < len(lines) else ""
-        yield _image_txt(path, number, line, points, observations)
-        at += 2
+        try:
+            image = _image_txt(line)
+        except (ValueError, IndexError) as error:
+            raise _wrong_line(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", error) from error
+        points = ""
+        if at < len(lines) and not _is_image(lines[at][1]):  # scripts leave out the empty lines of images without any
+            number, points = lines[at]
+            at += 1
+        if observations:
+            try:
+                table = np.array(list(map(float, points.split()))).reshape(-1, 3)
+                image = replace(image, observations=table[:, :2], point_ids=_whole(table[:, 2], np.int64))
+            except ValueError as error:
+                raise _wrong_line(path, number, "X Y POINT3D_ID, for each 2-D point of an image", error) from error
+        yield image
 
 
-def _image_txt(path: Path, number: int, line: str, points: str, observations: bool) -> ColmapImage:
-    expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+def _image_txt(line: str) -> ColmapImage:
+    """Return the image of its line (ValueError, IndexError)."""
     words = line.split(maxsplit=9)  # a name may hold spaces
+    image_id, camera_id, name = int(words[0]), int(words[8]), words[9]
+    pose = [parsed(word) for word in words[1:8]]
+    return ColmapImage(image_id, camera_id, name, pose_matrix(pose[:4], pose[4:]))
+
+
+def _is_image(line: str) -> bool:
+    """Whether a line has nine numbers and a name. A line of 2-D points has numbers only."""
     try:
-        image_id, camera_id, name = int(words[0]), int(words[8]), words[9]
-        pose = [float(word) for word in words[1:8]]
-        table = np.array(list(map(float, points.split()))).reshape(-1, 3) if observations else None
-        ids = None if table is None else _whole(table[:, 2], np.int64)
-    except (ValueError, IndexError) as error:
-        raise _wrong_line(path, number, expected, error) from error
-    T = pose_matrix(pose[:4], pose[4:], f"{path}: image {name}")
-    if table is None:
-        return ColmapImage(image_id, camera_id, name, T)
-    return ColmapImage(image_id, camera_id, name, T, table[:, :2], ids)
+        words = _image_txt(line).name.split()
+    except (ValueError, IndexError):
+        return False
+    try:
+        parsed(words[0])
+        parsed(words[-1])
+    except ValueError:
+        return True
+    return (9 + len(words)) % 3 != 0
 
 
 def _points_txt(path: Path) -> ColmapPoints:
@@ -376,21 +402,20 @@ def _whole(values: np.ndarray, dtype: type[np.integer]) -> np.ndarray:
     return values.astype(dtype)
 
 
-def pose_matrix(quat: list[float], translation: list[float], where: str) -> np.ndarray:
-    """T_cam_world [4, 4] of COLMAP's (w, x, y, z) and translation.
-
-    Raises
-    ------
-    DataError
-        NaN, infinity or a zero quaternion.
-    """
+def pose_matrix(quat: list[float], translation: list[float]) -> np.ndarray:
+    """T_cam_world [4, 4] of COLMAP's (w, x, y, z) and translation; NaN for NaN, infinity or a zero quaternion."""
     norm = math.sqrt(sum(q * q for q in quat))
     if not (math.isfinite(norm) and norm > 1e-8 and all(map(math.isfinite, translation))):
-        raise DataError(f"{where} must have a finite pose, got quaternion {quat} and translation {translation}")
+        return np.full((4, 4), np.nan)
     T = np.eye(4)
     T[:3, :3] = quats_to_matrices(torch.tensor([quat], dtype=torch.float64))[0].numpy()
     T[:3, 3] = translation
     return T
+
+
+def _check_pose(image: ColmapImage, path: Path) -> None:
+    if not np.isfinite(image.T_cam_world).all():
+        raise UnusableViewError(f"{path}: image {image.name} must have a finite pose and a quaternion that is not zero")
 
 
 # -- the scene ---------------------------------------------------------------------------------------------------------
@@ -398,12 +423,38 @@ MODEL_FOLDERS = ("sparse/0", "sparse", ".")
 
 
 def model_folder(root: Path) -> tuple[Path, str] | None:
-    """Find the model's folder and kind ("bin" or "txt"), or None: ``sparse/0``, ``sparse`` or ``root`` itself."""
-    for name in MODEL_FOLDERS:
-        kind = find_model(root / name)
+    """Find the model's folder and kind ("bin" or "txt"), or None.
+
+    The largest of ``sparse/0``, ``sparse/1`` and so on, else ``sparse``, else ``root`` itself.
+    """
+    sparse = in_any_case(root, "sparse")
+    numbered = [model for model in _models_in(sparse) if is_number(model.name)]
+    folders = [max(numbered, key=_num_images)] if len(numbered) > 1 else numbered
+    for folder in (*folders, sparse, root):
+        kind = find_model(folder)
         if kind is not None:
-            return root / name, kind
+            return folder, kind
     return None
+
+
+def _models_in(folder: Path) -> list[Path]:
+    """Return the sub-folders that hold a model, 2 before 10."""
+    if not folder.is_dir():
+        return []
+    return sorted((path for path in folder.iterdir() if find_model(path)), key=lambda path: natural_key(path.name))
+
+
+def _num_images(folder: Path) -> int:
+    """Return the number of images of a model; 0 where its file is broken."""
+    kind = find_model(folder) or "bin"
+    path = _file(folder, "images", kind)
+    try:
+        if kind == "txt":
+            return sum(1 for _ in _images_txt(path, observations=False))
+        with _Bytes(path) as file:
+            return file.count("images", _IMAGE_BYTES)
+    except DataError:
+        return 0
 
 
 def read_colmap(root: Path, downscale: int) -> Capture:
@@ -424,31 +475,34 @@ def read_colmap(root: Path, downscale: int) -> Capture:
         )
     folder, kind = found
     cameras = read_cameras(folder, kind)
-    images = read_images(folder, kind)
+    images = list(_each_image(folder, kind, observations=False))
     home, photographs = _photographs(root, folder, kind, images)
     notes: list[str] = _other_models(folder)
-    scaled = home / f"images_{downscale}"
+    scaled = in_any_case(home, f"images_{downscale}")
     factor = 1
     if downscale > 1 and scaled.is_dir():
-        smaller = _found(images, [scaled], folder / f"images.{kind}")
+        smaller = _found(images, [scaled], _file(folder, "images", kind))
         if any(photo.path is not None for photo in smaller.values()):
             photographs, factor = smaller, downscale
             notes.append(f"photographs of 1/{downscale} size are read from {scaled.name}")
         else:
             notes.append(f"{scaled.name} holds none of the model's photographs and is not used")
-    frames, skipped = [], []
+    frames: list[PosedImage] = []
+    skipped: list[str] = []
     intrinsics: dict[int, Intrinsics] = {}
     for image in images:
         photo = photographs[image.name]
         if photo.path is None:
             skipped.append(f"{image.name}: {photo.reason}")
             continue
-        if image.camera_id not in intrinsics:
-            intrinsics[image.camera_id] = _intrinsics(folder / f"cameras.{kind}", cameras, image)
-        k = intrinsics[image.camera_id]
-        if factor > 1:
-            _check_factor(photo.path, k, factor)
-        frames.append(PosedImage(photo.name, photo.path, k, image.T_cam_world))
+        with skipping(image.name, skipped):
+            _check_pose(image, _file(folder, "images", kind))
+            if image.camera_id not in intrinsics:
+                intrinsics[image.camera_id] = _intrinsics(_file(folder, "cameras", kind), cameras, image)
+            k = intrinsics[image.camera_id]
+            if factor > 1:
+                _check_factor(photo.path, k, factor)
+            frames.append(PosedImage(photo.name, photo.path, k, image.T_cam_world))
     return Capture(
         "colmap",
         tuple(frames),
@@ -516,9 +570,9 @@ def _intrinsics(path: Path, cameras: dict[int, ColmapCamera], image: ColmapImage
 def _photographs(root: Path, model: Path, kind: str, images: list[ColmapImage]) -> tuple[Path, dict[str, Photograph]]:
     """Return the folder that holds images, masks and sparse, and the photographs by name in the model."""
     homes = list(dict.fromkeys([root, model.parent, model.parent.parent]))
-    listing = model / f"images.{kind}"
+    listing = _file(model, "images", kind)
     for home in homes:
-        if (at := subfolder(home, "images")).is_dir():
+        if (at := in_any_case(home, "images")).is_dir():
             return home, _found(images, [at], listing)
     exact = (home for home in homes if any((home / image.name).is_file() for image in images))
     home = next(exact, root)  # folders above root are not searched
@@ -537,10 +591,15 @@ def _found(images: list[ColmapImage], folders: list[Path], listing: Path) -> dic
 
 
 def _other_models(folder: Path) -> list[str]:
-    if folder.name != "0":
+    """Return a note with the sizes of the models beside the one that is read."""
+    others = [path for path in _models_in(folder.parent) if path != folder] if is_number(folder.name) else []
+    if not others:
         return []
-    others = sorted(p.name for p in folder.parent.iterdir() if p != folder and p.is_dir() and find_model(p))
-    return [f"only the model sparse/0 is read; others are there: {', '.join(others)}"] if others else []
+    sizes = ", ".join(f"{path.name} has {_num_images(path)}" for path in others)
+    return [
+        f"the model {folder.parent.name}/{folder.name} is read, which has {_num_images(folder)} images; {sizes}. "
+        f"Read another one by its folder: gs2d train {shlex.quote(str(others[0]))}"
+    ]
 
 
 def _check_factor(path: Path, k: Intrinsics, factor: int) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,14 +13,15 @@ from typing import Any
 import numpy as np
 
 from gs2d.data.build import PosedImage
-from gs2d.data.file_names import IMAGES, NO_PHOTOGRAPHS, Files, name_below
+from gs2d.data.file_names import IMAGES, NO_PHOTOGRAPHS, Files, files_ending, in_any_case, name_below
 from gs2d.data.scene import PointCloud
-from gs2d.errors import DataError
+from gs2d.errors import DataError, UnusableViewError
 from gs2d.io.meshes import read_points
 from gs2d.io.splat_ply import ply_kind
 
 # -- numbers in files --------------------------------------------------------------------------------------------------
 _LARGEST = 1e300  # JSON has whole numbers of any size
+_NO_NUMBER = re.compile(r"[+-]?(nan\(\w*\)|1\.#\w+)", re.IGNORECASE)
 _HEAD = 4096  # bytes in which a file says what it is
 
 
@@ -31,20 +34,38 @@ def head(path: Path) -> bytes:
         return b""
 
 
+def parsed(text: str) -> float:
+    """Return the number of a text; NaN for ``-nan(ind)``, ``1.#INF`` and the like, which C programs write on Windows.
+
+    Raises
+    ------
+    ValueError
+        The text is no number.
+    """
+    return math.nan if _NO_NUMBER.fullmatch(text) else float(text)
+
+
 def real(value: Any, where: str) -> float:
     """Return a finite number, which may be written as text.
 
     Raises
     ------
+    UnusableViewError
+        NaN or infinity; names ``where``.
     DataError
         Anything else; names ``where``.
     """
+    kind: type[DataError] = DataError
     try:
-        if isinstance(value, bool) or not isinstance(value, int | float | str) or not abs(float(value)) <= _LARGEST:
+        if isinstance(value, bool) or not isinstance(value, int | float | str):
             raise ValueError
-        return float(value)
+        number = parsed(value) if isinstance(value, str) else float(value)
+        kind = DataError if math.isfinite(number) else UnusableViewError
+        if not abs(number) <= _LARGEST:
+            raise ValueError
+        return number
     except (ValueError, OverflowError) as error:
-        raise DataError(f"{where} must be a finite number, got {str(value)[:40]!r}") from error
+        raise kind(f"{where} must be a finite number, got {str(value)[:40]!r}") from error
 
 
 def reals(value: Any, count: int, where: str) -> np.ndarray:
@@ -199,8 +220,8 @@ def points_beside(root: Path, frames: Sequence[PosedImage]) -> tuple[PointCloud 
     DataError
         The file of that name is broken.
     """
-    beside = sorted(path for path in root.glob("*.ply") if path.name not in _TRUTHS)
-    named = [root / name for name in _NAMES if (root / name) in beside]
+    beside = [path for path in files_ending(root, ".ply") if path.name.lower() not in _TRUTHS]
+    named = [path for name in _NAMES if (path := in_any_case(root, name)) in beside]
     if not beside or not frames:
         return None, []
     if not named and len(beside) > 1:

@@ -14,6 +14,7 @@ from gs2d.core.arrays import read_npz
 from gs2d.core.camera import Camera
 from gs2d.core.images import image_size, is_number, natural_key
 from gs2d.data.build import Capture, PosedImage
+from gs2d.data.file_names import in_any_case
 from gs2d.data.priors import ObservedPoints
 from gs2d.data.readers.colmap import (
     ColmapCamera,
@@ -163,7 +164,7 @@ def dtu_silhouettes(root: Path) -> tuple[DtuSilhouette, ...]:
 
 def _matrices_of(root: Path, model: _Model | None) -> tuple[Path, dict[int, np.ndarray], dict[int, np.ndarray]]:
     """Return the archive, its world_mat and its scale_mat: of two, the one whose frame is that of ``sparse/0``."""
-    paths = [root / name for name in CAMERA_FILES if (root / name).is_file()]
+    paths = camera_archives(root)
     if not paths:
         raise DataError(f"{root} must hold {' or '.join(CAMERA_FILES)}, got neither")
     if len(paths) > 1 and model is not None:
@@ -177,6 +178,11 @@ def _matrices_of(root: Path, model: _Model | None) -> tuple[Path, dict[int, np.n
             if _same_places(centers, model):
                 return path, world, scale
     return (paths[0], *_read_matrices(paths[0]))
+
+
+def camera_archives(root: Path) -> list[Path]:
+    """Return the files of projection matrices that a folder has, the preferred one first."""
+    return [path for name in CAMERA_FILES if (path := in_any_case(root, name)).is_file()]
 
 
 def _read_matrices(path: Path) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
@@ -205,8 +211,8 @@ def _read_matrices(path: Path) -> tuple[dict[int, np.ndarray], dict[int, np.ndar
 
 def _files(root: Path, names: Sequence[str]) -> list[Path]:
     for name in names:
-        if (root / name).is_dir():
-            found = [p for p in (root / name).iterdir() if p.suffix.lower() in _IMAGE_SUFFIXES]
+        if (folder := in_any_case(root, name)).is_dir():
+            found = [p for p in folder.iterdir() if p.suffix.lower() in _IMAGE_SUFFIXES]
             return sorted(found, key=lambda path: natural_key(path.name))
     return []
 
@@ -235,7 +241,7 @@ class _Model:
 
 
 def _read_model(root: Path) -> _Model | None:
-    folder = root / "sparse" / "0"
+    folder = in_any_case(root, "sparse/0")
     kind = find_model(folder)
     if kind is None:
         return None

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from gs2d.core.json_files import read_json
-from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world
-from gs2d.data.file_names import subfolder
+from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world, skipping
+from gs2d.data.file_names import files_ending, in_any_case
 from gs2d.data.readers.common import entries, find_photographs, head, points_beside, real, reals, required, whole
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, Lens
@@ -43,7 +43,7 @@ _FILES = ("cameras.sfm", "sfm.json", "cameras.json")
 
 def scene_file(root: Path) -> Path | None:
     """Find the file of a folder with a scene of AliceVision with poses: ``cameras.sfm`` first; None without."""
-    files = [root / name for name in _FILES] + sorted(root.glob("*.sfm"))
+    files = [in_any_case(root, name) for name in _FILES] + files_ending(root, ".sfm")
     return next((path for path in files if _is_scene(path)), None)
 
 
@@ -88,12 +88,13 @@ def read_alicevision(root: Path) -> Capture:
     for index, view in enumerate(views):
         written = str(required(view, "path", f"{path}: view {index}"))
         in_rig = "rigId" in view and not _is_independent(view, shared[_pose_id(view)])
-        T = _pose(view, poses, rigs if in_rig else None, f"{path}: view {written}")
-        if isinstance(T, str):
-            skipped.append(f"{_label(written)}: {T}")
-        else:
-            placed.append((view, written, T))
-    photographs = find_photographs([written for _, written, _ in placed], [subfolder(root, "images"), root], path)
+        with skipping(_label(written), skipped):
+            T = _pose(view, poses, rigs if in_rig else None, f"{path}: view {written}")
+            if isinstance(T, str):
+                skipped.append(f"{_label(written)}: {T}")
+            else:
+                placed.append((view, written, T))
+    photographs = find_photographs([written for _, written, _ in placed], [in_any_case(root, "images"), root], path)
     for view, written, T in placed:
         photo = photographs[written]
         if photo.path is None:
@@ -102,8 +103,9 @@ def read_alicevision(root: Path) -> Capture:
         key = str(view.get("intrinsicId"))
         if key not in cameras:
             raise DataError(f"{path}: intrinsics must hold {key} of view {_label(written)}, got {sorted(cameras)[:9]}")
-        k = _intrinsics(cameras[key], version, f"{path}: intrinsic {key}")
-        frames.append(PosedImage(photo.name, photo.path, k, T))
+        with skipping(_label(written), skipped):
+            k = _intrinsics(cameras[key], version, f"{path}: intrinsic {key}")
+            frames.append(PosedImage(photo.name, photo.path, k, T))
     points, notes = _points(data, path), list[str]()
     if points is None:
         points, notes = points_beside(root, frames)

@@ -24,9 +24,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world
+from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world, skipping
 from gs2d.data.faces import panorama
-from gs2d.data.file_names import subfolder
+from gs2d.data.file_names import files_ending, in_any_case
 from gs2d.data.readers.common import find_photographs, head, points_beside, real, reals, whole
 from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.errors import DataError
@@ -51,7 +51,7 @@ _SAME = Similarity(1.0, np.eye(3), np.zeros(3))
 
 def camera_file(root: Path) -> Path | None:
     """Find the XML file with Metashape's cameras: ``cameras.xml``, else the first by name; or None."""
-    files = sorted(root.glob("*.xml"), key=lambda path: (path.name.lower() != "cameras.xml", path.name))
+    files = sorted(files_ending(root, ".xml"), key=lambda path: (path.name.lower() != "cameras.xml", path.name))
     return next((path for path in files if b"<document" in (begins := head(path)) and b"<chunk" in begins), None)
 
 
@@ -77,8 +77,9 @@ def read_metashape(root: Path) -> Capture:
     world = _world(chunk, component, path)
     poses = [(pose.camera, pose.label, _to_world(pose.M, world)) for pose in placed if pose.component == component]
     poses, moved = _off_the_globe(poses)
-    photographs = find_photographs([label for _, label, _ in poses], [subfolder(root, "images"), root], path)
-    frames, lost = [], [*skipped, *more]
+    photographs = find_photographs([label for _, label, _ in poses], [in_any_case(root, "images"), root], path)
+    frames: list[PosedImage] = []
+    lost = [*skipped, *more]
     for camera, label, M in poses:
         where = f"{path}: camera {label}"
         photo = photographs[label]
@@ -88,9 +89,10 @@ def read_metashape(root: Path) -> Capture:
         key = camera.get("sensor_id", "")
         if key not in sensors:
             raise DataError(f"{path} must hold sensor {key!r} of camera {label}, got {sorted(sensors)[:9]}")
-        k = _intrinsics(sensors[key], f"{path}: sensor {key}")
-        T = pose_from_camera_to_world(M, f"{where}: transform", opengl=False)
-        frames.append(PosedImage(photo.name, photo.path, k, T))
+        with skipping(label, lost):
+            k = _intrinsics(sensors[key], f"{path}: sensor {key}")
+            T = pose_from_camera_to_world(M, f"{where}: transform", opengl=False)
+            frames.append(PosedImage(photo.name, photo.path, k, T))
     points, said = points_beside(root, frames)
     return Capture("metashape", tuple(frames), points, skipped=tuple(lost), notes=(*notes, *moved, *said))
 

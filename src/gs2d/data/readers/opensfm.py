@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from gs2d.core.images import image_size
 from gs2d.core.json_files import read_json
-from gs2d.data.build import Capture, PosedImage
+from gs2d.data.build import Capture, PosedImage, skipping
 from gs2d.data.faces import panorama
-from gs2d.data.file_names import subfolder
+from gs2d.data.file_names import in_any_case
 from gs2d.data.readers.common import entries, find_photographs, real, reals, required, whole
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, Lens
@@ -41,7 +41,7 @@ FILES = ("reconstruction.json", "opensfm/reconstruction.json")
 
 def reconstruction_file(root: Path) -> Path | None:
     """Return the file of a data set of OpenSfM, or of a project of OpenDroneMap; None where there is none."""
-    return next((root / name for name in FILES if (root / name).is_file()), None)
+    return next((path for name in FILES if (path := in_any_case(root, name)).is_file()), None)
 
 
 def read_opensfm(root: Path) -> Capture:
@@ -63,11 +63,10 @@ def read_opensfm(root: Path) -> Capture:
     shots = entries(required(reconstruction, "shots", str(path)), f"{path}: shots")
     frames: list[PosedImage] = []
     skipped: list[str] = []
-    photographs = find_photographs(list(shots), [*(subfolder(home, "images") for home in homes), root], path)
+    photographs = find_photographs(list(shots), [*(in_any_case(home, "images") for home in homes), root], path)
     for name, shot in shots.items():
         where = f"{path}: shot {name}"
         shot = entries(shot, where)
-        T = _pose(shot, where)
         photo = photographs[name]
         if photo.path is None:
             skipped.append(f"{name}: {photo.reason}")
@@ -75,8 +74,9 @@ def read_opensfm(root: Path) -> Capture:
         key = str(required(shot, "camera", where))
         if key not in cameras:
             raise DataError(f"{path}: cameras must hold {key!r} of shot {name}, got {sorted(cameras)[:9]}")
-        k = _intrinsics(entries(cameras[key], f"{path}: camera {key}"), photo.path, f"{path}: camera {key}")
-        frames.append(PosedImage(photo.name, photo.path, k, T))
+        with skipping(name, skipped):
+            k = _intrinsics(entries(cameras[key], f"{path}: camera {key}"), photo.path, f"{path}: camera {key}")
+            frames.append(PosedImage(photo.name, photo.path, k, _pose(shot, where)))
     points = _points(reconstruction.get("points"), path)
     return Capture(
         "opensfm", tuple(frames), points, skipped=tuple(skipped), notes=tuple(notes), mask_homes=tuple(homes)

@@ -13,17 +13,19 @@ import numpy as np
 
 from gs2d.core.images import image_size
 from gs2d.core.json_files import read_json
-from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world
+from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world, skipping
 from gs2d.data.faces import panorama
-from gs2d.data.file_names import Files, subfolder
+from gs2d.data.file_names import Files, in_any_case
 from gs2d.data.masks import FOLDER
 from gs2d.data.priors import DEPTHS, NORMALS, MapFiles
 from gs2d.data.readers.common import Photograph, find_photographs
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, Lens
-from gs2d.errors import DataError
+from gs2d.errors import DataError, UnusableViewError
 from gs2d.io.meshes import read_points
 
+TRAIN, TEST = "transforms_train.json", "transforms_test.json"  # of Blender
+CAMERAS = "transforms.json"  # of nerfstudio and instant-ngp
 _LARGEST = 1e300  # JSON has whole numbers of any size
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 _FISHEYE = {"OPENCV_FISHEYE", "FISHEYE"}
@@ -42,7 +44,7 @@ def read_blender(root: Path) -> Capture:
     DataError
         A broken or incomplete JSON file; names the file, the frame and the key.
     """
-    train, test = (root / f"transforms_{split}.json" for split in ("train", "test"))
+    train, test = (in_any_case(root, name) for name in (TRAIN, TEST))
     if test.is_file():
         entries = [*_entries(train, _read_meta(train), "train"), *_entries(test, _read_meta(test), "test")]
     else:
@@ -64,7 +66,7 @@ def read_nerfstudio(root: Path) -> Capture:
     DataError
         A broken or incomplete JSON file; names the file, the frame and the key.
     """
-    path = root / "transforms.json"
+    path = in_any_case(root, CAMERAS)
     meta = _read_meta(path)
     frames, skipped, notes = _read_frames(_entries(path, meta, None), path)
     frames, unlisted = _named_split(path, meta, frames)
@@ -118,21 +120,19 @@ def _read_frames(entries: Sequence[_Entry], path: Path) -> tuple[list[PosedImage
             continue
         for key, found in zip(_NAMED, (masks, depths, normals), strict=True):
             lost[_WHAT[key]] += entry.frame.get(key) is not None and found[index] is None
-        pose = pose_from_camera_to_world(
-            _required(entry.frame, "transform_matrix", entry.where),
-            f"{entry.where} ({entry.name}): transform_matrix",
-            opengl=True,
-        )
-        intrinsics = frame_intrinsics(entry.both, photo.path, f"{entry.where} ({entry.name})")
-        maps = _maps_of(entry, depths[index], normals[index])
-        frames.append(PosedImage(photo.name, photo.path, intrinsics, pose, entry.split, mask=masks[index], maps=maps))
+        maps, where = _maps_of(entry, depths[index], normals[index]), f"{entry.where} ({entry.name})"
+        with skipping(entry.name, skipped):
+            matrix = _required(entry.frame, "transform_matrix", entry.where)
+            pose = pose_from_camera_to_world(matrix, f"{where}: transform_matrix", opengl=True)
+            k = frame_intrinsics(entry.both, photo.path, where)
+            frames.append(PosedImage(photo.name, photo.path, k, pose, entry.split, mask=masks[index], maps=maps))
     notes = [f"{count} {what}s named in {path.name} do not exist" for what, count in lost.items() if count]
     return frames, skipped, notes
 
 
 def _photographs(names: Sequence[str], path: Path) -> dict[str, Photograph]:
     root = path.parent
-    return find_photographs(names, [subfolder(root, "images"), root], path, base=root, homes=[root])
+    return find_photographs(names, [in_any_case(root, "images"), root], path, base=root, homes=[root])
 
 
 def _entries(path: Path, meta: Mapping[str, Any], split: str | None) -> list[_Entry]:
@@ -194,7 +194,8 @@ def frame_intrinsics(entry: Mapping[str, Any], image: Path, where: str) -> Intri
         if value is None:
             return None
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _LARGEST:
-            raise DataError(f"{where}: {key} must be a finite number, got {str(value)[:40]!r}")
+            kind = UnusableViewError if isinstance(value, float) and not math.isfinite(value) else DataError
+            raise kind(f"{where}: {key} must be a finite number, got {str(value)[:40]!r}")
         return float(value)
 
     w, h = number("w"), number("h")

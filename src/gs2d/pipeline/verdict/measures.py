@@ -17,8 +17,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.json_files import read_json
 from gs2d.core.transforms import focus_point, up_direction
 from gs2d.data import Scene, View
-from gs2d.data.priors import ObservedPoints
-from gs2d.errors import DataError, RecipeError, RunError
+from gs2d.errors import RecipeError, RunError
 from gs2d.evaluation.hidden_points import hidden_points
 from gs2d.evaluation.images import ImageMetrics, psnr_float
 from gs2d.pipeline.exposure import GREY, matched_by_halves, over
@@ -121,12 +120,7 @@ class Collector:
         self._background = background
         self._views: dict[str, ViewMeasures] = {}
         self._failure: Exception | None = None
-        self._observed: ObservedPoints | None = None
-        if scene.observe is not None:
-            try:
-                self._observed = scene.observe()
-            except DataError:
-                self._observed = None  # a capture without sparse points: there is no such figure
+        self._observed = scene.observed(guessed=False)  # None: there is no such figure
 
     @property
     def views(self) -> tuple[ViewMeasures, ...]:
