@@ -288,8 +288,8 @@ def test_what_photographs_show_is_read_once_until_it_is_forgotten(tmp_path: Path
 def test_a_model_without_points_cannot_say_which_are_seen(tmp_path: Path) -> None:
     small_colmap(tmp_path, points=[])
     scene = load_scene(tmp_path)
-    with pytest.raises(DataError, match="must hold sparse points in points3D.bin"):
-        scene.observe()
+    assert "must hold sparse points in points3D.bin" in scene.unobserved()
+    assert scene.observed() is None
 
 
 def test_other_formats_do_not_say_which_points_are_seen(tmp_path: Path) -> None:
