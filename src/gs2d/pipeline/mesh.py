@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gs2d.core.files import disk_error
+from gs2d.core.files import disk_error, is_full
 from gs2d.core.georeference import Georeference
 from gs2d.core.memory_limit import memory_budget
 from gs2d.core.splats import Splats
@@ -74,15 +74,21 @@ class MeshFrames:
         self.spool = Spool()
 
     def visit(self, seen: SeenView, scores: ImageMetrics) -> None:
-        """Keep what is fused of a training view.
+        """Keep what is fused of a training view; without any one of them, the mesh renders all again.
 
         Raises
         ------
         DiskError
+            The disk is full.
         """
-        if seen.split == "train":
+        if seen.split != "train":
+            return
+        try:
             frame = fusion_frame(self._job, seen.view, seen.output, self._job.protocol.fused_depth, self._reach)
             self.spool.append(depth_map(frame))
+        except Exception as error:  # must not cost the scores; the mesh meets and reports it
+            if is_full(error):
+                raise
 
     @property
     def complete(self) -> bool:

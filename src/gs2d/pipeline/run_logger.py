@@ -16,18 +16,21 @@ from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.errors import DivergedError, Gs2dError
 from gs2d.evaluation.images import ImageMetrics
-from gs2d.io.run_dir import VERDICT, RunFolder, load_tensors
-from gs2d.pipeline.attempts import attempted
+from gs2d.io.run_dir import SPLATS, VERDICT, RunFolder, load_tensors
+from gs2d.io.splat_ply import write_splats
+from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.changes import Snapshot, mean_changes, take_snapshot
 from gs2d.pipeline.estimate import start_text
 from gs2d.pipeline.events import Notice, OnEvent, Phase, StageDone, Step
-from gs2d.pipeline.exposure import Transforms, named
+from gs2d.pipeline.exposure import Transforms, named, write_exposures
 from gs2d.pipeline.interruption import HeldSignals
 from gs2d.pipeline.job import Job
 from gs2d.pipeline.loss_reports import report_losses
 from gs2d.pipeline.memory import release_buffers
 from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.photometry import write_photometries
 from gs2d.pipeline.predicted_exposure import metered, with_predicted
+from gs2d.pipeline.refined_poses import NONE, found_poses, write_poses
 from gs2d.pipeline.render import choose_views, draw_stage
 from gs2d.pipeline.resume import ResumePoint, put_in_cache
 from gs2d.pipeline.scoring import (
@@ -264,29 +267,58 @@ class RunLogger:
             return
         self._stop_clock()
         for split, views in self._scored(last=False):
-            scores = self._score(split, views, f"scoring after the clone ({split})")
-            self._at_entry |= split_metrics(scores, split, of=len(self._views(split)))
+            with attempted(f"scores of {split} views after the clone", "", self._on_event):
+                scores = self._score(split, views, f"scoring after the clone ({split})")
+                self._at_entry |= split_metrics(scores, split, of=len(self._views(split)))
         self._run.events.append({"kind": "after_clone", "stage": event.stage, **self._at_entry})
         self._phase()
         self._start_clock()
 
     def _finish_stage(self, index: int) -> None:
         self._save(index, None)
+        if self._is_last(index):
+            self._write_results()
         self._signals.release()
         release_buffers()  # scoring has its own
-        self._score_stage(index)
+        with self._attempted_at_end(index):
+            self._score_stage(index)
         if index + 1 < len(self._job.recipe.stages):
             self._phase()
 
     def _finish_reused(self, state: TrainState) -> None:
         """Pictures of the stages taken over, and the scores of one that was killed before it was scored."""
-        stages = self._run.metrics()["stages"]
-        if state.stage > 0 and len(stages) < state.stage:
-            self._score_stage(state.stage - 1)
-        elif state.stage > 0 and self._is_last(state.stage - 1) and (self._unseen or is_partial(stages[-1])):
-            self._score_stage(state.stage - 1, taken_over=stages[-1])  # the last one here: every view has to be seen
-        elif state.stage > 0:
-            self._draw(self._stage(state.stage - 1).name)
+        stages, index = self._run.metrics()["stages"], state.stage - 1
+        if index < 0:
+            return
+        if self._is_last(index):
+            self._write_results()
+        with self._attempted_at_end(index):
+            if len(stages) <= index:
+                self._score_stage(index)
+            elif self._is_last(index) and (self._unseen or is_partial(stages[-1])):
+                self._score_stage(index, taken_over=stages[-1])  # the last one here: every view has to be seen
+            else:
+                self._draw(self._stage(index).name)
+
+    def _write_results(self) -> None:
+        """Write the splats and what belongs to them, before anything that is made of them can fail."""
+        run, job, state = self._run, self._job, self._state
+        with attempted("learned cameras and exposures", None, self._on_event):
+            now = scene_now(state, job.scene)
+            poses = NONE if job.recipe.poses is None else found_poses(job.scene, now)
+            write_exposures(run, named(job.scene.train, state.exposures), self._on_event)
+            write_poses(run, job.scene, poses, self._on_event)
+            write_photometries(run, now, self._on_event)
+        write_splats(run.file(SPLATS), state.splats)
+
+    @contextmanager
+    def _attempted_at_end(self, index: int) -> Iterator[None]:
+        """After the last stage, report an error and go on; before it, raise it."""
+        if not self._is_last(index):
+            yield
+            return
+        with attempted(f"scores of stage {self._stage(index).name}", again("evaluate", self._run.path), self._on_event):
+            yield
 
     def _score_stage(self, index: int, taken_over: Mapping[str, Any] = MappingProxyType({})) -> None:
         """Score a finished stage, draw it, write its entry of metrics.json, put it in the cache.
@@ -315,8 +347,12 @@ class RunLogger:
                 outputs[seen.view.name] = seen.output
 
         for split, views in self._scored(last=last):
-            scores = self._score(split, views, f"scoring {split} views", [keep, *(self._visitors if last else ())])
-            entry |= split_metrics(scores, split, of=len(self._views(split)))
+            entry |= {split: None, f"{split}_reason": "its views could not be scored"}
+            with attempted(f"scores of {split} views, stage {stage.name}", None, self._on_event):
+                visitors = [keep, *(self._visitors if last else ())]
+                scores = self._score(split, views, f"scoring {split} views", visitors)
+                del entry[f"{split}_reason"]
+                entry |= split_metrics(scores, split, of=len(self._views(split)))
         with attempted(f"what the losses say of stage {stage.name}", None, self._on_event):
             assert self._trainer is not None
             entry |= report_losses(self._run, self._trainer, self._job.scene.train)

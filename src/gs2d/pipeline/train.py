@@ -26,10 +26,8 @@ from gs2d.io.run_dir import (
     make_folder,
     remove_made,
 )
-from gs2d.io.splat_ply import write_splats
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Event, Expected, Notice, OnEvent, Phase, Plan, ignore
-from gs2d.pipeline.exposure import Transforms, named, write_exposures
 from gs2d.pipeline.job import Job, check_train_options, prepare_job
 from gs2d.pipeline.live import open_live
 from gs2d.pipeline.memory import release, use_memory
@@ -38,12 +36,10 @@ from gs2d.pipeline.observer import TrainingObserver
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.page import page_run
 from gs2d.pipeline.photographs import PREPARED
-from gs2d.pipeline.photometry import write_photometries
 from gs2d.pipeline.plan import TRAINED
 from gs2d.pipeline.planned import plan_notices
 from gs2d.pipeline.processes import connected, follow, lead, memory_of
 from gs2d.pipeline.quality import by_quality
-from gs2d.pipeline.refined_poses import NONE, found_poses, write_poses
 from gs2d.pipeline.report import report_run
 from gs2d.pipeline.resume import ResumePoint, check_sources, choose_start
 from gs2d.pipeline.run_logger import RunLogger
@@ -130,20 +126,14 @@ def _train(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> Ru
                 on_event(event)
         hold()
         if options.part is not None:
-            splats, exposures, _ = train_stages(run, job, options, start, watch)
+            train_stages(run, job, options, start, watch)
             release(job.scene)
-            write_exposures(run, exposures, on_event)
-            write_splats(run.file(SPLATS), splats)
             return run
         collected = Collector(job.scene, job.settings.background)
         with MeshFrames(job) as frames:
             visitors = [frames.visit, collected.visit]
-            splats, exposures, now = train_stages(run, job, options, start, watch, visitors, together)
-            poses = NONE if job.recipe.poses is None else found_poses(job.scene, now)
+            splats, now = train_stages(run, job, options, start, watch, visitors, together)
             release(job.scene)  # before the volume of the mesh
-            write_exposures(run, exposures, on_event)
-            write_poses(run, job.scene, poses, on_event)
-            write_photometries(run, now, on_event)
             job = replace(job, scene=now)
             mesh = MeshOptions(subject_box=options.subject_box, whole_scene=options.whole_scene)
             finish(run, job, splats, mesh, on_event, frames, collected, with_page=options.page)
@@ -224,10 +214,10 @@ def train_stages(
     watch: TrainingObserver,
     visitors: Sequence[Visitor] = (),
     together: OneProcess = ONE_PROCESS,
-) -> tuple[Splats, Transforms, Scene]:
-    """Train from where ``start`` is to the end of the last stage; splats, exposures, and the cameras as they are now.
+) -> tuple[Splats, Scene]:
+    """Train from where ``start`` is to the end of the last stage; return the splats and the cameras as they are now.
 
-    ``visitors`` see every view of the finished splats.
+    The splats are written before they are scored. ``visitors`` see every view of the finished splats.
     """
     from gs2d.training.per_image import scene_now
     from gs2d.training.trainer import Trainer
@@ -268,7 +258,7 @@ def train_stages(
     with recorder.ending_well():
         trainer.run()
     state = trainer.state
-    return state.splats, named(job.scene.train, state.exposures), scene_now(state, job.scene)
+    return state.splats, scene_now(state, job.scene)
 
 
 def pretraining_notices(job: Job) -> list[Event]:
@@ -296,8 +286,7 @@ def finish(
     *,
     with_page: bool,
 ) -> None:
-    """Write what the user came for: the splats, and then each thing that is made of them, whatever the others do."""
-    write_splats(run.file(SPLATS), splats)
+    """Write each thing that is made of the splats of a run, whatever the others do."""
     with attempted(MESH, again("mesh", run.path), on_event):
         subject = meshed_subject(run, job, splats, mesh, on_event)
         if not (run.file(MESH).exists() and "mesh" in run.metrics()):  # a kill may come between the two

@@ -1,0 +1,97 @@
+"""Once training is over, the splats are written first, and no later step can end the run."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ball_runs import SCALE, SMALL, options
+from gs2d.cli import run as gs2d
+from gs2d.errors import DataError
+from gs2d.io.run_dir import RunFolder
+from gs2d.io.splat_ply import read_splats
+from gs2d.pipeline.events import Event, MissingFile
+from gs2d.pipeline.train import train
+
+LATER = {  # of a training, with what is missing then
+    "run_logger.write_exposures": "learned cameras and exposures",
+    "run_logger.write_poses": "learned cameras and exposures",
+    "run_logger.write_photometries": "learned cameras and exposures",
+    "run_logger.score_views": "scores of train views, stage refine",
+    "run_logger.split_metrics": "scores of train views, stage refine",
+    "run_logger.report_losses": "what the losses say of stage refine",
+    "run_logger.draw_stage": "pictures of stage refine",
+    "run_logger.StageDone": "scores of stage refine",
+    "mesh.fusion_frame": "mesh.ply",
+    "verdict.measures.Collector._measure": "verdict.json",
+    "train.meshed_subject": "mesh.ply",
+    "train.extract_mesh": "mesh.ply",
+    "train.keep_facts": "mesh.ply",
+    "train.page_run": "scene.html",
+    "train.write_verdict": "verdict.json",
+    "train.report_run": "report.html",
+}
+
+
+def failing(error: Exception) -> Callable[..., Any]:
+    def fail(*_args: Any, **_kwargs: Any) -> None:
+        raise error
+
+    return fail
+
+
+@pytest.fixture
+def trained(undisturbed: RunFolder, tmp_path: Path) -> Path:
+    """A run that was killed when its last iteration was done: the checkpoints are all that it has of its last stage."""
+    copy = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
+    for name in ("splats.ply", "mesh.ply", "scene.html", "verdict.json", "report.html", "subject.json"):
+        copy.file(name).unlink()
+    copy.write_metrics({"stages": copy.metrics()["stages"][:-1], "surface": None})
+    return copy.path
+
+
+@pytest.mark.parametrize("place", LATER)
+@pytest.mark.parametrize("error", [DataError("the points are gone"), ZeroDivisionError("a fault")], ids=["data", "any"])
+def test_a_step_that_fails_after_training_is_named_and_costs_no_splats(
+    place: str,
+    error: Exception,
+    capture: Path,
+    undisturbed: RunFolder,
+    trained: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(f"gs2d.pipeline.{place}", failing(error))
+    words = ["train", str(capture), "--out", str(trained), "--schedule-scale", str(SCALE), "--recipe", "2dgs-r"]
+    words += [word for override in SMALL for word in ("--set", override)]
+    code = gs2d([*words, "--threads", "1", "--checkpoint-every", "4", "--resume"])
+    told = " ".join(capsys.readouterr().err.split())
+    assert code == 3
+    assert f"not made {LATER[place]}: " in told
+    assert str(error) in told
+    assert (trained / "splats.ply").read_bytes() == undisturbed.file("splats.ply").read_bytes()
+
+
+def test_a_training_whose_views_cannot_be_scored_has_its_splats(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gs2d.pipeline.run_logger.score_views", failing(DataError("no points")))
+    heard: list[Event] = []
+    run = train(options(capture, tmp_path / "run", page=False), heard.append)
+    assert len(read_splats(run.file("splats.ply"))) > 0
+    missing = [event.what for event in heard if isinstance(event, MissingFile)]
+    assert [what for what in missing if what.endswith("refine")] == [
+        "scores of train views, stage refine",
+        "scores of test views, stage refine",
+    ]
+    assert run.metrics()["stages"][-1]["train"] is None
+    assert {"mesh.ply", "report.html"} <= {path.name for path in run.path.iterdir()}
+    monkeypatch.undo()
+    run = train(options(capture, run.path, page=False, resume=True))
+    assert run.metrics()["stages"][-1]["train"]["psnr"] > 0
+    assert "train_reason" not in run.metrics()["stages"][-1]
+    assert run.file("verdict.json").exists()
