@@ -270,7 +270,6 @@ def test_terms_of_one_kind_add_up() -> None:
     ("change", "error", "words"),
     [
         ({"backend": "metal"}, BackendError, "cpu"),
-        ({"terms": [LossTerm("l3", 1.0)]}, RecipeError, "l3"),
         ({"terms": [LossTerm("distortion", None)]}, RecipeError, "no weight"),
         ({"target": torch.zeros(8, 8, 3)}, ShapeError, "target"),
         ({"mask": torch.ones(9, 8, dtype=torch.bool)}, ShapeError, "mask"),

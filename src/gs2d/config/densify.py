@@ -26,7 +26,7 @@ register_densifier = DENSIFIERS.register
 
 @dataclass(frozen=True)
 class Densify:
-    """A densifier by its name; ``GradDensify`` is that of 2DGS and of AbsGS, with their numbers as fields.
+    """A registered densifier, by its name; ``GradDensify`` is that of 2DGS and of AbsGS, with their numbers as fields.
 
     Attributes
     ----------
@@ -34,10 +34,18 @@ class Densify:
     options : mapping of str to values of JSON
         The keyword arguments of its constructor. ``start`` and ``stop``, where it has them, are iterations of the
         stage, and scale with the schedule.
+
+    Raises
+    ------
+    RecipeError
+        If no densifier has this name.
     """
 
     name: str
     options: Mapping[str, Any] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        DENSIFIERS.check(self.name)
 
     @property
     def stop(self) -> int:

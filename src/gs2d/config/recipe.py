@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any
 
-from gs2d.config.densify import DENSIFIERS, Densify
+from gs2d.config.densify import Densify
 from gs2d.config.losses import LOSSES
 from gs2d.config.multiview import MULTIVIEW_KINDS, MultiView, check_multiview
 from gs2d.config.priors import DepthPrior, NormalPrior, check_priors
@@ -71,6 +71,11 @@ class LossTerm:
         written, not multiplied by ``every``.
     required : bool
         Of silhouette: whether photographs must have an alpha channel; if not, those without do without the term.
+
+    Raises
+    ------
+    RecipeError
+        If no loss of this kind is registered.
     """
 
     kind: str
@@ -83,6 +88,9 @@ class LossTerm:
     edge_power: float = field(default=0.0, metadata={"omit_empty": True})
     every: int = field(default=1, metadata={"omit_empty": True})
     required: bool = field(default=True, metadata={"omit_empty": True})
+
+    def __post_init__(self) -> None:
+        LOSSES.check(self.kind)
 
     def is_active(self, iteration: int) -> bool:
         """Whether an iteration (from 1) of the stage has this term."""
@@ -402,8 +410,8 @@ class Recipe:
         return sum(stage.iterations for stage in self.stages)
 
 
-def validate(recipe: Recipe, *, to_train: bool = True) -> Recipe:
-    """Check that a recipe can be trained as written; returns it. Not ``to_train``: names may be those of absent guests.
+def validate(recipe: Recipe) -> Recipe:
+    """Check that a recipe can be trained as written; returns it.
 
     Raises
     ------
@@ -446,11 +454,11 @@ def validate(recipe: Recipe, *, to_train: bool = True) -> Recipe:
         )
     groups: list[str] = []
     for stage in recipe.stages:
-        _check_stage(f"stage {stage.name!r}", stage, groups, to_train)
+        _check_stage(f"stage {stage.name!r}", stage, groups)
     return recipe
 
 
-def _check_stage(where: str, stage: Stage, groups: list[str], to_train: bool) -> None:
+def _check_stage(where: str, stage: Stage, groups: list[str]) -> None:
     """Check one stage; ``groups`` are the row groups written so far, and is extended."""
     integer(f"{where}: iterations", stage.iterations, low=0)
     integer(f"{where}: sh_interval", stage.sh_interval, low=0)
@@ -477,7 +485,7 @@ def _check_stage(where: str, stage: Stage, groups: list[str], to_train: bool) ->
         one_of(f"{where}: train", attribute, ALL)
         if rows != "all":
             group(f"{where}: train[{attribute!r}]", rows, groups)
-    _check_losses(where, stage, to_train)
+    _check_losses(where, stage)
     for entry in fields(LearningRates):
         number(f"{where}: lr.{entry.name}", getattr(stage.lr, entry.name), low=0.0)
     require(
@@ -491,17 +499,13 @@ def _check_stage(where: str, stage: Stage, groups: list[str], to_train: bool) ->
     for name in ("settle_start", "settle_steps"):
         integer(f"{where}: lr.{name}", getattr(stage.lr, name), low=0)
     require(stage.lr.settle_factor <= 1, f"{where}: lr.settle_factor must be at most 1, got {stage.lr.settle_factor}")
-    if isinstance(stage.densify, Densify):
-        name = stage.densify.name
-        require(not to_train or name in DENSIFIERS, f"{where}: {DENSIFIERS.unknown(name)}")
-    elif stage.densify is not None:
+    if isinstance(stage.densify, GradDensify):
         _check_densify(f"{where}: densify", stage.densify, stage)
 
 
-def _check_losses(where: str, stage: Stage, to_train: bool) -> None:
+def _check_losses(where: str, stage: Stage) -> None:
     kinds = [term.kind for term in stage.losses]
     for term in stage.losses:
-        require(not to_train or term.kind in LOSSES, f"{where}: {LOSSES.unknown(term.kind)}")
         guest = term.kind not in LOSSES.builtin
         require(guest or not term.options, f"{where}: loss {term.kind!r} takes no options, got {dict(term.options)}")
         require(kinds.count(term.kind) == 1, f"{where}: loss {term.kind!r} is there twice; add up the weights")

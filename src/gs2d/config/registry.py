@@ -9,6 +9,8 @@ from __future__ import annotations
 import difflib
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
@@ -16,10 +18,21 @@ from typing import Any, Generic, TypeVar
 
 from gs2d.errors import Gs2dError, PluginWarning
 
-__all__ = ["Registry", "did_you_mean"]
+__all__ = ["Registry", "absent_guests", "did_you_mean"]
 
 T = TypeVar("T")
 U = TypeVar("U")
+_ABSENT = ContextVar("absent guests", default=False)
+
+
+@contextmanager
+def absent_guests() -> Iterator[None]:
+    """Accept names that nothing has: the recipe of a finished run may name what is no longer installed."""
+    token = _ABSENT.set(True)
+    try:
+        yield
+    finally:
+        _ABSENT.reset(token)
 
 
 class Registry(Generic[T]):
@@ -100,6 +113,20 @@ class Registry(Generic[T]):
         names = (*also, *self.names())
         return f"{self.what} must be one of {', '.join(names)}, got {name!r}{did_you_mean(name, names)}"
 
+    def check(self, name: object) -> None:
+        """Raise for a name that a recipe gives and nothing has, unless :func:`absent_guests` allows it.
+
+        Nothing is imported. Names of this program must be registered before a recipe gives them.
+
+        Raises
+        ------
+        Gs2dError
+            Lists the names, and the nearest of them.
+        """
+        if name not in self and not _ABSENT.get():
+            text = self.unknown(str(name))
+            raise self._error(text if text.endswith("?") else f"{text}; gs2d.register_{self.what} adds one")
+
     @property
     def builtin(self) -> tuple[str, ...]:
         """The names of what gs2d itself has."""
@@ -132,7 +159,7 @@ class Registry(Generic[T]):
         return str(getattr(self._things.get(name), "__module__", "this program"))
 
     def __contains__(self, name: object) -> bool:
-        return name in self._homes or name in self._things or name in self._offered
+        return isinstance(name, str) and (name in self._homes or name in self._things or name in self._offered)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.names())

@@ -6,9 +6,9 @@ where. Pure Python; never imports torch.
 
 from __future__ import annotations
 
-import contextlib
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import MISSING, Field, fields, is_dataclass
 from functools import cache
 from types import NoneType, UnionType
@@ -16,6 +16,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from gs2d.config.densify import Densify
 from gs2d.config.recipe import CloneInPlace, GradDensify, RankByError, Recipe, validate
+from gs2d.config.registry import absent_guests
 from gs2d.config.renamed import current_names, current_path
 from gs2d.errors import RecipeError
 
@@ -45,9 +46,10 @@ def from_json(data: Mapping[str, Any], *, to_train: bool = True) -> Recipe:
     RecipeError
         Where a key is unknown or missing, or a value has another type.
     """
-    recipe = decode(current_names(data), Recipe, "recipe")
+    with nullcontext() if to_train else absent_guests():
+        recipe = decode(current_names(data), Recipe, "recipe")
     assert isinstance(recipe, Recipe)
-    return validate(recipe, to_train=to_train)
+    return validate(recipe)
 
 
 def apply_overrides(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
@@ -222,7 +224,7 @@ def _decode_plain(value: Any, kind: Any, where: str) -> Any:
     if kind is Any:
         return value
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
-        with contextlib.suppress(OverflowError):  # a whole number of 400 digits is none
+        with suppress(OverflowError):  # a whole number of 400 digits is none
             return float(value)
     if kind is int and isinstance(value, float) and value.is_integer():
         return int(value)
