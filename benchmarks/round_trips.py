@@ -28,7 +28,7 @@ import torch
 from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.errors import BackendError
-from gs2d.io.formats.registry import LAYOUTS, read_disks, write_layout, written_bytes
+from gs2d.io.formats.registry import LAYOUTS, read_splats, write_layout, written_bytes
 from gs2d.io.formats.sog import read_level
 from gs2d.io.run_dir import open_run
 from gs2d.pipeline.finished import finished_splats
@@ -71,7 +71,7 @@ def row(layout: str, splats: Splats, draw: Draw, own: list[np.ndarray], real: li
     write_layout(path, splats, layout)
     written = time.perf_counter() - start
     start = time.perf_counter()
-    back = read_disks(path)
+    back = read_splats(path)
     read = time.perf_counter() - start
     drawn = draw(back)
     furthest = max(float(np.abs(a - b).max()) for a, b in zip(drawn, own, strict=True))

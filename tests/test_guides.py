@@ -61,13 +61,20 @@ def test_the_loss_of_the_tutorial_reaches_the_splats_and_its_recipe_trains(
     assert not torch.equal(plain.splats.opacity_logits, crisp.splats.opacity_logits)
 
 
+def test_the_program_that_optimises_poses_finds_the_cameras() -> None:
+    names = run_blocks(DOCS / "tutorials" / "camera-poses.md", 1)
+    before, after = names["errors"](names["start"]), names["errors"](names["found"])
+    assert before.min() > 0.02
+    assert after.max() < 1e-3
+
+
 def test_the_program_of_the_quickstart_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     write_capture(tmp_path / "capture")
     page = tmp_path / "quickstart.md"
     text = (DOCS / "quickstart.md").read_text(encoding="utf-8")
-    assert "downscale=4), schedule_scale=0.1)" in text
-    text = text.replace("downscale=4), schedule_scale=0.1)", "downscale=1), schedule_scale=0.001)")  # seconds
+    assert "downscale=4), iterations=3000" in text
+    text = text.replace("downscale=4), iterations=3000", "downscale=1), iterations=20")  # seconds
     page.write_text(text, encoding="utf-8")
     run_blocks(page, 1)
     assert (tmp_path / "splats.ply").is_file()
@@ -78,8 +85,8 @@ def test_the_program_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.Monk
     write_capture(tmp_path / "capture")
     page = tmp_path / "README.md"
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert "downscale=4), schedule_scale=0.1)" in text
-    text = text.replace("downscale=4), schedule_scale=0.1)", "downscale=1), schedule_scale=0.001)")  # seconds
+    assert "downscale=4), iterations=3000" in text
+    text = text.replace("downscale=4), iterations=3000", "downscale=1), iterations=20")  # seconds
     page.write_text(text, encoding="utf-8")
     run_blocks(page, 1)
     assert len(gs2d.read_splats(tmp_path / "splats.ply")) > 0

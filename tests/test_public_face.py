@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
 import os
+import re
 import subprocess
 import sys
+from dataclasses import fields, is_dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -15,7 +19,9 @@ import gs2d
 FACE = (
     *("load_scene", "train", "Trainer", "Recipe", "Stage", "get_recipe", "list_recipes", "compute_losses"),
     *("rasterize", "rasterize_2dgs", "splat_errors", "read_splats", "write_splats", "extract_mesh", "evaluate"),
-    *("Camera", "Splats", "Scene", "Mesh"),
+    *("Camera", "Splats", "Scene", "Mesh", "MeshOptions", "TrainOptions", "Protocol", "LossTerm"),
+    *("register_loss", "register_densifier", "register_recipe", "register_reader", "register_backend"),
+    *("register_format", "perturb_pose", "rgb_to_sh0", "normals_from_depth", "write_mesh"),
 )
 
 
@@ -34,6 +40,50 @@ def test_each_name_says_what_it_is(name: str) -> None:
     assert found.__module__.startswith("gs2d.")
     for folder in Path(gs2d.__file__).parent.iterdir():  # a function and a package of one name collide
         assert folder.name != name
+
+
+def documented(text: str) -> dict[str, str]:
+    """Return the names of a docstring's Parameters and Attributes with what is said of them."""
+    found: dict[str, str] = {}
+    for section in re.findall(r"^(?:Parameters|Attributes)\n-+\n(.*?)(?=^\w[^\n]*\n-+$|\Z)", text, re.M | re.S):
+        names: list[str] = []
+        for line in section.splitlines():
+            if match := re.match(r"([\w*]+(?:, [\w*]+)*)(?: : (.*))?$", line):
+                names = match[1].replace("*", "").split(", ")
+                found |= dict.fromkeys(names, match[2] or "")
+            else:
+                found |= {name: found[name] + line for name in names}
+    return found
+
+
+def field_strings(kind: type) -> set[str]:
+    """Return the fields of a class that have a string below them."""
+    body = ast.parse(inspect.getsource(kind)).body[0].body  # type: ignore[attr-defined]
+    pairs = pairwise(body)
+    return {
+        field.target.id
+        for field, below in pairs
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(below, ast.Expr)
+    }
+
+
+@pytest.mark.parametrize("name", [name for name in gs2d.__all__ if name != "__version__"])
+def test_each_parameter_and_field_is_documented_and_each_array_has_a_shape(name: str) -> None:
+    found = getattr(gs2d, name)
+    said = documented(inspect.getdoc(found) or "")
+    if is_dataclass(found):
+        assert isinstance(found, type)
+        own = set().union(*(field_strings(kind) for kind in found.__mro__ if is_dataclass(kind)))
+        wanted = {entry.name for entry in fields(found) if "Suppress" not in str(entry.type)} - own
+    elif inspect.isclass(found) and issubclass(found, Exception):
+        return
+    else:
+        wanted = set(inspect.signature(found).parameters) - {"self"}
+    assert wanted <= set(said), f"{name}: {sorted(wanted - set(said))} are not documented"
+    shapeless = [entry for entry, text in said.items() if re.search("ndarray|Tensor", text) and "[" not in text]
+    assert not shapeless
+    if inspect.isfunction(found) and inspect.signature(found).return_annotation not in ("None", None):
+        assert "Returns\n-------" in (inspect.getdoc(found) or "")
 
 
 def test_importing_gs2d_loads_nothing_else() -> None:

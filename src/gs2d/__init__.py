@@ -9,19 +9,28 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gs2d.config.presets import get_recipe, list_recipes
+    from gs2d.config.densify import register_densifier
+    from gs2d.config.losses import register_loss
+    from gs2d.config.presets import get_recipe, list_recipes, register_recipe
+    from gs2d.config.protocols import Protocol
     from gs2d.config.recipe import LossTerm, Recipe, Stage
     from gs2d.core.camera import Camera, look_at
     from gs2d.core.mesh import Mesh
+    from gs2d.core.sh import rgb_to_sh0
     from gs2d.core.splats import Splats
+    from gs2d.core.transforms import perturb_pose
     from gs2d.data.load import load_scene
+    from gs2d.data.readers.registry import register_reader
     from gs2d.data.scene import Scene
     from gs2d.errors import Gs2dError
-    from gs2d.io.splat_ply import read_splats, write_splats
+    from gs2d.io.formats.registry import read_splats, register_format, write_splats
+    from gs2d.io.meshes import write_mesh
     from gs2d.losses.api import compute_losses
+    from gs2d.losses.reference import normals_from_depth
     from gs2d.pipeline.in_memory import Trained, evaluate, extract_mesh, train
+    from gs2d.pipeline.options import MeshOptions, TrainOptions
     from gs2d.render.api import rasterize, splat_errors
-    from gs2d.render.backends import backend_report, get_backend
+    from gs2d.render.backends import backend_report, get_backend, register_backend
     from gs2d.render.tensor_api import rasterize_2dgs
     from gs2d.render.types import RasterSettings, RenderOutput
     from gs2d.training.trainer import Trainer
@@ -33,12 +42,15 @@ __all__ = [
     "Gs2dError",
     "LossTerm",
     "Mesh",
+    "MeshOptions",
+    "Protocol",
     "RasterSettings",
     "Recipe",
     "RenderOutput",
     "Scene",
     "Splats",
     "Stage",
+    "TrainOptions",
     "Trained",
     "Trainer",
     "__version__",
@@ -51,11 +63,21 @@ __all__ = [
     "list_recipes",
     "load_scene",
     "look_at",
+    "normals_from_depth",
+    "perturb_pose",
     "rasterize",
     "rasterize_2dgs",
     "read_splats",
+    "register_backend",
+    "register_densifier",
+    "register_format",
+    "register_loss",
+    "register_reader",
+    "register_recipe",
+    "rgb_to_sh0",
     "splat_errors",
     "train",
+    "write_mesh",
     "write_splats",
 ]
 
@@ -64,12 +86,15 @@ _HOME = {
     "Gs2dError": "gs2d.errors",
     "LossTerm": "gs2d.config.recipe",
     "Mesh": "gs2d.core.mesh",
+    "MeshOptions": "gs2d.pipeline.options",
+    "Protocol": "gs2d.config.protocols",
     "RasterSettings": "gs2d.render.types",
     "Recipe": "gs2d.config.recipe",
     "RenderOutput": "gs2d.render.types",
     "Scene": "gs2d.data.scene",
     "Splats": "gs2d.core.splats",
     "Stage": "gs2d.config.recipe",
+    "TrainOptions": "gs2d.pipeline.options",
     "Trained": "gs2d.pipeline.in_memory",
     "Trainer": "gs2d.training.trainer",
     "backend_report": "gs2d.render.backends",
@@ -81,12 +106,22 @@ _HOME = {
     "list_recipes": "gs2d.config.presets",
     "load_scene": "gs2d.data.load",
     "look_at": "gs2d.core.camera",
+    "normals_from_depth": "gs2d.losses.reference",
+    "perturb_pose": "gs2d.core.transforms",
     "rasterize": "gs2d.render.api",
     "rasterize_2dgs": "gs2d.render.tensor_api",
-    "read_splats": "gs2d.io.splat_ply",
+    "read_splats": "gs2d.io.formats.registry",
+    "register_backend": "gs2d.render.backends",
+    "register_densifier": "gs2d.config.densify",
+    "register_format": "gs2d.io.formats.registry",
+    "register_loss": "gs2d.config.losses",
+    "register_reader": "gs2d.data.readers.registry",
+    "register_recipe": "gs2d.config.presets",
+    "rgb_to_sh0": "gs2d.core.sh",
     "splat_errors": "gs2d.render.api",
     "train": "gs2d.pipeline.in_memory",
-    "write_splats": "gs2d.io.splat_ply",
+    "write_mesh": "gs2d.io.meshes",
+    "write_splats": "gs2d.io.formats.registry",
 }
 
 

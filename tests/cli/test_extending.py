@@ -16,5 +16,5 @@ def test_every_example_of_the_page_is_a_piece_of_the_package() -> None:
     assert len(examples) == 9
     for language, example in examples:
         assert example in (code if language == "python" else entries), example
-    doors = re.findall(r"^@register_(\w+)", code, flags=re.MULTILINE)
+    doors = re.findall(r"^@gs2d.register_(\w+)", code, flags=re.MULTILINE)
     assert doors == ["loss", "loss", "reader", "densifier", "recipe", "backend", "format"]

@@ -374,3 +374,18 @@ def test_fields_that_came_later_are_written_where_they_say_something_and_can_alw
 def test_a_term_without_options_is_written_as_it_was_before_there_were_any() -> None:
     written = to_json(one(losses=L1))["stages"][0]["losses"][0]
     assert list(written) == ["kind", "weight", "start", "depth"]
+
+
+def test_with_loss_adds_a_term_to_all_stages_or_to_those_that_are_named() -> None:
+    recipe = Recipe("r", (Stage("one", 10, losses=L1), Stage("two", 10, losses=L1)))
+    term = LossTerm("l2", 0.5, start=3)
+    assert [stage.losses for stage in recipe.with_loss(term).stages] == [(*L1, term)] * 2
+    for stages in ("two", ["two"]):
+        assert [stage.losses for stage in recipe.with_loss(term, stages=stages).stages] == [L1, (*L1, term)]
+    assert [stage.losses for stage in recipe.stages] == [L1, L1]
+    with pytest.raises(RecipeError, match="stage of recipe 'r' must be one of one, two; got 'tow'"):
+        recipe.with_loss(term, stages="tow")
+    with pytest.raises(RecipeError, match="stage 'one': loss 'l1' is there twice"):
+        recipe.with_loss(LossTerm("l1", 1.0))
+    with pytest.raises(RecipeError, match="depth_prior is null, but loss 'depth_prior' needs it"):
+        recipe.with_loss(LossTerm("depth_prior", 1.0))

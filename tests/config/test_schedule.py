@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 
 from gs2d.config.presets import RECIPES, get_recipe
-from gs2d.config.recipe import ALL, GradDensify, LearningRates
-from gs2d.config.schedule import count_densifications, longer_steps, scale_schedule
+from gs2d.config.recipe import ALL, GradDensify, LearningRates, validate
+from gs2d.config.schedule import count_densifications, fit_schedule, longer_steps, scale_schedule
 from gs2d.errors import RecipeError
 
 
@@ -175,3 +175,27 @@ def test_steps_are_longer_where_there_are_fewer_and_nothing_else_changes() -> No
     for stage, before in zip(longer_steps(recipe, 1 / 16).stages, recipe.stages, strict=True):
         longer = {name: 2 * getattr(before.lr, name) for name in (*ALL, "means_final")}
         assert stage == replace(before, lr=replace(before.lr, **longer))
+
+
+@pytest.mark.parametrize("name", ["2dgs", "2dgs-r", "2dgs-60k"])
+@pytest.mark.parametrize("total", [3, 41, 1001, 77_777])
+def test_a_schedule_fits_its_total_exactly(name: str, total: int) -> None:
+    recipe = get_recipe(name)
+    fitted = validate(fit_schedule(recipe, total))
+    assert fitted.iterations == total
+    for before, after in zip(recipe.stages, fitted.stages, strict=True):
+        assert abs(after.iterations - max(1, before.iterations * total / recipe.iterations)) <= 1
+    assert fit_schedule(recipe, recipe.iterations) is recipe
+    assert fit_schedule(recipe, 3000 * len(recipe.stages)).stages[0].densify != recipe.stages[0].densify
+
+
+def test_a_total_in_thousandths_is_the_same_schedule_as_the_factor() -> None:
+    assert fit_schedule(get_recipe("2dgs-r"), 6000) == scale_schedule(get_recipe("2dgs-r"), 0.1)
+
+
+@pytest.mark.parametrize("total", [2, 0, -5, 6_000_001, 100.0, True])
+def test_a_total_that_no_stage_can_have_is_refused(total: int) -> None:
+    with pytest.raises(
+        RecipeError, match="iterations must be a whole number from 3 to 6000000 for recipe '2dgs-r', got"
+    ):
+        fit_schedule(get_recipe("2dgs-r"), total)

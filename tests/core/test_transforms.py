@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from gs2d.core.camera import look_at
+from gs2d.core.camera import Camera, look_at
 from gs2d.core.transforms import camera_extent, focus_point, nearest_distances, perturb_pose, quats_to_matrices, se3_exp
 from gs2d.errors import ShapeError
 
@@ -123,3 +124,33 @@ def test_the_extent_is_a_tenth_more_than_the_farthest_camera_from_their_mean() -
 def test_no_cameras_say_nothing(function: object) -> None:
     with pytest.raises(ShapeError, match="needs at least one camera"):
         function([])  # type: ignore[operator]
+
+
+def test_poses_are_moved_in_batches_as_one_camera_is() -> None:
+    generator = torch.Generator().manual_seed(1)
+    motions = 0.3 * torch.randn(2, 3, 6, generator=generator, dtype=torch.float64)
+    poses = perturb_pose(torch.eye(4, dtype=torch.float64), 0.3 * torch.randn(3, 6, generator=generator).double())
+    moved = perturb_pose(poses, motions)
+    assert moved.shape == (2, 3, 4, 4)
+    for i in range(2):
+        for k in range(3):
+            camera = Camera(8, 6, 5.0, 5.0, 4.0, 3.0, poses[k].numpy())
+            np.testing.assert_allclose(moved[i, k], perturb_pose(camera, motions[i, k]).T_cam_world, atol=1e-12)
+    motions = torch.zeros(3, 6, requires_grad=True)
+    perturb_pose(poses, motions)[:, :3, 3].sum().backward()
+    assert motions.grad is not None
+    assert torch.equal(motions.grad[:, 3:], torch.ones(3, 3))
+
+
+@pytest.mark.parametrize(
+    ("poses", "motion", "message"),
+    [
+        (torch.eye(4), torch.zeros(7), r"motion must be \[..., 6\], a rotation vector and a velocity, got \[7\]"),
+        (torch.eye(3), torch.zeros(6), r"poses must be \[..., 4, 4\], got \[3, 3\]"),
+        (torch.eye(4).expand(2, 4, 4), torch.zeros(3, 6), "leading dimensions must broadcast, got poses .* one motion"),
+        (Camera(8, 6, 5.0, 5.0, 4.0, 3.0, np.eye(4)), torch.zeros(2, 6), r"motion must be \[6\] for one camera, got"),
+    ],
+)
+def test_motions_that_fit_no_pose_are_refused(poses: Any, motion: torch.Tensor, message: str) -> None:
+    with pytest.raises(ShapeError, match=message):
+        perturb_pose(poses, motion)

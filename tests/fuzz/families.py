@@ -155,14 +155,14 @@ def as_ascii(name: str) -> Callable[[Path], object]:
 
 def read_splats_everywhere(root: Path) -> None:
     """As `gs2d info`, `gs2d export` and `--init` do."""
-    from gs2d.io.formats.registry import LAYOUTS, read_disks, read_splat_file, read_surfels, write_layout
+    from gs2d.io.formats.registry import LAYOUTS, read_splat_file, read_splats, read_surfels, write_layout
     from gs2d.pipeline.info import describe_file
 
     (path,) = (p for p in root.iterdir() if p.is_file())
     describe_file(path)
     read_splat_file(path)
     read_surfels(path)
-    disks = read_disks(path)
+    disks = read_splats(path)
     for layout in ("2dgs", "3dgs", "compressed", "spz", "splat"):
         write_layout(root / f"out{LAYOUTS.get(layout).ending}", disks, layout)
 

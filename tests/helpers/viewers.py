@@ -36,7 +36,7 @@ from browser import browser, require_browser
 from gs2d.core.camera import look_at
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import transform_splats
-from gs2d.io.formats.registry import LAYOUTS, read_disks, write_layout
+from gs2d.io.formats.registry import LAYOUTS, read_splats, write_layout
 from gs2d.io.formats.sog import read_level
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
@@ -419,7 +419,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--up", type=float, nargs=3, default=(0.0, 0.0, 1.0))
     parser.add_argument("--viewers", nargs="+", choices=list(VIEWERS), default=list(VIEWERS))
     options = parser.parse_args(argv)
-    splats = upright(read_disks(options.run / "splats.ply" if options.run.is_dir() else options.run), options.up)
+    splats = upright(read_splats(options.run / "splats.ply" if options.run.is_dir() else options.run), options.up)
     (options.out / "shots").mkdir(parents=True, exist_ok=True)
     try:
         require_browser()

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
+from gs2d.errors import ShapeError
 from gs2d.losses import reference
 from gs2d.losses.api import normals_from_depth
 from loss_images import make_camera, make_output, plane_depth
@@ -271,3 +272,13 @@ def test_the_silhouette_loss_sees_a_splat_that_has_the_colour_of_the_background(
     assert torch.autograd.grad(value, alpha)[0].tolist() == [[0.25, 0.0], [0.0, 0.0]]
     # Ignoring that pixel leaves nothing wrong among the other three.
     assert reference.silhouette(alpha, wanted, torch.tensor([[False, True], [True, True]])).item() == 0.0
+
+
+def test_normals_of_depth_of_another_size_or_with_unknown_edges_are_refused() -> None:
+    camera, depth = make_camera(9, 8), torch.ones(8, 9, dtype=torch.float64)
+    with pytest.raises(ShapeError, match=r"depth must be \[8, 9\], got \[9, 8\]"):
+        normals_from_depth(depth.T, camera)
+    with pytest.raises(ShapeError, match=r"mask must be \[8, 9\], got \[8, 1\]"):
+        normals_from_depth(depth, camera, torch.ones(8, 1, dtype=torch.bool))
+    with pytest.raises(ShapeError, match="edges must be 'undefined' or 'camera', got 'clamp'"):
+        normals_from_depth(depth, camera, edges="clamp")

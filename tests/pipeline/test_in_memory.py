@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 
 import gs2d
 from ball_runs import SCALE, SMALL
-from gs2d.errors import DataError, RecipeError
+from gs2d.errors import DataError, ProtocolError, RecipeError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.in_memory import Trained
@@ -68,3 +69,29 @@ def test_mistakes_are_named_before_anything_is_trained(trained: Trained) -> None
         gs2d.train(scene, "2dgz")
     with pytest.raises(DataError, match="split must be 'test' or 'train'"):
         gs2d.evaluate(trained, split="val")
+
+
+def test_a_total_of_iterations_is_trained_and_shown(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    events: list[Any] = []
+    small = {"overrides": ("init_points=60",), "backend": "cpu", "on_event": events.append}
+    short = gs2d.train(capture, "2dgs-r", iterations=41, progress=True, **small)
+    assert [stage.iterations for stage in short.recipe.stages] == [20, 7, 14]
+    out, err = capsys.readouterr()
+    assert out == ""
+    for stage in short.recipe.stages:
+        assert re.search(
+            rf"^{stage.name}, loss 0\.\d+, [\d,]+ splats .* {stage.iterations}/{stage.iterations}", err, re.M
+        )
+    assert "preparing" not in err
+    assert {"StageStarted", "Progress"} <= {type(event).__name__ for event in events}
+    with pytest.raises(RecipeError, match=r"iterations and schedule_scale both set .*, got 41 and 0.5; give one"):
+        gs2d.train(capture, "2dgs-r", iterations=41, schedule_scale=0.5, **small)
+
+
+def test_a_mesh_has_the_voxel_that_was_asked_for(trained: Trained) -> None:
+    coarse = gs2d.extract_mesh(trained, voxel=0.2)
+    assert 0 < len(coarse.faces) < len(gs2d.extract_mesh(trained).faces)
+    same = gs2d.extract_mesh(trained, options=gs2d.MeshOptions(voxel=0.2))
+    assert np.array_equal(coarse.vertices, same.vertices)
+    with pytest.raises(ProtocolError, match=r"voxel was given twice, as 0.1 and in options as 0.2; leave one out"):
+        gs2d.extract_mesh(trained, voxel=0.1, options=gs2d.MeshOptions(voxel=0.2))

@@ -5,28 +5,23 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gs2d.config.densify import Densify, register_densifier
-from gs2d.config.losses import register_loss
-from gs2d.config.presets import get_recipe, register_recipe
-from gs2d.config.recipe import LossTerm
-from gs2d.data.load import load_scene
-from gs2d.data.readers.registry import register_reader
+import gs2d
+from gs2d.config.densify import Densify
 from gs2d.errors import DivergedError
-from gs2d.io.formats.registry import register_format
 from gs2d.losses.api import LossReport
-from gs2d.render.backends import CpuBackend, register_backend
+from gs2d.render.backends import CpuBackend
 from gs2d.training.densify.densifier import Densifier
 from gs2d.training.events import Densified
 from gs2d.training.rows import keep_rows
 
 
-@register_loss("example-contrast")
+@gs2d.register_loss("example-contrast")
 def contrast(output, view, gain=1.0):
     """Compare the spread of colours with that of the photograph."""
     return gain * (output.color.std() - view.target.std()).square()
 
 
-@register_loss("example-brightness")
+@gs2d.register_loss("example-brightness")
 class Brightness:
     """Compare the mean brightness with that of the photograph, which is found once."""
 
@@ -45,7 +40,7 @@ class Brightness:
         return LossReport(float(error), {title: image.cpu().numpy() for title, image in images.items()})
 
 
-@register_reader("example-link")
+@gs2d.register_reader("example-link")
 class LinkReader:
     """A folder whose capture.txt names the folder where the capture is."""
 
@@ -53,10 +48,10 @@ class LinkReader:
         return (path / "capture.txt").is_file()
 
     def read(self, path, *, downscale):
-        return load_scene((path / "capture.txt").read_text().strip(), downscale=downscale)
+        return gs2d.load_scene((path / "capture.txt").read_text().strip(), downscale=downscale)
 
 
-@register_densifier("example-prune")
+@gs2d.register_densifier("example-prune")
 class PruneFaint(Densifier):
     """Drop the faintest splats at one iteration."""
 
@@ -76,17 +71,16 @@ class PruneFaint(Densifier):
         return (Densified(self.surroundings.stage, iteration, 0, 0, self.count, 0, len(state.splats)),)
 
 
-@register_recipe("example-2dgs")
+@gs2d.register_recipe("example-2dgs")
 def recipe():
     """Like 2dgs, with a loss and a densifier of this package."""
-    base = get_recipe("2dgs")
-    guests = (LossTerm("example-contrast", 0.1, options={"gain": 2.0}), LossTerm("example-brightness", 0.1))
-    losses = (*base.stages[0].losses, *guests)
-    stage = replace(base.stages[0], losses=losses, densify=Densify("example-prune", {"at": 3, "count": 2}))
+    base = gs2d.get_recipe("2dgs").with_loss(gs2d.LossTerm("example-contrast", 0.1, options={"gain": 2.0}))
+    base = base.with_loss(gs2d.LossTerm("example-brightness", 0.1))
+    stage = replace(base.stages[0], densify=Densify("example-prune", {"at": 3, "count": 2}))
     return replace(base, name="example-2dgs", stages=(stage, *base.stages[1:]))
 
 
-@register_backend("example-checked")
+@gs2d.register_backend("example-checked")
 class CheckedBackend(CpuBackend):
     """The native kernels, stopping at the first image that is not finite."""
 
@@ -99,7 +93,7 @@ class CheckedBackend(CpuBackend):
         return output
 
 
-@register_format("example-xyz", ending=".xyz")
+@gs2d.register_format("example-xyz", ending=".xyz")
 def write_xyz(path, splats):
     """Write the centres as text."""
     np.savetxt(path, splats.means.detach().cpu().numpy(), fmt="%.6g")

@@ -1,12 +1,13 @@
-"""The losses that there are, by name. Pure Python: a name can be checked without torch."""
+"""Registered losses, by name. Pure Python: a name can be checked without torch."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from gs2d.config.multiview import MULTIVIEW_KINDS
 from gs2d.config.priors import PRIOR_KINDS
-from gs2d.config.registry import Registry
+from gs2d.config.registry import Register, Registry
 from gs2d.errors import RecipeError
 
 LOSS_KINDS = (
@@ -20,4 +21,34 @@ LOSSES: Registry[Any] = Registry(
     error=RecipeError,
 )
 """Kinds of loss -> a function of images, or a class with data of its own (``gs2d.losses.api``)."""
-register_loss = LOSSES.register
+
+
+def register_loss(name: str) -> Callable[[Register], Register]:
+    """Return a decorator that registers a loss, so that ``LossTerm(name, weight)`` can use it.
+
+    Parameters
+    ----------
+    name : str
+        Kind of the loss; must not be taken.
+
+    Returns
+    -------
+    callable
+        Decorates a function ``(output, view, **options)`` that returns a scalar Tensor, unweighted, or None to skip the
+        view: ``output`` is a RenderOutput (images [H, W, C]), ``view`` a ``gs2d.losses.api.LossView``. Or a class whose
+        constructor takes the options, with ``prepare(scene, recipe, device)`` and ``__call__(output, view)``.
+
+    Raises
+    ------
+    RecipeError
+        From the decorator: the name is taken.
+
+    Examples
+    --------
+    >>> import gs2d
+    >>> @gs2d.register_loss("crisp")
+    ... def crisp(output, view, power=1.0):
+    ...     return (4 * output.alpha * (1 - output.alpha)).clamp_min(0).pow(power).mean()
+    >>> recipe = gs2d.get_recipe("2dgs").with_loss(gs2d.LossTerm("crisp", 0.1, options={"power": 2.0}))
+    """
+    return LOSSES.register(name)

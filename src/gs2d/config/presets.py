@@ -34,7 +34,7 @@ from gs2d.config.recipe import (
     Stage,
 )
 from gs2d.config.recipe_files import is_recipe_file, made_recipe, read_recipe_file
-from gs2d.config.registry import Registry
+from gs2d.config.registry import Register, Registry
 from gs2d.config.robust import BackgroundSphere, DenseStart, FreeSpace, OpacityDecay, SeenArea, SplatDropout, StartFit
 from gs2d.config.schedule import LONGER
 from gs2d.errors import RecipeError
@@ -578,7 +578,38 @@ RECIPES: Registry[Any] = Registry("recipe", "gs2d.recipes", builtin=dict.fromkey
 """Names of recipes -> NamedRecipe; of guests a Recipe, or a function without arguments that makes one."""
 for _name, _named in _OWN.items():
     RECIPES.register(_name)(_named)
-register_recipe = RECIPES.register
+
+
+def register_recipe(name: str) -> Callable[[Register], Register]:
+    """Return a decorator that registers a recipe, so that its name can be given to ``gs2d.train`` and ``--recipe``.
+
+    Parameters
+    ----------
+    name : str
+        Must not be taken.
+
+    Returns
+    -------
+    callable
+        Decorates a function without arguments that returns a Recipe; the first line of its docstring is what
+        ``gs2d recipes`` prints. A Recipe itself can be registered, too.
+
+    Raises
+    ------
+    RecipeError
+        From the decorator: the name is taken.
+
+    Examples
+    --------
+    >>> import gs2d
+    >>> @gs2d.register_recipe("2dgs-l2")
+    ... def squared():
+    ...     '''2DGS with a squared error.'''
+    ...     return gs2d.get_recipe("2dgs").with_loss(gs2d.LossTerm("l2", 1.0))
+    >>> gs2d.get_recipe("2dgs-l2").stages[0].losses[-1].kind
+    'l2'
+    """
+    return RECIPES.register(name)
 
 
 def about_recipe(name: str) -> str:
@@ -636,10 +667,14 @@ def get_recipe(name: str) -> Recipe:
         One that is registered, ``file.json`` (what ``gs2d recipes show NAME --json`` prints) or ``file.py:name`` (a
         Recipe, or a function without arguments that makes one).
 
+    Returns
+    -------
+    Recipe
+
     Raises
     ------
     RecipeError
-        Unknown name; says what is close or what exists. Of a file: that it cannot be read, or holds no recipe.
+        If the name is unknown, or the file cannot be read or holds no recipe.
     """
     if is_recipe_file(name):
         return read_recipe_file(name)
@@ -651,5 +686,11 @@ def get_recipe(name: str) -> Recipe:
 
 
 def list_recipes() -> tuple[str, ...]:
-    """Return the names that :func:`get_recipe` takes, in the order in which ``gs2d recipes`` lists them."""
+    """List the registered recipes.
+
+    Returns
+    -------
+    tuple of str
+        Names for :func:`get_recipe`, in the order of ``gs2d recipes``.
+    """
     return tuple(RECIPES)

@@ -9,7 +9,7 @@ This module never imports torch.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any
@@ -373,16 +373,43 @@ class Stage:
 
 @dataclass(frozen=True)
 class Recipe:
-    """Stages in order, the seed of every random choice, and the start.
+    """A training method: stages in order, and settings that hold for all of them.
 
-    ``init_points`` is how many random points training starts from when the scene has none. ``exposure`` None: all
-    photographs are taken to have one exposure. ``poses`` None: cameras are where the capture says; ``intrinsics`` None:
-    their focal lengths are the capture's; ``photometry`` None: they have neither vignetting nor a response.
-    ``multiview``, ``depth_prior``, ``normal_prior``: how views are compared, and what is known of them, for the losses
-    that do.
-    ``dense_start``, ``free_space``, ``opacity_decay``, ``seen_area``, ``dropout``: what keeps fog out where photographs
-    are few.
-    ``fused_depth``: the depth that becomes the mesh ("mean", "median" or "transmittance"); None: the protocol says.
+    Attributes
+    ----------
+    name : str
+    stages : tuple of Stage
+    seed : int
+        Of every random choice.
+    sh_degree : int
+        Highest SH degree of the splats, 0 to 3.
+    init_points : int
+        Random points that training starts from if the scene has no sparse points.
+    exposure : Exposure or None
+        Learns an exposure for each image; None: all images have the same.
+    poses : PoseRefinement or None
+        Learns camera poses; None: those of the capture.
+    multiview : MultiView or None
+        Settings of the multi-view losses.
+    depth_prior, normal_prior : DepthPrior, NormalPrior or None
+        Settings of the losses on known depths and normals.
+    dense_start : DenseStart or None
+        Starts from a plane sweep of the images.
+    free_space, opacity_decay, seen_area, dropout : FreeSpace, OpacityDecay, SeenArea, SplatDropout or None
+        Measures against floaters.
+    fused_depth : "mean", "median", "transmittance" or None
+        Depth that is fused into the mesh; None: that of the protocol.
+    intrinsics : IntrinsicsRefinement or None
+        Learns focal lengths and lenses with the poses; None: those of the capture.
+    photometry : Photometry or None
+        Learns vignetting and response of the cameras; None: neither.
+
+    Examples
+    --------
+    >>> import gs2d
+    >>> recipe = gs2d.get_recipe("2dgs-r")
+    >>> [stage.name for stage in recipe.stages], recipe.iterations
+    (['surface', 'appearance', 'refine'], 60000)
     """
 
     name: str
@@ -408,6 +435,39 @@ class Recipe:
     def iterations(self) -> int:
         """Iterations of all stages."""
         return sum(stage.iterations for stage in self.stages)
+
+    def with_loss(self, term: LossTerm, *, stages: str | Sequence[str] | None = None) -> Recipe:
+        """Return a recipe with one more loss; this one stays as it is.
+
+        Parameters
+        ----------
+        term : LossTerm
+        stages : str or sequence of str, optional
+            Names of the stages that get the loss; None: all stages.
+
+        Returns
+        -------
+        Recipe
+            Validated.
+
+        Raises
+        ------
+        RecipeError
+            If a stage does not exist or has this kind of loss already, or the loss needs settings that are missing.
+
+        Examples
+        --------
+        >>> import gs2d
+        >>> recipe = gs2d.get_recipe("2dgs-r").with_loss(gs2d.LossTerm("l2", 0.5), stages="refine")
+        >>> [len(stage.losses) for stage in recipe.stages]
+        [3, 3, 4]
+        """
+        existing = [stage.name for stage in self.stages]
+        chosen = existing if stages is None else [stages] if isinstance(stages, str) else list(stages)
+        for name in chosen:
+            one_of(f"stage of recipe {self.name!r}", name, tuple(existing))
+        added = (replace(s, losses=(*s.losses, term)) if s.name in chosen else s for s in self.stages)
+        return validate(replace(self, stages=tuple(added)))
 
 
 def validate(recipe: Recipe) -> Recipe:

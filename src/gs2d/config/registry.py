@@ -18,10 +18,10 @@ from typing import Any, Generic, TypeVar
 
 from gs2d.errors import Gs2dError, PluginWarning
 
-__all__ = ["Registry", "absent_guests", "did_you_mean"]
+__all__ = ["Register", "Registry", "absent_guests", "did_you_mean"]
 
 T = TypeVar("T")
-U = TypeVar("U")
+Register = TypeVar("Register")
 _ABSENT = ContextVar("absent guests", default=False)
 
 
@@ -65,7 +65,7 @@ class Registry(Generic[T]):
         self._homes = {} if builtin is None else dict(builtin)
         self._things: dict[str, T] = {}
 
-    def register(self, name: str) -> Callable[[U], U]:
+    def register(self, name: str) -> Callable[[Register], Register]:
         """Return a decorator that registers what it decorates under a name.
 
         Raises
@@ -74,7 +74,7 @@ class Registry(Generic[T]):
             From the decorator: the name is taken.
         """
 
-        def registered(thing: U) -> U:
+        def registered(thing: Register) -> Register:
             module = getattr(thing, "__module__", "")
             if self._homes.get(name, module) != module:
                 raise self._error(f"{self.what} {name!r} is one of gs2d's own; give yours another name")

@@ -13,6 +13,7 @@ Pure Python; never imports torch.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -59,12 +60,46 @@ def scale_schedule(recipe: Recipe, factor: float) -> Recipe:
     """
     if not 0 < factor <= MAX_SCALE:
         raise RecipeError(f"--schedule-scale must be a positive number up to {MAX_SCALE:g}, got {factor}")
-    if factor == 1:
-        return recipe
+    return recipe if factor == 1 else _scale(recipe, factor, [factor] * len(recipe.stages))
+
+
+def fit_schedule(recipe: Recipe, iterations: int) -> Recipe:
+    """Return the same recipe with a total of ``iterations``, scaled like :func:`scale_schedule`.
+
+    Parameters
+    ----------
+    recipe : Recipe
+    iterations : int
+        Total of all stages. Each stage has its share of them, to within one, and at least one.
+
+    Raises
+    ------
+    RecipeError
+        If there are fewer iterations than stages, or more than ``MAX_SCALE`` times those of the recipe.
+    """
+    lengths = [stage.iterations for stage in recipe.stages]
+    least, most = sum(length > 0 for length in lengths), round(MAX_SCALE * recipe.iterations)
+    whole = isinstance(iterations, int) and not isinstance(iterations, bool)
+    if not (whole and 0 < least <= iterations <= most):
+        raise RecipeError(
+            f"iterations must be a whole number from {least} to {most} for recipe {recipe.name!r}, got {iterations!r}"
+        )
+    factor = iterations / recipe.iterations
+    found = [max(1, math.floor(length * factor)) if length else 0 for length in lengths]
+    while missing := iterations - sum(found):  # at most one a stage: the stage that is farthest from its share
+        step = 1 if missing > 0 else -1
+        open_stages = [i for i, length in enumerate(lengths) if length and found[i] + step >= 1]
+        found[max(open_stages, key=lambda i: step * (lengths[i] * factor - found[i]))] += step
+    factors = [now / length if length else factor for now, length in zip(found, lengths, strict=True)]
+    return recipe if factor == 1 else _scale(recipe, factor, factors)
+
+
+def _scale(recipe: Recipe, factor: float, of_stages: Sequence[float]) -> Recipe:
+    """Return the recipe ``factor`` times as long, each stage by its own factor."""
     points = max(MIN_INIT_POINTS, round(recipe.init_points * math.sqrt(factor)))
     return replace(
         recipe,
-        stages=tuple(_scale_stage(stage, factor) for stage in recipe.stages),
+        stages=tuple(map(_scale_stage, recipe.stages, of_stages)),
         init_points=min(recipe.init_points, points),
         exposure=None if recipe.exposure is None else _scale_views(recipe.exposure, factor),
         poses=None if recipe.poses is None else _scale_poses(recipe.poses, factor),

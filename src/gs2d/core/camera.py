@@ -187,12 +187,33 @@ class Camera:
 def look_at(
     eye: np.ndarray, target: np.ndarray, up: np.ndarray, *, width: int, height: int, fx: float, fy: float | None = None
 ) -> Camera:
-    """Return a camera at ``eye`` [3] that looks at ``target`` [3], ``up`` [3] towards the top of the image.
+    """Return a camera that looks from one point at another.
+
+    Parameters
+    ----------
+    eye, target : ndarray [3]
+        Camera centre, and a point on the optical axis, world units.
+    up : ndarray [3]
+        Direction towards the top of the image, of any length.
+    width, height : int
+        Image size, px.
+    fx, fy : float
+        Focal lengths, px; ``fy`` None: the same as ``fx``. The principal point is the image centre.
+
+    Returns
+    -------
+    Camera
 
     Raises
     ------
     ShapeError
-        ``eye`` is at ``target``, or looks straight along ``up``: the image could be turned in any way.
+        If ``eye`` is at ``target``, or ``up`` is along the optical axis.
+
+    Examples
+    --------
+    >>> camera = look_at(np.array([0, -2.0, 0.5]), np.zeros(3), np.array([0, 0, 1.0]), width=64, height=48, fx=60.0)
+    >>> camera.center.round(6).tolist()
+    [0.0, -2.0, 0.5]
     """
     eye, target, up = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
     right = np.cross(target - eye, up)

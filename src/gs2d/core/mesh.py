@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,28 @@ class Mesh:
         check_shapes({"vertices": (self.vertices, "P 3"), "faces": (self.faces, "F 3")})
         if self.colors is not None:
             check_shapes({"vertices": (self.vertices, "P 3"), "colors": (self.colors, "P 3")})
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the mesh to a file, in the format of its ending: .ply or .glb.
+
+        Parameters
+        ----------
+        path : path
+
+        Raises
+        ------
+        DataError
+            If the name has another ending.
+        DiskError
+            If the file could not be written.
+
+        Examples
+        --------
+        >>> gs2d.extract_mesh(trained).save("garden.ply")  # doctest: +SKIP
+        """
+        import gs2d  # the writers lie above this layer; the package imports them when they are used
+
+        gs2d.write_mesh(path, self)
 
 
 @dataclass(frozen=True, eq=False)

@@ -129,6 +129,27 @@ def sh_to_rgb(sh0: Tensor, shN: Tensor, directions: Tensor, degree: int) -> Tens
 
 
 def rgb_to_sh0(rgb: Tensor) -> Tensor:
-    """Return the degree-0 coefficients [N, 1, 3] whose colour is ``rgb`` [N, 3] from every direction."""
+    """Return the degree-0 SH coefficients of colours that look the same from every direction.
+
+    Parameters
+    ----------
+    rgb : Tensor [N, 3]
+        Colours, sRGB in [0, 1].
+
+    Returns
+    -------
+    Tensor [N, 1, 3]
+        ``sh0`` of Splats: (rgb - 0.5) * sqrt(4 pi).
+
+    Raises
+    ------
+    ShapeError
+        If ``rgb`` is not [N, 3].
+
+    Examples
+    --------
+    >>> rgb_to_sh0(torch.tensor([[0.5, 0.5, 0.5]])).squeeze()
+    tensor([0., 0., 0.])
+    """
     check_shapes({"rgb": (rgb, "N 3")})
     return ((rgb - 0.5) / C0)[:, None, :]

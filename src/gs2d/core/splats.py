@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 
@@ -103,6 +104,33 @@ class Splats:
         if isinstance(device, torch.dtype):
             device, dtype = None, device
         return Splats(**{name: tensor.to(device=device, dtype=dtype) for name, tensor in self.items()})
+
+    def save(self, path: str | os.PathLike[str], *, layout: str | None = None) -> None:
+        """Write the splats to a file, in the format of its ending.
+
+        Parameters
+        ----------
+        path : path
+            Ends in .ply (as viewers open it), .compressed.ply, .spz, .splat, .usd, .glb, .sog or the ending of a
+            registered format. ``gs2d.read_splats`` reads all of gs2d's own.
+        layout : str, optional
+            A format by its name, as for ``gs2d.write_splats``: "2dgs" is the PLY of the official code, which holds
+            float32 bit for bit.
+
+        Raises
+        ------
+        DataError
+            If no format has this ending or name.
+        DiskError
+            If the file could not be written.
+
+        Examples
+        --------
+        >>> trained.splats.save("garden.spz")  # doctest: +SKIP
+        """
+        import gs2d  # the writers lie above this layer; the package imports them when they are used
+
+        gs2d.write_splats(path, self, layout=layout)
 
     def followed_by(self, others: Splats) -> Splats:
         """Return these splats and then others, of the same SH degree; gradients reach both."""

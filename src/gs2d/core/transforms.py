@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import torch
@@ -64,38 +64,76 @@ def se3_exp(motion: Tensor) -> Tensor:
 
     Parameters
     ----------
-    motion : Tensor [6]
+    motion : Tensor [..., 6]
         A rotation vector (axis times angle, rad), then a velocity (world units): the motion of a body that turns
         and moves at these rates for one unit of time. Without rotation the velocity is the translation.
 
     Returns
     -------
-    Tensor [4, 4]
+    Tensor [..., 4, 4]
         In the dtype and on the device of ``motion``.
     """
-    check_shapes({"motion": (motion, "6")})
-    x, y, z, u, v, w = motion.unbind()
+    if not motion.ndim or motion.shape[-1] != 6:
+        raise ShapeError(f"motion must be [..., 6], a rotation vector and a velocity, got {list(motion.shape)}")
+    x, y, z, u, v, w = motion.unbind(-1)
     o = torch.zeros_like(x)
     rows = ((o, -z, y, u), (z, o, -x, v), (-y, x, o, w), (o, o, o, o))
-    return torch.linalg.matrix_exp(torch.stack([torch.stack(row) for row in rows]))
+    return torch.linalg.matrix_exp(torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2))
 
 
-def perturb_pose(camera: Camera, motion: Tensor) -> Camera:
-    """Return the camera after a motion in its own frame: ``T_cam_world = se3_exp(motion) @ camera.T_cam_world``.
+@overload
+def perturb_pose(camera: Camera, motion: Tensor) -> Camera: ...
+@overload
+def perturb_pose(camera: Tensor, motion: Tensor) -> Tensor: ...
+def perturb_pose(camera: Camera | Tensor, motion: Tensor) -> Camera | Tensor:
+    """Move cameras in their own frames: ``T_cam_world`` becomes ``exp(motion) @ T_cam_world``.
 
-    The rotation is about the camera's own centre. Where ``motion`` (or the camera) requires a gradient the result
-    carries it to ``gs2d.rasterize``.
+    The rotation is about the camera's own centre. The motion is exact and has a gradient everywhere, also at 0. Where
+    ``motion`` or the pose requires a gradient, ``gs2d.rasterize`` carries it through the result.
 
     Parameters
     ----------
-    camera : Camera
-    motion : Tensor [6]
-        As for :func:`se3_exp`; best float64, whose digits the camera keeps.
+    camera : Camera or Tensor [..., 4, 4]
+        One camera, or world-to-camera poses.
+    motion : Tensor [..., 6]
+        Rotation vector (axis times angle, rad), then velocity (world units); without rotation the velocity is the
+        translation in the camera's frame. [6] for a Camera; leading dimensions broadcast against those of poses.
+        Prefer float64: a Camera keeps all digits.
+
+    Returns
+    -------
+    Camera or Tensor [..., 4, 4]
+        What was given, moved; a tensor has the dtype and the device of ``motion``.
+
+    Raises
+    ------
+    ShapeError
+        If a shape is wrong, the leading dimensions do not broadcast, or several motions are given for one Camera.
+
+    Examples
+    --------
+    >>> import torch
+    >>> poses = torch.eye(4).expand(3, 4, 4)
+    >>> perturb_pose(poses, torch.zeros(3, 6)).shape
+    torch.Size([3, 4, 4])
     """
-    pose = torch.as_tensor(camera.T_cam_world) if camera.pose is None else camera.pose
     T = se3_exp(motion)
-    placed: Any = T @ pose.to(T)
-    return replace(camera, T_cam_world=placed, pose=None)
+    if isinstance(camera, Camera):
+        if motion.ndim != 1:
+            raise ShapeError(
+                f"motion must be [6] for one camera, got {list(motion.shape)}; give poses [..., 4, 4] to move several"
+            )
+        pose = torch.as_tensor(camera.T_cam_world) if camera.pose is None else camera.pose
+        placed: Any = T @ pose.to(T)
+        return replace(camera, T_cam_world=placed, pose=None)
+    if camera.shape[-2:] != (4, 4):
+        raise ShapeError(f"poses must be [..., 4, 4], got {list(camera.shape)}")
+    try:
+        torch.broadcast_shapes(camera.shape[:-2], motion.shape[:-1])
+    except RuntimeError as error:
+        shapes = f"poses {list(camera.shape)} and motion {list(motion.shape)}"
+        raise ShapeError(f"leading dimensions must broadcast, got {shapes}; give one motion for each pose") from error
+    return T @ camera.to(T)
 
 
 def similarity_motions(poses: np.ndarray, extent: float) -> np.ndarray:

@@ -175,10 +175,21 @@ def load_scene(
         What a black pixel of a mask is: "ignore", it takes part in nothing; "empty", nothing is there, as an alpha
         channel says; "off", masks are not used. None: ignored, where the protocol uses masks.
 
+    Returns
+    -------
+    Scene
+        Views with their cameras and splits, and the sparse points; images are decoded when they are used.
+
     Raises
     ------
     DataError
-        Anything missing or wrong with the files; one line with expected, got and remedy.
+        If a file is missing or wrong; the message says what to do.
+
+    Examples
+    --------
+    >>> scene = gs2d.load_scene("captures/garden", downscale=4)  # doctest: +SKIP
+    >>> len(scene.train), len(scene.test)  # doctest: +SKIP
+    (161, 24)
     """
     root = _folder(path)
     if format == "auto":

@@ -44,15 +44,31 @@ class Points:
 
 
 def write_mesh(path: str | os.PathLike[str], mesh: Mesh) -> None:
-    """Write a triangle mesh as PLY, atomically: float32 or float64 vertices as they are, uchar vertex colours.
+    """Write a triangle mesh with its vertex colours: the whole file, or nothing.
 
-    The vertex list is the only property of a face, which is all that common readers understand.
+    Parameters
+    ----------
+    path : path
+        Ends in .ply (vertices [P, 3] as they are, float32 or float64) or .glb (glTF, vertices in float32).
+    mesh : Mesh
 
     Raises
     ------
+    DataError
+        If the name has another ending.
     DiskError
         If the file could not be written.
+
+    Examples
+    --------
+    >>> gs2d.write_mesh("garden.ply", gs2d.extract_mesh(trained))  # doctest: +SKIP
     """
+    suffix = Path(path).suffix.lower()
+    if suffix == ".glb":
+        write_glb(Path(path), mesh)
+        return
+    if suffix != ".ply":
+        raise DataError(f"a mesh is written as .ply or .glb, got {os.fspath(path)}; choose such a name")
     real = "<f8" if mesh.vertices.dtype == np.float64 else "<f4"
     fields = [(name, real) for name in "xyz"]
     if mesh.colors is not None:
@@ -64,7 +80,7 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh) -> None:
         for i, name in enumerate(COLORS):
             vertices[name] = mesh.colors[:, i]
     faces = np.empty(len(mesh.faces), dtype=[("vertex_indices", "<i4", (3,))])
-    faces["vertex_indices"] = mesh.faces
+    faces["vertex_indices"] = mesh.faces  # the only property: all that common readers understand
     write_ply(path, {"vertex": vertices, "face": faces})
 
 
@@ -220,7 +236,7 @@ def write_textured(path: str | Path, mesh: TexturedMesh, *, up: np.ndarray | Non
         write_obj(files[0], mesh)
 
 
-def write_glb(path: Path, mesh: TexturedMesh, *, up: np.ndarray | None = None) -> None:
+def write_glb(path: Path, mesh: Mesh | TexturedMesh, *, up: np.ndarray | None = None) -> None:
     """Write glTF 2.0 in one file."""
     data = glb_bytes(mesh, up=up)
     with atomic_write(path) as file:

@@ -11,7 +11,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from gs2d.config.recipe import EDGES
 from gs2d.core.camera import Camera
+from gs2d.core.checks import check_shapes
+from gs2d.errors import ShapeError
 
 WINDOW_RADIUS = 5  # px: 11 taps
 WINDOW_SIGMA = 1.5  # px
@@ -105,7 +108,24 @@ def normals_from_depth(
     Tensor [H, W, 3]
         Unit normals in the world frame; 0 where undefined, and on the one-pixel border.
         Differentiable in ``depth``, and in the camera's ``intrinsics`` where they learn; its pose is a constant.
+
+    Raises
+    ------
+    ShapeError
+        If ``depth`` or ``mask`` does not have the camera's size, or ``edges`` is unknown.
+
+    Examples
+    --------
+    >>> import torch
+    >>> import gs2d
+    >>> camera = gs2d.Camera(4, 3, 5.0, 5.0, 2.0, 1.5, torch.eye(4).numpy())
+    >>> normals_from_depth(torch.full((3, 4), 2.0), camera)[1, 1]  # a wall across the optical axis
+    tensor([ 0.,  0., -1.])
     """
+    size = f"{camera.height} {camera.width}"
+    check_shapes({"depth": (depth, size)} | ({} if mask is None else {"mask": (mask, size)}))
+    if edges not in EDGES:
+        raise ShapeError(f"edges must be {' or '.join(map(repr, EDGES))}, got {edges!r}")
     height, width = depth.shape
     if min(height, width) < 3:
         return torch.zeros_like(depth)[..., None].expand(-1, -1, 3)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.errors import RunError
-from gs2d.io.formats.registry import ENDINGS, LAYOUTS, layout_of, read_disks, write_layout, written_bytes
+from gs2d.io.formats.registry import ENDINGS, LAYOUTS, layout_of, read_splats, write_layout, written_bytes
 from gs2d.io.run_dir import (
     MESH,
     open_run,
@@ -46,7 +46,7 @@ def export_run(
     if path.is_file() and out.resolve() == path.resolve():
         raise RunError(f"--out {out} is the file that is read; choose another name")
     if path.is_file():
-        splats = read_disks(path)
+        splats = read_splats(path)
     else:
         run = open_run(path)
         run.sweep()

@@ -8,14 +8,14 @@ import torch
 
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError, RunError
-from gs2d.io.formats.registry import read_disks
+from gs2d.io import splat_ply
+from gs2d.io.formats.registry import read_splats
 from gs2d.io.georeference import georeference_of_file
 from gs2d.io.run_dir import (
     SPLATS,
     RunFolder,
     open_run,
 )
-from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.events import OnEvent
 from gs2d.pipeline.job import Job, reload_job
 from gs2d.pipeline.threads import use_threads
@@ -32,7 +32,7 @@ def finished_splats(run: RunFolder) -> Splats:
     path = run.file(SPLATS)
     if not path.exists():
         raise RunError(f"{run.path} is not finished: no {SPLATS}; continue it with `gs2d train ... --resume`")
-    splats = read_splats(path)
+    splats = splat_ply.read_splats(path)
     whole = torch.stack([tensor.unsqueeze(-1).flatten(1).isfinite().all(dim=1) for _, tensor in splats.items()])
     broken = len(splats) - int(whole.all(dim=0).sum())
     if broken:
@@ -73,7 +73,7 @@ def _splats_of(path: Path, out: Path | None) -> Splats:
         raise DataError(f"--splats must be a file of splats, got the folder {path}; give the splats.ply in it")
     if georeference_of_file(path) is not None:
         raise DataError(f"--splats must be in the frame of the run, {path} is in metres of the world; export it again")
-    return read_disks(path)
+    return read_splats(path)
 
 
 def checked_output(path: Path, out: Path, ending: str = ".ply", what: str = "") -> Path:

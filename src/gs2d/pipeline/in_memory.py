@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from gs2d.core.mesh import Mesh
 from gs2d.core.splats import Splats
 from gs2d.data import Scene, load_scene
 from gs2d.data.subject import OBJECT
-from gs2d.errors import DataError
+from gs2d.errors import DataError, ProtocolError
 from gs2d.evaluation.images import ImageMetrics, mean_metrics
 from gs2d.evaluation.lpips import Lpips
 from gs2d.pipeline.events import ignore
@@ -30,6 +31,7 @@ from gs2d.pipeline.masks import with_masks, without_masked_points
 from gs2d.pipeline.mesh import fused
 from gs2d.pipeline.options import MeshOptions, Robust, TrainOptions
 from gs2d.pipeline.predicted_exposure import metered, with_predicted
+from gs2d.pipeline.progress_bar import progress_bar
 from gs2d.pipeline.scoring import score_views
 from gs2d.pipeline.subject import subject_in, wants_subject
 from gs2d.render.backends import Backend
@@ -76,14 +78,16 @@ def train(
     *,
     protocol: str | Protocol = "auto",
     backend: str = "auto",
+    iterations: int | None = None,
     schedule_scale: float = 1.0,
     overrides: tuple[str, ...] = (),
     seed: int = 0,
     robust: Robust = "auto",
     exposure: bool | None = None,
+    progress: bool = False,
     on_event: OnAnyEvent = ignore,
 ) -> Trained:
-    """Train splats in memory, as ``gs2d train`` does without writing a run folder.
+    """Train splats in memory, as ``gs2d train`` does, without writing a run folder.
 
     ``gs2d.pipeline.train.train`` writes one, with checkpoints, metrics, a mesh and a report;
     :class:`gs2d.Trainer` is the loop alone, one iteration at a time.
@@ -98,8 +102,10 @@ def train(
         "auto": by the capture.
     backend : str
         "auto", "cpu", "cuda" or "reference".
+    iterations : int, optional
+        Total iterations of the schedule; all of it is scaled. Excludes ``schedule_scale``. None: the recipe's own.
     schedule_scale : float
-        Length of the schedule; 0.1 is a tenth of the recipe's.
+        Length of the schedule as a fraction of the recipe's; 0.1 is a tenth.
     overrides : tuple of str
         ``stage.field=value``, applied after the schedule is scaled.
     seed : int
@@ -107,6 +113,8 @@ def train(
         "auto", "on" or "off": help for captures that have sparse points (``gs2d train --robust``).
     exposure : bool, optional
         Learn an exposure for each image; None: where the images differ.
+    progress : bool
+        Show notices and a progress bar on stderr.
     on_event : callable
         Gets the events of :mod:`gs2d.training.events`, and Notices of what was decided before.
 
@@ -118,13 +126,13 @@ def train(
     Raises
     ------
     Gs2dError
-        Anything that the user can mend: one line with expected, got and remedy.
+        If an argument, the recipe or the capture is wrong; the message says what to do.
 
     Examples
     --------
     >>> scene = gs2d.load_scene("captures/garden", downscale=4)  # doctest: +SKIP
-    >>> trained = gs2d.train(scene, schedule_scale=0.1)  # doctest: +SKIP
-    >>> gs2d.write_splats("garden.ply", trained.splats)  # doctest: +SKIP
+    >>> trained = gs2d.train(scene, iterations=3000, progress=True)  # doctest: +SKIP
+    >>> trained.splats.save("garden.ply")  # doctest: +SKIP
     """
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
     root = scene.root or Path(".")
@@ -134,19 +142,21 @@ def train(
         recipe=recipe,
         protocol=protocol,
         schedule_scale=schedule_scale,
+        iterations=iterations,
         overrides=overrides,
         seed=seed,
         robust=robust,
         exposure=exposure is True,
         no_exposure=exposure is False,
     )
-    chosen = choose_backend(backend, on_event)
-    rules = choose_protocol(options, scene.format, on_event)
-    rules = with_masks(rules, scene, on_event)
-    scene = without_masked_points(scene, rules, on_event)
-    fitted, rules = settled(options, scene, rules, on_event)
-    trainer = Trainer(scene, fitted, rules, backend=chosen, on_event=on_event)
-    trainer.run()
+    with progress_bar(on_event) if progress else nullcontext(on_event) as tell:
+        chosen = choose_backend(backend, tell)
+        rules = choose_protocol(options, scene.format, tell)
+        rules = with_masks(rules, scene, tell)
+        scene = without_masked_points(scene, rules, tell)
+        fitted, rules = settled(options, scene, rules, tell)
+        trainer = Trainer(scene, fitted, rules, backend=chosen, on_event=tell)
+        trainer.run()
     exposures = named(scene.train, trainer.state.exposures)
     found = scene_now(trainer.state, scene)
     return Trained(trainer.splats, found, rules, trainer.settings, chosen, trainer.recipe, exposures)
@@ -238,6 +248,7 @@ def extract_mesh(
     trained: Trained | Splats,
     scene: Scene | None = None,
     *,
+    voxel: float | None = None,
     options: MeshOptions = MeshOptions(),  # noqa: B008 (frozen)
     protocol: str | Protocol = "auto",
     backend: str = "auto",
@@ -251,8 +262,10 @@ def extract_mesh(
         What :func:`gs2d.train` returned; or splats, with ``scene``.
     scene : Scene, optional
         The capture of splats from elsewhere.
+    voxel : float, optional
+        Voxel size, world units; the same as ``options.voxel``. None: from the scene.
     options : MeshOptions
-        Voxel, box, depth and so on; what is left open comes from the scene and the protocol.
+        Box, depth and so on; what is None comes from the scene and the protocol.
     protocol, backend
         Of splats from elsewhere; as for :func:`gs2d.train`.
     on_event : callable
@@ -267,6 +280,10 @@ def extract_mesh(
     ------
     ProtocolError, DataError, BackendError
     """
+    if voxel is not None:
+        if options.voxel is not None:
+            raise ProtocolError(f"voxel was given twice, as {voxel} and in options as {options.voxel}; leave one out")
+        options = replace(options, voxel=voxel)
     finished = _finished(trained, scene, protocol, backend, on_event)
     subject = None
     if wants_subject(finished, options):

@@ -28,7 +28,7 @@ from gs2d.config.presets import (
 from gs2d.config.protocols import BLACK, GENERIC, Protocol, get_protocol, protocol_for
 from gs2d.config.recipe import Recipe, validate
 from gs2d.config.robust import FEW_VIEWS
-from gs2d.config.schedule import longer_steps, scale_schedule
+from gs2d.config.schedule import fit_schedule, longer_steps, scale_schedule
 from gs2d.config.serialize import apply_overrides, decode, from_json, to_json
 from gs2d.core.splats import Splats
 from gs2d.core.text import name_bytes
@@ -203,7 +203,8 @@ def recipe_of(recipe: str | Recipe) -> Recipe:
 def build_recipe(
     recipe: str | Recipe,
     *,
-    schedule_scale: float,
+    schedule_scale: float = 1.0,
+    iterations: int | None = None,
     seed: int,
     overrides: tuple[str, ...],
     exposure: bool = False,
@@ -233,8 +234,12 @@ def build_recipe(
     value = with_robustness(value) if robust else value
     if by_points and value.exposure is not None:
         value = replace(value, exposure=replace(value.exposure, initial="points"))
-    value = scale_schedule(value, schedule_scale)
-    value = longer_steps(value, schedule_scale) if robust else value
+    if iterations is not None and schedule_scale != 1:
+        both = f"{iterations} and {schedule_scale}"
+        raise RecipeError(f"iterations and schedule_scale both set the length of training, got {both}; give one")
+    full = value.iterations
+    value = scale_schedule(value, schedule_scale) if iterations is None else fit_schedule(value, iterations)
+    value = longer_steps(value, schedule_scale if iterations is None else iterations / full) if robust else value
     value = apply_overrides(replace(value, seed=seed), overrides)
     for option, wanted, field in (
         ("--exposure", exposure, "exposure"),
@@ -290,6 +295,7 @@ def _recipe_of(options: TrainOptions, *, robust: bool, exposure: bool) -> Recipe
     return build_recipe(
         options.recipe,
         schedule_scale=options.schedule_scale,
+        iterations=options.iterations,
         seed=options.seed,
         overrides=options.overrides,
         exposure=exposure,

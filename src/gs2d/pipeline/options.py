@@ -224,6 +224,8 @@ class TrainOptions(Training, Resources, HowItRuns):
     """Folder of masks of the photographs, white = keep (default: where COLMAP, nerfstudio and Metashape put them)."""
     schedule_scale: float = 1.0
     """Fraction of the full schedule: 0.1 trains a tenth of the iterations."""
+    iterations: Annotated[int | None, Fixed, Suppress] = None
+    """Total iterations of the schedule, instead of ``schedule_scale``."""
     sharded: bool = False
     """Under torchrun: each process keeps a part of the splats, for scenes beyond the memory of one."""
     init: Annotated[Path | None, arg(metavar="FILE")] = None

@@ -12,7 +12,7 @@ from gs2d.core.transforms import up_direction
 from gs2d.data import View
 from gs2d.data.subject import Subject, read_subject
 from gs2d.errors import DataError, RunError
-from gs2d.io.formats.registry import read_disks
+from gs2d.io.formats.registry import read_splats
 from gs2d.io.run_dir import PAGE, is_run, open_run
 from gs2d.pipeline.events import Notice, OnEvent, Phase, ignore
 from gs2d.pipeline.finished import finished_splats
@@ -75,7 +75,7 @@ def page_run(
     else:
         if not path.exists():
             raise DataError(f"expected a run folder or a file of splats at {path}, found nothing{where_it_ends(path)}")
-        splats, title = read_disks(path), path.stem
+        splats, title = read_splats(path), path.stem
     views = [] if job is None else _some(job.scene.train)
     cameras = [view.camera for view in views]
     frame = frame_around(cameras, splats.means.cpu().numpy())

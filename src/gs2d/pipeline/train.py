@@ -28,7 +28,7 @@ from gs2d.io.run_dir import (
 )
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Event, Expected, Notice, OnEvent, Phase, Plan, ignore
-from gs2d.pipeline.job import Job, check_train_options, prepare_job
+from gs2d.pipeline.job import Job, check_train_options, prepare_job, recipe_of
 from gs2d.pipeline.live import open_live
 from gs2d.pipeline.memory import release, use_memory
 from gs2d.pipeline.mesh import MeshFrames, extract_mesh, keep_facts
@@ -115,7 +115,10 @@ def _train(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> Ru
                 )
         else:
             extra = {"title": options.title} if options.title else {}
-            run.write_definition({**job.definition(), "schedule_scale": options.schedule_scale, **extra})
+            scale = options.schedule_scale
+            if options.iterations is not None:
+                scale = options.iterations / recipe_of(options.recipe).iterations
+            run.write_definition({**job.definition(), "schedule_scale": scale, **extra})
         job = lead(job, options, together, on_event)
         start = choose_start(run, job, options, on_event)
         if start.state is None and _is_planned(options, len(job.scene.views)):

@@ -22,7 +22,7 @@ from gs2d.core.transforms import up_direction
 from gs2d.data import View
 from gs2d.data.subject import read_subject
 from gs2d.errors import DataError, RunError
-from gs2d.io.formats.registry import read_disks
+from gs2d.io.formats.registry import read_splats
 from gs2d.io.georeference import georeference_of_file, read_georeference
 from gs2d.io.meshes import glb_bytes, glb_turn, read_mesh
 from gs2d.io.run_dir import MESH, TEXTURED, RunFolder, is_run, load_tensors, open_run
@@ -178,7 +178,7 @@ def _splats_of(checkpoint: Path) -> Splats:
 def _of_file(path: Path) -> _Content:
     if not path.exists():
         raise DataError(f"expected a run folder or a file of splats at {path}, found nothing{where_it_ends(path)}")
-    splats = read_disks(path)
+    splats = read_splats(path)
     settings, backend = settings_without_run(splats), get_backend("auto")
     return _Content(path.name, {FINAL: lambda: splats}, (), settings, backend, "median", lambda _: None)
 

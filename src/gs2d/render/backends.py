@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from gs2d.config.registry import Registry
+from gs2d.config.registry import Register, Registry
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.errors import BackendError
@@ -52,7 +52,37 @@ BACKENDS: Registry[Callable[[], Backend]] = Registry(
     "backend", "gs2d.backends", builtin=dict.fromkeys(("cpu", "cuda", "reference"), __name__), error=BackendError
 )
 """Names of backends -> what makes one ready to run, or raises BackendError: its class."""
-register_backend = BACKENDS.register
+
+
+def register_backend(name: str) -> Callable[[Register], Register]:
+    """Return a decorator that registers a rasterizer backend, so that ``backend=name`` can be given.
+
+    Parameters
+    ----------
+    name : str
+        Must not be taken.
+
+    Returns
+    -------
+    callable
+        Decorates a subclass of ``gs2d.render.backends.Backend`` with methods ``rasterize`` and ``splat_errors``. It is
+        called without arguments, and raises BackendError where it cannot run.
+
+    Raises
+    ------
+    BackendError
+        From the decorator: the name is taken.
+
+    Examples
+    --------
+    The guide "Extending gs2d" has a whole backend.
+
+    >>> @gs2d.register_backend("checked")  # doctest: +SKIP
+    ... class Checked(CpuBackend):
+    ...     name = "checked"
+    >>> output = gs2d.rasterize(splats, camera, backend="checked")  # doctest: +SKIP
+    """
+    return BACKENDS.register(name)
 
 
 @dataclass(frozen=True)
@@ -501,6 +531,10 @@ def get_backend(name: str, device: str | None = None) -> Backend:
         Type of the device on which the tensors already lie. It decides for "auto": "cuda" is the cuda backend or an
         error, "cpu" the native kernels or the reference, any other the reference.
 
+    Returns
+    -------
+    Backend
+
     Raises
     ------
     BackendError
@@ -526,7 +560,14 @@ def _auto(device: str | None) -> Backend:
 
 
 def backend_report() -> tuple[BackendStatus, ...]:
-    """Return what this machine can run and why not: in the order in which "auto" prefers it, then those of packages."""
+    """Report which backends this machine can run.
+
+    Returns
+    -------
+    tuple of BackendStatus
+        In the order in which "auto" prefers them, then registered ones: ``name``, ``available``, and the ``reason`` and
+        ``remedy`` where a backend cannot run.
+    """
     own = (CudaBackend.status(), CpuBackend.status(), ReferenceBackend.status())
     guests = (_status(name, make) for name, make in BACKENDS.working() if name not in BACKENDS.builtin)
     return (*own, *guests)

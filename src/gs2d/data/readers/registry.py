@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from gs2d.config.registry import Registry
+from gs2d.config.registry import Register, Registry
 from gs2d.data.build import Capture
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
@@ -35,4 +35,35 @@ READERS: Registry[Callable[[], Reader]] = Registry(
     "format", "gs2d.readers", builtin=dict.fromkeys(FORMATS, "gs2d.data.load"), error=DataError
 )
 """Names of formats -> classes of readers; in the order in which a folder is looked at."""
-register_reader = READERS.register
+
+
+def register_reader(name: str) -> Callable[[Register], Register]:
+    """Return a decorator that registers a reader of captures, so that ``load_scene`` recognises its format.
+
+    Parameters
+    ----------
+    name : str
+        Format of the captures, also for ``--format``; must not be taken.
+
+    Returns
+    -------
+    callable
+        Decorates a class without constructor arguments. Its method ``detect(path)`` returns whether a folder is of
+        this format; ``read(path, *, downscale)`` returns a Scene or a ``gs2d.data.build.Capture``.
+
+    Raises
+    ------
+    DataError
+        From the decorator: the name is taken.
+
+    Examples
+    --------
+    >>> import gs2d
+    >>> @gs2d.register_reader("link")
+    ... class LinkReader:
+    ...     def detect(self, path):
+    ...         return (path / "capture.txt").is_file()
+    ...     def read(self, path, *, downscale):
+    ...         return gs2d.load_scene((path / "capture.txt").read_text().strip(), downscale=downscale)
+    """
+    return READERS.register(name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 from gs2d.config.registry import Registry
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
+from gs2d.io import splat_ply
 from gs2d.io.formats.compressed_ply import read_compressed_ply, write_compressed_ply
 from gs2d.io.formats.gltf import read_gltf, write_gltf
 from gs2d.io.formats.sog import read_sog, write_sog
@@ -21,7 +23,7 @@ from gs2d.io.formats.spz import read_spz, write_spz
 from gs2d.io.formats.usd import ENDINGS as USD_ENDINGS
 from gs2d.io.formats.usd import read_usd, write_usd
 from gs2d.io.gaussians import Gaussians, logit
-from gs2d.io.splat_ply import ply_kind, read_gaussians, read_splats, write_splats
+from gs2d.io.splat_ply import ply_kind, read_gaussians
 
 Writer = Callable[[Path, Splats], tuple[str, ...] | None]
 Reader = Callable[[str | os.PathLike[str]], tuple[Gaussians, str]]
@@ -49,9 +51,33 @@ LAYOUTS: Registry[Layout] = Registry(
 
 
 def register_format(name: str, *, ending: str) -> Callable[[Writer], Writer]:
-    """Return a decorator that registers a function ``(path, splats)`` as a format of files with this ending.
+    """Return a decorator that registers an export format, for ``Splats.save`` and ``gs2d export``.
 
-    The function writes the file, and returns what the format could not hold, one sentence each, or None.
+    Parameters
+    ----------
+    name : str
+        Name of the layout, for ``layout=`` and ``--layout``; must not be taken.
+    ending : str
+        Ending of the file names, with its dot; one that begins with / is a whole file name.
+
+    Returns
+    -------
+    callable
+        Decorates a function ``(path, splats)`` that writes the file. It returns a tuple with one sentence for each
+        thing that the format cannot store, or None.
+
+    Raises
+    ------
+    DataError
+        From the decorator: the name is taken.
+
+    Examples
+    --------
+    >>> import gs2d, numpy as np
+    >>> @gs2d.register_format("xyz", ending=".xyz")
+    ... def write_xyz(path, splats):
+    ...     np.savetxt(path, splats.means.detach().cpu().numpy())
+    ...     return ("only the centres were written",)
     """
 
     def registered(write: Writer) -> Writer:
@@ -63,12 +89,12 @@ def register_format(name: str, *, ending: str) -> Callable[[Writer], Writer]:
 
 @register_format("2dgs", ending=".ply")
 def _write_2dgs(path: Path, splats: Splats) -> None:
-    write_splats(path, splats, layout="2dgs")
+    splat_ply.write_splats(path, splats, layout="2dgs")
 
 
 @register_format("3dgs", ending=".ply")
 def _write_3dgs(path: Path, splats: Splats) -> None:
-    write_splats(path, splats, layout="3dgs")
+    splat_ply.write_splats(path, splats, layout="3dgs")
 
 
 @register_format("compressed", ending=".ply")
@@ -152,6 +178,51 @@ def write_layout(path: Path, splats: Splats, layout: str) -> tuple[str, ...]:
     return LAYOUTS.get(layout).write(path, splats) or ()
 
 
+def write_splats(path: str | os.PathLike[str], splats: Splats, *, layout: str | None = "2dgs") -> None:
+    """Write splats to a file, as ``gs2d export`` does: the whole file, or nothing.
+
+    Parameters
+    ----------
+    path : path
+    splats : Splats
+        On any device.
+    layout : str, optional
+        "2dgs" (the PLY of the official code: float32 bit for bit), "3dgs" (the PLY that viewers open), "compressed",
+        "spz", "spz4", "splat", "usd", "gltf", "sog", "streamed", or a registered format. None: by the ending of
+        ``path``, where .ply is "3dgs".
+
+    Raises
+    ------
+    DataError
+        If no format has this name or ending, or the layout needs another ending.
+    DiskError
+        If the file could not be written.
+
+    Warns
+    -----
+    UserWarning
+        For each thing that the format cannot store.
+
+    Examples
+    --------
+    >>> gs2d.write_splats("garden.ply", trained.splats)  # doctest: +SKIP
+    >>> gs2d.write_splats("garden.spz", trained.splats, layout=None)  # doctest: +SKIP
+    """
+    path = Path(path)
+    chosen = layout_of(path) if layout is None else layout
+    if chosen is None:
+        endings = ", ".join(ENDINGS).replace("/", "")
+        raise DataError(f"splats are written as {endings}, got {path}; choose such a name, or give a layout")
+    ending = LAYOUTS.get(chosen).ending
+    if not f"/{path.name}".lower().endswith(ending):
+        raise DataError(
+            f"layout {chosen} is a {ending.removeprefix('/')} file, got {path}; choose such a name, or layout=None for "
+            "the format of the ending"
+        )
+    for note in write_layout(path, splats, chosen):
+        warnings.warn(f"{path.name}: {note}", stacklevel=2)
+
+
 def written_bytes(path: Path, layout: str) -> int:
     """Return the bytes of what was written, of all files that belong to it."""
     return streamed_bytes(path) if layout == "streamed" else path.stat().st_size
@@ -202,17 +273,31 @@ def read_splat_file(path: str | os.PathLike[str]) -> SplatFile:
         return _told("compressed PLY", read_compressed_ply(path), path)
     if kind == "3dgs":
         return _told("3dgs (three scales, for viewers)", read_gaussians(path), path)
-    splats = read_splats(path)  # names another kind
+    splats = splat_ply.read_splats(path)  # names another kind
     return SplatFile("2dgs", _finite(Gaussians.of(splats), path), splats)
 
 
-def read_disks(path: str | os.PathLike[str]) -> Splats:
-    """Return the flat splats of a file of any format that is written here.
+def read_splats(path: str | os.PathLike[str]) -> Splats:
+    """Read flat splats from a file of any format that gs2d writes.
+
+    Parameters
+    ----------
+    path : path
+        PLY (2DGS, 3DGS or compressed), .spz, .splat, .usd, .glb or .sog.
+
+    Returns
+    -------
+    Splats
+        float32 on the CPU; those of a 2DGS PLY are the stored numbers.
 
     Raises
     ------
     DataError
-        Missing, broken, no splats, or 3D Gaussians.
+        If the file is missing, broken, holds no splats, or holds 3D Gaussians with three scales.
+
+    Examples
+    --------
+    >>> splats = gs2d.read_splats("runs/garden/splats.ply")  # doctest: +SKIP
     """
     file = read_splat_file(path)
     return file.gaussians.to_surfels(path) if file.surfels is None else file.surfels

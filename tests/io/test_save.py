@@ -1,0 +1,101 @@
+"""``Splats.save`` and ``Mesh.save`` write what the exporters write, by the ending of the name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import gs2d
+from gs2d.errors import DataError, DiskError
+from gs2d.io.formats.registry import LAYOUTS, write_layout
+from gs2d.io.meshes import read_mesh
+
+
+@pytest.fixture
+def splats() -> gs2d.Splats:
+    g = torch.Generator().manual_seed(0)
+    return gs2d.Splats(
+        means=torch.rand(20, 3, generator=g),
+        quats=torch.nn.functional.normalize(torch.randn(20, 4, generator=g), dim=1),
+        log_scales=torch.randn(20, 2, generator=g) - 3,
+        opacity_logits=torch.randn(20, generator=g),
+        sh0=gs2d.rgb_to_sh0(torch.rand(20, 3, generator=g)),
+        shN=0.1 * torch.randn(20, 15, 3, generator=g),
+    )
+
+
+@pytest.fixture
+def mesh() -> gs2d.Mesh:
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+    return gs2d.Mesh(vertices, np.array([[0, 1, 2]], np.int32), np.full((3, 3), 200, np.uint8))
+
+
+@pytest.fixture
+def lossy() -> Iterator[None]:
+    @gs2d.register_format("centres", ending=".xyz")
+    def write_xyz(path: Path, splats: gs2d.Splats) -> tuple[str, ...]:
+        np.savetxt(path, splats.means.numpy())
+        return ("only the centres were written",)
+
+    yield
+    del LAYOUTS._things["centres"]
+
+
+@pytest.mark.parametrize(
+    ("name", "layout"), [("a.ply", "3dgs"), ("a.compressed.ply", "compressed"), ("A.SPZ", "spz"), ("a.splat", "splat")]
+)
+def test_the_ending_chooses_the_format_and_read_splats_reads_it(
+    splats: gs2d.Splats, tmp_path: Path, name: str, layout: str
+) -> None:
+    splats.save(tmp_path / name)
+    write_layout(tmp_path / "exported", splats, layout)
+    assert (tmp_path / name).read_bytes() == (tmp_path / "exported").read_bytes()
+    assert len(gs2d.read_splats(tmp_path / name)) == len(splats)
+
+
+def test_the_official_layout_holds_every_bit(splats: gs2d.Splats, tmp_path: Path) -> None:
+    splats.save(str(tmp_path / "a.ply"), layout="2dgs")
+    gs2d.write_splats(tmp_path / "b.ply", splats)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    again = gs2d.read_splats(tmp_path / "a.ply")
+    assert all(torch.equal(tensor, getattr(again, name)) for name, tensor in splats.items())
+
+
+@pytest.mark.parametrize(
+    ("name", "layout", "message"),
+    [
+        ("a.txt", None, "splats are written as .compressed.ply, .ply, .spz, .* got .*a.txt; choose such a name"),
+        ("a.spz", "2dgs", "layout 2dgs is a .ply file, got .*a.spz; choose such a name, or layout=None"),
+        ("a.ply", "3dg", "layout must be one of 2dgs, 3dgs, .* got '3dg'; did you mean 3dgs"),
+    ],
+)
+def test_a_name_that_no_format_has_is_refused_and_nothing_is_written(
+    splats: gs2d.Splats, tmp_path: Path, name: str, layout: str | None, message: str
+) -> None:
+    with pytest.raises(DataError, match=message):
+        splats.save(tmp_path / name, layout=layout)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("lossy")
+def test_what_a_format_cannot_hold_is_a_warning(splats: gs2d.Splats, tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="a.xyz: only the centres were written"):
+        splats.save(tmp_path / "a.xyz")
+
+
+def test_a_mesh_is_saved_by_its_ending(mesh: gs2d.Mesh, tmp_path: Path) -> None:
+    mesh.save(tmp_path / "a.ply")
+    again = read_mesh(tmp_path / "a.ply")
+    assert np.array_equal(again.vertices, mesh.vertices)
+    assert np.array_equal(again.colors, mesh.colors)
+    mesh.save(str(tmp_path / "a.GLB"))
+    assert (tmp_path / "a.GLB").read_bytes()[:4] == b"glTF"
+    with pytest.raises(DataError, match="a mesh is written as .ply or .glb, got .*a.stl; choose such a name"):
+        mesh.save(tmp_path / "a.stl")
+    with pytest.raises(DiskError, match="create it first"):
+        mesh.save(tmp_path / "none" / "a.ply")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.GLB", "a.ply"]
