@@ -455,6 +455,6 @@ class ViewOptions:
     port: int | None = None
     """Port of the page (default: the first free one from 8080 on)."""
     host: str = "127.0.0.1"
-    """Address that is listened on; 0.0.0.0 lets other machines in, and there is no password."""
+    """Address to listen on; 0.0.0.0 admits other machines too. The printed address holds the token that is needed."""
     threads: int | None = None
     """CPU threads."""
