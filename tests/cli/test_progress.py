@@ -120,6 +120,14 @@ def test_quiet_and_json_draw_nothing_on_stdout(capsys: pytest.CaptureFixture[str
     assert err == "training (3)\nnote n\n"
 
 
+@pytest.mark.parametrize(("verbose", "printed"), [(False, "note act\n"), (True, "note act\nnote routine\n")])
+def test_details_are_printed_with_verbose_only(verbose: bool, printed: str, capsys: pytest.CaptureFixture[str]) -> None:
+    console = Console(quiet=False, as_json=False, verbose=verbose)
+    for event in (Notice("act"), Notice("routine", detail=True)):
+        console.on_event(event)
+    assert capsys.readouterr().err == printed
+
+
 def test_a_table_is_whole_in_a_pipe_and_a_record_a_row_where_it_does_not_fit(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -62,7 +62,7 @@ def test_nodes_are_lost_in_the_middle_and_no_byte_changes(
 def test_an_interrupted_command_goes_on_to_the_same_bytes(
     nodes: tuple[subprocess.Popen[str], str], capture: Path, straight: Path, tmp_path: Path
 ) -> None:
-    words = blocks_words(capture, tmp_path / "job", nodes[1], SCHEDULE)
+    words = [*blocks_words(capture, tmp_path / "job", nodes[1], SCHEDULE), "--verbose"]
     with begin(words) as process:
         read_until(process, "block-0-0: starting from")
         process.send_signal(signal.SIGINT)
@@ -103,7 +103,7 @@ def test_photographs_become_a_run_though_the_machine_of_the_training_is_lost(
     words = ["reconstruct", str(room.photos), "--threads", "1", "--downscale", "4", "--recipe", "2dgs", "--robust"]
     words += ["off", "--schedule-scale", "0.005", "--checkpoint-every", "20", "--no-page"]
     words += ["--set", "init_points=100", "--set", "surface.densify.max_splats=150"]
-    with begin([*words, "--out", str(tmp_path / "run"), "--cluster", address]) as process:
+    with begin([*words, "--verbose", "--out", str(tmp_path / "run"), "--cluster", address]) as process:
         said = read_until(process, "training begins on")
         said += read_until(process, "training: starting from")
         lose(cluster)

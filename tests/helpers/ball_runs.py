@@ -25,12 +25,13 @@ def options(capture: Path, out: Path, **changes: Any) -> TrainOptions:
 
 
 def comparable(run: RunFolder) -> tuple[bytes, list[dict[str, Any]], list[dict[str, Any]]]:
-    """All of a run that may not depend on how it got there: splats, log, metrics without times."""
+    """All of a run that may not depend on how it got there: splats, log without notices, metrics without times."""
     stages = [
         {k: v for k, v in stage.items() if k not in ("seconds", "peak_memory_bytes", "reused_from")}
         for stage in run.metrics()["stages"]
     ]
-    return run.file("splats.ply").read_bytes(), run.events.read(), stages
+    log = [event for event in run.events.read() if event["kind"] != "notice"]  # they name memory and GPU of the machine
+    return run.file("splats.ply").read_bytes(), log, stages
 
 
 class Stop(Exception):

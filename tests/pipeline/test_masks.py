@@ -126,7 +126,7 @@ def test_points_that_lie_in_masked_pixels_alone_start_nothing(tmp_path: Path) ->
     scene = without_masked_points(load_scene(tmp_path, test_every=0), GENERIC, said.append)
     assert scene.points is not None
     np.testing.assert_allclose(scene.points.points, [*left, np.array([0.3, 0, 0])])
-    assert said == [Notice("3 of 7 sparse points lie in masked pixels alone: left out")]
+    assert said == [Notice("3 of 7 sparse points lie in masked pixels alone: left out", detail=True)]
     scene = without_masked_points(load_scene(tmp_path, test_every=0, masked="off"), GENERIC, said.append)
     assert scene.points is not None
     assert len(scene.points) == 7

@@ -18,7 +18,7 @@ from gs2d.io.run_dir import RunFolder
 from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.demo import demo
 from gs2d.pipeline.estimate import duration, full_iterations
-from gs2d.pipeline.events import Event, Notice, Step, ignore
+from gs2d.pipeline.events import Event, Notice, Phase, Step, ignore
 from gs2d.pipeline.job import prepare_job
 from gs2d.pipeline.options import DemoOptions
 from gs2d.pipeline.train import train
@@ -207,16 +207,21 @@ def test_iterations_on_smaller_photographs_count_for_less_in_an_estimate() -> No
     assert full_iterations(smaller) == 8_000 / 16 + 12_000 / 4 + 10_000 + 30_000
 
 
-def test_an_estimate_is_told_before_training_and_changes_no_byte(
+def test_two_lines_are_told_before_training_and_the_estimate_changes_no_byte(
     undisturbed: RunFolder, capture: Path, tmp_path: Path
 ) -> None:
     heard: list[Event] = []
     run = train(replace(options(capture, tmp_path / "run"), estimate=True), heard.append)
     assert run.file("splats.ply").read_bytes() == undisturbed.file("splats.ply").read_bytes()
-    texts = [event.text for event in heard if isinstance(event, Notice)]
-    told = next(i for i, text in enumerate(texts) if text.startswith("training will take about"))
-    assert "60 iterations" in texts[told]
-    assert "photographs do not train, they score the result" in texts[told + 1]
+    training = next(i for i, event in enumerate(heard) if isinstance(event, Phase) and event.name == "training 2dgs-r")
+    told = [event for event in heard[:training] if isinstance(event, Notice)]
+    used, takes = (event.text for event in told if not event.detail)
+    assert used.endswith(" score the result")
+    assert " photographs train at 24x24 for 60 iterations (--schedule-scale 0.001); " in used
+    assert takes.startswith("training will take about ")
+    details = [event.text for event in told if event.detail]
+    assert details
+    assert [event["text"] for event in run.events.read() if event["kind"] == "notice"] == details
 
 
 @pytest.mark.parametrize(

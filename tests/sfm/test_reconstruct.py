@@ -58,7 +58,7 @@ def test_photographs_become_a_run_with_its_capture(
     assert run(words_for(room.photos, out)) == 0
     said = capsys.readouterr()
     assert "12 of 12 photographs have a place" in said.err
-    assert "on pictures of 25x25 (--downscale 8)" in said.err
+    assert "12 of 12 photographs train at 25x25 (--downscale 8) for " in said.err
     assert re.search(r"training will take about \d+ s to \d+ s: \d+ iterations", said.err)
     assert said.out.splitlines()[-1] == f"look at it: open scene.html in a browser, or gs2d view '{out}'"
     assert (out / "scene.html").exists()
@@ -314,7 +314,8 @@ def test_test_views_are_as_many_as_asked_for(room: Room, tmp_path: Path) -> None
     out = started(room, tmp_path)
     training = replace(TRAINING, test_every=4)
     options = ReconstructOptions(photos=room.photos, out=out, resume=True, training=training, **SMALL)  # type: ignore[arg-type]
-    assert "3 of 12 photographs do not train, they score the result (--test-every 0 trains on all)" in notices(options)
+    (line,) = [text for text in notices(options) if text.startswith("9 of 12 photographs train at ")]
+    assert line.endswith("; 3 do not train, they score the result (--test-every 0 trains on all)")
     definition = open_run(out).definition()
     assert (definition["scene"]["train"], definition["scene"]["test"]) == (9, 3)
     assert definition["protocol"]["test_every"] == 4

@@ -83,7 +83,9 @@ def run(argv: Sequence[str]) -> int:
     except (UsageError, Gs2dError) as error:
         return _fail(str(error)) if os.environ.get("RANK", "0") == "0" else EXIT_USAGE
     interruptible = Interruptible()
-    console = Console(quiet=command.quiet, as_json=command.json, before_each=interruptible.check)
+    console = Console(
+        quiet=command.quiet, as_json=command.json, verbose=command.verbose, before_each=interruptible.check
+    )
     try:
         if not isinstance(command, _LIGHT):
             check_address_space()

@@ -34,6 +34,8 @@ class Common:
 
     quiet: bool = False
     """No progress and no tables; errors only."""
+    verbose: bool = False
+    """Print every decision; without it those that need no action are in events.jsonl only."""
     json: bool = False
     """Results as JSON on stdout, and nothing else there."""
     debug: bool = False

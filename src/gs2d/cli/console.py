@@ -57,10 +57,16 @@ def _has_cursor(file: IO[str] | None) -> bool:
 
 
 class Console:
-    """The screen. With ``quiet`` nothing but results asked for as JSON; with ``as_json`` stdout carries only JSON."""
+    """The screen. With ``quiet`` nothing but results asked for as JSON; with ``as_json`` stdout carries only JSON.
 
-    def __init__(self, *, quiet: bool, as_json: bool, before_each: Callable[[], None] = lambda: None) -> None:
+    Notices that are details are printed with ``verbose`` only.
+    """
+
+    def __init__(
+        self, *, quiet: bool, as_json: bool, verbose: bool = False, before_each: Callable[[], None] = lambda: None
+    ) -> None:
         self.quiet = quiet
+        self._verbose = verbose
         self.as_json = as_json
         self._before_each = before_each  # event; may raise
         self._out = _screen(sys.stdout, soft_wrap=True)
@@ -92,7 +98,8 @@ class Console:
             self._whole.on_step(event.done)
             self._step(event)
         elif isinstance(event, Notice):
-            self._note(event.text)
+            if self._verbose or not event.detail:
+                self._note(event.text)
         elif isinstance(event, MissingFile):
             self._err.print(
                 f"[red]not made[/red] {escape(printable(event.what))}: {escape(printable(event.reason))}",

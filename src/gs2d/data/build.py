@@ -310,14 +310,8 @@ def build_scene(
         bounds=bounds,
         T_metric_scene=capture.T_metric_scene,
         skipped=capture.skipped,
-        notes=capture.notes
-        + mask_notes
-        + cut
-        + _lens_notes(frames)
-        + map_notes
-        + place_notes
-        + point_notes
-        + bound_notes,
+        notes=capture.notes + mask_notes + cut + map_notes + place_notes + point_notes + bound_notes,
+        details=_lens_notes(frames),
         root=root,
         masks=masks,
         observe=_observed(capture, frames, points, {view.name: view.camera for view in views}),

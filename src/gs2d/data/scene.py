@@ -249,7 +249,9 @@ class Scene:
     skipped : tuple of str
         Views that are listed but could not be used, one sentence each, for the user to see.
     notes : tuple of str
-        What loading decided that the user may want to know, one sentence each.
+        What loading decided that the user may have to act on, one sentence each.
+    details : tuple of str
+        Routine decisions of loading, one sentence each.
     root : Path or None
         The folder it came from.
     observe : callable or None
@@ -271,6 +273,7 @@ class Scene:
     T_metric_scene: np.ndarray = field(default_factory=lambda: np.eye(4))
     skipped: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    details: tuple[str, ...] = ()
     root: Path | None = None
     observe: Callable[[], ObservedPoints] | None = None
     ahead: int = 0

@@ -336,7 +336,7 @@ class OnCluster(Executor[AnyTask]):
         elif isinstance(event, Step):
             at.done = event.done
         elif isinstance(event, Notice) and not event.text.startswith(f"{name} failed: "):  # said when it has ended
-            on_event(Notice(f"{name}: {event.text}"))
+            on_event(Notice(f"{name}: {event.text}", event.detail))
         elif isinstance(event, StageDone):
             on_event(Notice(f"{name}: {event.line()}"))
         elif isinstance(event, MissingFile):

@@ -55,9 +55,17 @@ class Step:
 
 @dataclass(frozen=True)
 class Notice:
-    """Something the user should know: what was chosen for him, skipped or found odd."""
+    """A line for the user.
+
+    Attributes
+    ----------
+    text : str
+    detail : bool
+        A decision that needs no action: printed with ``--verbose``, and logged in ``events.jsonl`` before training.
+    """
 
     text: str
+    detail: bool = False
 
 
 @dataclass(frozen=True)

@@ -42,8 +42,8 @@ def describe_capture(path: Path) -> dict[str, Any]:
     }
     if scene.skipped:
         facts["skipped"] = list(scene.skipped)
-    if scene.notes:
-        facts["notes"] = list(scene.notes)
+    if notes := scene.notes + scene.details:
+        facts["notes"] = list(notes)
     if missing := missing_lines(path):
         facts["missing"] = list(missing)
     return facts

@@ -335,7 +335,7 @@ def fit_recipe(options: TrainOptions, scene: Scene, protocol: Protocol, on_event
         exposure = found.spread >= DIFFERS
         least, most = found.gains.mean(axis=1).min(), found.gains.mean(axis=1).max()
         what = "learned for each" if exposure else "taken to be one (--exposure learns them)"
-        on_event(Notice(f"exposures of the photographs: {least:.2f} to {most:.2f} times their mean; {what}"))
+        on_event(Notice(f"exposures of the photographs: {least:.2f} to {most:.2f} times their mean; {what}", detail=True))
     if options.response and len(Photometries.start(scene.train).reach) == 1:
         on_event(Notice("--response learns by what cameras differ: of one camera, as here, it learns nothing"))
     faces = sum(view.is_face for view in scene.train)
@@ -360,7 +360,7 @@ def with_backdrop(recipe: Recipe, protocol: Protocol, scene: Scene, on_event: On
     decay = recipe.opacity_decay
     fades = decay is not None and decay.backdrop_rate is not None and decay.backdrop_rate > decay.rate
     also = "; splats of that colour fade" if fades else ""
-    on_event(Notice(f"background ({shown}): the colour of what shows no sparse points{also}"))
+    on_event(Notice(f"background ({shown}): the colour of what shows no sparse points{also}", detail=True))
     return recipe, replace(protocol, background=found.color)
 
 
@@ -401,7 +401,8 @@ def prepare_job(options: TrainOptions, on_event: OnEvent) -> Job:
     digest = with_priors(digest, scene, recipe, on_event)
     settings = raster_settings(protocol, scene.extent, recipe.sh_degree)
     if protocol.near is None:
-        on_event(Notice(f"near plane at {settings.near:.4g}: 1 % of the scene's extent of {scene.extent:.4g}"))
+        near = f"near plane at {settings.near:.4g}: 1 % of the scene's extent of {scene.extent:.4g}"
+        on_event(Notice(near, detail=True))
     cache_bytes = options.stage2_cache_mb << 20
     if options.part is not None and options.part.splats is not None:
         part = load_part(options.part, scene, recipe)
@@ -422,7 +423,7 @@ def settled(options: TrainOptions, scene: Scene, protocol: Protocol, on_event: O
     if len(scene.train) <= FEW_VIEWS and (slower := with_few_views(recipe)) != recipe:
         recipe = slower
         few = f"{len(scene.train)} training photographs"
-        on_event(Notice(f"{few}: SH beyond degree 0 learn as in 2DGS, not faster, and L2 is left out"))
+        on_event(Notice(f"{few}: SH beyond degree 0 learn as in 2DGS, not faster, and L2 is left out", detail=True))
     return recipe, with_fused_depth(protocol, recipe)
 
 
@@ -439,7 +440,7 @@ def read_init(path: Path, on_event: OnEvent) -> tuple[Splats, str]:
         hint = f"give {inside}" if inside.exists() else "give a file of splats"
         raise DataError(f"--init must be a file of splats, got the folder {path}; {hint}")
     splats, kind = read_surfels(path)
-    on_event(Notice(f"starting from {path.name}: {len(splats):,} {kind}"))
+    on_event(Notice(f"starting from {path.name}: {len(splats):,} {kind}", detail=True))
     return splats, hashlib.sha256(path.read_bytes()).hexdigest()
 
 
@@ -454,7 +455,8 @@ def choose_protocol(options: TrainOptions, scene_format: str, on_event: OnEvent)
     if named == "auto":
         protocol = protocol_of(options.scene, scene_format)
         if protocol is not protocol_for(scene_format):
-            on_event(Notice(f"protocol {protocol.name}: {options.scene.name} is a scene of that data set"))
+            line = f"protocol {protocol.name}: {options.scene.name} is a scene of that data set"
+            on_event(Notice(line, detail=True))
     else:
         protocol = get_protocol(named) if isinstance(named, str) else named
     if options.test_every is None:
@@ -475,7 +477,7 @@ def choose_backend(name: str, on_event: OnEvent) -> Backend:
     report = backend_report()  # best first: all before the one that was taken cannot run
     taken = [status.name for status in report].index(backend.name)
     if backend.device != "cpu":
-        on_event(Notice(f"training on {report[taken].details} (--backend cpu for the processor)"))
+        on_event(Notice(f"training on {report[taken].details} (--backend cpu for the processor)", detail=True))
     elif (torch.version.cuda or torch.version.hip) is not None and torch.cuda.device_count() > 0:
         on_event(Notice(f"training without the GPU: {report[0].reason}; {report[0].remedy}"))
     if backend.slow:
@@ -505,6 +507,8 @@ def read_scene(
     scene = load_scene(path, format=scene_format, downscale=downscale, test_every=test_every, **masks.options())
     for text in scene.notes:
         on_event(Notice(text))
+    for text in scene.details:
+        on_event(Notice(text, detail=True))
     _say_some(scene.skipped, "views skipped", on_event)
     return scene
 

@@ -55,7 +55,8 @@ def without_masked_points(scene: Scene, protocol: Protocol, on_event: OnEvent) -
     out = (masked > 0) & (kept == 0)
     if not out.any() or out.all():
         return scene
-    on_event(Notice(f"{int(out.sum()):,} of {len(points):,} sparse points lie in masked pixels alone: left out"))
+    line = f"{int(out.sum()):,} of {len(points):,} sparse points lie in masked pixels alone: left out"
+    on_event(Notice(line, detail=True))
     return replace(scene, points=_rows(points, ~out))
 
 

@@ -94,4 +94,4 @@ def command_of(options: PlanOptions, found: CapturePlan) -> str:
 def plan_notices(job: Job, prepare: str, *, timed: bool) -> list[Notice]:
     """Return what is said before a training begins; how long it takes too, unless that is going to be measured."""
     lines = planned_of(job, prepare).lines()
-    return [Notice(line) for line in lines if timed or not line.startswith("time: ")]
+    return [Notice(line, detail=True) for line in lines if timed or not line.startswith("time: ")]

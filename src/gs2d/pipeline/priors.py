@@ -45,9 +45,10 @@ def with_priors(digest: str, scene: Scene, recipe: Recipe, on_event: OnEvent) ->
     if priors.plan is not None:
         if not depths:
             raise DataError(f"the depth maps of {scene.name} leave nothing known in any training view; are they empty?")
-        on_event(Notice(depth_text(priors.plan, depths, len(scene.train))))
+        on_event(Notice(depth_text(priors.plan, depths, len(scene.train)), detail=True))
     if priors.axes is not None:
-        on_event(Notice(f"known normals: {normals} of {len(scene.train)} training views, axes {priors.axes}"))
+        line = f"known normals: {normals} of {len(scene.train)} training views, axes {priors.axes}"
+        on_event(Notice(line, detail=True))
     return whole.hexdigest()
 
 

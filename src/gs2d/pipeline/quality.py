@@ -74,12 +74,11 @@ def at_quality(
     chosen = replace(options, schedule_scale=scale, downscale=downscale)
     iterations = check_train_options(chosen).iterations
     shown = max(cameras, key=lambda camera: max(camera.width, camera.height)).downscaled(downscale)
-    on_event(
-        Notice(
-            f"quality {name}: {iterations:,} iterations (--schedule-scale {scale:g}) "
-            f"on pictures of {shown.width}x{shown.height} (--downscale {downscale})"
-        )
+    line = (
+        f"quality {name}: {iterations:,} iterations (--schedule-scale {scale:g}) "
+        f"on pictures of {shown.width}x{shown.height} (--downscale {downscale})"
     )
+    on_event(Notice(line, detail=True))
     return chosen
 
 

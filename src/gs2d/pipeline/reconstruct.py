@@ -272,6 +272,5 @@ def _by_the_images(training: TrainOptions, options: ReconstructOptions, on_event
     sized = replace(training, downscale=options.downscale)
     chosen = at_quality(sized, options.quality, cameras, on_event, options.schedule_scale)
     if training.test_every is None and training.protocol == "auto" and photographs < FEW:
-        on_event(Notice(f"all photographs train, because they are fewer than {FEW} (--test-every 8 holds some out)"))
         chosen = replace(chosen, test_every=0)
     return chosen

@@ -183,7 +183,7 @@ class RunLogger:
             if isinstance(event, _ROWS_OR_JUMPS):
                 self._before = None  # other rows, or a jump that no gradient made
             if isinstance(event, train_events.Initialised):
-                self._on_event(Notice(start_text(event)))
+                self._on_event(Notice(start_text(event), detail=True))
             self._log(_KINDS[type(event)], event)
 
     # -- the log -------------------------------------------------------------------------------------------------------

@@ -129,7 +129,10 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
     except BaseException:
         remove_made(made)
         raise
-    for line in filter(None, (result["lens"]["about"], _pieces_line(result), *_doubts(result))):
+    lens = result["lens"]
+    if lens["about"]:
+        on_event(Notice(lens["about"], detail=not (lens.get("asked") or lens.get("fisheyes"))))
+    for line in filter(None, (_pieces_line(result), *_doubts(result))):
         on_event(Notice(line))
     return {"capture": str(options.out), **result}
 
@@ -294,7 +297,7 @@ def _stage(
     if options.link and counts["copied"]:
         on_event(Notice(f"{counts['copied']} photographs were copied: --out is on a disk that cannot link to theirs"))
     if turned := sum(photo.orientation != 1 for photo in photos):
-        on_event(Notice(f"{turned} photographs were turned upright, as their EXIF orientation says"))
+        on_event(Notice(f"{turned} photographs were turned upright, as their EXIF orientation says", detail=True))
     return staged
 
 

@@ -96,6 +96,8 @@ def _train(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> Ru
     use_threads(options.threads, together.place.local_size)
     use_memory(memory_of(together.place, options.memory))
     on_event(Plan(TRAINED))
+    details: list[str] = []
+    on_event = keeping_details(on_event, details)
     options = by_quality(options, on_event)
     job = prepare_job(options, on_event)
     if options.overwrite:
@@ -124,9 +126,11 @@ def _train(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> Ru
         if start.state is None and _is_planned(options, len(job.scene.views)):
             for line in plan_notices(job, options.prepare, timed=not options.estimate):
                 on_event(line)
-        if options.estimate and start.state is None:
-            for event in pretraining_notices(job):
+        if start.state is None:
+            for event in pretraining_notices(job, options):
                 on_event(event)
+            for text in details:
+                run.events.append({"kind": "notice", "text": text})
         hold()
         if options.part is not None:
             train_stages(run, job, options, start, watch)
@@ -264,17 +268,41 @@ def train_stages(
     return state.splats, scene_now(state, job.scene)
 
 
-def pretraining_notices(job: Job) -> list[Event]:
-    """Tell before hours of training which photographs do not train, and how long it takes."""
+def keeping_details(on_event: OnEvent, details: list[str]) -> OnEvent:
+    """Return a listener that adds the text of each detail to ``details`` and passes every event on."""
+
+    def listen(event: Event) -> None:
+        if isinstance(event, Notice) and event.detail:
+            details.append(event.text)
+        on_event(event)
+
+    return listen
+
+
+def pretraining_notices(job: Job, options: TrainOptions) -> list[Event]:
+    """Return what the user should know before training: photographs, image size, length and expected time."""
     from gs2d.pipeline.estimate import estimate, estimate_text
 
-    found, test, views = estimate(job), len(job.scene.test), len(job.scene.views)
-    told: list[Event] = []
+    scene, shrunk, shortened = job.scene, "", ""
+    camera = max((view.camera for view in scene.views), key=lambda camera: max(camera.width, camera.height))
+    if job.downscale > 1:
+        shrunk = f" (--downscale {job.downscale})"
+    if options.schedule_scale != 1:
+        shortened = f" (--schedule-scale {options.schedule_scale:g})"
+    if scene.test:
+        held_out = f"{len(scene.test)} do not train, they score the result"
+        held_out += "" if scene.format == "blender" else " (--test-every 0 trains on all)"  # which has its own split
+    else:
+        held_out = "none is held out to score the result (--test-every 8 holds some out)"
+    told: list[Event] = [
+        Notice(
+            f"{len(scene.train)} of {len(scene.views)} photographs train at {camera.width}x{camera.height}{shrunk} for "
+            f"{job.recipe.iterations:,} iterations{shortened}; {held_out}"
+        )
+    ]
+    found = estimate(job) if options.estimate else None
     if found is not None:
         told += [Expected(found.least, found.most), Notice(estimate_text(found, job.recipe.iterations))]
-    if test:
-        text = f"{test} of {views} photographs do not train, they score the result (--test-every 0 trains on all)"
-        told.append(Notice(text))
     return told
 
 
