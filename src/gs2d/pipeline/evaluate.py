@@ -64,7 +64,7 @@ def evaluate_run(
         best = tuple(aligned(splats, job.scene.test, *drawing, job.scene.extent, on_event))
         scores = score_views(splats, best, *drawing, name=name, on_event=on_event, lpips=lpips)
         result |= split_metrics(scores, "test_aligned", "test")
-    collected = Collector(job.scene, job.settings.background)
+    collected = Collector(job.scene)
     for split, views in (("train", job.scene.train), ("test", job.scene.test)):
         name = f"scoring {split} views"
         more: dict[str, Any] = {"exposures": exposures, "split": split, "visitors": [collected.visit]}

@@ -335,7 +335,9 @@ def fit_recipe(options: TrainOptions, scene: Scene, protocol: Protocol, on_event
         exposure = found.spread >= DIFFERS
         least, most = found.gains.mean(axis=1).min(), found.gains.mean(axis=1).max()
         what = "learned for each" if exposure else "taken to be one (--exposure learns them)"
-        on_event(Notice(f"exposures of the photographs: {least:.2f} to {most:.2f} times their mean; {what}", detail=True))
+        on_event(
+            Notice(f"exposures of the photographs: {least:.2f} to {most:.2f} times their mean; {what}", detail=True)
+        )
     if options.response and len(Photometries.start(scene.train).reach) == 1:
         on_event(Notice("--response learns by what cameras differ: of one camera, as here, it learns nothing"))
     faces = sum(view.is_face for view in scene.train)

@@ -136,7 +136,7 @@ def _train(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> Ru
             train_stages(run, job, options, start, watch)
             release(job.scene)
             return run
-        collected = Collector(job.scene, job.settings.background)
+        collected = Collector(job.scene)
         with MeshFrames(job) as frames:
             visitors = [frames.visit, collected.visit]
             splats, now = train_stages(run, job, options, start, watch, visitors, together)

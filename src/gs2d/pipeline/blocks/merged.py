@@ -158,7 +158,7 @@ def finish_merged(settled: Settled, options: TrainOptions, on_event: OnEvent) ->
     brightness = metered(splats, job.settings, job.backend)
     exposures = with_predicted(read_exposures(run, job.recipe), scene, brightness)
     entry = {**_spent(options.out), "splats": len(splats), "bytes": splats.nbytes}
-    collected = Collector(scene, job.settings.background)
+    collected = Collector(scene)
     hold()
     with MeshFrames(job) as frames:
         for split, views in (("train", scene.train), ("test", scene.test)):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from gs2d.core.json_files import read_json, write_json
 from gs2d.data.subject import OBJECT, read_subject
 from gs2d.errors import DataError, RunError
@@ -33,8 +31,9 @@ def write_verdict(run: RunFolder, job: Job, collected: Collector) -> dict[str, A
     if collected.failure is not None:
         raise collected.failure
     if collected.views:
-        learns = job.recipe.exposure is not None
-        measures = measure(job.scene, collected.views, subject=_subject(run), learns_exposure=learns)
+        subject = read_subject(run.path)
+        center = subject.center if subject is not None and subject.kind == OBJECT else None
+        measures = measure(job.scene, collected.views, center)
     else:
         measures = _measured_before(run)
     data = {"format": FORMAT, "verdict": judge(measures).to_json(), "measured": measures.to_json()}
@@ -62,9 +61,3 @@ def _measured_before(run: RunFolder) -> Measures:
     if not run.file(VERDICT).exists():
         raise RunError("the views were scored before the run was broken off, and are not measured")
     return measures_from_json(_read(run).get("measured") or {})
-
-
-def _subject(run: RunFolder) -> np.ndarray | None:
-    """Return the middle of the subject, where one was found."""
-    subject = read_subject(run.path)
-    return subject.center if subject is not None and subject.kind == OBJECT else None

@@ -8,7 +8,7 @@ from typing import Any
 from jinja2 import UndefinedError
 from markupsafe import Markup
 
-from gs2d.config.grades import TEST_PSNR, TRAIN_PSNR
+from gs2d.config.grades import LIMITS, NEW, TRAINED
 from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
 from gs2d.report.html import render
@@ -38,7 +38,7 @@ def verdict_section(path: Path) -> Markup:
 
 def grade_of(psnr: float, split: str) -> str:
     """Return the grade of a mean PSNR."""
-    return (TEST_PSNR if split == "test" else TRAIN_PSNR).grade(psnr)
+    return LIMITS[NEW if split == "test" else TRAINED].grade(psnr)
 
 
 def scaled(value: Any, factor: float) -> float | None:
