@@ -112,8 +112,9 @@ def _score(
     fit = fit_exposure(output.color, target, everywhere)
     fitted = output.color @ fit[:, :3].T + fit[:, 3]
     points = HiddenPoints(0, 0)
-    if scene.observe is not None:
-        points = hidden_points(output.depth_median.numpy(), scene.observe().in_view(view.name, view.camera))
+    observed = scene.observed(guessed=False)
+    if observed is not None:
+        points = hidden_points(output.depth_median.numpy(), observed.in_view(view.name, view.camera))
     return {
         "psnr": psnr_float(color, target, mask),
         "fitted": psnr_float(fitted, target, mask),
@@ -127,8 +128,8 @@ def near_weight(scene: Scene, splats: Splats, settings: RasterSettings) -> float
 
     The weight of a splat in a view is the derivative of the sum of all pixels with respect to its colour.
     """
-    assert scene.observe is not None
-    observed = scene.observe()
+    observed = scene.observed(guessed=False)
+    assert observed is not None
     depths = [observed.in_view(view.name, view.camera).depth for view in scene.train]
     limit = NEARER * float(np.percentile(np.concatenate(depths), NEAR_PERCENTILE))
     near, whole = 0.0, 0.0
@@ -177,7 +178,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for capture in args.captures:
         path, _, downscale = capture.partition(":")
         scene = load_scene(path, downscale=int(downscale or 1))
-        if scene.observe is None or not scene.test:
+        if scene.observed(guessed=False) is None or not scene.test:
             raise SystemExit(f"{path} must say which sparse points its photographs show, and have test views")
         for variant in args.variants:
             trainer, seconds = train_variant(scene, variant, args.recipe, args.scale, args.seed)

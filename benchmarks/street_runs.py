@@ -243,9 +243,9 @@ def score_run(path: Path) -> dict[str, Any]:
 
 def hidden_fraction(job: Job, splats: Splats) -> dict[str, Any] | None:
     """Sparse points that the rendered median depth of test views hides; None without test views or points."""
-    if job.scene.observe is None or not job.scene.test:
+    observed, counts = job.scene.observed(guessed=False), {}
+    if observed is None or not job.scene.test:
         return None
-    observed, counts = job.scene.observe(), {}
     for view in job.scene.test:
         with torch.no_grad():
             depth = rasterize(splats, view.camera, job.settings, backend=job.backend).depth_median.cpu().numpy()
