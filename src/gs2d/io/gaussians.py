@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 
 import numpy as np
 import torch
 
+from gs2d.core.sh import MAX_DEGREE, harmonics, num_coefficients
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import transform_splats
 from gs2d.errors import DataError
 
-FLAT_LOG_SCALE = math.log(1e-6)  # world units, the thickness that files of three scales are told
-_THIN = 0.25  # third scale / larger of the others: of disks that a file of few bits made thicker
+Tell = Callable[[str], object]
+"""Receives one sentence about what a reader left out or changed."""
+FLAT_LOG_SCALE = math.log(1e-6)  # world units, the largest thickness that a disk has in files of three scales
+NO_SCALE = -80.0  # the log scale that stands for a scale of 0
+_SHARE = 0.01  # largest thickness of a disk / its smaller scale
+THIN = 0.25  # third scale / larger of the others: of disks that a file of few bits made thicker
+_OBLIQUE = np.array([0.36, 0.48, 0.8])  # a direction in which no harmonic is 0
 _FLAT = 0.99  # share of the Gaussians that must be disks
 
 
@@ -53,10 +60,9 @@ class Gaussians:
 
     @classmethod
     def of(cls, splats: Splats) -> Gaussians:
-        """Disks as Gaussians with a third scale of 1e-6 along their normals."""
+        """Disks as Gaussians whose third scale, along their normals, is that of ``with_thickness``."""
         a = {name: tensor.detach().to("cpu", torch.float32).numpy() for name, tensor in splats.items()}
-        flat = np.full((len(splats), 1), FLAT_LOG_SCALE, np.float32)
-        scales = np.concatenate([a["log_scales"], flat], axis=1)
+        scales = with_thickness(a["log_scales"])
         return cls(a["means"], a["quats"], scales, a["opacity_logits"], a["sh0"].reshape(-1, 3), a["shN"])
 
     @classmethod
@@ -86,24 +92,28 @@ class Gaussians:
             turns = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
         if not (turns and np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6)):
             raise ValueError("a transform that turns, shifts and scales alike in all directions was expected")
-        tensors = [torch.from_numpy(np.ascontiguousarray(a, dtype=np.float32)) for a in (
-            self.means, self.quats, self.log_scales[:, :2], self.opacity_logits, self.sh0[:, None, :], self.shN
-        )]  # fmt: skip
-        moved = Gaussians.of(transform_splats(Splats(*tensors), scale, rotation, matrix[:3, 3]))
+        moved = Gaussians.of(transform_splats(self.disks(), scale, rotation, matrix[:3, 3]))
         thickness = (self.log_scales[:, 2:].astype(np.float64) + math.log(scale)).astype(np.float32)
         return replace(moved, log_scales=np.concatenate([moved.log_scales[:, :2], thickness], axis=1))
 
     def half_turned_about_z(self) -> Gaussians:
         """Return them after a half turn of their frame about z: signs and places change, and no number."""
         w, x, y, z = self.quats.T
-        orders = [m for degree in range(1, self.sh_degree + 1) for m in range(-degree, degree + 1)]
-        signs = np.array([-1 if m % 2 else 1 for m in orders], np.float32)[:, None]  # Y(-x, -y, z) = (-1)^m Y(x, y, z)
+        return replace(self.mirrored((-1, -1, 1)), quats=np.stack([-z, -y, x, w], axis=1))
+
+    def mirrored(self, signs: tuple[int, int, int]) -> Gaussians:
+        """Return them with axes of their frame reversed, one sign (1 or -1) an axis; exact, no number changes.
+
+        A rotation R becomes S R S with S = diag(signs), which is a rotation too and gives the mirrored covariance.
+        """
+        x, y, z = signs
+        at, there = (np.array(harmonics(*place, self.sh_degree)) for place in (_OBLIQUE, np.multiply(_OBLIQUE, signs)))
         with np.errstate(invalid="ignore"):  # of a NaN that signals: what comes of it is checked
             return replace(
                 self,
-                means=self.means * np.array([-1, -1, 1], np.float32),
-                quats=np.stack([-z, -y, x, w], axis=1),
-                shN=self.shN * signs,
+                means=self.means * np.array(signs, np.float32),
+                quats=self.quats * np.array([1, y * z, x * z, x * y], np.float32),
+                shN=self.shN * np.sign(at * there).astype(np.float32).reshape(-1, 1),
             )
 
     def rows(self, index: np.ndarray) -> Gaussians:
@@ -114,7 +124,7 @@ class Gaussians:
     def is_flat(self) -> bool:
         """Whether nearly all are disks with their normals along the third axis, as ours are."""
         thickest = self.log_scales[:, 2] - self.log_scales[:, :2].max(axis=1, initial=-np.inf)
-        return bool((thickest <= math.log(_THIN)).mean() >= _FLAT) if len(self) else True
+        return bool((thickest <= math.log(THIN)).mean() >= _FLAT) if len(self) else True
 
     def to_surfels(self, path: str | os.PathLike[str]) -> Splats:
         """Return the disks of a file ``path`` that flat splats were written to.
@@ -129,10 +139,12 @@ class Gaussians:
                 f"{os.fspath(path)}: flat splats were expected, got 3D Gaussians with three scales; give splats of a "
                 "gs2d or 2DGS run"
             )
-        tensors = [torch.from_numpy(np.ascontiguousarray(a, dtype=np.float32)) for a in (
-            self.means, self.quats, self.log_scales[:, :2], self.opacity_logits, self.sh0[:, None, :], self.shN
-        )]  # fmt: skip
-        return Splats(*tensors)
+        return self.disks()
+
+    def disks(self) -> Splats:
+        """Return them without their third scales, whatever these are."""
+        arrays = (self.means, self.quats, self.log_scales[:, :2], self.opacity_logits, self.sh0[:, None, :], self.shN)
+        return Splats(*(torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)) for array in arrays))
 
     def flattened(self) -> Splats:
         """Return flat splats: each Gaussian loses its smallest scale, along whose axis its normal then points.
@@ -159,6 +171,25 @@ class Gaussians:
         return Splats(*(torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)) for array in arrays))
 
 
+def with_thickness(log_scales: np.ndarray) -> np.ndarray:
+    """Return log scales [N, 3] of disks [N, 2] for formats of 3D Gaussians, float32.
+
+    The third scale is 1e-6 world units, or a hundredth of the smaller of the two where that is less: disks stay disks
+    in a scene of any units.
+    """
+    thickness = np.minimum(log_scales.min(axis=1, keepdims=True) + math.log(_SHARE), FLAT_LOG_SCALE)
+    return np.concatenate([log_scales, thickness], axis=1).astype(np.float32)
+
+
+def drawn_bands(path: str | os.PathLike[str], shN: np.ndarray, tell: Tell) -> np.ndarray:
+    """Return higher SH coefficients [N, K-1, ...] without the bands above degree 3; ``tell`` hears of those."""
+    if shN.shape[1] < num_coefficients(MAX_DEGREE):
+        return shN
+    degree = math.isqrt(1 + shN.shape[1]) - 1
+    tell(f"{Path(path).name}: SH degree {degree} was read without what is above degree {MAX_DEGREE}, the highest here")
+    return shN[:, : num_coefficients(MAX_DEGREE) - 1]
+
+
 def unit_quats(quats: np.ndarray) -> np.ndarray:
     """Quaternions [N, 4] of length 1, float64; zero becomes no rotation."""
     q = quats.astype(np.float64)
@@ -178,9 +209,9 @@ def logit(opacities: np.ndarray) -> np.ndarray:
 
 
 def log_scales_of(scales: np.ndarray) -> np.ndarray:
-    """Return logarithms, float32, of scales of 0 or more; that of 0 is -80."""
+    """Return logarithms, float32, of scales of 0 or more; that of 0 is -80, that of NaN is NaN."""
     with np.errstate(divide="ignore"):
-        return np.maximum(np.log(scales.astype(np.float64)), -80.0).astype(np.float32)
+        return np.maximum(np.log(scales.astype(np.float64)), NO_SCALE).astype(np.float32)
 
 
 def logit_of_byte(alpha: np.ndarray) -> np.ndarray:

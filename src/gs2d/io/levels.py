@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from gs2d.io.gaussians import FLAT_LOG_SCALE, Gaussians, logit, sigmoid, unit_quats
+from gs2d.io.gaussians import Gaussians, logit, sigmoid, unit_quats, with_thickness
 
 _NEIGHBOURS = 10
 _COLOR = 100.0  # of a squared difference of colours (in [0, 1]), against the logarithm of a volume
@@ -144,7 +144,7 @@ def _merged(g: Gaussians, pairs: np.ndarray) -> Gaussians:
     values, axes = np.linalg.eigh(shared)  # ascending: the normal, then the axes of the disk
     axes = axes[:, :, ::-1].copy()
     axes[:, :, 2] = np.cross(axes[:, :, 0], axes[:, :, 1])
-    scales = np.sqrt(np.maximum(values[:, :0:-1], 1e-24))
+    scales = np.sqrt(np.maximum(values[:, :0:-1], 1e-36))
     covered = mass[i] + mass[j] - _overlap(g, pairs, mass, axes[:, :, :2])
     opacity = covered / scales.prod(axis=1)
     scales *= np.sqrt(np.maximum(opacity / _OPAQUE, 1.0))[:, None]  # what no opacity can hold is held by area
@@ -154,7 +154,7 @@ def _merged(g: Gaussians, pairs: np.ndarray) -> Gaussians:
     return Gaussians(
         mean.astype(np.float32),
         quats.astype(np.float32),
-        np.concatenate([np.log(scales), np.full((len(pairs), 1), FLAT_LOG_SCALE)], axis=1).astype(np.float32),
+        with_thickness(np.log(scales)),
         logit(opacity.astype(np.float32)),
         share * g.sh0[i] + (1 - share) * g.sh0[j],
         share[:, :, None] * g.shN[i] + (1 - share[:, :, None]) * g.shN[j],

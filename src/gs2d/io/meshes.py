@@ -171,13 +171,9 @@ def triangulate(counts: np.ndarray, indices: np.ndarray) -> np.ndarray:
 
 
 def _colors(vertex: PlyElement) -> np.ndarray | None:
-    """Vertex colours as uint8: as stored, or from floats in [0, 1]."""
-    colors = vertex.scalars(*COLORS)
-    if colors is None:
-        return None
-    if all(vertex.scalar(name).dtype.kind == "f" for name in COLORS):
-        colors = colors * 255.0
-    return np.clip(np.rint(np.nan_to_num(colors)), 0, 255).astype(np.uint8)
+    """Return vertex colours as uint8."""
+    colors = vertex.colors()
+    return None if colors is None else np.rint(255.0 * colors).astype(np.uint8)
 
 
 def read_points(path: str | os.PathLike[str]) -> Points:

@@ -23,6 +23,7 @@ _TYPES = {
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
 _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}  # fmt: skip # noqa: E501
+_COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MAX_WORD = 64  # letters of a number
 _HEADER_LIMIT = 1 << 20  # bytes: a header longer than this is no PLY header
@@ -55,6 +56,42 @@ class PlyElement:
         arrays = [column for column in columns if isinstance(column, np.ndarray)]
         with np.errstate(invalid="ignore"):  # of a NaN that signals
             return np.stack(arrays, axis=1).astype(np.float64) if len(arrays) == len(names) else None
+
+    def reals(self, path: object, name: str) -> np.ndarray:
+        """Return a property [count] of real numbers, float64; the bits of a 2-byte integer are those of a half float.
+
+        PLY has no type for half floats, so programs that write them declare ``ushort``.
+
+        Raises
+        ------
+        DataError
+            It is of another integer type.
+        """
+        values = self.scalar(name)
+        if values.dtype.kind in "iu" and values.dtype.itemsize != 2:
+            raise DataError(
+                f"{path}: expected the property {name} as float, or as ushort that holds half floats, got "
+                f"{_NAMES[values.dtype.str[1:]]}; export the splats with float properties"
+            )
+        with np.errstate(invalid="ignore"):  # of a NaN that signals
+            return (values if values.dtype.kind == "f" else values.view(np.float16)).astype(np.float64)
+
+    def colors(self) -> np.ndarray | None:
+        """Return colours [count, 3] as float64, 0 to 1, or None without any.
+
+        They are called ``red green blue``, ``diffuse_red ...`` or ``r g b``. Integers, and floats of which one is above
+        2, count to 255; where one is above 255 they count to 65535.
+        """
+        for names in _COLORS:
+            colors = self.scalars(*names)
+            if colors is not None:
+                break
+        else:
+            return None
+        whole = any(self.scalar(name).dtype.kind in "iu" for name in names)
+        largest = colors.max(initial=0.0, where=np.isfinite(colors))
+        scale = 65535.0 if largest > 255 else 255.0 if whole or largest > 2 else 1.0
+        return np.clip(np.nan_to_num(colors / scale), 0.0, 1.0)
 
 
 @dataclass(frozen=True)

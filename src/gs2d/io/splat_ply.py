@@ -1,23 +1,27 @@
 """Splats as PLY files.
 
 They are raw (before activation). The official 2DGS layout has two scales; common viewers know only the 3DGS layout,
-whose third scale we write as ``log 1e-6``: a disk with no thickness, its normal along the third axis in both.
+whose third scale is a thickness that does not show, with the disk's normal along the third axis in both.
 """
 
 from __future__ import annotations
 
+import math
 import os
+import warnings
 
 import numpy as np
 import torch
 
+from gs2d.core.sh import C0
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
-from gs2d.io.gaussians import FLAT_LOG_SCALE, Gaussians
+from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, with_thickness
 from gs2d.io.ply_format import PlyElement, PlyFile, read_ply, write_ply
 
 _ROT = ("rot_0", "rot_1", "rot_2", "rot_3")
-_FIXED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", *_ROT)
+_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+_FIXED = ("x", "y", "z", *_DC, "opacity", "scale_0", "scale_1", *_ROT)
 
 
 def splat_fields(n_rest: int, *, layout: str) -> list[str]:
@@ -38,7 +42,7 @@ def write_splats(path: str | os.PathLike[str], splats: Splats, *, layout: str = 
     splats : Splats
         On any device; float32 comes back bit for bit (``layout="2dgs"``).
     layout : "2dgs" or "3dgs"
-        The official 2DGS layout, or the one common viewers open (``scale_2`` = log 1e-6 after ``scale_1``).
+        The official 2DGS layout, or the one common viewers open (``scale_2``, the thickness, after ``scale_1``).
 
     Raises
     ------
@@ -54,7 +58,7 @@ def write_splats(path: str | os.PathLike[str], splats: Splats, *, layout: str = 
     rows["opacity"] = columns["opacity_logits"]
     _fill(rows, ("scale_0", "scale_1"), columns["log_scales"])
     if layout == "3dgs":
-        rows["scale_2"] = FLAT_LOG_SCALE
+        rows["scale_2"] = with_thickness(columns["log_scales"])[:, 2]
     _fill(rows, [f"rot_{i}" for i in range(4)], columns["quats"])
     write_ply(path, {"vertex": rows})
 
@@ -64,8 +68,16 @@ def _fill(rows: np.ndarray, names: list[str] | tuple[str, ...], columns: np.ndar
         rows[name] = columns[:, i]
 
 
-def read_splats(path: str | os.PathLike[str]) -> Splats:
+def read_splats(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> Splats:
     """Read splats in the official 2DGS layout (extra properties are passed over), float32 on the CPU.
+
+    Half floats stored as ``ushort`` are decoded. Colours ``red green blue`` in place of ``f_dc_*`` are of SH degree 0.
+
+    Parameters
+    ----------
+    path : path
+    tell : callable
+        Receives a sentence on SH bands above degree 3, which are left out.
 
     Raises
     ------
@@ -73,11 +85,11 @@ def read_splats(path: str | os.PathLike[str]) -> Splats:
         If the file is no PLY, is broken, or is of another kind: 3DGS (three scales), compressed, a mesh, points.
     """
     vertex = _splat_element(path, read_ply(path))
-    return Splats(**_attributes(path, vertex, ("scale_0", "scale_1")))
+    return Splats(**_attributes(path, vertex, ("scale_0", "scale_1"), tell))
 
 
-def read_gaussians(path: str | os.PathLike[str]) -> Gaussians:
-    """Read 3DGS splats, which have three scales (extra properties are passed over).
+def read_gaussians(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> Gaussians:
+    """Read 3DGS splats, which have three scales, as ``read_splats`` reads those of two.
 
     Raises
     ------
@@ -85,37 +97,51 @@ def read_gaussians(path: str | os.PathLike[str]) -> Gaussians:
         If the file is no PLY, is broken, or has no three scales.
     """
     vertex = read_ply(path).elements.get("vertex")
-    wanted = (*_FIXED, "scale_2")
-    missing = [name for name in wanted if vertex is None or not isinstance(vertex.properties.get(name), np.ndarray)]
-    if vertex is None or missing:
-        raise DataError(f"{path}: 3DGS splats were expected, the properties {', '.join(missing)} are missing")
-    a = {name: t.numpy() for name, t in _attributes(path, vertex, ("scale_0", "scale_1", "scale_2")).items()}
+    if vertex is None:
+        raise DataError(f"{path}: 3DGS splats were expected, got a PLY without vertices; give a file of splats")
+    _check_complete(f"{path}: 3DGS splats were expected", vertex, (*_FIXED, "scale_2"))
+    a = {name: t.numpy() for name, t in _attributes(path, vertex, ("scale_0", "scale_1", "scale_2"), tell).items()}
     return Gaussians(**{**a, "sh0": a["sh0"][:, 0]})
 
 
-def _attributes(path: object, vertex: PlyElement, scales: tuple[str, ...]) -> dict[str, torch.Tensor]:
+def _check_complete(expected: str, vertex: PlyElement, wanted: tuple[str, ...]) -> None:
+    """Raise where properties are missing; any colours will do in place of ``f_dc_*``."""
+    missing = [name for name in wanted if not isinstance(vertex.properties.get(name), np.ndarray)]
+    if not set(missing) <= set(_DC) or (missing and vertex.colors() is None):
+        raise DataError(
+            f"{expected}, the properties {', '.join(missing)} are missing; export the splats with SH coefficients"
+        )
+
+
+def _attributes(path: object, vertex: PlyElement, scales: tuple[str, ...], tell: Tell) -> dict[str, torch.Tensor]:
     """Return the fields of Splats of the rows of an element."""
     names = {name for name, values in vertex.properties.items() if isinstance(values, np.ndarray)}
     n_rest = sum(name.startswith("f_rest_") for name in names)
     rest = [f"f_rest_{i}" for i in range(n_rest)]
-    if n_rest not in (0, 9, 24, 45) or not names.issuperset(rest):
-        raise DataError(f"{path}: 0, 9, 24 or 45 properties f_rest_* were expected, got {n_rest}; export it again")
+    places = n_rest // 3
+    if n_rest % 3 or math.isqrt(1 + places) ** 2 != 1 + places or not names.issuperset(rest):
+        raise DataError(
+            f"{path}: 0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3) were expected, got {n_rest}; export the "
+            "splats again"
+        )
 
-    def columns(*wanted: str) -> torch.Tensor:
+    def columns(*wanted: str) -> np.ndarray:
         table = np.empty((vertex.count, len(wanted)), np.float32)
         with np.errstate(over="ignore"):  # a double beyond float32 is infinite
             for i, name in enumerate(wanted):
-                table[:, i] = vertex.scalar(name)
-        return torch.from_numpy(table)
+                table[:, i] = vertex.reals(path, name)
+        return table
 
-    return {
+    colors = None if names.issuperset(_DC) else vertex.colors()
+    arrays = {
         "means": columns("x", "y", "z"),
         "quats": columns(*_ROT),
         "log_scales": columns(*scales),
-        "opacity_logits": columns("opacity")[:, 0].contiguous(),
-        "sh0": columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :].contiguous(),
-        "shN": columns(*rest).reshape(vertex.count, 3, n_rest // 3).transpose(1, 2).contiguous(),
+        "opacity_logits": columns("opacity")[:, 0],
+        "sh0": (columns(*_DC) if colors is None else ((colors - 0.5) / C0).astype(np.float32))[:, None],
+        "shN": drawn_bands(str(path), columns(*rest).reshape(vertex.count, 3, places).transpose(0, 2, 1), tell),
     }
+    return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()}
 
 
 def ply_kind(path: str | os.PathLike[str]) -> str:
@@ -151,7 +177,5 @@ def _splat_element(path: object, file: PlyFile) -> PlyElement:
         has_faces = "face" in file.elements and file.elements["face"].count > 0
         kind = "a mesh" if has_faces else "a point cloud" if {"x", "y", "z"} <= names else "a PLY without vertices"
         raise DataError(f"{expected}, got {kind}; give the splats.ply of a gs2d or 2DGS run")
-    missing = [name for name in _FIXED if not isinstance(vertex.properties.get(name), np.ndarray)]
-    if missing:
-        raise DataError(f"{expected}, the properties {', '.join(missing)} are missing; export the splats again")
+    _check_complete(expected, vertex, _FIXED)
     return vertex

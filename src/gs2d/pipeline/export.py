@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
 from gs2d.errors import RunError
 from gs2d.io.formats.registry import ENDINGS, LAYOUTS, layout_of, read_splats, write_layout, written_bytes
-from gs2d.io.run_dir import (
-    MESH,
-    open_run,
-)
+from gs2d.io.meshes import FOREIGN
+from gs2d.io.run_dir import MESH, open_run
 from gs2d.pipeline.finished import checked_output, finished_splats
 from gs2d.pipeline.options import Box
 from gs2d.pipeline.placed import place_of, placed_splats, say_where
@@ -37,7 +36,11 @@ def export_run(
     """
     layout = layout or layout_of(Path(out))
     if layout is None:
-        raise RunError(f"--out must end in {', '.join(ENDINGS).replace('/', '')}, which say what is written, got {out}")
+        meshes = f"; `gs2d mesh {shlex.quote(str(path))}` writes meshes" if Path(out).suffix.lower() in FOREIGN else ""
+        raise RunError(
+            f"splats are written as {', '.join(ENDINGS).replace('/', '')} files, got --out {out}; choose such a name"
+            f"{meshes}"
+        )
     if layout not in LAYOUTS:
         raise RunError(LAYOUTS.unknown(layout))
     path, out = Path(path), checked_output(path, out, LAYOUTS.get(layout).ending, f"layout {layout} is")
@@ -45,15 +48,16 @@ def export_run(
         raise RunError(f"--out {out} is the mesh of the run, which stays as it is; choose another name")
     if path.is_file() and out.resolve() == path.resolve():
         raise RunError(f"--out {out} is the file that is read; choose another name")
+    notes: list[str] = []
     if path.is_file():
-        splats = read_splats(path)
+        splats = read_splats(path, notes.append)
     else:
         run = open_run(path)
         run.sweep()
         splats = finished_splats(run)
     splats = splats if bbox is None else within(splats, bbox)
     place = place_of(path, asked=georeferenced)
-    notes = write_layout(out, splats if place is None else placed_splats(splats, place), layout)
+    notes += write_layout(out, splats if place is None else placed_splats(splats, place), layout)
     told = {} if place is None else say_where(out, place)
     size = written_bytes(out, layout)
-    return {"file": str(out), "splats": len(splats), "bytes": size, "layout": layout, "notes": list(notes), **told}
+    return {"file": str(out), "splats": len(splats), "bytes": size, "layout": layout, "notes": notes, **told}

@@ -16,7 +16,7 @@ from gs2d.io.run_dir import (
     RunFolder,
     open_run,
 )
-from gs2d.pipeline.events import OnEvent
+from gs2d.pipeline.events import Notice, OnEvent
 from gs2d.pipeline.job import Job, reload_job
 from gs2d.pipeline.threads import use_threads
 
@@ -61,19 +61,19 @@ def open_job(
     """
     use_threads(threads)
     run = open_run(path)
-    splats = finished_splats(run) if splats_file is None else _splats_of(Path(splats_file), out)
+    splats = finished_splats(run) if splats_file is None else _splats_of(Path(splats_file), out, on_event)
     job = reload_job(run, on_event)
     return run, job, splats.to(job.backend.device)
 
 
-def _splats_of(path: Path, out: Path | None) -> Splats:
+def _splats_of(path: Path, out: Path | None, on_event: OnEvent) -> Splats:
     if out is None:
         raise RunError("--splats needs --out: what is in the run is made of its own splats; name another place")
     if path.is_dir():
         raise DataError(f"--splats must be a file of splats, got the folder {path}; give the splats.ply in it")
     if georeference_of_file(path) is not None:
         raise DataError(f"--splats must be in the frame of the run, {path} is in metres of the world; export it again")
-    return read_splats(path)
+    return read_splats(path, lambda text: on_event(Notice(text)))
 
 
 def checked_output(path: Path, out: Path, ending: str = ".ply", what: str = "") -> Path:

@@ -10,6 +10,7 @@ from gs2d.data import detect_format, load_scene
 from gs2d.data.archive import is_archive, unpack
 from gs2d.data.benchmarks import missing_lines
 from gs2d.errors import DataError
+from gs2d.io.formats.gltf import gltf_mesh
 from gs2d.io.formats.registry import is_splat_file, read_splat_file
 from gs2d.io.georeference import georeference_of_file
 from gs2d.io.meshes import FOREIGN, read_mesh, read_points
@@ -70,13 +71,17 @@ def describe_file(path: Path) -> dict[str, Any]:
 
 
 def _facts_of(path: Path, size: int) -> dict[str, Any]:
+    if path.suffix.lower() in (".glb", ".gltf") and (mesh := gltf_mesh(path)) is not None:
+        return {**mesh, "bytes": size}
     kind = "mesh" if path.suffix.lower() in FOREIGN else "splats" if is_splat_file(path) else ply_kind(path)
     if kind == "mesh":
-        mesh = read_mesh(path)
-        return {"vertices": len(mesh.vertices), "triangles": len(mesh.faces), "bytes": size}
+        surface = read_mesh(path)
+        return {"vertices": len(surface.vertices), "triangles": len(surface.faces), "bytes": size}
     if kind == "points":
         return {"points": len(read_points(path).points), "bytes": size}
     file = read_splat_file(path)
     shape = {} if kind == "2dgs" else {"shape": "flat" if file.surfels is not None else "3D, which gs2d does not draw"}
     gaussians = file.gaussians
-    return {"splats": len(gaussians), "layout": file.kind, **shape, "SH degree": gaussians.sh_degree, "bytes": size}
+    notes = {"notes": list(file.notes)} if file.notes else {}
+    facts = {"splats": len(gaussians), "layout": file.kind, **shape, "SH degree": gaussians.sh_degree, "bytes": size}
+    return {**facts, **notes}

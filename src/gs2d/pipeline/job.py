@@ -441,7 +441,7 @@ def read_init(path: Path, on_event: OnEvent) -> tuple[Splats, str]:
         inside = path / "splats.ply"
         hint = f"give {inside}" if inside.exists() else "give a file of splats"
         raise DataError(f"--init must be a file of splats, got the folder {path}; {hint}")
-    splats, kind = read_surfels(path)
+    splats, kind = read_surfels(path, lambda text: on_event(Notice(text)))
     on_event(Notice(f"starting from {path.name}: {len(splats):,} {kind}", detail=True))
     return splats, hashlib.sha256(path.read_bytes()).hexdigest()
 

@@ -75,7 +75,7 @@ def page_run(
     else:
         if not path.exists():
             raise DataError(f"expected a run folder or a file of splats at {path}, found nothing{where_it_ends(path)}")
-        splats, title = read_splats(path), path.stem
+        splats, title = read_splats(path, lambda text: on_event(Notice(text))), path.stem
     views = [] if job is None else _some(job.scene.train)
     cameras = [view.camera for view in views]
     frame = frame_around(cameras, splats.means.cpu().numpy())

@@ -76,7 +76,7 @@ def open_viewer(
     """
     required_viser()
     use_threads(options.threads)
-    content = _of_run(path, on_event) if path.is_dir() or is_run(path) else _of_file(path)
+    content = _of_run(path, on_event) if path.is_dir() or is_run(path) else _of_file(path, on_event)
     load = lru_cache(maxsize=1)(lambda name: content.stages[name]())  # one stage in memory
     final = load(list(content.stages)[-1])
     centers = final.means.cpu().numpy()
@@ -175,10 +175,10 @@ def _splats_of(checkpoint: Path) -> Splats:
     return TrainState.from_state_dict(load_tensors(checkpoint)["state"]).splats
 
 
-def _of_file(path: Path) -> _Content:
+def _of_file(path: Path, on_event: OnEvent) -> _Content:
     if not path.exists():
         raise DataError(f"expected a run folder or a file of splats at {path}, found nothing{where_it_ends(path)}")
-    splats = read_splats(path)
+    splats = read_splats(path, lambda text: on_event(Notice(text)))
     settings, backend = settings_without_run(splats), get_backend("auto")
     return _Content(path.name, {FINAL: lambda: splats}, (), settings, backend, "median", lambda _: None)
 

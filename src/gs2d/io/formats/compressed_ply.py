@@ -8,18 +8,20 @@ SH coefficients are 256 steps from -4 to 4. After what SplatTransform and SuperS
 
 from __future__ import annotations
 
+import math
 import os
+import warnings
 
 import numpy as np
 
 from gs2d.core.sh import C0
 from gs2d.errors import DataError
-from gs2d.io.gaussians import Gaussians, logit_of_byte, sigmoid, to_byte, unit_quats
+from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, logit_of_byte, sigmoid, to_byte, unit_quats
 from gs2d.io.ply_format import PlyElement, PlyFile, read_ply, write_ply
 
 _CHUNK = 256
 _BITS = (11, 10, 11)
-_SMALLEST = 1e-5  # a range below it is one value
+_SMALLEST = -40.0  # log scale, 4e-18 units: the range of a chunk is divided into 1,023 steps
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _SPAN = {
     "position": ("x", "y", "z"),
@@ -46,7 +48,7 @@ def write_compressed_ply(path: str | os.PathLike[str], gaussians: Gaussians) -> 
     chunks = -(-n // _CHUNK)
     values = {
         "position": g.means.astype(np.float64),
-        "scale": np.clip(g.log_scales.astype(np.float64), -20.0, 20.0),
+        "scale": np.clip(g.log_scales.astype(np.float64), _SMALLEST, 20.0),
         "color": 0.5 + C0 * g.sh0.astype(np.float64),
     }
     ends = [f"{end}_{x}" for names in _SPAN.values() for end in ("min", "max") for x in names]
@@ -98,7 +100,7 @@ def _fractions(values: np.ndarray, chunks: int) -> tuple[np.ndarray, np.ndarray,
     high = np.maximum.reduceat(values, starts).astype(np.float32).astype(np.float64)
     at = np.arange(len(values)) // _CHUNK
     span = (high - low)[at]
-    fraction = np.where(span < _SMALLEST, 0.0, (values - low[at]) / np.where(span < _SMALLEST, 1.0, span))
+    fraction = (values - low[at]) / np.where(span > 0, span, 1.0)
     return low, high, np.clip(fraction, 0.0, 1.0)
 
 
@@ -122,8 +124,8 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
     return np.asarray(word)
 
 
-def read_compressed_ply(path: str | os.PathLike[str]) -> Gaussians:
-    """Read a compressed PLY, in the order of the file.
+def read_compressed_ply(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> Gaussians:
+    """Read a compressed PLY, in the order of the file; ``tell`` hears of SH bands that are left out.
 
     Raises
     ------
@@ -146,7 +148,7 @@ def read_compressed_ply(path: str | os.PathLike[str]) -> Gaussians:
             scale.astype(np.float32),
             logit_of_byte(to_byte(255.0 * rgba[:, 3])),
             ((color - 0.5) / C0).astype(np.float32),
-            _sh(path, file.elements.get("sh"), n),
+            drawn_bands(str(path), _sh(path, file.elements.get("sh"), n), tell),
         )
 
 
@@ -169,6 +171,11 @@ def _column(path: object, element: PlyElement, name: str) -> np.ndarray:
     return values
 
 
+def _real(path: object, element: PlyElement, name: str) -> np.ndarray:
+    _column(path, element, name)
+    return element.reals(path, name)
+
+
 def _words(path: object, vertex: PlyElement, name: str) -> np.ndarray:
     """Return the packed words of a property, whose type may be another one that holds whole numbers."""
     words = _column(path, vertex, name)
@@ -180,10 +187,11 @@ def _words(path: object, vertex: PlyElement, name: str) -> np.ndarray:
 def _between(path: object, chunk: PlyElement, what: str, fractions: np.ndarray, at: np.ndarray) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore"):  # of NaN and between infinite ends: what comes of it is checked
         low, high = (
-            np.stack([_column(path, chunk, f"{end}_{x}").astype(np.float64) for x in _SPAN[what]], axis=1)
-            for end in ("min", "max")
+            np.stack([_real(path, chunk, f"{end}_{x}") for x in _SPAN[what]], axis=1) for end in ("min", "max")
         )
-        return np.asarray(low[at] * (1.0 - fractions) + high[at] * fractions)
+        between = low[at] * (1.0 - fractions) + high[at] * fractions
+        # The ends themselves: 0 times an infinite one, a scale of 0, is NaN.
+        return np.where(fractions == 0, low[at], np.where(fractions == 1, high[at], between))
 
 
 def _unpack(word: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
@@ -212,11 +220,17 @@ def _sh(path: object, element: PlyElement | None, n: int) -> np.ndarray:
     if element is None:
         return np.zeros((n, 0, 3), np.float32)
     count = sum(name.startswith("f_rest_") for name in element.properties)
-    if count not in (9, 24, 45) or element.count != n:
+    if not count or count % 3 or math.isqrt(1 + count // 3) ** 2 != 1 + count // 3 or element.count != n:
         raise DataError(
             f"{path}: 9, 24 or 45 SH coefficients for {n} splats were expected, got {count} for {element.count}; "
             "export the file again"
         )
-    rest = np.stack([_column(path, element, f"f_rest_{i}") for i in range(count)], axis=1).astype(np.float64)
+    columns = [_column(path, element, f"f_rest_{i}") for i in range(count)]
+    if any(c.dtype.kind not in "iu" or (c.size and (c.min() < 0 or c.max() > 255)) for c in columns):
+        raise DataError(
+            f"{path}: expected whole numbers of 0 to 255 (uchar) as f_rest_* of a compressed PLY, got "
+            f"{columns[0].dtype}; export the file again"
+        )
+    rest = np.stack(columns, axis=1).astype(np.float64)
     fraction = np.where(rest == 0, 0.0, np.where(rest == 255, 1.0, (rest + 0.5) / 256.0))
     return ((fraction - 0.5) * 8.0).astype(np.float32).reshape(n, 3, count // 3).transpose(0, 2, 1)

@@ -1,6 +1,6 @@
 """glTF 2.0 with ``KHR_gaussian_splatting`` (release candidate of February 2026): 3D Gaussians, ours flat ones.
 
-Its one kernel is the projected ellipsoid: a disk is written with a thickness of a millionth of a unit. Attributes are
+Its one kernel is the projected ellipsoid: a disk is written with a thickness that does not show. Attributes are
 float32 and not raw: unit quaternions, linear scales, linear opacities; spherical harmonics are those of 3DGS. glTF has
 y up. As SplatTransform (PlayCanvas, MIT) does with a PLY, a half turn about z takes our coordinates there, which
 changes signs alone; a file that knows where it is in the world (``gs2d.io.georeference``) has z up before that.
@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import os
 import struct
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from gs2d.core.growth import check_growth
 from gs2d.core.sh import C0
 from gs2d.errors import DataError
 from gs2d.io.formats.gltf_document import GltfDocument, node_matrices, read_document
-from gs2d.io.gaussians import Gaussians, log_scales_of, logit, sigmoid, to_byte, unit_quats
+from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, log_scales_of, logit, sigmoid, to_byte, unit_quats
 from gs2d.io.meshes import LINEAR_U16
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -118,8 +119,10 @@ def _places(degree: int) -> list[tuple[int, int]]:
     return [(level, place) for level in range(degree + 1) for place in range(2 * level + 1)]
 
 
-def read_gltf(path: str | os.PathLike[str]) -> tuple[Gaussians, str]:
+def read_gltf(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Gaussians, str]:
     """Read all splats of a .glb or .gltf file's scene, and say in words what they are.
+
+    ``tell`` receives a sentence on SH bands above degree 3, which are left out.
 
     Raises
     ------
@@ -137,12 +140,44 @@ def read_gltf(path: str | os.PathLike[str]) -> tuple[Gaussians, str]:
         found = list(_primitives(document))
         total = sum(document.bytes_of(index) for _, attributes in found for index in attributes.values())
         check_growth(path, document.packed_bytes() if found else 0, total, "splats", small=_SMALL, ratio=_RATIO)
-        parts = [_placed(path, _gaussians(document, attributes), turn @ matrix) for matrix, attributes in found]
+        parts = [_placed(path, _gaussians(document, attributes, tell), turn @ matrix) for matrix, attributes in found]
     if not parts and "meshes" not in document.json and EXTENSION in document.json.get("extensionsUsed", ()):
         return _none(), "glTF"
     if not parts:
-        raise DataError(f"{path}: Gaussian splats ({EXTENSION}) were expected, got glTF without; give another file")
+        mesh = gltf_mesh(path)
+        got = "glTF without" if mesh is None else f"a mesh of {mesh['triangles']:,} triangles"
+        raise DataError(
+            f"{path}: Gaussian splats ({EXTENSION}) were expected, got {got}; give the splats.ply of a run or another "
+            "file of splats"
+        )
     return Gaussians.joined(parts), "glTF"
+
+
+def gltf_mesh(path: str | os.PathLike[str]) -> dict[str, int | str] | None:
+    """Return the numbers of vertices and triangles of a .glb or .gltf file, and its colours; None without a mesh.
+
+    Raises
+    ------
+    DataError
+        Missing, or no glTF.
+    """
+    document = read_document(path)
+    vertices = triangles = 0
+    colors = "none"
+    with document.reading():
+        accessors = document.json.get("accessors", [])
+        for _, mesh in node_matrices(document):
+            for primitive in document.json["meshes"][mesh]["primitives"]:
+                if primitive.get("mode", 4) != 4:  # points, lines and strips
+                    continue
+                attributes = primitive["attributes"]
+                vertices += accessors[attributes["POSITION"]]["count"]
+                triangles += accessors[primitive.get("indices", attributes["POSITION"])]["count"] // 3
+                if "TEXCOORD_0" in attributes and document.json.get("textures"):
+                    colors = "texture"
+                elif "COLOR_0" in attributes and colors == "none":
+                    colors = "of the vertices"
+    return {"vertices": vertices, "triangles": triangles, "colours": colors} if triangles else None
 
 
 def _none() -> Gaussians:
@@ -157,23 +192,28 @@ def _primitives(document: GltfDocument) -> Iterator[tuple[np.ndarray, dict[str, 
             splatting = primitive.get("extensions", {}).get(EXTENSION)
             if splatting is None:
                 continue
-            if splatting["kernel"] != "ellipse" or splatting.get("extensions"):
+            attributes = {str(n).removeprefix(f"{EXTENSION}:"): index for n, index in primitive["attributes"].items()}
+            compressed = splatting.get("extensions")
+            if not compressed and ("kernel" not in splatting or "ROTATION" not in attributes):
+                raise DataError(
+                    f"{document.path}: splats of {EXTENSION} were expected as its release candidate has them, got an "
+                    "early draft (no kernel, or no attribute ROTATION); export the file again with a newer program, or "
+                    "as PLY"
+                )
+            if compressed or splatting["kernel"] != "ellipse":
                 more = ", ".join(sorted(splatting.get("extensions", {}))) or repr(splatting["kernel"])
                 raise DataError(
                     f"{document.path}: splats with the kernel 'ellipse' and no compression were expected, got {more}; "
                     "convert the file to a PLY"
                 )
-            yield (
-                matrix,
-                {str(name).removeprefix(f"{EXTENSION}:"): index for name, index in primitive["attributes"].items()},
-            )
+            yield matrix, attributes
 
 
-def _gaussians(document: GltfDocument, attributes: dict[str, int]) -> Gaussians:
+def _gaussians(document: GltfDocument, attributes: dict[str, int], tell: Tell) -> Gaussians:
     """Return one primitive in its own frame."""
     degree = max((int(name.split("_")[2]) for name in attributes if name.startswith("SH_DEGREE_")), default=0)
-    if not 0 <= degree <= 3:
-        raise DataError(f"{document.path}: SH degree 0 to 3 was expected, got {degree}")
+    if not 0 <= degree <= 8:
+        raise DataError(f"{document.path}: SH degree 0 to 3 was expected, got {degree}; export it with three bands")
     means = document.array(attributes["POSITION"], "VEC3")
     quats = document.array(attributes["ROTATION"], "VEC4")
     scales = document.array(attributes["SCALE"], "VEC3")
@@ -183,7 +223,7 @@ def _gaussians(document: GltfDocument, attributes: dict[str, int]) -> Gaussians:
     ]
     if len({len(array) for array in (means, quats, scales, opacities, *harmonics)}) != 1:
         raise DataError(f"{document.path}: as many values in each attribute of splats were expected; export it again")
-    if not ((scales >= 0).all() and (opacities >= 0).all() and (opacities <= 1).all()):
+    if (scales < 0).any() or (opacities < 0).any() or (opacities > 1).any():  # NaN is left out later
         raise DataError(f"{document.path}: scales from 0 and opacities of 0 to 1 were expected; export it again")
     return Gaussians(
         means,
@@ -191,7 +231,9 @@ def _gaussians(document: GltfDocument, attributes: dict[str, int]) -> Gaussians:
         log_scales_of(scales),
         logit(opacities),
         harmonics[0],
-        np.stack([*harmonics[1:]], axis=1) if degree else np.zeros((len(means), 0, 3), np.float32),
+        drawn_bands(document.path, np.stack([*harmonics[1:]], axis=1), tell)
+        if degree
+        else np.zeros((len(means), 0, 3), np.float32),
     )
 
 

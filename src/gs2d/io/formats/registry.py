@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +22,11 @@ from gs2d.io.formats.splat import read_splat, write_splat
 from gs2d.io.formats.spz import read_spz, write_spz
 from gs2d.io.formats.usd import ENDINGS as USD_ENDINGS
 from gs2d.io.formats.usd import read_usd, write_usd
-from gs2d.io.gaussians import Gaussians, logit
+from gs2d.io.gaussians import NO_SCALE, Gaussians, Tell, logit
 from gs2d.io.splat_ply import ply_kind, read_gaussians
 
 Writer = Callable[[Path, Splats], tuple[str, ...] | None]
-Reader = Callable[[str | os.PathLike[str]], tuple[Gaussians, str]]
+Reader = Callable[[str | os.PathLike[str], Tell], tuple[Gaussians, str]]
 
 
 @dataclass(frozen=True)
@@ -152,11 +152,15 @@ ENDINGS = tuple(ending for ending, _ in _BY_ENDING)
 
 @dataclass(frozen=True, eq=False)
 class SplatFile:
-    """What a file of splats holds: the kind of file in words, and its Gaussians (flat where ``surfels`` are there)."""
+    """What a file of splats holds: the kind of file in words, and its Gaussians (flat where ``surfels`` are there).
+
+    ``notes`` are sentences on what was left out.
+    """
 
     kind: str
     gaussians: Gaussians
     surfels: Splats | None
+    notes: tuple[str, ...] = ()
 
 
 def layout_of(path: Path) -> str | None:
@@ -228,13 +232,22 @@ def written_bytes(path: Path, layout: str) -> int:
     return streamed_bytes(path) if layout == "streamed" else path.stat().st_size
 
 
-def _read_spz(path: str | os.PathLike[str]) -> tuple[Gaussians, str]:
-    gaussians, version = read_spz(path)
+def _read_spz(path: str | os.PathLike[str], tell: Tell) -> tuple[Gaussians, str]:
+    gaussians, version = read_spz(path, tell)
     return gaussians, f"SPZ version {version}"
 
 
-def _read_splat(path: str | os.PathLike[str]) -> tuple[Gaussians, str]:
+def _read_splat(path: str | os.PathLike[str], _: Tell) -> tuple[Gaussians, str]:
     return read_splat(path), ".splat"
+
+
+def _read_ply(path: str | os.PathLike[str], tell: Tell) -> tuple[Gaussians, str]:
+    kind = ply_kind(path)
+    if kind == "compressed":
+        return read_compressed_ply(path, tell), "compressed PLY"
+    if kind == "3dgs":
+        return read_gaussians(path, tell), "3dgs (three scales, for viewers)"
+    return Gaussians.of(splat_ply.read_splats(path, tell)), "2dgs"  # names another kind
 
 
 _READERS: tuple[tuple[tuple[str, ...], Reader], ...] = (
@@ -259,31 +272,30 @@ def is_splat_file(path: str | os.PathLike[str]) -> bool:
 def read_splat_file(path: str | os.PathLike[str]) -> SplatFile:
     """Read splats of any format that is written here, and 3DGS.
 
+    A log scale of -inf is a scale of 0, an infinite opacity logit an opaque or an empty splat. Splats with any other
+    number that is not finite are left out, which the notes say.
+
     Raises
     ------
     DataError
         Missing, broken, or no splats.
     """
-    reader = _reader_of(path)
-    if reader is not None:
-        gaussians, kind = reader(path)
-        return _told(kind, gaussians, path)
-    kind = ply_kind(path)
-    if kind == "compressed":
-        return _told("compressed PLY", read_compressed_ply(path), path)
-    if kind == "3dgs":
-        return _told("3dgs (three scales, for viewers)", read_gaussians(path), path)
-    splats = splat_ply.read_splats(path)  # names another kind
-    return SplatFile("2dgs", _finite(Gaussians.of(splats), path), splats)
+    notes: list[str] = []
+    gaussians, kind = (_reader_of(path) or _read_ply)(path, notes.append)
+    gaussians = _finite(_mended(gaussians), path, notes.append)
+    flat = kind == "2dgs" or gaussians.is_flat
+    return SplatFile(kind, gaussians, gaussians.disks() if flat else None, tuple(dict.fromkeys(notes)))
 
 
-def read_splats(path: str | os.PathLike[str]) -> Splats:
+def read_splats(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> Splats:
     """Read flat splats from a file of any format that gs2d writes.
 
     Parameters
     ----------
     path : path
         PLY (2DGS, 3DGS or compressed), .spz, .splat, .usd, .glb or .sog.
+    tell : callable
+        Receives a sentence on splats or SH bands that were left out (default: a Python warning).
 
     Returns
     -------
@@ -300,14 +312,16 @@ def read_splats(path: str | os.PathLike[str]) -> Splats:
     >>> splats = gs2d.read_splats("runs/garden/splats.ply")  # doctest: +SKIP
     """
     file = read_splat_file(path)
+    for note in file.notes:
+        tell(note)
     return file.gaussians.to_surfels(path) if file.surfels is None else file.surfels
 
 
-def read_surfels(path: str | os.PathLike[str]) -> tuple[Splats, str]:
+def read_surfels(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Splats, str]:
     """Read the splats of a file to start a training from, and say in words what they were.
 
     Flat ones are as they are. 3D Gaussians lose their smallest scale, whose axis becomes the normal
-    (:meth:`gs2d.io.gaussians.Gaussians.flattened`).
+    (:meth:`gs2d.io.gaussians.Gaussians.flattened`). ``tell`` is that of ``read_splats``.
 
     Raises
     ------
@@ -321,6 +335,8 @@ def read_surfels(path: str | os.PathLike[str]) -> tuple[Splats, str]:
             "run, or what `gs2d export` writes"
         )
     file = read_splat_file(path)
+    for note in file.notes:
+        tell(note)
     if len(file.gaussians) == 0:
         raise DataError(f"{os.fspath(path)} must hold splats to start from, got none; give a file with some")
     if file.surfels is not None:
@@ -328,18 +344,32 @@ def read_surfels(path: str | os.PathLike[str]) -> tuple[Splats, str]:
     return file.gaussians.flattened(), "3D Gaussians without their smallest scales, whose axes are the normals now"
 
 
-def _told(kind: str, gaussians: Gaussians, path: str | os.PathLike[str]) -> SplatFile:
-    # Other programs write the logits of opaque and of empty splats as infinite (SplatTransform, of bytes of 255 and 0).
-    infinite = np.isinf(gaussians.opacity_logits)
-    if infinite.any():
-        ends = logit((gaussians.opacity_logits > 0).astype(np.float32))
-        gaussians = replace(gaussians, opacity_logits=np.where(infinite, ends, gaussians.opacity_logits))
-    return SplatFile(kind, _finite(gaussians, path), gaussians.to_surfels(path) if gaussians.is_flat else None)
+def _mended(gaussians: Gaussians) -> Gaussians:
+    """Return Gaussians whose scales of 0, and opaque and empty opacities, have finite logarithms and logits.
+
+    Other programs write these as infinite numbers (SplatTransform: the logits of bytes of 255 and 0).
+    """
+    logits, scales = gaussians.opacity_logits, gaussians.log_scales
+    ends = logit((logits > 0).astype(np.float32))
+    return replace(
+        gaussians,
+        opacity_logits=np.where(np.isinf(logits), ends, logits),
+        log_scales=np.where(np.isneginf(scales), np.float32(NO_SCALE), scales),
+    )
 
 
-def _finite(gaussians: Gaussians, path: str | os.PathLike[str]) -> Gaussians:
-    for name in ("means", "log_scales", "quats", "sh0", "shN", "opacity_logits"):
-        values = getattr(gaussians, name)
-        if not np.isfinite(values).all():
-            raise DataError(f"{os.fspath(path)}: finite numbers were expected, got NaN or infinity in its {name}")
-    return gaussians
+def _finite(gaussians: Gaussians, path: str | os.PathLike[str], tell: Tell) -> Gaussians:
+    """Return the Gaussians without those with NaN or infinity, of which ``tell`` hears."""
+    finite = {}
+    for field in fields(gaussians):
+        values = getattr(gaussians, field.name)
+        finite[field.name] = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+    kept = np.logical_and.reduce(list(finite.values()))
+    if kept.all():
+        return gaussians
+    count, among = int((~kept).sum()), ", ".join(name for name, rows in finite.items() if not rows.all())
+    got = f"{count:,} of {len(gaussians):,} splats have NaN or infinity ({among})"
+    if not kept.any():
+        raise DataError(f"{os.fspath(path)}: finite numbers were expected, {got}; export the file again")
+    tell(f"{Path(path).name}: {got} and were left out")
+    return gaussians.rows(kept)

@@ -1,6 +1,7 @@
 """SOG, PlayCanvas's splats as lossless WebP pictures: a ZIP file, a folder with meta.json, or a tree of such folders.
 
-After the format's page (developer.playcanvas.com, version 2). A pixel is a splat: positions in 16 bits of a logarithm
+After the format's page (developer.playcanvas.com, version 2; of version 1, ranges in place of codebooks, files are
+read). A pixel is a splat: positions in 16 bits of a logarithm
 in two pictures, scales and colours as places in codebooks of 256, rotations as the three smallest components, opacities
 in 8 bits, and the higher harmonics as one of at most 65,536 rows of a palette. Coordinates are those of a PLY. Of the
 streamed form (lod-meta.json) the finest level is read; sog_streamed.py writes it.
@@ -12,6 +13,7 @@ import io
 import json
 import math
 import os
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -26,9 +28,8 @@ from gs2d.core.images import open_image
 from gs2d.errors import DataError
 from gs2d.io.formats.compressed_ply import morton_order
 from gs2d.io.formats.sog_palette import codebook, nearest_code, palette
-from gs2d.io.gaussians import Gaussians, logit_of_byte, sigmoid, to_byte, unit_quats
+from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, logit_of_byte, sigmoid, to_byte, unit_quats
 
-_COEFFICIENTS = (0, 3, 8, 15)  # of the degrees
 _ROW = 64  # rows of the palette side by side in its picture
 _SMALL, _RATIO = 64 << 20, 60  # unpacked bytes that any file may have, and those for one of a larger one
 _LONGEST = 16 << 20  # bytes of a JSON file
@@ -120,7 +121,7 @@ def _packed_harmonics(shN: np.ndarray, shape: tuple[int, int]) -> tuple[dict[str
     places = np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1).astype(np.uint8)
     meta = {
         "count": len(centers),
-        "bands": _COEFFICIENTS.index(coefficients),
+        "bands": math.isqrt(coefficients),
         "codebook": codes.tolist(),
         "files": ["shN_centroids.webp", "shN_labels.webp"],
     }
@@ -131,8 +132,10 @@ def _packed_harmonics(shN: np.ndarray, shape: tuple[int, int]) -> tuple[dict[str
     return meta, pictures
 
 
-def read_sog(path: str | os.PathLike[str]) -> tuple[Gaussians, str]:
+def read_sog(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Gaussians, str]:
     """Read a .sog file, the meta.json of a folder, or the finest level of a lod-meta.json.
+
+    ``tell`` receives a sentence on SH bands above degree 3, which are left out.
 
     Raises
     ------
@@ -142,12 +145,14 @@ def read_sog(path: str | os.PathLike[str]) -> tuple[Gaussians, str]:
     path = Path(path)
     try:
         if path.name.lower() == "lod-meta.json":
-            return read_level(path), "streamed SOG, its finest level"
+            return read_level(path, tell=tell), "streamed SOG, its finest level"
         if path.suffix.lower() == ".json":
-            return _Reader(path, _in_folder(path.parent, path), path.stat().st_size).read(path.name), "SOG, unpacked"
+            fetch, size = _in_folder(path.parent, path), path.stat().st_size
+            return _Reader(path, fetch, size, tell).read(path.name), "SOG, unpacked"
         with open(path, "rb") as file, zipfile.ZipFile(file) as archive:
             check_entries(path, archive.infolist())
-            return _Reader(path, lambda name: _of_archive(path, archive, name), path.stat().st_size).read(), "SOG"
+            size = path.stat().st_size
+            return _Reader(path, lambda name: _of_archive(path, archive, name), size, tell).read(), "SOG"
     except OSError as error:
         raise DataError(f"cannot read {error.filename or path}: {error.strerror or error}") from error
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError) as error:
@@ -177,25 +182,28 @@ def _in_folder(home: Path, told: Path) -> Fetch:
 class _Reader:
     """One data set of SOG, whose files are fetched by name; ``size`` counts what its pictures may grow from."""
 
-    def __init__(self, path: Path, fetch: Fetch, size: int) -> None:
-        self.path, self.fetch, self.size = path, fetch, size
+    def __init__(self, path: Path, fetch: Fetch, size: int, tell: Tell) -> None:
+        self.path, self.fetch, self.size, self.tell = path, fetch, size, tell
 
     def read(self, name: str = "meta.json") -> Gaussians:
         """Return the splats."""
         meta = parsed(self.path, self.fetch(name))
         try:
-            if meta["version"] != 2:
-                raise DataError(f"{self.path}: SOG of version 2 was expected, got {str(meta['version'])[:20]}")
+            version = meta.get("version", 1 if "means" in meta else None)
+            if version not in (1, 2):
+                raise DataError(
+                    f"{self.path}: SOG of version 1 or 2 was expected, got {str(version)[:20]}; convert it to a PLY"
+                )
             return self._gaussians(meta)
         except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
             words = " ".join(str(error).split())[:80]
             raise DataError(
-                f"{self.path}: SOG of version 2 was expected, something in it does not fit "
+                f"{self.path}: SOG was expected, something in it does not fit "
                 f"({type(error).__name__}: {words}); export the file again"
             ) from error
 
     def _gaussians(self, meta: dict[str, Any]) -> Gaussians:
-        count = meta["count"]
+        count = meta["count"] if "count" in meta else meta["means"]["shape"][0]
         if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count < 1 << 40:
             raise ValueError("a number of splats was expected")
         low, high = (np.array(_floats(meta["means"][end], 3)) for end in ("mins", "maxs"))
@@ -203,20 +211,24 @@ class _Reader:
         with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is checked
             logs = low + (high - low) * ((lower + 256.0 * upper) / 65535.0)
             means = (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32)
-        scales = _codes(meta["scales"])[self._rows(count, 3, *_names(meta["scales"], 1))]
+        scales = _values(meta["scales"], self._rows(count, 3, *_names(meta["scales"], 1)))
         quats = _quats(self._rows(count, 4, *_names(meta["quats"], 1)))
         color = self._rows(count, 4, *_names(meta["sh0"], 1))
         shN = np.zeros((count, 0, 3), np.float32)
         if meta.get("shN") is not None:
             shN = self._harmonics(meta["shN"], count)
-        return Gaussians(means, quats, scales, logit_of_byte(color[:, 3]), _codes(meta["sh0"])[color[:, :3]], shN)
+        if "codebook" in meta["sh0"]:
+            return Gaussians(means, quats, scales, logit_of_byte(color[:, 3]), _values(meta["sh0"], color[:, :3]), shN)
+        color = _values(meta["sh0"], color)  # of version 1: opacity logits are among them
+        return Gaussians(means, quats, scales, color[:, 3], color[:, :3], shN)
 
     def _harmonics(self, told: dict[str, Any], count: int) -> np.ndarray:
-        coefficients, codes = _COEFFICIENTS[int(told["bands"])], _codes(told)
-        if not coefficients:
-            raise ValueError("1 to 3 bands of harmonics were expected")
         centroids, labels = _names(told, 2)
         picture = self._pixels(centroids)[:, :, :3]
+        bands = int(told["bands"]) if "bands" in told else math.isqrt(picture.shape[1] // _ROW)  # version 1 has none
+        if not 1 <= bands <= 8:
+            raise ValueError("1 to 3 bands of harmonics were expected")
+        coefficients = (bands + 1) ** 2 - 1
         if picture.shape[1] != _ROW * coefficients:
             raise ValueError(f"{_ROW * coefficients} columns of centroids were expected, got {picture.shape[1]}")
         centers = picture.reshape(-1, coefficients, 3)
@@ -226,7 +238,7 @@ class _Reader:
             raise ValueError(f"labels below {len(centers)} were expected, got {which.max()}")
         packed = count * coefficients * 12
         check_growth(self.path, self.size, packed, f"a cloud of splats ({count:,} of them)", small=_SMALL, ratio=_RATIO)
-        return codes[centers[which]]
+        return _values(told, drawn_bands(self.path, centers[which], self.tell))
 
     def _rows(self, count: int, width: int, name: str) -> np.ndarray:
         """Return the pixels of the splats [N, width] of a picture."""
@@ -279,9 +291,15 @@ def _floats(values: Any, count: int) -> list[float]:
     return numbers
 
 
-def _codes(told: dict[str, Any]) -> np.ndarray:
-    with np.errstate(over="ignore"):  # what comes of it is checked
-        return np.array(_floats(told["codebook"], 256)).astype(np.float32)
+def _values(told: dict[str, Any], packed: np.ndarray) -> np.ndarray:
+    """Return what bytes [..., C] stand for: values of a codebook, or shares of a range (version 1), float32."""
+    with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is checked
+        if "codebook" in told:
+            return np.array(_floats(told["codebook"], 256)).astype(np.float32)[packed]
+        low, high = (np.array(told[end], np.float64) for end in ("mins", "maxs"))  # [C], or one number
+        if low.shape != high.shape or low.shape not in ((), packed.shape[-1:]):
+            raise ValueError(f"mins and maxs for {packed.shape[-1]} columns were expected")
+        return (low + (high - low) * (packed / 255.0)).astype(np.float32)
 
 
 def _names(told: dict[str, Any], count: int) -> list[str]:
@@ -302,7 +320,7 @@ def _quats(packed: np.ndarray) -> np.ndarray:
     return q.astype(np.float32)
 
 
-def read_level(path: Path, level: int = 0) -> Gaussians:
+def read_level(path: Path, level: int = 0, tell: Tell = warnings.warn) -> Gaussians:
     """Return a level of all that a lod-meta.json refers to, and its surroundings; 0 is the finest.
 
     Where a leaf has not that level, its next coarser one is taken, or else its coarsest.
@@ -318,12 +336,12 @@ def read_level(path: Path, level: int = 0) -> Gaussians:
         files: dict[int, Gaussians] = {}
         for file, offset, count in wanted:
             if file not in files:
-                files[file] = _data_set(path, fetch, names[file])
+                files[file] = _data_set(path, fetch, names[file], tell)
             if offset < 0 or count < 0 or offset + count > len(files[file]):
                 raise ValueError(f"splats {offset} to {offset + count} of a chunk of {len(files[file])} were expected")
             parts.append(files[file].rows(np.arange(offset, offset + count)))
         if index.get("environment") is not None:
-            parts.append(_data_set(path, fetch, index["environment"]))
+            parts.append(_data_set(path, fetch, index["environment"], tell))
         if not parts:
             raise ValueError("no chunk of the finest level")
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
@@ -335,11 +353,12 @@ def read_level(path: Path, level: int = 0) -> Gaussians:
     return Gaussians.joined(parts)
 
 
-def _data_set(path: Path, fetch: Fetch, name: Any) -> Gaussians:
+def _data_set(path: Path, fetch: Fetch, name: Any, tell: Tell) -> Gaussians:
     if not isinstance(name, str):
         raise TypeError("names of chunks were expected")
     folder = name.rpartition("/")[0]
-    return _Reader(path, lambda inner: fetch(f"{folder}/{inner}" if folder else inner), 0).read(name.rpartition("/")[2])
+    reader = _Reader(path, lambda inner: fetch(f"{folder}/{inner}" if folder else inner), 0, tell)
+    return reader.read(name.rpartition("/")[2])
 
 
 def _places(tree: Any, wanted: int) -> list[tuple[int, int, int]]:

@@ -14,7 +14,7 @@ import numpy as np
 from gs2d.core.json_files import atomic_write
 from gs2d.core.sh import C0
 from gs2d.errors import DataError
-from gs2d.io.gaussians import Gaussians, logit_of_byte, sigmoid, to_byte, unit_quats
+from gs2d.io.gaussians import Gaussians, log_scales_of, logit_of_byte, sigmoid, to_byte, unit_quats
 
 _RECORD = np.dtype([("position", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 
@@ -59,16 +59,13 @@ def read_splat(path: str | os.PathLike[str]) -> Gaussians:
             "in all; copy or export the file again"
         )
     rows = np.frombuffer(data, dtype=_RECORD)
-    numbers = np.concatenate([rows["position"], rows["scales"]], axis=1)
-    if not (np.isfinite(numbers).all() and (rows["scales"] >= 0).all()):
-        raise DataError(f"{os.fspath(path)}: finite positions and positive scales were expected; is it a .splat file?")
-    with np.errstate(divide="ignore"):
-        log_scales = np.maximum(np.log(rows["scales"]), -80.0)
+    if (rows["scales"] < 0).any():
+        raise DataError(f"{os.fspath(path)}: positive scales were expected; is it a .splat file?")
     color = rows["rgba"][:, :3].astype(np.float64) / 255.0
     return Gaussians(
         rows["position"].copy(),
         unit_quats((rows["rotation"].astype(np.float64) - 128.0) / 128.0).astype(np.float32),
-        log_scales,
+        log_scales_of(rows["scales"]),
         logit_of_byte(rows["rgba"][:, 3]),
         ((color - 0.5) / C0).astype(np.float32),
         np.zeros((len(rows), 0, 3), np.float32),

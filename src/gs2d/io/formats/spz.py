@@ -6,6 +6,8 @@ log scales in 16ths above -10, rotations, SH coefficients (coefficient by coeffi
 (extra ``spz4``) has the same streams, each packed for itself, behind a header that is not packed: the reserved byte is
 the number of streams, u32 where the table of their sizes is (u64 packed, u64 unpacked), 12 bytes of nothing.
 Its coordinates are right, up, back, where PLY's are taken to be right, down, front: y and z change sign on the way.
+With flag 0x2 there are records (u32 type, u32 size, content) behind the header of version 4, or behind the streams of
+older ones. One of them names another coordinate system of the stored numbers.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from __future__ import annotations
 import importlib
 import os
 import struct
+import warnings
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,7 +27,17 @@ from gs2d.core.extras import install
 from gs2d.core.growth import check_growth
 from gs2d.core.json_files import atomic_write
 from gs2d.errors import BackendError, DataError
-from gs2d.io.gaussians import Gaussians, logit_of_byte, sigmoid, to_byte, unit_quats
+from gs2d.io.gaussians import (
+    THIN,
+    Gaussians,
+    Tell,
+    drawn_bands,
+    logit_of_byte,
+    sigmoid,
+    to_byte,
+    unit_quats,
+    with_thickness,
+)
 
 _MAGIC = 0x5053474E  # "NGSP"
 _HEADER = struct.Struct("<IIIBBBB")
@@ -32,7 +45,12 @@ _HEADER_4 = struct.Struct("<IIIBBBBI12x")
 _SIZES = struct.Struct("<QQ")
 _WINDOW = 1 << 26  # bytes that a stream of zstd may look back
 _LARGEST = (1 << 23) - 1  # of 24 bits with a sign
-_EXTENDED = 0x2  # flag: vendors' records follow the header
+_EXTENDED = 0x2  # flag: there are records
+_RECORD, _COORDINATES = struct.Struct("<II"), 0xADBE0003  # head of a record; the type that names a coordinate system
+_RECORDS = 1 << 20  # bytes of records, at most
+_RUB, _SYSTEMS = 4, 16
+_DEGREES = 4  # the highest that the format has
+_QUARTER = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # a turn by -90 degrees about x
 _FINEST = 20  # fractional bits
 _STEPS = 64  # of a position in the size of a typical splat
 _COLOR = 0.15  # of 255: colours beyond black and white are kept
@@ -43,9 +61,6 @@ _SH1_STEP, _SH_STEP = (
 _ROOT = np.sqrt(0.5)  # no component but the largest exceeds it
 _WORDS = (1 << 9) - 1
 _SMALL, _RATIO = 16 << 20, 20  # unpacked bytes that any file may have, and those for one of a larger one: 2 is usual
-#: What (x, -y, -z) makes of the harmonics of degree 1 to 3
-_FLIP = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
-_TURN = np.array([1.0, -1.0, -1.0], np.float32)
 
 
 def required_zstd() -> Any:
@@ -83,7 +98,7 @@ def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, *, version: in
     DiskError
         If the file could not be written.
     """
-    g = gaussians
+    g = gaussians.mirrored((1, -1, -1))
     farthest = float(np.abs(g.means).max()) if len(g) else 0.0
     bits = _fractional_bits(g, farthest)
     if farthest > _LARGEST:
@@ -121,9 +136,9 @@ def _fractional_bits(g: Gaussians, farthest: float) -> int:
 
 def _streams(g: Gaussians, bits: int) -> list[np.ndarray]:
     """Return the attributes in their order, uint8."""
-    fixed = np.rint(g.means.astype(np.float64) * _TURN * (1 << bits)).astype("<i4")
+    fixed = np.rint(g.means.astype(np.float64) * (1 << bits)).astype("<i4")
     positions = fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3]
-    sh = np.rint(np.clip(g.shN, -2.0, 2.0) * _FLIP[: g.shN.shape[1], None] * 128.0).astype(np.int64) + 128
+    sh = np.rint(np.clip(g.shN, -2.0, 2.0) * 128.0).astype(np.int64) + 128
     step = np.where(np.arange(g.shN.shape[1]) < 3, _SH1_STEP, _SH_STEP)[:, None]
     sh = np.clip((sh + step // 2) // step * step, 0, 255).astype(np.uint8)
     return [
@@ -138,7 +153,7 @@ def _streams(g: Gaussians, bits: int) -> list[np.ndarray]:
 
 def _packed_quats(quats: np.ndarray) -> np.ndarray:
     """32 bits each [N]: the index of the largest of (x, y, z, w), then sign and 9 bits of each of the others."""
-    q = unit_quats(quats)[:, [1, 2, 3, 0]] * (*_TURN, 1.0)
+    q = unit_quats(quats)[:, [1, 2, 3, 0]]
     rows, largest = np.arange(len(q)), np.abs(q).argmax(axis=1)
     q *= np.where(q[rows, largest] < 0, -1.0, 1.0)[:, None]
     word = largest.astype(np.uint32)
@@ -161,15 +176,30 @@ def _losses(g: Gaussians) -> tuple[str, ...]:
         (vivid, "colours far beyond black or white"),
         (steep, "colours that change too much with the view (SH beyond 1)"),
     )
-    clipped = int((thin | wide | vivid | steep).sum())
-    if not clipped:
-        return ()
-    parts = ", ".join(f"{int(rows.sum()):,} {text}" for rows, text in every if rows.any())
-    return (f"{clipped:,} of {len(g):,} splats did not fit into SPZ and were clipped to what it holds: {parts}",)
+    lines = []
+    if clipped := int((thin | wide | vivid | steep).sum()):
+        parts = ", ".join(f"{int(rows.sum()):,} {text}" for rows, text in every if rows.any())
+        lines.append(
+            f"{clipped:,} of {len(g):,} splats did not fit into SPZ and were clipped to what it holds: {parts}"
+        )
+    if thick := int((g.log_scales[:, :2].max(axis=1, initial=-np.inf) + np.log(THIN) < -10.0).sum()):
+        lines.append(
+            f"{thick:,} of {len(g):,} disks are less than four times as wide as SPZ makes them thick (4.5e-5 units): "
+            "other programs show balls; choose another format"
+        )
+    return tuple(lines)
 
 
-def read_spz(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
+def read_spz(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Gaussians, int]:
     """Read SPZ of version 2, 3 or 4: (Gaussians, version).
+
+    A third scale of the smallest that SPZ has, 4.5e-5 units, comes back as the thickness of a disk.
+
+    Parameters
+    ----------
+    path : path
+    tell : callable
+        Receives a sentence on SH bands above degree 3, which are left out.
 
     Raises
     ------
@@ -182,8 +212,37 @@ def read_spz(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
         packed = Path(path).read_bytes()
     except OSError as error:
         raise DataError(f"cannot read {os.fspath(path)}: {error.strerror or error}") from error
-    version, degree, bits, parts = (_parts_of_4 if packed[:4] == b"NGSP" else _parts_of_3)(path, packed)
-    return _gaussians(version, degree, bits, parts), version
+    version, bits, system, parts = (_parts_of_4 if packed[:4] == b"NGSP" else _parts_of_3)(path, packed)
+    return _in_our_axes(_gaussians(path, version, bits, parts, tell), system), version
+
+
+def _in_our_axes(g: Gaussians, system: int) -> Gaussians:
+    """Return splats stored in a coordinate system of the format, 1 to 16, in right, down, front.
+
+    The bits of the number less 1 say: right (else left), up (else down), front (else back). Those above 8 (LFD to RBU)
+    are the first eight after a quarter turn about x. It comes after the signs, as in the format's own library, which
+    therefore has half a turn about x between LFD, RFD, LBU, RBU and the axes that these letters name.
+    """
+    right, up, front, turned = (system - 1 >> bit & 1 for bit in range(4))
+    g = g.mirrored((1 if right else -1, -1 if up else 1, 1 if front else -1))
+    return g.placed(_QUARTER) if turned else g
+
+
+def _system(path: str | os.PathLike[str], records: bytes) -> int:
+    """Return the coordinate system that records name, else right, up, back; records of other types are passed over."""
+    system, at = _RUB, 0
+    while at + _RECORD.size <= len(records):
+        kind, size = _RECORD.unpack_from(records, at)
+        content = records[at + _RECORD.size : at + _RECORD.size + size]
+        at += _RECORD.size + size
+        if kind == _COORDINATES:
+            system = int.from_bytes(content, "little") or _RUB
+            if len(content) != 4 or system > _SYSTEMS:
+                raise DataError(
+                    f"{os.fspath(path)}: SPZ names its coordinate system by a number of 1 to {_SYSTEMS} in 4 bytes, "
+                    f"got {system} in {len(content)}; export it again"
+                )
+    return system
 
 
 def _sizes(version: int, degree: int) -> list[int]:
@@ -192,41 +251,43 @@ def _sizes(version: int, degree: int) -> list[int]:
 
 
 def _parts_of_3(path: str | os.PathLike[str], tail: bytes) -> tuple[int, int, int, list[np.ndarray]]:
-    """Return version, SH degree, fractional bits and streams [N, bytes] of a gzip file."""
+    """Return version, fractional bits, coordinate system and streams [N, bytes] of a gzip file."""
     unpack = zlib.decompressobj(16 + zlib.MAX_WBITS)
     header = _unpacked(path, unpack, tail, _HEADER.size)
     magic, version, count, degree, bits, flags, _ = _HEADER.unpack(header)
-    if magic != _MAGIC or version not in (2, 3) or degree > 3 or bits > 23 or flags & _EXTENDED:
+    if magic != _MAGIC or version not in (2, 3) or degree > _DEGREES or bits > 23:
         raise DataError(
-            f"{os.fspath(path)}: SPZ of version 2 or 3 with SH degree 0 to 3 and no extensions was expected, got "
-            f"version {version}, degree {degree}, flags {flags}; convert it to a PLY"
+            f"{os.fspath(path)}: SPZ of version 2 or 3 with SH degree 0 to {_DEGREES} was expected, got version "
+            f"{version}, degree {degree}; convert it to a PLY"
         )
     sizes = _sizes(version, degree)
     check_growth(
         path, len(tail), count * sum(sizes), f"a cloud of splats ({count:,} of them)", small=_SMALL, ratio=_RATIO
     )
     data = _unpacked(path, unpack, unpack.unconsumed_tail, count * sum(sizes))
-    _unpacked(path, unpack, unpack.unconsumed_tail, 1, or_end=True)  # its checksum
+    size = _RECORDS if flags & _EXTENDED else 1
+    records = _unpacked(path, unpack, unpack.unconsumed_tail, size, or_end=True)  # and gzip's checksum
     parts, at = [], 0
     for size in sizes:
         parts.append(np.frombuffer(data, np.uint8, count * size, at).reshape(count, size))
         at += count * size
-    return int(version), degree, bits, parts
+    return int(version), bits, _system(path, records) if flags & _EXTENDED else _RUB, parts
 
 
 def _parts_of_4(path: str | os.PathLike[str], data: bytes) -> tuple[int, int, int, list[np.ndarray]]:
-    """Return version, SH degree, fractional bits and streams [N, bytes] of a file of version 4."""
+    """Return version, fractional bits, coordinate system and streams [N, bytes] of a file of version 4."""
     header = data[: _HEADER_4.size].ljust(_HEADER_4.size, b"\0")
-    _, version, count, degree, bits, _, streams, at = _HEADER_4.unpack(header)
+    _, version, count, degree, bits, flags, streams, at = _HEADER_4.unpack(header)
     sizes = _sizes(4, degree)[: 6 if degree else 5]
-    if version != 4 or degree > 3 or bits > 23 or streams not in (len(sizes), 6) or len(data) < _HEADER_4.size:
+    if version != 4 or degree > _DEGREES or bits > 23 or streams not in (len(sizes), 6) or len(data) < _HEADER_4.size:
         raise DataError(
-            f"{os.fspath(path)}: SPZ of version 2, 3 or 4 with SH degree 0 to 3 was expected, got version {version}, "
-            f"degree {degree}, {streams} streams in {len(data)} bytes; convert it to a PLY"
+            f"{os.fspath(path)}: SPZ of version 2, 3 or 4 with SH degree 0 to {_DEGREES} was expected, got version "
+            f"{version}, degree {degree}, {streams} streams in {len(data)} bytes; convert it to a PLY"
         )
     check_growth(
         path, len(data), count * sum(sizes), f"a cloud of splats ({count:,} of them)", small=_SMALL, ratio=_RATIO
     )
+    system = _system(path, data[_HEADER_4.size : at]) if flags & _EXTENDED else _RUB
     begin, parts = at + streams * _SIZES.size, []
     for size in sizes:
         told = data[at : at + _SIZES.size].ljust(_SIZES.size, b"\0")
@@ -241,7 +302,7 @@ def _parts_of_4(path: str | os.PathLike[str], data: bytes) -> tuple[int, int, in
         at, begin = at + _SIZES.size, begin + length
     if not degree:
         parts.append(np.zeros((count, 0), np.uint8))
-    return 4, degree, bits, parts
+    return 4, bits, system, parts
 
 
 def _unzstd(path: str | os.PathLike[str], packed: bytes, size: int) -> bytes:
@@ -254,20 +315,24 @@ def _unzstd(path: str | os.PathLike[str], packed: bytes, size: int) -> bytes:
         raise DataError(f"{os.fspath(path)}: SPZ was expected, its zstd is broken ({error}); copy it again") from error
 
 
-def _gaussians(version: int, degree: int, bits: int, parts: list[np.ndarray]) -> Gaussians:
-    count, coefficients = len(parts[0]), (degree + 1) ** 2 - 1
+def _gaussians(path: str | os.PathLike[str], version: int, bits: int, parts: list[np.ndarray], tell: Tell) -> Gaussians:
+    """Return splats in the coordinates of the file."""
+    count = len(parts[0])
     positions, alphas, colors, scales, rotations, sh = parts
     low = positions.reshape(count, 3, 3).astype(np.int32)
     fixed = low[..., 0] | (low[..., 1] << 8) | (low[..., 2] << 16)
     fixed = np.where(fixed >= 1 << 23, fixed - (1 << 24), fixed)
-    shN = (sh.reshape(count, coefficients, 3).astype(np.float32) - 128.0) / 128.0 * _FLIP[:coefficients, None]
+    sh = drawn_bands(path, sh.reshape(count, sh.shape[1] // 3, 3), tell)
+    log_scales = scales.astype(np.float32) / 16.0 - 10.0
+    thinnest = scales[:, 2] == 0
+    log_scales[thinnest] = with_thickness(log_scales[thinnest, :2])
     return Gaussians(
-        (fixed / float(1 << bits) * _TURN).astype(np.float32),
+        (fixed / float(1 << bits)).astype(np.float32),
         _old_quats(rotations) if version == 2 else _quats(rotations),
-        scales.astype(np.float32) / 16.0 - 10.0,
+        log_scales,
         logit_of_byte(alphas[:, 0]),
         ((colors.astype(np.float64) / 255.0 - 0.5) / _COLOR).astype(np.float32),
-        shN,
+        (sh.astype(np.float32) - 128.0) / 128.0,
     )
 
 
@@ -295,17 +360,16 @@ def _quats(rotations: np.ndarray) -> np.ndarray:
         stored = largest != i
         q[stored, i] = value[stored]
         word = np.where(stored, word >> np.uint32(10), word)
-    return _ours(q, largest)
+    return _completed(q, largest)
 
 
 def _old_quats(rotations: np.ndarray) -> np.ndarray:
     q = np.zeros((len(rotations), 4))
     q[:, :3] = rotations / 127.5 - 1.0
-    return _ours(q, np.full(len(q), 3))
+    return _completed(q, np.full(len(q), 3))
 
 
-def _ours(q: np.ndarray, left_out: np.ndarray) -> np.ndarray:
+def _completed(q: np.ndarray, left_out: np.ndarray) -> np.ndarray:
     """(w, x, y, z) of (x, y, z, w) of which one component is 0 and follows from the others."""
     q[np.arange(len(q)), left_out] = np.sqrt(np.maximum(0.0, 1.0 - np.square(q).sum(axis=1)))
-    q *= (*_TURN, 1.0)
     return q[:, [3, 0, 1, 2]].astype(np.float32)

@@ -3,7 +3,7 @@
 The schema (UsdVol of OpenUSD 26.03) has centres, rotations, linear scales, linear opacities and spherical harmonics as
 3DGS orders them. Scales and opacities as training has them, logarithms and logits, stand beside them as user
 properties, so that what comes back is the same to the bit; they count where they agree with the schema's. The third
-scale says nothing of a surflet; programs that take all fields for ellipsoids find a millionth of a unit there.
+scale says nothing of a surflet; programs that take all fields for ellipsoids find a thickness there that does not show.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import os
 import subprocess
 import sys
 import tempfile
+import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,16 @@ from gs2d.core.files import atomic_write, disk_error
 from gs2d.core.growth import check_growth
 from gs2d.errors import BackendError, DataError
 from gs2d.io.formats import usd_process
-from gs2d.io.gaussians import FLAT_LOG_SCALE, Gaussians, log_scales_of, logit, sigmoid, unit_quats
+from gs2d.io.gaussians import (
+    Gaussians,
+    Tell,
+    drawn_bands,
+    log_scales_of,
+    logit,
+    sigmoid,
+    unit_quats,
+    with_thickness,
+)
 
 ENDINGS = (".usd", ".usdc", ".usda", ".usdz")
 _APIS = (
@@ -158,10 +169,11 @@ def usd_georeference(path: str | os.PathLike[str]) -> str | None:
         return None  # whoever reads the splats says what is wrong with it
 
 
-def read_usd(path: str | os.PathLike[str]) -> tuple[Gaussians, str]:
+def read_usd(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Gaussians, str]:
     """Read all particle fields of an OpenUSD file, in the frame of its stage: Gaussians, and their kernels in words.
 
-    Fields of surflets are flat whatever their third scale says.
+    Fields of surflets are flat whatever their third scale says. ``tell`` receives a sentence on SH bands above degree
+    3, which are left out.
 
     Raises
     ------
@@ -178,7 +190,7 @@ def read_usd(path: str | os.PathLike[str]) -> tuple[Gaussians, str]:
             size = fact["count"] * width
             arrays[name] = np.frombuffer(data, "<f4", size, at).reshape(fact["count"], width)
             at += 4 * size
-        fields.append(_gaussians(path, fact, arrays))
+        fields.append(_gaussians(path, fact, arrays, tell))
     if not fields:
         raise DataError(f"{os.fspath(path)}: a ParticleField was expected, the stage has none; export splats to it")
     kernels = sorted({fact["kernel"] for fact in facts["fields"]})
@@ -225,32 +237,35 @@ def _read_apart(path: str, most: int, seconds: int) -> tuple[int, bytes]:
     return done.returncode, done.stdout
 
 
-def _gaussians(path: object, fact: dict[str, Any], arrays: dict[str, np.ndarray]) -> Gaussians:
+def _gaussians(
+    path: str | os.PathLike[str], fact: dict[str, Any], arrays: dict[str, np.ndarray], tell: Tell
+) -> Gaussians:
     """Return one field; what it does not say is as the schema has it."""
     where, count = f"{path}: {fact['path']}", fact["count"]
     if fact["kernel"] not in ("surflet", "ellipsoid"):
         raise DataError(f"{where}: a kernel of Gaussian surflets or ellipsoids was expected, got {fact['kernel']}")
     opacities = arrays.get("opacities", np.ones((count, 1), np.float32))
-    if not ((opacities >= 0) & (opacities <= 1)).all():
+    if ((opacities < 0) | (opacities > 1)).any():  # NaN is left out later
         raise DataError(f"{where}: opacities of 0 to 1 were expected; export the file again")
     scales = arrays.get("scales", np.ones((count, 3), np.float32))
-    if not (scales >= 0).all():
+    if (scales < 0).any():
         raise DataError(f"{where}: scales of 0 or more were expected; export the file again")
     quats = arrays.get("orientations", np.tile(np.array([0, 0, 0, 1], np.float32), (count, 1)))
     harmonics = arrays.get("harmonics", np.zeros((count, 3), np.float32))
     harmonics = harmonics.reshape(count, harmonics.shape[1] // 3, 3)
     log_scales = log_scales_of(scales)
-    if fact["kernel"] == "surflet":
-        log_scales[:, 2] = FLAT_LOG_SCALE
     raw = Gaussians(
         arrays.get("positions", np.zeros((0, 3), np.float32)).copy(),
         np.ascontiguousarray(quats[:, [3, 0, 1, 2]]),
         log_scales,
         logit(opacities[:, 0]),
         harmonics[:, 0].copy(),
-        harmonics[:, 1:].copy(),
+        drawn_bands(path, harmonics[:, 1:], tell).copy(),
     )
-    return _placed(where, _exact(raw, scales, opacities[:, 0], quats, arrays), np.array(fact["matrix"]))
+    exact = _exact(raw, scales, opacities[:, 0], quats, arrays)
+    if fact["kernel"] == "surflet":
+        exact = replace(exact, log_scales=with_thickness(exact.log_scales[:, :2]))
+    return _placed(where, exact, np.array(fact["matrix"]))
 
 
 def _exact(

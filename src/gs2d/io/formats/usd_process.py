@@ -85,8 +85,8 @@ def _field(prim: Any, when: Any, cache: Any) -> tuple[dict[str, Any], list[np.nd
     degree = prim.GetAttribute("radiance:sphericalHarmonicsDegree")
     degree = degree.Get() if degree else None
     degree = 3 if degree is None else int(degree)
-    if not 0 <= degree <= 3:
-        raise _UnfitError(f"SH degree 0 to 3 was expected, got {degree}")
+    if not 0 <= degree <= 8:
+        raise _UnfitError(f"SH degree 0 to 3 was expected, got {degree}; export it with three bands")
     harmonics = _values(prim, _HARMONICS, 3, when, half=True)
     coefficients = (degree + 1) ** 2
     if harmonics is not None and len(harmonics) >= count * coefficients:
