@@ -199,7 +199,9 @@ def test_an_export_whose_layout_and_ending_contradict_each_other_is_refused(
     assert "--out must name a .ply file, which is what layout 3dgs is, got" in capsys.readouterr().err
     assert run(["export", str(trained), "--out", str(tmp_path / "a.fbx")]) == 2
     endings = ".compressed.ply, .ply, .spz, .splat, .usd, .glb, .sog, lod-meta.json"
-    assert f"--out must end in {endings}, which say" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert f"splats are written as {endings} files, got --out" in told
+    assert "meshes are written by `gs2d mesh RUN`" in told
     assert list(tmp_path.iterdir()) == []
 
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import Any
 
 from gs2d.errors import RunError
 from gs2d.io.formats.registry import ENDINGS, LAYOUTS, layout_of, read_splats, write_layout, written_bytes
-from gs2d.io.meshes import FOREIGN
 from gs2d.io.run_dir import MESH, open_run
 from gs2d.pipeline.finished import checked_output, finished_splats
 from gs2d.pipeline.options import Box
@@ -36,10 +34,9 @@ def export_run(
     """
     layout = layout or layout_of(Path(out))
     if layout is None:
-        meshes = f"; `gs2d mesh {shlex.quote(str(path))}` writes meshes" if Path(out).suffix.lower() in FOREIGN else ""
         raise RunError(
-            f"splats are written as {', '.join(ENDINGS).replace('/', '')} files, got --out {out}; choose such a name"
-            f"{meshes}"
+            f"splats are written as {', '.join(ENDINGS).replace('/', '')} files, got --out {out}; choose such a name "
+            "(meshes are written by `gs2d mesh RUN`: .ply, with --texture .glb or .obj)"
         )
     if layout not in LAYOUTS:
         raise RunError(LAYOUTS.unknown(layout))

@@ -199,12 +199,16 @@ def test_fields_of_one_stage_come_together(tmp_path: Path) -> None:
         ("[(0.1, 0.2, 0.3), ", "[(0.1, -0.2, 0.3), ", "scales of 0 or more were expected"),
         ("(2, 2, 2)", "(2, 2, 1)", "scales alike in all directions was expected; bake the transform"),
         ("(2, 2, 2)", "(2, 2, -2)", "scales alike in all directions was expected; bake the transform"),
-        ("Degree = 1", "Degree = 4", "SH degree 0 to 3 was expected, got 4"),
+        ("Degree = 1", "Degree = 9", "SH degree 0 to 3 was expected, got 9"),
         ("#usda 1.0", "#usda 9.0", "its reader"),
         ("point3f[] positions", "string[] positions", "OpenUSD was expected|3 numbers a splat"),
         ('"Y"\n)', '"Y"\n    subLayers = [@/etc/passwd@]\n)', "in its folder was expected, it refers to '/etc/passwd'"),
         ('"Y"\n)', '"Y"\n    subLayers = [@../b.usda@]\n)', "in its folder was expected, it refers to '../b.usda'"),
-        ("0, 1, 2)", "nan, 1, 2)", "finite numbers were expected, got NaN or infinity in its means"),
+        (
+            "scales = [(0.1, 0.2, 0.3), (0.2",
+            "scales = [(nan, 1, 2), (nan",
+            "finite numbers were expected, 2 of 2 splats",
+        ),
     ],
 )
 def test_a_stage_that_holds_no_splats_as_ours_is_one_line(tmp_path: Path, old: str, new: str, words: str) -> None:

@@ -1,10 +1,10 @@
 """SOG, PlayCanvas's splats as lossless WebP pictures: a ZIP file, a folder with meta.json, or a tree of such folders.
 
-After the format's page (developer.playcanvas.com, version 2; of version 1, ranges in place of codebooks, files are
-read). A pixel is a splat: positions in 16 bits of a logarithm
+After the format's page (developer.playcanvas.com, version 2). A pixel is a splat: positions in 16 bits of a logarithm
 in two pictures, scales and colours as places in codebooks of 256, rotations as the three smallest components, opacities
 in 8 bits, and the higher harmonics as one of at most 65,536 rows of a palette. Coordinates are those of a PLY. Of the
-streamed form (lod-meta.json) the finest level is read; sog_streamed.py writes it.
+streamed form (lod-meta.json) the finest level is read; sog_streamed.py writes it. Version 1, which is read too, has
+ranges in place of codebooks, and opacity logits as the fourth colour.
 """
 
 from __future__ import annotations
