@@ -24,7 +24,7 @@ from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.errors import DataError
 from gs2d.io.formats.gltf import write_gltf
-from gs2d.io.formats.registry import LAYOUTS, read_disks, read_splat_file, write_layout
+from gs2d.io.formats.registry import LAYOUTS, read_splats, read_splat_file, write_layout
 from gs2d.io.formats.sog import packed_sog
 from gs2d.io.formats.spz import read_spz, write_spz
 from gs2d.io.gaussians import Gaussians
@@ -134,7 +134,7 @@ def test_half_floats_declared_as_ushort_are_decoded(tmp_path: Path, layout: str)
     splats, path = a_scene(30, 1), tmp_path / "a.ply"
     write_splats(path, splats, layout=layout)
     write_ply(path, {"vertex": with_types(table(path), "<u2", bits=True)})
-    back = read_disks(path)
+    back = read_splats(path)
     for name, tensor in splats.items():
         np.testing.assert_array_equal(getattr(back, name).numpy(), tensor.numpy().astype(np.float16))
 
@@ -287,7 +287,7 @@ def test_a_splat_with_nan_is_left_out_and_counted(tmp_path: Path, layout: str, w
     assert file.notes == (f"{path.name}: 1 of 6 splats have NaN or infinity ({among}) and were left out",)
     assert describe_file(path)["notes"] == list(file.notes)
     told: list[str] = []
-    assert len(read_disks(path, told.append)) == 5
+    assert len(read_splats(path, told.append)) == 5
     assert told == list(file.notes)
 
 
