@@ -24,7 +24,7 @@ from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.errors import DataError
 from gs2d.io.formats.gltf import write_gltf
-from gs2d.io.formats.registry import LAYOUTS, read_splats, read_splat_file, write_layout
+from gs2d.io.formats.registry import LAYOUTS, read_splat_file, read_splats, write_layout
 from gs2d.io.formats.sog import packed_sog
 from gs2d.io.formats.spz import read_spz, write_spz
 from gs2d.io.gaussians import Gaussians
