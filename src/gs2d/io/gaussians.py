@@ -22,7 +22,7 @@ FLAT_LOG_SCALE = math.log(1e-6)  # world units, the largest thickness that a dis
 NO_SCALE = -80.0  # the log scale that stands for a scale of 0
 _SHARE = 0.01  # largest thickness of a disk / its smaller scale
 THIN = 0.25  # third scale / larger of the others: of disks that a file of few bits made thicker
-_OBLIQUE = np.array([0.36, 0.48, 0.8])  # a direction in which no harmonic is 0
+_OBLIQUE = (0.36, 0.48, 0.8)  # a direction in which no harmonic is 0
 _FLAT = 0.99  # share of the Gaussians that must be disks
 
 
@@ -107,7 +107,9 @@ class Gaussians:
         A rotation R becomes S R S with S = diag(signs), which is a rotation too and gives the mirrored covariance.
         """
         x, y, z = signs
-        at, there = (np.array(harmonics(*place, self.sh_degree)) for place in (_OBLIQUE, np.multiply(_OBLIQUE, signs)))
+        a, b, c = _OBLIQUE
+        at = np.array(harmonics(a, b, c, self.sh_degree))
+        there = np.array(harmonics(x * a, y * b, z * c, self.sh_degree))
         with np.errstate(invalid="ignore"):  # of a NaN that signals: what comes of it is checked
             return replace(
                 self,
