@@ -25,11 +25,10 @@ from tiny import write_capture
 Files = dict[str, bytes]
 _POSE = np.eye(4).tolist()
 _MOVED = {"pixels": 0.5, "degrees": 0.1, "shift": 0.01}
-_VIEW = {"name": "a", "psnr": 20.5, "psnr_matched": 21.0, "stops": 0.1, "blur": 1.5, "points": 10, "hidden": 1}
+_VIEW = {"name": "a", "psnr": 20.5, "blur": 1.5, "points": 10, "hidden": 1, "next": "b", "degrees": 12.5}
 _MEASURED = {
     "views": [{**_VIEW, "split": "test"}, {**_VIEW, "split": "train", "name": "b"}],
-    "neighbours": [{"name": "a", "next": "b", "degrees": 12.5}], "around": 200.0, "placed": 2, "count": 3,
-    "lost": ["c"], "learns_exposure": True,
+    "placed": 2, "count": 3, "lost": ["c"],
 }  # fmt: skip
 _CAMERA = {"model": "PINHOLE", "size": [40, 30], "params": [35, 36, 20, 15], "focal_px": 35.5, "photos": 2}
 _PHOTO = {"name": "a.png", "source": "a.png", "file": "copied", "features": 900, "placed": True}

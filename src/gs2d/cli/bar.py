@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
-from gs2d.cli.whole import WholeRun
+from gs2d.cli.whole import Countdown, Left, WholeRun
 from gs2d.core.text import printable
 from gs2d.pipeline.events import Phase, duration
 
@@ -22,17 +22,19 @@ class Bar:
     def __init__(self, phase: Phase, whole: WholeRun, clock: Callable[[], float] = time.monotonic) -> None:
         self.phase, self._whole, self._clock = phase, whole, clock
         self.done, self.detail = phase.done, ""
-        self._began = clock()
+        self._began, self._shown = clock(), Countdown()
 
     def step(self, done: int, detail: str = "") -> None:
         """Count a step."""
         self.done, self.detail = done, detail
 
     def left(self) -> str:
-        """Return "3 min left", or how long the phase has taken where nobody can tell."""
+        """Return "3 min left", or how long the phase has taken where it is too early to tell."""
         elapsed = self._clock() - self._began
         seconds = self.phase.seconds_left(self.done, elapsed)
-        return duration(elapsed) if seconds is None else f"{duration(seconds)} left"
+        return (
+            duration(elapsed) if seconds is None else f"{duration(self._shown.show(Left(seconds, seconds)).most)} left"
+        )
 
     def lines(self, width: int, *, ascii_only: bool = False) -> Iterator[Text]:
         """Draw it: never wider than ``width``."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,8 +10,8 @@ from dataclasses import dataclass
 from gs2d.pipeline.events import Expected, Part, Phase, Plan, duration
 
 SPREAD = 2.0  # by what a share of training that was measured elsewhere may be wrong, either way
-GROWTH = 2.0  # training gets slower while splats are added: what is left may cost so many times the iterations before
-TRUSTED = 0.02  # of training: from here on its own speed tells more than the estimate before it
+GROWTH = 1.5  # training gets slower while splats are added: what is left may cost so many times more than expected
+GREW = (2.0, 60.0)  # an estimate of more than so many times what is shown and so many s: the work grew
 _TRAINING = "training"
 
 
@@ -23,6 +24,20 @@ class Left:
 
     def __add__(self, other: Left) -> Left:
         return Left(self.least + other.least, self.most + other.most)
+
+
+class Countdown:
+    """The seconds left as they are shown: they do not rise, unless the work grew."""
+
+    def __init__(self) -> None:
+        self._shown = Left(math.inf, math.inf)
+
+    def show(self, left: Left) -> Left:
+        """Take up a new estimate, and return what to show."""
+        if left.most <= GREW[0] * self._shown.most + GREW[1]:
+            left = Left(min(left.least, self._shown.least), min(left.most, self._shown.most))
+        self._shown = left
+        return left
 
 
 class WholeRun:
@@ -38,11 +53,13 @@ class WholeRun:
         self._done = 0
         self._own = False  # whether the phase that runs is the part's own
         self._training: Left | None = None  # all of it
+        self._shown = Countdown()
 
     def on_plan(self, plan: Plan) -> None:
         """Take up a plan; one that is a part of the plan before says nothing new, the same one is another run."""
         if not set(plan.parts) < set(self._parts):
             self._parts, self._now, self._phase, self._training = plan.parts, -1, None, None
+            self._shown = Countdown()
 
     def on_expected(self, expected: Expected) -> None:
         """Hear how long training will take."""
@@ -81,7 +98,7 @@ class WholeRun:
         return f"{text}; whole run: known once training begins" if known_later else text
 
     def left(self) -> Left | None:
-        """Return the seconds until the run ends; None where nobody can tell yet."""
+        """Return the seconds until the run ends, which do not rise; None where nobody can tell yet."""
         if self._now < 0:
             return None
         left = self._left_of_this()
@@ -90,7 +107,7 @@ class WholeRun:
             if left is None or later is None:
                 return None
             left = left + later
-        return left
+        return None if left is None else self._shown.show(left)
 
     @property
     def _is_training(self) -> bool:
@@ -102,7 +119,7 @@ class WholeRun:
         if self._phase is not None and self._phase.total and self._phase.name.startswith(self._parts[self._now].begins):
             fraction = (self._done - self._phase.done) / max(self._phase.total - self._phase.done, 1)
             seconds = self._phase.seconds_left(self._done, self._clock() - self._phase_began)
-            if seconds is not None and (fraction >= TRUSTED or not self._is_training):
+            if seconds is not None:
                 growth = 1 + (GROWTH - 1) * (1 - fraction) if self._is_training else 1.0
                 return Left(seconds, seconds * growth)
         expected = self._expected(self._parts[self._now])

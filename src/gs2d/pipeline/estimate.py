@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import statistics
 import time
 from dataclasses import dataclass, replace
@@ -51,7 +52,13 @@ def estimate(job: Job) -> Estimate | None:
 
 def full_iterations(recipe: Recipe) -> float:
     """Return the iterations of a recipe, each counted as the fraction of pixels that its photographs have."""
-    return sum(1 / stage.downscale_at(i) ** 2 for stage in recipe.stages for i in range(1, stage.iterations + 1))
+    return sum(count * cost for count, cost in iteration_costs(recipe))
+
+
+def iteration_costs(recipe: Recipe) -> tuple[tuple[int, float], ...]:
+    """Return runs of iterations of a recipe, with the fraction of pixels that its photographs have there."""
+    each = (1 / stage.downscale_at(i) ** 2 for stage in recipe.stages for i in range(1, stage.iterations + 1))
+    return tuple((sum(1 for _ in run), cost) for cost, run in itertools.groupby(each))
 
 
 def seconds_of(trainer: Trainer, iterations: int) -> float | None:

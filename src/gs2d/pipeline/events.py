@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+SOON, SETTLED = 0.05, 60.0  # share of a phase, and seconds: before both, its first steps tell little of the others
 
 
 @dataclass(frozen=True)
@@ -22,15 +23,18 @@ class Phase:
     growth : float
         Steps that grow dearer: the first share s of the steps takes the share s ** growth of the time. 1: all cost
         the same; 2: each costs in proportion to those before it, as cameras do that are adjusted with all others.
+    costs : tuple of (int, float)
+        Runs of steps with the relative cost of one, where costs differ; empty: all cost the same.
     """
 
     name: str
     total: int
     done: int = 0
     growth: float = 1.0
+    costs: tuple[tuple[int, float], ...] = ()
 
     def seconds_left(self, done: int, elapsed: float) -> float | None:
-        """Return the seconds until the phase ends, after ``elapsed`` seconds of it; None where nobody can tell.
+        """Return the seconds until the phase ends, after ``elapsed`` seconds of it; None where it is too early to tell.
 
         Parameters
         ----------
@@ -41,8 +45,19 @@ class Phase:
         """
         if not self.total or done <= self.done:
             return None
-        before, now = ((steps / self.total) ** self.growth for steps in (self.done, min(done, self.total)))
+        before, now = (self._share(steps) for steps in (self.done, min(done, self.total)))
+        if now - before < SOON * (1.0 - before) and elapsed < SETTLED:
+            return None
         return elapsed * (1.0 - now) / (now - before)
+
+    def _share(self, steps: int) -> float:
+        """Return the share of the whole phase's time that its first ``steps`` take."""
+        costs = self.costs or ((self.total, 1.0),)
+        spent, left = 0.0, steps
+        for count, cost in costs:
+            spent += min(count, left) * cost
+            left -= min(count, left)
+        return float((spent / sum(count * cost for count, cost in costs)) ** self.growth)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from gs2d.io.run_dir import SPLATS, VERDICT, RunFolder, load_tensors
 from gs2d.io.splat_ply import write_splats
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.changes import Snapshot, mean_changes, take_snapshot
-from gs2d.pipeline.estimate import start_text
+from gs2d.pipeline.estimate import iteration_costs, start_text
 from gs2d.pipeline.events import Notice, OnEvent, Phase, StageDone, Step
 from gs2d.pipeline.exposure import Transforms, named, write_exposures
 from gs2d.pipeline.interruption import HeldSignals
@@ -53,6 +53,7 @@ from gs2d.training.trainer import Trainer
 LOG_LINES = 300  # step lines a stage
 PROBES = 30  # times a stage at which the probe views are scored for the PSNR curve
 PROBE_VIEWS = 4
+GROWTH = 1.1  # of the cost of iterations, while splats are added (``Phase.growth``)
 EARLY_VIEWS = 16  # training views that score a stage before the last, where stages are compared by test views
 REPORTS = {"cpu": 10, "cuda": 50}  # iterations between progress events, by device: for each the host waits for a GPU
 
@@ -445,7 +446,9 @@ class RunLogger:
     def _phase(self) -> None:
         state = self._state
         done = self._iterations_before(state.stage) + state.step
-        self._on_event(Phase(f"training {self._job.recipe.name}", self._job.recipe.iterations, done))
+        recipe = self._job.recipe
+        costs = iteration_costs(recipe)
+        self._on_event(Phase(f"training {recipe.name}", recipe.iterations, done, growth=GROWTH, costs=costs))
 
     def _start_clock(self) -> None:
         self._stage_clock = time.perf_counter() - self._seconds

@@ -143,7 +143,7 @@ def _overlap(measures: Measures) -> list[Finding]:
     """Name the widest gaps between neighbouring cameras."""
     apart = [(v.degrees, v.name, v.next) for v in measures.views if v.degrees is not None and v.next is not None]
     limit = LIMITS[grades.ANGLE]
-    pairs = {frozenset(names): (degrees, *names) for degrees, *names in sorted(apart) if limit.grade(degrees) != GOOD}
+    pairs = {frozenset(row[1:]): row for row in sorted(apart) if limit.grade(row[0]) != GOOD}  # each pair once
     if not pairs:
         return []
     shown = sorted(pairs.values(), reverse=True)[:NAMED]
