@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import re
 import shutil
 import stat
 import struct
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -70,6 +72,67 @@ def test_names_of_windows_and_of_macos_are_understood(tmp_path: Path) -> None:
     root = unpacked(path, tmp_path / "out")
     assert len(load_scene(root).views) == 9
     assert {p.name for p in root.iterdir()} == {".DS_Store", "images", "transforms.json", "B\u00e4ume.txt"}
+
+
+NAMES = {
+    "gb18030": "\u7167\u7247",
+    "cp932": "\u5199\u771f\u30bd",  # the last character ends with the byte of a backslash
+    "cp949": "\uc0ac\uc9c4",
+    "cp1251": "\u0441\u043d\u0438\u043c\u043e\u043a",
+    "cp850": "Gr\u00fcn",
+}
+
+
+def write_zip_in(encoding: str, folder: Path, path: Path) -> None:
+    """A ZIP file with stored entries whose names are bytes of an encoding, without the flag of UTF-8."""
+    entries, directory = b"", b""
+    files = [source for source in sorted(folder.rglob("*")) if source.is_file()]
+    for source in files:
+        name, data = source.relative_to(folder).as_posix().encode(encoding), source.read_bytes()
+        facts = struct.pack("<HHHHIIIHH", 0, 0, 0, 0, zlib.crc32(data), len(data), len(data), len(name), 0)
+        directory += b"PK\x01\x02" + struct.pack("<HH", 20, 20) + facts
+        directory += struct.pack("<HHHII", 0, 0, 0, 0, len(entries)) + name
+        entries += b"PK\x03\x04" + struct.pack("<H", 20) + facts + name + data
+    count, size = len(files), len(directory)
+    end = b"PK\x05\x06" + struct.pack("<HHHHIIH", 0, 0, count, count, size, len(entries), 0)
+    path.write_bytes(entries + directory + end)
+
+
+def rename_photographs(root: Path, word: str) -> None:
+    path = root / "transforms.json"
+    path.write_text(path.read_text().replace("/f_", f"/{word}_"), encoding="utf-8")
+    for image in sorted((root / "images").iterdir()):
+        image.rename(image.with_name(image.name.replace("f_", f"{word}_")))
+
+
+@pytest.mark.parametrize("escaped", [False, True])
+@pytest.mark.parametrize("encoding", NAMES)
+def test_names_in_an_unstated_encoding_are_those_of_the_camera_file(
+    tmp_path: Path, encoding: str, escaped: bool
+) -> None:
+    small_nerfstudio(tmp_path / "capture")
+    rename_photographs(tmp_path / "capture", NAMES[encoding])
+    if escaped:
+        path = tmp_path / "capture" / "transforms.json"
+        path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8"))))
+    write_zip_in(encoding, tmp_path / "capture", tmp_path / "a.zip")
+    scene = load_scene(unpacked(tmp_path / "a.zip", tmp_path / "out"))
+    assert (len(scene.views), scene.skipped) == (9, ())
+    assert f"images/{NAMES[encoding]}_00.png" in {view.name for view in scene.views}
+
+
+def test_names_in_an_unstated_encoding_that_fits_nothing_are_one_line(tmp_path: Path) -> None:
+    small_nerfstudio(tmp_path / "capture")
+    rename_photographs(tmp_path / "capture", NAMES["gb18030"])
+    path = tmp_path / "capture" / "transforms.json"
+    path.write_text(path.read_text(encoding="utf-8").replace(NAMES["gb18030"], "f"), encoding="utf-8")
+    write_zip_in("gb18030", tmp_path / "capture", tmp_path / "a.zip")
+    with pytest.raises(DataError, match=r"must have names in UTF-8, got .*does not state.*gb18030.*pack it again"):
+        unpacked(tmp_path / "a.zip", tmp_path / "out")
+    assert list((tmp_path / "out").iterdir()) == []
+    (tmp_path / "capture" / "images" / "f_00.png").write_bytes(b"")  # one that is not in question
+    write_zip_in("gb18030", tmp_path / "capture", tmp_path / "a.zip")
+    assert unpack(tmp_path / "a.zip", tmp_path / "out").is_dir()
 
 
 def test_the_same_contents_are_unpacked_once_under_whatever_name_they_come(tmp_path: Path) -> None:
