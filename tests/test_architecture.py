@@ -46,7 +46,7 @@ INSIDE = {
     "core": {
         "checks growth light locks extras memory memory_limit missing processes spill text": 0,
         "exr files float_tiff georeference similarity": 1,
-        "arrays json_files camera images mesh sh splats": 2,
+        "arrays json_files camera images mesh photo_formats sh splats": 2,
         "exif photometry residual_lens transforms": 3,
     },
     "data": {

@@ -75,6 +75,16 @@ def test_a_dumb_terminal_gets_no_escape_and_no_color_no_style(module: str) -> No
     assert "3,000/6,000" in plain
 
 
+def test_what_is_left_out_of_the_input_is_a_warning_and_not_one_of_the_notes(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    console = Console(quiet=False, as_json=False)
+    console.on_event(Notice("4 of 9 photographs are left out", is_warning=True))
+    console.on_event(Notice("starting from random points"))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["warning 4 of 9 photographs are left out", "note starting from random points"]
+
+
 def test_a_log_file_gets_a_line_a_phase_and_now_and_then_how_far_it_is(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -14,6 +14,7 @@ from PIL import Image
 
 from capture_writers import small_blender, small_colmap, small_nerfstudio
 from foreign_writers import small_alicevision, small_metashape, small_opensfm
+from gs2d.core.photo_formats import HEIF
 from gs2d.data import file_names, load_scene
 from gs2d.data.file_names import Files, in_any_case
 from gs2d.data.priors import find_maps
@@ -237,3 +238,18 @@ def test_maps_are_found_whatever_their_case(tmp_path: Path) -> None:
     files(tmp_path, "A/1.PNG", "a/2.jpg.npy")
     found = find_maps(tmp_path, ["a/1.jpg", "a/2.jpg", "b/1.jpg"], (".npy", ".png"))
     assert found == [tmp_path / "A/1.PNG", tmp_path / "a/2.jpg.npy", None]
+
+
+@pytest.mark.skipif(bool(HEIF), reason="a package for HEIC is installed")
+def test_photographs_in_a_format_that_cannot_be_read_are_left_out_with_the_reason(tmp_path: Path) -> None:
+    small_metashape(tmp_path, labels="{}.HEIC")
+    images = sorted((tmp_path / "images").iterdir())
+    for path in images[:4]:
+        path.with_suffix(".HEIC").write_bytes(b"\0\0\0\x18ftypheic")
+        path.unlink()
+    for path in images[4:]:
+        path.rename(path.with_suffix(".HEIC"))  # JPEG with a wrong extension, which is read
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 5
+    assert len(scene.skipped) == 4
+    assert scene.skipped[0].startswith("a_0.HEIC: HEIC cannot be read; pip install pi-heif")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -193,8 +194,12 @@ def test_the_user_is_told_where_training_starts_and_what_was_skipped(capture: Pa
         train(options(folder, tmp_path / "run", protocol="generic"), listen)
     texts = [event.text for event in heard if isinstance(event, Notice)]
     assert "starting from 150 random points in the box the cameras look at" in texts
-    assert any("r_0" in text for text in texts)
-    assert "... and 1 more views skipped; `gs2d info` lists them" in texts
+    (warning,) = [event.text for event in heard if isinstance(event, Notice) and event.is_warning]
+    assert re.fullmatch(
+        r"4 of \d+ photographs are left out \(`gs2d info` lists them\): \S*r_0, \S*r_1, \S*r_2 and 1 more: "
+        r"listed in transforms_train.json, but there is no such file",
+        warning,
+    )
     assert any(text.startswith("near plane at") for text in texts)
     assert not (tmp_path / "run").exists()  # nothing was saved yet
 

@@ -14,11 +14,12 @@ from PIL import ExifTags, Image, ImageOps
 
 from gs2d.core.camera import look_at
 from gs2d.core.images import image_size, read_image
+from gs2d.core.photo_formats import AVIF, HEIF
 from gs2d.core.similarity import rotation_to_z
 from gs2d.errors import DataError
 from gs2d.sfm import compare
 from gs2d.sfm.image_copies import copy_images
-from gs2d.sfm.images import AVIF, HEIF, Photo, camera_groups, find_photos, in_order_taken, read_photos, turn
+from gs2d.sfm.images import Photo, camera_groups, find_photos, in_order_taken, read_photos, turn
 from gs2d.sfm.pairs import chosen, near_pairs, neighbour_pairs, similar_pairs
 from gs2d.sfm.upright import up_direction
 
@@ -58,7 +59,8 @@ def photos_of(root: Path) -> list[Photo]:
 def test_photographs_are_found_in_subfolders_and_sorted_as_people_count(tmp_path: Path) -> None:
     for name in ("b/frame_10.jpg", "b/frame_2.jpg", "a 1.JPG", "c.png", ".hidden.jpg", ".git/d.jpg", "__MACOSX/e.jpg"):
         image(tmp_path / name)
-    found, notes = find_photos(tmp_path)
+    found, notes, warning = find_photos(tmp_path)
+    assert warning == ""
     assert [path.relative_to(tmp_path).as_posix() for path in found] == [
         "a 1.JPG", "b/frame_2.jpg", "b/frame_10.jpg", "c.png"
     ]  # fmt: skip
@@ -74,7 +76,7 @@ def test_folders_that_are_linked_are_read_once_and_a_pipe_is_not_waited_for(tmp_
     (root / "monday").symlink_to(tmp_path / "disk")
     (root / "again").symlink_to(root)  # a way that does not end
     os.mkfifo(root / "pipe.jpg")
-    found, notes = find_photos(root)
+    found, notes, _ = find_photos(root)
     assert [path.relative_to(root).as_posix() for path in found] == ["monday/0.png", "monday/1.png", "monday/2.png"]
     assert notes == ("pipe.jpg was not read: no photographs",)
 
@@ -96,13 +98,17 @@ def test_names_in_the_capture_have_no_white_space_and_stay_different(tmp_path: P
 def test_files_that_are_no_photographs_are_named_with_what_to_do(tmp_path: Path) -> None:
     for i in range(3):
         image(tmp_path / f"{i}.jpg")
-    for name in ("x.HEIC", "y.heic", "clip.MOV", "notes.txt", "masks/0.jpg.png"):
+    for name in ("x.HEIC", "y.heic", "z.CR2", "clip.MOV", "notes.txt", "masks/0.jpg.png"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"?")
-    found, notes = find_photos(tmp_path)
+    found, notes, warning = find_photos(tmp_path)
     assert len(found) == 3
-    heic, video, other = notes
-    assert heic.startswith("x.HEIC and 1 more were not read: pip install pi-heif (its wheel holds LGPL code)")
+    assert warning == (
+        "3 of 6 photographs cannot be read and are left out: 2 HEIC (x.HEIC ...): pip install pi-heif (its wheel holds "
+        "LGPL code), or convert them to JPEG (magick mogrify -format jpg *.heic); 1 CR2 (z.CR2): raw files are not "
+        "developed here; export JPEG or PNG from your photo program"
+    )
+    video, other = notes
     assert video == "clip.MOV was not read: a video; give it alone, or put frames of it here"
     assert other == "notes.txt was not read: no photographs"
 
@@ -151,11 +157,11 @@ def write_only_video(root: Path) -> Path:
         pytest.param(
             *(
                 write_only_heic,
-                r"got none; IMG_1.HEIC was not read: pip install pi-heif \(.*\) to have HEIC read, or convert",
+                r"got none; 1 of 1 .* left out: 1 HEIC \(IMG_1.HEIC\): pip install pi-heif \(.*\), or convert",
             ),
             marks=pytest.mark.skipif(bool(HEIF), reason="a package for HEIC is installed"),
         ),
-        (write_only_raw, r"raw files \(.cr2\) are not developed here; export JPEG"),
+        (write_only_raw, r"1 CR2 \(a.CR2\): raw files are not developed here; export JPEG"),
         (write_only_video, "got none; walk.mp4 was not read: a video; give it alone"),
     ],
 )
@@ -307,7 +313,7 @@ def test_a_package_that_reads_heic_is_used_where_there_is_one(tmp_path: Path) ->
         os.rename(tmp_path / f"photos/{i}.bmp", tmp_path / f"photos/{i}.HEIC")
     program = (
         "import sys; from pathlib import Path; from gs2d.sfm.images import find_photos, read_photos\n"
-        "root = Path(sys.argv[1]); paths, notes = find_photos(root)\n"
+        "root = Path(sys.argv[1]); paths, notes, _ = find_photos(root)\n"
         "print([photo.name for photo in read_photos(paths, root, threads=1)], notes)"
     )
     words = [sys.executable, "-c", program, str(tmp_path / "photos")]

@@ -99,7 +99,7 @@ class Console:
             self._step(event)
         elif isinstance(event, Notice):
             if self._verbose or not event.detail:
-                self._note(event.text)
+                self._note(event)
         elif isinstance(event, MissingFile):
             self._err.print(
                 f"[red]not made[/red] {escape(printable(event.what))}: {escape(printable(event.reason))}",
@@ -108,12 +108,13 @@ class Console:
         elif isinstance(event, StageDone):
             self._lines(wrapped(event.line(), self._err.width, rest="  "))
 
-    def _note(self, text: str) -> None:
+    def _note(self, notice: Notice) -> None:
         """Print a notice; on a terminal its lines break between words."""
-        text = printable(text)
-        first, *rest = wrapped(text, self._err.width - 5) if self._err.is_terminal else [text]
-        self._err.print(f"[yellow]note[/yellow] {escape(first)}", soft_wrap=True)
-        self._lines([f"     {line}" for line in rest])
+        label, style = ("warning", "bold red") if notice.is_warning else ("note", "yellow")
+        text, indent = printable(notice.text), len(label) + 1
+        first, *rest = wrapped(text, self._err.width - indent) if self._err.is_terminal else [text]
+        self._err.print(f"[{style}]{label}[/{style}] {escape(first)}", soft_wrap=True)
+        self._lines([" " * indent + line for line in rest])
 
     def _lines(self, lines: Sequence[str]) -> None:
         for line in lines if self._err.is_terminal else [" ".join(map(str.strip, lines))]:

@@ -77,10 +77,13 @@ class Notice:
     text : str
     detail : bool
         A decision that needs no action: printed with ``--verbose``, and logged in ``events.jsonl`` before training.
+    is_warning : bool
+        A part of the input is left out.
     """
 
     text: str
     detail: bool = False
+    is_warning: bool = False
 
 
 @dataclass(frozen=True)

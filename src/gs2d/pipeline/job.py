@@ -511,7 +511,8 @@ def read_scene(
         on_event(Notice(text))
     for text in scene.details:
         on_event(Notice(text, detail=True))
-    _say_some(scene.skipped, "views skipped", on_event)
+    if scene.skipped:
+        on_event(Notice(_about_skipped(scene), is_warning=True))
     return scene
 
 
@@ -552,6 +553,22 @@ def _say_some(lines: Sequence[str], what: str, on_event: OnEvent) -> None:
         on_event(Notice(line))
     if len(lines) > SHOWN_SKIPS:
         on_event(Notice(f"... and {len(lines) - SHOWN_SKIPS} more {what}; `gs2d info` lists them"))
+
+
+def _about_skipped(scene: Scene) -> str:
+    """Return one line about the views that are left out: how many, and which for each reason."""
+    reasons: dict[str, list[tuple[str, str]]] = {}
+    for line in scene.skipped:
+        name, _, reason = line.partition(": ")
+        reasons.setdefault(reason.partition("; ")[0], []).append((name, reason))
+    parts = []
+    for found in reasons.values():
+        names = ", ".join(name for name, _ in found[:SHOWN_SKIPS])
+        more = f" and {len(found) - SHOWN_SKIPS} more" if len(found) > SHOWN_SKIPS else ""
+        parts.append(f"{names}{more}: {found[0][1]}")
+    wholes = len({view.path or view.name for view in scene.views})
+    count = f"{len(scene.skipped)} of {len(scene.skipped) + wholes} photographs are left out"
+    return f"{count} (`gs2d info` lists them): {'; '.join(parts)}"
 
 
 def scene_digest(scene: Scene, on_event: OnEvent, *, uses_masks: bool = False) -> str:

@@ -223,7 +223,9 @@ def _masks_of(options: PosesOptions, photos: Sequence[Photo], is_video: bool, on
 
 def _folder_of(photos: Path, on_event: OnEvent) -> list[Path]:
     """Return the photographs of a folder; what is not used is told."""
-    paths, notes = find_photos(photos)
+    paths, notes, warning = find_photos(photos)
+    if warning:
+        on_event(Notice(warning, is_warning=True))
     for note in notes:
         on_event(Notice(note))
     return paths

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import importlib
-import importlib.util
 import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -13,39 +10,23 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, features
+from PIL import Image
 
-from gs2d.core import exr
 from gs2d.core.exif import Taken, read_taken
-from gs2d.core.extras import install
 from gs2d.core.images import is_twice_as_wide, natural_key, read_image
 from gs2d.core.missing import where_it_ends
+from gs2d.core.photo_formats import AVIF, EXR, HEIF, UNREAD, remedy
 from gs2d.data.masks import FOLDER, without_masks
 from gs2d.errors import DataError
 from gs2d.sfm.fisheye import Circle, circle_of, named_fisheye, small_if_dark
 from gs2d.sfm.panoramas import PANORAMA, meets_itself
 from gs2d.sfm.video_frames import VIDEOS
 
-
-def _reads_heif() -> bool:
-    """Let Pillow read HEIC by a package that the user has; none is asked for, because their wheels hold LGPL code."""
-    for name in ("pi_heif", "pillow_heif"):
-        with contextlib.suppress(ImportError):
-            importlib.import_module(name).register_heif_opener()
-            return True
-    return False
-
-
 JPEG, PNG = (".jpg", ".jpeg"), (".png",)
-AVIF = (".avif",) if "avif" in features.modules and features.check("avif") else ()  # Pillow 11.3 and newer
-HEIF = (".heic", ".heif") if _reads_heif() else ()
-EXR = (exr.SUFFIX,) if importlib.util.find_spec("OpenEXR") is not None else ()
 CONVERTED = (".bmp", ".tif", ".tiff", ".webp", *AVIF, *HEIF, *EXR)
-UNREAD = (".heic", ".heif", ".avif")  # without a package for them, by an older Pillow
-RAWS = (*UNREAD, exr.SUFFIX, ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 _KINDS = {
     suffix: kind
-    for kind, suffixes in (("raw", RAWS), ("video", VIDEOS), ("photo", JPEG + PNG + CONVERTED))
+    for kind, suffixes in (("unread", UNREAD), ("video", VIDEOS), ("photo", JPEG + PNG + CONVERTED))
     for suffix in suffixes
 }
 FISHEYE = "OPENCV_FISHEYE"  # the model of --camera-model
@@ -111,8 +92,17 @@ class Photo:
         return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...]]:
-    """Return the photographs in a folder and its sub-folders, in the order of people, and lines about what is not used.
+def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...], str]:
+    """Return the photographs in a folder and its sub-folders, and what is not used.
+
+    Returns
+    -------
+    list of Path
+        The photographs, in the order of people.
+    tuple of str
+        A line about each kind of files that are no photographs.
+    str
+        A line about the photographs that cannot be read: how many, why, and what to do; "" without any.
 
     Raises
     ------
@@ -123,26 +113,40 @@ def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...]]:
         raise DataError(f"{root} must be a folder of photographs or a video, got another file; give its folder")
     if not root.is_dir():
         raise DataError(f"{root} must be a folder of photographs, got no such folder{where_it_ends(root)}")
-    sorted_out: dict[str, list[Path]] = {"photo": [], "video": [], "raw": [], "mask": [], "other": []}
+    sorted_out: dict[str, list[Path]] = {"photo": [], "video": [], "unread": [], "mask": [], "other": []}
     for path in _files(root):
         kind = _KINDS.get(path.suffix.lower(), "other")
         if path.exists() and not path.is_file():  # a pipe, which would be waited for
             kind = "other"
-        sorted_out["mask" if FOLDER in path.relative_to(root).parent.as_posix().lower().split("/") else kind].append(
-            path
-        )
-    photos, videos, raws, _, others = sorted_out.values()
+        if FOLDER in path.relative_to(root).parent.as_posix().lower().split("/"):
+            kind = "mask"
+        sorted_out[kind].append(path)
+    photos, videos, unread, _, others = sorted_out.values()
     photos = without_masks(photos)
-    notes = [f"{_some(raws, root)} not read: {_raw_remedy(raws[0])}"] if raws else []
+    notes = []
     if videos:
         notes.append(f"{_some(videos, root)} not read: a video; give it alone, or put frames of it here")
     if others:
         notes.append(f"{_some(others, root)} not read: no photographs")
+    warning = _about_unread(unread, len(photos), root)
     if len(photos) < FEWEST:
         got = f"{len(photos)} photographs" if photos else "none"
-        why = f"; {notes[0]}" if notes else ""
+        why = next((f"; {line}" for line in (warning, *notes) if line), "")
         raise DataError(f"{root} must hold {FEWEST} or more photographs, got {got}{why or '; ' + _SHOOTING}")
-    return photos, tuple(notes)
+    return photos, tuple(notes), warning
+
+
+def _about_unread(unread: Sequence[Path], read: int, root: Path) -> str:
+    """Return one line about the photographs that cannot be read, or ""."""
+    kinds: dict[str, list[Path]] = {}
+    for path in unread:
+        kinds.setdefault(path.suffix.lower(), []).append(path)
+    parts = []
+    for suffix, paths in kinds.items():
+        first = paths[0].relative_to(root).as_posix() + (" ..." if len(paths) > 1 else "")
+        parts.append(f"{len(paths)} {suffix[1:].upper()} ({first}): {remedy(suffix)}")
+    count = f"{len(unread)} of {read + len(unread)} photographs cannot be read and are left out"
+    return f"{count}: {'; '.join(parts)}" if unread else ""
 
 
 def _files(root: Path) -> Iterator[Path]:
@@ -166,17 +170,6 @@ def _some(paths: Sequence[Path], root: Path) -> str:
     """``a.heic`` or ``a.heic and 3 more``."""
     first = paths[0].relative_to(root).as_posix()
     return f"{first} was" if len(paths) == 1 else f"{first} and {len(paths) - 1} more were"
-
-
-def _raw_remedy(path: Path) -> str:
-    kind = path.suffix.lower()
-    if kind in (".heic", ".heif"):
-        return f"pip install pi-heif (its wheel holds LGPL code) to have {kind[1:].upper()} read, or convert to JPEG"
-    if kind == exr.SUFFIX:
-        return f"{install('exr')} to have OpenEXR read"
-    if kind in UNREAD:
-        return f"{kind[1:].upper()} is not decoded here; convert to JPEG (magick mogrify -format jpg *{path.suffix})"
-    return f"raw files ({kind}) are not developed here; export JPEG or PNG from your photo program"
 
 
 def read_photos(paths: Sequence[Path], root: Path, *, threads: int) -> Iterator[Photo]:

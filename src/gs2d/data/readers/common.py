@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from gs2d.core.photo_formats import UNREAD, remedy
 from gs2d.data.build import PosedImage
 from gs2d.data.file_names import IMAGES, NO_PHOTOGRAPHS, Files, files_ending, in_any_case, name_below
 from gs2d.data.scene import PointCloud
@@ -22,6 +23,7 @@ from gs2d.io.splat_ply import ply_kind
 # -- numbers in files --------------------------------------------------------------------------------------------------
 _LARGEST = 1e300  # JSON has whole numbers of any size
 _NO_NUMBER = re.compile(r"[+-]?(nan\(\w*\)|1\.#\w+)", re.IGNORECASE)
+_BOXES = b"ftyp"  # in the head of HEIC and AVIF; other files with such an extension are read as what they are
 _HEAD = 4096  # bytes in which a file says what it is
 
 
@@ -180,6 +182,9 @@ def find_photographs(
             if other is not None:
                 why += f"; {other.parent.name}/{other.name} is there: list it under its own extension"
             found[name] = Photograph(None, reason=why)
+        elif match.path.suffix.lower() in UNREAD and head(match.path)[4:8] == _BOXES:
+            suffix = match.path.suffix.lower()
+            found[name] = Photograph(None, reason=f"{suffix[1:].upper()} cannot be read; {remedy(suffix)}")
         else:
             found[name] = Photograph(match.path, name_below(match.path, homes))
     return found
