@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gs2d.core.camera import look_at
 from gs2d.core.mesh import Mesh
+from gs2d.meshing.bounds import backproject
 from gs2d.meshing.depth_maps import RenderedView, depth_map
-from gs2d.meshing.evidence import FACES_A_PIXEL, areas, clean, gather, min_views, simplified_to
+from gs2d.meshing.evidence import FACES_A_PIXEL, areas, clean, gather, simplified_to
 from gs2d.meshing.extract import extract
 from surface_shapes import orbit, sphere_depth
 
@@ -92,7 +94,7 @@ def test_what_views_say_is_said_vertex_by_vertex_whatever_the_parts(monkeypatch:
     whole = gather(mesh, made, 0.1)
     monkeypatch.setattr("gs2d.meshing.evidence.VERTICES_AT_ONCE", 37)
     parts = gather(mesh, made, 0.1)
-    for name in ("support", "against", "density"):
+    for name in ("views", "support", "against", "density"):
         np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
     for at in range(0, len(mesh.vertices), 29):  # one by one, in double precision
         support, against, least = 0, 0, np.inf
@@ -110,14 +112,49 @@ def test_what_views_say_is_said_vertex_by_vertex_whatever_the_parts(monkeypatch:
             assert (whole.support[at], whole.against[at]) == (support, against)
 
 
-def test_few_photographs_need_fewer_witnesses() -> None:
-    assert [min_views(count) for count in (1, 2, 11, 12, 300)] == [1, 2, 2, 3, 3]
+def views_of_a_floor(count: int = 12) -> list[RenderedView]:
+    """Cameras look down at the plane z = 0, whose depth is loose and weighs little, as that of a plain floor."""
+    made = []
+    for number in range(count):
+        angle = 2 * np.pi * number / count
+        eye = np.array([2 * np.cos(angle), 2 * np.sin(angle), 2.0])
+        camera = look_at(eye, np.zeros(3), np.array([0, 0, 1.0]), width=40, height=30, fx=40)
+        rows, columns = np.indices((30, 40)).reshape(2, -1)
+        ray = backproject(camera, np.ones(len(rows)), rows, columns) - eye
+        depth = (-eye[2] / ray[:, 2]).reshape(30, 40) + 0.04 * np.sin(np.arange(40) / 5 + number)
+        made.append(RenderedView(camera, depth, None, np.full((30, 40), 0.25)))
+    return made
+
+
+def part_of_floor(frames: list[RenderedView]) -> float:
+    """The part of the square |x|, |y| < 0.7 that is covered by a mesh of the frames, and what lies above it."""
+    mesh = extract(frames, bbox=BOX, voxel=0.06, truncation=0.3, min_weight=0.25, threads=1, by_evidence=True).mesh
+    inside = (np.abs(mesh.vertices[mesh.faces].mean(axis=1)[:, :2]) < 0.7).all(axis=1)
+    return float(areas(mesh)[inside].sum()) / 1.4**2
+
+
+def test_a_floor_on_which_depths_are_loose_stays_whole() -> None:
+    assert part_of_floor(views_of_a_floor()) == pytest.approx(1, abs=0.1)
+
+
+def test_views_that_say_nothing_remove_nothing_and_views_that_see_past_everything_do() -> None:
+    seen = views_of_a_floor()
+    for silent, left in ((0.0, 1), (np.nan, 1), (np.inf, 0)):
+        rest = [replace(frame, depth=np.full_like(frame.depth, silent)) for frame in seen[5:]]
+        assert part_of_floor([*seen[:5], *rest]) == pytest.approx(left, abs=0.1)
+
+
+def test_a_sheet_that_two_views_see_goes_where_more_see_past_everything() -> None:
+    near = [replace(f, depth=np.full_like(f.depth, 1.4), valid=None) for f in views_of_a_floor()[:2]]
+    far = [replace(f, depth=np.full_like(f.depth, np.inf), valid=None) for f in views_of_a_floor()[2:]]
+    assert part_of_floor(near) > 0.1
+    assert part_of_floor([*near, *far]) == 0.0
 
 
 def test_a_mesh_of_nothing_that_was_seen_is_empty_and_no_error() -> None:
     mesh = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), None)
     camera = orbit(1, 4.0)[0]
-    found = clean(mesh, [depth_map(RenderedView(camera, np.zeros((camera.height, camera.width))))], 1, 0.1)
+    found = clean(mesh, [depth_map(RenderedView(camera, np.zeros((camera.height, camera.width))))], 0.1)
     assert (len(found.mesh.faces), found.pixels, found.unsupported) == (0, 0.0, 1.0)
 
 

@@ -6,7 +6,6 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,18 +13,21 @@ import torch
 
 from gs2d.config.protocols import PROTOCOLS
 from gs2d.data import View
-from gs2d.data.subject import OBJECT, given_subject, read_subject
+from gs2d.data.reach import Reach
+from gs2d.data.subject import OBJECT, read_subject
 from gs2d.errors import DataError, ProtocolError, RunError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import PAGE, RunFolder
 from gs2d.io.splat_ply import read_splats
+from gs2d.pipeline.believed import sky_direction
 from gs2d.pipeline.events import Notice
 from gs2d.pipeline.export import export_run
 from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.job import protocol_from_json, reload_job
-from gs2d.pipeline.mesh import bare_of, extract_mesh, mesh_run
+from gs2d.pipeline.mesh import SEVERAL, extract_mesh, fusion_frame, mesh_run
 from gs2d.pipeline.options import MeshOptions
 from gs2d.pipeline.subject import meshed_subject, subject_line, within
+from gs2d.render.api import rasterize
 from gs2d.report.sections.subject import subject_section
 from wall_scene import wall
 
@@ -71,44 +73,42 @@ def test_a_box_of_the_user_becomes_the_subject_and_limits_the_mesh(undisturbed: 
             meshed_subject(run, generic, splats, replace(options, subject_box=BOX), said.append)
 
 
-def test_what_shows_nothing_is_left_out_of_a_subject_and_kept_in_a_scene(
-    undisturbed: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    job, splats = reload_job(undisturbed, lambda _: None), finished_splats(undisturbed)
-    generic = replace(job, protocol=replace(job.protocol, fusion=PROTOCOLS["generic"].fusion))
-    asked: list[bool] = []
-
-    def extract(frames: Any, *, with_bare: bool, **rest: Any) -> Any:
-        asked.append(with_bare)
-        raise ProtocolError("enough")
-
-    monkeypatch.setattr("gs2d.pipeline.mesh.extract", extract)
-    box = given_subject(BOX, [view.camera for view in job.scene.train])
-    for one, options, subject in (
-        (generic, MeshOptions(), box),
-        (generic, MeshOptions(bbox=BOX), None),
-        (generic, MeshOptions(), None),
-        (generic, MeshOptions(bbox=BOX, whole_scene=True), None),
-        (job, MeshOptions(), box),
-    ):
-        with pytest.raises(ProtocolError, match="enough"):
-            extract_mesh(one, splats, options, tmp_path / "mesh.ply", lambda _: None, subject=subject)
-    assert asked == [False, False, True, True, True]
-
-
-def test_bare_walls_are_found_in_photographs_that_say_where_their_points_are(undisturbed: RunFolder) -> None:
+def test_depth_that_is_loose_counts_less_and_depth_of_the_sky_is_infinite(undisturbed: RunFolder) -> None:
     job = replace(reload_job(undisturbed, lambda _: None), scene=wall())
     generic = replace(job, protocol=PROTOCOLS["generic"])
     view = generic.scene.train[0]
-    found = bare_of(generic, view)
-    assert found is not None
-    gray = (np.abs(view.image().astype(int) - 128) <= 1).all(axis=2)  # the left third
-    assert found[gray].mean() > 0.8
-    assert found[~gray].mean() < 0.1
-    assert bare_of(job, view) is None  # official protocols are as they were
-    assert bare_of(replace(generic, scene=replace(wall(), observe=None)), view) is None
+    with torch.no_grad():
+        output = rasterize(finished_splats(undisturbed), view.camera, job.settings, backend=job.backend)
+    at = torch.ones_like(output.alpha)
+    mean = torch.where(torch.arange(at.shape[1]) < 24, 4.0, 5.0).expand_as(at)
+    output = replace(output, alpha=at, depth_mean=mean, depth_median=4 * at)
+    loose = fusion_frame(generic, view, output, "median")
+    assert (loose.depth == 4).all()  # the plain part of the wall too
+    np.testing.assert_array_equal(loose.valid, np.where(mean.numpy() == 4, 1, SEVERAL))
+    assert fusion_frame(job, view, output, "median").valid.all()  # of a data set: all alike
+    plain = (np.abs(view.image().astype(int) - 128) <= 1).all(axis=2)  # the left third
+    rays = np.array([-1.0, 0, 0])  # were the plain third above the cameras, it would be the sky
+    found = fusion_frame(generic, view, output, "median", None, rays)
+    assert np.isinf(found.depth)[plain].mean() > 0.8
+    assert np.isinf(found.depth)[~plain].mean() < 0.1
+    assert (found.valid[np.isinf(found.depth)] == 1).all()
+    up = sky_direction(generic)
+    assert up is not None
+    np.testing.assert_allclose(up, [0, -1, 0], atol=0.1)
+    assert not np.isinf(fusion_frame(generic, view, output, "median", None, up).depth)[18:].any()
+    near = Reach(view.camera.center, 3.0)
+    assert np.isinf(fusion_frame(generic, view, output, "median", near).depth).all()
+
+
+def test_the_sky_is_searched_where_photographs_alone_say_what_is_empty(undisturbed: RunFolder) -> None:
+    job = replace(reload_job(undisturbed, lambda _: None), scene=wall())
+    generic = replace(job, protocol=PROTOCOLS["generic"])
+    assert sky_direction(job) is None  # data sets have limits of their own
+    assert sky_direction(replace(generic, scene=replace(wall(), observe=None))) is None
+    view = wall().train[0]
     opaque = np.concatenate([view.image(), np.full((*view.image().shape[:2], 1), 255, np.uint8)], axis=2)
-    assert bare_of(generic, View.from_arrays(view.name, view.camera, opaque)) is None
+    views = (View.from_arrays(view.name, view.camera, opaque),)
+    assert sky_direction(replace(generic, scene=replace(wall(), train=views))) is None
 
 
 def test_a_new_subject_is_in_the_page_and_what_is_said_of_the_mesh_in_the_metrics(

@@ -79,7 +79,7 @@ def backproject(camera: Camera, depth: np.ndarray, rows: np.ndarray, columns: np
 
 def sample_depths(item: DepthMap, count: int = 4096) -> DepthSample:
     """About ``count`` seen pixels of a depth map, evenly spread (no randomness)."""
-    rows, columns = np.nonzero(item.depth > 0)
+    rows, columns = np.nonzero((item.depth > 0) & np.isfinite(item.depth))
     pick = slice(None, None, max(1, len(rows) // count))
     rows, columns = rows[pick].copy(), columns[pick].copy()  # not a view that holds all of them
     depth = item.depth[rows, columns].astype(np.float64)

@@ -29,20 +29,18 @@ class RenderedView:
     ----------
     camera : Camera
     depth : ndarray or Tensor [H, W] world units
-        Depth along the optical axis at pixel centres; 0, negative, NaN and infinity carry nothing.
+        Depth along the optical axis at pixel centres; 0, negative and NaN carry nothing. Infinity makes no surface,
+        but says that the view sees past everything along this ray.
     color : ndarray or Tensor [H, W, 3] or None
         uint8, or float in [0, 1].
     valid : ndarray or Tensor [H, W] or None
         bool (False carries nothing: background, masked out, alpha < 0.5), or a weight >= 0 of each pixel.
-    bare : ndarray [H, W] bool or None
-        Pixels that show nothing which could be matched (``meshing/bare.py``): their depth is a guess.
     """
 
     camera: Camera
     depth: Any
     color: Any = None
     valid: Any = None
-    bare: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +48,9 @@ class DepthMap:
     """A frame as fusion reads it: numpy, cleaned."""
 
     camera: Camera
-    depth: np.ndarray  # [H, W] float32 world units, 0 where nothing was seen
+    depth: np.ndarray  # [H, W] float32 world units, 0 where nothing was seen, infinite where no surface is
     color: np.ndarray | None  # [H, W, 3] uint8
     weight: np.ndarray | None  # [H, W] float32, None: 1 wherever depth > 0
-    bare: np.ndarray | None = None  # [H, W] bool
 
 
 def depth_map(frame: RenderedView) -> DepthMap:
@@ -69,7 +66,7 @@ def depth_map(frame: RenderedView) -> DepthMap:
     color = None if frame.color is None else _array(frame.color)
     valid = None if frame.valid is None else _array(frame.valid)
     check_shapes({"depth": (depth, f"{camera.height} {camera.width}")})
-    seen = np.isfinite(depth) & (depth > 0)
+    seen = depth > 0
     weight = None
     if valid is not None:
         check_shapes({"valid": (valid, f"{camera.height} {camera.width}")})
@@ -82,9 +79,7 @@ def depth_map(frame: RenderedView) -> DepthMap:
         check_shapes({"color": (color, f"{camera.height} {camera.width} 3")})
         if color.dtype != np.uint8:
             color = np.rint(np.clip(np.nan_to_num(color), 0.0, 1.0) * 255.0).astype(np.uint8)
-    if frame.bare is not None:
-        check_shapes({"bare": (frame.bare, f"{camera.height} {camera.width}")})
-    return DepthMap(camera, np.where(seen, depth, 0).astype(np.float32), color, weight, frame.bare)
+    return DepthMap(camera, np.where(seen, depth, 0).astype(np.float32), color, weight)
 
 
 def _array(value: Any) -> np.ndarray:
@@ -102,7 +97,6 @@ class _Slot:
     offset: int
     has_color: bool
     has_weight: bool
-    has_bare: bool
 
 
 class Spool:
@@ -125,7 +119,6 @@ class Spool:
         except OSError as error:
             raise DiskError(f"a temporary file for depth maps cannot be made in {folder}: {error.strerror}") from error
         self._slots: list[_Slot] = []
-        self._with_bare = True
 
     def append(self, item: DepthMap) -> None:
         """Write one depth map."""
@@ -136,15 +129,13 @@ class Spool:
                 self._file.write(np.ascontiguousarray(item.color, np.uint8).tobytes())
             if item.weight is not None:
                 self._file.write(np.ascontiguousarray(item.weight, np.float32).tobytes())
-            if item.bare is not None:
-                self._file.write(np.ascontiguousarray(item.bare, bool).tobytes())
             self._file.flush()
         except OSError as error:
             raise DiskError(
                 f"depth maps need a temporary file, writing number {len(self._slots) + 1} failed "
                 f"({error.strerror}); free some space or name another folder"
             ) from error
-        has = (part is not None for part in (item.color, item.weight, item.bare))
+        has = (part is not None for part in (item.color, item.weight))
         self._slots.append(_Slot(item.camera, offset, *has))
 
     @classmethod
@@ -168,10 +159,6 @@ class Spool:
         for frame in frames:
             self.append(depth_map(frame))
 
-    def leave_out_bare(self) -> None:
-        """From now on give no depth where nothing could be matched."""
-        self._with_bare = False
-
     @property
     def cameras(self) -> list[Camera]:
         """Cameras of the depth maps, in order."""
@@ -187,10 +174,7 @@ class Spool:
             depth = self._read(np.float32, shape)
             color = self._read(np.uint8, (*shape, 3)) if slot.has_color else None
             weight = self._read(np.float32, shape) if slot.has_weight else None
-            bare = self._read(bool, shape) if slot.has_bare else None
-            if bare is not None and not self._with_bare:
-                depth = np.where(bare, np.float32(0), depth)
-            yield DepthMap(slot.camera, depth, color, weight, bare)
+            yield DepthMap(slot.camera, depth, color, weight)
 
     def _read(self, dtype: type, shape: tuple[int, ...]) -> np.ndarray:
         count = int(np.prod(shape))

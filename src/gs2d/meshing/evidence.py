@@ -1,8 +1,9 @@
 """What the photographs say about each part of a mesh, and a mesh that holds no more than they do.
 
-A view supports a vertex if it looks at its front and has its own surface there; it contradicts it if it sees farther.
-Sheets before a camera, ribbons at depth edges and shreds of background are supported by few views, and go; faces are as
-many as the pixels that saw the surface best, not as the voxels that it was cut from.
+A view supports a vertex if it looks at its front and has its own surface there, and contradicts it if it sees farther.
+A vertex goes if more views contradict it than support it: sheets before a camera, ribbons at depth edges and shreds of
+background do. A view that says nothing, for example because of missing texture, removes nothing. Faces are as many as
+the pixels that saw the surface best, not as the voxels that it was cut from.
 """
 
 from __future__ import annotations
@@ -19,9 +20,8 @@ from gs2d.meshing.depth_maps import DepthMap
 from gs2d.meshing.marching_cubes import components, select_faces
 from gs2d.meshing.simplify import collapse
 
-VIEWS = 3.0  # that support a vertex
-FEW_VIEWS = 12  # in a capture, of which two are enough
 SMALL = 0.01  # of the largest component's area: smaller ones go
+VIEWS = 2  # that see a vertex: a single view does not measure depth
 FACES_A_PIXEL = 2.0  # a depth map has as many
 VERTICES_AT_ONCE = 1 << 15  # by all views in turn: what is made of so many stays in a core's cache
 FACES_AT_ONCE = 1 << 16  # corners of all faces, nine numbers each, were most of what cleaning a mesh took
@@ -34,22 +34,24 @@ class Evidence:
 
     Attributes
     ----------
-    support : ndarray [P] int32
-        Views that saw it.
-    against : ndarray [P] int32
-        Views that see farther at its place.
+    views : ndarray [P] int32
+        Views that see it.
+    support : ndarray [P] float32
+        Sum of the weights of the pixels that show it, one of each view.
+    against : ndarray [P] float32
+        The same of the pixels that see farther where it lies.
     density : ndarray [P] float32
         Pixels per world unit^2 of surface in the view that saw it best.
     """
 
+    views: np.ndarray
     support: np.ndarray
     against: np.ndarray
     density: np.ndarray
 
-
-def min_views(count: int) -> int:
-    """Return how many of ``count`` views must have seen a surface."""
-    return min(int(VIEWS), count) if count >= FEW_VIEWS else min(2, count)
+    def rows(self, rows: np.ndarray | slice) -> Evidence:
+        """Return the evidence of some vertices; a view of it for a slice."""
+        return Evidence(self.views[rows], self.support[rows], self.against[rows], self.density[rows])
 
 
 def gather(mesh: Mesh, maps: Iterable[DepthMap], tolerance: float) -> Evidence:
@@ -66,49 +68,43 @@ def gather(mesh: Mesh, maps: Iterable[DepthMap], tolerance: float) -> Evidence:
     parts = [slice(start, start + VERTICES_AT_ONCE) for start in range(0, len(mesh.vertices), VERTICES_AT_ONCE)]
     xyz = [np.ascontiguousarray(places[:, part], np.float32) for part in parts]
     ahead = [np.ascontiguousarray(normals[:, part]) for part in parts]
-    support = np.zeros(len(mesh.vertices), np.int32)
-    against = np.zeros(len(mesh.vertices), np.int32)
-    density = np.zeros(len(mesh.vertices), np.float32)
+    count = len(mesh.vertices)
+    found = Evidence(np.zeros(count, np.int32), *(np.zeros(count, np.float32) for _ in range(3)))
     for item in maps:
         for part, vertices, normal in zip(parts, xyz, ahead, strict=True):
-            _count(item, vertices, normal, tolerance, support[part], against[part], density[part])
-    return Evidence(support, against, density)
+            _count(item, vertices, normal, tolerance, found.rows(part))
+    return found
 
 
-def _count(
-    item: DepthMap,
-    vertices: np.ndarray,
-    normals: np.ndarray,
-    tolerance: float,
-    support: np.ndarray,
-    against: np.ndarray,
-    density: np.ndarray,
-) -> None:
-    """Add what one view says of some vertices [3, P] with normals [3, P] to the counts, in place."""
+def _count(item: DepthMap, vertices: np.ndarray, normals: np.ndarray, tolerance: float, found: Evidence) -> None:
+    """Add what one view says of some vertices [3, P] with normals [3, P] to their evidence, in place."""
     camera: Camera = item.camera
-    rows, z, seen = _look(item, vertices)
-    against[rows[seen > z + tolerance]] += 1
+    rows, z, seen, weight = _look(item, vertices)
+    through = np.flatnonzero(seen > z + tolerance)
+    found.against[rows.take(through)] += weight.take(through)
     here = np.flatnonzero((seen > 0) & (np.abs(seen - z) <= tolerance))
-    rows, z = rows.take(here), z.take(here)
+    rows, z, weight = rows.take(here), z.take(here), weight.take(here)
     arm = camera.center.astype(np.float32)[:, None] - vertices.take(rows, axis=1)  # [:, rows] would be strided
     length = np.sqrt((arm * arm).sum(axis=0))
     facing = (arm * normals.take(rows, axis=1)).sum(axis=0) / np.maximum(length, np.float32(1e-30))
     front = np.flatnonzero(facing > GRAZING)
     rows, z = rows.take(front), z.take(front)
-    support[rows] += 1
+    found.views[rows] += 1
+    found.support[rows] += weight.take(front)
     near = np.float32(camera.fx * camera.fy) * facing.take(front) / (z * z)
-    density[rows] = np.maximum(density.take(rows), near)
+    found.density[rows] = np.maximum(found.density.take(rows), near)
 
 
-def _look(item: DepthMap, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return indices of the vertices [3, P] in the image, their depths, and what the view itself sees there."""
+def _look(item: DepthMap, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return indices of the vertices [3, P] in the image, their depths, and the view's own depths and weights there."""
     camera: Camera = item.camera
     x, y, z = camera.rotation.astype(np.float32) @ vertices + camera.T_cam_world[:3, 3:].astype(np.float32)
     z[~(z > 0)] = np.nan
     column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
     rows = np.flatnonzero((column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height))
-    seen = item.depth[row.take(rows).astype(np.int64), column.take(rows).astype(np.int64)]
-    return rows, z.take(rows), seen
+    pixels = row.take(rows).astype(np.int64), column.take(rows).astype(np.int64)
+    weight = np.ones(len(rows), np.float32) if item.weight is None else item.weight[pixels]
+    return rows, z.take(rows), item.depth[pixels], weight
 
 
 def _normals(mesh: Mesh) -> np.ndarray:
@@ -160,7 +156,7 @@ class Cleaned:
     pixels : float
         That its surface has, each part of it in the view that saw it best.
     unsupported, small : float
-        Parts of the area that went because too few views saw them, and because they lay apart.
+        Parts of the area that went because views contradict them, and because they lay apart.
     """
 
     mesh: Mesh
@@ -169,19 +165,19 @@ class Cleaned:
     small: float
 
 
-def clean(mesh: Mesh, maps: Iterable[DepthMap], count: int, tolerance: float) -> Cleaned:
+def clean(mesh: Mesh, maps: Iterable[DepthMap], tolerance: float) -> Cleaned:
     """Leave of a mesh what the views saw.
 
     Parameters
     ----------
     maps : iterable of DepthMap
-        Those that it was fused from, ``count`` of them.
+        Those that it was fused from.
     tolerance : float
         As for ``gather``.
     """
     evidence = gather(mesh, maps, tolerance)
     left = [float(areas(mesh).sum())]
-    mesh, evidence = supported(mesh, evidence, min_views(count))  # what is left takes the name: one is held, not three
+    mesh, evidence = supported(mesh, evidence)  # what is left takes the name: one is held, not three
     left.append(float(areas(mesh).sum()))
     mesh, evidence = large_components(mesh, evidence)
     left.append(float(areas(mesh).sum()))
@@ -195,9 +191,9 @@ def simplified(cleaned: Cleaned) -> Cleaned:
     return replace(cleaned, mesh=simplified_to(cleaned.mesh, int(FACES_A_PIXEL * cleaned.pixels)))
 
 
-def supported(mesh: Mesh, evidence: Evidence, views: int) -> tuple[Mesh, Evidence]:
-    """Return the part of a mesh that so many views saw, and more than see through it, and what is said of it."""
-    good = (evidence.support >= views) & (evidence.support > evidence.against)
+def supported(mesh: Mesh, evidence: Evidence) -> tuple[Mesh, Evidence]:
+    """Return the part of a mesh that two views see, and more than see through it, and its evidence."""
+    good = (evidence.views >= VIEWS) & (evidence.support > evidence.against)
     kept = good[mesh.faces].sum(axis=1) >= 2  # the border may hang over by a vertex
     return _selected(mesh, evidence, kept)
 
@@ -214,8 +210,7 @@ def large_components(mesh: Mesh, evidence: Evidence, fraction: float = SMALL) ->
 def _selected(mesh: Mesh, evidence: Evidence, faces: np.ndarray) -> tuple[Mesh, Evidence]:
     used = np.zeros(len(mesh.vertices), bool)
     used[mesh.faces[faces]] = True
-    rest = Evidence(evidence.support[used], evidence.against[used], evidence.density[used])
-    return select_faces(mesh, faces), rest
+    return select_faces(mesh, faces), evidence.rows(used)
 
 
 def simplified_to(mesh: Mesh, faces: int) -> Mesh:

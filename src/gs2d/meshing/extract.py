@@ -58,7 +58,6 @@ def extract(
     backend: str | Backend = "auto",
     folder: str | os.PathLike[str] | None = None,
     by_evidence: bool = False,
-    with_bare: bool = True,
     slab_bytes: int = SLAB_BYTES,
 ) -> Extraction:
     """Fuse frames into a mesh.
@@ -84,9 +83,8 @@ def extract(
     folder : path, optional
         Where the temporary file goes.
     by_evidence : bool
-        Leave only what enough views saw, in no more faces than their pixels carry (``evidence.clean``).
-    with_bare : bool
-        Take the depth of pixels that show nothing which could be matched (``RenderedView.bare``).
+        Leave only what more views see than see through, in no more faces than their pixels carry
+        (``evidence.clean``).
     slab_bytes : int
         Of the volume that are in memory at a time; the mesh does not depend on it.
 
@@ -105,8 +103,6 @@ def extract(
         raise TypeError("give limits, or the numbers to derive them from, not both")
     backend = fusion_backend(backend)
     with Spool.of(frames, folder) as spool:
-        if not with_bare:
-            spool.leave_out_bare()
         if limits is None:
             samples = sampled(spool)
             limits = derive_limits(
@@ -140,7 +136,7 @@ def extract(
         if not by_evidence:
             return found
         del whole
-        cleaned = clean(found.mesh, spool, len(spool), limits.truncation)
+        cleaned = clean(found.mesh, spool, limits.truncation)
         found = replace(found, mesh=cleaned.mesh)  # the other is let go before the collapse, which takes most
         cleaned = simplified(cleaned)
         return replace(found, mesh=cleaned.mesh, cleaned=cleaned)

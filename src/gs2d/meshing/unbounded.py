@@ -288,7 +288,7 @@ def _fuse_into(
 
 def _distances(item: DepthMap, cascade: TsdfCascade) -> np.ndarray:
     """Distance [H, W] of what each pixel saw from the centre, along the farthest axis, in halves; 0 where nothing."""
-    rows, columns = np.nonzero(item.depth > 0)
+    rows, columns = np.nonzero((item.depth > 0) & np.isfinite(item.depth))
     points = backproject(item.camera, item.depth[rows, columns].astype(np.float64), rows, columns)
     distance = np.zeros(item.depth.shape)
     distance[rows, columns] = np.abs(points - np.asarray(cascade.center)).max(axis=1) / cascade.half
@@ -311,7 +311,7 @@ def _touched(item: DepthMap, cascade: TsdfCascade, library: Library | None) -> l
         margin = (3 * limits.truncation + 2 * BLOCK * limits.voxel) / cascade.half
         inner = 2.0 ** (k - 1) if k else 0.0
         near = (distance > inner - margin) & (distance < 2.0**k + margin)
-        part = replace(item, depth=np.where(near, item.depth, 0).astype(np.float32))
+        part = replace(item, depth=np.where(near, item.depth, np.float32(0)))
         # a block more on every side: what lies just outside the level touches its border too
         step = BLOCK * limits.voxel
         lower = (limits.lower[0] - step, limits.lower[1] - step, limits.lower[2] - step)

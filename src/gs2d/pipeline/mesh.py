@@ -31,13 +31,12 @@ from gs2d.io.run_dir import (
     TEXTURED,
     RunFolder,
 )
-from gs2d.meshing.bare import bare_pixels
 from gs2d.meshing.depth_maps import RenderedView, Spool, depth_map
 from gs2d.meshing.extract import Extraction, extract, extract_unbounded
 from gs2d.meshing.slabs import SLAB_BYTES
 from gs2d.meshing.tsdf import VolumeTooLargeError
 from gs2d.pipeline.attempts import again, attempted
-from gs2d.pipeline.believed import surface_reach, within_reach
+from gs2d.pipeline.believed import sky_direction, sky_of, surface_reach, within_reach
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
 from gs2d.pipeline.finished import checked_output, open_job
 from gs2d.pipeline.job import Job, RenderedScene
@@ -52,7 +51,7 @@ from gs2d.render.api import rasterize
 from gs2d.render.types import RenderOutput
 
 ONE_SURFACE = 0.02  # of the depth: where mean and median differ by more, a pixel sees several surfaces
-MIN_POINTS = 20  # sparse points in a photograph, below which it is not known where it shows anything
+SEVERAL = 0.25  # weight of such a pixel
 KEPT = (  # of what is said of a mesh, in metrics.json
     *("vertices", "faces", "voxel", "truncation", "depth_limit", "depth", "unbounded"),
     *("pixels", "faces_per_pixel", "area_unsupported", "area_apart"),
@@ -70,7 +69,7 @@ class MeshFrames:
     """
 
     def __init__(self, job: Job) -> None:
-        self._job, self._reach = job, surface_reach(job)
+        self._job, self._reach, self._up = job, surface_reach(job), sky_direction(job)
         self.spool = Spool()
 
     def visit(self, seen: SeenView, scores: ImageMetrics) -> None:
@@ -84,7 +83,9 @@ class MeshFrames:
         if seen.split != "train":
             return
         try:
-            frame = fusion_frame(self._job, seen.view, seen.output, self._job.protocol.fused_depth, self._reach)
+            frame = fusion_frame(
+                self._job, seen.view, seen.output, self._job.protocol.fused_depth, self._reach, self._up
+            )
             self.spool.append(depth_map(frame))
         except Exception as error:  # must not cost the scores; the mesh meets and reports it
             if is_full(error):
@@ -177,10 +178,14 @@ def fused(
         raise ProtocolError("a scene with splats was expected, got none; train longer or check the cameras")
     check_mesh_options(options)
     depth = options.depth or job.protocol.fused_depth
-    usable = seen is not None and seen.complete and depth == job.protocol.fused_depth
+    usable = seen is not None and seen.complete and depth == job.protocol.fused_depth and not options.whole_scene
 
     def frames() -> Iterable[RenderedView] | Spool:
-        return seen.spool if seen is not None and usable else _frames(job, splats, depth, on_event)
+        return (
+            seen.spool
+            if seen is not None and usable
+            else _frames(job, splats, depth, on_event, whole=options.whole_scene)
+        )
 
     result = _extract_that_fits(job, frames, options, on_event, subject)
     if seen is not None:
@@ -269,10 +274,7 @@ def _extract(
     bbox = None if options.bbox is None else np.asarray(options.bbox, np.float64).reshape(2, 3)
     bbox = bbox if subject is None else subject.box
     own = bbox is not None or options.unbounded
-    subject_only = fusion.subject and not options.unbounded
-    bare = not subject_only or options.whole_scene or bbox is None  # in a room bare walls are most of what there is
-    bounded = partial(extract, by_evidence=subject_only, with_bare=bare)
-    fuse_frames = extract_unbounded if options.unbounded else bounded
+    fuse_frames = extract_unbounded if options.unbounded else partial(extract, by_evidence=fusion.subject)
     if isinstance(frames, Spool):
         on_event(Phase("fusing", 0))
     result = fuse_frames(
@@ -281,6 +283,7 @@ def _extract(
         voxel=options.voxel if own else options.voxel or fusion.voxel,
         truncation=options.truncation or (None if own or options.voxel else fusion.truncation),
         depth_limit=options.depth_limit if own else options.depth_limit or fusion.depth_limit,
+        min_weight=SEVERAL if fusion.subject else 1.0,  # of one pixel
         keep=keep or None,
         max_bytes=_volume_bytes(options),
         slab_bytes=_slab_bytes(),
@@ -310,22 +313,35 @@ def _slab_bytes() -> int:
     return SLAB_BYTES if budget is None else min(SLAB_BYTES, max(LEAST_SLAB_BYTES, budget // 32))
 
 
-def _frames(job: RenderedScene, splats: Splats, depth: str, on_event: OnEvent) -> Iterator[RenderedView]:
+def _frames(
+    job: RenderedScene, splats: Splats, depth: str, on_event: OnEvent, *, whole: bool
+) -> Iterator[RenderedView]:
+    """Yield what is fused of each training view; of the ``whole`` scene the sky may be a ceiling, and stays."""
     views, settings = job.scene.train, replace(job.settings, with_distortion=False).for_depths(depth)
-    reach = surface_reach(job)
+    reach, up = surface_reach(job), None if whole else sky_direction(job)
     for view in counted(views, "rendering depth", len(views), on_event):
         with torch.no_grad():
             output = rasterize(splats, view.camera, settings, backend=job.backend)
-        yield fusion_frame(job, view, output, depth, reach)
+        yield fusion_frame(job, view, output, depth, reach, up)
     release(job.scene)  # photographs were looked at for where they are known
     on_event(Phase("fusing", 0))
 
 
 def fusion_frame(
-    job: RenderedScene, view: View, output: RenderOutput, depth: str, reach: Reach | None = None
+    job: RenderedScene,
+    view: View,
+    output: RenderOutput,
+    depth: str,
+    reach: Reach | None = None,
+    up: np.ndarray | None = None,
 ) -> RenderedView:
-    """Return what fusion takes of a view: depth of a kind and colour, where it is covered well enough and in reach."""
-    valid = (output.alpha >= OPAQUE).cpu().numpy()
+    """Return what fusion takes of a view: depth of a kind and colour, where it is covered well enough.
+
+    Depth beyond ``reach``, and of the sky where its direction ``up`` is known, is infinite: the view sees past all
+    surfaces there.
+    """
+    sky = np.zeros(output.alpha.shape, bool) if up is None else sky_of(job, view, up)
+    valid = (output.alpha >= OPAQUE).cpu().numpy() | sky
     mask = view.object_mask() if job.protocol.use_mask_in_fusion else None
     # Beyond the photograph, and where it is ignored, nothing has said how far the surface is.
     for pixels in (mask, view.usable(masks=job.protocol.use_mask_in_fusion)):
@@ -333,32 +349,20 @@ def fusion_frame(
             valid = valid & pixels
     depths = output.depth(depth).cpu().numpy()
     if job.protocol.fusion.subject:
-        valid = valid & one_surface(output)
-    if reach is not None:
-        valid = valid & within_reach(reach, view.camera, depths)
+        valid = valid * np.maximum(confidence(output), sky)
+    past = sky if reach is None else sky | ~within_reach(reach, view.camera, depths)
+    depths = np.where(past, np.float32(np.inf), depths)
     color = surface_color(output, job).cpu().numpy()
-    return RenderedView(view.camera, depths, color, valid, bare_of(job, view))
+    return RenderedView(view.camera, depths, color, valid)
 
 
-def bare_of(job: RenderedScene, view: View) -> np.ndarray | None:
-    """Return the pixels of a photograph that show nothing which could be matched, [H, W] bool.
+def confidence(output: RenderOutput) -> np.ndarray:
+    """Return how much the depths [H, W] count: less where the light of a pixel ends at several depths.
 
-    None where that is not asked for (the protocols of data sets), where the photograph itself says what is empty, or
-    where the capture does not say enough of which points its photographs show.
+    Such pixels lie at the outline of a thing, in fog, or on a surface without texture, whose splats lie loosely.
     """
-    scene = job.scene
-    if not job.protocol.fusion.subject or view.alpha() is not None or (observed := scene.observed()) is None:
-        return None
-    points = observed.inside(view.camera, min_track=2).pixels
-    if len(points) < MIN_POINTS:
-        return None
-    return bare_pixels(view.target(job.settings.background), points, view.valid())
-
-
-def one_surface(output: RenderOutput) -> np.ndarray:
-    """Return where the light of a pixel ends in one place [H, W]: not at the rim of a thing, nor in fog."""
     mean, median = output.depth_mean, output.depth_median
-    return np.asarray(((mean - median).abs() <= ONE_SURFACE * median).cpu().numpy())
+    return np.where(((mean - median).abs() <= ONE_SURFACE * median).cpu().numpy(), 1.0, SEVERAL)
 
 
 def surface_color(output: RenderOutput, job: RenderedScene) -> torch.Tensor:

@@ -1,0 +1,102 @@
+"""Sky is found above the horizon; smooth parts of a thing, and all below the horizon, are not sky."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gs2d.meshing.sky import sky_pixels
+
+HEIGHT, WIDTH, ROOF = 90, 120, 40  # the sky is above this row
+NO_POINTS = np.zeros((0, 2))
+
+
+def castle(*, sky: float = 0.9, noise: float = 0.004, height: int = HEIGHT, width: int = WIDTH) -> np.ndarray:
+    """A bright, noisy sky that fades towards the side, above a textured wall with a tower."""
+    rng = np.random.default_rng(0)
+    image = rng.uniform(0.1, 0.7, (height, width, 1)).repeat(3, axis=2)
+    fading = sky * np.linspace(1, 0.7, width)[None, :, None] * np.array([0.9, 0.95, 1.0])
+    tower = (np.arange(width) > width // 2 - 6) & (np.arange(width) < width // 2 + 6)
+    end = np.where(tower, height * ROOF // HEIGHT - 14, height * ROOF // HEIGHT)
+    above = np.arange(height)[:, None] < end
+    image[above] = np.broadcast_to(fading, image.shape)[above]
+    return np.clip(image + rng.normal(0, noise, image.shape), 0, 1).astype(np.float32)
+
+
+def sky_in(image: np.ndarray, points: np.ndarray, valid: np.ndarray | None = None, horizon: float = 1.0) -> np.ndarray:
+    """``sky_pixels`` of an image whose rays rise above a row, a part of its height."""
+    above = np.arange(len(image))[:, None] < horizon * len(image) + np.zeros((1, image.shape[1]))
+    return sky_pixels(image, points, above, valid)
+
+
+def points_on(mask: np.ndarray, every: int = 7) -> np.ndarray:
+    """Pixel centres [M, 2] in a mask."""
+    rows, columns = np.nonzero(mask)
+    return np.stack([columns, rows], axis=1)[::every] + 0.5
+
+
+def wall_points(image: np.ndarray) -> np.ndarray:
+    """Points on what is below the sky, and on the tower."""
+    return points_on(np.arange(len(image))[:, None] > ROOF + 1 + np.zeros((1, WIDTH)))
+
+
+@pytest.mark.parametrize("sky", [0.9, 0.03])
+def test_a_sky_without_points_is_found_up_to_the_roofs(sky: float) -> None:
+    image = castle(sky=sky)
+    found = sky_in(image, wall_points(image))
+    assert found[: ROOF - 16].all()
+    assert found[:ROOF, : WIDTH // 2 - 8].mean() > 0.97  # the seam along the roof belongs to it
+    assert found[ROOF + 1 :].mean() < 0.005  # pixels of the wall that happen to be as bright
+    assert found[ROOF - 10 : ROOF, WIDTH // 2 - 4 : WIDTH // 2 + 4].mean() < 0.1  # the tower
+
+
+def test_where_sparse_points_lie_there_is_no_sky() -> None:
+    image = castle()
+    everywhere = points_on(np.ones((HEIGHT, WIDTH), bool), every=23)
+    assert not sky_in(image, everywhere).any()
+    half = everywhere[everywhere[:, 0] > WIDTH / 2]
+    found = sky_in(image, half)
+    assert found[:ROOF, : WIDTH // 3].mean() > 0.95
+    assert found[:, 2 * WIDTH // 3 :].mean() < 0.005
+
+
+def test_texture_is_not_sky_even_where_no_point_was_found() -> None:
+    assert not sky_in(castle(noise=0.02), NO_POINTS).any()
+
+
+def test_smooth_parts_of_a_thing_are_not_sky() -> None:
+    image = castle()
+    image[ROOF + 10 : ROOF + 45, 20:100] = 0.9  # a smooth plate within the wall
+    image[-12:, :14] = 0.9  # and a small one at the rim
+    found = sky_in(image, wall_points(castle())[:40])
+    assert found[: ROOF - 16].all()
+    assert found[ROOF + 1 :].mean() < 0.005
+
+
+def test_the_rim_is_that_of_what_the_photograph_shows() -> None:
+    image, valid = castle(), np.ones((HEIGHT, WIDTH), bool)
+    valid[:9], valid[:, :6], valid[:, -6:] = False, False, False
+    image[~valid] = 0.0
+    found = sky_in(image, wall_points(image), valid)
+    assert found[16 : ROOF - 16, 14:-14].all()
+    assert found[ROOF + 1 :, 6:-6].mean() < 0.005
+
+
+def test_large_photographs_are_looked_at_small() -> None:
+    image = castle(height=5 * HEIGHT, width=5 * WIDTH + 3)  # shrunk by two
+    points = points_on(np.arange(5 * HEIGHT)[:, None] > 5 * ROOF + 5 + np.zeros((1, 5 * WIDTH + 3)), every=97)
+    found = sky_in(image, points)
+    assert found.shape == image.shape[:2]
+    assert found[: 5 * ROOF - 20, : 2 * WIDTH].all()
+    assert found[5 * ROOF + 4 :].mean() < 0.005
+
+
+def test_a_smooth_floor_or_table_below_the_horizon_is_not_sky() -> None:
+    image = castle()[::-1]  # the smooth area is below, and reaches the rim
+    points = points_on(np.arange(HEIGHT)[:, None] < HEIGHT - ROOF + np.zeros((1, WIDTH)))
+    assert sky_in(image, points)[-ROOF + 16 :].all()  # it would be, were it above
+    assert not sky_in(image, points, horizon=0.5).any()
+    level = castle()
+    found = sky_in(level, wall_points(level), horizon=0.2)
+    assert found[: int(0.2 * HEIGHT)].all()
+    assert not found[int(0.2 * HEIGHT) :].any()
