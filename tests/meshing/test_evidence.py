@@ -42,7 +42,7 @@ def test_a_sheet_that_one_view_saw_goes_and_the_ball_stays_whole() -> None:
     before, after = (extract(seen, bbox=BOX, voxel=0.1, threads=1, by_evidence=cleans) for cleans in (False, True))
     assert off_the_ball(before.mesh) > 0.01  # there was a sheet
     assert off_the_ball(after.mesh) == 0.0
-    assert areas(after.mesh).sum() == pytest.approx(4 * np.pi, rel=0.07)
+    assert areas(after.mesh).sum() == pytest.approx(4 * np.pi, rel=0.1)
     assert before.cleaned is None
     assert after.cleaned is not None
     assert after.cleaned.unsupported + after.cleaned.small > 0.01
@@ -147,7 +147,7 @@ def test_views_that_say_nothing_remove_nothing_and_views_that_see_past_everythin
 def test_a_sheet_that_two_views_see_goes_where_more_see_past_everything() -> None:
     near = [replace(f, depth=np.full_like(f.depth, 1.4), valid=None) for f in views_of_a_floor()[:2]]
     far = [replace(f, depth=np.full_like(f.depth, np.inf), valid=None) for f in views_of_a_floor()[2:]]
-    assert part_of_floor(near) > 0.1
+    assert part_of_floor(near) > 0.02
     assert part_of_floor([*near, *far]) == 0.0
 
 
