@@ -417,3 +417,12 @@ def test_the_other_conventions_of_the_image_metrics_are_named_beside_the_table()
     assert "From floats, unrounded, the last stage has 27.36 dB and 0.9123 (test views)." in text
     assert "fed with [-1, 1], as its authors do, it is 0.1568" in text
     assert "From floats" not in text_of(stage_table(record()))  # an older run
+
+
+def test_transparent_pixels_have_a_column_and_the_worst_view_where_they_were_counted() -> None:
+    counted = {**stage_entry(2), "transparent": {"part": 0.0123, "view": "b.jpg", "worst": 0.2}}
+    text = text_of(stage_table(record(stages=(counted,))))
+    assert "Transparent, %" in text
+    assert "1.2" in text
+    assert "b.jpg ( 20.0 %)" in text.replace("(20", "( 20")
+    assert "ransparent" not in text_of(stage_table(record()))

@@ -43,6 +43,8 @@ from gs2d.pipeline.scoring import (
     mean_psnr,
     score_views,
     split_metrics,
+    transparent_entry,
+    transparent_part,
 )
 from gs2d.render.types import RenderOutput
 from gs2d.training import events as train_events
@@ -342,10 +344,14 @@ class RunLogger:
         entry |= taken_over
         shown = {view.name for _, view in self._shown}
         outputs: dict[str, RenderOutput] = {}
+        transparent: dict[str, float] = {}
 
         def keep(seen: SeenView, scores: ImageMetrics) -> None:
             if seen.view.name in shown:
                 outputs[seen.view.name] = seen.output
+            part = transparent_part(seen) if seen.split == "train" else None
+            if part is not None and math.isfinite(part):  # a mask may leave no pixel
+                transparent[seen.view.name] = part
 
         for split, views in self._scored(last=last):
             entry |= {split: None, f"{split}_reason": "its views could not be scored"}
@@ -354,6 +360,7 @@ class RunLogger:
                 scores = self._score(split, views, f"scoring {split} views", visitors)
                 del entry[f"{split}_reason"]
                 entry |= split_metrics(scores, split, of=len(self._views(split)))
+        entry |= transparent_entry(transparent)
         with attempted(f"what the losses say of stage {stage.name}", None, self._on_event):
             assert self._trainer is not None
             entry |= report_losses(self._run, self._trainer, self._job.scene.train)

@@ -50,6 +50,25 @@ class SeenView:
     mask: torch.Tensor | None
 
 
+CLEAR = 0.9  # alpha below which a pixel of an opaque photograph lets the background through
+
+
+def transparent_part(seen: SeenView) -> float | None:
+    """Return the part of a view's pixels whose alpha is below 0.9; None where the photograph has an alpha channel."""
+    if seen.view.alpha() is not None:
+        return None
+    clear = seen.output.alpha < CLEAR
+    return float((clear if seen.mask is None else clear[seen.mask]).float().mean())
+
+
+def transparent_entry(parts: Mapping[str, float]) -> dict[str, Any]:
+    """Return the mean of ``transparent_part`` over the views, by name, and the worst view, for ``metrics.json``."""
+    if not parts:
+        return {}
+    worst = max(parts, key=parts.__getitem__)
+    return {"transparent": {"part": sum(parts.values()) / len(parts), "view": worst, "worst": parts[worst]}}
+
+
 Visitor = Callable[[SeenView, ImageMetrics], None]
 """Is shown each view with its scores while it is in memory, and keeps what it needs of it, not the view."""
 

@@ -30,6 +30,8 @@ TERMS = {
     "Depth": "How far away what a pixel shows is, along the axis of the camera, in world units.",
     "World unit": "The unit of the capture. Without known cameras or a scan it is arbitrary, no metre.",
     "Opacity": "How much a splat hides of what lies behind it, from 0 to 1.",
+    "Transparent": "Pixels of training views with an alpha below 0.9, in percent, where photographs are opaque. Near 0 "
+    "is good: elsewhere the background shows through, and the mesh may have holes.",
     "Floater": "Something before the camera or in the air that no photograph shows: fog, sheets, specks.",
     "Error": "Mean absolute difference of rendering and photograph over red, green and blue.",
     "Accuracy, completeness": "Mean distance from the mesh to the true surface, and from there to the mesh. Lower is "

@@ -255,7 +255,8 @@ def stage_table(record: RunRecord) -> Markup:
         if any((stage.get(split) or {}).get(key) is not None for stage in record.stages)
     ]
     columns += [f"{label} ({split})" for split, _, label, _, _ in shown]
-    columns += ["Splats", "MB", "Seconds", "Peak memory, MB"]
+    opaque = any(stage.get("transparent") for stage in record.stages)  # photographs have no alpha channel
+    columns += ["Transparent, %"] * opaque + ["Splats", "MB", "Seconds", "Peak memory, MB"]
     rows: list[list[str]] = []
     marked: list[tuple[int, int]] = []
     for stage in record.stages:
@@ -270,6 +271,7 @@ def stage_table(record: RunRecord) -> Markup:
                 _stage_name(stage),
                 figure(stage.get("iterations"), 0),
                 *(figure(value, digits) for value, (*_, digits, _) in zip(values, shown, strict=True)),
+                *[figure(scaled((stage.get("transparent") or {}).get("part"), 100), 1)] * opaque,
                 figure(stage.get("splats"), 0),
                 figure(scaled(stage.get("bytes"), 1e-6), 2),
                 figure(stage.get("seconds"), 1),
@@ -285,6 +287,7 @@ def stage_table(record: RunRecord) -> Markup:
         is_scored=bool(shown),
         split=record.split,
         other=_other_conventions(record),
+        transparent=record.stages[-1].get("transparent"),
         reasons=_reasons(record.stages, splits),
         clones=_clones(record),
     )
