@@ -177,7 +177,7 @@ def test_distorted_frames_are_undistorted_and_reported(tmp_path: Path) -> None:
     from gs2d.core.images import read_image
 
     assert not np.array_equal(view.image(), read_image(view.path))
-    assert any("9 of 9 views are undistorted" in note for note in load_scene(tmp_path).notes)
+    assert any("9 of 9 views are undistorted" in note for note in load_scene(tmp_path).details)
 
 
 @pytest.mark.parametrize(
