@@ -11,7 +11,15 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from gs2d.core.camera import Camera, look_at
-from gs2d.core.transforms import camera_extent, focus_point, nearest_distances, perturb_pose, quats_to_matrices, se3_exp
+from gs2d.core.transforms import (
+    camera_extent,
+    camera_outliers,
+    focus_point,
+    nearest_distances,
+    perturb_pose,
+    quats_to_matrices,
+    se3_exp,
+)
 from gs2d.errors import ShapeError
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -118,6 +126,33 @@ def test_the_extent_is_a_tenth_more_than_the_farthest_camera_from_their_mean() -
     cameras = [look_at(eye, np.array([0.0, 9.0, 0.0]), UP, width=8, height=8, fx=8) for eye in eyes]
     assert camera_extent(cameras) == pytest.approx(2.2)
     assert camera_extent(cameras[:1]) == 0
+
+
+def on_a_ring(*distances: float) -> list[Camera]:
+    """Cameras that look at the origin from evenly spread directions, at these distances."""
+    angles = np.arange(len(distances)) * 2 * np.pi / len(distances)
+    eyes = [r * np.array([np.cos(a), np.sin(a), 0.2]) for r, a in zip(distances, angles, strict=True)]
+    return [look_at(eye, np.zeros(3), np.array([0.0, 0.0, 1.0]), width=8, height=8, fx=8) for eye in eyes]
+
+
+def test_a_camera_far_beyond_all_others_is_an_outlier_and_does_not_set_the_extent() -> None:
+    cameras = on_a_ring(1, 1, 1, 1, 1000, 1, 1, 1e100, 1)
+    assert list(camera_outliers(cameras)) == [4, 7]
+    assert camera_outliers(cameras)[4] == pytest.approx(1000, rel=0.3)
+    assert camera_extent(cameras) == camera_extent([c for i, c in enumerate(cameras) if i not in (4, 7)])
+    assert camera_extent(cameras) == pytest.approx(1.1, rel=0.5)
+
+
+@pytest.mark.parametrize(
+    "distances",
+    [(1,) * 8 + (30,), (1,) * 6 + (100,) * 4, (1, 1, 1000), (1e-12,) * 7 + (1,)],
+    ids=["thirty times", "two scales", "three cameras", "most at one place"],
+)
+def test_cameras_that_may_be_right_are_no_outliers_and_set_the_extent(distances: tuple[float, ...]) -> None:
+    cameras = on_a_ring(*distances)
+    centers = np.stack([camera.center for camera in cameras])
+    assert camera_outliers(cameras) == {}
+    assert camera_extent(cameras) == 1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
 
 
 @pytest.mark.parametrize("function", [focus_point, camera_extent])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -188,6 +189,43 @@ def test_extent_is_1_1_times_the_largest_distance_of_a_training_camera(tmp_path:
     """A full ring of radius 4 has its mean on the axis: every camera is 4 away."""
     small_nerfstudio(tmp_path, count=8)
     assert load_scene(tmp_path, test_every=0).extent == pytest.approx(4.4)
+
+
+def move_away(root: Path, index: int, factor: float) -> None:
+    """Put one camera of a transforms.json so many times as far from the origin."""
+    meta = json.loads((root / "transforms.json").read_text())
+    for row in meta["frames"][index]["transform_matrix"][:3]:
+        row[3] *= factor
+    (root / "transforms.json").write_text(json.dumps(meta))
+
+
+@pytest.mark.parametrize("index", [4, 8])  # a training view, a test view
+@pytest.mark.parametrize("factor", [1e3, 1e100])
+def test_a_view_whose_camera_stands_far_from_all_others_is_named_and_left_out(
+    tmp_path: Path, index: int, factor: float
+) -> None:
+    small_nerfstudio(tmp_path, count=20)
+    name = f"images/f_{index:02d}.png"
+    right = load_scene(tmp_path)
+    move_away(tmp_path, index, factor)
+    scene = load_scene(tmp_path)
+    assert [view.name for view in scene.train] == [v.name for v in right.train if v.name != name]
+    assert [view.name for view in scene.test] == [v.name for v in right.test if v.name != name]
+    assert scene.extent == pytest.approx(right.extent, rel=0.1)
+    np.testing.assert_allclose(scene.bounds, right.bounds, atol=0.5)
+    (line,) = scene.skipped
+    assert line.startswith(f"{name} is left out: its camera is ")
+
+
+def test_a_far_camera_does_not_hide_that_positions_are_too_coarse(tmp_path: Path) -> None:
+    small_nerfstudio(tmp_path, count=12)
+    meta = json.loads((tmp_path / "transforms.json").read_text())
+    for frame in meta["frames"]:
+        frame["transform_matrix"][0][3] += 4e8
+    (tmp_path / "transforms.json").write_text(json.dumps(meta))
+    move_away(tmp_path, 3, 1e3)
+    with pytest.raises(DataError, match="positions are 32-bit numbers"):
+        load_scene(tmp_path)
 
 
 def test_a_downscale_that_leaves_nothing_or_is_no_factor_is_an_error(tmp_path: Path) -> None:

@@ -13,7 +13,9 @@ import pytest
 import torch
 
 from ball_runs import Stop, comparable, options
+from capture_writers import small_colmap
 from gs2d.config.presets import get_recipe
+from gs2d.config.protocols import get_protocol
 from gs2d.errors import DiskError, DivergedError, ProtocolError, RecipeError, RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.io.splat_ply import read_splats
@@ -202,6 +204,17 @@ def test_the_user_is_told_where_training_starts_and_what_was_skipped(capture: Pa
     )
     assert any(text.startswith("near plane at") for text in texts)
     assert not (tmp_path / "run").exists()  # nothing was saved yet
+
+
+def test_a_near_plane_that_cuts_most_sparse_points_away_is_named_before_training(tmp_path: Path) -> None:
+    small_colmap(tmp_path / "capture")
+    near = {name: replace(get_protocol("generic"), near=near) for name, near in (("far", 3.9), ("right", 0.1))}
+    for name, protocol in near.items():
+        heard: list[Event] = []
+        prepare_job(options(tmp_path / "capture", tmp_path / "run", protocol=protocol), heard.append)
+        cuts = [e.text for e in heard if isinstance(e, Notice) and "of the sparse points" in e.text]
+        assert bool(cuts) == (name == "far")
+        assert all(re.match(r"near plane at 3\.9 cuts away \d+% of", text) for text in cuts)
 
 
 def test_iterations_on_smaller_photographs_count_for_less_in_an_estimate() -> None:

@@ -19,6 +19,7 @@ from gs2d.errors import ShapeError
 
 __all__ = [
     "camera_extent",
+    "camera_outliers",
     "common_motion",
     "focus_point",
     "harmonics_rotation",
@@ -31,6 +32,7 @@ __all__ = [
     "up_direction",
 ]
 
+OUTLIER = 50  # times the median distance; up to here training is as good as without the camera
 _SPREAD = 0.02  # of the cameras' horizontal axes, mean square, from which they tell what is up
 
 
@@ -246,7 +248,7 @@ def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
 def camera_extent(cameras: Sequence[Camera]) -> float:
     """1.1 x the largest distance of a camera centre from the mean centre, world units (official 2DGS scene extent).
 
-    0 for a single camera: the caller chooses what stands in for it.
+    Outliers (:func:`camera_outliers`) do not count. 0 for a single camera: the caller chooses what stands in for it.
 
     Raises
     ------
@@ -255,8 +257,34 @@ def camera_extent(cameras: Sequence[Camera]) -> float:
     """
     if not cameras:
         raise ShapeError("camera_extent needs at least one camera, got none")
-    centers = np.stack([camera.center for camera in cameras])
+    outliers = camera_outliers(cameras)
+    centers = np.stack([camera.center for i, camera in enumerate(cameras) if i not in outliers])
     return float(1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+
+
+def camera_outliers(cameras: Sequence[Camera]) -> dict[int, float]:
+    """Return cameras whose position cannot be right: their index, and how many times too far away they stand.
+
+    An outlier is more than ``OUTLIER`` times as far from the median centre as the median camera. Structure from motion
+    leaves such cameras. If more than a quarter of the cameras are that far away, or most stand at one place, none is an
+    outlier: the capture has two scales.
+
+    Returns
+    -------
+    dict of int to float
+        Index in ``cameras``, and distance divided by the median distance.
+    """
+    if len(cameras) < 4:
+        return {}
+    centers = np.stack([camera.center for camera in cameras])
+    middle = np.median(centers, axis=0)
+    with np.errstate(over="ignore"):
+        distances = np.linalg.norm(centers - middle, axis=1)
+    typical = float(np.median(distances))
+    far = np.flatnonzero(distances > OUTLIER * typical)
+    if typical <= 1e-9 * (1 + np.abs(middle).max()) or 4 * len(far) > len(cameras):
+        return {}
+    return {int(i): float(distances[i] / typical) for i in far}
 
 
 def harmonics_rotation(rotation: np.ndarray, degree: int) -> np.ndarray:

@@ -17,7 +17,7 @@ from PIL import Image
 
 from gs2d.core.camera import Camera
 from gs2d.core.images import image_size, read_image, read_mask
-from gs2d.core.transforms import camera_extent
+from gs2d.core.transforms import camera_extent, camera_outliers
 from gs2d.data.bounds import scene_bounds
 from gs2d.data.cache import DecodedImage, ImageCache
 from gs2d.data.faces import GLANCE, LEAST_SHOWN, Face, face_name, face_positions, faces_of, wrapped
@@ -292,8 +292,9 @@ def build_scene(
         raise DataError(f"{root} must name each view once, got {twice} more than once")
     frames, map_notes = (frames, ()) if cut else _with_maps(frames, capture.home or root)
     views = [_view(frame, factor, cache, lens_maps) for frame in frames]
+    outliers = camera_outliers([view.camera for view in views])
     try:
-        train, test = _split(frames, views, capture.default_test_every, test_every, root)
+        train, test = _split(frames, views, capture.default_test_every, test_every, root, set(outliers))
         cameras = [view.camera for view in train]
         extent, place_notes = _measured_extent(cameras, root)
     except DataError as error:
@@ -309,12 +310,17 @@ def build_scene(
         extent=extent,
         bounds=bounds,
         T_metric_scene=capture.T_metric_scene,
-        skipped=capture.skipped,
+        skipped=tuple(
+            f"{names[i]} is left out: its camera is {ratio:,.0f} times as far from the centre of the cameras "
+            "as the median camera, so its pose is wrong"
+            for i, ratio in outliers.items()
+        )
+        + capture.skipped,
         notes=capture.notes + mask_notes + cut + map_notes + place_notes + point_notes + bound_notes,
         details=_lens_notes(frames),
         root=root,
         masks=masks,
-        observe=_observed(capture, frames, points, {view.name: view.camera for view in views}),
+        observe=_observed(capture, frames, points, {view.name: view.camera for view in (*train, *test)}),
     )
 
 
@@ -490,7 +496,12 @@ def _with_maps(frames: list[PosedImage], home: Path) -> tuple[list[PosedImage], 
 
 
 def _split(
-    frames: list[PosedImage], views: list[View], default_every: int, test_every: int | None, root: Path
+    frames: list[PosedImage],
+    views: list[View],
+    default_every: int,
+    test_every: int | None,
+    root: Path,
+    outliers: set[int],
 ) -> tuple[tuple[View, ...], tuple[View, ...]]:
     if any(frame.split for frame in frames):
         is_test = [frame.split == "test" for frame in frames]
@@ -499,8 +510,10 @@ def _split(
         wholes = [frame.name if frame.face is None else str(frame.path) for frame in frames]
         numbers = {whole: number for number, whole in enumerate(dict.fromkeys(wholes))}  # faces stay together
         is_test = [bool(every) and numbers[whole] % every == 0 for whole in wholes]
-    train = tuple(view for view, test in zip(views, is_test, strict=True) if not test)
-    test = tuple(view for view, test in zip(views, is_test, strict=True) if test)
+    train, test = (  # by the position among all views: an outlier does not change which others are test views
+        tuple(view for i, view in enumerate(views) if is_test[i] == wanted and i not in outliers)
+        for wanted in (False, True)
+    )
     if not train:
         raise DataError(f"{root} must have a training view, got {len(test)} test views only; use test_every=0")
     return train, test

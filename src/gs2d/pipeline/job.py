@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shlex
 import typing
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -54,6 +55,7 @@ from gs2d.render.backends import Backend, backend_report, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training.backdrop import find_backdrop
 from gs2d.training.cached_objective import is_cacheable
+from gs2d.training.initialize import usable_points
 from gs2d.training.photometry import Photometries
 from gs2d.training.point_gains import point_gains
 from gs2d.training.robust import check_free_space
@@ -62,6 +64,7 @@ from gs2d.training.trainer import raster_settings
 DECODE_THREADS = 2
 SHOWN_SKIPS = 3
 MAX_VIEWS = 1_000_000
+NEAR_SAMPLES = 2000  # sparse points by which the near plane is checked
 ROBUST = ("auto", "on", "off")
 DIFFERS = 0.03  # standard deviation of the logarithm of gains from which photographs are said to differ in exposure
 LATER_FIELDS = (  # of recipes, that run folders of before there were such lack
@@ -405,11 +408,28 @@ def prepare_job(options: TrainOptions, on_event: OnEvent) -> Job:
     if protocol.near is None:
         near = f"near plane at {settings.near:.4g}: 1 % of the scene's extent of {scene.extent:.4g}"
         on_event(Notice(near, detail=True))
+    if (cut := near_cuts(scene, settings.near)) > 0.5:
+        on_event(
+            Notice(
+                f"near plane at {settings.near:.4g} cuts away {cut:.0%} of the sparse points, and with them the scene: "
+                f"check the camera positions with `gs2d info {shlex.quote(str(options.scene))}`, or use a --protocol "
+                "with another near plane"
+            )
+        )
     cache_bytes = options.stage2_cache_mb << 20
     if options.part is not None and options.part.splats is not None:
         part = load_part(options.part, scene, recipe)
         return Job(recipe, protocol, scene, backend, settings, downscale, digest, cache_bytes, part=part)
     return Job(recipe, protocol, scene, backend, settings, downscale, digest, cache_bytes, *init)
+
+
+def near_cuts(scene: Scene, near: float) -> float:
+    """Return the fraction of the sparse points in front of the training cameras that ``near`` makes unusable."""
+    if scene.points is None:
+        return 0.0
+    points = scene.points.points[:: max(1, len(scene.points) // NEAR_SAMPLES)]
+    ahead = usable_points(points, scene, 0.0)
+    return 1 - float(usable_points(points[ahead], scene, near).mean()) if ahead.any() else 0.0
 
 
 def settled(options: TrainOptions, scene: Scene, protocol: Protocol, on_event: OnEvent) -> tuple[Recipe, Protocol]:
