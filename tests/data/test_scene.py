@@ -69,7 +69,7 @@ def test_a_missing_folder_a_file_an_empty_folder_and_an_unknown_layout_are_error
     with pytest.raises(DataError, match="empty must hold a capture, got an empty folder"):
         load_scene(empty)
     (tmp_path / "note.txt").write_text("hello")
-    with pytest.raises(DataError, match="got a file; give its folder"):
+    with pytest.raises(DataError, match="got a file; give photographs with their cameras"):
         load_scene(tmp_path / "note.txt")
     with pytest.raises(DataError, match=r"transforms_train\.json .*sparse/0, sparse, .*got empty/, note\.txt"):
         load_scene(tmp_path)

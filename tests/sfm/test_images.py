@@ -151,7 +151,7 @@ def write_only_video(root: Path) -> Path:
     ("write", "expected"),
     [
         (write_nothing, "got no such folder"),
-        (write_file, "must be a folder of photographs or a video, got another file; give its folder"),
+        (write_file, "must be a folder of photographs or a video, got another file; give the folder"),
         (write_empty, "3 or more photographs, got none; take 30 or more"),
         (write_two, "3 or more photographs, got 2 photographs; take 30 or more"),
         pytest.param(

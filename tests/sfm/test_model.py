@@ -310,7 +310,7 @@ def test_training_on_photographs_without_cameras_names_this_command(
         (photos / f"{i}.JPG").touch()
     assert run(["train", str(tmp_path / "photos"), "--out", str(tmp_path / "run"), "--quiet"]) == 2
     line = one_line(capsys.readouterr().err)
-    assert f"got 3 photographs without any; find them first: gs2d poses {photos} --out CAPTURE" in line
+    assert f"got 3 photographs without any; `gs2d reconstruct {photos} --out RUN` makes a run" in line
     assert not (tmp_path / "run").exists()
 
 

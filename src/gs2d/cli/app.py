@@ -35,7 +35,7 @@ from gs2d.cli.commands import (
 )
 from gs2d.cli.console import Console, show_help
 from gs2d.cli.interrupts import INTERRUPTED, Interruptible
-from gs2d.cli.usage import HELP_WORDS, NAMES, UsageError, check
+from gs2d.cli.usage import HELP_WORDS, NAMES, UsageError, check, check_inputs
 from gs2d.core.memory_limit import address_space, check_address_space
 from gs2d.core.processes import here
 from gs2d.core.text import printable
@@ -75,6 +75,7 @@ def run(argv: Sequence[str]) -> int:
             show_help(asked)
             return OK
         command = _of_this_process(parse(argv))
+        check_inputs(command)  # before anything heavy is imported
     except SystemExit as exit_:
         return OK if exit_.code is None else exit_.code if isinstance(exit_.code, int) else EXIT_USAGE
     except BrokenPipeError:  # `gs2d train --help | head`

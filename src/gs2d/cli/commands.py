@@ -99,13 +99,15 @@ class Render(Common):
 
     run: RunPath
     """Run folder."""
-    split: Literal["test", "train"] = "test"
-    """Which views."""
+    split: Literal["test", "train"] | None = None
+    """Which views (default: the test views, or the training views if the run has no test views)."""
     orbit: int = 0
     """Instead of the views, so many frames of a circle around the subject, or to and fro where only a part of the
     circle was photographed."""
     flight: int = 0
     """Instead of the views, so many frames of a smooth flight along the photographs."""
+    width: Annotated[int | None, arg(metavar="PIXELS")] = None
+    """Width of the images; the height follows from the aspect ratio (default: as in training)."""
     out: Path | None = None
     """Folder for the pictures (default: renders/SPLIT, renders/orbit or renders/flight in the run)."""
     video: Annotated[Path | None, arg(metavar="FILE")] = None

@@ -11,9 +11,8 @@ from gs2d.cli import commands as c
 from gs2d.cli.commands import Common
 from gs2d.cli.console import Console
 from gs2d.cli.tables import say_where_it_is, score_rows, show_run, show_surface
-from gs2d.core.missing import where_it_ends
 from gs2d.core.processes import here
-from gs2d.errors import DataError, ProtocolError, RecipeError
+from gs2d.errors import ProtocolError, RecipeError
 from gs2d.pipeline.options import MeshOptions, TextureOptions, values
 
 
@@ -158,6 +157,7 @@ def render(command: c.Render, console: Console) -> None:
         split=command.split,
         orbit=command.orbit,
         flight=command.flight,
+        width=command.width,
         out=command.out,
         video=command.video,
         fps=command.fps,
@@ -359,11 +359,6 @@ def info(command: c.Info, console: Console) -> None:
         run = open_run(path)
         show_run(path, run.metrics(), console, definition=run.definition())
         return
-    if not path.exists():
-        raise DataError(
-            f"expected a run folder, a capture or a file of splats, a mesh or points at {path}, found nothing"
-            f"{where_it_ends(path)}"
-        )
     facts = describe_capture(path) if path.is_dir() or is_archive(path) else describe_file(path)
     for name, value in facts.items():
         for part in value if isinstance(value, list) else [value]:

@@ -41,7 +41,7 @@ _FIRST: dict[str, tuple[str, ...]] = {  # options that `--help` explains; of oth
     ),
     "blocks": ("scene", "out", "blocks", "recipe", "schedule_scale", "downscale", "memory", "slots"),
     "mesh": ("run", "out", "texture", "voxel", "bbox", "unbounded"),
-    "render": ("run", "split", "orbit", "flight", "video", "out"),
+    "render": ("run", "split", "orbit", "flight", "width", "video", "out"),
     "evaluate": ("run", "ground_truth", "thresholds", "lpips_weights"),
     "paper": ("table", "data", "out", "scenes", "schedule_scale", "train"),
     "sweep": ("recipes", "data", "out", "seeds", "schedule_scale", "train"),

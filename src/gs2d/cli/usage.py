@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import re
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from gs2d.cli.catalogue import Option, options_of
 from gs2d.cli.commands import COMMANDS
+from gs2d.core.missing import where_it_ends
 
 NAMES: dict[str, type] = {command.__name__.lower(): command for command in COMMANDS}
 HELP_WORDS = ("-h", "--help", "--help-all")
@@ -26,6 +29,18 @@ _ELSEWHERE: dict[str, tuple[str, str]] = {  # what other programs of the field c
     **dict.fromkeys(("--iterations", "--iters", "--max-steps", "--num-iters", "--steps", "--total-steps"), _SHORTER),
     **dict.fromkeys(("-r", "--resolution", "--data-factor", "--images", "--downscale-factor"), _SMALLER),
     "--eval": ("--test-every", "--test-every 8 holds every eighth photograph out"),
+}
+
+
+_OUTPUTS = ("out", "video", "cache")  # paths that need not exist
+_EXPECTED = {
+    "RUN": "a run folder",
+    "SCENE": "the folder of a capture",
+    "CAPTURE": "the folder of a capture",
+    "PHOTOS": "a folder of photographs or a video",
+    "DIR": "a folder",
+    "FILE": "a file",
+    "PATH": "a run folder, a capture or a file of splats, a mesh or points",
 }
 
 
@@ -47,6 +62,37 @@ def check(argv: Sequence[str]) -> None:
         _check_words(name, words)
     except UsageError as error:
         raise UsageError(_with_help(str(error), f"gs2d {name} --help")) from None
+
+
+def check_inputs(command: object) -> None:
+    """Raise for a path to read that leads nowhere; cheap, so that a misspelt path is reported at once.
+
+    Raises
+    ------
+    UsageError
+    """
+    paths = dict(_inputs(command))
+    for option in options_of(type(command)):
+        path = paths.get(option.field)
+        try:
+            found = path is None or path.stat()
+        except (OSError, ValueError) as error:  # others are reported by whatever reads it
+            found = not isinstance(error, FileNotFoundError | NotADirectoryError)
+        if not found:
+            what = _EXPECTED.get(option.metavar, "a file or a folder")
+            what += " or a file of splats" if (option.field, option.metavar) == ("path", "RUN") else ""
+            raise UsageError(f"expected {what} at {path}, found nothing{where_it_ends(path)}")
+
+
+def _inputs(options: Any) -> Iterator[tuple[str, Path]]:
+    """Yield the paths that a command reads, by their fields."""
+    for field in dataclasses.fields(options):
+        value = getattr(options, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from _inputs(value)
+        unneeded = field.name == "photos" and getattr(options, "resume", False)  # their cameras may be known
+        if isinstance(value, Path) and field.name not in _OUTPUTS and not unneeded:
+            yield field.name, value
 
 
 def _with_help(text: str, command: str) -> str:

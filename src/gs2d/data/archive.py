@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import re
@@ -11,11 +12,12 @@ import tempfile
 import unicodedata
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from gs2d.core.files import disk_error
 from gs2d.core.growth import check_entries
+from gs2d.core.missing import holds_photographs, instead
 from gs2d.data.file_names import IMAGES
 from gs2d.data.load import detect_format
 from gs2d.errors import DataError
@@ -68,7 +70,38 @@ def unpack(path: Path, home: Path) -> Path:
         raise DataError(f"{path} must be a whole ZIP file without a password, got: {error}; pack it again") from error
     except OSError as error:
         raise disk_error(home, error) from error
-    return _capture_in(target)
+    try:
+        with named_by(path, target):
+            return _capture_in(target)
+    except DataError as error:
+        if not holds_photographs(path):
+            raise
+        remedy = instead(path, "capture")
+        raise DataError(f"{path} must hold cameras, got photographs without any{remedy}") from error
+
+
+@contextlib.contextmanager
+def unpacked_for_a_moment(path: Path) -> Iterator[Path]:
+    """Unpack a ZIP file into a temporary folder; errors about what is in it name the archive.
+
+    Raises
+    ------
+    DataError, DiskError
+        As :func:`unpack`.
+    """
+    with tempfile.TemporaryDirectory(prefix="gs2d-") as home:
+        folder = unpack(path, Path(home))
+        with named_by(path, folder):
+            yield folder
+
+
+@contextlib.contextmanager
+def named_by(path: Path, folder: Path) -> Iterator[None]:
+    """Let errors about the folder that an archive was unpacked into name the archive: the folder may be gone."""
+    try:
+        yield
+    except DataError as error:
+        raise type(error)(str(error).replace(str(folder), str(path))) from error
 
 
 def _move(made: Path, target: Path) -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from gs2d.core.memory_limit import cache_bytes as room_for_cache
-from gs2d.core.missing import where_it_ends
+from gs2d.core.missing import instead, where_it_ends
 from gs2d.data.benchmarks import missing_lines
 from gs2d.data.build import Capture, build_scene
 from gs2d.data.file_names import IMAGES, in_any_case
@@ -90,7 +89,9 @@ def detect_format(path: str | os.PathLike[str]) -> str:
             return name
     held = sorted(entry.name + ("/" if entry.is_dir() else "") for entry in root.iterdir())
     if not held:
-        raise DataError(f"{root} must hold a capture, got an empty folder")
+        raise DataError(f"{root} must hold a capture, got an empty folder{instead(root, 'capture')}")
+    if "run.json" in held:
+        raise DataError(f"{root} must hold a capture, got a run{instead(root, 'capture')}")
     project = next((name for name in held if os.path.splitext(name)[1].lower() in _PROJECTS), None)
     if project is not None:
         remedy = _PROJECTS[os.path.splitext(project)[1].lower()]
@@ -100,9 +101,7 @@ def detect_format(path: str | os.PathLike[str]) -> str:
     images = next((folder for folder in (root, in_any_case(root, "images")) if _images(folder)), None)
     if images is not None and not lacking:
         raise DataError(
-            f"{root} must hold cameras, got {_images(images)} photographs without any; find them first: "
-            f"gs2d poses {shlex.quote(str(images))} --out CAPTURE, then train CAPTURE; or both in one: "
-            f"gs2d reconstruct {shlex.quote(str(images))} --out RUN"
+            f"{root} must hold cameras, got {_images(images)} photographs without any{instead(root, 'capture')}"
         )
     raise DataError(
         f"{root} must hold transforms_train.json (Blender), transforms.json (nerfstudio), {' or '.join(CAMERA_FILES)} "
@@ -123,7 +122,7 @@ def _folder(path: str | os.PathLike[str]) -> Path:
     try:
         os.listdir(root)
     except (FileNotFoundError, NotADirectoryError) as error:
-        got = "a file; give its folder" if root.exists() else f"no such folder{where_it_ends(root)}"
+        got = f"a file{instead(root, 'capture')}" if root.exists() else f"no such folder{where_it_ends(root)}"
         raise DataError(f"{root} must be the folder of a capture, got {got}") from error
     except OSError as error:
         raise DataError(f"cannot read the folder {root}: {error.strerror or error}") from error

@@ -41,7 +41,7 @@ from gs2d.core.files import atomic_write, disk_error, is_temporary, sweep
 from gs2d.core.growth import check_entries
 from gs2d.core.json_files import read_json, write_json
 from gs2d.core.locks import try_lock
-from gs2d.core.missing import where_it_ends
+from gs2d.core.missing import instead, where_it_ends
 from gs2d.errors import DataError, RunError
 from gs2d.io.event_log import EventLog
 from gs2d.io.run_schema import DEFINITION_SHAPE, METRICS_SHAPE, check_shape
@@ -268,9 +268,8 @@ def open_run(path: str | Path) -> RunFolder:
     path = Path(path)
     if not is_run(path):
         got = "a folder without run.json" if path.is_dir() else "a file" if path.exists() else "nothing"
-        meant = "" if path.exists() else where_it_ends(path)
-        makes = f"`gs2d train SCENE --out {path}` makes one"
-        raise RunError(f"expected a run folder at {path}, found {got}{meant}{'' if '?' in meant else f'; {makes}'}")
+        remedy = instead(path, "run") if path.exists() else where_it_ends(path)
+        raise RunError(f"expected a run folder at {path}, found {got}{remedy}")
     return RunFolder(path)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 import warnings
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -176,6 +177,7 @@ def _splat_element(path: object, file: PlyFile) -> PlyElement:
     if vertex is None or "scale_0" not in names:
         has_faces = "face" in file.elements and file.elements["face"].count > 0
         kind = "a mesh" if has_faces else "a point cloud" if {"x", "y", "z"} <= names else "a PLY without vertices"
-        raise DataError(f"{expected}, got {kind}; give the splats.ply of a gs2d or 2DGS run")
+        beside = Path(str(path)).with_name("splats.ply")
+        raise DataError(f"{expected}, got {kind}; give {beside if beside.exists() else 'that of a gs2d or 2DGS run'}")
     _check_complete(expected, vertex, _FIXED)
     return vertex

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 from typing import Any
 
+from gs2d.core.missing import instead
 from gs2d.data import detect_format, load_scene
-from gs2d.data.archive import is_archive, unpack
+from gs2d.data.archive import is_archive, unpacked_for_a_moment
 from gs2d.data.benchmarks import missing_lines
 from gs2d.errors import DataError
 from gs2d.io.formats.gltf import gltf_mesh
@@ -27,8 +27,8 @@ def describe_capture(path: Path) -> dict[str, Any]:
     DataError
     """
     if is_archive(path):
-        with tempfile.TemporaryDirectory(prefix="gs2d-") as home:
-            return {**describe_capture(unpack(path, Path(home))), "capture": str(path)}
+        with unpacked_for_a_moment(path) as folder:
+            return {**describe_capture(folder), "capture": str(path)}
     scene = load_scene(path, format=detect_format(path))
     sizes = sorted({(view.camera.width, view.camera.height) for view in scene.views})
     facts: dict[str, Any] = {
@@ -60,7 +60,7 @@ def describe_file(path: Path) -> dict[str, Any]:
     """
     if path.suffix.lower() in _OF_CAPTURES and not is_splat_file(path):
         raise DataError(
-            f"{path}: a file of splats, a mesh or points was expected, got a file of a capture; give its folder"
+            f"{path}: a file of splats, a mesh or points was expected, got another file{instead(path, 'capture')}"
         )
     size = path.stat().st_size
     place = georeference_of_file(path)

@@ -251,7 +251,7 @@ class PlanOptions(Resources):
     """What is to be planned: a training as `gs2d train` would do it."""
 
     scene: Annotated[Positional[Path], arg(metavar="CAPTURE")]
-    """Folder of the capture."""
+    """Folder of the capture, or a .zip of it."""
     recipe: Annotated[str | Recipe, arg(constructor=str)] = DEFAULT_RECIPE
     """As in `gs2d train`."""
     downscale: int = 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,11 @@ from gs2d.errors import RunError
 from gs2d.geo.projection import wkt_of
 from gs2d.io.georeference import georeference_of_file, read_georeference, stamp, write_sidecars
 from gs2d.io.run_dir import open_run
+
+HOW = (
+    "find them with `gs2d georeference {run} --gps` if the photographs have GPS positions, else with "
+    "`gs2d georeference {run} --known-distance X0 Y0 Z0 X1 Y1 Z1 METRES`, from two points of the mesh"
+)
 
 
 def place_of(path: Path, *, asked: bool) -> Georeference | None:
@@ -34,8 +40,8 @@ def place_of(path: Path, *, asked: bool) -> Georeference | None:
     of_file = georeference_of_file(path) if path.is_file() else None
     place = read_georeference(open_run(path).path) if asked and not path.is_file() else of_file
     if asked and place is None:
-        remedy = "" if path.is_file() else f"; `gs2d georeference {path}` with --gps or another source finds it"
-        raise RunError(f"--georeferenced needs to know where {path} is in the world, which it does not say{remedy}")
+        remedy = "export from a run folder" if path.is_file() else HOW.format(run=shlex.quote(str(path)))
+        raise RunError(f"the scale and the position in the world of {path} are not known: {remedy}")
     return place
 
 

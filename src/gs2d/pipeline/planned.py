@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
 
 from gs2d.data import detect_format
+from gs2d.data.archive import is_archive, unpacked_for_a_moment
 from gs2d.errors import DataError, RecipeError
 from gs2d.pipeline.capture_plan import CapturePlan, plan_capture, set_words
 from gs2d.pipeline.events import Notice, OnEvent, Phase, ignore
@@ -28,6 +30,9 @@ def plan(options: PlanOptions, on_event: OnEvent = ignore) -> CapturePlan:
     Gs2dError
         The capture cannot be read, or training on it cannot fit into memory or disk.
     """
+    if is_archive(options.scene):
+        with unpacked_for_a_moment(options.scene) as folder:
+            return plan(replace(options, scene=folder), on_event)
     use_threads(options.threads)
     use_memory(options.memory)
     if options.downscale < 1:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.core.json_files import read_json
+from gs2d.core.missing import instead
 from gs2d.data import detect_format, load_scene
 from gs2d.data.masks import OFF
 from gs2d.errors import DataError, ProtocolError, RunError
@@ -192,7 +193,7 @@ def _check_photos(options: ReconstructOptions) -> None:
         return
     raise DataError(
         f"{photos} must hold photographs alone, got cameras too ({kind}): gs2d train {shlex.quote(str(photos))} --out "
-        f"{shlex.quote(str(out))} trains with these; to find others give the folder of the photographs"
+        f"{shlex.quote(str(out))} trains with these; to find others{instead(photos, 'photographs').removeprefix(';')}"
     )
 
 

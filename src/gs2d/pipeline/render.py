@@ -203,6 +203,7 @@ def splatted(splats: Splats, values: Tensor, view: View, settings: RasterSetting
 
 
 MAX_FRAMES = 100_000  # of an orbit or a flight
+MAX_WIDTH = 1 << 14  # px
 FPS = 30.0
 
 
@@ -210,9 +211,10 @@ def render_run(
     path: Path,
     on_event: OnEvent = ignore,
     *,
-    split: str = "test",
+    split: str | None = None,
     orbit: int = 0,
     flight: int = 0,
+    width: int | None = None,
     out: Path | None = None,
     video: Path | None = None,
     fps: float = FPS,
@@ -222,9 +224,10 @@ def render_run(
 ) -> dict[str, Any]:
     """Render the views of a split, ``orbit`` frames of a circle or ``flight`` frames past the photographs, as PNGs.
 
-    Frames of a circle or a flight can be made a video too: ``video`` names it, ``fps`` frames a second. All are in the
-    mean exposure of the photographs, or in that of the training photograph ``exposure_of``. ``splats_file`` is drawn
-    instead of the run's splats, into ``out``.
+    ``split`` None takes the test views, or the training views of a run that has none. ``width`` (px) resizes the
+    cameras; heights follow. Frames of a circle or a flight can be made a video too: ``video`` names it, ``fps`` frames
+    a second. All are in the mean exposure of the photographs, or in that of the training photograph ``exposure_of``.
+    ``splats_file`` is drawn instead of the run's splats, into ``out``.
 
     Raises
     ------
@@ -233,6 +236,8 @@ def render_run(
     from gs2d.io.video import write_video
 
     path, out, video = Path(path), None if out is None else Path(out), None if video is None else Path(video)
+    if width is not None and not (isinstance(width, int) and 1 <= width <= MAX_WIDTH):
+        raise RunError(f"--width must be a number of pixels from 1 to {MAX_WIDTH}, got {width}")
     asked, (moving, video) = video, check_frames(orbit, flight, video, fps)
     if video is not None and video != asked and video.suffix == ".webp":
         on_event(Notice(f"the video is an animated WebP, {video}: MP4 needs ffmpeg with libx264 ({FFMPEG})"))
@@ -247,15 +252,21 @@ def render_run(
         cameras = orbit_cameras(seen, orbit, focus) if orbit else flight_cameras(seen, flight)
         views = [(f"{i:04d}", View.from_arrays(f"{i:04d}", camera, image)) for i, camera in enumerate(cameras)]
     else:
+        if split is None and not job.scene.test:
+            split = "train"
+            on_event(Notice("rendering the training views, because the run has no test views"))
+        split = split or "test"
         chosen = job.scene.test if split == "test" else job.scene.train
         views = list(zip(file_names(chosen), chosen, strict=True))
     if not views:
-        raise DataError(f"the capture of {path} has no {split} views; use --split train or --orbit N")
+        raise DataError(f"the capture of {path} has no {split} views; use --split train or --orbit 120")
+    if width is not None:
+        views = [(name, replace(view, camera=_at_width(view.camera, width))) for name, view in views]
     if out is not None:
         _spare_images([out / f"{name}.png" for name, _ in views], "--out", job)
     if video is not None:
         _spare_images([video], "--video", job)
-    folder = out or run.file(RENDERS) / (moving or split)
+    folder = out or run.file(RENDERS) / (moving or split or "test")
     made = make_folder(folder)
     with _alone_in(folder) if out is None else contextlib.nullcontext():
         if moving and out is None:  # the run's own folder: no frame of a longer film stays among these
@@ -286,6 +297,11 @@ def render_run(
             write_video(video, frames, fps=fps, threads=threads, on_frame=lambda done: on_event(Step(done)))
             result |= {"video": str(video), "seconds": len(views) / fps, "video_bytes": video.stat().st_size}
         return result
+
+
+def _at_width(camera: Camera, width: int) -> Camera:
+    """Return the camera with an image of another width and the same aspect ratio."""
+    return camera.resized(width, max(1, round(camera.height * width / camera.width)))
 
 
 @contextlib.contextmanager

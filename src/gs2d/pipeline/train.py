@@ -10,7 +10,7 @@ from pathlib import Path
 
 from gs2d.core.memory import hold
 from gs2d.core.splats import Splats
-from gs2d.data.archive import is_archive, unpack
+from gs2d.data.archive import is_archive, named_by, unpack
 from gs2d.data.scene import Scene
 from gs2d.errors import RecipeError, RunError
 from gs2d.io.run_dir import (
@@ -100,6 +100,8 @@ def _train(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> Ru
     on_event = keeping_details(on_event, details)
     options = by_quality(options, on_event)
     job = prepare_job(options, on_event)
+    if line := _unlike_its_run(options, job):
+        on_event(Notice(line))
     if options.overwrite:
         check_sources(job, options)
     run = claim_run(options.out, **claim)  # type: ignore[arg-type]
@@ -147,6 +149,21 @@ def _train(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> Ru
     return run
 
 
+def _unlike_its_run(options: TrainOptions, job: Job) -> str:
+    """Return how this training differs from that of the run whose folder the capture lies in, as of `reconstruct`."""
+    home = Path(options.scene).absolute().parent
+    if not is_run(home) or home.resolve() == options.out.resolve():
+        return ""
+    run = RunFolder(home).definition()
+    pairs = (
+        ("--schedule-scale", run.get("schedule_scale"), options.schedule_scale),
+        ("--downscale", run.get("downscale"), job.downscale),
+        ("--test-every", (run.get("protocol") or {}).get("test_every"), job.protocol.test_every),
+    )
+    others = " ".join(f"{name} {theirs:g}" for name, theirs, ours in pairs if theirs not in (None, ours))
+    return f"{options.scene.parent} was trained with {others}; give the same for comparable results" if others else ""
+
+
 def _is_planned(options: TrainOptions, views: int) -> bool:
     """Whether a plan is told before a training begins."""
     return options.part is None and bool(options.estimate or options.memory or options.disk or views >= MANY)
@@ -161,7 +178,9 @@ def _train_archive(options: TrainOptions, on_event: OnEvent, together: OneProces
     made = make_folder(home)
     try:
         on_event(Phase(f"unpacking {options.scene.name}", 0))
-        return _train(replace(options, scene=unpack(options.scene, home)), on_event, together)
+        scene = unpack(options.scene, home)
+        with named_by(options.scene, scene):
+            return _train(replace(options, scene=scene), on_event, together)
     finally:  # what the run is not of goes: all of it where there is no run, the older one where a run was replaced
         used = RunFolder(options.out).definition()["scene"]["path"] if is_run(options.out) else ""
         for folder in home.iterdir():

@@ -14,7 +14,7 @@ from PIL import Image
 
 from gs2d.core.exif import Taken, read_taken
 from gs2d.core.images import is_twice_as_wide, natural_key, read_image
-from gs2d.core.missing import where_it_ends
+from gs2d.core.missing import belongs_to_run, instead, where_it_ends
 from gs2d.core.photo_formats import AVIF, EXR, HEIF, UNREAD, remedy
 from gs2d.data.masks import FOLDER, without_masks
 from gs2d.errors import DataError
@@ -110,9 +110,12 @@ def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...], str]:
         No folder, a video, formats that are not read, or too few photographs.
     """
     if root.is_file():
-        raise DataError(f"{root} must be a folder of photographs or a video, got another file; give its folder")
+        other = instead(root, "photographs")
+        raise DataError(f"{root} must be a folder of photographs or a video, got another file{other}")
     if not root.is_dir():
         raise DataError(f"{root} must be a folder of photographs, got no such folder{where_it_ends(root)}")
+    if belongs_to_run(root):
+        raise DataError(f"{root} must be a folder of photographs, got files of a run{instead(root, 'photographs')}")
     sorted_out: dict[str, list[Path]] = {"photo": [], "video": [], "unread": [], "mask": [], "other": []}
     for path in _files(root):
         kind = _KINDS.get(path.suffix.lower(), "other")

@@ -154,7 +154,10 @@ def test_a_broken_file_is_one_line_that_names_it(tmp_path: Path, write: Callable
         ("my.psx", "got my.psx: in Metashape, File > Export > Export Cameras as Agisoft XML"),
         ("sfm.abc", "got sfm.abc: take cameras.sfm of Meshroom's node"),
         ("scene.RCPROJ", "got scene.RCPROJ: in RealityCapture, export the registration as COLMAP"),
-        ("a_0.xmp", "got 9 photographs without any; find them first: gs2d poses"),  # any photo editor writes such
+        (
+            "a_0.xmp",
+            "got 9 photographs without any; `gs2d reconstruct .* --out RUN` makes a run",
+        ),  # any photo editor writes such
     ],
 )
 def test_a_project_of_another_tool_says_what_to_export(tmp_path: Path, name: str, words: str) -> None:

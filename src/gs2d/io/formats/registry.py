@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from gs2d.config.registry import Registry
+from gs2d.core.missing import instead
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.io import splat_ply
@@ -311,6 +312,10 @@ def read_splats(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> Spl
     --------
     >>> splats = gs2d.read_splats("runs/garden/splats.ply")  # doctest: +SKIP
     """
+    if not is_splat_file(path) and Path(path).is_file():
+        with open(path, "rb") as opened:
+            if opened.read(3) != b"ply":
+                raise DataError(f"{path} must be a file of splats or a run folder{instead(Path(path), 'run')}")
     file = read_splat_file(path)
     for note in file.notes:
         tell(note)

@@ -19,6 +19,7 @@ from gs2d.config.recipe import ALL, GradDensify, Recipe, validate
 from gs2d.config.schedule import longer_steps, scale_schedule
 from gs2d.config.serialize import to_json
 from gs2d.core.memory_limit import memory_budget
+from gs2d.core.missing import instead
 from gs2d.core.text import name_bytes
 from gs2d.data import Scene, detect_format
 from gs2d.data.archive import is_archive
@@ -87,7 +88,8 @@ def settle(options: TrainOptions, on_event: OnEvent) -> Settled:
     """
     recipe = check_train_options(options)
     if is_archive(options.scene):
-        raise DataError(f"blocks need the folder of a capture, got the file {options.scene}; unpack it first")
+        remedy = instead(options.scene, "capture")
+        raise DataError(f"blocks need the folder of a capture, got the file {options.scene}{remedy}")
     kind = detect_format(options.scene) if options.format == "auto" else options.format
     found = open_settled(options, recipe, choose_protocol(options, kind, on_event), on_event)
     scene = without_masked_points(found.scene, found.protocol, on_event)
