@@ -16,7 +16,8 @@ from ball_runs import Stop, comparable, options
 from capture_writers import small_colmap
 from gs2d.config.presets import get_recipe
 from gs2d.config.protocols import get_protocol
-from gs2d.errors import DiskError, DivergedError, ProtocolError, RecipeError, RunError
+from gs2d.core.images import read_image
+from gs2d.errors import DataError, DiskError, DivergedError, ProtocolError, RecipeError, RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.demo import demo
@@ -24,6 +25,7 @@ from gs2d.pipeline.estimate import duration, full_iterations
 from gs2d.pipeline.events import Event, Notice, Phase, Step, ignore
 from gs2d.pipeline.job import prepare_job
 from gs2d.pipeline.options import DemoOptions
+from gs2d.pipeline.render import render_run
 from gs2d.pipeline.train import train
 from tiny import write_capture
 
@@ -272,3 +274,36 @@ def test_a_capture_with_a_split_of_its_own_takes_no_other(capture: Path, tmp_pat
         ProtocolError, match=r"--test-every is for captures without a split of their own, got .*leave it"
     ):
         prepare_job(options(capture, tmp_path / "run", test_every=4), ignore)
+
+
+def test_a_run_without_test_views_renders_its_training_views_and_another_training_names_its_options(
+    tmp_path: Path,
+) -> None:
+    """As `gs2d reconstruct` leaves it: the capture is in the run, and few photographs all train."""
+    small_colmap(tmp_path / "run" / "capture")
+    short = options(tmp_path / "run" / "capture", tmp_path / "run", protocol="generic", schedule_scale=0.0005)
+    train(replace(short, test_every=0, downscale=2, allowed=("capture",)))
+    heard: list[Event] = []
+    result = render_run(tmp_path / "run", heard.append, width=31, threads=1)
+    assert (result["images"], Path(result["folder"]).name) == (9, "train")
+    assert any("because the run has no test views" in e.text for e in heard if isinstance(e, Notice))
+    sizes = {read_image(path).shape for path in Path(result["folder"]).glob("*.png")}
+    assert sizes == {(23, 31, 3)}  # of 20x15
+    with pytest.raises(DataError, match="no test views; use --split train or --orbit 120"):
+        render_run(tmp_path / "run", split="test", threads=1)
+    with pytest.raises(RunError, match="--width must be a number of pixels from 1 to 16384, got 0"):
+        render_run(tmp_path / "run", width=0)
+
+    def listen(event: Event) -> None:
+        heard.append(event)
+        if isinstance(event, Step) and "loss" in event.detail:
+            raise Stop
+
+    for changes, line in (({}, "--downscale 2 --test-every 0"), ({"test_every": 0, "downscale": 2}, "")):
+        heard.clear()
+        with pytest.raises(Stop):
+            train(replace(short, out=tmp_path / "other", **changes), listen)
+        said = [e.text for e in heard if isinstance(e, Notice) and "run was trained with" in e.text]
+        assert said == (
+            [f"{tmp_path / 'run'} was trained with {line}; give the same for comparable results"] * bool(line)
+        )
