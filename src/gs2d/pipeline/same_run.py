@@ -46,7 +46,8 @@ def check_same_run(run: RunFolder, job: Job) -> None:
     for name, value in after.items():
         old = before.get(name)
         if name == "protocol" and isinstance(old, dict):
-            old, value = training_facts(old), training_facts(value)
+            # The background can follow from the scene: "raster", which comes after it, has it too.
+            old, value = ({**training_facts(facts), "background": None} for facts in (old, value))
         if name == "recipe" and isinstance(old, dict):
             old = {**dict.fromkeys(LATER_FIELDS), **old}  # runs of before there were such
             if old["exposure"] is not None:
@@ -59,8 +60,12 @@ def check_same_run(run: RunFolder, job: Job) -> None:
                 )
         where = ""
         if name == "scene":
+            masks = [facts.get("masks", {}) for facts in (old or {}, value)]
             old, value = old and old.get("digest"), value["digest"]
-            name = "scene: its photographs, cameras, points or maps changed, or this is another kind of processor"
+            if masks[0] != masks[1]:
+                name, where = "scene: its masks changed", difference(*masks)
+            else:
+                name = "scene: its photographs, cameras, points or maps changed, or this is another kind of processor"
         elif name == "init":
             name = "--init: another file, or none"
         elif name == "part":
