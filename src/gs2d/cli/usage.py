@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.cli.catalogue import Option, options_of
-from gs2d.cli.commands import COMMANDS
+from gs2d.cli.commands import COMMANDS, Common
 from gs2d.core.missing import where_it_ends
 
 NAMES: dict[str, type] = {command.__name__.lower(): command for command in COMMANDS}
@@ -64,7 +64,7 @@ def check(argv: Sequence[str]) -> None:
         raise UsageError(_with_help(str(error), f"gs2d {name} --help")) from None
 
 
-def check_inputs(command: object) -> None:
+def check_inputs(command: Common) -> None:
     """Raise for a path to read that leads nowhere; cheap, so that a misspelt path is reported at once.
 
     Raises
@@ -72,16 +72,18 @@ def check_inputs(command: object) -> None:
     UsageError
     """
     paths = dict(_inputs(command))
-    for option in options_of(type(command)):
-        path = paths.get(option.field)
+    kind: type = type(command)
+    for option in options_of(kind):
+        if (path := paths.get(option.field)) is None:
+            continue
         try:
-            found = path is None or path.stat()
-        except (OSError, ValueError) as error:  # others are reported by whatever reads it
-            found = not isinstance(error, FileNotFoundError | NotADirectoryError)
-        if not found:
+            path.stat()
+        except (FileNotFoundError, NotADirectoryError):
             what = _EXPECTED.get(option.metavar, "a file or a folder")
             what += " or a file of splats" if (option.field, option.metavar) == ("path", "RUN") else ""
-            raise UsageError(f"expected {what} at {path}, found nothing{where_it_ends(path)}")
+            raise UsageError(f"expected {what} at {path}, found nothing{where_it_ends(path)}") from None
+        except (OSError, ValueError):
+            continue  # reported by whatever reads it
 
 
 def _inputs(options: Any) -> Iterator[tuple[str, Path]]:

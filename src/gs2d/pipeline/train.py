@@ -100,8 +100,8 @@ def _train(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> Ru
     on_event = keeping_details(on_event, details)
     options = by_quality(options, on_event)
     job = prepare_job(options, on_event)
-    if line := _unlike_its_run(options, job):
-        on_event(Notice(line))
+    if unlike := _unlike_its_run(options, job):
+        on_event(Notice(unlike))
     if options.overwrite:
         check_sources(job, options)
     run = claim_run(options.out, **claim)  # type: ignore[arg-type]
