@@ -1,13 +1,19 @@
-"""How much a texture adds to a mesh: pictures of it from the test views, beside vertex colours and the photographs.
+"""Compare textured meshes with the photographs of views that were not baked.
 
 ::
 
-    python -m benchmarks.texture RUN [--downscale N] [--faces 50000] [--every 1] [--pictures FOLDER]
+    python -m benchmarks.texture RUN [--downscale N] [--faces 50000] [--every 1] [--hold-out 4] [--pictures FOLDER]
 
-Bakes a texture from the photographs and one from the renderings of a run with a ``mesh.ply``, draws all of them with
-the demo's ray caster (2 x 2 rays a pixel) and prints the mean PSNR over the test views: of the whole picture, and of
-the pixels that both the mesh and the photograph's alpha channel (where there is one) cover wholly. ``--downscale`` is
-that of the photographs that are baked and compared (default: the run's).
+Bakes a texture from the photographs and one from the renderings of a run with a ``mesh.ply``. Draws the mesh with each
+texture and with its vertex colours, by the ray caster of the demo (2 x 2 rays per pixel), from the test views. A run
+without test views leaves every N-th training view out of the baking (``--hold-out``). Prints means over these views:
+
+- PSNR of the whole image, and of the pixels that the mesh and the photograph's alpha channel, if any, cover entirely;
+- the median absolute error of those pixels, which obstacles in the photographs hardly change;
+- sharpness: the mean gradient of those pixels relative to the photograph's.
+
+Photographs are compared in the mean exposure of the run. ``--downscale`` is that of the photographs that are baked and
+compared (default: the run's).
 """
 
 from __future__ import annotations
@@ -15,18 +21,20 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from gs2d.core.camera import Camera
-from gs2d.core.images import write_image
+from gs2d.core.images import composite, write_image
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.data import View
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, open_run
 from gs2d.meshing.raycast import Hits, cast_camera
 from gs2d.meshing.texture import bilinear
+from gs2d.pipeline.exposure import NONE, Transforms, as_scene, read_exposures
 from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.job import read_scene, reload_job
 from gs2d.pipeline.options import TextureOptions
@@ -63,23 +71,44 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(-10 * np.log10(np.mean((a - b) ** 2)))
 
 
+def sharpness(image: np.ndarray, inside: np.ndarray) -> float:
+    """Mean gradient of the grey image [H, W, 3] between pixels that are both ``inside`` [H, W]."""
+    grey = image.mean(axis=2)
+    steps = [
+        np.abs(np.diff(grey, axis=k))[
+            inside.take(range(1, inside.shape[k]), k) & inside.take(range(inside.shape[k] - 1), k)
+        ]
+        for k in (0, 1)
+    ]
+    return float(np.concatenate(steps).mean())
+
+
 def compare(
-    meshes: dict[str, Mesh | TexturedMesh], views: Sequence[View], background: Sequence[float], pictures: Path | None
+    meshes: dict[str, Mesh | TexturedMesh],
+    views: Sequence[View],
+    background: Sequence[float],
+    pictures: Path | None,
+    exposures: Transforms = NONE,
 ) -> None:
     """Print the figures of each mesh, and write the pictures."""
     for name, mesh in meshes.items():
-        whole, inside = [], []
+        figures = []
         for i, view in enumerate(views):
-            target = view.target(background)
+            target = composite(as_scene(view, exposures), background)
             drawn, covered = image(mesh, view.camera, background)
             alpha = view.alpha()
             both = (covered == 1) & (alpha == 1 if alpha is not None else True)
-            whole.append(psnr(drawn, target))
-            inside.append(psnr(drawn[both], target[both]))
+            error = float(np.median(np.abs(drawn[both] - target[both]))) * 255
+            sharp = sharpness(drawn, both) / sharpness(target, both)
+            figures.append((psnr(drawn, target), psnr(drawn[both], target[both]), error, sharp))
             if pictures is not None:
                 write_image(pictures / f"{i:03d}-{name}.png", drawn)
                 write_image(pictures / f"{i:03d}-photograph.png", target)
-        print(f"{name:>16}: {np.mean(whole):.2f} dB, {np.mean(inside):.2f} dB where both cover a pixel")
+        whole, inside, error, sharp = np.mean(figures, axis=0)
+        print(
+            f"{name:>16}: {whole:.2f} dB, {inside:.2f} dB where both cover a pixel, median error {error:.1f} of 255, "
+            f"sharpness {sharp:.2f}"
+        )
 
 
 def main() -> None:
@@ -90,25 +119,30 @@ def main() -> None:
     parser.add_argument("--faces", type=int, default=TextureOptions().faces)
     parser.add_argument("--size", type=int)
     parser.add_argument("--every", type=int, default=1, help="only every so many test views")
+    parser.add_argument("--hold-out", type=int, default=4, help="without test views: leave out every N-th view")
     parser.add_argument("--pictures", type=Path, help="an existing folder")
     arguments = parser.parse_args()
     run = open_run(arguments.run)
     job, splats, mesh = reload_job(run, lambda _event: None), finished_splats(run), read_mesh(run.file(MESH))
-    scene, shrink = job.scene, arguments.downscale or job.downscale
-    if shrink != job.downscale and scene.root is not None:
-        scene = read_scene(scene.root, scene.format, shrink, job.protocol, lambda _event: None)
+    shrink, exposures = arguments.downscale or job.downscale, read_exposures(run, job.recipe)
+    if shrink != job.downscale and job.scene.root is not None:
+        scene = read_scene(job.scene.root, job.scene.format, shrink, job.protocol, lambda _event: None)
+        job = replace(job, scene=scene, downscale=shrink)
+    views = job.scene.test
+    if not views:
+        views = job.scene.train[:: arguments.hold_out]
+        rest = tuple(view for view in job.scene.train if view not in views)
+        job = replace(job, scene=replace(job.scene, train=rest, test=views))
     meshes: dict[str, Mesh | TexturedMesh] = {"vertex colours": mesh}
     for source in ("photographs", "renders"):
-        options = TextureOptions(
-            faces=arguments.faces, texture_size=arguments.size, texture_from=source, texture_downscale=shrink
-        )
+        options = TextureOptions(faces=arguments.faces, texture_size=arguments.size, texture_from=source)
         start, cpu = time.perf_counter(), time.process_time()
-        baked = textured_mesh(job, splats, mesh, options)
+        baked = textured_mesh(job, splats, mesh, options, exposures=exposures)
         took = f"{time.perf_counter() - start:.1f} s ({time.process_time() - cpu:.1f} s of CPU)"
         size, unseen = len(baked.mesh.texture), baked.unseen / baked.texels
         print(f"from {source}: {size}x{size}, {len(baked.mesh.faces):,} faces, {unseen:.2%} unseen, {took}", flush=True)
         meshes[f"from {source}"] = baked.mesh
-    compare(meshes, (scene.test or scene.train)[:: arguments.every], job.settings.background, arguments.pictures)
+    compare(meshes, views[:: arguments.every], job.settings.background, arguments.pictures, exposures)
 
 
 if __name__ == "__main__":

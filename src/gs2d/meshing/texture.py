@@ -14,7 +14,7 @@ in the choice, both have weight 0. See docs/math.md and docs/decisions/meshing.m
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -25,8 +25,11 @@ from scipy.sparse import coo_array
 
 from gs2d.core.camera import Camera
 from gs2d.core.extras import install
+from gs2d.core.images import area_downscale, mask_downscale
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.errors import BackendError, ProtocolError
+from gs2d.meshing.agreement import VOTE, Agreement, agree, corrected
+from gs2d.meshing.evidence import areas
 from gs2d.meshing.raycast import cast_camera
 from gs2d.meshing.simplify import collapse
 
@@ -66,7 +69,7 @@ class Texels:
     Attributes
     ----------
     size : int
-        Side of the square texture.
+        Texels in a row.
     index : ndarray [T] int32
         row * size + column.
     face : ndarray [T] int32
@@ -193,6 +196,9 @@ _CHUNK = 1 << 17  # texels
 _TYPICAL_USE = 0.55  # part of the atlas that charts cover
 _FINER = 2.0  # texels in the length of a pixel: a picture drawn twice over keeps its edges
 _SAMPLES = 5000  # faces that choose the size
+COARSE = 2  # px: photographs are compared in images smaller by this factor
+_STRIDE = 4  # texels between points at which photographs are compared
+TABLE_BYTES = 512 << 20  # of the colours of these points in all photographs
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,6 +217,16 @@ class ColorSource:
     camera: Camera
     image: np.ndarray
     valid: np.ndarray | None = None
+
+    def shrunk(self, factor: int) -> ColorSource:
+        """Return the averages of ``factor`` x ``factor`` pixels."""
+        factor = min(factor, *self.image.shape[:2])
+        valid = None if self.valid is None else mask_downscale(self.valid, factor, need=1.0)
+        return ColorSource(self.camera.downscaled(factor), area_downscale(self.image, factor), valid)
+
+
+ColorSources = Callable[[int], Iterable[ColorSource]]
+"""Reads all images, one at a time, in the same order each time: smaller by the factor that it is given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,21 +265,14 @@ def texture_size(mesh: Mesh, cameras: list[Camera]) -> int:
     return int(np.clip(2 ** np.ceil(np.log2(side)), 4 * MIN_SIZE, MAX_AUTO_SIZE))
 
 
-def bake(
-    atlas: Atlas,
-    images: Iterable[ColorSource],
-    size: int,
-    *,
-    best: int = BEST,
-    threads: int | None = None,
-) -> Baked:
+def bake(atlas: Atlas, images: ColorSources, size: int, *, best: int = BEST, threads: int | None = None) -> Baked:
     """Colour the texels of an atlas from photographs.
 
     Parameters
     ----------
     atlas : Atlas
-    images : iterable of ColorSource
-        Read once, one at a time.
+    images : callable
+        Reads the photographs; called twice.
     size : int
         Side of the texture, texels. Memory: about 70 bytes for each texel on the surface.
     best : int
@@ -291,17 +300,17 @@ def bake(
 
 
 def surface_colors(
-    mesh: Mesh, texels: Texels, images: Iterable[ColorSource], *, best: int = BEST, threads: int | None = None
+    mesh: Mesh, texels: Texels, images: ColorSources, *, best: int = BEST, threads: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return colours [T, 3] uint8 of places on a mesh from photographs, and which of them some photograph sees [T].
+    """Return colours [T, 3] uint8 of points on a mesh from photographs, and which of them some photograph sees [T].
 
     Parameters
     ----------
     mesh : Mesh
     texels : Texels
         On the faces of the mesh.
-    images : iterable of ColorSource
-        Read once, one at a time.
+    images : callable
+        Reads the photographs; called twice.
     best : int
         Photographs that a colour is made of.
     threads : int, optional
@@ -311,9 +320,17 @@ def surface_colors(
     ProtocolError
         No photograph sees any of them.
     """
-    chooser = _Chooser(mesh, texels, best, threads or os.cpu_count() or 1)
-    for image in images:
-        chooser.add(image)
+    origin = mesh.vertices.astype(np.float64).mean(axis=0)
+    points = _Points.of(mesh, texels, origin)
+    compared = _Compared(points, texels, float(areas(mesh).sum()))
+    for image in images(COARSE):
+        compared.add(_Looked(mesh, image, origin))
+    compared.agree()
+    chooser = _Chooser(points, best, threads or os.cpu_count() or 1)
+    for number, image in enumerate(images(1)):
+        looked = _Looked(mesh, image, origin)
+        compared.correct(looked, number)
+        chooser.add(looked)
     colors, seen = chooser.colors()
     if not seen.any():
         raise ProtocolError(
@@ -322,43 +339,95 @@ def surface_colors(
     return colors, seen
 
 
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """Points of a surface relative to an origin, float32: places [n, 3], normals [n, 3] and heights n . x [n]."""
+
+    places: np.ndarray
+    normals: np.ndarray
+    heights: np.ndarray
+
+    @classmethod
+    def of(cls, mesh: Mesh, texels: Texels, origin: np.ndarray) -> _Points:
+        """Return the points of texels."""
+        vertices, vertex_normal = mesh.vertices - origin, vertex_normals(mesh)
+        n = len(texels.index)
+        places, normals = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
+        for start in range(0, n, _CHUNK):
+            part = slice(start, start + _CHUNK)
+            places[part] = texels.interpolated(vertices, mesh.faces, part)
+            normal = texels.interpolated(vertex_normal, mesh.faces, part)
+            normals[part] = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+        return cls(places, normals, (places * normals).sum(axis=1))
+
+    def subset(self, rows: np.ndarray | slice) -> _Points:
+        """Return some of the points."""
+        return _Points(self.places[rows], self.normals[rows], self.heights[rows])
+
+
+class _Compared:
+    """Colours of points of the surface in all photographs, and what they agree on."""
+
+    def __init__(self, points: _Points, texels: Texels, area: float) -> None:
+        row, column = np.divmod(texels.index, texels.size)
+        self._points = points.subset(np.flatnonzero((row % _STRIDE == 0) & (column % _STRIDE == 0)))
+        self._area = area / max(len(self._points.places), 1)  # world units^2 for each point
+        self._samples: list[np.ndarray] = []  # [P, 4] uint8: colour and vote, later the weight
+        self._agreement: Agreement | None = None
+
+    def add(self, looked: _Looked) -> None:
+        """Look the points up in an image; every second point is dropped where the table would become too large."""
+        while (len(self._samples) + 1) * len(self._points.places) * 4 > TABLE_BYTES:
+            self._points = self._points.subset(slice(None, None, 2))
+            self._samples = [samples[::2].copy() for samples in self._samples]
+        samples = np.zeros((len(self._points.places), 4), np.uint8)
+        seen = looked.see(self._points, np.zeros(len(samples), np.float32))
+        resolved = np.minimum(seen.density * self._area, 1)  # pixels for each point
+        samples[seen.rows, :3] = np.rint(seen.colors)
+        samples[seen.rows, 3] = np.ceil(VOTE * seen.clear * seen.cosine * resolved)
+        self._samples.append(samples)
+
+    def agree(self) -> None:
+        """Find the consensus."""
+        self._agreement = agree(self._samples)
+
+    def correct(self, looked: _Looked, number: int) -> None:
+        """Correct the photograph that was added as this ``number``."""
+        assert self._agreement is not None
+        rows = np.flatnonzero(self._samples[number][:, 3])
+        looked.correct(
+            self._points.places[rows],
+            self._samples[number][rows],
+            self._agreement.colors[rows],
+            self._agreement.gains[number],
+        )
+
+
 class _Chooser:
     """The best photographs of each texel so far."""
 
-    def __init__(self, mesh: Mesh, texels: Texels, best: int, threads: int) -> None:
-        self._mesh = mesh
-        self._origin = mesh.vertices.astype(np.float64).mean(axis=0)
-        self._threads = threads
+    def __init__(self, points: _Points, best: int, threads: int) -> None:
+        self._points, self._threads = points, threads
         self.count = 0
-        n = len(texels.index)
+        n = len(points.places)
         self._parts = [slice(start, min(start + _CHUNK, n)) for start in range(0, n, _CHUNK)]
-        places, normals = mesh.vertices - self._origin, vertex_normals(mesh)
-        self._places, self._normals = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
-        for part in self._parts:
-            self._places[part] = texels.interpolated(places, mesh.faces, part)
-            normal = texels.interpolated(normals, mesh.faces, part)
-            self._normals[part] = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-        self._heights = (self._places * self._normals).sum(axis=1)  # n . x
         self._scores = np.zeros((n, best + 1), np.float32)
         self._least = np.zeros(n, np.float32)  # of the scores
         self._colors = np.zeros((n, best + 1, 3), np.uint8)
 
-    def add(self, image: ColorSource) -> None:
+    def add(self, looked: _Looked) -> None:
         """Let every texel choose whether it wants this photograph."""
         self.count += 1
-        looked = _Looked(self._mesh, image, self._origin)
         with ThreadPoolExecutor(self._threads) as pool:
             for _ in pool.map(lambda part: self._choose(looked, part), self._parts):
                 pass
 
     def _choose(self, looked: _Looked, part: slice) -> None:
-        places, scores, least = self._places[part], self._scores[part], self._least[part]
-        rows, density = looked.before(places, self._normals[part], self._heights[part], least)
-        chosen, score, color = looked.visible(places[rows], self._normals[part][rows], density, least[rows])
-        rows = rows[chosen]
-        worst = scores[rows].argmin(axis=1)
-        scores[rows, worst], self._colors[part][rows, worst] = score, color
-        least[rows] = scores[rows].min(axis=1)
+        scores, least = self._scores[part], self._least[part]
+        seen = looked.see(self._points.subset(part), least)
+        worst = scores[seen.rows].argmin(axis=1)
+        scores[seen.rows, worst], self._colors[part][seen.rows, worst] = seen.density * seen.clear, np.rint(seen.colors)
+        least[seen.rows] = scores[seen.rows].min(axis=1)
 
     def colors(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean colours [T, 3] uint8 of the texels, and which of them some photograph saw [T]."""
@@ -369,6 +438,28 @@ class _Chooser:
             mean = np.einsum("tk,tkc->tc", weights, self._colors[part].astype(np.float32)) / total[:, None]
             colors[part] = np.rint(mean)
         return colors, self._scores.max(axis=1) > 0
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Points that a photograph sees.
+
+    Attributes
+    ----------
+    rows : ndarray [m] int64
+    density : ndarray [m]
+        q, pixels per unit of surface.
+    clear : ndarray [m]
+        b, how far from an outline.
+    cosine : ndarray [m]
+    colors : ndarray [m, 3]
+    """
+
+    rows: np.ndarray
+    density: np.ndarray
+    clear: np.ndarray
+    cosine: np.ndarray
+    colors: np.ndarray
 
 
 class _Looked:
@@ -385,40 +476,46 @@ class _Looked:
         self._shift = (camera.T_cam_world[:3, 3] + camera.rotation @ origin).astype(np.float32)
         self._center = (camera.center - origin).astype(np.float32)
         self._depth = cast_camera(mesh.vertices.astype(np.float64), mesh.faces, small).depth
-        self._feather = feather(self._depth, small.fx, _shown(image, small))
+        self._clear = feather(self._depth, small.fx, _shown(image, small))
 
-    def before(
-        self, places: np.ndarray, normals: np.ndarray, heights: np.ndarray, least: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Rows [m] of the texels that face the camera and have a density q [m] above ``least``; cheap, for all."""
-        facing = normals @ self._center - heights
-        z = places @ self._rotation[2] + self._shift[2]
+    def correct(self, places: np.ndarray, samples: np.ndarray, colors: np.ndarray, gain: np.ndarray) -> None:
+        """Bring the image to the colours of the consensus, and lower its score where it does not agree."""
+        pixels = np.stack(self._project(places)[:2], axis=1)
+        self._image, weights = corrected(self._image, pixels, samples, colors, gain, COARSE)
+        height, width = self._clear.shape
+        row = ((np.arange(height) + 0.5) * (weights.shape[0] / height)).astype(np.int64)[:, None]
+        column = ((np.arange(width) + 0.5) * (weights.shape[1] / width)).astype(np.int64)[None]
+        self._clear *= weights[row, column]
+
+    def see(self, points: _Points, least: np.ndarray) -> _Seen:
+        """Look up the points that are visible with a score above ``least`` [n]."""
+        facing = points.normals @ self._center - points.heights
+        z = points.places @ self._rotation[2] + self._shift[2]
         with np.errstate(divide="ignore", invalid="ignore"):
             density = np.float32(self._camera.fx * self._camera.fy) * facing / (z * z * z)
-        rows = np.flatnonzero((facing > 0) & (z > 0) & (density > least))
-        return rows, density[rows]
-
-    def visible(
-        self, places: np.ndarray, normals: np.ndarray, density: np.ndarray, least: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rows [m] of the places [t, 3] that are seen better than ``least``, their scores [m] and colours [m, 3]."""
+        rows = np.flatnonzero((facing > 0) & (z > 0) & (density > least))  # cheap, for all
         camera, small = self._camera, self._small
-        x, y, z = (places @ self._rotation[i] + self._shift[i] for i in range(3))
-        x, y = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        rows = np.flatnonzero((x >= 0.5) & (y >= 0.5) & (x <= camera.width - 0.5) & (y <= camera.height - 0.5))
-        column = np.minimum((x[rows] * (small.width / camera.width)).astype(np.int32), small.width - 1)
-        row = np.minimum((y[rows] * (small.height / camera.height)).astype(np.int32), small.height - 1)
+        x, y, z = self._project(points.places[rows])
+        inside = (x >= 0.5) & (y >= 0.5) & (x <= camera.width - 0.5) & (y <= camera.height - 0.5)
+        rows, x, y, z = rows[inside], x[inside], y[inside], z[inside]
+        column = np.minimum((x * (small.width / camera.width)).astype(np.int32), small.width - 1)
+        row = np.minimum((y * (small.height / camera.height)).astype(np.int32), small.height - 1)
         pixel = row * small.width + column
-        score = density[rows] * self._feather.reshape(-1)[pixel]
-        better = score > least[rows]
-        rows, pixel, score = rows[better], pixel[better], score[better]
-        ray = places[rows] - self._center
-        cosine = -(ray * normals[rows]).sum(axis=1) / np.sqrt((ray * ray).sum(axis=1))
+        clear = self._clear.reshape(-1)[pixel]
+        better = density[rows] * clear > least[rows]
+        rows, x, y, z, pixel, clear = (values[better] for values in (rows, x, y, z, pixel, clear))
+        ray = points.places[rows] - self._center
+        cosine = facing[rows] / np.sqrt((ray * ray).sum(axis=1))
         # depth changes by tan(incidence) footprints within a pixel of a plane; twice that, and a footprint of its own
-        tolerance = z[rows] / small.fx * (1 + 2 / np.maximum(cosine, GRAZING))
-        seen = (cosine > GRAZING) & (np.abs(z[rows] - self._depth.reshape(-1)[pixel]) <= tolerance)
-        rows, score = rows[seen], score[seen]
-        return rows, score, bilinear(self._image, x[rows], y[rows])
+        tolerance = z / small.fx * (1 + 2 / np.maximum(cosine, GRAZING))
+        seen = (cosine > GRAZING) & (np.abs(z - self._depth.reshape(-1)[pixel]) <= tolerance)
+        rows = rows[seen]
+        return _Seen(rows, density[rows], clear[seen], cosine[seen], bilinear(self._image, x[seen], y[seen]))
+
+    def _project(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return x and y in px, and the depth."""
+        x, y, z = (places @ self._rotation[i] + self._shift[i] for i in range(3))
+        return self._camera.fx * x / z + self._camera.cx, self._camera.fy * y / z + self._camera.cy, z
 
 
 def _shown(photograph: ColorSource, small: Camera) -> np.ndarray:
@@ -454,7 +551,7 @@ def feather(depth: np.ndarray, focal: float, shown: np.ndarray) -> np.ndarray:
 
 
 def bilinear(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Colours [m, 3] uint8 of an image [H, W, >= 3] at places in px (pixel centres at +0.5), clamped to it."""
+    """Colours [m, 3] float32 of an image [H, W, >= 3] at places in px (pixel centres at +0.5), clamped to it."""
     height, width = image.shape[:2]
     flat = image.reshape(height * width, -1)
     x, y = np.clip(x - 0.5, 0, width - 1), np.clip(y - 0.5, 0, height - 1)
@@ -464,7 +561,7 @@ def bilinear(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     fx, fy = (x - column).astype(np.float32)[:, None], (y - row).astype(np.float32)[:, None]
     upper = flat[corner, :3] * (1 - fx) + flat[corner + right, :3] * fx
     lower = flat[corner + below, :3] * (1 - fx) + flat[corner + below + right, :3] * fx
-    return np.asarray(np.rint(upper * (1 - fy) + lower * fy).astype(np.uint8))
+    return np.asarray(upper * (1 - fy) + lower * fy)
 
 
 def fill_unseen(atlas: Atlas, texels: Texels, colors: np.ndarray, seen: np.ndarray) -> None:

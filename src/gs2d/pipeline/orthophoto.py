@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +14,19 @@ import torch
 from gs2d.core.files import check_writable
 from gs2d.core.georeference import Georeference
 from gs2d.core.mesh import Mesh
-from gs2d.data import View
 from gs2d.errors import ProtocolError, RunError
 from gs2d.io.geotiff import NO_DATA, required, write_geotiff
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, open_run
 from gs2d.meshing.raycast import Hits, cast_down
-from gs2d.meshing.texture import ColorSource, Texels, surface_colors
-from gs2d.pipeline.events import OnEvent, Phase, counted, ignore
-from gs2d.pipeline.exposure import Transforms, as_scene, read_exposures
+from gs2d.meshing.texture import Texels, surface_colors
+from gs2d.pipeline.events import OnEvent, Phase, ignore
+from gs2d.pipeline.exposure import Transforms, read_exposures
 from gs2d.pipeline.finished import open_job
 from gs2d.pipeline.job import Job
 from gs2d.pipeline.options import OrthophotoOptions
 from gs2d.pipeline.placed import place_of
-from gs2d.pipeline.texture import usable_pixels
+from gs2d.pipeline.texture import photographs
 
 ELEVATION = "_elevation"  # after the name of the orthophoto
 MAX_CELLS = 36_000_000  # a colour's choice takes about 70 bytes a cell: 2.5 GB
@@ -145,25 +144,19 @@ def _colors(job: Job, mesh: Mesh, hits: Hits, exposures: Transforms, on_event: O
     height, width = hits.face.shape
     index = np.flatnonzero(hits.face.reshape(-1) >= 0)
     texels = Texels(
-        max(height, width),
+        width,
         index.astype(np.int32),
         hits.face.reshape(-1)[index],
         np.ascontiguousarray(hits.weights.reshape(-1, 3)[index, :2]),
     )
-    found, seen = surface_colors(mesh, texels, _photographs(job, exposures, on_event), threads=torch.get_num_threads())
+    images = partial(photographs, job, job.scene.train, exposures, on_event)
+    found, seen = surface_colors(mesh, texels, images, threads=torch.get_num_threads())
     if mesh.colors is not None and not seen.all():
         found[~seen] = np.rint(texels.interpolated(mesh.colors, mesh.faces))[~seen].astype(np.uint8)
     image = np.zeros((height * width, 4), dtype=np.uint8)
     image[index, :3] = found
     image[index, 3] = 255
     return image.reshape(height, width, 4), int((~seen).sum())
-
-
-def _photographs(job: Job, exposures: Transforms, on_event: OnEvent) -> Iterator[ColorSource]:
-    """Yield the training views, taken back to the mean exposure."""
-    views: tuple[View, ...] = tuple(job.scene.train)
-    for view in counted(views, "colouring from the photographs", len(views), on_event):
-        yield ColorSource(view.camera, as_scene(view, exposures), usable_pixels(view, job))
 
 
 def _elevations(local: np.ndarray, mesh: Mesh, hits: Hits, place: Georeference) -> np.ndarray:

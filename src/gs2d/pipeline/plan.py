@@ -17,7 +17,7 @@ PLACED = (
 )
 _TRAINING = Part("training", ("training",))
 _MESH = Part("mesh", ("rendering depth", "fusing"), of_training=0.17)
-_TEXTURE = Part("texture", ("cutting the surface", "colouring the texture"), of_training=0.1)
+_TEXTURE = Part("texture", ("cutting the surface", "comparing the colours", "colouring the texture"), of_training=0.1)
 _REPORT = Part("report", ("writing the report", "writing the page"), of_training=0.03)
 TRAINED = (_TRAINING, _MESH, _REPORT)
 TEXTURED_TOO = (_TRAINING, _MESH, _REPORT, _TEXTURE)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +38,11 @@ from gs2d.pipeline.job import Job, read_scene
 from gs2d.pipeline.mesh import fused, mesh_run
 from gs2d.pipeline.options import MeshOptions, TextureOptions
 from gs2d.pipeline.placed import placed_output, placed_textured, say_where
-from gs2d.pipeline.render import render_view
 from gs2d.pipeline.subject import OPAQUE, meshed_subject
+from gs2d.render.api import rasterize
 
 PACKAGES = ("xatlas",)  # of the extra `texture`
+PASSES = ("colouring the texture", "comparing the colours")
 
 
 def texture_run(
@@ -128,7 +130,7 @@ def textured_mesh(
             Notice(f"simplified to {len(small.faces):,} triangles, as near as it comes to --faces {options.faces}")
         )
     size = options.texture_size or texture_size(small, [view.camera for view in views])
-    images = _images(job, views, splats, options, exposures, on_event)
+    images = partial(_images, job, views, splats, options, exposures, on_event)
     return bake(unwrap(small, size), images, size, threads=torch.get_num_threads())
 
 
@@ -175,15 +177,26 @@ def _images(
     options: TextureOptions,
     exposures: Transforms,
     on_event: OnEvent,
+    factor: int,
 ) -> Iterator[ColorSource]:
-    """Yield the views, or what the splats look like from them."""
-    for view in counted(views, "colouring the texture", len(views), on_event):
-        if options.texture_from == "renders":
-            output = render_view(splats, view, job.settings, job.backend)
-            shown = (output.alpha >= OPAQUE).cpu().numpy()
-            yield ColorSource(view.camera, to_uint8(output.color.clamp(0, 1).cpu().numpy()), shown)
-        else:
-            yield ColorSource(view.camera, as_scene(view, exposures), usable_pixels(view, job))
+    """Yield the views, or renderings of the splats from them, smaller by ``factor``."""
+    if options.texture_from == "photographs":
+        yield from photographs(job, views, exposures, on_event, factor)
+        return
+    for view in counted(views, PASSES[factor > 1], len(views), on_event):
+        camera = view.camera.downscaled(factor)
+        with torch.no_grad():
+            output = rasterize(splats, camera, job.settings, backend=job.backend)
+        shown = (output.alpha >= OPAQUE).cpu().numpy()
+        yield ColorSource(camera, to_uint8(output.color.clamp(0, 1).cpu().numpy()), shown)
+
+
+def photographs(
+    job: Job, views: Sequence[View], exposures: Transforms, on_event: OnEvent, factor: int
+) -> Iterator[ColorSource]:
+    """Yield photographs in the mean exposure of a run, smaller by ``factor``."""
+    for view in counted(views, PASSES[factor > 1], len(views), on_event):
+        yield ColorSource(view.camera, as_scene(view, exposures), usable_pixels(view, job)).shrunk(factor)
 
 
 def usable_pixels(view: View, job: Job) -> np.ndarray | None:

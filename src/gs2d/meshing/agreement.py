@@ -1,0 +1,174 @@
+"""Agreement between photographs about the colours of a surface: exposures, consensus colours and outliers.
+
+Sample points on the surface are looked up in every photograph that sees them. Each photograph gets a gain per channel,
+each point the colour that most photographs agree on, and each pair a weight that is near 0 where the photograph shows
+something else there: an obstacle, a moving object, a highlight. Photographs are then corrected in image space, by a
+smooth weight and a smooth colour offset. See docs/math.md and docs/decisions/meshing.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+VOTE = 255  # of a photograph that faces the surface, in the fourth channel of its samples; 0: it does not see the point
+MIN_SCALE, MAX_SCALE = 6.0, 16.0  # of 255: bounds of the spread between photographs that agree
+CUT = 2.0  # spreads at which the weight of a photograph falls to exp(-1/2)
+REJECTED, ACCEPTED = 0.35, 0.75  # mean weights of a neighbourhood that is left out, or used entirely
+LEAST = 1e-3  # weight of a neighbourhood that is left out: used only where no other photograph sees the surface
+MAX_GAIN = 4.0
+LEVEL_CELLS = 8.0  # standard deviation of the smoothing of colour offsets, cells
+_GAIN_POINTS = 20_000
+_CHUNK = 1 << 21  # samples that are compared at a time
+_WIDE = 6.0  # cells, of the smoothing that reaches across gaps between points
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """Colours of points, and how photographs relate to them.
+
+    Attributes
+    ----------
+    colors : ndarray [P, 3] float32
+        Consensus, in [0, 255].
+    gains : ndarray [V, 3] float32
+        A photograph shows gain * consensus.
+    """
+
+    colors: np.ndarray
+    gains: np.ndarray
+
+
+def agree(samples: Sequence[np.ndarray]) -> Agreement:
+    """Find the consensus of photographs; replaces their votes by the weights of inliers, in place.
+
+    Parameters
+    ----------
+    samples : sequence of ndarray [P, 4] uint8
+        For each photograph the colours of the points and its vote. Afterwards the fourth channel is 1 to 255 where
+        the photograph sees the point: 255 times the weight, rounded up.
+    """
+    count = len(samples[0])
+    gains = _gains(np.stack([table[:: -(-count // _GAIN_POINTS)] for table in samples]))
+    colors = np.zeros((count, 3), np.float32)
+    step = max(1, _CHUNK // len(samples))
+    for start in range(0, count, step):
+        part = slice(start, start + step)
+        table = np.stack([table[part] for table in samples])
+        votes = table[..., 3].astype(np.float32)
+        colors[part], weights = _consensus(table[..., :3] / gains[:, None], votes)
+        marks = np.where(votes > 0, np.ceil(1 + 254 * weights), 0).astype(np.uint8)
+        for k, photograph in enumerate(samples):
+            photograph[part, 3] = marks[k]
+    return Agreement(colors, gains)
+
+
+def _gains(table: np.ndarray) -> np.ndarray:
+    """Return gains [V, 3] with a mean logarithm of 0, from samples [V, p, 4] that are neither dark nor saturated.
+
+    Minimises sum_vp w_vp (log c_vp - g_v - m_p)^2 over g and m, with weights that follow the residuals.
+    """
+    colors = table[..., :3].astype(np.float32)
+    clear = (table[..., :3].min(axis=2) > 8) & (table[..., :3].max(axis=2) < 247)
+    votes = table[..., 3] * clear / np.float32(VOTE)
+    shown = (votes > 0).sum(axis=0) > 1
+    votes, logs = votes[:, shown], np.log(np.maximum(colors[:, shown], 1.0))
+    gains, count = np.zeros((len(table), 3), np.float32), votes.shape[1]
+    if count == 0:
+        return np.exp(gains)
+    residual = logs - _weighted_median(logs, np.broadcast_to(votes[..., None], logs.shape))
+    for _ in range(6):
+        distance = np.sqrt((residual**2).mean(axis=2))
+        scale = max(1.5 * float(np.median(distance[votes > 0])), 0.03)
+        weights = votes / (1 + (distance / (2 * scale)) ** 2) ** 2
+        total = np.maximum(weights.sum(axis=0), 1e-6)
+        mean = (weights[..., None] * logs).sum(axis=0) / total[:, None]
+        system = np.diag(weights.sum(axis=1) + 1e-3) - weights @ (weights / total).T
+        right = (weights[..., None] * (logs - mean)).sum(axis=1)
+        gains = np.linalg.solve(system.astype(np.float64), right).astype(np.float32)
+        gains -= gains.mean(axis=0)
+        level = logs - gains[:, None]
+        residual = level - (weights[..., None] * level).sum(axis=0) / total[:, None]
+    return np.exp(np.clip(gains, -np.log(MAX_GAIN), np.log(MAX_GAIN)))
+
+
+def _consensus(colors: np.ndarray, votes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return consensus colours [p, 3] of samples [V, p, 3] with votes [V, p], and the weights [V, p] of inliers.
+
+    A redescending estimate (Welsch's weights) that starts at the weighted median.
+    """
+    middle = _weighted_median(colors, np.broadcast_to(votes[..., None], colors.shape))
+    distance = np.sqrt(((colors - middle) ** 2).mean(axis=2))
+    scale = np.clip(1.5 * _weighted_median(distance, votes), MIN_SCALE, MAX_SCALE)
+    for _ in range(4):
+        weights = np.exp(-0.5 * (distance / (CUT * scale)) ** 2)
+        shares = votes * np.maximum(weights, 1e-6)
+        shares /= np.maximum(shares.sum(axis=0), 1e-12)
+        middle = (shares[..., None] * colors).sum(axis=0)
+        distance = np.sqrt(((colors - middle) ** 2).mean(axis=2))
+    return middle, np.exp(-0.5 * (distance / (CUT * scale)) ** 2)
+
+
+def _weighted_median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the weighted lower median over the first axis."""
+    order = np.argsort(values, axis=0)
+    reached = np.cumsum(np.take_along_axis(weights, order, axis=0), axis=0)
+    first = (reached < 0.5 * reached[-1:]).sum(axis=0, keepdims=True)
+    return np.take_along_axis(values, np.take_along_axis(order, np.minimum(first, len(values) - 1), 0), 0)[0]
+
+
+def corrected(
+    image: np.ndarray,
+    pixels: np.ndarray,
+    samples: np.ndarray,
+    colors: np.ndarray,
+    gain: np.ndarray,
+    cell: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a photograph in the colours of the consensus [H, W, 3 or 4] uint8, and weights of its pixels [H, W].
+
+    Parameters
+    ----------
+    image : ndarray [H, W, 3 or 4] uint8
+    pixels : ndarray [n, 2] px
+        Where the photograph shows points.
+    samples : ndarray [n, 4] uint8
+        As ``agree`` leaves them.
+    colors : ndarray [n, 3]
+        Consensus.
+    gain : ndarray [3]
+    cell : int, px
+        Side of the cells of an image in which weights and offsets are smoothed.
+    """
+    height, width = image.shape[:2]
+    shape = -(-height // cell), -(-width // cell)
+    index = (pixels[:, 1] / cell).astype(np.int64) * shape[1] + (pixels[:, 0] / cell).astype(np.int64)
+    weights = (samples[:, 3] - 1.0) / 254
+    offsets = (colors - samples[:, :3] / gain) * weights[:, None]
+
+    def cells(values: np.ndarray | None = None) -> np.ndarray:
+        return np.bincount(index, values, shape[0] * shape[1]).reshape(shape).astype(np.float32)
+
+    def smooth(values: np.ndarray, sigma: float) -> np.ndarray:
+        return np.asarray(gaussian_filter(values, sigma, mode="constant"))
+
+    def enlarged(values: np.ndarray) -> np.ndarray:
+        whole = Image.fromarray(values)
+        box = (0.0, 0.0, width / cell, height / cell)
+        return np.asarray(whole.resize((width, height), Image.Resampling.BILINEAR, box=box))
+
+    number, accepted = cells(), cells(weights)
+    near, below = (smooth(values, 1.0) + 1e-3 * smooth(values, _WIDE) for values in (accepted, number))
+    usual = np.where(below > 1e-9, near / np.maximum(below, 1e-9), 1.0)
+    usable = np.clip((usual - REJECTED) / (ACCEPTED - REJECTED), LEAST, 1).astype(np.float32)
+    below = smooth(accepted, LEVEL_CELLS) + np.float32(0.02)
+    result = image.copy()
+    for channel in range(3):
+        offset = smooth(cells(offsets[:, channel]), LEVEL_CELLS) / below
+        level = image[..., channel] / gain[channel] + enlarged(offset)
+        result[..., channel] = np.rint(np.clip(level, 0, 255))
+    return result, enlarged(usable)
