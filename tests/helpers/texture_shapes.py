@@ -9,7 +9,7 @@ import numpy as np
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.mesh import Mesh
 from gs2d.meshing.raycast import cast_camera
-from gs2d.meshing.texture import Atlas, ColorSource
+from gs2d.meshing.texture import Atlas, ColorSource, ColorSources
 
 Paint = Callable[[np.ndarray], np.ndarray]  # places [n, 3] to colours [n, 3] in [0, 1]
 
@@ -79,3 +79,8 @@ def above(height: float, size: int = 64, focal: float = 64.0) -> Camera:
     """A camera on the z axis that looks down; its image's x is the world's x."""
     down = np.array([0.0, 0, height])
     return look_at(down, np.zeros(3), np.array([0.0, 1, 0]), width=size, height=size, fx=focal)
+
+
+def listed(images: list[ColorSource]) -> ColorSources:
+    """Images in memory, read as often as they are needed."""
+    return lambda factor: (image.shrunk(factor) for image in images)

@@ -1,0 +1,132 @@
+"""Consensus of photographs in a texture: obstacles, highlights, exposures, and the memory for them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gs2d.core.camera import Camera, look_at
+from gs2d.meshing import texture as baking
+from gs2d.meshing.agreement import agree
+from gs2d.meshing.raycast import cast_camera
+from gs2d.meshing.texture import ColorSource, bake
+from texture_shapes import Paint, flat_atlas, grid_plane, join, listed, photograph
+
+SIZE = 128
+
+
+def stripes(places: np.ndarray) -> np.ndarray:
+    """Fine waves on colours that change slowly."""
+    wave = np.sin(12 * places[:, :1]) * np.sin(10 * places[:, 1:2])
+    return np.asarray(0.45 + 0.12 * places * (1, -1, 0) + 0.15 * wave * (1.0, 0.8, 0.4))
+
+
+def cameras(count: int) -> list[Camera]:
+    """Cameras in a ring above the plane."""
+    found = []
+    for k in range(count):
+        angle = 2 * np.pi * k / count
+        eye = np.array([1.2 * np.cos(angle), 1.2 * np.sin(angle), 3.0])
+        found.append(look_at(eye, np.zeros(3), np.array([0.0, 1, 0]), width=SIZE, height=SIZE, fx=1.25 * SIZE))
+    return found
+
+
+def photographs(count: int, gains: tuple[float, ...] = (), paint: Paint = stripes) -> list[ColorSource]:
+    """The plane from each camera."""
+    plane, seen = grid_plane(16), cameras(count)
+    return [photograph(plane, camera, paint, gain) for camera, gain in zip(seen, gains or (1.0,) * count, strict=True)]
+
+
+def with_plate(image: ColorSource, height: float, color: tuple[int, int, int]) -> ColorSource:
+    """The same photograph with a plate before the plane that is not part of the mesh."""
+    plate = join([grid_plane(2, side=0.9)])
+    plate = type(plate)(plate.vertices + np.float32([0.2, 0.1, height]), plate.faces)
+    hidden = cast_camera(plate.vertices.astype(np.float64), plate.faces, image.camera).face >= 0
+    changed = image.image.copy()
+    changed[hidden, :3] = color
+    assert 0.02 < hidden.mean() < 0.6
+    return ColorSource(image.camera, changed)
+
+
+def errors(images: list[ColorSource], scale: float = 1.0) -> np.ndarray:
+    """Absolute errors [t, 3] of the texels, of 255, up to the rim of the plane."""
+    texture = bake(flat_atlas(grid_plane(16)), listed(images), SIZE, threads=1).mesh.texture
+    row, column = np.indices((SIZE, SIZE)).reshape(2, -1)
+    places = np.stack([(column + 0.5) / SIZE * 2 - 1, 1 - (row + 0.5) / SIZE * 2, np.zeros(SIZE * SIZE)], axis=1)
+    inner = np.abs(places).max(axis=1) < 0.95
+    return np.abs(texture.reshape(-1, 3)[inner] - 255 * scale * stripes(places[inner]))
+
+
+def test_an_obstacle_in_two_of_eight_photographs_is_not_painted_on_the_surface() -> None:
+    images = photographs(8)
+    clean = errors(images)
+    images[2] = with_plate(images[2], 1.0, (210, 190, 40))
+    images[3] = with_plate(images[3], 1.0, (200, 200, 60))
+    found = errors(images)
+    assert found.mean() < clean.mean() + 0.5
+    assert found.max() < clean.max() + 6
+
+
+def test_the_nearest_photograph_alone_does_not_decide() -> None:
+    images = photographs(6)
+    near = look_at(np.array([0, 0, 1.9]), np.zeros(3), np.array([0.0, 1, 0]), width=SIZE, height=SIZE, fx=1.25 * SIZE)
+    images.append(with_plate(photograph(grid_plane(16), near, stripes), 0.4, (30, 200, 30)))
+    assert errors(images).max() < 30
+
+
+def test_a_highlight_that_moves_with_the_camera_vanishes() -> None:
+    images = []
+    for image in photographs(8):
+        x, y = image.camera.center[:2] / 2
+
+        def shiny(places: np.ndarray, x: float = x, y: float = y) -> np.ndarray:
+            spot = np.exp(-((places[:, :1] - x) ** 2 + (places[:, 1:2] - y) ** 2) / 0.02)
+            return stripes(places) + 0.6 * spot
+
+        images.append(photograph(grid_plane(16), image.camera, shiny))
+    assert np.quantile(errors(images), 0.999) < 20  # of 150 in one photograph
+
+
+def test_exposures_are_levelled() -> None:
+    gains = (0.8, 1.0, 1.25, 0.9, 1.1, 1.0, 0.85, 1.2)
+    found = errors(photographs(8, gains), float(np.exp(np.mean(np.log(gains)))))
+    assert found.mean() < 3
+
+
+@pytest.mark.parametrize("halves", [False, True])
+def test_photographs_leave_no_seam_where_they_end(halves: bool) -> None:
+    """Each shows a part of the plane only, in an exposure of its own; a uniform wall shows every step."""
+    gains, images = (0.8, 1.2, 0.9, 1.15), []
+    wall = photographs(4, gains, lambda places: np.full_like(places, 0.5))
+    for k, image in enumerate(wall):
+        valid = np.ones((SIZE, SIZE), bool)
+        if halves:
+            (valid if k % 2 else valid.T)[:, : SIZE // 2 + 8 * k - 12] = False
+        images.append(ColorSource(image.camera, image.image, valid))
+    texture = bake(flat_atlas(grid_plane(16)), listed(images), SIZE, threads=1).mesh.texture[8:-8, 8:-8].astype(int)
+    assert max(np.abs(np.diff(texture, axis=k)).max() for k in (0, 1)) <= 2  # of 50 between photographs
+    assert np.ptp(texture) <= 8
+
+
+def test_the_table_of_samples_stays_within_its_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    images = photographs(6)
+    images[1] = with_plate(images[1], 1.0, (220, 40, 40))
+    whole = errors(images)
+    tables: list[int] = []
+    monkeypatch.setattr(
+        baking, "agree", lambda samples: tables.append(sum(t.nbytes for t in samples)) or agree(samples)
+    )
+    monkeypatch.setattr(baking, "TABLE_BYTES", 6 * 4 * 300)
+    thinned = errors(images)
+    assert 0 < tables[0] <= 6 * 4 * 300
+    assert thinned.mean() < whole.mean() + 2
+
+
+def test_gains_of_photographs_that_share_no_points_are_one() -> None:
+    samples = [np.zeros((40, 4), np.uint8) for _ in range(2)]
+    samples[0][:20] = (100, 100, 100, 255)
+    samples[1][20:] = (50, 50, 50, 255)
+    found = agree(samples)
+    np.testing.assert_allclose(found.gains, 1)
+    np.testing.assert_allclose(found.colors, np.repeat([[100.0] * 3, [50.0] * 3], 20, axis=0))
+    assert [int((s[:, 3] == 255).sum()) for s in samples] == [20, 20]
