@@ -14,7 +14,7 @@ from benchmarks.texture import image, psnr
 
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.errors import BackendError, DataError, DiskError, ProtocolError
-from gs2d.io.meshes import read_mesh, turn_to_y, write_textured
+from gs2d.io.meshes import read_mesh, read_textured, turn_to_y, write_textured
 from gs2d.meshing import texture as atlas_module
 from gs2d.meshing.texture import (
     FEATHER,
@@ -291,6 +291,18 @@ def test_other_programs_open_the_files_with_their_texture(tmp_path: Path, name: 
     top, bottom = loaded.vertices[:, 1] > 0.5, loaded.vertices[:, 1] < -0.5
     assert (colors[top] == (250, 0, 0)).all()
     assert (colors[bottom] == (0, 0, 250)).all()
+
+
+def test_a_textured_mesh_is_read_as_it_was_written(tmp_path: Path) -> None:
+    mesh = textured()
+    write_textured(tmp_path / "a.glb", mesh, up=np.array([0.0, 0, 1]))
+    read = read_textured(tmp_path / "a.glb")
+    for name in ("vertices", "normals", "faces", "uv", "texture"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(mesh, name))
+    data = (tmp_path / "a.glb").read_bytes()
+    (tmp_path / "a.glb").write_bytes(data[: len(data) // 2])
+    with pytest.raises(DataError, match="a.glb: a .glb file as"):
+        read_textured(tmp_path / "a.glb")
 
 
 def test_a_glb_file_is_what_the_format_says(tmp_path: Path) -> None:

@@ -18,8 +18,9 @@ from PIL import Image
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.json_files import write_json
-from gs2d.core.mesh import Mesh
+from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.errors import DataError, RunError, ShapeError
+from gs2d.io.meshes import write_textured
 from gs2d.report import images as report_images
 from gs2d.report import mesh_images as report_mesh
 from gs2d.report import write as report
@@ -376,6 +377,39 @@ def test_the_mesh_is_shaded_by_its_faces_and_coloured_by_its_vertices() -> None:
     assert shown.color is not None
     np.testing.assert_allclose(shown.color[10, 20], 0.2, atol=1e-6)
     np.testing.assert_allclose(shown.shape[10, 2], 1.0)  # beside it: white
+
+
+def square_with_texture() -> TexturedMesh:
+    """A square across the optical axis at depth 2: red on its left, green on its right half."""
+    vertices = np.array([[-1, -1, 2.0], [1, -1, 2.0], [1, 1, 2.0], [-1, 1, 2.0]], np.float32)
+    texture = np.zeros((8, 8, 3), np.uint8)
+    texture[:, :4, 0], texture[:, 4:, 1] = 255, 255
+    uv = (vertices[:, :2] + 1) / 2
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    return TexturedMesh(vertices, np.tile(np.float32([0, 0, -1]), (4, 1)), faces, uv, texture)
+
+
+def test_the_mesh_is_shown_with_its_texture() -> None:
+    textured = square_with_texture()
+    mesh = Mesh(textured.vertices, textured.faces)
+    camera = Camera(40, 20, 20.0, 20.0, 20.0, 10.0, np.eye(4))
+    color = report_mesh.mesh_images(mesh, [camera], textured, width=40)[0].color
+    assert color is not None
+    np.testing.assert_allclose(color[10, 14], [1, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(color[10, 25], [0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(color[10, 2], 1.0)  # beside it: white
+
+
+def test_the_report_shows_the_textured_mesh_beside_the_clay(tmp_path: Path) -> None:
+    run = fabricate(tmp_path / "run", size=16)
+    before = write_report(run).read_text()
+    write_textured(run / "mesh.glb", square_with_texture())
+    text = write_report(run).read_text()
+    assert "as clay and in its vertex colours" in text_of(before)
+    assert "as clay and with its texture" in text_of(text)
+    assert text.count("the mesh with its texture") >= 2
+    (run / "mesh.glb").write_bytes(b"not a mesh, of some length")
+    assert "a .glb file as `gs2d mesh --texture` writes it was expected" in text_of(write_report(run).read_text())
 
 
 def test_a_mesh_is_shaded_the_same_in_any_number_of_rows_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:

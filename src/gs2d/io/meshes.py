@@ -305,15 +305,48 @@ def glb_turn(data: bytes) -> list[float]:
     DataError
         It is no such file.
     """
-    try:
-        magic, _, _, length, kind = struct.unpack("<IIIII", data[:20])
-        if (magic, kind) != (_MAGIC, _JSON):
-            raise ValueError("another kind of file")
-        node = json.loads(data[20 : 20 + length])["nodes"][0]
+    with _own_glb():
+        node = _glb_parts(data)[0]["nodes"][0]
         return [float(q) for q in node.get("rotation", (0.0, 0.0, 0.0, 1.0))]
-    except (ValueError, KeyError, IndexError, TypeError, struct.error) as error:
+
+
+def read_textured(path: str | Path) -> TexturedMesh:
+    """Read a .glb file that ``write_glb`` wrote.
+
+    Raises
+    ------
+    DataError
+        The file is something else, or damaged.
+    """
+    with _own_glb(f"{path}: "):
+        document, binary = _glb_parts(Path(path).read_bytes())
+        parts = [binary[v["byteOffset"] : v["byteOffset"] + v["byteLength"]] for v in document["bufferViews"]]
+        vertices, normals, uv, faces, png = parts
+        return TexturedMesh(
+            np.frombuffer(vertices, "<f4").reshape(-1, 3),
+            np.frombuffer(normals, "<f4").reshape(-1, 3),
+            np.frombuffer(faces, "<u4").astype(np.int32).reshape(-1, 3),
+            np.frombuffer(uv, "<f4").reshape(-1, 2),
+            np.asarray(Image.open(io.BytesIO(png)).convert("RGB")),
+        )
+
+
+def _glb_parts(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """Return the JSON document and the buffer of a .glb file."""
+    magic, _, _, length, kind = struct.unpack("<IIIII", data[:20])
+    if (magic, kind) != (_MAGIC, _JSON):
+        raise ValueError("another kind of file")
+    return json.loads(data[20 : 20 + length]), data[28 + length :]
+
+
+@contextlib.contextmanager
+def _own_glb(name: str = "") -> Iterator[None]:
+    """Turn errors of a .glb file that was not written here into one line."""
+    try:
+        yield
+    except (ValueError, KeyError, IndexError, TypeError, OSError, struct.error) as error:
         raise DataError(
-            f"a .glb file as `gs2d mesh --texture` writes it was expected, got another ({error})"
+            f"{name}a .glb file as `gs2d mesh --texture` writes it was expected, got another ({error})"
         ) from error
 
 

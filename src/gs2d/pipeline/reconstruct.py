@@ -31,7 +31,6 @@ from gs2d.pipeline.options import (
 )
 from gs2d.pipeline.plan import PLACED, TEXTURED_TOO, TRAINED
 from gs2d.pipeline.quality import at_quality, quality_of
-from gs2d.pipeline.report import report_again
 from gs2d.pipeline.sfm import asked_for, check_poses_options, find_poses, placed_line
 from gs2d.pipeline.texture import PACKAGES as TEXTURE_PACKAGES
 from gs2d.pipeline.texture import texture_run
@@ -129,7 +128,6 @@ def train_found(options: ReconstructOptions, on_event: OnEvent) -> RunFolder:
             if not run.file(MESH).exists():
                 raise ProtocolError(f"there is no {MESH} to be given a texture")
             texture_run(run.path, on_event=on_event, threads=options.threads)
-        report_again(run, on_event)  # it links to it
     return run
 
 

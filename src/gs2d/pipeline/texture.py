@@ -38,6 +38,7 @@ from gs2d.pipeline.job import Job, read_scene
 from gs2d.pipeline.mesh import fused, mesh_run
 from gs2d.pipeline.options import MeshOptions, TextureOptions
 from gs2d.pipeline.placed import placed_output, placed_textured, say_where
+from gs2d.pipeline.report import report_again
 from gs2d.pipeline.subject import OPAQUE, meshed_subject
 from gs2d.render.api import rasterize
 
@@ -90,6 +91,8 @@ def texture_run(
         write_textured(target, baked.mesh, up=up)
     else:
         write_textured(target, placed_textured(baked.mesh, place), up=np.array([0.0, 0.0, 1.0]))
+    if target.resolve() == run.file(TEXTURED).resolve():
+        report_again(run, on_event)
     told = {} if place is None else say_where(target, place)
     return {
         "files": [str(file) for file in files],

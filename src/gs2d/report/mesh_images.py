@@ -9,8 +9,9 @@ from functools import partial
 import numpy as np
 
 from gs2d.core.camera import Camera, look_at
-from gs2d.core.mesh import Mesh
+from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.meshing.raycast import Hits, cast_camera
+from gs2d.meshing.texture import bilinear
 
 _CLAY = np.array([0.86, 0.86, 0.88])
 _LAMP = np.array([-0.45, -0.65, -1.0]) / np.linalg.norm([-0.45, -0.65, -1.0])  # camera axes: left, up, towards the eye
@@ -27,7 +28,7 @@ class MeshImage:
     shape : ndarray [H, W, 3] float32
         Clay, shaded by the normals of the faces.
     color : ndarray [H, W, 3] float32 or None
-        Vertex colours, unshaded; None where the mesh has none.
+        The texture or the vertex colours, unshaded; None where the mesh has neither.
     """
 
     shape: np.ndarray
@@ -49,14 +50,20 @@ def orbit_cameras(mesh: Mesh, *, count: int = 2, size: int = 420) -> tuple[Camer
     return tuple(cameras)
 
 
-def mesh_images(mesh: Mesh, cameras: Sequence[Camera], *, width: int = 420) -> list[MeshImage]:
-    """Render a mesh from each camera, resized to ``width`` px."""
+def mesh_images(
+    mesh: Mesh, cameras: Sequence[Camera], textured: TexturedMesh | None = None, *, width: int = 420
+) -> list[MeshImage]:
+    """Render a mesh from each camera, resized to ``width`` px, in colours of its textured copy if there is one."""
     images = []
     for camera in cameras:
         resized = camera.resized(width, max(round(width * camera.height / camera.width), 1))
         hits = cast_camera(mesh.vertices.astype(np.float64), mesh.faces, resized, samples=_SAMPLES)
         shape = _average(hits, partial(_clay, mesh, resized))
-        color = None if mesh.colors is None else _average(hits, partial(_vertex_colors, mesh))
+        if textured is not None:
+            seen = cast_camera(textured.vertices.astype(np.float64), textured.faces, resized, samples=_SAMPLES)
+            color = _average(seen, partial(_texture_colors, textured))
+        else:
+            color = None if mesh.colors is None else _average(hits, partial(_vertex_colors, mesh))
         images.append(MeshImage(shape, color))
     return images
 
@@ -86,6 +93,13 @@ def _vertex_colors(mesh: Mesh, hits: Hits, _top: int) -> np.ndarray:
     hit = hits.face >= 0
     corners = mesh.colors[mesh.faces[hits.face[hit]]].astype(np.float64) / 255  # [hits, 3, 3]
     return np.einsum("hk,hkc->hc", hits.weights[hit].astype(np.float64), corners)
+
+
+def _texture_colors(mesh: TexturedMesh, hits: Hits, _top: int) -> np.ndarray:
+    """Colours [hits, 3] of the texture in [0, 1]."""
+    hit = hits.face >= 0
+    uv = np.einsum("hk,hkc->hc", hits.weights[hit], mesh.uv[mesh.faces[hits.face[hit]]]) * len(mesh.texture)
+    return bilinear(mesh.texture, uv[:, 0], uv[:, 1]) / 255
 
 
 def _average(hits: Hits, paint: Callable[[Hits, int], np.ndarray]) -> np.ndarray:

@@ -14,8 +14,8 @@ from gs2d.core.camera import Camera
 from gs2d.core.images import composite, read_image
 from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
-from gs2d.io.meshes import read_mesh
-from gs2d.io.run_dir import RENDERS
+from gs2d.io.meshes import read_mesh, read_textured
+from gs2d.io.run_dir import RENDERS, TEXTURED
 from gs2d.report.html import Pair, missing, render
 from gs2d.report.images import ERROR_TOP, HIGHLIGHT, depth_scale, error_scale
 from gs2d.report.mesh_images import mesh_images, orbit_cameras
@@ -217,7 +217,7 @@ def _psnr_caption(image: np.ndarray, photo: np.ndarray | None) -> str:
 
 
 def mesh_section(path: Path, cameras: Sequence[Camera]) -> Markup:
-    """Return pictures of the mesh as clay and in its colours.
+    """Return pictures of the mesh as clay and in its colours: those of the textured mesh beside it, if there is one.
 
     Raises
     ------
@@ -233,11 +233,12 @@ def mesh_section(path: Path, cameras: Sequence[Camera]) -> Markup:
     if len(mesh.faces) > MAX_FACES:
         return missing(f"mesh.ply has {counts}: too many for a picture here (at most {MAX_FACES:,} faces).")
     chosen = tuple(cameras)[:3] or orbit_cameras(mesh)
+    textured = read_textured(path.with_name(TEXTURED)) if path.with_name(TEXTURED).is_file() else None
     where = "from cameras of the capture" if cameras else "from two sides, taking the third axis as up"
     return render(
         "mesh.html",
-        images=mesh_images(mesh, chosen),
+        images=mesh_images(mesh, chosen, textured),
         counts=counts,
-        has_colors=mesh.colors is not None,
+        coloring="with its texture" if textured else "in its vertex colours" if mesh.colors is not None else "",
         where=where,
     )
