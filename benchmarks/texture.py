@@ -9,6 +9,7 @@ texture and with its vertex colours, by the ray caster of the demo (2 x 2 rays p
 without test views leaves every N-th training view out of the baking (``--hold-out``). Prints means over these views:
 
 - PSNR of the whole image, and of the pixels that the mesh and the photograph's alpha channel, if any, cover entirely;
+- PSNR of those pixels after one gain per channel and image, which the exposure of the photograph does not change;
 - the median absolute error of those pixels, which obstacles in the photographs hardly change;
 - sharpness: the mean gradient of those pixels relative to the photograph's.
 
@@ -98,15 +99,19 @@ def compare(
             drawn, covered = image(mesh, view.camera, background)
             alpha = view.alpha()
             both = (covered == 1) & (alpha == 1 if alpha is not None else True)
+            level = drawn[both] * np.median(target[both], axis=0) / np.maximum(np.median(drawn[both], axis=0), 1e-6)
             error = float(np.median(np.abs(drawn[both] - target[both]))) * 255
             sharp = sharpness(drawn, both) / sharpness(target, both)
-            figures.append((psnr(drawn, target), psnr(drawn[both], target[both]), error, sharp))
+            figures.append(
+                (psnr(drawn, target), psnr(drawn[both], target[both]), psnr(level, target[both]), error, sharp)
+            )
             if pictures is not None:
                 write_image(pictures / f"{i:03d}-{name}.png", drawn)
                 write_image(pictures / f"{i:03d}-photograph.png", target)
-        whole, inside, error, sharp = np.mean(figures, axis=0)
+        whole, inside, levelled, error, sharp = np.mean(figures, axis=0)
         print(
-            f"{name:>16}: {whole:.2f} dB, {inside:.2f} dB where both cover a pixel, median error {error:.1f} of 255, "
+            f"{name:>16}: {whole:.2f} dB, {inside:.2f} dB where both cover a pixel, {levelled:.2f} dB after a gain, "
+            f"median error {error:.1f} of 255, "
             f"sharpness {sharp:.2f}"
         )
 

@@ -1,9 +1,13 @@
 """The colours of a texture: for every texel, a mean of the few photographs that see its point of the surface best.
 
+All photographs are compared first (``agreement``): each is brought to the colours that most photographs agree on, and
+its scores fall where it shows something else, such as an obstacle.
+
 A photograph with focal lengths f_x, f_y that sees the point at depth z, along the ray r, on a surface of unit normal n,
 has q = f_x f_y |n . r| / z^3 pixels per unit of surface (the Jacobian of the projection): the cosine and the resolution
-in one number. Its score is s = q b, where b falls from 1 to 0.01 over the last ``FEATHER`` pixels before an outline, a
-border of the image or of its mask. The ``best`` + 1 highest scores of a texel are kept, and its colour is
+in one number. Its score is s = q b a, where b falls from 1 to 0.01 over the last ``FEATHER`` pixels before an outline,
+a border of the image or of its mask, and a falls to 0.001 where the photograph disagrees with the others. The highest
+``best`` + 1 scores of a texel are kept, and its colour is
 
     sum_v w_v c_v / sum_v w_v,    w_v = s_v - (the lowest of them)
 
