@@ -59,11 +59,12 @@ def mesh_images(
         resized = camera.resized(width, max(round(width * camera.height / camera.width), 1))
         hits = cast_camera(mesh.vertices.astype(np.float64), mesh.faces, resized, samples=_SAMPLES)
         shape = _average(hits, partial(_clay, mesh, resized))
+        color = None
         if textured is not None:
             seen = cast_camera(textured.vertices.astype(np.float64), textured.faces, resized, samples=_SAMPLES)
             color = _average(seen, partial(_texture_colors, textured))
-        else:
-            color = None if mesh.colors is None else _average(hits, partial(_vertex_colors, mesh))
+        elif mesh.colors is not None:
+            color = _average(hits, partial(_vertex_colors, mesh))
         images.append(MeshImage(shape, color))
     return images
 
