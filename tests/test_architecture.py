@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ast
+import functools
 import graphlib
 import importlib
 import os
 import subprocess
 import sys
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
@@ -86,34 +88,40 @@ def module_of(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def imports_of(path: Path) -> list[str]:
-    """Every gs2d module that a file imports, lazily or not; typing-only imports count too."""
-    found = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            found += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}: relative import; write the full name"
-            found += [f"{node.module}.{alias.name}" for alias in node.names]
-    return [name for name in found if name == "gs2d" or name.startswith("gs2d.")]
-
-
 MODULES = {module_of(path): path for path in FILES}
 
 
-@pytest.mark.parametrize("path", FILES, ids=module_of)
-def test_imports_only_go_down(path: Path) -> None:
-    here = module_of(path)
-    own = unit(here)
-    if own in ("", "__main__"):
-        return  # gs2d/__init__.py exports lazily from every floor
-    assert own in FLOORS, f"{here}: give the new room {own!r} a floor in docs/architecture.md and here"
-    for imported in imports_of(path):
-        other = unit(imported)
-        if other in ("", own, "__version__"):
-            continue
-        assert other in FLOORS, f"{here} imports {imported}, which has no floor"
-        assert FLOORS[other] < FLOORS[own], f"{here} (floor {FLOORS[own]}) imports {imported}"
+@functools.cache
+def nodes_of(module: str) -> list[ast.AST]:
+    return list(ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))))
+
+
+@functools.cache
+def imports_of(module: str) -> list[str]:
+    """Return every gs2d module that a module imports, lazily or not; typing-only imports count too."""
+    found = []
+    for node in nodes_of(module):
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            found += [f"{'.' * node.level}{node.module or ''}.{alias.name}" for alias in node.names]
+    return [name for name in found if name == "gs2d" or name.startswith(("gs2d.", "."))]
+
+
+def test_imports_only_go_down() -> None:
+    assert set(map(unit, MODULES)) - {"", "__main__"} == set(FLOORS), "a package lacks its layer, or the reverse"
+    wrong = []
+    for module in MODULES:
+        own = unit(module)
+        if own in ("", "__main__"):
+            continue  # gs2d/__init__.py exports lazily from every layer
+        for imported in imports_of(module):
+            other = unit(imported)
+            if other not in ("", own, "__version__") and not FLOORS.get(other, 99) < FLOORS[own]:
+                wrong.append(f"{module} imports {imported}")
+            if imported.startswith("."):
+                wrong.append(f"{module} imports {imported}: write the full name")
+    assert not wrong
 
 
 def module_meant(imported: str) -> str:
@@ -132,7 +140,7 @@ def import_graph() -> dict[str, set[str]]:
     to the modules that it exports from; ``from gs2d.data.scene import Scene`` is no edge to it. That of gs2d itself
     exports lazily from every floor, so that its own imports do not count.
     """
-    graph = {module: {module_meant(name) for name in imports_of(path)} for module, path in MODULES.items()}
+    graph = {module: set(map(module_meant, imports_of(module))) for module in MODULES}
     return graph | {"gs2d": set()}
 
 
@@ -158,69 +166,72 @@ def test_inside_a_room_imports_go_down_too(room: str) -> None:
         "__init__",
         "__pycache__",
     }
-    for module, path in MODULES.items():
+    wrong = []
+    for module in MODULES:
         if unit(module) != room or module == f"gs2d.{room}":
             continue
         own = module.split(".")[2]
-        for imported in imports_of(path):
+        for imported in imports_of(module):
             other = imported.split(".")[2] if unit(imported) == room else own
-            if other in floors and other != own:
-                assert floors[other] < floors[own], f"{module} imports {imported}"
+            if other in floors and other != own and not floors[other] < floors[own]:
+                wrong.append(f"{module} imports {imported}")
+    assert not wrong
 
 
-@pytest.mark.parametrize("path", FILES, ids=module_of)
-def test_outside_of_render_nothing_asks_which_backend_it_has(path: Path) -> None:
+def test_outside_of_render_nothing_asks_which_backend_it_has() -> None:
     """What differs between processors is the matter of ``Backend``: no comparison with its name, no table by it."""
-    if unit(module_of(path)) == "render":
-        return
 
     def is_name(node: ast.AST) -> bool:
         return isinstance(node, ast.Attribute) and node.attr == "name" and "backend" in ast.unparse(node.value).lower()
 
-    where = module_of(path)
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    def asks(node: ast.AST) -> bool:
         if isinstance(node, ast.Compare):
-            compared = any(map(is_name, [node.left, *node.comparators]))
-            assert not compared, f"{where}: line {node.lineno} compares a backend's name"
+            return any(map(is_name, [node.left, *node.comparators]))
         if isinstance(node, ast.Subscript):
-            assert not is_name(node.slice), f"{where}: line {node.lineno} looks something up by a backend's name"
+            return is_name(node.slice)
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "get":
-            assert not any(map(is_name, node.args)), f"{where}: line {node.lineno} looks up a backend's name"
-        if isinstance(node, ast.alias):
-            assert not node.name.startswith(("gs2d.render.cuda", "gs2d.render.pair_budget")), f"imports {node.name}"
+            return any(map(is_name, node.args))
+        return isinstance(node, ast.alias) and node.name.startswith(("gs2d.render.cuda", "gs2d.render.pair_budget"))
+
+    assert asks(ast.parse("job.backend.name == 'cpu'", mode="eval").body)
+    outside = [module for module in MODULES if unit(module) != "render"]
+    assert not lines_where(asks, outside)
 
 
-@pytest.mark.parametrize("path", FILES, ids=module_of)
-def test_files_have_one_subject_and_no_more_lines_than_that_takes(path: Path) -> None:
-    assert len(path.read_text(encoding="utf-8").splitlines()) <= MAX_LINES
+def test_files_have_one_subject_and_no_more_lines_than_that_takes() -> None:
+    lines = {module: len(path.read_text(encoding="utf-8").splitlines()) for module, path in MODULES.items()}
+    assert not {module: count for module, count in lines.items() if count > MAX_LINES}
 
 
-@pytest.mark.parametrize("path", FILES, ids=module_of)
-def test_only_the_command_line_prints(path: Path) -> None:
-    if unit(module_of(path)) == "cli":
-        return
-    calls = [node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
-    prints = [call.lineno for call in calls if isinstance(call.func, ast.Name) and call.func.id == "print"]
-    assert not prints, f"print at lines {prints}"
+def lines_where(is_wrong: Callable[[ast.AST], bool], modules: Iterable[str]) -> list[str]:
+    """Return MODULE:LINE of each node that is wrong."""
+    return [f"{name}:{getattr(node, 'lineno', 0)}" for name in modules for node in nodes_of(name) if is_wrong(node)]
 
 
-@pytest.mark.parametrize("path", FILES, ids=module_of)
-def test_no_bare_or_silent_except(path: Path) -> None:
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ExceptHandler):
-            assert node.type is not None, f"bare except at line {node.lineno}"
-            broad = isinstance(node.type, ast.Name) and node.type.id in ("Exception", "BaseException")
-            silent = all(isinstance(statement, ast.Pass) for statement in node.body)
-            assert not (broad and silent), f"silent except at line {node.lineno}"
+def test_only_the_command_line_prints() -> None:
+    def prints(node: ast.AST) -> bool:
+        return isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
+
+    assert lines_where(prints, MODULES)
+    assert not lines_where(prints, [module for module in MODULES if unit(module) != "cli"])
 
 
-@pytest.mark.parametrize("path", FILES, ids=module_of)
-def test_declared_names_exist(path: Path) -> None:
-    module = importlib.import_module(module_of(path))
-    names = getattr(module, "__all__", [])
-    assert len(names) == len(set(names))
-    for name in names:
-        assert hasattr(module, name), f"{module.__name__}.__all__ names {name!r}"
+def test_no_bare_or_silent_except() -> None:
+    def is_wrong(node: ast.AST) -> bool:
+        if not isinstance(node, ast.ExceptHandler):
+            return False
+        broad = isinstance(node.type, ast.Name) and node.type.id in ("Exception", "BaseException")
+        return node.type is None or (broad and all(isinstance(statement, ast.Pass) for statement in node.body))
+
+    assert not lines_where(is_wrong, MODULES)
+
+
+def test_declared_names_exist() -> None:
+    for name in MODULES:
+        module = importlib.import_module(name)
+        names = getattr(module, "__all__", [])
+        assert len(names) == len(set(names)), name
+        assert not [each for each in names if not hasattr(module, each)], name
 
 
 def test_the_package_exports_exactly_what_can_be_imported() -> None:
@@ -245,9 +256,12 @@ def run_python(code: str) -> None:
 LIGHT = ["gs2d", "gs2d.errors", "gs2d.core.checks", *(module for module in MODULES if unit(module) == "config")]
 
 
-@pytest.mark.parametrize("module", LIGHT)
-def test_recipes_and_protocols_import_without_torch(module: str) -> None:
-    run_python(f"import sys, {module}; assert 'torch' not in sys.modules, 'torch was imported'")
+def test_recipes_and_protocols_import_without_torch() -> None:
+    code = (
+        "import importlib, sys\n"
+        f"for name in {LIGHT!r}: importlib.import_module(name); assert 'torch' not in sys.modules, name\n"
+    )
+    run_python(code)
 
 
 def test_importing_a_module_has_no_side_effect_on_torch() -> None:

@@ -1,4 +1,4 @@
-"""Ten seconds of mutated inputs of every family, always from the same first one, and every input that was a finding.
+"""Two seconds of mutated inputs of every family, always from the same first one, and every input that was a finding.
 
 ``GS2D_FUZZ_SECONDS=0`` throws no more than so many as are needed to see that some are refused. ``make fuzz`` throws
 new ones for an hour a family; what it finds goes into ``findings/FAMILY/`` as the changed file alone (``drive.py
@@ -30,7 +30,7 @@ from gs2d.io.formats import usd  # noqa: E402
 COUNTS = dict.fromkeys(FAMILIES, 60) | {"run-files": 12, "zip": 40, "dtu": 30, "obj-stl-off": 40, "rasterize": 20}
 COUNTS |= {"tables": 12, "run-found": 100}
 READ = {"rasterize", "searches"}  # whatever they get: the one draws it, the others begin anew
-SECONDS = float(os.environ.get("GS2D_FUZZ_SECONDS", "10"))  # a family, at least
+SECONDS = float(os.environ.get("GS2D_FUZZ_SECONDS", "2"))  # a family, at least
 FINDINGS = sorted(path for path in (HERE / "findings").rglob("*") if path.is_file())
 
 
