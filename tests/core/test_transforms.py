@@ -75,8 +75,8 @@ def test_a_moved_camera_turns_about_its_own_centre_and_moves_along_its_own_axes(
 
 
 def test_a_motion_of_another_size_is_refused() -> None:
-    with pytest.raises(ShapeError, match=r"motion must be \[6\], got \[1, 6\]"):
-        se3_exp(torch.zeros(1, 6))
+    with pytest.raises(ShapeError, match=r"motion must be \[\.\.\., 6\], .*, got \[6, 1\]"):
+        se3_exp(torch.zeros(6, 1))
 
 
 def test_nearest_distances_are_the_rms_to_the_three_nearest_others() -> None:

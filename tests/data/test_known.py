@@ -136,7 +136,7 @@ def test_the_depth_of_unknown_pixels_is_not_fused(use_masks: bool) -> None:
         backend=get_backend("reference"),
         protocol=SimpleNamespace(use_mask_in_fusion=use_masks, fusion=SimpleNamespace(subject=False)),
     )
-    frame = next(iter(surface._frames(job, splat, "median", ignore)))
+    frame = next(iter(surface._frames(job, splat, "median", ignore, whole=True)))
     assert frame.valid is not None
     assert frame.valid[:, 4:].any()
     assert not frame.valid[:, :4].any()
