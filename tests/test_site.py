@@ -72,14 +72,16 @@ def test_the_parts_of_the_site_are_the_headings_of_its_contents() -> None:
     assert "/docs/decisions/libraries\n" in "".join(navigation.toctrees("docs/decisions/README.md"))
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_links_to_headings_lead_to_headings(page: str) -> None:
-    text = re.sub(r"^```.*?^```$", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.M | re.S)
-    for target, anchor in re.findall(r"\]\(([^)#\s]*)#([^)\s]+)\)", text):
-        if "://" not in target and (not target or target.endswith(".md")):
-            goal = (ROOT / page).parent.joinpath(target).resolve() if target else ROOT / page
-            found = headings(goal.relative_to(ROOT).as_posix())
-            assert anchor in found, f"{page} links to {target}#{anchor}; there are {sorted(found)}"
+def test_links_to_headings_lead_to_headings() -> None:
+    dead = []
+    for page in PAGES:
+        text = re.sub(r"^```.*?^```$", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.M | re.S)
+        for target, anchor in re.findall(r"\]\(([^)#\s]*)#([^)\s]+)\)", text):
+            if "://" not in target and (not target or target.endswith(".md")):
+                goal = (ROOT / page).parent.joinpath(target).resolve() if target else ROOT / page
+                if anchor not in headings(goal.relative_to(ROOT).as_posix()):
+                    dead.append(f"{page} links to {target}#{anchor}")
+    assert not dead
 
 
 def test_every_picture_is_on_a_page() -> None:
