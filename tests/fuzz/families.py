@@ -161,8 +161,10 @@ def read_splats_everywhere(root: Path) -> None:
     (path,) = (p for p in root.iterdir() if p.is_file())
     describe_file(path)
     read_splat_file(path)
-    read_surfels(path)
-    disks = read_splats(path)
+    notes: list[str] = []
+    read_surfels(path, notes.append)
+    disks = read_splats(path, notes.append)
+    assert not [note for note in notes if "\n" in note]
     for layout in ("2dgs", "3dgs", "compressed", "spz", "splat"):
         write_layout(root / f"out{LAYOUTS.get(layout).ending}", disks, layout)
 
@@ -214,7 +216,7 @@ def read_usd_once(root: Path) -> None:
 
     (path,) = (p for p in root.iterdir() if p.is_file())
     with mock.patch.object(usd, "_read_apart", _usd_server().read):
-        read_surfels(path)
+        read_surfels(path, lambda _: None)
 
 
 def _gltf_text(root: Path) -> None:
