@@ -161,7 +161,7 @@ def test_a_file_of_splats_is_exported_too(trained: Path, tmp_path: Path, capsys:
     assert run(["export", str(spz), "--out", str(spz)]) == 2
     assert "is the file that is read" in capsys.readouterr().err
     assert run(["info", str(trained / "run.json")]) == 2
-    assert "got a file of a capture; give its folder" in capsys.readouterr().err
+    assert f"got another file; give the run folder {trained}" in capsys.readouterr().err
 
 
 def test_the_splats_of_a_file_are_drawn_and_meshed_with_the_cameras_of_a_run(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from gs2d.core.missing import instead
+from gs2d.core.missing import belongs_to_run, instead
 from gs2d.data import detect_format, load_scene
 from gs2d.data.archive import is_archive, unpacked_for_a_moment
 from gs2d.data.benchmarks import missing_lines
@@ -59,9 +59,8 @@ def describe_file(path: Path) -> dict[str, Any]:
         The file is none of these, or is broken.
     """
     if path.suffix.lower() in _OF_CAPTURES and not is_splat_file(path):
-        raise DataError(
-            f"{path}: a file of splats, a mesh or points was expected, got another file{instead(path, 'capture')}"
-        )
+        remedy = instead(path, "run" if belongs_to_run(path) else "capture")
+        raise DataError(f"{path}: a file of splats, a mesh or points was expected, got another file{remedy}")
     size = path.stat().st_size
     place = georeference_of_file(path)
     return {
