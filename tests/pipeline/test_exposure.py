@@ -169,7 +169,7 @@ def test_the_texture_takes_photographs_in_the_exposure_of_the_scene(run: RunFold
     _, job, splats = open_job(run.path, 1, ignore)
     transforms = read_exposures(run, job.recipe)
     views = job.scene.train[:2]
-    for view, image in zip(views, _images(job, views, splats, TextureOptions(), transforms, ignore), strict=True):
+    for view, image in zip(views, _images(job, views, splats, TextureOptions(), transforms, ignore, 1), strict=True):
         A, b = np.split(transforms[view.name].double().numpy(), [3], axis=1)
         inside = view.image()[..., 3] > 0
         expected = 255 * np.clip((view.image()[inside][:, :3] / 255 - b[:, 0]) @ np.linalg.inv(A).T, 0, 1)

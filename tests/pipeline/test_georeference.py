@@ -209,7 +209,7 @@ def test_remove_and_show(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
         (["--gps", "--epsg", "32632", "--enu"], "contradict"),
         (["--known-distance", *"0 0 0 0 0 0 1".split()], "two different points"),
         (["--known-distance", *"0 0 0 1 0 0 -1".split()], "positive distance"),
-        (["--positions", "no-such.csv"], "cannot read"),
+        (["--positions", "no-such.csv"], "expected a file at no-such.csv"),
         (["--control", "control.csv"], "has no photograph of that name|no photograph of"),
         (["--markers", "0"], "positive number"),
         (["--up", "0", "0", "0", "--gps"], "--up must be a direction"),
@@ -336,7 +336,7 @@ def test_no_georeference_and_no_file_to_write_are_one_line(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["export", str(run), "--out", str(tmp_path / "a.ply"), "--georeferenced"]
-    assert "--georeferenced needs to know" in error_of(words, capsys)
+    assert "position in the world of" in error_of(words, capsys)
     assert not (tmp_path / "a.ply").exists()
     placed(run)
     assert "needs --out" in error_of(["mesh", str(run), "--georeferenced"], capsys)
