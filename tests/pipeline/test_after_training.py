@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -35,6 +36,7 @@ LATER = {  # of a training, with what is missing then
     "train.write_verdict": "verdict.json",
     "train.report_run": "report.html",
 }
+ERRORS = (DataError("the points are gone"), ZeroDivisionError("a fault"))
 
 
 def failing(error: Exception) -> Callable[..., Any]:
@@ -54,8 +56,7 @@ def trained(undisturbed: RunFolder, tmp_path: Path) -> Path:
     return copy.path
 
 
-@pytest.mark.parametrize("place", LATER)
-@pytest.mark.parametrize("error", [DataError("the points are gone"), ZeroDivisionError("a fault")], ids=["data", "any"])
+@pytest.mark.parametrize(("place", "error"), list(zip(LATER, itertools.cycle(ERRORS), strict=False)))
 def test_a_step_that_fails_after_training_is_named_and_costs_no_splats(
     place: str,
     error: Exception,
