@@ -169,7 +169,9 @@ def test_without_pycolmap_the_extra_is_named_before_anything_is_read(
     monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
     with pytest.raises(BackendError):
         check_installed()
-    assert run(["poses", str(tmp_path / "none"), "--out", str(tmp_path / "out")]) == 2
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "broken.jpg").write_bytes(b"x")
+    assert run(["poses", str(tmp_path / "photos"), "--out", str(tmp_path / "out")]) == 2
     assert "pip install 'pycolmap>=" in one_line(capsys.readouterr().err)
 
 
