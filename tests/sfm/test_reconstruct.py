@@ -146,11 +146,7 @@ def a_capture(photos: Path) -> None:
         (nothing, [], "must hold 3 or more photographs, got none"),
         (lambda photos: write_room(photos, 1), [], "must hold 3 or more photographs, got 1 photographs"),
         (a_capture, [], "must hold photographs alone, got cameras too (blender): gs2d train"),
-        (
-            lambda photos: (photos / "a.heic").write_bytes(b"x"),
-            [],
-            "LGPL code), or convert them to JPEG",
-        ),
+        (lambda photos: (photos / "a.heic").write_bytes(b"x"), [], "LGPL code), or convert them to JPEG"),
         (lambda photos: write_room(photos, 3), ["--schedule-scale", "0"], "schedule"),
         (lambda photos: write_room(photos, 3), ["--downscale", "0"], "--downscale must be a whole number >= 1, got 0"),
         (lambda photos: write_room(photos, 3), ["--test-every", "1"], "--test-every must be 0"),
