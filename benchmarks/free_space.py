@@ -40,7 +40,7 @@ def look(scene: Scene, repeat: int) -> tuple[int, list[float], int]:
             taken = []
             for _ in range(repeat):
                 begun = time.process_time()
-                inside = maps.inside(splats)
+                inside = maps.against(splats)
                 taken.append(time.process_time() - begun)
             found.append(inside)
             seconds.append(min(taken))

@@ -16,12 +16,11 @@ from gs2d.config.presets import (
     SILHOUETTE,
     SQUARES,
     get_recipe,
-    with_fading_backdrop,
     with_few_views,
     with_robustness,
 )
 from gs2d.config.recipe import GradDensify, LearningRates, Recipe, validate
-from gs2d.config.robust import BackgroundSphere, DenseStart, FreeSpace
+from gs2d.config.robust import BackgroundSphere, DenseStart, Removal
 from gs2d.config.schedule import longer_steps, scale_schedule
 from gs2d.config.serialize import apply_overrides, from_json, to_json
 from gs2d.errors import RecipeError
@@ -158,8 +157,9 @@ def test_robust_training_starts_as_it_was_tried_and_spares_sky_and_ground() -> N
     assert isinstance(stage.densify, GradDensify)
     assert not any(stage.densify.culls_scale(i) for i in range(1, stage.iterations + 1))
     assert with_robustness(get_recipe("2dgs")).stages == get_recipe("2dgs").stages
-    own = replace(get_recipe("2dgs-dense"), free_space=FreeSpace())
+    own = replace(get_recipe("2dgs-dense"), removal=Removal(every=20))
     assert with_robustness(own).dense_start == own.dense_start
+    assert with_robustness(own).removal == own.removal
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -167,15 +167,3 @@ def test_normal_consistency_is_asked_of_the_object_alone(name: str) -> None:
     terms = [term for stage in get_recipe(name).stages for term in stage.losses if term.kind == "normal_consistency"]
     assert terms
     assert all(term.where == "object" for term in terms)
-
-
-def test_the_backdrop_fades_only_where_opacity_decays_and_no_rate_was_chosen() -> None:
-    plain, robust = get_recipe("best"), with_robustness(get_recipe("best"))
-    assert robust.opacity_decay is not None
-    assert with_fading_backdrop(plain) == plain
-    fading = with_fading_backdrop(robust).opacity_decay
-    assert fading is not None
-    assert fading.backdrop_rate is not None
-    assert fading.backdrop_rate > fading.rate
-    own = replace(robust, opacity_decay=replace(robust.opacity_decay, backdrop_rate=0.0))
-    assert with_fading_backdrop(own) == own

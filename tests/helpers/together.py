@@ -24,7 +24,7 @@ from gs2d.config.densify import Densify
 from gs2d.config.presets import two_dgs, with_robustness
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Exposure, PoseRefinement, Recipe
-from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea, SplatDropout
+from gs2d.config.robust import DenseStart, Removal
 from gs2d.config.schedule import scale_schedule
 from gs2d.core.processes import Place
 from gs2d.errors import Gs2dError
@@ -112,15 +112,14 @@ def cached() -> Recipe:
 
 def dropping() -> Recipe:
     """Splats are left out of iterations, and views compared with their neighbours."""
-    return replace(compared(), dropout=SplatDropout(rate=0.3))
+    return replace(compared(), removal=Removal(every=1_000, decay=0.0, dropout=0.3))
 
 
 def robust() -> Recipe:
-    """15 iterations on a wall: a dense start, free space looked at in the tenth, seen area and decay in each fifth."""
+    """15 iterations on a wall: a dense start, and floaters removed."""
     made = scale_schedule(with_robustness(two_dgs()), 0.0005)
     start = DenseStart(side=48, planes=32, min_angle=1.0, cell=3.0)
-    decay, area = OpacityDecay(rate=0.1, every=5, least=0.02), SeenArea(times=3)
-    made = replace(made, dense_start=start, free_space=FreeSpace(every=10), opacity_decay=decay, seen_area=area)
+    made = replace(made, dense_start=start, removal=Removal(every=5, decay=0.1))
     return replace(made, stages=(replace(made.stages[0], densify=None),), sh_degree=1)
 
 

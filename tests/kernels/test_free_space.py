@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gs2d.config.robust import DenseStart, FreeSpace
+from gs2d.config.robust import DenseStart
 from gs2d.core.splats import Splats
 from gs2d.kernels import free_space as native
 from gs2d.training import free_space
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("native")
 
 @pytest.fixture(scope="module")
 def maps() -> FreeSpaceMaps:
-    return FreeSpaceMaps(sweep_views(wall(), DenseStart(side=48, planes=16, min_angle=1.0)), FreeSpace())
+    return FreeSpaceMaps(sweep_views(wall(), DenseStart(side=48, planes=16, min_angle=1.0)))
 
 
 def scattered(count: int, seed: int = 0) -> Splats:
@@ -52,10 +52,10 @@ def test_it_counts_what_torch_counts(maps: FreeSpaceMaps, monkeypatch: pytest.Mo
     for ours, theirs in zip(found, true, strict=True):
         assert int((ours != theirs).sum()) <= 10  # places on the border of two pixels
         assert int((ours - theirs).abs().max()) <= 1
-    inside = maps.inside(splats)
+    inside = maps.against(splats)
     monkeypatch.setattr(free_space, "look_at_free_space", lambda *_, **__: False)
-    assert int((maps.inside(splats) != inside).sum()) <= 10
-    assert 0 < int(inside.sum()) < len(splats)
+    assert int((maps.against(splats) != inside).sum()) <= 10
+    assert 0 < int((inside > 0).sum()) < len(splats)
 
 
 def test_places_that_are_no_numbers_or_very_far_are_nowhere(maps: FreeSpaceMaps) -> None:

@@ -17,7 +17,7 @@ from gs2d.cli.app import run as main
 from gs2d.config.densify import Densify
 from gs2d.config.presets import get_recipe
 from gs2d.config.recipe import Stage
-from gs2d.config.robust import FreeSpace, SeenArea
+from gs2d.config.robust import Removal
 from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import apply_overrides
 from gs2d.core import memory_limit
@@ -218,8 +218,8 @@ def test_what_a_splat_adds_is_told_apart_for_those_that_are_seen_and_those_that_
 def test_looks_of_robust_training_are_counted_as_training_makes_them() -> None:
     recipe = scale_schedule(get_recipe("best"), 0.01)
     assert looks_of(recipe) == (0, 0)
-    looking = replace(recipe, free_space=FreeSpace(every=50), seen_area=SeenArea(times=3))
-    assert looks_of(looking) == (sum(stage.iterations // 50 for stage in recipe.stages), 3 * len(recipe.stages))
+    looking = replace(recipe, removal=Removal(every=50))
+    assert looks_of(looking) == (sum(stage.iterations // 50 for stage in recipe.stages), 5 * len(recipe.stages))
 
 
 def test_the_plan_of_a_robust_training_takes_longer_by_its_looks(
@@ -229,7 +229,7 @@ def test_the_plan_of_a_robust_training_takes_longer_by_its_looks(
     monkeypatch.setattr(capture_plan, "probe", lambda *_: tried)
     seconds = {}
     for robust in ("on", "off"):
-        overrides = () if robust == "on" else ("free_space=null", "seen_area=null")
+        overrides = () if robust == "on" else ("removal=null",)
         found = plan(planned(capture, recipe="best", overrides=overrides))
         seconds[robust] = found.seconds.expected
     recipe_looks = seconds["on"] - seconds["off"]

@@ -12,17 +12,11 @@ import pytest
 import torch
 
 from gs2d.config.presets import (
-    SH_FASTER,
-    get_recipe,
-    with_fading_backdrop,
-    with_few_views,
     with_robustness,
-    without_optional_losses,
-    without_squares,
 )
 from gs2d.config.protocols import DTU, GENERIC
 from gs2d.config.recipe import LearningRates
-from gs2d.config.robust import FEW_VIEWS, SplatDropout
+from gs2d.config.robust import Removal
 from gs2d.config.serialize import to_json
 from gs2d.core.camera import look_at
 from gs2d.data.priors import ObservedPoints
@@ -33,7 +27,7 @@ from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.job import fit_recipe, reload_job, settled
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.predicted_exposure import metered, with_predicted
-from gs2d.pipeline.same_run import as_begun, check_same_run
+from gs2d.pipeline.same_run import check_same_run
 from gs2d.render.api import rasterize
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
@@ -99,7 +93,7 @@ def test_training_is_robust_where_protocol_and_capture_allow_it(
     asked: dict[str, object], scene: Scene, protocol: object, robust: bool, exposure: bool
 ) -> None:
     recipe = fit_recipe(options(**asked), scene, protocol, lambda _: None)  # type: ignore[arg-type]
-    for part in (recipe.dense_start, recipe.free_space, recipe.opacity_decay):
+    for part in (recipe.dense_start, recipe.removal):
         assert (part is not None) == robust
     assert (recipe.exposure is not None) == exposure
     assert (recipe.stages[0].lr.sh0 > LearningRates().sh0) == robust  # a tenth of the schedule: longer steps
@@ -124,17 +118,17 @@ def test_what_was_decided_is_said() -> None:
     ]
     guessed = replace(EQUAL, observe=lambda: replace(EQUAL.observe(), guessed="no tracks"))  # type: ignore[misc]
     said.clear()
-    assert fit_recipe(options(), guessed, GENERIC, said.append).free_space is not None
+    assert fit_recipe(options(), guessed, GENERIC, said.append).removal is not None
     assert said == [Notice("sparse points are projected into the images: no tracks")]
     with pytest.raises(DataError, match="ring must say which sparse points .* train with --robust off"):
         settled(options(robust="on"), EMPTY, GENERIC, said.append)
 
 
 def test_a_part_can_be_left_out_or_changed_by_its_name() -> None:
-    recipe = fit_recipe(options(overrides=("dense_start=null", "free_space.nearer=0.8")), EQUAL, GENERIC, print)
+    recipe = fit_recipe(options(overrides=("dense_start=null", "removal.every=70")), EQUAL, GENERIC, print)
     assert recipe.dense_start is None
-    assert recipe.free_space is not None
-    assert recipe.free_space.nearer == 0.8
+    assert recipe.removal is not None
+    assert recipe.removal.every == 70
 
 
 def test_an_unknown_word_is_refused() -> None:
@@ -224,119 +218,35 @@ def test_another_robustness_is_refused_by_the_name_of_its_option(undisturbed: Ru
         check_same_run(undisturbed, replace(job, recipe=with_robustness(job.recipe)))
 
 
-def test_a_run_of_before_seen_area_and_dropout_goes_on_as_it_began(undisturbed: RunFolder, tmp_path: Path) -> None:
+def test_another_removal_makes_another_stage_and_another_run(undisturbed: RunFolder, tmp_path: Path) -> None:
     run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
     job = reload_job(run, lambda _: None)
     robust = replace(job, recipe=with_robustness(job.recipe))
+    none = replace(robust, recipe=replace(robust.recipe, removal=None))
+    more = replace(robust, recipe=replace(robust.recipe, removal=Removal(dropout=0.3)))
+    assert len({one.stage_key(0) for one in (robust, none, more)}) == 3
     data = json.loads(run.file("run.json").read_text())
     data["recipe"] = to_json(robust.recipe)
     run.file("run.json").write_text(json.dumps(data))
-    assert as_begun(run, robust).recipe == robust.recipe
-    del data["recipe"]["dropout"]
-    run.file("run.json").write_text(json.dumps(data))
-    assert as_begun(run, robust).recipe == replace(robust.recipe, dropout=None)
-    del data["recipe"]["seen_area"]
-    run.file("run.json").write_text(json.dumps(data))
-    assert as_begun(run, robust).recipe == replace(robust.recipe, seen_area=None, dropout=None)
+    with pytest.raises(RunError, match=r"made with another recipe \(removal.dropout: 0.1, now 0.3"):
+        check_same_run(run, more)
+    check_same_run(run, robust)
 
 
-def test_a_run_of_before_the_sphere_goes_on_as_it_began(undisturbed: RunFolder, tmp_path: Path) -> None:
-    run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
-    job = reload_job(run, lambda _: None)
-    robust = with_robustness(job.recipe)
-    assert robust.dense_start is not None
-    assert robust.dense_start.sphere is not None
-    before = replace(robust, dense_start=replace(robust.dense_start, sphere=None))
-    data = json.loads(run.file("run.json").read_text())
-    data["recipe"] = to_json(before)
-    run.file("run.json").write_text(json.dumps(data))
-    assert as_begun(run, replace(job, recipe=robust)).recipe == before
-    data["recipe"] = to_json(robust)
-    run.file("run.json").write_text(json.dumps(data))
-    assert as_begun(run, replace(job, recipe=robust)).recipe == robust
-
-
-def test_a_run_of_before_alpha_was_compared_or_squares_counted_goes_on_as_it_began(
-    undisturbed: RunFolder, tmp_path: Path
+@pytest.mark.parametrize(("brightness", "proposed"), [(1.0, False), (0.1, True)])
+def test_splats_in_the_colour_of_an_unlit_backdrop_are_proposed_and_those_of_a_white_floor_are_not(
+    brightness: float, proposed: bool
 ) -> None:
-    run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
-    job, recipe = reload_job(run, lambda _: None), get_recipe("best")
-    with_alpha = without_squares(recipe)
-    before = without_optional_losses(with_alpha)
-    losses = [(term.kind, term.weight) for term in before.stages[0].losses]
-    assert losses == [("l1", 0.8), ("ssim", 0.2), ("normal_consistency", 0.02)]
-    data = json.loads(run.file("run.json").read_text())
-    few = with_few_views(recipe)  # has no L2 either
-    for begun, now in [*((r, recipe) for r in (before, with_alpha, recipe)), (few, few)]:
-        data["recipe"] = to_json(begun)
-        run.file("run.json").write_text(json.dumps(data))
-        assert as_begun(run, replace(job, recipe=now)).recipe == begun
-
-
-def test_dropout_makes_another_stage_and_another_run(undisturbed: RunFolder, tmp_path: Path) -> None:
-    run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
-    job = reload_job(run, lambda _: None)
-    robust = replace(job, recipe=with_robustness(job.recipe))
-    none = replace(robust, recipe=replace(robust.recipe, dropout=None))
-    more = replace(robust, recipe=replace(robust.recipe, dropout=SplatDropout(rate=0.3)))
-    assert len({one.stage_key(0) for one in (robust, none, more)}) == 3
-    data = json.loads(run.file("run.json").read_text())
-    data["recipe"] = to_json(none.recipe)  # begun with dropout=null: that is said, not lacking
-    run.file("run.json").write_text(json.dumps(data))
-    for other in (robust, more):
-        with pytest.raises(RunError, match=r"made with another recipe \(dropout: None, now"):
-            check_same_run(run, as_begun(run, other))
-    check_same_run(run, as_begun(run, none))
-
-
-def test_a_run_of_before_backdrops_faded_goes_on_as_it_began(undisturbed: RunFolder, tmp_path: Path) -> None:
-    run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
-    job = reload_job(run, lambda _: None)
-    begun = with_robustness(job.recipe)
-    data = json.loads(run.file("run.json").read_text())
-    data["recipe"] = to_json(begun)  # as it was written before there was such a rate
-    run.file("run.json").write_text(json.dumps(data))
-    fading = with_fading_backdrop(begun)
-    assert fading != begun
-    assert as_begun(run, replace(job, recipe=fading)).recipe == begun
-    assert begun.opacity_decay is not None
-    own = replace(begun, opacity_decay=replace(begun.opacity_decay, backdrop_rate=0.2))
-    assert as_begun(run, replace(job, recipe=own)).recipe == own  # asked for: another run, which is refused
-    data["recipe"] = to_json(fading)
-    run.file("run.json").write_text(json.dumps(data))
-    assert as_begun(run, replace(job, recipe=fading)).recipe == fading
-
-
-@pytest.mark.parametrize(
-    ("overrides", "varied", "rate", "said"),
-    [
-        ((), False, 0.3, True),
-        ((), True, None, False),
-        (("opacity_decay.backdrop_rate=0.01",), False, 0.01, False),
-        (("opacity_decay.backdrop_rate=0.2",), True, 0.2, True),
-    ],
-)
-def test_splats_of_an_even_backdrop_fade_and_that_is_said(
-    overrides: tuple[str, ...], varied: bool, rate: float | None, said: bool
-) -> None:
-    scene = ring(np.linspace(0.4, 1.6, COUNT) if varied else np.ones(COUNT))
     heard: list[Event] = []
-    recipe, protocol = settled(options(overrides=overrides), scene, GENERIC, heard.append)
-    assert recipe.opacity_decay is not None
-    assert recipe.opacity_decay.backdrop_rate == rate
-    assert protocol.background == pytest.approx((0.5, 0.5, 0.5), abs=0.02 if not varied else 0.1)
+    recipe, protocol = settled(options(), ring(np.full(COUNT, brightness)), GENERIC, heard.append)
+    assert recipe.removal is not None
+    assert recipe.removal.backdrop == proposed
+    assert protocol.background == pytest.approx((0.5 * brightness,) * 3, abs=0.02)
     (line,) = [event.text for event in heard if isinstance(event, Notice) and event.text.startswith("background")]
-    assert line.endswith("splats of that colour fade") == said
+    assert ("are removed" in line) == proposed
 
 
-@pytest.mark.parametrize(("views", "times"), [(FEW_VIEWS, 1.0), (FEW_VIEWS + 1, SH_FASTER)])
-@pytest.mark.parametrize("robust", ["on", "off"])
-def test_few_photographs_teach_colours_by_direction_slowly(views: int, times: float, robust: str) -> None:
-    heard: list[Event] = []
-    asked = options(recipe="best", robust=robust)
-    (stage,) = settled(asked, ring(np.ones(views)), GENERIC, heard.append)[0].stages
-    assert stage.lr.shN == pytest.approx(times * stage.lr.sh0 / 20)
-    said = [event.text for event in heard if isinstance(event, Notice) and "SH beyond" in event.text]
-    few = "24 training photographs: SH beyond degree 0 learn as in 2DGS, not faster, and L2 is left out"
-    assert said == [few] * (times == 1.0)
-    assert any(term.kind == "l2" for term in stage.losses) == (times != 1.0)
+def test_a_backdrop_of_many_colours_is_none() -> None:
+    recipe, _ = settled(options(), ring(np.linspace(0.0, 1.6, COUNT)), GENERIC, lambda _: None)
+    assert recipe.removal is not None
+    assert not recipe.removal.backdrop

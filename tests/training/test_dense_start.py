@@ -12,7 +12,7 @@ import torch
 from gs2d.config.presets import two_dgs
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe, validate
-from gs2d.config.robust import DenseStart, FreeSpace, StartFit
+from gs2d.config.robust import DenseStart, Removal, StartFit
 from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import from_json, to_json
 from gs2d.core.camera import look_at
@@ -140,7 +140,7 @@ def test_sparse_points_are_a_start_where_no_photographs_can_be_compared() -> Non
 
 def test_free_space_still_needs_sparse_points() -> None:
     with pytest.raises(DataError, match="must say which sparse points .* for free space"):
-        Trainer(ball(), replace(recipe(BALL), free_space=FreeSpace()), GENERIC, backend="reference")
+        Trainer(ball(), replace(recipe(BALL), removal=Removal()), GENERIC, backend="reference")
 
 
 # -- how splats are fitted ------------------------------------------------------------------------------------------

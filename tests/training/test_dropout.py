@@ -10,31 +10,30 @@ import torch
 from gs2d.config.presets import best, two_dgs, two_dgs_r, with_robustness
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe, validate
-from gs2d.config.robust import SplatDropout
-from gs2d.core.splats import Splats
+from gs2d.config.robust import FEW_VIEWS, Removal
 from gs2d.errors import RecipeError
 from gs2d.render.api import rasterize
 from gs2d.training.dropout import dropout_rate, dropped_out, kept_splats
 from gs2d.training.trainer import Trainer
-from train_toys import make_scene, same, short
+from train_toys import make_scene, short
 
 
-def dropping(rate: float, max_views: int = 24) -> Recipe:
-    return replace(short(), dropout=SplatDropout(rate, max_views))
+def dropping(rate: float) -> Recipe:
+    return replace(short(), removal=Removal(dropout=rate))
 
 
 def test_robust_recipes_have_it_and_the_paper_s_have_not() -> None:
-    assert two_dgs_r().dropout is None
-    assert best().dropout is None
-    assert with_robustness(two_dgs()).dropout == SplatDropout()
-    own = replace(two_dgs(), dropout=SplatDropout(rate=0.3))
-    assert with_robustness(own).dropout == SplatDropout(rate=0.3)
+    assert two_dgs_r().removal is None
+    assert best().removal is None
+    assert with_robustness(two_dgs()).removal == Removal()
+    own = replace(two_dgs(), removal=Removal(dropout=0.3))
+    assert with_robustness(own).removal == Removal(dropout=0.3)
 
 
 def test_only_stages_that_train_all_of_geometry_and_opacity_drop_splats_and_only_of_few_views() -> None:
-    recipe = replace(two_dgs_r(), dropout=SplatDropout(rate=0.2, max_views=24))
-    assert [dropout_rate(recipe, stage, 24) for stage in recipe.stages] == [0.2, 0.0, 0.0]
-    assert dropout_rate(recipe, recipe.stages[0], 25) == 0
+    recipe = replace(two_dgs_r(), removal=Removal(dropout=0.2))
+    assert [dropout_rate(recipe, stage, FEW_VIEWS) for stage in recipe.stages] == [0.2, 0.0, 0.0]
+    assert dropout_rate(recipe, recipe.stages[0], FEW_VIEWS + 1) == 0
     assert dropout_rate(two_dgs_r(), recipe.stages[0], 3) == 0
 
 
@@ -68,19 +67,7 @@ def test_those_that_are_left_out_are_not_drawn_and_learn_nothing() -> None:
     assert gradient[kept].any()
 
 
-def test_training_with_it_differs_and_without_few_views_it_is_as_if_there_were_none() -> None:
-    scene = make_scene()
-
-    def trained(recipe: Recipe) -> Splats:
-        return Trainer(scene, recipe, GENERIC, backend="cpu").run()
-
-    plain = trained(short())
-    assert same(trained(dropping(0.2, max_views=len(scene.train) - 1)), plain)
-    assert same(trained(dropping(0.0)), plain)
-    assert not same(trained(dropping(0.2)), plain)
-
-
-@pytest.mark.parametrize(("settings", "what"), [(SplatDropout(1.0), "rate"), (SplatDropout(0.1, 0), "max_views")])
-def test_a_bad_value_is_named(settings: SplatDropout, what: str) -> None:
-    with pytest.raises(RecipeError, match=f"dropout.{what} must be"):
-        validate(replace(short(), dropout=settings))
+@pytest.mark.parametrize("rate", [1.0, -0.1])
+def test_a_bad_rate_is_named(rate: float) -> None:
+    with pytest.raises(RecipeError, match=r"removal.dropout must be"):
+        validate(dropping(rate))

@@ -32,7 +32,7 @@ def test_resuming_from_any_event_gives_the_same_bytes(scene: Scene, absgs: bool)
         on_event=lambda event: kept.append((event, saved(trainer))),
     )
     end = trainer.run()
-    robust = {events.FreeSpacePruned, events.UnseenPruned}  # of robust recipes alone: test_robust
+    robust = {events.FloatersRemoved}  # of robust recipes alone: test_robust
     assert {type(event) for event, _ in kept} == set(events.Event.__args__) - robust  # type: ignore[attr-defined]
     for event, data in kept[:: 1 if backend == "cpu" else 5]:
         resumed = Trainer(scene, short(absgs), GENERIC, backend=backend, state=reload(data))

@@ -13,13 +13,14 @@ from fake_backends import lacking
 from gs2d.config.presets import refine, surface, two_dgs, with_exposure, with_robustness
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe, validate
-from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea, StartFit
+from gs2d.config.robust import DenseStart, Removal, StartFit
 from gs2d.config.schedule import scale_schedule
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.sh import rgb_to_sh0
 from gs2d.core.splats import Splats
 from gs2d.data.scene import PointCloud, View
 from gs2d.errors import DataError, RecipeError
+from gs2d.render.api import rasterize
 from gs2d.render.backends import PLAIN, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events
@@ -31,6 +32,7 @@ from gs2d.training.point_gains import point_gains
 from gs2d.training.robust import Robustness
 from gs2d.training.seen_area import inside_fraction, mostly_unseen, shown_weights, shrunk, whole_weights
 from gs2d.training.trainer import Trainer
+from gs2d.training.trial import Witness, missed
 from train_toys import full_state, make_scene, random_splats
 from wall_scene import HEIGHT, WALL, WIDTH, wall
 
@@ -136,69 +138,150 @@ def test_at_most_so_many_photographs_are_swept() -> None:
 # -- free space -----------------------------------------------------------------------------------------------------
 @pytest.fixture
 def maps() -> FreeSpaceMaps:
-    return FreeSpaceMaps(swept_wall(), FreeSpace())  # type: ignore[arg-type]
+    return FreeSpaceMaps(swept_wall())  # type: ignore[arg-type]
 
 
 def test_splats_before_the_wall_are_in_free_space_and_those_on_it_or_behind_are_not(maps: FreeSpaceMaps) -> None:
     splats = splat_at((0.5, 0, 2.0), (0.5, 0, 0.97 * WALL), (0.5, 0, WALL), (0.5, 0, 6.0), (0.5, 0, -2.0))
-    assert maps.inside(splats).tolist() == [True, False, False, False, False]
+    assert (maps.against(splats) > 0).tolist() == [True, False, False, False, False]
 
 
 def test_before_what_is_not_known_only_what_is_nearer_than_anything_known_is_free(maps: FreeSpaceMaps) -> None:
     # Nearest known depth 4, floor 0.8 of it, free below 0.9 of that: 2.88; the bare part is at x < -1.2.
     splats = splat_at((-1.6, 0, 3.3), (-1.6, 0, 2.0))
-    assert maps.inside(splats).tolist() == [False, True]
+    assert (maps.against(splats) > 0).tolist() == [False, True]
 
 
-def test_a_ball_around_each_camera_is_free_also_behind_it(maps: FreeSpaceMaps) -> None:
+def test_a_ball_around_each_camera_is_free_also_behind_it(maps: FreeSpaceMaps, monkeypatch: pytest.MonkeyPatch) -> None:
     # Radius 0.5 x 0.8 x 4 = 1.6.
-    assert maps.inside(splat_at((0.0, 0, -1.0), (0.0, 0, -1.9))).tolist() == [True, False]
-    without = FreeSpaceMaps(swept_wall(), FreeSpace(ball=0.0))  # type: ignore[arg-type]
-    assert without.inside(splat_at((0.0, 0, -1.0))).tolist() == [False]
+    assert (maps.against(splat_at((0.0, 0, -1.0), (0.0, 0, -1.9))) > 0).tolist() == [True, False]
+    monkeypatch.setattr("gs2d.training.free_space.BALL", 0.0)
+    without = FreeSpaceMaps(swept_wall())  # type: ignore[arg-type]
+    assert without.against(splat_at((0.0, 0, -1.0))).tolist() == [0]
 
 
-def test_a_large_splat_is_looked_at_by_its_ends_too() -> None:
-    beside = (4.5, 0.0, 3.2)  # out of every picture; its left end, 3 world units away, is before the wall
+def test_a_large_splat_is_looked_at_by_its_ends_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    beside = (4.5, 0.0, 3.2)  # out of every image; its left end, 3 world units away, is before the wall
     large, small = splat_at(beside, scale=3.0), splat_at(beside)
-    maps = FreeSpaceMaps(swept_wall(), FreeSpace(ball=0.0))  # type: ignore[arg-type]
-    assert maps.inside(small).tolist() == [False]
-    assert maps.inside(large).tolist() == [True]
-    by_centre = FreeSpaceMaps(swept_wall(), FreeSpace(ball=0.0, spread=0.0))  # type: ignore[arg-type]
-    assert by_centre.inside(large).tolist() == [False]
+    monkeypatch.setattr("gs2d.training.free_space.BALL", 0.0)
+    maps = FreeSpaceMaps(swept_wall())  # type: ignore[arg-type]
+    assert maps.against(small).tolist() == [0]
+    assert maps.against(large).item() > 0
 
 
-def test_so_many_photographs_must_say_so() -> None:
-    seen_by_all, seen_by_few = (0.2, 0.0, 2.0), (2.1, 0.0, 3.0)
-    settings = FreeSpace(ball=0.0, views=5)
-    maps = FreeSpaceMaps(swept_wall(), settings)  # type: ignore[arg-type]
-    assert maps.inside(splat_at(seen_by_all, seen_by_few)).tolist() == [True, False]
-    one = FreeSpaceMaps(swept_wall(), replace(settings, views=1))  # type: ignore[arg-type]
-    assert one.inside(splat_at(seen_by_all, seen_by_few)).tolist() == [True, True]
+def test_the_images_that_see_through_a_splat_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gs2d.training.free_space.BALL", 0.0)
+    maps = FreeSpaceMaps(swept_wall())  # type: ignore[arg-type]
+    all_of_them, some = maps.against(splat_at((0.2, 0.0, 2.0), (2.1, 0.0, 3.0))).tolist()
+    assert all_of_them == len(wall().train)
+    assert 0 < some < all_of_them
+
+
+# -- the trial ------------------------------------------------------------------------------------------------------
+def wall_of_splats() -> tuple[Splats, list[Witness]]:
+    """A grid of grey splats on a wall of their colour, which five cameras see, and the images that show it."""
+    x, y = torch.meshgrid(torch.linspace(-2, 2, 9), torch.linspace(-1.5, 1.5, 7), indexing="ij")
+    places = [(float(a), float(b), WALL) for a, b in zip(x.flatten(), y.flatten(), strict=True)]
+    splats = splat_at(*places, scale=0.35)
+    splats.opacity_logits[:] = 4.0
+    splats.sh0[:] = rgb_to_sh0(torch.tensor([[0.6, 0.5, 0.4]]))
+    splats.shN[:] = 0
+    witnesses = []
+    for camera in cameras_of_the_wall():
+        color = rasterize(splats, camera, RASTER, backend=BACKEND).color.detach()
+        witnesses.append(Witness(camera, color, torch.ones(color.shape[:2], dtype=torch.bool), None))
+    return splats, witnesses
+
+
+def with_fog(splats: Splats, place: tuple[float, float, float]) -> Splats:
+    """The splats, and in the last row a dark one before a camera."""
+    fog = splat_at(place, scale=0.1)
+    fog.opacity_logits[:] = 2.0
+    fog.sh0[:] = rgb_to_sh0(torch.tensor([[0.1, 0.1, 0.1]]))
+    fog.shN[:] = 0
+    return Splats(**{name: torch.cat([tensor, getattr(fog, name)]) for name, tensor in splats.items()})
+
+
+def test_what_the_images_miss_stays_though_depths_speak_against_it() -> None:
+    """A mirror: one of five depth maps sees through the middle of the wall, and all five images show it."""
+    splats, witnesses = wall_of_splats()
+    middle = (splats.means[:, :2].norm(dim=1) < 0.6).to(torch.int32)
+    assert missed(splats, middle, witnesses, RASTER, BACKEND).tolist() == (middle > 0).tolist()
+    assert not missed(splats, 6 * middle, witnesses, RASTER, BACKEND).any()  # more than there are images
+    assert not missed(splats, 0 * middle, witnesses, RASTER, BACKEND).any()
+
+
+def test_fog_that_one_image_was_trained_with_goes() -> None:
+    splats, witnesses = wall_of_splats()
+    place = tuple(witnesses[0].camera.center + np.array([0.0, 0.0, 1.0]))
+    foggy = with_fog(splats, place)  # type: ignore[arg-type]
+    color = rasterize(foggy, witnesses[0].camera, RASTER, backend=BACKEND).color.detach()
+    assert not torch.allclose(color, witnesses[0].color, atol=0.1)
+    learned = [replace(witnesses[0], color=color), *witnesses[1:]]  # that image shows the fog, no other
+    against = torch.zeros(len(foggy), dtype=torch.int32)
+    against[-1] = 1
+    assert not missed(foggy, against, learned, RASTER, BACKEND).any()
+
+
+def test_pixels_that_do_not_count_miss_nothing_and_exposures_are_applied() -> None:
+    splats, witnesses = wall_of_splats()
+    against = torch.ones(len(splats), dtype=torch.int32)
+    masked = [replace(one, usable=torch.zeros_like(one.usable)) for one in witnesses]
+    assert not missed(splats, against, masked, RASTER, BACKEND).any()
+    half = torch.eye(3, 4) * 0.5
+    darker = [replace(one, color=0.5 * one.color, exposure=half) for one in witnesses]
+    as_before = missed(splats, against, witnesses, RASTER, BACKEND)
+    assert as_before.any()
+    assert torch.equal(missed(splats, against, darker, RASTER, BACKEND), as_before)
 
 
 # -- in training ----------------------------------------------------------------------------------------------------
 def short(**changes: object) -> Recipe:
     made = scale_schedule(with_robustness(two_dgs()), 0.0005)  # 15 iterations
     stage = replace(made.stages[0], densify=None)
-    made = replace(made, stages=(stage,), sh_degree=1, free_space=FreeSpace(every=10), dense_start=SMALL)
+    made = replace(made, stages=(stage,), sh_degree=1, removal=Removal(every=10), dense_start=SMALL)
     return replace(made, **changes)  # type: ignore[arg-type]
 
 
-def test_fog_is_pruned_at_every_turn_and_said() -> None:
+def test_floaters_are_removed_at_every_turn_and_that_is_an_event() -> None:
     happened: list[object] = []
     trainer = Trainer(wall(), short(), GENERIC, backend="auto", on_event=happened.append)
     trainer.enter(0)
     assert isinstance(happened[0], events.Initialised)
     assert happened[0].source == "sweep"
-    trainer.state.splats.means[:7] = torch.tensor([0.5, 0.0, 1.8])
-    before = len(trainer.splats)
-    for _ in range(9):
-        trainer.step()
-    assert len(trainer.splats) == before
     trainer.step()
-    pruned = [event for event in happened if isinstance(event, events.FreeSpacePruned)]
-    assert [(event.iteration, event.pruned >= 7) for event in pruned] == [(10, True)]
-    assert len(trainer.splats) == pruned[0].splats == before - pruned[0].pruned
+    trainer.step()
+    trainer.state.splats.means[:7] = torch.tensor([0.5, 0.0, 1.8])
+    trainer.state.splats.sh0[:7] = 2.0
+    before = len(trainer.splats)
+    trainer.step()  # a fifth of 15 iterations ends
+    (removed,) = [event for event in happened if isinstance(event, events.FloatersRemoved)]
+    assert removed.iteration == 3
+    assert removed.removed >= 7
+    assert len(trainer.splats) == removed.splats == before - removed.removed
+    assert not ((trainer.splats.means - torch.tensor([0.5, 0.0, 1.8])).norm(dim=1) < 0.1).any()
+
+
+def test_few_new_proposals_wait_for_the_end_of_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[int] = []
+    monkeypatch.setattr(
+        "gs2d.training.robust.missed",
+        lambda splats, against, *_, **__: tried.append(int((against > 0).sum())) or against > 0,
+    )
+    recipe = short(removal=Removal(every=1))
+    robust, stage = Robustness(wall(), recipe, RASTER, BACKEND), recipe.stages[0]
+    state = full_state(1000)
+    state.splats.means[:] = torch.tensor([0.5, 0.0, WALL])
+    state.splats.means[0] = torch.tensor([0.5, 0.0, 1.8])
+    assert robust.remove(state, stage, 1) == []
+    assert tried == []  # 1 of 1,000
+    state.splats.means[:3] = torch.tensor([0.5, 0.0, 1.8])
+    robust.remove(state, stage, 1)
+    robust.remove(state, stage, 2)
+    assert tried == [3]  # they were missed, and are not tried again
+    assert state.groups["missed"].sum() == 3
+    robust.remove(state, stage, 3)
+    assert tried == [3, 3]  # but at the end of a fifth
 
 
 def test_a_resumed_run_starts_from_the_same_places_and_ends_with_the_same_bits() -> None:
@@ -220,7 +303,7 @@ def test_a_capture_without_observations_is_refused_in_one_line() -> None:
 def test_a_scene_of_fog_alone_is_left_as_it_is() -> None:
     robust, state = Robustness(wall(), short(), RASTER, BACKEND), full_state(4)
     state.splats.means[:] = torch.tensor([0.5, 0.0, 1.8])
-    assert robust.prune(state, short().stages[0], 10) == []
+    assert robust.remove(state, short().stages[0], 10) == []
     assert len(state.splats) == 4
 
 
@@ -255,21 +338,17 @@ def test_large_splats_of_which_only_a_border_is_photographed_are_found() -> None
     behind = (0.2, 2 * WALL, 1.0, 1.0, 0.99)
     before = (0.2, WALL, 4.0, 4.0, 0.99)
     splats = walls_of(before, beside, behind)
-    found = mostly_unseen(splats, cameras_of_the_wall(), SeenArea(), RASTER, BACKEND)
+    found = mostly_unseen(splats, cameras_of_the_wall(), RASTER, BACKEND)
     assert found.tolist() == [False, True, False]  # what is behind another hides nothing
-    strict = mostly_unseen(splats, cameras_of_the_wall(), SeenArea(inside=1.1), RASTER, BACKEND)
-    assert strict.tolist() == [False, True, True]
-    lenient = mostly_unseen(splats, cameras_of_the_wall(), SeenArea(least=1e-6), RASTER, BACKEND)
-    assert not lenient.any()
 
 
-def test_one_photograph_that_shows_a_splat_is_enough_and_small_ones_stay() -> None:
+def test_one_photograph_that_shows_a_splat_is_enough_and_small_ones_stay(monkeypatch: pytest.MonkeyPatch) -> None:
     cameras = cameras_of_the_wall()
     beside = walls_of((9.0, WALL, 3.0, 3.0, 0.99))
-    assert mostly_unseen(beside, cameras, SeenArea(), RASTER, BACKEND).tolist() == [True]
-    assert mostly_unseen(beside, [*cameras, aside()], SeenArea(), RASTER, BACKEND).tolist() == [False]
-    small = SeenArea(size=20.0)
-    assert mostly_unseen(beside, cameras, small, RASTER, BACKEND).tolist() == [False]
+    assert mostly_unseen(beside, cameras, RASTER, BACKEND).tolist() == [True]
+    assert mostly_unseen(beside, [*cameras, aside()], RASTER, BACKEND).tolist() == [False]
+    monkeypatch.setattr("gs2d.training.seen_area.LARGE", 20.0)
+    assert mostly_unseen(beside, cameras, RASTER, BACKEND).tolist() == [False]
 
 
 def test_what_lies_within_the_pictures_is_counted_over_all_of_them() -> None:
@@ -289,49 +368,51 @@ def test_small_pictures_are_looked_at() -> None:
     assert (shrunk(camera, 200).width, shrunk(camera, 200).fx) == (WIDTH, camera.fx)
 
 
-def test_what_is_hardly_photographed_is_pruned_so_many_times_a_stage_and_said() -> None:
-    recipe = short(dense_start=None, free_space=None, opacity_decay=None, seen_area=SeenArea(times=3))
+def test_what_is_hardly_photographed_is_proposed_at_the_end_of_each_fifth() -> None:
+    recipe = short(dense_start=SMALL)
     robust, stage = Robustness(wall(), recipe, RASTER, BACKEND), recipe.stages[0]
-    due = [n for n in range(1, stage.iterations + 1) if robust.prunes(stage, n)]
-    assert due == [5, 10, 15]
+    due = [n for n in range(1, stage.iterations + 1) if robust.removes(stage, n)]
+    assert due == [3, 6, 9, 10, 12, 15]
     state = full_state(2)
     for (_, mine), (_, made) in zip(state.splats.items(), walls_of((0, WALL, 1, 1, 0.9), (9, WALL, 3, 3, 0.9)).items(),
                                     strict=True):  # fmt: skip
         mine.copy_(made[:, : mine.shape[1]] if mine.dim() > 1 else made)
-    assert robust.prune(state, stage, 4) == []
-    assert robust.prune(state, stage, 5) == [events.UnseenPruned(stage.name, 5, 1, 1)]
+    assert robust.remove(state, stage, 4) == []
+    assert robust.remove(state, stage, 6) == [events.FloatersRemoved(stage.name, 6, 1, 1)]
     assert state.splats.means[0, 0] == 0
-    assert not any(robust.prunes(refine(), n) for n in range(1, 20))
+    assert not any(robust.removes(refine(), n) for n in range(1, 20))
 
 
 # -- opacity decay --------------------------------------------------------------------------------------------------
-def test_opacity_decays_by_its_rate_every_so_many_iterations_and_not_below_the_least() -> None:
-    recipe = short(dense_start=None, free_space=None, opacity_decay=OpacityDecay(rate=0.1, every=5, least=0.02))
-    robust, state = Robustness(make_scene(), recipe, RASTER, BACKEND), full_state(4)
-    state.splats.opacity_logits[:] = torch.logit(torch.tensor([0.9, 0.5, 0.021, 0.01]))
-    robust.decay(state, recipe.stages[0], 4, PLAIN)
-    assert state.splats.opacities == pytest.approx(torch.tensor([0.9, 0.5, 0.021, 0.01]), abs=1e-6)
-    robust.decay(state, recipe.stages[0], 5, lacking(1))
-    assert state.splats.opacities == pytest.approx(torch.tensor([0.9, 0.5, 0.021, 0.01]), abs=1e-6)
-    robust.decay(state, recipe.stages[0], 5, lacking(0))
-    assert state.splats.opacities == pytest.approx(torch.tensor([0.81, 0.45, 0.02, 0.01]), abs=1e-6)
+def test_opacity_decays_by_its_rate_every_ten_iterations_and_not_below_the_least() -> None:
+    recipe = short(dense_start=None, removal=Removal(decay=0.1))
+    robust, state = Robustness(wall(), recipe, RASTER, BACKEND), full_state(4)
+    state.splats.opacity_logits[:] = torch.logit(torch.tensor([0.9, 0.5, 0.0051, 0.001]))
+    state.splats.sh0[:] = 1.0  # not in the colour of the background
+    robust.decay(state, recipe.stages[0], 9, PLAIN)
+    assert state.splats.opacities == pytest.approx(torch.tensor([0.9, 0.5, 0.0051, 0.001]), abs=1e-6)
+    robust.decay(state, recipe.stages[0], 10, lacking(1))
+    assert state.splats.opacities == pytest.approx(torch.tensor([0.9, 0.5, 0.0051, 0.001]), abs=1e-6)
+    robust.decay(state, recipe.stages[0], 10, lacking(0))
+    assert state.splats.opacities == pytest.approx(torch.tensor([0.81, 0.45, 0.005, 0.001]), abs=1e-6)
 
 
-def test_what_has_the_colour_behind_everything_decays_faster() -> None:
-    decay = OpacityDecay(rate=0.1, every=1, backdrop_rate=0.5, backdrop_within=0.1)
-    recipe = short(dense_start=None, free_space=None, opacity_decay=decay)
+def test_what_has_the_colour_of_the_background_does_not_decay() -> None:
+    """No image would ask for it again: a white floor before a white background would become transparent."""
+    recipe = short(dense_start=None, removal=Removal(decay=0.1))
     raster = RasterSettings(background=(0.2, 0.6, 1.0))
-    robust, state = Robustness(make_scene(), recipe, raster, BACKEND), full_state(4)
+    robust, state = Robustness(wall(), recipe, raster, BACKEND), full_state(3)
     state.splats.opacity_logits[:] = torch.logit(torch.tensor([0.8]))
-    colours = [[0.2, 0.6, 1.0], [0.29, 0.51, 1.09], [0.2, 0.6, 1.11], [0.0, 0.0, 0.0]]  # one channel too far is other
+    colours = [[0.2, 0.6, 1.0], [0.25, 0.55, 1.05], [0.2, 0.6, 1.07]]  # one channel too far is another colour
     state.splats.sh0[:] = rgb_to_sh0(torch.tensor(colours))
-    robust.decay(state, recipe.stages[0], 1, PLAIN)
-    assert state.splats.opacities == pytest.approx(torch.tensor([0.4, 0.4, 0.72, 0.72]), abs=1e-6)
+    robust.decay(state, recipe.stages[0], 10, PLAIN)
+    assert state.splats.opacities == pytest.approx(torch.tensor([0.8, 0.8, 0.72]), abs=1e-6)
 
 
 def test_frozen_opacity_does_not_decay() -> None:
-    recipe = short(dense_start=None, free_space=None)
-    robust, state = Robustness(make_scene(), recipe, RASTER, BACKEND), full_state(4)
+    recipe = short(dense_start=None)
+    robust, state = Robustness(wall(), recipe, RASTER, BACKEND), full_state(4)
+    state.splats.sh0[:] = 1.0
     before = state.splats.opacity_logits.clone()
     robust.decay(state, refine(), 10, PLAIN)
     assert torch.equal(state.splats.opacity_logits, before)
@@ -359,7 +440,7 @@ def test_a_capture_without_observations_says_nothing_of_gains() -> None:
 def test_exposures_begin_with_the_gains_of_points_where_the_recipe_says_so() -> None:
     scene = wall((0.7, 0.85, 1.0, 0.9, 0.8))
     for initial, spread in (("points", 0.11), ("identity", 0.0)):
-        recipe = with_exposure(short(dense_start=None, free_space=None))
+        recipe = with_exposure(short(dense_start=None, removal=None))
         assert recipe.exposure is not None
         recipe = replace(recipe, exposure=replace(recipe.exposure, initial=initial))
         trainer = Trainer(scene, recipe, GENERIC, backend="auto")
@@ -374,14 +455,16 @@ def test_the_backdrop_is_the_colour_of_what_shows_no_sparse_points() -> None:
     assert found.color == pytest.approx((0.5, 0.5, 0.5), abs=0.02)
 
 
-@pytest.mark.parametrize(("most", "even"), [(0, True), (200, False)])
-def test_a_backdrop_is_even_where_nearly_all_that_is_bare_has_one_colour(most: int, even: bool) -> None:
-    shades = np.linspace(0, most, HEIGHT).astype(np.uint8)[:, None, None]
+@pytest.mark.parametrize(("base", "most", "unlit"), [(0, 0, True), (0, 200, False), (60, 0, False)])
+def test_a_backdrop_is_unlit_where_nearly_all_that_is_bare_has_one_dark_colour(
+    base: int, most: int, unlit: bool
+) -> None:
+    shades = (base + np.linspace(0, most, HEIGHT)).astype(np.uint8)[:, None, None]
     views = [View.from_arrays(view.name, view.camera, view.image() // 16 + shades) for view in wall().train]
     found = find_backdrop(replace(wall(), train=tuple(views)))
     assert found is not None
-    assert found.is_even == even
-    assert (found.alike > 0.9) if even else (found.alike < EVEN / 2)
+    assert found.is_unlit == unlit
+    assert (found.alike > 0.9) if most == 0 else (found.alike < EVEN / 2)
 
 
 def test_photographs_with_alpha_or_without_known_points_have_no_backdrop() -> None:
@@ -399,9 +482,8 @@ def test_photographs_with_alpha_or_without_known_points_have_no_backdrop() -> No
         ({"dense_start": DenseStart(planes=1)}, "dense_start.planes"),
         ({"dense_start": DenseStart(cell=0.5)}, "dense_start.cell must be at least 1 px"),
         ({"dense_start": DenseStart(min_angle=50.0)}, "min_angle must be below max_angle"),
-        ({"free_space": FreeSpace(nearer=1.0)}, "nearer must be below 1"),
-        ({"free_space": FreeSpace(window=4)}, "window must be odd"),
-        ({"opacity_decay": OpacityDecay(rate=1.0)}, "opacity_decay.rate must be below 1"),
+        ({"removal": Removal(every=0)}, "removal.every"),
+        ({"removal": Removal(decay=1.0)}, "removal.decay must be below 1"),
     ],
 )
 def test_values_that_mean_nothing_are_refused(changes: dict[str, object], message: str) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 from gs2d.config.densify import Densify
 from gs2d.config.recipe import ALL, CloneInPlace, GradDensify, LearningRates, LossTerm, RankByError, Recipe, Stage
+from gs2d.config.robust import FEW_VIEWS
 
 
 def describe_recipe(recipe: Recipe) -> Iterator[str]:
@@ -50,9 +51,10 @@ def describe_recipe(recipe: Recipe) -> Iterator[str]:
         otherwise = "" if start.required else "; without where they agree on nothing"
         around = "" if start.sphere is None else f", and {start.sphere.splats:,} on a sphere around, if needed"
         yield f"dense start: a sweep over photographs of about {start.side} px{fitted}{around}{otherwise}"
-    if recipe.dropout is not None:
-        d = recipe.dropout
-        yield f"dropout: {d.rate:g} of the splats each iteration, with at most {d.max_views:,} training views"
+    if recipe.removal is not None:
+        r = recipe.removal
+        yield f"floaters: proposed every {r.every:,} iterations, removed unless the training images miss them"
+        yield f"dropout: {r.dropout:g} of the splats each iteration, with at most {FEW_VIEWS} training views"
     if recipe.fused_depth is not None:
         yield f"the mesh is of the {recipe.fused_depth} depth"
     for number, stage in enumerate(recipe.stages, start=1):

@@ -35,7 +35,7 @@ from gs2d.config.recipe import (
 )
 from gs2d.config.recipe_files import is_recipe_file, made_recipe, read_recipe_file
 from gs2d.config.registry import Register, Registry
-from gs2d.config.robust import BackgroundSphere, DenseStart, FreeSpace, OpacityDecay, SeenArea, SplatDropout, StartFit
+from gs2d.config.robust import BackgroundSphere, DenseStart, Removal, StartFit
 from gs2d.config.schedule import LONGER
 from gs2d.errors import RecipeError
 
@@ -51,7 +51,6 @@ SILHOUETTE = 0.1  # weight of the silhouette loss: docs/decisions/losses.md
 # Weight of normal consistency in best, and in best where it has no L2: docs/decisions/losses.md
 BEST_NC, NC_WITHOUT_SQUARES = 0.035, 0.02
 SQUARES, SQUARES_START = 10.0, 0.5  # weight of L2 in best, and from which part of its iterations on: the same page
-BACKDROP_RATE = 0.3  # docs/decisions/fog.md
 SH_FASTER = 2.5  # times the official rate of SH beyond degree 0: docs/decisions/training.md
 SETTLING, SETTLED = 0.3, 0.1  # of the iterations, at the end, in which rates fall, and to what: decisions/training.md
 DENSE_START = DenseStart(side=256, neighbours=3, fit=StartFit())  # docs/decisions/training.md
@@ -165,15 +164,6 @@ def with_silhouette(recipe: Recipe, weight: float = SILHOUETTE, *, name: str) ->
 
     stages = (extended(stage) if set(stage.train) - set(SH) else stage for stage in recipe.stages)
     return replace(recipe, name=name, stages=tuple(stages))
-
-
-def without_optional_losses(recipe: Recipe) -> Recipe:
-    """Return the recipe without the losses that some photographs do without."""
-
-    def required(stage: Stage) -> Stage:
-        return replace(stage, losses=tuple(term for term in stage.losses if term.required))
-
-    return replace(recipe, stages=tuple(map(required, recipe.stages)))
 
 
 def without_squares(recipe: Recipe) -> Recipe:
@@ -290,13 +280,11 @@ def with_normal_prior(recipe: Recipe, weight: float = NORMAL_WEIGHT, *, name: st
 
 
 def with_robustness(recipe: Recipe, *, name: str | None = None) -> Recipe:
-    """Return the recipe with what photographs of the street need; what it has of that already stays.
+    """Return the recipe with a dense start and the removal of floaters, unless it has its own.
 
-    Not in the paper: a dense start, free space that is kept free, opacity that decays, no large splat that is
-    hardly photographed, and splats left out at random where photographs are few (docs/decisions/fog.md). The
-    capture must have sparse points. A dense start that is not required gives way to the
-    one that was tried with the rest; and where no resets delay the prune by size there is none, which would take
-    sky and ground.
+    Not in the paper; for captures that say which sparse points their images show (docs/decisions/fog.md). A dense start
+    that is not required gives way to the one that was tried with the removal. Where no resets delay the prune by size
+    there is none, because it would take sky and ground.
     """
     start = recipe.dense_start or STREET_START
     return replace(
@@ -304,30 +292,8 @@ def with_robustness(recipe: Recipe, *, name: str | None = None) -> Recipe:
         name=name or recipe.name,
         stages=tuple(map(_sparing_large_splats, recipe.stages)),
         dense_start=start if start.required else STREET_START,
-        free_space=recipe.free_space or FreeSpace(),
-        opacity_decay=recipe.opacity_decay or OpacityDecay(),
-        seen_area=recipe.seen_area or SeenArea(),
-        dropout=recipe.dropout or SplatDropout(),
+        removal=recipe.removal or Removal(),
     )
-
-
-def with_fading_backdrop(recipe: Recipe) -> Recipe:
-    """Return the recipe, if opacity decays in it, with a faster decay of splats of the background's colour.
-
-    For captures before an even backdrop (docs/decisions/fog.md). A rate that the recipe has already stays.
-    """
-    decay = recipe.opacity_decay
-    if decay is None or decay.backdrop_rate is not None:
-        return recipe
-    return replace(recipe, opacity_decay=replace(decay, backdrop_rate=BACKDROP_RATE))
-
-
-def without_fading_backdrop(recipe: Recipe) -> Recipe:
-    """Return the recipe without what :func:`with_fading_backdrop` gives it; a rate of another's choice stays."""
-    decay = recipe.opacity_decay
-    if decay is None or decay.backdrop_rate != BACKDROP_RATE:
-        return recipe
-    return replace(recipe, opacity_decay=replace(decay, backdrop_rate=None))
 
 
 def _sparing_large_splats(stage: Stage) -> Stage:

@@ -18,7 +18,7 @@ from gs2d.config.densify import Densify
 from gs2d.config.losses import LOSSES
 from gs2d.config.multiview import MULTIVIEW_KINDS, MultiView, check_multiview
 from gs2d.config.priors import DepthPrior, NormalPrior, check_priors
-from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea, SplatDropout, check_robust
+from gs2d.config.robust import DenseStart, Removal, check_robust
 from gs2d.config.validate import group, integer, number, one_of, require
 from gs2d.config.views import Exposure as Exposure  # a field's type: whoever reads a recipe finds it here
 from gs2d.config.views import IntrinsicsRefinement as IntrinsicsRefinement
@@ -395,8 +395,8 @@ class Recipe:
         Settings of the losses on known depths and normals.
     dense_start : DenseStart or None
         Starts from a plane sweep of the images.
-    free_space, opacity_decay, seen_area, dropout : FreeSpace, OpacityDecay, SeenArea, SplatDropout or None
-        Measures against floaters.
+    removal : Removal or None
+        Removes floaters.
     fused_depth : "mean", "median", "transmittance" or None
         Depth that is fused into the mesh; None: that of the protocol.
     intrinsics : IntrinsicsRefinement or None
@@ -423,10 +423,7 @@ class Recipe:
     depth_prior: DepthPrior | None = None
     normal_prior: NormalPrior | None = None
     dense_start: DenseStart | None = None
-    free_space: FreeSpace | None = None
-    opacity_decay: OpacityDecay | None = None
-    seen_area: SeenArea | None = None
-    dropout: SplatDropout | None = None
+    removal: Removal | None = None
     fused_depth: str | None = field(default=None, metadata={"omit_empty": True})
     intrinsics: IntrinsicsRefinement | None = field(default=None, metadata={"omit_empty": True})
     photometry: Photometry | None = field(default=None, metadata={"omit_empty": True})
@@ -504,8 +501,7 @@ def validate(recipe: Recipe) -> Recipe:
     check_priors(where, recipe.depth_prior, recipe.normal_prior, kinds)
     if recipe.fused_depth is not None:
         one_of(f"{where}: fused_depth", recipe.fused_depth, DEPTH_KINDS)
-    robust = (recipe.dense_start, recipe.free_space, recipe.opacity_decay, recipe.seen_area, recipe.dropout)
-    check_robust(where, *robust)
+    check_robust(where, recipe.dense_start, recipe.removal)
     names = [stage.name for stage in recipe.stages]
     for name in names:
         require(names.count(name) == 1, f"{where}: two stages are called {name!r}; give each its own name")

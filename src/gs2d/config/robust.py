@@ -1,6 +1,6 @@
-"""What photographs of the street need beside losses: a dense start, free space kept free, opacity that decays.
+"""Settings of robust training beside losses: a dense start, and the removal of floaters.
 
-Why each is there, and what was tried instead: docs/decisions/fog.md. Pure Python; never imports torch.
+Reasons and alternatives: docs/decisions/fog.md. Pure Python; never imports torch.
 """
 
 from __future__ import annotations
@@ -121,122 +121,39 @@ class DenseStart:
 
 
 @dataclass(frozen=True)
-class FreeSpace:
-    """Prune splats from space that photographs show to be empty (``training/free_space.py``).
+class Removal:
+    """Remove floaters: splats that something speaks against and that the training images do not miss.
 
-    What a photograph shows at a depth, it sees through all that lies before it. Depths are those of sparse points and
-    of the plane sweep, as far as a neighbour agrees.
+    Depth maps, sizes and colours only propose splats; the training images decide (``training/trial.py``).
 
     Attributes
     ----------
     every : int
-        Iterations between prunings, and from the start to the first.
-    views : int
-        Photographs in whose free space a splat must lie to be pruned.
-    nearer : float
-        Free is what is nearer than this fraction of the depth: depths are good to a few percent.
-    window : int, px
-        The nearest depth in a window of so many pixels of the shrunk photographs counts, because a splat has a size and
-        edges are not sharp.
-    spread : float
-        Standard deviations from its centre at which a splat is looked at too, along both axes.
-    floor : float
-        Where a photograph's depth is unknown, what is nearer than this fraction of the nearest sparse point in its
-        picture is free, whether the photograph was found to show that point or not.
-    ball : float
-        Around a camera, within this fraction of that nearest depth, is free: the photographer stood there.
-    agree : float
-        Depths of the plane sweep count where a neighbour's differs by at most this fraction.
+        Iterations between proposals, and from the start to the first.
+    decay : float
+        Fraction of its opacity that a splat loses every ten iterations, in stages that train the opacity of all splats.
+        What several images need grows back at once, a veil that one image asks for does not.
+    dropout : float
+        Fraction of the splats that each iteration leaves out at random, where at most ``FEW_VIEWS`` images train: with
+        more, dropout gains on some captures and loses on others.
+    backdrop : bool
+        Also propose splats in the colour of the background. Set for captures before an even, unlit backdrop, where such
+        splats draw what is drawn without them and hide what new views should show.
     """
 
     every: int = 50
-    views: int = 1
-    nearer: float = 0.9
-    window: int = 5
-    spread: float = 1.0
-    floor: float = 0.8
-    ball: float = 0.5
-    agree: float = 0.03
+    decay: float = 0.01
+    dropout: float = 0.1
+    backdrop: bool = False
 
 
-@dataclass(frozen=True)
-class OpacityDecay:
-    """Opacity is multiplied by ``1 - rate`` every ``every`` iterations, in stages that train it for all splats.
-
-    What many photographs need grows back at once; what one or two need for a veil does not. Unlike resets it works at
-    any schedule. Splats never decay below ``least``, where they would be pruned or not drawn.
-
-    ``backdrop_rate``, instead of ``rate``, is that of splats whose colour (of degree 0) is within ``backdrop_within``
-    of the background's in every channel, both in [0, 1]; None: they are like all others. They draw what is drawn
-    without them, and only hide what is wrong behind them: in a new view they hide what is right.
-    """
-
-    rate: float = 0.01
-    every: int = 10
-    least: float = 0.005
-    backdrop_rate: float | None = field(default=None, metadata={"omit_empty": True})
-    backdrop_within: float = field(default=0.06, metadata={"omit_empty": True})
-
-
-@dataclass(frozen=True)
-class SeenArea:
-    """Prune large splats of which photographs show next to nothing (``training/seen_area.py``).
-
-    What lies outside of all pictures answers to no loss, and hides what a new view between them should show. What lies
-    behind other things hides nothing, and stays.
-
-    Attributes
-    ----------
-    times : int
-        Looks per stage that moves all splats, evenly spaced; the last one after its last iteration.
-    least : float
-        A splat stays where some photograph shows this fraction of its weight.
-    inside : float
-        It stays as well where this fraction of it lies within the pictures, all together.
-    size : float
-        Large is a splat that would fill this fraction of some picture; smaller ones cannot hide much.
-    side : int, px
-        Longer side of the pictures that are looked at.
-    """
-
-    times: int = 5
-    least: float = 0.05
-    inside: float = 0.6
-    size: float = 0.001
-    side: int = 200
-
-
-@dataclass(frozen=True)
-class SplatDropout:
-    """Splats that an iteration leaves out at random where photographs are few (``training/dropout.py``).
-
-    Attributes
-    ----------
-    rate : float
-        Part of the splats that is left out, anew in each iteration of stages that train all of geometry and opacity.
-    max_views : int
-        With more training views than that none is: there it gains on some captures and loses on others
-        (docs/decisions/fog.md).
-    """
-
-    rate: float = 0.1
-    max_views: int = FEW_VIEWS
-
-
-def check_robust(
-    where: str,
-    start: DenseStart | None,
-    free: FreeSpace | None,
-    decay: OpacityDecay | None,
-    seen: SeenArea | None = None,
-    dropout: SplatDropout | None = None,
-) -> None:
+def check_robust(where: str, start: DenseStart | None, removal: Removal | None) -> None:
     """Raise RecipeError for a value that cannot be trained with."""
-    if dropout is not None:
-        at = f"{where}: dropout"
-        rate = number(f"{at}.rate", dropout.rate, low=0.0)
-        require(rate < 1, f"{at}.rate must be below 1, got {rate}: nothing would be drawn")
-        integer(f"{at}.max_views", dropout.max_views, low=1)
+    if removal is not None:
+        integer(f"{where}: removal.every", removal.every, low=1)
+        for name in ("decay", "dropout"):
+            value = number(f"{where}: removal.{name}", getattr(removal, name), low=0.0)
+            require(value < 1, f"{where}: removal.{name} must be below 1, got {value}: nothing would be drawn")
     if start is not None:
         at = f"{where}: dense_start"
         least = {"side": 16, "planes": 4, "neighbours": 1, "radius": 1, "votes": 1, "max_views": 2}
@@ -254,31 +171,6 @@ def check_robust(
             for name in ("radius", "size"):
                 value = number(f"{at}.sphere.{name}", getattr(start.sphere, name), low=0.0)
                 require(value > 0, f"{at}.sphere.{name} must be positive, got {value}")
-    if free is not None:
-        at = f"{where}: free_space"
-        for name in ("every", "views", "window"):
-            integer(f"{at}.{name}", getattr(free, name), low=1)
-        require(free.window % 2 == 1, f"{at}.window must be odd, got {free.window}")
-        for name in ("nearer", "spread", "floor", "ball", "agree"):
-            number(f"{at}.{name}", getattr(free, name), low=0.0)
-        require(free.nearer < 1, f"{at}.nearer must be below 1, got {free.nearer}: surfaces would be pruned")
-    if decay is not None:
-        at = f"{where}: opacity_decay"
-        integer(f"{at}.every", decay.every, low=1)
-        for name in ("rate", "least"):
-            value = number(f"{at}.{name}", getattr(decay, name), low=0.0)
-            require(value < 1, f"{at}.{name} must be below 1, got {value}")
-        number(f"{at}.backdrop_within", decay.backdrop_within, low=0.0)
-        if decay.backdrop_rate is not None:
-            value = number(f"{at}.backdrop_rate", decay.backdrop_rate, low=0.0)
-            require(value < 1, f"{at}.backdrop_rate must be below 1, got {value}")
-    if seen is not None:
-        at = f"{where}: seen_area"
-        integer(f"{at}.times", seen.times, low=1)
-        integer(f"{at}.side", seen.side, low=16)
-        for name in ("least", "inside", "size"):
-            number(f"{at}.{name}", getattr(seen, name), low=0.0)
-        require(seen.least < 1, f"{at}.least must be below 1, got {seen.least}: no splat is seen whole")
 
 
 def _check_fit(at: str, fit: StartFit) -> None:

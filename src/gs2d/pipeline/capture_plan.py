@@ -28,7 +28,7 @@ from gs2d.pipeline.photographs import fits
 from gs2d.pipeline.probe import Probe, probe
 from gs2d.render.backends import Backend
 from gs2d.training.plane_sweep import sweep_downscale
-from gs2d.training.robust import looks_at_free_space, looks_at_seen_area
+from gs2d.training.robust import ends_part, looks_at_free_space
 
 PROGRAM_BYTES = 384 << 20  # torch, the kernels, the scene
 SPLAT_BYTES = 1200  # parameters, moments, gradients and what the rasterizer holds of a splat (docs/performance.md)
@@ -275,4 +275,4 @@ def _seconds(tried: Probe, recipe: Recipe, scene: Scene, start: int, splats: Ran
 def looks_of(recipe: Recipe) -> tuple[int, int]:
     """Return how often robust training looks at free space and at the seen area, at all photographs each time."""
     each = [(stage, i) for stage in recipe.stages for i in range(1, stage.iterations + 1)]
-    return sum(looks_at_free_space(recipe, *at) for at in each), sum(looks_at_seen_area(recipe, *at) for at in each)
+    return sum(looks_at_free_space(recipe, *at) for at in each), sum(ends_part(recipe, *at) for at in each)

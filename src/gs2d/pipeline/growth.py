@@ -95,7 +95,7 @@ def try_growth(part: Scene, recipe: Recipe, protocol: Protocol, backend: Backend
     try:
         trainer = Trainer(
             part,
-            replace(recipe, stages=(stage,), free_space=None, seen_area=None),
+            replace(recipe, stages=(stage,), removal=None),
             protocol,
             backend=backend,
             on_event=listen,

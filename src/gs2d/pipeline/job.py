@@ -18,7 +18,6 @@ from gs2d.config.presets import (
     get_recipe,
     with_depth_prior,
     with_exposure,
-    with_fading_backdrop,
     with_few_views,
     with_intrinsics,
     with_normal_prior,
@@ -67,10 +66,6 @@ MAX_VIEWS = 1_000_000
 NEAR_SAMPLES = 2000  # sparse points by which the near plane is checked
 ROBUST = ("auto", "on", "off")
 DIFFERS = 0.03  # standard deviation of the logarithm of gains from which photographs are said to differ in exposure
-LATER_FIELDS = (  # of recipes, that run folders of before there were such lack
-    *("exposure", "poses", "multiview", "depth_prior", "normal_prior"),
-    *("dense_start", "free_space", "opacity_decay", "seen_area", "dropout"),
-)
 
 
 @dataclass(frozen=True)
@@ -161,7 +156,11 @@ class Job:
             **({} if not processes else {"processes": list(map(list, processes))}),
             **({} if self.recipe.intrinsics is None else {"intrinsics": recipe["intrinsics"]}),
             **({} if self.recipe.photometry is None else {"photometry": recipe["photometry"]}),
-            **{name: recipe[name] for name in LATER_FIELDS[2:] if recipe[name] is not None},
+            **{
+                name: recipe[name]
+                for name in ("multiview", "depth_prior", "normal_prior", "dense_start", "removal")
+                if recipe[name] is not None
+            },
         }
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
@@ -353,18 +352,17 @@ def fit_recipe(options: TrainOptions, scene: Scene, protocol: Protocol, on_event
 
 
 def with_backdrop(recipe: Recipe, protocol: Protocol, scene: Scene, on_event: OnEvent) -> tuple[Recipe, Protocol]:
-    """Put the colour of sky and bare walls behind everything, where training is robust.
+    """Put the colour of sky and bare walls behind everything, where floaters are removed.
 
-    Where nearly all that is bare has that colour, splats of it say no more than empty space, and are made to fade.
+    Before an even, unlit backdrop, splats of its colour are proposed for removal.
     """
-    found = find_backdrop(scene) if recipe.free_space is not None and protocol.background == BLACK else None
-    if found is None:
+    found = find_backdrop(scene) if recipe.removal is not None and protocol.background == BLACK else None
+    if found is None or recipe.removal is None:
         return recipe, protocol
     shown = ", ".join(f"{value:.2f}" for value in found.color)
-    recipe = with_fading_backdrop(recipe) if found.is_even else recipe
-    decay = recipe.opacity_decay
-    fades = decay is not None and decay.backdrop_rate is not None and decay.backdrop_rate > decay.rate
-    also = "; splats of that colour fade" if fades else ""
+    if found.is_unlit:
+        recipe = replace(recipe, removal=replace(recipe.removal, backdrop=True))
+    also = "; splats of that colour are removed where no image misses them" if found.is_unlit else ""
     on_event(Notice(f"background ({shown}): the colour of what shows no sparse points{also}", detail=True))
     return recipe, replace(protocol, background=found.color)
 

@@ -171,8 +171,7 @@ def _iteration(part: Scene, recipe: Recipe, protocol: Protocol, backend: Backend
         recipe,
         stages=(replace(first, downscale=1, halve_at=()), *rest),
         dense_start=None,
-        free_space=None,
-        seen_area=None,
+        removal=None,
     )
     start = Trainer(part, bare, protocol, backend=backend, progress_every=1).splats.to("cpu")
 
@@ -192,12 +191,11 @@ def _looks(
 ) -> tuple[Cost, Cost, float]:
     """Return what robust training's looks at one photograph cost, and fitting one splat of the start to one."""
     count, free_look, seen_look, fit = len(part.train), FREE, FREE, 0.0
-    if sweep is not None and recipe.free_space is not None:
-        maps = FreeSpaceMaps(sweep, recipe.free_space)
+    if sweep is not None and recipe.removal is not None:
+        maps = FreeSpaceMaps(sweep)
         maps.move_to(backend.device)
-        free_look = cost_of(splats, part.extent, lambda some: _timed(maps.inside, some.to(backend.device)) / count)
-    settings = recipe.seen_area
-    if settings is not None:
+        free_look = cost_of(splats, part.extent, lambda some: _timed(maps.against, some.to(backend.device)) / count)
+    if recipe.removal is not None:
         cameras = [view.camera for view in part.train]
         raster = raster_settings(protocol, part.extent, recipe.sh_degree)
         seen_look = cost_of(
@@ -205,7 +203,7 @@ def _looks(
             part.extent,
             lambda some: (
                 _timed(
-                    partial(mostly_unseen, cameras=cameras, settings=settings, raster=raster, backend=backend),
+                    partial(mostly_unseen, cameras=cameras, raster=raster, backend=backend),
                     some.to(backend.device),
                 )
                 / count

@@ -20,14 +20,13 @@ import torch
 from gs2d.core.memory_limit import memory_limit
 from gs2d.core.processes import Place, here
 from gs2d.errors import BackendError, Gs2dError, RunError
-from gs2d.io.run_dir import RunFolder, is_run
+from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.events import Notice, OnEvent, ignore
 from gs2d.pipeline.interruption import HeldSignals
 from gs2d.pipeline.job import Job, prepare_job
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.quality import by_quality
 from gs2d.pipeline.run_logger import progress_every
-from gs2d.pipeline.same_run import as_begun
 from gs2d.training.parallel import ONE_PROCESS, LostContactError, ManyProcesses, OneProcess
 from gs2d.training.shards import Shards
 from gs2d.training.trainer import Trainer
@@ -138,7 +137,6 @@ def follow(options: TrainOptions, together: ManyProcesses) -> RunFolder:
     prepared = by_quality(replace(options, scene=Path(told["scene"]), prepare=told["prepare"]), ignore)
     job = prepare_job(prepared, ignore)
     run = RunFolder(options.out)
-    job = as_begun(run, job) if is_run(run.path) else job
     _check_same(told["definition"], _definition(job))
     trainer = Trainer(
         job.scene,

@@ -470,14 +470,12 @@ _KINDS = {
     train_events.Cloned: "cloned",
     train_events.Densified: "densify",
     train_events.OpacityLimited: "opacity_limited",
-    train_events.FreeSpacePruned: "free_space_pruned",
-    train_events.UnseenPruned: "unseen_pruned",
+    train_events.FloatersRemoved: "floaters_removed",
 }
 _ROWS_OR_JUMPS = (
     train_events.Densified,
     train_events.OpacityLimited,
-    train_events.FreeSpacePruned,
-    train_events.UnseenPruned,
+    train_events.FloatersRemoved,
 )
 
 

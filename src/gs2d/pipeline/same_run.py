@@ -1,36 +1,13 @@
-"""Whether a run that is gone on with is the same: by its definition, and without what runs of before did not have."""
+"""Whether a resumed run has the same definition."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from typing import Any
 
-from gs2d.config.presets import without_fading_backdrop, without_optional_losses, without_squares
 from gs2d.errors import RunError
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.job import LATER_FIELDS, Job, training_facts
-
-
-def as_begun(run: RunFolder, job: Job) -> Job:
-    """Return a job without what runs of before did not have: it goes on as it began."""
-    before, recipe = run.definition().get("recipe"), job.recipe
-    if not isinstance(before, dict):
-        return job
-    lacking: dict[str, Any] = {name: None for name in ("seen_area", "dropout") if name not in before}
-    recipe = replace(recipe, **lacking)
-    start = before.get("dense_start")
-    if recipe.dense_start is not None and isinstance(start, dict) and "sphere" not in start:
-        recipe = replace(recipe, dense_start=replace(recipe.dense_start, sphere=None))
-    decay = before.get("opacity_decay")
-    if isinstance(decay, dict) and "backdrop_rate" not in decay:
-        recipe = without_fading_backdrop(recipe)
-    kinds = {term.get("kind") for stage in before.get("stages", ()) for term in stage.get("losses", ())}
-    if "silhouette" not in kinds:
-        recipe = without_optional_losses(recipe)
-    if "l2" not in kinds:
-        recipe = without_squares(recipe)
-    return replace(job, recipe=recipe)
+from gs2d.pipeline.job import Job, training_facts
 
 
 def check_same_run(run: RunFolder, job: Job) -> None:
@@ -49,10 +26,7 @@ def check_same_run(run: RunFolder, job: Job) -> None:
             # The background can follow from the scene: "raster", which comes after it, has it too.
             old, value = ({**training_facts(facts), "background": None} for facts in (old, value))
         if name == "recipe" and isinstance(old, dict):
-            old = {**dict.fromkeys(LATER_FIELDS), **old}  # runs of before there were such
-            if old["exposure"] is not None:
-                old["exposure"] = {"initial": "identity", **old["exposure"]}
-            was, now = ("off" if facts["free_space"] is None else "on" for facts in (old, value))
+            was, now = ("off" if facts.get("removal") is None else "on" for facts in (old, value))
             if was != now:
                 raise RunError(
                     f"{run.path} was made with --robust {was}, and would go on with {now}; resume with --robust {was}, "

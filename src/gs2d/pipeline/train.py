@@ -43,7 +43,7 @@ from gs2d.pipeline.quality import by_quality
 from gs2d.pipeline.report import report_run
 from gs2d.pipeline.resume import ResumePoint, check_sources, choose_start
 from gs2d.pipeline.run_logger import RunLogger
-from gs2d.pipeline.same_run import as_begun, check_same_run
+from gs2d.pipeline.same_run import check_same_run
 from gs2d.pipeline.scoring import Visitor
 from gs2d.pipeline.subject import meshed_subject
 from gs2d.pipeline.threads import use_threads
@@ -110,7 +110,6 @@ def _train(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> Ru
         if options.cache is not None:  # now, not when the first stage has been trained
             run.made += make_folder(options.cache)
         if is_run(run.path):
-            job = as_begun(run, job)
             check_same_run(run, job)
             if run.file(SPLATS).exists() and not run.checkpoints():
                 raise RunError(

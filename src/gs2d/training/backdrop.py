@@ -10,15 +10,18 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
+from torch import Tensor
 
-from gs2d.config.robust import OpacityDecay
+from gs2d.core.sh import C0, rgb_to_sh0
+from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
 
 APART = 1 / 20  # of the longer side: pixels farther from every sparse point are taken to be bare
 MAX_VIEWS = 60  # that are asked, evenly chosen
 STRIDE = 7  # every so many of those pixels
-WITHIN = OpacityDecay.backdrop_within  # of the colour, in every channel: splats that near it may fade
-EVEN = 2 / 3  # of the bare pixels: 0.81 before a black cloth, 0.50 on a grey desk, 0.13 and less elsewhere
+WITHIN = 0.06  # in every channel, [0, 1]: differences by which a colour is still that of the background
+EVEN = 2 / 3  # of the bare pixels have nearly the colour: 0.81 before a black cloth, 0.50 on a grey desk, else < 0.13
+UNLIT = 0.1  # in every channel: darker than a lit surface of any colour
 
 
 @dataclass(frozen=True)
@@ -37,9 +40,9 @@ class Backdrop:
     alike: float
 
     @property
-    def is_even(self) -> bool:
-        """Whether a splat of this colour says no more than empty space: nearly all that is bare has it."""
-        return self.alike >= EVEN
+    def is_unlit(self) -> bool:
+        """Whether a splat of this colour says no more than empty space: all that is bare is dark and alike."""
+        return self.alike >= EVEN and max(self.color) <= UNLIT
 
 
 def find_backdrop(scene: Scene) -> Backdrop | None:
@@ -69,3 +72,9 @@ def find_backdrop(scene: Scene) -> Backdrop | None:
     red, green, blue = (round(float(value), 3) for value in np.median(colors, axis=0))
     alike = (np.abs(colors - np.array([red, green, blue])) <= WITHIN).all(axis=1)
     return Backdrop((red, green, blue), float(alike.mean()))
+
+
+def in_color(splats: Splats, color: tuple[float, float, float]) -> Tensor:
+    """Return which splats have nearly this colour (of degree 0), [N] bool."""
+    target = rgb_to_sh0(splats.sh0.new_tensor([color]))
+    return (splats.sh0 - target).abs().amax(dim=(1, 2)) <= WITHIN / C0

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from gs2d.config.recipe import Recipe, Stage
+from gs2d.config.robust import FEW_VIEWS
 from gs2d.core.splats import Splats
 
 NOT_DRAWN = -30.0  # logit of an opacity far below ``alpha_min``
@@ -18,9 +19,8 @@ def dropout_rate(recipe: Recipe, stage: Stage, views: int) -> float:
 
     0 but in stages that train all of geometry and opacity: others work on splats that are settled.
     """
-    settings = recipe.dropout
     trained = stage.moves_all and stage.train.get("opacity_logits") == "all"
-    return settings.rate if settings is not None and trained and views <= settings.max_views else 0.0
+    return recipe.removal.dropout if recipe.removal is not None and trained and views <= FEW_VIEWS else 0.0
 
 
 def kept_splats(recipe: Recipe, stage: int, iteration: int, count: int, rate: float) -> Tensor:

@@ -113,22 +113,12 @@ class OpacityLimited:
 
 
 @dataclass(frozen=True)
-class FreeSpacePruned:
-    """Splats in space that photographs show to be empty were pruned."""
+class FloatersRemoved:
+    """Splats that something spoke against, and that the training images did not miss, were removed."""
 
     stage: str
     iteration: int
-    pruned: int
-    splats: int
-
-
-@dataclass(frozen=True)
-class UnseenPruned:
-    """Large splats of which the training photographs show next to nothing were pruned."""
-
-    stage: str
-    iteration: int
-    pruned: int
+    removed: int
     splats: int
 
 
@@ -152,7 +142,6 @@ Event = (
     | Progress
     | Densified
     | OpacityLimited
-    | FreeSpacePruned
-    | UnseenPruned
+    | FloatersRemoved
     | StageFinished
 )

@@ -15,7 +15,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gs2d.config.robust import FreeSpace
 from gs2d.core.memory_limit import cache_bytes
 from gs2d.core.spill import Spilled
 from gs2d.core.splats import Splats
@@ -23,6 +22,12 @@ from gs2d.core.transforms import quats_to_matrices
 from gs2d.kernels.free_space import look_at_free_space
 from gs2d.training.plane_sweep import SWEEP_BYTES, Sweep
 
+NEARER = 0.9  # free is what is nearer than this fraction of the depth: depths are good to a few percent
+WINDOW = 5  # px of the small images, the nearest depth of which counts: splats have a size, and edges are not sharp
+SPREAD = 1.0  # standard deviations from its centre, along both axes, at which a splat is looked at too
+FLOOR = 0.8  # where a depth is unknown, the fraction of the nearest sparse point's in the image that is free
+BALL = 0.5  # of that distance: the radius of a free ball around a camera, where the photographer stood
+AGREE = 0.03  # depths of the plane sweep count where a neighbour's differs by at most this fraction
 _UNKNOWN = float("inf")
 
 
@@ -47,11 +52,11 @@ class FreeView:
 class FreeSpaceMaps:
     """The free space of all training views of a scene."""
 
-    def __init__(self, sweep: Sweep, settings: FreeSpace, *, spilled: bool = False) -> None:
-        self._settings, self._device = settings, torch.device("cpu")
+    def __init__(self, sweep: Sweep, *, spilled: bool = False) -> None:
+        self._device = torch.device("cpu")
         limit = 0 if spilled else cache_bytes(SWEEP_BYTES)
         self._views: Sequence[FreeView] = Spilled(
-            (_free_view(sweep, index, settings) for index in range(len(sweep.views))), limit
+            (_free_view(sweep, index) for index in range(len(sweep.views))), limit
         )
 
     def move_to(self, device: torch.device | str) -> None:
@@ -61,43 +66,42 @@ class FreeSpaceMaps:
             self._views = [view.to(device) for view in self._views]
 
     @torch.no_grad()
-    def inside(self, splats: Splats) -> Tensor:
-        """Return the splats [N] bool that lie in the free space of enough photographs, and on what fewer show.
+    def against(self, splats: Splats) -> Tensor:
+        """Return how many images see through each splat, [N] int32; 0 where as many show a surface there.
 
-        Of each photograph one or two percent of the depths are wrong, mostly at edges; of all photographs together that
-        is much. So a place is free where more of them see through it than see a surface there.
+        One or two percent of the depths of each image are wrong, mostly at edges. Over all images that is much, so a
+        place is free only where more of them see through it than see a surface there.
         """
         ends = self._ends(splats)
         reach = (ends - ends[0]).norm(dim=2).amax(dim=0)
         against = torch.zeros(len(splats), dtype=torch.int32, device=splats.device)
         support = torch.zeros_like(against)
         for kept in self._views:
-            _look(kept.to(self._device), ends, reach, 1 - self._settings.nearer, against, support)
-        return (against >= self._settings.views) & (against > support)
+            _look(kept.to(self._device), ends, reach, 1 - NEARER, against, support)
+        return torch.where(against > support, against, 0)
 
     def _ends(self, splats: Splats) -> Tensor:
         """Places [P, N, 3] at which a splat is looked at: its centre, and its ends along both axes."""
-        reach = self._settings.spread * splats.scales
+        reach = SPREAD * splats.scales
         axes = quats_to_matrices(splats.quats)
         ends = [splats.means]
-        if self._settings.spread > 0:
-            for axis in (0, 1):
-                offset = axes[:, :, axis] * reach[:, axis : axis + 1]
-                ends += [splats.means + offset, splats.means - offset]
+        for axis in (0, 1):
+            offset = axes[:, :, axis] * reach[:, axis : axis + 1]
+            ends += [splats.means + offset, splats.means - offset]
         return torch.stack(ends)
 
 
-def _free_view(sweep: Sweep, index: int, settings: FreeSpace) -> FreeView:
+def _free_view(sweep: Sweep, index: int) -> FreeView:
     view = sweep.views[index]
-    known = np.where(sweep.agreeing(index, settings.agree) >= 1, sweep.depths[index], _UNKNOWN)
+    known = np.where(sweep.agreeing(index, AGREE) >= 1, sweep.depths[index], _UNKNOWN)
     column, row = np.floor(view.pixels).astype(np.int64).T
     np.minimum.at(known, (row, column), view.depth)
-    half = settings.window // 2
-    grown = -F.max_pool2d(-torch.from_numpy(known)[None, None], settings.window, 1, half)[0, 0]
-    floor = torch.full_like(grown, settings.floor * view.nearest)
-    limit = settings.nearer * torch.where(torch.isfinite(grown), grown, floor)
+    half = WINDOW // 2
+    grown = -F.max_pool2d(-torch.from_numpy(known)[None, None], WINDOW, 1, half)[0, 0]
+    floor = torch.full_like(grown, FLOOR * view.nearest)
+    limit = NEARER * torch.where(torch.isfinite(grown), grown, floor)
     tensors = (torch.from_numpy(np.ascontiguousarray(array)).float() for array in (view.K, view.T))
-    radius = settings.ball * settings.floor * view.nearest
+    radius = BALL * FLOOR * view.nearest
     return FreeView(limit.float(), torch.from_numpy(known).float(), radius, *tensors)
 
 

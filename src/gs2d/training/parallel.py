@@ -145,9 +145,9 @@ class OneProcess:
         """Return where a mask is True in any process."""
         return mask
 
-    def decide(self, mask: Callable[[Splats], Tensor], splats: Splats) -> Tensor:
-        """Return a mask [N] that process 0 makes of the splats' places, sizes and opacities."""
-        return mask(splats)
+    def decide(self, judge: Callable[[Splats, Tensor], Tensor], splats: Splats, known: Tensor) -> Tensor:
+        """Return what ``judge`` says of each splat, uint8 [N], in process 0; ``known`` is what it knows, bool [N]."""
+        return judge(splats, known)
 
     def whole_state(self, state: TrainState) -> TrainState:
         """Return the state with all splats, to process 0 while the others attend."""
@@ -351,13 +351,13 @@ class ManyProcesses(OneProcess):
         """Return where a mask is True in any process."""
         return self.sum(mask.to(torch.int32)) > 0
 
-    def decide(self, mask: Callable[[Splats], Tensor], splats: Splats) -> Tensor:
-        """Return a mask [N] that process 0 makes."""
+    def decide(self, judge: Callable[[Splats, Tensor], Tensor], splats: Splats, known: Tensor) -> Tensor:
+        """Return what ``judge`` says in process 0."""
         nothing = torch.empty(len(splats), dtype=torch.uint8, device=splats.device)
-        found = mask(splats).to(torch.uint8) if self.leads else nothing
+        found = judge(splats, known) if self.leads else nothing
         with self.contact():
             self._group.broadcast(found, src=0)
-        return found.bool()
+        return found
 
 
 def _tensors(state: TrainState) -> Iterator[Tensor]:

@@ -1,38 +1,45 @@
-"""What keeps fog out of a scene, as the training loop meets it: where to start, what to prune, how opacity decays."""
+"""Robust training, as the training loop meets it: where to start, which floaters to remove, how opacity decays."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 
 import torch
 from torch import Tensor
 
 from gs2d.config.recipe import Recipe, Stage
-from gs2d.config.robust import DenseStart, SeenArea
-from gs2d.core.sh import C0, rgb_to_sh0
+from gs2d.config.robust import DenseStart, Removal
+from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events, per_image
+from gs2d.training.backdrop import in_color
 from gs2d.training.background_sphere import sphere_points
 from gs2d.training.free_space import FreeSpaceMaps
 from gs2d.training.initialize import Initial
 from gs2d.training.parallel import ONE_PROCESS, OneProcess
-from gs2d.training.plane_sweep import Sweep, start_points, sweep_views
+from gs2d.training.plane_sweep import SmallView, Sweep, start_points, sweep_views
 from gs2d.training.rows import keep_rows
 from gs2d.training.seen_area import mostly_unseen
 from gs2d.training.start_fit import fit_start
 from gs2d.training.state import TrainState
+from gs2d.training.trial import Witness, missed
+
+PARTS = 5  # of a stage: at the end of each, all splats are proposed and tried anew, also those that were missed before
+FEW_NEW = 0.002  # of the splats: fewer new proposals wait, because a trial costs as much as some 50 iterations
+MAX_WITNESSES = 24  # images that a trial asks; of more images each trial asks others
+DECAY_EVERY, LEAST_OPACITY = 10, 0.005  # iterations; splats never decay below what is pruned or not drawn
+MISSED = "missed"  # the row group of splats that a trial has found to be needed
 
 
 def check_free_space(scene: Scene, recipe: Recipe) -> None:
-    """Raise DataError where free space is to be kept, and no sparse points say where it is."""
-    if recipe.free_space is not None and scene.observed() is None:
+    """Raise DataError where floaters are to be removed, and no sparse points say where space is free."""
+    if recipe.removal is not None and scene.observed() is None:
         raise DataError(
             f"{scene.name} must say which sparse points its photographs show (COLMAP does) for free space; "
             f"train with --robust off ({scene.unobserved()})"
@@ -40,17 +47,18 @@ def check_free_space(scene: Scene, recipe: Recipe) -> None:
 
 
 class Robustness:
-    """The dense start, pruning and opacity decay of a recipe on a scene; nothing where it has none of them.
+    """The dense start, the removal of floaters and the opacity decay of a recipe on a scene, where it has them.
 
     Parameters
     ----------
     scene : Scene
     recipe : Recipe
     raster : RasterSettings
-        Of training, and ``backend`` that renders: to see how much of a splat is photographed.
+        Of training.
     backend : Backend
+        Renders what is tried.
     processes : OneProcess
-        Those that train together. Process 0 makes the start, and looks at free space and seen area for all.
+        Those that train together. Process 0 makes the start and tries removals for all.
 
     Attributes
     ----------
@@ -62,8 +70,8 @@ class Robustness:
     Raises
     ------
     DataError
-        From the constructor: free space is to be kept, and the capture has no sparse points that its photographs show;
-        or a plane sweep finds nothing to start from, and the recipe requires that.
+        From the constructor: floaters are to be removed, and the capture has no sparse points that its images show; or
+        a plane sweep finds nothing to start from, and the recipe requires that.
     """
 
     def __init__(
@@ -78,9 +86,10 @@ class Robustness:
         self.scene, self._given, self._recipe = scene, scene, recipe
         self._raster, self._backend = raster, backend
         self._free: FreeSpaceMaps | None = None
+        self._images: Sequence[SmallView] = ()
         self._sweep: Sweep | None = None  # until the first splats are fitted
         self.lacks = ""
-        if (recipe.dense_start is None and recipe.free_space is None) or not processes.leads:
+        if (recipe.dense_start is None and recipe.removal is None) or not processes.leads:
             return
         check_free_space(scene, recipe)
         start = recipe.dense_start
@@ -90,13 +99,14 @@ class Robustness:
                 around = None if start.sphere is None else sphere_points(scene, sweep, start.sphere)
                 self.scene = replace(scene, points=start_points(scene, sweep, start, around))
         except DataError as error:
-            if start is None or start.required or recipe.free_space is not None:
+            if start is None or start.required or recipe.removal is not None:
                 raise
             self.lacks = str(error).partition("; ")[0]  # without what to do about it
             return
         self._sweep = None if start is None or start.fit is None else sweep
-        if recipe.free_space is not None:
-            self._free = FreeSpaceMaps(sweep, recipe.free_space, spilled=scene.ahead > 0)
+        if recipe.removal is not None:
+            self._free = FreeSpaceMaps(sweep, spilled=scene.ahead > 0)
+            self._images = sweep.views
 
     @property
     def starts_densely(self) -> bool:
@@ -115,71 +125,104 @@ class Robustness:
         if self._free is not None:
             self._free.move_to(device)
 
-    def prunes(self, stage: Stage, iteration: int) -> bool:
-        """Whether splats may be pruned at the end of an iteration (1-based) of a stage."""
-        return looks_at_free_space(self._recipe, stage, iteration) or looks_at_seen_area(self._recipe, stage, iteration)
+    def removes(self, stage: Stage, iteration: int) -> bool:
+        """Whether splats may be removed at the end of an iteration (1-based) of a stage."""
+        return looks_at_free_space(self._recipe, stage, iteration) or ends_part(self._recipe, stage, iteration)
 
-    def prune(self, state: TrainState, stage: Stage, iteration: int) -> list[events.Event]:
-        """Prune the splats in free space, and those of which little is photographed, where that is due."""
-        happened: list[events.Event] = []
-        if looks_at_free_space(self._recipe, stage, iteration):
-            pruned = self._drop(state, self._in_free_space)
-            if pruned:
-                happened.append(events.FreeSpacePruned(stage.name, iteration, pruned, state.count))
-        settings = self._recipe.seen_area
-        if settings is not None and looks_at_seen_area(self._recipe, stage, iteration):
-            pruned = self._drop(state, partial(self._unseen, state, settings))
-            if pruned:
-                happened.append(events.UnseenPruned(stage.name, iteration, pruned, state.count))
-        return happened
+    def remove(self, state: TrainState, stage: Stage, iteration: int) -> list[events.Event]:
+        """Remove the proposed splats that the training images do not miss, where that is due."""
+        if not self.removes(stage, iteration):
+            return []
+        nobody = torch.zeros(state.splats.means.shape[0], dtype=torch.bool, device=state.splats.device)
+        known = nobody if ends_part(self._recipe, stage, iteration) else state.groups.get(MISSED, nobody)
+        verdict = self._processes.decide(
+            lambda splats, spared: self._tried(state, stage, iteration, splats, spared), state.splats, known
+        )
+        guilty = verdict == REMOVED
+        state.groups[MISSED] = known | (verdict == NEEDED)
+        removed = state.parts.count(int(guilty.sum()))
+        if removed == 0 or removed == state.count:  # all: the images contradict each other
+            return []
+        keep_rows(state, ~guilty)
+        return [events.FloatersRemoved(stage.name, iteration, removed, state.count)]
 
-    def _in_free_space(self, splats: Splats) -> Tensor:
+    def _tried(self, state: TrainState, stage: Stage, iteration: int, splats: Splats, spared: Tensor) -> Tensor:
+        """Propose splats, but those that are spared, and try them: NEEDED, REMOVED or neither, uint8 [N]."""
+        last = ends_part(self._recipe, stage, iteration)
+        against = self._proposed(state, splats, last=last).masked_fill(spared, 0)
+        verdict = torch.zeros(len(splats), dtype=torch.uint8, device=splats.device)
+        proposed = against > 0
+        if not proposed.any() or (not last and int(proposed.sum()) < FEW_NEW * len(splats)):
+            return verdict
+        step = max(1, -(-len(self._images) // MAX_WITNESSES))
+        rows = range(iteration // self._removal.every % step, len(self._images), step)
+        needed = missed(
+            splats,
+            against,
+            self._witnesses(state, rows),
+            self._raster,
+            self._backend,
+            stands_for=len(self._images) / len(rows),
+        )
+        verdict[proposed] = REMOVED
+        verdict[needed] = NEEDED
+        return verdict
+
+    @property
+    def _removal(self) -> Removal:
+        assert self._recipe.removal is not None
+        return self._recipe.removal
+
+    def _proposed(self, state: TrainState, splats: Splats, *, last: bool) -> Tensor:
+        """Return how many images speak against each splat, int32 [N]."""
         assert self._free is not None
-        return self._free.inside(splats)
+        against = self._free.against(splats)
+        if last:
+            cameras = [view.camera for view in per_image.scene_now(state, self._given).train]
+            against = against.maximum(mostly_unseen(splats, cameras, self._raster, self._backend).to(against))
+        if self._removal.backdrop:
+            against = against.maximum(in_color(splats, self._raster.background).to(against))
+        return against
 
-    def _unseen(self, state: TrainState, settings: SeenArea, splats: Splats) -> Tensor:
-        cameras = [view.camera for view in per_image.scene_now(state, self._given).train]
-        return mostly_unseen(splats, cameras, settings, self._raster, self._backend)
-
-    def _drop(self, state: TrainState, mask: Callable[[Splats], Tensor]) -> int:
-        """Drop the splats of a mask [N] and return how many: none where nothing would be left."""
-        found = self._processes.decide(mask, state.splats)
-        dropped = state.parts.count(int(found.sum()))
-        if dropped == 0 or dropped == state.count:  # all: the photographs contradict each other
-            return 0
-        keep_rows(state, ~found)
-        return dropped
-
-    def _like_backdrop(self, splats: Splats, within: float) -> Tensor:
-        """Find the splats [N] of the colour that is drawn where there is none."""
-        backdrop = rgb_to_sh0(splats.sh0.new_tensor([self._raster.background]))
-        return (splats.sh0 - backdrop).abs().amax(dim=(1, 2)) <= within / C0
+    def _witnesses(self, state: TrainState, rows: range) -> Iterator[Witness]:
+        views = per_image.scene_now(state, self._given).train
+        for row in rows:
+            image, device = self._images[row], state.splats.device
+            height, width = image.size
+            (fx, _, cx), (_, fy, cy), _ = image.K.tolist()
+            yield Witness(
+                Camera(width, height, fx, fy, cx, cy, views[row].camera.T_cam_world),
+                image.color.permute(1, 2, 0).to(device),
+                torch.from_numpy(image.usable).to(device),
+                None if state.exposures is None else state.exposures.transform(row),
+            )
 
     @torch.no_grad()
     def decay(self, state: TrainState, stage: Stage, iteration: int, backend: Backend) -> None:
-        """Let opacity decay, where that is due."""
-        settings = self._recipe.opacity_decay
-        if settings is None or stage.train.get("opacity_logits") != "all" or iteration % settings.every:
+        """Let opacity decay, where that is due, but of splats in the colour of the background.
+
+        Over that background no image would ask for them again.
+        """
+        removal = self._recipe.removal
+        if removal is None or stage.train.get("opacity_logits") != "all" or iteration % DECAY_EVERY:
             return
         logits = state.splats.opacity_logits
-        least = math.log(settings.least / (1 - settings.least))
-        kept: Tensor | float = 1 - settings.rate
-        if settings.backdrop_rate is not None:
-            like = self._like_backdrop(state.splats, settings.backdrop_within)
-            kept = torch.where(like, 1 - settings.backdrop_rate, kept).reshape(logits.shape)
-        faded = torch.logit(torch.sigmoid(logits) * kept).clamp_min(least)
-        backend.assign(logits, torch.where(logits > least, faded, logits))
+        least = math.log(LEAST_OPACITY / (1 - LEAST_OPACITY))
+        faded = torch.logit(torch.sigmoid(logits) * (1 - removal.decay)).clamp_min(least)
+        fades = ~in_color(state.splats, self._raster.background).reshape(logits.shape) & (logits > least)
+        backend.assign(logits, torch.where(fades, faded, logits))
+
+
+NEEDED, REMOVED = 1, 2
 
 
 def looks_at_free_space(recipe: Recipe, stage: Stage, iteration: int) -> bool:
-    """Whether splats are pruned from free space at the end of an iteration (1-based) of a stage."""
-    settings = recipe.free_space
-    return settings is not None and stage.moves_all and iteration % settings.every == 0
+    """Whether splats in free space are proposed for removal at the end of an iteration (1-based) of a stage."""
+    return recipe.removal is not None and stage.moves_all and iteration % recipe.removal.every == 0
 
 
-def looks_at_seen_area(recipe: Recipe, stage: Stage, iteration: int) -> bool:
-    """Whether splats of which little is photographed are pruned at the end of an iteration (1-based) of a stage."""
-    settings = recipe.seen_area
-    if settings is None or not stage.moves_all:
+def ends_part(recipe: Recipe, stage: Stage, iteration: int) -> bool:
+    """Whether a fifth of a stage ends with an iteration (1-based), after which all splats are tried anew."""
+    if recipe.removal is None or not stage.moves_all:
         return False
-    return iteration * settings.times // stage.iterations > (iteration - 1) * settings.times // stage.iterations
+    return iteration * PARTS // stage.iterations > (iteration - 1) * PARTS // stage.iterations

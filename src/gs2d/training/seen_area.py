@@ -12,7 +12,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gs2d.config.robust import SeenArea
 from gs2d.core.camera import Camera
 from gs2d.core.sh import C0
 from gs2d.core.splats import Splats
@@ -22,11 +21,13 @@ from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 
 PLACES = 7
+LEAST = 0.05  # a splat stays where some image shows this fraction of its weight
+INSIDE = 0.6  # it stays as well where this fraction of it lies within the images, all together
+LARGE = 0.001  # of an image: smaller splats cannot hide much
+SIDE = 200  # px, longer side of the images that are rendered
 
 
-def mostly_unseen(
-    splats: Splats, cameras: Sequence[Camera], settings: SeenArea, raster: RasterSettings, backend: Backend
-) -> Tensor:
+def mostly_unseen(splats: Splats, cameras: Sequence[Camera], raster: RasterSettings, backend: Backend) -> Tensor:
     """Find large splats of which no photograph shows more than a small fraction, and which lie outside of most.
 
     Parameters
@@ -43,13 +44,13 @@ def mostly_unseen(
     most = torch.zeros(len(splats), dtype=splats.dtype, device=splats.device)
     large = torch.zeros(len(splats), dtype=torch.bool, device=splats.device)
     for camera in cameras:
-        small = shrunk(camera, settings.side)
+        small = shrunk(camera, SIDE)
         whole = whole_weights(splats, small)
-        large |= whole > settings.size * small.width * small.height
+        large |= whole > LARGE * small.width * small.height
         most = torch.maximum(most, shown_weights(splats, small, raster, backend) / whole.clamp_min(1e-6))
-    found = large & (most < settings.least)
+    found = large & (most < LEAST)
     rows = found.nonzero().squeeze(1)
-    found[rows] = inside_fraction(splats.rows(rows), cameras) < settings.inside
+    found[rows] = inside_fraction(splats.rows(rows), cameras) < INSIDE
     return found
 
 

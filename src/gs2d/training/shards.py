@@ -251,17 +251,14 @@ class Shards(ManyProcesses, Whole):
         """Return the same."""
         return mask
 
-    def decide(self, mask: Callable[[Splats], Tensor], splats: Splats) -> Tensor:
-        """Return a mask [n] that process 0 makes, of the places, sizes and opacities of all splats."""
-        bare = {name: self.whole(getattr(splats, name)) for name in ("means", "quats", "log_scales", "opacity_logits")}
-        count = len(bare["means"])
-        found = torch.empty(count, dtype=torch.uint8, device=splats.device)
-        if self.leads:
-            nothing = splats.means.new_zeros(count, 1, 3)
-            found = mask(Splats(**bare, sh0=nothing, shN=nothing[:, :0])).to(torch.uint8)
+    def decide(self, judge: Callable[[Splats, Tensor], Tensor], splats: Splats, known: Tensor) -> Tensor:
+        """Return what ``judge`` says of all splats in process 0, uint8 [n]."""
+        every = Splats(**{name: self.whole(tensor.detach()) for name, tensor in splats.items()})
+        spared = self.whole(known.to(torch.uint8)).bool()
+        found = judge(every, spared) if self.leads else torch.empty_like(spared, dtype=torch.uint8)
         with self.contact():
             self._group.broadcast(found, src=0)
-        return self.own(found.bool(), splats.means)
+        return self.own(found, splats.means)
 
 
 def spread(values: Tensor, rows: Tensor, count: int) -> Tensor:

@@ -141,7 +141,7 @@ class Trainer:
             raise RunError("training goes on from a state or starts from init, got both; leave one out")
         # What goes on has begun; free space is found by the settings of the dense start, so that sweep is made again.
         self._within = within
-        goes_on = (init is not None and within is None) or (state is not None and self.recipe.free_space is None)
+        goes_on = (init is not None and within is None) or (state is not None and self.recipe.removal is None)
         begins = replace(self.recipe, dense_start=None) if goes_on else self.recipe
         self._robust = Robustness(scene, begins, self.settings, self.backend, processes)
         if state is not None:
@@ -275,7 +275,7 @@ class Trainer:
             limit = 0 if together.splits else self._stage2_cache_bytes // together.place.local_size
             self._objective = choose_objective(self._whole, state, stage, limit, together.size)
         reports = any(i % self._progress_every == 0 for i in iterations) or iteration == stage.iterations
-        changes_rows = any(self._changes(i) or self._robust.prunes(stage, i) for i in iterations)
+        changes_rows = any(self._changes(i) or self._robust.removes(stage, i) for i in iterations)
         sharpens = stage.downscale_at(iteration + 1) != stage.downscale_at(iteration)  # then nothing may be done again
         result, happened = self._learner.iterate(
             partial(self._learn, stage, turns),
@@ -283,7 +283,7 @@ class Trainer:
             exact=reports or changes_rows or sharpens or together.size > 1,  # what is summed up cannot be taken back
         )
         for number in iterations:
-            happened += self._robust.prune(self.state, stage, number)
+            happened += self._robust.remove(self.state, stage, number)
         state.step = iteration
         if changes_rows:
             together.check(state)

@@ -227,7 +227,7 @@ def coarse_recipe(recipe: Recipe, partition: Partition) -> Recipe:
     """Return the recipe of the coarse model."""
     coarse = partition.coarse
     value = scale_schedule(recipe, coarse.schedule)
-    value = longer_steps(value, coarse.schedule) if recipe.free_space is not None else value
+    value = longer_steps(value, coarse.schedule) if recipe.removal is not None else value
     return validate(with_budget(value, coarse.max_splats))
 
 
@@ -276,8 +276,7 @@ def seam_recipe(recipe: Recipe, partition: Partition, photographs: float) -> Rec
         halve_at=(),
     )
     exposure = None if recipe.exposure is None else replace(recipe.exposure, initial="given")
-    found = replace(recipe, stages=(stage,), exposure=exposure, dense_start=None, free_space=None)
-    return validate(replace(found, opacity_decay=None, seen_area=None, dropout=None))
+    return validate(replace(recipe, stages=(stage,), exposure=exposure, dense_start=None, removal=None))
 
 
 def seam_folder(out: Path) -> Path:

@@ -1,0 +1,102 @@
+"""Removal on trial: the training images decide which of the splats that something speaks against are floaters.
+
+Depth maps, sizes and colours only propose splats for removal. Each of these signs is wrong somewhere: a mirror image on
+a table has a depth below the table. So the images decide. Each is rendered with and without all proposed splats, and
+the change of its squared error is shared among them by their blending weights. A splat stays if more images miss it
+than speak against it. Fog before a camera, learned by heart from one image, is missed by that image alone, and goes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gs2d.core.camera import Camera
+from gs2d.core.sh import C0
+from gs2d.core.splats import Splats
+from gs2d.render.api import rasterize
+from gs2d.render.backends import Backend
+from gs2d.render.types import RasterSettings
+from gs2d.training.dropout import dropped_out
+
+
+@dataclass(frozen=True, eq=False)
+class Witness:
+    """A training image that is asked, no larger than it need be.
+
+    Attributes
+    ----------
+    camera : Camera
+    color : Tensor [H, W, 3] in [0, 1]
+    usable : Tensor [H, W] bool
+        Pixels that count.
+    exposure : Tensor [3, 4] or None
+        What training applies to a rendering of this view.
+    """
+
+    camera: Camera
+    color: Tensor
+    usable: Tensor
+    exposure: Tensor | None
+
+
+def missed(
+    splats: Splats,
+    against: Tensor,
+    witnesses: Iterable[Witness],
+    raster: RasterSettings,
+    backend: Backend,
+    *,
+    stands_for: float = 1.0,
+) -> Tensor:
+    """Return which of the proposed splats the training images miss.
+
+    The images that miss a splat are counted by how much: their losses together, divided by the largest. Ten equal
+    losses are ten images; one large loss among small ones is hardly more than one image.
+
+    Parameters
+    ----------
+    splats : Splats
+        N of them.
+    against : Tensor [N] int
+        How many images speak against each splat; 0: it is not proposed.
+    witnesses : iterable of Witness
+    raster : RasterSettings
+        Of training.
+    backend : Backend
+    stands_for : float
+        Training images for each witness.
+
+    Returns
+    -------
+    Tensor [N] bool
+    """
+    proposed = against > 0
+    parts = {name: tensor.detach() for name, tensor in splats.items()}
+    sh0 = parts["sh0"].clone().requires_grad_()
+    whole, without = Splats(**{**parts, "sh0": sh0}), dropped_out(Splats(**parts), ~proposed)
+    settings = replace(raster, with_distortion=False)
+    total = torch.zeros(len(splats), dtype=sh0.dtype, device=sh0.device)
+    largest = torch.zeros_like(total)
+    for witness in witnesses:
+        with torch.enable_grad():
+            color = rasterize(whole, witness.camera, settings, backend=backend).color
+        with torch.no_grad():
+            bare = rasterize(without, witness.camera, settings, backend=backend).color
+            loss = _errors(bare, witness) - _errors(color, witness)
+        # The derivative with respect to a splat's colour sums the loss over pixels, with its blending weights.
+        (shared,) = torch.autograd.grad(color, sh0, (loss / 3)[..., None].expand_as(color))
+        miss = shared.sum(dim=(1, 2)) / C0
+        total += miss
+        largest = torch.maximum(largest, miss)
+    return proposed & (total * stands_for > against * largest) & (total > largest)
+
+
+def _errors(color: Tensor, witness: Witness) -> Tensor:
+    """Return squared errors [H, W] of a rendering, 0 where the image does not count."""
+    if witness.exposure is not None:
+        color = color @ witness.exposure[:, :3].T + witness.exposure[:, 3]
+    return (color - witness.color).square().sum(dim=2) * witness.usable
