@@ -37,10 +37,11 @@ def counted(maps: FreeSpaceMaps, splats: Splats, *, reference: bool) -> tuple[Te
     reach = (ends - ends[0]).norm(dim=2).amax(dim=0)
     against, support = (torch.zeros(len(splats), dtype=torch.int32) for _ in range(2))
     for view in maps._views:
+        limit = torch.maximum(view.limit, view.nearest)
         if reference:
-            free_space.look_at_free_space_reference(view, ends, 0.05, against, support)
+            free_space.look_at_free_space_reference(view, ends, limit, view.radius, against, support)
         else:
-            free_space._look(view, ends, reach, 0.05, against, support)
+            free_space._look(view, ends, reach, limit, view.radius, against, support)
     return against, support
 
 

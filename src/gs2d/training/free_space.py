@@ -8,7 +8,7 @@ and the recipe, so a resume knows the same.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -33,20 +33,33 @@ _UNKNOWN = float("inf")
 
 @dataclass(frozen=True, eq=False)
 class FreeView:
-    """One image: what is before ``limit`` [H, W] (world units) is free, and a ball of ``radius`` around the camera.
+    """What one image says of free space.
 
-    ``known`` [H, W] world units is the depth of what it shows, infinite where that is not known.
+    Attributes
+    ----------
+    limit : Tensor [H, W] world units
+        What is nearer is free, because the image shows something behind it; 0 where it is not known what.
+    known : Tensor [H, W] world units
+        Depth of what the image shows; infinite where that is not known.
+    nearest : Tensor [H, W] world units
+        Where the image shows something of unknown depth, what is nearer than anything known; 0 elsewhere.
+    radius : float, world units
+        Of a ball around the camera where nothing is expected.
+    K, T : Tensor [3, 3], [4, 4]
+        Intrinsics; T_cam_world.
     """
 
     limit: Tensor
     known: Tensor
+    nearest: Tensor
     radius: float
-    K: Tensor  # [3, 3]
-    T: Tensor  # [4, 4] T_cam_world
+    K: Tensor
+    T: Tensor
 
     def to(self, device: torch.device | str) -> FreeView:
         """Return the same on a device."""
-        return FreeView(self.limit.to(device), self.known.to(device), self.radius, self.K.to(device), self.T.to(device))
+        moved = {name: getattr(self, name).to(device) for name in ("limit", "known", "nearest", "K", "T")}
+        return replace(self, **moved)
 
 
 class FreeSpaceMaps:
@@ -67,18 +80,21 @@ class FreeSpaceMaps:
 
     @torch.no_grad()
     def against(self, splats: Splats) -> Tensor:
-        """Return how many images see through each splat, [N] int32; 0 where as many show a surface there.
+        """Return how many images speak against each splat, [N] int32; 0 where as many show a surface there.
 
-        One or two percent of the depths of each image are wrong, mostly at edges. Over all images that is much, so a
-        place is free only where more of them see through it than see a surface there.
+        An image speaks against a splat if it shows something behind it. One or two percent of the depths of each image
+        are wrong, mostly at edges; over all images that is much, so more of them must see through a splat than see a
+        surface there. Where no depth is known an image is silent. A splat nearer than anything known, or beside a
+        camera, is proposed all the same, but by one vote: what images miss there stays.
         """
         ends = self._ends(splats)
         reach = (ends - ends[0]).norm(dim=2).amax(dim=0)
-        against = torch.zeros(len(splats), dtype=torch.int32, device=splats.device)
-        support = torch.zeros_like(against)
+        against, silent, support, unused = torch.zeros((4, len(splats)), dtype=torch.int32, device=splats.device)
         for kept in self._views:
-            _look(kept.to(self._device), ends, reach, 1 - NEARER, against, support)
-        return torch.where(against > support, against, 0)
+            view = kept.to(self._device)
+            _look(view, ends, reach, view.limit, 0.0, against, support)
+            _look(view, ends, reach, view.nearest, view.radius, silent, unused)
+        return torch.where(against > support, against, (silent > support).to(against.dtype))
 
     def _ends(self, splats: Splats) -> Tensor:
         """Places [P, N, 3] at which a splat is looked at: its centre, and its ends along both axes."""
@@ -98,40 +114,56 @@ def _free_view(sweep: Sweep, index: int) -> FreeView:
     np.minimum.at(known, (row, column), view.depth)
     half = WINDOW // 2
     grown = -F.max_pool2d(-torch.from_numpy(known)[None, None], WINDOW, 1, half)[0, 0]
-    floor = torch.full_like(grown, FLOOR * view.nearest)
-    limit = NEARER * torch.where(torch.isfinite(grown), grown, floor)
+    unknown = ~torch.isfinite(grown)
+    limit = torch.where(unknown, 0.0, NEARER * grown)
+    nearest = torch.where(unknown, NEARER * FLOOR * view.nearest, 0.0)
     tensors = (torch.from_numpy(np.ascontiguousarray(array)).float() for array in (view.K, view.T))
     radius = BALL * FLOOR * view.nearest
-    return FreeView(limit.float(), torch.from_numpy(known).float(), radius, *tensors)
+    return FreeView(limit.float(), torch.from_numpy(known).float(), nearest.float(), radius, *tensors)
 
 
-def _look(view: FreeView, ends: Tensor, reach: Tensor, fraction: float, against: Tensor, support: Tensor) -> None:
-    """Add one photograph to what is counted of each splat [N]: natively where that can be, else in torch."""
+def _look(
+    view: FreeView,
+    ends: Tensor,
+    reach: Tensor,
+    limit: Tensor,
+    radius: float,
+    against: Tensor,
+    support: Tensor,
+) -> None:
+    """Count one image for each splat [N], natively if possible, else in torch."""
     done = look_at_free_space(
         ends,
         reach,
         _projection(view),
         _center(view),
-        radius=view.radius,
-        limit=view.limit,
+        radius=radius,
+        limit=limit,
         known=view.known,
-        fraction=fraction,
+        fraction=1 - NEARER,
         against=against,
         support=support,
     )
     if not done:
-        look_at_free_space_reference(view, ends, fraction, against, support)
+        look_at_free_space_reference(view, ends, limit, radius, against, support)
 
 
 def look_at_free_space_reference(
-    view: FreeView, ends: Tensor, fraction: float, against: Tensor, support: Tensor
+    view: FreeView, ends: Tensor, limit: Tensor, radius: float, against: Tensor, support: Tensor
 ) -> None:
-    """Add one photograph to what is counted of each splat [N], in torch."""
-    free = (ends[0] - _center(view)).norm(dim=1) < view.radius
+    """Count one image for each splat [N], in torch.
+
+    One is added to ``against`` [N] where an end of the splat is nearer than ``limit`` [H, W] or its centre is within
+    ``radius`` of the camera, and to ``support`` [N] where its centre lies on the surface that the image shows.
+    """
+    free = (ends[0] - _center(view)).norm(dim=1) < radius
     for places in ends:
-        free |= _is_free(view, places)
+        z, inside, row, column = _seen(view, places)
+        free |= inside & (z < limit[row, column])
     against += free
-    support += _is_shown(view, ends[0], fraction)
+    z, inside, row, column = _seen(view, ends[0])
+    known = view.known[row, column]
+    support += inside & torch.isfinite(known) & ((z - known).abs() <= (1 - NEARER) * known)
 
 
 def _center(view: FreeView) -> Tensor:
@@ -140,19 +172,6 @@ def _center(view: FreeView) -> Tensor:
 
 def _projection(view: FreeView) -> Tensor:
     return view.K @ view.T[:3]
-
-
-def _is_free(view: FreeView, places: Tensor) -> Tensor:
-    """Which places [N, 3] a photograph sees through."""
-    z, inside, row, column = _seen(view, places)
-    return inside & (z < view.limit[row, column])
-
-
-def _is_shown(view: FreeView, places: Tensor, fraction: float) -> Tensor:
-    """Which places [N, 3] lie on the surface that a photograph shows, within a fraction of its depth."""
-    z, inside, row, column = _seen(view, places)
-    known = view.known[row, column]
-    return inside & torch.isfinite(known) & ((z - known).abs() <= fraction * known)
 
 
 def _seen(view: FreeView, places: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
