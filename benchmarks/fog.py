@@ -7,8 +7,8 @@
 Trains each capture (with the sparse points that its photographs show: COLMAP's) once for each variant, every 8th view
 held out, and measures: PSNR and SSIM of test views, the worst one, PSNR after an affine fit of colour (what exposure
 explains), PSNR of training views, sparse points hidden in test views (mean and worst view), the share of the blending
-weight of all training views that lies clearly nearer to a camera than 99 % of the sparse points, splats and CPU
-seconds. One thread; CPU seconds of a shared machine are comparable within one run only, and only roughly.
+weight of all training views that lies clearly nearer to a camera than 99 % of the sparse points, pixels of training
+views with alpha below 0.9, splats and CPU seconds. One thread; CPU seconds of a shared machine are comparable within one run only, and only roughly.
 """
 
 from __future__ import annotations
@@ -24,10 +24,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from gs2d.config.presets import with_fading_backdrop
 from gs2d.config.protocols import GENERIC, Protocol
 from gs2d.config.recipe import Recipe
-from gs2d.config.robust import OpacityDecay
+from gs2d.config.robust import Removal
 from gs2d.core.sh import C0
 from gs2d.core.splats import Splats
 from gs2d.data import Scene, View, load_scene
@@ -44,6 +43,7 @@ from gs2d.training.trainer import Trainer
 
 NEAR_PERCENTILE, NEARER = 1.0, 0.9  # of the depths of sparse points in the photographs that show them; a margin
 TRAINING_VIEWS = 12  # that are scored, evenly chosen
+OPAQUE = 0.9  # alpha below which a pixel of a training view is counted as transparent
 
 
 def _without(field: str) -> Callable[[Recipe], Recipe]:
@@ -54,10 +54,9 @@ VARIANTS: Mapping[str, tuple[dict[str, Any], Callable[[Recipe], Recipe]]] = {  #
     "off": ({"robust": "off"}, lambda recipe: recipe),
     "robust": ({}, lambda recipe: recipe),
     "no dense start": ({}, _without("dense_start")),
-    "no free space": ({}, _without("free_space")),
-    "no decay": ({}, _without("opacity_decay")),
-    "backdrop stays": ({}, lambda recipe: replace(recipe, opacity_decay=OpacityDecay())),
-    "backdrop fades": ({}, with_fading_backdrop),
+    "no removal": ({}, _without("removal")),
+    "no decay": ({}, lambda recipe: replace(recipe, removal=Removal(decay=0.0))),
+    "no dropout": ({}, lambda recipe: replace(recipe, removal=Removal(dropout=0.0))),
     "no exposure": ({"exposure": False}, lambda recipe: recipe),
     "black background": ({}, lambda recipe: recipe),
     "off, exposure": ({"robust": "off", "exposure": True}, lambda recipe: recipe),
@@ -87,12 +86,15 @@ def measure(scene: Scene, trainer: Trainer) -> dict[str, Any]:
     brightness = metered(splats, settings, trainer.backend)
     transforms = with_predicted(named(scene.train, trainer.state.exposures), scene, brightness)
     tests = [_score(scene, view, splats, settings, transforms) for view in scene.test]
+    by_view = [score["psnr"] for score in tests]
     chosen = scene.train[:: max(1, len(scene.train) // TRAINING_VIEWS)]
     trains = [_score(scene, view, splats, settings, transforms) for view in chosen]
     hidden = [score.pop("points") for score in tests]
     return {
         "test": {key: float(np.mean([score[key] for score in tests])) for key in ("psnr", "ssim", "fitted")},
-        "worst": min(score["psnr"] for score in tests),
+        "worst": min(by_view),
+        "views": by_view,
+        "transparent": float(np.mean([score["transparent"] for score in trains])),
         "train": float(np.mean([score["psnr"] for score in trains])),
         "hidden": total(hidden).fraction,
         "hidden_worst": max((points.fraction or 0.0 for points in hidden), default=0.0),
@@ -120,6 +122,7 @@ def _score(
         "fitted": psnr_float(fitted, target, mask),
         "ssim": image_metrics(color, target, mask, backend="cpu").ssim.value,
         "points": points,
+        "transparent": float((output.alpha[everywhere] < OPAQUE).float().mean()),
     }
 
 
@@ -150,15 +153,15 @@ def near_weight(scene: Scene, splats: Splats, settings: RasterSettings) -> float
 def show(rows: Sequence[dict[str, Any]]) -> str:
     """The figures as a Markdown table."""
     lines = [
-        "| capture | variant | test | worst | SSIM | colour fitted | training | hidden | worst | near | splats | CPU |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "| capture | variant | test | worst | SSIM | colour fitted | training | hidden | worst | near | transparent | splats | CPU |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         test = row["test"]
         lines.append(
             f"| {row['capture']} | {row['variant']} | {test['psnr']:.2f} | {row['worst']:.2f} | {test['ssim']:.3f} "
             f"| {test['fitted']:.2f} | {row['train']:.2f} | {row['hidden']:.2%} | {row['hidden_worst']:.1%} "
-            f"| {row['near_weight']:.1%} | {row['splats']:,} | {row['cpu_seconds']:.0f} |"
+            f"| {row['near_weight']:.1%} | {row['transparent']:.1%} | {row['splats']:,} | {row['cpu_seconds']:.0f} |"
         )
     return "\n".join(lines)
 
