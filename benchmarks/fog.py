@@ -7,8 +7,9 @@
 Trains each capture (with the sparse points that its photographs show: COLMAP's) once for each variant, every 8th view
 held out, and measures: PSNR and SSIM of test views, the worst one, PSNR after an affine fit of colour (what exposure
 explains), PSNR of training views, sparse points hidden in test views (mean and worst view), the share of the blending
-weight of all training views that lies clearly nearer to a camera than 99 % of the sparse points, pixels of training
-views with alpha below 0.9, splats and CPU seconds. One thread; CPU seconds of a shared machine are comparable within one run only, and only roughly.
+weight of all training views that lies clearly nearer to a camera than 99 % of the sparse points, the share of the
+pixels of training views with alpha below 0.9, splats and CPU seconds. One thread; CPU seconds of a shared machine are
+comparable within one run only, and only roughly.
 """
 
 from __future__ import annotations
@@ -153,7 +154,8 @@ def near_weight(scene: Scene, splats: Splats, settings: RasterSettings) -> float
 def show(rows: Sequence[dict[str, Any]]) -> str:
     """The figures as a Markdown table."""
     lines = [
-        "| capture | variant | test | worst | SSIM | colour fitted | training | hidden | worst | near | transparent | splats | CPU |",
+        "| capture | variant | test | worst | SSIM | colour fitted | training | hidden | worst | near | transparent "
+        "| splats | CPU |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
