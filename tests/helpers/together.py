@@ -112,7 +112,7 @@ def cached() -> Recipe:
 
 def dropping() -> Recipe:
     """Splats are left out of iterations, and views compared with their neighbours."""
-    return replace(compared(), removal=Removal(every=1_000, decay=0.0, dropout=0.3))
+    return replace(compared(), removal=Removal(decay=0.0, dropout=0.3))
 
 
 def robust() -> Recipe:
@@ -151,7 +151,7 @@ def trained(
     begun = None if state is None else TrainState.from_state_dict(state)
     room = ROOM * together.place.local_size
     given = {"backend": backends()[-1], "progress_every": 1, "stage2_cache_bytes": room} | options
-    scene = wall() if recipe.dense_start else make_scene()
+    scene = wall() if recipe.removal else make_scene()
     trainer = Trainer(scene, recipe, GENERIC, on_event=on_event, processes=together, state=begun, **given)
     trainer.run()
     return trainer.state, heard

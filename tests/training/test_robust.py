@@ -207,7 +207,6 @@ def test_what_the_images_miss_stays_though_depths_speak_against_it() -> None:
     splats, witnesses = wall_of_splats()
     middle = (splats.means[:, :2].norm(dim=1) < 0.6).to(torch.int32)
     assert missed(splats, middle, witnesses, RASTER, BACKEND).tolist() == (middle > 0).tolist()
-    assert not missed(splats, 6 * middle, witnesses, RASTER, BACKEND).any()  # more than there are images
     assert not missed(splats, 0 * middle, witnesses, RASTER, BACKEND).any()
 
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from gs2d.config.protocols import BLACK
 from gs2d.config.recipe import Recipe, Stage
 from gs2d.config.robust import DenseStart, Removal
 from gs2d.core.camera import Camera
@@ -154,13 +155,15 @@ class Robustness:
         proposed = against > 0
         if not proposed.any() or (not last and int(proposed.sum()) < FEW_NEW * len(splats)):
             return verdict
+        # Over black: what has the colour of the background is missed too, unless that is unlit and nothing is there.
+        raster = self._raster if self._removal.backdrop else replace(self._raster, background=BLACK)
         step = max(1, -(-len(self._images) // MAX_WITNESSES))
         rows = range(iteration // self._removal.every % step, len(self._images), step)
         needed = missed(
             splats,
             against,
             self._witnesses(state, rows),
-            self._raster,
+            raster,
             self._backend,
             stands_for=len(self._images) / len(rows),
         )
@@ -204,7 +207,9 @@ class Robustness:
         Over that background no image would ask for them again.
         """
         removal = self._recipe.removal
-        if removal is None or stage.train.get("opacity_logits") != "all" or iteration % DECAY_EVERY:
+        if removal is None or removal.decay == 0 or stage.train.get("opacity_logits") != "all":
+            return
+        if iteration % DECAY_EVERY:
             return
         logits = state.splats.opacity_logits
         least = math.log(LEAST_OPACITY / (1 - LEAST_OPACITY))

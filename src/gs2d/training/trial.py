@@ -23,6 +23,9 @@ from gs2d.render.types import RasterSettings
 from gs2d.training.dropout import dropped_out
 
 
+ENOUGH = 2  # images that miss a splat and keep it, however many speak against it: wrong depths come in groups
+
+
 @dataclass(frozen=True, eq=False)
 class Witness:
     """A training image that is asked, no larger than it need be.
@@ -62,7 +65,7 @@ def missed(
     splats : Splats
         N of them.
     against : Tensor [N] int
-        How many images speak against each splat; 0: it is not proposed.
+        How many images speak against each splat, of which ``ENOUGH`` count; 0: it is not proposed.
     witnesses : iterable of Witness
     raster : RasterSettings
         Of training.
@@ -92,7 +95,7 @@ def missed(
         miss = shared.sum(dim=(1, 2)) / C0
         total += miss
         largest = torch.maximum(largest, miss)
-    return proposed & (total * stands_for > against * largest) & (total > largest)
+    return proposed & (total > largest) & (total * stands_for > against.clamp_max(ENOUGH) * largest)
 
 
 def _errors(color: Tensor, witness: Witness) -> Tensor:
