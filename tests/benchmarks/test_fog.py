@@ -53,11 +53,11 @@ def test_the_command_trains_variants_and_writes_their_figures(
     monkeypatch.setattr(fog, "load_scene", lambda path, downscale: split())
     out = tmp_path / "fog.json"
     threads = torch.get_num_threads()
-    fog.main(["captures/wall:2", "--scale", "0.001", "--variants", "off", "robust", "no free space", "--out", str(out)])
+    fog.main(["captures/wall:2", "--scale", "0.001", "--variants", "off", "robust", "no removal", "--out", str(out)])
     torch.set_num_threads(threads)
     rows = json.loads(out.read_text())
     assert [(row["capture"], row["downscale"], row["variant"]) for row in rows] == [
-        ("wall", 2, variant) for variant in ("off", "robust", "no free space")
+        ("wall", 2, variant) for variant in ("off", "robust", "no removal")
     ]
     assert all(np.isfinite(row["test"]["psnr"]) for row in rows)
     assert len({row["test"]["psnr"] for row in rows}) > 1

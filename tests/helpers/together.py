@@ -31,6 +31,7 @@ from gs2d.errors import Gs2dError
 from gs2d.training import events
 from gs2d.training.objective import StepResult
 from gs2d.training.parallel import OF_A_VIEW, OneProcess, Turn
+from gs2d.training.rows import keep_rows
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
 from train_toys import backends, compared, make_scene, short
@@ -242,7 +243,12 @@ def do(case: str, many: Any) -> Any:
     if case == "dropped":  # by a mask that process 0 makes, of all splats
         trainer = Trainer(make_scene(), short(), GENERIC, backend=backends()[-1], processes=many)
         trainer._stop_telling()
-        dropped = trainer._robust._drop(trainer.state, lambda splats: splats.means[:, 0] > 0.1)
+        splats = trainer.state.splats
+        known = splats.means[:, 1] > 0
+        found = many.decide(lambda every, known: (every.means[:, 0] > 0.1).to(torch.uint8) * (1 + known), splats, known)
+        dropped = trainer.state.parts.count(int((found > 0).sum()))
+        assert torch.equal(found == 2, (splats.means[:, 0] > 0.1) & known)
+        keep_rows(trainer.state, found == 0)
         return {"dropped": dropped, "here": len(trainer.state.splats), "state": many.end(trainer.state).state_dict()}
     if case == "resumed":  # in the middle of a stage: the state of process 0 counts, the others have none
         whole, heard = trained(short(), many)

@@ -251,7 +251,7 @@ def test_floaters_are_removed_at_every_turn_and_that_is_an_event() -> None:
     trainer.step()
     trainer.step()
     trainer.state.splats.means[:7] = torch.tensor([0.5, 0.0, 1.8])
-    trainer.state.splats.sh0[:7] = 2.0
+    trainer.state.splats.sh0[:7] = -3.0  # black
     before = len(trainer.splats)
     trainer.step()  # a fifth of 15 iterations ends
     (removed,) = [event for event in happened if isinstance(event, events.FloatersRemoved)]

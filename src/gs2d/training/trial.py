@@ -22,7 +22,6 @@ from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 from gs2d.training.dropout import dropped_out
 
-
 ENOUGH = 2  # images that miss a splat and keep it, however many speak against it: wrong depths come in groups
 
 
