@@ -27,6 +27,7 @@ from gs2d.config.recipe import Exposure, PoseRefinement, Recipe
 from gs2d.config.robust import DenseStart, Removal
 from gs2d.config.schedule import scale_schedule
 from gs2d.core.processes import Place
+from gs2d.core.splats import Splats
 from gs2d.errors import Gs2dError
 from gs2d.training import events
 from gs2d.training.objective import StepResult
@@ -245,7 +246,11 @@ def do(case: str, many: Any) -> Any:
         trainer._stop_telling()
         splats = trainer.state.splats
         known = splats.means[:, 1] > 0
-        found = many.decide(lambda every, known: (every.means[:, 0] > 0.1).to(torch.uint8) * (1 + known), splats, known)
+
+        def judge(every: Splats, known: torch.Tensor) -> torch.Tensor:
+            return ((every.means[:, 0] > 0.1).long() * (1 + known.long())).to(torch.uint8)
+
+        found = many.decide(judge, splats, known)
         dropped = trainer.state.parts.count(int((found > 0).sum()))
         assert torch.equal(found == 2, (splats.means[:, 0] > 0.1) & known)
         keep_rows(trainer.state, found == 0)
