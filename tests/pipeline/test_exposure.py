@@ -223,19 +223,6 @@ def test_the_flag_is_the_named_recipe() -> None:
     assert get_recipe("2dgs-r").exposure is None
 
 
-def test_a_run_made_before_there_were_exposures_and_comparisons_is_resumed(
-    undisturbed: RunFolder, capture: Path, tmp_path: Path
-) -> None:
-    copy = tmp_path / "old"
-    shutil.copytree(undisturbed.path, copy)
-    definition = json.loads((copy / "run.json").read_text())
-    assert definition["recipe"].pop("exposure", "absent") is None
-    assert definition["recipe"].pop("multiview", "absent") is None
-    (copy / "run.json").write_text(json.dumps(definition))
-    resumed = train(options(capture, copy, resume=True))
-    assert comparable(resumed) == comparable(undisturbed)
-
-
 def test_a_lost_or_damaged_file_of_exposures_is_named_with_its_remedy(run: RunFolder, tmp_path: Path) -> None:
     copy = RunFolder(tmp_path / "copy")
     shutil.copytree(run.path, copy.path)

@@ -183,13 +183,3 @@ def test_the_option_is_the_named_recipe_and_takes_a_source() -> None:
     assert [any(t.kind == "depth_prior" for t in s.losses) for s in flagged.stages] == [True, False, True]
     with pytest.raises(RecipeError, match="depth_prior is null, but loss 'depth_prior' needs it"):
         build_recipe("2dgs", depth_prior="auto", **{**rest, "overrides": ("depth_prior=null",)})
-
-
-def test_a_run_made_before_there_were_priors_is_resumed(undisturbed: RunFolder, capture: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "old"
-    shutil.copytree(undisturbed.path, copy)
-    definition = json.loads((copy / "run.json").read_text())
-    assert definition["recipe"].pop("depth_prior", "absent") is None
-    assert definition["recipe"].pop("normal_prior", "absent") is None
-    (copy / "run.json").write_text(json.dumps(definition))
-    assert comparable(train(options(capture, copy, resume=True))) == comparable(undisturbed)

@@ -311,7 +311,7 @@ def build_scene(
         bounds=bounds,
         T_metric_scene=capture.T_metric_scene,
         skipped=tuple(
-            f"{names[i]} is left out: its camera is {ratio:,.0f} times as far from the centre of the cameras "
+            f"{names[i]} is left out: its camera is {ratio:,.4g} times as far from the centre of the cameras "
             "as the median camera, so its pose is wrong"
             for i, ratio in outliers.items()
         )
