@@ -35,6 +35,7 @@ PARTS = 5  # of a stage: at the end of each, all splats are proposed and tried a
 FEW_NEW = 0.002  # of the splats: fewer new proposals wait, because a trial costs as much as some 50 iterations
 MAX_WITNESSES = 24  # images that a trial asks; of more images each trial asks others
 DECAY_EVERY, LEAST_OPACITY = 10, 0.005  # iterations; splats never decay below what is pruned or not drawn
+NEEDED, REMOVED = 1, 2  # verdicts; 0: not tried
 MISSED = "missed"  # the row group of splats that a trial has found to be needed
 
 
@@ -216,9 +217,6 @@ class Robustness:
         faded = torch.logit(torch.sigmoid(logits) * (1 - removal.decay)).clamp_min(least)
         fades = ~in_color(state.splats, self._raster.background).reshape(logits.shape) & (logits > least)
         backend.assign(logits, torch.where(fades, faded, logits))
-
-
-NEEDED, REMOVED = 1, 2
 
 
 def looks_at_free_space(recipe: Recipe, stage: Stage, iteration: int) -> bool:

@@ -555,7 +555,10 @@ def model_points(folder: Path, kind: str) -> PointCloud | None:
 def _intrinsics(path: Path, cameras: dict[int, ColmapCamera], image: ColmapImage) -> Intrinsics:
     camera = cameras.get(image.camera_id)
     if camera is None:
-        raise DataError(f"{path} must hold camera {image.camera_id} of image {image.name}, got {sorted(cameras)[:9]}")
+        raise DataError(
+            f"{path} must hold camera {image.camera_id} of image {image.name}, got {sorted(cameras)[:9] or 'none'}; is "
+            "the file complete? Copy or export it again"
+        )
     where = f"{path}: camera {image.camera_id}"
     if camera.model == PANORAMA:
         size = (camera.width, camera.height)
