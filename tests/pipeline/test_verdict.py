@@ -63,6 +63,7 @@ RECORDED: dict[str, tuple[Any, ...]] = {
     "castle (11), draft": (25.96, 15.70, 8.80, 4575, 0.0031, (11, 11), "poor"),
     "castle (11), normal": (29.10, 15.77, 8.73, 4576, 0.0046, (11, 11), "poor"),
     "lounge, good images of a misplaced surface": (34.79, 31.20, 27.42, 722, 0.24, (12, 12), "usable"),
+    "white table, draft, points of reflections": (32.46, 31.83, 28.96, 4308, 0.098, (60, 60), "good"),
     "flat": (32.32, 24.13, 21.20, 3944, 0.030, (13, 13), "usable"),
     "lane": (20.96, 16.86, 15.27, 836, 0.097, (29, 29), "poor"),
     "kitchen": (26.26, 19.06, 15.84, 1311, 0.0023, (25, 25), "poor"),

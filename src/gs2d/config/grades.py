@@ -14,6 +14,7 @@ GOOD, USABLE, POOR = "good", "usable", "poor"
 GRADES = (GOOD, USABLE, POOR)
 NEW, TRAINED, FLOATERS, PLACED = "new views", "training views", "floaters", "placed"  # these are graded
 GAP, ANGLE, BLUR = "gap", "overlap", "blur"  # these decide on advice only
+BEHIND = "behind"  # takes the place of FLOATERS where every new view is good
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,9 @@ LIMITS: Mapping[str, Limits] = MappingProxyType(
         NEW: Limits(25.0, 20.0, "dB", "differences are hard to find from 25 dB, and parts are wrong or foggy below 20"),
         TRAINED: Limits(27.0, 22.0, "dB", "training views are about 2 dB better than new ones in dense captures"),
         FLOATERS: Limits(0.02, 0.3, "of the points", "clean scenes hide up to 0.5 %, visible fog 5 to 20 %"),
+        BEHIND: Limits(
+            0.15, 0.3, "of the points", "a reflecting table has 10 % of its points behind it, a misplaced wall 24 %"
+        ),
         PLACED: Limits(0.8, 0.0, "of the photographs", "a fifth of the photographs is a side of the subject"),
         GAP: Limits(3.0, math.inf, "dB", "beyond it, three times the iterations gained 0.1 dB at most"),
         ANGLE: Limits(20.0, math.inf, "degrees", "matching features gets hard from there on"),

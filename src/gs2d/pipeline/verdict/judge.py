@@ -113,14 +113,19 @@ def _train_longer(psnr: float) -> str:
 
 
 def _floaters(measures: Measures) -> list[Finding]:
-    """Judge the sparse points of test views that something nearer hides in the rendering."""
+    """Judge the sparse points of test views that something nearer hides in the rendering.
+
+    Where every new view is good, what hides them is no fog: mirrors and glass have points behind their surface.
+    """
     rows = [view for view in measures.views if view.hidden is not None and view.points]
     shown, hidden = sum(view.points or 0 for view in rows), sum(view.hidden or 0 for view in rows)
     if not shown:
         text = "Needs test views, and a capture that says which sparse points its photographs show."
         return [Finding(grades.FLOATERS, None, NOT_MEASURED, text)]
     rate = {view.name: (view.hidden or 0) / (view.points or 1) for view in rows}
-    limit = LIMITS[grades.FLOATERS]
+    new = [view.psnr for view in measures.views if view.split == "test" and view.psnr is not None]
+    clear = bool(new) and LIMITS[grades.NEW].grade(min(new)) == GOOD
+    limit = LIMITS[grades.BEHIND if clear else grades.FLOATERS]
     grade = limit.grade(hidden / shown)
     views = tuple(name for name in sorted(rate, key=lambda n: -rate[n]) if limit.grade(rate[name]) != GOOD)
     text = "Sparse points of new views that something nearer hides in the rendering: floaters or misplaced surfaces."
