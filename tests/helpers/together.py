@@ -27,12 +27,10 @@ from gs2d.config.recipe import Exposure, PoseRefinement, Recipe
 from gs2d.config.robust import DenseStart, Removal
 from gs2d.config.schedule import scale_schedule
 from gs2d.core.processes import Place
-from gs2d.core.splats import Splats
 from gs2d.errors import Gs2dError
 from gs2d.training import events
 from gs2d.training.objective import StepResult
 from gs2d.training.parallel import OF_A_VIEW, OneProcess, Turn
-from gs2d.training.rows import keep_rows
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
 from train_toys import backends, compared, make_scene, short
@@ -215,46 +213,11 @@ def together_in(size: int, cases: Sequence[str], folder: Path) -> dict[str, list
     return {case: [torch.load(path, weights_only=False) for path in paths] for case, paths in found.items()}
 
 
-SHARDED = "sharded-"  # before a case: each process has a part of the splats
-
-
-def counting(many: Any) -> Any:
-    """The processes of a group, each with a part of the splats, that note how many this one has: ``rows``."""
-    from gs2d.training.shards import Shards
-
-    class Counting(Shards):
-        rows: list[tuple[int, int]] = []  # noqa: RUF012 (of this process, of all)
-
-        def settle(self, state: TrainState, pieces: Sequence[int]) -> None:
-            super().settle(state, pieces)
-            self.rows = [*self.rows, (len(state.splats), state.count)]
-
-    return Counting(many.place, many.hears)
-
-
 def do(case: str, many: Any) -> Any:
     """Do one case in this process of several."""
-    if case.startswith(SHARDED):
-        shards = counting(many)
-        done = do(case.removeprefix(SHARDED), shards)
-        return {**done, "rows": shards.rows} if isinstance(done, dict) else done
     if case in RECIPES:
         state, heard = trained(RECIPES[case](), many)
         return {"state": state.state_dict(), "losses": heard["losses"]}
-    if case == "dropped":  # by a mask that process 0 makes, of all splats
-        trainer = Trainer(make_scene(), short(), GENERIC, backend=backends()[-1], processes=many)
-        trainer._stop_telling()
-        splats = trainer.state.splats
-        known = splats.means[:, 1] > 0
-
-        def judge(every: Splats, known: torch.Tensor) -> torch.Tensor:
-            return ((every.means[:, 0] > 0.1).long() * (1 + known.long())).to(torch.uint8)
-
-        found = many.decide(judge, splats, known)
-        dropped = trainer.state.parts.count(int((found > 0).sum()))
-        assert torch.equal(found == 2, (splats.means[:, 0] > 0.1) & known)
-        keep_rows(trainer.state, found == 0)
-        return {"dropped": dropped, "here": len(trainer.state.splats), "state": many.end(trainer.state).state_dict()}
     if case == "resumed":  # in the middle of a stage: the state of process 0 counts, the others have none
         whole, heard = trained(short(), many)
         kept = many.tell(heard["states"][3]) if many.leads else many.tell(None)

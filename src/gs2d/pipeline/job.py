@@ -85,8 +85,6 @@ class Job:
         What training starts from instead of points, and the hash of its file.
     processes : int
         That train together.
-    splits : bool
-        Whether each of them has a part of the splats.
     part : LoadedPart or None
         What a part of a larger training begins with and is surrounded by.
     """
@@ -102,7 +100,6 @@ class Job:
     init: Splats | None = None
     init_digest: str | None = None
     processes: int = 1
-    splits: bool = False
     part: LoadedPart | None = None
 
     def definition(self) -> dict[str, Any]:
@@ -138,7 +135,7 @@ class Job:
         """
         recipe = to_json(self.recipe)
         if processes is None:
-            processes = [(0, 0, self.processes, *([1] if self.splits else []))] if self.processes > 1 else []
+            processes = [(0, 0, self.processes)] if self.processes > 1 else []
         facts = {
             "scene": self.images_digest,
             "protocol": training_facts(asdict(self.protocol)),

@@ -226,8 +226,6 @@ class TrainOptions(Training, Resources, HowItRuns):
     """Fraction of the full schedule: 0.1 trains a tenth of the iterations."""
     iterations: Annotated[int | None, Fixed, Suppress] = None
     """Total iterations of the schedule, instead of ``schedule_scale``."""
-    sharded: bool = False
-    """Under torchrun: each process keeps a part of the splats, for scenes beyond the memory of one."""
     init: Annotated[Path | None, arg(metavar="FILE")] = None
     """Start from the splats of a file (PLY of 2DGS or 3DGS, .spz, .splat, .usd, .glb, .sog) in the frame of the
     capture, not from points. 3D Gaussians lose their smallest scale, along which the normal then points."""

@@ -28,7 +28,6 @@ from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.quality import by_quality
 from gs2d.pipeline.run_logger import progress_every
 from gs2d.training.parallel import ONE_PROCESS, LostContactError, ManyProcesses, OneProcess
-from gs2d.training.shards import Shards
 from gs2d.training.trainer import Trainer
 
 PATIENCE = timedelta(days=7)  # the others wait while process 0 scores; who is gone is noticed by its connection
@@ -36,31 +35,24 @@ GIB = 2**30
 
 
 @contextmanager
-def connected(backend: str, *, sharded: bool = False) -> Iterator[OneProcess]:
+def connected(backend: str) -> Iterator[OneProcess]:
     """Meet the other processes, if the environment says that there are any.
 
     Parameters
     ----------
     backend : str
         As it was asked for: each process of a machine takes a GPU of its own, unless it is of the CPU.
-    sharded : bool
-        Each process has a part of the splats.
 
     Raises
     ------
     BackendError
-        A process has no GPU, torch was built without what they would talk through, or one is to have a part of the
-        splats and there are no others.
+        If a process has no GPU, or torch was built without ``torch.distributed``.
     """
     place = here()
     if place.size == 1:
-        if sharded:
-            raise BackendError(
-                "--sharded needs several processes, got one; torchrun --standalone --nproc-per-node N -m gs2d train ..."
-            )
         yield ONE_PROCESS
         return
-    together = _connect(place, backend, Shards if sharded else ManyProcesses)
+    together = _connect(place, backend)
     try:
         yield together
     except LostContactError:
@@ -75,7 +67,7 @@ def connected(backend: str, *, sharded: bool = False) -> Iterator[OneProcess]:
     torch.distributed.destroy_process_group()
 
 
-def _connect(place: Place, backend: str, kind: type[ManyProcesses]) -> ManyProcesses:
+def _connect(place: Place, backend: str) -> ManyProcesses:
     """Join the group of all processes."""
     if not torch.distributed.is_available():
         raise BackendError("several processes need torch.distributed, which this torch is built without; use one")
@@ -84,7 +76,7 @@ def _connect(place: Place, backend: str, kind: type[ManyProcesses]) -> ManyProce
         _take_gpu(place)
     both = on_gpu and torch.distributed.is_nccl_available()
     torch.distributed.init_process_group("cpu:gloo,cuda:nccl" if both else "gloo", timeout=PATIENCE)
-    return kind(place)
+    return ManyProcesses(place)
 
 
 def _take_gpu(place: Place) -> None:
@@ -115,12 +107,11 @@ def lead(job: Job, options: TrainOptions, together: OneProcess, on_event: OnEven
     if not isinstance(together, ManyProcesses):
         return job
     rate = job.recipe.stages[0].lr.for_views(together.size).sh0 / job.recipe.stages[0].lr.sh0
-    kept = "; each keeps a part of the splats" if together.splits else ""
-    text = f"{together.size} processes: as many photographs an iteration, each a view; rates times {rate:.3g}{kept}"
+    text = f"{together.size} processes: as many photographs an iteration, each a view; rates times {rate:.3g}"
     on_event(Notice(text))
     prepare = "always" if job.scene.ahead else "never"
     together.tell({"scene": str(options.scene.resolve()), "prepare": prepare, "definition": _definition(job)})
-    return replace(job, processes=together.size, splits=together.splits)
+    return replace(job, processes=together.size)
 
 
 def follow(options: TrainOptions, together: ManyProcesses) -> RunFolder:

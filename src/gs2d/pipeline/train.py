@@ -79,7 +79,7 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
     Gs2dError
         Anything that the user can mend.
     """
-    with connected(options.backend, sharded=options.sharded) as together:
+    with connected(options.backend) as together:
         if isinstance(together, ManyProcesses) and not together.leads:
             use_threads(options.threads, together.place.local_size)
             use_memory(memory_of(together.place, options.memory))
@@ -214,8 +214,6 @@ def check_viewer(options: TrainOptions) -> None:
         if options.viewer_port is not None:
             raise RecipeError("--viewer-port belongs to --viewer, which was not given; give both")
         return
-    if options.sharded:
-        raise RecipeError("--viewer shows all splats, which no process has with --sharded; leave one of them out")
     required_viser()
     free_port("127.0.0.1", options.viewer_port, option="--viewer-port")
 
@@ -252,8 +250,7 @@ def train_stages(
     def listen(event: events.Event) -> None:
         recorder.on_training_event(event)
         watch.scored(recorder.psnr)
-        if not together.splits:  # the viewer is refused there: the state of all splats is not made for each event
-            watch.on_training_event(event, trainer.state)
+        watch.on_training_event(event, trainer.state)
         if isinstance(event, events.Progress):  # on a GPU the only time when nothing is under way
             between()
 

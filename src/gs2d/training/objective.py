@@ -25,10 +25,10 @@ from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backends import Backend
 from gs2d.render.exposure import identity
 from gs2d.render.photometry import Shading, photograph
-from gs2d.render.types import PLAIN_COLORS, RasterSettings, RenderOutput
+from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.training.dropout import dropout_rate, dropped_out, kept_splats
 from gs2d.training.exposure import apply_exposure
-from gs2d.training.multiview import PATCH_BYTES, ImageFiles, Turn, draw_turn, find_neighbours, is_compared
+from gs2d.training.multiview import PATCH_BYTES, ImageFiles, draw_turn, find_neighbours, is_compared
 from gs2d.training.poses import pose_rate
 from gs2d.training.state import TrainState
 from gs2d.training.targets import Target, TargetSource
@@ -229,19 +229,12 @@ class FullRender:
         return torch.cat([own, own.new_zeros(len(self.frozen))])
 
     @torch.no_grad()
-    def residual(
-        self, state: TrainState, stage: Stage, iteration: int, index: int, plain: Splats | None = None
-    ) -> ViewResidual:
-        """Render view ``index`` as it is trained on at an iteration (from 1), beside its photograph.
-
-        ``plain`` are splats in plain colours, that are rendered instead of those of the state.
-        """
+    def residual(self, state: TrainState, stage: Stage, iteration: int, index: int) -> ViewResidual:
+        """Render view ``index`` as it is trained on at an iteration (from 1), beside its photograph."""
         camera = self.camera(state, index)
         target = self._straight(state, index, camera)
         settings = replace(self.settings(stage, iteration), with_distortion=False)
-        settings = settings if plain is None else replace(settings, sh_degree=PLAIN_COLORS)
-        drawn = self.drawn(state.splats) if plain is None else plain
-        color = rasterize(drawn, camera, settings, backend=self.backend).color
+        color = rasterize(self.drawn(state.splats), camera, settings, backend=self.backend).color
         if state.exposures is not None or state.photometries is not None:
             given = (self._transform(state, index, color), target.silhouette, self._background)
             shading = self._shading(state, index, camera, color)
@@ -282,20 +275,16 @@ class FullRender:
         photometry = None if state.photometries is None else state.photometries.photometry(index)
         return apply_exposure(splats, camera, transform, settings, photometry)
 
-    def turn_of(self, state: TrainState, stage: Stage, iteration: int, index: int) -> Turn | None:
-        """Return with what view ``index`` is compared in an iteration; None: with none."""
-        settings = self.recipe.multiview
-        if settings is None or not is_compared(stage, iteration):
-            return None
-        return draw_turn(self.recipe, state.stage, iteration, self._neighbours[index], settings)
-
     @torch.no_grad()
     def neighbour_of(
         self, state: TrainState, stage: Stage, iteration: int, index: int, splats: Splats
     ) -> Neighbour | None:
         """Return the view that view ``index`` is compared with in an iteration, rendered; None: with none."""
-        settings, turn = self.recipe.multiview, self.turn_of(state, stage, iteration, index)
-        if settings is None or turn is None:
+        settings = self.recipe.multiview
+        if settings is None or not is_compared(stage, iteration):
+            return None
+        turn = draw_turn(self.recipe, state.stage, iteration, self._neighbours[index], settings)
+        if turn is None:
             return None
         camera, other = self.camera(state, turn.neighbour), turn.neighbour
         kind = next((term.depth for term in stage.losses if term.kind in MULTIVIEW_KINDS and term.depth), None)

@@ -59,13 +59,10 @@ class OneProcess:
     place : Place
     stop_asked : bool
         Whether any process was asked to stop, as of the last meeting.
-    splits : bool
-        Whether each process has a part of the splats (:class:`gs2d.training.shards.Shards`); else all have all.
     """
 
     place = Place()
     stop_asked = False
-    splits = False
 
     @property
     def size(self) -> int:
@@ -137,10 +134,6 @@ class OneProcess:
         """Return the sum of a tensor over the processes, in its place."""
         return tensor
 
-    def sum_views(self, tensor: Tensor) -> Tensor:
-        """Return numbers of splats that are sums over some views, of which each process did others: over all."""
-        return self.sum(tensor)
-
     def any(self, mask: Tensor) -> Tensor:
         """Return where a mask is True in any process."""
         return mask
@@ -148,20 +141,6 @@ class OneProcess:
     def decide(self, judge: Callable[[Splats, Tensor], Tensor], splats: Splats, known: Tensor) -> Tensor:
         """Return what ``judge`` says of each splat, uint8 [N], in process 0; ``known`` is what it knows, bool [N]."""
         return judge(splats, known)
-
-    def whole_state(self, state: TrainState) -> TrainState:
-        """Return the state with all splats, to process 0 while the others attend."""
-        return state
-
-    def end(self, state: TrainState) -> TrainState:
-        """Return the state with all splats to process 0, when all have come to the end."""
-        return state
-
-    def attend(self, state: TrainState) -> None:
-        """Be there for process 0 while it tells somebody of an event, and may want the whole state."""
-
-    def dismiss(self) -> None:
-        """Let the others go on, who attend."""
 
 
 ONE_PROCESS = OneProcess()

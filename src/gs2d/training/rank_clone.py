@@ -32,11 +32,6 @@ def rank_by_error(
     combine : callable
         The sum over several processes, of which each gives the errors of some views.
 
-    Returns
-    -------
-    Tensor [N]
-        Of all splats, where this process has a part of them, too.
-
     Raises
     ------
     DivergedError
@@ -45,13 +40,12 @@ def rank_by_error(
     total = torch.zeros(len(state.splats), dtype=torch.float64, device=state.splats.device)
     for errors in errors_by_view:
         total += errors
-    own = combine(total)
-    total = state.parts.whole(own)
+    total = combine(total)
     if not bool(torch.isfinite(total).all()):
         raise DivergedError("ranking by error met NaN or infinity: a splat or a photograph is not finite")
     group = torch.zeros(len(total), dtype=torch.bool, device=total.device)
     group[worst(total, action.top_percent)] = True
-    state.groups[action.writes] = state.parts.own(group, own)
+    state.groups[action.writes] = group
     return total
 
 
@@ -63,7 +57,7 @@ def worst(errors: Tensor, top_percent: float) -> Tensor:
 
 @torch.no_grad()
 def clone_in_place(state: TrainState, action: CloneInPlace) -> int:
-    """Append a copy of the rows of a group, and return how many (of all processes).
+    """Append a copy of the rows of a group, and return how many.
 
     Clones belong to every group of their originals, and to ``action.writes``. With ``opacity="preserve"`` originals and
     clones get 1 - sqrt(1 - o): at their centre two such splats transmit what one of opacity o does.
@@ -75,7 +69,7 @@ def clone_in_place(state: TrainState, action: CloneInPlace) -> int:
     groups = {name: group[rows] for name, group in state.groups.items() if name != action.writes}
     groups[action.writes] = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
     append_rows(state, state.splats.rows(rows), groups)
-    return state.parts.count(len(rows))
+    return len(rows)
 
 
 def halved_opacity(logits: Tensor) -> Tensor:

@@ -142,11 +142,11 @@ class Robustness:
         )
         guilty = verdict == REMOVED
         state.groups[MISSED] = known | (verdict == NEEDED)
-        removed = state.parts.count(int(guilty.sum()))
-        if removed == 0 or removed == state.count:  # all: the images contradict each other
+        removed = int(guilty.sum())
+        if removed == 0 or removed == len(state.splats):  # all: the images contradict each other
             return []
         keep_rows(state, ~guilty)
-        return [events.FloatersRemoved(stage.name, iteration, removed, state.count)]
+        return [events.FloatersRemoved(stage.name, iteration, removed, len(state.splats))]
 
     def _tried(self, state: TrainState, stage: Stage, iteration: int, splats: Splats, spared: Tensor) -> Tensor:
         """Propose splats, but those that are spared, and try them: NEEDED, REMOVED or neither, uint8 [N]."""

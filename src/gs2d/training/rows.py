@@ -5,7 +5,7 @@ Either is one pass: what stays of each tensor is gathered once, straight into st
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -28,7 +28,6 @@ def append_rows(
     groups: Mapping[str, Tensor] | None = None,
     *,
     keep: Tensor | None = None,
-    pieces: Sequence[int] | None = None,
 ) -> None:
     """Append M splats: zero moments and statistics.
 
@@ -42,9 +41,6 @@ def append_rows(
         which no old row is.
     keep : Tensor [N] bool, optional
         Drop the old rows where it is False, in the same pass.
-    pieces : sequence of int, optional
-        Lengths of what ``splats`` consists of, where processes have parts of the rows (``training.parts``): all first
-        pieces come before all second ones.
     """
     groups = {} if groups is None else groups
     check_shapes({"means": (splats.means, "M 3")} | {f"group {k}": (mask, "M") for k, mask in groups.items()})
@@ -60,17 +56,6 @@ def append_rows(
     nowhere = torch.zeros(rows.before if new_names else 0, dtype=torch.bool, device=state.splats.device)
     old_groups = state.groups | dict.fromkeys(new_names, nowhere)
     state.groups = {name: rows.of(group, groups.get(name)) for name, group in old_groups.items()}
-    state.parts.settle(state, (len(splats),) if pieces is None else pieces)
-
-
-def change_rows(state: TrainState, change: Callable[[Tensor], Tensor]) -> None:
-    """Replace every tensor that has a row for each splat by what ``change`` makes of it."""
-    state.splats = Splats(**{name: change(tensor) for name, tensor in state.splats.items()})
-    for moments in state.moments.values():
-        moments.mean, moments.square = change(moments.mean), change(moments.square)
-    state.groups = {name: change(group) for name, group in state.groups.items()}
-    if state.statistics is not None:
-        state.statistics = {name: change(tensor) for name, tensor in state.statistics.items()}
 
 
 class _Rows:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,7 +13,6 @@ from gs2d.core.checks import check_shapes
 from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import RunError, ShapeError
 from gs2d.training.exposure import Exposures
-from gs2d.training.parts import WHOLE, Whole
 from gs2d.training.photometry import Photometries
 from gs2d.training.poses import Poses
 from gs2d.training.zooms import Zooms
@@ -71,14 +70,12 @@ class TrainState:
         Colour transforms of the training views, where the recipe learns them.
     poses : Poses or None
         Motions of the training cameras, where the recipe learns them.
-    processes : list of (stage, step, count), or (stage, step, count, 1)
-        From where on so many processes trained, and whether each had a part of the splats; empty: one, all the time.
+    processes : list of (stage, step, count)
+        The number of processes from this stage and step on; empty for one process throughout.
     zooms : Zooms or None
         Their focal lengths, where the recipe learns them.
     photometries : Photometries or None
         Their vignetting and response, where the recipe learns them.
-    parts : Whole
-        Who has the other rows, where these are a part of all; no part of a checkpoint, which has all.
     """
 
     splats: Splats
@@ -92,15 +89,9 @@ class TrainState:
     queue: list[int] = field(default_factory=list)
     exposures: Exposures | None = None
     poses: Poses | None = None
-    processes: list[tuple[int, ...]] = field(default_factory=list)
+    processes: list[tuple[int, int, int]] = field(default_factory=list)
     zooms: Zooms | None = None
     photometries: Photometries | None = None
-    parts: Whole = WHOLE
-
-    @property
-    def count(self) -> int:
-        """Splats in all: where these are a part of them, those of all processes, which must all ask."""
-        return self.parts.count(len(self.splats))
 
     def of_views(self) -> list[tuple[str, Exposures | Poses | Zooms | Photometries]]:
         """Return what is learned of photographs and cameras, by name; empty where the recipe learns nothing of them."""
@@ -112,11 +103,10 @@ class TrainState:
         }
         return [(name, it) for name, it in learned.items() if it is not None]
 
-    def trained_by(self, count: int, *, splits: bool = False) -> None:
-        """Note that so many processes train from here on, and whether each has a part: the result depends on it."""
-        now = (count, 1) if splits else (count,)
-        if now != (self.processes[-1][2:] if self.processes else (1,)):
-            self.processes.append((self.stage, self.step, *now))
+    def trained_by(self, count: int) -> None:
+        """Note the number of processes that train from here on: the result depends on it."""
+        if count != (self.processes[-1][2] if self.processes else 1):
+            self.processes.append((self.stage, self.step, count))
 
     def next_view(self, count: int) -> int:
         """Index of the next training view: shuffled epochs, without replacement."""
@@ -181,7 +171,7 @@ class TrainState:
                 [int(index) for index in data["queue"]],
                 Exposures.from_state_dict(data["exposures"]) if "exposures" in data else None,
                 Poses.from_state_dict(data["poses"]) if "poses" in data else None,
-                [_since(entry) for entry in data.get("processes", ())],
+                [(int(stage), int(step), int(count)) for stage, step, count in data.get("processes", ())],
                 Zooms.from_state_dict(data["zooms"]) if "zooms" in data else None,
                 Photometries.from_state_dict(data["photometries"]) if "photometries" in data else None,
             )
@@ -247,14 +237,6 @@ class TrainState:
         least = min([self.stage, self.step, *steps, *self.queue, *(count for counts in learned for count in counts)])
         if least < 0:
             raise RunError(f"counts of iterations and views must be 0 or more, got {least}; train again")
-
-
-def _since(entry: Sequence[Any]) -> tuple[int, ...]:
-    """Return since when so many processes trained, from a checkpoint."""
-    stage, step, count, *splits = map(int, entry)
-    if splits not in ([], [1]):
-        raise ValueError(f"processes: {splits}")
-    return (stage, step, count, *splits)
 
 
 def _copy(tensor: Tensor) -> Tensor:

@@ -7,7 +7,6 @@ loss, backward, statistics, densify and prune, opacity reset, Adam. So on an ite
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 
@@ -49,8 +48,6 @@ from gs2d.training.rank_clone import clone_in_place, rank_by_error
 from gs2d.training.resumable import check_resumable
 from gs2d.training.robust import Robustness
 from gs2d.training.rows import keep_rows
-from gs2d.training.shards import Shards
-from gs2d.training.split_views import SplitViews
 from gs2d.training.state import TrainState
 from gs2d.training.targets import PINNED_BYTES, TARGET_BYTES, DeviceTargets, Targets, TargetSource
 from gs2d.training.whole_steps import WholeSteps
@@ -146,16 +143,12 @@ class Trainer:
         self._robust = Robustness(scene, begins, self.settings, self.backend, processes)
         if state is not None:
             check_resumable(state, self.recipe, len(scene.train))
-        self._telling = False  # somebody in process 0 of an event
-        self._told: TrainState | None = None  # with all splats, if that was asked for
-        self._state = processes.share(lambda: self._new_state(dtype, init, exposures) if state is None else state)
-        self.state.trained_by(processes.size, splits=processes.splits)
+        self.state = processes.share(lambda: self._new_state(dtype, init, exposures) if state is None else state)
+        self.state.trained_by(processes.size)
         self._frozen = None if frozen is None or len(frozen) == 0 else frozen.detach().to(self.backend.device)
         if self._frozen is not None and self._frozen.sh_degree != self.recipe.sh_degree:
             degrees = f"{self._frozen.sh_degree}, the recipe trains {self.recipe.sh_degree}"
             raise RecipeError(f"frozen splats must have the recipe's SH degree, got {degrees}; set sh_degree")
-        if self._frozen is not None and processes.splits:
-            raise RecipeError(f"frozen splats need all splats in a process, got {len(self._frozen)}; do not shard")
         self.state.move_to(self.backend.device)
         self._robust.move_to(self.backend.device)
         self._learner = self.backend.for_training()
@@ -169,19 +162,6 @@ class Trainer:
         self._check_sizes()
         stage = self.recipe.stages[min(self.state.stage, len(self.recipe.stages) - 1)]
         self._look_at(stage.downscale_at(self.state.step + 1))
-        self._telling = processes.splits and processes.leads  # until it runs
-
-    @property
-    def state(self) -> TrainState:
-        """The state as it is now.
-
-        Where processes have parts of the splats it is of this one's; to who hears an event, in process 0, of all.
-        """
-        if not self._telling:
-            return self._state
-        if self._told is None:
-            self._told = self.processes.whole_state(self._state)
-        return self._told
 
     @property
     def splats(self) -> Splats:
@@ -214,7 +194,6 @@ class Trainer:
 
     def run(self) -> Splats:
         """Train from where the state is to the end of the last stage."""
-        self._stop_telling()
         while not self.done:
             if not self.state.entered:
                 self.enter(self.state.stage)
@@ -222,10 +201,8 @@ class Trainer:
             while self.state.step < stage.iterations:
                 self.step()
                 if not is_async(self.state.splats.device):
-                    with self._event():
-                        self._between()
+                    self._between()
             self._finish(stage)
-        self._state = self.processes.end(self._state)
         return self.state.splats
 
     def enter(self, index: int) -> None:
@@ -236,7 +213,7 @@ class Trainer:
         self._look_at(stage.downscale_at(1))
         while self._pending:  # of who made the start
             self._on_event(self._pending.pop(0))
-        self._tell(events.StageEntering(stage.name, index, state.count))
+        self._on_event(events.StageEntering(stage.name, index, len(state.splats)))
         happened = [self._act(stage, action) for action in stage.on_enter]
         begin_stage(state, stage)
         state.statistics, densifier = None, self._densifiers[index]
@@ -247,8 +224,8 @@ class Trainer:
         state.entered = True
         self.processes.check(state)
         for event in happened:
-            self._tell(event)
-        self._tell(events.StageStarted(stage.name, index, stage.iterations, state.count))
+            self._on_event(event)
+        self._on_event(events.StageStarted(stage.name, index, stage.iterations, len(state.splats)))
 
     def step(self) -> None:
         """One iteration of the stage that was entered; several processes do as many of the schedule in one.
@@ -272,7 +249,7 @@ class Trainer:
         if self._ahead is not None:
             self._ahead.expect(together.part(state.queue[-self.scene.ahead * together.size :][::-1]))
         if self._objective is None:
-            limit = 0 if together.splits else self._stage2_cache_bytes // together.place.local_size
+            limit = self._stage2_cache_bytes // together.place.local_size
             self._objective = choose_objective(self._whole, state, stage, limit, together.size)
         reports = any(i % self._progress_every == 0 for i in iterations) or iteration == stage.iterations
         changes_rows = any(self._changes(i) or self._robust.removes(stage, i) for i in iterations)
@@ -288,31 +265,13 @@ class Trainer:
         if changes_rows:
             together.check(state)
         for event in happened:
-            self._tell(event)
+            self._on_event(event)
         if reports:
             assert result is not None  # of an iteration that was looked at
             losses = check_losses(stage, iteration, together.mean_losses(result.losses, self.views))
             self._check_parameters(stage, tuple(stage.train))  # on a CPU gradients are checked each time
             lr = lr_at(stage.lr.for_views(self.views), iteration, self.scene.extent)
-            self._tell(self._progress(stage, iteration, losses, lr))
-
-    def _tell(self, event: events.Event) -> None:
-        with self._event():
-            self._on_event(event)
-
-    @contextmanager
-    def _event(self) -> Iterator[None]:
-        """While somebody hears of an event, who may want the state of all splats: the others are there for that."""
-        self._telling = self.processes.splits and self.processes.leads
-        yield
-        self._stop_telling()
-
-    def _stop_telling(self) -> None:
-        if self.processes.splits and not self.processes.leads:
-            self.processes.attend(self._state)
-        elif self._telling:
-            self._telling, self._told = False, None
-            self.processes.dismiss()
+            self._on_event(self._progress(stage, iteration, losses, lr))
 
     def _changes(self, iteration: int) -> bool:
         """Whether the densifier of the stage under way may change splats in an iteration."""
@@ -361,9 +320,7 @@ class Trainer:
         self, objective: Objective, stage: Stage, turns: Sequence[Turn], probe: Tensor | None
     ) -> tuple[StepResult, Sequence[Mapping[str, Tensor]]]:
         """Gradients of the mean loss of some views, and those of each view."""
-        state, split = self.state, self._split
-        if split is not None:
-            return split.evaluate(state, stage, turns, probe)
+        state = self.state
         return self.processes.evaluate(
             turns,
             lambda turn: objective.evaluate(state, stage, turn.iteration, turn.index, probe),
@@ -371,11 +328,6 @@ class Trainer:
             rows=objective.rows,
             of_views=bool(state.of_views()),
         )
-
-    @property
-    def _split(self) -> SplitViews | None:
-        """How views are rendered where each process has a part of the splats; None: where all have all."""
-        return SplitViews(self._whole, self.processes) if isinstance(self.processes, Shards) else None
 
     def _learn_at_once(self, stage: Stage, turns: Sequence[Turn], densifier: Densifier | None) -> bool:
         """Let the backend do an iteration of one process in one piece, if it is of a kind that it does."""
@@ -405,11 +357,6 @@ class Trainer:
                     f"stage {stage.name!r}: its densifier must know several views in an iteration to train in {many} "
                     f"processes, got {kind}, which knows one (Densifier.shares_views); train in one process"
                 )
-            if self.processes.splits and not densifier.splits_rows:
-                raise RecipeError(
-                    f"stage {stage.name!r}: its densifier must do with a part of the splats to train with --sharded, "
-                    f"got {kind}, which looks at all (Densifier.splits_rows); train without, or by another one"
-                )
             if type(densifier).changes is Densifier.changes:
                 raise RecipeError(
                     f"stage {stage.name!r}: {kind} must say in which iterations it leaves splats alone to train in "
@@ -420,8 +367,6 @@ class Trainer:
         """Where the densifier of a stage works."""
 
         def blame(state: TrainState, iteration: int, index: int) -> tuple[Tensor, Tensor]:
-            if self._split is not None:
-                return self._split.blame(state, stage, iteration, index)
             found = self._whole.residual(state, stage, iteration, index)
             return blended_sums(state.splats, found, self._learner)
 
@@ -509,17 +454,14 @@ class Trainer:
         """Run an entry action."""
         if isinstance(action, CloneInPlace):
             count = clone_in_place(self.state, action)
-            return events.Cloned(stage.name, action.writes, count, action.opacity, self.state.count)
-        errors = rank_by_error(self.state, action, self._errors_by_view(action.occlusion), self.processes.sum_views)
-        group = self.state.parts.whole(self.state.groups[action.writes])
+            return events.Cloned(stage.name, action.writes, count, action.opacity, len(self.state.splats))
+        errors = rank_by_error(self.state, action, self._errors_by_view(action.occlusion), self.processes.sum)
+        group = self.state.groups[action.writes]
         fraction = float(errors[group].sum() / errors.sum().clamp(min=1e-300))
         return events.Ranked(stage.name, action.writes, int(group.sum()), float(errors[group].min()), fraction)
 
     def _errors_by_view(self, occlusion: bool) -> Iterator[Tensor]:
         """Yield the inner sum of E_i [N] for each training view that this process looks at."""
-        if self._split is not None:
-            yield from self._split.errors(self.state, self.settings, occlusion=occlusion)
-            return
         for index in self.processes.part(range(len(self.scene.train))):
             found = self._whole.errors(self.state, index, self.drawn, self.settings, occlusion=occlusion)
             yield found[: len(self.state.splats)]
@@ -530,7 +472,7 @@ class Trainer:
         unseen = self._drop_unseen(stage)
         state.stage, state.step, state.entered, state.statistics = index + 1, 0, False, None
         self._objective = self._whole_steps = None
-        self._tell(events.StageFinished(stage.name, index, stage.iterations, state.count, unseen))
+        self._on_event(events.StageFinished(stage.name, index, stage.iterations, len(state.splats), unseen))
 
     def _drop_unseen(self, stage: Stage) -> int:
         """Drop the splats that no training view sees; how many.
@@ -543,8 +485,8 @@ class Trainer:
             return 0
         views = self.processes.part(per_image.scene_now(self.state, self.scene).train)
         seen = self.processes.any(visible_mask(self.state.splats, views, self.settings, self.backend))
-        unseen = self.state.parts.count(int((~seen).sum()))
-        if unseen == self.state.count:
+        unseen = int((~seen).sum())
+        if unseen == len(self.state.splats):
             return 0  # nothing is left to say what the scene is; evaluation will show it
         if unseen:
             keep_rows(self.state, seen)
@@ -561,9 +503,9 @@ class Trainer:
             iterations=stage.iterations,
             losses=losses,
             loss=sum(losses.values()),
-            splats=self.state.count,
-            mean_opacity=self.state.parts.mean(splats.opacities),
-            mean_k_a=self.state.parts.mean(splats.scales.prod(dim=1)),
+            splats=len(self.state.splats),
+            mean_opacity=float(splats.opacities.mean()),
+            mean_k_a=float(splats.scales.prod(dim=1).mean()),
             lr={name: lr[name] for name in stage.train},
             sh_degree=stage.active_sh_degree(iteration, self.recipe.sh_degree),
         )

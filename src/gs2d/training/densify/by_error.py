@@ -49,8 +49,7 @@ class MultiViewErrorDensifier(GradientDensifier):
         for index in around.processes.part(views):
             weighted, weights = around.blame(state, iteration, index)
             error, seen = error + weighted, seen + (weights > 0)
-        error, seen = around.processes.sum_views(error), around.processes.sum_views(seen)
+        error, seen = around.processes.sum(error), around.processes.sum(seen)
         error = error / seen.clamp(min=1)
-        errors = state.parts.whole(error)
-        positive = errors[errors > 0]
+        positive = error[error > 0]
         return (error / positive.median()) ** options.error_power if len(positive) else torch.ones_like(error)

@@ -46,7 +46,7 @@ class Surroundings:
         that of its blending weight.
     processes : OneProcess
         Those that train together: what a densifier gathers of views goes through ``gather``, or ``part`` and
-        ``sum_views``.
+        ``sum``.
     """
 
     stage: str
@@ -76,13 +76,9 @@ class Densifier:
     shares_views : bool
         Whether it may train in several processes, where an iteration has a view in each: it takes what ``output`` says
         of the view (``losses``, ``signal``, ``radii``) through ``surroundings.processes`` alone, or not at all.
-    splits_rows : bool
-        Whether it may train where each process has a part of the splats: it renders by ``surroundings.blame`` alone,
-        and what it asks of all splats goes through ``state.parts`` (``training.parts``).
     """
 
     shares_views = False
-    splits_rows = False
 
     def __init__(self, surroundings: Surroundings) -> None:
         self.surroundings = surroundings

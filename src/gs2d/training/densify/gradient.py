@@ -21,7 +21,6 @@ from gs2d.errors import DivergedError
 from gs2d.render.backends import PLAIN, Backend
 from gs2d.training import events
 from gs2d.training.densify.densifier import Densifier, Surroundings
-from gs2d.training.parts import Whole
 from gs2d.training.rows import append_rows, keep_rows
 from gs2d.training.state import Moments, TrainState
 
@@ -42,7 +41,7 @@ class GradientDensifier(Densifier):
     """
 
     absolute: bool | None = False  # None: as the options say
-    shares_views = splits_rows = True
+    shares_views = True
 
     def __init__(self, surroundings: Surroundings, densify: GradDensify | None = None, **options: Any) -> None:
         super().__init__(surroundings)
@@ -101,7 +100,7 @@ class GradientDensifier(Densifier):
                 )
             except DivergedError as error:
                 raise DivergedError(f"stage {around.stage!r}: {error}") from error
-            happened.append(events.Densified(around.stage, iteration, **vars(counts), splats=state.count))
+            happened.append(events.Densified(around.stage, iteration, **vars(counts), splats=len(state.splats)))
         reset = options.resets(iteration, white=white)
         if reset or self._caps(iteration):
             ceiling = options.reset_opacity if reset else options.opacity_cap
@@ -125,16 +124,16 @@ class GradientDensifier(Densifier):
         if not options.only_prunes(iteration):
             return ()
         large = _largest(state.splats.scales) > options.scale_cull * around.scene.extent
-        count = state.parts.count(int(large.sum()))
+        count = int(large.sum())
         if count == 0:
             return ()
-        if count == state.parts.count(len(large)):
+        if count == len(large):
             raise DivergedError(
                 f"stage {around.stage!r}: all {count} splats were pruned at iteration {iteration}: none is of size <= "
                 f"{options.scale_cull * around.scene.extent:g}; check the cameras, or scale_cull"
             )
         keep_rows(state, ~large)
-        return (events.Densified(around.stage, iteration, 0, 0, 0, count, state.count),)
+        return (events.Densified(around.stage, iteration, 0, 0, 0, count, len(state.splats)),)
 
 
 def no_statistics(splats: Splats) -> dict[str, Tensor]:
@@ -212,12 +211,11 @@ def densify_and_prune(
         splats.opacities[children], _largest(shrunk.exp()), densify, iteration=iteration, extent=extent, white=white
     )
     # draws for all children, whether they live or not
-    means = points_in_plane(state, children, pieces=densify.split_count)
+    means = points_in_plane(state, children)
     keep, living = ~(split | faint | large), ~(ends[0] | ends[1])
     cloned = (clone & keep).nonzero().squeeze(1)
-    counts = _counts(state, clone, split, (faint, large), ends)
-    left = int(keep.sum()) + len(cloned) + int(living.sum())
-    if state.parts.count(left) == 0:
+    counts = _counts(clone, split, (faint, large), ends)
+    if int(keep.sum()) + len(cloned) + int(living.sum()) == 0:
         raise DivergedError(
             f"all {counts.pruned_by_opacity + counts.pruned_large} splats were pruned at iteration {iteration}: none "
             f"has opacity >= {densify.opacity_cull} and size <= {densify.scale_cull * extent:g}; check the cameras, or "
@@ -228,8 +226,7 @@ def densify_and_prune(
     new.means[len(cloned) :] = means[living]
     new.log_scales[len(cloned) :] = shrunk[living]
     state.statistics = None  # of rows that are no more
-    pieces = (len(cloned), *living.reshape(densify.split_count, len(parents)).sum(dim=1).tolist())
-    append_rows(state, new, {name: group[rows] for name, group in state.groups.items()}, keep=keep, pieces=pieces)
+    append_rows(state, new, {name: group[rows] for name, group in state.groups.items()}, keep=keep)
     state.statistics = no_statistics(state.splats)
     return counts
 
@@ -268,12 +265,11 @@ def _select(
     to_split = ~small & (for_split >= split_threshold)
     if densify.max_splats is not None:
         urgency = torch.where(small, signed / densify.grad_threshold, for_split / split_threshold)
-        to_clone, to_split = _within_budget(state.parts, densify, to_clone, to_split, urgency, ends)
+        to_clone, to_split = _within_budget(densify, to_clone, to_split, urgency, ends)
     return to_clone, to_split
 
 
 def _within_budget(
-    parts: Whole,
     densify: GradDensify,
     to_clone: Tensor,
     to_split: Tensor,
@@ -286,24 +282,22 @@ def _within_budget(
     stays = ~(faint | large)
     to_clone, to_split = to_clone & stays, to_split & ~faint  # what would be pruned at once takes no room
     growth = torch.where(to_split, densify.split_count - stays.long(), to_clone.long())  # [N] rows gained
-    wanted = parts.whole(urgency.where(growth > 0, -torch.ones_like(urgency)))
+    wanted = urgency.where(growth > 0, -torch.ones_like(urgency))
     order = torch.sort(wanted, descending=True, stable=True).indices
     chosen = torch.zeros_like(wanted, dtype=torch.bool)
-    chosen[order] = parts.whole(growth)[order].cumsum(0) <= densify.max_splats - parts.total(stays.sum())
-    chosen = parts.own(chosen, to_clone)
+    chosen[order] = growth[order].cumsum(0) <= densify.max_splats - stays.sum()
     return to_clone & chosen, to_split & chosen
 
 
-def points_in_plane(state: TrainState, rows: Tensor, reach: Tensor | None = None, *, pieces: int = 1) -> Tensor:
+def points_in_plane(state: TrainState, rows: Tensor, reach: Tensor | None = None) -> Tensor:
     """Return a point [M, 3] world units drawn from the Gaussian of each of these splats, in its plane.
 
-    ``reach`` [M]: standard deviations, of a Gaussian that much as wide. ``pieces``: how often ``rows`` repeat others.
+    ``reach`` [M]: standard deviations, of a Gaussian that much as wide.
     """
     splats = state.splats
-    if state.parts.count(len(rows)) == 0:
+    if len(rows) == 0:
         return splats.means[rows]
-    lengths = (len(rows) // pieces,) * pieces
-    draws = state.parts.normal(state.generator, lengths, 2, splats.dtype).to(splats.device)
+    draws = torch.randn(len(rows), 2, generator=state.generator, dtype=splats.dtype).to(splats.device)
     draws = draws if reach is None else draws * reach[:, None]
     in_plane = draws * splats.log_scales[rows].exp()  # [M, 2] world units
     frames = quats_to_matrices(splats.quats[rows])[:, :, :2]  # [M, 3, 2] columns t_u, t_v
@@ -329,7 +323,6 @@ def _prunable(
 
 
 def _counts(
-    state: TrainState,
     clone: Tensor,
     split: Tensor,
     ends: tuple[Tensor, Tensor],
@@ -345,4 +338,4 @@ def _counts(
         (copies * faint).sum() + child_faint.sum(),
         (copies * (large & ~faint)).sum() + (child_large & ~child_faint).sum(),
     )
-    return DensifyCounts(*state.parts.total(torch.stack(figures)).tolist())
+    return DensifyCounts(*torch.stack(figures).tolist())

@@ -112,7 +112,6 @@ class RelocationDensifier(Densifier):
     """
 
     shares_views = True  # it asks nothing of a view
-    splits_rows = True
 
     def __init__(self, surroundings: Surroundings, **options: Any) -> None:
         super().__init__(surroundings)
@@ -139,9 +138,9 @@ class RelocationDensifier(Densifier):
         options, splats, gradients = self._options, state.splats, output.gradients
         if options.opacity_weight > 0 and "opacity_logits" in gradients:
             o = splats.opacities
-            gradients["opacity_logits"].add_(o * (1 - o), alpha=options.opacity_weight / state.count)
+            gradients["opacity_logits"].add_(o * (1 - o), alpha=options.opacity_weight / len(state.splats))
         if options.scale_weight > 0 and "log_scales" in gradients:
-            weight = options.scale_weight / (2 * state.count * self.surroundings.scene.extent)
+            weight = options.scale_weight / (2 * len(state.splats) * self.surroundings.scene.extent)
             gradients["log_scales"].add_(splats.scales, alpha=weight)
 
     @torch.no_grad()
@@ -155,22 +154,21 @@ class RelocationDensifier(Densifier):
 
     @torch.no_grad()
     def _relocate(self, state: TrainState, number_of_round: int, iteration: int) -> Sequence[events.Event]:
-        options, splats, around, parts = self._options, state.splats, self.surroundings, state.parts
+        options, splats, around = self._options, state.splats, self.surroundings
         opacities = splats.opacities
         faint = opacities < options.dead_opacity
         large = splats.scales.amax(dim=1) > options.scale_cull * around.scene.extent
         live = ~(faint | large)
-        living = parts.count(int(live.sum()))
+        living = int(live.sum())
         if living == 0:
             raise DivergedError(
-                f"stage {around.stage!r}: all {state.count} splats are dead at iteration {iteration}: none has opacity "
+                f"stage {around.stage!r}: all {len(splats)} splats are dead at iteration {iteration}: none has opacity "
                 f">= {options.dead_opacity} and size <= {options.scale_cull * around.scene.extent:g}; check the cameras"
             )
-        grown = options.added(state.count, number_of_round)
-        dead = min(state.count - living, max(0, options.max_splats - living))
+        grown = options.added(len(state.splats), number_of_round)
+        dead = min(len(state.splats) - living, max(0, options.max_splats - living))
         sources = live.nonzero().squeeze(1)
-        drawn_of_all = drawn(parts.whole(opacities[sources]), dead + grown, state.generator)
-        counts = parts.own(drawn_of_all, sources)  # copies of each
+        counts = drawn(opacities[sources], dead + grown, state.generator)  # copies of each
         spread = counts > 0
         changed, copies = sources[spread], counts[spread]
         logits, log_scales = shared(splats.opacity_logits[changed], splats.log_scales[changed], copies + 1)
@@ -183,8 +181,8 @@ class RelocationDensifier(Densifier):
             new.means = points_in_plane(state, rows, torch.full_like(opacities[rows], options.scatter))
         append_rows(state, new, {name: group[rows] for name, group in state.groups.items()}, keep=live)
         figures = torch.stack([faint.sum(), (large & ~faint).sum(), counts.sum()])
-        faded, grew, copied = parts.total(figures).tolist()
-        return (events.Densified(around.stage, iteration, copied, 0, faded, grew, state.count),)
+        faded, grew, copied = figures.tolist()
+        return (events.Densified(around.stage, iteration, copied, 0, faded, grew, len(state.splats)),)
 
 
 def drawn(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
