@@ -29,6 +29,7 @@ from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.training.dropout import dropout_rate, dropped_out, kept_splats
 from gs2d.training.exposure import apply_exposure
 from gs2d.training.multiview import PATCH_BYTES, ImageFiles, draw_turn, find_neighbours, is_compared
+from gs2d.training.opaque import another_background
 from gs2d.training.poses import pose_rate
 from gs2d.training.state import TrainState
 from gs2d.training.targets import Target, TargetSource
@@ -146,12 +147,15 @@ class FullRender:
         device, terms = torch.device(backend.device), {loss_of(term): term for s in recipe.stages for term in s.losses}
         self._functions = {known_by: prepared(term, scene, recipe, device) for known_by, term in terms.items()}
 
-    def settings(self, stage: Stage, iteration: int) -> RasterSettings:
-        """Return the rasterizer's constants at an iteration (1-based)."""
+    def settings(
+        self, stage: Stage, iteration: int, background: tuple[float, float, float] | None = None
+    ) -> RasterSettings:
+        """Return the rasterizer's constants at an iteration (1-based), over the protocol's background or another."""
         degree = stage.active_sh_degree(iteration, self.recipe.sh_degree)
         wanted = any(term.kind == "distortion" and term.is_active(iteration) for term in stage.losses)
         settings = replace(
             raster_settings(self.protocol, self.scene.extent, degree),
+            background=background or self.protocol.background,
             with_distortion=wanted,
             with_transmittance_depth=False,
         )
@@ -209,7 +213,8 @@ class FullRender:
         splats = state.splats
         leaves = Splats(**{k: t.detach().requires_grad_(k in stage.train) for k, t in splats.items()})
         camera = self.camera(state, index, learns=self.learns(state, iteration))
-        settings = self.settings(stage, iteration)
+        another = another_background(self.recipe, stage, iteration) if self.targets[index].silhouette is None else None
+        settings = self.settings(stage, iteration, another)
         rows = learning_rows(state, stage) if probe is None else None  # the signal is of every splat
         drawn, of_all = self._left(leaves, state, stage, iteration), probe
         rows = self._with_frozen(rows, len(splats), camera)

@@ -42,6 +42,7 @@ from gs2d.training.objective import (
     raster_settings,
     visible_mask,
 )
+from gs2d.training.opaque import is_opaque
 from gs2d.training.parallel import ONE_PROCESS, OneProcess, Turn
 from gs2d.training.priors import with_known_points
 from gs2d.training.rank_clone import clone_in_place, rank_by_error
@@ -415,7 +416,8 @@ class Trainer:
             background,
             use_masks=use_masks,
             maps=partial(target_maps, backend=self.backend) if keeps else None,
-            with_silhouettes=self.recipe.exposure is not None
+            with_silhouettes=is_opaque(self.recipe)
+            or self.recipe.exposure is not None
             or self.recipe.photometry is not None
             or any(t.kind == "silhouette" or t.where == "object" for s in self.recipe.stages for t in s.losses),
             dtype=dtype,

@@ -13,6 +13,7 @@ from gs2d.render.whole_step import Learned, WholeStep
 from gs2d.training.adam import lr_at
 from gs2d.training.densify.densifier import Densifier
 from gs2d.training.objective import FullRender, Objective, learning_rows
+from gs2d.training.opaque import another_background
 from gs2d.training.state import TrainState
 
 __all__ = ["WholeSteps"]
@@ -39,7 +40,7 @@ class WholeSteps:
         self._whole, self._stage = whole, stage
         self._terms = whole.protocol.resolve(stage.losses)
         self._possible = objective is whole and whole.frozen is None and whole.drops(stage) == 0
-        self._settings: dict[int, RasterSettings] = {}  # by SH degree
+        self._settings: dict[object, RasterSettings] = {}  # by SH degree and background
         self._rows: tuple[tuple[Tensor, ...], Tensor | None] | None = None  # groups, and what they are together
 
     def learn(self, state: TrainState, iteration: int, index: int, densifier: Densifier | None) -> bool:
@@ -53,7 +54,8 @@ class WholeSteps:
         photograph = self._whole.targets.photograph(index)
         if photograph is None:
             return False
-        if photograph.image.shape[2] == 3:  # no alpha
+        opaque = photograph.image.shape[2] == 3
+        if opaque:
             active = [term for term in active if term.required]
             if any(term.kind == "silhouette" for term in active):
                 return False
@@ -66,7 +68,7 @@ class WholeSteps:
         step = WholeStep(
             splats=state.splats,
             camera=whole.camera(state, index),
-            settings=self._settings_at(iteration),
+            settings=self._settings_at(iteration, opaque=opaque),
             photograph=photograph.image,
             mask=photograph.mask,
             valid=photograph.valid,
@@ -95,12 +97,14 @@ class WholeSteps:
                 found[name] = Learned(moments.mean, moments.square, rates[name], moments.steps + 1, trained)
         return found
 
-    def _settings_at(self, iteration: int) -> RasterSettings:
+    def _settings_at(self, iteration: int, *, opaque: bool) -> RasterSettings:
         """Return the rasterizer's constants: the same object while they are the same."""
-        degree = self._stage.active_sh_degree(iteration, self._whole.recipe.sh_degree)
-        if degree not in self._settings:
-            self._settings[degree] = self._whole.settings(self._stage, iteration)
-        return self._settings[degree]
+        recipe = self._whole.recipe
+        background = another_background(recipe, self._stage, iteration) if opaque else None
+        key = self._stage.active_sh_degree(iteration, recipe.sh_degree), background
+        if key not in self._settings:
+            self._settings[key] = self._whole.settings(self._stage, iteration, background)
+        return self._settings[key]
 
     def _learning_rows(self, state: TrainState) -> Tensor | None:
         """Return the splats of which the stage trains anything; worked out anew where the groups are others."""

@@ -1,0 +1,66 @@
+"""Photographs without an alpha channel are opaque, and what is trained on them becomes so."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gs2d.config.presets import two_dgs, two_dgs_r
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import LossTerm, Recipe
+from gs2d.config.robust import Removal
+from gs2d.core.sh import rgb_to_sh0
+from gs2d.data.scene import View
+from gs2d.render.backends import get_backend
+from gs2d.training.objective import FullRender
+from gs2d.training.opaque import BACKGROUNDS, another_background
+from gs2d.training.targets import Targets
+from train_toys import full_state, make_scene
+
+GREY = (128 / 255,) * 3
+
+
+def robust(**changes: object) -> Recipe:
+    return replace(two_dgs_r(), removal=Removal(**changes))  # type: ignore[arg-type]
+
+
+def test_the_background_changes_in_the_second_half_of_stages_that_train_opacity() -> None:
+    recipe = robust()
+    surface, appearance, refine = recipe.stages
+    half = surface.iterations // 2
+    assert another_background(recipe, surface, half) is None
+    assert {another_background(recipe, surface, half + 1 + i) for i in range(len(BACKGROUNDS))} == set(BACKGROUNDS)
+    for stage in (appearance, refine):
+        assert another_background(recipe, stage, stage.iterations) is None
+
+
+@pytest.mark.parametrize("recipe", [two_dgs(), robust(backdrop=True)])
+def test_the_paper_s_recipes_and_unlit_backdrops_keep_one_background(recipe: Recipe) -> None:
+    assert another_background(recipe, recipe.stages[0], recipe.stages[0].iterations) is None
+
+
+def opacity_gradient(iterations: range, *, channels: int) -> float:
+    """Of all opacities together, over iterations of which photograph, splats and background have one colour."""
+    scene, recipe, state = make_scene(), robust(dropout=0.0), full_state(20)
+    camera = scene.train[0].camera
+    pixels = np.full((camera.height, camera.width, channels), 128, np.uint8)
+    pixels[..., 3:] = 255
+    scene = replace(scene, train=(View.from_arrays("grey.png", camera, pixels),))
+    state.splats.sh0[:], state.splats.shN[:] = rgb_to_sh0(torch.tensor([GREY])), 0
+    targets = Targets(scene.train, GREY, use_masks=False, with_silhouettes=True)
+    backend = get_backend("reference")
+    whole = FullRender(scene, recipe, replace(GENERIC, background=GREY), backend, targets)
+    stage = replace(recipe.stages[0], losses=(LossTerm("l2", 1.0),))
+    found = [whole.evaluate(state, stage, iteration, 0).gradients["opacity_logits"] for iteration in iterations]
+    return float(torch.stack(found).sum())
+
+
+def test_a_hole_in_the_colour_of_the_background_is_filled_only_where_the_photograph_is_opaque() -> None:
+    last = robust().stages[0].iterations
+    late = range(last - len(BACKGROUNDS) + 1, last + 1)
+    assert opacity_gradient(late, channels=3) < -1e-3  # a step against it raises opacity
+    assert opacity_gradient(late, channels=4) == pytest.approx(0, abs=1e-6)
+    assert opacity_gradient(range(1, len(BACKGROUNDS) + 1), channels=3) == pytest.approx(0, abs=1e-6)
