@@ -19,7 +19,7 @@ from pathlib import Path
 import gs2d
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import compile as nvrtc
-from gs2d.kernels.cuda.shipped import FOLDER, MANIFEST, PTX, SHIPPED, digest_of, write_archives
+from gs2d.kernels.cuda.shipped import FOLDER, PTX, SHIPPED, digest_of, write_archives
 
 
 def build(folder: Path, architectures: Sequence[str] = (*SHIPPED, PTX), names: Sequence[str] | None = None) -> int:
@@ -37,7 +37,7 @@ def build(folder: Path, architectures: Sequence[str] = (*SHIPPED, PTX), names: S
         "sources": digest_of(nvrtc.sources(), nvrtc.OPTIONS),
         "cuda": list(nvrtc.nvrtc_version()),
     }
-    return write_archives(folder, architectures, names or nvrtc.source_names(), code_of, MANIFEST, facts)
+    return write_archives(folder, architectures, names or nvrtc.source_names(), code_of, facts)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -31,7 +31,6 @@ from gs2d.data.scene import Scene, View
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.compile import compile_source
-from gs2d.kernels.cuda.graph import OLDEST_DRIVER
 from gs2d.render import pair_budget
 from gs2d.training import objective, trainer
 from gs2d.training.state import TrainState
@@ -59,7 +58,6 @@ class NullDriver:
     CUfunction_attribute = SimpleNamespace(CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES=8)
     CUstream = CUfunction = CUkernel = staticmethod(int)
     CUDA_KERNEL_NODE_PARAMS = SimpleNamespace
-    OLDEST_GRAPHS, MAX_THREADS = OLDEST_DRIVER, None  # of AMD's; what is not here is a function that does nothing
 
     def __init__(self) -> None:
         self.launches = 0

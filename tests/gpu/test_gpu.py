@@ -18,7 +18,6 @@ from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.compile import compile_source, cubin, source_names
-from gs2d.kernels.cuda.hiprtc import code_object
 from gs2d.render import cuda
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backends import Backend, backend_report, get_backend
@@ -62,8 +61,7 @@ def test_every_kernel_loads(gpu: Backend) -> None:
     device = torch.device("cuda", torch.cuda.current_device())
     launcher = launch.launcher_for(device)
     assert isinstance(launcher, launch.GpuLauncher)
-    make = (lambda name, arch: cubin(name, arch).code) if torch.version.hip is None else code_object
-    assert all(make(name, launcher.architecture).startswith(b"\x7fELF") for name in source_names())
+    assert all(cubin(name, launcher.architecture).code.startswith(b"\x7fELF") for name in source_names())
     with launcher._in_context():
         for name in launcher._source_of:
             launcher._load(name)
@@ -108,7 +106,6 @@ def test_deterministic_gradients_are_the_same_bits_each_time(gpu: Backend) -> No
     assert all(torch.equal(grad, b[name]) for name, grad in a.items())
 
 
-@pytest.mark.skipif(torch.version.hip is not None, reason="AMD's run-time library translates nothing")
 def test_ptx_for_devices_to_come_is_translated_by_the_driver(gpu: Backend) -> None:
     """Of a device that NVRTC does not know; here the device is known, and gives the same image to rounding."""
     splats, camera = scene()

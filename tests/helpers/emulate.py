@@ -80,21 +80,19 @@ def build(
     approximate: bool = False,
     addresses: bool = False,
     undefined: bool = False,
-    wave: int = 0,
 ) -> EmulatedKernels:
     """Compile, unless that was done; the compiler gets two minutes. Skips without g++.
 
     ``approximate``: with the largest errors of the approximate instructions. ``addresses``: with AddressSanitizer;
-    ``undefined``: undefined behaviour ends the process. ``wave``: 32 or 64, as for AMD's GPUs with waves of so many.
+    ``undefined``: undefined behaviour ends the process.
     """
     if shutil.which("g++") is None:
         pytest.skip("no g++ here, which runs the CUDA kernels on the CPU; install one")
     chosen = ["-DEMULATE_APPROXIMATIONS"] if approximate else []
     chosen += ADDRESSES if addresses else []
     chosen += UNDEFINED if undefined else []
-    chosen += [f"-DGS2D_WAVE={wave}", "-DGS2D_EMULATED"] if wave else []
     command = ["g++", *FLAGS, *chosen, f"-I{include}"]
-    wrapper = wrapper_of(sources, wave)
+    wrapper = wrapper_of(sources)
     digest = hashlib.sha256("\0".join([compiler(), *command, wrapper]).encode())
     for path in (*sources, *sorted(HERE.glob("*.h")), *sorted(include.rglob("*.h"))):
         digest.update(path.read_bytes() + b"\0")
@@ -110,10 +108,9 @@ def build(
     return EmulatedKernels(library)
 
 
-def wrapper_of(sources: Sequence[Path], wave: int) -> str:
+def wrapper_of(sources: Sequence[Path]) -> str:
     """Return the source of a library: the sources, and a function for each of their kernels."""
-    headers = [HERE / "emulator.h", *([KERNELS / "cuda" / "amd.h"] if wave else [])]
-    lines = [f'#include "{path}"' for path in headers]
+    lines = [f'#include "{HERE / "emulator.h"}"']
     lines.append("namespace gs2d {}\nusing namespace gs2d;")  # where our kernels live
     lines += [f'#include "{path}"' for path in sources]
     signature = "(unsigned x, unsigned y, unsigned block, int order, const void* a)"
@@ -160,7 +157,6 @@ class Emulator(OneByOne):
     approximate: bool = False
     addresses: bool = False
     undefined: bool = False
-    wave: int = 0
     _built: dict[str, EmulatedKernels] = field(default_factory=dict)
 
     def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
@@ -170,6 +166,6 @@ class Emulator(OneByOne):
         if name not in self._built:
             source = next(s for s in sorted((KERNELS / "cuda").glob("*.cu")) if name in KERNEL.findall(s.read_text()))
             sanitizers = {"addresses": self.addresses, "undefined": self.undefined}
-            built = build([source], KERNELS, approximate=self.approximate, wave=self.wave, **sanitizers)
+            built = build([source], KERNELS, approximate=self.approximate, **sanitizers)
             self._built.update(dict.fromkeys(KERNEL.findall(source.read_text()), built))
         self._built[name].launch(name, (blocks, 1), threads, arguments, descending=self.descending, seed=self.seed)

@@ -5,10 +5,6 @@
 // filled with NaN before each block. Threads run in ascending or descending order between collectives, or shuffled: then
 // blocks come in any order too, and of the warps that could go on some stay behind, so that others run ahead of them as far
 // as barriers let them. A missing barrier changes the result of one of these. Races between collectives are not found.
-//
-// With GS2D_WAVE (and GS2D_EMULATED) collectives are those of AMD's hardware instead, from which cuda/amd.h makes CUDA's: for
-// the lanes of a wave that stand at the same call, at times without those of its other warp that do too, which is as right
-// where the code has parted. Lanes of a warp must still come together, and an exchange from a lane that is not there is NaN.
 #pragma once
 
 #include <link.h>
@@ -43,10 +39,9 @@ constexpr unsigned WARP = 32, MOST_THREADS = 1024;
 constexpr size_t STACK = 128 << 10;
 constexpr unsigned FULL = 0xffffffffu;
 
-enum class Op { NONE, BARRIER, SYNC_WARP, BALLOT, ANY, SHUFFLE_XOR, WAVE_BALLOT, WAVE_SWIZZLE };
+enum class Op { NONE, BARRIER, SYNC_WARP, BALLOT, ANY, SHUFFLE_XOR };
 inline const char* name_of(Op op) {
-    static const char* const names[] = {"-", "__syncthreads", "__syncwarp", "__ballot_sync", "__any_sync", "__shfl_xor_sync",
-                                        "wave_ballot", "wave_swizzle"};
+    static const char* const names[] = {"-", "__syncthreads", "__syncwarp", "__ballot_sync", "__any_sync", "__shfl_xor_sync"};
     return names[static_cast<int>(op)];
 }
 
@@ -57,7 +52,6 @@ struct Fiber {
     Op op;  // waits here
     int line, operand;
     uint32_t value;
-    uint64_t ballot;  // of a wave
 };
 
 inline Fiber fibers[MOST_THREADS];
@@ -114,10 +108,6 @@ inline unsigned random_below(unsigned n) {  // xorshift
     random_state ^= random_state << 13, random_state ^= random_state >> 17, random_state ^= random_state << 5;
     return random_state % n;
 }
-// Whether a warp that could be with the other one of its wave is not: now and then, where the order is random.
-inline bool leaves_behind() {
-    return order_of_threads != ASCENDING && order_of_threads != DESCENDING && random_below(2) == 0;
-}
 
 inline void complete_warp(unsigned first) {
     uint32_t given[WARP], ballot = 0;
@@ -130,36 +120,6 @@ inline void complete_warp(unsigned first) {
     }
     release(first, WARP);
 }
-
-#if defined(GS2D_WAVE)
-static_assert(GS2D_WAVE == 32 || GS2D_WAVE == 64, "waves are of 32 or 64 lanes");
-
-// Of the lanes of a wave that stand at the call of this warp's; some that could are left to come later.
-inline void complete_wave(unsigned warp) {
-    const unsigned first = warp / GS2D_WAVE * GS2D_WAVE, end = first + GS2D_WAVE < threads ? first + GS2D_WAVE : threads;
-    const Op op = fibers[warp].op;
-    const int line = fibers[warp].line;
-    bool here[GS2D_WAVE] = {};
-    uint64_t ballot = 0;
-    for (unsigned w = first; w < end; w += WARP) {
-        const bool stands_there = !fibers[w].done && fibers[w].op == op && fibers[w].line == line;
-        if (!stands_there || (w != warp && leaves_behind())) continue;
-        if (!together(w, WARP, "a divergent collective")) return;
-        for (unsigned i = w; i < w + WARP; ++i) here[i - first] = true, ballot |= uint64_t(fibers[i].value != 0) << (i - first);
-    }
-    uint32_t given[GS2D_WAVE];
-    for (unsigned lane = 0; lane < GS2D_WAVE; ++lane) given[lane] = here[lane] ? fibers[first + lane].value : 0xffffffffu;
-    for (unsigned lane = 0; lane < GS2D_WAVE; ++lane) {
-        if (!here[lane]) continue;
-        Fiber& f = fibers[first + lane];
-        f.ballot = ballot;
-        const unsigned kept = unsigned(f.operand) & 31u, turned = unsigned(f.operand) >> 10 & 31u;
-        if (op == Op::WAVE_SWIZZLE) f.value = given[(lane & ~31u) | (((lane & 31u) & kept) ^ turned)];
-    }
-    for (unsigned w = first; w < end; w += WARP)
-        if (here[w - first]) release(w, WARP);
-}
-#endif
 
 // After every thread has run as far as it can: completes what came together. True when the block is finished.
 inline bool complete_collectives() {
@@ -174,12 +134,8 @@ inline bool complete_collectives() {
         if (!together(w, WARP, "a divergent collective")) return false;
         if (fibers[w].done || fibers[w].op == Op::BARRIER) continue;
         progress = true;
-        if (fibers[w].op == Op::NONE) continue;  // it has not run yet, or has gone on with the other warp of its wave
-#if defined(GS2D_WAVE)
-        complete_wave(w);
-#else
+        if (fibers[w].op == Op::NONE) continue;  // it has not run yet
         complete_warp(w);
-#endif
     }
     if (!progress) together(0, threads, "a barrier that not all threads reach");
     return false;
@@ -295,25 +251,12 @@ template <class T> inline T from_bits(uint32_t b) {
 
 #define GS2D_LINE int line = __builtin_LINE()
 inline void __syncthreads(GS2D_LINE) { emulator::wait(emulator::Op::BARRIER, line, emulator::FULL, 0, 0); }
-#if defined(GS2D_WAVE)
-namespace emulator {
-inline unsigned long long wave_ballot(bool mine, int line) {
-    wait(Op::WAVE_BALLOT, line, FULL, mine, 0);
-    return fibers[current].ballot;
-}
-template <int PATTERN> inline int wave_swizzle(int value, int line) {
-    return int(wait(Op::WAVE_SWIZZLE, line, FULL, uint32_t(value), PATTERN));
-}
-inline void wave_sync(int line) { wait(Op::SYNC_WARP, line, FULL, 0, 0); }
-}  // namespace emulator
-#else
 inline void __syncwarp(unsigned mask = emulator::FULL, GS2D_LINE) { emulator::wait(emulator::Op::SYNC_WARP, line, mask, 0, 0); }
 inline unsigned __ballot_sync(unsigned mask, int p, GS2D_LINE) { return emulator::wait(emulator::Op::BALLOT, line, mask, p != 0, 0); }
 inline int __any_sync(unsigned mask, int p, GS2D_LINE) { return int(emulator::wait(emulator::Op::ANY, line, mask, p != 0, 0)); }
 template <class T> inline T __shfl_xor_sync(unsigned mask, T v, int lanes, GS2D_LINE) {
     return emulator::from_bits<T>(emulator::wait(emulator::Op::SHUFFLE_XOR, line, mask, emulator::to_bits(v), lanes));
 }
-#endif
 #undef GS2D_LINE
 
 template <class T> inline T atomicAdd(T* p, T v) {

@@ -1,6 +1,6 @@
 """Every kernel of the package once or more, on sizes that are a multiple of nothing: what comes out, by name.
 
-For the sanitizers, which must be in the process from its start, and for the hardware's waves: the same bits of both.
+For the sanitizers, which must be in the process from its start.
 """
 
 from __future__ import annotations

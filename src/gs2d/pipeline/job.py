@@ -495,7 +495,7 @@ def choose_backend(name: str, on_event: OnEvent) -> Backend:
     taken = [status.name for status in report].index(backend.name)
     if backend.device != "cpu":
         on_event(Notice(f"training on {report[taken].details} (--backend cpu for the processor)", detail=True))
-    elif (torch.version.cuda or torch.version.hip) is not None and torch.cuda.device_count() > 0:
+    elif torch.version.cuda is not None and torch.cuda.device_count() > 0:
         on_event(Notice(f"training without the GPU: {report[0].reason}; {report[0].remedy}"))
     if backend.slow:
         better = report[taken - 1]

@@ -20,7 +20,7 @@ from gs2d.core.splats import Splats
 from gs2d.errors import BackendError
 from gs2d.kernels import adam, densify_stats, library, losses, multiview, reference
 from gs2d.kernels.cuda import adam as cuda_adam
-from gs2d.kernels.cuda import launch, readiness
+from gs2d.kernels.cuda import diagnose, launch
 from gs2d.kernels.cuda import losses as cuda_losses
 from gs2d.kernels.cuda import multiview as cuda_multiview
 from gs2d.kernels.losses import LossOperations
@@ -503,7 +503,7 @@ class CudaBackend(Backend):
     @classmethod
     def status(cls) -> BackendStatus:
         """Return what ``gs2d doctor`` says of it."""
-        lacking, words = readiness.report()
+        lacking, words = diagnose.report()
         if lacking is None:
             return BackendStatus(cls.name, True, "", "", words)
         return BackendStatus(cls.name, False, lacking.reason, lacking.remedy, "")
@@ -512,7 +512,7 @@ class CudaBackend(Backend):
 @register_backend("cuda")
 @cache  # a machine that can run it is asked once, not at each rendering; an error is not kept
 def _cuda() -> Backend:
-    lacking, _ = readiness.report()
+    lacking, _ = diagnose.report()
     if lacking is not None:
         raise BackendError(f"backend 'cuda' cannot run: {lacking.reason}; {lacking.remedy}")
     return CudaBackend()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,16 +11,13 @@ import torch
 
 import emulate
 import fake_gpu
-import fake_hip as fake_hip_module
 import kernel_cases
-from fake_hip import FakeHip
-from gs2d.kernels.cuda import launch
 
 
-@pytest.fixture(scope="session", params=[0, pytest.param(64, marks=pytest.mark.slow)], ids=["warps", "waves"])
-def emulator(request: pytest.FixtureRequest) -> emulate.Emulator:
-    """A launcher that runs the package's kernels on the CPU: in warps, and as AMD's GPUs do in waves of 64."""
-    return emulate.Emulator(wave=request.param)
+@pytest.fixture(scope="session")
+def emulator() -> emulate.Emulator:
+    """A launcher that runs the package's kernels on the CPU."""
+    return emulate.Emulator()
 
 
 @pytest.fixture(scope="session")
@@ -44,19 +40,3 @@ def guard(tmp_path_factory: pytest.TempPathFactory) -> Path:
     command = ["g++", "-std=c++20", "-O0", "-fPIC", "-shared", "-w", f"-I{root / 'include'}", str(source)]
     subprocess.run([*command, "-o", str(library), f"-L{root / 'lib'}", "-lc10"], check=True, timeout=90)
     return library
-
-
-@pytest.fixture(scope="session")
-def _hip(tmp_path_factory: pytest.TempPathFactory) -> FakeHip:
-    return fake_hip_module.build(tmp_path_factory.mktemp("hip"))
-
-
-@pytest.fixture
-def fake_hip(_hip: FakeHip, monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeHip]:
-    """AMD's run-time library, as new."""
-    monkeypatch.delenv(launch.STEP_VARIABLE, raising=False)
-    _hip.library.fake_hip_forget()
-    yield _hip
-    _hip.run_by(None)
-    errors, _hip.errors = _hip.errors, []
-    assert not errors

@@ -26,12 +26,6 @@ def cases() -> emulate.EmulatedKernels:
     return emulate.build([HELPERS / "emulator_cases.cu"], HELPERS)
 
 
-@pytest.fixture(scope="module", params=[0, 32, 64], ids=["warps", "waves of 32", "waves of 64"])
-def lanes(request: pytest.FixtureRequest) -> emulate.EmulatedKernels:
-    """The same, also as on AMD's GPUs, through cuda/amd.h."""
-    return emulate.build([HELPERS / "emulator_cases.cu"], HELPERS, wave=request.param)
-
-
 def run(
     kernels: emulate.EmulatedKernels,
     name: str,
@@ -81,10 +75,10 @@ def test_warps_that_run_ahead_show_a_vote_in_the_place_of_a_barrier(cases: emula
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_warp_collectives_stay_within_their_warp(lanes: emulate.EmulatedKernels, seed: int) -> None:
+def test_warp_collectives_stay_within_their_warp(cases: emulate.EmulatedKernels, seed: int) -> None:
     given = ints(64)
     given[40] = -8
-    out = run(lanes, "warp_collectives", given, torch.zeros(64, 3, dtype=torch.int32), seed=seed)
+    out = run(cases, "warp_collectives", given, torch.zeros(64, 3, dtype=torch.int32), seed=seed)
     first, second = out[:32], out[32:]
     odd = 0xAAAAAAAA - (1 << 32)
     assert first.tolist() == [[sum(range(32)), odd, 0]] * 32
@@ -92,9 +86,9 @@ def test_warp_collectives_stay_within_their_warp(lanes: emulate.EmulatedKernels,
 
 
 @pytest.mark.parametrize("seed", [0, *range(1, 9)])
-def test_warps_of_a_wave_may_part_and_each_hears_its_own_votes(lanes: emulate.EmulatedKernels, seed: int) -> None:
+def test_warps_may_diverge_and_each_has_its_own_ballots(cases: emulate.EmulatedKernels, seed: int) -> None:
     given = torch.tensor([3, 7, 0, 5], dtype=torch.int32).repeat(32)
-    out = run(lanes, "warps_that_part", given, torch.full((128, 2), -1, dtype=torch.int32), seed=seed).view(4, 32, 2)
+    out = run(cases, "warps_that_part", given, torch.full((128, 2), -1, dtype=torch.int32), seed=seed).view(4, 32, 2)
     for warp, count in enumerate((3, 7, None, 5)):
         there = [-1, -1] if count is None else [sum(range(count + 1)), sum(range(32 * warp, 32 * warp + 32))]
         assert out[warp].tolist() == [there] * 32
@@ -132,13 +126,6 @@ def test_threads_that_do_not_meet_are_an_error_with_words_not_a_hang(
         run(cases, name, ints(64), ints(64))
     with pytest.raises(RuntimeError):
         run(cases, name, ints(64), ints(64), seed=3)
-
-
-@pytest.mark.parametrize("name", ["collective_in_a_branch", "different_collectives", "barrier_of_one_warp"])
-def test_lanes_of_a_warp_must_meet_in_waves_too(lanes: emulate.EmulatedKernels, name: str) -> None:
-    for seed in (0, 3):
-        with pytest.raises(RuntimeError, match="divergent collective|barrier that not all threads reach"):
-            run(lanes, name, ints(128), ints(128), seed=seed)
 
 
 def test_a_source_that_does_not_compile_is_reported(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ import fake_gpu
 import torch
 from emulate import Emulator
 
-emulator = Emulator(wave=int(sys.argv[4]))
+emulator = Emulator()
 """
 
 RULES = """
@@ -107,7 +107,7 @@ print(render_run(folder / "run", orbit=1)["images"])
 def said(script: str, guard: Path, emulator: emulate.Emulator, folder: Path) -> list[str]:
     """What a script prints in a process of its own; kernels that these tests have compiled already are taken."""
     given = [str(guard), str(Path(__file__).resolve().parents[2] / "helpers"), str(folder)]
-    command = [sys.executable, "-c", COMMON + script, *given, str(emulator.wave)]
+    command = [sys.executable, "-c", COMMON + script, *given]
     done = subprocess.run(command, capture_output=True, text=True, timeout=270, check=False, env=dict(os.environ))
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout.splitlines()

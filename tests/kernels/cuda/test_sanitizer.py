@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from emulate import Emulator
 
-emulator = Emulator(wave=int(sys.argv[2]), **{sys.argv[3]: True})
+emulator = Emulator(**{sys.argv[2]: True})
 """
 
 BEYOND = """
@@ -52,7 +52,7 @@ emulator.launch("clear_words", 1, 256, ClearArguments(words=words.data_ptr() + 4
 SANITIZERS = {"addresses": "libasan.so", "undefined": "libubsan.so"}
 
 
-def run(script: str, kind: str = "addresses", wave: int = 0) -> subprocess.CompletedProcess[str]:
+def run(script: str, kind: str = "addresses") -> subprocess.CompletedProcess[str]:
     """The script under a sanitizer."""
     if shutil.which("g++") is None:
         pytest.skip("no g++ here")
@@ -63,7 +63,7 @@ def run(script: str, kind: str = "addresses", wave: int = 0) -> subprocess.Compl
     # Fibers have stacks of their own, which it does not follow; the rest is about other libraries.
     options = "detect_leaks=0:detect_stack_use_after_return=0:alloc_dealloc_mismatch=0:detect_odr_violation=0"
     settings = {**os.environ, "LD_PRELOAD": str(library), "ASAN_OPTIONS": options, "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", COMMON + script, str(HELPERS), str(wave), kind]
+    command = [sys.executable, "-c", COMMON + script, str(HELPERS), kind]
     return subprocess.run(command, env=settings, capture_output=True, text=True, timeout=800, check=False)
 
 
@@ -81,9 +81,8 @@ def test_words_that_do_not_lie_on_their_boundary_are_found_with_their_line() -> 
     assert "sort.cu" in done.stderr
 
 
-@pytest.mark.parametrize("wave", [0, 64], ids=["warps", "waves"])
 @pytest.mark.parametrize("kind", list(SANITIZERS))
-def test_no_kernel_reads_or_writes_beyond_a_tensor_or_does_what_is_undefined(kind: str, wave: int) -> None:
-    done = run(EVERYTHING, kind, wave)
+def test_no_kernel_reads_or_writes_beyond_a_tensor_or_does_what_is_undefined(kind: str) -> None:
+    done = run(EVERYTHING, kind)
     assert done.returncode == 0, done.stderr[-3000:]
     assert done.stdout == "all done\n"

@@ -48,7 +48,7 @@ def sort(emulator: Emulator, keys: Tensor, payloads: Tensor | None, bits: int) -
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("count", [1, 31, PIECE - 1, PIECE, 2 * PIECE + 77])
 def test_a_sort_by_radix_is_torchs_stable_sort(emulator: Emulator, count: int, seed: int) -> None:
-    emulator = Emulator(wave=emulator.wave, seed=seed)
+    emulator = Emulator(seed=seed)
     generator = torch.Generator().manual_seed(count)
     depths = torch.rand(count, generator=generator).mul(100).floor().div(7)  # many equal ones
     depths[::5] = float("inf")
@@ -65,7 +65,7 @@ def test_tiles_are_sorted_with_what_lies_in_them(emulator: Emulator, tiles: int,
     keys = torch.randint(0, tiles + 1, (count,), generator=generator, dtype=torch.int32)
     payloads = torch.randint(0, 1 << 31, (count,), generator=generator, dtype=torch.int64).to(torch.int32)
     given = keys.to(torch.int16) if width == 16 else keys
-    found = sort(Emulator(wave=emulator.wave, seed=3), given, payloads, tiles.bit_length())
+    found = sort(Emulator(seed=3), given, payloads, tiles.bit_length())
     order = torch.sort(keys, stable=True).indices
     assert torch.equal(found[0].to(torch.int32), keys[order])
     assert torch.equal(found[1], payloads[order])
@@ -75,7 +75,7 @@ def test_tiles_are_sorted_with_what_lies_in_them(emulator: Emulator, tiles: int,
 @pytest.mark.parametrize("count", [1, 300, PIECE, 40 * PIECE + 5])
 def test_running_sums_follow_an_order_and_say_whether_there_is_room(emulator: Emulator, count: int, seed: int) -> None:
     """Of 41 pieces the last looks back further than a warp is wide, unless one before it has said its sum."""
-    emulator = Emulator(wave=emulator.wave, seed=seed)
+    emulator = Emulator(seed=seed)
     generator = torch.Generator().manual_seed(count)
     counts = torch.randint(0, 9, (count,), generator=generator, dtype=torch.int32)
     order = torch.randperm(count, generator=generator).to(torch.int32)

@@ -19,7 +19,6 @@ import train_toys
 from emulate import Emulator
 from fake_backends import cuda_on_host
 from fake_driver import FakeDriver, Result
-from fake_hip import FakeHip
 from gs2d.config.presets import with_silhouette
 from gs2d.config.protocols import GENERIC, Protocol
 from gs2d.config.recipe import GradDensify, LossTerm, PoseRefinement, Recipe
@@ -192,7 +191,7 @@ def test_memory_of_before_and_the_order_of_threads_change_nothing(
         return done
 
     monkeypatch.setattr(cuda_step.Stepper, "run", poisoned)
-    shuffled = Emulator(wave=emulator.wave, seed=seed)
+    shuffled = Emulator(seed=seed)
     parts, _ = trained(shuffled, scene, train_toys.short(), "autograd")
     whole, some = trained(shuffled, scene, train_toys.short(), "launches")
     assert some == checked["extras"] >= 11
@@ -250,21 +249,6 @@ def test_a_driver_without_graphs_launches_one_by_one(emulator: Emulator, scene: 
     assert same(plain, found)
     assert some == as_many
     assert len(driver.replays) <= 2  # both halves once, where the refusal comes afterwards
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("chosen", ["launches", "graph"])
-def test_training_by_way_of_hip_in_waves_of_64_has_the_bits_of_warps(
-    fake_hip: FakeHip, emulator: Emulator, scene: Scene, chosen: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recipe = brief()
-    expected, some = trained(emulator, scene, recipe, "launches")
-    fake_hip.run_by(Emulator(wave=64))
-    monkeypatch.setenv(launch.STEP_VARIABLE, chosen)
-    found, as_many = trained(fake_hip.launcher(), scene, recipe, chosen)
-    assert some == as_many == 6
-    assert same(expected, found)
-    assert any(line["call"] == "replay" for line in fake_hip.said()) is (chosen == "graph")
 
 
 def test_a_way_that_does_not_exist_is_one_line(scene: Scene, emulator: Emulator) -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -34,7 +34,6 @@ __all__ = [
     "compile_text",
     "cubin",
     "is_writable",
-    "kept_code",
     "kernel_sources",
     "nvrtc_version",
     "shipped_kernels",
@@ -325,25 +324,14 @@ def cubin(name: str, arch: str, folder: Path | None = None) -> Cubin:
     if brought is not None:
         return Cubin(brought, "")
     folder = folder or cache_folder()
-    made: list[Cubin] = []
-
-    def make() -> bytes:
-        made.append(compile_source(name, arch))
-        return made[0].code
-
-    code = kept_code(folder, f"{stem}-{arch}-{_key(name, arch)}.cubin", make)
-    return made[0] if made else Cubin(code, "")
-
-
-def kept_code(folder: Path | None, name: str, make: Callable[[], bytes]) -> bytes:
-    """Return what a file of the cache holds; made, and written there if possible, where it holds nothing whole."""
-    path = None if folder is None else folder / name
+    path = None if folder is None else folder / f"{stem}-{arch}-{_key(name, arch)}.cubin"
     code = None if path is None else _read(path)
-    if code is None:
-        code = make()
-        if path is not None:
-            _write(path, code)
-    return code
+    if code is not None:
+        return Cubin(code, "")
+    made = compile_source(name, arch)
+    if path is not None:
+        _write(path, made.code)
+    return made
 
 
 def _read(path: Path) -> bytes | None:

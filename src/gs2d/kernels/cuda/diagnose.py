@@ -145,6 +145,13 @@ def cache_words(cache: Path | None, writable: bool) -> str:
     return f"; {where}: kernels are compiled at every start"
 
 
+def report() -> tuple[MissingFile | None, str]:
+    """Return what keeps the backend from running here, and a line about the machine where nothing does."""
+    facts = gather()
+    lacking = missing(facts)
+    return lacking, "" if lacking is not None else describe(facts)
+
+
 def gather() -> Facts:
     """Return the facts of this machine; only the first where torch is built without CUDA. Makes no context on a GPU."""
     cuda = torch.version.cuda

@@ -34,21 +34,6 @@ REMEDIES = {
     "CUDA_ERROR_ECC_UNCORRECTABLE": "the GPU's memory is failing: reset it, or use another one",
 }
 
-HIP_REMEDIES = {
-    "hipErrorOutOfMemory": REMEDIES["CUDA_ERROR_OUT_OF_MEMORY"],
-    "hipErrorNoDevice": "check `rocminfo` and HIP_VISIBLE_DEVICES, or use --backend cpu",
-    "hipErrorInvalidDevice": "check `rocminfo` and HIP_VISIBLE_DEVICES, or use --backend cpu",
-    "hipErrorNoBinaryForGpu": "install the torch build of the driver's version of ROCm",
-    "hipErrorInvalidImage": "install the torch build of the driver's version of ROCm",
-    "hipErrorInsufficientDriver": "update AMD's driver (amdgpu), or install a torch build for an older ROCm",
-    "hipErrorNotFound": REMEDIES["CUDA_ERROR_NOT_FOUND"],
-    "hipErrorIllegalAddress": RESTART,
-    "hipErrorLaunchFailure": RESTART,
-    "hipErrorLaunchTimeOut": REMEDIES["CUDA_ERROR_LAUNCH_TIMEOUT"],
-    "hipErrorLaunchOutOfResources": REMEDIES["CUDA_ERROR_LAUNCH_OUT_OF_RESOURCES"],
-    "hipErrorECCNotCorrectable": REMEDIES["CUDA_ERROR_ECC_UNCORRECTABLE"],
-}
-
 # With it cuda.bindings takes stream 0 for one of the calling thread, torch for the one of all threads.
 PER_THREAD = "CUDA_PYTHON_CUDA_PER_THREAD_DEFAULT_STREAM"
 
@@ -71,7 +56,7 @@ def fault_of(what: str) -> Iterator[None]:
         yield
     except RuntimeError as error:  # torch.AcceleratorError is one, since torch 2.8
         words = one_line(error)
-        if not words.startswith(("CUDA error", "HIP error")):
+        if not words.startswith("CUDA error"):
             raise
         remedy = REMEDIES["CUDA_ERROR_OUT_OF_MEMORY"] if "out of memory" in words else RESTART
         raise BackendError(f"the GPU failed in {what} or before ({words}); {remedy}") from error
@@ -117,16 +102,13 @@ def call(driver: Any, name: str, *arguments: Any) -> Any:
     """
     status, *values = getattr(driver, name)(*arguments)
     if status != driver.CUresult.CUDA_SUCCESS:
-        raise failure(getattr(driver, "CALLED", {}).get(name, name), status)
+        raise failure(name, status)
     return values[0] if values else None
 
 
 def failure(what: str, status: Any) -> BackendError:
     """Return the error for a status that is not success."""
     name = str(getattr(status, "name", status))
-    if name.startswith("hip"):
-        remedy = HIP_REMEDIES.get(name, "check `rocminfo` and ROCm's driver, or use --backend cpu")
-        return BackendError(f"AMD's run-time library failed in {what} ({name}); {remedy}")
     remedy = REMEDIES.get(name, "check `nvidia-smi` and the driver, or use --backend cpu")
     return BackendError(f"the CUDA driver failed in {what} ({name}); {remedy}")
 

@@ -52,7 +52,7 @@ def can_replay(driver: Any) -> bool:
     if not all(hasattr(driver, name) for name in NEEDED):
         return False
     try:
-        return driver_version(driver) >= getattr(driver, "OLDEST_GRAPHS", OLDEST_DRIVER)
+        return driver_version(driver) >= OLDEST_DRIVER
     except BackendError:
         return False
 
@@ -63,7 +63,7 @@ class Graph:
     Parameters
     ----------
     driver : module
-        ``cuda.bindings.driver``, or what stands for it.
+        ``cuda.bindings.driver``.
     kernels : sequence
         Handles of loaded kernels, one for each launch.
     works : sequence of Work

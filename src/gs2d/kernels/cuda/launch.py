@@ -19,12 +19,10 @@ import torch
 
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.cuda import compile as nvrtc
-from gs2d.kernels.cuda import hiprtc
 from gs2d.kernels.cuda.driver import PER_THREAD, call, failure, load_driver, own_default_stream
 from gs2d.kernels.cuda.graph import Graph, Work, can_replay
-from gs2d.kernels.cuda.hip import load_hip
 
-__all__ = ["GpuLauncher", "Launcher", "OneByOne", "Work", "grow_in_place", "hip_launcher", "launcher_for", "steps"]
+__all__ = ["GpuLauncher", "Launcher", "OneByOne", "Work", "grow_in_place", "launcher_for", "steps"]
 
 ALLOCATOR_VARIABLES = ("PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_ALLOC_CONF")
 STEP_VARIABLE, GRAPH, LAUNCHES, AUTOGRAD = "GS2D_CUDA_STEP", "graph", "launches", "autograd"
@@ -73,15 +71,13 @@ class GpuLauncher:
     device : torch.device
         With an index.
     driver : module, optional
-        ``cuda.bindings.driver``, or what stands for it: :class:`gs2d.kernels.cuda.hip.HipDriver`, or the tests' own.
+        ``cuda.bindings.driver``, or the tests' own.
     stream_of, architecture_of : callable
         The current stream's handle, and the architecture (``"sm_90"``), of a device.
     code_of : callable
         Machine code of a source file for an architecture.
     source_of : mapping of str to str, optional
         The file of each kernel; by default the package's.
-    graphs : bool
-        Whether launches that come again and again are made a graph, where the driver can.
 
     Raises
     ------
@@ -98,13 +94,11 @@ class GpuLauncher:
         architecture_of: Callable[[torch.device], str] = _architecture_of,
         code_of: Callable[[str, str], bytes] = lambda name, arch: nvrtc.cubin(name, arch).code,
         source_of: Mapping[str, str] | None = None,
-        graphs: bool = True,
     ) -> None:
         if own_default_stream():
             raise BackendError(f"{PER_THREAD} is set: kernels would run beside torch's work, not after it; unset it")
         self.device = device
         self._driver = load_driver() if driver is None else driver
-        self._max_threads: int | None = getattr(self._driver, "MAX_THREADS", None)
         self._stream_of, self._code_of = stream_of, code_of
         self.architecture = architecture_of(device)
         call(self._driver, "cuInit", 0)
@@ -117,7 +111,7 @@ class GpuLauncher:
         self._functions: dict[str, Any] = {}  # by kernel
         self._allowed: dict[str, int] = {}  # dynamic shared memory asked for so far, by kernel
         self._lock = threading.Lock()  # the backward pass runs in a thread of its own
-        self._replays = graphs and can_replay(self._driver)
+        self._replays = can_replay(self._driver)
         self._graphs: dict[tuple[str, ...], Graph | int] = {}  # by their kernels; how often these came before
 
     def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
@@ -133,11 +127,6 @@ class GpuLauncher:
             return
         if blocks > MAX_BLOCKS:
             raise BackendError(f"{name} needs {blocks} blocks, expected at most 2^31 - 1; use fewer splats or pixels")
-        if self._max_threads is not None and blocks * threads > self._max_threads:
-            raise BackendError(
-                f"{name} needs {blocks} blocks of {threads}, expected at most {self._max_threads} threads on this GPU; "
-                "use fewer splats or pixels"
-            )
         driver = self._driver
         given = (name, blocks, threads, ctypes.c_void_p(ctypes.addressof(arguments)), shared_bytes)
         if int(call(driver, "cuCtxGetCurrent")) == self._context_number:  # nearly always
@@ -297,27 +286,7 @@ def grow_in_place() -> bool:
 
 @cache
 def _of_device(index: int) -> GpuLauncher:
-    device = torch.device("cuda", index)
-    return GpuLauncher(device) if torch.version.hip is None else hip_launcher(device)
-
-
-def hip_launcher(device: torch.device, **options: Any) -> GpuLauncher:
-    """Return the launcher of an AMD GPU, which torch built for ROCm calls "cuda" as well.
-
-    Iterations that come again are graphs only where ``GS2D_CUDA_STEP=graph`` says so: on a machine that nobody has seen
-    launches are the way on which less can go wrong.
-
-    Raises
-    ------
-    BackendError
-        As of :class:`GpuLauncher`.
-    """
-    chosen: dict[str, Any] = {
-        "architecture_of": hiprtc.architecture_of,
-        "code_of": hiprtc.code_object,
-        "graphs": os.environ.get(STEP_VARIABLE) == GRAPH,
-    }
-    return GpuLauncher(device, driver=options.pop("driver", None) or load_hip(), **{**chosen, **options})
+    return GpuLauncher(torch.device("cuda", index))
 
 
 def launcher_for(device: torch.device) -> Launcher:

@@ -12,7 +12,7 @@ __device__ __forceinline__ int64 word_of(int64 begin, int tile, int64 chunk) {
     return 8 * ((begin >> 5) + tile + chunk);
 }
 
-// Step by step, in words: AMD's compiler leaves such a loop as it is where it stands in another.
+// Written out, so that it is unrolled in any loop that it is called from.
 __device__ __forceinline__ uint or_over_warp(uint bits) {
     bits |= __shfl_xor_sync(FULL_MASK, bits, 16);
     bits |= __shfl_xor_sync(FULL_MASK, bits, 8);

@@ -1,7 +1,7 @@
 """The machine code that a wheel brings: with it neither a compiler nor its libraries are needed, the driver alone.
 
-``scripts/build_cubins.py`` and ``build_code_objects.py`` put it there; a source checkout has none. It is taken where it
-was made of these very sources for this version of the package: whoever edits a kernel gets what NVRTC makes of it.
+``scripts/build_cubins.py`` puts it there; a source checkout has none. It is taken where it was made of these very
+sources for this version of the package: whoever edits a kernel gets what NVRTC makes of it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from importlib import resources
 from pathlib import Path
 
 __all__ = [
-    "AMD_MANIFEST",
     "FOLDER",
     "INTEGRATED",
     "MANIFEST",
@@ -31,7 +30,7 @@ __all__ = [
 
 SHIPPED = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
 PTX = "compute_80"  # for GPUs to come and those in one chip with a CPU; the driver translates it
-FOLDER, MANIFEST, AMD_MANIFEST = "cubins", "manifest.json", "amd.json"
+FOLDER, MANIFEST = "cubins", "manifest.json"
 # GPUs in one chip with a CPU (Xavier, Orin, Thor): their code runs on no other GPU of the same major version, nor any
 # other's on them.
 INTEGRATED = frozenset({72, 87, 88, 101, 110})
@@ -46,7 +45,7 @@ class Shipped:
     folder : Path
         One archive for each architecture.
     compiler : (int, int)
-        Version of CUDA's, whose code a driver of that major version or a newer one takes, or of clang for AMD's GPUs.
+        Version of CUDA's, whose code a driver of that major version or a newer one takes.
     architectures : tuple of str
     """
 
@@ -105,7 +104,6 @@ def write_archives(
     architectures: Sequence[str],
     names: Sequence[str],
     code_of: Callable[[str, str], bytes],
-    manifest: str,
     facts: Mapping[str, object],
 ) -> int:
     """Write an archive for each architecture and the manifest, which comes last.
@@ -116,8 +114,6 @@ def write_archives(
         Source files (``cuda/project.cu``).
     code_of : callable
         Machine code of a source file for an architecture.
-    manifest : str
-        Its name.
     facts : mapping
         What it says beside the architectures: ``version`` of the package, ``sources``, and the compiler's.
 
@@ -127,7 +123,7 @@ def write_archives(
         Bytes of all that was written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / manifest).unlink(missing_ok=True)
+    (folder / MANIFEST).unlink(missing_ok=True)
     size = 0
     for arch in architectures:
         path = folder / f"{arch}.zip"
@@ -136,21 +132,19 @@ def write_archives(
                 archive.writestr(zipfile.ZipInfo(entry_of(name)), code_of(name, arch), zipfile.ZIP_DEFLATED, 9)
         size += path.stat().st_size
     text = json.dumps({**facts, "architectures": list(architectures)}, indent=1)
-    return size + (folder / manifest).write_text(text + "\n", encoding="utf-8")  # as many characters as bytes
+    return size + (folder / MANIFEST).write_text(text + "\n", encoding="utf-8")  # as many characters as bytes
 
 
 @cache
-def shipped(
-    version: str, digest: str, folder: Path | None = None, name: str = MANIFEST, compiler: str = "cuda"
-) -> Shipped | None:
+def shipped(version: str, digest: str, folder: Path | None = None) -> Shipped | None:
     """Return what was made of these sources for this version of the package; None where there is no such thing."""
     if folder is None:
         folder = Path(str(resources.files("gs2d.kernels.cuda"))) / FOLDER
     try:
-        manifest = json.loads((folder / name).read_text(encoding="utf-8"))
+        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
         if (manifest["version"], manifest["sources"]) != (version, digest):
             return None
-        major, minor = manifest[compiler]
+        major, minor = manifest["cuda"]
         return Shipped(folder, (int(major), int(minor)), tuple(manifest["architectures"]))
     except (OSError, ValueError, KeyError, TypeError):
         return None
