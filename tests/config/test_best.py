@@ -133,12 +133,6 @@ def test_they_are_written_read_and_described(name: str) -> None:
     assert "rates but that of the means fall after iteration" in said
 
 
-def test_recipes_of_before_are_written_as_they_were() -> None:
-    written = to_json(get_recipe("2dgs-dense"))
-    assert "fused_depth" not in written
-    assert "required" not in written["dense_start"]
-
-
 def test_a_fused_depth_that_is_none_is_refused() -> None:
     with pytest.raises(RecipeError, match="fused_depth must be one of mean, median, transmittance; got 'nearest'"):
         validate(replace(get_recipe("best"), fused_depth="nearest"))

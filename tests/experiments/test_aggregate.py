@@ -95,7 +95,7 @@ def test_rows_that_have_no_run_in_common_say_so() -> None:
 
 def test_a_run_whose_surface_could_not_be_scored_keeps_its_pictures_scores(tmp_path: Path) -> None:
     place = {"name": "a", "path": ".", "format": "blender", "train": 1, "test": 1}
-    definition = {"format": 1, "recipe": {"name": "2dgs"}, "scene": place, "backend": {"name": "cpu"}}
+    definition = {"format": 2, "recipe": {"name": "2dgs"}, "scene": place, "backend": {"name": "cpu"}}
     (tmp_path / "run.json").write_text(json.dumps(definition))
     stage: dict[str, Any] = {"name": "surface", "iterations": 3, "seconds": 5.0, "splats": 7, "bytes": 9}
     stage["test"] = {"psnr": 30.0, "psnr_float": 31.0}

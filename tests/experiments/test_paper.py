@@ -145,15 +145,14 @@ def test_the_figures_of_a_run_count_shared_stages_and_the_protocols_views(tmp_pa
     last = {"name": "refine", "iterations": 1, "seconds": 2.0, "splats": 8, "bytes": 10, "test": scores}
     stages = [{**surface, "reused_from": "a cache"}, {**last, "train": {**scores, "psnr": 40.0}}]
     place = {"name": "a", "path": ".", "format": "blender", "train": 1, "test": 1}
-    definition = {"format": 1, "recipe": {"name": "2dgs"}, "scene": place, "backend": {"name": "cpu"}}
+    definition = {"format": 2, "recipe": {"name": "2dgs"}, "scene": place, "backend": {"name": "cpu"}}
     (tmp_path / "run.json").write_text(json.dumps(definition))
-    rows = [{"threshold": t, "precision": 1, "recall": 1, "f_score": t} for t in (0.1, 0.2, 0.3)]
-    metrics = {"stages": stages, "surface": {"chamfer": 0.5, "f_score": 0.2, "thresholds": rows}}
+    metrics = {"stages": stages, "surface": {"chamfer": 0.5, "f_score": 0.1}}
     (tmp_path / "metrics.json").write_text(json.dumps(metrics))
     options: Any = {"scene": "a", "data_set": DTU, "seed": 0, "record": {"state": "done"}}
     cell = read_cell(tmp_path, test_on="test", **options)
     assert (cell.figures["psnr"], cell.figures["seconds"], cell.figures["bytes"]) == (30.0, 7.0, 10)
-    assert (cell.figures["fscore"], cell.figures["chamfer"]) == (0.1, 0.5)  # not the 0.2 of runs of before
+    assert (cell.figures["fscore"], cell.figures["chamfer"]) == (0.1, 0.5)
     assert cell.reasons == {"lpips": "no weights"}
     assert read_cell(tmp_path, test_on="train", **options).figures["psnr"] == 40.0
     failed = {**options, "record": {"state": "failed", "reason": "no photographs"}}

@@ -38,7 +38,7 @@ def stage_entry(index: int) -> dict[str, Any]:
 
 def definition() -> dict[str, Any]:
     return {
-        "format": 1,
+        "format": 2,
         "versions": {"2dgs-r": "0.1.0", "torch": "2.4"},
         "machine": {"processor": "a processor & <its> makers", "cores": 2},
         "created": "2026-01-01T00:00:00+00:00",

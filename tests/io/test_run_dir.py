@@ -116,14 +116,17 @@ def test_opening_what_is_no_run_says_what_was_found(tmp_path: Path, make: str | 
         open_run(path)
 
 
-def test_a_run_of_a_later_format_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("versions", "words"), [({"2dgs-r": "9.9"}, "gs2d 9.9"), ({}, "another version"), (3, "another version")]
+)
+def test_a_run_of_another_format_names_the_version_that_wrote_it(tmp_path: Path, versions: object, words: str) -> None:
     run = new_run(tmp_path)
-    (tmp_path / "run.json").write_text(json.dumps({"format": 99}))
-    with pytest.raises(RunError, match="format 99, expected 1"):
+    (tmp_path / "run.json").write_text(json.dumps({"format": 99, "versions": versions}))
+    with pytest.raises(RunError, match=f"format 99, expected 2; it was written by {words}: use that one"):
         run.definition()
 
 
-@pytest.mark.parametrize("text", ["[]", "{}", '{"format": 1}', '{"format": 1, "recipe": 3, "scene": {}}', "3"])
+@pytest.mark.parametrize("text", ["[]", "{}", '{"format": 2}', '{"format": 2, "recipe": 3, "scene": {}}', "3"])
 def test_a_damaged_definition_is_one_line(tmp_path: Path, text: str) -> None:
     run = new_run(tmp_path)
     (tmp_path / "run.json").write_text(text)

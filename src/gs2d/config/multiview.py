@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from gs2d.config.validate import integer, number, require
 
@@ -48,7 +48,7 @@ class MultiView:
     max_angle: float = 45.0
     min_baseline: float = 0.05
     max_baseline: float = 1.0
-    depth_downscale: int = field(default=1, metadata={"omit_empty": True})
+    depth_downscale: int = 1
 
     @property
     def side(self) -> int:

@@ -82,12 +82,12 @@ class LossTerm:
     weight: float | None
     start: int = 0
     depth: str | None = None
-    options: Mapping[str, Any] = field(default_factory=dict, metadata={"omit_empty": True}, hash=False)
-    edges: str = field(default="undefined", metadata={"omit_empty": True})
-    where: str = field(default="image", metadata={"omit_empty": True})
-    edge_power: float = field(default=0.0, metadata={"omit_empty": True})
-    every: int = field(default=1, metadata={"omit_empty": True})
-    required: bool = field(default=True, metadata={"omit_empty": True})
+    options: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    edges: str = "undefined"
+    where: str = "image"
+    edge_power: float = 0.0
+    every: int = 1
+    required: bool = True
 
     def __post_init__(self) -> None:
         LOSSES.check(self.kind)
@@ -126,11 +126,11 @@ class LearningRates:
     beta1: float = 0.9
     beta2: float = 0.999
     eps: float = 1e-15
-    stretch: float = field(default=0.0, metadata={"omit_empty": True})
-    view_power: float = field(default=0.5, metadata={"omit_empty": True})
-    settle_start: int = field(default=0, metadata={"omit_empty": True})
-    settle_steps: int = field(default=0, metadata={"omit_empty": True})
-    settle_factor: float = field(default=0.0, metadata={"omit_empty": True})
+    stretch: float = 0.0
+    view_power: float = 0.5
+    settle_start: int = 0
+    settle_steps: int = 0
+    settle_factor: float = 0.0
 
     def settled_at(self, iteration: int) -> float:
         """Factor of all rates but the means' at an iteration (1-based): 1, then linear, then constant."""
@@ -253,11 +253,11 @@ class GradDensify:
     opacity_cap: float = 0.8
     cap_every: int = 0
     max_splats: int | None = None
-    scale_cull_start: int | None = field(default=None, metadata={"omit_empty": True})
-    prune_until: int = field(default=0, metadata={"omit_empty": True})
-    reset_at_on_white: tuple[int, ...] = field(default=(), metadata={"omit_empty": True})
-    error_views: int = field(default=0, metadata={"omit_empty": True})
-    error_power: float = field(default=0.5, metadata={"omit_empty": True})
+    scale_cull_start: int | None = None
+    prune_until: int = 0
+    reset_at_on_white: tuple[int, ...] = ()
+    error_views: int = 0
+    error_power: float = 0.5
 
     def resets(self, iteration: int, *, white: bool) -> bool:
         """Whether opacity is reset at the end of this iteration."""
@@ -351,8 +351,8 @@ class Stage:
     on_enter: tuple[Action, ...] = ()
     sh_interval: int = 0
     moments: str = "fresh"
-    downscale: int = field(default=1, metadata={"omit_empty": True})
-    halve_at: tuple[int, ...] = field(default=(), metadata={"omit_empty": True})
+    downscale: int = 1
+    halve_at: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "train", MappingProxyType(dict(self.train)))
@@ -424,9 +424,9 @@ class Recipe:
     normal_prior: NormalPrior | None = None
     dense_start: DenseStart | None = None
     removal: Removal | None = None
-    fused_depth: str | None = field(default=None, metadata={"omit_empty": True})
-    intrinsics: IntrinsicsRefinement | None = field(default=None, metadata={"omit_empty": True})
-    photometry: Photometry | None = field(default=None, metadata={"omit_empty": True})
+    fused_depth: str | None = None
+    intrinsics: IntrinsicsRefinement | None = None
+    photometry: Photometry | None = None
 
     @property
     def iterations(self) -> int:

@@ -5,7 +5,7 @@ Reasons and alternatives: docs/decisions/fog.md. Pure Python; never imports torc
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from gs2d.config.validate import integer, number, require
 
@@ -115,9 +115,9 @@ class DenseStart:
     votes: int = 2
     cell: float = 3.0
     max_views: int = 120
-    fit: StartFit | None = field(default=None, metadata={"omit_empty": True})
-    required: bool = field(default=True, metadata={"omit_empty": True})
-    sphere: BackgroundSphere | None = field(default=None, metadata={"omit_empty": True})
+    fit: StartFit | None = None
+    required: bool = True
+    sphere: BackgroundSphere | None = None
 
 
 @dataclass(frozen=True)

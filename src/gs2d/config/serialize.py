@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import MISSING, Field, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -17,7 +17,6 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 from gs2d.config.densify import Densify
 from gs2d.config.recipe import CloneInPlace, GradDensify, RankByError, Recipe, validate
 from gs2d.config.registry import absent_guests
-from gs2d.config.renamed import current_names, current_path
 from gs2d.errors import RecipeError
 
 ACTIONS: Mapping[str, type] = {"rank_by_error": RankByError, "clone_in_place": CloneInPlace}
@@ -25,18 +24,14 @@ ACTION_KEY = "action"
 
 
 def to_json(recipe: Recipe) -> dict[str, Any]:
-    """Return a recipe as plain dicts, lists, numbers and strings.
-
-    Every field is written out but those that came later (``omit_empty``) and have their default: a recipe without them
-    is written as it was before there were any.
-    """
+    """Return a recipe, with every field, as plain dicts, lists, numbers and strings."""
     encoded = _encode(recipe)
     assert isinstance(encoded, dict)
     return encoded
 
 
 def from_json(data: Mapping[str, Any], *, to_train: bool = True) -> Recipe:
-    """Return the recipe that :func:`to_json` wrote, validated; names of version 0.1 are read too.
+    """Return the recipe that :func:`to_json` wrote, validated.
 
     Of a run that is there, and is not trained on (``to_train`` False), losses and densifiers may be gone that a file
     or a package had registered.
@@ -47,7 +42,7 @@ def from_json(data: Mapping[str, Any], *, to_train: bool = True) -> Recipe:
         Where a key is unknown or missing, or a value has another type.
     """
     with nullcontext() if to_train else absent_guests():
-        recipe = decode(current_names(data), Recipe, "recipe")
+        recipe = decode(data, Recipe, "recipe")
     assert isinstance(recipe, Recipe)
     return validate(recipe)
 
@@ -75,10 +70,10 @@ def apply_overrides(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
     RecipeError
         Unknown field (says which exist), or a value of another type.
     """
-    data = _encode(recipe, whole=True)  # what is left out of JSON can be set too
+    data = to_json(recipe)
     for override in overrides:
         path, equals, text = override.partition("=")
-        words = current_path(path.strip().split("."))
+        words = path.strip().split(".")
         if not equals or not all(words):
             raise RecipeError(f"an override is stage.field=value, got {override!r}")
         _set(data, words, _parse(text.strip()), override)
@@ -138,24 +133,17 @@ def _entry(entries: list[Any], word: str, override: str) -> Any:
     return entries[tags.index(word)]
 
 
-def _encode(value: Any, *, whole: bool = False) -> Any:
-    """Return the JSON form; ``whole``: with every field, also those that are left out at their default."""
+def _encode(value: Any) -> Any:
+    """Return the JSON form."""
     if is_dataclass(value) and not isinstance(value, type):
-        kept = [entry for entry in fields(value) if whole or not _is_left_out(entry, getattr(value, entry.name))]
-        encoded = {entry.name: _encode(getattr(value, entry.name), whole=whole) for entry in kept}
+        encoded = {entry.name: _encode(getattr(value, entry.name)) for entry in fields(value)}
         tags = [name for name, kind in ACTIONS.items() if type(value) is kind]
         return {ACTION_KEY: tags[0], **encoded} if tags else encoded
     if isinstance(value, Mapping):
-        return {str(key): _encode(entry, whole=whole) for key, entry in value.items()}
+        return {str(key): _encode(entry) for key, entry in value.items()}
     if isinstance(value, tuple | list):
-        return [_encode(entry, whole=whole) for entry in value]
+        return [_encode(entry) for entry in value]
     return value
-
-
-def _is_left_out(entry: Field[Any], value: Any) -> bool:
-    """Whether a field came later and has its default."""
-    default = entry.default if entry.default_factory is MISSING else entry.default_factory()
-    return bool(entry.metadata.get("omit_empty")) and value == default
 
 
 def decode(value: Any, kind: Any, where: str) -> Any:

@@ -24,7 +24,6 @@ from gs2d.core.locks import try_lock
 from gs2d.errors import DiskError
 
 _TEMPORARY = re.compile(r"\..+\.gs2d\.tmp", re.DOTALL)
-_BEFORE_LOCKS = re.compile(r"\..+\.(\d+)\.[0-9a-f]{8}\.tmp", re.DOTALL)  # as gs2d 0.2 called them: with the process
 _LONGEST = 200  # bytes of a file's name that are in the temporary one
 _ATTEMPTS = 100  # at a temporary name
 _ESCAPED = "backslashreplace"  # a file name that is not UTF-8 is written as \udcff, which JSON reads back
@@ -204,7 +203,7 @@ def _removed(temporary: Path) -> bool:
 
 def is_temporary(name: str) -> bool:
     """Whether a file has the name of one that is being written, or was when its process was killed."""
-    return bool(_TEMPORARY.fullmatch(name) or _BEFORE_LOCKS.fullmatch(name))
+    return _TEMPORARY.fullmatch(name) is not None
 
 
 def sweep(folder: Path) -> int:
@@ -212,24 +211,9 @@ def sweep(folder: Path) -> int:
     swept = 0
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         for entry in list(entries):
-            older = _BEFORE_LOCKS.fullmatch(entry.name)
-            abandoned = _TEMPORARY.fullmatch(entry.name) or (older and not _runs(int(older[1])))
-            if abandoned and entry.is_file(follow_symlinks=False):
+            if is_temporary(entry.name) and entry.is_file(follow_symlinks=False):
                 swept += _removed(Path(entry.path))
     return swept
-
-
-def _runs(process: int) -> bool:
-    """Whether there is such a process on this machine (True where that cannot be told)."""
-    if sys.platform == "win32":  # where os.kill ends it
-        return True
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:
-        return True
-    return True
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:

@@ -266,10 +266,7 @@ def surface_figures(surface: dict[str, Any] | None, data_set: str) -> dict[str, 
     """F-score at the first threshold, and Chamfer distance, from the ``surface`` entry of ``metrics.json``."""
     if not surface:
         return {"fscore": None, "chamfer": None}
-    scores = surface.get("thresholds") or []
-    # not the entry's own f_score, which runs of before 2026-11-27 have at the second threshold
-    first = scores[0]["f_score"] if scores else surface.get("f_score")
-    return {"fscore": first, "chamfer": surface.get("chamfer")}
+    return {"fscore": surface.get("f_score"), "chamfer": surface.get("chamfer")}
 
 
 # -- claims ----------------------------------------------------------------------------------------------------------

@@ -36,7 +36,6 @@ from pathlib import Path
 from typing import Any
 
 from gs2d import __version__
-from gs2d.config.renamed import current_names
 from gs2d.core.files import atomic_write, disk_error, is_temporary, sweep
 from gs2d.core.growth import check_entries
 from gs2d.core.json_files import read_json, write_json
@@ -53,7 +52,7 @@ SPLATS, MESH, TEXTURED, REPORT, PAGE = "splats.ply", "mesh.ply", "mesh.glb", "re
 EXPOSURE, POSES, SUBJECT, VERDICT = "exposure.json", "poses.json", "subject.json", "verdict.json"
 PHOTOMETRY = "photometry.json"
 GEOREFERENCE = "georeference.json"
-FORMAT = 1
+FORMAT = 2
 KEPT_CHECKPOINTS = 2
 _UNREADABLE = (
     *(OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError, AttributeError),
@@ -105,15 +104,18 @@ class RunFolder:
         Raises
         ------
         RunError
-            Written by a later gs2d, or damaged.
+            If another version of gs2d wrote it, or it is damaged.
         """
         try:
-            data = current_names(_object(self.file(RUN_JSON)))
+            data = _object(self.file(RUN_JSON))
         except RecursionError as error:
             raise RunError(f"{self.file(RUN_JSON)} is nested too deeply to read; it was damaged: restore it") from error
         if data.get("format") != FORMAT:
+            made = data.get("versions")
+            writer = f"gs2d {made['2dgs-r']}" if isinstance(made, dict) and "2dgs-r" in made else "another version"
             raise RunError(
-                f"{self.file(RUN_JSON)} has format {data.get('format')!r}, expected {FORMAT}; use the gs2d that made it"
+                f"{self.file(RUN_JSON)} has format {str(data.get('format'))[:40]}, expected {FORMAT}; it was written "
+                f"by {writer[:40]}: use that one, or train again with --overwrite"
             )
         for name, keys in (("recipe", {"name"}), ("scene", _SCENE)):
             if not isinstance(data.get(name), dict) or not data[name].keys() >= keys:

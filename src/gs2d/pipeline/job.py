@@ -25,7 +25,7 @@ from gs2d.config.presets import (
     with_poses,
     with_robustness,
 )
-from gs2d.config.protocols import BLACK, GENERIC, Protocol, get_protocol, protocol_for
+from gs2d.config.protocols import BLACK, Protocol, get_protocol, protocol_for
 from gs2d.config.recipe import Recipe, validate
 from gs2d.config.robust import FEW_VIEWS
 from gs2d.config.schedule import fit_schedule, longer_steps, scale_schedule
@@ -647,7 +647,7 @@ def reload_job(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> J
         check_settings(settings)
         settings = settings.for_depths(protocol.depth, protocol.fused_depth)
         named, downscale, digest = data["backend"]["name"], data["downscale"], data["scene"]["digest"]
-        cache_bytes = int(data.get("stage2_cache_bytes", 0))  # runs of before there were cached views had none
+        cache_bytes = int(data["stage2_cache_bytes"])
         said = data["scene"].get("masks", {})
         masks = Masks(None if said.get("folder") is None else Path(said["folder"]), said.get("masked"))
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RecipeError, ShapeError) as error:
@@ -677,8 +677,7 @@ def protocol_from_json(data: dict[str, Any]) -> Protocol:
     """
     if not isinstance(data, dict) or not isinstance(data.get("fusion"), dict):
         raise RecipeError("protocol must be an object with its fusion, got something else")
-    old = {"subject": data.get("name") == GENERIC.name}  # for runs of before there was such a field
-    protocol: Protocol = decode({**data, "fusion": {**old, **data["fusion"]}}, Protocol, "protocol")
+    protocol: Protocol = decode(data, Protocol, "protocol")
     return protocol
 
 

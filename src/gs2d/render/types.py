@@ -75,7 +75,7 @@ class RasterSettings:
     near_plane_policy: str = "draw"
     with_distortion: bool = True
     with_transmittance_depth: bool = field(default=False, metadata={"derived": True})
-    depth_width_px: float = field(default=2.0, metadata={"omit_default": True})
+    depth_width_px: float = 2.0
 
     def for_depths(self, *kinds: str | None) -> RasterSettings:
         """Return the settings that render these kinds of depth; None: no particular one."""
@@ -84,12 +84,9 @@ class RasterSettings:
     def facts(self) -> dict[str, Any]:
         """Return the constants by name, as they are written down.
 
-        Without which depths are rendered, which protocol and losses say, and without defaults that older runs do not
-        name.
+        Without which depths are rendered, which protocol and losses say.
         """
-        named = {f.name: getattr(self, f.name) for f in fields(self) if not f.metadata.get("derived")}
-        later = {f.name: f.default for f in fields(self) if f.metadata.get("omit_default")}
-        return {name: value for name, value in named.items() if name not in later or value != later[name]}
+        return {f.name: getattr(self, f.name) for f in fields(self) if not f.metadata.get("derived")}
 
     def depth_width(self, camera: Camera) -> float:
         """Return kappa of rule 22: the half width as a fraction of the depth."""
