@@ -20,6 +20,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+from benchmarks.controls import spec
 from benchmarks.quality_run import score_splats
 from benchmarks.results import Case, Method, run_case
 from gs2d.core.json_files import write_json
@@ -42,7 +43,7 @@ KEY = ("capture", "recipe", "seed", "scale")  # of a row
 
 def row_of(case: Case, recipe: str, args: argparse.Namespace) -> dict[str, Any]:
     """Train and score one run unless it is done, and return its figures."""
-    metrics = run_case(case, Method(recipe, recipe, recipe), str(args.data), args.folder, args.scale, args.seed)
+    metrics = run_case(case, Method(recipe, recipe, spec(recipe)), str(args.data), args.folder, args.scale, args.seed)
     run = RunFolder(args.folder / f"{case.name}-{recipe}-s{args.seed}")
     stages, surface = metrics["stages"], metrics.get("surface")
     return {

@@ -55,13 +55,14 @@ METHODS = (
     Method("2dgs-60k", "2DGS, as long as 2DGS-R", "2dgs-60k"),
     Method("best", "`best`", "best"),
 )
+PRESERVE = ("refine.on_enter.clone_in_place.opacity=preserve",)
 LONG_STAGE_3 = ("appearance.iterations=1", "refine.iterations=2999")
 # Where the gain of stage 3 comes from. The numbers of iterations are for --scale 0.1.
 WHY = (
     Method("60k-2000", "2DGS continued for as long as stage 3 alone", "2dgs-60k", ("continue.iterations=2000",)),
     Method("r-2999", "2DGS-R, all but 1 of stage 2 given to stage 3", "2dgs-r", LONG_STAGE_3),
     Method("r-free", "2DGS-R, opacity free in stage 3", "2dgs-r-freeze-none"),
-    Method("r-preserve", "2DGS-R, clones share the opacity", "2dgs-r-clone-preserve"),
+    Method("r-preserve", "2DGS-R, clones share the opacity", "2dgs-r", PRESERVE),
     Method("r-k30", "2DGS-R, K = 30", "2dgs-r-k30"),
 )
 

@@ -151,7 +151,7 @@ def test_robust_training_starts_as_it_was_tried_and_spares_sky_and_ground() -> N
     assert isinstance(stage.densify, GradDensify)
     assert not any(stage.densify.culls_scale(i) for i in range(1, stage.iterations + 1))
     assert with_robustness(get_recipe("2dgs")).stages == get_recipe("2dgs").stages
-    own = replace(get_recipe("2dgs-dense"), removal=Removal(every=20))
+    own = replace(get_recipe("2dgs"), dense_start=DenseStart(side=99), removal=Removal(every=20))
     assert with_robustness(own).dense_start == own.dense_start
     assert with_robustness(own).removal == own.removal
 

@@ -14,10 +14,9 @@ from gs2d.config.presets import (
     TABLES,
     get_recipe,
     with_depth_prior,
-    with_edges,
+    with_exposure,
     with_multiview,
     with_normal_prior,
-    with_silhouette,
 )
 from gs2d.config.priors import DepthPrior, NormalPrior
 from gs2d.config.recipe import ALL, CloneInPlace, Exposure, GradDensify, LossTerm, RankByError, Recipe, Stage, validate
@@ -151,53 +150,6 @@ def test_absgs_rows_densify_in_stage_3_instead_of_the_clone() -> None:
     assert adjusted.densify.percent_dense < d.percent_dense
 
 
-def test_variants_change_what_they_say() -> None:
-    assert dict(get_recipe("2dgs-r-sh-of-all").stages[1].train) == {"sh0": "all", "shN": "all"}
-    assert set(get_recipe("2dgs-r-clones-only").stages[2].train.values()) == {"clones"}
-    assert get_recipe("2dgs-r-clone-preserve").stages[2].on_enter == (CloneInPlace("high_error", "preserve"),)
-    assert get_recipe("2dgs-r-rerank").stages[2].on_enter == (RankByError(), CloneInPlace("high_error", "copy"))
-    assert get_recipe("2dgs-r-occlusion").stages[1].on_enter == (RankByError(occlusion=True),)
-
-
-def test_a_dense_start_is_fitted_and_not_reset() -> None:
-    plain, dense, still = (get_recipe(name) for name in ("2dgs", "2dgs-dense", "2dgs-dense-still"))
-    assert dense.dense_start is not None
-    assert dense.dense_start.fit is not None
-    assert dense.dense_start == still.dense_start
-    assert isinstance(plain.stages[0].densify, GradDensify)
-    assert dense.stages[0] == replace(plain.stages[0], densify=replace(plain.stages[0].densify, reset_every=0))
-    assert still.stages[0] == replace(plain.stages[0], densify=None)
-
-
-def test_controls_change_what_they_say() -> None:
-    def but_for_the_last(name: str, base: str) -> tuple[Stage, Stage]:
-        recipe, plain = get_recipe(name), get_recipe(base)
-        assert recipe.stages[:-1] == plain.stages[:-1]
-        return recipe.stages[-1], plain.stages[-1]
-
-    for name, base in (("2dgs-r-restart", "2dgs-r"), ("2dgs-60k-restart", "2dgs-60k")):
-        last, plain = but_for_the_last(name, base)
-        assert replace(last, lr=plain.lr) == plain
-        # falls once more, and ends with the stage
-        assert last.lr.means_at(0) == pytest.approx(1.6e-4)
-        assert last.lr.means_at(last.iterations - 100) > last.lr.means_at(last.iterations) == pytest.approx(1.6e-6)
-    last, plain = but_for_the_last("2dgs-60k-no-nc-late", "2dgs-60k")
-    assert "normal_consistency" not in weights(last)
-    assert replace(last, losses=plain.losses) == plain
-    last, plain = but_for_the_last("2dgs-r-no-clone", "2dgs-r")
-    assert replace(last, on_enter=plain.on_enter) == plain
-    assert last.on_enter == ()
-
-
-@pytest.mark.parametrize("base", ["2dgs", "2dgs-60k"])
-def test_the_other_reading_of_normals_beside_empty_pixels_changes_nothing_else(base: str) -> None:
-    other = get_recipe(f"{base}-edges-camera")
-    edges = [term.edges for stage in other.stages for term in stage.losses if term.kind == "normal_consistency"]
-    assert edges == ["camera"] * len(other.stages)
-    assert with_edges(other, "undefined", name=base) == get_recipe(base)
-    assert "reading" in RECIPES[f"{base}-edges-camera"].about
-
-
 def test_a_weight_of_zero_leaves_the_term_out() -> None:
     assert all(term.weight != 0 for name in RECIPES for s in get_recipe(name).stages for term in s.losses)
     assert LossTerm("normal_consistency", 0.0) not in get_recipe("2dgs-no-nc").stages[0].losses
@@ -208,21 +160,11 @@ def test_an_unknown_name_suggests_a_near_one() -> None:
         get_recipe("2dgs-r-k100")
 
 
-def test_silhouettes_are_kept_wherever_opacity_or_geometry_learns() -> None:
-    surface, appearance, refine = get_recipe("2dgs-r-silhouette").stages
-    plain = get_recipe("2dgs-r").stages
-    assert weights(surface) == weights(plain[0]) | {"silhouette": (0.1, 0)}
-    assert appearance == plain[1]  # colours alone: alpha cannot change, and views can be cached
-    assert weights(refine) == weights(plain[2]) | {"silhouette": (0.1, 0)}
-    again = with_silhouette(get_recipe("2dgs-r-silhouette"), 0.3, name="more")
-    assert weights(again.stages[0]) == weights(plain[0]) | {"silhouette": (0.3, 0)}
-
-
 @pytest.mark.parametrize("base", ["2dgs", "2dgs-60k", "2dgs-r"])
 def test_views_are_compared_by_the_recipes_that_say_so_with_normal_consistency_and_without_densification(
     base: str,
 ) -> None:
-    plain, comparing = get_recipe(base), get_recipe(f"{base}-multiview")
+    plain, comparing = get_recipe(base), with_multiview(get_recipe(base))
     assert plain.multiview is None
     assert comparing.multiview == MultiView()
     starts = {"surface": 15_000, "continue": 0, "refine": 0}
@@ -237,13 +179,12 @@ def test_views_are_compared_by_the_recipes_that_say_so_with_normal_consistency_a
     assert late.multiview == settings
     found = [term for term in late.stages[0].losses if term.kind == "multiview_geometric"]
     assert found == [LossTerm("multiview_geometric", 0.02, round(0.8 * plain.stages[0].iterations), every=2)]
-    compared = ["best-surface", *(f"{x}-multiview" for x in ("2dgs", "2dgs-60k", "2dgs-r"))]
-    assert [name for name in RECIPES if get_recipe(name).multiview] == compared
+    assert [name for name in RECIPES if get_recipe(name).multiview] == ["best-surface", "2dgs-multiview"]
 
 
 @pytest.mark.parametrize("base", ["2dgs", "2dgs-60k", "2dgs-r"])
-def test_known_depths_are_asked_by_the_recipes_that_say_so_while_all_splats_move(base: str) -> None:
-    plain, knowing = get_recipe(base), get_recipe(f"{base}-depth")
+def test_known_depths_are_compared_while_all_splats_move(base: str) -> None:
+    plain, knowing = get_recipe(base), with_depth_prior(get_recipe(base))
     assert plain.depth_prior is None
     assert knowing.depth_prior == DepthPrior()
     for before, after in zip(plain.stages, knowing.stages, strict=True):
@@ -255,9 +196,6 @@ def test_known_depths_are_asked_by_the_recipes_that_say_so_while_all_splats_move
     assert validate(both) == with_normal_prior(both)
     starts = [t.start for s in both.stages for t in s.losses if t.kind == "normal_prior"]
     assert starts == [7_000, 0][: len(starts)]
-    assert [name for name in RECIPES if get_recipe(name).depth_prior] == [
-        f"{x}-depth" for x in ("2dgs", "2dgs-60k", "2dgs-r")
-    ]
 
 
 def test_without_normal_consistency_there_is_no_stage_to_compare_views_in() -> None:
@@ -266,14 +204,11 @@ def test_without_normal_consistency_there_is_no_stage_to_compare_views_in() -> N
 
 
 @pytest.mark.parametrize("base", ["2dgs", "2dgs-60k", "2dgs-r"])
-def test_only_the_recipes_that_say_so_learn_exposures_and_view_dependence_then_comes_later(base: str) -> None:
-    plain, learning = get_recipe(base), get_recipe(f"{base}-exposure")
+def test_with_exposures_view_dependence_comes_later(base: str) -> None:
+    plain, learning = get_recipe(base), with_exposure(get_recipe(base))
     assert plain.exposure is None
     assert learning.exposure == Exposure()
     assert [stage.sh_interval for stage in learning.stages] == [3 * stage.sh_interval for stage in plain.stages]
     intervals = [stage.sh_interval for stage in plain.stages]
     stages = (replace(s, sh_interval=k) for s, k in zip(learning.stages, intervals, strict=True))
     assert replace(learning, name=base, exposure=None, stages=tuple(stages)) == plain
-    assert [name for name in RECIPES if get_recipe(name).exposure] == [
-        f"{x}-exposure" for x in ("2dgs", "2dgs-60k", "2dgs-r")
-    ]

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from gs2d.config.presets import RECIPES, get_recipe
+from gs2d.config.presets import RECIPES, get_recipe, with_exposure, with_poses
 from gs2d.config.recipe import ALL, GradDensify, LearningRates, validate
 from gs2d.config.schedule import count_densifications, fit_schedule, longer_steps, scale_schedule
 from gs2d.errors import RecipeError
@@ -134,14 +134,14 @@ def test_a_factor_must_be_positive_and_finite(factor: float) -> None:
 
 def test_views_are_compared_from_the_scaled_end_of_densification_on() -> None:
     for factor in (1.0, 0.1, 0.05, 0.03):
-        surface = scale_schedule(get_recipe("2dgs-r-multiview"), factor).stages[0]
+        surface = scale_schedule(get_recipe("2dgs-multiview"), factor).stages[0]
         (start,) = (term.start for term in surface.losses if term.kind == "multiview_photometric")
         assert surface.densify is not None
         assert start == surface.densify.stop == round(15_000 * factor)
 
 
 def test_exposures_wait_for_colours_by_the_count_of_iterations() -> None:
-    recipe = get_recipe("2dgs-exposure")
+    recipe = with_exposure(get_recipe("2dgs"))
     # start: 500 of 30,000; a tenth of the schedule waits 200, not 50; at most a sixth of its 3000, 1200 or 300.
     facts = {factor: scale_schedule(recipe, factor).exposure for factor in (1.0, 0.5, 0.1, 0.04, 0.01)}
     assert {f: (e.decay_steps, e.start) for f, e in facts.items() if e is not None} == {
@@ -155,7 +155,7 @@ def test_exposures_wait_for_colours_by_the_count_of_iterations() -> None:
 
 
 def test_poses_take_longer_steps_where_they_have_fewer_turns() -> None:
-    facts = {factor: scale_schedule(get_recipe("2dgs-poses"), factor).poses for factor in (1.0, 0.25, 0.01)}
+    facts = {factor: scale_schedule(with_poses(get_recipe("2dgs")), factor).poses for factor in (1.0, 0.25, 0.01)}
     assert {f: (p.decay_steps, p.start) for f, p in facts.items() if p is not None} == {
         1.0: (30_000, 500),
         0.25: (7_500, 200),

@@ -92,7 +92,7 @@ def test_overrides_that_are_not_named_stay_as_they_were() -> None:
 
 def test_exposures_can_be_switched_on_changed_and_off() -> None:
     assert changed("exposure={}").exposure == Exposure()
-    learning = get_recipe("2dgs-r-exposure")
+    learning = changed("exposure={}")
     assert apply_overrides(learning, ["exposure.rate=0.01"]).exposure == Exposure(rate=0.01)
     assert apply_overrides(learning, ["exposure=null"]).exposure is None
 

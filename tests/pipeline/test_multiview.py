@@ -22,7 +22,7 @@ WIDE = (  # for few cameras, far apart, and pictures of a few pixels
 
 
 def comparing(capture: Path, out: Path, **changes: Any) -> TrainOptions:
-    made = options(capture, out, recipe="2dgs-r-multiview", overrides=(*SMALL, *WIDE))
+    made = options(capture, out, recipe="2dgs-multiview", overrides=(*SMALL, *WIDE))
     return replace(made, **changes)
 
 

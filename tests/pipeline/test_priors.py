@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 
 from ball_runs import SMALL, Stop, comparable, options
+from gs2d.config.presets import with_depth_prior
 from gs2d.errors import DataError, RecipeError
 from gs2d.io.run_dir import REPORT, RunFolder
 from gs2d.pipeline.events import Event, MissingFile, Notice, Step, ignore
@@ -171,14 +172,13 @@ def test_a_capture_without_depths_is_refused_and_leaves_nothing(capture: Path, t
     assert not (tmp_path / "run").exists()
 
 
-def test_the_option_is_the_named_recipe_and_takes_a_source() -> None:
+def test_the_option_takes_a_source() -> None:
     rest: dict[str, Any] = {"schedule_scale": 0.1, "seed": 3, "overrides": ()}
     flagged = build_recipe("2dgs-r", depth_prior="auto", **rest)
-    assert flagged == build_recipe("2dgs-r-depth", **rest)
-    assert flagged == build_recipe("2dgs-r-depth", depth_prior="auto", **rest)
+    assert with_depth_prior(flagged) == flagged
     assert flagged.depth_prior is not None
     assert flagged.depth_prior.decay_steps == 3000
-    chosen = build_recipe("2dgs-r-depth", depth_prior="sparse", **rest).depth_prior
+    chosen = build_recipe("2dgs-r", depth_prior="sparse", **rest).depth_prior
     assert chosen == replace(flagged.depth_prior, source="sparse")
     assert [any(t.kind == "depth_prior" for t in s.losses) for s in flagged.stages] == [True, False, True]
     with pytest.raises(RecipeError, match="depth_prior is null, but loss 'depth_prior' needs it"):

@@ -165,4 +165,3 @@ def test_a_sphere_is_a_value_of_the_recipe_that_is_written_and_left_out_by_name(
     assert changed.dense_start.sphere == BackgroundSphere(splats=300)
     without: Recipe = apply_overrides(recipe, ["dense_start.sphere=null"])
     assert without.dense_start == replace(recipe.dense_start, sphere=None)
-    assert "sphere" not in to_json(get_recipe("2dgs-dense"))["dense_start"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d.config.presets import get_recipe, with_silhouette
+from gs2d.config.presets import get_recipe
 from gs2d.config.protocols import NERF_SYNTHETIC
 from gs2d.config.recipe import LossTerm, Recipe
 from gs2d.config.schedule import scale_schedule
@@ -76,7 +76,7 @@ def test_normal_consistency_of_the_whole_image_grows_sheets(with_sheets: Outcome
 def test_there_are_no_sheets_where_it_is_asked_of_the_object_or_silhouettes_are_kept(
     scene: Scene, with_sheets: Outcome, cure: str
 ) -> None:
-    recipe = recipe_with("object") if cure == "object" else with_silhouette(recipe_with("image"), name="kept")
+    recipe = recipe_with("object") if cure == "object" else recipe_with("image").with_loss(LossTerm("silhouette", 0.1))
     found = outcome(scene, recipe)
     assert found.longest < RADIUS
     assert found.covered < with_sheets.covered / 2

@@ -1,4 +1,4 @@
-"""The recipes: one value per row of every table of the 2DGS-R paper, and the variants where the paper is silent.
+"""The recipes: the ones for users, and one for each row of the tables of the 2DGS-R paper.
 
 Stage 1 is the official 2DGS training (facts: arguments and loop of hbb1/2d-gaussian-splatting), stages 2 and 3 are the
 paper's. Scenes are unknown here: what depends on the data set is the protocol's. Pure Python; never imports torch.
@@ -19,7 +19,6 @@ from gs2d.config.priors import DepthPrior, NormalPrior
 from gs2d.config.recipe import (
     ALL,
     ALPHA,
-    NORMAL_KINDS,
     SH,
     CloneInPlace,
     Exposure,
@@ -82,56 +81,41 @@ def surface(nc: float = 0.05, distortion: float | None = 0.0, iterations: int = 
     )
 
 
-def appearance(k: float = 1.0, rows: str = "high_error") -> Stage:
-    """Stage 2: rank by E_i; only the SH of the worst ``k`` percent learn (``rows="all"``: of every splat)."""
+def appearance(k: float = 1.0) -> Stage:
+    """Stage 2: rank by E_i; only the SH of the worst ``k`` percent learn."""
     return Stage(
         "appearance",
         10_000,
-        train=dict.fromkeys(SH, rows),
+        train=dict.fromkeys(SH, "high_error"),
         losses=PHOTOMETRIC,
         lr=_lr_after_surface(),
         on_enter=(RankByError(top_percent=k),),
     )
 
 
-def refine(
-    nc: float = 0.05,
-    freeze: tuple[str, ...] = ALPHA,
-    *,
-    clone: str | None = "copy",
-    densify: GradDensify | None = None,
-    rows: str = "all",
-    rerank: float | None = None,
-    restart: bool = False,
-) -> Stage:
+def refine(nc: float = 0.05, freeze: tuple[str, ...] = ALPHA, *, densify: GradDensify | None = None) -> Stage:
     """Stage 3: clone the high-error splats in place, then train everything but ``freeze``, NC from the start.
 
-    ``clone`` is the opacity of the clones ("copy" or "preserve"), None for no clone (AbsGS densifies instead);
-    ``rerank`` ranks by E_i once more (top percent) before the clone; ``rows`` limits training to a group ("clones");
-    ``restart``: the means' rate falls once more, from its start.
+    With ``densify`` nothing is cloned (AbsGS densifies instead).
     """
-    rank = () if rerank is None else (RankByError(top_percent=rerank),)
     return Stage(
         "refine",
         20_000,
-        train={name: rows for name in ALL if name not in freeze},
+        train={name: "all" for name in ALL if name not in freeze},
         losses=(*PHOTOMETRIC, *_normal_consistency(nc, 0)),
-        lr=LearningRates(means_decay_steps=20_000) if restart else _lr_after_surface(),
+        lr=_lr_after_surface(),
         densify=densify,
-        on_enter=rank if clone is None else (*rank, CloneInPlace("high_error", clone)),
+        on_enter=(CloneInPlace("high_error", "copy"),) if densify is None else (),
     )
 
 
-def continue_training(nc: float = 0.05, iterations: int = 30_000, *, restart: bool = False) -> Stage:
-    """More of the same after stage 1: its last rates, its moments, NC on, no densification.
-
-    ``restart``: the means' rate falls once more, from its start.
-    """
+def continue_training() -> Stage:
+    """More of the same after stage 1: its last rates, its moments, NC on, no densification."""
     return Stage(
         "continue",
-        iterations,
-        losses=(*PHOTOMETRIC, *_normal_consistency(nc, 0)),
-        lr=LearningRates(means_decay_steps=iterations) if restart else _lr_after_surface(),
+        30_000,
+        losses=(*PHOTOMETRIC, *_normal_consistency(0.05, 0)),
+        lr=_lr_after_surface(),
         moments="kept",
     )
 
@@ -141,29 +125,14 @@ def two_dgs(nc: float = 0.05, distortion: float | None = 0.0, *, name: str = "2d
     return Recipe(name, (surface(nc, distortion),))
 
 
-def two_dgs_60k(nc: float = 0.05, *, name: str = "2dgs-60k", more: Stage | None = None) -> Recipe:
+def two_dgs_60k(*, name: str = "2dgs-60k") -> Recipe:
     """Return the fair control: 2DGS for as many iterations as 2DGS-R in total; its first stage is that of ``2dgs``."""
-    return Recipe(name, (surface(nc), more or continue_training(nc)))
+    return Recipe(name, (surface(), continue_training()))
 
 
 def two_dgs_r(*, name: str = "2dgs-r", stage_2: Stage | None = None, stage_3: Stage | None = None) -> Recipe:
     """2DGS-R: surface 30k, appearance 10k, refine 20k."""
     return Recipe(name, (surface(), stage_2 or appearance(), stage_3 or refine()))
-
-
-def with_silhouette(recipe: Recipe, weight: float = SILHOUETTE, *, name: str) -> Recipe:
-    """Add a silhouette loss wherever opacity or geometry is trained; photographs need an alpha channel.
-
-    Not in the paper. Colour cannot see splats that have the background's colour, and the official normal consistency
-    rewards their coverage: they grow without bound (docs/results.md).
-    """
-
-    def extended(stage: Stage) -> Stage:
-        others = (term for term in stage.losses if term.kind != "silhouette")
-        return replace(stage, losses=(*others, LossTerm("silhouette", weight)))
-
-    stages = (extended(stage) if set(stage.train) - set(SH) else stage for stage in recipe.stages)
-    return replace(recipe, name=name, stages=tuple(stages))
 
 
 def without_squares(recipe: Recipe) -> Recipe:
@@ -186,17 +155,7 @@ def _is(term: LossTerm, kind: str, weight: float) -> bool:
     return term.kind == kind and term.weight == weight
 
 
-def with_edges(recipe: Recipe, edges: str, *, name: str) -> Recipe:
-    """Return the recipe with the other reading of normal consistency beside empty pixels (``LossTerm.edges``)."""
-
-    def changed(term: LossTerm) -> LossTerm:
-        return replace(term, edges=edges) if term.kind in NORMAL_KINDS else term
-
-    stages = (replace(stage, losses=tuple(map(changed, stage.losses))) for stage in recipe.stages)
-    return replace(recipe, name=name, stages=tuple(stages))
-
-
-def with_exposure(recipe: Recipe, *, name: str | None = None) -> Recipe:
+def with_exposure(recipe: Recipe) -> Recipe:
     """Add a colour transform for each training photograph (``NAME-exposure``) to a recipe without one.
 
     Not in the paper. For photographs of a camera on automatic, whose exposure or white balance changes. View-dependent
@@ -205,12 +164,10 @@ def with_exposure(recipe: Recipe, *, name: str | None = None) -> Recipe:
     if recipe.exposure is not None:
         return recipe
     stages = (replace(stage, sh_interval=SH_PATIENCE * stage.sh_interval) for stage in recipe.stages)
-    return replace(recipe, name=name or f"{recipe.name}-exposure", stages=tuple(stages), exposure=Exposure())
+    return replace(recipe, name=f"{recipe.name}-exposure", stages=tuple(stages), exposure=Exposure())
 
 
-def with_photometry(
-    recipe: Recipe, *, vignetting: bool = True, response: bool = True, name: str | None = None
-) -> Recipe:
+def with_photometry(recipe: Recipe, *, vignetting: bool = True, response: bool = True) -> Recipe:
     """Add what a recipe without it learns of cameras: vignetting, response or both (``NAME-photometry``).
 
     Not in the paper. For lenses that darken corners, and for several cameras whose curves differ
@@ -219,7 +176,7 @@ def with_photometry(
     if recipe.photometry is not None:
         return recipe
     learned = Photometry(vignetting=vignetting, response=response)
-    return replace(recipe, name=name or f"{recipe.name}-photometry", photometry=learned)
+    return replace(recipe, name=f"{recipe.name}-photometry", photometry=learned)
 
 
 def with_multiview(
@@ -252,9 +209,7 @@ def with_multiview(
     return replace(recipe, name=name or f"{recipe.name}-multiview", stages=stages, multiview=multiview)
 
 
-def with_depth_prior(
-    recipe: Recipe, source: str = "auto", weight: float = DEPTH_WEIGHT, *, name: str | None = None
-) -> Recipe:
+def with_depth_prior(recipe: Recipe, source: str = "auto", weight: float = DEPTH_WEIGHT) -> Recipe:
     """Return the recipe with a loss on known depths in the stages that train the means of all splats (``NAME-depth``).
 
     Not in the paper. For indoor rooms, walls without texture and few photographs (docs/guides/priors.md). A recipe that
@@ -265,10 +220,10 @@ def with_depth_prior(
         return replace(recipe, depth_prior=known)
     # The mean depth: its gradient reaches every splat of a pixel, that of the median one alone.
     term = LossTerm("depth_prior", weight, depth="mean")
-    return replace(_in_stages(recipe, term), name=name or f"{recipe.name}-depth", depth_prior=DepthPrior(source))
+    return replace(_in_stages(recipe, term), name=f"{recipe.name}-depth", depth_prior=DepthPrior(source))
 
 
-def with_normal_prior(recipe: Recipe, weight: float = NORMAL_WEIGHT, *, name: str | None = None) -> Recipe:
+def with_normal_prior(recipe: Recipe, weight: float = NORMAL_WEIGHT) -> Recipe:
     """Add a loss on known normals to the stages that train the means of all splats (``NAME-normals``).
 
     From where normal consistency begins: before, splats are where colours put them, and turning them does harm.
@@ -276,10 +231,10 @@ def with_normal_prior(recipe: Recipe, weight: float = NORMAL_WEIGHT, *, name: st
     if recipe.normal_prior is not None:
         return recipe
     term = LossTerm("normal_prior", weight, NC_START)
-    return replace(_in_stages(recipe, term), name=name or f"{recipe.name}-normals", normal_prior=NormalPrior())
+    return replace(_in_stages(recipe, term), name=f"{recipe.name}-normals", normal_prior=NormalPrior())
 
 
-def with_robustness(recipe: Recipe, *, name: str | None = None) -> Recipe:
+def with_robustness(recipe: Recipe) -> Recipe:
     """Return the recipe with a dense start and the removal of floaters, unless it has its own.
 
     Not in the paper; for captures that say which sparse points their images show (docs/decisions/fog.md). A dense start
@@ -289,7 +244,6 @@ def with_robustness(recipe: Recipe, *, name: str | None = None) -> Recipe:
     start = recipe.dense_start or STREET_START
     return replace(
         recipe,
-        name=name or recipe.name,
         stages=tuple(map(_sparing_large_splats, recipe.stages)),
         dense_start=start if start.required else STREET_START,
         removal=recipe.removal or Removal(),
@@ -301,17 +255,6 @@ def _sparing_large_splats(stage: Stage) -> Stage:
     if not isinstance(densify, GradDensify) or densify.reset_every or densify.scale_cull_start is not None:
         return stage
     return replace(stage, densify=replace(densify, scale_cull_start=stage.iterations))
-
-
-def with_dense_start(recipe: Recipe, *, still: bool = False, name: str | None = None) -> Recipe:
-    """Return the recipe from a dense start, fitted to the photographs (``NAME-dense``); ``still`` never densifies.
-
-    Not in the paper. There are no opacity resets in its first stage: they take away what the fit has found.
-    """
-    first, *rest = recipe.stages
-    if isinstance(first.densify, GradDensify):
-        first = replace(first, densify=None if still else replace(first.densify, reset_every=0))
-    return replace(recipe, name=name or f"{recipe.name}-dense", stages=(first, *rest), dense_start=DENSE_START)
 
 
 def best(
@@ -410,17 +353,17 @@ def _lr_after_surface() -> LearningRates:
     return LearningRates().at_end(30_000)
 
 
-def with_poses(recipe: Recipe, *, name: str | None = None) -> Recipe:
+def with_poses(recipe: Recipe) -> Recipe:
     """Return the recipe with a refined pose for each training photograph (``NAME-poses``); itself if it has them.
 
     Not in the paper. For cameras that are off by a pixel or more (docs/guides/poses.md).
     """
     if recipe.poses is not None:
         return recipe
-    return replace(recipe, name=name or f"{recipe.name}-poses", poses=PoseRefinement())
+    return replace(recipe, name=f"{recipe.name}-poses", poses=PoseRefinement())
 
 
-def with_intrinsics(recipe: Recipe, *, name: str | None = None) -> Recipe:
+def with_intrinsics(recipe: Recipe) -> Recipe:
     """Return the recipe with refined poses, focal lengths and lenses (``NAME-cameras``); itself if it has them.
 
     Not in the paper. For cameras whose focal length is off by a few per mille to per cent (docs/guides/poses.md).
@@ -428,7 +371,7 @@ def with_intrinsics(recipe: Recipe, *, name: str | None = None) -> Recipe:
     if recipe.intrinsics is not None:
         return recipe
     refined = replace(with_poses(recipe), intrinsics=IntrinsicsRefinement(distortion=True))
-    return replace(refined, name=name or f"{recipe.name.removesuffix('-poses')}-cameras")
+    return replace(refined, name=f"{recipe.name.removesuffix('-poses')}-cameras")
 
 
 @dataclass(frozen=True)
@@ -450,7 +393,9 @@ def _registry() -> dict[str, NamedRecipe]:
     def add(name: str, about: str, build: Callable[..., Recipe]) -> None:
         entries[name] = NamedRecipe(about, partial(build, name=name))
 
-    _add_best(add)
+    add("best", "The default: the best pictures and surface per minute; 2DGS from a fitted dense start", best)
+    add("best-fast", "best in a third of its iterations", partial(best, FAST_ITERATIONS))
+    add("best-surface", "best with neighbouring photographs compared at the end: Chamfer before dB", best_surface)
     add("2dgs", "2DGS with normal consistency 0.05: the paper's baseline and its stage 1", two_dgs)
     add("2dgs-no-nc", "2DGS without normal consistency", partial(two_dgs, nc=0.0))
     add("2dgs-60k", "2DGS for as many iterations as 2DGS-R: the fair control", two_dgs_60k)
@@ -460,83 +405,21 @@ def _registry() -> dict[str, NamedRecipe]:
     for nc in (0.1, 0.3):
         add(f"2dgs-nc-{nc}", f"Table 1: NC {nc}", partial(two_dgs, nc))
     add("2dgs-r", "2DGS-R: surface, appearance of the worst 1 %, clone in place and refine", two_dgs_r)
-    for k in (1, 3, 5, 10, 30, 50):
+    for k in (3, 5, 10, 30, 50):
         add(f"2dgs-r-k{k}", f"K ablation: the worst {k} %", partial(two_dgs_r, stage_2=appearance(float(k))))
-    freezes = {"none": (), "alpha-sh": ALPHA + SH, "sh": SH, "alpha": ALPHA}
-    for label, freeze in freezes.items():
+    for label, freeze in {"none": (), "alpha-sh": ALPHA + SH, "sh": SH}.items():
         about = f"Freeze ablation: stage 3 freezes {', '.join(freeze) or 'nothing'}"
         add(f"2dgs-r-freeze-{label}", about, partial(two_dgs_r, stage_3=refine(freeze=freeze)))
-    add("2dgs-r-module-i", "Module row I: 2DGS, 30k", two_dgs)
     module_ii = partial(two_dgs_r, stage_3=refine(nc=0.0, freeze=()))
     add("2dgs-r-module-ii", "Module row II: clone; opacity free, no NC in stage 3", module_ii)
     add("2dgs-r-module-iii", "Module row III: II with opacity frozen", partial(two_dgs_r, stage_3=refine(nc=0.0)))
-    add("2dgs-r-module-iv", "Module row IV: III with NC back, which is 2DGS-R", two_dgs_r)
     for label, densify in {"d": ABSGS_DEFAULT, "a": ABSGS_ADJUSTED}.items():
-        stage_3 = refine(freeze=(), clone=None, densify=densify)
+        stage_3 = refine(freeze=(), densify=densify)
         about = f"AbsGS-{label.upper()}: stage 3 densifies by absolute gradients instead of the clone; opacity free"
         add(f"2dgs-r-absgs-{label}", about, partial(two_dgs_r, stage_3=stage_3))
-    _add_variants(add)
+    about = "2dgs with patches of neighbouring photographs compared, for better surfaces of textured things"
+    add("2dgs-multiview", about, partial(with_multiview, two_dgs()))
     return entries
-
-
-def _add_best(add: Callable[[str, str, Callable[..., Recipe]], None]) -> None:
-    """Add the recipes for users."""
-    add("best", "The default: the best pictures and surface per minute; 2DGS from a fitted dense start", best)
-    add("best-fast", "best in a third of its iterations", partial(best, FAST_ITERATIONS))
-    add("best-surface", "best with neighbouring photographs compared at the end: Chamfer before dB", best_surface)
-
-
-def _add_variants(add: Callable[[str, str, Callable[..., Recipe]], None]) -> None:
-    """Add the other readings of what the paper leaves open."""
-    preserve = partial(two_dgs_r, stage_3=refine(clone="preserve"))
-    about = "2DGS from a plane sweep of the photographs, splats fitted to them; "
-    add("2dgs-dense", about + "no opacity resets", partial(with_dense_start, two_dgs()))
-    add("2dgs-dense-still", about + "never densified", partial(with_dense_start, two_dgs(), still=True))
-    add(
-        "2dgs-r-clone-preserve",
-        "Variant: a splat and its clone share the opacity, so the image hardly changes",
-        preserve,
-    )
-    sh_of_all = partial(two_dgs_r, stage_2=appearance(rows="all"))
-    add("2dgs-r-sh-of-all", "Variant: stage 2 trains the SH of every splat", sh_of_all)
-    clones_only = partial(two_dgs_r, stage_3=refine(rows="clones"))
-    add("2dgs-r-clones-only", "Variant: stage 3 trains the clones alone", clones_only)
-    rerank = partial(two_dgs_r, stage_3=refine(rerank=1.0))
-    add("2dgs-r-rerank", "Variant: E_i is ranked again after stage 2", rerank)
-    restart = "the means' rate falls once more from 1.6e-4 to 1.6e-6"
-    about = f"Control of 2dgs-r: in stage 3 {restart}"
-    add("2dgs-r-restart", about, partial(two_dgs_r, stage_3=refine(restart=True)))
-    about = f"Control of 2dgs-r-restart: 2dgs-60k, where {restart} in the last 30,000 iterations"
-    add("2dgs-60k-restart", about, partial(two_dgs_60k, more=continue_training(restart=True)))
-    about = "Control of module row III: 2dgs-60k without normal consistency in the last 30,000 iterations"
-    add("2dgs-60k-no-nc-late", about, partial(two_dgs_60k, more=continue_training(nc=0.0)))
-    add(
-        "2dgs-r-no-clone",
-        "Control of 2dgs-r: stage 3 without the clone",
-        partial(two_dgs_r, stage_3=refine(clone=None)),
-    )
-    visible = replace(appearance(), on_enter=(RankByError(occlusion=True),))
-    add("2dgs-r-occlusion", "Variant: E_i counts visible pixels only", partial(two_dgs_r, stage_2=visible))
-    bases: dict[str, Callable[..., Recipe]] = {"2dgs": two_dgs, "2dgs-60k": two_dgs_60k, "2dgs-r": two_dgs_r}
-    for base in ("2dgs", "2dgs-60k"):
-        about = f"Variant: {base} in the official code's reading of normals beside empty pixels"
-        add(f"{base}-edges-camera", about, partial(with_edges, bases[base](), "camera"))
-    for base, build in bases.items():
-        add(
-            f"{base}-silhouette",
-            f"{base} that also keeps empty what the photographs' alpha channel says is empty",
-            partial(with_silhouette, build()),
-        )
-    for base, build in bases.items():
-        about = f"{base} with an exposure and a white balance for each photograph (`gs2d train --exposure`)"
-        add(f"{base}-exposure", about, partial(with_exposure, build()))
-    for base, build in bases.items():
-        about = f"{base} with a refined pose for each photograph (`gs2d train --refine-poses`)"
-        add(f"{base}-poses", about, partial(with_poses, build()))
-        about = f"{base} with patches of neighbouring photographs compared, for better surfaces of textured things"
-        add(f"{base}-multiview", about, partial(with_multiview, build()))
-        about = f"{base} with known depths, of sparse points or of depth maps (`gs2d train --depth-prior`)"
-        add(f"{base}-depth", about, partial(with_depth_prior, build()))
 
 
 _OWN = _registry()
@@ -605,14 +488,19 @@ TABLES: Mapping[str, Mapping[str, str]] = MappingProxyType(
             "2DGS-R": "2dgs-r",
             "2DGS (60k)": "2dgs-60k",
         },
-        "k": {f"K={k}": f"2dgs-r-k{k}" for k in (1, 3, 5, 10, 30, 50)},  # tab:ablation_K
+        "k": {"K=1": "2dgs-r", **{f"K={k}": f"2dgs-r-k{k}" for k in (3, 5, 10, 30, 50)}},  # tab:ablation_K
         "freeze": {  # tab:ablation_freeze
             "(,)": "2dgs-r-freeze-none",
             "(alpha,SHs)": "2dgs-r-freeze-alpha-sh",
             "(SHs)": "2dgs-r-freeze-sh",
-            "(alpha)": "2dgs-r-freeze-alpha",
+            "(alpha)": "2dgs-r",
         },
-        "modules": {f"({n.upper()})": f"2dgs-r-module-{n}" for n in ("i", "ii", "iii", "iv")},  # tab:ab_module
+        "modules": {  # tab:ab_module
+            "(I)": "2dgs",
+            "(II)": "2dgs-r-module-ii",
+            "(III)": "2dgs-r-module-iii",
+            "(IV)": "2dgs-r",
+        },
         "absgs": {  # tab:absgs
             "2DGS (w/o NC)": "2dgs-no-nc",
             "2DGS (w NC)": "2dgs",

@@ -9,10 +9,10 @@ from __future__ import annotations
 import itertools
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
-from gs2d.config.presets import RECIPES, get_recipe
+from gs2d.config.presets import get_recipe
 from gs2d.config.recipe import Recipe, validate
 from gs2d.config.recipe_files import short_name
 from gs2d.config.schedule import scale_schedule
@@ -58,12 +58,11 @@ def make_plan(options: PaperOptions | SweepOptions) -> Plan:
         if value is not None and value < 1:
             raise RecipeError(f"--{name} must be a whole number >= 1, got {value}")
     scenes = find_scenes(options.data, options.scenes, protocol=options.protocol, truths=options.truth)
-    names = {row.recipe: canonical_recipe(row.recipe) for row in table.rows if row.recipe is not None}
-    recipes = {name: trained_recipe(name, options) for name in dict.fromkeys(names.values())}
+    recipes = {row.recipe: trained_recipe(row.recipe, options) for row in table.rows if row.recipe is not None}
     _check_overrides(options.overrides, [get_recipe(name) for name in recipes])
     cells = {
-        (row_recipe, scene.name, seed): make_job(options, scene, name, recipes[name], seed)
-        for scene, seed, (row_recipe, name) in itertools.product(scenes, options.seeds, names.items())
+        (name, scene.name, seed): make_job(options, scene, name, recipe, seed)
+        for scene, seed, (name, recipe) in itertools.product(scenes, options.seeds, recipes.items())
     }
     return Plan(options, table, scenes, cells)
 
@@ -79,13 +78,6 @@ def _table(options: PaperOptions | SweepOptions) -> PaperTable:
     if options.table not in PAPER_TABLES:
         raise RecipeError(f"no table {options.table!r} in the paper; there is {', '.join(PAPER_TABLES)}")
     return PAPER_TABLES[options.table]
-
-
-def canonical_recipe(name: str) -> str:
-    """Return the first named recipe that trains the same: "2dgs-r" for "2dgs-r-k1"."""
-    recipe = replace(get_recipe(name), name="")
-    same = (other for other in RECIPES.builtin if replace(get_recipe(other), name="") == recipe)
-    return next(same, name)
 
 
 def trained_recipe(name: str, options: TableOptions) -> Recipe:

@@ -19,7 +19,6 @@ import train_toys
 from emulate import Emulator
 from fake_backends import cuda_on_host
 from fake_driver import FakeDriver, Result
-from gs2d.config.presets import with_silhouette
 from gs2d.config.protocols import GENERIC, Protocol
 from gs2d.config.recipe import GradDensify, LossTerm, PoseRefinement, Recipe
 from gs2d.data.scene import Scene, View
@@ -315,7 +314,7 @@ def test_silhouettes_have_the_bits_of_those_that_go_through_torch(emulator: Emul
     assert same(
         trained(emulator, scene, recipe, "launches")[0], trained(emulator, scene, of_object(brief()), "launches")[0]
     )
-    strict = with_silhouette(brief(), name="strict")
+    strict = with_term(brief(), LossTerm("silhouette", 0.1))
     with pytest.raises(RecipeError, match="alpha channel, got one without"):
         trained(emulator, scene, strict, "launches")
 
