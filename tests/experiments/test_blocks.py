@@ -234,8 +234,6 @@ def test_a_capture_that_changed_is_told_and_nothing_is_lost(straight: Path, capt
     [
         ({"blocks": "0x2"}, "--blocks must be auto, or two or three whole numbers of 1 or more"),
         ({"slots": 0}, "--slots must be a whole number >= 1, got 0"),
-        ({"refine_poses": True}, "--refine-poses is of one training, got it for blocks; leave it out"),
-        ({"cache": Path("x")}, "--cache is of one training, got it for blocks; leave it out"),
         ({"recipe": "no-such"}, "no-such"),
         ({"partition": ("margin=2",)}, "partition.margin must be at most 1"),
     ],

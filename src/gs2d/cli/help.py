@@ -9,7 +9,7 @@ from gs2d.cli.catalogue import Option, about, options_of
 from gs2d.cli.commands import Common
 from gs2d.cli.layout import entries, terminal_width, wrapped
 from gs2d.cli.usage import NAMES
-from gs2d.pipeline.options import Finding, HowItRuns, Training
+from gs2d.pipeline.options import CommonTraining, Finding, HowItRuns, Training
 
 _SLOGAN = "Photographs in; a surface mesh and a scene of 2D Gaussian splats out."
 _FIRST_DAY = (
@@ -49,6 +49,7 @@ _FIRST: dict[str, tuple[str, ...]] = {  # options that `--help` explains; of oth
 _OWN = "Of this command"
 TITLES = {  # in the order in which they are shown
     Finding: "Cameras of photographs",
+    CommonTraining: "Training",
     Training: "Training",
     HowItRuns: "How it runs",
     Common: "What is printed",

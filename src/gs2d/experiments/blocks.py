@@ -40,7 +40,7 @@ from gs2d.pipeline.exposure import read_exposures
 from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.job import check_train_options, protocol_from_json
 from gs2d.pipeline.memory import use_memory
-from gs2d.pipeline.options import Part, Training, TrainOptions, values
+from gs2d.pipeline.options import CommonTraining, Part, TrainOptions, values
 from gs2d.pipeline.same_run import difference
 from gs2d.pipeline.threads import use_threads
 from gs2d.pipeline.train import train
@@ -53,16 +53,6 @@ SETTLED: dict[str, Any] = {  # what options have already decided: recipe and pro
     **{"depth_prior": None, "normal_prior": False, "overrides": (), "schedule_scale": 1.0},
 }
 RETRIES = 2  # of what is killed: another time it may have the memory
-NOT_OF_BLOCKS = {  # options of a training that mean nothing in several
-    "start_from": "--from",
-    "cache": "--cache",
-    "viewer": "--viewer",
-    "viewer_port": "--viewer-port",
-    "refine_poses": "--refine-poses",
-    "refine_cameras": "--refine-cameras",
-    "vignetting": "--vignetting",
-    "response": "--response",
-}
 
 
 # -- tasks -------------------------------------------------------------------------------------------------------------
@@ -260,9 +250,6 @@ def blocks(options: BlocksOptions, on_event: OnEvent = ignore) -> RunFolder:
         Anything that the user can mend; what was done stays.
     """
     partition = make_partition(options.blocks, options.partition)
-    for name, flag in NOT_OF_BLOCKS.items():
-        if getattr(options, name):
-            raise RecipeError(f"{flag} is of one training, got it for blocks; leave it out")
     if options.slots is not None and options.slots < 1:
         raise RecipeError(f"--slots must be a whole number >= 1, got {options.slots}")
     training = training_of(options)
@@ -333,7 +320,7 @@ def training_of(options: BlocksOptions) -> TrainOptions:
         memory=options.memory,
         disk=options.disk,
         prepare=options.prepare,
-        **values(Training, options),
+        **values(CommonTraining, options),
     )
 
 

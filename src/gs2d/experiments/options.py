@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Fixed, Positional, Suppress, UseAppendAction, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from gs2d.errors import RecipeError
-from gs2d.pipeline.options import Overrides, ReconstructOptions, Resources, Training, paths_of
+from gs2d.pipeline.options import CommonTraining, Overrides, ReconstructOptions, Resources, paths_of
 
 SWEEP = "sweep"  # the name of a table of chosen recipes
 
@@ -113,7 +113,7 @@ def parse_seeds(words: Iterable[str | int]) -> tuple[int, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BlocksOptions(Training, Resources):
+class BlocksOptions(CommonTraining, Resources):
     """What is trained in blocks, how it is cut, and where."""
 
     scene: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -144,18 +144,9 @@ class BlocksOptions(Training, Resources):
     """CPU threads, of each of several blocks (default: the cores divided among them)."""
     masks: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder of masks of the photographs, white = keep (default: where COLMAP, nerfstudio and Metashape put them)."""
-    # Of one training:
-    start_from: Annotated[Path | None, Fixed, Suppress] = None
-    cache: Annotated[Path | None, Fixed, Suppress] = None
-    viewer: Annotated[bool, Fixed, Suppress] = False
-    viewer_port: Annotated[int | None, Fixed, Suppress] = None
-    refine_poses: Annotated[bool, Fixed, Suppress] = False
-    refine_cameras: Annotated[bool, Fixed, Suppress] = False
-    vignetting: Annotated[bool, Fixed, Suppress] = False
-    response: Annotated[bool, Fixed, Suppress] = False
 
     def __post_init__(self) -> None:
-        paths_of(self, "scene", "out", "masks", "start_from", "cache")
+        paths_of(self, "scene", "out", "masks")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -72,8 +72,8 @@ class Resources:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Training:
-    """What is trained and how: options of `gs2d train`, and of every command that trains on photographs."""
+class CommonTraining:
+    """What is trained and how: options of every command that trains on photographs."""
 
     recipe: Annotated[str | Recipe, arg(constructor=str)] = DEFAULT_RECIPE
     """What is trained; `gs2d recipes` lists them."""
@@ -85,24 +85,12 @@ class Training:
     """Learn an exposure and a white balance for each photograph (robust training does where photographs differ)."""
     no_exposure: bool = False
     """Take all photographs to have one exposure."""
-    vignetting: bool = False
-    """Learn how much darker each camera's corners are, one falloff for all photographs of a camera."""
-    response: bool = False
-    """Learn how the curves of several cameras differ, by which each turns light into values (one camera: nothing)."""
     test_every: int | None = None
     """Every so many-th view, by name, is a test view; 0: all train (default: what the protocol says, mostly 8)."""
-    refine_poses: bool = False
-    """Learn where each photograph was taken from, beginning where the capture says: for poses that are a little off."""
-    refine_cameras: bool = False
-    """Learn focal lengths and lenses, too: --refine-poses, and both once for all photographs of a camera."""
     depth_prior: Literal["auto", "sparse", "sensor", "relative"] | None = None
     """Train with known depths: of sparse points, or of maps in depths/, a sensor's or relative; auto: what is there."""
     normal_prior: bool = False
     """Train with known normals, of maps in normals/."""
-    start_from: Annotated[Path | None, arg(name="from", metavar="RUN")] = None
-    """Take the stages that this recipe shares with another run from that run."""
-    cache: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Keep finished stages here, and take them from here when scene, settings and stages are the same."""
     overrides: Overrides = ()
     """Change the recipe, e.g. --set surface.iterations=2000; may be repeated."""
     checkpoint_every: int = 10_000
@@ -111,10 +99,6 @@ class Training:
     """Seconds between checkpoints, whichever comes first."""
     page: bool = True
     """Do not write scene.html, the splats as a page for any browser, at the end."""
-    viewer: bool = False
-    """Show the training in the browser while it runs; the address is printed, and nothing of the result changes."""
-    viewer_port: int | None = None
-    """With --viewer: port of the page (default: the first free one from 8080 on)."""
     subject_box: BoxOption = None
     """What the photographs are of, as a box (default: what most cameras look at). The mesh is of it."""
     whole_scene: Annotated[bool, arg(name="scene")] = False
@@ -137,6 +121,28 @@ class Training:
         if self.exposure and self.no_exposure:
             raise RecipeError("--exposure and --no-exposure contradict each other, got both; leave one out")
         return True if self.exposure else False if self.no_exposure else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training(CommonTraining):
+    """Options of the commands that train a scene in one piece: `gs2d train` and `gs2d reconstruct`."""
+
+    vignetting: bool = False
+    """Learn how much darker each camera's corners are, one falloff for all photographs of a camera."""
+    response: bool = False
+    """Learn how the curves of several cameras differ, by which each turns light into values (one camera: nothing)."""
+    refine_poses: bool = False
+    """Learn where each photograph was taken from, beginning where the capture says: for poses that are a little off."""
+    refine_cameras: bool = False
+    """Learn focal lengths and lenses, too: --refine-poses, and both once for all photographs of a camera."""
+    start_from: Annotated[Path | None, arg(name="from", metavar="RUN")] = None
+    """Take the stages that this recipe shares with another run from that run."""
+    cache: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Keep finished stages here, and take them from here when scene, settings and stages are the same."""
+    viewer: bool = False
+    """Show the training in the browser while it runs; the address is printed, and nothing of the result changes."""
+    viewer_port: int | None = None
+    """With --viewer: port of the page (default: the first free one from 8080 on)."""
 
 
 @dataclass(frozen=True, kw_only=True)
