@@ -49,12 +49,7 @@ class UsageError(Exception):
 
 
 def check(argv: Sequence[str]) -> None:
-    """Raise for a command line with a mistake that can be explained; ``argv`` has at least one word.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Raise for a command line with a mistake that can be explained; ``argv`` has at least one word."""
     name, words = argv[0], argv[1:]
     if name not in NAMES:
         raise UsageError(_with_help(_no_command(name, words), "gs2d --help"))
@@ -65,12 +60,7 @@ def check(argv: Sequence[str]) -> None:
 
 
 def check_inputs(command: Common) -> None:
-    """Raise for a path to read that leads nowhere; cheap, so that a misspelt path is reported at once.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Raise for a path to read that leads nowhere; cheap, so that a misspelt path is reported at once."""
     paths = dict(_inputs(command))
     kind: type = type(command)
     for option in options_of(kind):

@@ -143,12 +143,7 @@ def check_partition(partition: Partition) -> Partition:
 
 
 def parse_grid(text: str) -> tuple[int, ...]:
-    """Return the grid that ``--blocks`` says: ``3x3``, ``4x2x2``; () for ``auto``.
-
-    Raises
-    ------
-    RecipeError
-    """
+    """Return the grid that ``--blocks`` says: ``3x3``, ``4x2x2``; () for ``auto``."""
     if text == AUTO:
         return ()
     parts = re.fullmatch(r"(\d{1,5})x(\d{1,5})(?:x(\d{1,5}))?", text)
@@ -161,12 +156,7 @@ def parse_grid(text: str) -> tuple[int, ...]:
 
 
 def make_partition(blocks: str, changes: Sequence[str] = ()) -> Partition:
-    """Return the partition of ``--blocks`` and of ``field=value`` changes (``margin=0.3``, ``coarse.side=800``).
-
-    Raises
-    ------
-    RecipeError
-    """
+    """Return the partition of ``--blocks`` and of ``field=value`` changes (``margin=0.3``, ``coarse.side=800``)."""
     data = to_json(replace(Partition(), grid=parse_grid(blocks)))
     for change in changes:
         name, equals, text = change.partition("=")
@@ -191,12 +181,7 @@ def to_json(partition: Partition) -> dict[str, Any]:
 
 
 def from_json(data: Any) -> Partition:
-    """Return the partition that :func:`to_json` wrote, checked.
-
-    Raises
-    ------
-    RecipeError
-    """
+    """Return the partition that :func:`to_json` wrote, checked."""
     found: Partition = decode(data, Partition, "partition")
     return check_partition(found)
 

@@ -117,10 +117,6 @@ def temporary_beside(target: Path) -> Iterator[tuple[Path, int]]:
 
     Yields its path, which other programs may write to as long as they do not replace it, and a descriptor that is open
     for writing. At the end the bytes reach the disk (fsync) before the file is renamed.
-
-    Raises
-    ------
-    DiskError
     """
     try:
         temporary, descriptor = _claimed(target)
@@ -217,12 +213,7 @@ def sweep(folder: Path) -> int:
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Raise now what ``atomic_write`` would raise at the end of a long work: no such folder, no permission, a folder.
-
-    Raises
-    ------
-    DiskError
-    """
+    """Raise now what ``atomic_write`` would raise at the end: no such folder, no permission, a folder."""
     target = Path(path)
     try:
         # Not Path.is_dir: from Python 3.14 on it answers False where the system has an error, as for too long a name.

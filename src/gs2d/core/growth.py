@@ -37,12 +37,7 @@ def check_growth(
 
 
 def check_entries(path: str | os.PathLike[str], entries: Iterable[zipfile.ZipInfo]) -> list[zipfile.ZipInfo]:
-    """Return the entries of a ZIP file, all of them stored or deflated, and not too many.
-
-    Raises
-    ------
-    DataError
-    """
+    """Return the entries of a ZIP file, all of them stored or deflated, and not too many."""
     checked = list(entries)
     if len(checked) > MAX_ENTRIES:
         raise DataError(

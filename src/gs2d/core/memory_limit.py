@@ -99,10 +99,6 @@ def check_address_space() -> None:
 
     Looked at before they are: OpenBLAS asks for its buffers again and again for ever if it gets none, and C++ ends the
     process. Python's package for CUDA takes more, and says so itself.
-
-    Raises
-    ------
-    BackendError
     """
     limit = address_space()
     needed = LEAST_ADDRESSES + THREAD_ADDRESSES * (_blas_threads() - 1)

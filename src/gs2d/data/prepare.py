@@ -40,10 +40,6 @@ def check_disk(folder: Path, views: Sequence[View], disk: int | None) -> None:
         Those to prepare.
     disk : int or None
         Bytes that the user allows.
-
-    Raises
-    ------
-    DiskError
     """
     there = next(place for place in (folder, *folder.resolve().parents) if place.exists())
     free, need = shutil.disk_usage(there).free, packed_bytes(views)

@@ -97,12 +97,7 @@ def file_of(folder: Path, key: str) -> Path:
 
 
 def write_prepared(file: Path, key: str, picture: DecodedImage) -> int:
-    """Write a picture; its file appears when it is whole. Returns its bytes.
-
-    Raises
-    ------
-    DiskError
-    """
+    """Write a picture; its file appears when it is whole. Returns its bytes."""
     parts: list[tuple[str, bytes]] = []
     for name in _PARTS:
         array: np.ndarray | None = getattr(picture, name)

@@ -186,12 +186,7 @@ def distance_colors(distances: np.ndarray, tau: float) -> np.ndarray:
 
 
 def write_clouds(folder: Path, clouds: ScoredClouds) -> dict[str, str]:
-    """Write ``precision.ply`` (the reconstruction), ``recall.ply`` (the truth) and ``surface.png``; returns the names.
-
-    Raises
-    ------
-    DiskError
-    """
+    """Write ``precision.ply`` (reconstruction), ``recall.ply`` (truth) and ``surface.png``; return the names."""
     for name, points, distances in (
         (PRECISION, clouds.mesh, clouds.mesh_distances),
         (RECALL, clouds.truth, clouds.truth_distances),

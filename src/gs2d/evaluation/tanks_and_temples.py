@@ -88,12 +88,7 @@ def box(low: np.ndarray, high: np.ndarray) -> CropVolume:
 
 
 def read_crop(path: Path) -> CropVolume:
-    """Read ``SCENE.json`` of Tanks and Temples (Open3D's SelectionPolygonVolume).
-
-    Raises
-    ------
-    DataError
-    """
+    """Read ``SCENE.json`` of Tanks and Temples (Open3D's SelectionPolygonVolume)."""
     data = read_json(path)
     try:
         axis = "XYZ".index(str(data["orthogonal_axis"]).upper())
@@ -152,12 +147,7 @@ def read_tnt_truth(scene: str, files: Mapping[str, Path]) -> TntTruth:
 
 
 def read_transform(path: Path) -> np.ndarray:
-    """Return a 4x4 matrix of numbers in four lines (``SCENE_trans.txt``).
-
-    Raises
-    ------
-    DataError
-    """
+    """Return a 4x4 matrix of numbers in four lines (``SCENE_trans.txt``)."""
     rows = _number_rows(path)
     if len(rows) != 4 or any(len(row) != 4 for row in rows):
         raise DataError(f"{path} must hold four lines of four numbers, got {len(rows)} lines; copy it again")
@@ -168,12 +158,7 @@ def read_transform(path: Path) -> np.ndarray:
 
 
 def read_trajectory(path: Path) -> np.ndarray:
-    """Camera-to-world matrices [n, 4, 4] of a ``.log`` file: a line of three whole numbers, then the matrix, each.
-
-    Raises
-    ------
-    DataError
-    """
+    """Camera-to-world matrices [n, 4, 4] of a ``.log`` file: a line of three whole numbers, then the matrix, each."""
     rows = _number_rows(path)
     if not rows or len(rows) % 5 or any(len(row) != (3 if i % 5 == 0 else 4) for i, row in enumerate(rows)):
         raise DataError(

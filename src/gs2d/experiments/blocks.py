@@ -88,12 +88,7 @@ class BlocksTask(Task):
         return from_json(settled_of(self.options.out)["partition"])
 
     def settled(self, on_event: OnEvent) -> Settled:
-        """Return what is settled, with the scene.
-
-        Raises
-        ------
-        Gs2dError
-        """
+        """Return what is settled, with the scene."""
         data = settled_of(self.options.out)
         recipe, protocol = recipe_from_json(data["recipe"]), protocol_from_json(data["protocol"])
         found = open_settled(self.training(), recipe, protocol, on_event)
@@ -325,12 +320,7 @@ def training_of(options: BlocksOptions) -> TrainOptions:
 
 
 def check_job_folder(out: Path) -> None:
-    """Refuse a folder that holds something else.
-
-    Raises
-    ------
-    RunError
-    """
+    """Refuse a folder that holds something else."""
     if (out / BLOCKS_JSON).exists():
         return
     check_claim(out, resume=True, overwrite=False, allowed=(LOCK, "jobs"))
@@ -371,12 +361,7 @@ def check_same_job(out: Path, definition: dict[str, Any]) -> None:
 
 
 def check_capture(out: Path, before: dict[str, Any], digest: str) -> None:
-    """Refuse to go on with another capture than ``blocks.json`` says.
-
-    Raises
-    ------
-    RunError
-    """
+    """Refuse to go on with another capture than ``blocks.json`` says."""
     old = before.get("capture")
     if not isinstance(old, dict) or old.get("digest") != digest:
         where = old.get("path") if isinstance(old, dict) else "the capture"

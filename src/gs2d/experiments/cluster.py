@@ -49,12 +49,7 @@ ray.shutdown()
 
 # -- the way to the cluster --------------------------------------------------------------------------------------------
 def check_address(address: str) -> None:
-    """Refuse what is no address of a cluster, or leads to nobody.
-
-    Raises
-    ------
-    BackendError
-    """
+    """Refuse what is no address of a cluster, or leads to nobody."""
     if address == "auto":
         return
     host, _, port = address.rpartition(":")
@@ -98,12 +93,7 @@ def check_cluster(address: str) -> None:
 
 
 def connect(address: str) -> tuple[Any, bool]:
-    """Return the ``ray`` module, connected, and whether the connection is ours to close.
-
-    Raises
-    ------
-    BackendError
-    """
+    """Return the ``ray`` module, connected, and whether the connection is ours to close."""
     try:
         import ray
     except ImportError:
@@ -183,12 +173,7 @@ def _sum(nodes: Sequence[Mapping[str, float]], name: str) -> float:
 
 
 def check_room(nodes: Sequence[Mapping[str, float]], taken: Mapping[str, Any], name: str) -> None:
-    """Refuse a task that no machine has room for: Ray would wait for ever.
-
-    Raises
-    ------
-    BackendError
-    """
+    """Refuse a task that no machine has room for: Ray would wait for ever."""
     asked = {"CPU": taken["num_cpus"], "GPU": taken["num_gpus"], "memory": taken.get("memory", 0)}
     if not any(all(node.get(key, 0) >= value for key, value in asked.items()) for node in nodes):
         memory = f" and {asked['memory'] / 2**30:.3g} GiB" if asked["memory"] else ""

@@ -83,10 +83,6 @@ def write_figures(
     -------
     tuple of Path
         The files, in the order above.
-
-    Raises
-    ------
-    RunError, DiskError
     """
     folders = {label: open_run(path) for label, path in runs.items()}
     make_folder(out)
@@ -117,10 +113,6 @@ def coverage(runs: Mapping[str, Path]) -> dict[str, tuple[float, ...]]:
     """Mean K_a and opacity of each run after its first stage, then both at its end: the numbers of the paper's figure.
 
     Runs whose log does not hold them are left out.
-
-    Raises
-    ------
-    RunError
     """
     found = {}
     for label, path in runs.items():
@@ -252,12 +244,7 @@ def map_image(splats: Splats, positions: Tensor, view: View, job: Job, alpha: np
 def draw_error_maps(
     run: RunFolder, path: Path, on_event: OnEvent = ignore, *, title: str = "", views: int = 3, backend: str = "auto"
 ) -> None:
-    """Write the E_i map of one run as a PNG: a row for each view.
-
-    Raises
-    ------
-    RunError, DataError, BackendError, DiskError
-    """
+    """Write the E_i map of one run as a PNG: a row for each view."""
     job = reload_job(run, on_event, backend=backend)
     ranking, transforms = rank_run(run, job, on_event), read_exposures(run, job.recipe)
     limits = map_limits(ranking.errors)

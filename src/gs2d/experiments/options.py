@@ -93,12 +93,7 @@ def _split(words: Iterable[str]) -> tuple[str, ...]:
 
 
 def parse_seeds(words: Iterable[str | int]) -> tuple[int, ...]:
-    """Return seeds: ``0,1,2`` and ``0 1 2`` are seeds; one word n > 0 alone is a count, the seeds 0 to n - 1.
-
-    Raises
-    ------
-    RecipeError
-    """
+    """Return seeds: ``0,1,2`` and ``0 1 2`` are seeds; one word n > 0 alone is a count, the seeds 0 to n - 1."""
     given = tuple(words)
     if all(isinstance(seed, int) for seed in given):
         return tuple(map(int, given))

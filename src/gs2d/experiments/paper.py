@@ -101,12 +101,7 @@ def with_other_rows(plan: Plan) -> Plan:
 
 
 def check_folder(plan: Plan) -> None:
-    """Refuse a folder whose runs were made for something else.
-
-    Raises
-    ------
-    RunError
-    """
+    """Refuse a folder whose runs were made for something else."""
     path = plan.options.out / ABOUT
     if plan.options.out.is_file():
         raise RunError(f"--out must be a folder, {plan.options.out} is a file")

@@ -42,12 +42,7 @@ class Plan:
 
 
 def make_plan(options: PaperOptions | SweepOptions) -> Plan:
-    """Decide everything that can be decided, and can be wrong, before a photograph is read.
-
-    Raises
-    ------
-    RecipeError, DataError, ProtocolError
-    """
+    """Decide everything that can be decided, and can be wrong, before a photograph is read."""
     table = _table(options)
     if not options.seeds or len(set(options.seeds)) != len(options.seeds):
         raise RecipeError(

@@ -288,12 +288,7 @@ def write_page(
     out: Path,
     on_event: OnEvent = ignore,
 ) -> Path:
-    """Write ``index.html`` into a folder.
-
-    Raises
-    ------
-    DiskError
-    """
+    """Write ``index.html`` into a folder."""
     template = _templates().get_template("page.html")
     body = template.render(
         table=table,

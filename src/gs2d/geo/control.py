@@ -54,12 +54,7 @@ class Located:
 
 
 def read_control(path: Path) -> ControlPoints:
-    """Read control points: CSV, or OpenDroneMap's ``gcp_list.txt``; see docs/guides/georeference.md for the columns.
-
-    Raises
-    ------
-    DataError
-    """
+    """Read control points: CSV, or OpenDroneMap's ``gcp_list.txt``; see docs/guides/georeference.md for the columns."""
     table = read_table(path, _ODM, ("name",))
     in_degrees = {"lat", "lon"} <= set(table.columns) or table.epsg == WGS84
     world = ("lat", "lon", "height") if "lat" in table.columns else ("y", "x", "z") if in_degrees else ("x", "y", "z")

@@ -54,12 +54,7 @@ def required_cv2() -> Any:
 
 
 def detector(dictionary: str) -> Any:
-    """Return OpenCV's detector of a dictionary.
-
-    Raises
-    ------
-    BackendError, DataError
-    """
+    """Return OpenCV's detector of a dictionary."""
     cv2 = required_cv2()
     if dictionary not in DICTIONARIES:
         raise DataError(f"--marker-dictionary must be one of {', '.join(DICTIONARIES)}, got {dictionary}")

@@ -59,12 +59,7 @@ class WorldFrame:
 
 
 def read_positions(path: Path) -> Positions:
-    """Read a file of positions: CSV (``name,lat,lon,height`` or ``name,x,y,z``), or OpenDroneMap's ``geo.txt``.
-
-    Raises
-    ------
-    DataError
-    """
+    """Read a file of positions: CSV (``name,lat,lon,height`` or ``name,x,y,z``), or OpenDroneMap's ``geo.txt``."""
     table = read_table(path, ("name", "x", "y", "z"), ("name",))
     in_degrees = {"lat", "lon"} <= set(table.columns) or table.epsg == WGS84
     names = ("lat", "lon", "height") if "lat" in table.columns else ("y", "x", "z") if in_degrees else ("x", "y", "z")
@@ -130,10 +125,6 @@ def in_frame(places: np.ndarray, epsg: int | None, *, wanted: int | None, enu: b
         The projected system that is asked for; None: the UTM zone of the places, or the system that they are in.
     enu : bool
         East, north and up of their middle instead; only of latitude and longitude.
-
-    Raises
-    ------
-    BackendError, DataError
     """
     height = np.nanmedian(places[:, 2]) if np.isfinite(places[:, 2]).any() else 0.0
     middle = np.array([*np.median(places[:, :2], axis=0), height])

@@ -33,12 +33,7 @@ class Table:
     columns: tuple[str, ...]
 
     def number(self, line: int, row: Mapping[str, str], column: str) -> float:
-        """Return a number of a row.
-
-        Raises
-        ------
-        DataError
-        """
+        """Return a number of a row."""
         text = row.get(column, "").strip()
         try:
             value = float(text)
@@ -62,10 +57,6 @@ def read_table(path: Path, plain: Sequence[str], required: Sequence[str]) -> Tab
         The columns of OpenDroneMap's layout, in order; what follows them in a line is passed over.
     required : sequence of str
         Columns that a CSV file must have.
-
-    Raises
-    ------
-    DataError
     """
     lines = _lines(path)
     first = next((line for line in lines if line[1] and not line[1].startswith("#")), None)

@@ -46,12 +46,7 @@ class EventLog:
         return self.path.stat().st_size if self.path.exists() else 0
 
     def cut(self, size: int) -> None:
-        """Forget everything after ``size`` bytes (and an unfinished last line).
-
-        Raises
-        ------
-        DiskError
-        """
+        """Forget everything after ``size`` bytes (and an unfinished last line)."""
         if not self.path.exists():
             return
         try:
@@ -69,12 +64,7 @@ class EventLog:
             return file.read(size)
 
     def sync(self) -> None:
-        """Bring the log to the disk, before a checkpoint that refers to it.
-
-        Raises
-        ------
-        DiskError
-        """
+        """Bring the log to the disk, before a checkpoint that refers to it."""
         if not self.path.exists():
             return
         try:

@@ -54,12 +54,7 @@ def read_georeference(run: Path) -> Georeference | None:
 
 
 def write_georeference(run: Path, georeference: Georeference) -> Path:
-    """Write that of a run folder.
-
-    Raises
-    ------
-    DiskError
-    """
+    """Write that of a run folder."""
     path = Path(run) / GEOREFERENCE
     write_json(path, georeference.to_json())
     return path
@@ -69,10 +64,6 @@ def stamp(path: Path, georeference: Georeference) -> bool:
     """Let a file in local metres say where it is, in itself; False where its format has no room for that.
 
     Whoever wrote the file need not know of georeferences, so that every format of the kind can be stamped.
-
-    Raises
-    ------
-    DiskError
     """
     path = Path(path)
     kind = path.suffix.lower()
@@ -136,12 +127,7 @@ def sidecars(path: Path, georeference: Georeference, wkt: str | None) -> tuple[t
 
 
 def write_sidecars(path: Path, georeference: Georeference, wkt: str | None) -> tuple[Path, ...]:
-    """Write the files beside a file in local metres; returns them.
-
-    Raises
-    ------
-    DiskError
-    """
+    """Write the files beside a file in local metres; returns them."""
     found = sidecars(path, georeference, wkt)
     for name, text in found:
         with atomic_write(name, "w") as file:

@@ -53,10 +53,6 @@ def write_geotiff(
         The projected coordinate system; None: one of the scene's own.
     frame : str
         Its name, for people.
-
-    Raises
-    ------
-    BackendError, DiskError
     """
     tifffile = required()
     colored = raster.ndim == 3

@@ -220,10 +220,6 @@ def write_textured(path: str | Path, mesh: TexturedMesh, *, up: np.ndarray | Non
     up : ndarray [3], optional
         What is up in the mesh's frame: the node of a .glb is turned so that viewers, which take y for up (glTF 2.0,
         3.4), show it upright. The vertices stay as they are. An OBJ file says nothing about that.
-
-    Raises
-    ------
-    DataError, DiskError
     """
     files = written_files(Path(path))
     if len(files) == 1:

@@ -316,10 +316,6 @@ def claim_run(path: str | Path, *, resume: bool, overwrite: bool, allowed: tuple
         What to do with a run that is already there; ``overwrite`` deletes the run's own files only.
     allowed : tuple of str
         Names that may already be in a folder that holds no run.
-
-    Raises
-    ------
-    RunError, DiskError
     """
     check_claim(path, resume=resume, overwrite=overwrite, allowed=allowed)
     path = Path(path)
@@ -332,12 +328,7 @@ def claim_run(path: str | Path, *, resume: bool, overwrite: bool, allowed: tuple
 
 
 def make_folder(path: Path) -> tuple[Path, ...]:
-    """Make a folder and its parents; returns those that were made, innermost first.
-
-    Raises
-    ------
-    DiskError
-    """
+    """Make a folder and its parents; returns those that were made, innermost first."""
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -354,12 +345,7 @@ def remove_made(folders: tuple[Path, ...]) -> None:
 
 
 def save_tensors(path: Path, payload: dict[str, Any]) -> None:
-    """``torch.save`` to a temporary name, then rename.
-
-    Raises
-    ------
-    DiskError
-    """
+    """``torch.save`` to a temporary name, then rename."""
     import torch
 
     with atomic_write(path) as file:

@@ -86,10 +86,6 @@ def write_video(
         Of ffmpeg.
     on_frame : callable
         Told how many frames were read; what it raises stops the work, and no file is left.
-
-    Raises
-    ------
-    DataError, BackendError, DiskError
     """
     check_video(path, fps, len(frames))
     if path.suffix.lower() == ".mp4":

@@ -72,10 +72,6 @@ def sweep_planes(
         Patches are of 2 radius + 1 pixels a side; images are mirrored at their edges.
     noise : float
         Variance that is no texture: added to both sides of the NCC.
-
-    Raises
-    ------
-    MemoryError
     """
     library = library_for(image)
     if library is None or library.dtype != torch.float32:

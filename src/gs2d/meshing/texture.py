@@ -116,12 +116,7 @@ def required(module: str) -> Any:
 
 
 def simplified(mesh: Mesh, faces: int) -> Mesh:
-    """Simplify to at most ``faces`` triangles, by quadric edge collapse; a changed mesh has no vertex colours.
-
-    Raises
-    ------
-    BackendError, ProtocolError
-    """
+    """Simplify to at most ``faces`` triangles, by quadric edge collapse; a changed mesh has no vertex colours."""
     if faces < 4:
         raise ProtocolError(f"--faces must be a whole number >= 4, got {faces}")
     if len(mesh.faces) <= faces:

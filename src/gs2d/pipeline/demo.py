@@ -28,12 +28,7 @@ def demo(
     options: DemoOptions = DemoOptions(),  # noqa: B008 (frozen)
     on_event: OnEvent = ignore,
 ) -> RunFolder:
-    """Run the demo. An earlier demo in the same folder is replaced, any other run there is not.
-
-    Raises
-    ------
-    Gs2dError
-    """
+    """Run the demo. An earlier demo in the same folder is replaced, any other run there is not."""
     capture = options.out / CAPTURE
     overwrite = options.overwrite
     if is_run(options.out) and not options.resume and not overwrite:

@@ -33,12 +33,7 @@ def evaluate_run(
     *,
     threads: int | None = None,
 ) -> dict[str, Any]:
-    """Score the final splats of a run, and its mesh against a ground truth; updates ``metrics.json`` and the report.
-
-    Raises
-    ------
-    RunError, DataError
-    """
+    """Score the final splats of a run, and its mesh against a ground truth; updates ``metrics.json`` and the report."""
     from gs2d.pipeline.truth import OfficialTruth, Truth, check_thresholds, choose_truth, read_truth, score_surface
 
     check_thresholds(options.thresholds)

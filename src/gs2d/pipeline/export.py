@@ -27,10 +27,6 @@ def export_run(
         Only the splats with their centres in this box, x0 y0 z0 x1 y1 z1, world units of the run.
     georeferenced : bool
         In metres of the world, less an offset that is said in the file and beside it.
-
-    Raises
-    ------
-    RunError, DataError, DiskError
     """
     layout = layout or layout_of(Path(out))
     if layout is None:

@@ -41,12 +41,7 @@ def named(views: Sequence[View], exposures: Exposures | None) -> Transforms:
 
 
 def write_exposures(run: RunFolder, transforms: Transforms, on_event: OnEvent) -> None:
-    """Write ``exposure.json`` beside the splats, where there are any, and say how far they differ.
-
-    Raises
-    ------
-    DiskError
-    """
+    """Write ``exposure.json`` beside the splats, where there are any, and say how far they differ."""
     if not transforms:
         return
     images = []

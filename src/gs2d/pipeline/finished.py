@@ -54,10 +54,6 @@ def open_job(
         Take the splats of this file instead, of any format that is read, in the frame of the run.
     out : Path or None
         Where what is made of it goes, which must be said then: files of the run are of its own splats.
-
-    Raises
-    ------
-    RunError, DataError
     """
     use_threads(threads)
     run = open_run(path)
@@ -85,10 +81,6 @@ def checked_output(path: Path, out: Path, ending: str = ".ply", what: str = "") 
         That of its name.
     what : str
         What needs that ending, for the error.
-
-    Raises
-    ------
-    RunError
     """
     path, out = Path(path), Path(out)
     if not f"/{out.name}".lower().endswith(ending):

@@ -51,10 +51,6 @@ def georeference_run(
     -------
     Georeference or None
         None where the run has none, or it was removed.
-
-    Raises
-    ------
-    RunError, DataError, BackendError, DiskError
     """
     run = open_run(path)
     asked = [name for name in SOURCES if _is_given(getattr(options, name))]
@@ -72,12 +68,7 @@ def georeference_run(
 
 
 def _check(options: GeoreferenceOptions, asked: Sequence[str]) -> None:
-    """Refuse options that contradict each other or would do nothing.
-
-    Raises
-    ------
-    RunError
-    """
+    """Refuse options that contradict each other or would do nothing."""
     names = [f"--{name.replace('_', '-')}" for name in asked]
     if len(asked) > 1 or (options.remove and asked):
         raise RunError(f"one source at a time was expected, got {' and '.join([*names, *_removing(options)])}")
@@ -286,12 +277,7 @@ def _of_control(views: Sequence[View], options: GeoreferenceOptions, up: np.ndar
 
 
 def fit_control(located: Located, target: np.ndarray, up: np.ndarray | None, tilt: str) -> Fit:
-    """Fit to all control points that are not check points: somebody measured each, so that none is voted out.
-
-    Raises
-    ------
-    DataError
-    """
+    """Fit to all control points that are not check points: somebody measured each, so that none is voted out."""
     fitted = ~located.check
     fit = fit_places(located.source[fitted], target[fitted], up, tilt=tilt, robust=False)
     residuals = located.source @ fit.T[:3, :3].T + fit.T[:3, 3] - target

@@ -275,10 +275,6 @@ def extract_mesh(
     -------
     Mesh
         In the capture's frame, with colours; of the subject where the protocol meshes the subject and there is one.
-
-    Raises
-    ------
-    ProtocolError, DataError, BackendError
     """
     if voxel is not None:
         if options.voxel is not None:

@@ -20,12 +20,7 @@ _OF_CAPTURES = (".json", ".xml", ".sfm", ".npz", ".bin", ".txt")
 
 
 def describe_capture(path: Path) -> dict[str, Any]:
-    """Facts of a capture: a folder, or a ZIP file, which is unpacked for a moment.
-
-    Raises
-    ------
-    DataError
-    """
+    """Facts of a capture: a folder, or a ZIP file, which is unpacked for a moment."""
     if is_archive(path):
         with unpacked_for_a_moment(path) as folder:
             return {**describe_capture(folder), "capture": str(path)}

@@ -187,12 +187,7 @@ class RenderedScene(typing.Protocol):
 
 
 def recipe_of(recipe: str | Recipe) -> Recipe:
-    """Return the recipe of a name, or the recipe itself.
-
-    Raises
-    ------
-    RecipeError
-    """
+    """Return the recipe of a name, or the recipe itself."""
     value = get_recipe(recipe) if isinstance(recipe, str) else recipe
     if not isinstance(value, Recipe):
         raise RecipeError(f"recipe must be a name that `gs2d recipes` lists or a Recipe, got {type(value).__name__}")
@@ -216,12 +211,7 @@ def build_recipe(
     robust: bool = False,
     by_points: bool = False,
 ) -> Recipe:
-    """Return the recipe as it will be trained: found, scaled, seeded, overridden, validated.
-
-    Raises
-    ------
-    RecipeError
-    """
+    """Return the recipe as it will be trained: found, scaled, seeded, overridden, validated."""
     value = recipe_of(recipe)
     value = with_exposure(value) if exposure else value
     if vignetting or response:
@@ -255,12 +245,7 @@ def build_recipe(
 
 
 def check_train_options(options: TrainOptions) -> Recipe:
-    """Return the recipe, if the options mean something; nothing is read.
-
-    Raises
-    ------
-    RecipeError, ProtocolError, DataError
-    """
+    """Return the recipe, if the options mean something; nothing is read."""
     if options.robust not in ROBUST:
         raise RecipeError(f"--robust must be one of {', '.join(ROBUST)}, got {options.robust}")
     recipe = _recipe_of(options, robust=options.robust != "off", exposure=bool(options.learns_exposure))
@@ -315,10 +300,6 @@ def fit_recipe(options: TrainOptions, scene: Scene, protocol: Protocol, on_event
     Where ``options.robust`` is "auto" it is made robust under a protocol that says so, if the capture has sparse
     points that its photographs show; where ``options.learns_exposure`` is None, exposures are learned if those
     points say that the photographs differ.
-
-    Raises
-    ------
-    RecipeError, DataError
     """
     robust = options.robust == "on" or (options.robust == "auto" and protocol.robust)
     lacks = scene.unobserved() if robust else ""
@@ -371,12 +352,7 @@ def with_fused_depth(protocol: Protocol, recipe: Recipe) -> Protocol:
 
 
 def prepare_job(options: TrainOptions, on_event: OnEvent) -> Job:
-    """Check the options, cheapest first, then read the capture.
-
-    Raises
-    ------
-    RecipeError, ProtocolError, BackendError, DataError
-    """
+    """Check the options, cheapest first, then read the capture."""
     check_train_options(options)
     backend = choose_backend(options.backend, on_event)
     init = (None, None) if options.init is None else read_init(options.init, on_event)
@@ -428,12 +404,7 @@ def near_cuts(scene: Scene, near: float) -> float:
 
 
 def settled(options: TrainOptions, scene: Scene, protocol: Protocol, on_event: OnEvent) -> tuple[Recipe, Protocol]:
-    """Return recipe and protocol as this capture is trained with.
-
-    Raises
-    ------
-    RecipeError, DataError
-    """
+    """Return recipe and protocol as this capture is trained with."""
     recipe = fit_recipe(options, scene, protocol, on_event)
     check_free_space(scene, recipe)
     recipe, protocol = with_backdrop(recipe, protocol, scene, on_event)
@@ -462,12 +433,7 @@ def read_init(path: Path, on_event: OnEvent) -> tuple[Splats, str]:
 
 
 def choose_protocol(options: TrainOptions, scene_format: str, on_event: OnEvent) -> Protocol:
-    """Return the protocol of a name, or of the capture, with what the options change in it.
-
-    Raises
-    ------
-    ProtocolError
-    """
+    """Return the protocol of a name, or of the capture, with what the options change in it."""
     named = options.protocol
     if named == "auto":
         protocol = protocol_of(options.scene, scene_format)
@@ -669,12 +635,7 @@ def reload_job(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> J
 
 
 def protocol_from_json(data: dict[str, Any]) -> Protocol:
-    """Return the protocol that ``asdict`` and JSON made of one.
-
-    Raises
-    ------
-    RecipeError
-    """
+    """Return the protocol that ``asdict`` and JSON made of one."""
     if not isinstance(data, dict) or not isinstance(data.get("fusion"), dict):
         raise RecipeError("protocol must be an object with its fusion, got something else")
     protocol: Protocol = decode(data, Protocol, "protocol")

@@ -129,10 +129,6 @@ def extract_mesh(
     -------
     dict
         File, counts and the limits that were used.
-
-    Raises
-    ------
-    ProtocolError, DiskError
     """
     if not out.parent.is_dir():
         raise disk_error(out, FileNotFoundError(2, "No such file or directory"))
@@ -168,12 +164,7 @@ def fused(
     subject: Subject | None = None,
     seen: MeshFrames | None = None,
 ) -> Extraction:
-    """Render depth of all training views and fuse it; arguments as of :func:`extract_mesh`, which writes the mesh.
-
-    Raises
-    ------
-    ProtocolError, DiskError
-    """
+    """Render depth of all training views and fuse it; arguments as of :func:`extract_mesh`, which writes the mesh."""
     if not len(splats):
         raise ProtocolError("a scene with splats was expected, got none; train longer or check the cameras")
     check_mesh_options(options)
@@ -223,12 +214,7 @@ def _cut_text(result: Extraction, options: MeshOptions) -> str:
 
 
 def check_mesh_options(options: MeshOptions) -> None:
-    """Raise for limits that are none, before anything is rendered.
-
-    Raises
-    ------
-    ProtocolError
-    """
+    """Raise for limits that are none, before anything is rendered."""
     for name in ("voxel", "truncation", "depth_limit", "max_gib"):
         value = getattr(options, name)
         if value is not None and not (value > 0 and math.isfinite(value)):
@@ -390,10 +376,6 @@ def mesh_run(
         Mesh the splats of this file instead of the run's, into ``out``.
     georeferenced : bool
         Write ``out`` in metres of the world; without options it is the run's mesh.ply, which is not made again.
-
-    Raises
-    ------
-    RunError, DataError, ProtocolError, DiskError
     """
     path, out = Path(path), None if out is None else checked_output(path, out)
     place = placed_output(path, out, MESH) if georeferenced else None
@@ -430,10 +412,5 @@ def _is_own(options: MeshOptions, splats_file: Path | None) -> bool:
 
 
 def keep_facts(run: RunFolder, result: Mapping[str, Any]) -> None:
-    """Write what is said of a run's mesh into ``metrics.json``, beside the scores.
-
-    Raises
-    ------
-    DiskError
-    """
+    """Write what is said of a run's mesh into ``metrics.json``, beside the scores."""
     run.write_metrics({**run.metrics(), "mesh": {name: result[name] for name in KEPT if name in result}})

@@ -64,10 +64,6 @@ def orthophoto_run(
 
     The surface is the run's mesh; a cell shows the highest of it, in the colours of the photographs that see it best,
     or in those of the mesh where none does.
-
-    Raises
-    ------
-    RunError, DataError, ProtocolError, BackendError, DiskError
     """
     required()  # before minutes are spent
     path = Path(path)

@@ -50,10 +50,6 @@ def page_run(
     -------
     dict
         ``file``, ``splats``, ``sh_degree``, ``views``, ``bytes``.
-
-    Raises
-    ------
-    RunError, DataError, DiskError
     """
     path = Path(path)
     of_run = path.is_dir() or is_run(path)

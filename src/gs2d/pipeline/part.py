@@ -74,12 +74,7 @@ def part_scene(scene: Scene, part: Part) -> Scene:
 
 
 def write_start(path: Path, rows: np.ndarray, exposures: np.ndarray | None) -> None:
-    """Write which splats train [N] uint8: ``ABSENT``, ``FROZEN`` or ``OWN``; and exposures [V, 3, 4] of the views.
-
-    Raises
-    ------
-    DiskError
-    """
+    """Write which splats train [N] uint8: ``ABSENT``, ``FROZEN`` or ``OWN``; and exposures [V, 3, 4] of the views."""
     packed, none = io.BytesIO(), np.zeros((0, 3, 4), np.float32)
     np.savez_compressed(packed, rows=rows, exposures=none if exposures is None else exposures)
     with atomic_write(path) as file:
@@ -108,12 +103,7 @@ def read_start(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def load_part(part: Part, scene: Scene, recipe: Recipe) -> LoadedPart:
-    """Read what a part begins with.
-
-    Raises
-    ------
-    DataError, RunError
-    """
+    """Read what a part begins with."""
     assert part.splats is not None
     assert part.start is not None
     splats = splats_as_start(read_splats(part.splats), sh_degree=recipe.sh_degree)

@@ -42,10 +42,6 @@ def with_prepared(
         Bytes that may be written.
     shared : bool
         Other runs keep photographs there too: what is not of this scene stays.
-
-    Raises
-    ------
-    DataError, DiskError
     """
     if how == "never" or (how == "auto" and fits(scene)):
         return scene

@@ -24,12 +24,7 @@ ABOUT = (
 
 
 def write_photometries(run: RunFolder, scene: Scene, on_event: OnEvent) -> None:
-    """Write ``photometry.json`` beside the splats, where views have any, and say what was found.
-
-    Raises
-    ------
-    DiskError
-    """
+    """Write ``photometry.json`` beside the splats, where views have any, and say what was found."""
     names: dict[CameraPhotometry, list[str]] = {}
     for view in scene.views:
         if view.photometry is not None:

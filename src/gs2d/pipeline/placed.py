@@ -46,12 +46,7 @@ def place_of(path: Path, *, asked: bool) -> Georeference | None:
 
 
 def placed_output(path: Path, out: Path | None, name: str) -> Georeference:
-    """Return where a run is, if a georeferenced file may be written: not among those of the run.
-
-    Raises
-    ------
-    RunError, DataError
-    """
+    """Return where a run is, if a georeferenced file may be written: not among those of the run."""
     if out is None or Path(out).resolve() == (Path(path) / name).resolve():
         raise RunError(f"--georeferenced needs --out FILE: {name} of the run keeps the coordinates of the run")
     place = place_of(path, asked=True)
@@ -78,12 +73,7 @@ def placed_textured(mesh: TexturedMesh, place: Georeference) -> TexturedMesh:
 
 
 def say_where(out: Path, place: Georeference) -> dict[str, Any]:
-    """Let a file in local metres say where it is, in itself and beside it; returns what is said of that.
-
-    Raises
-    ------
-    DiskError
-    """
+    """Let a file in local metres say where it is, in itself and beside it; returns what is said of that."""
     stamp(out, place)
     beside = write_sidecars(out, place, wkt_of(place.epsg))
     return {

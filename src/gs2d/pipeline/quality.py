@@ -45,12 +45,7 @@ QUALITIES: Mapping[str, Mapping[str, Quality]] = MappingProxyType(  # name -> de
 
 
 def quality_of(name: str, backend: str) -> Quality:
-    """Return the schedule and the picture size that are meant, on the device that this machine trains with.
-
-    Raises
-    ------
-    RecipeError
-    """
+    """Return the schedule and the picture size that are meant, on the device that this machine trains with."""
     if name not in QUALITIES:
         raise RecipeError(f"--quality must be one of {', '.join(QUALITIES)}, got {name}")
     return QUALITIES[name][get_backend(backend).device]
@@ -63,10 +58,6 @@ def at_quality(
 
     ``scale``: the fraction of the schedule that was asked for, None: what the quality says. ``options.downscale``
     stays where it is given.
-
-    Raises
-    ------
-    RecipeError
     """
     quality = quality_of(name, options.backend)
     scale = quality.schedule_scale(recipe_of(options.recipe)) if scale is None else scale
@@ -83,12 +74,7 @@ def at_quality(
 
 
 def by_quality(options: TrainOptions, on_event: OnEvent) -> TrainOptions:
-    """Return the options of ``gs2d train`` with what their quality says; a schedule or a size that is given stays.
-
-    Raises
-    ------
-    DataError, RecipeError
-    """
+    """Return the options of ``gs2d train`` with what their quality says; a schedule or a size that is given stays."""
     if options.quality is None:
         return options
     check_train_options(options)

@@ -83,10 +83,6 @@ def reconstruct(options: ReconstructOptions, on_event: OnEvent = ignore) -> RunF
 
     What can be refused is refused before anything is made. The capture is kept in the run folder from when it is
     whole, also where training fails later: ``resume`` then does not find the cameras again.
-
-    Raises
-    ------
-    Gs2dError
     """
     check_reconstruct(options)
     on_event(Plan((*PLACED, *(TEXTURED_TOO if options.texture else TRAINED))))
@@ -95,12 +91,7 @@ def reconstruct(options: ReconstructOptions, on_event: OnEvent = ignore) -> RunF
 
 
 def find_cameras(options: ReconstructOptions, on_event: OnEvent) -> None:
-    """Put the photographs with their cameras into the run folder, or take those that ``resume`` finds there.
-
-    Raises
-    ------
-    Gs2dError
-    """
+    """Put the photographs with their cameras into the run folder, or take those that ``resume`` finds there."""
     capture = options.out / CAPTURE
     if options.resume and (capture / POSES_JSON).exists():
         poses = _same_poses(capture, options)
@@ -115,12 +106,7 @@ def find_cameras(options: ReconstructOptions, on_event: OnEvent) -> None:
 
 
 def train_found(options: ReconstructOptions, on_event: OnEvent) -> RunFolder:
-    """Train on the cameras that were found; texture the mesh, if it is asked for.
-
-    Raises
-    ------
-    Gs2dError
-    """
+    """Train on the cameras that were found; texture the mesh, if it is asked for."""
     training = replace(train_options(options), overwrite=False)
     run = train(_by_the_images(training, options, on_event), on_event)
     if options.texture and not run.file(TEXTURED).exists():
@@ -139,12 +125,7 @@ def _title(photos: Path) -> str:
 
 
 def check_reconstruct(options: ReconstructOptions) -> None:
-    """Refuse what can be refused before anything is made.
-
-    Raises
-    ------
-    Gs2dError
-    """
+    """Refuse what can be refused before anything is made."""
     training, out = train_options(options), options.out
     quality = quality_of(options.quality, options.backend)
     scale = options.schedule_scale

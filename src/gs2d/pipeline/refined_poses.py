@@ -73,12 +73,7 @@ def found_poses(given: Scene, now: Scene) -> FoundPoses:
 
 
 def write_poses(run: RunFolder, scene: Scene, poses: FoundPoses, on_event: OnEvent) -> None:
-    """Write ``poses.json`` beside the splats, where cameras were refined, and say how far they moved.
-
-    Raises
-    ------
-    DiskError
-    """
+    """Write ``poses.json`` beside the splats, where cameras were refined, and say how far they moved."""
     if not poses:
         return
     refined = poses.of(scene)

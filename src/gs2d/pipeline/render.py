@@ -108,10 +108,6 @@ def draw_stage(
         The high-error splats, once they are known.
     outputs : mapping
         By the name of the view: what was rendered of these splats already.
-
-    Raises
-    ------
-    DiskError
     """
     folder = run.file(RENDERS)
     for name in ("photos", stage):
@@ -228,10 +224,6 @@ def render_run(
     cameras; heights follow. Frames of a circle or a flight can be made a video too: ``video`` names it, ``fps`` frames
     a second. All are in the mean exposure of the photographs, or in that of the training photograph ``exposure_of``.
     ``splats_file`` is drawn instead of the run's splats, into ``out``.
-
-    Raises
-    ------
-    RunError, DataError, BackendError, DiskError
     """
     from gs2d.io.video import write_video
 
@@ -319,10 +311,6 @@ def check_frames(orbit: int, flight: int, video: Path | None, fps: float) -> tup
     """Return what moves ("orbit", "flight" or nothing) and the video's whole name.
 
     Raises for what makes no video, before anything is loaded.
-
-    Raises
-    ------
-    RunError, DataError, BackendError
     """
     from gs2d.io.video import check_video
 

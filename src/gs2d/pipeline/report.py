@@ -16,12 +16,7 @@ from gs2d.pipeline.render import shown_cameras
 
 
 def report_run(path: Path, on_event: OnEvent = ignore) -> Path:
-    """Write the report of a run; a section that fails is said in it, and told as ``Missing``.
-
-    Raises
-    ------
-    RunError, DataError, DiskError
-    """
+    """Write the report of a run; a section that fails is said in it, and told as ``Missing``."""
     from gs2d.report.write import write_report
 
     run = open_run(Path(path))

@@ -91,12 +91,7 @@ def choose_start(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEv
 
 
 def check_sources(job: Job, options: TrainOptions) -> None:
-    """Raise what would be raised for ``start_from`` and ``cache``, before the run that is to be overwritten goes.
-
-    Raises
-    ------
-    RunError, DiskError
-    """
+    """Raise what would be raised for ``start_from`` and ``cache``, before the run that is to be overwritten goes."""
     if options.start_from is not None:
         if options.start_from.resolve() == options.out.resolve():
             raise RunError(f"--from and --out are the same run, {options.out}; take another --out")
@@ -127,12 +122,7 @@ def _resume(run: RunFolder, job: Job, on_event: OnEvent) -> ResumePoint:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Return what a checkpoint holds: all of it is there, and of the types that ``RunLogger`` writes.
-
-    Raises
-    ------
-    RunError
-    """
+    """Return what a checkpoint holds: all of it is there, and of the types that ``RunLogger`` writes."""
     payload = load_tensors(path)
     try:
         size, extra = payload["events_bytes"], json.loads(payload["extra"])
@@ -151,12 +141,7 @@ def _unreadable(path: Path, reason: str) -> RunError:
 
 
 def _state(path: Path, payload: dict[str, Any]) -> TrainState:
-    """Return the state in a checkpoint that was read.
-
-    Raises
-    ------
-    RunError
-    """
+    """Return the state in a checkpoint that was read."""
     try:
         return TrainState.from_state_dict(payload["state"])
     except RunError as error:
@@ -164,12 +149,7 @@ def _state(path: Path, payload: dict[str, Any]) -> TrainState:
 
 
 def _state_at(checkpoint: CheckpointFile, payload: dict[str, Any], job: Job) -> TrainState:
-    """Return the state in a checkpoint of this run, if it is where its name says and training can go on from it.
-
-    Raises
-    ------
-    RunError
-    """
+    """Return the state in a checkpoint of this run, if it is where its name says and training can go on from it."""
     state, ended = _state(checkpoint.path, payload), checkpoint.iteration is None
     place = (checkpoint.stage_index + ended, 0 if ended else checkpoint.iteration)
     try:
@@ -193,12 +173,7 @@ def _adopt(run: RunFolder, job: Job, stage: FinishedStage, on_event: OnEvent) ->
 
 
 def _from_run(job: Job, path: Path) -> FinishedStage:
-    """Return the furthest stage that another run has in common with this one.
-
-    Raises
-    ------
-    RunError
-    """
+    """Return the furthest stage that another run has in common with this one."""
     other = open_run(path)
     ends = [c for c in other.checkpoints() if c.iteration is None]
     for checkpoint in reversed(ends):
@@ -288,12 +263,7 @@ def stage_end(run: RunFolder, job: Job, index: int) -> TrainState | None:
 
 
 def _keep_scored(run: RunFolder, folder: Path) -> None:
-    """Keep the last stage that a killed process had scored, and had no time to keep; remove what it left half-written.
-
-    Raises
-    ------
-    DiskError
-    """
+    """Keep the last stage that a killed process had scored but not kept; remove what it left half-written."""
     sweep(folder)
     stages = run.metrics()["stages"]
     ends = [c for c in run.checkpoints() if c.iteration is None and c.stage_index < len(stages)]
@@ -304,12 +274,7 @@ def _keep_scored(run: RunFolder, folder: Path) -> None:
 
 
 def put_in_cache(folder: Path, run: RunFolder, index: int, payload: dict[str, Any]) -> None:
-    """Keep a finished and scored stage for other runs.
-
-    Raises
-    ------
-    DiskError
-    """
+    """Keep a finished and scored stage for other runs."""
     make_folder(folder)
     path = _cache_file(folder, payload["key"])
     if not path.exists():

@@ -203,12 +203,7 @@ def _finish(
 
 
 def _masks_of(options: PosesOptions, photos: Sequence[Photo], is_video: bool, on_event: OnEvent) -> list[Path | None]:
-    """Return the mask of each photograph, and say how many have one.
-
-    Raises
-    ------
-    DataError
-    """
+    """Return the mask of each photograph, and say how many have one."""
     if is_video:
         if options.masks is not None:
             raise DataError(
@@ -304,12 +299,7 @@ def _stage(
 
 
 def _request(options: PosesOptions, work: Path, photos: Sequence[Photo], threads: int, on_event: OnEvent) -> Request:
-    """Return what COLMAP is asked to do.
-
-    Raises
-    ------
-    DataError
-    """
+    """Return what COLMAP is asked to do."""
     places = places_of(photos, options.positions)
     for note in places.notes:
         on_event(Notice(note))

@@ -103,12 +103,7 @@ def _draw(run: RunFolder, job: Job, subject: Subject, on_event: OnEvent) -> None
 
 
 def meshed_subject(run: RunFolder, job: Job, splats: Splats, options: MeshOptions, on_event: OnEvent) -> Subject | None:
-    """Find the subject of a run, and return it where the mesh is to be of it: None for everything, or a box of its own.
-
-    Raises
-    ------
-    ProtocolError, RunError, DataError, DiskError
-    """
+    """Find the subject of a run; return it if the mesh is of it, None if it is of everything or of a box of its own."""
     wanted = wants_subject(job, options)
     subject = subject_of(run, job, splats, on_event, box=options.subject_box)
     return subject if wanted and subject.kind == OBJECT else None

@@ -60,10 +60,6 @@ def texture_run(
 
     The mesh is ``mesh.ply`` of the run as it is, unless some mesh option is given or it is not there: then it is
     extracted anew, and takes the place of ``mesh.ply`` if ``out`` is None.
-
-    Raises
-    ------
-    RunError, DataError, ProtocolError, BackendError, DiskError
     """
     check_texture_options(options)
     for package in PACKAGES:
@@ -121,10 +117,6 @@ def textured_mesh(
     """Simplify a mesh of a run, cut it into charts and colour them.
 
     Photographs whose exposure is known are taken back to the mean exposure first.
-
-    Raises
-    ------
-    BackendError, DataError, ProtocolError
     """
     on_event(Phase("cutting the surface into charts", 0))
     views, small = _views(job, options, on_event), simplified(mesh, options.faces)
@@ -138,12 +130,7 @@ def textured_mesh(
 
 
 def check_texture_options(options: TextureOptions) -> None:
-    """Raise for numbers that make no texture.
-
-    Raises
-    ------
-    ProtocolError
-    """
+    """Raise for numbers that make no texture."""
     if options.faces < 4:
         raise ProtocolError(f"--faces must be a whole number >= 4, got {options.faces}")
     if options.texture_downscale is not None and options.texture_downscale < 1:

@@ -204,12 +204,7 @@ def watched(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEvent) 
 
 
 def check_viewer(options: TrainOptions) -> None:
-    """Raise for a page that cannot be served, before anything slow happens.
-
-    Raises
-    ------
-    RecipeError, BackendError
-    """
+    """Raise for a page that cannot be served, before anything slow happens."""
     if not options.viewer:
         if options.viewer_port is not None:
             raise RecipeError("--viewer-port belongs to --viewer, which was not given; give both")

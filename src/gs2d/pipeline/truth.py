@@ -63,12 +63,7 @@ class OfficialTruth:
 
 
 def read_truth(path: Path) -> Truth:
-    """Read a ground truth: a mesh (with the counts of ``NAME_seen.npy`` beside it, if any) or the points of a PLY file.
-
-    Raises
-    ------
-    DataError
-    """
+    """Read a ground truth: a mesh (with the counts of ``NAME_seen.npy``, if it exists) or the points of a PLY file."""
     kind = "mesh" if path.suffix.lower() in FOREIGN else ply_kind(path)
     if kind == "points":
         return Truth(path, np.asarray(read_points(path).points, np.float64), None)
@@ -120,12 +115,7 @@ def choose_truth(given: Path | None, root: Path, on_event: OnEvent) -> Truth | O
 
 
 def check_thresholds(thresholds: tuple[float, ...]) -> None:
-    """Raise for a threshold that is no distance, before anything slow happens.
-
-    Raises
-    ------
-    DataError
-    """
+    """Raise for a threshold that is no distance, before anything slow happens."""
     if not all(t > 0 and math.isfinite(t) for t in thresholds):
         raise DataError(f"--thresholds must be positive distances, got {', '.join(map(str, thresholds))}")
 
@@ -133,12 +123,7 @@ def check_thresholds(thresholds: tuple[float, ...]) -> None:
 def score_surface(
     mesh: Mesh, truth: Truth | OfficialTruth, job: Job, options: EvaluateOptions, on_event: OnEvent, *, folder: Path
 ) -> dict[str, Any]:
-    """Return the ``surface`` entry of ``metrics.json`` (docs/guides/runs.md); the coloured clouds go to ``folder``.
-
-    Raises
-    ------
-    DataError, DiskError
-    """
+    """Return the ``surface`` entry of ``metrics.json`` (docs/guides/runs.md); the coloured clouds go to ``folder``."""
     on_event(Phase("scoring the surface", 0))
     if isinstance(truth, Truth):
         return _score_visible(mesh, truth, job, options, on_event, folder)

@@ -23,12 +23,7 @@ from gs2d.pipeline.job import Job
 
 
 def score_dtu(mesh: Mesh, scene: SceneFacts, files: Mapping[str, Path], job: Job, folder: Path) -> dict[str, Any]:
-    """Chamfer distance, mm.
-
-    Raises
-    ------
-    DataError, DiskError
-    """
+    """Chamfer distance, mm."""
     truth = read_dtu_truth(scene.scan or 0, files)
     silhouettes, T = _silhouettes(job), job.scene.T_metric_scene
     score = evaluate_dtu(mesh, silhouettes, T, truth)
@@ -62,12 +57,7 @@ def _silhouettes(job: Job) -> list[Silhouette]:
 
 
 def score_tnt(mesh: Mesh, scene: SceneFacts, files: Mapping[str, Path], job: Job, folder: Path) -> dict[str, Any]:
-    """Precision, recall and F-score at the scene's tau.
-
-    Raises
-    ------
-    DataError, DiskError
-    """
+    """Precision, recall and F-score at the scene's tau."""
     if scene.tau is None:
         raise DataError(f"a tau was expected for {scene.name}, its data set names none")
     log = None if job.scene.root is None else published_log(job.scene.root, scene.name)

@@ -290,12 +290,7 @@ def _checked(splats: Splats, settings: RasterSettings, backend: Backend) -> Rast
 
 
 def check_settings(s: RasterSettings) -> None:
-    """Raise for a number or a word that no rasterizer takes.
-
-    Raises
-    ------
-    ShapeError
-    """
+    """Raise for a number or a word that no rasterizer takes."""
 
     def require(holds: bool, field: str, rule: str) -> None:
         if not holds:

@@ -48,10 +48,6 @@ def normal_image(normal: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     Returns
     -------
     ndarray float32 [H, W, 3] in [0, 1]
-
-    Raises
-    ------
-    ShapeError
     """
     check_shapes({"normal": (normal, "H W 3"), "alpha": (alpha, "H W")})
     length = np.linalg.norm(normal, axis=2, keepdims=True)

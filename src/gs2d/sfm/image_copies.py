@@ -33,10 +33,6 @@ def copy_images(
         The longer side may have so many px.
     link : bool
         Hard links where the bytes stay the same: no disk is used. Copied all the same where the disk is another one.
-
-    Raises
-    ------
-    DiskError, DataError
     """
     for parent in sorted({(folder / photo.name).parent for photo in photos}):
         try:

@@ -17,12 +17,7 @@ _CAMERA = "#d62728"
 
 
 def write_image_of(path: Path, piece: SfmModel, title: str) -> None:
-    """Draw a model in the plane of its first two axes, and of the first and third.
-
-    Raises
-    ------
-    DiskError
-    """
+    """Draw a model in the plane of its first two axes, and of the first and third."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure

@@ -27,12 +27,7 @@ EXIT_BUG = (IMAGES, SPARSE, POSES_JSON, POSES_PNG)
 
 
 def check_out(given: Path, images: Path, *, overwrite: bool) -> None:
-    """Raise before anything slow begins, where the capture cannot or must not be put.
-
-    Raises
-    ------
-    RunError, DiskError
-    """
+    """Raise before anything slow begins, where the capture cannot or must not be put."""
     out, photos = given.resolve(), images.resolve()
     if out == photos or photos in out.parents or out in photos.parents:
         raise RunError(
@@ -124,12 +119,7 @@ def _empty(work: Path) -> None:
 
 
 def put_in_place(capture: Path, out: Path, work: Path) -> None:
-    """Rename the finished capture to its name; an older one goes with the workplace.
-
-    Raises
-    ------
-    DiskError
-    """
+    """Rename the finished capture to its name; an older one goes with the workplace."""
     try:
         if out.exists():
             os.rename(out, work / OLD)

@@ -96,10 +96,6 @@ def write_model(
     tracks : for each photograph (numbers [n] of the points that it shows, where they are [n, 2] px)
     least : int
         Photographs that must see a point; the others are left out, here and in the photographs.
-
-    Raises
-    ------
-    DiskError
     """
     counts = np.bincount(np.concatenate([numbers for numbers, _ in tracks]), minlength=len(points))
     identity = np.where(counts >= least, np.cumsum(counts >= least), 0)  # COLMAP's numbers, from 1; 0 = left out

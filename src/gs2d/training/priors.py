@@ -225,10 +225,6 @@ def with_known_points(scene: Scene, recipe: Recipe) -> Scene:
     As many as the recipe's ``init_points``, of random pixels of all training views alike: the rates of means let a
     splat wander by a few per cent of the extent, not to a wall that no sparse point is near. They lie in the planes of
     their neighbours in a map: discs that are turned at random are as thick as they are wide.
-
-    Raises
-    ------
-    DataError
     """
     settings = recipe.depth_prior
     if settings is None or not settings.start:

@@ -10,12 +10,7 @@ from gs2d.training.state import TrainState
 
 
 def check_resumable(state: TrainState, recipe: Recipe, views: int) -> None:
-    """Raise unless training of a recipe, on so many training views, can go on from a state.
-
-    Raises
-    ------
-    RunError, ShapeError
-    """
+    """Raise unless training of a recipe, on so many training views, can go on from a state."""
     state.check()
     if state.splats.sh_degree != recipe.sh_degree:
         raise RunError(

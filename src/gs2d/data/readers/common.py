@@ -86,12 +86,7 @@ def reals(value: Any, count: int, where: str) -> np.ndarray:
 
 
 def whole(value: Any, where: str) -> int:
-    """Return a whole number that is not negative.
-
-    Raises
-    ------
-    DataError
-    """
+    """Return a whole number that is not negative."""
     number = real(value, where)
     if number != int(number) or number < 0:
         raise DataError(f"{where} must be a whole number >= 0, got {str(value)[:40]!r}")
@@ -99,24 +94,14 @@ def whole(value: Any, where: str) -> int:
 
 
 def entries(value: Any, where: str) -> Mapping[str, Any]:
-    """Return an object of JSON.
-
-    Raises
-    ------
-    DataError
-    """
+    """Return an object of JSON."""
     if not isinstance(value, dict):
         raise DataError(f"{where} must be an object, got {type(value).__name__}; is the file of another tool?")
     return value
 
 
 def required(entry: Mapping[str, Any], key: str, where: str) -> Any:
-    """Return the value of a key that must be there.
-
-    Raises
-    ------
-    DataError
-    """
+    """Return the value of a key that must be there."""
     if key not in entry:
         raise DataError(f'{where} must have the key "{key}", got {sorted(map(str, entry))[:12]}')
     return entry[key]

@@ -144,10 +144,6 @@ def dtu_silhouettes(root: Path) -> tuple[DtuSilhouette, ...]:
     """Return the mask files of a scan in full size, with the archive's cameras, which were made for that size.
 
     What the official evaluation culls with, whatever the size of the photographs. Empty without mask files.
-
-    Raises
-    ------
-    DataError
     """
     masks = _files(root, ("mask", "masks"))
     if not masks:

@@ -174,12 +174,7 @@ def layout_of(path: Path) -> str | None:
 
 
 def write_layout(path: Path, splats: Splats, layout: str) -> tuple[str, ...]:
-    """Write splats in a layout of ``LAYOUTS``, atomically; what it could not hold, one sentence each.
-
-    Raises
-    ------
-    DataError, DiskError
-    """
+    """Write splats in a layout of ``LAYOUTS``, atomically; what it could not hold, one sentence each."""
     return LAYOUTS.get(layout).write(path, splats) or ()
 
 

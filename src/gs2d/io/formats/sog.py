@@ -266,12 +266,7 @@ class _Reader:
 
 
 def parsed(path: Path, data: bytes) -> dict[str, Any]:
-    """Return a JSON object.
-
-    Raises
-    ------
-    DataError
-    """
+    """Return a JSON object."""
     try:
         if len(data) > _LONGEST:
             raise ValueError(f"more than {_LONGEST} bytes")
@@ -324,10 +319,6 @@ def read_level(path: Path, level: int = 0, tell: Tell = warnings.warn) -> Gaussi
     """Return a level of all that a lod-meta.json refers to, and its surroundings; 0 is the finest.
 
     Where a leaf has not that level, its next coarser one is taken, or else its coarsest.
-
-    Raises
-    ------
-    DataError, OSError
     """
     index = parsed(path, path.read_bytes())
     fetch, parts = _in_folder(path.parent, path), []

@@ -85,12 +85,7 @@ class Cells:
 
     @classmethod
     def from_json(cls, data: Any) -> Cells:
-        """Return the cells that :meth:`to_json` described.
-
-        Raises
-        ------
-        RunError
-        """
+        """Return the cells that :meth:`to_json` described."""
         try:
             cells = data["cells"]
             low, high = (

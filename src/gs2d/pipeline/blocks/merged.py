@@ -63,10 +63,6 @@ def write_merged(settled: Settled, options: TrainOptions, partition: Partition, 
     -------
     dict
         ``splats``, and ``views``: how many photographs show a seam.
-
-    Raises
-    ------
-    RunError, DiskError
     """
     out, splats, views = options.out, merged_splats(options.out), tuple[str, ...]()
     if partition.seam > 0 and partition.seam_schedule > 0:
@@ -102,12 +98,7 @@ def read_seam_views(out: Path) -> tuple[str, ...]:
 
 
 def write_result(settled: Settled, options: TrainOptions, partition: Partition, on_event: OnEvent) -> int:
-    """Write the merged scene as a run, its seams as they have learned; returns its splats.
-
-    Raises
-    ------
-    RunError, DiskError
-    """
+    """Write the merged scene as a run, its seams as they have learned; returns its splats."""
     run, splats = RunFolder(options.out), read_splats(options.out / MERGED)
     if read_seam_views(options.out):
         rows, _ = read_start(start_file(partition_folder(options.out), SEAMS))
@@ -140,12 +131,7 @@ def merged_job(settled: Settled, options: TrainOptions, scene: Scene) -> Job:
 
 
 def finish_merged(settled: Settled, options: TrainOptions, on_event: OnEvent) -> dict[str, Any]:
-    """Score the merged scene, mesh it, write its page, verdict and report; returns its entry of ``metrics.json``.
-
-    Raises
-    ------
-    RunError, DataError, DiskError
-    """
+    """Score the merged scene, mesh it, write its page, verdict and report; returns its entry of ``metrics.json``."""
     run, memory = RunFolder(options.out), PeakMemory()
     if not run.file(SPLATS).exists():
         raise RunError(f"{options.out} must have {SPLATS} by now, got none; run the command again")

@@ -80,12 +80,7 @@ class Settled:
 
 
 def settle(options: TrainOptions, on_event: OnEvent) -> Settled:
-    """Read the headers of a capture and settle what all blocks have in common; nothing is written.
-
-    Raises
-    ------
-    Gs2dError
-    """
+    """Read the headers of a capture and settle what all blocks have in common; nothing is written."""
     recipe = check_train_options(options)
     if is_archive(options.scene):
         remedy = instead(options.scene, "capture")
@@ -108,12 +103,7 @@ def settle(options: TrainOptions, on_event: OnEvent) -> Settled:
 
 
 def open_settled(options: TrainOptions, recipe: Recipe, protocol: Protocol, on_event: OnEvent) -> Settled:
-    """Read the headers of a capture for a recipe and a protocol that are settled.
-
-    Raises
-    ------
-    Gs2dError
-    """
+    """Read the headers of a capture for a recipe and a protocol that are settled."""
     backend = choose_backend(options.backend, on_event)
     kind = detect_format(options.scene) if options.format == "auto" else options.format
     masks = Masks(options.masks, options.masked)
@@ -154,12 +144,7 @@ def capture_digest(scene: Scene) -> str:
 def fitting_partition(
     settled: Settled, options: TrainOptions, partition: Partition, on_event: OnEvent
 ) -> Partition | None:
-    """Return the partition with as many blocks as memory needs; None where everything fits into one training.
-
-    Raises
-    ------
-    Gs2dError
-    """
+    """Return the partition with as many blocks as memory needs; None where everything fits into one training."""
     found: CapturePlan | None = None
     recipe = settled.recipe
     try:

@@ -77,12 +77,7 @@ class Split:
 
     @classmethod
     def from_json(cls, data: Any) -> Split:
-        """Return the split that :meth:`to_json` described.
-
-        Raises
-        ------
-        RunError
-        """
+        """Return the split that :meth:`to_json` described."""
         try:
             if data["format"] != FORMAT:
                 raise ValueError(f"format {data['format']!r}, expected {FORMAT}")
@@ -98,12 +93,7 @@ def start_file(folder: Path, block: str) -> Path:
 
 
 def read_split(folder: Path) -> Split:
-    """Return the split of a folder.
-
-    Raises
-    ------
-    DataError, RunError
-    """
+    """Return the split of a folder."""
     return Split.from_json(read_json(folder / CELLS))
 
 

@@ -22,12 +22,7 @@ _CAMERA, _BOX = "#d62728", "#111111"
 
 
 def write_subject_image(path: Path, subject: Subject, cameras: Sequence[Camera], points: np.ndarray) -> None:
-    """Draw a subject among the training cameras and sparse points [P, 3] of a capture, as PNG.
-
-    Raises
-    ------
-    DiskError
-    """
+    """Draw a subject among the training cameras and sparse points [P, 3] of a capture, as PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
