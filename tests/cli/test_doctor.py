@@ -38,18 +38,18 @@ def test_the_doctor_looks_for_all_that_single_commands_need(
 ) -> None:
     monkeypatch.setenv("PATH", "")
     monkeypatch.setattr(
-        "gs2d.cli.doctor_extras._version", lambda name: None if name in ("viser", "pi-heif") else "1.2.3"
+        "gs2d.cli.doctor_extras._version", lambda name: None if name in ("xatlas", "pi-heif") else "1.2.3"
     )
     assert run(["doctor", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["extras"] == {
-        "sfm": True, "geo": True, "exr": True, "markers": True, "ffmpeg": False, "heic": True, "texture": True,
-        "spz4": True, "usd": True, "view": False, "cluster": True
+        "sfm": True, "geo": True, "exr": True, "markers": True, "ffmpeg": False, "heic": True, "texture": False,
+        "spz4": True, "usd": True, "cluster": True
     }  # fmt: skip
     assert report["optional"]["heic"]["details"] == "pillow-heif 1.2.3"
     assert run(["doctor"]) == 0
     text = capsys.readouterr().out
-    assert "no   viewer in the browser (gs2d view, --viewer): viser missing\n       to get it: pip install 'vi" in text
+    assert "no   textured meshes (--texture): xatlas missing\n       to get it: pip install 'xatlas" in text
     ffmpeg = "no   videos, read and made (gs2d render --video x.mp4): no ffmpeg and no ffprobe on the PATH"
     assert f"{ffmpeg}\n       to get it: apt" in text
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import trimesh
 
 from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError, DiskError
-from gs2d.io.meshes import read_mesh, triangulate, write_mesh
+from gs2d.io.meshes import glb_bytes, read_mesh, triangulate, write_mesh
 from gs2d.io.ply_format import write_ply
 from gs2d.io.splat_ply import ply_kind
 from surface_shapes import tetrahedron
@@ -124,3 +126,19 @@ def test_real_meshes_are_read(shared: Callable[[str], Path]) -> None:
     mesh = read_mesh(shared("rendered_bottle") / "mesh_gt.ply")
     assert (len(mesh.vertices), len(mesh.faces)) == (20341, 40670)
     assert np.allclose(mesh.vertices.min(0), [-0.9, -0.9, -0.85], atol=1e-3)
+
+
+def test_a_coloured_mesh_becomes_a_glb_with_its_colours(tmp_path: Path) -> None:
+    colors = np.array([[255, 0, 0], [0, 188, 0], [12, 0, 255]], np.uint8)
+    data = glb_bytes(Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), colors))
+    (tmp_path / "a.glb").write_bytes(data)
+    loaded = trimesh.load(tmp_path / "a.glb", force="mesh", process=False)
+    np.testing.assert_allclose(loaded.vertices, np.eye(3))
+    # linear in the file (glTF 3.7.2.1): ((188 / 255 + 0.055) / 1.055)^2.4 = 0.5029, 12 / 255 / 12.92 about 0.0037
+    length = struct.unpack("<I", data[12:16])[0]
+    document = json.loads(data[20 : 20 + length])
+    accessor = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    assert (accessor["componentType"], accessor["type"], accessor["normalized"]) == (5123, "VEC4", True)
+    start = 28 + length + document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+    found = np.frombuffer(data, "<u2", 12, start).reshape(3, 4) / 65535
+    np.testing.assert_allclose(found, [[1, 0, 0, 1], [0, 0.5029, 0, 1], [0.00364, 0, 1, 1]], atol=1e-4)

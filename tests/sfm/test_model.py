@@ -330,4 +330,3 @@ def test_the_doctor_says_whether_the_extra_is_there(
     remedy = "\n       to get it: pip install 'pycolmap>=4.2'\n"
     assert f"  no   cameras of photographs (gs2d reconstruct, poses): pycolmap missing{remedy}" in text
     assert "  no   textured meshes (--texture): xatlas missing\n" in text
-    assert "  yes  viewer in the browser (gs2d view, --viewer): viser 1.2.3\n" in text

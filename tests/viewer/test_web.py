@@ -13,7 +13,6 @@ import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +25,18 @@ from gs2d.errors import DataError
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
 from gs2d.report.images import depth_image, normal_image
-from gs2d.viewer.web import MAX_SPLATS, Packed, Seen, pack, texels_of, write_page
+from gs2d.viewer.web import (
+    MAX_SPLATS,
+    Packed,
+    PageScene,
+    Seen,
+    Served,
+    pack,
+    served_page,
+    splats_answer,
+    texels_of,
+    write_page,
+)
 
 ORIGIN = np.array([1000.0, -2000.0, 500.0])  # far away: float32 keeps a tenth of a millimetre there
 CAMERA = look_at(ORIGIN + np.array([0.3, -4.0, 0.8]), ORIGIN, np.array([0.0, 0.0, 1.0]), width=120, height=80, fx=100.0)
@@ -77,7 +87,7 @@ def unpacked(data: bytes, count: int, degree: int, scales: list[float]) -> Splat
 
 def data_of(packed: Packed) -> bytes:
     """What the page is given, in one piece."""
-    return packed.words.tobytes() + packed.harmonics.tobytes()
+    return b"".join(packed.data)
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
@@ -169,16 +179,18 @@ class Scripts(HTMLParser):
         self._id, self._in_title = "", False
 
 
-def page_of(path: Path, **changes: Any) -> Scripts:
-    arguments: dict[str, Any] = {
-        "title": "a <b> & {{facts}}",
-        "focus": ORIGIN,
-        "unit": 4.0,
-        "up": np.array([0, 0, 1.0]),
-    }
-    settings = changes.pop("settings", SETTINGS)
-    views = [Seen("</script>.png", CAMERA), Seen("2.png", CAMERA)]
-    write_page(path, some_splats(), views, settings, **{**arguments, **changes})
+SCENE = PageScene(
+    title="a <b> & {{facts}} {{splats}}",
+    views=[Seen("</script>.png", CAMERA), Seen("2.png", CAMERA)],
+    settings=SETTINGS,
+    focus=ORIGIN,
+    unit=4.0,
+    up=np.array([0, 0, 1.0]),
+)
+
+
+def page_of(path: Path, settings: RasterSettings = SETTINGS) -> Scripts:
+    write_page(path, some_splats(), replace(SCENE, settings=settings))
     page = Scripts()
     page.feed(path.read_text())
     return page
@@ -189,7 +201,7 @@ def test_the_page_is_one_file_that_loads_nothing_and_holds_what_it_is_told(tmp_p
     page = page_of(path)
     text = path.read_text()
     assert page.loads == []
-    assert page.title == "a <b> & {{facts}}"
+    assert page.title == SCENE.title
     assert not re.search(r"https?://", text)
     assert "default-src 'none'" in text
     assert set(page.texts) == {
@@ -218,11 +230,38 @@ def test_the_page_is_one_file_that_loads_nothing_and_holds_what_it_is_told(tmp_p
     assert again.read_bytes() == path.read_bytes()
 
 
+def served() -> Scripts:
+    """A page as a server offers it."""
+    page = Scripts()
+    page.feed(served_page(SCENE, Served(["surface", "final"], has_mesh=True, has_images=True)).decode())
+    return page
+
+
+def test_a_served_page_has_no_splats_and_asks_its_own_server_only(tmp_path: Path) -> None:
+    page, alone = served(), page_of(tmp_path / "scene.html")
+    assert page.loads == ["data:,"]
+    assert page.texts["splats"].strip() == ""
+    assert set(page.texts) == {*alone.texts, "mesh-vert", "mesh-frag"}
+    facts, of_file = json.loads(page.texts["facts"]), json.loads(alone.texts["facts"])
+    assert facts["served"] == {"stages": ["surface", "final"], "has_mesh": True, "has_images": True, "is_live": False}
+    assert of_file["served"] is None
+    packed = pack(some_splats(), ORIGIN, 3, SETTINGS.alpha_min)
+    answer = splats_answer(packed)
+    assert b"".join(answer.parts) == data_of(packed)
+    assert {**facts, **json.loads(answer.headers["X-Splats"]), "served": None} == of_file
+    text = served_page(SCENE, Served()).decode()
+    assert "default-src 'none'" in text
+    assert "connect-src 'self'; img-src 'self' data:" in text
+    assert not re.search(r"https?://", text)
+    assert "connect-src" not in (tmp_path / "scene.html").read_text()
+
+
 @node
 def test_the_scripts_are_javascript_and_the_sorter_sorts_exactly(tmp_path: Path) -> None:
     page = page_of(tmp_path / "scene.html")
-    (tmp_path / "main.js").write_text(page.texts["main"])
-    subprocess.run(["node", "--check", str(tmp_path / "main.js")], check=True)
+    for name, text in (("alone.js", page.texts["main"]), ("served.js", served().texts["main"])):
+        (tmp_path / name).write_text(text)
+        subprocess.run(["node", "--check", str(tmp_path / name)], check=True)
     rng = np.random.default_rng(0)
     means = rng.normal(size=(500, 3)).astype(np.float32)
     means[100:200] = means[:100]  # equal depths: later rows are drawn first, because rule 2 has them behind

@@ -18,7 +18,7 @@ from gs2d.core.splats import Splats
 from gs2d.data.subject import Subject
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
-from gs2d.viewer.web import Seen, guessed_subject, home_camera, photographed_arc, write_page
+from gs2d.viewer.web import PageScene, Seen, guessed_subject, home_camera, photographed_arc, write_page
 
 ORIGIN = np.array([100.0, -200.0, 50.0])
 UP = np.array([0.0, 0.0, 1.0])
@@ -47,7 +47,7 @@ def two_balls() -> Splats:
 
 
 def write(path: Path, views: list[Seen] = ONE_SIDE) -> Path:
-    write_page(path, two_balls(), views, SETTINGS, title="two balls", focus=ORIGIN, unit=4.0, up=UP, subject=SUBJECT)
+    write_page(path, two_balls(), PageScene("two balls", views, SETTINGS, ORIGIN, 4.0, UP, SUBJECT))
     return path
 
 
@@ -195,7 +195,7 @@ def test_a_phone_has_every_button_in_sight_turns_and_pinches(page: Page) -> None
     try:
         page.key("h")
         shown = page.ask(
-            "[...document.querySelectorAll('#bar button')].map((b) => b.getBoundingClientRect())"
+            "[...document.querySelectorAll('#bar button:not([hidden])')].map((b) => b.getBoundingClientRect())"
             ".every((r) => r.left >= 0 && r.right <= innerWidth && r.bottom <= innerHeight && r.height >= 40)"
         )
         assert shown
@@ -293,5 +293,5 @@ def test_a_georeferenced_page_measures_in_metres_with_the_height(page: Page, tmp
     assert (short, long) == ("5 m", "level 4 m, height +3 m")
     np.testing.assert_allclose(world.ground_way(np.array([0, 0.6, 0.8])), [4, 0, 3])
     path = tmp_path / "there.html"
-    write_page(path, two_balls(), ONE_SIDE, SETTINGS, title="x", focus=ORIGIN, unit=4.0, up=UP, world=world)
+    write_page(path, two_balls(), PageScene("x", ONE_SIDE, SETTINGS, ORIGIN, 4.0, UP, world=world))
     assert f'"world": {json.dumps(told)}' in path.read_text()

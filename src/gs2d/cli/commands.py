@@ -21,7 +21,6 @@ from gs2d.pipeline.options import (
     PosesOptions,
     TextureOptions,
     TrainOptions,
-    ViewOptions,
 )
 
 MemoryOption = Annotated[float | None, arg(metavar="GIB")]
@@ -125,11 +124,13 @@ class Render(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(ViewOptions, Common):
+class View(Common):
     """Look at a trained run in the browser: splats, mesh and cameras, served from this machine only."""
 
     path: Annotated[Positional[Path], arg(metavar="RUN")]
     """Run folder, or a file of flat splats: PLY (compressed too), .spz, .splat, .usd, .glb or .sog."""
+    port: int | None = None
+    """Port of the page (default: the first free one from 8080 on)."""
 
 
 @dataclass(frozen=True, kw_only=True)

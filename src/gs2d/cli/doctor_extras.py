@@ -82,7 +82,6 @@ OPTIONAL = (
     Wanted(
         "cluster", "several machines (gs2d sweep, paper, blocks, reconstruct --cluster)", _packages("cluster", "ray")
     ),
-    Wanted("view", "viewer in the browser (gs2d view, --viewer)", _packages("view", "viser")),
 )
 
 

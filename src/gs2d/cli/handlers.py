@@ -176,15 +176,15 @@ def view(command: c.View, console: Console) -> None:
     """``gs2d view``: until Ctrl-C."""
     from gs2d.pipeline.view import open_viewer, serve
 
-    viewer = open_viewer(command.path, command, console.on_event)
+    server, shown = open_viewer(command.path, command.port, console.on_event)
     try:
         console.close()
-        console.say(f"{viewer.url}  (Ctrl-C ends it)")
-        console.result({"url": viewer.url, "port": viewer.port, "shown": sorted(viewer.nodes)})
+        console.say(f"{server.url}  (Ctrl-C ends it)")
+        console.result({"url": server.url, "port": server.port, "shown": shown})
         console.flush()
-        serve(viewer, console.on_event)
+        serve(server, console.on_event)
     finally:
-        viewer.close()
+        server.close()
 
 
 def page(command: c.Page, console: Console) -> None:

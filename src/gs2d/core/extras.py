@@ -18,7 +18,6 @@ EXTRAS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "spz4": ("zstandard>=0.22",),
         "texture": ("xatlas>=0.0.9",),
         "usd": ("usd-core>=26.3",),
-        "view": ("viser>=1.1,<2", "msgspec>=0.18", "websockets>=14"),
     }
 )
 FFMPEG = "apt install ffmpeg, brew install ffmpeg, or ffmpeg.org"

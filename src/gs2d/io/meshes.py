@@ -293,19 +293,6 @@ def glb_bytes(mesh: Mesh | TexturedMesh, *, up: np.ndarray | None = None) -> byt
     return head + text + struct.pack("<II", offset, _BIN) + body
 
 
-def glb_turn(data: bytes) -> list[float]:
-    """Return the rotation x, y, z, w that a .glb file written here gives its mesh.
-
-    Raises
-    ------
-    DataError
-        It is no such file.
-    """
-    with _own_glb():
-        node = _glb_parts(data)[0]["nodes"][0]
-        return [float(q) for q in node.get("rotation", (0.0, 0.0, 0.0, 1.0))]
-
-
 def read_textured(path: str | Path) -> TexturedMesh:
     """Read a .glb file that ``write_glb`` wrote.
 
@@ -336,7 +323,7 @@ def _glb_parts(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 @contextlib.contextmanager
-def _own_glb(name: str = "") -> Iterator[None]:
+def _own_glb(name: str) -> Iterator[None]:
     """Turn errors of a .glb file that was not written here into one line."""
     try:
         yield

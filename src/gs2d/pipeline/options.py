@@ -450,15 +450,3 @@ class OrthophotoOptions:
 
     resolution: Annotated[float | None, arg(metavar="METRES")] = None
     """Side of a cell (default: that of the photographs' pixels on the surface, rounded up to 1, 2, 2.5 or 5)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViewOptions:
-    """How the page of the viewer is served."""
-
-    port: int | None = None
-    """Port of the page (default: the first free one from 8080 on)."""
-    host: str = "127.0.0.1"
-    """Address to listen on; 0.0.0.0 admits other machines too. The printed address holds the token that is needed."""
-    threads: int | None = None
-    """CPU threads."""

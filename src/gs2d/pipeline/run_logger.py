@@ -151,19 +151,6 @@ class RunLogger:
         finally:
             self._signals.forget()
 
-    @contextmanager
-    def timer_paused(self) -> Iterator[None]:
-        """Pause the clock of training for what may take long: signals act at once, after a checkpoint."""
-        self._stop_clock()
-        try:
-            self._signals.release()
-            yield
-        except KeyboardInterrupt:
-            self._keep_what_is_trained()
-            raise
-        self._signals.hold()
-        self._start_clock()
-
     def on_training_event(self, event: train_events.Event) -> None:
         """Log an event, and do what is due."""
         if isinstance(event, train_events.Progress):

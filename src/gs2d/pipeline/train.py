@@ -29,10 +29,9 @@ from gs2d.io.run_dir import (
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Event, Expected, Notice, OnEvent, Phase, Plan, ignore
 from gs2d.pipeline.job import Job, check_train_options, prepare_job, recipe_of
-from gs2d.pipeline.live import open_live
+from gs2d.pipeline.live import Live
 from gs2d.pipeline.memory import release, use_memory
 from gs2d.pipeline.mesh import MeshFrames, extract_mesh, keep_facts
-from gs2d.pipeline.observer import TrainingObserver
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.page import page_run
 from gs2d.pipeline.photographs import PREPARED
@@ -51,7 +50,7 @@ from gs2d.pipeline.verdict.file import write_verdict
 from gs2d.pipeline.verdict.measures import Collector
 from gs2d.training import events
 from gs2d.training.parallel import ONE_PROCESS, ManyProcesses, OneProcess
-from gs2d.viewer.server import free_port, required_viser
+from gs2d.viewer.server import free_port
 
 MANY = 500  # photographs, from which a training is planned before it begins
 UNPACKED = "unpacked"  # in the run folder: what came as a ZIP file
@@ -105,8 +104,8 @@ def _train(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> Ru
     if options.overwrite:
         check_sources(job, options)
     run = claim_run(options.out, **claim)  # type: ignore[arg-type]
-    with run.locked(), discard_on_failure(run), watched(run, job, options, on_event) as watch:
-        on_event = watch.on_event
+    with run.locked(), discard_on_failure(run), watched(job, options, on_event) as live:
+        on_event = on_event if live is None else live.on_event
         if options.cache is not None:  # now, not when the first stage has been trained
             run.made += make_folder(options.cache)
         if is_run(run.path):
@@ -134,13 +133,13 @@ def _train(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> Ru
                 run.events.append({"kind": "notice", "text": text})
         hold()
         if options.part is not None:
-            train_stages(run, job, options, start, watch)
+            train_stages(run, job, options, start, on_event, live=live)
             release(job.scene)
             return run
         collected = Collector(job.scene)
         with MeshFrames(job) as frames:
             visitors = [frames.visit, collected.visit]
-            splats, now = train_stages(run, job, options, start, watch, visitors, together)
+            splats, now = train_stages(run, job, options, start, on_event, visitors, together, live)
             release(job.scene)  # before the volume of the mesh
             job = replace(job, scene=now)
             mesh = MeshOptions(subject_box=options.subject_box, whole_scene=options.whole_scene)
@@ -189,18 +188,16 @@ def _train_archive(options: TrainOptions, on_event: OnEvent, together: OneProces
 
 
 @contextmanager
-def watched(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEvent) -> Iterator[TrainingObserver]:
-    """Serve the page of a training while it lasts, if one is asked for."""
+def watched(job: Job, options: TrainOptions, on_event: OnEvent) -> Iterator[Live | None]:
+    """Serve the page of a training while it lasts, with ``--viewer``."""
     if not options.viewer:
-        yield TrainingObserver(on_event)
+        yield None
         return
-    live = open_live(job, options, on_event)
+    live = Live(job, options, on_event)
     try:
         yield live
-        live.close(f"**finished**: `gs2d view {run.path}`")
-    except BaseException:
-        live.close("**stopped**")
-        raise
+    finally:
+        live.close()
 
 
 def check_viewer(options: TrainOptions) -> None:
@@ -209,8 +206,7 @@ def check_viewer(options: TrainOptions) -> None:
         if options.viewer_port is not None:
             raise RecipeError("--viewer-port belongs to --viewer, which was not given; give both")
         return
-    required_viser()
-    free_port("127.0.0.1", options.viewer_port, option="--viewer-port")
+    free_port(options.viewer_port, option="--viewer-port")
 
 
 @contextmanager
@@ -229,9 +225,10 @@ def train_stages(
     job: Job,
     options: TrainOptions,
     start: ResumePoint,
-    watch: TrainingObserver,
+    on_event: OnEvent,
     visitors: Sequence[Visitor] = (),
     together: OneProcess = ONE_PROCESS,
+    live: Live | None = None,
 ) -> tuple[Splats, Scene]:
     """Train from where ``start`` is to the end of the last stage; return the splats and the cameras as they are now.
 
@@ -240,20 +237,14 @@ def train_stages(
     from gs2d.training.per_image import scene_now
     from gs2d.training.trainer import Trainer
 
-    recorder = RunLogger(run, job, options, start, watch.on_event, visitors)
+    recorder = RunLogger(run, job, options, start, on_event, visitors)
 
     def listen(event: events.Event) -> None:
         recorder.on_training_event(event)
-        watch.scored(recorder.psnr)
-        watch.on_training_event(event, trainer.state)
+        if live is not None:
+            live.on_training_event(event, trainer.state, recorder.psnr)
         if isinstance(event, events.Progress):  # on a GPU the only time when nothing is under way
-            between()
-
-    def between() -> None:
-        recorder.stop_if_asked()
-        if watch.waiting:
-            with recorder.timer_paused():
-                watch.turn()
+            recorder.stop_if_asked()
 
     trainer = Trainer(
         job.scene,
@@ -261,7 +252,7 @@ def train_stages(
         job.protocol,
         backend=job.backend,
         on_event=listen,
-        between=between,
+        between=recorder.stop_if_asked,
         state=start.state,
         init=None if start.state is not None else job.init if job.part is None else job.part.own,
         frozen=None if job.part is None else job.part.frozen,

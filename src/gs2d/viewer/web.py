@@ -2,7 +2,8 @@
 
 It needs no server, no network and no library: it can be mailed, or put on any web space. The files that it is made of
 lie in ``web_assets``; its shaders follow the rasterizer's contract (``render/api.py``), with the browser's float32 and
-with attributes that are stored as below.
+with attributes that are stored as below. ``viewer/server.py`` serves the same page without the splats
+(:func:`served_page`), which then fetches them (:func:`splats_answer`) and whatever else the server offers.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import os
 import re
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ from gs2d.core.text import printable
 from gs2d.data.subject import OBJECT, SCENE, Subject
 from gs2d.errors import DataError
 from gs2d.render.types import MAX_SIZE, NEAR_PLANE_POLICIES, RasterSettings
+from gs2d.viewer.server import Answer
 
 # -- where the page opens ----------------------------------------------------------------------------------------------
 ROUND = math.radians(100.0)  # a gap between neighbouring directions from which a capture is one-sided
@@ -135,6 +137,11 @@ PARTS = {  # script elements: id -> file, type
     "sorter": ("sorter.js", "text/plain"),
 }
 SCRIPTS = ("camera.js", "viewer.js", "measure.js", "panel.js")  # one script, in this order
+SERVED_PARTS = {  # what a served page has besides
+    "mesh-vert": ("mesh.vert", "x-shader/x-vertex"),
+    "mesh-frag": ("mesh.frag", "x-shader/x-fragment"),
+}
+SERVED_SCRIPTS = (*SCRIPTS, "served.js")
 HINT = (
     '<span class="mouse">Drag to turn, wheel to come closer, ? for more.</span>'
     '<span class="finger">One finger turns, two fingers come closer and shift.</span>'
@@ -153,6 +160,60 @@ class Seen:
 
     name: str
     camera: Camera
+
+
+@dataclass(frozen=True, eq=False)
+class PageScene:
+    """What a page shows, except the splats.
+
+    Attributes
+    ----------
+    title : str
+    views : sequence of Seen
+        At least one.
+    settings : RasterSettings
+        As they were trained with.
+    focus : ndarray [3] world units
+        What the views look at; places are stored relative to it.
+    unit : float, world units
+        About how far away it is seen from.
+    up : ndarray [3]
+        Unit.
+    subject : Subject or None
+        What is shown first and turned about. None: something around the focus.
+    world : Georeference or None
+        Where the splats are in the world: the page measures in metres. None: in units of the capture.
+    """
+
+    title: str
+    views: Sequence[Seen]
+    settings: RasterSettings
+    focus: np.ndarray
+    unit: float
+    up: np.ndarray
+    subject: Subject | None = None
+    world: Georeference | None = None
+
+
+@dataclass(frozen=True)
+class Served:
+    """What a served page can fetch, and the controls that it has for it.
+
+    Attributes
+    ----------
+    stages : sequence of str
+        Names of splats to choose from.
+    has_mesh : bool
+    has_images : bool
+        Whether the server has the image of each view.
+    is_live : bool
+        Whether the splats change.
+    """
+
+    stages: Sequence[str] = ()
+    has_mesh: bool = False
+    has_images: bool = False
+    is_live: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,14 +242,23 @@ class Packed:
     words: np.ndarray
     harmonics: np.ndarray
 
+    @property
+    def data(self) -> list[memoryview]:
+        """Words, then harmonics, as bytes."""
+        return [array.reshape(-1).view(np.uint8).data for array in (self.words, self.harmonics)]
+
     def zipped(self) -> Iterator[bytes]:
         """Words, then harmonics, as a gzip file, piece by piece."""
         zipper = zlib.compressobj(ZIP_LEVEL, zlib.DEFLATED, 16 + zlib.MAX_WBITS)
-        for array in (self.words, self.harmonics):
-            flat = array.reshape(-1).view(np.uint8)
+        for flat in self.data:
             for start in range(0, len(flat), PIECE):
-                yield zipper.compress(flat[start : start + PIECE].data)
+                yield zipper.compress(flat[start : start + PIECE])
         yield zipper.flush()
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What a page must know to read the data."""
+        return {"splats": self.count, "degree": self.degree, "stored": self.stored, "scales": self.scales}
 
     @property
     def stored(self) -> int:
@@ -269,43 +339,16 @@ def _fill_harmonics(stored: np.ndarray, shN: np.ndarray, scales: np.ndarray, deg
     stored[:, : 3 * places] = np.clip(np.round(shN[:, :places] / steps * 127), -127, 127).reshape(len(shN), -1)
 
 
-def write_page(
-    path: str | os.PathLike[str],
-    splats: Splats,
-    views: Sequence[Seen],
-    settings: RasterSettings,
-    *,
-    title: str,
-    focus: np.ndarray,
-    unit: float,
-    up: np.ndarray,
-    sh_degree: int = 3,
-    subject: Subject | None = None,
-    world: Georeference | None = None,
-) -> dict[str, Any]:
+def write_page(path: str | os.PathLike[str], splats: Splats, scene: PageScene, *, sh_degree: int = 3) -> dict[str, Any]:
     """Write the page.
 
     Parameters
     ----------
     path : path
     splats : Splats
-    views : sequence of Seen
-        At least one.
-    settings : RasterSettings
-        As they were trained with.
-    title : str
-    focus : ndarray [3] world units
-        What the views look at; places are stored relative to it.
-    unit : float, world units
-        About how far away it is seen from.
-    up : ndarray [3]
-        Unit.
+    scene : PageScene
     sh_degree : int
         Of the stored coefficients at most: 45, 24, 9 or 0 bytes a splat.
-    subject : Subject, optional
-        What is shown first and turned about. Default: something around the focus.
-    world : Georeference, optional
-        Where the splats are in the world: the page measures in metres. Default: in units of the capture.
 
     Returns
     -------
@@ -316,17 +359,44 @@ def write_page(
     ------
     DataError, DiskError
     """
-    packed = pack(splats, focus, min(sh_degree, settings.sh_degree), settings.alpha_min)
+    settings = scene.settings
+    packed = pack(splats, scene.focus, min(sh_degree, settings.sh_degree), settings.alpha_min)
+    before, after = _around_splats(scene, packed.facts, None)
+    written = 0
+    with atomic_write(Path(path)) as file:
+        for piece in _pieces(before, packed, after):
+            written += file.write(piece)
+    return {"splats": packed.count, "sh_degree": packed.degree, "bytes": written}
+
+
+def served_page(scene: PageScene, served: Served) -> bytes:
+    """Return the page that a server offers: it fetches the splats and what else ``served`` names."""
+    nothing = {"splats": 0, "degree": 0, "stored": 0, "scales": [0.0] * 15}
+    return b"".join(_around_splats(scene, nothing, served))
+
+
+def splats_answer(packed: Packed) -> Answer:
+    """Return splats as a served page fetches them: the data uncompressed, what describes it as a header."""
+    return Answer("application/octet-stream", packed.data, {"X-Splats": json.dumps(packed.facts, allow_nan=False)})
+
+
+def _around_splats(scene: PageScene, splats: Mapping[str, Any], served: Served | None) -> tuple[bytes, bytes]:
+    """Return the page before and after the splats."""
+    subject = scene.subject
     if subject is None:
-        subject = guessed_subject([view.camera for view in views], focus, unit, up)
-    shade = "#" + "".join(f"{round(255 * part):02x}" for part in settings.background)
-    is_dark = sum(settings.background) < 1.5
-    facts = {**_facts(packed, views, settings, unit, up, subject), "world": None if world is None else _world(world)}
-    told = json.dumps(facts, allow_nan=False)
+        subject = guessed_subject([view.camera for view in scene.views], scene.focus, scene.unit, scene.up)
+    background = scene.settings.background
+    is_dark = sum(background) < 1.5
+    facts = json.dumps({**splats, **_facts(scene, subject), "served": served and asdict(served)}, allow_nan=False)
+    parts, scripts = PARTS, SCRIPTS
+    if served is not None:
+        parts, scripts = {**PARTS, **SERVED_PARTS}, SERVED_SCRIPTS
     values = {
-        "title": html.escape(printable(title)),
-        "count": f"{packed.count:,}",
-        "background": shade,
+        "title": html.escape(printable(scene.title)),
+        "count": f"{splats['splats']:,}",
+        "network": "" if served is None else "; connect-src 'self'; img-src 'self' data:",
+        "icon": "" if served is None else '<link rel="icon" href="data:,">\n',  # else browsers ask for one
+        "background": "#" + "".join(f"{round(255 * part):02x}" for part in background),
         "ink": "#eee" if is_dark else "#222",
         "onink": "#222" if is_dark else "#fff",
         "paper": "rgba(0,0,0,.55)" if is_dark else "rgba(255,255,255,.75)",
@@ -335,19 +405,15 @@ def write_page(
         "boxrows": "\n".join(_box_row(i) for i in range(3)),
         "boxname": "the subject's box" if subject.kind == OBJECT else "the first box",
         "aboutwhat": "the subject" if subject.kind == OBJECT else "what is in the middle of the picture",
-        "facts": told.replace("<", "\\u003c"),
-        "parts": "\n".join(_part(name, *part) for name, part in PARTS.items()),
-        "viewer": "\n\n".join(map(_text, SCRIPTS)),
+        "facts": facts.replace("<", "\\u003c"),
+        "parts": "\n".join(_part(name, *part) for name, part in parts.items()),
+        "viewer": "\n\n".join(map(_text, scripts)),
     }
     before, after = (
         re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], part).encode()
         for part in _text("page.html").split("{{splats}}")
     )
-    written = 0
-    with atomic_write(Path(path)) as file:
-        for piece in _pieces(before, packed, after):
-            written += file.write(piece)
-    return {"splats": packed.count, "sh_degree": packed.degree, "bytes": written}
+    return before, after
 
 
 def _pieces(before: bytes, packed: Packed, after: bytes) -> Iterator[bytes]:
@@ -381,22 +447,11 @@ def _box_row(axis: int) -> str:
     return f'<div class="row"><b class="{name}" aria-hidden="true">{name}</b>{inputs}</div>'
 
 
-def _facts(
-    packed: Packed,
-    views: Sequence[Seen],
-    settings: RasterSettings,
-    unit: float,
-    up: np.ndarray,
-    subject: Subject,
-) -> Mapping[str, Any]:
-    """Return what the page is told beside the splats; places are relative to the packed origin."""
-    cameras = [view.camera for view in views]
-    arc = photographed_arc(cameras, subject, up)
+def _facts(scene: PageScene, subject: Subject) -> dict[str, Any]:
+    """Return what the page is told about the scene; places are relative to its focus."""
+    cameras, settings, origin = [view.camera for view in scene.views], scene.settings, scene.focus
+    arc = photographed_arc(cameras, subject, scene.up)
     return {
-        "splats": packed.count,
-        "degree": packed.degree,
-        "stored": packed.stored,
-        "scales": packed.scales,
         "near": settings.near,
         "alphaMin": settings.alpha_min,
         "alphaMax": settings.alpha_max,
@@ -404,19 +459,20 @@ def _facts(
         "near_plane_policy": NEAR_PLANE_POLICIES.index(settings.near_plane_policy),
         "crossingCutoff": settings.error_cutoff,
         "background": list(settings.background),
-        "origin": packed.origin.tolist(),
+        "origin": origin.tolist(),
         "subject": {
             "object": subject.kind == OBJECT,
-            "center": (subject.center - packed.origin).tolist(),
-            "low": (subject.low - packed.origin).tolist(),
-            "high": (subject.high - packed.origin).tolist(),
+            "center": (subject.center - origin).tolist(),
+            "low": (subject.low - origin).tolist(),
+            "high": (subject.high - origin).tolist(),
             "radius": subject.radius,
-            "home": home_camera(cameras, subject, arc, up),
+            "home": home_camera(cameras, subject, arc, scene.up),
             "arc": {"middle": arc.middle.tolist(), "half": arc.half, "low": arc.low, "high": arc.high},
         },
-        "unit": unit,
-        "up": up.tolist(),
-        "cameras": [_camera(view, packed.origin) for view in views],
+        "unit": scene.unit,
+        "up": scene.up.tolist(),
+        "cameras": [_camera(view, origin) for view in scene.views],
+        "world": None if scene.world is None else _world(scene.world),
     }
 
 

@@ -176,4 +176,3 @@ function listen() {
   canvas.addEventListener("webglcontextlost", () => failed(Error("the graphics card gave up; reload the page")));
 }
 
-begin().catch(failed);

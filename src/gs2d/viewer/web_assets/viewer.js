@@ -51,6 +51,10 @@ const fit = () => Math.min(canvas.clientWidth / here.w, canvas.clientHeight / he
 function touched() {
   moving = performance.now();
   document.body.dataset.drawn = "moving";
+  redraw();
+}
+
+function redraw() {
   if (!dirty) requestAnimationFrame(frame);
   dirty = true;
 }
@@ -61,8 +65,7 @@ worker.onmessage = ({ data }) => {
   gl.bindBuffer(gl.ARRAY_BUFFER, orderBuffer);
   gl.bufferData(gl.ARRAY_BUFFER, data.order, gl.DYNAMIC_DRAW);
   drawn = data.number;
-  if (!dirty) requestAnimationFrame(frame);
-  dirty = true;
+  redraw();
 };
 
 function sort() {
@@ -99,11 +102,12 @@ function frame() {
   render(width, height);
   overlay();
   drawRuler();
+  if (facts.served) drawServed();
   if (!still) {
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits: how long does a picture take here?
     const took = performance.now() - began;
     coarse = took > 60 ? Math.max(0.25, coarse * 0.8) : took < 25 ? Math.min(1, coarse * 1.1) : coarse;
-    setTimeout(() => { if (!dirty) requestAnimationFrame(frame); dirty = true; }, 300); // sharp again, once at rest
+    setTimeout(redraw, 300); // sharp again, once at rest
   }
   told();
   if (spinning) spin();
@@ -122,28 +126,34 @@ function depths() {
   return found.length > 9 && at(0.97) > at(0.03) ? [at(0.03), at(0.97)] : [facts.near, facts.near + 2 * facts.unit];
 }
 
-function render(width, height) {
-  const s = fit() * (width / canvas.clientWidth), { at } = splatProgram;
+function aim({ made, at }, width, height) {
+  // Uses a program, with the camera and the clip box for a picture of that size.
+  const s = fit() * (width / canvas.clientWidth), { right, down, ahead, eye } = here;
   const cx = width / 2 + s * (here.cx - here.w / 2), cy = height / 2 + s * (here.cy - here.h / 2);
+  gl.useProgram(made);
+  gl.uniformMatrix3fv(at.turn, true, [...right, ...down, ...ahead]);
+  gl.uniform3f(at.shift, -dot(right, eye), -dot(down, eye), -dot(ahead, eye));
+  gl.uniform4f(at.lens, s * here.fx, s * here.fy, cx, cy);
+  gl.uniform2f(at.size, width, height);
+  gl.uniform3f(at.boxLow, ...(box.on ? box.low : [-1e30, -1e30, -1e30]));
+  gl.uniform3f(at.boxHigh, ...(box.on ? box.high : [1e30, 1e30, 1e30]));
+}
+
+function render(width, height) {
+  if (kind === 3) return drawMesh();
+  const { at } = splatProgram;
   gl.bindFramebuffer(gl.FRAMEBUFFER, frameBuffer);
   gl.viewport(0, 0, width, height);
   gl.clearColor(0, 0, 0, 0);
   gl.clear(gl.COLOR_BUFFER_BIT);
-  gl.useProgram(splatProgram.made);
   gl.enable(gl.BLEND);
   gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-  const { right, down, ahead, eye } = here;
-  gl.uniformMatrix3fv(at.turn, true, [...right, ...down, ...ahead]);
-  gl.uniform3f(at.shift, -dot(right, eye), -dot(down, eye), -dot(ahead, eye));
-  gl.uniform3f(at.eye, ...eye);
-  gl.uniform4f(at.lens, s * here.fx, s * here.fy, cx, cy);
-  gl.uniform2f(at.size, width, height);
+  aim(splatProgram, width, height);
+  gl.uniform3f(at.eye, ...here.eye);
   gl.uniform1f(at.height, height);
   gl.uniform1i(at.kind, kind);
   if (kind === 2) range = fixed || depths();
   gl.uniform2f(at.range, ...range);
-  gl.uniform3f(at.boxLow, ...(box.on ? box.low : [-1e30, -1e30, -1e30]));
-  gl.uniform3f(at.boxHigh, ...(box.on ? box.high : [1e30, 1e30, 1e30]));
   [splatTable, shTable].forEach((texture, i) => {
     gl.activeTexture(gl.TEXTURE0 + i);
     gl.bindTexture(gl.TEXTURE_2D, texture);
@@ -160,10 +170,11 @@ function render(width, height) {
   gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
 }
 
-async function begin() {
-  if (!gl) throw Error("this browser has no WebGL 2");
-  const buffer = await unpacked(), n = facts.splats;
-  [splatProgram, finalProgram] = [program(gl, "splat-vert", "splat-frag"), program(gl, "final-vert", "final-frag")];
+function load(buffer) {
+  // Takes the splats that `facts` describes.
+  const n = facts.splats, { at } = splatProgram;
+  gl.deleteTexture(splatTable || null);
+  gl.deleteTexture(shTable || null);
   splatTable = table(gl, buffer, 0, 2 * n);
   shTable = table(gl, buffer, 32 * n, facts.stored * n);
   keepRecords(buffer);
@@ -172,18 +183,28 @@ async function begin() {
   const every = Math.max(1, Math.floor(n / 4000));
   sample = Float32Array.from({ length: 3 * Math.floor(n / every) }, (_, i) => means[3 * every * Math.floor(i / 3) + (i % 3)]);
   worker.postMessage({ means }, [means.buffer]);
+  gl.useProgram(splatProgram.made);
+  for (const name of ["degree", "stored"]) gl.uniform1i(at[name], facts[name]);
+  gl.uniform1fv(at.scales, facts.scales);
+  $("count").textContent = n.toLocaleString("en");
+  last = ""; // sorted anew
+}
+
+async function begin() {
+  if (!gl) throw Error("this browser has no WebGL 2");
+  const buffer = facts.served ? new ArrayBuffer(0) : await unpacked();
+  [splatProgram, finalProgram] = [program(gl, "splat-vert", "splat-frag"), program(gl, "final-vert", "final-frag")];
+  load(buffer);
   [orderBuffer, frameBuffer, picture] = [gl.createBuffer(), gl.createFramebuffer(), gl.createTexture()];
   gl.bindBuffer(gl.ARRAY_BUFFER, orderBuffer);
   gl.enableVertexAttribArray(0);
   gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
   gl.vertexAttribDivisor(0, 1);
-  gl.useProgram(splatProgram.made);
   const { at } = splatProgram;
   gl.uniform1i(at.splats, 0);
   gl.uniform1i(at.harmonics, 1);
   for (const name of ["near", "alphaMin", "alphaMax", "lowpass", "crossingCutoff"]) gl.uniform1f(at[name], facts[name]);
-  for (const name of ["degree", "stored", "near_plane_policy"]) gl.uniform1i(at[name], facts[name]);
-  gl.uniform1fv(at.scales, facts.scales);
+  gl.uniform1i(at.near_plane_policy, facts.near_plane_policy);
   gl.useProgram(finalProgram.made);
   gl.uniform3f(finalProgram.at.background, ...facts.background);
   listen();
@@ -192,6 +213,7 @@ async function begin() {
   if (asked.has("view")) goTo(Number(asked.get("view")) || 0);
   else home();
   show(Math.max(0, kinds.indexOf(asked.get("kind"))));
+  if (facts.served) await connect();
   $("wait").remove();
 }
 
