@@ -179,6 +179,16 @@ def test_a_viewer_that_fails_is_told_once_and_training_goes_on(live: Live, heard
     assert told[1:] == ["the viewer failed, training goes on: OSError: no memory"]
 
 
+def test_a_copy_without_memory_stops_no_training(live: Live, splats: Splats, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any, **__: Any) -> torch.Tensor:
+        raise RuntimeError("not enough memory")
+
+    version_of(live)
+    monkeypatch.setattr(torch.Tensor, "to", fail)
+    live.on_training_event(progress(), state_of(splats), None)
+    assert str(live._server.failure) == "not enough memory"
+
+
 def test_the_page_says_what_is_done(live: Live, splats: Splats) -> None:
     live.on_event(Phase("training 2dgs-r", 6000))
     live.on_training_event(progress(), state_of(splats), 24.318)

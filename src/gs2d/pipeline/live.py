@@ -84,7 +84,11 @@ class Live:
             return
         if now - self._asked > WATCHED or self._server.failure is not None:
             return
-        copy = Splats(**{name: tensor.detach().to("cpu", copy=True) for name, tensor in state.splats.items()})
+        try:
+            copy = Splats(**{name: tensor.detach().to("cpu", copy=True) for name, tensor in state.splats.items()})
+        except (MemoryError, RuntimeError) as error:  # RuntimeError: torch has no memory for it
+            self._server.failure = error
+            return
         with self._lock:  # nobody packs now: _copy_at is infinite meanwhile
             self._copy, self._packed = copy, None
             self._version += 1
