@@ -68,11 +68,7 @@ def test_an_archive_that_cannot_train_leaves_nothing(tmp_path: Path, capsys: pyt
         file.writestr("readme.txt", b"hello")
     assert train(tmp_path / "a.zip", tmp_path / "deep" / "run") == 2
     assert "must hold transforms_train.json" in one_line(capsys.readouterr().err)
-    with zipfile.ZipFile(tmp_path / "b.zip", "w") as file:
-        file.writestr("../evil.txt", b"hello")
-    assert train(tmp_path / "b.zip", tmp_path / "deep" / "run") == 2
-    assert "leads elsewhere" in one_line(capsys.readouterr().err)
-    assert sorted(p.name for p in tmp_path.rglob("*")) == ["a.zip", "b.zip"]
+    assert sorted(p.name for p in tmp_path.rglob("*")) == ["a.zip"]
 
 
 def test_info_looks_into_an_archive_and_leaves_nothing(

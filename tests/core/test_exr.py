@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import struct
 from pathlib import Path
 
@@ -102,14 +101,17 @@ def test_a_header_that_announces_more_than_its_file_can_hold_is_refused_before_d
 
 def test_broken_files_are_one_line(tmp_path: Path) -> None:
     whole = write(tmp_path / "a.exr", {"Y": np.random.default_rng(0).random((40, 40), dtype=np.float32)}).read_bytes()
-    several = whole[:4] + struct.pack("<I", 2 | 0x1000) + whole[8:]
+    cropped = whole.replace(b"displayWindow\0box2i\0\x10\0\0\0\0", b"displayWindow\0box2i\0\x10\0\0\0\1")
+    OpenEXR.File([OpenEXR.Part({}, {"Z": np.zeros((4, 4), np.float32)}, name) for name in "ab"]).write(
+        str(tmp_path / "b.exr")
+    )
     cases = (
-        (b"", "must be an OpenEXR file, got: other first bytes"),
-        (whole[:30], "must be an OpenEXR file"),
+        (b"", "does not decode"),
+        (whole[:30], "does not decode"),
         (whole[: len(whole) // 2], "does not decode"),
-        (whole.replace(b"channels", b"channelz"), "no channels in its header"),
-        (several, "must be one part of plain pixels"),
-        (whole.replace(b"displayWindow\0box2i\0\x10\0\0\0\0", b"displayWindow\0box2i\0\x10\0\0\0\1"), "uncropped"),
+        (whole.replace(b"channels", b"channelz"), "does not decode"),
+        ((tmp_path / "b.exr").read_bytes(), "one part"),
+        (cropped, "uncropped"),
     )
     for data, words in cases:
         (tmp_path / "b.exr").write_bytes(data)
@@ -138,7 +140,7 @@ def test_damage_anywhere_gives_a_picture_or_a_plain_error(tmp_path: Path) -> Non
 def test_pixels_that_do_not_decode_are_refused_and_nothing_is_printed(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """The library gives other pixels then, and says on the terminal alone, stdout too, that they are."""
+    """OpenEXR writes lines to stdout and stderr of its own."""
     path = tmp_path / "a.exr"
     write(path, {"Z": np.arange(32 * 32, dtype=np.float32).reshape(32, 32)})
     data = bytearray(path.read_bytes())
@@ -149,14 +151,6 @@ def test_pixels_that_do_not_decode_are_refused_and_nothing_is_printed(
     assert capfd.readouterr() == ("", "")
 
 
-def test_what_others_say_while_a_file_is_decoded_is_said_afterwards(capfd: pytest.CaptureFixture[str]) -> None:
-    with exr._listening() as said:
-        print("mine\nWarning: Exception raised reading pixel data\nhalf", end="")
-        os.write(2, b"/tmp/a.exr: (EXR_ERR_CORRUPT_CHUNK) Unable to decompress\nyours\n")
-    assert capfd.readouterr() == ("mine\nhalf", "yours\n")
-    assert said == ["Unable to decompress", "Exception raised reading pixel data"]
-
-
 def test_without_the_library_the_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path / "a.exr", colors(0.5))
 
@@ -164,6 +158,6 @@ def test_without_the_library_the_line_says_what_to_install(tmp_path: Path, monke
         raise ImportError(name)
 
     monkeypatch.setattr(exr.importlib, "import_module", missing)
-    assert image_size(path) == (1, 1)  # its header needs none
-    with pytest.raises(DataError, match=r"needs OpenEXR, which is not installed; pip install 'OpenEXR>=3.3'"):
-        read_image(path)
+    for read in (image_size, read_image):
+        with pytest.raises(DataError, match=r"needs OpenEXR, which is not installed; pip install 'OpenEXR"):
+            read(path)

@@ -184,9 +184,9 @@ def test_an_image_that_would_explode_is_not_decoded(tmp_path: Path) -> None:
     """36 megapixels of black: a hundred kilobytes, and half a gigabyte on the way to an array."""
     bomb = png_of(tmp_path / "bomb.png", 6000, 6000)
     assert bomb.stat().st_size < 200_000
-    with pytest.raises(DataError, match=r"bomb\.png: an image \(6000x6000\) .* would take 144.0 MB"):
+    with pytest.raises(DataError, match=r"bomb\.png: an image \(6000x6000\) .* would take 144 MB"):
         read_image(bomb)
-    with pytest.raises(DataError, match="would take 144.0 MB"):
+    with pytest.raises(DataError, match="would take 144 MB"):
         read_mask(bomb)
     assert image_size(bomb) == (6000, 6000)
 

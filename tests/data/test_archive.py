@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from capture_writers import small_colmap, small_nerfstudio
+from gs2d.core import growth
 from gs2d.data import archive as module
 from gs2d.data import load_scene
 from gs2d.data.archive import is_archive, unpack
@@ -121,20 +122,6 @@ def test_names_in_an_unstated_encoding_are_those_of_the_camera_file(
     assert f"images/{NAMES[encoding]}_00.png" in {view.name for view in scene.views}
 
 
-def test_names_in_an_unstated_encoding_that_fits_nothing_are_one_line(tmp_path: Path) -> None:
-    small_nerfstudio(tmp_path / "capture")
-    rename_photographs(tmp_path / "capture", NAMES["gb18030"])
-    path = tmp_path / "capture" / "transforms.json"
-    path.write_text(path.read_text(encoding="utf-8").replace(NAMES["gb18030"], "f"), encoding="utf-8")
-    write_zip_in("gb18030", tmp_path / "capture", tmp_path / "a.zip")
-    with pytest.raises(DataError, match=r"must have names in UTF-8, got .*does not state.*gb18030.*pack it again"):
-        unpacked(tmp_path / "a.zip", tmp_path / "out")
-    assert list((tmp_path / "out").iterdir()) == []
-    (tmp_path / "capture" / "images" / "f_00.png").write_bytes(b"")  # one that is not in question
-    write_zip_in("gb18030", tmp_path / "capture", tmp_path / "a.zip")
-    assert unpack(tmp_path / "a.zip", tmp_path / "out").is_dir()
-
-
 def test_the_same_contents_are_unpacked_once_under_whatever_name_they_come(tmp_path: Path) -> None:
     small_nerfstudio(tmp_path / "capture")
     first = unpacked(pack(tmp_path / "capture", tmp_path / "a.zip"), tmp_path / "out")
@@ -161,25 +148,25 @@ def test_two_processes_may_unpack_the_same_archive_at_once(tmp_path: Path, monke
 
 
 @pytest.mark.parametrize(
-    "name", ["../evil.txt", "a/../../evil.txt", "/etc/evil.txt", "C:\\evil.txt", "..\\evil.txt", "\\evil.txt", "a/b:c"]
+    "name", ["../evil.txt", "a/../../evil.txt", "/etc/evil.txt", "C:\\evil.txt", "..\\evil.txt", "\\evil.txt"]
 )
-def test_a_name_that_leads_elsewhere_is_refused(tmp_path: Path, name: str) -> None:
-    with zipfile.ZipFile(tmp_path / "a.zip", "w") as file:
-        file.writestr("transforms.json", b"{}")
+def test_a_name_that_leads_elsewhere_stays_inside(tmp_path: Path, name: str) -> None:
+    small_nerfstudio(tmp_path / "capture")
+    path = pack(tmp_path / "capture", tmp_path / "a.zip")
+    with zipfile.ZipFile(path, "a") as file:
         file.writestr(zipfile.ZipInfo(name), b"evil")
-    with pytest.raises(
-        DataError, match=r"a\.zip must hold names below it, got .*which leads elsewhere; do not trust it"
-    ):
-        unpack(tmp_path / "a.zip", tmp_path)
+    root = unpacked(path, tmp_path / "out")
+    assert len(list(root.rglob("*evil.txt"))) == len(list(tmp_path.rglob("*evil.txt"))) == 1
 
 
-def test_a_link_is_refused(tmp_path: Path) -> None:
-    with zipfile.ZipFile(tmp_path / "a.zip", "w") as file:
-        info = zipfile.ZipInfo("images")
+def test_a_link_is_not_followed(tmp_path: Path) -> None:
+    small_nerfstudio(tmp_path / "capture")
+    path = pack(tmp_path / "capture", tmp_path / "a.zip")
+    with zipfile.ZipFile(path, "a") as file:
+        info = zipfile.ZipInfo("secrets")
         info.external_attr = (stat.S_IFLNK | 0o777) << 16
         file.writestr(info, "/etc")
-    with pytest.raises(DataError, match="must hold files, got the link images; pack it without links"):
-        unpack(tmp_path / "a.zip", tmp_path)
+    assert (unpacked(path, tmp_path / "out") / "secrets").read_text() == "/etc"
 
 
 def test_what_grows_beyond_reason_is_refused_before_it_is_unpacked(
@@ -188,8 +175,8 @@ def test_what_grows_beyond_reason_is_refused_before_it_is_unpacked(
     with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr("transforms.json", b"\0" * 10_000_000)
     assert unpacked(tmp_path / "a.zip", tmp_path / "out").name == "a"
-    monkeypatch.setattr(module, "_SMALL", 1_000_000)
-    with pytest.raises(DataError, match=r"got 0\.0 MB that unpack to 0 GB; unpack it yourself if it is to be so"):
+    monkeypatch.setattr(growth, "SMALL", 1_000_000)
+    with pytest.raises(DataError, match="a capture of at most"):
         unpack(tmp_path / "a.zip", tmp_path)
 
 

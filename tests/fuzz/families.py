@@ -441,17 +441,6 @@ def read_places(root: Path) -> None:
 
 # -- official ground truth ---------------------------------------------------------------------------------------------
 def _official(root: Path) -> None:
-    from scipy.io import savemat
-
-    observed = np.ones((5, 6, 7), np.uint8)
-    for packed in (True, False):
-        savemat(
-            root / f"mask{int(packed)}.mat",
-            {"ObsMask": observed, "BB": np.eye(3)[:2], "Res": 2.0},
-            do_compression=packed,
-        )
-    savemat(root / "plane.mat", {"P": np.ones((4, 1))})
-    ply_points(root / "scan.ply")
     (root / "crop.json").write_text(json.dumps({
         "axis_max": 1.0, "axis_min": -1.0, "bounding_polygon": [[0, 0, 0], [1, 0, 0], [1, 1, 0]], "class_name":
         "SelectionPolygonVolume", "orthogonal_axis": "Z", "version_major": 1, "version_minor": 0,
@@ -462,16 +451,13 @@ def _official(root: Path) -> None:
 
 def read_official(root: Path) -> None:
     from gs2d.errors import DataError
-    from gs2d.evaluation.dtu import read_dtu_truth
     from gs2d.evaluation.tanks_and_temples import read_crop, read_trajectory, read_transform
 
     refused: Exception | None = None
-    plane, scan = root / "plane.mat", root / "scan.ply"
-    reads = [partial(read_dtu_truth, 1, {"mask": root / f"mask{i}.mat", "plane": plane, "scan": scan}) for i in (0, 1)]
-    reads += [partial(read_crop, root / "crop.json"), partial(read_transform, root / "trans.txt")]
-    for read in (*reads, partial(read_trajectory, root / "a.log")):
+    reads = {"crop.json": read_crop, "trans.txt": read_transform, "a.log": read_trajectory}
+    for name, read in reads.items():
         try:
-            read()
+            read(root / name)
         except DataError as error:
             refused = error
     if refused is not None:
@@ -581,8 +567,7 @@ _ALL = (
                              _georeferenced),
            {".csv": _TEXT, ".txt": _TEXT, ".json": _JSON, ".ply": m.of_ply, ".obj": _TEXT, ".glb": m.of_glb},
            read_places),
-    Family("official", written(_official), {".mat": m.of_bytes, ".json": _JSON, ".txt": _TEXT, ".log": _TEXT},
-           read_official),
+    Family("official", written(_official), {".json": _JSON, ".txt": _TEXT, ".log": _TEXT}, read_official),
     Family("zip", written(_packed(zipfile.ZIP_DEFLATED), _packed(zipfile.ZIP_STORED)),
            {".zip": m.either(m.of_zip(_JSON), m.of_bytes)}, read_archive),
     Family("checkpoint", written(_checkpoint), {".pt": m.either(m.of_zip(m.of_bytes), m.of_bytes)}, read_checkpoint),

@@ -135,7 +135,7 @@ def outcome(target: Callable[[Path], object], folder: Path, size: int) -> tuple[
     held = max(0, _peak() - LOADED)
     with warnings.catch_warnings(record=True) as said, _terminal_bytes() as words:
         warnings.simplefilter("always")
-        warnings.filterwarnings("ignore", module=r"PIL\.")  # as the command line does
+        warnings.filterwarnings("ignore", module=r"PIL\.|numpy\.lib")  # as the command line does
         signal.setitimer(signal.ITIMER_REAL, SECONDS)
         watch.on = True
         try:

@@ -24,8 +24,8 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from gs2d.cli.app import leave
 
-    # Photographs with a damaged EXIF block decode; what Pillow thinks of it, with lines of its code, helps nobody.
-    warnings.filterwarnings("ignore", module=r"PIL\.")
+    # What Pillow says of a damaged EXIF block, and NumPy of arrays of Python 2, both of which are read, helps nobody.
+    warnings.filterwarnings("ignore", module=r"PIL\.|numpy\.lib")
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # None if it is closed
             stream.reconfigure(errors="backslashreplace")  # a terminal that cannot show a name shows its numbers

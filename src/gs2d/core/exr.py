@@ -1,8 +1,4 @@
-"""OpenEXR files: scene-linear floats, of photographs and depth maps. Needs OpenEXR, of the extra ``exr``.
-
-A header is read here, before anything is decoded: size and channels that it announces are compared with its bytes.
-Layout: the OpenEXR file layout (https://openexr.com/en/latest/OpenEXRFileLayout.html).
-"""
+"""OpenEXR files: scene-linear floats, of photographs and depth maps. Needs OpenEXR, of the extra ``exr``."""
 
 from __future__ import annotations
 
@@ -10,14 +6,9 @@ import contextlib
 import importlib
 import io
 import os
-import re
-import struct
-import sys
-import tempfile
 import threading
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import IO, Any
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -27,97 +18,39 @@ from gs2d.core.light import display_values
 from gs2d.errors import DataError
 
 SUFFIX = ".exr"
-MAGIC = b"\x76\x2f\x31\x01"
-PARTS, DEEP = 0x1000, 0x0800  # bits of the version
-MOST_HEADER = 1 << 20  # bytes; a preview is among them
-_SIZES = (4, 2, 4)  # bytes of whole numbers, halves and floats
 _ONE = threading.Lock()
-_SAID = re.compile(r"\(EXR_ERR_\w+\) (.*)|^Warning: (Exception raised .*)")  # its C library, and its bindings
-_REMEDY = "write it again as one part of scan lines or tiles"
-
-
-@dataclass(frozen=True)
-class Header:
-    """Size of a picture, px, and its channels by name: bytes of a pixel."""
-
-    width: int
-    height: int
-    channels: Mapping[str, int]
 
 
 def is_exr(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is called as one of OpenEXR."""
+    """Return whether a file has the extension of OpenEXR."""
     return os.fspath(path).lower().endswith(SUFFIX)
 
 
-def read_header(path: str | os.PathLike[str]) -> Header:
-    """Return what a file announces.
+def read_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+    """Return (width, height), px, from the header of a file.
 
     Raises
     ------
     DataError
-        Missing, no OpenEXR file of one part of pixels, or one that announces more than its bytes can hold.
+        OpenEXR is not installed, or the file is missing, damaged, not one part of plain pixels, or announces more
+        pixels than its bytes can hold.
     """
     name = os.fspath(path)
-    try:
-        with open(path, "rb") as file:
-            data, packed = file.read(MOST_HEADER), os.fstat(file.fileno()).st_size
-    except FileNotFoundError as error:
-        raise DataError(f"image {name} does not exist") from error
-    except OSError as error:
-        raise DataError(f"cannot read {name}: {error.strerror or error}") from error
-    try:
-        header = _parsed(data, name)
-    except (struct.error, ValueError, IndexError, UnicodeDecodeError) as error:
-        raise DataError(f"{name} must be an OpenEXR file, got: {error}; copy it again, or {_REMEDY}") from error
-    pixels = header.width * header.height
-    # Decoded floats of all channels, and the picture that is made of them.
-    announced = f"an image ({header.width}x{header.height}, {len(header.channels)} channels)"
-    check_growth(path, packed, pixels * 4 * (len(header.channels) + 4), announced)
-    return header
-
-
-def _parsed(data: bytes, name: str) -> Header:
-    """Return the header in the first bytes of a file (ValueError, struct.error: it is none)."""
-    if data[:4] != MAGIC:
-        raise ValueError("other first bytes")
-    flags = struct.unpack_from("<I", data, 4)[0]
-    if flags & (PARTS | DEEP):
-        raise DataError(f"{name} must be one part of plain pixels, got several or deep ones; {_REMEDY}")
-    at, found = 8, dict[str, bytes]()
-    while data[at] != 0:
-        key, at = _word(data, at)
-        _, at = _word(data, at)
-        size = struct.unpack_from("<i", data, at)[0]
-        if not 0 <= size <= len(data) - at - 4:
-            raise ValueError(f"an attribute {key!r} of {size} bytes")
-        found[key], at = data[at + 4 : at + 4 + size], at + 4 + size
-    missing = [key for key in ("dataWindow", "displayWindow", "channels") if key not in found]
-    if missing:
-        raise ValueError(f"no {missing[0]} in its header")
-    if found["dataWindow"] != found["displayWindow"]:
+    file = _open(name, header_only=True)
+    header = file.header()
+    if len(file.parts) != 1 or "deep" in str(header.get("type")):
+        raise DataError(
+            f"{name} must be one part of plain pixels, got several or deep ones; write it again as one part of scan "
+            "lines or tiles"
+        )
+    (left, top), (right, bottom) = header["dataWindow"]
+    if not np.array_equal(header["dataWindow"], header["displayWindow"]):
         raise DataError(f"{name} must show its whole display window, got another data window; write it again uncropped")
-    left, top, right, bottom = struct.unpack("<4i", found["dataWindow"])
-    if right < left or bottom < top:
-        raise ValueError(f"a dataWindow from {left}, {top} to {right}, {bottom}")
-    return Header(right - left + 1, bottom - top + 1, _channels(found["channels"]))
-
-
-def _channels(data: bytes) -> dict[str, int]:
-    """Return the channels of a list: bytes of a pixel by name."""
-    at, found = 0, dict[str, int]()
-    while data[at] != 0:
-        name, at = _word(data, at)
-        kind, _, across, down = struct.unpack_from("<iIii", data, at)
-        if not 0 <= kind < len(_SIZES) or (across, down) != (1, 1):
-            raise ValueError(f"a channel {name!r} of type {kind}, sampled every {across}x{down} pixels")
-        found[name], at = _SIZES[kind], at + 16
-    return found
-
-
-def _word(data: bytes, at: int) -> tuple[str, int]:
-    end = data.index(b"\0", at)
-    return data[at:end].decode("utf-8"), end + 1
+    width, height, channels = int(right) - int(left) + 1, int(bottom) - int(top) + 1, len(header["channels"])
+    # Decoded floats of all channels, and the image that is made of them.
+    announced = f"an image ({width}x{height}, {channels} channels)"
+    check_growth(path, os.path.getsize(path), width * height * 4 * (channels + 4), announced)
+    return width, height
 
 
 def read_channels(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
@@ -126,83 +59,46 @@ def read_channels(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     Raises
     ------
     DataError
-        As :func:`read_header`, OpenEXR is not installed, or the pixels do not decode.
+        As :func:`read_size`, or the pixels do not decode.
     """
-    header, name = read_header(path), os.fspath(path)
-    library = _required(name)
-    try:
-        with _listening() as said:
-            decoded: Mapping[str, Any] = library.File(name, separate_channels=True).channels()
-        found = {key: np.asarray(channel.pixels, dtype=np.float32) for key, channel in decoded.items()}
-    except Exception as error:  # whatever its bindings make of a damaged file
-        raise DataError(f"image {name} does not decode: {_first_line(error)}; replace or remove the file") from error
-    if said:  # the pixels that it gives then are not those of the file
-        raise DataError(f"image {name} does not decode: {said[0]}; replace or remove the file")
-    if {key: pixels.shape for key, pixels in found.items()} != dict.fromkeys(
-        header.channels, (header.height, header.width)
-    ):
-        raise DataError(f"image {name} must hold the channels of its header, got others; replace or remove the file")
+    name, (width, height) = os.fspath(path), read_size(path)
+    file = _open(name, header_only=False)
+    found = {key: np.asarray(channel.pixels, dtype=np.float32) for key, channel in file.channels().items()}
+    if any(pixels.shape != (height, width) for pixels in found.values()):
+        raise DataError(f"image {name} must have channels of {width}x{height} pixels; write it again without sampling")
     return found
 
 
-def _required(name: str) -> Any:
-    """Return OpenEXR; lazily, because it is optional."""
+def _open(name: str, *, header_only: bool) -> Any:
+    """Return OpenEXR's ``File``, which has at least one part."""
+    if not os.path.exists(name):
+        raise DataError(f"image {name} does not exist")
     try:
-        return importlib.import_module("OpenEXR")
+        library: Any = importlib.import_module("OpenEXR")
     except ImportError as error:
         raise DataError(f"{name} needs OpenEXR, which is not installed; {install('exr')}") from error
+    with _quiet() as printed:
+        try:
+            file = library.File(name, separate_channels=True, header_only=header_only)
+            why = "" if file.parts else printed.getvalue()  # it drops a part whose pixels do not decode, and prints
+        except Exception as error:  # whatever it makes of a damaged file
+            why = str(error) or type(error).__name__
+    if why:
+        raise DataError(f"image {name} does not decode: {why.splitlines()[0]}; replace or remove the file")
+    return file
 
 
 @contextlib.contextmanager
-def _listening() -> Iterator[list[str]]:
-    """Take what the library says on the terminal: that is all it does about pixels that it cannot decode.
-
-    Its C library writes to stderr, its bindings to Python's stdout. Both are those of the whole process: one picture
-    at a time, and what others say meanwhile is said afterwards.
-    """
-    said: list[str] = []
-    with _ONE, _scratch() as file:
-        words = io.StringIO()
-        kept = None
-        with contextlib.suppress(OSError):  # closed
-            kept = os.dup(2)
-            os.dup2(file.fileno(), 2)
+def _quiet() -> Iterator[io.StringIO]:
+    """Yield what is printed; stderr, to which the C library writes lines of its own, is dropped."""
+    with _ONE, open(os.devnull, "w") as null, contextlib.redirect_stdout(io.StringIO()) as printed:
+        kept = os.dup(2)
+        os.dup2(null.fileno(), 2)
         try:
-            with contextlib.redirect_stdout(words):
-                yield said
+            yield printed
         finally:
-            if kept is not None:
-                os.dup2(kept, 2)
-                os.close(kept)
-            file.seek(0)
-            errors = file.read().decode("utf-8", "surrogateescape")
-            for text, say in ((errors, _say_error), (words.getvalue(), _say)):
-                for line in text.splitlines(keepends=True):
-                    match = _SAID.search(line)
-                    if match is None:
-                        say(line)
-                    else:
-                        said.append(match[1] or match[2])
-
-
-def _say(line: str) -> None:
-    if sys.stdout is not None:
-        sys.stdout.write(line)
-
-
-def _say_error(line: str) -> None:
-    os.write(2, line.encode("utf-8", "surrogateescape"))
-
-
-def _scratch() -> IO[bytes]:
-    """Return a file in memory, where the system has such."""
-    if hasattr(os, "memfd_create"):
-        return open(os.memfd_create("exr"), "w+b")
-    return tempfile.TemporaryFile()
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
+            os.dup2(kept, 2)
+            os.close(kept)
 
 
 def display_image(path: str | os.PathLike[str]) -> np.ndarray:

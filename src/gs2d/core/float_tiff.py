@@ -1,7 +1,6 @@
-"""TIFF photographs of floats: linear light with 1 as white, as OpenEXR's. Needs tifffile, of the extra ``exr``.
+"""TIFF photographs of floats: linear light with 1 as white, as OpenEXR's.
 
-Which files these are is read here from their first directory, before anything is decoded: size and samples that it
-announces are compared with the file's bytes. Layout: TIFF 6.0, and BigTIFF, whose offsets are twice as long.
+Pillow, which cannot decode them, reads their tags; tifffile, of the extra ``exr``, decodes.
 """
 
 from __future__ import annotations
@@ -9,11 +8,11 @@ from __future__ import annotations
 import importlib
 import logging
 import os
-import struct
 from dataclasses import dataclass
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
+from PIL import TiffImagePlugin
 
 from gs2d.core.extras import install
 from gs2d.core.growth import check_growth
@@ -21,62 +20,37 @@ from gs2d.core.light import display_values
 from gs2d.errors import DataError
 
 SUFFIXES = (".tif", ".tiff")
-_WIDTH, _HEIGHT, _BITS, _SAMPLES, _FORMAT = 256, 257, 258, 277, 339  # tags
+_WIDTH, _HEIGHT, _SAMPLES, _FORMAT = 256, 257, 277, 339  # tags
 _FLOATS = 3  # of _FORMAT
-_MOST_TAGS = 1000
-_TYPES = {3: "H", 4: "I", 16: "Q"}
 _ASSOCIATED = 1  # alpha that the colours are multiplied by
 _BRIGHT = 0.5  # of the values beyond white: then 1 is not white in this file
 
 
 @dataclass(frozen=True)
 class Header:
-    """Size of a picture of floats, px, and how many samples of how many bytes a pixel has."""
+    """Size of an image of floats, px, and how many samples a pixel has."""
 
     width: int
     height: int
     samples: int
-    sample_bytes: int
 
 
 def float_header(path: str | os.PathLike[str]) -> Header | None:
-    """Return what a TIFF of floats announces, or None for any other file, damaged ones too."""
+    """Return what the first directory of a TIFF of floats announces, or None for any other file, damaged ones too."""
     if not os.fspath(path).lower().endswith(SUFFIXES):
         return None
     try:
         with open(path, "rb") as file:
-            tags = _tags(file)
-    except (OSError, struct.error, KeyError, ValueError):
+            head = file.read(8)
+            head += file.read(8) if head[2:3] == b"+" else b""  # BigTIFF
+            tags = TiffImagePlugin.ImageFileDirectory_v2(head)
+            file.seek(tags.next)
+            tags.load(file)
+        width, height, samples = (int(tags.get(tag, 1)) for tag in (_WIDTH, _HEIGHT, _SAMPLES))
+        floats = tags.get(_FORMAT, (0,))[0] == _FLOATS
+    except Exception:  # whatever Pillow makes of a damaged file; whoever decodes it says what is wrong
         return None
-    if tags.get(_FORMAT) != _FLOATS or not (tags.get(_WIDTH) and tags.get(_HEIGHT)):
-        return None
-    return Header(tags[_WIDTH], tags[_HEIGHT], tags.get(_SAMPLES, 1), max(1, tags.get(_BITS, 32) // 8))
-
-
-def _tags(file: IO[bytes]) -> dict[int, int]:
-    """Return the first value of each tag of whole numbers in the first directory (KeyError, ValueError: none)."""
-    order = {b"II": "<", b"MM": ">"}[file.read(2)]
-    (version,) = struct.unpack(order + "H", file.read(2))
-    if version not in (42, 43):
-        raise ValueError("no TIFF")
-    big = version == 43
-    if big:
-        file.seek(8)
-    (at,) = struct.unpack(order + ("Q" if big else "I"), file.read(8 if big else 4))
-    file.seek(at)
-    (count,) = struct.unpack(order + ("Q" if big else "H"), file.read(8 if big else 2))
-    layout = order + ("HHQ8s" if big else "HHI4s")
-    found: dict[int, int] = {}
-    for entry in struct.iter_unpack(layout, file.read(min(count, _MOST_TAGS) * struct.calcsize(layout))):
-        tag, kind, number, value = entry
-        if (letter := _TYPES.get(kind)) is None or not number:
-            continue
-        size = struct.calcsize(letter)
-        if number * size > len(value):  # they lie elsewhere
-            file.seek(struct.unpack(order + ("Q" if big else "I"), value)[0])
-            value = file.read(size)
-        found[tag] = struct.unpack(order + letter, value[:size])[0]
-    return found
+    return Header(width, height, samples) if floats and min(width, height) > 0 else None
 
 
 def display_image(path: str | os.PathLike[str], header: Header) -> np.ndarray:
@@ -92,7 +66,7 @@ def display_image(path: str | os.PathLike[str], header: Header) -> np.ndarray:
     name = os.fspath(path)
     pixels = header.width * header.height
     announced = f"an image ({header.width}x{header.height}, {header.samples} floats)"
-    check_growth(path, os.stat(path).st_size, pixels * header.samples * max(4, header.sample_bytes), announced)
+    check_growth(path, os.stat(path).st_size, pixels * header.samples * 8, announced)
     values, associated = _decoded(name)
     if values.ndim != 3 or values.shape[:2] != (header.height, header.width) or values.shape[2] not in (1, 2, 3, 4):
         raise DataError(f"image {name} must have one or three colours and alpha at most, got {list(values.shape)}")

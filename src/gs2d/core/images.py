@@ -104,8 +104,7 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
         Missing, or not an image.
     """
     if exr.is_exr(path):
-        header = exr.read_header(path)
-        return header.width, header.height
+        return exr.read_size(path)
     if (floats := float_tiff.float_header(path)) is not None:
         return floats.width, floats.height
     with _opened(path, "{path} must be an image, got: {error}") as file:

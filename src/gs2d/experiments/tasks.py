@@ -20,10 +20,7 @@ from gs2d.io.run_dir import now
 from gs2d.io.run_schema import check_shape
 from gs2d.pipeline.events import Notice, OnEvent, ignore
 
-_OUTCOME = {
-    **{"state": str, "reason?": str, "notes?": ({"*": str}, None), "wanted?": [str], "trained?": bool},
-    **{"command?": ([str], str, None), "*": object},
-}
+_OUTCOME = {"state": str, "reason?": str, "notes?": (dict, None), "wanted?": [str], "trained?": bool}
 
 
 @dataclass(frozen=True, kw_only=True)

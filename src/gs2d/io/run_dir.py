@@ -61,10 +61,6 @@ _UNREADABLE = (
 _CHECKPOINT_NAME = re.compile(r"(\d+)-(.+)-(\d+|end)\.pt")
 
 
-_SCENE = {"name", "path", "format", "train", "test"}  # of run.json, at least
-_STAGE = {"name", "iterations", "seconds", "splats", "bytes"}  # of each entry of metrics.json, at least
-
-
 @dataclass(frozen=True)
 class CheckpointFile:
     """A checkpoint on disk; they sort by how far training had come."""
@@ -117,14 +113,6 @@ class RunFolder:
                 f"{self.file(RUN_JSON)} has format {str(data.get('format'))[:40]}, expected {FORMAT}; it was written "
                 f"by {writer[:40]}: use that one, or train again with --overwrite"
             )
-        for name, keys in (("recipe", {"name"}), ("scene", _SCENE)):
-            if not isinstance(data.get(name), dict) or not data[name].keys() >= keys:
-                raise RunError(
-                    f"{self.file(RUN_JSON)} must hold {name!r} with {', '.join(sorted(keys))}, "
-                    f"got {str(data.get(name))[:40]}; it was damaged: restore it, or train again with --overwrite"
-                )
-        if not isinstance(data["scene"]["path"], str):
-            raise RunError(f"{self.file(RUN_JSON)} must hold the capture's path, got {data['scene']['path']!r}")
         check_shape(self.file(RUN_JSON), data, DEFINITION_SHAPE, "restore it, or train again with --overwrite")
         return data
 
@@ -140,12 +128,6 @@ class RunFolder:
         if not path.exists():
             return {"stages": []}
         data = _object(path)
-        stages = data.get("stages")
-        if not are_stages(stages):
-            raise RunError(
-                f"{path} must hold a list 'stages', each with {', '.join(sorted(_STAGE))}; it was damaged: delete it "
-                "and go on with --resume"
-            )
         check_shape(path, data, METRICS_SHAPE, "delete it and go on with --resume")
         return data
 
@@ -227,18 +209,6 @@ class RunFolder:
         self.clear()
         self.file(LOCK).unlink(missing_ok=True)
         remove_made(self.made)
-
-
-def are_stages(entries: Any) -> bool:
-    """Whether a value is the list of stages of ``metrics.json``."""
-    return isinstance(entries, list) and all(map(_is_stage, entries))
-
-
-def _is_stage(entry: Any) -> bool:
-    """Whether an entry of ``metrics.json`` has what every stage has: a name, and numbers."""
-    if not (isinstance(entry, dict) and entry.keys() >= _STAGE and isinstance(entry["name"], str)):
-        return False
-    return all(isinstance(entry[key], int | float) for key in _STAGE - {"name"})
 
 
 def _object(path: Path) -> dict[str, Any]:

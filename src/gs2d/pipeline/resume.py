@@ -14,7 +14,6 @@ from gs2d.errors import RunError, ShapeError
 from gs2d.io.run_dir import (
     CheckpointFile,
     RunFolder,
-    are_stages,
     is_run,
     load_tensors,
     make_folder,
@@ -22,6 +21,7 @@ from gs2d.io.run_dir import (
     remove_made,
     save_tensors,
 )
+from gs2d.io.run_schema import METRICS_SHAPE, check_shape
 from gs2d.pipeline.events import Notice, OnEvent
 from gs2d.pipeline.job import Job
 from gs2d.pipeline.options import TrainOptions
@@ -229,7 +229,8 @@ def _cached(job: Job, index: int, path: Path, key: str) -> FinishedStage:
         metrics, log = json.loads(payload.pop("metrics")), payload.pop("log").encode()
     except (LookupError, TypeError, AttributeError, ValueError, RecursionError) as error:
         raise _unreadable(path, f"{type(error).__name__}: {error}") from error
-    if payload["key"] != key or not are_stages(metrics) or len(metrics) != index + 1:
+    check_shape(path, {"stages": metrics}, METRICS_SHAPE, "delete it")
+    if payload["key"] != key or len(metrics) != index + 1:
         raise _unreadable(path, "it is of another stage")
     return FinishedStage(index, payload, metrics, log, str(path))
 

@@ -96,7 +96,7 @@ def test_wrong_archives_are_errors(tmp_path: Path) -> None:
     path = tmp_path / "cameras_sphere.npz"
     whole = path.read_bytes()
     path.write_bytes(whole[:300])
-    with pytest.raises(DataError, match=r"cameras_sphere\.npz must be a numpy archive"):
+    with pytest.raises(DataError, match=r"cameras_sphere\.npz must be a numpy"):
         load_scene(tmp_path)
     np.savez(path, world_mat_0=np.eye(4))
     with pytest.raises(DataError, match="world_mat_i and scale_mat_i of every view, got 1 and 0"):
@@ -167,7 +167,7 @@ def test_a_damaged_archive_is_an_error(tmp_path: Path, signature: bytes, byte: i
     data = bytearray(path.read_bytes())
     data[data.index(signature) + byte] = value
     path.write_bytes(bytes(data))
-    with pytest.raises(DataError, match=r"cameras_sphere\.npz must be a numpy archive"):
+    with pytest.raises(DataError, match=r"cameras_sphere\.npz must be a numpy"):
         load_scene(tmp_path)
 
 
@@ -202,7 +202,7 @@ def test_an_archive_of_matrices_that_would_explode_is_refused(tmp_path: Path) ->
     small_dtu(tmp_path)
     path = tmp_path / "cameras_sphere.npz"
     np.savez_compressed(path, world_mat_0=np.zeros((20_000, 10_000), np.uint8), scale_mat_0=np.eye(4))
-    with pytest.raises(DataError, match="an archive of at most 400 times"):
+    with pytest.raises(DataError, match="an archive of at most"):
         load_scene(tmp_path)
 
 

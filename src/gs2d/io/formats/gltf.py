@@ -31,7 +31,6 @@ UPRIGHT = (0.0, 0.5**0.5, 0.5**0.5, 0.0)  # of the node, x y z w: after the half
 _FROM_GLTF = np.diag([-1.0, -1.0, 1.0, 1.0])
 _FROM_GLTF_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 _FLOAT, _USHORT, _VERTICES = 5126, 5123, 34962
-_SMALL, _RATIO = 64 << 20, 20  # bytes of attributes that any file may have, and those for one of a larger one
 _KNOWN = {EXTENSION, "KHR_mesh_quantization"}
 
 
@@ -139,7 +138,7 @@ def read_gltf(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple
     with document.reading():
         found = list(_primitives(document))
         total = sum(document.bytes_of(index) for _, attributes in found for index in attributes.values())
-        check_growth(path, document.packed_bytes() if found else 0, total, "splats", small=_SMALL, ratio=_RATIO)
+        check_growth(path, document.packed_bytes() if found else 0, total, "splats")
         parts = [_placed(path, _gaussians(document, attributes, tell), turn @ matrix) for matrix, attributes in found]
     if not parts and "meshes" not in document.json and EXTENSION in document.json.get("extensionsUsed", ()):
         return _none(), "glTF"

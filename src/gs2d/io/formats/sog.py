@@ -31,7 +31,6 @@ from gs2d.io.formats.sog_palette import codebook, nearest_code, palette
 from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, logit_of_byte, sigmoid, to_byte, unit_quats
 
 _ROW = 64  # rows of the palette side by side in its picture
-_SMALL, _RATIO = 64 << 20, 60  # unpacked bytes that any file may have, and those for one of a larger one
 _LONGEST = 16 << 20  # bytes of a JSON file
 _MOST_CHUNKS = 10_000
 Fetch = Callable[[str], bytes]
@@ -237,7 +236,7 @@ class _Reader:
         if len(which) and which.max() >= len(centers):
             raise ValueError(f"labels below {len(centers)} were expected, got {which.max()}")
         packed = count * coefficients * 12
-        check_growth(self.path, self.size, packed, f"a cloud of splats ({count:,} of them)", small=_SMALL, ratio=_RATIO)
+        check_growth(self.path, self.size, packed, f"a cloud of splats ({count:,} of them)")
         return _values(told, drawn_bands(self.path, centers[which], self.tell))
 
     def _rows(self, count: int, width: int, name: str) -> np.ndarray:
@@ -254,7 +253,7 @@ class _Reader:
         try:
             with open_image(io.BytesIO(data)) as file:
                 what = f"a picture ({file.width}x{file.height})"
-                check_growth(self.path, self.size, 4 * file.width * file.height, what, small=_SMALL, ratio=4 * _RATIO)
+                check_growth(self.path, self.size, 4 * file.width * file.height, what)
                 return np.asarray(file.convert("RGBA"))
         except DataError:
             raise

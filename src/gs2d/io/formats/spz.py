@@ -60,7 +60,6 @@ _SH1_STEP, _SH_STEP = (
 )  # of 255: 7 bits for degree 1, 6 for the others; Niantic's library has 5 and 4 (see decisions)
 _ROOT = np.sqrt(0.5)  # no component but the largest exceeds it
 _WORDS = (1 << 9) - 1
-_SMALL, _RATIO = 16 << 20, 20  # unpacked bytes that any file may have, and those for one of a larger one: 2 is usual
 
 
 def required_zstd() -> Any:
@@ -261,9 +260,7 @@ def _parts_of_3(path: str | os.PathLike[str], tail: bytes) -> tuple[int, int, in
             f"{version}, degree {degree}; convert it to a PLY"
         )
     sizes = _sizes(version, degree)
-    check_growth(
-        path, len(tail), count * sum(sizes), f"a cloud of splats ({count:,} of them)", small=_SMALL, ratio=_RATIO
-    )
+    check_growth(path, len(tail), count * sum(sizes), f"a cloud of splats ({count:,} of them)")
     data = _unpacked(path, unpack, unpack.unconsumed_tail, count * sum(sizes))
     size = _RECORDS if flags & _EXTENDED else 1
     records = _unpacked(path, unpack, unpack.unconsumed_tail, size, or_end=True)  # and gzip's checksum
@@ -284,9 +281,7 @@ def _parts_of_4(path: str | os.PathLike[str], data: bytes) -> tuple[int, int, in
             f"{os.fspath(path)}: SPZ of version 2, 3 or 4 with SH degree 0 to {_DEGREES} was expected, got version "
             f"{version}, degree {degree}, {streams} streams in {len(data)} bytes; convert it to a PLY"
         )
-    check_growth(
-        path, len(data), count * sum(sizes), f"a cloud of splats ({count:,} of them)", small=_SMALL, ratio=_RATIO
-    )
+    check_growth(path, len(data), count * sum(sizes), f"a cloud of splats ({count:,} of them)")
     system = _system(path, data[_HEADER_4.size : at]) if flags & _EXTENDED else _RUB
     begin, parts = at + streams * _SIZES.size, []
     for size in sizes:

@@ -23,7 +23,6 @@ import numpy as np
 
 from gs2d.core.extras import install
 from gs2d.core.files import atomic_write, disk_error
-from gs2d.core.growth import check_growth
 from gs2d.errors import BackendError, DataError
 from gs2d.io.formats import usd_process
 from gs2d.io.gaussians import (
@@ -44,7 +43,7 @@ _APIS = (
 )  # fmt: skip
 _OWN = "userProperties:gs2d:"
 _ADDRESSES = 3 << 30  # bytes of address space for OpenUSD's libraries and threads
-_SMALL, _RATIO = 64 << 20, 20  # bytes of arrays that any file may have, and those for one of a larger one
+_RATIO = 20  # bytes of addresses for one of the file, beyond ``_ADDRESSES``
 _SECONDS, _RATE = 10, 1 << 20  # of a processor for any file, and bytes of a larger one a second
 _WAIT = 10  # times that, on a machine that is busy
 _AGREE = 2e-6  # relative: rounding of exp and log is less
@@ -224,7 +223,6 @@ def _ask(path: str | os.PathLike[str]) -> tuple[dict[str, Any], memoryview]:
     if "error" in facts:
         raise DataError(f"{os.fspath(path)}: {facts['error']}")
     data = memoryview(said)[len(line) + 1 :]
-    check_growth(path, size, len(data), "splats", small=_SMALL, ratio=_RATIO)
     return facts, data
 
 
