@@ -17,7 +17,6 @@ from PIL import Image
 
 from gs2d.core.extras import FFMPEG
 from gs2d.core.files import atomic_write, disk_error, temporary_beside
-from gs2d.core.images import open_image
 from gs2d.errors import BackendError, DataError
 
 SUFFIXES = (".mp4", ".webp")
@@ -100,7 +99,7 @@ def write_video(
 
 
 def _write_mp4(path: Path, frames: Sequence[Path], fps: float, threads: int, on_frame: Callable[[int], None]) -> None:
-    with open_image(frames[0]) as first:
+    with Image.open(frames[0]) as first:
         size = f"{first.width}x{first.height}"
     given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-framerate", f"{fps:g}", "-i", "-", "-vf", _FILTERS]
     coded = ["-c:v", "libx264", "-crf", str(QUALITY), *_TAGS, "-threads", str(threads), "-movflags", "+faststart"]
@@ -143,7 +142,7 @@ def _decoded(frames: Sequence[Path], on_frame: Callable[[int], None]) -> Iterato
     """
     size = None
     for done, path in enumerate(frames, 1):
-        with open_image(path) as image:
+        with Image.open(path) as image:
             frame = image.convert("RGB")
         size = size or frame.size
         if frame.size != size:

@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from gs2d.core.files import atomic_write
 from gs2d.core.growth import check_entries, check_growth
-from gs2d.core.images import open_image
 from gs2d.errors import DataError
 from gs2d.io.formats.compressed_ply import morton_order
 from gs2d.io.formats.sog_palette import codebook, nearest_code, palette
@@ -251,7 +251,7 @@ class _Reader:
         data = self.fetch(name)
         self.size += len(data)
         try:
-            with open_image(io.BytesIO(data)) as file:
+            with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as file:
                 what = f"a picture ({file.width}x{file.height})"
                 check_growth(self.path, self.size, 4 * file.width * file.height, what)
                 return np.asarray(file.convert("RGBA"))
