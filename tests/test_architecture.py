@@ -47,8 +47,8 @@ TOP = {"__init__.py", "__main__.py", "errors.py"}  # nothing else lies loose
 INSIDE = {
     "core": {
         "checks growth light locks extras memory memory_limit missing processes spill text": 0,
-        "exr files float_tiff georeference similarity": 1,
-        "arrays json_files camera images mesh photo_formats sh splats": 2,
+        "exr files float_tiff georeference images similarity": 1,
+        "arrays json_files camera image_files mesh photo_formats sh splats": 2,
         "exif photometry residual_lens transforms": 3,
     },
     "data": {

@@ -130,7 +130,7 @@ def test_a_run_of_another_format_names_the_version_that_wrote_it(tmp_path: Path,
 def test_a_damaged_definition_is_one_line(tmp_path: Path, text: str) -> None:
     run = new_run(tmp_path)
     (tmp_path / "run.json").write_text(text)
-    with pytest.raises(RunError, match=r"run\.json (must hold|has format)"):
+    with pytest.raises(RunError, match=r"run\.json .*(must|format)"):
         run.definition()
 
 
@@ -138,7 +138,7 @@ def test_a_damaged_definition_is_one_line(tmp_path: Path, text: str) -> None:
 def test_damaged_metrics_are_one_line(tmp_path: Path, text: str) -> None:
     run = new_run(tmp_path)
     (tmp_path / "metrics.json").write_text(text)
-    with pytest.raises(RunError, match=r"metrics\.json must hold"):
+    with pytest.raises(RunError, match=r"metrics\.json .*must"):
         run.metrics()
 
 

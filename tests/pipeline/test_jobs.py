@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ball_runs import Stop, options
-from gs2d.core.images import read_image
+from gs2d.core.image_files import read_image
 from gs2d.core.mesh import Mesh
 from gs2d.core.splats import Splats
 from gs2d.data import View

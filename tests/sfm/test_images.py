@@ -13,7 +13,7 @@ import pytest
 from PIL import ExifTags, Image, ImageOps
 
 from gs2d.core.camera import look_at
-from gs2d.core.images import image_size, read_image
+from gs2d.core.image_files import image_size, read_image
 from gs2d.core.photo_formats import AVIF, HEIF
 from gs2d.core.similarity import rotation_to_z
 from gs2d.errors import DataError

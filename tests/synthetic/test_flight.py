@@ -10,7 +10,7 @@ import pytest
 from benchmarks.flown_capture import main
 
 from gs2d.core.exif import read_place
-from gs2d.core.images import read_image
+from gs2d.core.image_files import read_image
 from gs2d.data import load_scene
 from gs2d.data.readers.colmap import read_images, read_points
 from gs2d.errors import DataError

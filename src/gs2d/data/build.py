@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from gs2d.core.camera import Camera
-from gs2d.core.images import image_size, read_image, read_mask
+from gs2d.core.image_files import image_size, read_image, read_mask
 from gs2d.core.transforms import camera_extent, camera_outliers
 from gs2d.data.bounds import scene_bounds
 from gs2d.data.cache import DecodedImage, ImageCache

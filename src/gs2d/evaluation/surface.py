@@ -25,7 +25,7 @@ from torch import Tensor
 
 from gs2d.config.surface_protocols import VISIBLE_SURFACE
 from gs2d.core.camera import Camera
-from gs2d.core.images import write_image
+from gs2d.core.image_files import write_image
 from gs2d.core.mesh import Mesh
 from gs2d.core.similarity import similarity_scale
 from gs2d.errors import DataError

@@ -18,7 +18,7 @@ from torch import Tensor
 from gs2d.core.camera import Camera
 from gs2d.core.extras import FFMPEG
 from gs2d.core.files import check_writable
-from gs2d.core.images import write_image
+from gs2d.core.image_files import write_image
 from gs2d.core.json_files import write_json
 from gs2d.core.sh import rgb_to_sh0
 from gs2d.core.splats import Splats

@@ -11,7 +11,7 @@ import numpy as np
 
 from gs2d.config.datasets import SceneFacts
 from gs2d.config.surface_protocols import DTU_SURFACE, TNT_SURFACE
-from gs2d.core.images import read_mask
+from gs2d.core.image_files import read_mask
 from gs2d.core.mesh import Mesh
 from gs2d.data.benchmarks import published_log
 from gs2d.data.readers.dtu import dtu_silhouettes

@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gs2d.core.images import image_size, is_number, natural_key
+from gs2d.core.image_files import image_size
+from gs2d.core.images import is_number, natural_key
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.data.build import Capture, PosedImage, skipping
 from gs2d.data.faces import panorama

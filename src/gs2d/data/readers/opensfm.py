@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gs2d.core.images import image_size
+from gs2d.core.image_files import image_size
 from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage, skipping
 from gs2d.data.faces import panorama

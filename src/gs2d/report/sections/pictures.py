@@ -11,7 +11,8 @@ import numpy as np
 from markupsafe import Markup
 
 from gs2d.core.camera import Camera
-from gs2d.core.images import composite, read_image
+from gs2d.core.image_files import read_image
+from gs2d.core.images import composite
 from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
 from gs2d.io.meshes import read_mesh, read_textured

@@ -1,0 +1,193 @@
+"""Image files: reading, writing, and sizes from headers."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import importlib
+import logging
+import os
+from collections.abc import Iterator
+from functools import cache
+from typing import IO
+
+import numpy as np
+from PIL import Image
+
+from gs2d.core import exr, float_tiff
+from gs2d.core.files import atomic_write
+from gs2d.core.growth import check_growth
+from gs2d.core.images import to_uint8
+from gs2d.errors import DataError, ShapeError
+
+#: What Pillow is let near: formats of photographs, masks and depths. The forty others, some of which start programs
+#: (EPS: Ghostscript) or which nobody has looked at for years, are never tried, whatever a file is called.
+FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "WEBP", "AVIF", "HEIF", "BMP", "PPM", "JPEG2000")
+
+
+def open_image(path: str | os.PathLike[str] | IO[bytes]) -> Image.Image:
+    """Open an image of one of ``FORMATS`` by Pillow, which has then read its header; errors are Pillow's."""
+    _silence_decoders()
+    Image.init()  # asked for a format that it has not loaded, Pillow raises KeyError
+    return Image.open(path, formats=[name for name in FORMATS if name in Image.OPEN])
+
+
+@cache
+def _silence_decoders() -> None:
+    """Keep Pillow, and libtiff below it, from writing lines of their own about a damaged file to the terminal.
+
+    Pillow's go to whoever listens to its log. The handlers of libtiff are found through Pillow's module, whose
+    dependency it is; where it is part of that (Windows), it says what it always said.
+    """
+    logging.getLogger("PIL").addHandler(logging.NullHandler())
+    with contextlib.suppress(AttributeError, OSError):
+        library = ctypes.CDLL(importlib.import_module("PIL._imaging").__file__)
+        for name in ("TIFFSetErrorHandler", "TIFFSetWarningHandler"):
+            handler = getattr(library, name)
+            handler.argtypes, handler.restype = (ctypes.c_void_p,), ctypes.c_void_p
+            handler(None)
+
+
+@contextlib.contextmanager
+def _opened(path: str | os.PathLike[str], expected: str) -> Iterator[Image.Image]:
+    """Open an image, and turn whatever Pillow's parsers run into, here or in the body, into one line."""
+    try:
+        with open_image(path) as file:
+            yield file
+    except FileNotFoundError as error:
+        raise DataError(f"image {os.fspath(path)} does not exist") from error
+    except DataError:
+        raise
+    except MemoryError as error:  # JPEG 2000's decoder also says so of a damaged file
+        raise DataError(
+            f"image {os.fspath(path)} must decode in the memory there is, got a decoder that asked for more; "
+            "it is damaged, or too large for this machine"
+        ) from error
+    except Exception as error:
+        raise DataError(expected.format(path=os.fspath(path), error=_first_line(error))) from error
+
+
+def _check_pixels(path: str | os.PathLike[str], file: Image.Image, bytes_per_pixel: int) -> None:
+    """Raise for an image of many more pixels than its file can hold of a photograph, before any is decoded."""
+    packed = os.stat(path).st_size
+    check_growth(path, packed, file.width * file.height * bytes_per_pixel, f"an image ({file.width}x{file.height})")
+
+
+def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+    """(width, height) of an image file, px, from its header only. EXIF orientation is not applied.
+
+    Raises
+    ------
+    DataError
+        Missing, or not an image.
+    """
+    if exr.is_exr(path):
+        return exr.read_size(path)
+    if (floats := float_tiff.float_header(path)) is not None:
+        return floats.width, floats.height
+    with _opened(path, "{path} must be an image, got: {error}") as file:
+        return file.size
+
+
+def is_float(path: str | os.PathLike[str]) -> bool:
+    """Whether a photograph is of floats: linear light, of which display values are made."""
+    return exr.is_exr(path) or float_tiff.float_header(path) is not None
+
+
+_UNDECODED = "image {path} does not decode: {error}; replace or remove the file"
+
+
+def read_image(path: str | os.PathLike[str]) -> np.ndarray:
+    """Decode an image.
+
+    EXIF orientation is **not** applied: COLMAP does not apply it either, so poses belong to the stored pixels.
+    Grey images become RGB, palettes are resolved, 16-bit grey becomes 8-bit. OpenEXR's linear floats become sRGB values
+    (:func:`gs2d.core.exr.display_image`). Other images of floats are refused: what is white in them is not known.
+
+    Returns
+    -------
+    ndarray uint8 [H, W, 3], or [H, W, 4] with straight alpha if the file has transparency
+
+    Raises
+    ------
+    DataError
+        Missing, not an image of ``FORMATS``, cut short, or of far more pixels than its bytes can hold; names the file.
+    """
+    if exr.is_exr(path):
+        return exr.display_image(path)
+    if (floats := float_tiff.float_header(path)) is not None:
+        return float_tiff.display_image(path, floats)
+    with _opened(path, _UNDECODED) as file:
+        _check_pixels(path, file, 4)
+        if file.mode.startswith("I;16") or file.mode == "I":
+            grey = np.clip(np.asarray(file, dtype=np.float64) / 257.0, 0, 255)  # 65535 / 255 = 257
+            return np.repeat(np.round(grey).astype(np.uint8)[:, :, None], 3, axis=2)
+        has_alpha = file.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in file.info
+        mode = "RGBA" if has_alpha else "RGB"
+        return np.array(file if file.mode == mode else file.convert(mode))  # which copies where nothing changes
+
+
+def read_grey(path: str | os.PathLike[str]) -> tuple[np.ndarray, str]:
+    """Decode the numbers of an image as they are, and its mode: [h, w] where that is a grey one.
+
+    Raises
+    ------
+    DataError
+        As :func:`read_image`.
+    """
+    if exr.is_exr(path):
+        return exr.grey_values(path), "F"
+    with _opened(path, _UNDECODED) as file:
+        _check_pixels(path, file, 4)
+        return np.asarray(file), file.mode
+
+
+def read_mask(path: str | os.PathLike[str]) -> np.ndarray:
+    """Decode a mask: bool [H, W], True where the image is at least half white and half opaque.
+
+    In a file of zeros and ones, which would be all black, one is white. A mask of one colour is small at any size: of
+    8 bits it may have more pixels for its bytes than a photograph.
+    """
+    with _opened(path, _UNDECODED) as file:
+        plain = file.mode in ("1", "L") and "transparency" not in file.info
+        if plain:
+            _check_pixels(path, file, 1)
+            grey = np.array(file.convert("L"))
+    if not plain:
+        image = read_image(path)
+        grey = image[:, :, :3].max(axis=2)
+    if grey.max() == 1:
+        grey = grey * np.uint8(255)
+    if not plain and image.shape[2] == 4:
+        grey = np.minimum(grey, image[:, :, 3])
+    return np.asarray(grey >= 128)
+
+
+def _first_line(error: BaseException) -> str:
+    if isinstance(error, Image.DecompressionBombError):
+        return f"more than {2 * (Image.MAX_IMAGE_PIXELS or 0):,} pixels, which Pillow refuses to decode; shrink it"
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def write_image(path: str | os.PathLike[str], image: np.ndarray) -> None:
+    """Write a PNG atomically.
+
+    Parameters
+    ----------
+    path : path
+        Its folder must exist.
+    image : ndarray [H, W], [H, W, 3] or [H, W, 4]
+        uint8, bool (white = True), or float in [0, 1] (clipped, rounded to the nearest of 256 levels).
+
+    Raises
+    ------
+    ShapeError
+        Another shape, or NaN in a float image.
+    DiskError
+        The file could not be written.
+    """
+    pixels = to_uint8(image)
+    if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] not in (3, 4)):
+        raise ShapeError(f"image must be [H, W], [H, W, 3] or [H, W, 4], got {list(pixels.shape)}")
+    with atomic_write(path) as file:
+        Image.fromarray(np.ascontiguousarray(pixels)).save(file, format="PNG")
