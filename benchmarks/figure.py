@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from gs2d.core.camera import Camera
-from gs2d.core.image_files import write_image
+from gs2d.data.image_files import write_image
 from gs2d.io.meshes import read_mesh
 from gs2d.report.mesh_images import mesh_images
 

@@ -47,7 +47,10 @@ PARTS = (
     Rule("densification", (("training/densify/gradient.py", "densify_and_prune"),)),
     Rule("densification statistics", (("training/densify/gradient.py", "accumulate"),)),
     Rule("checks for NaN", (("training/objective.py", "first_not_finite"),)),
-    Rule("photographs", (("gs2d/core/images.py", ""), ("data/scene.py", ""), ("training/targets.py", ""))),
+    Rule(
+        "photographs",
+        (("gs2d/core/images.py", ""), ("data/image_files.py", ""), ("data/scene.py", ""), ("training/targets.py", "")),
+    ),
     Rule("fusion", (("meshing/tsdf.py", ""), ("meshing/sampling.py", ""))),
     Rule("depth maps", (("meshing/depth_maps.py", ""), ("meshing/bounds.py", ""), ("meshing/consistency.py", ""))),
     Rule("marching cubes", (("meshing/marching_cubes.py", ""),)),

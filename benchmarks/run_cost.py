@@ -41,7 +41,13 @@ PARTS = (
     Rule("render", (("render/cpu.py", ""), ("render/cpu_cached.py", ""))),
     Rule(
         "photographs",
-        (("gs2d/core/images.py", ""), ("data/scene.py", ""), ("data/build.py", ""), ("data/undistort.py", "")),
+        (
+            ("gs2d/core/images.py", ""),
+            ("data/image_files.py", ""),
+            ("data/scene.py", ""),
+            ("data/build.py", ""),
+            ("data/undistort.py", ""),
+        ),
     ),
     Rule("metrics", (("evaluation/images.py", ""), ("gs2d/losses/api.py", ""), ("kernels/losses.py", ""))),
     Rule("evidence", tuple(("meshing/evidence.py", name) for name in ("gather", "_count", "_look", "_normals"))),

@@ -36,8 +36,8 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.street_runs import Process, summary_of, watch_process
 from gs2d.core.camera import Camera
-from gs2d.core.image_files import read_image, write_image
 from gs2d.data import Scene, View
+from gs2d.data.image_files import read_image, write_image
 from gs2d.errors import DataError
 from gs2d.evaluation.images import ImageMetrics, image_metrics
 from gs2d.pipeline.events import ignore

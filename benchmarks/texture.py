@@ -28,10 +28,10 @@ from pathlib import Path
 import numpy as np
 
 from gs2d.core.camera import Camera
-from gs2d.core.image_files import write_image
 from gs2d.core.images import composite
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.data import View
+from gs2d.data.image_files import write_image
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, open_run
 from gs2d.meshing.raycast import Hits, cast_camera

@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from gs2d.core.camera import Camera, look_at
-from gs2d.core.image_files import write_image
+from gs2d.data.image_files import write_image
 from gs2d.synthetic.capture import CAMERA_ANGLE_X, render_image
 from gs2d.synthetic.scene import build_scene
 from gs2d.synthetic.shading import bake

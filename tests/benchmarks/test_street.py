@@ -14,8 +14,8 @@ from benchmarks.street_runs import Process, estimate_error, reconstruct_command,
 from PIL import Image
 
 from gs2d.core.camera import Camera
-from gs2d.core.image_files import write_image
 from gs2d.core.mesh import Mesh
+from gs2d.data.image_files import write_image
 from gs2d.evaluation.images import ImageMetrics, Metric
 from gs2d.io.meshes import write_mesh
 

@@ -14,9 +14,9 @@ from PIL import Image
 
 from capture_writers import small_blender, small_colmap, small_nerfstudio
 from foreign_writers import small_alicevision, small_metashape, small_opensfm
-from gs2d.core.photo_formats import HEIF
 from gs2d.data import file_names, load_scene
 from gs2d.data.file_names import Files, in_any_case
+from gs2d.data.photo_formats import HEIF
 from gs2d.data.priors import find_maps
 from gs2d.errors import DataError
 

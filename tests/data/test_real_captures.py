@@ -11,8 +11,8 @@ from skimage.feature import SIFT, match_descriptors
 
 from capture_writers import tree_hash
 from gs2d.core.camera import Camera
-from gs2d.core.image_files import read_image
 from gs2d.data import Scene, load_scene
+from gs2d.data.image_files import read_image
 from gs2d.data.readers.colmap import ColmapImage, model_folder, read_images, read_points
 from gs2d.data.undistort import colmap_intrinsics
 

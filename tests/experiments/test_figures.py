@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d.core.image_files import read_image
 from gs2d.core.splats import Splats
+from gs2d.data.image_files import read_image
 from gs2d.errors import RunError
 from gs2d.experiments.figures import coverage, error_positions, map_limits, rank_run, write_figures
 from gs2d.experiments.render import coverage_rows

@@ -322,7 +322,7 @@ def _image(name: str, mode: str = "RGB", **options: object) -> Callable[[Path], 
 
 def read_picture(root: Path) -> None:
     """As a photograph, as one without a camera yet, as a mask, as depths and as normals."""
-    from gs2d.core.image_files import image_size, read_image, read_mask
+    from gs2d.data.image_files import image_size, read_image, read_mask
     from gs2d.data.priors import read_depth, read_normals
     from gs2d.errors import DataError
     from gs2d.sfm.images import _read as looked_at

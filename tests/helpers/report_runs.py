@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from gs2d.core.camera import look_at
-from gs2d.core.image_files import write_image
 from gs2d.core.json_files import write_json
 from gs2d.core.mesh import Mesh
+from gs2d.data.image_files import write_image
 from gs2d.io.meshes import write_mesh
 from gs2d.meshing.raycast import cast_camera
 from gs2d.report.images import depth_image, error_image, highlight_image, normal_image

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gs2d.core.image_files import write_image
+from gs2d.data.image_files import write_image
 from gs2d.errors import BackendError, DataError, DiskError
 from gs2d.io.video import check_video, write_video
 

@@ -13,8 +13,8 @@ import torch
 
 from ball_runs import SMALL, Stop, comparable, options
 from gs2d.config.presets import get_recipe, with_exposure
-from gs2d.core.image_files import read_image, write_image
 from gs2d.data import View
+from gs2d.data.image_files import read_image, write_image
 from gs2d.data.subject import OBJECT, read_subject
 from gs2d.errors import RunError
 from gs2d.experiments import figures

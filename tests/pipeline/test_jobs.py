@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from ball_runs import Stop, options
-from gs2d.core.image_files import read_image
 from gs2d.core.mesh import Mesh
 from gs2d.core.splats import Splats
 from gs2d.data import View
+from gs2d.data.image_files import read_image
 from gs2d.errors import DataError, DiskError, ProtocolError, RecipeError, RunError
 from gs2d.io.meshes import read_mesh, write_mesh
 from gs2d.io.run_dir import RunFolder, open_run

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gs2d.core.exif import Taken
+from gs2d.data.exif import Taken
 from gs2d.errors import DataError
 from gs2d.pipeline.options import PosesOptions
 from gs2d.pipeline.photo_places import places_of

@@ -16,7 +16,7 @@ from ball_runs import Stop, comparable, options
 from capture_writers import small_colmap
 from gs2d.config.presets import get_recipe
 from gs2d.config.protocols import get_protocol
-from gs2d.core.image_files import read_image
+from gs2d.data.image_files import read_image
 from gs2d.errors import DataError, DiskError, DivergedError, ProtocolError, RecipeError, RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.io.splat_ply import read_splats

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from gs2d.core.image_files import read_image, write_image
+from gs2d.data.image_files import read_image, write_image
 from gs2d.errors import BackendError
 from gs2d.io.video import write_video
 from gs2d.report.html import image_tag

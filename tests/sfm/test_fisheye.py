@@ -13,9 +13,9 @@ from benchmarks.wide_captures import errors, write_photographs
 from PIL import Image
 
 from gs2d.core.camera import look_at
-from gs2d.core.image_files import read_mask
 from gs2d.core.json_files import read_json
 from gs2d.data import load_scene
+from gs2d.data.image_files import read_mask
 from gs2d.data.readers.colmap import ColmapCamera, read_cameras, read_images
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.options import PosesOptions

@@ -13,9 +13,9 @@ import pytest
 from PIL import ExifTags, Image, ImageOps
 
 from gs2d.core.camera import look_at
-from gs2d.core.image_files import image_size, read_image
-from gs2d.core.photo_formats import AVIF, HEIF
 from gs2d.core.similarity import rotation_to_z
+from gs2d.data.image_files import image_size, read_image
+from gs2d.data.photo_formats import AVIF, HEIF
 from gs2d.errors import DataError
 from gs2d.sfm import compare
 from gs2d.sfm.image_copies import copy_images

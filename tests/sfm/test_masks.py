@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gs2d.core.image_files import read_mask
 from gs2d.data import load_scene
+from gs2d.data.image_files import read_mask
 from gs2d.errors import DataError
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.options import PosesOptions

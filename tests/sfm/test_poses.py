@@ -21,8 +21,8 @@ from PIL import Image
 from cli_runs import TINY, one_line
 from gs2d.cli import run
 from gs2d.core.camera import look_at
-from gs2d.core.image_files import read_image
 from gs2d.data import load_scene
+from gs2d.data.image_files import read_image
 from gs2d.data.readers.colmap import read_images
 from gs2d.errors import RunError
 from gs2d.pipeline.events import Event, Notice, Phase

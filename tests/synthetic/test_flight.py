@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from benchmarks.flown_capture import main
 
-from gs2d.core.exif import read_place
-from gs2d.core.image_files import read_image
 from gs2d.data import load_scene
+from gs2d.data.exif import read_place
+from gs2d.data.image_files import read_image
 from gs2d.data.readers.colmap import read_images, read_points
 from gs2d.errors import DataError
 from gs2d.geo.projection import to_enu

@@ -16,12 +16,12 @@ import numpy as np
 from PIL import Image
 
 from gs2d.core.camera import Camera
-from gs2d.core.image_files import image_size, read_image, read_mask
 from gs2d.core.transforms import camera_extent, camera_outliers
 from gs2d.data.bounds import scene_bounds
 from gs2d.data.cache import DecodedImage, ImageCache
 from gs2d.data.faces import GLANCE, LEAST_SHOWN, Face, face_name, face_positions, faces_of, wrapped
 from gs2d.data.file_names import in_any_case
+from gs2d.data.image_files import image_size, read_image, read_mask
 from gs2d.data.masks import EMPTY, Masks, find_masks
 from gs2d.data.priors import (
     DEPTH_SUFFIXES,

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import minimum_filter
 
-from gs2d.core.arrays import read_npy
 from gs2d.core.camera import Camera
-from gs2d.core.image_files import image_size, read_grey, read_image
+from gs2d.data.arrays import read_npy
 from gs2d.data.file_names import Files
+from gs2d.data.image_files import image_size, read_grey, read_image
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
 

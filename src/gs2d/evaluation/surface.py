@@ -25,9 +25,9 @@ from torch import Tensor
 
 from gs2d.config.surface_protocols import VISIBLE_SURFACE
 from gs2d.core.camera import Camera
-from gs2d.core.image_files import write_image
 from gs2d.core.mesh import Mesh
 from gs2d.core.similarity import similarity_scale
+from gs2d.data.image_files import write_image
 from gs2d.errors import DataError
 from gs2d.evaluation.nearest import Cloud
 from gs2d.evaluation.visibility import frustum_counts, visible_counts

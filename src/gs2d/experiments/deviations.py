@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from gs2d.config.presets import get_recipe
 from gs2d.config.recipe import GradDensify
 from gs2d.config.schedule import scale_schedule
-from gs2d.core.image_files import image_size
+from gs2d.data.image_files import image_size
 from gs2d.errors import Gs2dError
 from gs2d.experiments.aggregate import NOT_YET, Results, surface_metric
 from gs2d.experiments.options import TableOptions

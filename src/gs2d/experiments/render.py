@@ -19,7 +19,7 @@ from markupsafe import Markup
 
 from gs2d.config.presets import about_recipe, get_recipe
 from gs2d.core.files import atomic_write
-from gs2d.core.image_files import read_image
+from gs2d.data.image_files import read_image
 from gs2d.errors import Gs2dError
 from gs2d.experiments.aggregate import FIGURES, Cell, ClaimResult, Results, Row
 from gs2d.experiments.tables import LOWER_IS_BETTER, METRICS, PaperTable, printed

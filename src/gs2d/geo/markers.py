@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from gs2d.core.extras import install
-from gs2d.core.image_files import read_image
 from gs2d.data import View
+from gs2d.data.image_files import read_image
 from gs2d.errors import BackendError, DataError
 from gs2d.geo.triangulate import triangulate
 

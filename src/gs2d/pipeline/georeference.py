@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from gs2d.core.camera import Camera
-from gs2d.core.exif import read_place
 from gs2d.core.georeference import CHECK, FITTED, LEFT_OUT, Georeference, Residual
 from gs2d.core.similarity import rotation_to_z
 from gs2d.data import View
+from gs2d.data.exif import read_place
 from gs2d.errors import DataError, RunError
 from gs2d.geo.control import Located, locate, read_control
 from gs2d.geo.fit import Fit, cameras_up, fit_places

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.core.image_files import write_image
 from gs2d.data import View
+from gs2d.data.image_files import write_image
 from gs2d.io.run_dir import LOSSES, RENDERS, RunFolder, make_folder
 from gs2d.pipeline.render import file_names
 from gs2d.report.images import depth_image, depth_limits

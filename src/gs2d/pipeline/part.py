@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from gs2d.config.recipe import Recipe
-from gs2d.core.arrays import read_npz
 from gs2d.core.files import atomic_write
 from gs2d.core.splats import Splats
 from gs2d.data import Scene
+from gs2d.data.arrays import read_npz
 from gs2d.errors import DataError, RunError
 from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.options import Part

@@ -12,8 +12,8 @@ import numpy as np
 
 from gs2d.config.datasets import DataSet, SceneFacts
 from gs2d.config.surface_protocols import VISIBLE_SURFACE
-from gs2d.core.arrays import read_npy
 from gs2d.core.mesh import Mesh
+from gs2d.data.arrays import read_npy
 from gs2d.data.benchmarks import MESH_TRUTHS, find_truth, recognise
 from gs2d.errors import DataError
 from gs2d.evaluation.surface import SurfaceScore, evaluate_surface, write_clouds

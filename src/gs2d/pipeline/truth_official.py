@@ -11,9 +11,9 @@ import numpy as np
 
 from gs2d.config.datasets import SceneFacts
 from gs2d.config.surface_protocols import DTU_SURFACE, TNT_SURFACE
-from gs2d.core.image_files import read_mask
 from gs2d.core.mesh import Mesh
 from gs2d.data.benchmarks import published_log
+from gs2d.data.image_files import read_mask
 from gs2d.data.readers.dtu import dtu_silhouettes
 from gs2d.errors import DataError
 from gs2d.evaluation.dtu import Silhouette, evaluate_dtu, read_dtu_truth

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from PIL import ExifTags, Image
 
-from gs2d.core.exif import DAMAGED_EXIF
 from gs2d.core.files import atomic_write, disk_error
-from gs2d.core.image_files import is_float, open_image, read_image
+from gs2d.data.exif import DAMAGED_EXIF
+from gs2d.data.image_files import is_float, open_image, read_image
 from gs2d.errors import DataError
 from gs2d.sfm.images import JPEG, Photo, turn
 

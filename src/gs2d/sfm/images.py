@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from gs2d.core.exif import Taken, read_taken
-from gs2d.core.image_files import read_image
 from gs2d.core.images import is_twice_as_wide, natural_key
 from gs2d.core.missing import belongs_to_run, instead, where_it_ends
-from gs2d.core.photo_formats import AVIF, EXR, HEIF, UNREAD, remedy
+from gs2d.data.exif import Taken, read_taken
+from gs2d.data.image_files import read_image
 from gs2d.data.masks import FOLDER, without_masks
+from gs2d.data.photo_formats import AVIF, EXR, HEIF, UNREAD, remedy
 from gs2d.errors import DataError
 from gs2d.sfm.fisheye import Circle, circle_of, named_fisheye, small_if_dark
 from gs2d.sfm.panoramas import PANORAMA, meets_itself

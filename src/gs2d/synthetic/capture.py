@@ -12,9 +12,9 @@ import numpy as np
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.files import atomic_write, disk_error
-from gs2d.core.image_files import write_image
 from gs2d.core.json_files import write_json
 from gs2d.core.mesh import Mesh
+from gs2d.data.image_files import write_image
 from gs2d.errors import DataError
 from gs2d.io.meshes import write_mesh
 from gs2d.meshing.raycast import cast_camera

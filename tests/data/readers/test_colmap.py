@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 
 from capture_writers import ColmapModel, ring, small_colmap, write_image_of
-from gs2d.core.image_files import read_image
 from gs2d.data import load_scene
+from gs2d.data.image_files import read_image
 from gs2d.data.readers import colmap
 from gs2d.data.readers.colmap import read_cameras, read_images, read_points
 from gs2d.errors import DataError

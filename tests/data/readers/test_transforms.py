@@ -174,7 +174,7 @@ def test_files_that_the_json_names_and_that_do_not_exist_are_reported(tmp_path: 
 def test_distorted_frames_are_undistorted_and_reported(tmp_path: Path) -> None:
     small_nerfstudio(tmp_path, meta={"camera_model": "OPENCV", "k1": -0.3, "p1": 0.01})
     view = load_scene(tmp_path, test_every=0).train[0]
-    from gs2d.core.image_files import read_image
+    from gs2d.data.image_files import read_image
 
     assert not np.array_equal(view.image(), read_image(view.path))
     assert any("9 of 9 views are undistorted" in note for note in load_scene(tmp_path).details)

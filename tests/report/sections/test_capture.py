@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gs2d.core.image_files import write_image
+from gs2d.data.image_files import write_image
 from gs2d.errors import DataError
 from gs2d.report.sections.capture import capture_section
 

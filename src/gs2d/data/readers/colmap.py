@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gs2d.core.image_files import image_size
 from gs2d.core.images import is_number, natural_key
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.data.build import Capture, PosedImage, skipping
 from gs2d.data.faces import panorama
 from gs2d.data.file_names import in_any_case
+from gs2d.data.image_files import image_size
 from gs2d.data.priors import ObservedPoints
 from gs2d.data.readers.common import Photograph, find_photographs, parsed
 from gs2d.data.scene import PointCloud

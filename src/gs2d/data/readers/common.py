@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.core.photo_formats import UNREAD, remedy
 from gs2d.data.build import PosedImage
 from gs2d.data.file_names import IMAGES, NO_PHOTOGRAPHS, Files, files_ending, in_any_case, name_below
+from gs2d.data.photo_formats import UNREAD, remedy
 from gs2d.data.scene import PointCloud
 from gs2d.errors import DataError, UnusableViewError
 from gs2d.io.meshes import read_points

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import rq
 
-from gs2d.core.arrays import read_npz
 from gs2d.core.camera import Camera
-from gs2d.core.image_files import image_size
 from gs2d.core.images import is_number, natural_key
+from gs2d.data.arrays import read_npz
 from gs2d.data.build import Capture, PosedImage
 from gs2d.data.file_names import in_any_case
+from gs2d.data.image_files import image_size
 from gs2d.data.priors import ObservedPoints
 from gs2d.data.readers.colmap import (
     ColmapCamera,

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.core.image_files import image_size
 from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world, skipping
 from gs2d.data.faces import panorama
 from gs2d.data.file_names import Files, in_any_case
+from gs2d.data.image_files import image_size
 from gs2d.data.masks import FOLDER
 from gs2d.data.priors import DEPTHS, NORMALS, MapFiles
 from gs2d.data.readers.common import Photograph, find_photographs

@@ -10,8 +10,8 @@ import numpy as np
 from jinja2 import UndefinedError
 from markupsafe import Markup
 
-from gs2d.core.image_files import read_image
 from gs2d.core.json_files import read_json
+from gs2d.data.image_files import read_image
 from gs2d.errors import DataError
 from gs2d.report.html import render
 

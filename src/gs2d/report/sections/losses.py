@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from gs2d.core.image_files import read_image
+from gs2d.data.image_files import read_image
 from gs2d.report.html import missing, render
 from gs2d.report.plots import INK, plot_by_image, svg_text
 

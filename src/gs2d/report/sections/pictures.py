@@ -11,9 +11,9 @@ import numpy as np
 from markupsafe import Markup
 
 from gs2d.core.camera import Camera
-from gs2d.core.image_files import read_image
 from gs2d.core.images import composite
 from gs2d.core.json_files import read_json
+from gs2d.data.image_files import read_image
 from gs2d.errors import DataError
 from gs2d.io.meshes import read_mesh, read_textured
 from gs2d.io.run_dir import RENDERS, TEXTURED

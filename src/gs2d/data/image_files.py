@@ -14,10 +14,10 @@ from typing import IO
 import numpy as np
 from PIL import Image
 
-from gs2d.core import exr, float_tiff
 from gs2d.core.files import atomic_write
 from gs2d.core.growth import check_growth
 from gs2d.core.images import to_uint8
+from gs2d.data import exr, float_tiff
 from gs2d.errors import DataError, ShapeError
 
 #: What Pillow is let near: formats of photographs, masks and depths. The forty others, some of which start programs
@@ -102,7 +102,7 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
 
     EXIF orientation is **not** applied: COLMAP does not apply it either, so poses belong to the stored pixels.
     Grey images become RGB, palettes are resolved, 16-bit grey becomes 8-bit. OpenEXR's linear floats become sRGB values
-    (:func:`gs2d.core.exr.display_image`). Other images of floats are refused: what is white in them is not known.
+    (:func:`gs2d.data.exr.display_image`). Other images of floats are refused: what is white in them is not known.
 
     Returns
     -------

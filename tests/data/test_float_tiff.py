@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gs2d.core import float_tiff
-from gs2d.core.image_files import image_size, read_grey, read_image
+from gs2d.data import float_tiff
+from gs2d.data.image_files import image_size, read_grey, read_image
 from gs2d.data.priors import read_depth
 from gs2d.errors import DataError
 

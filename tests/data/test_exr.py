@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gs2d.core import exr
-from gs2d.core.image_files import image_size, read_grey, read_image
 from gs2d.core.light import encode_srgb
-from gs2d.data import load_scene
+from gs2d.data import exr, load_scene
+from gs2d.data.image_files import image_size, read_grey, read_image
 from gs2d.data.priors import read_depth
 from gs2d.errors import DataError
 

@@ -8,8 +8,8 @@ import importlib.util
 
 from PIL import features
 
-from gs2d.core import exr
 from gs2d.core.extras import install
+from gs2d.data import exr
 
 
 def _reads_heif() -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gs2d.core.image_files import image_size, read_image, read_mask, write_image
+from gs2d.data.image_files import image_size, read_image, read_mask, write_image
 from gs2d.errors import DataError, DiskError, ShapeError
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from PIL import ExifTags, Image
 
-from gs2d.core.image_files import open_image
+from gs2d.data.image_files import open_image
 
 #: What Pillow raises for a damaged EXIF block.
 DAMAGED_EXIF = (

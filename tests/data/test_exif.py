@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from gs2d.core.exif import Taken, read_place, read_taken
+from gs2d.data.exif import Taken, read_place, read_taken
 
 DJI = (
     '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description drone-dji:AbsoluteAltitude="+198.31" '

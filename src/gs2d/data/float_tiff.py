@@ -56,7 +56,7 @@ def float_header(path: str | os.PathLike[str]) -> Header | None:
 def display_image(path: str | os.PathLike[str], header: Header) -> np.ndarray:
     """Decode a photograph of linear light: uint8 [H, W, 3], or [H, W, 4] with straight alpha, sRGB values.
 
-    One sample (grey) or three, with alpha or without; else as :func:`gs2d.core.exr.display_image`.
+    One sample (grey) or three, with alpha or without; else as :func:`gs2d.data.exr.display_image`.
 
     Raises
     ------

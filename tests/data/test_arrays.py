@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gs2d.core.arrays import read_npy, read_npz
+from gs2d.data.arrays import read_npy, read_npz
 from gs2d.errors import DataError
 
 
