@@ -53,7 +53,7 @@ VERDICT_SHAPE: Shape = {
         "findings": [{"name": str, "grade": (str, None), "figure": str, "text": str, "advice": (str, None)}],
     },
 }
-_KINDS = {
+_KINDS: dict[type, str] = {
     **{str: "text", bool: "true or false", int: "a whole number >= 0", float: "a finite number"},
     **{list: "a list", dict: "an object"},
 }
