@@ -1,9 +1,13 @@
-"""The packages and programs that some commands need and gs2d does not bring, and the words that install them."""
+"""Optional packages and programs: what installs them, and their import when they are needed."""
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Any
+
+from gs2d.errors import BackendError
 
 # extra -> what pyproject.toml says of it (a test compares them)
 EXTRAS: Mapping[str, tuple[str, ...]] = MappingProxyType(
@@ -30,3 +34,26 @@ def install(extra: str) -> str:
     looked for on an index that does not have it.
     """
     return "pip install " + " ".join(f"'{requirement}'" for requirement in EXTRAS[extra])
+
+
+def required(extra: str, module: str, what: str, otherwise: str = "") -> Any:
+    """Return a module of an extra, imported when it is needed.
+
+    Parameters
+    ----------
+    extra, module : str
+    what : str
+        What needs the module, for the message.
+    otherwise : str
+        What to do without it.
+
+    Raises
+    ------
+    BackendError
+        If it is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        remedy = f"{install(extra)}{otherwise and ', or '}{otherwise}"
+        raise BackendError(f"{what} needs {error.name}, which is not installed; {remedy}") from error

@@ -41,3 +41,8 @@ def _spelled(found: re.Match[str]) -> str:
         code -= 0xDC00
     named = {0x09: "\\t", 0x0A: "\\n", 0x0D: "\\r"}
     return named.get(code) or (f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}")
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error's message, or the name of its class where it has none."""
+    return (str(error).splitlines() or [type(error).__name__])[0]

@@ -12,6 +12,7 @@ from typing import IO
 import numpy as np
 
 from gs2d.core.growth import check_entries, check_growth
+from gs2d.core.text import first_line
 from gs2d.errors import DataError
 
 
@@ -71,5 +72,5 @@ def _one_line(name: str, kind: str) -> Iterator[None]:
     except FileNotFoundError as error:
         raise DataError(f"{name} does not exist") from error
     except Exception as error:
-        why = (str(error).splitlines() or [type(error).__name__])[0]
+        why = first_line(error)
         raise DataError(f"{name} must be a numpy file of numbers (.{kind}), got: {why}; copy it again") from error

@@ -17,6 +17,7 @@ from PIL import TiffImagePlugin
 from gs2d.core.extras import install
 from gs2d.core.growth import check_growth
 from gs2d.core.light import display_values
+from gs2d.core.text import first_line
 from gs2d.errors import DataError
 
 SUFFIXES = (".tif", ".tiff")
@@ -93,7 +94,7 @@ def _decoded(name: str) -> tuple[np.ndarray, bool]:
             values = np.asarray(page.asarray(), dtype=np.float32)
             axes, extra = str(page.axes), tuple(page.extrasamples)
     except Exception as error:  # whatever it makes of a damaged file, or of a packing that it lacks a decoder for
-        why = (str(error).splitlines() or [type(error).__name__])[0]
+        why = first_line(error)
         raise DataError(
             f"image {name} does not decode: {why}; write it unpacked, or by Deflate without a predictor"
         ) from error

@@ -17,6 +17,7 @@ from PIL import Image
 from gs2d.core.files import atomic_write
 from gs2d.core.growth import check_growth
 from gs2d.core.images import to_uint8
+from gs2d.core.text import first_line
 from gs2d.data import exr, float_tiff
 from gs2d.errors import DataError, ShapeError
 
@@ -166,7 +167,7 @@ def read_mask(path: str | os.PathLike[str]) -> np.ndarray:
 def _first_line(error: BaseException) -> str:
     if isinstance(error, Image.DecompressionBombError):
         return f"more than {2 * (Image.MAX_IMAGE_PIXELS or 0):,} pixels, which Pillow refuses to decode; shrink it"
-    return (str(error).splitlines() or [type(error).__name__])[0]
+    return first_line(error)
 
 
 def write_image(path: str | os.PathLike[str], image: np.ndarray) -> None:

@@ -19,6 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from gs2d.core.text import first_line
 from gs2d.errors import DataError, ShapeError
 
 CONVENTIONS = ("0..1", "-1..1")
@@ -141,7 +142,7 @@ def load_lpips(paths: str | Path | Iterable[str | Path], *, device: str = "cpu")
         except MemoryError:
             raise
         except Exception as error:  # whatever torch's readers of its old and new formats run into
-            first = (str(error).splitlines() or [type(error).__name__])[0]
+            first = first_line(error)
             first = first.split(".")[0] if isinstance(error, UnpicklingError) else first  # torch's advice is long
             raise DataError(f"{file} is not a readable PyTorch state dict ({first}); {REMEDY}") from error
         if not isinstance(state, Mapping):

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from gs2d.core.extras import install
+from gs2d.core.extras import install, required
 from gs2d.data import View
 from gs2d.data.image_files import read_image
 from gs2d.errors import BackendError, DataError
@@ -42,10 +41,7 @@ def required_cv2() -> Any:
     BackendError
         It is not installed, or without ArUco.
     """
-    try:
-        cv2 = importlib.import_module("cv2")
-    except ModuleNotFoundError as error:
-        raise BackendError(f"--markers needs OpenCV, which is not installed; {install('markers')}") from error
+    cv2 = required("markers", "cv2", "--markers")
     if not hasattr(getattr(cv2, "aruco", None), "ArucoDetector"):
         raise BackendError(
             f"--markers needs OpenCV 4.7 or newer with ArUco, got {cv2.__version__}; {install('markers')}"

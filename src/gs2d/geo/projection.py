@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 import re
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.core.extras import install
+from gs2d.core.extras import required
 from gs2d.errors import BackendError, DataError
 
 # WGS 84: the equatorial radius, m, and the flattening.
@@ -76,12 +75,7 @@ def required_pyproj() -> Any:
     BackendError
         It is not installed.
     """
-    try:
-        return importlib.import_module("pyproj")
-    except ModuleNotFoundError as error:
-        raise BackendError(
-            f"map projections need {error.name}, which is not installed; {install('geo')}, or use --enu, a local frame"
-        ) from error
+    return required("geo", "pyproj", "a map projection", "use --enu, a local frame")
 
 
 @dataclass(frozen=True)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import importlib
 import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gs2d.core.extras import install
+from gs2d.core.extras import required
 from gs2d.core.files import atomic_write
-from gs2d.errors import BackendError
 
 NO_DATA = -9999.0  # of elevations; what maps of heights use
 _TILE = (256, 256)
@@ -19,20 +17,6 @@ _DOUBLE, _SHORT, _ASCII = 12, 3, 2  # types of TIFF fields
 _PIXEL_SCALE, _TIE_POINT, _KEYS, _KEY_TEXTS, _NO_DATA = 33550, 33922, 34735, 34737, 42113  # TIFF tags
 _MODEL, _RASTER, _CITATION, _PROJECTED, _UNITS = 1024, 1025, 1026, 3072, 3076  # GeoKeys
 _METRE, _IS_PROJECTED, _PIXEL_IS_AREA, _OF_ITS_OWN = 9001, 1, 1, 32767
-
-
-def required() -> Any:
-    """Return tifffile.
-
-    Raises
-    ------
-    BackendError
-        It is not installed.
-    """
-    try:
-        return importlib.import_module("tifffile")
-    except ModuleNotFoundError as error:
-        raise BackendError(f"a GeoTIFF needs tifffile, which is not installed; {install('geo')}") from error
 
 
 def write_geotiff(
@@ -54,7 +38,7 @@ def write_geotiff(
     frame : str
         Its name, for people.
     """
-    tifffile = required()
+    tifffile = required("geo", "tifffile", "a GeoTIFF")
     colored = raster.ndim == 3
     tags = [
         (_PIXEL_SCALE, _DOUBLE, 3, (step, step, 0.0), True),

@@ -20,6 +20,7 @@ from PIL import Image
 
 from gs2d.core.files import atomic_write
 from gs2d.core.mesh import Mesh, TexturedMesh
+from gs2d.core.text import first_line
 from gs2d.errors import DataError
 from gs2d.io.ply_format import PlyElement, PlyList, read_ply, write_ply
 
@@ -152,7 +153,7 @@ def _read_foreign(path: Path) -> Mesh:
         visual: Any = loaded.visual
         colors = np.array(visual.vertex_colors, np.uint8)[:, :3] if visual.kind == "vertex" else None
     except Exception as error:  # whatever its parsers run into
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        reason = first_line(error)
         raise DataError(f"{path}: a mesh was expected, trimesh cannot read it ({reason}); export it again") from error
     if not len(faces):
         raise DataError(f"{path}: a mesh was expected, the file has no faces; give a triangle mesh")

@@ -41,6 +41,7 @@ from gs2d.core.growth import check_entries
 from gs2d.core.json_files import read_json, write_json
 from gs2d.core.locks import try_lock
 from gs2d.core.missing import instead, where_it_ends
+from gs2d.core.text import first_line
 from gs2d.errors import DataError, RunError
 from gs2d.io.event_log import EventLog
 from gs2d.io.run_schema import DEFINITION_SHAPE, METRICS_SHAPE, check_shape
@@ -349,7 +350,7 @@ def load_tensors(path: Path) -> dict[str, Any]:
             warnings.simplefilter("ignore")
             return dict(torch.load(path, map_location="cpu", weights_only=True))
     except (*_UNREADABLE, DataError, pickle.UnpicklingError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        reason = first_line(error)
         raise RunError(f"{path} is not a readable checkpoint ({reason}); delete it") from error
 
 

@@ -27,11 +27,11 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array
 
+from gs2d.core import extras
 from gs2d.core.camera import Camera
-from gs2d.core.extras import install
 from gs2d.core.images import area_downscale, mask_downscale
 from gs2d.core.mesh import Mesh, TexturedMesh
-from gs2d.errors import BackendError, ProtocolError
+from gs2d.errors import ProtocolError
 from gs2d.meshing.agreement import VOTE, Agreement, agree, corrected
 from gs2d.meshing.evidence import areas
 from gs2d.meshing.raycast import cast_camera
@@ -105,14 +105,7 @@ def required(module: str) -> Any:
     BackendError
         It is not installed.
     """
-    import importlib
-
-    try:
-        return importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        raise BackendError(
-            f"--texture needs {module}, which is not installed; {install('texture')}, or leave --texture out"
-        ) from error
+    return extras.required("texture", module, "--texture", "leave --texture out")
 
 
 def simplified(mesh: Mesh, faces: int) -> Mesh:

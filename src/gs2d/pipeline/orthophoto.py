@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from gs2d.core.extras import required
 from gs2d.core.files import check_writable
 from gs2d.core.georeference import Georeference
 from gs2d.core.mesh import Mesh
 from gs2d.errors import ProtocolError, RunError
-from gs2d.io.geotiff import NO_DATA, required, write_geotiff
+from gs2d.io.geotiff import NO_DATA, write_geotiff
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, open_run
 from gs2d.meshing.raycast import Hits, cast_down
@@ -65,7 +66,7 @@ def orthophoto_run(
     The surface is the run's mesh; a cell shows the highest of it, in the colours of the photographs that see it best,
     or in those of the mesh where none does.
     """
-    required()  # before minutes are spent
+    required("geo", "tifffile", "a GeoTIFF")  # before minutes are spent
     path = Path(path)
     place = place_of(open_run(path).path, asked=True)
     assert place is not None

@@ -12,7 +12,6 @@ older ones. One of them names another coordinate system of the stored numbers.
 
 from __future__ import annotations
 
-import importlib
 import os
 import struct
 import warnings
@@ -23,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.core.extras import install
+from gs2d.core.extras import required
 from gs2d.core.growth import check_growth
 from gs2d.core.json_files import atomic_write
-from gs2d.errors import BackendError, DataError
+from gs2d.errors import DataError
 from gs2d.io.gaussians import (
     THIN,
     Gaussians,
@@ -60,22 +59,6 @@ _SH1_STEP, _SH_STEP = (
 )  # of 255: 7 bits for degree 1, 6 for the others; Niantic's library has 5 and 4 (see decisions)
 _ROOT = np.sqrt(0.5)  # no component but the largest exceeds it
 _WORDS = (1 << 9) - 1
-
-
-def required_zstd() -> Any:
-    """Return the package zstandard.
-
-    Raises
-    ------
-    BackendError
-        It is not installed.
-    """
-    try:
-        return importlib.import_module("zstandard")
-    except ModuleNotFoundError as error:
-        raise BackendError(
-            f"SPZ of version 4 needs {error.name}, which is not installed; {install('spz4')}, or use version 3"
-        ) from error
 
 
 def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, *, version: int = 3) -> tuple[str, ...]:
@@ -118,7 +101,7 @@ def _parts_3(g: Gaussians, bits: int, streams: list[bytes]) -> Iterator[bytes]:
 
 def _parts_4(g: Gaussians, bits: int, streams: list[bytes]) -> list[bytes]:
     streams = streams if g.shN.shape[1] else streams[:-1]  # no stream of nothing, as Niantic's library writes none
-    compressor = required_zstd().ZstdCompressor(level=12)
+    compressor = required("spz4", "zstandard", "SPZ of version 4", "use version 3").ZstdCompressor(level=12)
     packed = [compressor.compress(stream) for stream in streams]
     header = _HEADER_4.pack(_MAGIC, 4, len(g), g.sh_degree, bits, 0, len(streams), _HEADER_4.size)
     table = [_SIZES.pack(len(a), len(b)) for a, b in zip(packed, streams, strict=True)]
@@ -302,7 +285,7 @@ def _parts_of_4(path: str | os.PathLike[str], data: bytes) -> tuple[int, int, in
 
 def _unzstd(path: str | os.PathLike[str], packed: bytes, size: int) -> bytes:
     """Return at most ``size`` bytes and one more of what a stream becomes."""
-    zstandard = required_zstd()
+    zstandard = required("spz4", "zstandard", "SPZ of version 4", "use version 3")
     try:
         with zstandard.ZstdDecompressor(max_window_size=_WINDOW).stream_reader(packed) as reader:
             return bytes(reader.read(size + 1))
