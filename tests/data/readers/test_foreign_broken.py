@@ -81,6 +81,12 @@ def without_images(writer: Callable[[Path], Any]) -> Callable[[Path], None]:
             alicevision_with(lambda d: d["poses"][1]["pose"]["transform"].update(center=["0", "-nan(ind)", "1"])),
             "a_1.jpg",
         ),
+        (
+            metashape_with(
+                "</cameras>", f"<camera id='9' label='z'><transform>{'nan ' * 16}</transform></camera></cameras>"
+            ),
+            "z",
+        ),
     ],
 )
 def test_an_image_whose_pose_is_not_finite_is_skipped_and_named(

@@ -136,7 +136,8 @@ def _placed(
     In a multi-camera system only the camera of the master sensor has a transform. The sensors of the others have a
     rotation and a location: their pose in the frame of the master.
     """
-    placed, skipped = [], []
+    placed: list[_Placed] = []
+    skipped: list[str] = []
     cameras = {camera.get("id"): camera for camera in listed}
     for camera in listed:
         label = camera.get("label") or camera.get("id") or "without a label"
@@ -147,15 +148,15 @@ def _placed(
         elif master is None or master.find("transform") is None:
             skipped.append(f"{label}: not aligned in Metashape")
         else:
-            M = reals(master.findtext("transform") or "", 16, f"{where}: transform").reshape(4, 4)
-            if master is not camera:
-                mounted = _in_master(sensors.get(camera.get("sensor_id", "")), where)
-                if mounted is None:
-                    skipped.append(f"{label}: its sensor has no rotation and location in its multi-camera system")
-                    continue
-                M = M @ mounted
-            component = camera.get("component_id") or master.get("component_id")
-            placed.append(_Placed(camera, label, component, M))
+            with skipping(label, skipped):
+                M = reals(master.findtext("transform") or "", 16, f"{where}: transform").reshape(4, 4)
+                if master is not camera:
+                    mounted = _in_master(sensors.get(camera.get("sensor_id", "")), where)
+                    if mounted is None:
+                        skipped.append(f"{label}: its sensor has no rotation and location in its multi-camera system")
+                        continue
+                    M = M @ mounted
+                placed.append(_Placed(camera, label, camera.get("component_id") or master.get("component_id"), M))
     return placed, skipped
 
 
