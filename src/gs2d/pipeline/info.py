@@ -16,7 +16,7 @@ from gs2d.io.georeference import georeference_of_file
 from gs2d.io.meshes import FOREIGN, read_mesh, read_points
 from gs2d.io.splat_ply import ply_kind
 
-_OF_CAPTURES = (".json", ".xml", ".sfm", ".npz", ".bin", ".txt")
+_OF_MODELS = (".ply", ".glb", ".gltf", *FOREIGN)
 
 
 def describe_capture(path: Path) -> dict[str, Any]:
@@ -53,7 +53,7 @@ def describe_file(path: Path) -> dict[str, Any]:
     DataError
         The file is none of these, or is broken.
     """
-    if path.suffix.lower() in _OF_CAPTURES and not is_splat_file(path):
+    if path.suffix.lower() not in _OF_MODELS and not is_splat_file(path):
         remedy = instead(path, "run" if belongs_to_run(path) else "capture")
         raise DataError(f"{path}: a file of splats, a mesh or points was expected, got another file{remedy}")
     size = path.stat().st_size
