@@ -129,7 +129,7 @@ def test_they_are_written_read_and_described(name: str) -> None:
     assert "the mesh is of the transmittance depth" in said
     fitted = "" if name == "best-surface" else ", its splats fitted to them"
     assert f"dense start: a sweep over photographs of about 256 px{fitted}, and 500 on a" in said
-    assert "on a sphere around, if needed; without where they agree on nothing" in said
+    assert "on a sphere around; without where they agree on nothing" in said
     assert "rates but that of the means fall after iteration" in said
 
 

@@ -49,7 +49,7 @@ def describe_recipe(recipe: Recipe) -> Iterator[str]:
         start = recipe.dense_start
         fitted = ", its splats fitted to them" if start.fit is not None else ""
         otherwise = "" if start.required else "; without where they agree on nothing"
-        around = "" if start.sphere is None else f", and {start.sphere.splats:,} on a sphere around, if needed"
+        around = "" if start.sphere is None else f", and {start.sphere.splats:,} on a sphere around"
         yield f"dense start: a sweep over photographs of about {start.side} px{fitted}{around}{otherwise}"
     if recipe.removal is not None:
         r = recipe.removal

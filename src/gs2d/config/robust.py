@@ -55,15 +55,11 @@ class BackgroundSphere:
         In units of how far the scene goes: its cameras, and nearly all of its sparse points and swept places.
     size : float
         Standard deviation of a splat, in units of the distance to its neighbours.
-    needed : float, dB
-        There is no sphere where photographs whose pixels of unknown depth had one colour would have a PSNR above this:
-        little is missing there, and large splats then stand where no photograph looks.
     """
 
     splats: int = 500
     radius: float = 3.0
     size: float = 0.8
-    needed: float = 22.0
 
 
 @dataclass(frozen=True)
@@ -167,7 +163,6 @@ def check_robust(where: str, start: DenseStart | None, removal: Removal | None) 
             _check_fit(f"{at}.fit", start.fit)
         if start.sphere is not None:
             integer(f"{at}.sphere.splats", start.sphere.splats, low=1)
-            number(f"{at}.sphere.needed", start.sphere.needed, low=0.0)
             for name in ("radius", "size"):
                 value = number(f"{at}.sphere.{name}", getattr(start.sphere, name), low=0.0)
                 require(value > 0, f"{at}.sphere.{name} must be positive, got {value}")

@@ -20,8 +20,6 @@ from gs2d.training.plane_sweep import Sweep, project, unproject
 
 BESIDE_KNOWN = 3  # px: so near to a pixel of known depth, another one is probably of the same thing
 MAX_VIEWS = 200  # that are looked at, evenly chosen
-EXACT = 200.0  # dB, of what is the same
-MEDIAN_OF = 1_000_000  # pixels, of all views
 STRIDE = 5  # px between those of which places are looked at
 
 
@@ -31,8 +29,7 @@ def sphere_points(
     """Return places, colours in [0, 1], normals (all [P, 3]) and sizes [P] of splats around everything.
 
     Places are left out that no photograph shows in a pixel of unknown depth; a colour is the median of those pixels.
-    There are none where photographs have an alpha channel, which says what is empty, and where one colour would do
-    (``settings.needed``).
+    There are none where photographs have an alpha channel, which says what is empty.
 
     Parameters
     ----------
@@ -43,7 +40,7 @@ def sphere_points(
     """
     looked_at = range(0, len(sweep.views), max(1, -(-len(sweep.views) // MAX_VIEWS)))
     reach = reach_of(scene, _swept_places(sweep, looked_at))
-    if reach is None or scene.train[0].alpha() is not None or _one_color(sweep, looked_at) > settings.needed:
+    if reach is None or scene.train[0].alpha() is not None:
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
     radius, directions = settings.radius * reach.radius, evenly_on_sphere(settings.splats)
     rows, colors = _looks(sweep, looked_at, reach.center + radius * directions)
@@ -75,25 +72,6 @@ def _unknown(sweep: Sweep, index: int) -> np.ndarray:
     """Return the pixels [H, W] of a shrunk photograph that show something of unknown depth."""
     known = binary_dilation(sweep.depths[index] > 0, iterations=BESIDE_KNOWN)
     return np.asarray(sweep.views[index].usable & ~known)
-
-
-def _one_color(sweep: Sweep, looked_at: Sequence[int]) -> float:
-    """Return the PSNR of photographs, dB, whose pixels of unknown depth had one colour, and all others their own."""
-    unknown = {index: _unknown(sweep, index) for index in looked_at}
-    step = max(1, -(-sum(int(mask.sum()) for mask in unknown.values()) // MEDIAN_OF))
-    some = np.concatenate([_colors(sweep, index, mask)[::step] for index, mask in unknown.items()])
-    if not len(some):
-        return EXACT
-    color, error, pixels = np.median(some, axis=0), 0.0, 0
-    for index, mask in unknown.items():  # view by view: those of hundreds of photographs are hundreds of MB
-        error += float(((_colors(sweep, index, mask) - color) ** 2).sum(dtype=np.float64))
-        pixels += int(sweep.views[index].usable.sum())
-    return EXACT if error == 0 else -10 * math.log10(error / (3 * pixels))
-
-
-def _colors(sweep: Sweep, index: int, mask: np.ndarray) -> np.ndarray:
-    """Return the colours [P, 3] of some pixels of a shrunk photograph."""
-    return np.asarray(sweep.views[index].color.permute(1, 2, 0).numpy()[mask])
 
 
 def _looks(sweep: Sweep, looked_at: Sequence[int], places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

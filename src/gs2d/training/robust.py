@@ -98,7 +98,8 @@ class Robustness:
         try:
             sweep = sweep_views(scene, start or DenseStart())
             if start is not None:
-                around = None if start.sphere is None else sphere_points(scene, sweep, start.sphere)
+                unlit = recipe.removal is not None and recipe.removal.backdrop  # there is nothing behind the subject
+                around = None if start.sphere is None or unlit else sphere_points(scene, sweep, start.sphere)
                 self.scene = replace(scene, points=start_points(scene, sweep, start, around))
         except DataError as error:
             if start is None or start.required or recipe.removal is not None:
