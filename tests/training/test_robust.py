@@ -283,6 +283,23 @@ def test_few_new_proposals_wait_for_the_end_of_a_part(monkeypatch: pytest.Monkey
     assert tried == [3, 3]  # but at the end of a fifth
 
 
+@pytest.mark.parametrize("behind", [True, False])
+def test_frozen_splats_stand_behind_what_is_tried(behind: bool) -> None:
+    """Dark fog is missed over black, which is darker, and not where the wall behind it is drawn."""
+    frozen = wall_of_splats()[0] if behind else None
+    state = full_state(20)
+    splats = state.splats
+    splats.means[:] = torch.tensor([0.5, 0.0, WALL])  # nothing speaks against these
+    splats.means[:5] = torch.tensor([0.5, 0.0, 1.8])
+    splats.quats[:] = torch.tensor([1.0, 0, 0, 0])
+    splats.log_scales[:] = float(np.log(0.1))
+    splats.opacity_logits[:], splats.opacity_logits[:5] = -8.0, 1.0
+    splats.sh0[:], splats.shN[:] = rgb_to_sh0(torch.tensor([[0.15, 0.15, 0.15]])), 0
+    robust = Robustness(wall(), short(), RASTER, BACKEND, frozen=frozen)
+    robust.remove(state, short().stages[0], 10)
+    assert len(state.splats) == (15 if behind else 20)
+
+
 def test_a_resumed_run_starts_from_the_same_places_and_ends_with_the_same_bits() -> None:
     whole = Trainer(wall(), short(), GENERIC, backend="auto").run()
     first = Trainer(wall(), short(), GENERIC, backend="auto")

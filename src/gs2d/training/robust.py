@@ -61,6 +61,8 @@ class Robustness:
         Renders what is tried.
     processes : OneProcess
         Those that train together. Process 0 makes the start and tries removals for all.
+    frozen : Splats, optional
+        Splats that photographs show too, and that stay.
 
     Attributes
     ----------
@@ -83,8 +85,9 @@ class Robustness:
         raster: RasterSettings,
         backend: Backend,
         processes: OneProcess = ONE_PROCESS,
+        frozen: Splats | None = None,
     ) -> None:
-        self._processes = processes
+        self._processes, self._frozen = processes, frozen
         self.scene, self._given, self._recipe = scene, scene, recipe
         self._raster, self._backend = raster, backend
         self._free: FreeSpaceMaps | None = None
@@ -161,14 +164,15 @@ class Robustness:
         raster = self._raster if self._removal.backdrop else replace(self._raster, background=BLACK)
         step = max(1, -(-len(self._images) // MAX_WITNESSES))
         rows = range(iteration // self._removal.every % step, len(self._images), step)
+        whole = splats if self._frozen is None else splats.followed_by(self._frozen)
         needed = missed(
-            splats,
-            against,
+            whole,
+            torch.cat([against, against.new_zeros(len(whole) - len(splats))]),
             self._witnesses(state, rows),
             raster,
             self._backend,
             stands_for=len(self._images) / len(rows),
-        )
+        )[: len(splats)]
         verdict[proposed] = REMOVED
         verdict[needed] = NEEDED
         return verdict

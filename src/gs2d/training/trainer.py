@@ -141,15 +141,15 @@ class Trainer:
         self._within = within
         goes_on = (init is not None and within is None) or (state is not None and self.recipe.removal is None)
         begins = replace(self.recipe, dense_start=None) if goes_on else self.recipe
-        self._robust = Robustness(scene, begins, self.settings, self.backend, processes)
-        if state is not None:
-            check_resumable(state, self.recipe, len(scene.train))
-        self.state = processes.share(lambda: self._new_state(dtype, init, exposures) if state is None else state)
-        self.state.trained_by(processes.size)
         self._frozen = None if frozen is None or len(frozen) == 0 else frozen.detach().to(self.backend.device)
         if self._frozen is not None and self._frozen.sh_degree != self.recipe.sh_degree:
             degrees = f"{self._frozen.sh_degree}, the recipe trains {self.recipe.sh_degree}"
             raise RecipeError(f"frozen splats must have the recipe's SH degree, got {degrees}; set sh_degree")
+        self._robust = Robustness(scene, begins, self.settings, self.backend, processes, self._frozen)
+        if state is not None:
+            check_resumable(state, self.recipe, len(scene.train))
+        self.state = processes.share(lambda: self._new_state(dtype, init, exposures) if state is None else state)
+        self.state.trained_by(processes.size)
         self.state.move_to(self.backend.device)
         self._robust.move_to(self.backend.device)
         self._learner = self.backend.for_training()
