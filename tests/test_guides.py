@@ -106,11 +106,6 @@ def test_links_to_files_of_the_repository_lead_somewhere() -> None:
     assert not dead
 
 
-def test_no_line_of_a_page_has_more_than_120_characters() -> None:
-    lines = {page: page.read_text(encoding="utf-8").splitlines() for page in PAGES}
-    assert not [f"{page.name}:{i}" for page in PAGES for i, line in enumerate(lines[page], 1) if len(line) > 120]
-
-
 def test_files_that_the_architecture_names_are_there() -> None:
     named = set(re.findall(r"[\w/]+\.py\b", (DOCS / "architecture.md").read_text(encoding="utf-8")))
     there = [path.as_posix() for folder in ("src", "tests") for path in (ROOT / folder).rglob("*.py")]

@@ -16,7 +16,7 @@ from gs2d.core.sh import rgb_to_sh0
 from gs2d.data.scene import View
 from gs2d.render.backends import get_backend
 from gs2d.training.objective import FullRender
-from gs2d.training.opaque import BACKGROUNDS, another_background
+from gs2d.training.opaque import BACKGROUNDS, FROM, another_background
 from gs2d.training.targets import Targets
 from train_toys import full_state, make_scene
 
@@ -27,12 +27,12 @@ def robust(**changes: object) -> Recipe:
     return replace(two_dgs_r(), removal=Removal(**changes))  # type: ignore[arg-type]
 
 
-def test_the_background_changes_in_the_second_half_of_stages_that_train_opacity() -> None:
+def test_the_background_changes_at_the_end_of_stages_that_train_opacity() -> None:
     recipe = robust()
     surface, appearance, refine = recipe.stages
-    half = surface.iterations // 2
-    assert another_background(recipe, surface, half) is None
-    assert {another_background(recipe, surface, half + 1 + i) for i in range(len(BACKGROUNDS))} == set(BACKGROUNDS)
+    before = int(FROM * surface.iterations)
+    assert another_background(recipe, surface, before) is None
+    assert {another_background(recipe, surface, before + 1 + i) for i in range(len(BACKGROUNDS))} == set(BACKGROUNDS)
     for stage in (appearance, refine):
         assert another_background(recipe, stage, stage.iterations) is None
 
