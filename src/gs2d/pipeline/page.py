@@ -96,12 +96,7 @@ class PageContent:
 
 
 def page_content(path: Path, on_event: OnEvent = ignore, job: Job | None = None) -> PageContent:
-    """Return what a page shows of a run (defined by ``job``, where it is at hand) or of a file of splats.
-
-    Raises
-    ------
-    RunError, DataError
-    """
+    """Return what a page shows of a run (defined by ``job``, where it is at hand) or of a file of splats."""
     run = open_run(path) if path.is_dir() or is_run(path) else None
     if run is not None:
         splats = finished_splats(run)

@@ -36,10 +36,6 @@ def open_viewer(path: Path, port: int | None = None, on_event: OnEvent = ignore)
     server : PageServer
     shown : list of str
         What there is to see: "cameras", "mesh", "splats".
-
-    Raises
-    ------
-    RunError, DataError, BackendError
     """
     content = page_content(path, on_event)
     stages: dict[str, Callable[[], Splats]] = {FINAL: lambda: content.splats}

@@ -354,10 +354,6 @@ def write_page(path: str | os.PathLike[str], splats: Splats, scene: PageScene, *
     -------
     dict
         ``splats`` stored, ``sh_degree``, and ``bytes`` of the file.
-
-    Raises
-    ------
-    DataError, DiskError
     """
     settings = scene.settings
     packed = pack(splats, scene.focus, min(sh_degree, settings.sh_degree), settings.alpha_min)
