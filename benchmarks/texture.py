@@ -38,7 +38,8 @@ from gs2d.meshing.raycast import Hits, cast_camera
 from gs2d.meshing.texture import bilinear
 from gs2d.pipeline.exposure import NONE, Transforms, as_scene, read_exposures
 from gs2d.pipeline.finished import finished_splats
-from gs2d.pipeline.job import read_scene, reload_job
+from gs2d.pipeline.job import reload_job
+from gs2d.pipeline.opened import read_scene
 from gs2d.pipeline.options import TextureOptions
 from gs2d.pipeline.texture import textured_mesh
 

@@ -18,6 +18,7 @@ from gs2d.core.mesh import Mesh
 from gs2d.data.image_files import write_image
 from gs2d.evaluation.images import ImageMetrics, Metric
 from gs2d.io.meshes import write_mesh
+from gs2d.pipeline.estimate import Estimate, Range
 
 
 def process(command: list[str], exit_code: int = 0) -> Process:
@@ -111,9 +112,12 @@ def test_the_estimate_is_read_from_what_the_run_said_and_its_error_is_a_factor()
 
 
 def test_the_estimate_that_gs2d_tells_today_is_understood() -> None:
-    from gs2d.pipeline.estimate import Estimate, estimate_text
-
-    told = told_estimate(estimate_text(Estimate(0.1, 80.0, 360.0), 900))
+    found = Estimate(
+        photographs=6, pixels=1, trained_pixels=1, downscale=1, iterations=900, start=1, splats=Range(1, 2, 3),
+        max_splats=None, memory=Range(1, 2, 3), allowed=None, prepared=False, disk=1, temporary=1,
+        training=Range(80.0, 160.0, 360.0), seconds=Range(90.0, 180.0, 400.0),
+    )  # fmt: skip
+    told = told_estimate(found.line())
     assert told is not None
     assert (told["least"], told["most"]) == (80.0, 360.0)
 

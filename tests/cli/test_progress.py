@@ -12,17 +12,16 @@ import pytest
 
 from gs2d.cli.bar import Bar
 from gs2d.cli.console import Console
-from gs2d.cli.whole import Left, WholeRun, between
-from gs2d.pipeline import plan
-from gs2d.pipeline.events import Expected, Notice, Phase, Plan, Step
+from gs2d.cli.whole import WholeRun
+from gs2d.pipeline import events
+from gs2d.pipeline.events import PLACED, TRAINED, Notice, Phase, Plan, Step
 from terminal import ESCAPES, raw_screen_of
 
 DRAWN = textwrap.dedent(
     """
     import time
     from gs2d.cli.console import Console
-    from gs2d.pipeline.events import Notice, Phase, Plan, Step
-    from gs2d.pipeline.plan import TRAINED
+    from gs2d.pipeline.events import TRAINED, Notice, Phase, Plan, Step
     console = Console(quiet=False, as_json=False)
     console.on_event(Plan(TRAINED))
     console.on_event(Phase("training 2dgs-r", 6000))
@@ -60,7 +59,7 @@ def test_bars_notes_and_tables_fit_the_terminal(columns: int, module: str) -> No
     lines = [line for part in ESCAPES.sub("", raw).split("\n") for line in part.split("\r")]
     assert max(map(len, lines)) <= columns
     assert any(line.startswith("training 2dgs-r  ") and "3,000/6,000  " in line and "left" in line for line in lines)
-    assert any(line.startswith("part 1 of 3: training; whole run: ") for line in lines)
+    assert any(line.startswith("part 1 of 3: training; whole run: about ") for line in lines)
     assert any(line.startswith("note a note that is") for line in lines)
     assert any("22.36" in line for line in lines)
 
@@ -121,7 +120,7 @@ def test_a_log_file_hears_of_a_long_training_within_a_minute_and_every_five(
 def test_quiet_and_json_draw_nothing_on_stdout(capsys: pytest.CaptureFixture[str]) -> None:
     quiet, as_json = Console(quiet=True, as_json=True), Console(quiet=False, as_json=True)
     for console in (quiet, as_json):
-        for event in (Plan(plan.TRAINED), Phase("training", 3), Step(1), Notice("n")):
+        for event in (Plan(TRAINED), Phase("training", 3), Step(1), Notice("n")):
             console.on_event(event)
         console.table("", ["a"], [["b"]])
         console.say("text")
@@ -179,47 +178,63 @@ def test_a_bar_gives_way_to_counts_where_there_is_no_room() -> None:
     assert "#" in next(bar.lines(80, ascii_only=True)).plain
 
 
-def test_the_whole_run_is_unknown_until_training_is_measured_and_then_a_range() -> None:
+def test_the_whole_run_is_unknown_until_training_tells_and_then_counts_what_comes_after() -> None:
     clock = Clock()
     whole = WholeRun(clock)
-    whole.on_plan(Plan((*plan.PLACED, *plan.TRAINED)))
+    whole.on_plan(Plan((*PLACED, *TRAINED)))
     assert whole.line() == ""
     whole.on_phase(Phase("finding features", 10))
-    assert whole.line() == "part 2 of 7: features; whole run: known once training begins"
+    assert whole.line() == "part 2 of 7: features"
     whole.on_phase(Phase("reading photographs", 10))  # of another part before: within this one
-    assert whole.line().startswith("part 2 of 7")
-    whole.on_plan(Plan(plan.TRAINED))  # of `train` within `reconstruct`
-    whole.on_expected(Expected(100.0, 400.0))
-    whole.on_phase(Phase("training 2dgs", 1000))
-    fractions = sum(part.of_training or 0.0 for part in plan.TRAINED)
-    assert whole.left() == Left(pytest.approx(100 * (1 + fractions / 2)), pytest.approx(400 * (1 + fractions * 2)))
+    whole.on_step(5)
+    assert whole.line() == "part 2 of 7: features"
+    whole.on_plan(Plan(TRAINED))  # of `train` within `reconstruct`
     clock.now = 100.0
-    whole.on_step(500)  # from its own speed: 100 s more, or a quarter more
-    left = whole.left()
-    assert left is not None
-    assert left.least == pytest.approx(100 * (1 + fractions / 2))  # of the estimate before: it does not rise
-    assert left.most == pytest.approx(125 + 225 * fractions * 2)
+    whole.on_phase(Phase("training 2dgs", 1000))
+    clock.now = 102.0
+    whole.on_step(10)
+    assert whole.line() == "part 5 of 7: training"  # too early
+    clock.now = 200.0
+    whole.on_step(500)  # as long again
+    later = sum(part.of_training or 0.0 for part in TRAINED)
+    assert whole.left() == pytest.approx(100 + 200 * later)
     whole.on_phase(Phase("scoring test views", 8))  # within training: not a step of it
     whole.on_step(8)
-    assert whole.line().startswith("part 5 of 7: training; whole run: ")
-    clock.now = 200.0
+    assert whole.line().startswith("part 5 of 7: training; whole run: about ")
+    whole.on_phase(Phase("training 2dgs", 1000, done=500))  # a later stage: the same training
+    clock.now = 310.0
+    whole.on_step(1000)
+    assert whole.left() == pytest.approx(210 * later)
     whole.on_phase(Phase("rendering depth", 40))
-    assert whole.line().startswith("part 6 of 7: mesh; whole run: ")
+    assert whole.left() == pytest.approx(210 * later)
+    clock.now = 320.0
+    assert whole.left() == pytest.approx(210 * later - 10)
     clock.now = 1000.0  # longer than it should take
     assert whole.line() == "part 6 of 7: mesh"
+
+
+def test_a_run_that_goes_on_knows_how_long_all_of_its_training_takes() -> None:
+    clock = Clock()
+    whole = WholeRun(clock)
+    whole.on_plan(Plan(TRAINED))
+    whole.on_phase(Phase("training 2dgs", 1000, done=800))
+    clock.now = 20.0
+    whole.on_step(900)
+    later = sum(part.of_training or 0.0 for part in TRAINED)
+    assert whole.left() == pytest.approx(20 + 200 * later)
 
 
 def test_the_next_run_of_a_sweep_begins_from_nothing() -> None:
     clock = Clock()
     whole = WholeRun(clock)
     for _ in range(2):
-        whole.on_plan(Plan(plan.TRAINED))
+        whole.on_plan(Plan(TRAINED))
         assert whole.line() == ""
         whole.on_phase(Phase("training 2dgs", 100))
         assert whole.left() is None
         clock.now += 50.0
         whole.on_step(50)
-        assert whole.line().startswith("part 1 of 3: training; whole run: 60 s to ")
+        assert whole.line() == "part 1 of 3: training; whole run: about 70 s left"
         whole.on_phase(Phase("writing the report", 0))
 
 
@@ -240,12 +255,11 @@ RECORDED_LATER = (
 )
 
 
-def follow(seconds: list[float], expected: Expected) -> Iterator[tuple[float, str, Left | None]]:
-    """Play a training, and yield seconds, the time left of its bar, and the bounds of the whole run."""
+def follow(seconds: list[float]) -> Iterator[tuple[float, str, float | None]]:
+    """Play a training, and yield seconds, the time left of its bar, and that of the whole run."""
     clock = Clock()
     whole = WholeRun(clock)
-    whole.on_plan(Plan(plan.TRAINED))
-    whole.on_expected(expected)
+    whole.on_plan(Plan(TRAINED))
     phase = Phase("training best", 10 * len(seconds), growth=1.1)
     whole.on_phase(phase)
     bar = Bar(phase, whole, clock)
@@ -262,34 +276,33 @@ def follow(seconds: list[float], expected: Expected) -> Iterator[tuple[float, st
 
 def test_the_time_left_of_a_recorded_run_never_rises() -> None:
     shown, bounds = [], []
-    for _, left, whole in follow([float(seconds) for seconds in RECORDED], Expected(114.4, 457.7)):
+    for _, left, whole in follow([float(seconds) for seconds in RECORDED]):
         shown += [left.removesuffix(" left")] if left.endswith(" left") else []
         bounds += [whole] if whole is not None else []
     seconds = [float(number) * {"s": 1, "min": 60}[unit] for number, unit in map(str.split, shown)]
     assert len(shown) > 80
-    for values in (seconds, [left.least for left in bounds], [left.most for left in bounds]):
+    for values in (seconds, bounds):
         assert values == sorted(values, reverse=True)
         assert values[-1] < values[0] / 4
     assert 200 < seconds[5] < 600  # 317 s were left
 
 
+def test_the_whole_run_is_told_within_a_third_once_200_iterations_are_done() -> None:
+    end = 469.5
+    for now, _, left in list(follow([float(seconds) for seconds in RECORDED]))[20:60]:
+        assert left is not None
+        assert (end - now) / 1.34 < left < (end - now) * 1.34
+
+
 def test_the_time_left_rises_where_the_work_grows() -> None:
     grown = [float(i) for i in range(1, 31)] + [30.0 + 20.0 * i for i in range(1, 61)]  # twenty times as slow
-    lefts = [whole.most for _, left, whole in follow(grown, Expected(60.0, 300.0)) if left and whole is not None]
+    lefts = [whole for _, left, whole in follow(grown) if left and whole is not None]
     assert max(lefts[40:60]) > 2 * min(lefts[20:30])
 
 
-@pytest.mark.parametrize(
-    ("least", "most", "text"),
-    [(240, 250, "about 4 min"), (240, 540, "4 to 9 min"), (50, 200, "50 s to 3 min"), (0, 20, "0 to 20 s")],
-)
-def test_two_bounds_are_said_in_one_unit_if_they_have_one(least: float, most: float, text: str) -> None:
-    assert between(Left(least, most)) == text
-
-
 def test_every_planned_part_is_begun_by_a_phase_of_the_pipeline() -> None:
-    source = "".join(path.read_text(encoding="utf-8") for path in Path(plan.__file__).parents[1].rglob("*.py"))
-    for part in (*plan.PLACED, *plan.TEXTURED_TOO, *plan.DEMO):
+    source = "".join(path.read_text(encoding="utf-8") for path in Path(events.__file__).parents[1].rglob("*.py"))
+    for part in (*PLACED, *events.TEXTURED_TOO, *events.DEMO):
         assert any(f'"{begin}' in source.replace('f"', '"') for begin in part.begins), part
 
 

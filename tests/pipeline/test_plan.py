@@ -3,49 +3,50 @@
 from __future__ import annotations
 
 import json
-import math
 import re
+import shlex
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
-import torch
 
+from gs2d.cli.app import parse
 from gs2d.cli.app import run as main
 from gs2d.config.densify import Densify
 from gs2d.config.presets import get_recipe
 from gs2d.config.recipe import Stage
 from gs2d.config.robust import Removal
-from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import apply_overrides
 from gs2d.core import memory_limit
-from gs2d.core.splats import Splats
 from gs2d.data import load_scene
 from gs2d.errors import DataError, RecipeError
-from gs2d.pipeline import capture_plan
-from gs2d.pipeline.capture_plan import (
-    FUSION_BYTES,
-    PLACE_BYTES,
+from gs2d.pipeline import estimate as module
+from gs2d.pipeline import plan as plan_module
+from gs2d.pipeline import train as train_module
+from gs2d.pipeline.estimate import (
+    DOUBT,
+    GROWTH,
     PROGRAM_BYTES,
-    SPLAT_BYTES,
+    TRIAL_ITERATIONS,
     budget_overrides,
+    estimate,
     expected_splats,
-    fitting_downscale,
-    looks_of,
-    meshing_bytes,
+    rasterizer_speed,
     rounded,
+    start_of,
+    training_work,
 )
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.options import PlanOptions, TrainOptions
-from gs2d.pipeline.planned import command_of, plan
-from gs2d.pipeline.probe import Cost, Probe, cost_of, crowded
+from gs2d.pipeline.plan import plan
 from gs2d.pipeline.train import train
+from gs2d.render.backends import get_backend
 from gs2d.synthetic.flight import Flight, write_flight
-from train_toys import random_splats
-
-MEGA = 1_000_000
+from train_toys import backends
 
 
 @pytest.fixture(autouse=True)
@@ -71,8 +72,9 @@ def test_a_plan_counts_photographs_and_pixels_and_bounds_the_rest_and_writes_not
     found = plan(planned(capture))
     assert (found.photographs, found.pixels, found.trained_pixels) == (12, 12 * 64 * 48, 12 * 64 * 48)
     assert (found.downscale, found.prepared, found.max_splats, found.iterations) == (1, False, None, 300)
-    assert found.start < found.splats.expected < found.splats.most
+    assert found.splats.least < found.start < found.splats.expected < found.splats.most
     assert 0 < found.seconds.least < found.seconds.expected < found.seconds.most
+    assert found.training.expected < found.seconds.expected
     assert PROGRAM_BYTES < found.memory.least <= found.memory.expected <= found.memory.most
     assert found.temporary == 8 * found.trained_pixels
     lines = found.lines()
@@ -84,22 +86,82 @@ def test_a_plan_counts_photographs_and_pixels_and_bounds_the_rest_and_writes_not
 def test_the_command_line_tells_it_as_json_with_the_command_that_trains(
     capture: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["plan", str(capture), "--recipe", "2dgs", "--schedule-scale", "0.01", "--prepare", "always", "--json"]
-    assert main(words) == 0
+    words = [str(capture), "--recipe", "2dgs", "--schedule-scale", "0.01", "--prepare", "always", "--no-page"]
+    words += ["--exposure", "--set", "surface.densify.every=50", "--set", "sh_degree=1", "--test-every", "4"]
+    words += ["--subject-box", "-1", "-1", "-1", "1", "1", "1"]
+    assert main(["plan", *words, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["prepared"] is True
     assert told["disk"] > 12 * 64 * 48
-    assert told["command"] == f"gs2d train {capture} --out RUN --recipe 2dgs --schedule-scale 0.01"
+    again = shlex.split(told["command"])
+    assert again[:5] == ["gs2d", "train", str(capture), "--out", "RUN"]
+    assert parse(again[1:]) == parse(["train", *words, "--out", "RUN"])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"downscale": 2, "test_every": 4, "exposure": True},
+        {"depth_prior": "sparse", "robust": "off"},
+        {"format": "colmap", "masked": "ignore", "recipe": "best", "seed": 3},
+        {"quality": "draft"},
+    ],
+)
+def test_a_plan_is_of_the_training_that_train_would_do(
+    options: dict[str, Any], capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[Any, ...]] = []
+
+    class Asked(Exception):
+        pass
+
+    def listen(scene: Any, recipe: Any, backend: Any, **more: Any) -> None:
+        asked.append((recipe, [view.name for view in scene.train], scene.train[0].camera.width, backend.name, more))
+        raise Asked
+
+    for place in (plan_module, train_module):
+        monkeypatch.setattr(place, "estimate", listen)
+    given = {"recipe": "2dgs", "schedule_scale": 0.01, **options}
+    with pytest.raises(Asked):
+        plan(PlanOptions(scene=capture, **given))
+    with pytest.raises(Asked):
+        train(TrainOptions(scene=capture, out=tmp_path / "run", estimate=True, **given))
+    assert asked[0] == asked[1]
+
+
+def test_a_plan_takes_a_second_at_most_for_the_speed_of_the_machine() -> None:
+    for name in backends():
+        backend = get_backend(name)
+        rasterizer_speed(backend)  # loads the library
+        begun = time.perf_counter()
+        seconds = rasterizer_speed(backend)
+        assert 0 < seconds < 1
+        assert time.perf_counter() - begun < 10  # a busy machine is slower
 
 
 def test_splats_at_the_end_are_those_at_the_start_times_growth_but_for_a_budget() -> None:
     recipe = get_recipe("2dgs")
     found = expected_splats(recipe, 1000)
-    assert (found.least, found.expected, found.most) == (1000, 4000, 9000)
+    assert (found.least, found.expected, found.most) == tuple(1000 * factor for factor in GROWTH)
     limited = expected_splats(apply_overrides(recipe, ("surface.densify.max_splats=2500",)), 1000)
-    assert (limited.least, limited.expected, limited.most) == (1000, 2500, 2500)
+    assert (limited.expected, limited.most) == (2500, 2500)
     frozen = expected_splats(apply_overrides(recipe, ("surface.densify=null",)), 1000)
     assert (frozen.least, frozen.most) == (1000, 1000)
+    once = expected_splats(apply_overrides(recipe, ("surface.densify.start=500", "surface.densify.stop=601")), 1000)
+    assert once.most == 2000  # one densification doubles at most
+
+
+def test_a_dense_start_goes_with_the_photographs_and_another_with_the_points(capture: Path) -> None:
+    scene = load_scene(capture, test_every=0)
+    assert scene.points is not None
+    assert start_of(scene, get_recipe("2dgs")) == len(scene.points)
+    assert start_of(replace(scene, points=None), get_recipe("2dgs")) == get_recipe("2dgs").init_points
+    best = get_recipe("best")
+    bare = replace(scene, points=None)
+    assert start_of(bare, best) == round(64 * 48 / 9 * 12**0.5)
+    assert start_of(replace(bare, train=scene.train[:3]), best) == round(64 * 48 / 9 * 3**0.5)
+    assert start_of(scene, best) - start_of(bare, best) == pytest.approx(len(scene.points) / 2, abs=1)
 
 
 def test_a_budget_is_set_in_each_stage_that_takes_one_whatever_it_is_called() -> None:
@@ -115,28 +177,18 @@ def test_a_budget_is_set_in_each_stage_that_takes_one_whatever_it_is_called() ->
     assert budget_overrides(replace(recipe, stages=(replace(first, densify=None),)), 700) == ()
 
 
-def test_the_downscale_is_the_first_at_which_an_iteration_fits() -> None:
-    allowed = PROGRAM_BYTES + 24 * MEGA * (216 // 4 + 12)  # of 24 megapixels at half their size
-    assert fitting_downscale(24 * MEGA, 1, allowed, on_host=True) == 2
-    assert fitting_downscale(24 * MEGA, 1, allowed - 1, on_host=True) == 3
-    assert fitting_downscale(24 * MEGA, 4, allowed, on_host=True) == 4
-    assert fitting_downscale(24 * MEGA, 1, allowed, on_host=False) == 1  # what a GPU has is its own
-    with pytest.raises(DataError, match="24 megapixels need 0.27 GiB to be read, got 0.38 GiB to keep to"):
-        fitting_downscale(24 * MEGA, 1, PROGRAM_BYTES + 10 * MEGA, on_host=True)
-
-
 def test_a_budget_of_splats_is_named_where_as_many_as_may_come_do_not_fit(
     capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(capture_plan, "SPLAT_BYTES", 1 << 20)  # a thousand are a gigabyte
+    monkeypatch.setattr(module, "SPLAT_BYTES", 1 << 20)  # a thousand are a gigabyte
     options = planned(capture, memory=2.0)
     found = plan(options)
     assert found.max_splats is not None
     assert found.start < found.max_splats < 1700
     assert found.memory.most <= 2 << 30
-    assert f"--set surface.densify.max_splats={found.max_splats} --memory 2" in command_of(options, found)
+    assert found.budget == (f"surface.densify.max_splats={found.max_splats}",)
     assert f"only with --set surface.densify.max_splats={found.max_splats}" in found.lines()[1]
-    monkeypatch.setattr(capture_plan, "SPLAT_BYTES", 1 << 24)
+    monkeypatch.setattr(module, "SPLAT_BYTES", 1 << 24)
     with pytest.raises(DataError, match=r"12 photographs start from about .* splats, which need .* got 2 GiB to keep"):
         plan(options)
 
@@ -182,20 +234,8 @@ def test_a_training_with_limits_says_its_plan_before_it_begins(capture: Path, tm
     assert any(text.startswith("time: ") for text in heard)
 
 
-def test_a_crowd_of_splats_covers_what_the_few_did() -> None:
-    few = random_splats(20, seed=1)
-    many = crowded(few)
-    assert len(many) == 80
-    area = few.scales.prod(dim=1).sum()
-    assert many.scales.prod(dim=1).sum() == pytest.approx(float(area), rel=1e-5)
-    shift = (many.means.reshape(20, 4, 3) - few.means[:, None]).norm(dim=2)
-    assert bool((shift < 3 * few.scales.max(dim=1).values[:, None]).all())
-    assert torch.equal(crowded(few).means, many.means)
-
-
 def test_figures_for_people_have_two_digits() -> None:
     assert [rounded(value) for value in (0.3, 7, 1234, 98_765)] == [0, 7, 1200, 99_000]
-    assert math.isclose(capture_plan.Range(1, 2, 3).scaled(2).most, 6)
 
 
 def test_a_memory_that_is_none_is_refused(capture: Path) -> None:
@@ -203,61 +243,20 @@ def test_a_memory_that_is_none_is_refused(capture: Path) -> None:
         plan(planned(capture, memory=0.0))
 
 
-def test_what_a_splat_adds_is_told_apart_for_those_that_are_seen_and_those_that_are_not() -> None:
-    splats = random_splats(20, seed=1)
-
-    def seconds(some: Splats) -> float:
-        far = int((some.means.norm(dim=1) > 100).sum())
-        return 1.0 + 0.02 * (len(some) - far) + 0.005 * far
-
-    found = cost_of(splats, 1.0, seconds)
-    assert (found.base, found.seen, found.unseen) == pytest.approx((1.0, 0.02, 0.005))
-    assert found.of(1000, 0.25) == pytest.approx(1 + 5 + 3.75)
-
-
-def test_looks_of_robust_training_are_counted_as_training_makes_them() -> None:
-    recipe = scale_schedule(get_recipe("best"), 0.01)
-    assert looks_of(recipe) == (0, 0)
-    looking = replace(recipe, removal=Removal(every=50))
-    assert looks_of(looking) == (sum(stage.iterations // 50 for stage in recipe.stages), 5 * len(recipe.stages))
-
-
-def test_the_plan_of_a_robust_training_takes_longer_by_its_looks(
+def test_time_grows_with_pixels_iterations_and_trials_of_removal(
     capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tried = Probe(1000, 0.0, 0.0, 1.0, Cost(0.01, 0.0, 0.0), Cost(0.5, 0.0, 0.0), Cost(1.0, 0.0, 0.0), 0.0, 1.0, None)
-    monkeypatch.setattr(capture_plan, "probe", lambda *_: tried)
-    seconds = {}
-    for robust in ("on", "off"):
-        overrides = () if robust == "on" else ("removal=null",)
-        found = plan(planned(capture, recipe="best", overrides=overrides))
-        seconds[robust] = found.seconds.expected
-    recipe_looks = seconds["on"] - seconds["off"]
-    assert recipe_looks == pytest.approx(10 * (0.5 * (200 // 50) + 1.0 * 5), rel=0.3)
-
-
-def test_memory_of_the_mesh_goes_with_the_places_of_a_dense_start_up_to_a_slab(
-    capture: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The upper bound, by which is refused, has all of it; a start from sparse points says nothing of the surface."""
-    free = Cost(0.0, 0.0, 0.0)
-    found = {}
-    for start in (None, 2, 2_000, 1_000_000):
-        tried = Probe(start, 0.0, 0.0, 1.0, Cost(0.01, 0.0, 0.0), free, free, 0.0, 1.0, None)
-        monkeypatch.setattr(capture_plan, "probe", lambda *_, tried=tried: tried)
-        fixed = ("surface.densify=null",)
-        told = plan(planned(capture, overrides=fixed))
-        found[start] = told.memory.expected - told.splats.expected * SPLAT_BYTES
-        assert told.memory.most - told.splats.most * SPLAT_BYTES == pytest.approx(found[None])
-    assert found[2_000] - found[2] == pytest.approx(1_998 * PLACE_BYTES)
-    assert found[1_000_000] == found[None]
-
-
-def test_a_place_is_as_many_pixels_as_the_photographs_have_for_one_that_was_swept(capture: Path) -> None:
-    scene, recipe = load_scene(capture), get_recipe("best")
-    assert recipe.dense_start is not None
-    assert meshing_bytes(scene, recipe, 100) == 100 * PLACE_BYTES
-    halved = replace(recipe, dense_start=replace(recipe.dense_start, side=32))  # of 64 px
-    assert meshing_bytes(scene, halved, 100) == 400 * PLACE_BYTES
-    assert meshing_bytes(scene, halved, 100, shrink=0.25) == 100 * PLACE_BYTES
-    assert meshing_bytes(scene, get_recipe("2dgs"), 100) == meshing_bytes(scene, recipe, None) == FUSION_BYTES
+    scene, recipe = load_scene(capture, test_every=0), apply_overrides(get_recipe("2dgs"), ("surface.densify=null",))
+    work = training_work(scene, recipe, 1000)
+    longer = replace(recipe, stages=(replace(recipe.stages[0], iterations=2 * recipe.iterations),))
+    assert training_work(scene, longer, 1000) == pytest.approx(2 * work)
+    assert training_work(load_scene(capture, downscale=2, test_every=0), recipe, 0) == pytest.approx(
+        training_work(scene, recipe, 0) / 4
+    )
+    removing = replace(recipe, removal=Removal(every=recipe.iterations + 1))  # five trials, at the ends of parts
+    trials = 5 * TRIAL_ITERATIONS * 12 / 24  # of 12 photographs half the witnesses
+    assert training_work(scene, removing, 0) == pytest.approx(training_work(scene, recipe, 0) * (1 + trials / 30_000))
+    monkeypatch.setattr(module, "rasterizer_speed", lambda _: 1e-6)
+    found = estimate(scene, recipe, get_backend(backends()[-1]), start=1000)
+    assert found.training.expected == pytest.approx(work * 1e-6)
+    assert found.training.most == pytest.approx(DOUBT * work * 1e-6)

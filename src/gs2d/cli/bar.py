@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
-from gs2d.cli.whole import Countdown, Left, WholeRun
+from gs2d.cli.whole import Countdown, WholeRun
 from gs2d.core.text import printable
 from gs2d.pipeline.events import Phase, duration
 
@@ -32,9 +32,7 @@ class Bar:
         """Return "3 min left", or how long the phase has taken where it is too early to tell."""
         elapsed = self._clock() - self._began
         seconds = self.phase.seconds_left(self.done, elapsed)
-        return (
-            duration(elapsed) if seconds is None else f"{duration(self._shown.show(Left(seconds, seconds)).most)} left"
-        )
+        return duration(elapsed) if seconds is None else f"{duration(self._shown.show(seconds))} left"
 
     def lines(self, width: int, *, ascii_only: bool = False) -> Iterator[Text]:
         """Draw it: never wider than ``width``."""

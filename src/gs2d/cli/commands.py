@@ -58,7 +58,7 @@ class Poses(PosesOptions, Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Plan(PlanOptions, Common):
-    """Say what training on a capture takes: splats, memory, disk and hours on this machine, by trying for seconds."""
+    """Estimate what training on a capture takes: splats, memory, disk and hours on this machine. Nothing is trained."""
 
 
 @dataclass(frozen=True, kw_only=True)

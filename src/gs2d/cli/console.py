@@ -19,7 +19,7 @@ from gs2d.cli.bar import Bar
 from gs2d.cli.layout import records, wrapped
 from gs2d.cli.whole import WholeRun
 from gs2d.core.text import printable
-from gs2d.pipeline.events import Event, Expected, MissingFile, Notice, Phase, Plan, StageDone, Step
+from gs2d.pipeline.events import Event, MissingFile, Notice, Phase, Plan, StageDone, Step
 
 LOG_SECONDS, LOG_FRACTION = 60.0, 0.1  # in a log file: a line after so long, if at least so much of the phase was done
 LOG_SILENCE = 300.0  # s, after which there is a line whatever was done; the first one comes after LOG_SECONDS
@@ -89,8 +89,6 @@ class Console:
             return
         if isinstance(event, Plan):
             self._whole.on_plan(event)
-        elif isinstance(event, Expected):
-            self._whole.on_expected(event)
         elif isinstance(event, Phase):
             self._whole.on_phase(event)
             self._begin(event)

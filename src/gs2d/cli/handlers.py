@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from gs2d.cli import commands as c
+from gs2d.cli.catalogue import options_of
 from gs2d.cli.commands import Common
 from gs2d.cli.console import Console
 from gs2d.cli.tables import say_where_it_is, score_rows, show_run, show_surface
@@ -53,15 +55,38 @@ def execute(command: Common, console: Console) -> None:
 
 def plan(command: c.Plan, console: Console) -> None:
     """``gs2d plan``."""
-    from gs2d.pipeline.planned import command_of
-    from gs2d.pipeline.planned import plan as make_plan
+    from gs2d.pipeline.estimate import set_words
+    from gs2d.pipeline.plan import plan as make_plan
 
     found = make_plan(command, console.on_event)
     console.close()
+    again = shlex.join(["gs2d", "train", *_words_of(command, c.Train), *set_words(found.budget)])
     for line in found.lines():
         console.say(line)
-    console.say(f"train so: {command_of(command, found)}")
-    console.result({**found.to_json(), "command": command_of(command, found)})
+    console.say(f"train so: {again}")
+    console.result({**asdict(found), "command": again})
+
+
+def _words_of(command: Common, kind: type) -> list[str]:
+    """Return the options of a command that differ from their defaults, as words of the command line of ``kind``."""
+    words: list[str] = []
+    for option in sorted(options_of(kind), key=lambda option: (bool(option.flags), option.field != "out")):
+        value = getattr(command, option.field)
+        if value == option.default or option.group is Common:
+            continue
+        values = [f"{each:g}" if isinstance(each, float) else str(each) for each in _listed(value)]
+        flag = list(option.flags[:1])
+        if option.kind is bool:
+            words += flag
+        elif isinstance(value, tuple) and option.count == 1:  # the option is repeated for each value
+            words += [word for each in values for word in (*flag, each)]
+        else:
+            words += [*flag, *values]
+    return words
+
+
+def _listed(value: object) -> tuple[object, ...]:
+    return value if isinstance(value, tuple) else (value,)
 
 
 def train(command: c.Train, console: Console) -> None:

@@ -35,7 +35,7 @@ _FIRST: dict[str, tuple[str, ...]] = {  # options that `--help` explains; of oth
     "demo": ("out", "schedule_scale", "viewer", "resume", "overwrite"),
     "reconstruct": ("photos", "out", "quality", "texture", "viewer", "resume", "overwrite"),
     "poses": ("photos", "out", "frames", "camera_model", "max_size", "overwrite"),
-    "plan": ("scene", "recipe", "schedule_scale", "downscale", "memory", "disk"),
+    "plan": ("scene", "quality", "recipe", "schedule_scale", "downscale", "memory", "disk"),
     "train": (
         "scene", "out", "quality", "recipe", "schedule_scale", "downscale", "exposure", "viewer", "resume", "overwrite"
     ),

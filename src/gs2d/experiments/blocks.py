@@ -90,8 +90,7 @@ class BlocksTask(Task):
     def settled(self, on_event: OnEvent) -> Settled:
         """Return what is settled, with the scene."""
         data = settled_of(self.options.out)
-        recipe, protocol = recipe_from_json(data["recipe"]), protocol_from_json(data["protocol"])
-        found = open_settled(self.training(), recipe, protocol, on_event)
+        found = open_settled(self.training(), recipe_from_json(data["recipe"]), on_event)
         check_capture(self.options.out, data, found.capture)
         return found
 

@@ -8,10 +8,9 @@ from gs2d.errors import RunError
 from gs2d.io.run_dir import RunFolder, check_claim, is_run, open_run
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.evaluate import evaluate_run
-from gs2d.pipeline.events import OnEvent, Phase, Plan, Step, ignore
+from gs2d.pipeline.events import DEMO, OnEvent, Phase, Plan, Step, ignore
 from gs2d.pipeline.job import check_train_options
 from gs2d.pipeline.options import DemoOptions, EvaluateOptions, TrainOptions
-from gs2d.pipeline.plan import DEMO
 from gs2d.pipeline.threads import use_threads
 from gs2d.pipeline.train import check_viewer, train
 from gs2d.synthetic.capture import write_demo_capture

@@ -26,9 +26,9 @@ from gs2d.evaluation.images import ImageMetrics, mean_metrics
 from gs2d.evaluation.lpips import Lpips
 from gs2d.pipeline.events import ignore
 from gs2d.pipeline.exposure import named
-from gs2d.pipeline.job import choose_backend, choose_protocol, settled
-from gs2d.pipeline.masks import with_masks, without_masked_points
+from gs2d.pipeline.job import resolve
 from gs2d.pipeline.mesh import fused
+from gs2d.pipeline.opened import open_capture
 from gs2d.pipeline.options import MeshOptions, Robust, TrainOptions
 from gs2d.pipeline.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.progress_bar import progress_bar
@@ -141,6 +141,7 @@ def train(
         out=root,  # nothing is written
         recipe=recipe,
         protocol=protocol,
+        backend=backend,
         schedule_scale=schedule_scale,
         iterations=iterations,
         overrides=overrides,
@@ -150,11 +151,8 @@ def train(
         no_exposure=exposure is False,
     )
     with progress_bar(on_event) if progress else nullcontext(on_event) as tell:
-        chosen = choose_backend(backend, tell)
-        rules = choose_protocol(options, scene.format, tell)
-        rules = with_masks(rules, scene, tell)
-        scene = without_masked_points(scene, rules, tell)
-        fitted, rules = settled(options, scene, rules, tell)
+        fitted, opened = resolve(options, open_capture(options, tell, scene), tell)
+        scene, rules, chosen = opened.scene, opened.protocol, opened.backend
         trainer = Trainer(scene, fitted, rules, backend=chosen, on_event=tell)
         trainer.run()
     exposures = named(scene.train, trainer.state.exposures)
@@ -173,10 +171,9 @@ def _finished(
     if scene is None:
         raise DataError("splats must come with the scene that they are of, got none; give it as the second argument")
     root = scene.root or Path(".")
-    chosen = choose_backend(backend, on_event)
-    rules = choose_protocol(TrainOptions(scene=root, out=root, protocol=protocol), scene.format, on_event)
-    settings = raster_settings(rules, scene.extent, trained.sh_degree)
-    return Trained(trained.to(chosen.device), scene, rules, settings, chosen)
+    opened = open_capture(TrainOptions(scene=root, out=root, protocol=protocol, backend=backend), on_event, scene)
+    settings = raster_settings(opened.protocol, scene.extent, trained.sh_degree)
+    return Trained(trained.to(opened.backend.device), scene, opened.protocol, settings, opened.backend)
 
 
 def evaluate(

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from gs2d.config.presets import (
     get_recipe,
@@ -25,24 +24,23 @@ from gs2d.config.presets import (
     with_poses,
     with_robustness,
 )
-from gs2d.config.protocols import BLACK, Protocol, get_protocol, protocol_for
+from gs2d.config.protocols import BLACK, Protocol, get_protocol
 from gs2d.config.recipe import Recipe, validate
 from gs2d.config.robust import FEW_VIEWS
 from gs2d.config.schedule import fit_schedule, longer_steps, scale_schedule
 from gs2d.config.serialize import apply_overrides, decode, from_json, to_json
 from gs2d.core.splats import Splats
 from gs2d.core.text import name_bytes
-from gs2d.data import FORMATS, Scene, View, detect_format, load_scene
-from gs2d.data.benchmarks import missing_lines, protocol_of
-from gs2d.data.load import reader_of
+from gs2d.data import FORMATS, Scene, View
+from gs2d.data.benchmarks import missing_lines
 from gs2d.data.masks import EMPTY, Masks
 from gs2d.data.subject import check_subject_box
 from gs2d.errors import DataError, ProtocolError, RecipeError, RunError, ShapeError
 from gs2d.io.formats.registry import read_surfels
-from gs2d.io.run_dir import RUN_JSON, RunFolder, is_run, versions
-from gs2d.pipeline.events import Event, Notice, OnEvent, Phase, Step
-from gs2d.pipeline.masks import with_masks, without_masked_points
-from gs2d.pipeline.memory import check_memory, least_downscale
+from gs2d.io.run_dir import RUN_JSON, RunFolder, versions
+from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
+from gs2d.pipeline.masks import without_masked_points
+from gs2d.pipeline.opened import SHOWN_SKIPS, Opened, open_capture, read_scene
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.part import LoadedPart, load_part, part_scene
 from gs2d.pipeline.photographs import HOW, already_prepared, with_prepared
@@ -50,7 +48,7 @@ from gs2d.pipeline.photometry import with_found_photometries
 from gs2d.pipeline.priors import with_priors
 from gs2d.pipeline.refined_poses import with_found_poses
 from gs2d.render.api import check_settings
-from gs2d.render.backends import Backend, backend_report, get_backend
+from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training.backdrop import find_backdrop
 from gs2d.training.cached_objective import is_cacheable
@@ -61,7 +59,6 @@ from gs2d.training.robust import check_free_space
 from gs2d.training.trainer import raster_settings
 
 DECODE_THREADS = 2
-SHOWN_SKIPS = 3
 MAX_VIEWS = 1_000_000
 NEAR_SAMPLES = 2000  # sparse points by which the near plane is checked
 ROBUST = ("auto", "on", "off")
@@ -354,13 +351,9 @@ def with_fused_depth(protocol: Protocol, recipe: Recipe) -> Protocol:
 def prepare_job(options: TrainOptions, on_event: OnEvent) -> Job:
     """Check the options, cheapest first, then read the capture."""
     check_train_options(options)
-    backend = choose_backend(options.backend, on_event)
     init = (None, None) if options.init is None else read_init(options.init, on_event)
-    scene_format = detect_format(options.scene) if options.format == "auto" else options.format
-    reader_of(scene_format)  # a wrong name is told before anything is read
-    protocol = choose_protocol(options, scene_format, on_event)
-    downscale, scene = scene_that_fits(options, scene_format, protocol, backend, on_event)
-    protocol = with_masks(protocol, scene, on_event)
+    opened = open_capture(options, on_event)
+    scene = opened.scene
     disk, home = None if options.disk is None else int(options.disk * 2**30), options.out
     if options.part is not None:
         scene, home = part_scene(scene, options.part), options.part.prepared or options.out
@@ -368,12 +361,9 @@ def prepare_job(options: TrainOptions, on_event: OnEvent) -> Job:
         scene, home, options.prepare, on_event, disk=disk, threads=options.threads, shared=home != options.out
     )
     _say_some(missing_lines(options.scene), "pieces are missing", on_event)
-    digest = scene_digest(scene, on_event, uses_masks=protocol.use_mask_in_training)
-    scene = without_masked_points(scene, protocol, on_event)
-    if options.part is None:
-        recipe, protocol = settled(options, scene, protocol, on_event)
-    else:
-        recipe = validate(replace(recipe_of(options.recipe), seed=options.seed))
+    digest = scene_digest(scene, on_event, uses_masks=opened.protocol.use_mask_in_training)
+    recipe, opened = resolve(options, replace(opened, scene=scene), on_event)
+    scene, protocol, backend, downscale = opened.scene, opened.protocol, opened.backend, opened.downscale
     digest = with_priors(digest, scene, recipe, on_event)
     settings = raster_settings(protocol, scene.extent, recipe.sh_degree)
     if protocol.near is None:
@@ -392,6 +382,16 @@ def prepare_job(options: TrainOptions, on_event: OnEvent) -> Job:
         part = load_part(options.part, scene, recipe)
         return Job(recipe, protocol, scene, backend, settings, downscale, digest, cache_bytes, part=part)
     return Job(recipe, protocol, scene, backend, settings, downscale, digest, cache_bytes, *init)
+
+
+def resolve(options: TrainOptions, opened: Opened, on_event: OnEvent) -> tuple[Recipe, Opened]:
+    """Return what is trained, and on what, as the options and this capture decide: the same for every command."""
+    scene = without_masked_points(opened.scene, opened.protocol, on_event)
+    if options.part is not None:  # the whole training has decided
+        recipe, protocol = validate(replace(recipe_of(options.recipe), seed=options.seed)), opened.protocol
+    else:
+        recipe, protocol = settled(options, scene, opened.protocol, on_event)
+    return recipe, replace(opened, scene=scene, protocol=protocol)
 
 
 def near_cuts(scene: Scene, near: float) -> float:
@@ -432,43 +432,6 @@ def read_init(path: Path, on_event: OnEvent) -> tuple[Splats, str]:
     return splats, hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def choose_protocol(options: TrainOptions, scene_format: str, on_event: OnEvent) -> Protocol:
-    """Return the protocol of a name, or of the capture, with what the options change in it."""
-    named = options.protocol
-    if named == "auto":
-        protocol = protocol_of(options.scene, scene_format)
-        if protocol is not protocol_for(scene_format):
-            line = f"protocol {protocol.name}: {options.scene.name} is a scene of that data set"
-            on_event(Notice(line, detail=True))
-    else:
-        protocol = get_protocol(named) if isinstance(named, str) else named
-    if options.test_every is None:
-        return protocol
-    if scene_format == "blender":
-        raise ProtocolError(
-            f"--test-every is for captures without a split of their own, got {options.scene} with its "
-            "transforms_test.json; leave it out"
-        )
-    return replace(protocol, test_every=options.test_every)
-
-
-def choose_backend(name: str, on_event: OnEvent) -> Backend:
-    """Return the backend of a name; say what "auto" took if that is a GPU, not one that is here, or the reference."""
-    backend = get_backend(name)
-    if name != "auto":
-        return backend
-    report = backend_report()  # best first: all before the one that was taken cannot run
-    taken = [status.name for status in report].index(backend.name)
-    if backend.device != "cpu":
-        on_event(Notice(f"training on {report[taken].details} (--backend cpu for the processor)", detail=True))
-    elif torch.version.cuda is not None and torch.cuda.device_count() > 0:
-        on_event(Notice(f"training without the GPU: {report[0].reason}; {report[0].remedy}"))
-    if backend.slow:
-        better = report[taken - 1]
-        on_event(Notice(f"training with a slow backend, {backend.name}: {better.reason}; {better.remedy}"))
-    return backend
-
-
 def _masks_of(scene: Scene) -> dict[str, Any]:
     """Return what the user said about masks, for ``run.json``: nothing, mostly."""
     folder, masked = scene.masks.folder, scene.masks.masked
@@ -477,79 +440,11 @@ def _masks_of(scene: Scene) -> dict[str, Any]:
     return {"masks": {"folder": None if folder is None else str(folder.resolve()), "masked": masked}}
 
 
-def read_scene(
-    path: Path,
-    scene_format: str,
-    downscale: int,
-    protocol: Protocol,
-    on_event: OnEvent,
-    masks: Masks = Masks(),  # noqa: B008 (frozen)
-) -> Scene:
-    """Load a capture and tell what was decided or skipped."""
-    test_every = None if scene_format == "blender" else protocol.test_every  # Blender captures bring their split
-    scene = load_scene(path, format=scene_format, downscale=downscale, test_every=test_every, **masks.options())
-    for text in scene.notes:
-        on_event(Notice(text))
-    for text in scene.details:
-        on_event(Notice(text, detail=True))
-    if scene.skipped:
-        on_event(Notice(_about_skipped(scene), is_warning=True))
-    return scene
-
-
-def scene_that_fits(
-    options: TrainOptions, scene_format: str, protocol: Protocol, backend: Backend, on_event: OnEvent
-) -> tuple[int, Scene]:
-    """Load a capture, and by what it is shrunk: as asked for, as the run was begun, or as much as memory needs.
-
-    Raises
-    ------
-    DataError
-        At the downscale that was asked for it cannot be trained in the memory there is, or at none.
-    """
-    masks = Masks(options.masks, options.masked)
-    fixed = options.downscale or _begun_with(options)
-    said: list[Event] = []
-    scene = read_scene(options.scene, scene_format, fixed or 1, protocol, said.append, masks)
-    fitting, need = (1, "") if fixed else least_downscale(scene, 1, backend.device)
-    if fitting is not None and fitting > 1:
-        said = [Notice(f"{need}: they are shrunk by {fitting}, as by --downscale {fitting}")]
-        scene = read_scene(options.scene, scene_format, fitting, protocol, said.append, masks)
-    for event in said:
-        on_event(event)
-    check_memory(scene, fixed or fitting or 1, backend.device)
-    return fixed or fitting or 1, scene
-
-
-def _begun_with(options: TrainOptions) -> int | None:
-    """Return the downscale of the run that is gone on with; None: there is none, or it was not written down."""
-    if not (options.resume and is_run(options.out)):
-        return None
-    begun = RunFolder(options.out).definition().get("downscale")
-    return begun if isinstance(begun, int) and begun >= 1 else None
-
-
 def _say_some(lines: Sequence[str], what: str, on_event: OnEvent) -> None:
     for line in lines[:SHOWN_SKIPS]:
         on_event(Notice(line))
     if len(lines) > SHOWN_SKIPS:
         on_event(Notice(f"... and {len(lines) - SHOWN_SKIPS} more {what}; `gs2d info` lists them"))
-
-
-def _about_skipped(scene: Scene) -> str:
-    """Return one line about the views that are left out: how many, and which for each reason."""
-    reasons: dict[str, list[tuple[str, str]]] = {}
-    for line in scene.skipped:
-        name, _, reason = line.partition(": ")
-        reasons.setdefault(reason.partition("; ")[0], []).append((name, reason))
-    parts = []
-    for found in reasons.values():
-        names = ", ".join(name for name, _ in found[:SHOWN_SKIPS])
-        more = f" and {len(found) - SHOWN_SKIPS} more" if len(found) > SHOWN_SKIPS else ""
-        parts.append(f"{names}{more}: {found[0][1]}")
-    wholes = len({view.path or view.name for view in scene.views})
-    count = f"{len(scene.skipped)} of {len(scene.skipped) + wholes} photographs are left out"
-    return f"{count} (`gs2d info` lists them): {'; '.join(parts)}"
 
 
 def scene_digest(scene: Scene, on_event: OnEvent, *, uses_masks: bool = False) -> str:

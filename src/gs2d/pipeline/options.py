@@ -242,7 +242,7 @@ class TrainOptions(Training, Resources, HowItRuns):
     allowed: Annotated[tuple[str, ...], Fixed, Suppress] = ()
     """Names that may already be in ``out`` (the demo's capture)."""
     estimate: Annotated[bool, Fixed, Suppress] = False
-    """Tell before training how long it will take and what is held out."""
+    """Print before training how long it will take."""
     part: Annotated[Part | None, Fixed, Suppress] = None
     """What is trained of something larger."""
 
@@ -251,26 +251,11 @@ class TrainOptions(Training, Resources, HowItRuns):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlanOptions(Resources):
-    """What is to be planned: a training as `gs2d train` would do it."""
+class PlanOptions(TrainOptions):
+    """A training that is estimated: it takes the options of `gs2d train`."""
 
-    scene: Annotated[Positional[Path], arg(metavar="CAPTURE")]
-    """Folder of the capture, or a .zip of it."""
-    recipe: Annotated[str | Recipe, arg(constructor=str)] = DEFAULT_RECIPE
-    """As in `gs2d train`."""
-    downscale: int = 1
-    """As in `gs2d train`; the plan may need more."""
-    schedule_scale: float = 1.0
-    """As in `gs2d train`."""
-    overrides: Overrides = ()
-    """As in `gs2d train`."""
-    backend: str = "auto"
-    """As in `gs2d train`."""
-    threads: int | None = None
-    """CPU threads."""
-
-    def __post_init__(self) -> None:
-        paths_of(self, "scene")
+    out: Annotated[Path, arg(metavar="RUN")] = Path("RUN")
+    """Run folder of the training; nothing is written."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,24 +1,44 @@
-"""The parts of whole runs, for the line that says how far one is and what time is left of it.
-
-Shares of training: a run on 292 photographs of a room at 780x520 spent 13 % of its time on the mesh and most of the
-rest on training. That is one capture; the shares of texture, report and scores are coarser still. What is shown is
-therefore a range from half to twice of them.
-"""
+"""``gs2d plan``: what training on a capture takes, and whether it fits."""
 
 from __future__ import annotations
 
-from gs2d.pipeline.events import Part
+from dataclasses import replace
 
-PLACED = (
-    Part("photographs", ("looking for sharp frames", "taking frames", "reading photographs", "copying photographs")),
-    Part("features", ("finding features",)),
-    Part("matching", ("finding similar", "matching")),
-    Part("cameras", ("placing", "checking the capture")),
-)
-_TRAINING = Part("training", ("training",))
-_MESH = Part("mesh", ("rendering depth", "fusing"), of_training=0.17)
-_TEXTURE = Part("texture", ("cutting the surface", "comparing the colours", "colouring the texture"), of_training=0.1)
-_REPORT = Part("report", ("writing the report", "writing the page"), of_training=0.03)
-TRAINED = (_TRAINING, _MESH, _REPORT)
-TEXTURED_TOO = (_TRAINING, _MESH, _REPORT, _TEXTURE)
-DEMO = (Part("photographs", ("photographing",)), *TRAINED, Part("scores", ("scoring the surface",), of_training=0.1))
+from gs2d.data.archive import is_archive, unpacked_for_a_moment
+from gs2d.errors import DataError
+from gs2d.pipeline.estimate import Estimate, estimate
+from gs2d.pipeline.events import OnEvent, ignore
+from gs2d.pipeline.job import check_train_options, read_init, resolve
+from gs2d.pipeline.memory import use_memory
+from gs2d.pipeline.opened import open_capture
+from gs2d.pipeline.options import PlanOptions
+from gs2d.pipeline.quality import by_quality
+from gs2d.pipeline.threads import use_threads
+
+
+def plan(options: PlanOptions, on_event: OnEvent = ignore) -> Estimate:
+    """Estimate a training: the capture is read as ``gs2d train`` does, nothing is trained or written.
+
+    Raises
+    ------
+    Gs2dError
+        The capture cannot be read, or training on it does not fit into memory or on the disk.
+    """
+    if is_archive(options.scene):
+        with unpacked_for_a_moment(options.scene) as folder:
+            return plan(replace(options, scene=folder), on_event)
+    check_train_options(options)
+    use_threads(options.threads)
+    use_memory(options.memory)
+    training = by_quality(options, on_event)
+    start = None if options.init is None else len(read_init(options.init, on_event)[0])
+    recipe, opened = resolve(training, open_capture(training, on_event), on_event)
+    found = estimate(
+        opened.scene, recipe, opened.backend, downscale=opened.downscale, prepare=options.prepare, start=start
+    )
+    if options.disk is not None and found.disk > options.disk * 2**30:
+        raise DataError(
+            f"{found.photographs:,} photographs take about {found.disk / 2**30:.2g} GiB of disk, got "
+            f"{options.disk:g} GiB that --disk allows; use a larger --downscale, or allow more"
+        )
+    return found

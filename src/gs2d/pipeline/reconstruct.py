@@ -17,7 +17,7 @@ from gs2d.errors import DataError, ProtocolError, RunError
 from gs2d.io.run_dir import LOCK, MESH, TEXTURED, RunFolder, check_claim, is_run, make_folder, open_run, remove_made
 from gs2d.meshing.texture import required
 from gs2d.pipeline.attempts import again, attempted
-from gs2d.pipeline.events import Notice, OnEvent, Plan, ignore
+from gs2d.pipeline.events import PLACED, TEXTURED_TOO, TRAINED, Notice, OnEvent, Plan, ignore
 from gs2d.pipeline.job import check_train_options, recipe_of
 from gs2d.pipeline.options import (
     Finding,
@@ -29,7 +29,6 @@ from gs2d.pipeline.options import (
     TrainOptions,
     values,
 )
-from gs2d.pipeline.plan import PLACED, TEXTURED_TOO, TRAINED
 from gs2d.pipeline.quality import at_quality, quality_of
 from gs2d.pipeline.sfm import asked_for, check_poses_options, find_poses, placed_line
 from gs2d.pipeline.texture import PACKAGES as TEXTURE_PACKAGES

@@ -20,7 +20,7 @@ from gs2d.io.run_dir import SPLATS, VERDICT, RunFolder, load_tensors
 from gs2d.io.splat_ply import write_splats
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.changes import Snapshot, mean_changes, take_snapshot
-from gs2d.pipeline.estimate import iteration_costs, start_text
+from gs2d.pipeline.estimate import iteration_costs
 from gs2d.pipeline.events import Notice, OnEvent, Phase, StageDone, Step
 from gs2d.pipeline.exposure import Transforms, named, write_exposures
 from gs2d.pipeline.interruption import HeldSignals
@@ -478,3 +478,18 @@ def _storable(value: Any) -> bool:
 def _group(state: TrainState) -> Any:
     """Return the rows to highlight, once they are known."""
     return state.groups.get("high_error")
+
+
+def start_text(event: train_events.Initialised) -> str:
+    """Return what training starts from, in words."""
+    sources = {
+        "points": "points of the capture",
+        "sweep": "places on which neighbouring photographs agree, and points of the capture",
+        "depths": "points of the capture and of its known depths",
+        "splats": "given splats",
+        "random": "random points in the box the cameras look at",
+    }
+    source = sources[event.source]
+    dropped = f" ({event.dropped:,} were not usable)" if event.dropped else ""
+    lacks = f"; no dense start: {event.lacks}" if event.lacks else ""
+    return f"starting from {event.splats:,} {source}{dropped}{lacks}"

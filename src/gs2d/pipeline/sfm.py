@@ -23,10 +23,9 @@ from gs2d.data.masks import FOLDER
 from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import make_folder, now, remove_made, versions
 from gs2d.pipeline.attempts import attempted
-from gs2d.pipeline.events import Notice, OnEvent, Phase, Plan, Step, counted, ignore
+from gs2d.pipeline.events import PLACED, Notice, OnEvent, Phase, Plan, Step, counted, ignore
 from gs2d.pipeline.options import PosesOptions
 from gs2d.pipeline.photo_places import Places, places_of
-from gs2d.pipeline.plan import PLACED
 from gs2d.sfm.colmap import Facts, Group, Request, Solved, check_installed, layers, read_facts, solve
 from gs2d.sfm.fisheye import Circle
 from gs2d.sfm.image_copies import copy_images

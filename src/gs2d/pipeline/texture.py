@@ -34,8 +34,9 @@ from gs2d.meshing.texture import (
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
 from gs2d.pipeline.exposure import NONE, Transforms, as_scene, read_exposures
 from gs2d.pipeline.finished import open_job
-from gs2d.pipeline.job import Job, read_scene
+from gs2d.pipeline.job import Job
 from gs2d.pipeline.mesh import fused, mesh_run
+from gs2d.pipeline.opened import read_scene
 from gs2d.pipeline.options import MeshOptions, TextureOptions
 from gs2d.pipeline.placed import placed_output, placed_textured, say_where
 from gs2d.pipeline.report import report_again

@@ -27,7 +27,8 @@ from gs2d.io.run_dir import (
     remove_made,
 )
 from gs2d.pipeline.attempts import again, attempted
-from gs2d.pipeline.events import Event, Expected, Notice, OnEvent, Phase, Plan, ignore
+from gs2d.pipeline.estimate import estimate
+from gs2d.pipeline.events import TRAINED, Event, Notice, OnEvent, Phase, Plan, ignore
 from gs2d.pipeline.job import Job, check_train_options, prepare_job, recipe_of
 from gs2d.pipeline.live import Live
 from gs2d.pipeline.memory import release, use_memory
@@ -35,8 +36,6 @@ from gs2d.pipeline.mesh import MeshFrames, extract_mesh, keep_facts
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.page import page_run
 from gs2d.pipeline.photographs import PREPARED
-from gs2d.pipeline.plan import TRAINED
-from gs2d.pipeline.planned import plan_notices
 from gs2d.pipeline.processes import connected, follow, lead, memory_of
 from gs2d.pipeline.quality import by_quality
 from gs2d.pipeline.report import report_run
@@ -52,7 +51,7 @@ from gs2d.training import events
 from gs2d.training.parallel import ONE_PROCESS, ManyProcesses, OneProcess
 from gs2d.viewer.server import free_port
 
-MANY = 500  # photographs, from which a training is planned before it begins
+MANY = 500  # photographs, from which time and memory are estimated before training
 UNPACKED = "unpacked"  # in the run folder: what came as a ZIP file
 
 
@@ -123,9 +122,6 @@ def _train(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> Ru
             run.write_definition({**job.definition(), "schedule_scale": scale, **extra})
         job = lead(job, options, together, on_event)
         start = choose_start(run, job, options, on_event)
-        if start.state is None and _is_planned(options, len(job.scene.views)):
-            for line in plan_notices(job, options.prepare, timed=not options.estimate):
-                on_event(line)
         if start.state is None:
             for event in pretraining_notices(job, options):
                 on_event(event)
@@ -163,7 +159,7 @@ def _unlike_its_run(options: TrainOptions, job: Job) -> str:
 
 
 def _is_planned(options: TrainOptions, views: int) -> bool:
-    """Whether a plan is told before a training begins."""
+    """Whether time and memory are estimated before a training begins."""
     return options.part is None and bool(options.estimate or options.memory or options.disk or views >= MANY)
 
 
@@ -282,8 +278,6 @@ def keeping_details(on_event: OnEvent, details: list[str]) -> OnEvent:
 
 def pretraining_notices(job: Job, options: TrainOptions) -> list[Event]:
     """Return what the user should know before training: photographs, image size, length and expected time."""
-    from gs2d.pipeline.estimate import estimate, estimate_text
-
     scene, shrunk, shortened = job.scene, "", ""
     camera = max((view.camera for view in scene.views), key=lambda camera: max(camera.width, camera.height))
     if job.downscale > 1:
@@ -301,9 +295,11 @@ def pretraining_notices(job: Job, options: TrainOptions) -> list[Event]:
             f"{job.recipe.iterations:,} iterations{shortened}; {held_out}"
         )
     ]
-    found = estimate(job) if options.estimate else None
-    if found is not None:
-        told += [Expected(found.least, found.most), Notice(estimate_text(found, job.recipe.iterations))]
+    if _is_planned(options, len(scene.views)):
+        start = None if job.init is None else len(job.init)
+        found = estimate(scene, job.recipe, job.backend, downscale=job.downscale, prepare=options.prepare, start=start)
+        told += [Notice(line, detail=True) for line in found.lines()]
+        told += [Notice(found.line())] if options.estimate else []
     return told
 
 

@@ -13,28 +13,29 @@ from gs2d.config.protocols import GENERIC
 from gs2d.errors import DataError
 from gs2d.pipeline.blocks import settle as module
 from gs2d.pipeline.blocks.settle import Settled, capture_digest, fitting_partition, seam_recipe
-from gs2d.pipeline.capture_plan import CapturePlan, Range
+from gs2d.pipeline.estimate import Estimate, Range
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.options import TrainOptions
 from gs2d.render.backends import get_backend
 from train_toys import backends, make_scene
 
 SCENE = make_scene()
-SETTLED = Settled(SCENE, "colmap", get_recipe("best"), GENERIC, get_backend(backends()[-1]), "digest")
+SETTLED = Settled(SCENE, get_recipe("best"), GENERIC, get_backend(backends()[-1]), "digest")
 OPTIONS = TrainOptions(scene=Path("capture"), out=Path("job"))
-PLAN = CapturePlan(
+PLAN = Estimate(
     photographs=6, pixels=1, trained_pixels=1, downscale=1, iterations=1, start=1_000_000, splats=Range(1, 2, 3),
-    max_splats=None, memory=Range(1, 2, 3), allowed=None, prepared=False, disk=1, temporary=1, seconds=Range(1, 2, 3),
+    max_splats=None, memory=Range(1, 2, 3), allowed=None, prepared=False, disk=1, temporary=1, training=Range(1, 2, 3),
+    seconds=Range(1, 2, 3),
 )  # fmt: skip
 
 
-def fitting(monkeypatch: pytest.MonkeyPatch, plan: CapturePlan | DataError, partition: Partition) -> Partition | None:
-    def planned(*_: object, **__: object) -> CapturePlan:
+def fitting(monkeypatch: pytest.MonkeyPatch, plan: Estimate | DataError, partition: Partition) -> Partition | None:
+    def planned(*_: object, **__: object) -> Estimate:
         if isinstance(plan, DataError):
             raise plan
         return plan
 
-    monkeypatch.setattr(module, "plan_capture", planned)
+    monkeypatch.setattr(module, "estimate", planned)
     return fitting_partition(SETTLED, OPTIONS, partition, lambda event: TOLD.append(event))
 
 

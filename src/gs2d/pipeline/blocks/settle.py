@@ -21,17 +21,15 @@ from gs2d.config.serialize import to_json
 from gs2d.core.memory_limit import memory_budget
 from gs2d.core.missing import instead
 from gs2d.core.text import name_bytes
-from gs2d.data import Scene, detect_format
+from gs2d.data import Scene
 from gs2d.data.archive import is_archive
-from gs2d.data.masks import Masks
 from gs2d.errors import DataError, RecipeError
 from gs2d.pipeline.blocks.cells import spread_of
 from gs2d.pipeline.blocks.split import Block
-from gs2d.pipeline.capture_plan import CapturePlan, expected_splats, plan_capture
+from gs2d.pipeline.estimate import Estimate, estimate, expected_splats, limit_of
 from gs2d.pipeline.events import Notice, OnEvent
-from gs2d.pipeline.job import check_train_options, choose_backend, choose_protocol, read_scene, settled
-from gs2d.pipeline.masks import with_masks, without_masked_points
-from gs2d.pipeline.memory import check_memory
+from gs2d.pipeline.job import check_train_options, resolve
+from gs2d.pipeline.opened import open_capture
 from gs2d.pipeline.options import TrainOptions
 from gs2d.render.backends import Backend
 
@@ -47,8 +45,6 @@ class Settled:
     Attributes
     ----------
     scene : Scene
-    format : str
-        Of the capture.
     recipe : Recipe
         As one training of everything would have it.
     protocol : Protocol
@@ -59,7 +55,6 @@ class Settled:
     """
 
     scene: Scene
-    format: str
     recipe: Recipe
     protocol: Protocol
     backend: Backend
@@ -69,7 +64,7 @@ class Settled:
         """Return what is written down and compared when the command is given again."""
         return {
             "format": FORMAT,
-            "capture": {"path": str(options.scene.resolve()), "digest": self.capture, "format": self.format},
+            "capture": {"path": str(options.scene.resolve()), "digest": self.capture, "format": self.scene.format},
             "downscale": (options.downscale or 1),
             "partition": partition_json(partition),
             "recipe": to_json(self.recipe),
@@ -81,14 +76,12 @@ class Settled:
 
 def settle(options: TrainOptions, on_event: OnEvent) -> Settled:
     """Read the headers of a capture and settle what all blocks have in common; nothing is written."""
-    recipe = check_train_options(options)
+    check_train_options(options)
     if is_archive(options.scene):
         remedy = instead(options.scene, "capture")
         raise DataError(f"blocks need the folder of a capture, got the file {options.scene}{remedy}")
-    kind = detect_format(options.scene) if options.format == "auto" else options.format
-    found = open_settled(options, recipe, choose_protocol(options, kind, on_event), on_event)
-    scene = without_masked_points(found.scene, found.protocol, on_event)
-    recipe, protocol = settled(options, scene, found.protocol, on_event)
+    opened = open_capture(replace(options, downscale=options.downscale or 1), on_event)
+    recipe, resolved = resolve(options, opened, on_event)
     if recipe.poses is not None:
         raise RecipeError(
             "blocks need cameras that stay where they are, got a recipe that refines poses; refine them in a run of "
@@ -99,18 +92,14 @@ def settle(options: TrainOptions, on_event: OnEvent) -> Settled:
             "blocks need cameras whose light is known, got a recipe that learns vignetting or response; leave "
             "--vignetting and --response out"
         )
-    return replace(found, recipe=recipe, protocol=replace(protocol, near=protocol.near_for(scene.extent)))
+    protocol = replace(resolved.protocol, near=resolved.protocol.near_for(opened.scene.extent))
+    return Settled(opened.scene, recipe, protocol, opened.backend, capture_digest(opened.scene))
 
 
-def open_settled(options: TrainOptions, recipe: Recipe, protocol: Protocol, on_event: OnEvent) -> Settled:
-    """Read the headers of a capture for a recipe and a protocol that are settled."""
-    backend = choose_backend(options.backend, on_event)
-    kind = detect_format(options.scene) if options.format == "auto" else options.format
-    masks = Masks(options.masks, options.masked)
-    scene = read_scene(options.scene, kind, (options.downscale or 1), protocol, on_event, masks)
-    protocol = with_masks(protocol, scene, on_event)
-    check_memory(scene, (options.downscale or 1), backend.device)
-    return Settled(scene, kind, recipe, protocol, backend, capture_digest(scene))
+def open_settled(options: TrainOptions, recipe: Recipe, on_event: OnEvent) -> Settled:
+    """Read the headers of a capture for a recipe and a protocol (of the options) that are settled."""
+    opened = open_capture(replace(options, downscale=options.downscale or 1), on_event)
+    return Settled(opened.scene, recipe, opened.protocol, opened.backend, capture_digest(opened.scene))
 
 
 def capture_digest(scene: Scene) -> str:
@@ -145,16 +134,11 @@ def fitting_partition(
     settled: Settled, options: TrainOptions, partition: Partition, on_event: OnEvent
 ) -> Partition | None:
     """Return the partition with as many blocks as memory needs; None where everything fits into one training."""
-    found: CapturePlan | None = None
+    found: Estimate | None = None
     recipe = settled.recipe
     try:
-        found = plan_capture(
-            settled.scene,
-            recipe,
-            settled.protocol,
-            settled.backend,
-            downscale=(options.downscale or 1),
-            prepare=options.prepare,
+        found = estimate(
+            settled.scene, recipe, settled.backend, downscale=(options.downscale or 1), prepare=options.prepare
         )
     except DataError as error:
         on_event(Notice(f"not in one training: {error}"))
@@ -200,12 +184,8 @@ def with_budget(recipe: Recipe, splats: int) -> Recipe:
 
 def budget_of(recipe: Recipe) -> int | None:
     """Return the splats that a recipe allows everything; None: any number."""
-    for stage in recipe.stages:
-        options = getattr(stage.densify, "options", {})
-        most = getattr(stage.densify, "max_splats", None) or options.get("max_splats")
-        if most is not None:
-            return int(most)
-    return None
+    limits = (limit_of(stage.densify) for stage in recipe.stages if stage.densify is not None)
+    return next((limit for limit in limits if limit is not None), None)
 
 
 def coarse_recipe(recipe: Recipe, partition: Partition) -> Recipe:
