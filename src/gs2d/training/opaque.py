@@ -14,7 +14,7 @@ from gs2d.config.recipe import Recipe, Stage
 FROM = 0.8  # of a stage: earlier, fog fills the holes (docs/decisions/fog.md)
 # Few, so that a GPU keeps its arguments. About as varied as random colours (standard deviation 0.3 in each channel):
 # black and white, which vary more, cost 0.5 to 0.9 dB beside those.
-BACKGROUNDS = tuple(product((0.2, 0.8), repeat=3))
+BACKGROUNDS = tuple((r, g, b) for r, g, b in product((0.2, 0.8), repeat=3))
 
 
 def is_opaque(recipe: Recipe) -> bool:

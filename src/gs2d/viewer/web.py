@@ -384,9 +384,9 @@ def _around_splats(scene: PageScene, splats: Mapping[str, Any], served: Served |
     background = scene.settings.background
     is_dark = sum(background) < 1.5
     facts = json.dumps({**splats, **_facts(scene, subject), "served": served and asdict(served)}, allow_nan=False)
-    parts, scripts = PARTS, SCRIPTS
+    parts, scripts = PARTS, tuple(SCRIPTS)
     if served is not None:
-        parts, scripts = {**PARTS, **SERVED_PARTS}, SERVED_SCRIPTS
+        parts, scripts = {**PARTS, **SERVED_PARTS}, tuple(SERVED_SCRIPTS)
     values = {
         "title": html.escape(printable(scene.title)),
         "count": f"{splats['splats']:,}",
