@@ -12,7 +12,7 @@ import torch
 from gs2d.config.presets import get_recipe, two_dgs
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe, validate
-from gs2d.config.robust import BackgroundSphere, DenseStart, StartFit
+from gs2d.config.robust import BackgroundSphere, DenseStart, Removal, StartFit
 from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import apply_overrides, from_json, to_json
 from gs2d.data.scene import Scene, View
@@ -101,7 +101,7 @@ def trained(scene: Scene, settings: DenseStart) -> tuple[float, int]:
     """PSNR of the bare part of a photograph after a few iterations, and how many splats began."""
     made = scale_schedule(two_dgs(), 60 / 30_000)
     stage = replace(made.stages[0], densify=None, sh_interval=0)
-    recipe: Recipe = replace(made, stages=(stage,), sh_degree=0, dense_start=settings)
+    recipe = replace(made, stages=(stage,), sh_degree=0, dense_start=settings, removal=Removal(decay=0.0, dropout=0.0))
     trainer = Trainer(scene, recipe, GENERIC, backend="auto")
     count = len(trainer.splats)
     trainer.run()

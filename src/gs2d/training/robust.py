@@ -23,6 +23,7 @@ from gs2d.training.backdrop import in_color
 from gs2d.training.background_sphere import sphere_points
 from gs2d.training.free_space import FreeSpaceMaps
 from gs2d.training.initialize import Initial
+from gs2d.training.opaque import is_opaque
 from gs2d.training.parallel import ONE_PROCESS, OneProcess
 from gs2d.training.plane_sweep import SmallView, Sweep, start_points, sweep_views
 from gs2d.training.rows import keep_rows
@@ -101,8 +102,8 @@ class Robustness:
         try:
             sweep = sweep_views(scene, start or DenseStart())
             if start is not None:
-                unlit = recipe.removal is not None and recipe.removal.backdrop  # there is nothing behind the subject
-                around = None if start.sphere is None or unlit else sphere_points(scene, sweep, start.sphere)
+                # Large splats do harm unless those that hide something are removed.
+                around = sphere_points(scene, sweep, start.sphere) if start.sphere and is_opaque(recipe) else None
                 self.scene = replace(scene, points=start_points(scene, sweep, start, around))
         except DataError as error:
             if start is None or start.required or recipe.removal is not None:
