@@ -66,7 +66,9 @@ def test_a_run_uses_all_of_them_and_says_so(trained: Path) -> None:
     assert said["recipe"]["name"] == "example-2dgs"
     assert said["recipe"]["stages"][0]["densify"] == {"name": "example-prune", "options": {"at": 3, "count": 2}}
     events = [json.loads(line) for line in (trained / "events.jsonl").read_text().splitlines()]
-    assert any("example-contrast" in event.get("losses", {}) for event in events)
+    losses = next(event["losses"] for event in events if "losses" in event)
+    assert losses["example-contrast"] > 0
+    assert losses["example-outside"] > 0  # the photographs have an alpha channel
     pruned = [event for event in events if event["kind"] == "densify"]
     assert [(event["iteration"], event["splats"]) for event in pruned] == [(3, 58)]
 
@@ -84,7 +86,7 @@ def test_its_loss_with_data_of_its_own_has_a_section_in_the_report(trained: Path
 def test_the_lists_name_what_the_package_adds(gs2d: Run) -> None:
     listed = gs2d("recipes").stdout
     assert "example-2dgs" in listed
-    assert "Like 2dgs, with a loss and a densifier of this package." in listed
+    assert "Like 2dgs, with losses and a densifier of this package." in listed
     assert "example-checked: " in gs2d("doctor").stdout
 
 

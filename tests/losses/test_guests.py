@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 import train_toys
+from emulate import Emulator
+from fake_backends import cuda_on_host
 from gs2d.config.losses import LOSSES, register_loss
 from gs2d.config.recipe import LossTerm, Recipe, validate
 from gs2d.config.serialize import from_json, to_json
-from gs2d.data.scene import Scene
+from gs2d.data.scene import Scene, View
 from gs2d.errors import RecipeError
+from gs2d.kernels.cuda import launch
+from gs2d.kernels.library import available_variants
 from gs2d.losses.api import LossView, compute_losses
+from gs2d.render.backends import get_backend
 from gs2d.render.types import RenderOutput
 from gs2d.training import events
 from loss_images import make_camera, make_output
@@ -91,3 +97,65 @@ def test_options_that_a_loss_does_not_take_stop_before_training() -> None:
         train_toys.train(train_toys.make_scene(), replace(recipe, stages=(stage,)))
     with pytest.raises(RecipeError, match="loss 'mean' has data of its own"):
         losses_of([LossTerm("mean", 1.0, options={"only": 1})])
+
+
+def transparent(scene: Scene) -> Scene:
+    """Return the scene with an alpha channel in its photographs."""
+    views = []
+    for view in scene.train:
+        alpha = np.full((*view.image().shape[:2], 1), 255, np.uint8)
+        alpha[:9] = 0
+        views.append(View.from_arrays(view.name, view.camera, np.concatenate([view.image(), alpha], axis=2)))
+    return replace(scene, train=tuple(views))
+
+
+def with_guest(recipe: Recipe, *, needs: Sequence[str]) -> tuple[Recipe, list[tuple[RenderOutput, LossView]]]:
+    """Return a recipe with a loss that has these needs in its first stage, and the list of its arguments."""
+    given: list[tuple[RenderOutput, LossView]] = []
+
+    def kept(output: RenderOutput, view: LossView) -> Tensor:
+        given.append((output, view))
+        return output.alpha.mean()
+
+    register_loss("kept", needs=needs)(kept)
+    stage = replace(recipe.stages[0], losses=(*recipe.stages[0].losses, LossTerm("kept", 0.1)))
+    return replace(recipe, stages=(stage,)), given
+
+
+@pytest.mark.parametrize("name", ["cpu", "reference", "cuda"])
+def test_a_loss_gets_the_silhouette_and_the_distortion_that_it_needs(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if name == "cuda":
+        emulator = Emulator()
+        monkeypatch.setattr(launch, "launcher_for", lambda device: emulator)
+    elif name == "cpu" and not available_variants():
+        pytest.skip("the native library is not built")
+    backend = cuda_on_host() if name == "cuda" else get_backend(name)
+    recipe, given = with_guest(train_toys.short(), needs=["silhouette", "distortion"])
+    train_toys.train(transparent(train_toys.make_scene()), recipe, backend=backend)
+    assert given
+    for output, view in given:
+        assert view.silhouette is not None
+        assert view.silhouette[:9].max() == 0
+        assert view.silhouette[9:].min() == 1
+        assert output.distortion.isfinite().all()
+
+
+def test_a_loss_gets_the_neighbour_that_it_needs() -> None:
+    recipe, given = with_guest(replace(train_toys.short(), multiview=train_toys.WIDE), needs=["neighbour"])
+    train_toys.train(train_toys.make_scene(), recipe)
+    assert given
+    assert all(view.neighbour is not None for _, view in given)
+
+
+def test_a_loss_of_two_views_needs_a_recipe_that_compares_views() -> None:
+    recipe, _ = with_guest(train_toys.short(), needs=["neighbour"])
+    with pytest.raises(RecipeError, match="loss 'kept' needs a second view, but the recipe's multiview is null; set"):
+        train_toys.train(train_toys.make_scene(), recipe)
+
+
+@pytest.mark.parametrize("needs", [["depth"], "silhouette"])
+def test_an_unknown_need_is_refused(needs: Sequence[str]) -> None:
+    with pytest.raises(RecipeError, match="needs of loss 'kept' must be a list of silhouette, distortion"):
+        register_loss("kept", needs=needs)

@@ -21,6 +21,14 @@ def contrast(output, view, gain=1.0):
     return gain * (output.color.std() - view.target.std()).square()
 
 
+@gs2d.register_loss("example-outside", needs=["silhouette", "distortion"])
+def outside(output, view):
+    """Penalise opacity and distortion where the photograph is transparent."""
+    if view.silhouette is None:
+        return None
+    return ((1 - view.silhouette) * (output.alpha + output.distortion)).mean()
+
+
 @gs2d.register_loss("example-brightness")
 class Brightness:
     """Compare the mean brightness with that of the photograph, which is found once."""
@@ -73,9 +81,9 @@ class PruneFaint(Densifier):
 
 @gs2d.register_recipe("example-2dgs")
 def recipe():
-    """Like 2dgs, with a loss and a densifier of this package."""
+    """Like 2dgs, with losses and a densifier of this package."""
     base = gs2d.get_recipe("2dgs").with_loss(gs2d.LossTerm("example-contrast", 0.1, options={"gain": 2.0}))
-    base = base.with_loss(gs2d.LossTerm("example-brightness", 0.1))
+    base = base.with_loss(gs2d.LossTerm("example-brightness", 0.1)).with_loss(gs2d.LossTerm("example-outside", 0.1))
     stage = replace(base.stages[0], densify=Densify("example-prune", {"at": 3, "count": 2}))
     return replace(base, name="example-2dgs", stages=(stage, *base.stages[1:]))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from gs2d.config.multiview import MULTIVIEW_KINDS
@@ -14,6 +14,8 @@ LOSS_KINDS = (
     *("l1", "ssim", "l2", "normal_consistency", "normal_consistency_per_splat", "distortion", "silhouette"),
     *MULTIVIEW_KINDS,
 )
+NEEDS = ("silhouette", "distortion", "neighbour")
+"""What a loss may need that is computed or loaded only on request."""
 LOSSES: Registry[Any] = Registry(
     "loss",
     "gs2d.losses",
@@ -23,13 +25,17 @@ LOSSES: Registry[Any] = Registry(
 """Kinds of loss -> a function of images, or a class with data of its own (``gs2d.losses.api``)."""
 
 
-def register_loss(name: str) -> Callable[[Register], Register]:
+def register_loss(name: str, *, needs: Sequence[str] = ()) -> Callable[[Register], Register]:
     """Return a decorator that registers a loss, so that ``LossTerm(name, weight)`` can use it.
 
     Parameters
     ----------
     name : str
         Kind of the loss; must not be taken.
+    needs : sequence of str
+        What is computed or loaded only for losses that need it: "silhouette" (``view.silhouette``, the alpha channel of
+        the photograph), "distortion" (``output.distortion``) or "neighbour" (``view.neighbour``, in recipes with
+        ``multiview``: its depth is that of the first term that names one).
 
     Returns
     -------
@@ -41,7 +47,7 @@ def register_loss(name: str) -> Callable[[Register], Register]:
     Raises
     ------
     RecipeError
-        From the decorator: the name is taken.
+        If a need is unknown; from the decorator, if the name is taken.
 
     Examples
     --------
@@ -51,4 +57,13 @@ def register_loss(name: str) -> Callable[[Register], Register]:
     ...     return (4 * output.alpha * (1 - output.alpha)).clamp_min(0).pow(power).mean()
     >>> recipe = gs2d.get_recipe("2dgs").with_loss(gs2d.LossTerm("crisp", 0.1, options={"power": 2.0}))
     """
-    return LOSSES.register(name)
+    if isinstance(needs, str) or not set(needs) <= set(NEEDS):
+        raise RecipeError(f"needs of loss {name!r} must be a list of {', '.join(NEEDS)}, got {needs!r}")
+
+    def registered(loss: Register) -> Register:
+        LOSSES.register(name)(loss)
+        if needs:
+            loss.needs = frozenset(needs)  # type: ignore[attr-defined]
+        return loss
+
+    return registered

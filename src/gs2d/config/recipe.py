@@ -497,7 +497,8 @@ def validate(recipe: Recipe) -> Recipe:
         fixed = "views are compared by the intrinsics that the capture says"
         require(recipe.multiview is None, f"{where}: intrinsics cannot learn with multiview: {fixed}; leave one out")
     kinds = [term.kind for stage in recipe.stages for term in stage.losses]
-    check_multiview(f"{where}: multiview", recipe.multiview, kinds)
+    guests = any(kind not in LOSSES.builtin for kind in kinds)
+    check_multiview(f"{where}: multiview", recipe.multiview, kinds, guests=guests)
     check_priors(where, recipe.depth_prior, recipe.normal_prior, kinds)
     if recipe.fused_depth is not None:
         one_of(f"{where}: fused_depth", recipe.fused_depth, DEPTH_KINDS)

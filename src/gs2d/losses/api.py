@@ -44,6 +44,7 @@ __all__ = [
     "TargetMaps",
     "compute_losses",
     "loss_of",
+    "needs_of",
     "normals_from_depth",
     "prepared",
     "register_loss",
@@ -121,9 +122,9 @@ class LossView:
     index : int or None
         Of the training view, in the order of ``scene.train``.
     silhouette : Tensor [H, W] or None
-        Alpha of the photograph, in [0, 1], if it has one.
+        Alpha of the photograph, in [0, 1], if it has one and an active loss needs it.
     neighbour : Neighbour or None
-        The second view of the losses that compare two.
+        The second view, for losses that need it.
     target_mean : Tensor [H, W, 3] or None
         Local mean of the target when known (fused SSIM only).
     weights : mapping of kind to float
@@ -233,6 +234,12 @@ def prepared(term: LossTerm, scene: Scene, recipe: Recipe, device: torch.device)
     return loss
 
 
+def needs_of(term: LossTerm) -> frozenset[str]:
+    """Return the entries of ``gs2d.config.losses.NEEDS`` that a term needs."""
+    needs: frozenset[str] = getattr(LOSSES.get(term.kind), "needs", frozenset())
+    return needs | {"silhouette"} if term.where == "object" else needs
+
+
 def loss_of(term: LossTerm) -> tuple[str, str]:
     """Return what a term's function is known by: its kind and its options."""
     return term.kind, json.dumps(dict(term.options), sort_keys=True, default=str)
@@ -279,12 +286,12 @@ def _normal_consistency_per_splat(output: RenderOutput, view: LossView) -> Tenso
     return reference.normal_consistency_per_splat(*_normals(output, view), edges=view.edges, weights=view.pixel_weights)
 
 
-@register_loss("distortion")
+@register_loss("distortion", needs=["distortion"])
 def _distortion(output: RenderOutput, view: LossView) -> Tensor:
     return reference.distortion(output.distortion, view.mask)
 
 
-@register_loss("silhouette")
+@register_loss("silhouette", needs=["silhouette"])
 def _silhouette(output: RenderOutput, view: LossView) -> Tensor:
     if view.silhouette is None:
         raise RecipeError(
@@ -293,14 +300,14 @@ def _silhouette(output: RenderOutput, view: LossView) -> Tensor:
     return reference.silhouette(output.alpha, view.silhouette, view.mask)
 
 
-@register_loss("multiview_photometric")
+@register_loss("multiview_photometric", needs=["neighbour"])
 def _multiview_photometric(output: RenderOutput, view: LossView) -> Tensor:
     if view.fused is not None and view.fused.compare_views is not None:
         return view.compared(output, view.fused.compare_views)[0]
     return multiview.photometric(view.two_views(output))
 
 
-@register_loss("multiview_geometric")
+@register_loss("multiview_geometric", needs=["neighbour"])
 def _multiview_geometric(output: RenderOutput, view: LossView) -> Tensor:
     if view.fused is not None and view.fused.compare_views is not None:
         return view.compared(output, view.fused.compare_views)[1]

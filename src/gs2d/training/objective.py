@@ -10,7 +10,6 @@ from typing import Protocol as Interface
 import torch
 from torch import Tensor
 
-from gs2d.config.multiview import MULTIVIEW_KINDS
 from gs2d.config.protocols import Protocol
 from gs2d.config.recipe import Recipe, Stage
 from gs2d.core.camera import Camera
@@ -19,7 +18,7 @@ from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DivergedError
 from gs2d.kernels.reference import finite
-from gs2d.losses.api import LossFunction, LossReport, LossView, compute_losses, loss_of, prepared
+from gs2d.losses.api import LossFunction, LossReport, LossView, compute_losses, loss_of, needs_of, prepared
 from gs2d.losses.multiview import Neighbour
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backends import Backend
@@ -28,7 +27,7 @@ from gs2d.render.photometry import Shading, photograph
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.training.dropout import dropout_rate, dropped_out, kept_splats
 from gs2d.training.exposure import apply_exposure
-from gs2d.training.multiview import PATCH_BYTES, ImageFiles, draw_turn, find_neighbours, is_compared
+from gs2d.training.multiview import PATCH_BYTES, ImageFiles, check_compared, draw_turn, find_neighbours, is_compared
 from gs2d.training.opaque import another_background
 from gs2d.training.poses import pose_rate
 from gs2d.training.state import TrainState
@@ -140,6 +139,7 @@ class FullRender:
         self.frozen = frozen
         self.targets = targets
         self._background = torch.tensor(protocol.background, device=backend.device)
+        check_compared(recipe)
         if recipe.multiview is not None:
             self._neighbours = find_neighbours(scene, recipe.multiview)
             limit = 0 if scene.ahead else PATCH_BYTES
@@ -152,15 +152,14 @@ class FullRender:
     ) -> RasterSettings:
         """Return the rasterizer's constants at an iteration (1-based), over the protocol's background or another."""
         degree = stage.active_sh_degree(iteration, self.recipe.sh_degree)
-        wanted = any(term.kind == "distortion" and term.is_active(iteration) for term in stage.losses)
+        active = [term for term in stage.losses if term.is_active(iteration)]
         settings = replace(
             raster_settings(self.protocol, self.scene.extent, degree),
             background=background or self.protocol.background,
-            with_distortion=wanted,
+            with_distortion=any("distortion" in needs_of(term) for term in active),
             with_transmittance_depth=False,
         )
-        asked = (term.depth or self.protocol.depth for term in stage.losses if term.is_active(iteration))
-        return settings.for_depths(*asked)
+        return settings.for_depths(*(term.depth or self.protocol.depth for term in active))
 
     def drawn(self, splats: Splats) -> Splats:
         """Return the splats, and in rows behind them those that are frozen: what photographs show."""
@@ -292,7 +291,7 @@ class FullRender:
         if turn is None:
             return None
         camera, other = self.camera(state, turn.neighbour), turn.neighbour
-        kind = next((term.depth for term in stage.losses if term.kind in MULTIVIEW_KINDS and term.depth), None)
+        kind = next((term.depth for term in stage.losses if "neighbour" in needs_of(term) and term.depth), None)
         kind = kind or self.protocol.depth
         bare = replace(self.settings(stage, iteration), sh_degree=0, with_distortion=False).for_depths(kind)
         small = camera.resized(*(-(-n // settings.depth_downscale) for n in (camera.width, camera.height)))
@@ -361,7 +360,7 @@ class FullRender:
             target.image,
             target.mask,
             camera,
-            [t for t in self.protocol.resolve(stage.losses) if neighbour is not None or t.kind not in MULTIVIEW_KINDS],
+            [t for t in self.protocol.resolve(stage.losses) if neighbour is not None or "neighbour" not in needs_of(t)],
             iteration=iteration,
             depth_kind=self.protocol.depth,
             backend=self.backend,

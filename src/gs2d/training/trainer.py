@@ -21,7 +21,7 @@ from gs2d.core.splats import Splats
 from gs2d.data.cache import ReadAhead
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError, RecipeError, RunError
-from gs2d.losses.api import LossFunction, LossReport, target_maps
+from gs2d.losses.api import LossFunction, LossReport, needs_of, target_maps
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events, per_image
@@ -419,7 +419,7 @@ class Trainer:
             with_silhouettes=is_opaque(self.recipe)
             or self.recipe.exposure is not None
             or self.recipe.photometry is not None
-            or any(t.kind == "silhouette" or t.where == "object" for s in self.recipe.stages for t in s.losses),
+            or any("silhouette" in needs_of(term) for stage in self.recipe.stages for term in stage.losses),
             dtype=dtype,
             device=device,
             limit_bytes=limit_bytes if limit_bytes is not None else 0 if scene.ahead else TARGET_BYTES,
