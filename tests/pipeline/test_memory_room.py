@@ -35,7 +35,7 @@ def limited(monkeypatch: pytest.MonkeyPatch, total: float, used: float) -> None:
 def test_what_cannot_fit_is_refused_with_the_number_and_a_remedy_that_works(monkeypatch: pytest.MonkeyPatch) -> None:
     limited(monkeypatch, 1.3, 0.35)
     with pytest.raises(DataError) as refused:
-        check_memory(scene(5888, 3926), 1, "cpu")
+        check_memory(scene(5888, 3926), 1, on_host=True)
     said = str(refused.value)
     assert "\n" not in said
     assert "23.1 megapixels" in said
@@ -43,24 +43,24 @@ def test_what_cannot_fit_is_refused_with_the_number_and_a_remedy_that_works(monk
     assert "raise the limit" in said
     downscale = int(said.partition("--downscale ")[2].split(",")[0])
     assert downscale > 1
-    check_memory(scene(5888 // downscale, 3926 // downscale), downscale, "cpu")  # as the line says
+    check_memory(scene(5888 // downscale, 3926 // downscale), downscale, on_host=True)  # as the line says
     needed = 5888 * 3926 * (module.ITERATION_BYTES / downscale**2 + module.DECODING_BYTES)
     assert needed < 0.6 * 0.95 * GB  # caches have room beside it
 
 
 def test_what_fits_is_not_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     limited(monkeypatch, 16, 0.35)
-    check_memory(scene(5888, 3926), 1, "cpu")
+    check_memory(scene(5888, 3926), 1, on_host=True)
     limited(monkeypatch, 1.3, 0.35)
-    check_memory(scene(5888, 3926), 1, "cuda:0")  # the host only decodes
+    check_memory(scene(5888, 3926), 1, on_host=False)  # the host only decodes
     monkeypatch.setattr(module, "memory_limit", lambda: None)
-    check_memory(scene(10**5, 10**5), 1, "cpu")
+    check_memory(scene(10**5, 10**5), 1, on_host=True)
 
 
 def test_where_not_even_decoding_fits_no_downscale_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     limited(monkeypatch, 0.5, 0.45)
     with pytest.raises(DataError, match="smaller files of the photographs"):
-        check_memory(scene(20000, 10000), 1, "cpu")
+        check_memory(scene(20000, 10000), 1, on_host=True)
 
 
 def test_a_training_that_nobody_said_the_size_of_shrinks_its_photographs_until_they_fit(

@@ -281,14 +281,14 @@ def test_the_help_states_the_qualities_that_are_there() -> None:
     assert stated is not None
     assert list(QUALITIES) == ["draft", "normal", "full"]
     cpu, gpu = stated[1].split("on a GPU")
-    for device, said in (("cpu", cpu), ("cuda", gpu)):
+    for device, said in (("cpu", cpu), ("gpu", gpu)):
         numbers = [float(number) for number in re.findall(r"\d+(?:\.\d+)?", said)]
         for quality in QUALITIES.values():
             assert quality[device].side in numbers
             assert quality[device].iterations in (*numbers, None)
     recipe = get_recipe("2dgs-r")
     assert [QUALITIES[name]["cpu"].schedule_scale(recipe) for name in QUALITIES] == [0.03, 0.1, 1.0]
-    assert QUALITIES["normal"]["cuda"].schedule_scale(get_recipe("best")) == 1.0  # never more than the recipe has
+    assert QUALITIES["normal"]["gpu"].schedule_scale(get_recipe("best")) == 1.0  # never more than the recipe has
 
 
 @pytest.mark.parametrize(("quality", "downscale"), [("draft", 4), ("normal", 2), ("full", 1)])

@@ -187,7 +187,7 @@ def estimate(
     splats, budget = expected_splats(recipe, start), None
     prepared = prepare == "always" or (prepare == "auto" and not fits(scene))
     largest = max(view.camera.width * view.camera.height for view in scene.views)
-    fixed = PROGRAM_BYTES + largest * (ITERATION_BYTES * (backend.device == "cpu") + DECODING_BYTES * downscale**2)
+    fixed = PROGRAM_BYTES + largest * (ITERATION_BYTES * backend.on_host + DECODING_BYTES * downscale**2)
     fixed += 0 if prepared else decoded_bytes(scene)
     memory = _memory(fixed, splats)
     if allowed is not None and memory.most > allowed:

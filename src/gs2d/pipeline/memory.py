@@ -32,7 +32,7 @@ def use_memory(gib: float | None) -> None:
     set_memory_budget(None if gib is None else int(gib * 2**30))
 
 
-def check_memory(scene: Scene, downscale: int, device: str) -> None:
+def check_memory(scene: Scene, downscale: int, *, on_host: bool) -> None:
     """Refuse to train on photographs that are too large for the memory that this process may have.
 
     Parameters
@@ -40,22 +40,22 @@ def check_memory(scene: Scene, downscale: int, device: str) -> None:
     scene : Scene
     downscale : int
         By which its photographs were made smaller than their files.
-    device : str
-        Where is trained: on a GPU, photographs are only decoded here.
+    on_host : bool
+        Whether training uses the CPU. For another device, photographs are only decoded in this memory.
 
     Raises
     ------
     DataError
         It cannot fit: the kernel would end the process without a word.
     """
-    fitting, need = least_downscale(scene, downscale, device)
+    fitting, need = least_downscale(scene, downscale, on_host=on_host)
     if fitting == downscale:
         return
     smaller = f"--downscale {fitting}" if fitting is not None else "smaller files of the photographs"
     raise DataError(f"{need}; use {smaller}, or raise the limit")
 
 
-def least_downscale(scene: Scene, downscale: int, device: str) -> tuple[int | None, str]:
+def least_downscale(scene: Scene, downscale: int, *, on_host: bool) -> tuple[int | None, str]:
     """Return the downscale at which training fits into memory: the one that a scene has, or a larger one; and why.
 
     Returns
@@ -67,7 +67,6 @@ def least_downscale(scene: Scene, downscale: int, device: str) -> tuple[int | No
     if limit is None:
         return downscale, ""
     pixels = max(view.camera.width * view.camera.height for view in (*scene.train, *scene.test))
-    on_host = device == "cpu"
 
     def need(factor: int) -> float:
         shrunk = pixels * (downscale / factor) ** 2

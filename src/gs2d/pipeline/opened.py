@@ -88,7 +88,7 @@ def choose_backend(name: str, on_event: OnEvent) -> Backend:
         return backend
     report = backend_report()  # best first: all before the one that was taken cannot run
     taken = [status.name for status in report].index(backend.name)
-    if backend.device != "cpu":
+    if not backend.on_host:
         on_event(Notice(f"training on {report[taken].details} (--backend cpu for the processor)", detail=True))
     elif torch.version.cuda is not None and torch.cuda.device_count() > 0:
         on_event(Notice(f"training without the GPU: {report[0].reason}; {report[0].remedy}"))
@@ -132,13 +132,13 @@ def scene_that_fits(
     fixed = options.downscale or _begun_with(options)
     said: list[Event] = []
     scene = read_scene(options.scene, scene_format, fixed or 1, protocol, said.append, masks)
-    fitting, need = (1, "") if fixed else least_downscale(scene, 1, backend.device)
+    fitting, need = (1, "") if fixed else least_downscale(scene, 1, on_host=backend.on_host)
     if fitting is not None and fitting > 1:
         said = [Notice(f"{need}: they are shrunk by {fitting}, as by --downscale {fitting}")]
         scene = read_scene(options.scene, scene_format, fitting, protocol, said.append, masks)
     for event in said:
         on_event(event)
-    check_memory(scene, fixed or fitting or 1, backend.device)
+    check_memory(scene, fixed or fitting or 1, on_host=backend.on_host)
     return fixed or fitting or 1, scene
 
 

@@ -35,11 +35,11 @@ class Quality:
 
 
 _FULL = Quality(None, 1600)  # the side at which the official code trains, too
-QUALITIES: Mapping[str, Mapping[str, Quality]] = MappingProxyType(  # name -> device -> what it means there
+QUALITIES: Mapping[str, Mapping[str, Quality]] = MappingProxyType(  # name -> values on a CPU and on other devices
     {
-        "draft": {"cpu": Quality(1_800, 400), "cuda": Quality(6_000, 800)},
-        "normal": {"cpu": Quality(6_000, 800), "cuda": Quality(30_000, 1600)},
-        "full": {"cpu": _FULL, "cuda": _FULL},
+        "draft": {"cpu": Quality(1_800, 400), "gpu": Quality(6_000, 800)},
+        "normal": {"cpu": Quality(6_000, 800), "gpu": Quality(30_000, 1600)},
+        "full": {"cpu": _FULL, "gpu": _FULL},
     }
 )
 
@@ -48,7 +48,7 @@ def quality_of(name: str, backend: str) -> Quality:
     """Return the schedule and the picture size that are meant, on the device that this machine trains with."""
     if name not in QUALITIES:
         raise RecipeError(f"--quality must be one of {', '.join(QUALITIES)}, got {name}")
-    return QUALITIES[name][get_backend(backend).device]
+    return QUALITIES[name]["cpu" if get_backend(backend).on_host else "gpu"]
 
 
 def at_quality(

@@ -57,7 +57,7 @@ PROBES = 30  # times a stage at which the probe views are scored for the PSNR cu
 PROBE_VIEWS = 4
 GROWTH = 1.1  # of the cost of iterations, while splats are added (``Phase.growth``)
 EARLY_VIEWS = 16  # training views that score a stage before the last, where stages are compared by test views
-REPORTS = {"cpu": 10, "cuda": 50}  # iterations between progress events, by device: for each the host waits for a GPU
+REPORT_EVERY, REPORT_EVERY_ON_GPU = 10, 50  # iterations between progress events, for which the host waits for a GPU
 
 
 class RunLogger:
@@ -468,7 +468,8 @@ _ROWS_OR_JUMPS = (
 
 def progress_every(job: Job, options: TrainOptions) -> int:
     """Return the iterations between progress events."""
-    return max(1, min(REPORTS[job.backend.device], options.checkpoint_every))
+    every = REPORT_EVERY if job.backend.on_host else REPORT_EVERY_ON_GPU
+    return max(1, min(every, options.checkpoint_every))
 
 
 def _storable(value: Any) -> bool:

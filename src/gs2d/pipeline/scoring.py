@@ -167,7 +167,7 @@ class PeakGpuMemory:
     """Peak of torch's memory on the current GPU since :meth:`reset`; 0 where the backend uses none."""
 
     def __init__(self, backend: Backend) -> None:
-        self._used = backend.device == "cuda"
+        self._used = torch.device(backend.device).type == "cuda"
 
     def reset(self) -> None:
         """Start again from what is allocated now."""

@@ -140,6 +140,11 @@ class Backend:
     slow: bool = False
     about: str = ""
 
+    @property
+    def on_host(self) -> bool:
+        """Whether its tensors lie in the memory of the CPU, so that nothing waits for another device."""
+        return torch.device(self.device).type == "cpu"
+
     # -- rendering ---------------------------------------------------------------------------------------------------
     def rasterize(
         self,

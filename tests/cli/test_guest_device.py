@@ -1,0 +1,45 @@
+"""A backend of a package on a device that gs2d has no backend for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from cli_runs import TINY
+from gs2d.cli import run
+from gs2d.io.run_dir import RunFolder
+from gs2d.pipeline.quality import QUALITIES, quality_of
+from gs2d.render.backends import BACKENDS, ReferenceBackend
+
+
+class OnNamedDevice(ReferenceBackend):
+    """The reference on a device whose name appears nowhere in gs2d; torch keeps its tensors on the CPU."""
+
+    name = "guest"
+    device = "cpu:0"
+
+
+class OnMetal(ReferenceBackend):
+    """A backend whose device is not in this machine."""
+
+    name = "guest"
+    device = "mps"
+
+
+def test_it_trains_meshes_and_scores_by_the_command_line(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(BACKENDS._things, "guest", OnNamedDevice)
+    out = tmp_path / "run"
+    assert run(["train", str(capture), "--out", str(out), "--backend", "guest", "--quiet", *TINY]) == 0
+    assert RunFolder(out).definition()["backend"]["name"] == "guest"
+    assert run(["mesh", str(out), "--quiet"]) == 0
+    assert run(["evaluate", str(out), "--quiet"]) == 0
+
+
+def test_another_device_is_trained_on_like_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(BACKENDS._things, "guest", OnMetal)
+    assert quality_of("normal", "guest") == QUALITIES["normal"]["gpu"]
+    monkeypatch.setitem(BACKENDS._things, "guest", OnNamedDevice)
+    assert quality_of("normal", "guest") == QUALITIES["normal"]["cpu"]
