@@ -50,7 +50,7 @@ def test_without_points_the_box_is_what_the_cameras_see() -> None:
     ],
 )
 def test_the_customary_blender_box_is_used_only_if_the_cameras_agree(cameras: list[Camera], customary: bool) -> None:
-    bounds, _ = scene_bounds(cameras, None, blender=True)
+    bounds, _ = scene_bounds(cameras, None, is_synthetic=True)
     assert np.array_equal(bounds, [[-1.3] * 3, [1.3] * 3]) == customary
     assert not np.array_equal(scene_bounds(cameras, None)[0], [[-1.3] * 3, [1.3] * 3])
 

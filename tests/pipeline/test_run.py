@@ -16,7 +16,10 @@ from ball_runs import Stop, comparable, options
 from capture_writers import small_colmap
 from gs2d.config.presets import get_recipe
 from gs2d.config.protocols import get_protocol
+from gs2d.data.build import Capture
 from gs2d.data.image_files import read_image
+from gs2d.data.readers.registry import READERS
+from gs2d.data.readers.transforms import read_blender
 from gs2d.errors import DataError, DiskError, DivergedError, ProtocolError, RecipeError, RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.io.splat_ply import read_splats
@@ -26,7 +29,7 @@ from gs2d.pipeline.events import Event, Notice, Phase, Step, duration, ignore
 from gs2d.pipeline.job import prepare_job
 from gs2d.pipeline.options import DemoOptions
 from gs2d.pipeline.render import render_run
-from gs2d.pipeline.train import train
+from gs2d.pipeline.train import pretraining_notices, train
 from tiny import write_capture
 
 
@@ -274,6 +277,27 @@ def test_a_capture_with_a_split_of_its_own_takes_no_other(capture: Path, tmp_pat
         ProtocolError, match=r"--test-every is for captures without a split of their own, got .*leave it"
     ):
         prepare_job(options(capture, tmp_path / "run", test_every=4), ignore)
+
+
+def test_a_reader_of_a_package_may_bring_its_split(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Guest:
+        def detect(self, path: Path) -> bool:
+            return False
+
+        def read(self, path: Path, *, downscale: int) -> Capture:
+            return replace(read_blender(path), format="guest")
+
+    monkeypatch.setitem(READERS._things, "guest", Guest)
+    chosen = options(capture, tmp_path / "run", format="guest")
+    job = prepare_job(chosen, ignore)
+    assert {view.name.split("/")[0] for view in job.scene.test} == {"test"}
+    assert job.scene.own_split
+    told = [event.text for event in pretraining_notices(job, chosen) if isinstance(event, Notice)]
+    assert "--test-every" not in told[0]
+    with pytest.raises(ProtocolError, match="--test-every is for captures without .*, which has one; leave it out"):
+        prepare_job(replace(chosen, test_every=4), ignore)
 
 
 def test_a_run_without_test_views_renders_its_training_views_and_another_training_names_its_options(

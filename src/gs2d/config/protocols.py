@@ -174,7 +174,7 @@ NERF_SYNTHETIC = Protocol(
     background=WHITE,  # [s] --white_background
     near=0.2,  # [c]
     near_plane_policy="cull",  # [d] else white sheets grow over the white background, also with the official box
-    test_every=0,  # the data set has its own split
+    test_every=8,  # [d] for captures without transforms_test.json, which has the split of the data set
     use_mask_in_training=False,  # the images are composited on the background instead
     # [d] no script meshes this set: limits from the scene; some objects come in pieces; median is nearer the truth
     fusion=FusionLimits(depth="median"),

@@ -16,12 +16,12 @@ _BLENDER_HALF = 1.3  # the initial box of NeRF-Synthetic in the 3DGS and 2DGS re
 
 
 def scene_bounds(
-    cameras: Sequence[Camera], points: PointCloud | None, *, blender: bool = False
+    cameras: Sequence[Camera], points: PointCloud | None, *, is_synthetic: bool = False
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return the box that the cameras look at.
 
     With sparse points, their 1st to 99th percentile on each axis, widened by a tenth. Without, the box around the
-    places that most cameras see. For a NeRF-Synthetic data set the customary [-1.3, 1.3]^3, if the cameras
+    places that most cameras see. For a synthetic data set the customary [-1.3, 1.3]^3, if the cameras
     agree with it.
 
     Parameters
@@ -29,6 +29,8 @@ def scene_bounds(
     cameras : sequence of Camera
         The training cameras.
     points : PointCloud or None
+    is_synthetic : bool
+        Whether to try the box of NeRF-Synthetic first.
 
     Returns
     -------
@@ -41,7 +43,7 @@ def scene_bounds(
         margin = 0.1 * np.maximum(high - low, 1e-3 * (high - low).max())
         if (margin > 0).all():
             return np.stack([low - margin, high + margin]), ()
-    if blender and _fits_blender_box(cameras):
+    if is_synthetic and _fits_blender_box(cameras):
         return np.array([[-_BLENDER_HALF] * 3, [_BLENDER_HALF] * 3]), ()
     box = _box_seen_by_most(cameras)
     if box is not None:

@@ -97,7 +97,8 @@ class Capture:
 
     ``downscaled_by`` is the factor by which the image files that were chosen are already smaller (``images_N``);
     ``home`` the folder that may hold the folders of maps and masks, where it is not the root, and ``mask_homes`` others
-    that may hold masks. ``finds_masks`` is False where files of these names are something else.
+    that may hold masks. ``finds_masks`` is False where files of these names are something else. ``is_synthetic`` says
+    that the object may fill the box [-1.3, 1.3]^3 of NeRF-Synthetic; it is used if the cameras agree with it.
     """
 
     format: str
@@ -112,6 +113,7 @@ class Capture:
     observe: Callable[[], ObservedPoints] | None = None
     mask_homes: tuple[Path, ...] = ()
     finds_masks: bool = True
+    is_synthetic: bool = False
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -300,7 +302,7 @@ def build_scene(
     except DataError as error:
         raise DataError(f"{error}{_explained(capture)}") from error
     points, point_notes = _finite_points(capture.points)
-    bounds, bound_notes = scene_bounds(cameras, points, blender=capture.format == "blender")
+    bounds, bound_notes = scene_bounds(cameras, points, is_synthetic=capture.is_synthetic)
     return Scene(
         name=root.resolve().name,
         format=capture.format,
@@ -320,6 +322,7 @@ def build_scene(
         details=_lens_notes(frames),
         root=root,
         masks=masks,
+        own_split=any(frame.split for frame in frames),
         observe=_observed(capture, frames, points, {view.name: view.camera for view in (*train, *test)}),
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -205,5 +205,5 @@ def load_scene(
             raise DataError(f"format {format} has masks of its own, got masks or masked; leave them out")
         if downscale > 1:
             raise DataError(f"format {format} cannot be shrunk when it is read, got downscale {downscale}; use 1")
-        return capture
+        return replace(capture, own_split=True)
     return build_scene(capture, root, downscale=downscale, test_every=test_every, cache_bytes=cache_bytes, masks=chosen)

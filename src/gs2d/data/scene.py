@@ -261,6 +261,8 @@ class Scene:
         each time (``gs2d.data.prepared``); 0: they are to stay in memory.
     masks : Masks
         Which of the photographs have a mask, and what it means.
+    own_split : bool
+        Whether the capture itself says which views are test views, so that ``test_every`` does not apply.
     """
 
     name: str
@@ -278,6 +280,7 @@ class Scene:
     observe: Callable[[], ObservedPoints] | None = None
     ahead: int = 0
     masks: Masks = Masks()  # noqa: RUF009 (frozen)
+    own_split: bool = False
 
     def with_poses(self, poses: Mapping[str, np.ndarray], zooms: Mapping[str, Zoom] = MappingProxyType({})) -> Scene:
         """Return the scene with other cameras. Images are shared.

@@ -58,6 +58,11 @@ def open_capture(options: TrainOptions, on_event: OnEvent, scene: Scene | None =
         downscale, scene = scene_that_fits(options, scene_format, protocol, backend, on_event)
     else:
         protocol, downscale = choose_protocol(options, scene.format, on_event), 1
+    if options.test_every is not None and scene.own_split:
+        raise ProtocolError(
+            f"--test-every is for captures without a split of their own, got {options.scene}, which has one; "
+            "leave it out"
+        )
     return Opened(scene, with_masks(protocol, scene, on_event), backend, downscale)
 
 
@@ -71,14 +76,7 @@ def choose_protocol(options: TrainOptions, scene_format: str, on_event: OnEvent)
             on_event(Notice(line, detail=True))
     else:
         protocol = get_protocol(named) if isinstance(named, str) else named
-    if options.test_every is None:
-        return protocol
-    if scene_format == "blender":
-        raise ProtocolError(
-            f"--test-every is for captures without a split of their own, got {options.scene} with its "
-            "transforms_test.json; leave it out"
-        )
-    return replace(protocol, test_every=options.test_every)
+    return protocol if options.test_every is None else replace(protocol, test_every=options.test_every)
 
 
 def choose_backend(name: str, on_event: OnEvent) -> Backend:
@@ -107,8 +105,8 @@ def read_scene(
     masks: Masks = Masks(),  # noqa: B008 (frozen)
 ) -> Scene:
     """Load a capture and tell what was decided or skipped."""
-    test_every = None if scene_format == "blender" else protocol.test_every  # Blender captures bring their split
-    scene = load_scene(path, format=scene_format, downscale=downscale, test_every=test_every, **masks.options())
+    chosen = masks.options()
+    scene = load_scene(path, format=scene_format, downscale=downscale, test_every=protocol.test_every, **chosen)
     for text in scene.notes:
         on_event(Notice(text))
     for text in scene.details:

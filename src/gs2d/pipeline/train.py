@@ -286,9 +286,10 @@ def pretraining_notices(job: Job, options: TrainOptions) -> list[Event]:
         shortened = f" (--schedule-scale {options.schedule_scale:g})"
     if scene.test:
         held_out = f"{len(scene.test)} do not train, they score the result"
-        held_out += "" if scene.format == "blender" else " (--test-every 0 trains on all)"  # which has its own split
+        held_out += "" if scene.own_split else " (--test-every 0 trains on all)"
     else:
-        held_out = "none is held out to score the result (--test-every 8 holds some out)"
+        held_out = "none is held out to score the result"
+        held_out += "" if scene.own_split else " (--test-every 8 holds some out)"
     told: list[Event] = [
         Notice(
             f"{len(scene.train)} of {len(scene.views)} photographs train at {camera.width}x{camera.height}{shrunk} for "

@@ -50,7 +50,7 @@ def read_blender(root: Path) -> Capture:
     else:
         entries = _entries(train, _read_meta(train), None)
     frames, skipped, notes = _read_frames(entries, train)
-    return Capture("blender", tuple(frames), skipped=tuple(skipped), notes=tuple(notes))
+    return Capture("blender", tuple(frames), skipped=tuple(skipped), notes=tuple(notes), is_synthetic=True)
 
 
 def read_nerfstudio(root: Path) -> Capture:
