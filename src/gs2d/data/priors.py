@@ -174,7 +174,7 @@ class PriorMaps:
     camera : Camera
         Of the view: pinhole, at the size in training.
     lens_maps : callable
-        ``lens.source_positions``, remembered.
+        ``undistort.source_positions``, with a cache.
     """
 
     files: MapFiles

@@ -1,4 +1,4 @@
-"""The densification signal of a view, added to what was gathered: ``training.densify.accumulate`` natively."""
+"""Adds the densification signal of a view: the native form of ``kernels.reference.accumulate``."""
 
 from __future__ import annotations
 

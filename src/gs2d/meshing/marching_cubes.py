@@ -130,7 +130,7 @@ def marching_cubes(volume: Volume, *, min_weight: float = 1.0) -> Mesh:
     volume : Volume
     min_weight : float
         A voxel is known from this weight on. A view adds 1 to voxels in front of its surface and to those behind it
-        up to ``integrate.FULL_WEIGHT_BEHIND`` of the truncation.
+        up to ``tsdf.FULL_WEIGHT_BEHIND`` of the truncation.
 
     Returns
     -------

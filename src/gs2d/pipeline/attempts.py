@@ -28,7 +28,7 @@ def attempted(what: str, command: str | None, on_event: OnEvent) -> Iterator[Non
     command : str or None
         What makes it again (:func:`again`); None: the same command with ``--resume``; "": nothing does.
     on_event : callable
-        Is told :class:`~gs2d.pipeline.events.Missing`.
+        Is told :class:`~gs2d.pipeline.events.MissingFile`.
     """
     try:
         yield

@@ -16,7 +16,7 @@ from gs2d.pipeline.render import shown_cameras
 
 
 def report_run(path: Path, on_event: OnEvent = ignore) -> Path:
-    """Write the report of a run; a section that fails is said in it, and told as ``Missing``."""
+    """Write the report of a run; a section that fails says so, and a ``MissingFile`` event is sent."""
     from gs2d.report.write import write_report
 
     run = open_run(Path(path))

@@ -82,7 +82,7 @@ def read_model(folder: Path, done: Mapping[str, Any]) -> SfmModel:
 
 
 def _median_angle(images: Sequence[ColmapImage], points: ColmapPoints) -> float:
-    """See ``Piece``; over at most ``_MAX_ANGLES`` points."""
+    """See ``SfmModel``; over at most ``_MAX_ANGLES`` points."""
     step = -(-len(points.ids) // _MAX_ANGLES)
     rays: dict[int, list[np.ndarray]] = {int(number): [] for number in points.ids[::step]}
     places = dict(zip(rays, points.xyz[::step], strict=True))
