@@ -16,8 +16,7 @@ import pytest
 
 import gs2d
 from browser import browser, require_browser
-from gs2d.cli.catalogue import options_of
-from gs2d.cli.usage import NAMES
+from gs2d.cli.arguments import NAMES, options_of
 
 ROOT = Path(__file__).resolve().parents[1]
 SITE = ROOT / "docs" / "site"

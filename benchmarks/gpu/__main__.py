@@ -131,9 +131,6 @@ def run(args: argparse.Namespace, bench: Bench, out: Path) -> int:
         given = (args.capture, args.recipe, args.schedule_scale, args.downscale)
         results, module = real.run(bench, *given, progress), real
     else:
-        from benchmarks.gpu.without_tyro import stand_in
-
-        stand_in()
         from benchmarks.gpu import training  # the pipeline, which the other commands need not have
 
         captures = (args.capture, args.schedule_scale, args.downscale, args.runs)

@@ -8,9 +8,8 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator
 
 import gs2d
-from gs2d.cli.catalogue import Option, about, options_of
+from gs2d.cli.arguments import NAMES, Option, about, options_of
 from gs2d.cli.help import GROUPS, TITLES, option_text
-from gs2d.cli.usage import NAMES
 
 _SPOKEN = re.compile(r"(`[^`]*`)")  # what is code already
 
@@ -19,7 +18,7 @@ def commands() -> str:
     """Return every command with every option, as Markdown; options of several commands once, at the end."""
     owners: dict[type, list[str]] = defaultdict(list)
     for name in _names():
-        for group in {option.group for option in options_of(NAMES[name])}:
+        for group in {option.owner for option in options_of(NAMES[name])}:
             owners[group].append(name)
     shared = {group for group, names in owners.items() if len(names) > 1}
     lines = []
@@ -32,7 +31,7 @@ def commands() -> str:
         used = ", ".join(f"[`{name}`](#gs2d-{name})" for name in owners[group])
         lines += [f"### {_heading(group)}", "", f"Of {used}.", ""]
         options = {option.field: option for name in owners[group] for option in options_of(NAMES[name])}
-        lines += _explained([option for option in options.values() if option.group is group])
+        lines += _explained([option for option in options.values() if option.owner is group])
     return "\n".join(lines)
 
 
@@ -48,7 +47,7 @@ def _command(name: str, shared: set[type]) -> list[str]:
     usage = " ".join(o.usage if o.required else f"[{o.usage}]" for o in needed)
     lines = [f"### gs2d {name}", "", "```text", f"gs2d {name} {usage} [OPTIONS]".replace("  ", " "), "```", ""]
     lines += [_plain(about(NAMES[name])), "", *_explained(_arguments_first(options, shared))]
-    others = list(dict.fromkeys(o.group for o in options if o.group in shared))
+    others = list(dict.fromkeys(o.owner for o in options if o.owner in shared))
     if others:
         links = ", ".join(f"[{_heading(group)}](#{_anchor(_heading(group))})" for group in others)
         lines += [f"Also: {links}.", ""]
@@ -57,7 +56,7 @@ def _command(name: str, shared: set[type]) -> list[str]:
 
 def _arguments_first(options: Iterable[Option], shared: set[type]) -> list[Option]:
     """Return a command's own options, what stands alone on a command line before what has a name."""
-    return sorted((o for o in options if o.group not in shared), key=lambda o: bool(o.flags))
+    return sorted((o for o in options if o.owner not in shared), key=lambda o: bool(o.flags))
 
 
 def _explained(options: list[Option]) -> list[str]:

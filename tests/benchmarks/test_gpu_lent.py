@@ -141,34 +141,6 @@ def test_the_share_of_the_time_in_which_the_gpu_works() -> None:
     assert first.busy_fraction([(5.0, 6.0), (0.0, 10.0)]) == 1.0
 
 
-NO_TYRO = """
-import sys
-from importlib.abc import MetaPathFinder
-class Absent(MetaPathFinder):
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] == "tyro":
-            raise ModuleNotFoundError(name)
-class Blocked(dict): pass
-import importlib.util
-real = importlib.util.find_spec
-importlib.util.find_spec = lambda name, *rest: None if name == "tyro" else real(name, *rest)
-sys.meta_path.insert(0, Absent())
-from benchmarks.gpu import first, kernels, correctness
-from benchmarks.gpu.without_tyro import stand_in
-assert stand_in() and not stand_in()
-from benchmarks.gpu import training
-print(training.TrainOptions(scene="a", out="b", backend="cuda").backend)
-"""
-
-
-def test_an_image_with_torch_and_without_tyro_measures_and_trains() -> None:
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT / 'src'}:{ROOT}"}
-    done = subprocess.run(
-        [sys.executable, "-c", NO_TYRO], env=environment, capture_output=True, text=True, timeout=250, check=False
-    )
-    assert done.stdout.strip() == "cuda", done.stderr[-2000:]
-
-
 def test_the_goals_have_their_inputs_and_the_largest_of_the_usual_scenes_comes_first() -> None:
     assert (300_000, 800, 800) in scenes.SIZES  # 60k iterations of an object in 75 s
     assert scenes.SIZES[0] == (1_000_000, 1600, 1060)

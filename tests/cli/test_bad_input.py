@@ -219,7 +219,7 @@ def test_a_mask_that_leaves_nothing_of_one_view_is_noted(tmp_path: Path) -> None
         (["--subject-box", "0", "0", "0", "1", "1", "nan"], "got 0 0 0 1 1 nan"),
         (["--subject-box", "0", "0", "0", "1", "1", "1", "--scene"], "--subject-box and --scene exclude each other"),
         (["--exposure", "--no-exposure"], "--exposure and --no-exposure contradict each other"),
-        (["--robust", "perhaps"], "--robust must be auto, on or off"),
+        (["--robust", "perhaps"], "--robust: invalid choice: 'perhaps'"),
     ],
 )
 def test_options_that_make_no_sense_give_one_line_and_leave_nothing(

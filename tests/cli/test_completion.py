@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 
 from gs2d.cli import run
-from gs2d.cli.catalogue import Option, options_of
+from gs2d.cli.arguments import NAMES, Option, options_of
 from gs2d.cli.completion import SHELLS, script
-from gs2d.cli.usage import NAMES
 
 # Options whose words differ between commands, and why. Kind, number and values are the same even of these.
 SAID_OTHERWISE = {
@@ -133,4 +132,4 @@ def test_the_command_prints_the_script_and_nothing_else(shell: str, capsys: pyte
 
 def test_a_shell_that_is_none_of_them_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["completion", "tcsh"]) == 2
-    assert "SHELL must be bash, zsh or fish, got 'tcsh'" in capsys.readouterr().err
+    assert "SHELL: invalid choice: 'tcsh'" in capsys.readouterr().err

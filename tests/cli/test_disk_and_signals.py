@@ -89,7 +89,7 @@ def test_ctrl_c_exits_with_130_and_says_how_to_go_on(
     assert line.endswith("--resume")
 
 
-@pytest.mark.parametrize("module", ["gs2d.cli.app", "tyro", "torch"])
+@pytest.mark.parametrize("module", ["gs2d.cli.app", "argparse", "torch"])
 def test_ctrl_c_while_modules_load_is_one_line_and_exit_code_130(module: str, trained: Path) -> None:
     code = f"""
 import os, signal, sys

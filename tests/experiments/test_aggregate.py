@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from gs2d.cli.app import parse
 from gs2d.cli.commands import Paper, Train
+from gs2d.cli.parser import parse
 from gs2d.config.protocols import MetricConventions
 from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.experiments.aggregate import Cell, Results, check_claim, read_cell

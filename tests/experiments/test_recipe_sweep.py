@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from gs2d.cli import run
-from gs2d.cli.app import parse
 from gs2d.cli.commands import Sweep
+from gs2d.cli.parser import parse
 from gs2d.config.presets import get_recipe
 from gs2d.config.serialize import to_json
 from gs2d.experiments import jobs as jobs_module

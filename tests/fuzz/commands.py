@@ -104,7 +104,7 @@ def execute(words: list[str]) -> None:
 
 @cache  # the words are the same for every run folder, and the parser has a family of its own
 def _parsed(words: tuple[str, ...]) -> Any:
-    from gs2d.cli.app import parse
+    from gs2d.cli.parser import parse
 
     return parse(words)
 
@@ -130,7 +130,7 @@ def line_seeds() -> list[dict[str, bytes]]:
 
 def read_line(root: Path) -> None:
     """The parser, and what is checked of a recipe and of what is set in it before anything is read."""
-    from gs2d.cli.app import UsageError, parse
+    from gs2d.cli.parser import UsageError, parse
     from gs2d.config.presets import get_recipe
     from gs2d.config.serialize import apply_overrides
     from gs2d.errors import DataError
@@ -140,14 +140,12 @@ def read_line(root: Path) -> None:
     except (ValueError, RecursionError):
         return  # no command line
     words = [word for word in words if isinstance(word, str) and "\0" not in word] if isinstance(words, list) else []
-    if not words or any(word.startswith("--tyro-") for word in words):
+    if not words:
         return
     try:
         command = parse(words)
     except UsageError as error:
         raise DataError(" ".join(str(error).split())) from error
-    except SystemExit:
-        return
     if hasattr(command, "overrides"):
         apply_overrides(get_recipe(getattr(command, "recipe", None) or "2dgs-r"), command.overrides)
 

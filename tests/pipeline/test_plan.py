@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from gs2d.cli.app import parse
 from gs2d.cli.app import run as main
+from gs2d.cli.parser import parse
 from gs2d.config.densify import Densify
 from gs2d.config.presets import get_recipe
 from gs2d.config.recipe import Stage

@@ -17,7 +17,7 @@ import pytest
 
 from cli_runs import TINY, one_line
 from gs2d.cli import commands, run
-from gs2d.cli.app import parse
+from gs2d.cli.parser import parse
 from gs2d.config.presets import DEFAULT_RECIPE, get_recipe
 from gs2d.io.run_dir import open_run
 from gs2d.pipeline import options as options_module

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import importlib
-import io
 import os
 import re
 import shlex
@@ -21,9 +20,9 @@ from typing import NoReturn
 
 import gs2d
 from gs2d.cli import layout
+from gs2d.cli.arguments import NAMES
 from gs2d.cli.commands import (
     COMMANDS,
-    Command,
     Common,
     Completion,
     Demo,
@@ -35,13 +34,12 @@ from gs2d.cli.commands import (
 )
 from gs2d.cli.console import Console, show_help
 from gs2d.cli.interrupts import INTERRUPTED, Interruptible
-from gs2d.cli.usage import HELP_WORDS, NAMES, UsageError, check, check_inputs
+from gs2d.cli.parser import HELP_WORDS, UsageError, check_inputs, parse
 from gs2d.core.memory_limit import address_space, check_address_space
 from gs2d.core.processes import here
 from gs2d.core.text import printable
 from gs2d.errors import Gs2dError
 from gs2d.experiments.options import TableOptions
-from gs2d.pipeline.options import HowItRuns
 
 OK, EXIT_BUG, EXIT_USAGE, INCOMPLETE, NOBODY_READS = 0, 1, 2, 3, 141
 _MENDABLE = {
@@ -76,8 +74,6 @@ def run(argv: Sequence[str]) -> int:
             return OK
         command = _of_this_process(parse(argv))
         check_inputs(command)  # before anything heavy is imported
-    except SystemExit as exit_:
-        return OK if exit_.code is None else exit_.code if isinstance(exit_.code, int) else EXIT_USAGE
     except BrokenPipeError:  # `gs2d train --help | head`
         _drop_stdout()
         return NOBODY_READS
@@ -149,36 +145,6 @@ def _answer(argv: Sequence[str]) -> list[str] | None:
     if words[0] in HELP_WORDS:
         return helps.program_help(everything=everything)
     return None
-
-
-def parse(argv: Sequence[str]) -> Common:
-    """Return the command that the arguments ask for.
-
-    Raises
-    ------
-    UsageError
-        In one line.
-    SystemExit
-        After tyro's own options (``--tyro-print-completion bash``), with code 0.
-    """
-    import tyro
-
-    config = (tyro.conf.FlagCreatePairsOff,)
-    if argv[0].startswith("--tyro-"):  # completions of a shell are of all commands
-        return tyro.cli(Command, prog="gs2d", args=list(argv), config=config)
-    check(argv)
-    try:
-        with contextlib.redirect_stderr(io.StringIO()):  # one command alone is ready ten times as soon as all of them
-            command: Common = tyro.cli(NAMES[argv[0]], prog=f"gs2d {argv[0]}", args=list(argv[1:]), config=config)
-    except SystemExit as exit_:
-        if not exit_.code:
-            raise
-        # `check` has said of all that can be wrong what it is; tyro's own words for the rest are a box of twenty lines.
-        words = shlex.join(argv[1:])
-        raise UsageError(f"gs2d {argv[0]} does not take {words}; see `gs2d {argv[0]} --help`") from None
-    if isinstance(command, HowItRuns) and command.resume and command.overwrite:
-        raise UsageError("--resume and --overwrite exclude each other; give one")
-    return command
 
 
 def _of_this_process(command: Common) -> Common:

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg, subcommand
-
+from gs2d.config.arguments import Arg
 from gs2d.experiments.options import BlocksOptions, PaperOptions, ReconstructAnywhereOptions, SweepOptions
 from gs2d.pipeline.options import (
     BoxOption,
@@ -23,8 +22,8 @@ from gs2d.pipeline.options import (
     TrainOptions,
 )
 
-MemoryOption = Annotated[float | None, arg(metavar="GIB")]
-RunPath = Annotated[Positional[Path], arg(metavar="RUN")]
+MemoryOption = Annotated[float | None, Arg(metavar="GIB")]
+RunPath = Annotated[Path, Arg(metavar="RUN", positional=True)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +78,7 @@ class Mesh(TextureOptions, MeshOptions, Common):
     """Run folder."""
     out: Path | None = None
     """Mesh file (default: mesh.ply in the run; with --texture mesh.glb)."""
-    splats: Annotated[Path | None, arg(metavar="FILE")] = None
+    splats: Annotated[Path | None, Arg(metavar="FILE")] = None
     """Take the splats of this file, of any format that is read, in the frame of the run; needs --out."""
     texture: bool = False
     """Write it with a texture from the photographs: mesh.glb, or what --out names, .glb or .obj. Without options that
@@ -105,17 +104,17 @@ class Render(Common):
     circle was photographed."""
     flight: int = 0
     """Instead of the views, so many frames of a smooth flight along the photographs."""
-    width: Annotated[int | None, arg(metavar="PIXELS")] = None
+    width: Annotated[int | None, Arg(metavar="PIXELS")] = None
     """Width of the images; the height follows from the aspect ratio (default: as in training)."""
     out: Path | None = None
     """Folder for the pictures (default: renders/SPLIT, renders/orbit or renders/flight in the run)."""
-    video: Annotated[Path | None, arg(metavar="FILE")] = None
+    video: Annotated[Path | None, Arg(metavar="FILE")] = None
     """With --orbit or --flight: also a video of the frames, .mp4 (H.264, by ffmpeg) or .webp; no ending: what works."""
     fps: float = 30.0
     """Frames a second of the video."""
-    exposure_of: Annotated[str | None, arg(metavar="PHOTOGRAPH")] = None
+    exposure_of: Annotated[str | None, Arg(metavar="PHOTOGRAPH")] = None
     """Of a run with --exposure: in the exposure of this training photograph (default: in the mean of all)."""
-    splats: Annotated[Path | None, arg(metavar="FILE")] = None
+    splats: Annotated[Path | None, Arg(metavar="FILE")] = None
     """Take the splats of this file, of any format that is read, in the frame of the run; needs --out."""
     memory: MemoryOption = None
     """GiB of memory to keep to (default: half of what this machine or container has)."""
@@ -127,7 +126,7 @@ class Render(Common):
 class View(Common):
     """Look at a trained run in the browser: splats, mesh and cameras, served from this machine only."""
 
-    path: Annotated[Positional[Path], arg(metavar="RUN")]
+    path: Annotated[Path, Arg(metavar="RUN", positional=True)]
     """Run folder, or a file of flat splats: PLY (compressed too), .spz, .splat, .usd, .glb or .sog."""
     port: int | None = None
     """Port of the page (default: the first free one from 8080 on)."""
@@ -137,9 +136,9 @@ class View(Common):
 class Page(Common):
     """Write the splats as one HTML file that any browser draws exactly: no server, no network, to mail or to host."""
 
-    path: Annotated[Positional[Path], arg(metavar="RUN")]
+    path: Annotated[Path, Arg(metavar="RUN", positional=True)]
     """Run folder, or a file of flat splats: PLY (compressed too), .spz, .splat, .usd, .glb or .sog."""
-    out: Annotated[Path | None, arg(metavar="FILE")] = None
+    out: Annotated[Path | None, Arg(metavar="FILE")] = None
     """HTML file (default: scene.html in the run, or beside the file)."""
     sh_degree: int = 3
     """How far colours may depend on the direction; less is a smaller file: 80, 64, 48 or 32 bytes a splat."""
@@ -163,7 +162,7 @@ class Export(Common):
 
     run: RunPath
     """Run folder, or a file of flat splats: PLY (compressed too), .spz, .splat, .usd, .glb or .sog."""
-    out: Annotated[Path, arg(metavar="FILE")]
+    out: Annotated[Path, Arg(metavar="FILE")]
     """File to write; by its ending .ply is 3dgs, .compressed.ply compressed, .spz spz, .splat splat, .usd usd, .glb
     gltf, .sog sog, lod-meta.json streamed (in a folder of its own)."""
     layout: str | None = None
@@ -191,7 +190,7 @@ class Orthophoto(OrthophotoOptions, Common):
 
     run: RunPath
     """Run folder, with mesh.ply and `gs2d georeference`."""
-    out: Annotated[Path | None, arg(metavar="FILE.tif")] = None
+    out: Annotated[Path | None, Arg(metavar="FILE.tif")] = None
     """The orthophoto (default: orthophoto.tif in the run); heights go to NAME_elevation.tif beside it."""
     threads: int | None = None
     """CPU threads."""
@@ -211,9 +210,9 @@ class Report(Common):
 class Recipes(Common):
     """List the recipes, or show one: `gs2d recipes show NAME`."""
 
-    action: Positional[Literal["list", "show"]] = "list"
+    action: Annotated[Literal["list", "show"], Arg(positional=True)] = "list"
     """What to do."""
-    name: Positional[str] = ""
+    name: Annotated[str, Arg(positional=True)] = ""
     """Name of the recipe to show."""
     schedule_scale: float = 1.0
     """As in `gs2d train`."""
@@ -240,7 +239,7 @@ class Doctor(Common):
 class Completion(Common):
     """Print what completes commands, options and values in a shell: source <(gs2d completion bash)."""
 
-    shell: Positional[Literal["bash", "zsh", "fish"]]
+    shell: Annotated[Literal["bash", "zsh", "fish"], Arg(positional=True)]
     """The shell; the first line of what is printed says where it goes."""
 
 
@@ -248,7 +247,7 @@ class Completion(Common):
 class Info(Common):
     """Show what a run folder, a capture or a file of splats, mesh or points holds."""
 
-    path: Annotated[Positional[Path], arg(metavar="PATH")]
+    path: Annotated[Path, Arg(metavar="PATH", positional=True)]
     """Run folder, capture (folder or .zip), or file: PLY, .spz, .splat, .usd, .glb or .sog."""
 
 
@@ -256,26 +255,3 @@ COMMANDS: tuple[type[Common], ...] = (
     Demo, Reconstruct, Poses, Plan, Train, Blocks, Mesh, Render, View, Page, Evaluate, Export, Georeference, Orthophoto,
     Report, Recipes, Paper, Sweep, Doctor, Info, Completion
 )  # fmt: skip
-Command = (
-    Annotated[Demo, subcommand("demo")]
-    | Annotated[Reconstruct, subcommand("reconstruct")]
-    | Annotated[Poses, subcommand("poses")]
-    | Annotated[Plan, subcommand("plan")]
-    | Annotated[Train, subcommand("train")]
-    | Annotated[Blocks, subcommand("blocks")]
-    | Annotated[Mesh, subcommand("mesh")]
-    | Annotated[Render, subcommand("render")]
-    | Annotated[View, subcommand("view")]
-    | Annotated[Page, subcommand("page")]
-    | Annotated[Evaluate, subcommand("evaluate")]
-    | Annotated[Export, subcommand("export")]
-    | Annotated[Georeference, subcommand("georeference")]
-    | Annotated[Orthophoto, subcommand("orthophoto")]
-    | Annotated[Report, subcommand("report")]
-    | Annotated[Recipes, subcommand("recipes")]
-    | Annotated[Paper, subcommand("paper")]
-    | Annotated[Sweep, subcommand("sweep")]
-    | Annotated[Doctor, subcommand("doctor")]
-    | Annotated[Info, subcommand("info")]
-    | Annotated[Completion, subcommand("completion")]
-)

@@ -9,8 +9,7 @@ import re
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
-from gs2d.cli.catalogue import Option, about, options_of
-from gs2d.cli.usage import NAMES
+from gs2d.cli.arguments import NAMES, Option, about, options_of
 
 _LONGEST = 72  # columns of a description beside a word
 _PROGRAM = ("--help", "--help-all", "--version")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.cli import commands as c
-from gs2d.cli.catalogue import options_of
+from gs2d.cli.arguments import options_of
 from gs2d.cli.commands import Common
 from gs2d.cli.console import Console
 from gs2d.cli.tables import say_where_it_is, score_rows, show_run, show_surface
@@ -72,13 +72,13 @@ def _words_of(command: Common, kind: type) -> list[str]:
     words: list[str] = []
     for option in sorted(options_of(kind), key=lambda option: (bool(option.flags), option.field != "out")):
         value = getattr(command, option.field)
-        if value == option.default or option.group is Common:
+        if value == option.default or option.owner is Common:
             continue
         values = [f"{each:g}" if isinstance(each, float) else str(each) for each in _listed(value)]
         flag = list(option.flags[:1])
         if option.kind is bool:
             words += flag
-        elif isinstance(value, tuple) and option.count == 1:  # the option is repeated for each value
+        elif option.repeated:
             words += [word for each in values for word in (*flag, each)]
         else:
             words += [*flag, *values]

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import gs2d
-from gs2d.cli.catalogue import Option, about, options_of
+from gs2d.cli.arguments import NAMES, Option, about, options_of
 from gs2d.cli.commands import Common
 from gs2d.cli.layout import entries, terminal_width, wrapped
-from gs2d.cli.usage import NAMES
 from gs2d.pipeline.options import CommonTraining, Finding, HowItRuns, Training
 
 _SLOGAN = "Photographs in; a surface mesh and a scene of 2D Gaussian splats out."
@@ -89,28 +88,27 @@ def program_help(*, everything: bool = False) -> list[str]:
 
 
 def command_help(name: str, *, everything: bool = False) -> list[str]:
-    """Return the help of a command: what one needs first, and the names of the rest; or all of it in groups."""
+    """Return the help of a command: the options needed first and the number of the others, or all of them in groups."""
     width, options = terminal_width(), options_of(NAMES[name])
     needed = [option for option in options if option.required or not option.flags]
     words = sorted(needed, key=lambda option: bool(option.flags))
     usage = " ".join(option.usage if option.required else f"[{option.usage}]" for option in words)
     lines = wrapped(f"gs2d {name} {usage} [OPTIONS]".replace("  ", " "), width, first="usage: ", rest="  ")
     lines += ["", *wrapped(about(NAMES[name]), width)]
-    if everything:
-        groups = _groups(name, options)
-        return [*lines, *(line for title in groups for line in ("", f"{title}:", *_explained(groups[title], width)))]
     groups = _groups(name, options)
+    if everything:
+        return [*lines, *(line for title in groups for line in ("", f"{title}:", *_explained(groups[title], width)))]
     if first := groups.pop("First", []):
         lines += ["", *_explained(first, width)]
-    if rest := [option.name for group in groups.values() for option in group]:
-        lines += ["", *wrapped(f"Also, explained by `gs2d {name} --help-all`: {', '.join(rest)}.", width)]
+    if more := len(options) - len(first):
+        lines += ["", f"{more} more options: gs2d {name} --help-all"]
     return lines
 
 
 def _first(name: str, options: Sequence[Option]) -> list[Option]:
     """Return the options that are explained at once, in the order in which they are needed."""
     if name not in _FIRST:
-        return _needed_first([option for option in options if option.group is not Common])
+        return _needed_first([option for option in options if option.owner is not Common])
     by_field = {option.field: option for option in options}
     return [by_field[field] for field in _FIRST[name]]
 
@@ -125,7 +123,7 @@ def _groups(name: str, options: Sequence[Option]) -> dict[str, list[Option]]:
     groups["First"] = first = _first(name, options)
     for option in options:
         if option not in first:
-            groups[TITLES.get(option.group, _OWN)].append(option)
+            groups[TITLES.get(option.owner, _OWN)].append(option)
     return {title: group for title, group in groups.items() if group}
 
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, UseAppendAction, arg
-
+from gs2d.config.arguments import Arg
 from gs2d.errors import RecipeError
 from gs2d.pipeline.options import CommonTraining, Overrides, ReconstructOptions, Resources, paths_of
 
@@ -19,9 +18,9 @@ SWEEP = "sweep"  # the name of a table of chosen recipes
 class TableOptions:
     """Options of the commands that train and score many runs, and write a table of them."""
 
-    data: Annotated[Path, arg(metavar="DIR")]
+    data: Annotated[Path, Arg(metavar="DIR")]
     """A capture, or a folder of captures."""
-    out: Annotated[Path, arg(metavar="DIR")]
+    out: Annotated[Path, Arg(metavar="DIR")]
     """Folder for runs, table and page. The command can be stopped and started again."""
     scenes: tuple[str, ...] = ()
     """Only these captures, by the names of their folders."""
@@ -31,20 +30,20 @@ class TableOptions:
     """Shrink the photographs by this integer (default: what the protocol says)."""
     schedule_scale: float = 1.0
     """Fraction of the full schedule."""
-    seeds: Annotated[tuple[int, ...], arg(constructor=tuple[str, ...])] = (0,)
+    seeds: Annotated[tuple[int, ...], Arg(kind=str)] = (0,)
     """Seeds, as 0,1,2; or a count: 3 is 0,1,2."""
     backend: str = "auto"
     """Rasterizer."""
-    slots: Annotated[int | None, arg(aliases=["--jobs"])] = None
+    slots: Annotated[int | None, Arg(alias="--jobs")] = None
     """Runs at the same time (default: one a GPU, else one)."""
-    cluster: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    cluster: Annotated[str | None, Arg(metavar="ADDRESS")] = None
     """Let the machines of a Ray cluster work, which share the disk of --out: HOST:PORT, or auto, the one that this
     machine is of."""
     threads: int | None = None
     """CPU threads of each of several runs (default: the cores divided among them)."""
-    cache: Annotated[Path | None, arg(metavar="DIR")] = None
+    cache: Annotated[Path | None, Arg(metavar="DIR")] = None
     """Stage cache (default: in --out). Tables that share it train their common stages once."""
-    truth: Annotated[Path | None, arg(metavar="DIR")] = None
+    truth: Annotated[Path | None, Arg(metavar="DIR")] = None
     """True surfaces, NAME.ply, for captures that have no mesh_gt.ply beside them."""
     lpips_weights: Path | None = None
     """VGG-16 and LPIPS weights for the LPIPS metric."""
@@ -64,7 +63,8 @@ class PaperOptions(TableOptions):
     """Which table of the paper, of which scenes, how."""
 
     table: Annotated[
-        Positional[Literal["regularisation", "benchmark", "k", "freeze", "modules", "absgs"]], arg(metavar="TABLE")
+        Literal["regularisation", "benchmark", "k", "freeze", "modules", "absgs"],
+        Arg(metavar="TABLE", positional=True),
     ]
     """Which table: regularisation, benchmark, k, freeze, modules or absgs."""
 
@@ -73,7 +73,7 @@ class PaperOptions(TableOptions):
 class SweepOptions(TableOptions):
     """Which recipes, on which scenes, how."""
 
-    recipes: Annotated[Positional[tuple[str, ...]], arg(metavar="RECIPE [RECIPE ...]")]
+    recipes: Annotated[tuple[str, ...], Arg(metavar="RECIPE [RECIPE ...]", positional=True)]
     """Names that `gs2d recipes` lists, or files: mine.json, mine.py:name. Recipes that --out has already keep their
     rows."""
 
@@ -111,18 +111,18 @@ def parse_seeds(words: Iterable[str | int]) -> tuple[int, ...]:
 class BlocksOptions(CommonTraining, Resources):
     """What is trained in blocks, how it is cut, and where."""
 
-    scene: Annotated[Positional[Path], arg(metavar="CAPTURE")]
+    scene: Annotated[Path, Arg(metavar="CAPTURE", positional=True)]
     """Folder of the capture, as in `gs2d train`."""
-    out: Annotated[Path, arg(metavar="JOB")]
+    out: Annotated[Path, Arg(metavar="JOB")]
     """Job folder, which becomes the run of the merged scene. The command can be stopped and given again."""
     blocks: str = "auto"
     """Blocks along the ground, as 3x3, or in space, as 2x2x2; auto: none where one training of everything fits into
     --memory, else as many as it needs."""
-    partition: Annotated[tuple[str, ...], arg(metavar="FIELD=VALUE"), UseAppendAction] = ()
+    partition: Annotated[tuple[str, ...], Arg(metavar="FIELD=VALUE", repeated=True)] = ()
     """Change how it is cut, e.g. --partition margin=0.3, --partition coarse.side=800; may be repeated."""
-    slots: Annotated[int | None, arg(aliases=["--jobs"])] = None
+    slots: Annotated[int | None, Arg(alias="--jobs")] = None
     """Runs at the same time (default: one a GPU, else one)."""
-    cluster: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    cluster: Annotated[str | None, Arg(metavar="ADDRESS")] = None
     """Let the machines of a Ray cluster work, which share the disk of --out: HOST:PORT, or auto, the one that this
     machine is of."""
     format: str = "auto"
@@ -137,7 +137,7 @@ class BlocksOptions(CommonTraining, Resources):
     """Seed of every random choice; the same seed gives the same bytes."""
     threads: int | None = None
     """CPU threads, of each of several blocks (default: the cores divided among them)."""
-    masks: Annotated[Path | None, arg(metavar="DIR")] = None
+    masks: Annotated[Path | None, Arg(metavar="DIR")] = None
     """Folder of masks of the photographs, white = keep (default: where COLMAP, nerfstudio and Metashape put them)."""
 
     def __post_init__(self) -> None:
@@ -148,6 +148,6 @@ class BlocksOptions(CommonTraining, Resources):
 class ReconstructAnywhereOptions(ReconstructOptions):
     """From photographs to a mesh, here or on a cluster."""
 
-    cluster: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    cluster: Annotated[str | None, Arg(metavar="ADDRESS")] = None
     """Let the machines of a Ray cluster work, which share the disk of --out: HOST:PORT, or auto, the one that this
     machine is of."""

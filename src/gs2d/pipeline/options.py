@@ -1,7 +1,7 @@
 """What the verbs of gs2d are asked to do: one class for each, in Python and on the command line.
 
-tyro makes the command line of these classes: a field is an option, its docstring the help, its default the default.
-``Positional`` fields have no flag; ``Fixed`` ones are not of the command line. Pure Python: `gs2d --help` is instant.
+`gs2d.cli` makes the command line of these classes: a field is an option, its docstring the help, its default the
+default; `gs2d.config.arguments` has the marks for the rest. Pure Python: `gs2d --help` is instant.
 """
 
 from __future__ import annotations
@@ -10,8 +10,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress, UseAppendAction, arg
-
+from gs2d.config.arguments import PYTHON_ONLY, Arg
 from gs2d.config.presets import DEFAULT_RECIPE
 from gs2d.config.protocols import Protocol
 from gs2d.config.recipe import Recipe
@@ -24,9 +23,9 @@ LensModel = Literal[
 ]
 Box = tuple[float, float, float, float, float, float]  # x0 y0 z0 x1 y1 z1, world units
 KnownDistance = tuple[float, float, float, float, float, float, float]  # two points of the run, metres
-BoxOption = Annotated[Box | None, arg(metavar="X0 Y0 Z0 X1 Y1 Z1")]
-Overrides = Annotated[tuple[str, ...], arg(name="set", metavar="STAGE.FIELD=VALUE"), UseAppendAction]
-Photos = Annotated[Positional[Path], arg(metavar="PHOTOS")]
+BoxOption = Annotated[Box | None, Arg(metavar="X0 Y0 Z0 X1 Y1 Z1")]
+Overrides = Annotated[tuple[str, ...], Arg(name="set", metavar="STAGE.FIELD=VALUE", repeated=True)]
+Photos = Annotated[Path, Arg(metavar="PHOTOS", positional=True)]
 
 
 def paths_of(options: object, *names: str) -> None:
@@ -62,9 +61,9 @@ class HowItRuns:
 class Resources:
     """What a training may take of the machine."""
 
-    memory: Annotated[float | None, arg(metavar="GIB")] = None
+    memory: Annotated[float | None, Arg(metavar="GIB")] = None
     """GiB of memory to keep to (default: half of what this machine or container has)."""
-    disk: Annotated[float | None, arg(metavar="GIB")] = None
+    disk: Annotated[float | None, Arg(metavar="GIB")] = None
     """GiB of disk to keep to, for prepared photographs first of all (default: what is free)."""
     prepare: Literal["auto", "always", "never"] = "auto"
     """Keep photographs on the disk, in the run, undistorted and shrunk: any number in the same memory, with the same
@@ -75,9 +74,9 @@ class Resources:
 class CommonTraining:
     """What is trained and how: options of every command that trains on photographs."""
 
-    recipe: Annotated[str | Recipe, arg(constructor=str)] = DEFAULT_RECIPE
+    recipe: str | Recipe = DEFAULT_RECIPE
     """What is trained; `gs2d recipes` lists them."""
-    protocol: Annotated[str | Protocol, arg(constructor=str)] = "auto"
+    protocol: str | Protocol = "auto"
     """What depends on the data set: background, depth, near plane, fusion limits."""
     robust: Robust = "auto"
     """Keep fog out: a dense start, free space kept free, opacity that decays; auto: for photographs of no data set."""
@@ -101,7 +100,7 @@ class CommonTraining:
     """Do not write scene.html, the splats as a page for any browser, at the end."""
     subject_box: BoxOption = None
     """What the photographs are of, as a box (default: what most cameras look at). The mesh is of it."""
-    whole_scene: Annotated[bool, arg(name="scene")] = False
+    whole_scene: Annotated[bool, Arg(name="scene")] = False
     """Mesh everything, not only the subject."""
     masked: Literal["ignore", "empty", "off"] | None = None
     """What a black pixel of a mask is: ignored, it takes part in nothing; empty, there is nothing, as an alpha channel
@@ -135,9 +134,9 @@ class Training(CommonTraining):
     """Learn where each photograph was taken from, beginning where the capture says: for poses that are a little off."""
     refine_cameras: bool = False
     """Learn focal lengths and lenses, too: --refine-poses, and both once for all photographs of a camera."""
-    start_from: Annotated[Path | None, arg(name="from", metavar="RUN")] = None
+    start_from: Annotated[Path | None, Arg(name="from", metavar="RUN")] = None
     """Take the stages that this recipe shares with another run from that run."""
-    cache: Annotated[Path | None, arg(metavar="DIR")] = None
+    cache: Annotated[Path | None, Arg(metavar="DIR")] = None
     """Keep finished stages here, and take them from here when scene, settings and stages are the same."""
     viewer: bool = False
     """Show the training in the browser while it runs; the address is printed, and nothing of the result changes."""
@@ -161,7 +160,7 @@ class Finding:
     neighbours: int = 40
     """Similar photographs that each is matched with, where not all pairs are; spatial: half as many near ones, and a
     quarter as many similar ones."""
-    positions: Annotated[Path | None, arg(metavar="FILE")] = None
+    positions: Annotated[Path | None, Arg(metavar="FILE")] = None
     """Where photographs were taken, to choose pairs by: CSV (name,lat,lon,height or name,x,y,z) or OpenDroneMap's
     geo.txt (default: GPS in their EXIF or XMP)."""
     mapper: Literal["auto", "incremental", "global"] = "auto"
@@ -172,7 +171,7 @@ class Finding:
     """Shrink the copies to this longer side, px (default: all pixels, the same bytes)."""
     feature_size: int = 1600
     """Longer side on which features are found, px: larger is slower and a little more accurate."""
-    masks: Annotated[Path | None, arg(metavar="DIR")] = None
+    masks: Annotated[Path | None, Arg(metavar="DIR")] = None
     """Folder of masks of the photographs, white = keep (default: where COLMAP, nerfstudio and Metashape put them)."""
     match_masked: bool = False
     """Find features in masked pixels too: of a thing that was cut out, but stood still with its background."""
@@ -214,10 +213,10 @@ class Part:
 class TrainOptions(Training, Resources, HowItRuns):
     """One training run. Overrides are applied after the schedule is scaled: a number means what it says."""
 
-    scene: Annotated[Positional[Path], arg(metavar="SCENE")]
+    scene: Annotated[Path, Arg(metavar="SCENE", positional=True)]
     """Folder of the capture, or a .zip of it: COLMAP, Blender or nerfstudio transforms, DTU, OpenSfM or OpenDroneMap,
     Metashape, Meshroom."""
-    out: Annotated[Path, arg(metavar="RUN")]
+    out: Annotated[Path, Arg(metavar="RUN")]
     """Run folder to make."""
     quality: Quality | None = None
     """How long is trained on how large pictures, as in `gs2d reconstruct`: minutes for a draft (default: all of the
@@ -226,24 +225,24 @@ class TrainOptions(Training, Resources, HowItRuns):
     """Format of the capture: blender, nerfstudio, dtu, colmap, opensfm, metashape, alicevision, or a package's."""
     downscale: int | None = None
     """Shrink the photographs by this integer, area-filtered (default: not, or so much that they fit into memory)."""
-    masks: Annotated[Path | None, arg(metavar="DIR")] = None
+    masks: Annotated[Path | None, Arg(metavar="DIR")] = None
     """Folder of masks of the photographs, white = keep (default: where COLMAP, nerfstudio and Metashape put them)."""
     schedule_scale: float = 1.0
     """Fraction of the full schedule: 0.1 trains a tenth of the iterations."""
-    iterations: Annotated[int | None, Fixed, Suppress] = None
+    iterations: Annotated[int | None, PYTHON_ONLY] = None
     """Total iterations of the schedule, instead of ``schedule_scale``."""
-    init: Annotated[Path | None, arg(metavar="FILE")] = None
+    init: Annotated[Path | None, Arg(metavar="FILE")] = None
     """Start from the splats of a file (PLY of 2DGS or 3DGS, .spz, .splat, .usd, .glb, .sog) in the frame of the
     capture, not from points. 3D Gaussians lose their smallest scale, along which the normal then points."""
-    title: Annotated[str | None, Fixed, Suppress] = None
+    title: Annotated[str | None, PYTHON_ONLY] = None
     """Heading of the report; None: the name of the capture."""
-    shown_views: Annotated[int, Fixed, Suppress] = 3
+    shown_views: Annotated[int, PYTHON_ONLY] = 3
     """Views that are rendered after each stage for the report."""
-    allowed: Annotated[tuple[str, ...], Fixed, Suppress] = ()
+    allowed: Annotated[tuple[str, ...], PYTHON_ONLY] = ()
     """Names that may already be in ``out`` (the demo's capture)."""
-    estimate: Annotated[bool, Fixed, Suppress] = False
+    estimate: Annotated[bool, PYTHON_ONLY] = False
     """Print before training how long it will take."""
-    part: Annotated[Part | None, Fixed, Suppress] = None
+    part: Annotated[Part | None, PYTHON_ONLY] = None
     """What is trained of something larger."""
 
     def __post_init__(self) -> None:
@@ -254,7 +253,7 @@ class TrainOptions(Training, Resources, HowItRuns):
 class PlanOptions(TrainOptions):
     """A training that is estimated: it takes the options of `gs2d train`."""
 
-    out: Annotated[Path, arg(metavar="RUN")] = Path("RUN")
+    out: Annotated[Path, Arg(metavar="RUN")] = Path("RUN")
     """Run folder of the training; nothing is written."""
 
 
@@ -264,7 +263,7 @@ class PosesOptions(Finding):
 
     photos: Photos
     """Folder of photographs, with or without sub-folders, or a video; it is only read."""
-    out: Annotated[Path, arg(metavar="CAPTURE")]
+    out: Annotated[Path, Arg(metavar="CAPTURE")]
     """Capture folder to make: images/, sparse/0, poses.json, poses.png. It appears when all is done."""
     threads: int | None = None
     """CPU threads (default: all cores that this process may use)."""
@@ -283,7 +282,7 @@ class ReconstructOptions(Resources, HowItRuns):
 
     photos: Photos
     """Folder of photographs, with or without sub-folders, or a video; it is only read."""
-    out: Annotated[Path, arg(metavar="RUN")]
+    out: Annotated[Path, Arg(metavar="RUN")]
     """Run folder to make; the photographs with their cameras go to its sub-folder `capture`."""
     quality: Quality = "normal"
     """How long is trained on how large pictures. On a CPU: 1800 iterations at 400 px, 6000 at 800, all of the recipe's
@@ -294,9 +293,9 @@ class ReconstructOptions(Resources, HowItRuns):
     """Shrink the photographs by this integer for training (default: by --quality)."""
     texture: bool = False
     """Also write mesh.glb, with a texture from the photographs."""
-    training: Annotated[Training, OmitArgPrefixes] = field(default_factory=Training)
+    training: Training = field(default_factory=Training)
     """As in `gs2d train`."""
-    finding: Annotated[Finding, OmitArgPrefixes] = field(default_factory=Finding)
+    finding: Finding = field(default_factory=Finding)
     """As in `gs2d poses`."""
 
     def __post_init__(self) -> None:
@@ -309,7 +308,7 @@ class DemoOptions(HowItRuns):
 
     out: Path = Path("runs/demo")
     """Run folder; the capture goes to its sub-folder `capture`. An earlier demo there is replaced."""
-    recipe: Annotated[str | Recipe, arg(constructor=str)] = DEFAULT_RECIPE
+    recipe: str | Recipe = DEFAULT_RECIPE
     """What is trained, as in `gs2d train`."""
     schedule_scale: float | None = None
     """Fraction of the recipe's iterations (default: 0.2, a minute or two on two cores)."""
@@ -327,9 +326,9 @@ class DemoOptions(HowItRuns):
     """Show the training in the browser while it runs, as in `gs2d train`."""
     viewer_port: int | None = None
     """With --viewer: port of the page (default: the first free one from 8080 on)."""
-    train_views: Annotated[int, Fixed, Suppress] = 40
-    test_views: Annotated[int, Fixed, Suppress] = 8
-    size: Annotated[int, Fixed, Suppress] = 256
+    train_views: Annotated[int, PYTHON_ONLY] = 40
+    test_views: Annotated[int, PYTHON_ONLY] = 8
+    size: Annotated[int, PYTHON_ONLY] = 256
     """Width and height of the photographs, px."""
 
     def __post_init__(self) -> None:
@@ -351,7 +350,7 @@ class MeshOptions:
     """Keep only this box, not the subject's. With --unbounded: where the voxels are finest."""
     subject_box: BoxOption = None
     """What the photographs are of, from now on (default: what the run says, or what most cameras look at)."""
-    whole_scene: Annotated[bool, arg(name="scene")] = False
+    whole_scene: Annotated[bool, Arg(name="scene")] = False
     """Mesh everything, not only the subject."""
     unbounded: bool = False
     """Mesh what lies far away too, in voxels that grow with the distance."""
@@ -382,7 +381,7 @@ class TextureOptions:
 class EvaluateOptions:
     """What is measured."""
 
-    ground_truth: Annotated[Path | None, arg(metavar="MESH_OR_POINTS")] = None
+    ground_truth: Annotated[Path | None, Arg(metavar="MESH_OR_POINTS")] = None
     """True surface (PLY, OBJ) in the capture's frame (DTU: mm), or the official folder of DTU or Tanks and Temples."""
     thresholds: tuple[float, ...] = ()
     """Distances at which precision and recall are taken, world units, the headline's first (default: 0.25, 0.5, 1 % of
@@ -404,15 +403,15 @@ class GeoreferenceOptions:
 
     gps: bool = False
     """From the positions in the EXIF of the photographs."""
-    positions: Annotated[Path | None, arg(metavar="FILE")] = None
+    positions: Annotated[Path | None, Arg(metavar="FILE")] = None
     """From a file of positions of photographs: CSV (name,lat,lon,height or name,x,y,z), or OpenDroneMap's geo.txt."""
-    control: Annotated[Path | None, arg(metavar="FILE")] = None
+    control: Annotated[Path | None, Arg(metavar="FILE")] = None
     """From control points: CSV with name,x,y,z,photo,u,v (pixels) or name,x,y,z,run_x,run_y,run_z, or gcp_list.txt."""
     check_points: tuple[str, ...] = ()
     """With --control: names of points that are held out and only measured (also by a column `check`)."""
-    known_distance: Annotated[KnownDistance | None, arg(metavar="X0 Y0 Z0 X1 Y1 Z1 METRES")] = None
+    known_distance: Annotated[KnownDistance | None, Arg(metavar="X0 Y0 Z0 X1 Y1 Z1 METRES")] = None
     """From the distance between two points in coordinates of the run, as a mesh viewer shows them of mesh.ply."""
-    markers: Annotated[float | None, arg(metavar="METRES")] = None
+    markers: Annotated[float | None, Arg(metavar="METRES")] = None
     """From printed ArUco markers with a side of so many metres, found in the photographs."""
     marker_dictionary: str = "4x4_50"
     """With --markers: which ones: 4x4_50 to 7x7_1000, aruco_original, apriltag_36h11."""
@@ -420,7 +419,7 @@ class GeoreferenceOptions:
     """The world's projected coordinate system, in metres (default: as the file says, or the UTM zone)."""
     enu: bool = False
     """With --gps or --positions: metres east, north and up of their middle, not a map projection; needs no package."""
-    up: Annotated[tuple[float, float, float] | None, arg(metavar="X Y Z")] = None
+    up: Annotated[tuple[float, float, float] | None, Arg(metavar="X Y Z")] = None
     """What is up in the run (default: by the places if they tell it well, else by how the cameras were held)."""
     remove: bool = False
     """Forget where the run is."""
@@ -433,5 +432,5 @@ class GeoreferenceOptions:
 class OrthophotoOptions:
     """How the view from above is made."""
 
-    resolution: Annotated[float | None, arg(metavar="METRES")] = None
+    resolution: Annotated[float | None, Arg(metavar="METRES")] = None
     """Side of a cell (default: that of the photographs' pixels on the surface, rounded up to 1, 2, 2.5 or 5)."""

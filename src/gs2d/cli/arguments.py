@@ -1,0 +1,174 @@
+"""The options of each command, read from its dataclass: for the parser, the help, the completion and the reference."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import dataclasses
+import functools
+import inspect
+import itertools
+import sys
+import types
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from gs2d.cli.commands import COMMANDS
+from gs2d.config.arguments import Arg
+
+NAMES: dict[str, type] = {command.__name__.lower(): command for command in COMMANDS}
+_METAVARS = {int: "N", float: "NUMBER", Path: "PATH", str: "NAME"}
+_MANY = 24  # columns; longer lists of choices are in the text of the option
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option or a positional argument of a command.
+
+    Attributes
+    ----------
+    field : str
+        Name of the dataclass field.
+    flags : tuple of str
+        Names on the command line, ``--out``; empty for a positional argument.
+    kind : type
+        bool for a switch, else the type of each value.
+    choices : tuple of str
+        The valid values; empty: any.
+    count : int or None
+        Number of values; None: one or more.
+    repeated : bool
+        One value for each time the option is given.
+    metavar : str
+        Word for a value in help.
+    required : bool
+    default : object
+    about : str
+        Docstring of the field, in one line.
+    owner : type
+        The dataclass that defines the field.
+    """
+
+    field: str
+    flags: tuple[str, ...]
+    kind: type
+    choices: tuple[str, ...]
+    count: int | None
+    repeated: bool
+    metavar: str
+    required: bool
+    default: Any
+    about: str
+    owner: type
+
+    @property
+    def name(self) -> str:
+        """Return the name for messages."""
+        return self.flags[0] if self.flags else self.metavar
+
+    @property
+    def usage(self) -> str:
+        """Return the option with its value, as it is written."""
+        value = f"{self.count} {self.metavar}S" if (self.count or 0) > 1 and " " not in self.metavar else self.metavar
+        value += " ..." if self.count is None and "..." not in value else ""
+        return " ".join(word for word in (self.name if self.flags else "", "" if self.kind is bool else value) if word)
+
+    def add_to(self, parser: argparse.ArgumentParser) -> None:
+        """Add the option to a parser. Missing ones are reported by the caller, so that misspelt ones come first."""
+        if self.kind is bool:
+            parser.add_argument(*self.flags, dest=self.field, action="store_false" if self.default else "store_true")
+            return
+        nargs: int | str | None = "+" if self.count is None else self.count if self.count > 1 else None
+        if not self.flags:
+            nargs = "*" if self.count is None else "?"
+        parser.add_argument(
+            *(self.flags or (self.field,)),
+            **({"dest": self.field} if self.flags else {"default": None}),
+            action="append" if self.repeated else "store",
+            nargs=nargs,
+            type=self.kind,
+            choices=self.choices or None,
+            metavar=tuple(self.metavar.split()) if isinstance(nargs, int) else self.metavar,
+        )
+
+
+def about(kind: type) -> str:
+    """Return the docstring of a command in one line."""
+    return " ".join((kind.__doc__ or "").split())
+
+
+@functools.cache
+def options_of(kind: type) -> tuple[Option, ...]:
+    """Return the options of a command, those of nested dataclasses included, in the order of the fields."""
+    hints = get_type_hints(kind, include_extras=True)
+    found: list[Option] = []
+    for field in dataclasses.fields(kind):
+        hint, mark = unmarked(hints[field.name])
+        if dataclasses.is_dataclass(hint):
+            found += options_of(hint)
+        elif not mark.python_only:
+            found.append(_option(kind, field, hint, mark))
+    return tuple(found)
+
+
+def unmarked(hint: Any) -> tuple[Any, Arg]:
+    """Return a type without its annotation, and the mark in it."""
+    if get_origin(hint) is not Annotated:
+        return hint, Arg()
+    inner, *marks = get_args(hint)
+    return inner, next((mark for mark in marks if isinstance(mark, Arg)), Arg())
+
+
+def _option(kind: type, field: dataclasses.Field[Any], hint: Any, mark: Arg) -> Option:
+    value, choices, count = _value(hint)
+    name = mark.name or field.name
+    switched_off = "no-" if value is bool and field.default is True else ""
+    flags = ("--" + switched_off + name.replace("_", "-"), *([mark.alias] if mark.alias else ()))
+    listed = "|".join(choices)
+    if choices and (mark.positional or len(listed) > _MANY):
+        listed = name.split("_")[-1].upper()
+    owner = next(base for base in kind.__mro__ if field.name in vars(base).get("__annotations__", {}))
+    return Option(
+        field=field.name,
+        flags=() if mark.positional else flags,
+        kind=mark.kind or value,
+        choices=choices,
+        count=1 if mark.repeated else count,
+        repeated=mark.repeated,
+        metavar=mark.metavar or listed or _METAVARS.get(value, "VALUE"),
+        required=field.default is dataclasses.MISSING,
+        default=None if field.default is dataclasses.MISSING else field.default,
+        about=_docstrings(owner).get(field.name, ""),
+        owner=owner,
+    )
+
+
+def _value(hint: Any) -> tuple[type, tuple[str, ...], int | None]:
+    """Return the type of a value, the choices, and the number of values; of a union the first type."""
+    if get_origin(hint) in (Union, types.UnionType):
+        return _value(get_args(hint)[0])
+    if get_origin(hint) is Literal:
+        return str, get_args(hint), 1
+    if get_origin(hint) is tuple:
+        parts = get_args(hint)
+        return *_value(parts[0])[:2], None if parts[-1] is Ellipsis else len(parts)
+    return hint, (), 1
+
+
+@functools.cache
+def _docstrings(kind: type) -> dict[str, str]:
+    """Return the strings below the fields of a dataclass, each in one line."""
+    found = {}
+    body = _classes(kind.__module__)[kind.__name__].body
+    for field, text in itertools.pairwise(body):
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr):
+            found[field.target.id] = " ".join(str(ast.literal_eval(text.value)).split())
+    return found
+
+
+@functools.cache
+def _classes(module: str) -> dict[str, ast.ClassDef]:
+    """Return the classes of a module as syntax trees. ``inspect.getsource`` would parse the module for each class."""
+    tree = ast.parse(inspect.getsource(sys.modules[module]))
+    return {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
