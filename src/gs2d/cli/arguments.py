@@ -101,10 +101,8 @@ def about(kind: type) -> str:
 @functools.cache
 def options_of(kind: type) -> tuple[Option, ...]:
     """Return the options of a command, those of nested dataclasses included, in the order of the fields."""
-    hints = get_type_hints(kind, include_extras=True)
     found: list[Option] = []
-    for field in dataclasses.fields(kind):
-        hint, mark = unmarked(hints[field.name])
+    for field, hint, mark in fields_of(kind):
         if dataclasses.is_dataclass(hint):
             found += options_of(hint)
         elif not mark.python_only:
@@ -112,12 +110,17 @@ def options_of(kind: type) -> tuple[Option, ...]:
     return tuple(found)
 
 
-def unmarked(hint: Any) -> tuple[Any, Arg]:
-    """Return a type without its annotation, and the mark in it."""
-    if get_origin(hint) is not Annotated:
-        return hint, Arg()
-    inner, *marks = get_args(hint)
-    return inner, next((mark for mark in marks if isinstance(mark, Arg)), Arg())
+@functools.cache
+def fields_of(kind: type) -> tuple[tuple[dataclasses.Field[Any], type, Arg], ...]:
+    """Return the fields of a dataclass, each with its type and its mark."""
+    hints = get_type_hints(kind, include_extras=True)
+    found = []
+    for field in dataclasses.fields(kind):
+        hint, mark = hints[field.name], Arg()
+        if get_origin(hint) is Annotated:
+            hint, mark = get_args(hint)
+        found.append((field, hint, mark))
+    return tuple(found)
 
 
 def _option(kind: type, field: dataclasses.Field[Any], hint: Any, mark: Arg) -> Option:

@@ -9,9 +9,9 @@ import re
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn, get_type_hints
+from typing import Any, NoReturn
 
-from gs2d.cli.arguments import NAMES, options_of, unmarked
+from gs2d.cli.arguments import NAMES, fields_of, options_of
 from gs2d.cli.commands import Common
 from gs2d.core.missing import where_it_ends
 from gs2d.pipeline.options import HowItRuns
@@ -99,10 +99,8 @@ def _given(name: str, words: Sequence[str]) -> dict[str, Any]:
 
 def _made(kind: type, given: Mapping[str, Any]) -> Any:
     """Return a dataclass with the given values, which are also those of its nested dataclasses."""
-    hints = get_type_hints(kind, include_extras=True)
     chosen = {}
-    for field in dataclasses.fields(kind):
-        hint, _ = unmarked(hints[field.name])
+    for field, hint, _ in fields_of(kind):
         if dataclasses.is_dataclass(hint):
             chosen[field.name] = _made(hint, given)
         elif field.name in given:
