@@ -126,7 +126,7 @@ def broken_files(folder: Path) -> dict[str, Path]:
         ("nan.npy", "must hold depths above 0"),
         ("words.npy", "must be an array of numbers, got <U1"),
         ("flat.npy", r"must be an array \[H, W\], got \[5\]"),
-        ("text.npy", "must be an array of numpy, got"),
+        ("text.npy", "must be a numpy file of numbers"),
         ("text.png", "must be an image, got"),
     ],
 )

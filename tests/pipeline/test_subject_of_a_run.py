@@ -23,7 +23,7 @@ from gs2d.pipeline.believed import sky_direction
 from gs2d.pipeline.events import Notice
 from gs2d.pipeline.export import export_run
 from gs2d.pipeline.finished import finished_splats
-from gs2d.pipeline.job import protocol_from_json, reload_job
+from gs2d.pipeline.job import reload_job
 from gs2d.pipeline.mesh import SEVERAL, extract_mesh, fusion_frame, mesh_run
 from gs2d.pipeline.options import MeshOptions
 from gs2d.pipeline.subject import meshed_subject, subject_line, within
@@ -126,15 +126,6 @@ def test_a_new_subject_is_in_the_page_and_what_is_said_of_the_mesh_in_the_metric
     run.file(PAGE).unlink()
     mesh_run(run.path, MeshOptions(voxel=0.05, subject_box=BOX))
     assert not run.file(PAGE).exists()  # whoever wanted none gets none
-
-
-def test_runs_of_before_there_was_a_subject_still_open() -> None:
-    from dataclasses import asdict
-
-    for protocol in PROTOCOLS.values():
-        data = asdict(protocol)
-        del data["fusion"]["subject"]
-        assert protocol_from_json(data) == protocol
 
 
 def test_splats_are_exported_within_a_box(undisturbed: RunFolder, tmp_path: Path) -> None:

@@ -255,11 +255,3 @@ def test_22_bare_tensors_refuse_it() -> None:
     given = (s.means, s.quats, s.scales, s.opacities, torch.ones(1, 3), torch.eye(4)[None], torch.eye(3)[None], 8, 8)
     with pytest.raises(ShapeError, match="no depth by transmittance"):
         rasterize_2dgs(*given, settings=SETTINGS, backend="reference")
-
-
-def test_22_constants_that_older_runs_do_not_name_are_written_only_where_they_differ() -> None:
-    facts = RasterSettings(with_transmittance_depth=True).facts()
-    assert "depth_width_px" not in facts
-    assert "with_transmittance_depth" not in facts  # what is asked for is no constant
-    written = replace(SETTINGS, near=0.5, depth_width_px=3.0).facts()
-    assert RasterSettings(**written).for_depths("transmittance") == replace(SETTINGS, near=0.5, depth_width_px=3.0)

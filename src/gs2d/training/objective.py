@@ -212,7 +212,9 @@ class FullRender:
         splats = state.splats
         leaves = Splats(**{k: t.detach().requires_grad_(k in stage.train) for k, t in splats.items()})
         camera = self.camera(state, index, learns=self.learns(state, iteration))
-        another = another_background(self.recipe, stage, iteration) if self.targets[index].silhouette is None else None
+        another = another_background(self.recipe, stage, iteration)
+        if another is not None and self.targets[index].silhouette is not None:
+            another = None
         settings = self.settings(stage, iteration, another)
         rows = learning_rows(state, stage) if probe is None else None  # the signal is of every splat
         drawn, of_all = self._left(leaves, state, stage, iteration), probe
