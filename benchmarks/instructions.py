@@ -36,8 +36,8 @@ MIN_VECTOR, LONGEST = 15, 400  # zmm instructions of a loop that counts; longer 
 # mangled names of the functions with the blend loops -> label
 LOOP_FUNCTIONS = {
     "blend_tileERNS": "forward",
-    "finish_batchILb1ELb1ELb0E": "backward, all images",
-    "finish_batchILb0ELb0ELb0E": "backward, colour image only",
+    "finish_batchILb1ELb1ELb0ELb0ELb0E": "backward, all images",
+    "finish_batchILb0ELb0ELb0ELb0ELb0E": "backward, colour image only",
 }
 Counts = dict[str, int]
 

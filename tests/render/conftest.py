@@ -14,7 +14,7 @@ from gs2d.errors import BackendError
 from gs2d.kernels.cuda.launch import Launcher
 from gs2d.render import cuda
 from gs2d.render.backends import Backend, CudaBackend, get_backend
-from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.render.types import Features, RasterSettings, RenderOutput
 
 
 @pytest.fixture(params=["reference", "cpu", "emulated", pytest.param("cuda", marks=pytest.mark.gpu)])
@@ -67,7 +67,18 @@ def _emulated(launcher: Launcher) -> Backend:
     ) -> Tensor:
         return cuda.splat_errors_with(launcher, s, c, image, r, mask, occlusion)
 
-    return altered(CudaBackend(), device="cpu", rasterize=rasterize, splat_errors=splat_errors)
+    def rasterize_features(
+        s: Splats, c: Camera, r: RasterSettings, f: Features, p: Tensor | None = None
+    ) -> RenderOutput:
+        return cuda.rasterize_with(launcher, s, c, r, p, features=f)
+
+    return altered(
+        CudaBackend(),
+        device="cpu",
+        rasterize=rasterize,
+        rasterize_features=rasterize_features,
+        splat_errors=splat_errors,
+    )
 
 
 def _from_host(backend: Backend) -> Backend:
@@ -77,16 +88,30 @@ def _from_host(backend: Backend) -> Backend:
     def there(tensor: Tensor | None) -> Tensor | None:
         return None if tensor is None else tensor.to(device)
 
+    def here(output: RenderOutput) -> RenderOutput:
+        return RenderOutput(**{k: t.cpu() for k, t in vars(output).items() if t is not None})
+
     def rasterize(
         s: Splats, c: Camera, r: RasterSettings, p: Tensor | None = None, rows: Tensor | None = None
     ) -> RenderOutput:
         moved = Splats(**{k: t.to(device) for k, t in s.items()})
-        output = backend.rasterize(moved, c, r, there(p), there(rows))
-        return RenderOutput(**{k: t.cpu() for k, t in vars(output).items() if t is not None})
+        return here(backend.rasterize(moved, c, r, there(p), there(rows)))
+
+    def rasterize_features(
+        s: Splats, c: Camera, r: RasterSettings, f: Features, p: Tensor | None = None
+    ) -> RenderOutput:
+        moved = Features(f.values.to(device), f.background.to(device))
+        return here(backend.rasterize_features(s.to(device), c, r, moved, there(p)))
 
     def splat_errors(
         s: Splats, c: Camera, image: Tensor, r: RasterSettings, mask: Tensor | None = None, occlusion: bool = False
     ) -> Tensor:
         return backend.splat_errors(s.to(device), c, image.to(device), r, there(mask), occlusion).cpu()
 
-    return altered(backend, device="cpu", rasterize=rasterize, splat_errors=splat_errors)
+    return altered(
+        backend,
+        device="cpu",
+        rasterize=rasterize,
+        rasterize_features=rasterize_features,
+        splat_errors=splat_errors,
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,12 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
+from fake_backends import altered
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.errors import ShapeError
 from gs2d.render.api import rasterize
-from gs2d.render.backends import Backend
+from gs2d.render.backends import Backend, get_backend
 from gs2d.render.tensor_api import CONSTANTS, Rasterization, rasterize_2dgs
 from gs2d.render.types import PLAIN_COLORS, RasterSettings, RenderOutput
 from render_scenes import IMAGES, random_camera, random_splats
@@ -153,6 +155,95 @@ def test_every_tensor_has_the_gradient_of_finite_differences() -> None:
     assert torch.autograd.gradcheck(images, chosen, eps=1e-6, atol=1e-4, rtol=1e-3, fast_mode=True)
 
 
+def three_at_a_time(backend: Backend) -> Backend:
+    """The same backend without a pass for further channels."""
+    return altered(backend, rasterize_features=partial(Backend.rasterize_features, backend))
+
+
+@pytest.mark.parametrize("channels", [1, 3, 5, 16, 33, 64])
+def test_channels_of_one_pass_are_those_of_three_at_a_time(backend: Backend, channels: int) -> None:
+    scene = Scene(channels=channels)
+    one_pass, parts = scene.learning(), scene.learning()
+    found, expected = render(one_pass, backend=backend), render(parts, backend=three_at_a_time(backend))
+    assert torch.equal(found.colors[..., :3], expected.colors[..., :3])
+    for ours, theirs in zip(found, expected, strict=True):
+        assert_close(ours, theirs, rtol=1e-5, atol=1e-6)
+    contraction(found).backward()
+    contraction(expected).backward()
+    for name in NAMES:
+        ours, theirs = one_pass[name].grad, parts[name].grad
+        assert ours is not None
+        assert theirs is not None
+        assert theirs.any()
+        assert_close(ours, theirs, rtol=1e-4, atol=1e-5 * float(theirs.abs().max()), msg=name)
+
+
+@pytest.mark.parametrize("names", [("colors",), ("opacities", "viewmats")])
+def test_further_channels_learn_whatever_else_does(backend: Backend, names: tuple[str, ...]) -> None:
+    """Also where no image but that of the colours has a gradient, and nothing or only a camera learns beside them."""
+    scene = Scene(channels=6)
+    one_pass, parts = scene.learning(*names), scene.learning(*names)
+    for given, chosen in ((one_pass, backend), (parts, three_at_a_time(backend))):
+        render(given, backend=chosen).colors.square().sum().backward()
+    for name in names:
+        found, expected = one_pass[name].grad, parts[name].grad
+        assert found is not None
+        assert expected is not None
+        assert expected.any()
+        assert_close(found, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()), msg=name)
+
+
+def test_an_empty_scene_of_many_channels_is_its_background(backend: Backend) -> None:
+    given = Scene(channels=9, count=12).learning()
+    names = ("means", "quats", "scales", "opacities", "colors")
+    empty = {**given, **{name: given[name].detach()[:0].requires_grad_() for name in names}}
+    empty["screen_probe"] = torch.zeros(2, 0, 2)
+    out = render(empty, backend=backend)
+    assert torch.equal(out.colors, given["backgrounds"].detach()[:, None, None].expand_as(out.colors))
+    contraction(out).backward()
+    assert all(empty[name].grad is not None and empty[name].grad.shape == empty[name].shape for name in names)
+
+
+def test_the_absolute_signal_is_that_of_all_channels(backend: Backend) -> None:
+    scene, signals = Scene(channels=8), []
+    for dtype, chosen in ((torch.float32, backend), (torch.float64, get_backend("reference"))):
+        given = scene.learning("screen_probe", dtype=dtype)
+        given["screen_probe"] = torch.zeros(2, 12, 4, dtype=dtype, requires_grad=True)
+        render(given, backend=chosen).colors.square().sum().backward()
+        signals.append(given["screen_probe"].grad)
+    found, expected = signals
+    assert found is not None
+    assert expected is not None
+    assert expected[..., 2:].any()
+    assert_close(found.double(), expected, rtol=1e-3, atol=1e-4 * float(expected.abs().max()))
+
+
+def test_three_channels_at_a_time_have_no_absolute_signal(cpu: Backend) -> None:
+    given = {**Scene(channels=5).learning("means"), "screen_probe": torch.zeros(2, 12, 4)}
+    with pytest.raises(ShapeError, match="absolute values cannot be summed in parts"):
+        render(given, backend=three_at_a_time(cpu))
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, 2e15])
+def test_one_channel_beyond_the_range_culls_the_splat(backend: Backend, value: float) -> None:
+    scene = Scene(channels=5)
+    given = scene.learning()
+    with torch.no_grad():
+        given["colors"][3, 4] = value
+    out = render(given, backend=backend)
+    without = {**scene.learning(), "opacities": scene.opacities.clone()}
+    without["opacities"][3] = 0.0
+    expected = render(without, backend=backend)
+    assert torch.equal(out.colors, expected.colors)
+    assert torch.equal(out.radii, expected.radii)
+    contraction(out).backward()
+    for name in ("means", "quats", "scales", "opacities", "colors"):
+        gradient = given[name].grad
+        assert gradient is not None
+        assert gradient.isfinite().all(), name
+        assert not gradient[3].any(), name
+
+
 @pytest.mark.parametrize("channels", [1, 2, 7, 64])
 def test_any_number_of_channels_is_the_weighted_sum_of_the_features(cpu: Backend, channels: int) -> None:
     """Blending is linear in features: a rendering of one-hot weights, times the features."""
@@ -255,7 +346,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "no camera": ({"viewmats": torch.zeros(0, 4, 4), "Ks": torch.zeros(0, 3, 3)}, "at least one camera"),
     "background": ({"backgrounds": torch.zeros(2, 3)}, r"backgrounds must be \[C, D\] = \[2, 5\] or \[5\]"),
     "probe": ({"screen_probe": torch.zeros(12, 2)}, r"screen_probe must be \[2, 12, 2\] or"),
-    "absolute": ({"screen_probe": torch.zeros(2, 12, 4)}, "absolute values cannot be summed in parts"),
+    "infinite background": ({"backgrounds": torch.full((5,), torch.inf)}, "background"),
     "degree": ({"sh_degree": 2, "colors": torch.zeros(12, 4, 3)}, "within the 4 coefficients of colors, got 2"),
     "no channels": ({"colors": torch.zeros(12, 0)}, "at least one channel"),
 }

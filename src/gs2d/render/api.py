@@ -91,9 +91,9 @@ from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, ShapeError
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.pose_gradient import attach_pose_grad, with_world_normals
-from gs2d.render.types import NEAR_PLANE_POLICIES, PLAIN_COLORS, RasterSettings, RenderOutput
+from gs2d.render.types import MAX_COLOR, NEAR_PLANE_POLICIES, PLAIN_COLORS, Features, RasterSettings, RenderOutput
 
-__all__ = ["rasterize", "splat_errors"]
+__all__ = ["rasterize", "rasterize_features", "splat_errors"]
 
 
 def rasterize(
@@ -136,7 +136,73 @@ def rasterize(
     """
     _check_types(splats, camera, settings, screen_probe=screen_probe, gradient_rows=gradient_rows)
     chosen = backend if isinstance(backend, Backend) else get_backend(backend, splats.device.type)
-    settings = _checked(splats, settings, chosen)
+    settings, camera = _checked_view(splats, camera, settings, chosen, screen_probe)
+    if gradient_rows is not None and (camera.pose is not None or camera.intrinsics is not None):
+        raise ShapeError(
+            "gradient_rows must be None for a camera that learns, whose gradient is a sum over all splats, got "
+            "rows; leave one of the two away"
+        )
+    if camera.pose is not None:
+        splats = attach_pose_grad(splats, camera.pose, settings.sh_degree)
+        output = chosen.rasterize(splats, camera, settings, screen_probe)
+        return with_world_normals(output, camera.pose)
+    if gradient_rows is None:
+        return chosen.rasterize(splats, camera, settings, screen_probe)
+    check_shapes({"means": (splats.means, "N 3"), "gradient_rows": (gradient_rows, "N")})
+    if gradient_rows.dtype != torch.bool or gradient_rows.device != splats.device:
+        raise ShapeError(
+            f"gradient_rows must be bool on {splats.device} (True = has gradients), got {gradient_rows.dtype} "
+            f"on {gradient_rows.device}"
+        )
+    return chosen.rasterize(splats, camera, settings, screen_probe, gradient_rows)
+
+
+def rasterize_features(
+    splats: Splats,
+    camera: Camera,
+    settings: RasterSettings,
+    features: Features,
+    *,
+    backend: Backend,
+    screen_probe: Tensor | None = None,
+) -> RenderOutput:
+    """Render splats with further plain channels: :func:`rasterize` with a colour image [H, W, 3 + F].
+
+    Rules 16 and 23 include these channels: a splat with one that is not finite, or whose absolute values add up to more
+    than 1e15, is culled.
+
+    Parameters
+    ----------
+    splats, camera, screen_probe
+        As for :func:`rasterize`.
+    settings : RasterSettings
+        With ``sh_degree`` -1 and without depth by transmittance.
+    features : Features
+    backend : Backend
+
+    Raises
+    ------
+    ShapeError, BackendError
+        As for :func:`rasterize`.
+    """
+    _check_types(splats, camera, settings, screen_probe=screen_probe)
+    settings, camera = _checked_view(splats, camera, settings, backend, screen_probe)
+    if not bool(features.background.isfinite().all()):
+        raise ShapeError("the background of all channels must be finite, got NaN or an infinity")
+    drawn = features.values.detach().abs().sum(dim=1) <= MAX_COLOR  # False for NaN
+    splats = replace(splats, opacity_logits=torch.where(drawn, splats.opacity_logits, torch.nan))
+    if camera.pose is None:
+        return backend.rasterize_features(splats, camera, settings, features, screen_probe)
+    splats = attach_pose_grad(splats, camera.pose, settings.sh_degree)
+    output = backend.rasterize_features(splats, camera, settings, features, screen_probe)
+    return with_world_normals(output, camera.pose)
+
+
+def _checked_view(
+    splats: Splats, camera: Camera, settings: RasterSettings, backend: Backend, screen_probe: Tensor | None
+) -> tuple[RasterSettings, Camera]:
+    """Validate one view; return the settings for these splats, and the camera, which learns only if gradients do."""
+    settings = _checked(splats, settings, backend)
     if settings.with_transmittance_depth and not settings.depth_width(camera) < 0.5:
         raise ShapeError(
             "RasterSettings.depth_width_px must be less than half the focal length "
@@ -157,24 +223,7 @@ def rasterize(
             raise ShapeError("screen_probe must be all zeros (its gradient is what matters), got other values")
     if not torch.is_grad_enabled() and (camera.pose is not None or camera.intrinsics is not None):
         camera = replace(camera, pose=None, intrinsics=None)
-    if gradient_rows is not None and (camera.pose is not None or camera.intrinsics is not None):
-        raise ShapeError(
-            "gradient_rows must be None for a camera that learns, whose gradient is a sum over all splats, got "
-            "rows; leave one of the two away"
-        )
-    if camera.pose is not None:
-        splats = attach_pose_grad(splats, camera.pose, settings.sh_degree)
-        output = chosen.rasterize(splats, camera, settings, screen_probe)
-        return with_world_normals(output, camera.pose)
-    if gradient_rows is None:
-        return chosen.rasterize(splats, camera, settings, screen_probe)
-    check_shapes({"means": (splats.means, "N 3"), "gradient_rows": (gradient_rows, "N")})
-    if gradient_rows.dtype != torch.bool or gradient_rows.device != splats.device:
-        raise ShapeError(
-            f"gradient_rows must be bool on {splats.device} (True = has gradients), got {gradient_rows.dtype} "
-            f"on {gradient_rows.device}"
-        )
-    return chosen.rasterize(splats, camera, settings, screen_probe, gradient_rows)
+    return settings, camera
 
 
 def splat_errors(

@@ -7,7 +7,7 @@ training iteration, fusion. So nothing outside of this room asks which one it ha
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any, TypeVar
 
@@ -17,7 +17,7 @@ from torch import Tensor
 from gs2d.config.registry import Register, Registry
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
-from gs2d.errors import BackendError
+from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels import adam, densify_stats, library, losses, multiview, reference
 from gs2d.kernels.cuda import adam as cuda_adam
 from gs2d.kernels.cuda import diagnose, launch
@@ -30,7 +30,7 @@ from gs2d.render import reference as reference_rasterizer
 from gs2d.render.cpu_cached import CachedView
 from gs2d.render.cuda_step import Stepper
 from gs2d.render.pair_budget import PairBudget
-from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.render.types import Features, RasterSettings, RenderOutput
 from gs2d.render.whole_step import WholeStep
 
 __all__ = [
@@ -157,6 +157,40 @@ class Backend:
         """Render one view: the contract is in :mod:`gs2d.render.api`."""
         raise NotImplementedError(f"backend {self.name!r} does not render")
 
+    def rasterize_features(
+        self,
+        splats: Splats,
+        camera: Camera,
+        settings: RasterSettings,
+        features: Features,
+        screen_probe: Tensor | None = None,
+    ) -> RenderOutput:
+        """Render one view with further channels; here each three of them are a rendering of their own.
+
+        Without depth by transmittance.
+
+        Raises
+        ------
+        ShapeError
+            If the probe has four columns: absolute values cannot be summed in parts.
+        """
+        if screen_probe is not None and screen_probe.shape[1] == 4:
+            raise ShapeError(
+                f"screen_probe must have 2 columns for more than 3 channels on backend {self.name!r}, got 4: it "
+                "renders three channels at a time, and absolute values cannot be summed in parts"
+            )
+        first = self.rasterize(splats, camera, settings, screen_probe)
+        count = features.values.shape[1]
+        padded = torch.nn.functional.pad(features.values, (0, -count % 3))
+        behind = [*features.background.tolist(), 0.0, 0.0]
+        images = [first.color]
+        for start in range(0, count, 3):
+            red, green, blue = behind[start : start + 3]
+            part = replace(splats, sh0=padded[:, None, start : start + 3])
+            of_part = replace(settings, background=(red, green, blue), with_distortion=False)
+            images.append(self.rasterize(part, camera, of_part, screen_probe).color)
+        return replace(first, color=torch.cat(images, dim=2)[..., : 3 + count])
+
     def splat_errors(
         self,
         splats: Splats,
@@ -273,6 +307,17 @@ class ReferenceBackend(Backend):
             screen_probe = None if screen_probe is None else _only_rows(screen_probe, gradient_rows)
         return reference_rasterizer.rasterize(splats, camera, settings, screen_probe)
 
+    def rasterize_features(
+        self,
+        splats: Splats,
+        camera: Camera,
+        settings: RasterSettings,
+        features: Features,
+        screen_probe: Tensor | None = None,
+    ) -> RenderOutput:
+        """Render one view with further channels."""
+        return reference_rasterizer.rasterize(splats, camera, settings, screen_probe, features)
+
     def splat_errors(
         self,
         splats: Splats,
@@ -321,6 +366,17 @@ class CpuBackend(Backend):
     ) -> RenderOutput:
         """Render one view; the work for gradients that are not wanted is saved."""
         return cpu.rasterize(splats, camera, settings, screen_probe, gradient_rows)
+
+    def rasterize_features(
+        self,
+        splats: Splats,
+        camera: Camera,
+        settings: RasterSettings,
+        features: Features,
+        screen_probe: Tensor | None = None,
+    ) -> RenderOutput:
+        """Render one view with further channels."""
+        return cpu.rasterize(splats, camera, settings, screen_probe, features=features)
 
     def splat_errors(
         self,
@@ -411,6 +467,19 @@ class CudaBackend(Backend):
     ) -> RenderOutput:
         """Render one view on the device of the splats."""
         return cuda.rasterize(splats, camera, settings, screen_probe, gradient_rows, budget=self._budget)
+
+    def rasterize_features(
+        self,
+        splats: Splats,
+        camera: Camera,
+        settings: RasterSettings,
+        features: Features,
+        screen_probe: Tensor | None = None,
+    ) -> RenderOutput:
+        """Render one view with further channels; deterministic gradients only three at a time."""
+        if torch.are_deterministic_algorithms_enabled():
+            return super().rasterize_features(splats, camera, settings, features, screen_probe)
+        return cuda.rasterize(splats, camera, settings, screen_probe, budget=self._budget, features=features)
 
     def splat_errors(
         self,

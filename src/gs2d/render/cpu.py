@@ -20,7 +20,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.library import Library, ready_library
-from gs2d.render.types import NEAR_PLANE_POLICIES, PLAIN_COLORS, RasterSettings, RenderOutput
+from gs2d.render.types import NEAR_PLANE_POLICIES, PLAIN_COLORS, Features, RasterSettings, RenderOutput
 
 __all__ = ["rasterize", "rasterize_with", "splat_errors", "splat_errors_with"]
 
@@ -67,6 +67,13 @@ class _ParameterGradients(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in (*ATTRIBUTES, "probe")),
         ("probe_columns", ctypes.c_int64),
         ("rows", ctypes.c_void_p),
+    )
+
+
+class _Features(ctypes.Structure):
+    _fields_ = (
+        ("count", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in ("values", "background", "color", "upstream", "gradients")),
     )
 
 
@@ -163,8 +170,22 @@ def _forward(
     return images, radii, frame
 
 
+def _with_features(library: Library, frame: _Frame, color: Tensor, values: Tensor, background: Tensor) -> Tensor:
+    """Return the image [H, W, 3 + F] of a frame's colours and of further channels [N, F], both contiguous."""
+    H, W, _ = color.shape
+    wide = library.pool.empty((H, W, 3 + values.shape[1]), library.dtype)
+    wide[..., :3] = color
+    blend = library.function("gs2d_raster_features", ctypes.c_int, [ctypes.c_void_p] * 2)
+    native = _Features(values.shape[1], *(_address(t) for t in (values, background, wide)))
+    _check(blend(frame.pointer, ctypes.byref(native)))
+    return wide
+
+
 class _Rasterize(torch.autograd.Function):
-    """Radii and images from the six parameter tensors; ``rows`` are those whose gradients are wanted, None for all."""
+    """Radii and images from the six parameter tensors; ``rows`` are those whose gradients are wanted, None for all.
+
+    With further channels ``values`` [N, F] the colours are [H, W, 3 + F].
+    """
 
     @staticmethod
     def forward(
@@ -173,30 +194,39 @@ class _Rasterize(torch.autograd.Function):
         view: _View,
         depth_width: float | None,
         rows: Tensor | None,
+        background: Tensor | None,
         probe: Tensor | None,
         intrinsics: Tensor | None,
+        values: Tensor | None,
         *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
         tensors = [p.detach().contiguous() for p in parameters]
         images, radii, frame = _forward(library, view, tensors, depth_width)
+        wide = None
+        if values is not None and background is not None:
+            values, background = values.detach().contiguous(), background.detach().contiguous()
+            wide = _with_features(library, frame, images["color"], values, background)
         if any(ctx.needs_input_grad):
             ctx.library, ctx.frame, ctx.rows = library, frame, rows
             ctx.probe_shape = None if probe is None else tuple(probe.shape)
             ctx.of_intrinsics = None if intrinsics is None else intrinsics.detach()  # for its dtype and device
             saved = [images[name] for name in ("color", "alpha", "normal", "depth_mean", "distortion")]
-            ctx.save_for_backward(*saved, *tensors)
+            ctx.save_for_backward(wide, values, background, *saved, *tensors)
             ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii)
-        return (radii, *images.values())
+        return (radii, *(images if wide is None else images | {"color": wide}).values())
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
         library: Library = ctx.library
-        color, alpha, normal, depth_mean, distortion, *tensors = ctx.saved_tensors
+        wide, values, background, color, alpha, normal, depth_mean, distortion, *tensors = ctx.saved_tensors
         images = _Images(*(_address(t) for t in (color, alpha, normal, depth_mean, None, distortion, None)))
         given = [_plain(g, library.dtype) for g in upstream[1:]]
-        want_probe, want_intrinsics, *want = ctx.needs_input_grad[4:]
+        of_wide = None if values is None else given[0]
+        if of_wide is not None:
+            given[0] = of_wide[..., :3].contiguous()
+        want_probe, want_intrinsics, want_values, *want = ctx.needs_input_grad[5:]
         empty, dtype = library.pool.empty, library.dtype
         grads = [empty(t.shape, dtype) if wanted else None for t, wanted in zip(tensors, want, strict=True)]
         probe = empty(ctx.probe_shape, dtype) if want_probe else None
@@ -205,16 +235,18 @@ class _Rasterize(torch.autograd.Function):
         to_intrinsics = empty((len(tensors[0]), 4), dtype) if want_intrinsics else None
         native_splats, native_given = _parameters(tensors), _ImageGradients(*(_address(g) for g in given))
         arguments = (native_splats, images, native_given, out)
-        pointers = (ctx.frame.pointer, *(ctypes.byref(a) for a in arguments))
-        if to_intrinsics is None:
-            backward = library.function("gs2d_raster_backward", ctypes.c_int, [ctypes.c_void_p] * 5)
-            _check(backward(*pointers))
-            return None, None, None, None, probe, None, *grads
-        backward = library.function("gs2d_raster_backward_intrinsics", ctypes.c_int, [ctypes.c_void_p] * 6)
-        _check(backward(*pointers, _address(to_intrinsics)))
-        # numpy adds one row after the other: the same bits for any number of threads
-        total = torch.from_numpy(to_intrinsics.numpy().sum(axis=0, dtype=np.float64))
-        return None, None, None, None, probe, total.to(ctx.of_intrinsics), *grads
+        pointers = [ctx.frame.pointer, *(ctypes.byref(a) for a in arguments), _address(to_intrinsics)]
+        name, to_values = "gs2d_raster_backward_intrinsics", torch.zeros_like(values) if want_values else None
+        if of_wide is not None:
+            name, to_values = "gs2d_raster_backward_features", empty(values.shape, dtype)
+            addresses = (_address(t) for t in (values, background, wide, of_wide, to_values))
+            pointers.append(ctypes.byref(_Features(values.shape[1], *addresses)))
+        backward = library.function(name, ctypes.c_int, [ctypes.c_void_p] * len(pointers))
+        _check(backward(*pointers))
+        total = None
+        if to_intrinsics is not None:  # numpy adds one row after the other: the same bits for any number of threads
+            total = torch.from_numpy(to_intrinsics.numpy().sum(axis=0, dtype=np.float64)).to(ctx.of_intrinsics)
+        return None, None, None, None, None, probe, total, to_values, *grads
 
 
 def rasterize_with(
@@ -225,6 +257,7 @@ def rasterize_with(
     screen_probe: Tensor | None = None,
     gradient_rows: Tensor | None = None,
     *,
+    features: Features | None = None,
     exact_masks: bool = True,
 ) -> RenderOutput:
     """Run :func:`rasterize` on a given variant of the library.
@@ -240,8 +273,10 @@ def rasterize_with(
         gradient_rows = gradient_rows.to("cpu", copy=True).contiguous()  # it may change before the backward pass
     depth_width = settings.depth_width(camera) if settings.with_transmittance_depth else None
     view = _view(camera, settings, exact_masks)
-    given = (library, view, depth_width, gradient_rows, screen_probe, camera.intrinsics)
-    radii, *images = _Rasterize.apply(*given, *(t for _, t in splats.items()))
+    given = (library, view, depth_width, gradient_rows)
+    background, values = (None, None) if features is None else (features.background, features.values)
+    learning = (screen_probe, camera.intrinsics, values)
+    radii, *images = _Rasterize.apply(*given, background, *learning, *(t for _, t in splats.items()))
     names = (*IMAGES, "depth_transmittance")[: len(images)]
     return RenderOutput(**dict(zip(names, images, strict=True)), radii=radii)
 
@@ -252,6 +287,8 @@ def rasterize(
     settings: RasterSettings,
     screen_probe: Tensor | None = None,
     gradient_rows: Tensor | None = None,
+    *,
+    features: Features | None = None,
 ) -> RenderOutput:
     """Render one view on the CPU; the contract is in :mod:`gs2d.render.api`.
 
@@ -267,6 +304,8 @@ def rasterize(
         Zeros; its gradient is the densification signal.
     gradient_rows : Tensor [N] bool, optional
         Gradients are wanted of these splats only; the work for the others is skipped, the bits of these are the same.
+    features : Features, optional
+        Further channels; without ``gradient_rows`` and depth by transmittance.
 
     Raises
     ------
@@ -275,7 +314,7 @@ def rasterize(
     BackendError
         If the native library is missing, memory runs out, or a setting is one of the reference backend only.
     """
-    return rasterize_with(ready_library(), splats, camera, settings, screen_probe, gradient_rows)
+    return rasterize_with(ready_library(), splats, camera, settings, screen_probe, gradient_rows, features=features)
 
 
 def splat_errors_with(

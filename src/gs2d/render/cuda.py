@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn.functional import pad
 
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
@@ -19,10 +20,21 @@ from gs2d.errors import ShapeError
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.arguments import View
 from gs2d.kernels.cuda.launch import Launcher
-from gs2d.render.cuda_passes import DEPTH, IMAGES, PARAMETERS, ForwardState, Wanted, backward, errors, forward
+from gs2d.render.cuda_passes import (
+    CHANNELS,
+    DEPTH,
+    IMAGES,
+    PARAMETERS,
+    ForwardState,
+    Wanted,
+    backward,
+    blend_features,
+    errors,
+    forward,
+)
 from gs2d.render.cuda_passes import view_of as _view
 from gs2d.render.pair_budget import PairBudget
-from gs2d.render.types import PLAIN_COLORS, RasterSettings, RenderOutput
+from gs2d.render.types import PLAIN_COLORS, Features, RasterSettings, RenderOutput
 
 __all__ = ["rasterize", "rasterize_with", "splat_errors", "splat_errors_with"]
 
@@ -53,6 +65,7 @@ class _Options:
     deterministic: bool
     learns: Tensor | None
     budget: PairBudget | None
+    background: Tensor | None  # of further channels
 
 
 def _image_names(transmittance: bool) -> tuple[str, ...]:
@@ -63,11 +76,19 @@ SAVED = tuple(field.name for field in fields(ForwardState) if field.name not in 
 
 
 class _Rasterize(torch.autograd.Function):
-    """Images and radii from the six parameter tensors."""
+    """Images and radii from the six parameter tensors.
+
+    With further channels ``values`` [N, F] the colours are [H, W, 3 + F].
+    """
 
     @staticmethod
     def forward(
-        ctx: Any, options: _Options, probe: Tensor | None, intrinsics: Tensor | None, *parameters: Tensor
+        ctx: Any,
+        options: _Options,
+        probe: Tensor | None,
+        intrinsics: Tensor | None,
+        values: Tensor | None,
+        *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
         tensors = [p.detach().contiguous() for p in parameters]
         launcher, view = options.launcher, options.view
@@ -77,23 +98,32 @@ class _Rasterize(torch.autograd.Function):
             "transmittance": options.transmittance,
         }
         frame = forward(launcher, view, tensors, **choices, budget=options.budget)
+        features, color = None, frame.images["color"]
+        if values is not None and options.background is not None:
+            count = values.shape[1]
+            values = pad(values.detach(), (0, len(options.background) - count))
+            features = blend_features(launcher, frame, values, options.background)
+            color = torch.cat([color, features[:count].permute(1, 2, 0)], dim=2)
         if any(ctx.needs_input_grad):
             # The images returned to the user may be changed in place: save_for_backward would notice, a plain
             # attribute would not. The rest is nobody else's.
             ctx.options = options
             ctx.probe_shape = None if probe is None else tuple(probe.shape)
+            ctx.channels = 0 if options.background is None else count
             ctx.of_intrinsics = None if intrinsics is None else intrinsics.detach()  # for its dtype and device
-            ctx.save_for_backward(*(getattr(frame, name) for name in SAVED), *frame.images.values(), *tensors)
+            ctx.save_for_backward(
+                values, features, *(getattr(frame, name) for name in SAVED), *frame.images.values(), *tensors
+            )
             ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(frame.radii)
         names = _image_names(options.transmittance)
-        return (frame.radii, *(frame.images[name] for name in names))
+        return (frame.radii, color, *(frame.images[name] for name in names[1:]))
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
         options: _Options = ctx.options
-        saved = ctx.saved_tensors
+        values, features, *saved = ctx.saved_tensors
         tensors = saved[-len(PARAMETERS) :]
         images = dict(zip((*IMAGES, "final_T", "moments", *DEPTH), saved[len(SAVED) : -len(PARAMETERS)], strict=True))
         hidden = dict(zip(SAVED, saved[: len(SAVED)], strict=True))
@@ -101,7 +131,12 @@ class _Rasterize(torch.autograd.Function):
         given = [None if g is None else g.detach().to(torch.float32).contiguous() for g in upstream[1:]]
         if not options.distortion:
             given[IMAGES.index("distortion")] = None  # a constant
-        want_probe, want_intrinsics, *want = ctx.needs_input_grad[1:]
+        of_features = None
+        if values is not None and given[0] is not None:
+            filled = (0, values.shape[1] + 3 - given[0].shape[2])
+            of_features = pad(given[0][..., 3:], filled).permute(2, 0, 1).contiguous()
+            given[0] = given[0][..., :3].contiguous()
+        want_probe, want_intrinsics, want_values, *want = ctx.needs_input_grad[1:]
         gradients = {
             name: torch.empty_like(t) if w else None for name, t, w in zip(PARAMETERS, tensors, want, strict=True)
         }
@@ -110,9 +145,12 @@ class _Rasterize(torch.autograd.Function):
         each = torch.zeros(len(tensors[0]), 4, dtype=torch.float32, device=device) if want_intrinsics else None
         wanted = Wanted({**gradients, "probe": probe, "intrinsics": each}, options.learns, options.deterministic)
         by_name = {"depth_transmittance": None} | dict(zip(_image_names(options.transmittance), given, strict=True))
-        backward(options.launcher, frame, tensors, by_name, wanted)
+        to_values = torch.zeros_like(values) if want_values or of_features is not None else None
+        further = None if of_features is None else (values, options.background, features, of_features, to_values)
+        backward(options.launcher, frame, tensors, by_name, wanted, further)
         total = None if each is None else each.sum(dim=0, dtype=torch.float64).to(ctx.of_intrinsics)
-        return None, probe, total, *gradients.values()
+        to_values = None if to_values is None else to_values[:, : ctx.channels]
+        return None, probe, total, to_values, *gradients.values()
 
 
 def rasterize_with(
@@ -127,6 +165,7 @@ def rasterize_with(
     exact_masks: bool = True,
     deterministic: bool | None = None,
     budget: PairBudget | None = None,
+    features: Features | None = None,
 ) -> RenderOutput:
     """Render one view with the CUDA kernels; the contract is in :mod:`gs2d.render.api`.
 
@@ -154,6 +193,8 @@ def rasterize_with(
         None: as torch.use_deterministic_algorithms says.
     budget : PairBudget, optional
         Instead of waiting for the number of pairs of splat and tile; the caller looks whether it was enough.
+    features : Features, optional
+        Further channels; without ``gradient_rows``, ``deterministic`` and depth by transmittance.
 
     Raises
     ------
@@ -172,8 +213,13 @@ def rasterize_with(
         deterministic = torch.are_deterministic_algorithms_enabled()
     transmittance = settings.with_transmittance_depth
     choices = (exact_masks, distortion, transmittance, deterministic)
-    options = _Options(launcher, _view(camera, settings), *choices, gradient_rows, budget)
-    radii, *images = _Rasterize.apply(options, screen_probe, camera.intrinsics, *(t for _, t in splats.items()))
+    values = background = None
+    if features is not None:
+        values, background = features.values, features.background.detach()
+        background = pad(background, (0, -len(background) % CHANNELS))
+    options = _Options(launcher, _view(camera, settings), *choices, gradient_rows, budget, background)
+    learning = (screen_probe, camera.intrinsics, values)
+    radii, *images = _Rasterize.apply(options, *learning, *(t for _, t in splats.items()))
     return RenderOutput(**dict(zip(_image_names(transmittance), images, strict=True)), radii=radii)
 
 
@@ -185,11 +231,12 @@ def rasterize(
     gradient_rows: Tensor | None = None,
     *,
     budget: PairBudget | None = None,
+    features: Features | None = None,
 ) -> RenderOutput:
     """:func:`rasterize_with` on the device on which the splats lie, on torch's current stream there."""
     launcher = launch.launcher_for(splats.device)
     given = (splats, camera, settings, screen_probe, gradient_rows)
-    return rasterize_with(launcher, *given, distortion=settings.with_distortion, budget=budget)
+    return rasterize_with(launcher, *given, distortion=settings.with_distortion, budget=budget, features=features)
 
 
 def splat_errors_with(

@@ -24,6 +24,8 @@ from gs2d.kernels.cuda.arguments import (
     DepthArguments,
     EmitArguments,
     ErrorArguments,
+    FeatureArguments,
+    Features,
     OccludedArguments,
     OrderArguments,
     ProjectArguments,
@@ -37,11 +39,24 @@ from gs2d.kernels.cuda.launch import Launcher
 from gs2d.render.pair_budget import MAX_PAIRS, PairBudget, Rendering, room_for
 from gs2d.render.types import NEAR_PLANE_POLICIES, RasterSettings
 
-__all__ = ["DEPTH", "IMAGES", "PARAMETERS", "ForwardState", "Wanted", "backward", "errors", "forward", "view_of"]
+__all__ = [
+    "CHANNELS",
+    "DEPTH",
+    "IMAGES",
+    "PARAMETERS",
+    "ForwardState",
+    "Wanted",
+    "backward",
+    "blend_features",
+    "errors",
+    "forward",
+    "view_of",
+]
 
 TILE = 16
 THREADS = 128
 ORDER_THREADS = 512  # order.cu
+CHANNELS = 8  # pixels.h: further channels come in groups of these
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 MAX_SPLATS = 1 << 24  # an entry holds the splat in 24 bits
 MAX_SLOTTED = 1 << 30  # four slots each, counted in 32 bits
@@ -246,6 +261,27 @@ def forward(
     )
 
 
+def _features(
+    values: Tensor, background: Tensor, images: Tensor, upstream: Tensor | None = None, gradients: Tensor | None = None
+) -> Features:
+    """Return the structure of further channels, a multiple of ``CHANNELS``; all tensors are contiguous."""
+    features = Features(count=values.shape[1])
+    _fill(features, {"values": values, "background": background, "images": images})
+    _fill(features, {"upstream": upstream, "gradients": gradients})
+    return features
+
+
+def blend_features(launcher: Launcher, frame: ForwardState, values: Tensor, background: Tensor) -> Tensor:
+    """Return images [F, H, W] of further channels [N, F] over a background [F]: those of the view of ``frame``."""
+    final_T = frame.images["final_T"]
+    images = final_T.new_empty(values.shape[1], *final_T.shape)
+    blend = FeatureArguments(view=frame.view, features=_features(values, background, images))
+    _fill(blend, {name: getattr(frame, name) for name in ("records", "entries", "ranges", "tiles", "seen")})
+    _fill(blend, {"final_T": final_T})
+    launcher.launch("features_forward", len(frame.tiles), THREADS, blend)
+    return images
+
+
 def _bin(
     launcher: Launcher, view: View, projected: _Projected, exact: bool, budget: PairBudget | None = None
 ) -> _Lists:
@@ -316,11 +352,17 @@ def backward(
     parameters: Sequence[Tensor],
     upstream: dict[str, Tensor | None],
     wanted: Wanted,
+    features: Sequence[Tensor] | None = None,
 ) -> None:
-    """Fill the gradient tensors in ``wanted``."""
+    """Fill the gradient tensors in ``wanted``.
+
+    ``features`` are the values [N, F], background [F] and images [F, H, W] of further channels, the gradients of these
+    images, and zeros [N, F] for those of the values; then ``wanted`` is not deterministic, for all splats and without
+    depth by transmittance.
+    """
     if len(parameters[0]) == 0:
         return
-    if wanted.only_colors:
+    if wanted.only_colors and features is None:
         return _backward_colors(launcher, frame, parameters, upstream["color"], wanted)
     probe = wanted.parameters["probe"]
     absolute = probe is not None and probe.shape[1] == 4
@@ -337,7 +379,11 @@ def backward(
     _fill(blend, {name: image for name, image in frame.images.items() if name != "depth_median"})
     _fill(blend, {f"g_{name}": upstream[name] for name in (*IMAGES, "depth_transmittance")})
     _fill(blend, {"gradients": sums.gradients, "extras": sums.extras, "slots": sums.slots, "learns": wanted.learns})
-    launcher.launch(f"blend_vjp_{kind}{'_abs' if absolute else ''}", len(frame.tiles), THREADS, blend)
+    kernel = f"blend_vjp_{kind}"
+    if features is not None:
+        blend.features = _features(*features)
+        kernel = f"features_vjp{'_distortion' if kind == 'distortion' else ''}"
+    launcher.launch(f"{kernel}{'_abs' if absolute else ''}", len(frame.tiles), THREADS, blend)
     gradients, extras = sums.of_splats(launcher)
 
     project = ProjectVjpArguments(view=frame.view, count=len(parameters[0]), sh_rest=parameters[5].shape[1])

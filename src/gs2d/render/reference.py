@@ -25,15 +25,19 @@ from gs2d.render.reference_projection import (
     visible_rows,
 )
 from gs2d.render.reference_transmittance import depth_at_half
-from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.render.types import Features, RasterSettings, RenderOutput
 
 __all__ = ["Pairs", "blend_weights", "evaluate_pairs", "rasterize"]
 
-CHANNELS = 11  # color 3, normal 3, alpha, depth_mean, depth_median, distortion, depth_transmittance
+CHANNELS = 11  # and features: color 3, normal 3, alpha, depth_mean, depth_median, distortion, depth_transmittance
 
 
 def rasterize(
-    splats: Splats, camera: Camera, settings: RasterSettings, screen_probe: Tensor | None = None
+    splats: Splats,
+    camera: Camera,
+    settings: RasterSettings,
+    screen_probe: Tensor | None = None,
+    features: Features | None = None,
 ) -> RenderOutput:
     """Render one view; see :func:`gs2d.render.api.rasterize`, which checks the arguments."""
     H, W = camera.height, camera.width
@@ -41,26 +45,37 @@ def rasterize(
     screen = project(splats, rows, camera, settings)
     boxes = screen_boxes(screen, cutoff_squared(screen.opacity, settings), camera, settings)
     probe = None if screen_probe is None else screen_probe[rows]
+    further = None if features is None else Features(features.values[rows], features.background)
+    channels = CHANNELS + (0 if features is None else features.values.shape[1])
 
-    values, pixels = [_no_pixels(screen, probe)], [rows[:0]]
+    values, pixels = [_no_pixels(screen, probe, further, channels)], [rows[:0]]
     for block in blocks(boxes, camera, splats.dtype):
         # Checkpointing keeps only the inputs of a block for the backward pass, so memory does not grow with the image.
         values.append(
             checkpoint(
-                _blend_block, screen, block, probe, camera, settings, use_reentrant=False, preserve_rng_state=False
+                _blend_block,
+                screen,
+                block,
+                probe,
+                further,
+                camera,
+                settings,
+                use_reentrant=False,
+                preserve_rng_state=False,
             )
         )
         pixels.append(block.pixels)
 
     background = torch.tensor(settings.background, dtype=splats.dtype, device=splats.device)
-    images = torch.cat([background, background.new_zeros(CHANNELS - 3)]).repeat(H * W, 1)  # [H W, CHANNELS]
-    images = images.index_put((torch.cat(pixels),), torch.cat(values)).reshape(H, W, CHANNELS)
+    behind = [background, background.new_zeros(CHANNELS - 3), *([] if features is None else [features.background])]
+    images = torch.cat(behind).repeat(H * W, 1)  # [H W, channels]
+    images = images.index_put((torch.cat(pixels),), torch.cat(values)).reshape(H, W, channels)
 
     longer = (boxes[:, 2:] - boxes[:, :2]).amax(dim=1) / 2
     radii = torch.zeros(len(splats), dtype=splats.dtype, device=splats.device)
     radii[rows] = torch.where(holds_pixel(boxes), longer, 0.0).to(splats.dtype)
     return RenderOutput(
-        color=images[..., 0:3],
+        color=images[..., 0:3] if features is None else torch.cat([images[..., 0:3], images[..., CHANNELS:]], dim=2),
         normal=images[..., 3:6],
         alpha=images[..., 6],
         depth_mean=images[..., 7],
@@ -151,9 +166,14 @@ def pair_alpha(opacity: Tensor, pairs: Pairs, settings: RasterSettings) -> Tenso
 
 
 def _blend_block(
-    screen: ScreenSplats, block: Block, probe: Tensor | None, camera: Camera, settings: RasterSettings
+    screen: ScreenSplats,
+    block: Block,
+    probe: Tensor | None,
+    features: Features | None,
+    camera: Camera,
+    settings: RasterSettings,
 ) -> Tensor:
-    """All channels of the pixels of a block [P, CHANNELS]."""
+    """All channels of the pixels of a block [P, channels]."""
     screen = screen.rows(block.splats)
     shift = None if probe is None else _probe_shift(probe[block.splats], screen.Tw[:, 2], len(block.pixels), camera)
     pairs = evaluate_pairs(screen, block.points, settings, shift)
@@ -180,13 +200,17 @@ def _blend_block(
         blended = torch.where(w > 0, alphas, 0.0)
         depth_transmittance = depth_at_half(blended, 1 / pairs.depth, alpha, settings.depth_width(camera))
     channels = torch.stack([alpha, depth_mean, depth_median, distortion, depth_transmittance], dim=1)
-    return torch.cat([color, normal, channels], dim=1)
+    images = [color, normal, channels]
+    if features is not None:
+        images.append(w.T @ features.values[block.splats] + (1 - alpha)[:, None] * features.background)
+    return torch.cat(images, dim=1)
 
 
-def _no_pixels(screen: ScreenSplats, probe: Tensor | None) -> Tensor:
-    """Values of no pixels [0, CHANNELS]: a view that no splat reaches still has gradients, all zero."""
+def _no_pixels(screen: ScreenSplats, probe: Tensor | None, features: Features | None, channels: int) -> Tensor:
+    """Values of no pixels [0, channels]: a view that no splat reaches still has gradients, all zero."""
     parts = [getattr(screen, f.name) for f in fields(screen)] + ([] if probe is None else [probe])
-    return torch.cat([part.flatten()[:0] for part in parts]).reshape(0, CHANNELS)
+    parts += [] if features is None else [features.values]
+    return torch.cat([part.flatten()[:0] for part in parts]).reshape(0, channels)
 
 
 def _probe_shift(probe: Tensor, z_c: Tensor, pixels: int, camera: Camera) -> Tensor:

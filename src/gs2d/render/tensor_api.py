@@ -2,7 +2,8 @@
 
 The operator is for what captures graphs (``torch.compile``, ``torch.export``): its autograd formula renders again in
 the backward pass, because a graph can hold tensors but not what the kernels keep. Otherwise :func:`rasterize_2dgs`
-calls :func:`gs2d.render.api.rasterize` as anybody may, a camera and three channels at a time.
+calls :func:`gs2d.render.api.rasterize` a camera at a time, or with more than three channels
+:func:`gs2d.render.api.rasterize_features`.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
 from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, ShapeError
-from gs2d.render.api import check_dense, rasterize
+from gs2d.render.api import check_dense, rasterize, rasterize_features
 from gs2d.render.backends import Backend, get_backend
-from gs2d.render.types import PLAIN_COLORS, RasterSettings, RenderOutput
+from gs2d.render.types import PLAIN_COLORS, Features, RasterSettings, RenderOutput
 
 __all__ = ["Rasterization", "rasterize_2dgs"]
 
-GROUP = 3  # channels that a backend blends at a time
+COLORS = 3  # channels in ``sh0``
 MIN_SCALE = 1e-18  # world units; the kernels' own floor: a disc without extent is drawn by the low-pass filter alone
 MIN_OPACITY, MAX_OPACITY = 1e-30, 1 - 2.0**-20  # the logit is finite; below alpha_min a splat is not drawn anyway
 CONSTANTS = ("near", "far", "alpha_min", "alpha_max", "transmittance_min", "error_cutoff", "lowpass_px")
@@ -84,9 +85,9 @@ def rasterize_2dgs(
     exist); the distortion is the squared one; ``Ks`` has gradients; the densification signal is the gradient of
     ``screen_probe`` instead of an entry of a dictionary. docs/migration.md has the whole table.
 
-    Each camera, and each further three channels, is one call of :func:`gs2d.rasterize`, with the same bits: time and
-    memory grow with the channels (64 take about 30 times what 3 take, docs/performance.md). Under ``torch.compile`` and
-    ``torch.export`` it is the operator ``torch.ops.gs2d.rasterize_2dgs``, whose backward pass renders a second time.
+    Each camera is one call of :func:`gs2d.rasterize`, with the same bits. Further channels are blended in the same
+    pass: 64 take about 4 times what 3 take (docs/performance.md). Under ``torch.compile`` and ``torch.export`` it is
+    the operator ``torch.ops.gs2d.rasterize_2dgs``, whose backward pass renders a second time.
 
     Parameters
     ----------
@@ -113,8 +114,7 @@ def rasterize_2dgs(
     backgrounds : Tensor [C, D] or [D], optional
         Behind everything; default 0. With ``sh_degree`` in [0, 1].
     screen_probe : Tensor [C, N, 2] or [C, N, 4], optional
-        Zeros that require a gradient, which is the densification signal of 2DGS, and AbsGS's (rule 13). With four
-        columns at most three channels: sums of absolute values cannot be taken three channels at a time.
+        Zeros that require a gradient, which is the densification signal of 2DGS, and AbsGS's (rule 13).
     settings : RasterSettings
         The constants; its ``background`` and ``sh_degree`` are not looked at.
     backend : str or Backend
@@ -193,11 +193,6 @@ def _render(
     """Render by :func:`gs2d.render.api.rasterize`, whose autograd functions are all there is."""
     cameras = _cameras(viewmats, Ks, width, height)
     count, channels = len(cameras), _check(means, quats, scales, opacities, colors, viewmats, sh_degree)
-    if screen_probe is not None and screen_probe.shape[-1] == 4 and channels > GROUP:
-        raise ShapeError(
-            f"screen_probe must be [C, N, 2] for more than {GROUP} channels, got [C, N, 4] and {channels}: absolute "
-            "values cannot be summed in parts; render the features in a call of their own"
-        )
     if screen_probe is not None and screen_probe.shape[:-1] != (count, len(means)):
         raise ShapeError(
             f"screen_probe must be [{count}, {len(means)}, 2] or [{count}, {len(means)}, 4], "
@@ -210,39 +205,36 @@ def _render(
     views = []
     for index, camera in enumerate(cameras):
         own = colors[index] if per_camera else colors
-        parts, values = _parts(own, sh_degree), behind[index].tolist()
+        red, green, blue = (*behind[index, :COLORS].tolist(), 0.0, 0.0)[:COLORS]
+        constants = replace(
+            settings, background=(red, green, blue), sh_degree=PLAIN_COLORS if sh_degree is None else sh_degree
+        )
+        splats = Splats(means, quats, *shape, *_coefficients(own, sh_degree))
         probe = None if screen_probe is None else screen_probe[index]
-        outputs: list[RenderOutput] = []
-        for number, (sh0, shN) in enumerate(parts):
-            background = (*values[GROUP * number : GROUP * (number + 1)], 0.0, 0.0)[:GROUP]
-            constants = replace(
-                settings,
-                background=background,
-                sh_degree=PLAIN_COLORS if sh_degree is None else sh_degree,
-                with_distortion=settings.with_distortion and number == 0,
-            )
-            splats = Splats(means, quats, *shape, sh0, shN)
-            outputs.append(rasterize(splats, camera, constants, backend=backend, screen_probe=probe))
-        views.append(_joined(outputs, behind[index], channels))
+        if channels <= COLORS:
+            output = rasterize(splats, camera, constants, backend=backend, screen_probe=probe)
+        else:
+            further = Features(own[:, COLORS:], behind[index, COLORS:].detach().to(means))
+            output = rasterize_features(splats, camera, constants, further, backend=backend, screen_probe=probe)
+        views.append(_images(output, behind[index], channels))
     return Rasterization(*(torch.stack(images) for images in zip(*views, strict=True)))
 
 
-def _joined(outputs: Sequence[RenderOutput], background: Tensor, channels: int) -> tuple[Tensor, ...]:
-    """Return the images of one camera, in the order of Rasterization: channels of all parts, the rest of the first."""
-    first = outputs[0]
-    color = first.color if channels == GROUP else torch.cat([o.color for o in outputs], dim=2)[..., :channels]
+def _images(output: RenderOutput, background: Tensor, channels: int) -> tuple[Tensor, ...]:
+    """Return the images of one camera, in the order of Rasterization."""
+    color = output.color[..., :channels]
     if background.requires_grad and torch.is_grad_enabled():
-        color = _OverBackground.apply(color, first.alpha.detach(), background)
-    single = (first.depth_mean, first.depth_median, first.distortion)
-    return (color, first.alpha[..., None], first.normal, *(image[..., None] for image in single), first.radii)
+        color = _OverBackground.apply(color, output.alpha.detach(), background)
+    single = (output.depth_mean, output.depth_median, output.distortion)
+    return (color, output.alpha[..., None], output.normal, *(image[..., None] for image in single), output.radii)
 
 
-def _parts(colors: Tensor, sh_degree: int | None) -> list[tuple[Tensor, Tensor]]:
-    """``sh0`` [N, 1, 3] and ``shN`` of each call: coefficients, or three features at a time, the last filled with 0."""
+def _coefficients(colors: Tensor, sh_degree: int | None) -> tuple[Tensor, Tensor]:
+    """``sh0`` [N, 1, 3] and ``shN``: coefficients, or the first three features, filled with 0 if there are fewer."""
     if sh_degree is not None:
-        return [(colors[:, :1], colors[:, 1:])]
-    padded = torch.nn.functional.pad(colors, (0, -colors.shape[1] % GROUP))
-    return [(part[:, None], part.new_zeros(len(part), 0, GROUP)) for part in padded.split(GROUP, dim=1)]
+        return colors[:, :1], colors[:, 1:]
+    first = torch.nn.functional.pad(colors[:, :COLORS], (0, max(COLORS - colors.shape[1], 0)))
+    return first[:, None], first.new_zeros(len(first), 0, COLORS)
 
 
 def _cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> list[Camera]:
@@ -292,7 +284,7 @@ def _check(
     )
     if sh_degree is not None and not 0 <= (sh_degree + 1) ** 2 <= sizes["K"]:
         raise ShapeError(f"sh_degree must be within the {sizes['K']} coefficients of colors, got {sh_degree}")
-    channels = GROUP if sh_degree is not None else sizes["D"]
+    channels = COLORS if sh_degree is not None else sizes["D"]
     if channels < 1:
         raise ShapeError("colors must have at least one channel, got none")
     if sizes["N"] > 0:  # NaN passes: such splats are not drawn (rule 16)
@@ -430,7 +422,7 @@ def _python_options(
 def _(*arguments: Any) -> tuple[Tensor, ...]:
     means, colors, viewmats = arguments[0], arguments[4], arguments[5]
     width, height, sh_degree = arguments[_TENSORS : _TENSORS + 3]
-    cameras, channels = viewmats.shape[0], GROUP if sh_degree != PLAIN_COLORS else colors.shape[-1]
+    cameras, channels = viewmats.shape[0], COLORS if sh_degree != PLAIN_COLORS else colors.shape[-1]
     shapes = [(cameras, height, width, depth) for depth in (channels, 1, 3, 1, 1, 1)]
     return tuple(means.new_empty(shape) for shape in (*shapes, (cameras, means.shape[0])))
 

@@ -94,13 +94,29 @@ class RasterSettings:
 
 
 @dataclass(frozen=True, eq=False)
+class Features:
+    """Plain channels besides the three of ``sh0``, blended with the same weights.
+
+    Attributes
+    ----------
+    values : Tensor [N, F]
+        Of any sign; dtype and device of the splats.
+    background : Tensor [F]
+        Behind everything; dtype and device of the splats, without gradient.
+    """
+
+    values: Tensor
+    background: Tensor
+
+
+@dataclass(frozen=True, eq=False)
 class RenderOutput:
     """Images and per-splat facts of one view.
 
     Attributes
     ----------
     color : Tensor [H, W, 3]
-        sum w c + T_final background, not clamped above 1.
+        sum w c + T_final background, not clamped above 1. With further channels [H, W, 3 + F].
     alpha : Tensor [H, W]
         sum w = 1 - T_final.
     normal : Tensor [H, W, 3]

@@ -191,15 +191,17 @@ template <class V> struct PairGradient {
 
 // One splat at one pixel, front to back. T is 0 where the pixel has stopped (or does not exist).
 // Geo: normal or depth images have gradients. Dist: the distortion has. Trans: the depth by transmittance has.
-template <bool Geo, bool Dist, bool Trans, class V>
+// Feat: further channels have, and `features` is their part of dL/dw.
+template <bool Geo, bool Dist, bool Trans, bool Feat = false, class V>
 GS2D_HD PairGradient<V> weigh_vjp(const Record<V>& s, V depth, V inverse_depth, V raw_alpha, const BlendLimits<V>& k,
-                                  const PixelGradient<V>& g, V& T, V& S) {
+                                  const PixelGradient<V>& g, V& T, V& S, V features = V(0)) {
     const V alpha = min(raw_alpha, k.alpha_max);
     const V after = fnma(alpha, T, T);
     const auto goes_on = after >= k.transmittance_min;
     const V w = keep(goes_on, alpha * T);
     // s = dL/dw, transmittance held
     V along = fma(s.red, g.red, fma(s.green, g.green, fma(s.blue, g.blue, g.alpha)));
+    if constexpr (Feat) along = along + features;
     V gI = V(0);
     if constexpr (Geo) {
         along = along + fma(s.nx, g.nx, fma(s.ny, g.ny, fma(s.nz, g.nz, depth * g.depth)));
@@ -263,23 +265,31 @@ GS2D_HD void add_geometry(const Record<V>& s, V dx, V dy, V t, V tu, V tv, V rho
     }
 }
 
-// All of it.
-template <bool Geo, bool Dist, bool Abs, bool Trans, bool Filtered, bool Column, class V>
-GS2D_HD void composite_vjp(const Record<V>& s, V dx, V dy, const Hit<V>& h, const BlendLimits<V>& k,
-                           const PixelGradient<V>& g, V& T, V& S, PairSums<V>& sums) {
-    const PairGradient<V> p = weigh_vjp<Geo, Dist, Trans>(s, h.depth, h.inverse_depth, h.alpha, k, g, T, S);
+// All of it; returns the weight.
+template <bool Geo, bool Dist, bool Abs, bool Trans, bool Filtered, bool Column, bool Feat, class V>
+GS2D_HD V composite_vjp(const Record<V>& s, V dx, V dy, const Hit<V>& h, const BlendLimits<V>& k,
+                        const PixelGradient<V>& g, V& T, V& S, PairSums<V>& sums, V features) {
+    const PairGradient<V> p =
+        weigh_vjp<Geo, Dist, Trans, Feat>(s, h.depth, h.inverse_depth, h.alpha, k, g, T, S, features);
     add_colors<Geo>(g, p, sums);
     const V t = p.ln_alpha * h.depth;
     add_geometry<Geo, Abs, Filtered, Column>(s, dx, dy, t, t * h.u, t * h.v, h.rho, h.inverse_depth, h.ray, p, sums);
+    return p.w;
+}
+
+// The weight of one splat at one pixel, front to back, as `composite_weight` had it. T is 0 where the pixel has stopped.
+template <class V> GS2D_HD V pass_weight(const Hit<V>& h, const BlendLimits<V>& k, V& T) {
+    const V alpha = min(h.alpha, k.alpha_max), after = fnma(alpha, T, T);
+    const auto goes_on = after >= k.transmittance_min;
+    const V w = keep(goes_on, alpha * T);
+    T = keep(goes_on, after);
+    return w;
 }
 
 // The part of it that reaches the splat's colour: all that is needed while everything else is frozen.
 template <class V>
 GS2D_HD void composite_color_vjp(const Hit<V>& h, const BlendLimits<V>& k, Vec3<V> g_color, V& T, Vec3<V>& sum) {
-    const V alpha = min(h.alpha, k.alpha_max), after = fnma(alpha, T, T);
-    const auto goes_on = after >= k.transmittance_min;
-    sum = axpy(keep(goes_on, alpha * T), g_color, sum);
-    T = keep(goes_on, after);
+    sum = axpy(pass_weight(h, k, T), g_color, sum);
 }
 
 // For sums of `Column` calls: what they have left out.

@@ -16,7 +16,7 @@ constexpr int KEEP = 2;  // frames whose memory is kept for the next view
 template <class F> void for_each_buffer(Frame& f, F&& visit) {
     visit(f.records), visit(f.tile_begin), visit(f.entries), visit(f.tile_count), visit(f.taken), visit(f.saved),
         visit(f.depth_slope), visit(f.scratch);
-    visit(f.histogram), visit(f.slot_begin), visit(f.chunks), visit(f.own_sums);
+    visit(f.histogram), visit(f.slot_begin), visit(f.chunks), visit(f.own_sums), visit(f.feature_planes);
     visit(f.target), visit(f.splat_begin), visit(f.splat_slots);
 }
 
@@ -96,22 +96,33 @@ GS2D_EXPORT int gs2d_transmittance_depth(Frame* frame, const Images* images, dou
     return find_transmittance_depth(*frame, images->alpha, images->depth_median, width, depth) ? OK : NO_MEMORY;
 }
 
+// Further channels of the view that was just rendered.
+GS2D_EXPORT int gs2d_raster_features(Frame* frame, const Features* features) {
+    return blend_features(*frame, *features) ? OK : NO_MEMORY;
+}
+
 // Gradients of the parameters of the same call's splats; `images` are that call's outputs. `intrinsics` [N, 4], or null: what each
-// splat says of fx, fy, cx and cy.
-GS2D_EXPORT int gs2d_raster_backward_intrinsics(Frame* frame, const Parameters* splats, const Images* images,
-                                                const ImageGradients* upstream, const ParameterGradients* out,
-                                                real* intrinsics) {
-    if (!blend_tiles_vjp(*frame, *images, *upstream, splats->sh_rest, *out, intrinsics || wants_geometry(*out)))
-        return NO_MEMORY;
+// splat says of fx, fy, cx and cy. `features`, or null: those of the same view.
+GS2D_EXPORT int gs2d_raster_backward_features(Frame* frame, const Parameters* splats, const Images* images,
+                                              const ImageGradients* upstream, const ParameterGradients* out,
+                                              real* intrinsics, const Features* features) {
+    const bool geometry = intrinsics || features || wants_geometry(*out);
+    if (!blend_tiles_vjp(*frame, *images, *upstream, splats->sh_rest, *out, geometry, features)) return NO_MEMORY;
     StageClock clock;
     project_splats_vjp(*frame, *splats, *out, intrinsics);
     clock.done(PROJECT_BACKWARD);
     return OK;
 }
 
+GS2D_EXPORT int gs2d_raster_backward_intrinsics(Frame* frame, const Parameters* splats, const Images* images,
+                                                const ImageGradients* upstream, const ParameterGradients* out,
+                                                real* intrinsics) {
+    return gs2d_raster_backward_features(frame, splats, images, upstream, out, intrinsics, nullptr);
+}
+
 GS2D_EXPORT int gs2d_raster_backward(Frame* frame, const Parameters* splats, const Images* images,
                                      const ImageGradients* upstream, const ParameterGradients* out) {
-    return gs2d_raster_backward_intrinsics(frame, splats, images, upstream, out, nullptr);
+    return gs2d_raster_backward_features(frame, splats, images, upstream, out, nullptr, nullptr);
 }
 
 // The inner sum of E_i: `image` [H, W, 3], `mask` [H, W] bytes or null, `errors` [N].

@@ -1,5 +1,6 @@
 // Gradients of the blending: tile by tile, front to back, some splats at a time, the sums over a splat's pixels in registers.
 // Every (tile, splat) has its own slot of gradients (gradient_sums.h), so nothing depends on the order of the tiles.
+#include "cpu/features.h"
 #include "cpu/frame.h"
 #include "cpu/gradient_sums.h"
 #include "cpu/planes.h"
@@ -166,7 +167,7 @@ struct Batch {
     alignas(64) real depth[PAIRS][LANES], inverse_depth[PAIRS][LANES], rho[PAIRS][LANES];
     real alpha[PAIRS][LANES];                              // in the end dL/d ln(alpha)
     real I[PAIRS][LANES];                                  // dL/d(1 / z)
-    real w[COLORS_FIT ? 1 : PAIRS][LANES];                 // weight
+    real w[PAIRS][LANES];                                  // weight, where colours come after it
     M ray[PAIRS];                                          // of splats that are not plain
     uint8_t block[PAIRS + BLOCKS], splat[PAIRS + BLOCKS];  // `splat` counts within the batch
     // Of each splat. Its pairs are those before `end`; filtered: the low-pass filter decided one of them.
@@ -221,27 +222,78 @@ template <bool WithInverse> inline void find_hits(Batch& w, const Centres& centr
     }
 }
 
+// Further channels of a tile, or nothing.
+struct TileFeatures {
+    const Features* all = nullptr;
+    const real* upstream = nullptr;  // [rows, FEATURE_STRIDE]
+    real* slots = nullptr;           // [slots, rows], from the next splat's on
+    FeaturePairs* pairs = nullptr;
+    int done = 0;  // of `pairs`: those that have their weight
+};
+
+// Takes the splats of so many entries: their part of dL/dw.
+void begin_features(TileFeatures& t, const Entry* entries, int count) {
+    FeaturePairs& pairs = *t.pairs;
+    pairs.pairs = pairs.splats = t.done = 0;
+    for (int i = 0; i < count; ++i) pairs.add(entries[i], *t.all);
+    memset(pairs.of_pair, 0, sizeof pairs.of_pair[0] * pairs.pairs);
+    for_each_channels(feature_rows(t.all->count), [&](auto n, int64_t c) {
+        constexpr int N = decltype(n)::value;
+        pairs.for_each_splat([&](int j, int first, int end) {
+            V values[N];
+            load_channels<N>(*t.all, pairs.splat[j], c, values);
+            for (int i = first; i < end; ++i) {
+                const real* const at = t.upstream + c * FEATURE_STRIDE + pairs.block[i] * LANES;
+                V sums[4] = {load(pairs.of_pair[i]), V(0), V(0), V(0)};  // so that none waits for the one before
+                for (int k = 0; k < N; ++k) sums[k % 4] = fma(load(at + k * FEATURE_STRIDE), values[k], sums[k % 4]);
+                store(pairs.of_pair[i], (sums[0] + sums[1]) + (sums[2] + sums[3]));
+            }
+        });
+    });
+}
+
+// Writes the slots of those splats, from the weights.
+void finish_features(TileFeatures& t) {
+    const FeaturePairs& pairs = *t.pairs;
+    const int64_t rows = feature_rows(t.all->count);
+    for_each_channels(rows, [&](auto n, int64_t c) {
+        constexpr int N = decltype(n)::value;
+        pairs.for_each_splat([&](int j, int first, int end) {
+            V sums[N];
+            for (int k = 0; k < N; ++k) sums[k] = V(0);
+            for (int i = first; i < end; ++i) {
+                const V w = load(pairs.of_pair[i]);
+                const real* const at = t.upstream + c * FEATURE_STRIDE + pairs.block[i] * LANES;
+                for (int k = 0; k < N; ++k) sums[k] = fma(w, load(at + k * FEATURE_STRIDE), sums[k]);
+            }
+            for (int k = 0; k < N; k += 4) transpose_reduce<4>(sums + k, t.slots + j * rows + c + k);
+        });
+    });
+    t.slots += pairs.splats * rows;
+}
+
 // One pair: T and S move on; what its sums need is left in the batch.
-template <bool Geo, bool Dist, bool Trans>
+template <bool Geo, bool Dist, bool Trans, bool Feat>
 inline PairGradient<V> weigh_pair(Batch& w, int i, const Record<V>& splat, const PixelGradient<V>& g, Planes s,
-                                  const BlendLimits<V>& limits) {
+                                  const BlendLimits<V>& limits, V features = V(0)) {
     const int at = w.block[i] * LANES;
     V pixel_T = load(&s[T][at]), pixel_S = load(&s[S][at]);
     const V inverse_depth = Dist || Trans ? load(w.inverse_depth[i]) : V(0);
     const PairGradient<V> p =
-        weigh_vjp<Geo, Dist, Trans>(splat, load(w.depth[i]), inverse_depth, load(w.alpha[i]), limits, g, pixel_T, pixel_S);
+        weigh_vjp<Geo, Dist, Trans, Feat>(splat, load(w.depth[i]), inverse_depth, load(w.alpha[i]), limits, g,
+                                              pixel_T, pixel_S, features);
     store(&s[T][at], pixel_T), store(&s[S][at], pixel_S);
     store(w.alpha[i], p.ln_alpha);
     if constexpr (Geo) store(w.I[i], p.I);
     return p;
 }
 
-// Of one splat, whose pairs these are.
-template <bool Geo, bool Abs, bool Filtered>
+// Of one splat, whose pairs these are. Colors: add_colors is left to do, for which the weights are there.
+template <bool Geo, bool Abs, bool Filtered, bool Colors>
 inline void sum_pairs(const Batch& w, int j, int first, int end, const Record<V>& splat, const Planes s,
                       const Centres& centres, PairSums<V>& sums) {
     const auto pair = [&](int i) -> PairGradient<V> {
-        return {COLORS_FIT ? V(0) : load(w.w[COLORS_FIT ? 0 : i]), load(w.alpha[i]), Geo ? load(w.I[i]) : V(0)};
+        return {Colors ? load(w.w[i]) : V(0), load(w.alpha[i]), Geo ? load(w.I[i]) : V(0)};
     };
     const auto geometry = [&](int i) {
         const int b = w.block[i];
@@ -256,7 +308,7 @@ inline void sum_pairs(const Batch& w, int j, int first, int end, const Record<V>
                                                 sums);
     };
     for (int i = first; i < end; ++i) geometry(i);
-    if constexpr (!COLORS_FIT)
+    if constexpr (Colors)
         for (int i = first; i < end; ++i) add_colors<Geo>(load_gradient(s, w.block[i]), pair(i), sums);
 }
 
@@ -275,52 +327,66 @@ inline void write_slot(const Record<V>& splat, const PairSums<V>& sums, bool fil
 }
 
 // Empties the batch; returns where the next splat's slot is.
-template <bool Geo, bool Dist, bool Abs, bool Trans>
+template <bool Geo, bool Dist, bool Abs, bool Trans, bool Feat>
 __attribute__((noinline)) Slots finish_batch(Batch& w, Slots to, Planes s, const Centres& centres,
-                                             const BlendLimits<V>& limits) {
+                                             const BlendLimits<V>& limits, TileFeatures& features) {
+    constexpr bool WEIGHTS_FIRST = !COLORS_FIT || Feat;
     find_hits<Dist || Abs || Trans>(w, centres, limits);
-    if constexpr (!COLORS_FIT)
+    if constexpr (WEIGHTS_FIRST)
         for (int i = 0; i < w.pairs; ++i) {
             const PixelGradient<V> g = load_gradient(s, w.block[i]);
-            store(w.w[i], weigh_pair<Geo, Dist, Trans>(w, i, broadcast(w.record[w.splat[i]]), g, s, limits).w);
+            const Record<V> splat = broadcast(w.record[w.splat[i]]);
+            if constexpr (Feat) {
+                real* const of_pair = features.pairs->of_pair[features.done++];
+                const V weight = weigh_pair<Geo, Dist, Trans, true>(w, i, splat, g, s, limits, load(of_pair)).w;
+                store(w.w[i], weight), store(of_pair, weight);
+            } else {
+                store(w.w[i], weigh_pair<Geo, Dist, Trans, false>(w, i, splat, g, s, limits).w);
+            }
         }
     for (int j = 0, first = 0; j < w.splats; first = w.end[j++], to = to.from(1)) {
         const V zero = V(0);
         PairSums<V> sums = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero,
                             zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
         const Record<V> splat = broadcast(w.record[j]);
-        if constexpr (COLORS_FIT) {  // both read the same pixels
+        if constexpr (!WEIGHTS_FIRST) {  // both read the same pixels
             int i = first;
             do {
                 const PixelGradient<V> g = load_gradient(s, w.block[i]);
-                add_colors<Geo>(g, weigh_pair<Geo, Dist, Trans>(w, i, splat, g, s, limits), sums);
+                add_colors<Geo>(g, weigh_pair<Geo, Dist, Trans, false>(w, i, splat, g, s, limits), sums);
             } while (++i < w.end[j]);
         }
         if (w.filtered[j])
-            sum_pairs<Geo, Abs, true>(w, j, first, w.end[j], splat, s, centres, sums);
+            sum_pairs<Geo, Abs, true, WEIGHTS_FIRST>(w, j, first, w.end[j], splat, s, centres, sums);
         else
-            sum_pairs<Geo, Abs, false>(w, j, first, w.end[j], splat, s, centres, sums);
+            sum_pairs<Geo, Abs, false, WEIGHTS_FIRST>(w, j, first, w.end[j], splat, s, centres, sums);
         write_slot<Abs>(splat, sums, w.filtered[j], to, limits);
     }
     w.pairs = w.splats = 0, w.others = 0;
     return to;
 }
 
-template <bool Geo, bool Dist, bool Abs, bool Trans = false>
+template <bool Geo, bool Dist, bool Abs, bool Trans = false, bool Feat = false>
 void tile_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows, Planes s, const TileArea& area,
-              const BlendLimits<V>& limits, RowsAhead next) {
+              const BlendLimits<V>& limits, RowsAhead next, TileFeatures features) {
     const Centres centres(area);
     Batch batch;
     const Entry* entry = &f.entries[f.tile_begin[tile]];
     const int32_t count = f.tile_count[tile];
     Interest interest(entry, count, rows);
     for (int32_t at = 0; at < count && interest.blocks; ++at, ++entry) {
+        if constexpr (Feat)
+            if (at % FeaturePairs::SPLATS == 0) {
+                if (batch.splats) to = finish_batch<Geo, Dist, Abs, Trans, Feat>(batch, to, s, centres, limits, features);
+                if (at > 0) finish_features(features);
+                begin_features(features, entry, count - at < FeaturePairs::SPLATS ? count - at : FeaturePairs::SPLATS);
+            }
         next.ask();
         if (at + AHEAD < count) __builtin_prefetch(&f.records[size_t(entry[AHEAD].splat()) * RECORD]);
         const real* record = &f.records[size_t(entry->splat()) * RECORD];
         const bool learns = !rows || rows[entry->splat()];
         if (batch.splats && !(learns && batch.has_room(entry->blocks)))
-            to = finish_batch<Geo, Dist, Abs, Trans>(batch, to, s, centres, limits);
+            to = finish_batch<Geo, Dist, Abs, Trans, Feat>(batch, to, s, centres, limits, features);
         if (!learns) {
             pass_by<Geo, Dist>(record, entry->plain(), entry->blocks & interest.blocks, s, centres, limits);
             continue;
@@ -328,12 +394,13 @@ void tile_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows, Plane
         if (rows) interest.passed(*entry, at);
         batch.add(record, entry->plain(), entry->blocks, centres);
     }
-    if (batch.splats) finish_batch<Geo, Dist, Abs, Trans>(batch, to, s, centres, limits);
+    if (batch.splats) finish_batch<Geo, Dist, Abs, Trans, Feat>(batch, to, s, centres, limits, features);
+    if constexpr (Feat) finish_features(features);
 }
 
 // Only the colours' gradients: no geometry, no opacity.
 void tile_color_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows, Planes s, const TileArea& area,
-                    const BlendLimits<V>& limits, RowsAhead next) {
+                    const BlendLimits<V>& limits, RowsAhead next, TileFeatures) {
     const Centres centres(area);
     const Entry* entry = &f.entries[f.tile_begin[tile]];
     const int32_t count = f.tile_count[tile];
@@ -367,9 +434,11 @@ void tile_color_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows,
 }
 
 using TileVjp = void (*)(const Frame&, int64_t, Slots, const uint8_t*, Planes, const TileArea&, const BlendLimits<V>&,
-                         RowsAhead);
+                         RowsAhead, TileFeatures);
 
-TileVjp variant(bool geo, bool dist, bool abs, bool trans, bool color_only) {
+TileVjp variant(bool geo, bool dist, bool abs, bool trans, bool color_only, bool features) {
+    if (features && dist) return abs ? tile_vjp<true, true, true, false, true> : tile_vjp<true, true, false, false, true>;
+    if (features) return abs ? tile_vjp<true, false, true, false, true> : tile_vjp<true, false, false, false, true>;
     if (color_only) return tile_color_vjp;
     if (trans && dist) return abs ? tile_vjp<true, true, true, true> : tile_vjp<true, true, false, true>;
     if (trans) return abs ? tile_vjp<true, false, true, true> : tile_vjp<true, false, false, true>;
@@ -381,23 +450,31 @@ TileVjp variant(bool geo, bool dist, bool abs, bool trans, bool color_only) {
 }  // namespace
 
 bool blend_tiles_vjp(Frame& f, const Images& images, const ImageGradients& g, int64_t sh_rest,
-                     const ParameterGradients& out, bool geometry) {
+                     const ParameterGradients& out, bool geometry, const Features* features) {
     StageClock clock;
-    GradientSums sums(f, sh_rest, out);
-    if (!sums.prepare()) return false;
+    GradientSums sums(f, sh_rest, out, features);
+    if (!sums.prepare() || (features && !reserve_feature_planes(f, features->count))) return false;
     clock.done(INDEX_SLOTS);
     const bool dist = g.distortion != nullptr;
     const bool geo = dist || g.normal || g.depth_mean || g.depth_median;
-    const TileVjp vjp = variant(geo, dist, out.probe && out.probe_columns == 4, g.depth_transmittance, !geometry);
+    const bool abs = out.probe && out.probe_columns == 4;
+    const TileVjp vjp = variant(geo, dist, abs, g.depth_transmittance, !geometry, features);
     BlendLimits<V> limits = limits_of(f.view);
     limits.inv_depth_width = V(f.inv_depth_width);
     const RowLines read = images_read(f, images, g);
-    sums.for_each_tile([&](int64_t tile, int64_t next, Slots to) {
+    sums.for_each_tile([&](int64_t tile, int64_t next, Slots to, real* feature_slots, int64_t piece) {
         alignas(64) real planes[PLANES][PIXELS];
         const TileArea area = tile_area(f, tile);
         start(f, images, g, area, planes);
         if (g.depth_transmittance) start_transmittance(f, g.depth_transmittance, images.alpha, area, planes);
-        vjp(f, tile, to, out.rows, planes, area, limits, RowsAhead(f, read, next, f.tile_count[tile]));
+        TileFeatures further;
+        FeaturePairs pairs;
+        if (features) {
+            real* const upstream = feature_planes(f, features->count, piece);
+            start_features(f, *features, images.alpha, area, upstream, planes[ALPHA], planes[S]);
+            further = {features, upstream, feature_slots, &pairs};
+        }
+        vjp(f, tile, to, out.rows, planes, area, limits, RowsAhead(f, read, next, f.tile_count[tile]), further);
     });
     clock.done(BLEND_BACKWARD);
     return true;

@@ -78,6 +78,16 @@ struct ParameterGradients {  // null where not wanted
     const uint8_t* rows;    // [N] 0: this splat's gradients are 0; null: all are wanted
 };
 
+// Plain channels besides the three of sh0, blended with the same weights (features.cpp).
+struct Features {
+    int64_t count;           // F
+    const real* values;      // [N, F]
+    const real* background;  // [F]
+    real* color;             // [H, W, 3 + F], whose first three are not touched
+    const real* upstream;    // of `color`; the backward pass only, as what follows
+    real* gradients;         // [N, F]
+};
+
 // Whether anything but colours is wanted.
 inline bool wants_geometry(const ParameterGradients& g) {
     return g.means || g.quats || g.log_scales || g.opacity_logits || g.probe;
@@ -171,6 +181,7 @@ struct Frame {
     Buffer<GradientChunk> chunks;  // [tiles + 1] at most
     int64_t largest_chunk = 0;     // slots
     Buffer<real> own_sums;         // where no parameter's gradient has room for the sums
+    Buffer<real> feature_planes;   // of either pass: [threads, rows of channels, FEATURE_STRIDE]
     Sums sums = {};
 
     // Splat errors.
@@ -223,8 +234,11 @@ enum class Reach {
 bool project_splats(Frame& frame, const Parameters& splats, Reach reach, real* radii);
 bool bin_splats(Frame& frame);
 bool blend_tiles(Frame& frame, const Images& images);
+// After blend_tiles.
+bool blend_features(Frame& frame, const Features& features);
+// `features` may be null; with them the gradients of the geometry are computed too, and out.rows must be null.
 bool blend_tiles_vjp(Frame& frame, const Images& images, const ImageGradients& gradients, int64_t sh_rest,
-                     const ParameterGradients& out, bool geometry);
+                     const ParameterGradients& out, bool geometry, const Features* features);
 // Rule 22, after blend_tiles: `alpha` and `median` are its images, `width` the half width as a fraction of the depth.
 bool find_transmittance_depth(Frame& frame, const real* alpha, const real* median, double width, real* depth);
 bool splat_errors(Frame& frame, const real* image, const uint8_t* mask, real* errors);

@@ -9,12 +9,6 @@ constexpr int BATCH = 256;             // entries looked at before their slots a
 // The gradients of the coefficients are written last, and read by nobody else: the sums wait there, side by side.
 bool fits_in_coefficients(const ParameterGradients& out, int64_t sh_rest) { return out.shN && 3 * sh_rest >= GRADIENT; }
 
-constexpr size_t slot_bytes(bool extras) {
-    return GRADIENT * sizeof(real) + (extras ? GRADIENT_EXTRA * sizeof(real) + 1 : 0);
-}
-
-size_t chunk_bytes(int64_t slots, bool extras) { return (size_t(slots) * slot_bytes(extras) + LINE - 1) / LINE * LINE; }
-
 }  // namespace
 
 bool GradientSums::prepare() {
@@ -45,15 +39,18 @@ bool GradientSums::prepare() {
     parallel_ranges(f.count, 2048, [&](int64_t first, int64_t last) {
         memset(f.sums.row(first), 0, (last - first) * GRADIENT * sizeof(real));
         if (f.sums.columns) memset(f.sums.extra(first), 0, (last - first) * f.sums.columns * sizeof(real));
+        if (!features_) return;
+        const int64_t F = features_->count;
+        memset(features_->gradients + first * F, 0, (last - first) * F * sizeof(real));
     });
-    return f.scratch.reserve(2 * chunk_bytes(f.largest_chunk, out_.probe));
+    return f.scratch.reserve(2 * chunk_bytes());
 }
 
 // A chunk takes as many slots as the memory of the forward pass holds twice: large chunks, so that a thread seldom waits
 // for another that was interrupted.
 void GradientSums::cut_into_chunks() {
     Frame& f = f_;
-    const int64_t room = static_cast<int64_t>(forward_scratch(f.count) / (2 * slot_bytes(out_.probe)));
+    const int64_t room = static_cast<int64_t>(forward_scratch(f.count) / (2 * slot_bytes()));
     const int64_t limit = room > LEAST_SLOTS ? room : LEAST_SLOTS;
     f.largest_chunk = chunks_ = 0;
     f.chunks[0].first_tile = f.chunks[0].first_slot = 0;
@@ -77,11 +74,9 @@ void GradientSums::cut_into_chunks() {
 }
 
 Slots GradientSums::slots(int64_t c) const {
-    char* const memory = f_.scratch.data + (c % 2) * chunk_bytes(f_.largest_chunk, out_.probe);
-    real* const gradients = reinterpret_cast<real*>(memory);
-    if (!out_.probe) return {gradients, nullptr, nullptr};
-    real* const extras = gradients + f_.largest_chunk * GRADIENT;
-    return {gradients, extras, reinterpret_cast<uint8_t*>(extras + f_.largest_chunk * GRADIENT_EXTRA)};
+    if (!out_.probe) return {gradients(c), nullptr, nullptr};
+    real* const extras = feature_slots(c) + f_.largest_chunk * feature_row();
+    return {gradients(c), extras, reinterpret_cast<uint8_t*>(extras + f_.largest_chunk * GRADIENT_EXTRA)};
 }
 
 void GradientSums::add(int64_t c, uint32_t part) const {
@@ -111,6 +106,11 @@ void GradientSums::add(int64_t c, uint32_t part) const {
                     store(row + k * LANES, load(row + k * LANES) + load(s.gradients + k * LANES));
                 if (s.extras && *s.has_extra)
                     for (int k = 0; k < f.sums.columns; ++k) f.sums.extra(splats[i])[k] += s.extras[k];
+            }
+            for (int i = 0; features_ && i < count; ++i) {
+                real* const row = features_->gradients + splats[i] * features_->count;
+                const real* const slot_row = feature_slots(c) + slots[i] * feature_row();
+                for (int64_t k = 0; k < features_->count; ++k) row[k] += slot_row[k];
             }
         }
     }

@@ -5,6 +5,7 @@
 
 #include <sched.h>
 
+#include "cpu/features.h"
 #include "cpu/frame.h"
 #include "cpu/threads.h"
 
@@ -23,22 +24,23 @@ struct Slots {
 
 class GradientSums {
   public:
-    GradientSums(Frame& frame, int64_t sh_rest, const ParameterGradients& out)
-        : f_(frame), out_(out), sh_rest_(sh_rest) {}
+    GradientSums(Frame& frame, int64_t sh_rest, const ParameterGradients& out, const Features* features)
+        : f_(frame), out_(out), features_(features), sh_rest_(sh_rest) {}
 
     // Cuts the tiles into chunks and sets f.sums to 0; false when memory is short.
     bool prepare();
 
-    // Calls blend(tile, next, slots) for each tile with slots, on all threads, and adds the slots to f.sums. `next` is the
-    // tile that this thread will probably blend then; there may be none of that number.
+    // Calls blend(tile, next, slots, feature_slots, piece) for each tile with slots, on all threads, and adds the slots to
+    // f.sums and to the features' gradients. `next` is the tile that this thread will probably blend then; there may be none
+    // of that number. `piece` < get_threads() is another one for each call under way.
     // Every thread goes through the chunks: it blends groups of chunk c until somebody has each, then it adds parts of chunk
     // c - 1, until somebody has each. It waits only for what somebody is already working on.
     template <class F> void for_each_tile(F&& blend) {
-        parallel_for(threads_, [&](int64_t) {
+        parallel_for(threads_, [&](int64_t piece) {
             for (int64_t c = 0; c <= chunks_; ++c) {
                 if (c < chunks_)
                     share_out(first_group(c), first_group(c + 1), f_.taken.data,
-                              [&](int64_t group) { blend_group(c, group, blend); });
+                              [&](int64_t group) { blend_group(c, group, piece, blend); });
                 if (c > 0) add_parts(c - 1);
             }
         });
@@ -47,6 +49,7 @@ class GradientSums {
   private:
     Frame& f_;
     const ParameterGradients& out_;
+    const Features* const features_;  // or null
     const int64_t sh_rest_;
     int64_t chunks_ = 0, threads_ = 1;
     uint32_t parts_ = 1;  // pieces in which a chunk is added, each some of the splats; a power of two
@@ -55,15 +58,25 @@ class GradientSums {
     int64_t first_group(int64_t c) const { return (f_.chunks[c].first_tile + GROUP - 1) / GROUP; }
     int64_t tile_slots(int64_t tile) const { return f_.slot_begin[tile + 1] - f_.slot_begin[tile]; }
     void cut_into_chunks();
+    int64_t feature_row() const { return features_ ? feature_rows(features_->count) : 0; }
+    size_t slot_bytes() const {
+        return (GRADIENT + feature_row()) * sizeof(real) + (out_.probe ? GRADIENT_EXTRA * sizeof(real) + 1 : 0);
+    }
+    size_t chunk_bytes() const { return (size_t(f_.largest_chunk) * slot_bytes() + LINE - 1) / LINE * LINE; }
+    real* gradients(int64_t c) const { return reinterpret_cast<real*>(f_.scratch.data + (c % 2) * chunk_bytes()); }
+    // [slots, feature_row()]
+    real* feature_slots(int64_t c) const { return gradients(c) + f_.largest_chunk * GRADIENT; }
     Slots slots(int64_t c) const;
     void add(int64_t c, uint32_t part) const;
 
-    template <class F> void blend_group(int64_t c, int64_t group, F&& blend) {
+    template <class F> void blend_group(int64_t c, int64_t group, int64_t piece, F&& blend) {
         if (c >= 2) wait_for(f_.chunks[c - 2].sums_left);  // its slots' memory is used again
         const int64_t first = group * GROUP, last = first + GROUP - 1;
         for (int64_t tile = first; tile <= last && tile < f_.tiles; ++tile) {
             const int64_t next = tile == last ? tile + 1 + (threads_ - 1) * GROUP : tile + 1;
-            if (tile_slots(tile) > 0) blend(tile, next, slots(c).from(f_.slot_begin[tile] - f_.chunks[c].first_slot));
+            if (tile_slots(tile) == 0) continue;
+            const int64_t slot = f_.slot_begin[tile] - f_.chunks[c].first_slot;
+            blend(tile, next, slots(c).from(slot), feature_slots(c) + slot * feature_row(), piece);
         }
         f_.chunks[c].groups_left.fetch_sub(1, std::memory_order_release);
     }

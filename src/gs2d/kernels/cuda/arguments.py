@@ -18,6 +18,8 @@ __all__ = [
     "DigitArguments",
     "EmitArguments",
     "ErrorArguments",
+    "FeatureArguments",
+    "Features",
     "FinishArguments",
     "Gathered",
     "MeanArguments",
@@ -116,6 +118,25 @@ class BlendArguments(ctypes.Structure):
     )
 
 
+class Features(ctypes.Structure):
+    """Of pixels.h."""
+
+    _fields_ = (
+        ("count", ctypes.c_int64),
+        *_pointers("values", "background", "images", "upstream", "gradients"),
+    )
+
+
+class FeatureArguments(ctypes.Structure):
+    """Of features.cu."""
+
+    _fields_ = (
+        ("view", View),
+        *_pointers("records", "entries", "ranges", "tiles", "seen", "final_T"),
+        ("features", Features),
+    )
+
+
 class BlendVjpArguments(ctypes.Structure):
     """Of blend_vjp.cu."""
 
@@ -125,6 +146,7 @@ class BlendVjpArguments(ctypes.Structure):
         *_pointers("color", "alpha", "normal", "depth_mean", "distortion", "final_T", "moments"),
         *_pointers(*(f"g_{name}" for name in IMAGES), "learns", "slots", "gradients", "extras"),
         *_pointers("depth_transmittance", "slope", "g_depth_transmittance"),
+        ("features", Features),
     )
 
 

@@ -22,13 +22,14 @@ struct BlendVjpArguments {
     float* gradients;     // [N, 16], zeros on entry; with slots [4 * candidates, 16]
     float* extras;        // the same rows of 4: low-pass centre, absolute densification signal
     const float *depth_transmittance, *slope, *g_depth_transmittance;  // of transmittance.cu; TRANS only
+    Features features;                                                 // FEAT only: learns and slots are null
 };
 
 // One value of a plane that may be absent.
 __device__ __forceinline__ float at_or_zero(const float* plane, int64 i) { return plane ? plane[i] : 0.f; }
 
 // The upstream gradient as composite_vjp wants it, and S = the sum over all splats of w s, from the image's totals.
-template <bool GEO, bool DIST, bool TRANS>
+template <bool GEO, bool DIST, bool TRANS, bool FEAT>
 __device__ __forceinline__ PixelGradient<float> upstream_of(const BlendVjpArguments& a, int64 i, float& S) {
     const float* bg = a.view.background;
     const float T = a.final_T[i], alpha = a.alpha[i];
@@ -49,6 +50,12 @@ __device__ __forceinline__ PixelGradient<float> upstream_of(const BlendVjpArgume
         S = fma(g.depth, a.depth_mean[i] * alpha, S);
         g.median = at_or_zero(a.g_depth_median, i), g.median_below = max(T, 0.5f);
     }
+    if constexpr (FEAT)
+        for (int64 c = 0, k = i; c < a.features.count; ++c, k += int64(a.view.width) * a.view.height) {
+            const float up = a.features.upstream[k], behind = a.features.background[c];
+            g.alpha = fnma(up, behind, g.alpha);
+            S = fma(up, fnma(T, behind, a.features.images[k]), S);
+        }
     if constexpr (TRANS)
         add_transmittance(a.g_depth_transmittance[i], a.depth_transmittance[i], a.slope[i], alpha, g);
     S = fma(g.alpha, alpha, S);
@@ -110,7 +117,63 @@ struct Staged {  // of a warp: 32 splats
     uint rows[32];
 };
 
-template <bool GEO, bool DIST, bool ABS, bool TRANS = false>
+// Calls step(first channel, upstream gradients of the thread's pixels) for CHANNELS channels at a time.
+template <class F>
+__device__ __forceinline__ void for_each_channels(const BlendVjpArguments& a, const Place& at, F&& step) {
+    const int64 pixels = int64(a.view.width) * a.view.height, i = int64(at.y) * a.view.width + at.x;
+    for (int64 c = 0; c < a.features.count; c += CHANNELS) {
+        float g[HALVES][CHANNELS];
+#pragma unroll
+        for (int h = 0; h < HALVES; ++h)
+#pragma unroll
+            for (int k = 0; k < CHANNELS; ++k)
+                g[h][k] = at.inside[h] ? a.features.upstream[(c + k) * pixels + i + 4 * h * a.view.width] : 0.f;
+        step(c, g);
+    }
+}
+
+// The features' part of dL/dw of each splat that is wanted: each gradient of a pixel is read once for all of them.
+__device__ __forceinline__ void weigh_features(const BlendVjpArguments& a, const Place& at, const Staged& staged,
+                                               uint wanted, float (*to)[HALVES]) {
+    for (int j = 0; j < 32; ++j) to[j][0] = to[j][1] = 0.f;
+    for_each_channels(a, at, [&](int64 c, const float (&g)[HALVES][CHANNELS]) {
+        for (uint left = wanted; left; left &= left - 1) {
+            const int j = __ffs(int(left)) - 1;
+            const float* values = a.features.values + int64(staged.rows[j]) * a.features.count + c;
+            float v[CHANNELS];
+#pragma unroll
+            for (int k = 0; k < CHANNELS; k += 4) {
+                const float4 four = *reinterpret_cast<const float4*>(values + k);
+                v[k] = four.x, v[k + 1] = four.y, v[k + 2] = four.z, v[k + 3] = four.w;
+            }
+#pragma unroll
+            for (int h = 0; h < HALVES; ++h) {
+                float sum = to[j][h];
+#pragma unroll
+                for (int k = 0; k < CHANNELS; ++k) sum = fma(v[k], g[h][k], sum);
+                to[j][h] = sum;
+            }
+        }
+    });
+}
+
+// The gradients of the features of each of those splats, from its weights.
+__device__ __forceinline__ void add_features(const BlendVjpArguments& a, const Place& at, const Staged& staged,
+                                             uint wanted, const float (*weights)[HALVES]) {
+    for_each_channels(a, at, [&](int64 c, const float (&g)[HALVES][CHANNELS]) {
+        for (uint left = wanted; left; left &= left - 1) {  // the same for all lanes
+            const int j = __ffs(int(left)) - 1;
+            float v[CHANNELS];
+#pragma unroll
+            for (int k = 0; k < CHANNELS; ++k) v[k] = fma(weights[j][0], g[0][k], weights[j][1] * g[1][k]);
+            const float mine = transpose_reduce<CHANNELS>(v, at.lane);
+            float* row = a.features.gradients + int64(staged.rows[j]) * a.features.count + c;
+            if (at.lane % (32 / CHANNELS) == 0) atomicAdd(row + at.lane / (32 / CHANNELS), mine);
+        }
+    });
+}
+
+template <bool GEO, bool DIST, bool ABS, bool TRANS = false, bool FEAT = false>
 __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& staged, Upstream<GEO, TRANS>& upstream) {
     const Place at = place_of(a.view, a.tiles);
     const BlendLimits<float> limits = limits_of(a.view);
@@ -121,7 +184,7 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
         g[h] = {}, T[h] = 0.f, S[h] = 0.f;
         if (at.inside[h]) {
             T[h] = 1.f;
-            g[h] = upstream_of<GEO, DIST, TRANS>(a, int64(at.y + 4 * h) * a.view.width + at.x, S[h]);
+            g[h] = upstream_of<GEO, DIST, TRANS, FEAT>(a, int64(at.y + 4 * h) * a.view.width + at.x, S[h]);
         }
         upstream.put(h, g[h]);
     }
@@ -146,6 +209,8 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
         const uint plain = __ballot_sync(FULL_MASK, mine_is_plain);
         const uint learning = __ballot_sync(FULL_MASK, learns);
         __syncwarp();
+        float weights[FEAT ? 32 : 1][HALVES];  // and before that the features' part of dL/dw
+        if constexpr (FEAT) weigh_features(a, at, staged, wanted, weights);
         for_each_splat(wanted, plain, [&](auto is_plain, int j, uint bit) {
             constexpr bool PLAIN = decltype(is_plain)::value;
             const auto& r = staged.records;
@@ -156,22 +221,27 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
             PairSums<float> sums = {};
 #pragma unroll
             for (int h = 0; h < HALVES; ++h) {
+                if constexpr (FEAT)
+                    if (!(hits[h] & bit)) weights[j][h] = 0.f;
                 if (!(hits[h] & bit)) continue;
                 const float dy = first_dy + float(4 * h);
                 const Hit<float> hit = hit_of<PLAIN>(s, planes[h], dx, dy, limits);
                 upstream.get(h, g[h]);
-                composite_vjp<GEO, DIST, ABS, TRANS, !PLAIN, true>(s, dx, dy, hit, limits, g[h], T[h], S[h], sums);
+                const float w = composite_vjp<GEO, DIST, ABS, TRANS, !PLAIN, true, FEAT>(
+                    s, dx, dy, hit, limits, g[h], T[h], S[h], sums, FEAT ? weights[FEAT ? j : 0][h] : 0.f);
+                if constexpr (FEAT) weights[j][h] = w;
             }
             if (!(learning & bit)) return;  // the same for all lanes
             finish_column(dx, sums);
             add_gradient<ABS, PLAIN>(a, staged.rows[j], finish(s, ABS ? reciprocal(s.iz) : 0.f, sums, limits), at.lane);
         });
+        if constexpr (FEAT) add_features(a, at, staged, wanted, weights);
         __syncwarp();  // before the records are overwritten
     }
 }
 
 // GEO: normal or depth images have gradients (or the distortion has: DIST). ABS: the AbsGS signal is wanted. TRANS: the
-// depth by transmittance has.
+// depth by transmittance has. FEAT: further channels have.
 extern "C" __global__ void __launch_bounds__(128, 7) blend_vjp_color(BlendVjpArguments a) {
     __shared__ Staged staged[4];
     __shared__ Upstream<false> upstream;
@@ -230,6 +300,30 @@ extern "C" __global__ void __launch_bounds__(128, 5) blend_vjp_distortion_transm
     __shared__ Staged staged[4];
     __shared__ Upstream<true, true> upstream;
     blend_vjp<true, true, true, true>(a, staged[threadIdx.x >> 5], upstream);
+}
+
+extern "C" __global__ void __launch_bounds__(128, 4) features_vjp(BlendVjpArguments a) {
+    __shared__ Staged staged[4];
+    __shared__ Upstream<true> upstream;
+    blend_vjp<true, false, false, false, true>(a, staged[threadIdx.x >> 5], upstream);
+}
+
+extern "C" __global__ void __launch_bounds__(128, 4) features_vjp_abs(BlendVjpArguments a) {
+    __shared__ Staged staged[4];
+    __shared__ Upstream<true> upstream;
+    blend_vjp<true, false, true, false, true>(a, staged[threadIdx.x >> 5], upstream);
+}
+
+extern "C" __global__ void __launch_bounds__(128, 4) features_vjp_distortion(BlendVjpArguments a) {
+    __shared__ Staged staged[4];
+    __shared__ Upstream<true> upstream;
+    blend_vjp<true, true, false, false, true>(a, staged[threadIdx.x >> 5], upstream);
+}
+
+extern "C" __global__ void __launch_bounds__(128, 4) features_vjp_distortion_abs(BlendVjpArguments a) {
+    __shared__ Staged staged[4];
+    __shared__ Upstream<true> upstream;
+    blend_vjp<true, true, true, false, true>(a, staged[threadIdx.x >> 5], upstream);
 }
 
 }  // namespace gs2d

@@ -5,6 +5,17 @@
 
 namespace gs2d {
 
+// Plain channels besides the three of sh0, blended with the same weights.
+struct Features {
+    int64 count;              // F, a multiple of CHANNELS
+    const float* values;      // [N, F]
+    const float* background;  // [F]
+    float* images;            // [F, H, W]
+    const float* upstream;    // [F, H, W]; the backward pass only, as what follows
+    float* gradients;         // [N, F], zeros on entry
+};
+constexpr int CHANNELS = 8;  // worked on together
+
 constexpr int HALVES = 2;  // pixels per thread: the second lies four rows below the first
 
 // Chunk c of a tile's entries owns the 8 words at this place: unique, without a scan.

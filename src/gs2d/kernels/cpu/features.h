@@ -1,0 +1,76 @@
+// Channels besides the three of a splat's colour, in the memory of a tile: of each channel the pixels in block order.
+#pragma once
+
+#include "cpu/tile.h"
+
+namespace gs2d {
+
+// Pairs (splat, block) of some splats in a row of a tile. Many splats at a time: then the planes of some channels stay in the
+// first cache while all pairs are worked on.
+struct FeaturePairs {
+    static constexpr int SPLATS = 32;
+    alignas(64) real of_pair[SPLATS * BLOCKS][LANES];  // the weight; in the backward pass, before it, the part of dL/dw
+    uint8_t block[SPLATS * BLOCKS];
+    uint32_t splat[SPLATS];
+    int end[SPLATS];  // of each splat's pairs
+    int pairs = 0, splats = 0;
+    void add(const Entry& entry, const Features& features) {
+        const char* const values = reinterpret_cast<const char*>(features.values + entry.splat() * features.count);
+        for (size_t at = 0; at < features.count * sizeof(real); at += LINE) __builtin_prefetch(values + at);
+        for (uint32_t left = entry.blocks; left; left &= left - 1) block[pairs++] = uint8_t(__builtin_ctz(left));
+        splat[splats] = entry.splat(), end[splats++] = pairs;
+    }
+    // Calls f(j, first pair, end) for each splat.
+    template <class F> void for_each_splat(F&& f) const {
+        for (int j = 0, first = 0; j < splats; first = end[j++]) f(j, first, end[j]);
+    }
+};
+
+template <int N> struct ChannelCount {
+    static constexpr int value = N;
+};
+
+// Calls f(number of channels, first channel) for as many channels at a time as registers hold.
+template <class F> inline void for_each_channels(int64_t rows, F&& f) {
+    constexpr int MANY = REGISTERS / 2;
+    int64_t c = 0;
+    for (; c + MANY <= rows; c += MANY) f(ChannelCount<MANY>(), c);
+    for (; c < rows; c += 4) f(ChannelCount<4>(), c);
+}
+
+// Some channels of a splat in all lanes; 0 beyond the last one.
+template <int N> inline void load_channels(const Features& features, uint32_t splat, int64_t c, V (&values)[N]) {
+    const real* const from = features.values + splat * features.count + c;
+    if (c + N <= features.count) {
+        for (int k = 0; k < N; ++k) values[k] = V(from[k]);
+    } else {
+        for (int k = 0; k < N; ++k) values[k] = V(c + k < features.count ? from[k] : real(0));
+    }
+}
+
+// Calls f(pixel of a tile in block order, where its further channels are in an image [H, W, 3 + F]) for those inside.
+template <class Image, class F>
+inline void for_each_pixel(const TileArea& area, int image_width, int64_t count, Image* image, F&& f) {
+    for (int y = 0; y < area.height; ++y)
+        for (int x = 0; x < area.width; ++x)
+            f(block_order(x, y), image + (int64_t(area.y0 + y) * image_width + area.x0 + x) * (3 + count) + 3);
+}
+
+// From a channel to the next. Not a power of two: rows of those would share few sets of the first cache.
+constexpr int FEATURE_STRIDE = PIXELS + LANES;
+
+// Rows for so many channels: four at a time are worked on.
+inline int64_t feature_rows(int64_t count) { return (count + 3) / 4 * 4; }
+
+// Room for the planes of each thread; false when memory is short.
+bool reserve_feature_planes(Frame& f, int64_t count);
+inline real* feature_planes(const Frame& f, int64_t count, int64_t piece) {
+    return &f.feature_planes[size_t(piece * feature_rows(count)) * FEATURE_STRIDE];
+}
+
+// Reads the upstream gradients of a tile into `planes`, and adds what follows from the totals of the channels to the
+// gradient of alpha and to S, both in block order (backward.cpp).
+void start_features(const Frame& f, const Features& features, const real* alpha_image, const TileArea& area, real* planes,
+                    real* g_alpha, real* S);
+
+}  // namespace gs2d
