@@ -5,6 +5,7 @@ For the sanitizers, which must be in the process from its start.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -21,7 +22,7 @@ from gs2d.kernels.cuda.multiview import compare_views
 from gs2d.render import cuda
 from gs2d.render.cuda_step import Stepper
 from gs2d.render.pair_budget import PairBudget, Rendering
-from gs2d.render.types import RasterSettings
+from gs2d.render.types import PLAIN_COLORS, Features, RasterSettings
 from gs2d.render.whole_step import Learned, WholeStep
 from kernel_cases import SETTINGS, Case, many_tiles
 from render_scenes import contraction, random_cotangents
@@ -52,6 +53,18 @@ def rendering(emulator: Emulator, case: Case) -> dict[str, Tensor]:
     for sure in (False, True):
         render(f"all {sure}", every, deterministic=sure)
         render(f"colours {sure}", ("sh0", "shN"), deterministic=sure, gradient_rows=rows)
+    numbers = torch.randn(len(case.splats), 9, generator=_numbers())
+    for columns in (2, 4):
+        for distortion in (False, True):
+            values, probe = numbers.clone().requires_grad_(), torch.zeros(len(numbers), columns, requires_grad=True)
+            settings = replace(SETTINGS, sh_degree=PLAIN_COLORS)
+            further = Features(values, numbers[0])
+            output = cuda.rasterize_with(emulator, case.splats, case.camera, settings, probe, features=further)
+            (output.color.square().sum() + (output.distortion.sum() if distortion else 0.0)).backward()
+            assert values.grad is not None
+            assert probe.grad is not None
+            name = f"channels {columns} {distortion}"
+            found |= {f"{name}.values": values.grad, f"{name}.probe": probe.grad}
     render("by transmittance", every, SETTINGS.for_depths("transmittance"))
     image, mask = torch.rand(45, 70, 3, generator=_numbers()), torch.rand(45, 70, generator=_numbers()) > 0.3
     for occlusion in (False, True):

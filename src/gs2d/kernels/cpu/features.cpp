@@ -111,4 +111,43 @@ void start_features(const Frame& f, const Features& features, const real* alpha_
     });
 }
 
+void begin_features(TileFeatures& t, const Entry* entries, int count) {
+    FeaturePairs& pairs = *t.pairs;
+    pairs.pairs = pairs.splats = t.done = 0;
+    for (int i = 0; i < count; ++i) pairs.add(entries[i], *t.all);
+    memset(pairs.of_pair, 0, sizeof pairs.of_pair[0] * pairs.pairs);
+    for_each_channels(feature_rows(t.all->count), [&](auto n, int64_t c) {
+        constexpr int N = decltype(n)::value;
+        pairs.for_each_splat([&](int j, int first, int end) {
+            V values[N];
+            load_channels<N>(*t.all, pairs.splat[j], c, values);
+            for (int i = first; i < end; ++i) {
+                const real* const at = t.upstream + c * FEATURE_STRIDE + pairs.block[i] * LANES;
+                V sums[4] = {load(pairs.of_pair[i]), V(0), V(0), V(0)};  // so that none waits for the one before
+                for (int k = 0; k < N; ++k) sums[k % 4] = fma(load(at + k * FEATURE_STRIDE), values[k], sums[k % 4]);
+                store(pairs.of_pair[i], (sums[0] + sums[1]) + (sums[2] + sums[3]));
+            }
+        });
+    });
+}
+
+void finish_features(TileFeatures& t) {
+    const FeaturePairs& pairs = *t.pairs;
+    const int64_t rows = feature_rows(t.all->count);
+    for_each_channels(rows, [&](auto n, int64_t c) {
+        constexpr int N = decltype(n)::value;
+        pairs.for_each_splat([&](int j, int first, int end) {
+            V sums[N];
+            for (int k = 0; k < N; ++k) sums[k] = V(0);
+            for (int i = first; i < end; ++i) {
+                const V w = load(pairs.of_pair[i]);
+                const real* const at = t.upstream + c * FEATURE_STRIDE + pairs.block[i] * LANES;
+                for (int k = 0; k < N; ++k) sums[k] = fma(w, load(at + k * FEATURE_STRIDE), sums[k]);
+            }
+            for (int k = 0; k < N; k += 4) transpose_reduce<4>(sums + k, t.slots + j * rows + c + k);
+        });
+    });
+    t.slots += pairs.splats * rows;
+}
+
 }  // namespace gs2d

@@ -73,4 +73,19 @@ inline real* feature_planes(const Frame& f, int64_t count, int64_t piece) {
 void start_features(const Frame& f, const Features& features, const real* alpha_image, const TileArea& area, real* planes,
                     real* g_alpha, real* S);
 
+// Further channels of a tile, or nothing.
+struct TileFeatures {
+    const Features* all = nullptr;
+    const real* upstream = nullptr;  // [rows, FEATURE_STRIDE]
+    real* slots = nullptr;           // [slots, rows], from the next splat's on
+    FeaturePairs* pairs = nullptr;
+    int done = 0;  // of `pairs`: those that have their weight
+};
+
+// Takes the splats of so many entries: their part of dL/dw.
+void begin_features(TileFeatures& t, const Entry* entries, int count);
+
+// Writes the slots of those splats, from the weights.
+void finish_features(TileFeatures& t);
+
 }  // namespace gs2d

@@ -117,6 +117,13 @@ struct Staged {  // of a warp: 32 splats
     uint rows[32];
 };
 
+// Of the pairs of some splats of a chunk, in shared memory: the features' part of dL/dw, and then the weight.
+constexpr int PART = 16;
+using PairValues = float (*)[HALVES][128];
+__device__ __forceinline__ float& value_of(PairValues values, int j, int h) {
+    return values[j & (PART - 1)][h][threadIdx.x];
+}
+
 // Calls step(first channel, upstream gradients of the thread's pixels) for CHANNELS channels at a time.
 template <class F>
 __device__ __forceinline__ void for_each_channels(const BlendVjpArguments& a, const Place& at, F&& step) {
@@ -134,8 +141,8 @@ __device__ __forceinline__ void for_each_channels(const BlendVjpArguments& a, co
 
 // The features' part of dL/dw of each splat that is wanted: each gradient of a pixel is read once for all of them.
 __device__ __forceinline__ void weigh_features(const BlendVjpArguments& a, const Place& at, const Staged& staged,
-                                               uint wanted, float (*to)[HALVES]) {
-    for (int j = 0; j < 32; ++j) to[j][0] = to[j][1] = 0.f;
+                                               uint wanted, PairValues to) {
+    for (int j = 0; j < PART; ++j) value_of(to, j, 0) = value_of(to, j, 1) = 0.f;
     for_each_channels(a, at, [&](int64 c, const float (&g)[HALVES][CHANNELS]) {
         for (uint left = wanted; left; left &= left - 1) {
             const int j = __ffs(int(left)) - 1;
@@ -148,10 +155,10 @@ __device__ __forceinline__ void weigh_features(const BlendVjpArguments& a, const
             }
 #pragma unroll
             for (int h = 0; h < HALVES; ++h) {
-                float sum = to[j][h];
+                float sum = value_of(to, j, h);
 #pragma unroll
                 for (int k = 0; k < CHANNELS; ++k) sum = fma(v[k], g[h][k], sum);
-                to[j][h] = sum;
+                value_of(to, j, h) = sum;
             }
         }
     });
@@ -159,13 +166,14 @@ __device__ __forceinline__ void weigh_features(const BlendVjpArguments& a, const
 
 // The gradients of the features of each of those splats, from its weights.
 __device__ __forceinline__ void add_features(const BlendVjpArguments& a, const Place& at, const Staged& staged,
-                                             uint wanted, const float (*weights)[HALVES]) {
+                                             uint wanted, PairValues weights) {
     for_each_channels(a, at, [&](int64 c, const float (&g)[HALVES][CHANNELS]) {
         for (uint left = wanted; left; left &= left - 1) {  // the same for all lanes
             const int j = __ffs(int(left)) - 1;
+            const float first = value_of(weights, j, 0), second = value_of(weights, j, 1);
             float v[CHANNELS];
 #pragma unroll
-            for (int k = 0; k < CHANNELS; ++k) v[k] = fma(weights[j][0], g[0][k], weights[j][1] * g[1][k]);
+            for (int k = 0; k < CHANNELS; ++k) v[k] = fma(first, g[0][k], second * g[1][k]);
             const float mine = transpose_reduce<CHANNELS>(v, at.lane);
             float* row = a.features.gradients + int64(staged.rows[j]) * a.features.count + c;
             if (at.lane % (32 / CHANNELS) == 0) atomicAdd(row + at.lane / (32 / CHANNELS), mine);
@@ -174,7 +182,8 @@ __device__ __forceinline__ void add_features(const BlendVjpArguments& a, const P
 }
 
 template <bool GEO, bool DIST, bool ABS, bool TRANS = false, bool FEAT = false>
-__device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& staged, Upstream<GEO, TRANS>& upstream) {
+__device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& staged, Upstream<GEO, TRANS>& upstream,
+                                          PairValues pairs = nullptr) {
     const Place at = place_of(a.view, a.tiles);
     const BlendLimits<float> limits = limits_of(a.view);
     PixelGradient<float> g[HALVES];  // in registers only what is not in `upstream`
@@ -209,9 +218,7 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
         const uint plain = __ballot_sync(FULL_MASK, mine_is_plain);
         const uint learning = __ballot_sync(FULL_MASK, learns);
         __syncwarp();
-        float weights[FEAT ? 32 : 1][HALVES];  // and before that the features' part of dL/dw
-        if constexpr (FEAT) weigh_features(a, at, staged, wanted, weights);
-        for_each_splat(wanted, plain, [&](auto is_plain, int j, uint bit) {
+        const auto step = [&](auto is_plain, int j, uint bit) {
             constexpr bool PLAIN = decltype(is_plain)::value;
             const auto& r = staged.records;
             const Record<float> s = record_of(r[0][j], r[1][j], r[2][j], r[3][j]);
@@ -222,20 +229,30 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
 #pragma unroll
             for (int h = 0; h < HALVES; ++h) {
                 if constexpr (FEAT)
-                    if (!(hits[h] & bit)) weights[j][h] = 0.f;
+                    if (!(hits[h] & bit)) value_of(pairs, j, h) = 0.f;
                 if (!(hits[h] & bit)) continue;
                 const float dy = first_dy + float(4 * h);
                 const Hit<float> hit = hit_of<PLAIN>(s, planes[h], dx, dy, limits);
                 upstream.get(h, g[h]);
                 const float w = composite_vjp<GEO, DIST, ABS, TRANS, !PLAIN, true, FEAT>(
-                    s, dx, dy, hit, limits, g[h], T[h], S[h], sums, FEAT ? weights[FEAT ? j : 0][h] : 0.f);
-                if constexpr (FEAT) weights[j][h] = w;
+                    s, dx, dy, hit, limits, g[h], T[h], S[h], sums, FEAT ? value_of(pairs, j, h) : 0.f);
+                if constexpr (FEAT) value_of(pairs, j, h) = w;
             }
             if (!(learning & bit)) return;  // the same for all lanes
             finish_column(dx, sums);
             add_gradient<ABS, PLAIN>(a, staged.rows[j], finish(s, ABS ? reciprocal(s.iz) : 0.f, sums, limits), at.lane);
-        });
-        if constexpr (FEAT) add_features(a, at, staged, wanted, weights);
+        };
+        if constexpr (!FEAT) {
+            for_each_splat(wanted, plain, step);
+        } else {
+            for (int first = 0; first < 32; first += PART) {
+                const uint part = wanted & (((1u << PART) - 1u) << first);
+                if (part == 0u) continue;  // the same for all lanes
+                weigh_features(a, at, staged, part, pairs);
+                for_each_splat(part, plain, step);
+                add_features(a, at, staged, part, pairs);
+            }
+        }
         __syncwarp();  // before the records are overwritten
     }
 }
@@ -305,25 +322,29 @@ extern "C" __global__ void __launch_bounds__(128, 5) blend_vjp_distortion_transm
 extern "C" __global__ void __launch_bounds__(128, 4) features_vjp(BlendVjpArguments a) {
     __shared__ Staged staged[4];
     __shared__ Upstream<true> upstream;
-    blend_vjp<true, false, false, false, true>(a, staged[threadIdx.x >> 5], upstream);
+    __shared__ float pairs[PART][HALVES][128];
+    blend_vjp<true, false, false, false, true>(a, staged[threadIdx.x >> 5], upstream, pairs);
 }
 
 extern "C" __global__ void __launch_bounds__(128, 4) features_vjp_abs(BlendVjpArguments a) {
     __shared__ Staged staged[4];
     __shared__ Upstream<true> upstream;
-    blend_vjp<true, false, true, false, true>(a, staged[threadIdx.x >> 5], upstream);
+    __shared__ float pairs[PART][HALVES][128];
+    blend_vjp<true, false, true, false, true>(a, staged[threadIdx.x >> 5], upstream, pairs);
 }
 
 extern "C" __global__ void __launch_bounds__(128, 4) features_vjp_distortion(BlendVjpArguments a) {
     __shared__ Staged staged[4];
     __shared__ Upstream<true> upstream;
-    blend_vjp<true, true, false, false, true>(a, staged[threadIdx.x >> 5], upstream);
+    __shared__ float pairs[PART][HALVES][128];
+    blend_vjp<true, true, false, false, true>(a, staged[threadIdx.x >> 5], upstream, pairs);
 }
 
 extern "C" __global__ void __launch_bounds__(128, 4) features_vjp_distortion_abs(BlendVjpArguments a) {
     __shared__ Staged staged[4];
     __shared__ Upstream<true> upstream;
-    blend_vjp<true, true, true, false, true>(a, staged[threadIdx.x >> 5], upstream);
+    __shared__ float pairs[PART][HALVES][128];
+    blend_vjp<true, true, true, false, true>(a, staged[threadIdx.x >> 5], upstream, pairs);
 }
 
 }  // namespace gs2d
