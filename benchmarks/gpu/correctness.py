@@ -28,7 +28,7 @@ from gs2d.kernels.cuda.compile import ARCHITECTURES, compile_source, kernel_sour
 from gs2d.kernels.tsdf import arguments_of, fuse_on_gpu
 from gs2d.render import cuda, reference
 from gs2d.render.api import rasterize, splat_errors
-from gs2d.render.types import TRANSMITTANCE, RasterSettings
+from gs2d.render.types import PLAIN_COLORS, TRANSMITTANCE, Features, RasterSettings
 
 TOOLS = ("memcheck", "racecheck", "synccheck", "initcheck")
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
@@ -146,6 +146,12 @@ def _render_all_ways(bench: Bench) -> None:
         leaves = Splats(**{name: tensor.detach().requires_grad_() for name, tensor in splats.items()})
         probe = torch.zeros(len(splats), columns, device=bench.device, requires_grad=True)
         output = cuda.rasterize_with(launcher, leaves, camera, settings, probe, deterministic=deterministic)
+        sum(getattr(output, name).sum() for name in names).backward()  # type: ignore[union-attr]
+    values = torch.rand(len(splats), 9, device=bench.device, requires_grad=True)
+    further, plain = Features(values, values.detach()[0]), replace(SETTINGS, sh_degree=PLAIN_COLORS)
+    for names, columns in itertools.product((every[:1], every), (2, 4)):
+        probe = torch.zeros(len(splats), columns, device=bench.device, requires_grad=True)
+        output = cuda.rasterize_with(launcher, splats, camera, plain, probe, features=further)
         sum(getattr(output, name).sum() for name in names).backward()  # type: ignore[union-attr]
     image = torch.rand(camera.height, camera.width, 3, device=bench.device)
     for occlusion in (False, True):

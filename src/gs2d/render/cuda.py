@@ -146,7 +146,7 @@ class _Rasterize(torch.autograd.Function):
         wanted = Wanted({**gradients, "probe": probe, "intrinsics": each}, options.learns, options.deterministic)
         by_name = {"depth_transmittance": None} | dict(zip(_image_names(options.transmittance), given, strict=True))
         to_values = torch.zeros_like(values) if want_values or of_features is not None else None
-        further = None if of_features is None else (values, options.background, features, of_features, to_values)
+        further: Any = None if of_features is None else (values, options.background, features, of_features, to_values)
         backward(options.launcher, frame, tensors, by_name, wanted, further)
         total = None if each is None else each.sum(dim=0, dtype=torch.float64).to(ctx.of_intrinsics)
         to_values = None if to_values is None else to_values[:, : ctx.channels]
