@@ -28,9 +28,3 @@ def test_a_tree_against_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert all(0 < row["best"] <= row["quarter"] <= row["median"] for row in facts["rows"])
     assert facts["after_over_before"]["best"] == pytest.approx(facts["rows"][1]["best"] / facts["rows"][0]["best"])
     assert "after / before" in capsys.readouterr().out
-
-
-def test_one_checkout_is_not_enough(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["somewhere"])
-    assert "two checkouts were expected, BEFORE and AFTER, got 1" in capsys.readouterr().err

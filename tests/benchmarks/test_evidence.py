@@ -51,21 +51,3 @@ def test_rows_that_are_there_are_shown_and_others_are_made(
     assert all(line.count("|") == 12 for line in lines)
     evidence.main([*words, "--seed", "1", "--captures", "lego"])
     assert made[-1] == ("lego", "2dgs")
-
-
-def test_rows_of_several_days_stand_in_one_file_with_what_made_each(tmp_path: Path) -> None:
-    file = tmp_path / "rows.json"
-    again = {**row("lego", "2dgs"), "splats": 99, "made": {"commit": "b"}}
-    for one in (row("lego", "2dgs"), row("bottle", "2dgs"), again, row("lego", "best")):
-        evidence.merge_row(file, {"made": {"commit": "a"}, **one})
-    rows = json.loads(file.read_text())["rows"]
-    told = [(found["capture"], found["recipe"], found["splats"], found["made"]["commit"]) for found in rows]
-    assert told == [("lego", "2dgs", 99, "b"), ("bottle", "2dgs", 1234, "a"), ("lego", "best", 1234, "a")]
-
-
-def test_what_made_a_row_is_the_run_s_own_day_and_machine() -> None:
-    definition = {"created": "2026-01-01", "machine": {"cores": 64}, "versions": {"torch": "9"}, "recipe": {}}
-    made = evidence.made_by(definition)
-    assert (made["date"], made["machine"], made["versions"]) == ("2026-01-01", {"cores": 64}, {"torch": "9"})
-    assert made["kernels"]
-    assert made["commit"] is None or len(made["commit"]) >= 7

@@ -24,8 +24,3 @@ def test_it_tells_of_each_capture_what_a_look_takes_both_ways(
     assert float(cells[3]) < float(cells[4])
     assert int(cells[6]) <= 5
     assert free_space.look_at_free_space is before
-
-
-def test_a_capture_that_is_not_there_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["/nowhere"]) == 2
-    assert capsys.readouterr().err.count("\n") == 1

@@ -11,13 +11,3 @@ def test_the_fusion_benchmark_reports_every_step_of_a_small_run() -> None:
     assert result.faces > 5000
     assert result.volume_mib > 0
     assert result.worst_radius_error_voxels < 1.0
-
-
-def test_the_benchmark_fuses_the_same_frames_without_bounds() -> None:
-    plain = run(views=20, size=64, resolution=60, threads=1)
-    nested = run(views=20, size=64, resolution=60, threads=1, unbounded=True)
-    assert nested.levels > 1
-    # the sphere lies in the second level: voxels of twice the size make a quarter of the faces
-    assert 0.2 * plain.faces < nested.faces < 0.4 * plain.faces
-    assert nested.volume_mib < 0.6 * plain.volume_mib
-    assert nested.worst_radius_error_voxels < 2.0

@@ -9,20 +9,17 @@ import numpy as np
 import pytest
 from benchmarks.georeference import (
     CONTROL,
-    FAR,
     WORLD,
     Truth,
     judged,
     over_seeds,
     table,
     write_control,
-    write_positions,
 )
 
 from gs2d.core.georeference import Georeference
 from gs2d.data import View
 from gs2d.geo.control import locate, read_control
-from gs2d.geo.positions import read_positions
 from gs2d.synthetic.flight import Flight, flown_cameras
 
 CAMERAS = {f"{k}.jpg": camera for k, camera in enumerate(flown_cameras(Flight(24)))}
@@ -42,15 +39,6 @@ def test_marks_of_control_points_meet_where_the_points_are(tmp_path: Path) -> No
     located = locate(points, [View(name, camera, undecoded) for name, camera in CAMERAS.items()])
     np.testing.assert_allclose(located.source + WORLD, located.world, atol=1.5)  # of 0.5 px, which are 0.2 m there
     assert np.abs(located.source + WORLD - located.world).max() > 0.05  # there is noise
-
-
-def test_outliers_are_as_many_and_as_far_as_said(tmp_path: Path) -> None:
-    places = {name: camera.center for name, camera in CAMERAS.items()}
-    wrong = write_positions(tmp_path / "positions.csv", places, 0.01, np.random.default_rng(1))
-    read = read_positions(tmp_path / "positions.csv")
-    off = np.array([np.linalg.norm(read.places[name] - WORLD - place) for name, place in places.items()])
-    assert (off > 0.9 * FAR).sum() == wrong == 1
-    assert np.median(off) < 0.05
 
 
 def test_a_wrong_scale_is_an_error_of_scale_and_of_places() -> None:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import pytest
 from benchmarks import paper_tables
 
 from gs2d.experiments.aggregate import Results, check_claims
@@ -39,13 +36,3 @@ def test_tables_of_what_was_trained_and_known_orders_stay_and_nothing_else() -> 
     text = "\n".join(lines)
     assert not any(word in text for word in ("unknown", "24.0", "half the schedule", "gs2d train"))
     assert max(map(len, lines)) <= 120
-
-
-def test_a_command_that_fails_ends_it_with_its_code_and_leaves_nothing(tmp_path: Path) -> None:
-    words = ["--data", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out")]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", ["paper_tables", *words])
-        with pytest.raises(SystemExit) as ended:
-            paper_tables.main()
-    assert ended.value.code == 2
-    assert not (tmp_path / "out").exists()

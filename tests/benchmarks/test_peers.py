@@ -9,35 +9,12 @@ from typing import Any
 import pytest
 import torch
 from benchmarks import peers
-from benchmarks.peer_adapters import accumulate_along_rays, in_front, weights_along_rays
-from benchmarks.workload import room_workload
 
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.kernels.library import available_variants, load
 from gs2d.render.cpu import rasterize_with
 from gs2d.render.types import RasterSettings
-
-
-def test_weights_along_rays_are_alpha_times_what_the_samples_before_let_through() -> None:
-    # ray 0: 0.5, then 0.5 of what is left, then 0.9 of a quarter; ray 2 begins anew; ray 1 has none
-    alphas = torch.tensor([0.5, 0.5, 0.9, 0.2, 0.5])
-    rays = torch.tensor([0, 0, 0, 2, 2])
-    weights, before = weights_along_rays(alphas, ray_indices=rays, n_rays=3)
-    torch.testing.assert_close(before, torch.tensor([1, 0.5, 0.25, 1, 0.8]))
-    torch.testing.assert_close(weights, torch.tensor([0.5, 0.25, 0.225, 0.2, 0.4]))
-    sums = accumulate_along_rays(weights, torch.tensor([[1.0], [2.0], [0.0], [1.0], [1.0]]), ray_indices=rays, n_rays=3)
-    torch.testing.assert_close(sums, torch.tensor([[1.0], [0.0], [0.6]]))
-    assert accumulate_along_rays(weights, None, ray_indices=rays, n_rays=3)[:, 0].tolist() == pytest.approx(
-        [0.975, 0, 0.6]
-    )
-
-
-def test_splats_behind_the_near_plane_are_kept_from_the_peers() -> None:
-    workload = room_workload(8, 16, 16)
-    splats, camera = workload.splats.clone(), workload.cameras[0]
-    splats.means[3] = torch.as_tensor(camera.center - camera.rotation[2])
-    assert torch.equal(in_front(splats, camera).means, splats.means[torch.arange(8) != 3])
 
 
 class Twin:
@@ -79,13 +56,3 @@ def test_the_file_holds_both_times_their_ratio_and_that_the_same_was_drawn(
     assert row["ratio"]["best"] == pytest.approx(row["peer_ms"]["best"] / row["ours_ms"]["best"], rel=0.05)
     assert row["pairs_per_pixel"]["peer"] == 1
     assert row["mean_color_difference"] == 0
-
-
-def test_a_path_with_no_peer_is_a_mistake_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = ["--only", "20k", "--out", str(tmp_path / "peers.json")]
-    for option in ("--opensplat", "--gsplat"):
-        assert peers.main([option, str(tmp_path / "nothing"), *out]) == 2
-        assert capsys.readouterr().err.startswith("error: ")
-    with pytest.raises(SystemExit):
-        peers.main([])
-    assert "--opensplat LIBRARY" in capsys.readouterr().err

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import pytest
 from benchmarks import real
-from benchmarks.__main__ import runs_there
 from benchmarks.room_capture import room_splats, write_room_capture
-from benchmarks.workload import AbsentError, run_workload
 
 from gs2d.io.splat_ply import write_splats
 from gs2d.kernels.library import available_variants
@@ -29,28 +26,6 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scene = {"name": "capture", "path": str(folder / "capture")}
     (run / "run.json").write_text(json.dumps({"scene": scene, "downscale": 2, "title": "den"}))
     return run
-
-
-def test_a_run_says_where_its_photographs_are_and_how_large_it_took_them(finished: Path) -> None:
-    made = run_workload(finished)
-    assert made.name == "den-1500-96x64"
-    assert (len(made.splats), len(made.cameras)) == (1500, 4)
-
-
-def test_what_is_not_there_is_skipped_and_named(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    moved = tmp_path / "moved"
-    shutil.copytree(finished, moved)
-    (moved / "run.json").write_text(
-        json.dumps({"scene": {"name": "x", "path": str(tmp_path / "gone")}, "downscale": 1})
-    )
-    with pytest.raises(AbsentError, match="is not at"):
-        run_workload(moved)
-    with pytest.raises(AbsentError, match="is no finished run"):
-        run_workload(tmp_path)
-    assert len(runs_there([tmp_path, finished, moved])) == 1
-    assert capsys.readouterr().err.count("skipped: ") == 2
 
 
 def test_iterations_are_compared_at_equal_visible_pairs(

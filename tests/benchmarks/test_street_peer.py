@@ -8,13 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from benchmarks import street_peer
-from benchmarks.street_peer import Window, canvas, draw_command, schedule, seen_window, train_within, whole_steps
+from benchmarks.street_peer import Window, canvas
 
 from fake_peer import calls, fake_peer
 from gs2d.core.camera import Camera, look_at
 from gs2d.data import View, load_scene
 from gs2d.data.scene import PointCloud, Scene
-from gs2d.errors import DataError
 from gs2d.render.backends import get_backend
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -50,21 +49,6 @@ def test_the_canvas_holds_the_view_and_has_its_principal_point_in_the_middle(cx:
     assert window.cut(image).shape == (window.height, window.width, 3)
 
 
-def test_a_view_whose_point_is_in_the_middle_is_its_own_canvas() -> None:
-    assert canvas(Camera(333, 250, 400.0, 400.0, 166.5, 125.0, np.eye(4))) == Window(0, 0, 333, 250)
-
-
-def test_training_pictures_are_cut_to_where_the_photograph_has_pixels() -> None:
-    camera = Camera(40, 20, 20.0, 20.0, 20.0, 10.0, np.eye(4))
-    mask = np.ones((20, 40), dtype=bool)
-    mask[:, :3] = mask[19] = False  # the wedges of an undistorted photograph
-    window = seen_window(camera, mask)
-    assert window == Window(4, 2, 32, 16)  # two pixels of the shorter side are four of the longer one
-    assert seen_window(camera, None) == Window(0, 0, 40, 20)
-    with pytest.raises(DataError, match="no whole rectangle"):
-        seen_window(camera, np.zeros((20, 40), dtype=bool))
-
-
 # -- what it gets --------------------------------------------------------------------------------------------------
 def test_the_capture_of_the_peer_is_the_one_of_the_run(tmp_path: Path, scene: Scene) -> None:
     windows = [Window(2, 1, 20, 15)] * 4
@@ -82,56 +66,6 @@ def test_the_capture_of_the_peer_is_the_one_of_the_run(tmp_path: Path, scene: Sc
     assert (again.points.points == scene.points.points).all()
     assert again.points.colors is not None
     assert (again.points.colors == scene.points.colors).all()
-
-
-def test_its_schedule_is_scaled_and_nothing_moves_while_it_draws() -> None:
-    assert schedule(30_000, "own") == ["-n", "30000", "--refine-every", "500", "--densify-from", "500",
-                                "--sh-degree-interval", "1000"]  # fmt: skip
-    assert schedule(1500, "own")[2:] == ["--refine-every", "50", "--densify-from", "25", "--sh-degree-interval", "50"]
-    words = schedule(1500, "moving")
-    refines, until = (int(words[words.index(name) + 1]) for name in ("--refine-every", "--densify-until"))
-    assert until == 1500
-    assert max(range(0, 1500, refines)) < 0.95 * 1500  # what it adds last is still trained
-    assert [whole_steps(n) for n in (3, 64, 127.9, 128)] == [64, 64, 64, 128]
-    for iterations in range(64, 64 * 60, 64):
-        words = draw_command(Path("b"), Path("c"), Path("s"), iterations, "a.png", Path("o"))
-        last = int(words[words.index("-n") + 1])
-        steps = range(iterations + 1, last + 1)
-        assert [step for step in steps if step % 10 == 0] == [last]  # one picture
-        assert not [step for step in steps if step % 32 == 0]  # no step of its optimizer
-        assert words[words.index("--densify-until") + 1] == "0"
-
-
-# -- how long it trains --------------------------------------------------------------------------------------------
-def capture(tmp_path: Path, scene: Scene) -> Path:
-    street_peer.write_capture(tmp_path / "train", scene, scene.train, [canvas(v.camera) for v in scene.train])
-    return tmp_path / "train"
-
-
-def test_the_peer_trains_as_long_as_its_seconds_of_the_processor_allow(tmp_path: Path, scene: Scene) -> None:
-    binary = fake_peer(tmp_path / "bin", seconds=0.001)
-    found = train_within(binary, capture(tmp_path, scene), tmp_path, 1.5, "own")
-    assert 0.8 * 1.5 <= found.process.cpu_seconds <= 1.5
-    assert 1000 < found.iterations < 1500
-    assert found.iterations % 64 == 0
-    assert b"iteration %d" % found.iterations in (tmp_path / "splat.ply").read_bytes()
-    assert next(words[words.index("-n") + 1] for words in calls(binary)) == "256"
-
-
-def test_a_training_beyond_the_budget_does_not_count(tmp_path: Path, scene: Scene) -> None:
-    binary = fake_peer(tmp_path / "bin", seconds=0.003)  # the probe alone takes 0.8 s
-    found = train_within(binary, capture(tmp_path, scene), tmp_path, 0.5, "own")
-    assert found.process.cpu_seconds <= 0.5
-    assert found.iterations in (64, 128)
-    slow = fake_peer(tmp_path / "slow", seconds=0.002)
-    with pytest.raises(DataError, match=r"needs more than 0 s"):
-        train_within(slow, capture(tmp_path, scene), tmp_path, 0.01, "own")
-
-
-def test_a_peer_that_fails_is_an_error_with_its_last_words(tmp_path: Path) -> None:
-    binary = fake_peer(tmp_path / "bin", seconds=0.0)
-    with pytest.raises(DataError, match=r"exit code 1: \['Invalid project folder'\]"):
-        train_within(binary, tmp_path / "nowhere", tmp_path, 1.0, "own")
 
 
 # -- its pictures --------------------------------------------------------------------------------------------------

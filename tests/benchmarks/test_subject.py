@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 from benchmarks import subject
-from PIL import Image
 
-from ball_runs import options
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.mesh import Mesh
-from gs2d.errors import DataError
-from gs2d.pipeline.train import train
-from tiny import ball_image, write_ball_mesh, write_capture
+from tiny import ball_image
 
 ON_X, ON_Y = [(3, 0, 0), (-3, 0, 0)], [(0, 3, 0), (0, -3, 0), (0.5, 3, 0)]
 
@@ -44,37 +37,3 @@ def test_area_counts_as_inside_where_half_of_the_pictures_that_show_it_have_it_i
     assert (fraction.area, fraction.inside, fraction.unseen) == pytest.approx((0.04, 0.5, 0.25))
     assert subject.fraction_inside(squares(beside), masks(ON_X + ON_Y[:2])).inside == 1.0  # two of four
     assert subject.fraction_inside(squares(beside), masks(ON_X + ON_Y)).inside == 0.0  # two of five
-
-
-def test_the_share_is_of_the_area_and_not_of_the_number_of_faces() -> None:
-    small, large = squares((0, 0, 0)), squares((0.0, 0.0, 0.9), side=0.2)
-    both = Mesh(np.concatenate([small.vertices, large.vertices]), np.concatenate([small.faces, large.faces + 4]))
-    assert subject.fraction_inside(both, masks(ON_X + ON_Y)).inside == pytest.approx(0.2)
-
-
-def test_without_masks_or_area_there_is_no_share() -> None:
-    with pytest.raises(DataError, match="got 0 masks"):
-        subject.fraction_inside(squares((0, 0, 0)), [])
-    with pytest.raises(DataError, match="and 0 faces"):
-        subject.fraction_inside(Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32)), masks(ON_X))
-
-
-def test_the_masks_of_a_folder_judge_the_mesh_of_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    capture = write_capture(tmp_path / "ball", size=48)
-    train(options(capture, tmp_path / "run"))
-    write_ball_mesh(tmp_path / "ball.ply")
-    for name, turned in (("ball_masks", False), ("other_masks", True)):
-        (tmp_path / name / "train").mkdir(parents=True)
-        for path in sorted((capture / "train").iterdir())[:4]:
-            alpha = np.asarray(Image.open(path))[..., 3]
-            Image.fromarray(255 - alpha if turned else alpha).save(tmp_path / name / "train" / f"{path.stem}_mask.png")
-        out = tmp_path / f"{name}.json"
-        words = [str(tmp_path / "run"), "--mesh", str(tmp_path / "ball.ply"), "--masks", str(tmp_path / name)]
-        subject.main([*words, "--out", str(out)])
-        said, found = capsys.readouterr().out, json.loads(out.read_text())
-        assert found["masks"] == 4
-        assert found["inside"] == pytest.approx(0.0 if turned else 1.0, abs=0.02)  # but for the rims of pixels
-        assert f"{found['inside']:.1%} of the mesh's area is in the masks of 4 photographs" in said
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(SystemExit, match="got 0 masks"):
-        subject.main([str(tmp_path / "run"), "--masks", str(tmp_path / "empty")])

@@ -48,15 +48,6 @@ def test_a_failing_body_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> 
         assert names(tmp_path) == ["a"]
 
 
-def test_the_user_s_umask_decides_who_may_read(tmp_path: Path) -> None:
-    before = os.umask(0o027)
-    try:
-        write_json(tmp_path / "a.json", 1)
-    finally:
-        os.umask(before)
-    assert (tmp_path / "a.json").stat().st_mode & 0o777 == 0o640
-
-
 def test_a_folder_that_is_missing_or_a_file_or_the_name_of_a_folder_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     (tmp_path / "folder").mkdir()
@@ -81,12 +72,6 @@ def test_a_folder_without_permission_is_one_line(tmp_path: Path) -> None:
             write_json(tmp_path / "a.json", {})
     finally:
         tmp_path.chmod(0o700)
-
-
-def test_an_error_about_another_file_is_not_taken_for_a_failed_write(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError), atomic_write(tmp_path / "a") as file:
-        file.write((tmp_path / "input").read_bytes())
-    assert names(tmp_path) == []
 
 
 @pytest.mark.parametrize("what", ["bytes", "text", "json", "torch", "library"])
@@ -178,29 +163,6 @@ def test_a_link_in_the_place_of_the_temporary_file_is_not_followed(tmp_path: Pat
     assert ((tmp_path / "mine").read_text(), (tmp_path / "out").read_text()) == ("mine", "new")
 
 
-def test_two_who_write_the_same_file_at_once_both_write_it_whole(tmp_path: Path) -> None:
-    with atomic_write(tmp_path / "out") as first:
-        first.write(b"1" * 5)
-        with atomic_write(tmp_path / "out") as second:
-            second.write(b"2" * 3)
-        assert (tmp_path / "out").read_bytes() == b"222"
-    assert (tmp_path / "out").read_bytes() == b"11111"
-    assert names(tmp_path) == ["out"]
-
-
-def test_json_round_trip_keeps_order_and_letters(tmp_path: Path) -> None:
-    value = {"b": [1, 2.5, None, True], "a": "Glück"}
-    write_json(tmp_path / "a.json", value)
-    assert list(read_json(tmp_path / "a.json").items()) == list(value.items())
-    assert "Glück" in (tmp_path / "a.json").read_text(encoding="utf-8")
-
-
-def test_nan_is_not_json(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="JSON compliant"):
-        write_json(tmp_path / "a.json", {"psnr": float("nan")})
-    assert names(tmp_path) == []
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -214,13 +176,6 @@ def test_a_file_that_is_no_json_is_one_line(tmp_path: Path, content: bytes, mess
     (tmp_path / "a.json").write_bytes(content)
     with pytest.raises(DataError, match=message):
         read_json(tmp_path / "a.json")
-
-
-def test_a_missing_json_is_one_line_and_a_byte_order_mark_is_no_error(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"cannot read .*gone\.json: No such file"):
-        read_json(tmp_path / "gone.json")
-    (tmp_path / "bom.json").write_bytes(b"\xef\xbb\xbf[1]")
-    assert read_json(tmp_path / "bom.json") == [1]
 
 
 def test_a_file_name_that_is_no_utf_8_survives_json(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gs2d.core import images
-from gs2d.core.images import area_downscale, composite, is_number, mask_downscale, natural_key, to_uint8
+from gs2d.core.images import area_downscale, composite, natural_key, to_uint8
 from gs2d.errors import ShapeError
 
 
@@ -30,12 +30,6 @@ def test_area_downscale_averages_blocks_and_cuts_what_is_left_over() -> None:
     assert area_downscale(image, 1) is image
     with pytest.raises(ShapeError, match="at least one pixel of 5x3, got 4"):
         area_downscale(image, 4)
-
-
-@pytest.mark.parametrize("factor", [16, 17])
-def test_white_stays_white_in_large_blocks(factor: int) -> None:
-    white = np.full((factor, 2 * factor, 3), 255, np.uint8)
-    np.testing.assert_array_equal(area_downscale(white, factor), np.full((1, 2, 3), 255))
 
 
 def test_transparent_pixels_do_not_bleed_into_the_colour() -> None:
@@ -72,22 +66,10 @@ def test_composite_worked_by_hand() -> None:
         composite(image, (0.5, 0.5))
 
 
-def test_a_mask_pixel_counts_if_enough_of_its_block_does() -> None:
-    mask = np.array([[1, 1, 1, 0], [1, 1, 0, 1], [0, 0, 1, 0], [1, 0, 1, 0]], bool)
-    np.testing.assert_array_equal(mask_downscale(mask, 2, need=1.0), [[True, False], [False, False]])
-    np.testing.assert_array_equal(mask_downscale(mask, 2, need=0.5), [[True, True], [False, True]])
-
-
 def test_names_are_in_the_order_in_which_people_count() -> None:
     names = ["r_10.png", "r_2.png", "a.png", "r_2b.png", "r_002.png", "3.png", "12.png"]
     counted = ["3.png", "12.png", "a.png", "r_002.png", "r_2.png", "r_2b.png", "r_10.png"]
     assert sorted(names, key=natural_key) == counted
-
-
-def test_digits_of_other_scripts_are_no_number() -> None:
-    assert [is_number(text) for text in ("0", "00012", "", "-1", "1.0", "\u00b2", "\u0663", "9" * 19)] == [True] * 2 + [
-        False
-    ] * 6
 
 
 @pytest.mark.parametrize("channels", [3, 4])

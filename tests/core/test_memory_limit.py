@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from gs2d.core import memory_limit as module
-from gs2d.core.memory_limit import cache_bytes, check_address_space, memory_limit
+from gs2d.core.memory_limit import check_address_space, memory_limit
 from gs2d.errors import BackendError
 
 MB = 1 << 20
@@ -63,14 +62,6 @@ def test_the_limit_in_force_is_the_least(
     assert word in limit.source
 
 
-def test_the_limit_on_address_space_counts_what_is_mapped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resource, "getrlimit", lambda which: (1000 * MB, 1000 * MB))
-    limit = memory_limit(machine(tmp_path, "0::/\n", {}))
-    assert limit is not None
-    assert (limit.bytes, "ulimit -v" in limit.source) == (1000 * MB, True)
-    assert limit.room == pytest.approx(100 * MB, abs=1 << 16)
-
-
 def test_too_little_address_space_to_load_the_libraries_in_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "5")
     for allowed, fits in ((1300 * MB, False), (1400 * MB, True), (resource.RLIM_INFINITY, True)):
@@ -93,16 +84,6 @@ def test_a_command_in_too_little_address_space_ends_with_a_line(tmp_path: Path, 
     assert done.stderr.count("\n") == 1
     assert "of address space are needed, got a limit of" in done.stderr
     assert not (tmp_path / "run").exists()
-
-
-def test_a_cache_takes_a_part_of_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "memory_limit", lambda: module.MemoryLimit(1300 * MB, 300 * MB, "a test"))
-    assert cache_bytes(4 << 30) == 200 * MB
-    assert cache_bytes(10 * MB) == 10 * MB
-    monkeypatch.setattr(module, "memory_limit", lambda: None)
-    assert cache_bytes(4 << 30) == 4 << 30
-    monkeypatch.setattr(module, "memory_limit", lambda: module.MemoryLimit(100, 300, "a test"))
-    assert cache_bytes(4 << 30) == 0
 
 
 def test_a_real_limit_is_seen() -> None:

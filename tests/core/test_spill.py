@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import gc
 import tempfile
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,17 +28,6 @@ def test_values_come_back_bit_for_bit_in_any_order(limit: int) -> None:
     assert [number for number, _ in kept[3:9:2]] == kept.column(0)[3:9:2] == [3, 5, 7]
     with pytest.raises(IndexError):
         kept[len(given)]
-
-
-def test_its_file_has_no_name_and_goes_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    kept = Spilled(values(3), 0)
-    file = kept._file
-    assert file is not None
-    assert list(tmp_path.iterdir()) == []
-    del kept
-    gc.collect()
-    assert file.closed
 
 
 def test_a_disk_that_is_full_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

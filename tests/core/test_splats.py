@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gs2d.core.splats import ATTRIBUTES, Splats
+from gs2d.core.splats import Splats
 from gs2d.errors import ShapeError
 
 
@@ -13,10 +13,6 @@ def make(count: int = 3, K: int = 16) -> Splats:
     g = torch.Generator().manual_seed(0)
     shapes = ((3,), (4,), (2,), (), (1, 3), (K - 1, 3))
     return Splats(*[torch.randn(count, *shape, generator=g) for shape in shapes])
-
-
-def test_attributes_come_in_a_fixed_order() -> None:
-    assert tuple(name for name, _ in make().items()) == ATTRIBUTES
 
 
 def test_rows_must_agree() -> None:
@@ -28,19 +24,6 @@ def test_rows_must_agree() -> None:
 @pytest.mark.parametrize(("K", "degree"), [(1, 0), (4, 1), (9, 2), (16, 3)])
 def test_the_degree_follows_from_the_coefficients(K: int, degree: int) -> None:
     assert make(K=K).sh_degree == degree
-
-
-def test_scales_and_opacities_are_activated() -> None:
-    splats = make()
-    splats.log_scales.zero_()
-    splats.opacity_logits.zero_()
-    assert bool((splats.scales == 1).all())
-    assert bool((splats.opacities == 0.5).all())
-
-
-def test_size_counts_every_parameter() -> None:
-    assert len(make(5)) == 5
-    assert make(5).nbytes == 5 * 4 * (3 + 4 + 2 + 1 + 48)
 
 
 def test_detach_shares_storage_and_clone_does_not() -> None:
@@ -59,8 +42,3 @@ def test_rows_are_picked_by_mask_or_index() -> None:
     mask = torch.tensor([True, False, True])
     assert torch.equal(splats.rows(mask).means, splats.means[[0, 2]])
     assert torch.equal(splats.rows(torch.tensor([2, 0])).shN, splats.shN[[2, 0]])
-
-
-def test_dtype_moves_all_attributes() -> None:
-    assert {tensor.dtype for _, tensor in make().to(dtype=torch.float64).items()} == {torch.float64}
-    assert {tensor.dtype for _, tensor in make().to(torch.float64).items()} == {torch.float64}  # as of a tensor

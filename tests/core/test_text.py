@@ -15,10 +15,6 @@ def test_a_name_is_its_bytes_again(name: str) -> None:
     assert name_bytes(name) == os.fsencode(name)
 
 
-def test_half_a_character_that_only_json_can_hold_has_bytes_too() -> None:
-    assert name_bytes("\ud83d") == b"\xed\xa0\xbd"
-
-
 @pytest.mark.parametrize(
     ("text", "shown"),
     [
@@ -34,10 +30,6 @@ def test_half_a_character_that_only_json_can_hold_has_bytes_too() -> None:
 def test_what_would_steer_a_terminal_is_spelled_out(text: str, shown: str) -> None:
     assert printable(text) == shown
     assert printable(shown) == shown
-
-
-def test_lines_stay_where_there_are_to_be_several() -> None:
-    assert printable("a\n\tb\x1b", lines=True) == "a\n\tb\\x1b"
 
 
 def test_an_error_is_one_line_whatever_it_quotes() -> None:

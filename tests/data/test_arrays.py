@@ -40,12 +40,6 @@ def test_what_numpy_writes_comes_back(tmp_path: Path, dtype: str, order: str) ->
     assert list(read_npz(tmp_path / "a.npz", "archive", lambda name: name == "two")) == ["two"]
 
 
-@pytest.mark.filterwarnings("ignore:Reading")  # the command line does so
-def test_a_shape_of_python_2_is_read(tmp_path: Path) -> None:
-    (tmp_path / "a.npy").write_bytes(header(plain("(2L, 1L)")) + struct.pack("<2f", 1, 2))
-    np.testing.assert_array_equal(read_npy(tmp_path / "a.npy", "map"), [[1], [2]])
-
-
 @pytest.mark.parametrize(
     "data",
     [
@@ -76,14 +70,6 @@ def test_anything_but_numbers_is_one_line(tmp_path: Path, data: bytes) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_not_there_is_named(tmp_path: Path) -> None:
-    for name, read in (("a.npy", read_npy), ("a.npz", lambda path, what: read_npz(path, what, bool))):
-        with pytest.raises(DataError, match=f"map .*{name} does not exist"):
-            read(tmp_path / name, "map")
-    with pytest.raises(DataError, match="map .* Is a directory"):
-        read_npy(tmp_path, "map")
-
-
 def zeros(megabytes: int) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, np.zeros(megabytes << 20, np.uint8))
@@ -98,11 +84,3 @@ def test_an_archive_that_would_explode_is_not_unpacked(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="at most 400 times"):
         read_npz(tmp_path / "bomb.npz", "archive", lambda name: True)
     assert read_npz(tmp_path / "bomb.npz", "archive", lambda name: name == "b") == {}
-
-
-@pytest.mark.parametrize("method", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
-def test_only_what_can_be_unpacked_bit_by_bit_is_read(tmp_path: Path, method: int) -> None:
-    with zipfile.ZipFile(tmp_path / "a.npz", "w", method) as archive:
-        archive.writestr("a.npy", zeros(1))
-    with pytest.raises(DataError, match="'a.npy' is packed by method .*; pack it again with deflate"):
-        read_npz(tmp_path / "a.npz", "archive", lambda name: True)

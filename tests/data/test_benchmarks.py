@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from capture_writers import ColmapModel, ring, small_blender, small_colmap, small_dtu, write_image_of
-from gs2d.config.datasets import DATASETS, get_dataset
+from capture_writers import ColmapModel, small_blender, small_colmap, small_dtu, write_image_of
+from gs2d.config.datasets import get_dataset
 from gs2d.data import detect_format, load_scene
-from gs2d.data.benchmarks import describe, find_scenes, find_truth, missing_lines, protocol_of, recognise
-from gs2d.errors import DataError, ProtocolError
-from gs2d.experiments.scenes import find_scenes as find_captures
+from gs2d.data.benchmarks import describe, find_scenes, missing_lines, protocol_of, recognise
+from gs2d.errors import DataError
 
 
 def write_dtu_2dgs(data: Path) -> Path:
@@ -143,13 +142,6 @@ def files_of(layout: str) -> list[str]:
     return [f"360_v2/garden/{f}" for f in (*model, *capture)]
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_the_list_of_files_below_is_every_file(tmp_path: Path, layout: str) -> None:
-    LAYOUTS[layout][2](tmp_path)
-    written = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()}
-    assert written - {"360_v2/garden/poses_bounds.npy"} == set(files_of(layout))  # which says whose folder it is
-
-
 @pytest.mark.parametrize(("layout", "file"), [(layout, file) for layout in LAYOUTS for file in files_of(layout)])
 def test_a_file_that_is_taken_away_is_named_in_one_line(tmp_path: Path, layout: str, file: str) -> None:
     dataset, name, write = LAYOUTS[layout]
@@ -202,82 +194,8 @@ def test_a_scene_of_a_data_set_without_its_cameras_says_where_to_get_them(
     assert "known data set" not in str(plain.value)
 
 
-@pytest.mark.parametrize(
-    ("layout", "folder"),
-    [
-        ("dtu-2dgs", "mask"),
-        ("dtu-2dgs", "images"),
-        ("tnt", "images"),
-        ("tnt", "sparse/0"),
-        ("nerf-synthetic", "test"),
-        ("mip-nerf-360", "images_4"),
-    ],
-)
-def test_a_folder_that_is_taken_away_is_one_line(tmp_path: Path, layout: str, folder: str) -> None:
-    dataset, name, write = LAYOUTS[layout]
-    root = write(tmp_path)
-    shutil.rmtree(root / folder)
-    lines = describe(get_dataset(dataset), get_dataset(dataset).scene(name), root).lines()
-    assert [line.split(" is missing (")[0] for line in lines] == [str(root / folder)]
-    assert missing_lines(root) == lines
-
-
-def test_the_folder_one_stands_in_is_recognised_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    root = write_tnt(tmp_path)
-    monkeypatch.chdir(root)
-    assert recognise(Path()) == recognise(root)
-    assert recognise(root) is not None
-
-
 def _names(line: str, name: str) -> bool:
     return line.split(" is missing")[0].endswith(name)
-
-
-def test_a_scene_that_is_asked_for_and_is_not_there_is_an_error(tmp_path: Path) -> None:
-    write_tnt(tmp_path)
-    with pytest.raises(DataError, match="must hold the scene Truck of Tanks and Temples, got no such folder; get it"):
-        find_scenes(tmp_path, "tnt", ["Truck"])
-    with pytest.raises(ProtocolError, match="no scene 'Rome' in Tanks and Temples; there is Barn, Caterpillar"):
-        find_scenes(tmp_path, "tnt", ["Rome"])
-    with pytest.raises(ProtocolError, match="no data set 'kitti'; there is dtu, tnt"):
-        find_scenes(tmp_path, "kitti")
-    with pytest.raises(DataError, match="must be a folder of DTU, got no such folder"):
-        find_scenes(tmp_path / "none", "dtu")
-    assert find_scenes(tmp_path, "dtu") == ()
-
-
-def test_the_ground_truth_may_be_given(tmp_path: Path) -> None:
-    root = write_tnt(tmp_path)
-    elsewhere = tmp_path / "far/away/GT"
-    shutil.move(tmp_path / "TNT_GT", elsewhere)
-    dataset, facts = recognise(root) or (None, None)
-    assert dataset is not None
-    assert facts is not None
-    assert find_truth(dataset, facts, root, elsewhere)[1] == ()
-    assert find_truth(dataset, facts, root, elsewhere / "Barn")[1] == ()
-    found, missing = find_truth(dataset, facts, root)
-    assert found == {}  # the log beside the photographs is not a ground truth
-    assert len(missing) == 4
-
-
-def test_a_ground_truth_that_is_given_tells_whose_capture_it_is(tmp_path: Path) -> None:
-    root = write_tnt(tmp_path)
-    (root / "Barn_COLMAP_SfM.log").unlink()
-    given = tmp_path / "far/away/GT"
-    shutil.move(tmp_path / "TNT_GT", given)
-    assert recognise(root) is None  # anybody's barn
-    assert recognise(root, given) == (DATASETS["tnt"], DATASETS["tnt"].scene("Barn"))
-    assert (protocol_of(root, "colmap").name, protocol_of(root, "colmap", given).name) == ("generic", "tnt")
-    (scene,) = find_captures(root, truths=given)
-    assert (scene.data_set, scene.scored, scene.protocol.name) == ("TnT", True, "tnt")
-
-
-def test_a_scan_outside_the_tables_is_recognised_by_its_number(tmp_path: Path) -> None:
-    small_dtu(tmp_path / "scan33", count=3)
-    dataset, facts = recognise(tmp_path / "scan33") or (None, None)
-    assert dataset is DATASETS["dtu"]
-    assert facts is not None
-    assert facts.scan == 33
 
 
 @pytest.mark.parametrize(
@@ -287,36 +205,3 @@ def test_a_scan_outside_the_tables_is_recognised_by_its_number(tmp_path: Path) -
 def test_auto_takes_the_protocol_of_a_known_scene(tmp_path: Path, layout: str, protocol: str) -> None:
     root = LAYOUTS[layout][2](tmp_path)
     assert protocol_of(root, detect_format(root)).name == protocol
-
-
-def test_auto_follows_the_format_of_everything_else(tmp_path: Path) -> None:
-    small_colmap(tmp_path / "garden")
-    assert protocol_of(tmp_path / "garden", "colmap").name == "generic"
-    courthouse = tmp_path / "Courthouse"
-    small_colmap(courthouse)
-    assert protocol_of(courthouse, "colmap").name == "generic"  # anyone's, until something of the data set is there
-    (courthouse / "Courthouse_COLMAP_SfM.log").write_text("")
-    assert protocol_of(courthouse, "colmap").name == "tnt-large"
-    assert protocol_of(courthouse, "nerfstudio").name == "generic"
-
-
-def test_somebody_s_own_folder_is_of_no_data_set(tmp_path: Path) -> None:
-    small_colmap(tmp_path / "truck_stop")
-    small_colmap(tmp_path / "old_truck")
-    (tmp_path / "old_truck/Truck_COLMAP_SfM.log").write_text("")
-    small_colmap(tmp_path / "my_garden")
-    (tmp_path / "my_garden/poses_bounds.npy").write_text("")
-    small_colmap(tmp_path / "garden")  # the name alone is not enough
-    small_blender(tmp_path / "scan24")
-    for name in ("truck_stop", "old_truck", "my_garden", "garden", "scan24"):
-        assert recognise(tmp_path / name) is None, name
-
-
-@pytest.mark.parametrize("archive", ["cameras.npz", "cameras_sphere.npz"])
-def test_raw_dtu_has_the_same_cameras_under_either_name(tmp_path: Path, archive: str) -> None:
-    cameras = small_dtu(tmp_path, count=3, archive=archive)
-    scene = load_scene(tmp_path)
-    assert scene.format == "dtu"
-    for view, camera in zip(scene.train, cameras, strict=True):
-        np.testing.assert_allclose(view.camera.T_cam_world, camera.T_cam_world, atol=1e-9)
-    assert len(ring(3)) == len(scene.train)

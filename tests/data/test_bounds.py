@@ -66,14 +66,3 @@ def test_parallel_cameras_get_a_box_ahead_of_them_and_a_note() -> None:
     np.testing.assert_allclose(bounds[:, 2], (1.1, 4.4))
     np.testing.assert_allclose(bounds[:, 0], (-3.514286, 3.514286), rtol=1e-6)
     assert "optical axes do not meet" in notes[0]
-
-
-def test_one_camera_and_coplanar_points_still_give_a_box() -> None:
-    bounds, notes = scene_bounds(ring(3)[:1], None)
-    assert (bounds[1] > bounds[0]).all()
-    assert notes
-    flat = np.random.default_rng(0).uniform(-1, 1, (50, 3)) * (1, 1, 0)
-    bounds, _ = scene_bounds(ring(6), PointCloud(flat))
-    assert (bounds[1] > bounds[0]).all()
-    bounds, _ = scene_bounds(ring(6), PointCloud(np.zeros((50, 3))))
-    assert (bounds[1] > bounds[0]).all()

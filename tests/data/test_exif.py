@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
@@ -67,15 +65,6 @@ def test_a_place_is_read_from_xmp_where_exif_has_none(
     assert place == pytest.approx(expected)
 
 
-def test_exif_comes_before_xmp_which_gives_what_it_lacks(tmp_path: Path) -> None:
-    xmp = DJI.format(latitude="GpsLatitude", longitude="GpsLongitude")
-    assert read_taken(write(tmp_path / "a.jpg", xmp=xmp, gps=gps(10, 20, height=-3))).place == (10, 20, -3)
-    assert read_taken(write(tmp_path / "b.jpg", xmp=xmp, gps=gps(10, -20))).place == (10, -20, 198.31)
-    place = read_place(write(tmp_path / "c.jpg", gps=gps(-10, 20)))
-    assert place is not None
-    np.testing.assert_array_equal(place, [-10, 20, math.nan])
-
-
 @pytest.mark.parametrize(
     "xmp",
     [
@@ -93,19 +82,6 @@ def test_what_is_no_place_is_none(tmp_path: Path, xmp: str) -> None:
     assert read_place(tmp_path / "a.jpg") is None
 
 
-def test_times_are_compared_to_fractions_of_a_second(tmp_path: Path) -> None:
-    first = read_taken(write(tmp_path / "a.jpg", time="2026:05:01 10:00:59", part="25")).seconds
-    second = read_taken(write(tmp_path / "b.jpg", time="2026:05:01 10:01:00", part="5")).seconds
-    assert first is not None
-    assert second is not None
-    assert second - first == pytest.approx(1.25)
-
-
 @pytest.mark.parametrize("time", ["0000:00:00 00:00:00", "yesterday", "2026:13:01 10:00:59"])
 def test_a_clock_that_was_not_set_tells_no_time(tmp_path: Path, time: str) -> None:
     assert read_taken(write(tmp_path / "a.jpg", time=time)) == Taken()
-
-
-def test_a_file_that_is_no_image_tells_nothing(tmp_path: Path) -> None:
-    (tmp_path / "a.jpg").write_bytes(b"\xff\xd8\xff nothing")
-    assert read_taken(tmp_path / "a.jpg") == Taken()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
 import re
@@ -16,9 +15,8 @@ from capture_writers import ColmapModel, opengl_camera_to_world, ring
 from foreign_writers import metashape_document, metashape_transform, opensfm_reconstruction, poses
 from gs2d.core.camera import Camera
 from gs2d.data import Scene, load_scene
-from gs2d.data.faces import FACES, Face, face_name, faces_of, field_of_view, panorama, project_rays
-from gs2d.data.prepared import key_of
-from gs2d.data.undistort import Intrinsics, Lens, colmap_intrinsics
+from gs2d.data.faces import FACES, field_of_view
+from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.errors import DataError
 
 WIDTH = 256
@@ -119,18 +117,6 @@ def test_masks_go_along_and_downscaled_faces_agree_too(tmp_path: Path) -> None:
     assert_faces_agree(scene, 3.0)
 
 
-def test_prepared_pictures_of_faces_are_told_apart(tmp_path: Path) -> None:
-    panoramas(tmp_path, 3)
-    scene = load_scene(tmp_path)
-    assert len({key_of(view) for view in scene.views}) == len(scene.views) == 18
-
-
-def test_a_panorama_that_is_not_twice_as_wide_as_high_is_refused(tmp_path: Path) -> None:
-    panoramas(tmp_path, h=WIDTH // 3)
-    with pytest.raises(DataError, match=r"a panorama must be twice as wide|must be twice as wide as high, got 256x85"):
-        load_scene(tmp_path)
-
-
 def test_panoramas_of_opensfm_are_cut_too(tmp_path: Path) -> None:
     shots = poses(4)
     camera = {"projection_type": "spherical", "width": WIDTH, "height": WIDTH // 2}
@@ -158,18 +144,6 @@ def test_panoramas_of_a_colmap_model_are_cut_too(tmp_path: Path, kind: str) -> N
         model.write(tmp_path / "sparse/0", kind)
         with pytest.raises(DataError, match=words):
             load_scene(tmp_path)
-
-
-def test_a_panorama_is_projected_as_colmap_does() -> None:
-    if importlib.util.find_spec("pycolmap") is None:
-        pytest.skip("no pycolmap")
-    import pycolmap
-
-    camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=WIDTH, height=WIDTH // 2, params=[WIDTH, WIDTH // 2])
-    rays = np.random.default_rng(0).normal(size=(200, 3))
-    ours, shown = project_rays(panorama(WIDTH, WIDTH // 2, "it"), rays)
-    assert shown.all()
-    np.testing.assert_allclose(ours, camera.img_from_cam(rays), atol=1e-6)
 
 
 @pytest.mark.parametrize("calibrated", [False, True])
@@ -251,33 +225,3 @@ def test_faces_that_the_mask_of_a_round_fisheye_hides_are_left_out(tmp_path: Pat
     assert behind == ["8_back.png"]
     assert len(scene.views) == 8 * 5 + 6
     assert len([view for view in load_scene(tmp_path, test_every=0, masked="off").views if "_back" in view.name]) == 9
-
-
-def test_rays_are_seen_where_colmap_says(tmp_path: Path) -> None:
-    if importlib.util.find_spec("pycolmap") is None:
-        pytest.skip("no pycolmap")
-    import pycolmap
-
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-1.2, 1.2, (200, 2))
-    for model, params in (
-        ("OPENCV_FISHEYE", (90.0, 91.0, 100.0, 101.0, 0.02, -0.003, 0.0005, 0.0001)),
-        ("SIMPLE_FISHEYE", (90.0, 100.0, 101.0)),
-        ("FISHEYE", (90.0, 91.0, 100.0, 101.0)),
-        ("THIN_PRISM_FISHEYE", (90.0, 91.0, 100.0, 101.0, 0.02, -0.003, 0.004, -0.002, 0.0005, 0.0001, 0.003, -0.004)),
-    ):
-        camera = pycolmap.Camera(model=model, width=200, height=200, params=list(params))
-        theirs = np.array([camera.img_from_cam(np.array([x, y, 1.0])) for x, y in points])
-        k = colmap_intrinsics("camera", model, 200, 200, params)
-        ours, shown = project_rays(k, np.concatenate([points, np.ones((200, 1))], axis=1))
-        np.testing.assert_allclose(ours[shown], theirs[shown], atol=1e-6)
-        np.testing.assert_allclose(k.project(points), theirs, atol=1e-6)
-        assert shown.mean() > 0.9
-
-
-def test_a_face_is_named_by_its_photograph_and_others_need_none() -> None:
-    assert face_name("a.b/c.d.jpg", Face("up", 4)) == "a.b/c.d_up.jpg"
-    assert face_name("a.b/c", Face("up", 4)) == "a.b/c_up"
-    assert faces_of(Intrinsics(100, 80, 30.0, 30.0, 50.0, 40.0)) == ()
-    assert faces_of(Intrinsics(100, 80, 30.0, 30.0, 50.0, 40.0, Lens("perspective", (0.1,)))) == ()
-    assert [face.name for face in faces_of(panorama(100, 50, "it"))] == list(FACES)

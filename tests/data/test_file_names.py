@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import unicodedata
 from collections.abc import Callable
 from pathlib import Path
@@ -14,11 +13,9 @@ from PIL import Image
 
 from capture_writers import small_blender, small_colmap, small_nerfstudio
 from foreign_writers import small_alicevision, small_metashape, small_opensfm
-from gs2d.data import file_names, load_scene
-from gs2d.data.file_names import Files, in_any_case
+from gs2d.data import load_scene
+from gs2d.data.file_names import Files
 from gs2d.data.photo_formats import HEIF
-from gs2d.data.priors import find_maps
-from gs2d.errors import DataError
 
 
 def files(root: Path, *names: str) -> None:
@@ -58,42 +55,6 @@ def test_the_longest_end_of_a_path_that_names_one_file_counts(
 ) -> None:
     files(tmp_path, *there)
     assert matched(tmp_path, name) == [expected]
-
-
-def test_a_file_in_a_folder_that_contradicts_the_name_counts_only_if_all_were_moved(tmp_path: Path) -> None:
-    files(tmp_path, "left/1.png", "left/2.png")
-    assert matched(tmp_path, "right/1.png", "right/2.png") == ["left/1.png", "left/2.png"]
-    assert matched(tmp_path, "left/1.png", "right/2.png") == ["left/1.png", None]
-    assert matched(tmp_path, "right/1.png", moved=False) == [None]
-
-
-def test_no_two_names_get_one_file_by_an_end_of_their_paths(tmp_path: Path) -> None:
-    files(tmp_path, "1.png")
-    assert matched(tmp_path, "left/1.png", "right/1.png") == [None, None]
-    assert matched(tmp_path, "left/1.png", "1.png") == [None, "1.png"]
-    assert matched(tmp_path, "left/1.png", "left/1.png") == ["1.png", "1.png"]
-    assert matched(tmp_path, "left/1.png", taken={tmp_path / "1.png"}) == [None]
-
-
-def test_each_folder_is_listed_once_for_thousands_of_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    files(tmp_path, *(f"x/{i}.png" for i in range(50)))
-    walked, listed = [], []
-    walk, listdir = os.walk, os.listdir
-    monkeypatch.setattr(file_names.os, "walk", lambda folder: walked.append(folder) or walk(folder))
-    monkeypatch.setattr(file_names.os, "listdir", lambda folder: listed.append(folder) or listdir(folder))
-    names = [f"D:\\scan\\{i % 50}.png" for i in range(50)] + [f"lost/n{i}.png" for i in range(3000)]
-    assert sum(name is not None for name in matched(tmp_path, *names)) == 50
-    assert len(walked) == 1
-    assert len(listed) == 2  # the two folders of the names
-
-
-def test_a_folder_in_other_letters_is_found_if_it_is_the_only_one(tmp_path: Path) -> None:
-    (tmp_path / "Masks").mkdir()
-    assert in_any_case(tmp_path, "masks") == tmp_path / "Masks"
-    (tmp_path / "MASKS").mkdir()
-    assert in_any_case(tmp_path, "masks") == tmp_path / "masks"
-    (tmp_path / "masks").mkdir()
-    assert in_any_case(tmp_path, "masks") == tmp_path / "masks"
 
 
 def renamed(name: str) -> str:
@@ -157,39 +118,6 @@ def test_blender_finds_photographs_of_another_machine_and_takes_none_of_the_othe
     assert (len(scene.train), len(scene.test), len(scene.skipped)) == (4, 0, 2)
 
 
-@pytest.mark.parametrize("write", [small_colmap, small_nerfstudio, small_opensfm])
-def test_a_photograph_with_another_extension_is_named_in_the_error(
-    tmp_path: Path, write: Callable[[Path], object]
-) -> None:
-    write(tmp_path)
-    for path in (tmp_path / "images").iterdir():
-        Image.open(path).save(path.with_suffix(".webp"))
-        path.unlink()
-    with pytest.raises(DataError, match=r"no such file.*; images/\w+\.webp is there: list it under its own extension"):
-        load_scene(tmp_path)
-
-
-def test_sparse_points_belong_to_the_view_of_a_renamed_photograph(tmp_path: Path) -> None:
-    model = small_colmap(tmp_path, kind="txt")
-    path = tmp_path / "sparse/0/images.txt"
-    path.write_text(path.read_text().replace(" 7 8.png\n1.5 2.5 -1", " 7 8.png\n1.5 2.5 1"))
-    text = path.read_text().replace(" 7 8.png\n\n", " 7 8.png\n1.5 2.5 1\n").replace(" 7 ", " 7 D:\\scan\\")
-    path.write_text(text)
-    scene = load_scene(tmp_path)
-    assert scene.observe is not None
-    assert scene.observe().seen["8.png"].tolist() == [0]
-    assert model.points[0][0] == 1
-
-
-def test_images_n_of_another_case_is_used(tmp_path: Path) -> None:
-    small_colmap(tmp_path)
-    (tmp_path / "images_2").mkdir()
-    for path in (tmp_path / "images").iterdir():
-        Image.open(path).resize((20, 15)).save(tmp_path / "images_2" / path.name.upper())
-    scene = load_scene(tmp_path, downscale=2)
-    assert {view.path.parent.name for view in scene.views} == {"images_2"}
-
-
 def test_masks_maps_and_points_of_another_machine_are_found(tmp_path: Path) -> None:
     there = {"mask_path": "masks", "depth_file_path": "depths", "normal_file_path": "normals"}
     keys = {key: f"E:\\scan\\{folder}\\f.png" for key, folder in there.items()}
@@ -221,23 +149,6 @@ def test_a_photograph_is_not_its_own_mask_or_depth_map(tmp_path: Path) -> None:
     assert scene.masks.found == 0
     assert "2 masks named in transforms.json do not exist" in scene.notes
     assert "2 depth maps named in transforms.json do not exist" in scene.notes
-
-
-def test_the_split_may_be_written_in_other_paths_than_the_frames(tmp_path: Path) -> None:
-    names = [f"images/f_{i:02d}.png" for i in range(9)]
-    lists = {
-        "train_filenames": [f"D:\\x\\{name}" for name in names[:5]],
-        "test_filenames": [n.upper() for n in names[5:]],
-    }
-    small_nerfstudio(tmp_path, meta=lists)
-    scene = load_scene(tmp_path)
-    assert ([v.name for v in scene.train], [v.name for v in scene.test]) == (names[:5], names[5:])
-
-
-def test_maps_are_found_whatever_their_case(tmp_path: Path) -> None:
-    files(tmp_path, "A/1.PNG", "a/2.jpg.npy")
-    found = find_maps(tmp_path, ["a/1.jpg", "a/2.jpg", "b/1.jpg"], (".npy", ".png"))
-    assert found == [tmp_path / "A/1.PNG", tmp_path / "a/2.jpg.npy", None]
 
 
 @pytest.mark.skipif(bool(HEIF), reason="a package for HEIC is installed")

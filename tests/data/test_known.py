@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,13 +14,11 @@ from PIL import Image
 from capture_writers import ring, small_colmap
 from gs2d.core.splats import Splats
 from gs2d.data import View, load_scene
-from gs2d.data.cache import DecodedImage
 from gs2d.data.undistort import colmap_intrinsics, source_positions
 from gs2d.pipeline import mesh as surface
 from gs2d.pipeline.events import ignore
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
-from gs2d.report.images import HATCHED, IGNORED, valid_image
 from gs2d.training.targets import DeviceTargets, Targets
 
 WIDTH, HEIGHT = 160, 120
@@ -60,41 +57,11 @@ def test_what_the_photograph_does_not_reach_is_unknown_and_also_outside_the_mask
     np.testing.assert_array_equal(masked.usable(masks=True), masked.mask())
 
 
-def test_all_of_a_photograph_without_distortion_is_known(tmp_path: Path) -> None:
-    view = distorted(tmp_path / "a", (110.0, 80.0, 60.0, 0.0))
-    assert view.valid() is None
-    assert view.mask() is None
-    assert view.usable(masks=False) is None
-    masked = distorted(tmp_path / "b", (110.0, 80.0, 60.0, 0.0), mask=True)
-    assert masked.valid() is None
-    assert masked.usable(masks=False) is None
-    assert not masked.usable(masks=True)[60, 120]
-
-
-def test_nerfstudio_captures_say_it_too(tmp_path: Path) -> None:
-    (tmp_path / "images").mkdir()
-    frames = []
-    for i, camera in enumerate(ring(3)):
-        Image.fromarray(np.full((HEIGHT, WIDTH, 3), 90, np.uint8)).save(tmp_path / f"images/{i}.png")
-        pose = np.linalg.inv(camera.T_cam_world) @ np.diag([1.0, -1, -1, 1])
-        frames.append({"file_path": f"images/{i}.png", "transform_matrix": pose.tolist()})
-    f, cx, cy, k1 = PINCUSHION
-    facts = {"fl_x": f, "fl_y": f, "cx": cx, "cy": cy, "w": WIDTH, "h": HEIGHT, "k1": k1, "camera_model": "OPENCV"}
-    (tmp_path / "transforms.json").write_text(json.dumps({**facts, "frames": frames}))
-    np.testing.assert_array_equal(load_scene(tmp_path, test_every=0).train[0].valid(), reached())
-
-
 def test_a_smaller_picture_knows_what_all_its_pixels_know(tmp_path: Path) -> None:
     distorted(tmp_path)
     view = load_scene(tmp_path, test_every=0, downscale=4).train[0]
     blocks = reached().reshape(HEIGHT // 4, 4, WIDTH // 4, 4).all(axis=(1, 3))
     np.testing.assert_array_equal(view.valid(), blocks)
-
-
-def test_a_mask_that_is_what_is_known_takes_no_memory_twice() -> None:
-    valid = np.eye(4, dtype=bool)
-    image = DecodedImage(np.zeros((4, 4, 3), np.uint8), valid, None, valid)
-    assert image.nbytes == 48 + 16
 
 
 def images(unknown: int) -> View:
@@ -140,18 +107,3 @@ def test_the_depth_of_unknown_pixels_is_not_fused(use_masks: bool) -> None:
     assert frame.valid is not None
     assert frame.valid[:, 4:].any()
     assert not frame.valid[:, :4].any()
-
-
-def test_a_photograph_is_hatched_where_it_ends() -> None:
-    valid = np.ones((20, 20), bool)
-    valid[:, :10] = False
-    photo = np.where(valid[..., None], 0.5, np.zeros(3)).astype(np.float32)
-    shown = valid_image(photo, valid)
-    assert shown.dtype == np.float32
-    np.testing.assert_array_equal(shown[valid], photo[valid])
-    tones = np.unique(shown[~valid], axis=0)
-    np.testing.assert_allclose(tones, [IGNORED, HATCHED], atol=1e-6)
-    assert valid_image(photo, None) is photo
-    straight = valid_image(np.zeros((20, 20, 4), np.uint8), valid)
-    assert (straight[~valid][:, 3] == 255).all()
-    assert straight[~valid].min() > 200

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +13,6 @@ from PIL import Image
 from capture_writers import small_blender, small_colmap, small_dtu, small_nerfstudio
 from foreign_writers import small_alicevision, small_metashape, small_opensfm
 from gs2d.data import Scene, load_scene
-from gs2d.data.masks import find_masks_in
 from gs2d.errors import DataError
 
 HALF = np.where(np.arange(40) < 20, 255, 0).astype(np.uint8)[None].repeat(30, axis=0)  # the left half is kept
@@ -60,26 +58,6 @@ def test_masks_are_found_where_tools_put_them(
     assert scene.masks.found == 1
     assert any(f"masks: 1 of {len(names)} views have one in" in note for note in scene.notes)
     assert sorted(view.name for view in scene.views) == sorted(names)
-
-
-def test_nerfstudio_names_masks_itself_and_a_folder_of_the_user_wins(tmp_path: Path) -> None:
-    small_nerfstudio(tmp_path, frame={"mask_path": "other/m.png"})
-    write(tmp_path / "other" / "m.png")
-    scene = load_scene(tmp_path)
-    assert len(masked_names(scene)) == 9
-    assert any("masks: 9 of 9 views have one in the file of cameras (white = keep)" in note for note in scene.notes)
-    write(tmp_path / "mine" / "f_02.png")
-    scene = load_scene(tmp_path, masks=tmp_path / "mine")
-    assert masked_names(scene) == ["images/f_02.png"]
-    assert f"in {tmp_path / 'mine'} (white = keep, the rest is ignored); the other 8 are whole" in scene.notes[-1]
-
-
-def test_a_named_folder_serves_dtu_whose_own_masks_are_silhouettes(tmp_path: Path) -> None:
-    small_dtu(tmp_path / "scan")
-    assert load_scene(tmp_path / "scan").masks.found == 0
-    first = load_scene(tmp_path / "scan").views[0]
-    write(tmp_path / "mine" / f"{Path(first.name).stem}.png", HALF[: first.camera.height, : first.camera.width])
-    assert load_scene(tmp_path / "scan", masks=tmp_path / "mine").masks.found == 1
 
 
 @pytest.mark.parametrize("masked", ["ignore", "empty", "off"])
@@ -149,15 +127,6 @@ def test_empty_makes_an_alpha_channel_of_the_mask_in_every_view(tmp_path: Path) 
     assert any("(white = keep, the rest is empty)" in note for note in scene.notes)
 
 
-def test_off_uses_no_mask_and_says_so(tmp_path: Path) -> None:
-    small_nerfstudio(tmp_path, frame={"mask_path": "other/m.png"})
-    write(tmp_path / "other" / "m.png")
-    scene = load_scene(tmp_path, masked="off")
-    assert scene.masks.found == 0
-    assert all(view.mask() is None for view in scene.views)
-    assert "masks are not used (--masked off)" in scene.notes
-
-
 def test_masks_of_another_size_are_scaled_and_of_another_shape_refused(tmp_path: Path) -> None:
     small_colmap(tmp_path)
     write(tmp_path / "masks" / "3.png", HALF.repeat(2, axis=0).repeat(2, axis=1))
@@ -176,21 +145,3 @@ def test_a_folder_without_masks_of_these_photographs_and_a_wrong_word_are_refuse
         load_scene(tmp_path, masks=tmp_path / "missing")
     with pytest.raises(DataError, match="masked must be one of ignore, empty, off, got black"):
         load_scene(tmp_path, masked="black")
-
-
-def test_a_missing_mask_that_the_file_names_is_told(tmp_path: Path) -> None:
-    small_nerfstudio(tmp_path)
-    data = json.loads((tmp_path / "transforms.json").read_text())
-    data["frames"][0]["mask_path"] = "gone.png"
-    (tmp_path / "transforms.json").write_text(json.dumps(data))
-    assert "1 masks named in transforms.json do not exist" in load_scene(tmp_path).notes
-
-
-def test_the_longest_name_is_looked_for_first(tmp_path: Path) -> None:
-    for name in ("a/b.jpg.png", "a/b.png", "a/b_mask.png"):
-        write(tmp_path / name)
-    order = []
-    while (found := find_masks_in([tmp_path], ["a/b.jpg"])[0]) is not None:
-        order.append(found.name)
-        found.unlink()
-    assert order == ["b.jpg.png", "b.png", "b_mask.png"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,18 +12,17 @@ from PIL import Image
 from capture_writers import small_colmap
 from gs2d.data import Scene, View, load_scene
 from gs2d.data import prepare as preparing
-from gs2d.data.prepare import check_disk, prepare
+from gs2d.data.prepare import prepare
 from gs2d.data.prepared import (
     AHEAD,
     Stored,
     forget_others,
-    key_of,
     missing_views,
     prepared_scene,
     read_prepared,
     write_prepared,
 )
-from gs2d.errors import DataError, DiskError
+from gs2d.errors import DataError
 
 
 @pytest.fixture
@@ -91,13 +89,6 @@ def test_prepared_pictures_and_masks_are_those_of_the_photographs_bit_for_bit(
     assert any(view.valid() is not None for view in scene.views)  # the lens leaves corners unknown
 
 
-def test_few_pictures_stay_in_memory_however_many_there_are(capture: Path, tmp_path: Path) -> None:
-    scene = ready(capture, tmp_path / "prepared")
-    cache = scene.views[0].cache
-    assert cache.max_bytes == 2 * (AHEAD + 1) * 7 * 40 * 30
-    assert all(view.cache is cache for view in scene.views)
-
-
 def test_what_was_broken_off_is_gone_on_with_and_a_changed_photograph_is_prepared_again(
     capture: Path, tmp_path: Path
 ) -> None:
@@ -136,14 +127,6 @@ def test_a_damaged_file_is_as_none_and_the_photograph_is_read_instead(capture: P
         np.testing.assert_array_equal(view.image(), picture)
 
 
-def test_a_file_of_another_photograph_is_not_taken(capture: Path, tmp_path: Path) -> None:
-    scene = ready(capture, tmp_path / "prepared")
-    one, other = scene.views[:2]
-    stored(one).file.write_bytes(stored(other).file.read_bytes())
-    assert read_prepared(stored(one).file, stored(one).key) is None
-    assert key_of(loaded(capture).views[0]) != key_of(loaded(capture, 2).views[0])
-
-
 def test_several_processes_write_the_same_files(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     here = ready(capture, tmp_path / "here")
     monkeypatch.setattr(preparing, "MANY_PIXELS", 0)
@@ -165,23 +148,6 @@ def test_a_photograph_that_does_not_decode_in_a_process_is_one_line_and_the_othe
     with pytest.raises(DataError, match=f"image {broken} does not decode: .*; replace or remove the file"):
         list(prepare(missing_views(scene), 2))
     assert not any(path.name.endswith(".gs2d.tmp") for path in folder.iterdir())
-
-
-def test_a_disk_without_room_is_refused_before_anything_is_written(capture: Path, tmp_path: Path) -> None:
-    scene = prepared_scene(loaded(capture), tmp_path / "run/prepared")
-    with pytest.raises(DiskError, match=r"6 prepared photographs need about .* GiB of disk, got .* that --disk allows"):
-        check_disk(tmp_path / "run/prepared", missing_views(scene), 1000)
-    check_disk(tmp_path / "run/prepared", missing_views(scene), 1 << 20)
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write anywhere")
-def test_a_folder_that_cannot_be_written_is_one_line(capture: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "prepared"
-    folder.mkdir(mode=0o500)
-    scene = prepared_scene(loaded(capture), folder)
-    with pytest.raises(DiskError, match="cannot write"):
-        list(prepare(missing_views(scene), 1))
 
 
 def test_a_reader_from_elsewhere_keeps_its_views_as_they_are(capture: Path, tmp_path: Path) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from capture_writers import small_blender, small_colmap, small_nerfstudio
+from capture_writers import small_colmap, small_nerfstudio
 from gs2d.data import load_scene
 from gs2d.data.priors import read_depth, read_normals, sample, shrink
 from gs2d.data.scene import View
@@ -45,45 +44,11 @@ def test_depth_maps_lie_in_depths_under_the_names_of_the_photographs(tmp_path: P
     assert (scene.train[0].maps.depth().values == slope()).all()
 
 
-def test_a_capture_without_maps_says_nothing_about_them(tmp_path: Path) -> None:
-    small_colmap(tmp_path)
-    scene = load_scene(tmp_path)
-    assert not any("maps" in note for note in scene.notes)
-    assert all(view.maps is None for view in scene.views)
-
-
-def test_blender_views_have_their_maps_in_a_folder_of_the_split(tmp_path: Path) -> None:
-    small_blender(tmp_path)
-    write_depth(tmp_path / "depths" / "train" / "r_1.png", slope())
-    scene = load_scene(tmp_path)
-    assert [view.maps is not None for view in scene.train] == [False, True, False, False]
-    assert all(view.maps is None for view in scene.test)
-
-
 def test_transforms_json_names_maps_and_their_unit(tmp_path: Path) -> None:
     small_nerfstudio(tmp_path, meta={"depth_unit_scale_factor": 0.01}, frame={"depth_file_path": "d/one.png"})
     write_depth(tmp_path / "d" / "one.png", slope())
     files = view_of(tmp_path).maps.files
     assert (files.depth, files.unit, files.metric) == (tmp_path / "d" / "one.png", 0.01, True)
-
-
-def test_maps_that_are_named_and_missing_are_no_reason_to_stop(tmp_path: Path) -> None:
-    small_nerfstudio(tmp_path, frame={"depth_file_path": "d/none.png"})
-    assert view_of(tmp_path).maps is None
-
-
-@pytest.mark.parametrize("unit", [0, -1.0, "mm", True])
-def test_a_unit_that_is_none_is_refused(tmp_path: Path, unit: object) -> None:
-    small_nerfstudio(tmp_path, meta={"depth_unit_scale_factor": unit})
-    with pytest.raises(DataError, match="depth_unit_scale_factor must be a positive number, got"):
-        load_scene(tmp_path)
-
-
-def test_a_view_that_is_moved_keeps_its_maps(tmp_path: Path) -> None:
-    small_colmap(tmp_path)
-    write_depth(tmp_path / "depths" / "0.png", slope())
-    view = view_of(tmp_path)
-    assert view.at(view.camera.T_cam_world).maps is view.maps
 
 
 # -- files ----------------------------------------------------------------------------------------------------------
@@ -93,18 +58,6 @@ def test_depths_of_8_16_and_32_bits_are_read_as_they_are(tmp_path: Path, kind: t
     for suffix in (".npy", ".tif"):
         write_depth(tmp_path / f"d{suffix}", values)
         assert (read_depth(tmp_path / f"d{suffix}") == values).all()
-
-
-def test_three_channels_that_are_alike_are_one(tmp_path: Path) -> None:
-    values = np.array([[1, 2, 3], [4, 5, 250]], np.uint8)
-    Image.fromarray(np.repeat(values[..., None], 3, axis=2)).save(tmp_path / "d.png")
-    assert (read_depth(tmp_path / "d.png") == values).all()
-
-
-def test_an_array_may_have_an_axis_of_one_channel(tmp_path: Path) -> None:
-    for k, shape in enumerate(((1, 2, 3), (2, 3, 1))):
-        np.save(tmp_path / f"{k}.npy", np.arange(1, 7).reshape(shape))
-        assert read_depth(tmp_path / f"{k}.npy").shape == (2, 3)
 
 
 def broken_files(folder: Path) -> dict[str, Path]:
@@ -173,19 +126,6 @@ def test_downscaled_maps_fit_downscaled_photographs(tmp_path: Path) -> None:
     assert (found == shrink(slope().astype(np.float32), 4)[:7]).all()
 
 
-def test_a_view_that_is_downscaled_later_is_the_one_that_is_downscaled_at_once(tmp_path: Path) -> None:
-    small_colmap(tmp_path)
-    write_depth(tmp_path / "depths" / "0.png", slope())
-    whole, small = view_of(tmp_path), view_of(tmp_path, downscale=4)
-    later = whole.downscaled(4)
-    assert (later.camera.width, later.camera.height) == (small.camera.width, small.camera.height)
-    assert (later.camera.K == small.camera.K).all()
-    assert (later.image() == small.image()).all()
-    assert later.maps is not None
-    assert (later.maps.depth().values == small.maps.depth().values).all()
-    assert whole.downscaled(1) is whole
-
-
 def test_smaller_maps_are_interpolated_where_neighbours_agree_and_only_there() -> None:
     values = np.array([[100, 102, 200, 0]] * 2, dtype=np.float32)
     x = np.array([1.0, 1.75, 2.25, 3.0])  # centres are at 0.5, 1.5, 2.5, 3.5
@@ -193,14 +133,6 @@ def test_smaller_maps_are_interpolated_where_neighbours_agree_and_only_there() -
     found = sample(values, positions, np.ones((1, 4), dtype=bool))[0]
     assert found.tolist() == [101, 102, 200, 0]  # between; an edge: the nearest; an edge; a hole
     assert (sample(values, positions, np.zeros((1, 4), dtype=bool)) == 0).all()
-
-
-def test_a_map_of_half_the_size_covers_the_same_picture(tmp_path: Path) -> None:
-    small_colmap(tmp_path)
-    write_depth(tmp_path / "depths" / "0.npy", np.linspace(100, 103, 20)[None].repeat(15, axis=0))
-    found = view_of(tmp_path).maps.depth().values
-    expected = np.interp((np.arange(40) + 0.5) / 2 - 0.5, np.arange(20), np.linspace(100, 103, 20))
-    assert np.allclose(found, expected, atol=1e-4)
 
 
 def test_maps_are_undistorted_with_their_photographs(tmp_path: Path) -> None:
@@ -234,24 +166,6 @@ def test_normals_are_decoded_to_unit_vectors_and_black_is_unknown(tmp_path: Path
     assert np.allclose(read_normals(tmp_path / "n.npy"), [[[0, 0.6, 0.8], [0, 0, 0]]])
 
 
-@pytest.mark.parametrize(("name", "message"), [("zero.png", "must hold unit vectors"), ("flat.npy", r"\[H, W, 3\]")])
-def test_files_that_hold_no_normals_are_named(tmp_path: Path, name: str, message: str) -> None:
-    with pytest.raises(DataError, match=message):
-        read_normals(broken_files(tmp_path)[name])
-
-
-def test_normal_maps_lie_in_normals(tmp_path: Path) -> None:
-    small_colmap(tmp_path)
-    rgb = np.full((60, 80, 3), (128, 128, 255), np.uint8)
-    rgb[:, 40:] = (255, 128, 128)
-    (tmp_path / "normals").mkdir()
-    Image.fromarray(rgb).save(tmp_path / "normals" / "0.png")
-    found = view_of(tmp_path).maps.normal()
-    assert found.shape == (30, 40, 3)
-    assert np.allclose(found[:, :20], [0, 0, 1], atol=0.01)
-    assert np.allclose(found[:, 20:], [1, 0, 0], atol=0.01)  # no mixture between
-
-
 # -- points ---------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("kind", ["bin", "txt"])
 def test_points_are_known_by_the_photographs_that_were_found_to_show_them(tmp_path: Path, kind: str) -> None:
@@ -283,16 +197,3 @@ def test_what_photographs_show_is_read_once_until_it_is_forgotten(tmp_path: Path
     assert {name: rows.tolist() for name, rows in again.seen.items()} == {
         name: rows.tolist() for name, rows in first.seen.items()
     }
-
-
-def test_a_model_without_points_cannot_say_which_are_seen(tmp_path: Path) -> None:
-    small_colmap(tmp_path, points=[])
-    scene = load_scene(tmp_path)
-    assert "must hold sparse points in points3D.bin" in scene.unobserved()
-    assert scene.observed() is None
-
-
-def test_other_formats_do_not_say_which_points_are_seen(tmp_path: Path) -> None:
-    small_blender(tmp_path)
-    assert load_scene(tmp_path).observe is None
-    assert json.loads((tmp_path / "transforms_train.json").read_text())

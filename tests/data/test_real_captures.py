@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from skimage.feature import SIFT, match_descriptors
 
-from capture_writers import tree_hash
 from gs2d.core.camera import Camera
 from gs2d.data import Scene, load_scene
 from gs2d.data.image_files import read_image
-from gs2d.data.readers.colmap import ColmapImage, model_folder, read_images, read_points
+from gs2d.data.readers.colmap import model_folder, read_images, read_points
 from gs2d.data.undistort import colmap_intrinsics
 
 Shared = Callable[[str], Path]
@@ -168,26 +167,6 @@ def test_fox_loads_whole_with_its_missing_frames_reported(shared: Shared) -> Non
     assert np.abs(scene.bounds).max() < 8
 
 
-def test_dtu_masks_and_its_millimetres(shared: Shared) -> None:
-    scene = load_scene(shared("dtu_scan24"), downscale=2)
-    view = scene.train[10]
-    assert view.image().shape == (600, 800, 3)
-    mask = view.object_mask()
-    pixels, _ = view.camera.project(scene.points.points)
-    inside = (pixels >= 0).all(axis=1) & (pixels < (800, 600)).all(axis=1)
-    column, row = pixels[inside].astype(int).T
-    assert mask[row, column].mean() > mask.mean()  # the object has more points than the table
-    assert scene.T_metric_scene[0, 0] == pytest.approx(231.0682, abs=1e-3)
-
-
-def test_lego_and_bottle_have_their_customary_box_and_split(shared: Shared) -> None:
-    for name, train, test in (("nerf_synthetic_lego", 100, 40), ("rendered_bottle", 60, 20)):
-        scene = load_scene(shared(name))
-        assert (len(scene.train), len(scene.test)) == (train, test)
-        np.testing.assert_array_equal(scene.bounds, [[-1.3] * 3, [1.3] * 3])
-        assert scene.train[0].alpha() is not None
-
-
 def test_the_bottle_s_depth_maps_agree_with_its_cameras(shared: Shared) -> None:
     """Back-projected ground-truth depth of test view 0, seen from test view 1, falls on that view's silhouette."""
     root = shared("rendered_bottle")
@@ -204,23 +183,6 @@ def test_the_bottle_s_depth_maps_agree_with_its_cameras(shared: Shared) -> None:
     pixels, _ = b.camera.project(world)
     j, i = pixels.astype(int).T
     assert (b.alpha()[i, j] > 0).mean() > 0.999
-
-
-def test_loading_the_real_captures_changes_no_file(shared: Shared) -> None:
-    for name in ("strecha_fountain_P11", "fox_instant_ngp"):
-        root = shared(name)
-        before = tree_hash(root)
-        scene = load_scene(root, downscale=2)
-        scene.train[0].image()
-        assert tree_hash(root) == before
-
-
-def test_names_of_the_model_and_of_the_views_agree(shared: Shared) -> None:
-    root = shared("colmap_mouse")
-    scene = load_scene(root)
-    images: list[ColmapImage] = read_images(root / "sparse/0", "bin")
-    assert sorted(view.name for view in scene.views) == sorted(image.name for image in images)
-    assert {(v.camera.width, v.camera.height) for v in scene.views} == {(1920, 1440), (1440, 1920)}
 
 
 @pytest.mark.parametrize("name", ["dtu_scan24", "strecha_fountain_P11"])

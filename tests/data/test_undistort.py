@@ -12,7 +12,6 @@ from PIL import Image
 from capture_writers import small_colmap
 from gs2d.data import load_scene
 from gs2d.data.undistort import Intrinsics, Lens, colmap_intrinsics, source_positions, undistort_image
-from gs2d.errors import DataError
 
 WIDTH, HEIGHT, F, CX, CY = 160, 120, 110.0, 77.0, 63.5
 MODELS = {
@@ -62,13 +61,6 @@ def test_parameters_of_each_colmap_model_are_in_colmap_s_order() -> None:
     # A lens without distortion needs no undistortion, unless it is a fisheye.
     assert of("OPENCV", 1, 2, 3, 4, 0, 0, 0, 0).lens is None
     assert of("OPENCV_FISHEYE", 1, 2, 3, 4, 0, 0, 0, 0).lens == Lens("fisheye", (0, 0, 0, 0))
-
-
-def test_wrong_parameters_are_errors_that_name_the_camera() -> None:
-    with pytest.raises(DataError, match="camera 9: the model PINHOLE must have 4 parameters, got 3"):
-        colmap_intrinsics("camera 9", "PINHOLE", 40, 30, (1, 2, 3))
-    with pytest.raises(DataError, match="camera 9 must have a positive size and focal length"):
-        colmap_intrinsics("camera 9", "PINHOLE", 40, 30, (0, 2, 3, 4))
 
 
 def ideal_pixels_of_sensor(k: Intrinsics) -> np.ndarray:
@@ -146,24 +138,6 @@ def test_a_polynomial_that_folds_back_is_cut_where_it_turns() -> None:
     k = Intrinsics(400, 20, 100.0, 100.0, 200.0, 10.0, lens)
     _, valid = source_positions(k)
     np.testing.assert_array_equal(np.flatnonzero(valid[10])[[0, -1]], [200 - 129, 199 + 129])
-
-
-def test_undistortion_without_a_lens_is_the_identity() -> None:
-    image = np.random.default_rng(0).integers(0, 256, (17, 23, 4)).astype(np.uint8)
-    image[..., 3] |= 1
-    positions, valid = source_positions(Intrinsics(23, 17, 20.0, 20.0, 11.0, 8.0))
-    assert valid.all()
-    out = undistort_image(image, positions, valid)
-    np.testing.assert_allclose(out.astype(int), image.astype(int), atol=1)
-    np.testing.assert_array_equal(out[..., 3], image[..., 3])
-
-
-def test_colour_is_interpolated_premultiplied() -> None:
-    """Half way between opaque (200) and transparent (0): alpha 128, and the colour stays 200 instead of 100."""
-    image = np.zeros((1, 2, 4), np.uint8)
-    image[0, 0] = (200, 200, 200, 255)
-    out = undistort_image(image, np.array([[[1.0, 0.5]]], np.float32), np.ones((1, 1), bool))
-    np.testing.assert_array_equal(out[0, 0], (200, 200, 200, 128))
 
 
 def test_masks_are_undistorted_with_their_picture(tmp_path: Path) -> None:

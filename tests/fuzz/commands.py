@@ -1,4 +1,4 @@
-"""What is mutated beside foreign files: run folders changed by hand, command lines, and the numbers of splats."""
+"""What is mutated beside foreign files: run folders changed by hand, and command lines."""
 
 from __future__ import annotations
 
@@ -8,19 +8,14 @@ import os
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from random import Random
 from tempfile import TemporaryDirectory
 from typing import Any
 from unittest import mock
 
 import mutations as m
-import numpy as np
-import torch
 from PIL import Image
 
 from cli_runs import TINY
-from gs2d.core.splats import Splats
-from render_scenes import IMAGES, random_camera, random_splats
 from tiny import write_capture
 
 # -- runs --------------------------------------------------------------------------------------------------------------
@@ -148,59 +143,6 @@ def read_line(root: Path) -> None:
         raise DataError(" ".join(str(error).split())) from error
     if hasattr(command, "overrides"):
         apply_overrides(get_recipe(getattr(command, "recipe", None) or "2dgs-r"), command.overrides)
-
-
-# -- splats ------------------------------------------------------------------------------------------------------------
-_SHAPES = {"means": (3,), "quats": (4,), "log_scales": (2,), "opacity_logits": (), "sh0": (1, 3), "shN": (3, 3)}
-_EDGES = (*(float("nan"), float("inf"), -float("inf"), 0.0, -0.0, 1e-45, -1e-38, 1e18, -1e19, 1e20, 3.4e38, -3.4e38),
-          *(1.0, -1.0, 88.0, 89.0, -88.0, -104.0, 16777216.0, 0.2, 1000.0))  # fmt: skip
-
-
-def scene_seeds() -> list[dict[str, bytes]]:
-    """Random scenes of every kind: rows of 28 float32 each, and the seed of the camera in the name."""
-    seeds = []
-    for number in range(40):
-        rng = np.random.default_rng(number)
-        splats = random_splats(rng, random_camera(rng), int(rng.integers(1, 30)))
-        rows = [tensor.reshape(len(splats), -1) for _, tensor in splats.items()]
-        rows[-1] = torch.randn(len(splats), 9, generator=torch.Generator().manual_seed(number)) * 0.3
-        seeds.append({f"{number}.splats": torch.cat(rows, dim=1).float().numpy().tobytes()})
-    return seeds
-
-
-def of_floats(rng: Random, data: bytes) -> bytes:
-    """A few numbers become edges of float32."""
-    values = np.frombuffer(bytearray(data), np.float32)
-    for _ in range(rng.choice((0, 1, 1, 2, 5))):
-        values[rng.randrange(len(values))] = rng.choice(_EDGES)
-    return values.tobytes()
-
-
-def splats_of(data: bytes) -> Splats:
-    rows, parts, at = torch.from_numpy(np.frombuffer(bytearray(data), np.float32).reshape(-1, 22)), {}, 0
-    for name, shape in _SHAPES.items():
-        size = int(np.prod(shape, dtype=int))
-        parts[name], at = rows[:, at : at + size].reshape(-1, *shape).contiguous(), at + size
-    return Splats(**parts)
-
-
-def draw(root: Path) -> None:
-    """The CPU kernels against the reference: finite, and the same alpha and colours but for pixels on an edge."""
-    from gs2d.render.api import rasterize
-    from gs2d.render.types import RasterSettings
-
-    (path,) = root.iterdir()
-    rng = np.random.default_rng(int(path.stem))
-    camera, splats = random_camera(rng), splats_of(path.read_bytes())
-    settings = RasterSettings(background=(0.2, 0.5, 0.9))
-    low = rasterize(splats, camera, settings, backend="cpu")
-    high = rasterize(splats.to(dtype=torch.float64), camera, settings, backend="reference")
-    for name in IMAGES:
-        assert bool(getattr(low, name).isfinite().all()), f"{name} of the CPU is not finite"
-    colors = (low.color - high.color).abs() / high.color.abs().clamp_min(1)  # SH of 1e7 are rounded to 1e-7 of that
-    apart = torch.maximum((low.alpha - high.alpha).abs().reshape(-1), colors.amax(-1).reshape(-1))
-    share = float((apart > 0.02).double().mean())
-    assert share <= 0.01, f"{share:.1%} of the pixels differ by more than 0.02 (of their colour, where that is above 1)"
 
 
 JSON_LINE = m.either(m.of_json, m.of_json, m.of_text)

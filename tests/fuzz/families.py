@@ -17,7 +17,6 @@ from unittest import mock
 import commands as c
 import mutations as m
 import numpy as np
-import run_parts as parts
 import torch
 from mutations import Mutation
 from PIL import Image
@@ -62,10 +61,6 @@ class Family:
 @cache
 def _seeds(name: str) -> list[Files]:
     return FAMILIES[name].seeds()
-
-
-def files_of(root: Path) -> Files:
-    return {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
 
 
 def written(*writers: Callable[[Path], object]) -> Callable[[], list[Files]]:
@@ -230,6 +225,24 @@ def _gltf_text(root: Path) -> None:
     document["nodes"] = [{"mesh": 0, "rotation": [0, 0.6, 0, 0.8], "scale": [2, 2, 2]}, {"children": [0]}]
     document["scenes"] = [{"nodes": [1]}]
     (root / "a.gltf").write_text(json.dumps(document))
+
+
+def _stream(root: Path) -> None:
+    """A tree of a few leaves in some levels."""
+    from gs2d.io.formats import sog_streamed
+    from gs2d.io.formats.registry import write_layout
+
+    with mock.patch.object(sog_streamed, "_LEAF", 20), mock.patch.object(sog_streamed, "_FILE", 30):
+        write_layout(root / "lod-meta.json", some_splats(60), "streamed")
+
+
+def read_stream(root: Path) -> None:
+    """As `gs2d info` and `--init` do."""
+    from gs2d.io.formats.registry import read_splat_file
+    from gs2d.pipeline.info import describe_file
+
+    describe_file(root / "lod-meta.json")
+    read_splat_file(root / "lod-meta.json")
 
 
 def ply_points(path: Path) -> None:
@@ -544,8 +557,7 @@ _ALL = (
            read_splats_everywhere),
     Family("sog", written(_splats("sog", "a.sog")), {".sog": m.either(m.of_zip(_SOG), m.of_zip(_SOG), m.of_bytes)},
            read_splats_everywhere),
-    Family("sog-streamed", written(partial(parts.write_stream, make=some_splats)),
-           {".json": _JSON, ".webp": m.of_bytes}, parts.read_stream),
+    Family("sog-streamed", written(_stream), {".json": _JSON, ".webp": m.of_bytes}, read_stream),
     Family("usd", _usd_seeds, {".usd": m.of_bytes, ".usda": m.either(_TEXT, _TEXT, m.of_bytes)}, read_usd_once),
     Family("npy", written(_array("depth.npy", np.ones((8, 9))), _array("normal.npy", np.ones((8, 9, 3)) / 3**0.5)),
            {".npy": m.of_npy}, read_map),
@@ -573,11 +585,6 @@ _ALL = (
     Family("checkpoint", written(_checkpoint), {".pt": m.either(m.of_zip(m.of_bytes), m.of_bytes)}, read_checkpoint),
     Family("recipe", written(_recipe), {".json": _JSON}, read_recipe),
     Family("run-files", c.run_seeds, c.RUN_FILES, c.read_run),
-    Family("run-found", parts.found_seeds, {".json": _JSON}, parts.read_found),
-    Family("tables", parts.table_seeds, parts.TABLE_FILES, parts.read_table),
-    Family("blocks", parts.block_seeds, {".json": _JSON, ".npz": m.either(_NPZ, m.of_bytes)}, parts.read_blocks),
-    Family("searches", parts.search_seeds, {".json": _JSON, ".db": m.of_bytes}, parts.read_search),
     Family("command-line", c.line_seeds, {".json": c.JSON_LINE}, c.read_line),
-    Family("rasterize", c.scene_seeds, {".splats": c.of_floats}, c.draw),
 )  # fmt: skip
 FAMILIES = {family.name: family for family in _ALL}

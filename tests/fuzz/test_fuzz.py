@@ -1,6 +1,6 @@
 """Two seconds of mutated inputs of every family, always from the same first one, and every input that was a finding.
 
-``GS2D_FUZZ_SECONDS=0`` throws no more than so many as are needed to see that some are refused. ``make fuzz`` throws
+``GS2D_FUZZ_SECONDS=0`` throws a dozen inputs a family. ``make fuzz`` throws
 new ones for an hour a family; what it finds goes into ``findings/FAMILY/`` as the changed file alone (``drive.py
 --keep`` writes it; "__" stands for "/" in its name, behind a number and "--").
 """
@@ -27,26 +27,23 @@ from guard import outcome  # noqa: E402
 from gs2d.errors import DataError  # noqa: E402
 from gs2d.io.formats import usd  # noqa: E402
 
-COUNTS = dict.fromkeys(FAMILIES, 60) | {"run-files": 12, "zip": 40, "dtu": 30, "obj-stl-off": 40, "rasterize": 20}
-COUNTS |= {"tables": 12, "run-found": 100}
-READ = {"rasterize", "searches"}  # whatever they get: the one draws it, the others begin anew
+LEAST = 12  # inputs a family, whatever the time
+SLOW = {"run-files": 6}
 SECONDS = float(os.environ.get("GS2D_FUZZ_SECONDS", "2"))  # a family, at least
 FINDINGS = sorted(path for path in (HERE / "findings").rglob("*") if path.is_file())
 
 
 @pytest.mark.usefixtures("native")
-@pytest.mark.parametrize("name", COUNTS)
+@pytest.mark.parametrize("name", FAMILIES)
 def test_mutated_inputs_are_read_or_refused_in_one_line(tmp_path: Path, name: str) -> None:
-    family, verdicts = FAMILIES[name], set()
+    family = FAMILIES[name]
     end = time.monotonic() + SECONDS
     for seed in itertools.count():
-        if seed >= COUNTS[name] and time.monotonic() >= end:
+        if seed >= SLOW.get(name, LEAST) and time.monotonic() >= end:
             break
         files, victim = family.case(seed)
-        finding, verdict, _ = try_case(family, files, tmp_path)
+        finding, _, _ = try_case(family, files, tmp_path)
         assert finding is None or finding.startswith("memory"), f"{name} {seed} ({victim}): {finding}"
-        verdicts.add(verdict)
-    assert verdicts == {"read"} if name in READ else "refused" in verdicts
 
 
 @pytest.mark.usefixtures("native")

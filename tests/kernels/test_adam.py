@@ -98,15 +98,6 @@ def test_only_the_rows_that_are_named_are_written_and_as_they_would_be_alone(
         assert equal(masked, expected)
 
 
-def test_nothing_is_a_step_too(native: Library) -> None:
-    empty = attribute(5, (0, 3), torch.float32)
-    none = replace(attribute(5, (3,), torch.float32), rows=torch.zeros(0, dtype=torch.int64))
-    before = copied(none)
-    adam_step([empty, none], **BETAS, library=native)
-    adam_step([], **BETAS, library=native)
-    assert equal(none, before)
-
-
 @pytest.mark.parametrize("rows", [[0, 5], [-1]])
 def test_rows_that_are_not_there_change_nothing(native: Library, rows: list[int]) -> None:
     good, bad = attribute(5, (3,), torch.float32), attribute(5, (3,), torch.float32, seed=1)
@@ -114,29 +105,6 @@ def test_rows_that_are_not_there_change_nothing(native: Library, rows: list[int]
     with pytest.raises(ShapeError, match="rows must be those of the parameter"):
         adam_step([good, replace(bad, rows=torch.tensor(rows))], **BETAS, library=native)
     assert equal(good, before)
-
-
-def test_what_would_be_read_beyond_an_end_is_refused(native: Library) -> None:
-    good = attribute(6, (3,), native.dtype)
-    rows = torch.arange(2)
-    bad = {
-        r"compact gradient must be \[2, 3\], got \[2, 1\]": replace(
-            good, rows=rows, compact=True, gradient=good.gradient[:2, :1]
-        ),
-        r"rows must be int64 \[M\], got torch.int64 \[1, 2\]": replace(good, rows=rows[None]),
-        r"trained must be bool \[6\], got torch.bool \[6, 1\]": replace(good, trained=torch.ones(6, 1).bool()),
-    }
-    for words, update in bad.items():
-        with pytest.raises(ShapeError, match=words):
-            adam_step([update], **BETAS, library=native)
-
-
-def test_other_dtypes_are_refused(native: Library) -> None:
-    update = attribute(5, (3,), torch.float32)
-    with pytest.raises(ShapeError, match="gradient must be torch.float32 on the cpu, got torch.float64"):
-        adam_step([replace(update, gradient=update.gradient.double())], **BETAS, library=native)
-    with pytest.raises(ShapeError, match=r"tensors must be torch\.float32"):
-        first_not_finite([torch.zeros(3, dtype=torch.float64)], library=native)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])

@@ -32,23 +32,6 @@ def test_memory_comes_back_when_the_last_view_of_a_tensor_is_gone() -> None:
     assert pool.empty((9, 3), FLOAT).data_ptr() == first  # 27 of 30 reals
 
 
-def test_tensors_that_the_c_library_keeps_itself_are_its_own() -> None:
-    pool = BufferPool(min_bytes=64)
-    tensor = pool.empty((15,), FLOAT)  # 60 bytes
-    del tensor
-    assert pool.free_bytes == 0
-
-
-def test_a_block_that_splats_have_outgrown_is_given_up() -> None:
-    pool = BufferPool(min_bytes=64)
-    tensor = pool.empty((1000,), FLOAT)
-    del tensor
-    assert pool.free_bytes == (4000 + LINE) * 17 // 16
-    larger = pool.empty((1200,), FLOAT)  # the block holds 1079 reals behind the first cache line
-    assert pool.free_bytes == 0
-    del larger
-
-
 def test_blocks_of_other_sizes_wait_for_their_next_request_but_not_for_ever() -> None:
     pool = BufferPool(min_bytes=64)
     kept, small = pool.empty((100_000,), FLOAT), (100,)

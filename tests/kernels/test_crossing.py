@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import replace
 
 import numpy as np
@@ -93,69 +92,3 @@ def outlines(rng: np.random.Generator, lanes: int, kind: str) -> np.ndarray:
         coefficients[rng.integers(0, 6, lanes), np.arange(lanes)] = 0
         coefficients[rng.integers(0, 6, lanes), np.arange(lanes)] = 0
     return np.stack([*coefficients, iz, *center, k, 0.5 * k**2])
-
-
-def hits(outline: np.ndarray, x: np.ndarray, y: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels [H, W] that the kernels blend, and 1 / z there."""
-    au, bu, av, bv, ai, bi, iz, cx, cy, k, disc2 = outline
-    dx, dy = x - cx, y - cy
-    with np.errstate(all="ignore"):
-        X, Y, I = au * dx + bu * dy, av * dx + bv * dy, iz + (ai * dx + bi * dy)
-        z = 1 / I
-        ray = (I > 0) & (z >= near) & ((X * z) ** 2 + (Y * z) ** 2 <= k * k)
-    return ray | (dx * dx + dy * dy <= disc2), I
-
-
-@pytest.mark.parametrize("kind", ["usual", "far", "extreme", "not finite", "along the axes"])
-def test_an_outline_holds_every_pixel_that_is_hit(any_native: Library, kind: str) -> None:
-    real = np.dtype(np.float64 if any_native.dtype == torch.float64 else np.float32)
-    rng = np.random.default_rng(3)
-    width, height, near = 64, 48, real.type(0.2)
-    x, y = np.meshgrid(np.arange(width, dtype=real) + real.type(0.5), np.arange(height, dtype=real) + real.type(0.5))
-    found = signs = 0
-    for _ in range(40):
-        given = outlines(rng, any_native.lanes, kind).astype(real)
-        hit, inverse = zip(*(hits(column, x, y, near) for column in given.T), strict=True)
-        for first, rows in ((0, 16), (16, 16), (32, 4), (36, 4), (40, 2), (47, 1)):
-            left, right = reach(any_native, given, (near, width, height), first + 0.5, first + rows - 0.5)
-            for lane, (cx, lowest, highest) in enumerate(zip(given[7], left, right, strict=True)):
-                columns = np.flatnonzero(hit[lane][first : first + rows].any(axis=0)).astype(real) + real.type(0.5) - cx
-                found += len(columns)
-                part = inverse[lane][first : first + rows]
-                signs += bool((part > 0).any() and (part < 0).any())
-                assert (lowest <= columns).all(), (lane, first)
-                assert (columns <= highest).all(), (lane, first)
-    assert found > 12 * any_native.lanes  # 230 of 8 lanes where hardly any is finite
-    assert signs > 100 or kind in ("far", "not finite")  # rows where 1 / z changes its sign
-
-
-def reach(
-    library: Library, given: np.ndarray, image: tuple[float, int, int], y0: float, y1: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Left and right end of what each outline holds of the rows y0 to y1, from its centre."""
-    real = ctypes.c_double if library.dtype == torch.float64 else ctypes.c_float
-    pointer = ctypes.c_void_p
-    function = library.function("gs2d_selftest_outline", None, [pointer, pointer, real, real, pointer, pointer])
-    given, numbers = np.ascontiguousarray(given), np.array(image, dtype=given.dtype)
-    left, right = np.empty(library.lanes, given.dtype), np.empty(library.lanes, given.dtype)
-    function(given.ctypes.data, numbers.ctypes.data, y0, y1, left.ctypes.data, right.ctypes.data)
-    return left, right
-
-
-def test_outlines_are_tight(any_native: Library) -> None:
-    """In rows of four pixels they hold hardly more columns than are hit, beside one or two at the ends."""
-    real = np.dtype(np.float64 if any_native.dtype == torch.float64 else np.float32)
-    rng = np.random.default_rng(4)
-    width, height, near = 64, 48, 0.2
-    x, y = np.meshgrid(np.arange(width, dtype=real) + real.type(0.5), np.arange(height, dtype=real) + real.type(0.5))
-    wanted = held = 0
-    for _ in range(30):
-        given = outlines(rng, any_native.lanes, "usual").astype(real)
-        hit = [hits(column, x, y, real.type(near))[0] for column in given.T]
-        for first in range(0, height, 4):
-            left, right = reach(any_native, given, (near, width, height), first + 0.5, first + 3.5)
-            for lane, cx in enumerate(given[7]):
-                wanted += int(hit[lane][first : first + 4].any(axis=0).sum())
-                held += int(((x[0] - cx >= left[lane]) & (x[0] - cx <= right[lane])).sum())
-    assert wanted > 10_000
-    assert held < 1.15 * wanted

@@ -6,7 +6,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from gs2d.errors import ShapeError
 from gs2d.kernels.library import Library
 from gs2d.render.exposure import _exposed, _gradients
 from gs2d.render.exposure_native import exposed, gradients
@@ -38,11 +37,3 @@ def test_picture_and_gradients_are_torchs(
     by_us = gradients(any_native, upstream, color, transform, *cover, cut)
     for a, b in zip(by_us, by_torch, strict=True):
         assert torch.allclose(a, b, rtol=100 * digits, atol=100 * digits * float(b.abs().max()))
-
-
-def test_what_native_code_cannot_read_is_named(native: Library) -> None:
-    color, transform = torch.zeros(2, 2, 3), torch.eye(3, 4)
-    with pytest.raises(ShapeError, match=r"color must be torch\.float32 on the cpu, got torch\.float64"):
-        exposed(native, color.double(), transform, None, None, None)
-    with pytest.raises(ShapeError, match=r"clipped must be torch\.bool on the cpu, got torch\.float32"):
-        exposed(native, color, transform, None, None, color)

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from gs2d.config.robust import DenseStart
 from gs2d.core.splats import Splats
-from gs2d.kernels import free_space as native
 from gs2d.training import free_space
 from gs2d.training.free_space import FreeSpaceMaps
 from gs2d.training.plane_sweep import sweep_views
@@ -59,18 +58,6 @@ def test_it_counts_what_torch_counts(maps: FreeSpaceMaps, monkeypatch: pytest.Mo
     assert 0 < int((inside > 0).sum()) < len(splats)
 
 
-def test_places_that_are_no_numbers_or_very_far_are_nowhere(maps: FreeSpaceMaps) -> None:
-    splats = scattered(6)
-    splats.means[0] = float("nan")
-    splats.means[1] = float("inf")
-    splats.means[2] = 1e30
-    splats.means[3, 2] = -1e30
-    splats.log_scales[4] = 80.0
-    found, true = (counted(maps, splats, reference=reference) for reference in (False, True))
-    assert all(torch.equal(ours, theirs) for ours, theirs in zip(found, true, strict=True))
-    assert not found[0][:4].any()
-
-
 def test_the_result_is_the_same_for_any_number_of_threads(maps: FreeSpaceMaps) -> None:
     splats, results = scattered(10_000, seed=1), []
     try:
@@ -80,12 +67,3 @@ def test_the_result_is_the_same_for_any_number_of_threads(maps: FreeSpaceMaps) -
     finally:
         torch.set_num_threads(1)
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
-
-
-def test_what_it_cannot_read_it_leaves(maps: FreeSpaceMaps) -> None:
-    view, counts = maps._views[0], [torch.zeros(3, dtype=torch.int32) for _ in range(2)]
-    ends = torch.zeros(1, 3, 3, dtype=torch.float64)
-    limits = {"limit": view.limit, "known": view.known, "against": counts[0], "support": counts[1]}
-    rows = (torch.zeros(3), torch.zeros(3, 4), torch.zeros(3))
-    assert not native.look_at_free_space(ends, *rows, radius=9.0, fraction=0.1, **limits)
-    assert not counts[0].any()

@@ -10,7 +10,6 @@ from benchmarks.stages import Passes, count_work
 from benchmarks.workload import Workload, room_workload
 from torch import Tensor
 
-from gs2d.errors import ShapeError
 from gs2d.kernels.library import Library
 from gs2d.render import cpu
 from gs2d.render.api import rasterize
@@ -75,16 +74,6 @@ def test_the_same_where_only_colours_learn(native: Library, room: Workload) -> N
         assert some[name][rows].any()
 
 
-def test_no_rows_and_all_rows(native: Library, room: Workload) -> None:
-    everything = torch.ones(len(room.splats), dtype=torch.bool)
-    _, whole = gradients(native, room, IMAGES, 4, None)
-    _, all_rows = gradients(native, room, IMAGES, 4, everything)
-    _, none = gradients(native, room, IMAGES, 4, ~everything)
-    for name, gradient in whole.items():
-        assert torch.equal(gradient, all_rows[name])
-        assert not none[name].any()
-
-
 def test_many_chunks_of_tiles_add_up_to_the_same_bits_on_any_number_of_threads(native: Library) -> None:
     workload = room_workload(3000, 300, 257)
     passes = Passes(native, workload, 3)
@@ -145,9 +134,3 @@ def test_every_backend_masks_rows(name: str) -> None:
             assert b.grad is not None
             assert torch.equal(a.grad[1], b.grad[1])
             assert not b.grad[0].any()
-
-
-@pytest.mark.parametrize("rows", [torch.ones(2, dtype=torch.bool), torch.ones(1), torch.ones(1, 1, dtype=torch.bool)])
-def test_gradient_rows_must_be_one_bool_per_splat(rows: Tensor) -> None:
-    with pytest.raises(ShapeError, match="gradient_rows must be"):
-        rasterize(splat(), front_camera(), backend="reference", gradient_rows=rows)

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from gs2d.config.multiview import MultiView
-from gs2d.errors import ShapeError
 from gs2d.kernels.library import Library
 from gs2d.kernels.multiview import compare_views
 from two_views import Scenario, in_torch, scenario
@@ -54,15 +53,6 @@ def test_values_and_gradients_are_those_of_the_formulas_in_torch(
         assert int(off.sum()) <= 0.01 * int((e != 0).sum())
 
 
-@pytest.mark.parametrize(("learns", "depth_size"), [(False, None), (True, None), (True, (33, 20))])
-def test_in_float64_they_are_the_same_to_rounding(
-    native64: Library, learns: bool, depth_size: tuple[int, int] | None
-) -> None:
-    case = scenario(dtype=DOUBLE, masked=True, depth_size=depth_size)
-    for found, expected in zip(results(case, native64, learns=learns), results(case, None, learns=learns), strict=True):
-        assert relative_error(found, expected) < 1e-11
-
-
 def test_pixels_at_every_edge_of_what_counts_are_decided_alike(native64: Library) -> None:
     """Normals edge-on, turned away and of no length, an image that the patch leaves, and a neighbour far too near."""
     case = scenario(dtype=DOUBLE, settings=MultiView(patches=2000, radius=2, texture=0.03, occluded=4.0))
@@ -90,15 +80,3 @@ def test_a_view_without_a_pixel_to_ask_has_loss_zero_and_no_gradient(native: Lib
     unknown = torch.full_like(case.normal, torch.nan)
     nothing = replace(case, candidates=torch.zeros_like(case.candidates), normal=unknown)
     assert not any(part.any() for part in results(nothing, native, learns=True))
-
-
-def test_what_the_operation_would_misread_is_refused(native: Library) -> None:
-    case = scenario()
-    with pytest.raises(ShapeError, match="float32"):
-        results(case.double(), native)
-    source = case.neighbour.source
-    smaller = replace(case, neighbour=replace(case.neighbour, source=replace(source, clear=source.clear[1:])))
-    with pytest.raises(ShapeError, match="clear"):
-        results(smaller, native)
-    with pytest.raises(ShapeError, match="camera is 60x47"):
-        results(replace(case, camera=replace(case.camera, width=60)), native)

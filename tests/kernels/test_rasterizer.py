@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.splats import ATTRIBUTES, Splats
-from gs2d.errors import BackendError, ShapeError
+from gs2d.errors import BackendError
 from gs2d.kernels.library import Library, available_variants, load
 from gs2d.render import cpu, reference, reference_errors
 from gs2d.render.types import RasterSettings
@@ -114,26 +113,6 @@ def test_gradients_of_every_image_equal_finite_differences(native64: Library, im
     assert torch.autograd.gradcheck(scalar, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)
 
 
-def test_a_limited_alpha_passes_the_gradient_of_the_unlimited_one(native64: Library) -> None:
-    # Finite differences are 0 here; the official code and rule 6 pass dL/dalpha through. One splat, o = 0.999, at the
-    # pixel of its centre: rho = 0, alpha = 0.99, dalpha/dlogit = o (1 - o) = 0.000999.
-    camera = look_at(np.array([0.0, 0, -2]), np.zeros(3), np.array([0.0, -1, 0]), width=1, height=1, fx=1.0)
-    logit = torch.logit(torch.tensor([0.999], dtype=torch.float64)).requires_grad_()
-    one = torch.ones(1, 3, dtype=torch.float64)
-    splats = Splats(
-        torch.zeros(1, 3).double(),
-        torch.tensor([[1.0, 0, 0, 0]]).double(),
-        -one[:, :2],
-        logit,
-        one[None],
-        torch.zeros(1, 0, 3).double(),
-    )
-    alpha = cpu.rasterize_with(native64, splats, camera, replace(SETTINGS, sh_degree=0)).alpha
-    assert alpha.item() == pytest.approx(0.99)
-    (gradient,) = torch.autograd.grad(alpha.sum(), logit)
-    assert gradient.item() == pytest.approx(0.999 * 0.001, rel=1e-6)
-
-
 # --------------------------------------------------------------------------------------- instruction sets, threads
 
 
@@ -167,28 +146,6 @@ def test_results_are_bit_identical_for_any_number_of_threads(native: Library, pr
             assert torch.equal(tensor, other[name]), name
 
 
-def test_two_views_at_once_do_not_disturb_each_other(native: Library) -> None:
-    scenes = [awkward_scene(seed, 200) for seed in (1, 2, 3, 4)]
-    alone = [everything(native, *scene) for scene in scenes]
-    with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(lambda scene: everything(native, *scene), scenes * 4))
-    for i, found in enumerate(together):
-        for name, tensor in alone[i % 4].items():
-            assert torch.equal(tensor, found[name]), name
-
-
-def test_signed_gradients_do_not_depend_on_which_probe_is_asked_for(native: Library) -> None:
-    splats, camera = awkward_scene(5)
-    two, four = (everything(native, splats, camera, probe=columns) for columns in (2, 4))
-    assert torch.equal(two["d_probe"], four["d_probe"][:, :2])
-    assert (four["d_probe"][:, 2:] >= four["d_probe"][:, :2].abs() * (1 - 1e-4) - 1e-5).all()
-    none = everything(native, splats, camera, probe=0)
-    for name in ATTRIBUTES:  # without a probe the filter's gradient is added up elsewhere
-        torch.testing.assert_close(
-            none[f"d_{name}"], two[f"d_{name}"], rtol=1e-3, atol=1e-4 * float(two[f"d_{name}"].norm())
-        )
-
-
 # ------------------------------------------------------------------------------------------------- culling and order
 
 
@@ -201,22 +158,6 @@ def test_culling_inside_tiles_does_not_change_a_single_bit(any_native: Library, 
     )
     for name in IMAGES:
         assert torch.equal(getattr(culled, name), getattr(full, name)), name
-
-
-def test_equal_depths_are_blended_in_row_order_among_thousands(native: Library) -> None:
-    # 5000 opaque copies of one splat (alpha 0.9 each): only the first ones of the depth order are seen.
-    n = 5000
-    camera = look_at(np.array([0.0, 0, -2]), np.zeros(3), np.array([0.0, -1, 0]), width=1, height=1, fx=1.0)
-    sh0 = torch.zeros(n, 1, 3, requires_grad=True)
-    splats = Splats(
-        torch.zeros(n, 3), torch.tensor([[1.0, 0, 0, 0]]).expand(n, 4), torch.full((n, 2), -1.0),
-        torch.full((n,), 2.1972246), sh0, torch.zeros(n, 0, 3),
-    )  # fmt: skip
-    color = cpu.rasterize_with(native, splats, camera, replace(SETTINGS, sh_degree=0)).color
-    (gradient,) = torch.autograd.grad(color.sum(), sh0)
-    weights = gradient[:, 0, 0] / 0.28209479
-    assert weights[:3].tolist() == pytest.approx([0.9, 0.09, 0.009], rel=1e-4)
-    assert (weights[4:] == 0).all()
 
 
 @pytest.mark.parametrize("size", [(1, 1), (4, 4), (15, 17), (16, 16), (33, 5), (3, 50)])
@@ -232,20 +173,6 @@ def test_images_of_any_size_are_filled_to_the_last_pixel(any_native: Library, si
     output = cpu.rasterize_with(any_native, splats, camera, replace(SETTINGS, sh_degree=0))
     assert torch.allclose(output.alpha, torch.full_like(output.alpha, 0.99))
     assert output.radii.item() == max(width, height) / 2
-
-
-def test_no_splats_give_the_background(any_native: Library) -> None:
-    empty = Splats(
-        *(
-            torch.zeros(0, *shape, dtype=any_native.dtype, requires_grad=True)
-            for shape in ((3,), (4,), (2,), (), (1, 3), (15, 3))
-        )
-    )
-    camera = awkward_scene(0)[1]
-    found = everything(any_native, empty, camera)
-    assert torch.equal(found["color"][0, 0], torch.tensor(SETTINGS.background, dtype=any_native.dtype))
-    assert float(found["alpha"].abs().sum()) == 0
-    assert found["d_means"].shape == (0, 3)
 
 
 # --------------------------------------------------------------------------------------------------------- edges
@@ -273,19 +200,6 @@ def test_only_the_wanted_gradients_are_computed_and_they_are_the_same(
             assert tensor.grad is None
 
 
-def test_a_lower_sh_degree_ignores_the_coefficients_above_it(any_native: Library) -> None:
-    splats, camera = awkward_scene(6)
-    splats = requiring_grad(splats.to(dtype=any_native.dtype))
-    output = cpu.rasterize_with(any_native, splats, camera, replace(SETTINGS, sh_degree=1))
-    output.color.sum().backward()
-    cut = Splats(**{name: t.detach()[:, :3] if name == "shN" else t.detach() for name, t in splats.items()})
-    same = cpu.rasterize_with(any_native, cut, camera, replace(SETTINGS, sh_degree=1))
-    assert torch.equal(output.color, same.color)
-    assert splats.shN.grad is not None
-    assert (splats.shN.grad[:, 3:] == 0).all()
-    assert (splats.shN.grad[:, :3] != 0).any()
-
-
 def test_memory_of_views_without_a_backward_pass_is_given_back() -> None:
     if not available_variants():
         pytest.skip("the native library was not built")
@@ -300,17 +214,6 @@ def test_memory_of_views_without_a_backward_pass_is_given_back() -> None:
         cpu.rasterize_with(native, splats, camera, SETTINGS)
     growth = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before  # KiB on Linux
     assert growth < 150_000
-
-
-def test_other_dtypes_and_coefficients_that_are_not_there_are_refused(native: Library) -> None:
-    splats, camera = awkward_scene(0)
-    with pytest.raises(ShapeError, match=r"means must be torch.float32 on the CPU .* got torch.float64"):
-        cpu.rasterize_with(native, splats, camera, SETTINGS)
-    few = Splats(**{name: (t[:, :3] if name == "shN" else t).float() for name, t in splats.items()})
-    with pytest.raises(ShapeError, match=r"sh_degree .* stored coefficients \(4\), got 3"):
-        cpu.rasterize_with(native, few, camera, SETTINGS)
-    with pytest.raises(BackendError, match="lowpass_depth"):
-        cpu.rasterize_with(native, splats.to(dtype=torch.float32), camera, replace(SETTINGS, lowpass_depth="plane"))
 
 
 def test_the_best_variant_is_chosen_and_the_environment_overrides_it(monkeypatch: pytest.MonkeyPatch) -> None:

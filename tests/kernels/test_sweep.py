@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from gs2d.config.robust import DenseStart
-from gs2d.kernels import sweep as kernel
 from gs2d.kernels.library import Library, available_variants, library_for
 from gs2d.training import plane_sweep
 from gs2d.training.plane_sweep import SmallView, best_planes, best_planes_reference, sweep_views
@@ -66,17 +65,6 @@ def test_images_of_other_sizes_are_compared_and_what_they_do_not_show_is_unknown
     assert (best_planes(views[2], [away], Z, 2).score == -1).all()
 
 
-def test_nothing_is_asked_of_pixels_that_are_left_out(views: list[SmallView]) -> None:
-    usable = np.zeros(views[2].size, dtype=bool)
-    usable[5:20, 25:40] = True
-    some = best_planes(replace(views[2], usable=usable), views[3:], Z, 3)
-    all_ = best_planes(views[2], views[3:], Z, 3)
-    assert (some.score[:, :25] == -1).all()
-    assert torch.equal(some.score[torch.from_numpy(usable)], all_.score[torch.from_numpy(usable)])
-    nothing = best_planes(replace(views[2], usable=usable & False), views[3:], Z, 3)
-    assert (nothing.score == -1).all()
-
-
 def test_the_result_is_the_same_for_any_number_of_threads(views: list[SmallView]) -> None:
     tall = [replace(v, grey=v.grey.repeat(1, 1, 4, 1), usable=np.tile(v.usable, (4, 1))) for v in views]
     results = []
@@ -101,11 +89,3 @@ def test_every_library_finds_the_same_bits(
     other = best_planes(views[2], views[3:], Z, 3)
     for name in ("score", "plane", "before", "after"):
         assert torch.equal(getattr(found, name), getattr(other, name))
-
-
-def test_without_the_library_torch_does_it(views: list[SmallView], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kernel, "library_for", lambda tensor: None)
-    used = []
-    monkeypatch.setattr(plane_sweep, "best_planes_reference", lambda *a: used.append(1) or best_planes_reference(*a))
-    best_planes(views[2], views[3:], Z, 2)
-    assert used

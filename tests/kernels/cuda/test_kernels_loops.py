@@ -54,6 +54,7 @@ def measured() -> dict[str, dict[str, Any]]:
         pytest.skip(str(reason))
 
 
+@pytest.mark.slow
 def test_loops_registers_and_shared_memory_are_as_committed(measured: dict[str, dict[str, Any]]) -> None:
     committed = json.loads(cuda_loops.COMMITTED.read_text())
     if committed["compiler"] != cuda_loops.compiler_version():
@@ -62,6 +63,7 @@ def test_loops_registers_and_shared_memory_are_as_committed(measured: dict[str, 
     assert not over, f"{over}; if it is meant: python -m benchmarks.cuda_loops --update"
 
 
+@pytest.mark.slow
 def test_the_blend_kernels_leave_room_for_the_warps_that_hide_their_latencies(
     measured: dict[str, dict[str, Any]],
 ) -> None:

@@ -15,10 +15,8 @@ from torch import Tensor
 from emulate import Emulator
 from gs2d.core.camera import Camera
 from gs2d.core.splats import ATTRIBUTES, Splats
-from gs2d.errors import ShapeError
-from gs2d.kernels.cuda.arguments import SlotArguments, fill
 from gs2d.render import cuda, cuda_passes, reference
-from kernel_cases import SETTINGS, Case, cases, crossing_tiles, double, many_tiles
+from kernel_cases import SETTINGS, Case, crossing_tiles, double, many_tiles
 from render_scenes import IMAGES, contraction, front_camera, random_cotangents, requiring_grad, splat, stack
 
 pytestmark = pytest.mark.timeout(120)
@@ -110,13 +108,6 @@ def test_rows_that_learn_have_the_gradients_they_have_anyway_and_all_others_zero
         assert bool(whole[name][~rows].any()), name
 
 
-def test_colours_have_no_gradient_where_no_image_of_colour_has(emulator: Emulator) -> None:
-    case = many_tiles()
-    alpha = {"alpha": torch.ones(case.camera.height, case.camera.width)}
-    found = gradients(emulator, case, alpha, trained=COLORS)
-    assert not any(bool(grad.any()) for grad in found.values())
-
-
 def test_a_warp_stops_behind_the_last_splat_that_learns(emulator: Emulator) -> None:
     """100 faint layers; of those that learn the last is in the first, the second, or no chunk of 32."""
     layers = stack(*(splat((0.0, 0.0, 2.0 + 0.01 * i), (3.0, 3.0), 0.02, (i % 3 / 2, 0.5, 0.2)) for i in range(100)))
@@ -174,20 +165,6 @@ def test_culling_splats_without_an_ellipse_changes_no_bit(emulator: Emulator, se
     assert int((b["sh0"][near_plane_policy] != 0).any(2).sum()) > 5
 
 
-def test_torchs_switch_asks_for_deterministic_gradients(emulator: Emulator) -> None:
-    case = next(cases(1))
-    launcher = Recording(emulator)
-    try:
-        torch.use_deterministic_algorithms(True)
-        gradients(launcher, case, color_cotangent(case))
-    finally:
-        torch.use_deterministic_algorithms(False)
-    assert "sum_slots" in launcher.names
-    launcher.names.clear()
-    gradients(launcher, case, color_cotangent(case))
-    assert "sum_slots" not in launcher.names
-
-
 def test_without_distortion_the_other_images_and_gradients_keep_every_bit(emulator: Emulator) -> None:
     case = many_tiles()
     full = cuda.rasterize_with(emulator, case.splats, case.camera, SETTINGS)
@@ -199,13 +176,6 @@ def test_without_distortion_the_other_images_and_gradients_keep_every_bit(emulat
     del cotangents["distortion"]
     a, b = (gradients(emulator, case, cotangents, distortion=d, deterministic=True) for d in (True, False))
     assert all(torch.equal(a[name], b[name]) for name in ATTRIBUTES)
-
-
-def test_a_mask_of_rows_that_does_not_fit_is_refused(emulator: Emulator) -> None:
-    case = next(cases(1))
-    for bad in (torch.ones(len(case.splats)), torch.ones(len(case.splats) + 1, dtype=torch.bool)):
-        with pytest.raises(ShapeError, match="gradient_rows"):
-            cuda.rasterize_with(emulator, case.splats, case.camera, SETTINGS, gradient_rows=bad)
 
 
 class FewBlocks(Recording):
@@ -271,39 +241,3 @@ def test_the_highest_splat_ids_are_read_and_written_where_they_are(emulator: Emu
         results.append(means)
     assert bool(results[0].any())
     assert torch.equal(*results)
-
-
-def test_the_largest_errors_of_the_approximate_instructions_stay_within_the_tolerances(
-    emulator: Emulator, clear_cases: list[Case]
-) -> None:
-    """exp2 and 1/x are 2 and 1 units in the last place off, always: more than any GPU errs."""
-    same = {name: built for name, built in emulator._built.items() if not name.startswith("blend")}
-    launcher = Emulator(approximate=True, _built=same)  # only the blending has such instructions
-    errors: dict[str, list[float]] = {name: [] for name in ("color", *ATTRIBUTES)}
-    for case in clear_cases[:4]:
-        exact, rough = (cuda.rasterize_with(e, case.splats, case.camera, SETTINGS) for e in (emulator, launcher))
-        errors["color"].append(float((exact.color - rough.color).abs().max()))
-        cotangents = random_cotangents(np.random.default_rng(case.seed), case.camera)
-        scene = requiring_grad(double(case.splats))
-        contraction(reference.rasterize(scene, case.camera, SETTINGS), cotangents).backward()
-        found = gradients(launcher, case, cotangents)
-        for name, tensor in scene.items():
-            if tensor.grad is not None and float(tensor.grad.norm()) > 1e-3:
-                errors[name].append(relative_error(found[name], tensor.grad))
-    assert 0 < max(errors["color"]) < 2e-5
-    for name, values in errors.items():
-        assert np.median(values) < 1e-5, (name, values)
-        assert max(values) < 2e-3, (name, values)
-
-
-def test_slots_are_added_up_by_splat_and_none_is_read_beyond_those_there_are(emulator: Emulator) -> None:
-    """Splats 2, 0, 1 in depth order with 1, 0 and 4 pairs; only 3 pairs had room: 12 slots."""
-    slots, extra_slots = torch.randn(12, 16), torch.randn(12, 4)
-    order, ends = torch.tensor([2, 0, 1]), torch.tensor([1, 1, 5])
-    gradients, extras = torch.full((3, 16), torch.nan), torch.full((3, 4), torch.nan)
-    arguments = SlotArguments(count=3, candidates=3)
-    fill(arguments, order=order, ends=ends, slots=slots, extra_slots=extra_slots, gradients=gradients, extras=extras)
-    emulator.launch("sum_slots", 1, 128, arguments)
-    for found, given in ((gradients, slots), (extras, extra_slots)):
-        expected = torch.stack([torch.zeros(given.shape[1]), given[4:].sum(0), given[:4].sum(0)])
-        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)

@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.optim.adam import adam
 
 import emulate
-from gs2d.errors import ShapeError
 from gs2d.kernels.cuda.adam import AdamUpdate, adam_step
 
 pytestmark = pytest.mark.timeout(120)
@@ -112,29 +111,3 @@ def test_an_overflowed_step_changes_nothing(emulator: emulate.Emulator) -> None:
     adam_step([going], **BETAS, launcher=emulator, skip=torch.tensor(0, dtype=torch.int32))
     assert_same(stopped, start)
     assert_stepped(going, by_torch(start), start)
-
-
-def test_attributes_without_elements_are_left_out(emulator: emulate.Emulator) -> None:
-    nothing = [attribute(0, (3,)), attribute(5, (0, 3)), replace(attribute(5, (2,)), rows=torch.zeros(0).long())]
-    last = attribute(5, (3,))
-    start = copied(last)
-    adam_step([*nothing, last], **BETAS, launcher=emulator)
-    assert_stepped(last, by_torch(start), start)
-
-
-def test_what_would_be_written_to_the_wrong_place_is_refused(emulator: emulate.Emulator) -> None:
-    good = attribute(6, (3,))
-    bad = {
-        "square": replace(good, square=good.square[1:]),
-        "contiguous": replace(good, mean=torch.zeros(3, 6).T),
-        "float32": replace(good, gradient=good.gradient.double()),
-        "trained must be bool": replace(good, trained=torch.ones(6)),
-        "trained or rows": replace(good, trained=torch.ones(6).bool(), rows=torch.arange(2)),
-        "rows must be int64": replace(good, rows=torch.arange(2).int()),
-        "needs rows": replace(good, compact=True),
-    }
-    for words, update in bad.items():
-        with pytest.raises(ShapeError, match=words):
-            adam_step([update], **BETAS, launcher=emulator)
-    with pytest.raises(ShapeError, match="up to 6"):
-        adam_step([good] * 7, **BETAS, launcher=emulator)

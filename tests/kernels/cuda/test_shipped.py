@@ -66,16 +66,6 @@ def test_every_kernel_comes_with_the_package_and_nothing_is_compiled_or_written(
     assert not (tmp_path / "cache").exists()
 
 
-def test_gpus_to_come_and_those_beside_a_cpu_get_the_text_that_the_driver_translates(
-    bring: Callable[..., None],
-) -> None:
-    bring(*shipped.SHIPPED, shipped.PTX)
-    for capability in ((8, 7), (11, 0), (13, 0)):
-        assert nvrtc.architecture_for(capability) == shipped.PTX
-    with pytest.raises(BackendError, match=r"7\.5 or more"):
-        nvrtc.architecture_for((7, 0))
-
-
 @pytest.mark.parametrize("changes", [{"version": "0.0.1"}, {"sources": "of others"}, {"cuda": None}])
 def test_code_of_other_sources_or_of_another_version_is_not_taken(
     bring: Callable[..., None], changes: dict[str, object], tmp_path: Path
@@ -84,23 +74,6 @@ def test_code_of_other_sources_or_of_another_version_is_not_taken(
     assert nvrtc.shipped_kernels() is None
     with pytest.raises(BackendError, match="NVRTC is not here"):
         nvrtc.cubin("cuda/slots.cu", "sm_90", tmp_path)
-
-
-def test_an_edited_source_is_compiled(bring: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
-    bring("sm_90")
-    assert nvrtc.shipped_kernels() is not None
-    files = nvrtc.sources()
-    monkeypatch.setattr(nvrtc, "sources", lambda: files | {"core/base.h": files["core/base.h"] + "// edited\n"})
-    assert nvrtc.shipped_kernels() is None
-
-
-def test_a_damaged_archive_is_no_obstacle_where_there_is_a_compiler(
-    bring: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bring("sm_90")
-    (tmp_path / "brought" / "sm_90.zip").write_bytes(b"PK")
-    monkeypatch.setattr(nvrtc, "compile_source", lambda name, arch: nvrtc.Cubin(b"compiled", "log"))
-    assert nvrtc.cubin("cuda/slots.cu", "sm_90", tmp_path / "cache").code == b"compiled"
 
 
 def test_a_warm_cache_needs_no_compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

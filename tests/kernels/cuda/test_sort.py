@@ -7,14 +7,12 @@ import torch
 from torch import Tensor
 
 from emulate import Emulator
-from gs2d.kernels.cuda.arguments import ClearArguments, DigitArguments, RunningArguments, SortArguments, fill
+from gs2d.kernels.cuda.arguments import DigitArguments, RunningArguments, SortArguments, fill
 from gs2d.kernels.cuda.sort import (
     DIGITS,
     MOST_PASSES,
-    MOST_SORTED,
     PIECE,
     SORT_THREADS,
-    clear_blocks,
     digit_blocks,
     passes_of,
     pieces_of,
@@ -96,28 +94,3 @@ def run_counts(emulator: Emulator, order: Tensor, counts: Tensor, room: int) -> 
     fill(arguments, pairs=pairs, overflow=overflow)
     emulator.launch("running_counts", pieces_of(count), SORT_THREADS, arguments)
     return ends, int(pairs), int(overflow)
-
-
-def test_more_pairs_than_can_be_counted_are_too_many(emulator: Emulator) -> None:
-    """Sums stay at the largest number instead of beginning anew."""
-    count = 3 * PIECE
-    counts = torch.full((count,), 1 << 22, dtype=torch.int32)  # 2.6e10 in all
-    ends, pairs, overflow = run_counts(emulator, torch.arange(count, dtype=torch.int32), counts, MOST_SORTED)
-    assert (pairs, overflow) == ((1 << 30) - 1, 1)
-    assert bool((ends[1:] >= ends[:-1]).all())
-
-
-@pytest.mark.parametrize("count", [1, 5, 70_001])
-def test_memory_is_cleared_to_its_end_and_no_further(emulator: Emulator, count: int) -> None:
-    words = torch.full((4 * count + 4,), 3.0)
-    arguments = ClearArguments(count=count)
-    fill(arguments, words=words)
-    emulator.launch("clear_words", clear_blocks(count), SORT_THREADS, arguments)
-    assert not words[:-4].any()
-    assert words[-4:].tolist() == [3.0] * 4
-
-
-def test_passes_take_eight_bits_and_the_last_what_is_left() -> None:
-    assert passes_of(1) == ((0, 1),)
-    assert passes_of(12) == ((0, 8), (8, 4))
-    assert passes_of(32) == ((0, 8), (8, 8), (16, 8), (24, 8))
