@@ -85,16 +85,6 @@ def write_walk(folder: Path, count: int = 8) -> None:
         Image.fromarray(room_image(camera, walls)).save(folder / f"{i:03}.jpg", quality=95)
 
 
-def write_turn(folder: Path, count: int = 8) -> None:
-    """Write photographs of someone who stands in the room and turns."""
-    folder.mkdir(parents=True, exist_ok=True)
-    walls, eye = textures(), np.array([2.0, 2.2, 1.2])
-    for i, angle in enumerate(np.radians(np.linspace(20, 70, count))):
-        ahead = np.array([-np.cos(angle), -np.sin(angle), -0.15])
-        camera = look_at(eye, eye + ahead, UP, width=SIZE, height=SIZE, fx=SIZE)
-        Image.fromarray(room_image(camera, walls)).save(folder / f"{i:03}.jpg", quality=95)
-
-
 def turn_file(path: Path, orientation: int) -> None:
     """Store a picture as a camera held otherwise stores it: turned, with the EXIF orientation that turns it back."""
     with Image.open(path) as file:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,7 @@ from gs2d.core.camera import look_at
 from gs2d.core.mesh import Mesh
 from gs2d.meshing.bounds import backproject
 from gs2d.meshing.depth_maps import RenderedView, depth_map
-from gs2d.meshing.evidence import FACES_A_PIXEL, areas, clean, gather, simplified_to
+from gs2d.meshing.evidence import FACES_A_PIXEL, areas, gather, simplified_to
 from gs2d.meshing.extract import extract
 from surface_shapes import orbit, sphere_depth
 
@@ -67,27 +65,6 @@ def test_faces_are_no_more_than_the_pixels_that_saw_them_carry_and_keep_colour_a
     assert (np.abs(found.mesh.colors.astype(int) - (200, 40, 90)).max(axis=0) <= 1).all()
 
 
-def test_vertices_know_who_saw_them_and_who_sees_through_them() -> None:
-    cameras = orbit(12, 4.0, size=64, focal=80.0)
-    ahead = cameras[0].center / np.linalg.norm(cameras[0].center)
-    side = np.cross(ahead, [0.0, 0, 1])
-    side /= np.linalg.norm(side)
-    small = 0.02 * np.array([side, np.cross(ahead, side), -side])
-    near, sheet = (radius * ahead + small for radius in (1.0, 1.6))
-    mesh = Mesh(np.concatenate([near, sheet]).astype(np.float32), np.array([[0, 1, 2], [3, 4, 5]], np.int32), None)
-    outwards = np.cross(near[1] - near[0], near[2] - near[0]) @ ahead > 0
-    mesh = mesh if outwards else replace(mesh, faces=mesh.faces[:, ::-1].copy())
-    maps = [depth_map(RenderedView(camera, sphere_depth(camera, 1.0))) for camera in cameras]
-    evidence = gather(mesh, maps, 0.1)
-    assert (evidence.support[:3] >= 1).all()
-    assert (evidence.against[:3] == 0).all()
-    assert (evidence.support[3:] == 0).all()
-    assert (evidence.against[3:] >= 1).all()
-    assert evidence.density[:3] == pytest.approx((80 / 3) ** 2, rel=0.05)
-    turned = gather(replace(mesh, faces=mesh.faces[:, ::-1].copy()), maps, 0.1)
-    assert (turned.support == 0).all()  # nobody looks at its back
-
-
 def test_what_views_say_is_said_vertex_by_vertex_whatever_the_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     made = [depth_map(frame) for frame in frames(5, sheets=2)]
     mesh = extract(frames(5), bbox=BOX, voxel=0.1, threads=1).mesh
@@ -135,27 +112,6 @@ def part_of_floor(frames: list[RenderedView]) -> float:
 
 def test_a_floor_on_which_depths_are_loose_stays_whole() -> None:
     assert part_of_floor(views_of_a_floor()) == pytest.approx(1, abs=0.1)
-
-
-def test_views_that_say_nothing_remove_nothing_and_views_that_see_past_everything_do() -> None:
-    seen = views_of_a_floor()
-    for silent, left in ((0.0, 1), (np.nan, 1), (np.inf, 0)):
-        rest = [replace(frame, depth=np.full_like(frame.depth, silent)) for frame in seen[5:]]
-        assert part_of_floor([*seen[:5], *rest]) == pytest.approx(left, abs=0.1)
-
-
-def test_a_sheet_that_two_views_see_goes_where_more_see_past_everything() -> None:
-    near = [replace(f, depth=np.full_like(f.depth, 2.1), valid=None) for f in views_of_a_floor()[:2]]
-    far = [replace(f, depth=np.full_like(f.depth, np.inf), valid=None) for f in views_of_a_floor()[2:]]
-    assert part_of_floor(near) > 0.5
-    assert part_of_floor([*near, *far]) == 0.0
-
-
-def test_a_mesh_of_nothing_that_was_seen_is_empty_and_no_error() -> None:
-    mesh = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), None)
-    camera = orbit(1, 4.0)[0]
-    found = clean(mesh, [depth_map(RenderedView(camera, np.zeros((camera.height, camera.width))))], 0.1)
-    assert (len(found.mesh.faces), found.pixels, found.unsupported) == (0, 0.0, 1.0)
 
 
 def test_an_open_border_stays_where_it_was_when_faces_go() -> None:

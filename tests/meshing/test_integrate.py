@@ -9,22 +9,18 @@ import numpy as np
 import pytest
 
 from gs2d.core.camera import Camera
-from gs2d.errors import BackendError, ShapeError
-from gs2d.kernels.library import available_variants, load
-from gs2d.kernels.tsdf import arguments_of
+from gs2d.errors import BackendError
+from gs2d.kernels.library import available_variants
 from gs2d.meshing.bounds import sample_depths
 from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
 from gs2d.meshing.sampling import make_sampler
 from gs2d.meshing.tsdf import (
     Volume,
-    add_natively,
-    block_finder,
     block_grid,
     fuse,
     fusion_backend,
     integrator,
     invalid_volume,
-    touched_blocks,
 )
 from gs2d.meshing.unbounded import derive_cascade, fuse_cascade
 from surface_shapes import limits, orbit, sphere_depth
@@ -65,31 +61,6 @@ def test_the_native_field_is_that_of_numpy_in_every_bit(
     assert expected.color_weight is not None
     assert (expected.color_weight > 0).any()
     assert_same(fuse(frames, LIMITS, threads=threads, backend="cpu"), expected)
-
-
-@pytest.mark.parametrize("voxel", [0.05, 0.004])  # finer: a pixel is wider than half a block
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_the_blocks_that_are_found_natively_are_those_of_numpy(
-    variant: str, voxel: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("GS2D_CPU_VARIANT", variant)
-    library = block_finder("cpu", 3)
-    assert library is not None
-    assert block_finder("reference", 3) is None
-    bounds = replace(LIMITS, voxel=voxel, truncation=3 * voxel)
-    for view in views(2):
-        expected = touched_blocks(view, bounds, block_grid(bounds))
-        assert len(expected) > 50
-        np.testing.assert_array_equal(touched_blocks(view, bounds, block_grid(bounds), library), expected)
-
-
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_without_colours_too(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("GS2D_CPU_VARIANT", variant)
-    frames = [replace(view, color=None) for view in views(3)]
-    found = fuse(frames, LIMITS, threads=1, backend="cpu")
-    assert found.color is None
-    np.testing.assert_array_equal(found.tsdf, fuse(frames, LIMITS, threads=1, backend="reference").tsdf)
 
 
 @native
@@ -149,21 +120,4 @@ def test_without_the_native_library_auto_is_numpy_and_cpu_is_refused(
     monkeypatch.setattr("gs2d.kernels.library.FOLDER", tmp_path)
     assert fusion_backend("auto").name == "reference"
     with pytest.raises(BackendError, match="native CPU library"):
-        fuse(views(1), LIMITS, backend="cpu")
-
-
-@native
-def test_an_array_of_another_type_is_refused_before_native_code_reads_it() -> None:
-    volume, item, _ = wall(1.5)
-    view = replace(make_sampler(item, volume.limits), depth=np.zeros(66 * 66))
-    with pytest.raises(ShapeError, match="depth must be contiguous float32"), add_natively([volume], load(), 1) as add:
-        add(view)
-    with pytest.raises(ShapeError, match="rows"):
-        arguments_of((1, 1), 1.0, {"rows": np.zeros(1, np.int32)})
-
-
-@native
-def test_the_double_library_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("GS2D_CPU_VARIANT", "f64")
-    with pytest.raises(BackendError, match="fused in float32, got the f64 kernels; unset GS2D_CPU_VARIANT"):
         fuse(views(1), LIMITS, backend="cpu")

@@ -7,14 +7,9 @@ import pytest
 
 from gs2d.core.mesh import Mesh
 from gs2d.meshing.marching_cubes import (
-    CORNERS,
-    EDGES,
-    _numbered,
-    case_table,
     components,
     keep_components,
     marching_cubes,
-    select_faces,
 )
 from gs2d.meshing.tsdf import BLOCK, Volume
 from surface_shapes import area, dense, edge_uses, is_closed_manifold, limits, signed_volume, volume_of
@@ -43,23 +38,6 @@ def white_noise(seed: int) -> object:
         return np.where(np.abs(p).max(1) > 0.85, 1.0, values)
 
     return field
-
-
-def test_a_single_inside_corner_makes_one_triangle_around_it_that_faces_away() -> None:
-    table = case_table()
-    for corner in range(8):
-        triangles = table.edges[table.starts[1 << corner] : table.starts[(1 << corner) + 1]]
-        assert len(triangles) == 1
-        ends = np.array([CORNERS[EDGES[e][1]] + 0.5 * np.eye(3)[EDGES[e][0]] for e in triangles[0]])
-        normal = np.cross(ends[1] - ends[0], ends[2] - ends[0])
-        assert normal @ (ends.mean(0) - CORNERS[corner]) > 0
-
-
-def test_every_case_uses_exactly_the_edges_that_cross() -> None:
-    table = case_table()
-    for case in range(256):
-        near_plane_policy = {e for e, (a, c) in enumerate(EDGES) if (case >> c & 1) != (case >> (c | 1 << a) & 1)}
-        assert set(table.edges[table.starts[case] : table.starts[case + 1]].reshape(-1).tolist()) == near_plane_policy
 
 
 def test_a_sphere_has_its_radius_and_is_closed_and_faces_outward() -> None:
@@ -163,10 +141,6 @@ def strips() -> Mesh:
     return Mesh(vertices, faces, np.repeat(np.arange(12, dtype=np.uint8)[:, None], 3, axis=1))
 
 
-def test_components_are_numbered_by_size() -> None:
-    assert components(strips()).tolist() == [0, 2, 0, 1, 1]
-
-
 def test_small_components_and_unused_vertices_go() -> None:
     kept = keep_components(strips(), min_faces=2)
     assert kept.colors is not None
@@ -176,23 +150,3 @@ def test_small_components_and_unused_vertices_go() -> None:
     assert largest.faces.tolist() == [[0, 1, 2], [1, 3, 2]]
     assert len(keep_components(strips(), min_faces=3).vertices) == 0
     assert len(keep_components(keep_components(strips(), min_faces=3), min_faces=1).faces) == 0
-
-
-def test_selecting_no_face_gives_an_empty_mesh() -> None:
-    empty = select_faces(strips(), np.zeros(5, bool))
-    assert empty.faces.shape == (0, 3)
-    assert empty.vertices.shape == (0, 3)
-
-
-def test_edges_are_numbered_as_by_sorting_them() -> None:
-    """5 blocks of 1536 edges, of which the second and the fourth have none; and no edge at all."""
-    rng = np.random.default_rng(0)
-    corners = rng.integers(0, 1536, (400, 3)) + 1536 * rng.choice([0, 2, 4], (400, 3))
-    corners[0] = [0, 1535, 5 * 1536 - 1]
-    edges, faces = _numbered(corners, 5)
-    expected, numbers = np.unique(corners, return_inverse=True)
-    np.testing.assert_array_equal(edges, expected)
-    np.testing.assert_array_equal(faces, numbers.reshape(-1, 3))
-    edges, faces = _numbered(np.zeros((0, 3), np.int64), 0)
-    assert edges.shape == (0,)
-    assert faces.shape == (0, 3)

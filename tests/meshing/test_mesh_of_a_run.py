@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gs2d.cli import main
 from gs2d.core.json_files import write_json
 from gs2d.errors import ProtocolError, RunError
 from gs2d.io.meshes import read_mesh
@@ -51,29 +50,6 @@ def test_a_run_is_meshed_without_bounds_and_its_levels_are_told(run: Path, tmp_p
         RADIUS, rel=0.4
     )  # trained for a moment only
     assert json.dumps(result)
-
-
-def test_without_bounds_the_box_says_where_voxels_are_finest(run: Path, tmp_path: Path) -> None:
-    options = MeshOptions(unbounded=True, bbox=(-0.4, -0.4, -0.4, 0.4, 0.4, 0.4), voxel=0.025)
-    result = mesh_run(run, options, out=tmp_path / "far.ply", threads=1)
-    assert result["voxel"] == 0.025
-    assert result["side"] == pytest.approx(0.8)  # 32 voxels
-    assert result["levels"] > 1
-    assert np.abs(read_mesh(tmp_path / "far.ply").vertices).max() > 0.5  # not cut by the box
-
-
-def test_memory_is_bounded_by_an_option_of_the_command(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "far.ply"
-    with pytest.raises(SystemExit) as ended:
-        main(["mesh", str(run), "--unbounded", "--max-gib", "1e-5", "--out", str(out)])
-    assert ended.value.code == 2
-    error = capsys.readouterr().err
-    assert "use a voxel of about" in error
-    assert not out.exists()
-    with pytest.raises(ProtocolError, match="--max-gib must be a positive number of GiB"):
-        mesh_run(run, MeshOptions(max_gib=0.0), out=out)
 
 
 def test_voxels_that_nobody_asked_for_are_as_large_as_memory_needs(

@@ -29,14 +29,6 @@ def test_the_highest_surface_is_met_and_interpolated() -> None:
     np.testing.assert_allclose(x, np.tile(np.arange(4) + 0.5, (4, 1)), atol=1e-6)
 
 
-def test_winding_does_not_matter_and_what_stands_upright_is_not_met() -> None:
-    vertices, faces = two_floors()
-    turned = cast_down(vertices, faces[:, ::-1], (0.0, 4.0), 1.0, (4, 4))
-    assert (turned.face == cast_down(vertices, faces, (0.0, 4.0), 1.0, (4, 4)).face).all()
-    wall = np.array([[0.0, 0.5, 0.0], [4.0, 0.5, 0.0], [4.0, 0.5, 3.0]])
-    assert (cast_down(wall, np.array([[0, 1, 2]]), (0.0, 4.0), 1.0, (4, 4)).face == -1).all()
-
-
 def test_beside_the_surface_there_is_none_and_no_ray_slips_between_triangles() -> None:
     vertices, faces = two_floors()
     hits = cast_down(vertices, faces, (-1.0, 5.0), 0.25, (24, 24))

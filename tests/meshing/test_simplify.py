@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
 
@@ -41,8 +39,3 @@ def test_where_the_other_process_fails_the_work_is_done_here(monkeypatch: pytest
     assert simplify._elsewhere(points, faces, 300) is None
     found = simplify.collapse(points, faces, 300)
     assert found[1].tobytes() == expected[1].tobytes()
-
-
-def test_without_a_python_to_start_the_work_is_done_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "executable", "/nowhere/python")
-    assert simplify._elsewhere(*sheet(), 300) is None

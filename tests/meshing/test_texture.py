@@ -14,20 +14,18 @@ from benchmarks.texture import image, psnr
 
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.errors import BackendError, DataError, DiskError, ProtocolError
-from gs2d.io.meshes import read_mesh, read_textured, turn_to_y, write_textured
+from gs2d.io.meshes import read_mesh, write_textured
 from gs2d.meshing import texture as atlas_module
 from gs2d.meshing.texture import (
     FEATHER,
     MIN_FEATHER,
     ColorSource,
     bake,
-    bilinear,
     feather,
     fill_unseen,
     simplified,
     spread,
     texels_of,
-    texture_size,
     unwrap,
     vertex_normals,
 )
@@ -79,32 +77,6 @@ def test_a_texel_takes_the_photographs_with_most_pixels_per_area_less_the_first_
     assert middle(baked.mesh.texture) == pytest.approx([255 * 5 / 6, 0, 255 / 6], abs=1)
 
 
-def test_the_order_of_photographs_does_not_matter() -> None:
-    images = [plain(z, c, 256) for z, c in ((1, RED), (2, BLUE), (4, GREEN), (8, RED))]
-    one = bake(flat_atlas(grid_plane()), listed(images), 64, best=2, threads=1)
-    other = bake(flat_atlas(grid_plane()), listed(images[::-1]), 64, best=2, threads=2)
-    np.testing.assert_array_equal(one.mesh.texture, other.mesh.texture)
-
-
-@pytest.mark.usefixtures("uncorrected")
-def test_two_photographs_of_one_place_count_the_same() -> None:
-    baked = bake(flat_atlas(grid_plane()), listed([plain(2, RED, 256), plain(2, BLUE, 256)]), 64, best=1, threads=1)
-    assert middle(baked.mesh.texture) == [128, 0, 128]
-
-
-@pytest.mark.usefixtures("uncorrected")
-def test_a_slanted_view_counts_by_its_cosine() -> None:
-    # From 60 degrees aside at the same distance d: |n . r| = d / 2 and z = d, so half of f^2 / d^2. With room for both
-    # the least score is 0 and the weights are 2 to 1.
-    from gs2d.core.camera import look_at
-
-    eye = 2 * np.array([np.sin(np.pi / 3), 0, np.cos(np.pi / 3)])
-    slanted = look_at(eye, np.zeros(3), np.array([0, 1.0, 0]), width=256, height=256, fx=64.0)
-    images = [plain(2, RED, 256), ColorSource(slanted, plain(2, BLUE, 256).image)]
-    baked = bake(flat_atlas(grid_plane(16)), listed(images), 64, best=2, threads=1)
-    assert middle(baked.mesh.texture) == pytest.approx([170, 0, 85], abs=2)
-
-
 @pytest.mark.usefixtures("uncorrected")
 def test_what_stands_before_the_surface_does_not_colour_it() -> None:
     # A plate of half the side hides the middle of the floor from the near camera; the far one comes in from aside.
@@ -131,12 +103,6 @@ def test_pixels_that_are_masked_or_transparent_are_not_used() -> None:
     assert middle(bake(flat_atlas(grid_plane()), listed(images), 64, threads=1).mesh.texture) == [0, 0, 255]
     with pytest.raises(ProtocolError, match="none of 1 does"):
         bake(flat_atlas(grid_plane()), listed([masked]), 64, threads=1)
-
-
-def test_the_back_of_a_surface_has_no_colour() -> None:
-    below = ColorSource(above(-2.0, 256), plain(2, RED, 256).image)
-    with pytest.raises(ProtocolError, match="photographs that see the mesh"):
-        bake(flat_atlas(grid_plane()), listed([below]), 64, threads=1)
 
 
 def test_a_gain_between_photographs_leaves_no_step_where_one_of_them_ends() -> None:
@@ -185,20 +151,6 @@ def test_unseen_texels_take_the_colour_of_the_surface_beside_them() -> None:
     assert picture_[:, :32].reshape(-1, 3).tolist() == [[10, 200, 10]] * 1024 + [[200, 10, 10]] * 1024  # untouched
 
 
-def test_a_piece_that_nobody_saw_takes_the_mean_colour() -> None:
-    pieces = [grid_plane(4), grid_plane(4)]
-    pieces = [
-        Mesh(p.vertices * np.float32([0.4, 0.8, 1]) + np.float32([x, 0, 0]), p.faces)
-        for p, x in zip(pieces, (-0.5, 0.5), strict=True)
-    ]
-    atlas = flat_atlas(join(pieces))
-    texels = texels_of(atlas, 64)
-    colors, seen = np.zeros((len(texels.index), 3), np.uint8), texels.index % 64 < 32
-    colors[seen] = np.where((texels.index[seen] // 64 < 32)[:, None], (100, 0, 0), (200, 0, 0))
-    fill_unseen(atlas, texels, colors, seen)
-    assert set(map(tuple, colors[~seen].tolist())) == {(150, 0, 0)}
-
-
 def test_no_texel_of_the_texture_is_without_a_colour_of_its_nearest_chart() -> None:
     mesh = Mesh(grid_plane(2).vertices * np.float32(0.5), grid_plane(2).faces)  # the middle half of the texture
     texels = texels_of(flat_atlas(mesh), 64)
@@ -206,29 +158,6 @@ def test_no_texel_of_the_texture_is_without_a_colour_of_its_nearest_chart() -> N
     texture = spread(texels, np.where((texels.index % 64 < 32)[:, None], (9, 8, 7), (1, 2, 3)).astype(np.uint8))
     assert (texture[:, :32] == (9, 8, 7)).all()
     assert (texture[:, 32:] == (1, 2, 3)).all()
-
-
-def test_texels_know_their_place_on_the_surface() -> None:
-    pytest.importorskip("xatlas")
-    mesh = box(3)
-    atlas = unwrap(mesh, 128)
-    assert np.array_equal(atlas.source[atlas.faces], mesh.faces)
-    for size in (64, 100):
-        texels = texels_of(atlas, size)
-        assert len(np.unique(texels.index)) == len(texels.index) > size * size / 3
-        places = texels.interpolated(mesh.vertices, mesh.faces)
-        np.testing.assert_allclose(np.abs(places).max(axis=1), 1, atol=1e-5)  # on the box
-        uv = texels.interpolated(atlas.uv, atlas.faces) * size
-        np.testing.assert_allclose(uv[:, 0], texels.index % size + 0.5, atol=1e-3)
-        np.testing.assert_allclose(uv[:, 1], texels.index // size + 0.5, atol=1e-3)
-
-
-def test_bilinear_colours_are_those_of_pixels_at_their_centres_and_means_between() -> None:
-    image = np.zeros((2, 3, 3), np.uint8)
-    image[0, :, 0], image[1, :, 0] = (10, 20, 40), (30, 60, 80)
-    x, y = np.array([0.5, 1.5, 1.0, 2.0, 0.0, 3.0, 1.0]), np.array([0.5, 0.5, 0.5, 0.5, 0.0, 2.0, 1.0])
-    assert bilinear(image, x, y)[:, 0].tolist() == [10, 20, 15, 30, 10, 80, 30]
-    assert bilinear(image, np.array([1.0]), np.array([0.6]))[0, 0] == pytest.approx(15 + 0.1 * 30)
 
 
 def test_a_simplified_mesh_has_so_many_faces_and_the_same_shape() -> None:
@@ -241,23 +170,6 @@ def test_a_simplified_mesh_has_so_many_faces_and_the_same_shape() -> None:
     np.testing.assert_allclose(np.abs(small.vertices - 1e6).max(axis=1), 1, atol=1e-3)
     with pytest.raises(ProtocolError, match="--faces"):
         simplified(mesh, 3)
-
-
-def test_faces_without_area_have_finite_places_in_the_texture() -> None:
-    pytest.importorskip("xatlas")
-    point = Mesh(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32), np.array([[0, 0, 0]], np.int32))
-    atlas = unwrap(point, 64)
-    assert np.isfinite(atlas.uv).all()
-    assert len(texels_of(atlas, 64).index) == 0
-
-
-def test_the_size_of_a_texture_follows_the_pixels() -> None:
-    # 2 x 2 world units, 64 px each: 128 px, 256 half pixels, / sqrt(0.55) = 345: 512. From twice as near: 690: 1024.
-    assert texture_size(grid_plane(), [above(1.0, 256, 64.0), above(2.0, 256, 64.0)]) == 512
-    assert texture_size(grid_plane(), [above(0.5, 256, 64.0)]) == 1024
-    assert texture_size(grid_plane(), [above(-1.0, 256, 64.0)]) == 256  # nobody sees it: the least
-    with pytest.raises(ProtocolError, match="--texture-size must be 64 to 8192"):
-        bake(flat_atlas(grid_plane()), listed([]), 32)
 
 
 def test_a_missing_package_is_one_line_with_the_remedy() -> None:
@@ -293,18 +205,6 @@ def test_other_programs_open_the_files_with_their_texture(tmp_path: Path, name: 
     assert (colors[bottom] == (0, 0, 250)).all()
 
 
-def test_a_textured_mesh_is_read_as_it_was_written(tmp_path: Path) -> None:
-    mesh = textured()
-    write_textured(tmp_path / "a.glb", mesh, up=np.array([0.0, 0, 1]))
-    read = read_textured(tmp_path / "a.glb")
-    for name in ("vertices", "normals", "faces", "uv", "texture"):
-        np.testing.assert_array_equal(getattr(read, name), getattr(mesh, name))
-    data = (tmp_path / "a.glb").read_bytes()
-    (tmp_path / "a.glb").write_bytes(data[: len(data) // 2])
-    with pytest.raises(DataError, match="a.glb: a .glb file as"):
-        read_textured(tmp_path / "a.glb")
-
-
 def test_a_glb_file_is_what_the_format_says(tmp_path: Path) -> None:
     path = tmp_path / "a.GLB"
     write_textured(path, textured(), up=np.array([0.0, 0, 1]))
@@ -322,14 +222,6 @@ def test_a_glb_file_is_what_the_format_says(tmp_path: Path) -> None:
     assert document["extensionsUsed"] == ["KHR_materials_unlit"]
     # z up to y up is a quarter turn about x, backwards: sin and cos of -45 degrees
     np.testing.assert_allclose(document["nodes"][0]["rotation"], [-(0.5**0.5), 0, 0, 0.5**0.5])
-
-
-@pytest.mark.parametrize("up", [(0, 1, 0), (0, -1, 0), (0, 0, 1), (1, 0, 0), (0.3, -0.5, 0.8)])
-def test_up_is_turned_to_y(up: tuple[float, float, float]) -> None:
-    from scipy.spatial.transform import Rotation
-
-    turned = Rotation.from_quat(turn_to_y(np.array(up))).apply(up)
-    np.testing.assert_allclose(turned / np.linalg.norm(up), [0, 1, 0], atol=1e-9)
 
 
 def test_an_obj_file_is_not_torn_at_the_seams_of_its_texture(tmp_path: Path) -> None:

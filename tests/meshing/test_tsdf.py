@@ -6,15 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from gs2d.core.camera import Camera, look_at
-from gs2d.errors import DiskError, ProtocolError, ShapeError
+from gs2d.errors import ProtocolError
 from gs2d.meshing.bounds import derive_limits, sample_depths
 from gs2d.meshing.depth_maps import DepthMap, RenderedView, Spool, depth_map
 from gs2d.meshing.extract import extract
 from gs2d.meshing.marching_cubes import components, marching_cubes
-from gs2d.meshing.tsdf import BLOCK, FULL_WEIGHT_BEHIND, block_bytes, block_grid, fuse, min_blocks, touched_blocks
+from gs2d.meshing.tsdf import FULL_WEIGHT_BEHIND, block_bytes, fuse
 from surface_shapes import (
     box_depth,
     edge_uses,
@@ -167,73 +166,6 @@ def test_the_result_does_not_depend_on_threads() -> None:
     np.testing.assert_array_equal(one.weight, three.weight)
 
 
-def test_skipping_blocks_that_a_view_cannot_change_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The pyramid of farthest depths is an optimisation: compare with every block in front of the camera."""
-    cameras = orbit(8, 3.0)
-    frames = maps(
-        [RenderedView(c, box_depth(c, np.array([-0.9, -0.5, -0.2]), np.array([0.3, 0.8, 0.9]))) for c in cameras]
-    )
-    fast = fuse(frames, LIMITS, threads=1)
-    monkeypatch.setattr(
-        "gs2d.meshing.tsdf.block_visibility",
-        lambda view, centers, radius, truncation: np.flatnonzero(
-            centers @ view.projection[2, :3] + view.projection[2, 3] > 1.01 * radius
-        ),
-    )
-    slow = fuse(frames, LIMITS, threads=1)
-    np.testing.assert_array_equal(fast.weight, slow.weight)
-    np.testing.assert_array_equal(fast.tsdf, slow.tsdf)
-
-
-@pytest.mark.parametrize("marked", [True, False])
-def test_the_blocks_near_a_depth_map_are_those_of_a_plain_loop(marked: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Samples every half block from -0.15 to 0.15 of each pixel's depth; each takes the two nearest blocks by axis."""
-    if not marked:
-        monkeypatch.setattr("gs2d.meshing.tsdf._MAX_MARKS", 0)  # as for a grid that is too large to mark
-    camera = look_at(np.array([0.4, -2.5, 0.3]), np.zeros(3), np.array([0, 0, 1.0]), width=24, height=20, fx=40)
-    item = depth_map(RenderedView(camera, sphere_depth(camera, 1.0)))
-    dims = block_grid(LIMITS)
-    expected = set()
-    for row, column in zip(*np.nonzero(item.depth), strict=True):
-        for offset in np.linspace(-0.15, 0.15, 4):  # 2 * 0.15 in steps of at most 0.12, half a block of 8 * 0.03
-            local = np.array([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, 1.0])
-            point = (local * (item.depth[row, column] + offset) - camera.T_cam_world[:3, 3]) @ camera.rotation
-            lower = np.floor((point - LIMITS.lower) / 0.24 - 0.5).astype(int)
-            for corner in np.ndindex(2, 2, 2):
-                block = lower + corner
-                if (block >= 0).all() and (block < dims).all():
-                    expected.add((block[0] * dims[1] + block[1]) * dims[2] + block[2])
-    found = touched_blocks(item, LIMITS, dims)
-    assert found.tolist() == sorted(expected)
-    assert len(found) > 50
-
-
-def test_every_voxel_within_the_truncation_of_a_seen_point_has_a_block() -> None:
-    camera = orbit(1, 3.0)[0]
-    item = depth_map(RenderedView(camera, sphere_depth(camera, 1.0)))
-    dims = block_grid(LIMITS)
-    keys = set(touched_blocks(item, LIMITS, dims).tolist())
-    sample = sample_depths(item, 10**9)
-    ray = (sample.points - camera.center) / sample.depths[:, None]
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        offset = rng.uniform(-LIMITS.truncation, LIMITS.truncation, (len(ray), 1))
-        jitter = rng.uniform(-0.5, 0.5, ray.shape) * LIMITS.voxel  # the voxels next to the ray
-        block = np.floor((sample.points + offset * ray + jitter - LIMITS.lower) / (BLOCK * LIMITS.voxel)).astype(int)
-        assert set(((block[:, 0] * dims[1] + block[:, 1]) * dims[2] + block[:, 2]).tolist()) <= keys
-
-
-def test_a_pixel_wider_than_a_block_leaves_no_gaps() -> None:
-    """A wall at 2, pixels 0.25 wide, blocks 0.04 wide: the sheet has no holes."""
-    camera = Camera(8, 8, 8.0, 8.0, 4.0, 4.0, np.eye(4))
-    lim = replace(limits(1.0, 0.005), lower=(-0.3, -0.3, 1.8), upper=(0.3, 0.3, 2.2))
-    mesh = marching_cubes(fuse([depth_map(RenderedView(camera, np.full((8, 8), 2.0)))], lim, threads=1))
-    assert components(mesh).max() == 0
-    edges, uses, _ = edge_uses(mesh)
-    border = np.abs(mesh.vertices[edges[uses == 1]][..., :2]).max(axis=(1, 2))
-    assert border.min() > 0.28
-
-
 def test_memory_is_bounded_and_the_error_names_a_voxel_that_fits() -> None:
     frames = maps(sphere_frames(orbit(10, 3.0)))
     lim = limits(1.3, 0.01)
@@ -258,65 +190,6 @@ def test_a_voxel_that_is_far_too_small_is_refused_at_once(voxel: float) -> None:
     assert 0.3 * max_bytes < fuse(frames, limits(1.3, voxel), max_bytes=max_bytes, threads=1).nbytes <= max_bytes
 
 
-@pytest.mark.parametrize("truncation", [0.05, 0.3, 2.0])
-def test_the_least_number_of_blocks_is_not_above_the_number(truncation: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gs2d.meshing.tsdf._FEW_SAMPLES", 0)
-    for half in (1.3, 0.9):  # the second box cuts the sphere
-        lim = limits(half, 0.02, truncation)
-        for item in maps(sphere_frames(orbit(3, 3.0))):
-            number = len(touched_blocks(item, lim, block_grid(lim)))
-            assert 0.04 * number < min_blocks(item, lim) <= number
-
-
-def test_a_truncation_larger_than_the_box_is_refused() -> None:
-    with pytest.raises(ProtocolError, match=r"at most the side of the box, 2\.6 world units, was expected, got 1e\+09"):
-        fuse(maps(sphere_frames(orbit(2, 3.0))), limits(1.3, 0.03, 1e9), threads=1)
-
-
-def test_a_volume_weighs_what_the_bound_counts() -> None:
-    frames = sphere_frames(orbit(2, 3.0))
-    colored = [replace(f, color=np.zeros((96, 96, 3), np.uint8)) for f in frames]
-    for items, has_color in ((frames, False), (colored, True)):
-        volume = fuse(maps(items), LIMITS, threads=1)
-        assert volume.nbytes == len(volume.keys) * block_bytes(has_color)
-
-
-def test_a_voxel_absurdly_small_for_the_box_is_refused() -> None:
-    with pytest.raises(ProtocolError, match="voxel"):
-        block_grid(limits(1e6, 1e-6))
-
-
-def test_a_generator_of_depth_maps_is_refused_because_it_is_read_twice() -> None:
-    with pytest.raises(TypeError, match="twice"):
-        fuse(iter(maps(sphere_frames(orbit(1, 3.0)))), LIMITS)
-
-
-def test_maps_of_another_size_than_the_camera_are_refused() -> None:
-    camera = orbit(1, 3.0)[0]
-    depth = np.ones((96, 96))
-    for frame in (
-        RenderedView(camera, np.ones((96, 95))),
-        RenderedView(camera, depth, color=np.zeros((96, 96))),
-        RenderedView(camera, depth, valid=np.ones((95, 96), bool)),
-        RenderedView(camera, depth, valid=-depth),
-    ):
-        with pytest.raises(ShapeError):
-            depth_map(frame)
-
-
-def test_torch_tensors_and_arrays_are_the_same_frame() -> None:
-    camera = orbit(1, 3.0)[0]
-    depth, color = sphere_depth(camera, 1.0).astype(np.float32), np.full((96, 96, 3), 0.5, np.float32)
-    a = depth_map(RenderedView(camera, depth, color, depth > 0))
-    t = torch.from_numpy
-    b = depth_map(RenderedView(camera, t(depth).requires_grad_(), t(color), t(depth > 0)))
-    np.testing.assert_array_equal(a.depth, b.depth)
-    assert a.color is not None
-    assert b.color is not None
-    assert (a.color == 128).all()
-    assert (b.color == 128).all()
-
-
 def test_a_spool_gives_back_what_it_was_given_as_often_as_asked() -> None:
     camera = orbit(1, 3.0)[0]
     depth = sphere_depth(camera, 1.0)
@@ -337,11 +210,6 @@ def test_a_spool_gives_back_what_it_was_given_as_often_as_asked() -> None:
                     assert (a is None and b is None) or np.array_equal(a, b), name
 
 
-def test_a_spool_in_a_missing_folder_is_a_disk_error(tmp_path: object) -> None:
-    with pytest.raises(DiskError):
-        Spool(f"{tmp_path}/none")
-
-
 def test_extract_takes_a_generator_and_derives_everything() -> None:
     cameras = orbit(30, 3.0)
     result = extract((frame for frame in sphere_frames(cameras)), resolution=60, threads=1)
@@ -351,11 +219,6 @@ def test_extract_takes_a_generator_and_derives_everything() -> None:
     assert result.limits.voxel == pytest.approx(2 / 60, rel=0.1)
     radius = np.linalg.norm(result.mesh.vertices, axis=1)
     assert np.abs(radius - 1).max() < 0.6 * result.limits.voxel
-
-
-def test_extract_takes_limits_or_their_parts_but_not_both() -> None:
-    with pytest.raises(TypeError, match="not both"):
-        extract([], limits=LIMITS, voxel=0.1)
 
 
 def test_an_orbit_at_uneven_distances_keeps_the_whole_scene() -> None:

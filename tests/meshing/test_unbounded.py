@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,12 +10,11 @@ import pytest
 from cascade_scenes import BALL, GROUND, cascade_of, outdoor_frames, volumes_of
 from gs2d.core.camera import look_at
 from gs2d.errors import ProtocolError
-from gs2d.meshing import unbounded
 from gs2d.meshing.bounds import sample_depths
 from gs2d.meshing.depth_maps import RenderedView, depth_map
-from gs2d.meshing.extract import Extraction, extract, extract_unbounded
+from gs2d.meshing.extract import Extraction, extract_unbounded
 from gs2d.meshing.marching_cubes import components
-from gs2d.meshing.tsdf import BLOCK, VOXELS, Volume, block_bytes
+from gs2d.meshing.tsdf import block_bytes
 from gs2d.meshing.unbounded import (
     STEP,
     cascade_marching_cubes,
@@ -24,7 +22,6 @@ from gs2d.meshing.unbounded import (
     find_cascade_blocks,
     fuse_cascade,
     fused_cascade_surface,
-    valid_depth,
 )
 from surface_shapes import edge_uses, is_closed_manifold, orbit, rays, signed_volume, sphere_depth
 
@@ -65,18 +62,6 @@ def test_any_field_whatever_gives_a_closed_surface_across_the_joins() -> None:
     assert (uses % 2 == 0).all()  # no border
     assert (2 * upward == uses).all()  # as often one way as the other
     assert (uses == 2).mean() > 0.999
-
-
-def test_every_place_belongs_to_one_level() -> None:
-    """Cubes of half 1, 2 and 4: a voxel of 1/16, 1/8, 1/4, and no voxel of one level inside the level within."""
-    cascade = cascade_of(3)
-    points = np.array([[0.0, 0.99, 0.0], [1.01, 0.0, 0.0], [0.0, -1.99, 1.0], [2.5, 0.0, 0.0], [0.0, 0.0, 4.1]])
-    np.testing.assert_array_equal(cascade.level_of(points), [0, 1, 1, 2, 3])
-    local = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK,) * 3), axis=1)
-    for k, volume in enumerate(volumes_of(cascade, lambda p: p[:, 0])):
-        at = np.asarray(volume.limits.lower) + (volume.blocks[:, None] * BLOCK + local) * volume.limits.voxel
-        np.testing.assert_array_equal(cascade.level_of(at.reshape(-1, 3)), k)
-        assert len(volume.keys) == (64 if k == 0 else 56)  # 4^3 blocks, without the 2^3 in the middle
 
 
 # -- shapes at several distances ---------------------------------------------------------------------------------------
@@ -145,28 +130,6 @@ def test_a_sky_makes_no_shell_and_the_ground_reaches_far_out(sky: str) -> None:
     assert (result.mesh.colors == 128).all()
 
 
-def test_a_sky_that_one_view_is_believed_about_would_be_a_shell() -> None:
-    """What the number of agreeing views is for."""
-    mesh = extract_unbounded(outdoor_frames("cards"), resolution=64, threads=1, far_views=1.0).mesh
-    assert (mesh.vertices[:, 2] > 1).sum() > 1000
-
-
-def test_the_bounded_box_does_not_hold_the_far_ground() -> None:
-    near = extract(outdoor_frames("unseen"), resolution=64, threads=1)
-    far = outdoors("unseen")
-    assert np.abs(far.mesh.vertices).max() > 1.3 * np.abs(near.mesh.vertices).max()
-    assert far.limits.voxel < 0.5 * near.limits.voxel  # and yet it is finer where the scene is
-    assert far.volume_bytes < 4 * near.volume_bytes
-
-
-# -- limits ------------------------------------------------------------------------------------------------------------
-def test_depth_is_known_as_far_as_half_a_pixel_of_parallax_moves_a_point_less_than_the_truncation() -> None:
-    """Cameras at distance 2 from their mean: baseline 4; focal length 120 px, band 0.05: 0.05 * 4 * 120 / 0.5 = 48."""
-    cameras = orbit(50, 2.0)
-    assert valid_depth(cameras, 0.05) == pytest.approx(48, rel=0.02)
-    assert valid_depth(cameras[:1], 0.05) == np.inf
-
-
 def test_the_innermost_cube_holds_the_nearer_half_and_the_given_limits_are_kept() -> None:
     cameras = orbit(12, 3.0)
     samples = [sample_depths(depth_map(RenderedView(c, sphere_depth(c, 1.0)))) for c in cameras]
@@ -217,35 +180,3 @@ def test_slabs_of_any_size_give_the_bytes_of_the_mesh_of_whole_levels(
     assert (parts.colors is not None) == colored
     if colored:
         np.testing.assert_array_equal(parts.colors, whole.colors)
-
-
-def test_of_a_large_unbounded_volume_only_slabs_are_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    frames = outdoor_frames("unseen", views=6, size=48)
-    largest = 0
-    make = unbounded.invalid_volume
-
-    def watched(*given: Any, **named: Any) -> Volume:
-        nonlocal largest
-        volume = make(*given, **named)
-        largest = max(largest, volume.nbytes)
-        return volume
-
-    monkeypatch.setattr(unbounded, "invalid_volume", watched)
-    found = extract_unbounded(frames, voxel=0.03, threads=1, slab_bytes=4_000_000)
-    assert found.volume_bytes > 20_000_000
-    assert 0 < largest <= 4_000_000
-
-
-def test_the_result_does_not_depend_on_threads_or_on_levels_without_blocks() -> None:
-    maps = [depth_map(f) for f in outdoor_frames("unseen", views=6, size=48)]
-    cascade = cascade_of(4, depth_limit=6.0)
-    one = cascade_marching_cubes(fuse_cascade(maps, cascade, threads=1), cascade, far_weight=1.0)
-    two = cascade_marching_cubes(fuse_cascade(maps, cascade, threads=2), cascade, far_weight=1.0)
-    np.testing.assert_array_equal(one.vertices, two.vertices)
-    more = cascade_of(9, depth_limit=6.0)
-    same = cascade_marching_cubes(fuse_cascade(maps, more, threads=1), more, far_weight=1.0)
-    assert len(same.faces) == len(one.faces)
-    with pytest.raises(TypeError, match="read twice"):
-        fuse_cascade(iter(maps), cascade)
-    with pytest.raises(ProtocolError, match="depth inside"):
-        fuse_cascade([replace(m, depth=np.zeros_like(m.depth)) for m in maps], cascade)

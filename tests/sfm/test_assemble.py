@@ -12,11 +12,9 @@ from PIL import Image
 
 from gs2d.core.camera import Camera
 from gs2d.data.readers.colmap import read_images
-from gs2d.errors import DataError
 from gs2d.pipeline.options import PosesOptions
-from gs2d.pipeline.sfm import _pieces_line, find_poses
+from gs2d.pipeline.sfm import find_poses
 from gs2d.sfm.assemble import merged
-from gs2d.sfm.images import camera_groups, find_photos, read_photos, rig_folders
 from room_photos import room_cameras, room_image, textures
 
 COUNT = 14
@@ -87,13 +85,6 @@ def test_pieces_that_do_not_fit_stay_apart(pycolmap: Any, made: tuple[dict[str, 
     assert [piece.num_reg_images() for piece in pieces] == [9, smaller.num_reg_images()]
 
 
-def test_several_pieces_are_said_with_their_photographs() -> None:
-    others = [{"photos": ["a"] * count} for count in (30, 9, 7, 5, 4, 3)]
-    line = _pieces_line({"placed": 120, "other_models": others})
-    assert line.startswith("the photographs make 7 pieces that nothing joins, of 120, 30, 9, 7, 5, 4 ...: the largest")
-    assert _pieces_line({"placed": 120, "other_models": []}) == ""
-
-
 # -- rigs --------------------------------------------------------------------------------------------------------------
 def write_rig(root: Path, count: int) -> dict[str, Camera]:
     """Two cameras side by side, 0.25 apart, before the corner of the room; the true cameras by name."""
@@ -109,11 +100,6 @@ def write_rig(root: Path, count: int) -> dict[str, Camera]:
     return true
 
 
-def folders_of(root: Path, cameras: str = "auto") -> tuple[str, ...]:
-    photos = list(read_photos(find_photos(root)[0], root, threads=1))
-    return rig_folders(photos, camera_groups(photos, [photo.size for photo in photos], cameras))
-
-
 def test_cameras_of_a_rig_keep_their_distance_and_place_a_photograph_that_shows_nothing(
     colmap: None, tmp_path: Path
 ) -> None:
@@ -126,24 +112,3 @@ def test_cameras_of_a_rig_keep_their_distance_and_place_a_photograph_that_shows_
     between = [poses[f"right/{i:03}.jpg"] @ np.linalg.inv(poses[f"left/{i:03}.jpg"]) for i in range(6)]
     for one in between[1:]:
         np.testing.assert_allclose(one, between[0], atol=1e-9)
-
-
-def test_folders_that_are_no_rig_are_refused(tmp_path: Path) -> None:
-    def fill(folder: str, *names: str, size: int = 16) -> None:
-        for name in names:
-            (tmp_path / folder).mkdir(parents=True, exist_ok=True)
-            Image.new("RGB", (size, 16)).save(tmp_path / folder / name)
-
-    fill("left", "0.png", "1.png", "2.png")
-    with pytest.raises(DataError, match="--rig needs a sub-folder for each camera.*; got photographs in left"):
-        folders_of(tmp_path)
-    fill("right", "7.png", "8.png", "9.png")
-    with pytest.raises(DataError, match=r"got 6 of 6 names in one folder alone, such as 0.png"):
-        folders_of(tmp_path)
-    fill("right", "0.png", "1.png", "2.png")
-    assert folders_of(tmp_path) == ("right", "left")  # the one with most is the reference
-    with pytest.raises(DataError, match="--rig needs one camera a folder, got 9 cameras for 2 folders"):
-        folders_of(tmp_path, "each")
-    fill("right", "0.png", size=20)
-    with pytest.raises(DataError, match="--rig needs one camera a folder, got 3 cameras for 2 folders"):
-        folders_of(tmp_path)

@@ -14,7 +14,7 @@ from gs2d.cli import run
 from gs2d.data.readers.colmap import read_images
 from gs2d.sfm import colmap_worker
 from gs2d.sfm.steps import Steps
-from room_photos import write_turn, write_walk
+from room_photos import write_walk
 
 
 class _Piece(SimpleNamespace):
@@ -84,26 +84,6 @@ def test_easier_demands_are_believed_where_they_place_clearly_more(
     assert placing.said == ["cameras were placed as on a walk: 8 photographs, 4 by stricter rules"]
 
 
-def test_one_more_photograph_is_no_reason_to_believe_easier_demands(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    placing = _Placing(monkeypatch, tmp_path, strictly=(4,), as_on_a_walk=(5,))
-    assert (placing.run(20), placing.said) == (["strictly-0"], [])
-
-
-def test_a_way_that_was_tried_is_not_tried_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    placing = _Placing(monkeypatch, tmp_path, strictly=(), as_on_a_walk=(9,))
-    placing.steps.finish("tried strictly", {})
-    assert placing.run(10) == ["as on a walk-0"]
-    assert placing.tried == ["as on a walk"]
-
-
-def test_the_global_mapper_is_tried_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    placing = _Placing(monkeypatch, tmp_path, all_at_once=(3,))
-    assert placing.run(10, "global") == ["all at once-0"]
-    assert placing.tried == ["all at once"]
-
-
 def test_a_walk_straight_ahead_has_cameras(colmap: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """COLMAP's own demands refuse every pair of it. Focal length and depth are one scale then, which nothing tells."""
     write_walk(tmp_path / "photos")
@@ -117,13 +97,3 @@ def test_a_walk_straight_ahead_has_cameras(colmap: None, tmp_path: Path, capsys:
     assert np.linalg.norm(steps, axis=1) == pytest.approx(np.linalg.norm(steps, axis=1).mean(), rel=0.15)
     assert (ahead[:-1] * steps / np.linalg.norm(steps, axis=1, keepdims=True)).sum(axis=1) == pytest.approx(1, abs=0.02)
     assert "cameras were placed as on a walk: " in capsys.readouterr().err
-
-
-def test_a_camera_that_only_turned_has_no_place_by_easier_demands_either(
-    colmap: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The global mapper gives it eight, between rays of several degrees: nothing would doubt them."""
-    write_turn(tmp_path / "photos")
-    assert run(["poses", str(tmp_path / "photos"), "--out", str(tmp_path / "capture"), "--threads", "1"]) == 2
-    assert "do not turn on the spot" in capsys.readouterr().err
-    assert not (tmp_path / "capture").exists()

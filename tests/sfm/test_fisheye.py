@@ -16,17 +16,16 @@ from gs2d.core.camera import look_at
 from gs2d.core.json_files import read_json
 from gs2d.data import load_scene
 from gs2d.data.image_files import read_mask
-from gs2d.data.readers.colmap import ColmapCamera, read_cameras, read_images
+from gs2d.data.readers.colmap import read_cameras, read_images
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.options import PosesOptions
 from gs2d.pipeline.sfm import find_poses
 from gs2d.sfm import as_fisheye, colmap_worker
 from gs2d.sfm.fisheye import Circle, circle_of, named_fisheye, small_if_dark
 from gs2d.sfm.images import Photo, camera_groups, find_photos, fisheye_hints, read_photos
-from gs2d.sfm.lens import ASKED, CIRCLE, NAME, lens_line
-from gs2d.sfm.lens_probe import Probe, probe
+from gs2d.sfm.lens import ASKED, CIRCLE, NAME
+from gs2d.sfm.lens_probe import probe
 from gs2d.sfm.masks import copy_masks
-from gs2d.sfm.model import camera_line
 from gs2d.sfm.steps import Steps
 
 SIZE = (400, 300)
@@ -66,11 +65,6 @@ def test_the_circle_of_round_photographs_is_found(x: float, y: float, radius: fl
     assert inside[np.hypot(u - x, v - y) < 0.95 * radius].all()
 
 
-def test_photographs_that_show_all_of_their_corners_have_no_circle() -> None:
-    assert small_if_dark(mottled()) is None
-    assert found(mottled(), mottled(seed=1)) is None
-
-
 def test_darkness_of_another_shape_is_no_circle() -> None:
     """A frame, a statue that turns before black velvet, a round plate that is smaller than any fisheye's circle."""
     framed = np.zeros((300, 400, 3), np.uint8)
@@ -84,18 +78,6 @@ def test_darkness_of_another_shape_is_no_circle() -> None:
     assert found(framed) is None
     assert found(*statues) is None
     assert found(round_picture(200, 150, 90)) is None
-
-
-def test_a_dark_scene_is_seen_through_the_circle_by_those_that_show_some_of_it_bright() -> None:
-    """Each photograph has a dark half; together they have the circle."""
-    left, right = (round_picture(200, 150, 149, seed=seed) for seed in (0, 1))
-    left[:, 200:] = right[:, :200] = 0
-    assert found(left) is None
-    assert found(left, right) is not None
-
-
-def test_a_few_photographs_with_bright_corners_take_the_circle_from_all() -> None:
-    assert found(*(round_picture(200, 150, 149, seed=seed) for seed in range(4)), mottled()) is None
 
 
 # -- names and hints ---------------------------------------------------------------------------------------------------
@@ -221,12 +203,6 @@ def test_matches_tell_a_fisheye_and_its_focal_length(
         assert told.bent > 0.85
 
 
-def test_too_few_matches_tell_nothing(pycolmap: Any) -> None:
-    camera = pycolmap.Camera(model="SIMPLE_FISHEYE", width=SIZE[0], height=SIZE[1], params=[F, 200, 150], camera_id=1)
-    alone = _Database(pycolmap, "SIMPLE_PINHOLE", (300.0, 200, 150), count=1)
-    assert probe(pycolmap, alone, camera, reach=250.0, seed=0) is None
-
-
 @pytest.mark.parametrize(
     ("model", "params", "placed", "error", "is_doubted"),
     [
@@ -257,29 +233,6 @@ def test_a_camera_is_doubted_by_what_its_photographs_made_of_it(
     assert as_fisheye._is_doubted(piece, 1, 10) is is_doubted
     assert as_fisheye._is_doubted(piece, 2, 10)
     assert as_fisheye._is_doubted(None, 1, 10)
-
-
-@pytest.mark.parametrize(
-    ("told", "why", "expected"),
-    [
-        (Probe(0.8, 0.9, 140.0), "doubt", 140.0),
-        (Probe(0.9, 0.91, 140.0), "doubt", None),
-        (Probe(0.9, 0.91, 140.0), NAME, None),  # an action camera that stretched its pictures itself
-        (Probe(0.9, 0.9, 140.0), CIRCLE, 140.0),
-        (Probe(0.9, 0.8, 140.0), CIRCLE, None),
-        (None, CIRCLE, 100 / np.radians(90)),
-        (None, "doubt", None),
-        (Probe(0.9, 0.91, 140.0), ASKED, 111.0),  # EXIF's
-    ],
-)
-def test_the_focal_length_to_begin_with(told: Probe | None, why: str, expected: float | None) -> None:
-    known = SimpleNamespace(has_prior_focal_length=True, mean_focal_length=lambda: 111.0)
-    assert as_fisheye._focal(told, why, 100.0, known) == expected
-
-
-def test_a_fisheye_that_is_asked_for_and_tells_nothing_begins_at_150_degrees() -> None:
-    known = SimpleNamespace(has_prior_focal_length=False)
-    assert as_fisheye._focal(None, ASKED, 100.0, known) == pytest.approx(100 / np.radians(75))
 
 
 # -- which model is believed -------------------------------------------------------------------------------------------
@@ -337,27 +290,6 @@ def test_cameras_are_placed_once_more_as_fisheyes_and_the_better_model_stays(
     (tmp_path / "first.json").unlink()  # as if it had been ended here
     colmap_worker._first_round(None, {}, steps, lambda **_: None)
     assert "verified" not in done
-
-
-def test_what_was_found_is_said_with_its_numbers() -> None:
-    lens = {"chosen": "RADIAL_FISHEYE", "asked": None, "trials": [], "fisheyes": [row([1.0])]}
-    shares = "98.8 % of matches agree through one of 382 px, 84.2 % through a pinhole"
-    assert lens_line(lens) == f"lens: 16 photographs are taken for a fisheye's (other lenses left a doubt): {shares}"
-    named = {**lens, "fisheyes": [row(None, why=NAME)]}
-    assert lens_line(named) == (
-        f"lens: 16 photographs are not taken for a fisheye's, though (their camera or lens is called so): {shares}"
-    )
-    unknown = {**lens, "fisheyes": [{**row([1.0], why=CIRCLE), "bent": None, "plain": None, "probed": None}]}
-    assert lens_line(unknown).endswith("fisheye's (they are round), too few of which match to tell")
-    trials = [{"model": "RADIAL_FISHEYE", "error_px": 0.4, "doubts": []}]
-    assert lens_line({**lens, "trials": trials}).endswith(f"must save 1 %; {lens_line(lens)[6:]}")
-
-
-def test_the_line_of_a_fisheye_says_how_much_it_shows() -> None:
-    camera = ColmapCamera("SIMPLE_FISHEYE", 400, 300, (150.0, 200.0, 150.0))
-    assert camera_line(camera, 3).endswith("f = 150 px (153 degrees wide)")
-    assert camera_line(camera, 3, Circle(0.5, 0.5, 0.375)).endswith("f = 150 px (115 degrees wide)")
-    assert camera_line(ColmapCamera("SIMPLE_PINHOLE", 400, 300, (200.0, 200.0, 150.0)), 3).endswith("(90 degrees wide)")
 
 
 # -- whole searches ----------------------------------------------------------------------------------------------------

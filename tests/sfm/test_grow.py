@@ -84,19 +84,6 @@ def test_a_model_grows_on_from_its_snapshot(
     assert again == [COUNT]
 
 
-def test_without_snapshots_an_interrupted_model_is_grown_anew(
-    pycolmap: Any, matches: tuple[str, Any], tmp_path: Path
-) -> None:
-    database, options = matches
-    done = Steps(tmp_path / "mapping")
-    with pytest.raises(RuntimeError, match="ended"):
-        grow_all(pycolmap, database, options, done, "grown", ended_at(8), often=False)
-    assert done.names("grown") == []
-    counted: list[int] = []
-    grow_all(pycolmap, database, options, done, "grown", counted.append, often=False)
-    assert counted == [2] + [1] * (COUNT - 2)
-
-
 class Model:
     """What is written as a model."""
 
@@ -135,21 +122,6 @@ def test_snapshots_come_no_oftener_than_their_writing_allows_and_one_is_always_w
     assert done.names("s") == []
 
 
-def test_a_model_that_was_not_written_to_its_end_is_not_there(tmp_path: Path) -> None:
-    done = Steps(tmp_path)
-    done.write("a", Model("first"))
-
-    class Broken(Model):
-        def write(self, folder: str) -> None:
-            super().write(folder)
-            raise OSError("no space left")
-
-    with pytest.raises(OSError, match="no space"):
-        done.write("a", Broken("second"))
-    assert (tmp_path / "a" / "points").read_text() == "first"
-    assert not done.has("b")
-
-
 # -- what is kept of a search ------------------------------------------------------------------------------------------
 LAYERS = {"photographs": [1], "features": [2], "pairs": [3], "mapping": [4]}
 
@@ -177,17 +149,6 @@ def test_what_the_next_search_would_make_alike_is_kept(tmp_path: Path, changed: 
         assert {path.name for path in work.iterdir()} - {search.SEARCH, ".lock"} == left
         forget(work)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_search_whose_notes_are_damaged_begins_anew(tmp_path: Path) -> None:
-    with workspace(tmp_path / "room") as work:
-        go_on(work, LAYERS, ours=("capture",))
-        (work / "capture").mkdir()
-        (work / search.SEARCH).write_text("{")
-    with workspace(tmp_path / "room") as work:
-        assert go_on(work, LAYERS, ours=("capture",)) == ""
-        assert not (work / "capture").exists()
-        forget(work)
 
 
 @pytest.mark.slow

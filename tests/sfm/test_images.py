@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,9 +10,8 @@ import pytest
 from PIL import ExifTags, Image, ImageOps
 
 from gs2d.core.camera import look_at
-from gs2d.core.similarity import rotation_to_z
-from gs2d.data.image_files import image_size, read_image
-from gs2d.data.photo_formats import AVIF, HEIF
+from gs2d.data.image_files import read_image
+from gs2d.data.photo_formats import HEIF
 from gs2d.errors import DataError
 from gs2d.sfm import compare
 from gs2d.sfm.image_copies import copy_images
@@ -65,20 +61,6 @@ def test_photographs_are_found_in_subfolders_and_sorted_as_people_count(tmp_path
         "a 1.JPG", "b/frame_2.jpg", "b/frame_10.jpg", "c.png"
     ]  # fmt: skip
     assert notes == ()
-
-
-def test_folders_that_are_linked_are_read_once_and_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
-    root = tmp_path / "photos"
-    root.mkdir()
-    (tmp_path / "disk").mkdir()
-    for i in range(3):
-        image(tmp_path / "disk" / f"{i}.png")
-    (root / "monday").symlink_to(tmp_path / "disk")
-    (root / "again").symlink_to(root)  # a way that does not end
-    os.mkfifo(root / "pipe.jpg")
-    found, notes, _ = find_photos(root)
-    assert [path.relative_to(root).as_posix() for path in found] == ["monday/0.png", "monday/1.png", "monday/2.png"]
-    assert notes == ("pipe.jpg was not read: no photographs",)
 
 
 def test_names_in_the_capture_have_no_white_space_and_stay_different(tmp_path: Path) -> None:
@@ -171,15 +153,6 @@ def test_a_folder_without_photographs_is_one_line_with_a_remedy(tmp_path: Path, 
     assert "\n" not in str(caught.value)
 
 
-def test_a_photograph_that_does_not_decode_is_named(tmp_path: Path) -> None:
-    for i in range(3):
-        image(tmp_path / f"{i}.jpg", size=(64, 64))
-    path = tmp_path / "1.jpg"
-    path.write_bytes(path.read_bytes()[:400])
-    with pytest.raises(DataError, match=r"1\.jpg does not decode: .*; replace or remove the file"):
-        photos_of(tmp_path)
-
-
 def test_a_damaged_exif_block_is_no_exif_block(tmp_path: Path) -> None:
     for i in range(3):
         image(tmp_path / f"{i}.jpg", orientation=6, model="phone")
@@ -234,33 +207,6 @@ def test_a_photograph_that_exif_turns_is_stored_upright_and_keeps_its_focal_leng
                 assert float(ours.getexif().get_ifd(DETAILS)[ExifTags.Base.FocalLength]) == 4.25
 
 
-def test_the_profile_of_inks_is_not_kept_where_the_pixels_become_rgb(tmp_path: Path) -> None:
-    root = tmp_path / "photos"
-    for i in range(3):
-        image(root / f"{i}.jpg")
-    for name, mode in (("0.jpg", "CMYK"), ("1.jpg", "RGB")):
-        exif = Image.Exif()
-        exif[ExifTags.Base.Orientation] = 3
-        with Image.open(root / name) as file:
-            file.convert(mode).save(root / name, icc_profile=b"profile", exif=exif)
-    assert stage(root, tmp_path / "images") == ["turned", "turned", "copied"]
-    profiles = []
-    for name in ("0.jpg", "1.jpg"):
-        with Image.open(tmp_path / "images" / name) as file:
-            profiles.append((file.mode, file.info.get("icc_profile")))
-    assert profiles == [("RGB", None), ("RGB", b"profile")]
-
-
-def test_max_size_bounds_the_longer_side_and_leaves_small_photographs_alone(tmp_path: Path) -> None:
-    root = tmp_path / "photos"
-    image(root / "0.jpg", size=(100, 60))
-    image(root / "1.jpg", size=(100, 60), orientation=6)
-    image(root / "2.jpg", size=(40, 50))
-    assert stage(root, tmp_path / "images", max_size=50) == ["resized", "resized", "copied"]
-    sizes = [image_size(tmp_path / "images" / f"{i}.jpg") for i in range(3)]
-    assert sizes == [(50, 30), (30, 50), (40, 50)]
-
-
 def test_sixteen_bits_and_other_formats_become_png_of_eight(tmp_path: Path) -> None:
     root = tmp_path / "photos"
     image(root / "0.jpg")
@@ -269,66 +215,6 @@ def test_sixteen_bits_and_other_formats_become_png_of_eight(tmp_path: Path) -> N
     assert stage(root, tmp_path / "images") == ["copied", "converted", "converted"]
     with Image.open(tmp_path / "images/2.tif.png") as file:
         assert (file.format, file.mode, file.getpixel((0, 0))) == ("PNG", "RGB", (156,) * 3)  # 40000 / 257 = 155.6
-
-
-def test_floats_become_png_of_their_display_values(tmp_path: Path) -> None:
-    openexr, tifffile = pytest.importorskip("OpenEXR"), pytest.importorskip("tifffile")
-    root, light = tmp_path / "photos", np.linspace(0, 1.2, 24 * 16 * 3, dtype=np.float32).reshape(16, 24, 3)
-    image(root / "0.jpg")
-    facts = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
-    openexr.File(facts, {"RGB": light}).write(str(root / "1.exr"))
-    tifffile.imwrite(root / "2.tif", light, photometric="rgb")
-    assert find_photos(root)[1] == ()
-    assert stage(root, tmp_path / "images") == ["copied", "converted", "converted"]
-    for name in ("1.exr", "2.tif"):
-        np.testing.assert_array_equal(read_image(tmp_path / "images" / f"{name}.png"), read_image(root / name))
-    np.testing.assert_array_equal(read_image(root / "1.exr"), read_image(root / "2.tif"))
-
-
-@pytest.mark.skipif(not AVIF, reason="this Pillow has no AVIF")
-def test_avif_becomes_upright_png(tmp_path: Path) -> None:
-    root = tmp_path / "photos"
-    for i, orientation in enumerate((1, 6, 8)):  # AVIF stores the turn as one of its own, which Pillow tells as EXIF
-        image(root / f"{i}.avif", size=(64, 48), orientation=orientation, model="phone")
-    assert find_photos(root)[1] == ()
-    assert stage(root, tmp_path / "images") == ["converted", "turned", "turned"]
-    for i, size in enumerate(((64, 48), (48, 64), (48, 64))):
-        with Image.open(root / f"{i}.avif") as theirs, Image.open(tmp_path / "images" / f"{i}.avif.png") as ours:
-            assert (ours.format, ours.size) == ("PNG", size)
-            upright = np.asarray(ImageOps.exif_transpose(theirs), float)
-            assert np.abs(np.asarray(ours, float) - upright).mean() == 0
-            assert ours.getexif()[ExifTags.Base.Model] == "phone"
-
-
-def test_a_package_that_reads_heic_is_used_where_there_is_one(tmp_path: Path) -> None:
-    """A stand-in: its files are BMP inside. The real packages are not ours to install."""
-    (tmp_path / "pi_heif.py").write_text(
-        "from PIL import BmpImagePlugin, Image\n"
-        "def register_heif_opener():\n"
-        "    Image.register_open('HEIF', BmpImagePlugin.BmpImageFile, lambda head: head[:2] == b'BM')\n"
-        "    Image.register_extensions('HEIF', ['.heic'])\n"
-    )
-    for i in range(3):
-        image(tmp_path / f"photos/{i}.bmp", size=(24, 16))
-        os.rename(tmp_path / f"photos/{i}.bmp", tmp_path / f"photos/{i}.HEIC")
-    program = (
-        "import sys; from pathlib import Path; from gs2d.sfm.images import find_photos, read_photos\n"
-        "root = Path(sys.argv[1]); paths, notes, _ = find_photos(root)\n"
-        "print([photo.name for photo in read_photos(paths, root, threads=1)], notes)"
-    )
-    words = [sys.executable, "-c", program, str(tmp_path / "photos")]
-    path = os.pathsep.join([str(tmp_path), *sys.path])
-    done = subprocess.run(words, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "['0.HEIC.png', '1.HEIC.png', '2.HEIC.png'] ()"
-
-
-def test_link_makes_hard_links_of_what_needs_no_change(tmp_path: Path) -> None:
-    root = tmp_path / "photos"
-    image(root / "0.jpg")
-    image(root / "1.jpg", orientation=3)
-    image(root / "2.jpg")
-    assert stage(root, tmp_path / "images", link=True) == ["linked", "turned", "linked"]
-    assert os.path.samefile(root / "0.jpg", tmp_path / "images/0.jpg")
 
 
 def test_photographs_of_one_folder_size_camera_and_focal_length_share_a_camera(tmp_path: Path) -> None:
@@ -376,27 +262,6 @@ def test_up_is_found_from_a_half_ring_of_tilted_cameras() -> None:
     assert np.degrees(np.arccos(mean @ truth / np.linalg.norm(mean))) > 20.0
 
 
-def test_up_is_found_from_a_walk_along_a_wall() -> None:
-    """All x axes are parallel: they say nothing, the mean of the up vectors decides."""
-    eyes = np.stack([np.linspace(-3, 3, 7), np.full(7, -4.0), np.zeros(7)], axis=1)
-    views = np.stack([rotations(eye[None], eye + np.array([0, 1.0, 0]), np.eye(3))[0] for eye in eyes])
-    np.testing.assert_allclose(up_direction(views), [0, 0, 1], atol=1e-9)
-
-
-def test_cameras_that_disagree_on_up_have_none() -> None:
-    quarter = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # of a turn about the optical axis
-    turned = np.stack([np.linalg.matrix_power(quarter, k) for k in range(4)])
-    assert up_direction(turned) is None
-
-
-@pytest.mark.parametrize("up", [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0.48, -0.6, 0.64)])
-def test_a_rotation_takes_up_to_z(up: tuple[float, float, float]) -> None:
-    R = rotation_to_z(np.array(up, float))
-    np.testing.assert_allclose(R @ up, [0, 0, 1], atol=1e-12)
-    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(R) > 0
-
-
 # -- which pairs are matched -------------------------------------------------------------------------------------------
 def test_each_photograph_is_paired_with_the_next_ones_and_with_far_ones() -> None:
     """Overlap 3: the next 1, 2, 3 and those 2^0, 2^1, 2^2 on, i.e. 1, 2, 3, 4."""
@@ -412,10 +277,6 @@ def test_similar_photographs_are_paired_and_strangers_are_not() -> None:
     assert len(pairs) >= 12
     assert all(i % 2 == j % 2 and i < j for i, j in pairs)
     assert similar_pairs(lambda i: images[i], 12, neighbours=3) == pairs
-
-
-def test_photographs_without_features_have_no_similar_ones() -> None:
-    assert similar_pairs(lambda _: np.zeros((0, 128), np.uint8), 5, neighbours=3) == set()
 
 
 def flight(lines: int, shots: int) -> list[tuple[float, float, float]]:
@@ -434,26 +295,11 @@ def test_near_photographs_are_on_the_same_line_and_on_the_next_ones() -> None:
     assert all(i < j for i, j in pairs)
 
 
-def test_photographs_without_a_place_have_no_near_ones_and_all_at_one_place_are_no_error() -> None:
-    assert near_pairs([(0, 0, 0), None, (1, 0, 0), (9, 0, 0), None], 1) == {(0, 2), (2, 3)}
-    assert near_pairs([None, None, (0, 0, 0)], 5) == set()
-    same = near_pairs([(5, 5, 5)] * 6, 2)
-    assert all(i < j for i, j in same)
-    assert {number for pair in same for number in pair} == set(range(6))
-
-
 @pytest.mark.parametrize(("count", "most"), [(1000, 13_000), (5000, 70_000)])
 def test_pairs_of_many_photographs_grow_as_the_photographs_do(count: int, most: int) -> None:
     places = flight(count // 50, 50)
     picked = chosen({"next": neighbour_pairs(count, 3), "near": near_pairs(places, 20)})
     assert 10 * count < len(picked) < most
-
-
-def test_pairs_say_how_many_they_are_and_why() -> None:
-    picked = chosen({"near": {(0, 1), (2, 3)}, "alike": {(0, 1), (0, 3)}, "none": set()})
-    assert picked.pairs == ((0, 1), (0, 3), (2, 3))
-    assert picked.line(4) == "3 of 6 pairs of photographs are compared: 2 near, 2 alike (some for two reasons)"
-    assert chosen({"near": {(0, 1)}}).line(3) == "1 of 3 pairs of photographs are compared: 1 near"
 
 
 def test_the_order_is_that_of_the_clocks_where_they_all_run(tmp_path: Path) -> None:
@@ -466,13 +312,6 @@ def test_the_order_is_that_of_the_clocks_where_they_all_run(tmp_path: Path) -> N
     assert by == "time"
     image(tmp_path / "DSC_0003.jpg")
     assert in_order_taken(photos_of(tmp_path)) == ([0, 1, 2, 3, 4], "name")
-
-
-def test_times_that_are_all_the_same_tell_no_order(tmp_path: Path) -> None:
-    """A program that exported all of them in one minute."""
-    for i in range(4):
-        image(tmp_path / f"{i}.jpg", time="2026:05:01 10:00:00")
-    assert in_order_taken(photos_of(tmp_path)) == ([0, 1, 2, 3], "name")
 
 
 def test_where_places_are_known_fewer_are_compared_and_those_without_one_lose_nothing(tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ from PIL import Image
 
 from gs2d.data import load_scene
 from gs2d.data.image_files import read_mask
-from gs2d.errors import DataError
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.options import PosesOptions
 from gs2d.pipeline.sfm import find_poses
@@ -52,11 +51,6 @@ def test_masks_are_found_where_tools_put_them_and_are_no_photographs(tmp_path: P
     assert line.endswith("; the other 2 are whole")
 
 
-def test_a_photograph_called_mask_without_another_one_stays_a_photograph(tmp_path: Path) -> None:
-    root = folder_of(tmp_path, ("gas_mask.png", "b.png", "c.png"))
-    assert [path.name for path in find_photos(root)[0]] == ["b.png", "c.png", "gas_mask.png"]
-
-
 def test_masks_are_turned_and_shrunk_with_their_photograph(tmp_path: Path) -> None:
     write_room(tmp_path / "photos", 3)
     turn_file(tmp_path / "photos" / "001.jpg", 6)  # stored turned
@@ -79,22 +73,6 @@ def test_masks_are_turned_and_shrunk_with_their_photograph(tmp_path: Path) -> No
     assert turned.shape == (75, 100)  # orientation 6: the stored top is the right side
     assert turned[:, 75:].all()
     assert not turned[:, :75].any()
-
-
-def test_masks_of_another_shape_all_black_ones_and_a_folder_without_any_are_told(tmp_path: Path) -> None:
-    root = folder_of(tmp_path / "photos")
-    found = photos(root)
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(DataError, match=r"empty must hold masks of the photographs, got none of 3: a\.png\.png"):
-        masks_of(found, root, tmp_path / "empty")
-    with pytest.raises(DataError, match="--masks must be a folder of masks"):
-        masks_of(found, root, tmp_path / "missing")
-    write(tmp_path / "wide.png", np.full((16, 30), 255, np.uint8))
-    with pytest.raises(DataError, match=r"wide\.png must have the size \(or aspect\) of a\.png, 24x16, got 30x16"):
-        copy_masks(found, [tmp_path / "wide.png", None, None], tmp_path / "out", None)
-    write(tmp_path / "black.png", np.zeros((16, 24), np.uint8))
-    with pytest.raises(DataError, match="got 3 black ones; white = keep: invert them"):
-        copy_masks(found, [tmp_path / "black.png"] * 3, tmp_path / "black", None)
 
 
 def features(database: Path) -> np.ndarray:

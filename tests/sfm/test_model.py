@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
-import shutil
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from cli_runs import one_line
 from gs2d.cli import run
-from gs2d.data.readers.colmap import ColmapCamera, ColmapImage, ColmapPoints
+from gs2d.data.readers.colmap import ColmapImage, ColmapPoints
 from gs2d.errors import BackendError, DataError, RunError
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.options import PosesOptions
-from gs2d.pipeline.sfm import find_poses
 from gs2d.sfm.colmap import Facts, Group, Request, Solved, check_installed, solve
-from gs2d.sfm.model import SfmModel, camera_line, check_any, why_not_placed
+from gs2d.sfm.model import SfmModel, check_any, why_not_placed
 from gs2d.sfm.workspace import check_out, put_in_place, sweep_workspace, workspace
 
 
@@ -74,12 +70,6 @@ def test_no_model_at_all_says_at_which_step_it_ended(facts: Facts, expected: str
     check_any(PIECES, facts, Path("photos"))
 
 
-def test_a_camera_is_described_by_its_field_of_view() -> None:
-    """Half of 1000 px over f = 500 px: 2 atan(1) = 90 degrees."""
-    camera = ColmapCamera("OPENCV", 1000, 600, (500.0, 501.0, 500.0, 300.0, 0, 0, 0, 0))
-    assert camera_line(camera, 12) == "OPENCV of 12 photographs, 1000x600, f = 500 px (90 degrees wide)"
-
-
 # -- the worker --------------------------------------------------------------------------------------------------------
 def request(work: Path) -> Request:
     group = Group(("a.jpg",), "OPENCV", (9, 9), "a.jpg")
@@ -106,23 +96,6 @@ def test_what_the_worker_tells_becomes_phases_and_steps(tmp_path: Path) -> None:
     assert solved == Solved([{"upright": True}], {}, {})
 
 
-def test_the_second_round_counts_its_own_pairs(tmp_path: Path) -> None:
-    """Three pairs are in the database when it begins; two more come."""
-    code = (
-        "import sqlite3, time\n"
-        "base = sqlite3.connect(json.load(open(sys.argv[1]))['database'], isolation_level=None)\n"
-        "base.execute('CREATE TABLE two_view_geometries (rows INTEGER)')\n"
-        "add = lambda: base.execute('INSERT INTO two_view_geometries VALUES (20)')\n"
-        "add(); add(); add()\n"
-        "say(phase='again', total=2); time.sleep(0.3); add(); add(); time.sleep(1.5)\n"
-        "say(models=[], lens={'chosen': 'RADIAL'}, refused={'a': 'no'})"
-    )
-    seen, solved = follow(tmp_path, code)
-    assert seen[0] == ("matching pairs once more", 0, 2)
-    assert ("matching pairs once more", 2, 2) in seen
-    assert solved == Solved([], {"chosen": "RADIAL"}, {"a": "no"})
-
-
 @pytest.mark.parametrize(
     ("code", "expected"),
     [
@@ -143,26 +116,6 @@ def test_a_worker_that_dies_is_one_line_with_its_last_words(tmp_path: Path, code
     assert "\n" not in str(caught.value)
 
 
-def test_a_worker_that_dies_on_a_full_disk_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """COLMAP aborts, and what it says to a file on the same disk is lost."""
-    monkeypatch.setattr(shutil, "disk_usage", lambda _path: SimpleNamespace(free=2_000_000))
-    with pytest.raises(
-        DataError, match="signal 6 while finding features: .*; 2 MB are free on the disk of --out: free"
-    ):
-        follow(tmp_path, "say(phase='features', total=3); os.abort()")
-
-
-def test_the_worker_looks_for_modules_where_the_command_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not in the folder one is in, which ``-m`` puts first: a random.py there would be numpy's."""
-    (tmp_path / "random.py").write_text("raise ImportError('mine')")
-    (tmp_path / "first").mkdir()
-    (tmp_path / "first" / "pycolmap.py").write_text("raise RuntimeError('the one that is on my path')")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path / "first")
-    with pytest.raises(DataError, match="the one that is on my path"):
-        solve(request(tmp_path), lambda *_step: None)
-
-
 def test_without_pycolmap_the_extra_is_named_before_anything_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -173,13 +126,6 @@ def test_without_pycolmap_the_extra_is_named_before_anything_is_read(
     (tmp_path / "photos" / "broken.jpg").write_bytes(b"x")
     assert run(["poses", str(tmp_path / "photos"), "--out", str(tmp_path / "out")]) == 2
     assert "pip install 'pycolmap>=" in one_line(capsys.readouterr().err)
-
-
-def test_the_worker_does_not_load_torch() -> None:
-    import subprocess
-
-    code = "import sys, gs2d.sfm.colmap_worker; assert 'torch' not in sys.modules; assert 'pycolmap' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 # -- where the capture goes --------------------------------------------------------------------------------------------
@@ -211,27 +157,6 @@ def test_a_folder_with_other_files_is_never_replaced(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(RunError, match="must be a folder"):
         check_out(tmp_path / "file", tmp_path / "photos", overwrite=True)
-
-
-def test_options_of_python_are_checked_like_those_of_the_command(colmap: None) -> None:
-    assert PosesOptions(photos="a", out="b").photos == Path("a")  # type: ignore[arg-type]
-    with pytest.raises(RunError, match=r"--threads must be a whole number from 1 to 1024, got 1.5"):
-        find_poses(PosesOptions(photos=Path("a"), out=Path("b"), threads=1.5))  # type: ignore[arg-type]
-
-
-def test_a_disk_that_is_mounted_there_is_said_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "disk").mkdir()
-    monkeypatch.setattr(Path, "is_mount", lambda self: self == tmp_path / "disk")
-    check_out(tmp_path / "disk" / "capture", tmp_path / "photos", overwrite=False)
-    with pytest.raises(RunError, match="where a disk is mounted, and cannot be renamed; choose a folder in it"):
-        check_out(tmp_path / "disk", tmp_path / "photos", overwrite=False)
-
-
-def test_the_folder_one_is_in_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "out").mkdir()
-    monkeypatch.chdir(tmp_path / "out")
-    with pytest.raises(RunError, match="is the folder that you are in"):
-        check_out(Path("."), tmp_path / "photos", overwrite=False)
 
 
 def test_a_capture_takes_its_place_as_a_whole_and_an_older_one_goes(tmp_path: Path) -> None:
@@ -314,19 +239,3 @@ def test_training_on_photographs_without_cameras_names_this_command(
     line = one_line(capsys.readouterr().err)
     assert f"got 3 photographs without any; `gs2d reconstruct {photos} --out RUN` makes a run" in line
     assert not (tmp_path / "run").exists()
-
-
-def test_the_doctor_says_whether_the_extra_is_there(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def version(name: str) -> str:
-        if name in ("pycolmap", "xatlas"):
-            raise importlib.metadata.PackageNotFoundError(name)
-        return "1.2.3"
-
-    monkeypatch.setattr(importlib.metadata, "version", version)
-    assert run(["doctor"]) == 0
-    text = capsys.readouterr().out
-    remedy = "\n       to get it: pip install 'pycolmap>=4.2'\n"
-    assert f"  no   cameras of photographs (gs2d reconstruct, poses): pycolmap missing{remedy}" in text
-    assert "  no   textured meshes (--texture): xatlas missing\n" in text

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -11,24 +10,21 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from cli_runs import TINY, one_line
+from cli_runs import one_line
 from gs2d.cli import run
 from gs2d.core.camera import look_at
 from gs2d.data import load_scene
 from gs2d.data.image_files import read_image
 from gs2d.data.readers.colmap import read_images
-from gs2d.errors import RunError
 from gs2d.pipeline.events import Event, Notice, Phase
 from gs2d.pipeline.options import PosesOptions
 from gs2d.pipeline.sfm import find_poses
-from gs2d.sfm.lens import MODELS
 from room_photos import FOCAL, SIZE, UP, Room, room_image, textures, write_room
 
 
@@ -88,33 +84,6 @@ def test_the_capture_has_what_training_reads_and_nothing_else(room: Room) -> Non
     assert (np.ptp(image.astype(int), axis=2) > 60).sum() > 500  # red cameras
 
 
-def test_what_is_known_of_each_photograph_is_printed_and_written(room: Room) -> None:
-    written = json.loads((room.capture / "poses.json").read_text())
-    assert {**written, "capture": str(room.capture)} == room.printed
-    assert (written["count"], written["placed"], written["up"]) == (12, 12, "+z")
-    assert written["cameras"][0]["model"] == written["lens"]["chosen"] == "SIMPLE_PINHOLE"
-    assert [trial["model"] for trial in written["lens"]["trials"]] == list(MODELS)
-    assert written["lens"]["about"].startswith("lens: SIMPLE_PINHOLE 0.")
-    assert written["mean_error_px"] < 0.5
-    assert 20 < written["median_angle_degrees"] < 60  # the arc is 60 degrees wide
-    rows = {row["name"]: row for row in written["photographs"]}
-    assert {name for name, row in rows.items() if row["file"] == "turned"} == {"002.jpg", "005.jpg", "009.jpg"}
-    assert all(row["placed"] and row["features"] > 300 and "reason" not in row for row in rows.values())
-
-
-def test_the_photographs_are_only_read(room: Room) -> None:
-    assert len(list(room.photos.iterdir())) == 13
-    with Image.open(room.photos / "002.jpg") as file:
-        assert file.getexif()[274] == 6
-
-
-@pytest.mark.slow
-def test_the_capture_trains(room: Room, tmp_path: Path) -> None:
-    words = ["train", str(room.capture), "--out", str(tmp_path / "run"), "--downscale", "8", "--quiet", *TINY]
-    assert run(words) == 0
-    assert (tmp_path / "run" / "splats.ply").exists()
-
-
 def test_an_existing_capture_is_replaced_only_when_asked(
     room: Room, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -167,25 +136,6 @@ class Kept:
                 raise KeyboardInterrupt
         if isinstance(event, Notice):
             self.lines.append(event.text)
-
-
-def test_what_appears_in_the_folder_while_colmap_works_is_not_replaced(colmap: None, tmp_path: Path) -> None:
-    write_room(tmp_path / "photos", 4)
-    masks = tmp_path / "capture" / "masks"
-
-    def put(event: Event) -> None:
-        if isinstance(event, Phase) and event.name == "placing cameras":
-            masks.mkdir(parents=True)
-
-    with pytest.raises(RunError, match=r"holds other files \(masks\)"):
-        find_poses(PosesOptions(photos=tmp_path / "photos", out=tmp_path / "capture", threads=1), put)
-    assert masks.is_dir()
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".capture.poses", "capture", "photos"]
-    masks.rmdir()
-    found = find_poses(PosesOptions(photos=tmp_path / "photos", out=tmp_path / "capture", threads=1), kept := Kept())
-    assert found["placed"] == 4
-    assert "finding features" not in kept.phases  # what was found is not found again
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["capture", "photos"]
 
 
 def blank(root: Path) -> None:
@@ -262,20 +212,6 @@ def test_all_cameras_are_placed_at_once_where_that_is_asked_for(room: Room, tmp_
     assert centers < 0.01
     assert degrees < 0.6
     assert found["cameras"][0]["focal_px"] == pytest.approx(FOCAL, rel=0.02)
-
-
-def test_a_search_with_other_options_keeps_what_they_do_not_change(room: Room, tmp_path: Path) -> None:
-    options = PosesOptions(photos=room.photos, out=tmp_path / "capture", threads=2)
-    with pytest.raises(KeyboardInterrupt):
-        find_poses(options, Kept(interrupt_at="comparing lenses"))
-    find_poses(replace(options, matching="sequential", overlap=3), second := Kept())
-    assert "going on with the search that was interrupted: features of 12 photographs" in second.lines
-    # 1, 2, 3 and 4 places on
-    assert "38 of 66 pairs of photographs are compared: 38 next to each other by name" in second.lines
-    with pytest.raises(KeyboardInterrupt):
-        find_poses(replace(options, overwrite=True), Kept(interrupt_at="placing cameras"))
-    find_poses(replace(options, overwrite=True, feature_size=190), third := Kept())
-    assert "going on with the search that was interrupted: copies of photographs" in third.lines
 
 
 @pytest.mark.slow

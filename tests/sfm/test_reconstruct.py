@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +19,10 @@ from gs2d.cli import commands, run
 from gs2d.cli.parser import parse
 from gs2d.config.presets import DEFAULT_RECIPE, get_recipe
 from gs2d.io.run_dir import open_run
-from gs2d.pipeline import options as options_module
 from gs2d.pipeline import quality as quality_module
 from gs2d.pipeline import reconstruct as module
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.options import ReconstructOptions, Training, values
-from gs2d.pipeline.quality import QUALITIES
 from gs2d.pipeline.reconstruct import FEW, poses_options, reconstruct, train_options
 from room_photos import Room, write_room
 from tiny import write_capture
@@ -123,14 +120,6 @@ def test_a_resume_with_other_photographs_is_refused(
     assert "must be as `gs2d reconstruct` writes it, got another entry ('photos')" in one_line(capsys.readouterr().err)
 
 
-def test_a_folder_with_cameras_only_says_how_to_go_on(
-    room: Room, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = started(room, tmp_path)
-    assert run(words_for(room.photos, out, "--quiet")) == 2
-    assert "and no run: go on with --resume, or begin anew with --overwrite" in one_line(capsys.readouterr().err)
-
-
 def nothing(_photos: Path) -> None: ...
 
 
@@ -168,18 +157,6 @@ def test_what_makes_no_run_is_refused_before_anything_is_made(
     assert run(given) == 2
     assert message in one_line(capsys.readouterr().err)
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
-
-
-def test_a_run_does_not_lie_among_the_photographs(
-    room: Room, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    photos = tmp_path / "photos"
-    shutil.copytree(room.photos, photos)
-    for out in (photos, photos / "run"):
-        before = sorted(photos.rglob("*"))
-        assert run(words_for(photos, out, "--quiet")) == 2
-        assert "--out" in one_line(capsys.readouterr().err)
-        assert sorted(photos.rglob("*")) == before
 
 
 @pytest.mark.parametrize(
@@ -275,22 +252,6 @@ def test_every_option_of_train_is_one_of_reconstruct() -> None:
     assert poses_options(command).cameras == "each"
 
 
-def test_the_help_states_the_qualities_that_are_there() -> None:
-    text = (Path(options_module.__file__)).read_text(encoding="utf-8")
-    stated = re.search(r'quality: Quality = "normal"\n.*?"""(.*?)"""', text, re.DOTALL)
-    assert stated is not None
-    assert list(QUALITIES) == ["draft", "normal", "full"]
-    cpu, gpu = stated[1].split("on a GPU")
-    for device, said in (("cpu", cpu), ("gpu", gpu)):
-        numbers = [float(number) for number in re.findall(r"\d+(?:\.\d+)?", said)]
-        for quality in QUALITIES.values():
-            assert quality[device].side in numbers
-            assert quality[device].iterations in (*numbers, None)
-    recipe = get_recipe("2dgs-r")
-    assert [QUALITIES[name]["cpu"].schedule_scale(recipe) for name in QUALITIES] == [0.03, 0.1, 1.0]
-    assert QUALITIES["normal"]["gpu"].schedule_scale(get_recipe("best")) == 1.0  # never more than the recipe has
-
-
 @pytest.mark.parametrize(("quality", "downscale"), [("draft", 4), ("normal", 2), ("full", 1)])
 def test_the_size_of_the_pictures_is_by_the_quality(
     room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quality: str, downscale: int
@@ -308,14 +269,3 @@ def test_the_size_of_the_pictures_is_by_the_quality(
     assert asked[0].schedule_scale == 9 / get_recipe(DEFAULT_RECIPE).iterations
     assert asked[0].test_every == 0
     assert FEW > 12
-
-
-def test_test_views_are_as_many_as_asked_for(room: Room, tmp_path: Path) -> None:
-    out = started(room, tmp_path)
-    training = replace(TRAINING, test_every=4)
-    options = ReconstructOptions(photos=room.photos, out=out, resume=True, training=training, **SMALL)  # type: ignore[arg-type]
-    (line,) = [text for text in notices(options) if text.startswith("9 of 12 photographs train at ")]
-    assert line.endswith("; 3 do not train, they score the result (--test-every 0 trains on all)")
-    definition = open_run(out).definition()
-    assert (definition["scene"]["train"], definition["scene"]["test"]) == (9, 3)
-    assert definition["protocol"]["test_every"] == 4

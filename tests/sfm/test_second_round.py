@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from gs2d.sfm import second_round
-from gs2d.sfm.second_round import MIN_SEEN, NEXT, PARTNERS, partners, refuse_unsupported
+from gs2d.sfm.second_round import MIN_SEEN, refuse_unsupported
 from synthetic_model import synthetic_model
 
-NAMES = [f"{i:03}.jpg" for i in range(40)]
 LENS = (520.0, 320.0, 240.0)
 
 
@@ -22,21 +21,6 @@ def pycolmap(colmap: None) -> Any:
 
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
     return pycolmap
-
-
-def test_partners_are_those_that_look_alike_and_those_that_were_taken_before_and_after() -> None:
-    alike = {f"{i:03}.jpg": float(i) for i in range(20, 40)}
-    pairs = partners(["010.jpg"], NAMES, set(NAMES) - {"010.jpg", "011.jpg"}, lambda _a, b: alike.get(b, 0.0))
-    near = {f"{i:03}.jpg" for i in (7, 8, 9, 11, 12, 13)}
-    assert NEXT == 3
-    expected = near | {f"{i:03}.jpg" for i in range(40 - PARTNERS, 40)}
-    assert {a if b == "010.jpg" else b for a, b in pairs} == expected
-    assert all(a < b for a, b in pairs)
-
-
-def test_two_that_have_no_place_are_one_pair() -> None:
-    pairs = partners(["000.jpg", "001.jpg"], NAMES[:3], {"002.jpg"}, lambda _a, _b: 0.0)
-    assert pairs == {("000.jpg", "001.jpg"), ("000.jpg", "002.jpg"), ("001.jpg", "002.jpg")}
 
 
 def test_a_photograph_that_the_model_supports_stays(pycolmap: Any) -> None:

@@ -15,10 +15,9 @@ from gs2d.cli import run
 from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.options import PosesOptions, ReconstructOptions
-from gs2d.pipeline.reconstruct import train_options
+from gs2d.pipeline.options import PosesOptions
 from gs2d.pipeline.sfm import find_poses
-from gs2d.sfm.video_frames import Video, choose, is_video, look_into, sharpness_of, take
+from gs2d.sfm.video_frames import choose, look_into, sharpness_of, take
 from room_photos import write_room
 
 real = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="there is no ffmpeg on this machine")
@@ -40,15 +39,6 @@ def pattern(number: int, size: tuple[int, int] = (96, 64)) -> Image.Image:
     """Noise under a grey level that tells the number."""
     noise = np.random.default_rng(number).integers(-20, 20, (size[1], size[0], 1))
     return Image.fromarray(np.clip(20 + 9 * number + noise, 0, 255).astype(np.uint8).repeat(3, axis=2))
-
-
-def test_the_sharpest_of_each_stretch_is_chosen_and_every_frame_where_there_are_few() -> None:
-    assert choose([1, 5, 2, 9, 3, 3, 0, 4], 4) == [1, 3, 4, 7]
-    assert choose([1, 5, 2, 9, 3, 3, 0], 3) == [1, 3, 4]  # stretches of 2, 2 and 3
-    assert choose([1, 2, 3], 3) == choose([1, 2, 3], 9) == [0, 1, 2]
-    numbers = choose(list(np.random.default_rng(0).random(1000)), 77)
-    assert len(numbers) == 77
-    assert max(np.diff(numbers)) <= 2 * 13
 
 
 @real
@@ -110,14 +100,6 @@ def test_without_ffmpeg_the_line_says_how_to_get_it(
         look_into(tmp_path / "gone.mp4")
 
 
-def test_a_folder_may_be_called_like_a_video(tmp_path: Path) -> None:
-    (tmp_path / "a.mp4").mkdir()
-    assert not is_video(tmp_path / "a.mp4")
-    assert is_video(tmp_path / "b.mp4")
-    options = ReconstructOptions(photos=tmp_path / "room.mp4", out=tmp_path / "run")
-    assert train_options(options).title == "room"
-
-
 @real
 def test_a_video_becomes_a_capture_with_its_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pycolmap")
@@ -140,14 +122,3 @@ def test_a_video_becomes_a_capture_with_its_frames(tmp_path: Path, monkeypatch: 
     )
     assert read_json(tmp_path / "capture/poses.json")["photos"] == str(video.resolve())
     assert not list(tmp_path.glob(".*"))
-
-
-def test_hdr_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    path = tmp_path / "hdr.mov"
-    path.write_bytes(b"?")
-    answer = subprocess.CompletedProcess(
-        [], 0, '{"streams": [{"nb_read_packets": "7", "color_transfer": "arib-std-b67"}]}', ""
-    )
-    monkeypatch.setattr("gs2d.sfm.video_frames.shutil.which", lambda name: name)
-    monkeypatch.setattr("gs2d.sfm.video_frames.subprocess.run", lambda *_, **__: answer)
-    assert look_into(path) == Video(path, 7, "HLG")

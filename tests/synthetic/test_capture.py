@@ -11,13 +11,13 @@ from PIL import Image, ImageDraw
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.data import load_scene
-from gs2d.errors import DataError, DiskError
+from gs2d.errors import DiskError
 from gs2d.io.meshes import read_mesh
-from gs2d.meshing.raycast import NEAR, _sample_boxes, cast_camera, occluded
+from gs2d.meshing.raycast import cast_camera, occluded
 from gs2d.synthetic import capture as toy
 from gs2d.synthetic import shapes
-from gs2d.synthetic.capture import demo_cameras, demo_mesh, write_demo_capture
-from gs2d.synthetic.scene import FLOOR, RADIUS, ToyScene, build_scene
+from gs2d.synthetic.capture import demo_cameras, write_demo_capture
+from gs2d.synthetic.scene import ToyScene, build_scene
 
 TRAIN, TEST, SIZE = 3, 2, 48
 
@@ -37,27 +37,6 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def unit_camera(size: int = 64) -> Camera:
     """At the origin, looking along +z; a pixel is 2/size wide at depth 1."""
     return Camera(size, size, size / 2, size / 2, size / 2, size / 2, np.eye(4))
-
-
-def brute_force(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Moeller-Trumbore, every ray [R] with every triangle: the smallest t > 1e-3, inf for none.
-
-    In parts of 32 rays: all of a picture at once are gigabytes.
-    """
-    if len(directions) > 32:
-        cuts = range(32, len(directions), 32)
-        parts = zip(np.split(origins, cuts), np.split(directions, cuts), strict=True)
-        return np.concatenate([brute_force(vertices, faces, *part) for part in parts])
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    e1, e2 = b - a, c - a
-    p = np.cross(directions[:, None], e2[None])  # [R, F, 3]
-    det = (p * e1).sum(-1)
-    s = origins[:, None] - a[None]
-    u = (p * s).sum(-1) / det
-    q = np.cross(s, e1[None])
-    v = (q * directions[:, None]).sum(-1) / det
-    t = (q * e2).sum(-1) / det
-    return np.where((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 1e-3), t, np.inf).min(axis=1)
 
 
 def pixel_rays(camera: Camera) -> np.ndarray:
@@ -98,58 +77,6 @@ def test_depth_of_a_sphere_is_the_closed_form_up_to_its_facets() -> None:
     assert (hits.face.ravel()[under_root < 0] == -1).all()
 
 
-def test_random_triangles_give_the_hits_of_a_brute_force_search() -> None:
-    rng = np.random.default_rng(5)
-    centers = rng.uniform([-2, -2, -1], [2, 2, 5], (120, 1, 3))  # some behind, some across the camera plane
-    vertices = (centers + rng.normal(0, 0.8, (120, 3, 3))).reshape(-1, 3)
-    faces = np.arange(360).reshape(-1, 3)
-    camera = unit_camera(40)
-    hits = cast_camera(vertices, faces, camera)
-    rays = pixel_rays(camera)
-    expected = brute_force(vertices, faces, np.zeros_like(rays), rays)
-    found = hits.face.ravel() >= 0
-    assert 0.2 < found.mean() < 1.0
-    np.testing.assert_array_equal(found, np.isfinite(expected))
-    np.testing.assert_allclose(hits.depth.ravel()[found], expected[found], rtol=1e-5)
-    assert np.ptp(vertices[faces][:, :, 2], axis=1)[vertices[faces][:, :, 2].min(axis=1) < 0].max() > 1
-
-
-def test_from_within_a_room_few_faces_are_compared_with_the_whole_picture() -> None:
-    """The plane of a camera in a room cuts hundreds of its faces; all but a few lie beside the picture."""
-    room = shapes.ball(1.0, rows=90, around=180)
-    rng = np.random.default_rng(0)
-    for _ in range(4):
-        eye, target = rng.uniform(-0.4, 0.4, 3), rng.uniform(-0.4, 0.4, 3)
-        camera = look_at(eye, target, np.array([0, 0, 1.0]), width=40, height=30, fx=25.0)
-        local = room.vertices @ camera.rotation.T + camera.T_cam_world[:3, 3]
-        behind = (local[room.faces][:, :, 2] < 0).sum(axis=1)
-        assert ((behind == 1) | (behind == 2)).sum() > 200
-        _, low, high = _sample_boxes(local, room.faces, camera, 1, NEAR)
-        assert (high - low).prod(axis=1).sum() < 10 * 40 * 30
-        hits = cast_camera(room.vertices, room.faces, camera)
-        rays = pixel_rays(camera)[::7]
-        expected = brute_force(local, room.faces, np.zeros_like(rays), rays)
-        assert (hits.face >= 0).all()
-        np.testing.assert_allclose(hits.depth.ravel()[::7], expected, rtol=1e-4)
-
-
-def test_a_ray_along_a_shared_edge_hits_and_ties_go_to_the_lower_index() -> None:
-    # With an odd size the centre pixel's ray is the optical axis, on which the two triangles' common edge lies.
-    corners = np.array([[0, -1, 2.0], [0, 1, 2.0], [-1, 0, 2.0], [1, 0, 2.0]])
-    hits = cast_camera(corners, np.array([[0, 1, 2], [1, 0, 3]]), unit_camera(9))
-    assert hits.face[4, 4] == 0
-    assert hits.depth[4, 4] == 2.0
-
-
-def test_samples_are_the_centres_of_equal_parts_of_a_pixel() -> None:
-    # The half plane x <= 0.25 px right of the centre of column 1, at depth 1: 3 of 4 sub-columns of that pixel.
-    edge = (1.5 + 0.25 - 2) / 2  # x of the border for f = 2 px, centre 2 px
-    corners = np.array([[-9, -9, 1.0], [edge, -9, 1.0], [edge, 9, 1.0], [-9, 9, 1.0]])
-    hits = cast_camera(corners, np.array([[0, 1, 2], [0, 2, 3]]), unit_camera(4), samples=4)
-    coverage = (hits.face >= 0).reshape(4, 4, 4, 4).mean(axis=(1, 3))
-    np.testing.assert_array_equal(coverage, np.tile([1.0, 0.75, 0.0, 0.0], (4, 1)))
-
-
 def test_the_shadow_of_a_ball_is_the_cylinder_below_it() -> None:
     ball = shapes.ball(0.5, rows=60, around=120)
     direction = np.array([0.0, 0.6, 0.8])
@@ -161,18 +88,6 @@ def test_the_shadow_of_a_ball_is_the_cylinder_below_it() -> None:
     clear = np.abs(distance - 0.5) > 2e-3
     np.testing.assert_array_equal(blocked[clear], ((distance < 0.5) & (points[:, 2] < 0))[clear])
     assert blocked.sum() > 50
-
-
-def test_shadow_rays_agree_with_a_brute_force_search() -> None:
-    rng = np.random.default_rng(2)
-    vertices = rng.normal(0, 1, (90, 3))
-    faces = np.arange(90).reshape(-1, 3)
-    points = rng.normal(0, 1.2, (500, 3))
-    direction = np.array([-0.48, 0.6, 0.64])
-    expected = np.isfinite(brute_force(vertices, faces, points, np.tile(direction, (500, 1))))
-    t = brute_force(vertices, faces, points, np.tile(direction, (500, 1)))
-    assert np.isfinite(t).any()
-    np.testing.assert_array_equal(occluded(vertices, faces, points, direction, cells=17), expected)
 
 
 # -- the solids --------------------------------------------------------------------------------------------------------
@@ -201,15 +116,6 @@ def test_every_part_of_the_scene_is_closed_faces_outwards_and_lies_in_its_box(sc
         agreement = (np.cross(b - a, c - a) * patch.normals[patch.faces[:, 0]]).sum(axis=1)
         assert (agreement > 0).all()
     assert np.abs(scene.patch.vertices).max() < 1.3
-
-
-def test_volumes_are_those_of_the_shapes() -> None:
-    assert signed_volume(shapes.box((0.2, 0.3, 0.5))) == pytest.approx(0.03)
-    assert signed_volume(shapes.ball(0.5, rows=120, around=240)) == pytest.approx(4 / 3 * np.pi / 8, rel=1e-3)
-    # Pappus: cross-section times the length of the centre line, here a circle (a torus).
-    t = np.linspace(0, 2 * np.pi, 200, endpoint=False)
-    torus = shapes.tube(np.stack([np.cos(t), np.sin(t), 0 * t], axis=1), 0.1, around=60, closed=True)
-    assert signed_volume(torus) == pytest.approx(2 * np.pi * np.pi * 0.01, rel=4e-3)
 
 
 # -- the pictures ------------------------------------------------------------------------------------------------------
@@ -248,39 +154,6 @@ def test_rendered_alpha_is_the_projection_of_the_mesh_on_disk(capture: Path) -> 
     assert np.abs(coverage - alpha).max() < 0.3
     assert np.abs(coverage - alpha).mean() < 0.01
     assert ((coverage > 0.5) & (alpha > 0.5)).sum() / ((coverage > 0.5) | (alpha > 0.5)).sum() > 0.97
-
-
-def test_colour_is_straight_and_zero_where_nothing_was_hit(capture: Path) -> None:
-    rgba = read(capture, "train/r_0.png").astype(int)
-    empty, full, border = (rgba[..., 3] == 0), (rgba[..., 3] == 255), (rgba[..., 3] > 0) & (rgba[..., 3] < 100)
-    assert (rgba[empty] == 0).all()
-    assert border.sum() > 5
-    # Straight colour does not darken with alpha: faint pixels are as bright as the wires and leaves they belong to.
-    assert rgba[border][:, :3].max(axis=1).mean() > 40
-    assert rgba[full][:, :3].std() > 40
-
-
-def test_the_flat_plinth_carries_a_texture_that_varies_faster_than_its_geometry(scene: ToyScene) -> None:
-    plinth = scene.parts[0]
-    assert plinth.name == "plinth"
-    assert np.ptp(plinth.patch.vertices[:, 2]) == 0.0  # exactly flat
-    red = plinth.texture[300:724, 300:724, 0]  # a part of the tiled floor, 0.0021 world units per texel
-    step = 10  # texels, 0.021 world units: two pixels of a 256 px picture
-    assert np.abs(red[step:] - red[:-step]).mean() > 0.12
-
-
-def test_seen_counts_are_views_per_face(capture: Path, scene: ToyScene) -> None:
-    seen = np.load(capture / "mesh_gt_seen.npy")
-    mesh = demo_mesh(scene)
-    assert seen.dtype == np.uint8
-    assert seen.shape == (len(mesh.faces),)
-    assert seen.max() == TRAIN
-    middle = mesh.vertices[mesh.faces].mean(axis=1)
-    underside = np.isclose(middle[:, 2], FLOOR - 0.10) & (np.hypot(middle[:, 0], middle[:, 1]) < 0.9 * RADIUS)
-    assert underside.sum() > 500
-    assert (seen[underside] == 0).all()  # no camera is below the plinth
-    in_view = cast_camera(mesh.vertices, mesh.faces, demo_cameras(0, TRAIN, TEST, SIZE)["train"][2], samples=4).face
-    assert (seen[np.unique(in_view[in_view >= 0])] >= 1).all()
 
 
 # -- the files ---------------------------------------------------------------------------------------------------------
@@ -335,16 +208,3 @@ def test_a_capture_that_failed_is_not_taken_for_a_capture(tmp_path: Path, monkey
     with pytest.raises(DiskError, match="No space left"):
         write_demo_capture(tmp_path, train_views=1, test_views=0, size=16)
     assert not (tmp_path / "transforms_train.json").exists()
-
-
-@pytest.mark.parametrize("bad", [{"train_views": 0}, {"test_views": -1}, {"size": 8}])
-def test_a_capture_without_views_or_pixels_is_refused(tmp_path: Path, bad: dict[str, int]) -> None:
-    with pytest.raises(DataError, match="at least 1 training view"):
-        write_demo_capture(tmp_path / "x", **bad)
-    assert not (tmp_path / "x").exists()
-
-
-def test_a_folder_that_cannot_be_made_is_a_disk_error(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(DiskError, match="a part of the path is a file"):
-        write_demo_capture(tmp_path / "file" / "capture")

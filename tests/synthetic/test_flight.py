@@ -7,14 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.flown_capture import main
 
 from gs2d.data import load_scene
-from gs2d.data.exif import read_place
 from gs2d.data.image_files import read_image
 from gs2d.data.readers.colmap import read_images, read_points
-from gs2d.errors import DataError
-from gs2d.geo.projection import to_enu
 from gs2d.io.meshes import read_mesh
 from gs2d.meshing.raycast import cast_camera
 from gs2d.synthetic.flight import PIXEL_NOISE, Flight, flown_cameras, write_flight
@@ -63,14 +59,6 @@ def test_sparse_points_lie_where_the_true_surface_is_and_are_seen_where_they_pro
     assert min(seen.values()) >= 3
 
 
-def test_photographs_say_in_their_exif_where_they_were_taken(capture: Path) -> None:
-    origin = np.array([FLIGHT.latitude, FLIGHT.longitude, FLIGHT.altitude])
-    for k, camera in enumerate(flown_cameras(FLIGHT)):
-        position = read_place(capture / "images" / f"{k:06d}.jpg")
-        assert position is not None
-        np.testing.assert_allclose(to_enu(position[None], origin)[0], camera.center, atol=0.02)
-
-
 def test_no_photograph_looks_beyond_the_land_and_neighbours_show_the_same(capture: Path) -> None:
     mesh = read_mesh(capture / "mesh_gt.ply")
     cameras = flown_cameras(FLIGHT)
@@ -108,24 +96,3 @@ def test_the_same_land_may_be_flown_over_with_any_number_of_photographs() -> Non
         assert np.ptp(places[:, :2], axis=0) == pytest.approx([270, 270], rel=0.15)
     grown = [np.ptp([c.center[0] for c in flown_cameras(Flight(count))]) for count in (60, 960)]
     assert grown[1] / grown[0] == pytest.approx(4, rel=0.15)
-
-
-def test_too_few_photographs_are_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(DataError, match="at least 2 photographs of 16 px, got 1 of 64x48"):
-        write_flight(tmp_path / "one", Flight(1, width=64, height=48))
-    assert main([str(tmp_path / "one"), "--photographs", "1", "--size", "64"]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-    assert not (tmp_path / "one").exists()
-
-
-def test_land_that_ends_within_what_is_flown_over_is_the_same_for_any_number_of_photographs(tmp_path: Path) -> None:
-    surfaces = []
-    for count in (4, 9):
-        flight = Flight(count, width=32, height=24, points=2000, side=80.0, land=96.0)
-        write_flight(tmp_path / str(count), flight, threads=1)
-        surfaces.append((tmp_path / str(count) / "mesh_gt.ply").read_bytes())
-    assert surfaces[0] == surfaces[1]
-    assert np.abs(read_mesh(tmp_path / "4/mesh_gt.ply").vertices[:, :2]).max() == 48.0
-    wide = Flight(4, width=32, height=24, points=2000, side=80.0)
-    write_flight(tmp_path / "wide", wide, threads=1)
-    assert np.abs(read_mesh(tmp_path / "wide/mesh_gt.ply").vertices[:, :2]).max() > 96.0

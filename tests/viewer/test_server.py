@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import http.client
 import socket
-import threading
 import time
 from collections.abc import Iterator, Mapping
 
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 
 from gs2d.errors import BackendError, DataError
-from gs2d.viewer.server import HOST, Answer, PageServer, free_port, number_in
+from gs2d.viewer.server import HOST, Answer, PageServer, free_port
 
 
 def page(_: Mapping[str, str]) -> Answer:
@@ -75,21 +74,6 @@ def test_a_request_for_another_host_is_refused(server: PageServer, host: str, st
     assert get(server, f"/?token={server.token}", Host=host.format(port=server.port)).status == status
 
 
-def test_several_hosts_or_none_are_refused(server: PageServer) -> None:
-    for hosts in ([], ["127.0.0.1", "evil.example"]):
-        assert server.answer(f"/?token={server.token}", hosts)[0] == 403
-
-
-def test_errors_of_routes_are_told_and_defects_are_kept(server: PageServer) -> None:
-    answer = get(server, f"/refuse?token={server.token}")
-    assert (answer.status, answer.read()) == (400, b"there is no such stage")
-    assert server.failure is None
-    assert get(server, f"/nothing?token={server.token}").status == 404
-    answer = get(server, f"/fail?token={server.token}")
-    assert (answer.status, answer.read()) == (500, b"ValueError: a defect")
-    assert str(server.failure) == "a defect"
-
-
 @pytest.mark.parametrize(
     "sent",
     [
@@ -134,16 +118,6 @@ def test_idle_connections_are_limited_and_end_in_time(
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_closed_server_leaves_no_thread_and_frees_its_port() -> None:
-    before = set(threading.enumerate())
-    server = PageServer(None, {"": page})
-    with pytest.raises(BackendError, match="a free port"):
-        free_port(server.port)
-    server.close()
-    assert set(threading.enumerate()) <= before
-    assert free_port(server.port) == server.port
-
-
 def test_a_port_that_is_taken_is_refused_if_it_was_asked_for_and_passed_by_if_not() -> None:
     with socket.socket() as taken:
         taken.bind((HOST, 0))
@@ -154,10 +128,3 @@ def test_a_port_that_is_taken_is_refused_if_it_was_asked_for_and_passed_by_if_no
         assert free_port(None) != port
     with pytest.raises(BackendError, match="--port must be 1 to 65535, got 0"):
         free_port(0)
-
-
-@pytest.mark.parametrize("text", ["", "-1", "3", "1.0", "²", "9" * 5000])
-def test_an_index_out_of_range_is_refused(text: str) -> None:
-    assert number_in({"view": "2"}, "view", 3) == 2
-    with pytest.raises(DataError, match="view must be 0 to 2, got"):
-        number_in({"view": text}, "view", 3)

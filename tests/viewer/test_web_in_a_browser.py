@@ -18,7 +18,7 @@ from gs2d.core.splats import Splats
 from gs2d.data.subject import Subject
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
-from gs2d.viewer.web import PageScene, Seen, guessed_subject, home_camera, photographed_arc, write_page
+from gs2d.viewer.web import PageScene, Seen, write_page
 
 ORIGIN = np.array([100.0, -200.0, 50.0])
 UP = np.array([0.0, 0.0, 1.0])
@@ -83,34 +83,6 @@ def values(page: Page, *names: str) -> list[Any]:
     return list(json.loads(page.ask(f"JSON.stringify([{', '.join(names)}])")))
 
 
-# -- without a browser -------------------------------------------------------------------------------------------------
-def test_a_one_sided_capture_has_an_arc_and_opens_in_its_middle() -> None:
-    cameras = [view.camera for view in ONE_SIDE]
-    arc = photographed_arc(cameras, SUBJECT, UP)
-    np.testing.assert_allclose(arc.middle, [1, 0, 0], atol=1e-9)
-    assert np.degrees(arc.half) == pytest.approx(40 + 12)
-    rise = np.degrees(np.arctan2(1.0, 4.0))
-    assert np.degrees([arc.low, arc.high]) == pytest.approx([rise - 12, rise + 20])
-    assert home_camera(cameras, SUBJECT, arc, UP) == 2
-
-
-def test_a_ring_of_cameras_has_no_arc_and_opens_at_a_usual_height() -> None:
-    ring = [seen_from(degrees, height=1.0 if degrees else 4.0).camera for degrees in range(0, 360, 30)]
-    arc = photographed_arc(ring, SUBJECT, UP)
-    assert arc.half == pytest.approx(np.pi)
-    assert home_camera(ring, SUBJECT, arc, UP) != 0  # the one from high above
-
-
-def test_cameras_in_a_room_look_at_no_object() -> None:
-    def outwards(degrees: float) -> Any:
-        camera = seen_from(degrees, away=0.5).camera
-        return look_at(camera.center, 2 * camera.center - ORIGIN, UP, width=WIDTH, height=HEIGHT, fx=200.0)
-
-    assert guessed_subject([outwards(d) for d in range(0, 360, 45)], ORIGIN, 0.5, UP).kind == "scene"
-    assert guessed_subject([view.camera for view in ONE_SIDE], ORIGIN, 4.0, UP).kind == "object"
-    assert guessed_subject([], ORIGIN, 4.0, UP).kind == "scene"
-
-
 # -- in a browser ------------------------------------------------------------------------------------------------------
 def test_it_opens_where_a_photograph_was_taken_with_the_subject_in_the_middle(page: Page) -> None:
     page.key("h")
@@ -152,16 +124,6 @@ def test_dragging_turns_about_the_subject_and_stops_at_the_end_of_the_arc(page: 
     page.key("h")
     still(page)
     assert values(page, "$('note').hidden") == [True]
-
-
-def test_the_wheel_stops_before_the_subject_and_before_the_void(page: Page) -> None:
-    page.key("h")
-    for delta, least, most in ((-200, 0.1 * SUBJECT.radius, 0.2 * SUBJECT.radius), (200, 6.0, 8.0)):
-        for _ in range(20):
-            page.mouse("mouseWheel", 320, 160, deltaX=0, deltaY=delta)
-        assert least < np.linalg.norm(values(page, "here.eye")[0]) < most
-    page.click("#home")
-    assert np.linalg.norm(values(page, "here.eye")[0]) == pytest.approx(np.hypot(4, 1))
 
 
 def test_the_clip_box_cuts_what_is_drawn_and_its_numbers_are_an_option(page: Page) -> None:
@@ -228,13 +190,6 @@ def test_keys_open_help_show_normals_and_depth_and_step_through_photographs(page
     still(page)
 
 
-def test_keys_work_on_when_a_box_was_ticked(page: Page) -> None:
-    page.ask("$('help').showModal(); $('free').focus(); $('help').close(); $('free').focus()")
-    page.ask("$('free').dispatchEvent(new KeyboardEvent('keydown', { key: 'z', bubbles: true }))")
-    assert page.ask("kind") == 2
-    page.key("c")
-
-
 def test_a_photographed_view_is_drawn_as_the_rasterizer_draws_it_after_turning_and_coming_back(page: Page) -> None:
     page.drag((320, 160), (380, 170))
     page.size(WIDTH, HEIGHT)
@@ -269,16 +224,6 @@ def test_two_clicks_measure_a_distance_on_the_surface(page: Page) -> None:
     np.testing.assert_allclose([float(word) for word in words[4:]], [100, -199.7, 50, 100, -200.3, 50, 1.25], atol=3e-3)
     page.key("Escape")
     assert values(page, "ruler.on", "$('measurepanel').hidden") == [False, True]
-
-
-def test_a_drag_while_measuring_turns_and_a_click_beside_everything_says_so(page: Page) -> None:
-    page.key("m")
-    page.drag((320, 160), (360, 160))
-    assert values(page, "ruler.ends")[0] == []
-    page.mouse("mousePressed", 8, 200)
-    page.mouse("mouseReleased", 8, 200)
-    assert page.ask("$('aside').textContent") == "nothing solid there"
-    page.key("m")
 
 
 def test_a_georeferenced_page_measures_in_metres_with_the_height(page: Page, tmp_path: Path) -> None:
