@@ -6,7 +6,7 @@
         --recipes best $(python -m benchmarks.best_parts)
 
 Run as a program it prints the variants as ``gs2d train --recipe`` takes them (``benchmarks/best_parts.py:median``).
-The figures are in docs/recipes/best.md.
+The figures are in docs/notebook/best.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the paper has no rows for, by runs that share their stages: method or implementation? (docs/results.md)
+"""What the paper has no rows for, by runs that share their stages: method or implementation? (docs/notebook/results.md)
 
 ::
 

@@ -1,4 +1,4 @@
-"""The pictures of the README and docs/results.md: one strip a run (photograph, colour, normal, depth, mesh).
+"""The pictures of the README and docs/notebook/results.md: one strip a run (photograph, colour, normal, depth, mesh).
 
 ::
 

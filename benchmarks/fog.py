@@ -1,4 +1,4 @@
-"""Fog in new views of real captures, and what each part of robust training does against it: docs/decisions/fog.md.
+"""Fog in new views of real captures, and what each part of robust training does against it: docs/notebook/floaters.md.
 
 ::
 

@@ -1,4 +1,4 @@
-"""Meshes of some runs of one capture side by side with the true surface, in clay (docs/recipes/best.md).
+"""Meshes of some runs of one capture side by side with the true surface, in clay (docs/notebook/best.md).
 
 ::
 

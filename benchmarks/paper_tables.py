@@ -1,4 +1,4 @@
-"""The tables of docs/paper-tables.md: `gs2d paper` for every table of the paper and every group of captures.
+"""The tables of docs/notebook/paper-tables.md: `gs2d paper` for every table of the paper and every group of captures.
 
 ::
 

@@ -1,4 +1,4 @@
-"""The tables of docs/results.md: every row is one `gs2d` command, run here and tabulated.
+"""The tables of docs/notebook/results.md: every row is one `gs2d` command, run here and tabulated.
 
 ::
 

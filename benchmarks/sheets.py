@@ -1,4 +1,4 @@
-"""How much long and unseen splats of a run cost: the figures of docs/results.md, "Longer schedules".
+"""How much long and unseen splats of a run cost: the figures of docs/notebook/results.md, "Longer schedules".
 
 ::
 

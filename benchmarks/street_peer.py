@@ -1,7 +1,7 @@
 """A peer on the photographs and cameras of a run, for no more processor time: OpenSplat, 3D Gaussian splatting.
 
-The binary is the user's own build (``docs/street.md`` says how it was built); nothing of it is in this repository. It
-trains on our cameras, on the undistorted training views of the run, at the run's size. So that it shows the
+The binary is the user's own build (``docs/notebook/real-captures.md`` says how); nothing of it is in this repository.
+It trains on our cameras, on the undistorted training views of the run, at the run's size. So that it shows the
 best it can:
 
 - It knows no principal point: each picture is cut, or a canvas is laid around it, so that this point is in the middle.

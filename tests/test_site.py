@@ -15,7 +15,6 @@ from types import ModuleType
 import pytest
 
 import gs2d
-from browser import browser, require_browser
 from gs2d.cli.arguments import NAMES, options_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -45,7 +44,7 @@ def headings(page: str) -> set[str]:
 
 
 def test_every_page_is_in_the_navigation() -> None:
-    assert navigation.missing() == [], "add them to docs/README.md (decisions: docs/decisions/README.md)"
+    assert navigation.missing() == [], "add them to docs/README.md or docs/notebook/README.md"
 
 
 def test_the_navigation_names_a_page_that_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -66,9 +65,9 @@ def test_the_parts_of_the_site_are_the_headings_of_its_contents() -> None:
     for title, below in navigation.parts("docs/README.md"):
         assert f":caption: {title}\n" in trees
         assert below
-    assert "/docs/decisions/README\n" in trees
-    assert "/docs/decisions/libraries\n" not in trees  # one level deeper
-    assert "/docs/decisions/libraries\n" in "".join(navigation.toctrees("docs/decisions/README.md"))
+    assert "/docs/notebook/README\n" in trees
+    assert "/docs/notebook/libraries\n" not in trees  # one level deeper
+    assert "/docs/notebook/libraries\n" in "".join(navigation.toctrees("docs/notebook/README.md"))
 
 
 def test_links_to_headings_lead_to_headings() -> None:
@@ -145,16 +144,3 @@ def test_the_site_is_built_without_a_warning(site: Path) -> None:
         html = (site / page).with_suffix(".html").read_text(encoding="utf-8")
         for target in re.findall(r'<a class="reference internal" href="([^"#]+)', html):
             assert (site / page).parent.joinpath(target).exists(), f"{page}: {target}"
-
-
-@pytest.mark.slow
-def test_no_page_is_wider_than_its_window(site: Path) -> None:
-    require_browser()
-    with browser("--allow-file-access-from-files") as tab:
-        for width in (1600, 1400, 1200, 800, 390):  # with both sidebars, with one, with none, a phone
-            tab.size(width, 900, phone=width < 600)
-            for page in ("README.md", "docs/results.md", "docs/reference/python.md", "docs/tutorials/own-loss.md"):
-                tab.open((site / page).with_suffix(".html").as_uri())
-                wide, room = tab.ask("[document.documentElement.scrollWidth, document.documentElement.clientWidth]")
-                assert wide <= room, f"{page} is {wide} px wide in a window of {width}"
-        assert tab.errors == []

@@ -2,7 +2,7 @@
 
 A program of its own: ``failing_files.c`` must be loaded before Python is (LD_PRELOAD), and everything is imported once,
 each run is a fork. It prints a JSON object for each command and action: how many calls there are, by name, how many
-were tried, and what went wrong. By hand (docs/reliability.md)::
+were tried, and what went wrong. By hand (docs/notebook/reliability.md)::
 
     cc -shared -fPIC -o /tmp/failing.so tests/helpers/failing_files.c -ldl
     LD_PRELOAD=/tmp/failing.so GS2D_FAILING_FILES=/tmp/failing.so PYTHONPATH=src:tests/helpers OMP_NUM_THREADS=1 \

@@ -1,6 +1,6 @@
 """What a kill, a full disk, a stop or a second command does at any call that changes a file: nothing is lost by it.
 
-``kill_runs`` says how; the counts that were reached are in docs/reliability.md.
+``kill_runs`` says how; the counts that were reached are in docs/notebook/reliability.md.
 """
 
 from __future__ import annotations

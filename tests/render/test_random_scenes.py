@@ -5,7 +5,7 @@ What is compared how is that of ``test_parity``: the reference judges in float64
 at thresholds may flip for one pair in some 1e5, and gradients are compared where no decision is near its threshold.
 Every second scene has numbers at the edge of float32. There the kernels, which find what lies behind a splat as all of
 the pixel minus what lies before, cannot know a small gradient beside one of 1e14; the largest one is the measure.
-``KNOWN`` names the plain scene, of a thousand, in which gradients are off by more (docs/reliability.md).
+``KNOWN`` names the plain scene, of a thousand, in which gradients are off by more (docs/notebook/reliability.md).
 """
 
 from __future__ import annotations

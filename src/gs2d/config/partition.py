@@ -1,7 +1,7 @@
 """How a capture that is too large for one training is cut into blocks, as data. Pure Python; never imports torch.
 
 A coarse model of everything is trained first; blocks are cut of it, trained one by one or side by side with the coarse
-model frozen around them, and merged by who owns what. Why each value is as it is: docs/decisions/blocks.md.
+model frozen around them, and merged by who owns what. Why each value is as it is: docs/notebook/blocks.md.
 """
 
 from __future__ import annotations

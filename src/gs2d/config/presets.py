@@ -41,19 +41,19 @@ from gs2d.errors import RecipeError
 PHOTOMETRIC = (LossTerm("l1", 0.8), LossTerm("ssim", 0.2))  # official: lambda_dssim = 0.2
 SH_PATIENCE = 3  # times as many iterations for each SH degree where exposures are learned
 NC_START, DISTORTION_START = 7_000, 3_000  # official: active when iteration > start
-MULTIVIEW_WEIGHT = 0.3  # docs/decisions/multiview.md
-DEPTH_WEIGHT, NORMAL_WEIGHT = 0.2, 0.05  # docs/decisions/priors.md
+MULTIVIEW_WEIGHT = 0.3  # docs/notebook/multiview.md
+DEPTH_WEIGHT, NORMAL_WEIGHT = 0.2, 0.05  # docs/notebook/priors.md
 DEFAULT_RECIPE = "best"  # of `gs2d train`, `reconstruct` and `demo`
 OFFICIAL_ITERATIONS = 30_000  # of 2DGS, for which its rates were chosen
 BEST_ITERATIONS, FAST_ITERATIONS = 20_000, 6_600
-SILHOUETTE = 0.1  # weight of the silhouette loss: docs/decisions/losses.md
-# Weight of normal consistency in best, and in best where it has no L2: docs/decisions/losses.md
+SILHOUETTE = 0.1  # weight of the silhouette loss: docs/notebook/losses.md
+# Weight of normal consistency in best, and in best where it has no L2: docs/notebook/losses.md
 BEST_NC, NC_WITHOUT_SQUARES = 0.035, 0.02
 SQUARES, SQUARES_START = 10.0, 0.5  # weight of L2 in best, and from which part of its iterations on: the same page
-SH_FASTER = 2.5  # times the official rate of SH beyond degree 0: docs/decisions/training.md
-SETTLING, SETTLED = 0.3, 0.1  # of the iterations, at the end, in which rates fall, and to what: decisions/training.md
-DENSE_START = DenseStart(side=256, neighbours=3, fit=StartFit())  # docs/decisions/training.md
-STREET_START = DenseStart(sphere=BackgroundSphere())  # docs/decisions/fog.md
+SH_FASTER = 2.5  # times the official rate of SH beyond degree 0: docs/notebook/training.md
+SETTLING, SETTLED = 0.3, 0.1  # of the iterations, at the end, in which rates fall, and to what: notebook/training.md
+DENSE_START = DenseStart(side=256, neighbours=3, fit=StartFit())  # docs/notebook/training.md
+STREET_START = DenseStart(sphere=BackgroundSphere())  # docs/notebook/floaters.md
 
 # AbsGS, the numbers of its released code: clone 2e-4 signed, split 4e-4 absolute, percent_dense 0.001, cull 0.005,
 # reset every 3000, opacity capped at 0.8 every 500. "D" in the paper's table.
@@ -66,7 +66,7 @@ ABSGS_DEFAULT = GradDensify(
     reset_at_start_on_white=False,  # stage 3 starts from a trained scene, not from random points
 )
 # "A": "more sensitive thresholds for size and positional gradient"; the paper gives no numbers. Half of D's for the
-# gradient is what the sweep chose on lego (`python -m benchmarks.absgs`, docs/paper-tables.md); size decided nothing.
+# gradient is what the sweep chose on lego (`python -m benchmarks.absgs`); size decided nothing.
 ABSGS_ADJUSTED = replace(ABSGS_DEFAULT, grad_threshold=1e-4, abs_threshold=2e-4, percent_dense=0.0005)
 
 
@@ -159,7 +159,7 @@ def with_exposure(recipe: Recipe) -> Recipe:
     """Add a colour transform for each training photograph (``NAME-exposure``) to a recipe without one.
 
     Not in the paper. For photographs of a camera on automatic, whose exposure or white balance changes. View-dependent
-    colour comes three times as late: it can feign exposures (docs/decisions/exposure.md).
+    colour comes three times as late: it can feign exposures (docs/notebook/exposure.md).
     """
     if recipe.exposure is not None:
         return recipe
@@ -171,7 +171,7 @@ def with_photometry(recipe: Recipe, *, vignetting: bool = True, response: bool =
     """Add what a recipe without it learns of cameras: vignetting, response or both (``NAME-photometry``).
 
     Not in the paper. For lenses that darken corners, and for several cameras whose curves differ
-    (docs/decisions/exposure.md).
+    (docs/notebook/exposure.md).
     """
     if recipe.photometry is not None:
         return recipe
@@ -194,7 +194,7 @@ def with_multiview(
     In the ``last`` part of a stage's iterations, of which one in ``every`` compares.
 
     Not in the paper, and not PGSR's weights (0.15 and 0.03 of means over the pixels that count; here means run over all
-    pixels). Why they are these, and why they wait for the end of densification: docs/decisions/multiview.md.
+    pixels). Why they are these, and why they wait for the end of densification: docs/notebook/multiview.md.
     """
 
     def extended(stage: Stage) -> Stage:
@@ -237,8 +237,8 @@ def with_normal_prior(recipe: Recipe, weight: float = NORMAL_WEIGHT) -> Recipe:
 def with_robustness(recipe: Recipe) -> Recipe:
     """Return the recipe with a dense start and the removal of floaters, unless it has its own.
 
-    Not in the paper; for captures that say which sparse points their images show (docs/decisions/fog.md). A dense start
-    that is not required gives way to the one that was tried with the removal. Where no resets delay the prune by size
+    Not in the paper; for captures that say which sparse points their images show (docs/notebook/floaters.md). A dense
+    start that is not required gives way to the one that was tried with the removal. Where no resets delay the prune by size
     there is none, because it would take sky and ground.
     """
     start = recipe.dense_start or STREET_START
@@ -265,7 +265,7 @@ def best(
     Not in the paper. A scene that begins near its end needs no opacity resets, and half the iterations with rates that
     make up for it; large splats stay, which are what surroundings are made of; alpha is that of the photographs which
     have one; squares of differences count from the end of densification on; the mesh is of a depth in which no splat
-    decides alone (docs/recipes/best.md). ``nc`` is the weight of normal consistency, ``squares`` that of L2 (0: it is
+    decides alone (docs/notebook/best.md). ``nc`` is the weight of normal consistency, ``squares`` that of L2 (0: it is
     not there). Colours that depend on direction learn faster than in 2DGS, but where photographs are few
     (:func:`with_few_views`).
     """
@@ -304,8 +304,8 @@ def _best_rates(iterations: int) -> LearningRates:
 def with_few_views(recipe: Recipe) -> Recipe:
     """Return the recipe for at most ``FEW_VIEWS`` training photographs: SH beyond degree 0 learn as in 2DGS, no L2.
 
-    Of directions that a photograph or two show alone, faster SH learn those by heart (docs/decisions/training.md), and
-    squares help with it (docs/decisions/losses.md). Rates and weights of another's choice stay.
+    Of directions that a photograph or two show alone, faster SH learn those by heart (docs/notebook/training.md), and
+    squares help with it (docs/notebook/losses.md). Rates and weights of another's choice stay.
     """
 
     def slower(stage: Stage) -> Stage:
@@ -322,7 +322,7 @@ def best_surface(*, name: str = "best-surface") -> Recipe:
     """Return ``best`` with neighbouring photographs compared in its last fifth, and a start that is not fitted.
 
     Chamfer before dB: a fitted start has better colours, and more splats that lie a little off
-    (docs/recipes/best-surface.md).
+    (docs/notebook/best-surface.md).
     """
     recipe = best()
     assert recipe.dense_start is not None

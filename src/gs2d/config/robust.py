@@ -1,6 +1,6 @@
 """Settings of robust training beside losses: a dense start, and the removal of floaters.
 
-Reasons and alternatives: docs/decisions/fog.md. Pure Python; never imports torch.
+Reasons and alternatives: docs/notebook/floaters.md. Pure Python; never imports torch.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class BackgroundSphere:
     ----------
     splats : int
         On the whole sphere, evenly; those in directions that no photograph shows are left out. Few and large ones: more
-        of them learn each photograph's background by heart (docs/decisions/fog.md).
+        of them learn each photograph's background by heart (docs/notebook/floaters.md).
     radius : float
         In units of how far the scene goes: its cameras, and nearly all of its sparse points and swept places.
     size : float

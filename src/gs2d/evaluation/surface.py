@@ -1,6 +1,6 @@
 """How near a reconstructed mesh is to the truth, over the surface that the cameras can see.
 
-The protocol (ours; docs/decisions/evaluation.md):
+The protocol (ours; docs/notebook/evaluation.md):
 
 1. Points are spread over both surfaces, area-weighted, from a seed.
 2. Completeness and recall ask of every true point how far the reconstruction is. Only true surface seen by at least

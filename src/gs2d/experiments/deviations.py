@@ -75,17 +75,17 @@ def _methods(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
     """Yield what the paper leaves open in the recipes of a table, and where gs2d knowingly does otherwise."""
     yield (
         "the rasterizer is gs2d's own and departs from the official one in pixel centres, footprint, and depth where "
-        "the low-pass filter wins: docs/decisions/rasterizer.md"
+        "the low-pass filter wins: docs/notebook/rasterizer.md"
     )
     if any(scene.protocol.near_plane_policy == "cull" for scene in scenes):
         yield (
             "splats that reach the camera plane are left out of that view, where the official rasterizer draws a part "
-            "of them: docs/decisions/rasterizer.md"
+            "of them: docs/notebook/rasterizer.md"
         )
     if any(scene.protocol.near_plane_policy != "draw" for scene in scenes):
         yield (
             "splats that no training view sees, among them all with an opacity below 1/255, are dropped at the end of "
-            "a stage, so rows with free and with frozen opacity differ in storage: docs/decisions/rasterizer.md"
+            "a stage, so rows with free and with frozen opacity differ in storage: docs/notebook/rasterizer.md"
         )
     if any(scene.data_set == DTU for scene in scenes):
         yield (
@@ -96,7 +96,7 @@ def _methods(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
     if any(len(recipe.stages) > 2 for recipe in recipes.values()):
         yield (
             "the paper does not say which pixels count in E_i, with what opacity clones begin, nor the rates and "
-            "Adam's moments of stages 2 and 3: docs/decisions/training.md has the readings that were trained"
+            "Adam's moments of stages 2 and 3: docs/notebook/training.md has the readings that were trained"
         )
     if "2dgs-r-absgs-a" in recipes:
         yield (
@@ -151,7 +151,7 @@ def _scenes(options: TableOptions, scenes: Sequence[FoundScene], table: PaperTab
         if scene.data_set == NERF_SYNTHETIC and size is not None and size != NERF_SYNTHETIC_SIZE:
             yield (
                 f"{scene.name}: photographs of {size[0]}x{size[1]} px, the data set has 800x800; small ones overstate "
-                "what normal consistency costs: docs/decisions/rasterizer.md"
+                "what normal consistency costs: docs/notebook/rasterizer.md"
             )
         yield from (f"{scene.name}: {line}" for line in scene.missing[:SHOWN_PIECES])
         if len(scene.missing) > SHOWN_PIECES:

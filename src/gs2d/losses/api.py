@@ -339,7 +339,7 @@ FUSED: Mapping[str, Callable[[RenderOutput, LossView, LossOperations], Tensor]] 
     }
 )
 """The losses that every backend with fused operations has; for those of two views it may. The rest is not worth any
-(docs/performance.md)."""
+(docs/notebook/performance.md)."""
 
 
 def compute_losses(

@@ -3,7 +3,7 @@
 Sample points on the surface are looked up in every photograph that sees them. Each photograph gets a gain per channel,
 each point the colour that most photographs agree on, and each pair a weight that is near 0 where the photograph shows
 something else there: an obstacle, a moving object, a highlight. Photographs are then corrected in image space, by a
-smooth weight and a smooth colour offset. See docs/math.md and docs/decisions/meshing.md.
+smooth weight and a smooth colour offset. See docs/math.md and docs/notebook/meshing.md.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ a border of the image or of its mask, and a falls to 0.001 where the photograph 
     sum_v w_v c_v / sum_v w_v,    w_v = s_v - (the lowest of them)
 
 so the weights of ``best`` photographs, continuous across the surface: where one photograph takes the place of another
-in the choice, both have weight 0. See docs/math.md and docs/decisions/meshing.md.
+in the choice, both have weight 0. See docs/math.md and docs/notebook/meshing.md.
 """
 
 from __future__ import annotations

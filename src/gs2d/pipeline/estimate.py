@@ -1,7 +1,7 @@
 """Estimate what a training takes, by arithmetic from the capture and the recipe: splats, memory, disk and time.
 
 Nothing is trained. The number of splats is the least certain: it depends on what the photographs show. The constants
-were compared with ten finished runs (docs/scale.md); each estimate has bounds.
+were compared with ten finished runs (docs/notebook/scale.md); each estimate has bounds.
 
 Work is counted in units: a unit is the time in which the rasterizer renders one pixel of a small test scene, forwards
 and backwards. ``rasterizer_speed`` measures it on the machine that trains, in less than a second.
@@ -40,7 +40,7 @@ from gs2d.training.robust import MAX_WITNESSES, ends_part, looks_at_free_space
 
 # Memory and disk, bytes.
 PROGRAM_BYTES = 384 << 20  # torch, the kernels, the scene
-SPLAT_BYTES = 1200  # parameters, moments, gradients and what the rasterizer holds of a splat (docs/performance.md)
+SPLAT_BYTES = 1200  # a splat's parameters, moments, gradients and rasterizer state (docs/notebook/performance.md)
 FUSION_BYTES = 220 << 20  # the mesh: a slab of the volume and its surface; comes when the gradients are gone
 CHECKPOINT_BYTES = 59 * 3 * 4  # of a splat; two checkpoints are kept
 FILE_BYTES = 4 * 61 + 80 + 40  # of a splat: splats.ply, scene.html, the mesh

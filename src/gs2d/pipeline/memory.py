@@ -10,7 +10,7 @@ from gs2d.data import Scene
 from gs2d.errors import DataError, RecipeError
 from gs2d.kernels.library import available_variants, load
 
-ITERATION_BYTES = 216  # of a pixel: images, their gradients, losses, and what the heap keeps (docs/reliability.md)
+ITERATION_BYTES = 216  # of a pixel: images, gradients, losses, what the heap keeps (docs/notebook/reliability.md)
 CACHES = 2 * CACHE_FRACTION  # of the room, that those of photographs and of targets take beside it
 DECODING_BYTES = 12  # of a pixel of the file: what a JPEG is decoded through
 MAX_DOWNSCALE = 64

@@ -63,7 +63,7 @@ from gs2d.sfm.workspace import (
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", PANORAMA)
 MATCHINGS = ("auto", "exhaustive", "sequential", "similar", "spatial")
 MAPPERS = ("auto", "incremental", "global")
-MANY = 500  # photographs, from which on "auto" places all at once (docs/decisions/sfm.md)
+MANY = 500  # photographs, from which on "auto" places all at once (docs/notebook/sfm.md)
 ALL_PAIRS = 150  # photographs, up to which "auto" matches every pair
 ASKED_FOR = (  # what poses.json remembers of the options: with another of these the capture is another one
     *("cameras", "camera_model", "matching", "overlap", "neighbours", "positions"),

@@ -86,8 +86,8 @@ def rasterize_2dgs(
     ``screen_probe`` instead of an entry of a dictionary. docs/migration.md has the whole table.
 
     Each camera is one call of :func:`gs2d.rasterize`, with the same bits. Further channels are blended in the same
-    pass: 64 take 4 to 7 times what 3 take (docs/performance.md). Under ``torch.compile`` and ``torch.export`` it is
-    the operator ``torch.ops.gs2d.rasterize_2dgs``, whose backward pass renders a second time.
+    pass: 64 take 4 to 7 times what 3 take (docs/notebook/performance.md). Under ``torch.compile`` and
+    ``torch.export`` it is the operator ``torch.ops.gs2d.rasterize_2dgs``, whose backward pass renders a second time.
 
     Parameters
     ----------

@@ -21,7 +21,7 @@ from gs2d.sfm.panoramas import FINER, PANORAMA
 
 Say = Callable[..., None]
 ALIKE = "alike.json"  # beside the database: which photographs look alike
-LESS_NEXT, LESS_ALIKE = 3, 4  # times fewer next and similar ones where near ones are known (docs/decisions/sfm.md)
+LESS_NEXT, LESS_ALIKE = 3, 4  # times fewer next and similar ones where near ones are known (docs/notebook/sfm.md)
 
 
 def find_features(pycolmap: Any, request: dict[str, Any], say: Say) -> None:

@@ -35,7 +35,7 @@ def kept_splats(recipe: Recipe, stage: int, iteration: int, count: int, rate: fl
 def dropped_out(splats: Splats, kept: Tensor) -> Splats:
     """Return the splats [N], of which only ``kept`` [N] bool are drawn and have gradients.
 
-    Those stay as opaque as they are: to make up for what is left out was worse (docs/decisions/fog.md).
+    Those stay as opaque as they are: to make up for what is left out was worse (docs/notebook/floaters.md).
     """
     logits = splats.opacity_logits
     logits = torch.where(kept.to(logits.device), logits, logits.new_full((), NOT_DRAWN))

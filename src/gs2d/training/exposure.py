@@ -1,4 +1,4 @@
-"""One colour transform for each training photograph, learned with the splats (docs/decisions/exposure.md).
+"""One colour transform for each training photograph, learned with the splats (docs/notebook/exposure.md).
 
 T_k = I + theta_k - mean_j theta_j: the mean of all transforms is the identity by construction, since a scene that is
 twice as bright, seen by cameras half as sensitive, has the same pictures. So the scene is in the mean exposure of its

@@ -2,7 +2,7 @@
 
 Over one background, a hole in its colour costs nothing, and opacity that decays leaves many. Over another background
 each time, a hole has the wrong colour in every iteration. Training begins over one background: what only a single image
-shows should fade while splats are removed (docs/decisions/fog.md).
+shows should fade while splats are removed (docs/notebook/floaters.md).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from itertools import product
 
 from gs2d.config.recipe import Recipe, Stage
 
-FROM = 0.8  # of a stage: earlier, fog fills the holes (docs/decisions/fog.md)
+FROM = 0.8  # of a stage: earlier, fog fills the holes (docs/notebook/floaters.md)
 # Few, so that a GPU keeps its arguments. About as varied as random colours (standard deviation 0.3 in each channel):
 # black and white, which vary more, cost 0.5 to 0.9 dB beside those.
 BACKGROUNDS = tuple((r, g, b) for r, g, b in product((0.2, 0.8), repeat=3))

@@ -6,7 +6,7 @@ generator everywhere; what is decided by a look at all views is summed up, or de
 states stay the same to the bit, which :meth:`ManyProcesses.check` watches.
 
 The trainer asks one object: :data:`ONE_PROCESS`, which does nothing, or :class:`ManyProcesses` (``torch.distributed``:
-gloo in the host's memory, NCCL on GPUs). docs/decisions/processes.md says why it is so.
+gloo in the host's memory, NCCL on GPUs). docs/notebook/processes.md says why it is so.
 """
 
 from __future__ import annotations
