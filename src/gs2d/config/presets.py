@@ -238,8 +238,8 @@ def with_robustness(recipe: Recipe) -> Recipe:
     """Return the recipe with a dense start and the removal of floaters, unless it has its own.
 
     Not in the paper; for captures that say which sparse points their images show (docs/notebook/floaters.md). A dense
-    start that is not required gives way to the one that was tried with the removal. Where no resets delay the prune by size
-    there is none, because it would take sky and ground.
+    start that is not required gives way to the one that was tried with the removal. Where no resets delay the prune by
+    size there is none, because it would take sky and ground.
     """
     start = recipe.dense_start or STREET_START
     return replace(
