@@ -43,15 +43,6 @@ def test_twenty_steps_equal_torch_adam() -> None:
         assert state.moments[name].steps == 20
 
 
-def test_the_first_step_moves_by_the_rate_against_the_sign_of_the_gradient() -> None:
-    state, stage = fresh_state(2), Stage("s", 1)
-    state.splats.opacity_logits = torch.tensor([0.0, 1.0])
-    begin_stage(state, stage)
-    grads = gradients(state, 0) | {"opacity_logits": torch.tensor([1e-4, -30.0])}
-    adam_step(state, stage, grads, LR | {"opacity_logits": 0.05})
-    assert state.splats.opacity_logits.tolist() == pytest.approx([-0.05, 1.05])
-
-
 def test_rows_outside_the_group_and_attributes_outside_the_stage_keep_their_bits() -> None:
     state = fresh_state()
     state.groups["g"] = torch.tensor([0, 1, 0, 0, 1, 0, 0, 1, 0], dtype=torch.bool)
@@ -87,15 +78,6 @@ def test_a_row_group_trains_as_its_rows_would_alone() -> None:
     assert torch.equal(state.splats.shN[mask], alone.splats.shN)
 
 
-def test_an_empty_group_trains_nothing() -> None:
-    state = fresh_state()
-    state.groups["g"] = torch.zeros(9, dtype=torch.bool)
-    before, stage = state.splats.clone(), Stage("s", 1, train={"sh0": "g"})
-    begin_stage(state, stage)
-    adam_step(state, stage, gradients(state, 0), LR)
-    assert torch.equal(state.splats.sh0, before.sh0)
-
-
 def test_a_skipped_attribute_keeps_its_bits_and_its_count() -> None:
     state, stage = fresh_state(), Stage("s", 1)
     begin_stage(state, stage)
@@ -125,20 +107,3 @@ def test_rates_decay_only_for_the_means_which_scale_with_the_extent() -> None:
     assert lr_at(LearningRates(), 15_000, 2.0)["means"] == pytest.approx(2 * math.sqrt(1.6e-4 * 1.6e-6))
     assert {k: v for k, v in first.items() if k != "means"} == {k: v for k, v in last.items() if k != "means"}
     assert first["opacity_logits"] == 0.05
-
-
-def test_where_rates_settle_all_but_that_of_the_means_fall() -> None:
-    plain, settling = LearningRates(), LearningRates(settle_start=100, settle_steps=50, settle_factor=0.1)
-    for iteration, factor in ((100, 1.0), (125, 0.55), (150, 0.1), (900, 0.1)):
-        before, after = lr_at(plain, iteration, 2.0), lr_at(settling, iteration, 2.0)
-        assert after["means"] == before["means"]
-        for name in ("quats", "log_scales", "opacity_logits", "sh0", "shN"):
-            assert after[name] == pytest.approx(factor * before[name])
-
-
-def test_degree_0_has_no_higher_coefficients_to_train() -> None:
-    state = TrainState(random_splats(4, degree=0), torch.Generator())
-    stage = Stage("s", 1)
-    begin_stage(state, stage)
-    adam_step(state, stage, gradients(state, 0), LR)
-    assert state.splats.shN.shape == (4, 0, 3)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d.config.densify import Densify
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import GradDensify, Recipe
 from gs2d.data.scene import Scene, View
@@ -16,11 +15,10 @@ from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
 from gs2d.training.blended_sums import blended_sums
 from gs2d.training.densify.by_error import MultiViewErrorDensifier
-from gs2d.training.densify.gradient import densify_and_prune
 from gs2d.training.objective import ViewResidual
 from gs2d.training.trainer import Trainer
 from saved_states import reload, saved
-from train_toys import SIZE, VIEWS, full_state, random_splats, same, short
+from train_toys import SIZE, VIEWS, random_splats, same, short
 
 
 def by_error(views: int = 3, power: float = 1.0) -> Recipe:
@@ -70,19 +68,6 @@ def spoiled(scene: Scene, *, masked: bool = False) -> Scene:
     return replace(scene, train=tuple(views))
 
 
-def test_a_residual_is_that_of_the_photograph_where_it_counts(scene: Scene, backend: str) -> None:
-    trainer, _ = entered(spoiled(scene), by_error(), backend)
-    stage = trainer.recipe.stages[0]
-    found = trainer._whole.residual(trainer.state, stage, 3, 1)
-    color = rasterize(trainer.splats, found.camera, found.settings, backend=backend).color.detach()
-    photograph = torch.tensor(spoiled(scene).train[1].image()) / 255
-    expected = (color - photograph).abs().mean(dim=2)
-    torch.testing.assert_close(found.error, expected)
-    masked, _ = entered(spoiled(scene, masked=True), by_error(), backend)
-    left = masked._whole.residual(masked.state, stage, 3, 1).error[:, : SIZE // 3]
-    assert not left.any()
-
-
 def test_who_is_drawn_where_pictures_are_wrong_is_asked_first(scene: Scene, backend: str) -> None:
     trainer, densifier = entered(scene, by_error(views=VIEWS), backend)
     trainer.state.splats = random_splats(80, seed=3)  # what the photographs are of
@@ -102,18 +87,6 @@ def test_who_is_drawn_where_pictures_are_wrong_is_asked_first(scene: Scene, back
     torch.testing.assert_close(densifier.urgency(trainer.state, 3), wrong.sqrt(), rtol=1e-4, atol=1e-5)
 
 
-def test_gradients_count_times_their_factor() -> None:
-    state = full_state(4)
-    state.splats.log_scales.fill_(-7.0)  # all small: cloned
-    state.splats.opacity_logits.fill_(2.0)
-    state.statistics = {"signed": torch.full((4,), 1e-4), "absolute": torch.zeros(4), "count": torch.ones(4)}
-    factor = torch.tensor([1.0, 2.0, 3.0, 0.0])
-    where = {"iteration": 600, "extent": 1.0, "white": False}
-    before = state.splats.clone()
-    densify_and_prune(state, GradDensify(grad_threshold=2e-4), factor=factor, **where)  # type: ignore[arg-type]
-    assert torch.equal(state.splats.means[4:], before.means[[1, 2]])
-
-
 def test_a_run_that_grows_by_error_resumes_to_the_same_bytes(scene: Scene, backend: str) -> None:
     recipe, saves = by_error(views=2), []
     trainer = Trainer(
@@ -122,11 +95,3 @@ def test_a_run_that_grows_by_error_resumes_to_the_same_bytes(scene: Scene, backe
     end = trainer.run()
     for data in saves[::5]:
         assert same(Trainer(scene, recipe, GENERIC, backend=backend, state=reload(data)).run(), end)
-
-
-def test_it_may_be_named_too(scene: Scene) -> None:
-    recipe = short()
-    named = Densify("multi-view-error", {"start": 1, "stop": 10, "every": 3, "absolute": True})
-    recipe = replace(recipe, stages=(replace(recipe.stages[0], densify=named), *recipe.stages[1:]))
-    _, densifier = entered(scene, recipe, "reference")
-    assert (densifier._options.error_views, densifier._options.absolute) == (10, True)

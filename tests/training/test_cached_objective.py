@@ -17,7 +17,7 @@ from gs2d.config.recipe import Recipe, Stage
 from gs2d.data.scene import Scene, View
 from gs2d.render.backends import PLAIN, Backend
 from gs2d.training import events
-from gs2d.training.cached_objective import CachedViews, choose_objective, is_cacheable
+from gs2d.training.cached_objective import CachedViews, is_cacheable
 from gs2d.training.objective import FullRender
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
@@ -121,16 +121,6 @@ def test_the_first_views_that_fit_are_cached_and_the_others_are_evaluated_plainl
 
 
 @needs_cpu
-def test_no_view_is_cached_where_most_would_not_fit(masked: Scene) -> None:
-    made = entered(masked)
-    first = views_of(made).views[0].nbytes
-    stage = made.recipe.stages[0]
-    half = first * VIEWS // 2
-    assert choose_objective(made._whole, made.state, stage, half - 1) is made._whole
-    assert isinstance(choose_objective(made._whole, made.state, stage, half), CachedViews)
-
-
-@needs_cpu
 @pytest.mark.parametrize("part", [False, True])
 def test_the_bytes_do_not_depend_on_threads_or_on_where_a_run_resumes(masked: Scene, part: bool) -> None:
     room = views_of(entered(masked)).views[0].nbytes * (2 * VIEWS - 3) // 2 if part else ROOM
@@ -151,42 +141,6 @@ def test_the_bytes_do_not_depend_on_threads_or_on_where_a_run_resumes(masked: Sc
     for event, data in kept[::3]:
         state = TrainState.from_state_dict(torch.load(io.BytesIO(data), weights_only=True))
         assert same(trainer(masked, room, state=state).run(), end), event
-
-
-@needs_cpu
-def test_an_empty_group_changes_nothing_and_still_has_its_losses(masked: Scene) -> None:
-    made = entered(masked)
-    made.state.groups["high_error"][:] = False
-    before = made.splats.clone()
-    for _ in range(3):
-        made.step()
-    assert isinstance(made._objective, CachedViews)
-    assert same(made.splats, before)
-    stage = made.recipe.stages[0]
-    a, b = (e.evaluate(made.state, stage, 1, 0) for e in (made._objective, made._whole))
-    assert a.losses == b.losses  # the frozen image is the plain one, to the bit
-
-
-@needs_cpu
-def test_views_that_show_no_splat_of_the_group_have_losses_and_zero_gradients(masked: Scene) -> None:
-    made = entered(masked)
-    made.state.splats.means[made.state.groups["high_error"]] = torch.tensor([0.0, 0.0, 50.0])
-    stage = made.recipe.stages[0]
-    a, b = (e.evaluate(made.state, stage, 1, 3) for e in (views_of(made), made._whole))
-    assert a.losses == b.losses
-    assert all(bool((gradient == 0).all()) for gradient in a.gradients.values())
-
-
-@needs_cpu
-def test_the_cache_is_freed_at_the_end_of_its_stage(masked: Scene) -> None:
-    seen: list[tuple[type, type]] = []
-    made = trainer(
-        masked, ROOM, progress_every=99, on_event=lambda event: seen.append((type(event), type(made._objective)))
-    )
-    made.run()
-    assert [used for event, used in seen if event is events.Progress] == [CachedViews, FullRender]
-    assert {used for event, used in seen if event is not events.Progress} == {type(None)}
-    assert made._objective is None
 
 
 def test_only_stages_that_train_colours_of_a_group_by_colour_losses_on_the_native_backend_are_cached() -> None:

@@ -12,19 +12,18 @@ import torch
 from gs2d.config.presets import two_dgs
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe, validate
-from gs2d.config.robust import DenseStart, Removal, StartFit
+from gs2d.config.robust import DenseStart, StartFit
 from gs2d.config.schedule import scale_schedule
-from gs2d.config.serialize import from_json, to_json
 from gs2d.core.camera import look_at
 from gs2d.core.sh import sh_to_rgb
-from gs2d.data.scene import PointCloud, Scene, View
+from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError, RecipeError
 from gs2d.evaluation.images import psnr_float
 from gs2d.pipeline.run_logger import start_text
 from gs2d.render.api import rasterize
-from gs2d.training import plane_sweep, start_fit
+from gs2d.training import start_fit
 from gs2d.training.events import Initialised
-from gs2d.training.plane_sweep import Sweep, _unique_rows, start_points, sweep_views
+from gs2d.training.plane_sweep import Sweep, start_points, sweep_views
 from gs2d.training.start_fit import fit_start
 from gs2d.training.sweep_range import sweep_range
 from gs2d.training.trainer import Trainer
@@ -69,18 +68,6 @@ def test_a_view_is_swept_between_the_nearest_and_the_farthest_place_in_the_silho
     assert len(found.observed.points) <= 2 * 2000
 
 
-def test_without_silhouettes_it_is_the_part_of_the_bounds_that_two_photographs_show() -> None:
-    found = sweep_range(pointless_wall())
-    for near, far in found.limits.values():
-        assert 2.8 < near < 3.2
-        assert 4.9 < far < 5.4
-
-
-def test_sparse_points_say_it_where_there_are_some() -> None:
-    assert not sweep_range(wall()).limits
-    assert len(sweep_range(wall()).observed.points) == 300
-
-
 def test_a_wall_without_points_is_found_as_with_them() -> None:
     sweep = sweep_views(pointless_wall(), DenseStart(side=48, planes=32, min_angle=1.0))
     depth = sweep.depths[2][:, 20:]
@@ -118,29 +105,6 @@ def test_a_sweep_that_has_nothing_to_go_by_says_so_in_one_line(scene: Scene, set
         Trainer(scene, recipe(settings), GENERIC, backend="reference")
     assert "dense_start=null" in str(raised.value)
     assert "\n" not in str(raised.value)
-
-
-def test_of_many_views_those_are_swept_too_with_which_the_chosen_are_compared() -> None:
-    sweep = sweep_views(ball(), replace(BALL, max_views=4))  # 90 degrees apart: none agrees with another of them
-    swept = {index for index, others in enumerate(sweep.neighbours) if others}
-    chosen = {0, 10, 19, 29}
-    assert chosen < swept
-    assert swept == chosen | {other for index in chosen for other in sweep.neighbours[index]}
-    assert sum(int((sweep.agreeing(index, BALL.agree) >= 2).sum()) for index in chosen) > 100
-    assert all((depth > 0).any() == (index in swept) for index, depth in enumerate(sweep.depths))
-    assert len(start_points(ball(), sweep, replace(BALL, max_views=4))) > 100
-
-
-def test_sparse_points_are_a_start_where_no_photographs_can_be_compared() -> None:
-    points = PointCloud(np.random.default_rng(0).normal(size=(30, 3)) * 0.3)
-    alone = replace(BALL, min_angle=1.0, max_angle=1.1)
-    scene = replace(ball(), points=points)
-    assert len(start_points(scene, sweep_views(scene, alone), alone)) == 30
-
-
-def test_free_space_still_needs_sparse_points() -> None:
-    with pytest.raises(DataError, match="must say which sparse points .* for free space"):
-        Trainer(ball(), replace(recipe(BALL), removal=Removal()), GENERIC, backend="reference")
 
 
 # -- how splats are fitted ------------------------------------------------------------------------------------------
@@ -195,28 +159,6 @@ def test_a_splat_has_the_colour_that_the_views_show_its_opacity_and_a_bounded_si
     assert (fitted.shN[:, 3:] == 0).all()
 
 
-def test_a_splat_that_a_sparse_point_sized_keeps_its_opacity_and_size() -> None:
-    plain = Trainer(ball(), recipe(BALL), GENERIC, backend="reference").splats
-    kept = torch.arange(len(plain)) % 3 == 0
-    fit = StartFit(opacity=0.7, max_size=0.5, max_sparse_size=1e3)
-    fitted = fit_start(plain, swept_ball(), replace(BALL, fit=fit), kept)
-    assert torch.equal(fitted.log_scales[kept], plain.log_scales[kept])
-    small = fit_start(plain, swept_ball(), replace(BALL, fit=replace(fit, max_sparse_size=0.7)), kept)
-    assert (small.scales[kept] <= 0.7 * 1.1 * PIXEL).all()
-    assert torch.equal(fitted.opacity_logits[kept], plain.opacity_logits[kept])
-    assert (fitted.log_scales[~kept] < plain.log_scales[~kept]).any()
-    torch.testing.assert_close(fitted.opacities[~kept], torch.full_like(fitted.opacities[~kept], 0.7))
-
-
-def test_a_splat_that_no_view_sees_keeps_its_colour() -> None:
-    plain = Trainer(ball(), recipe(BALL), GENERIC, backend="reference").splats
-    hidden = plain.rows(torch.arange(len(plain)) < 3)
-    hidden = replace(hidden, means=torch.zeros(3, 3))  # in the middle of the ball
-    fitted = fit_start(hidden, swept_ball(), replace(BALL, fit=StartFit(sh_degree=1)))
-    assert torch.equal(fitted.sh0, hidden.sh0)
-    assert torch.equal(fitted.shN, hidden.shN)
-
-
 # -- in training ----------------------------------------------------------------------------------------------------
 def test_a_resumed_training_sweeps_nothing_again_and_ends_with_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
     made = recipe(replace(BALL, fit=StartFit()))
@@ -231,12 +173,6 @@ def test_a_resumed_training_sweeps_nothing_again_and_ends_with_the_same_bits(mon
     assert all(torch.equal(a, b) for (_, a), (_, b) in zip(whole.items(), again.items(), strict=True))
 
 
-def test_a_fit_is_written_and_read_again() -> None:
-    assert to_json(recipe(BALL))["dense_start"]["fit"] is None
-    made = recipe(replace(BALL, fit=StartFit(sh_degree=2)))
-    assert from_json(to_json(made)) == made
-
-
 @pytest.mark.parametrize(
     ("fit", "said"),
     [
@@ -249,14 +185,6 @@ def test_a_fit_is_written_and_read_again() -> None:
 def test_a_fit_that_cannot_be_made_is_refused(fit: StartFit, said: str) -> None:
     with pytest.raises(RecipeError, match=said):
         validate(recipe(replace(BALL, fit=fit)))
-
-
-@pytest.mark.parametrize("spread", [(30.0, 30.0, 2.0), (1e9, 1e9, 1e9)])
-def test_one_of_each_cell_is_found_as_numpy_finds_it(spread: tuple[float, ...]) -> None:
-    keys = np.floor(np.random.default_rng(0).normal(size=(5000, 3)) * spread)
-    for found, true in zip(_unique_rows(keys), np.unique(keys, axis=0, return_index=True), strict=True):
-        np.testing.assert_array_equal(found, true)
-    assert len(_unique_rows(keys[:0])[1]) == 0
 
 
 # -- a start that is wished for, not required -----------------------------------------------------------------------
@@ -284,25 +212,3 @@ def test_where_photographs_agree_on_nothing_an_optional_start_is_left_out_and_th
     assert start_text(start).endswith(f"; no dense start: {start.lacks}")
     with pytest.raises(DataError, match="a plane sweep of ball"):
         Trainer(scene, recipe(replace(wished, required=True)), GENERIC, backend="reference")
-
-
-def test_where_they_agree_it_is_as_if_it_were_required() -> None:
-    wished = Trainer(ball(), recipe(replace(BALL, required=False)), GENERIC, backend="reference").splats
-    needed = Trainer(ball(), recipe(BALL), GENERIC, backend="reference").splats
-    assert all(torch.equal(a, b) for (_, a), (_, b) in zip(wished.items(), needed.items(), strict=True))
-
-
-def test_places_are_thinned_view_by_view_as_if_all_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A view is held twice and cells are large, so that most places share one, and some are equally good."""
-    sweep = swept_ball()
-    whole = start_points(ball(), sweep, BALL)
-    twice = [plane_sweep._swept(sweep, index, BALL) for index in (*range(len(sweep.views)), 0)]
-    for cell in (3.0, 8.0):
-        expected = plane_sweep._thin(plane_sweep._joined(twice), cell)
-        monkeypatch.setattr(plane_sweep, "WAITING", 10)
-        found = plane_sweep._thinned(iter(twice), cell)
-        assert len(expected.score) < 0.9 * len(plane_sweep._joined(twice).score)
-        for name in ("places", "colors", "normals", "pixel", "score"):
-            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
-    again = start_points(ball(), sweep, BALL)
-    np.testing.assert_array_equal(again.points, whole.points)

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import LossTerm, Recipe
@@ -70,18 +69,6 @@ def test_stages_look_at_the_size_that_they_say_and_scores_at_the_full_one(scene:
     assert trainer.scene.train[0].camera.width == 24
 
 
-def test_the_size_may_grow_within_a_stage(scene: Scene, backend: str) -> None:
-    recipe = short()
-    recipe = replace(recipe, stages=(replace(recipe.stages[0], downscale=2, halve_at=(6,)), *recipe.stages[1:]))
-    trainer = Trainer(scene, recipe, GENERIC, backend=backend)
-    trainer.enter(0)
-    widths = []
-    for _ in range(10):
-        trainer.step()
-        widths.append(trainer._targets[0].image.shape[1])
-    assert widths == [12] * 6 + [24] * 4
-
-
 def test_a_run_of_several_sizes_resumes_to_the_same_bytes(scene: Scene, backend: str) -> None:
     recipe, saves = at_half(short(), 0, 2), []
     recipe = replace(recipe, stages=(replace(recipe.stages[0], halve_at=(5,)), *recipe.stages[1:]))
@@ -91,15 +78,6 @@ def test_a_run_of_several_sizes_resumes_to_the_same_bytes(scene: Scene, backend:
     end = trainer.run()
     for data in saves[::3]:
         assert same(Trainer(scene, recipe, GENERIC, backend=backend, state=reload(data)).run(), end)
-
-
-def test_ranking_by_error_asks_the_photographs_that_the_stage_trains_on(scene: Scene) -> None:
-    ranked = []
-    for stages in ((), (1,)):
-        trainer = Trainer(scene, at_half(short(), *stages), GENERIC, backend="reference")
-        trainer.enter(1)
-        ranked.append(trainer.state.groups["high_error"])
-    assert not torch.equal(*ranked)
 
 
 def test_photographs_that_would_be_too_small_are_refused_before_training(scene: Scene) -> None:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import pytest
 import torch
 
-from gs2d.config.presets import best, two_dgs, two_dgs_r, with_robustness
+from gs2d.config.presets import two_dgs_r
 from gs2d.config.protocols import GENERIC
-from gs2d.config.recipe import Recipe, validate
+from gs2d.config.recipe import Recipe
 from gs2d.config.robust import FEW_VIEWS, Removal
-from gs2d.errors import RecipeError
 from gs2d.render.api import rasterize
 from gs2d.training.dropout import dropout_rate, dropped_out, kept_splats
 from gs2d.training.trainer import Trainer
@@ -20,14 +18,6 @@ from train_toys import make_scene, short
 
 def dropping(rate: float) -> Recipe:
     return replace(short(), removal=Removal(dropout=rate))
-
-
-def test_robust_recipes_have_it_and_the_paper_s_have_not() -> None:
-    assert two_dgs_r().removal is None
-    assert best().removal is None
-    assert with_robustness(two_dgs()).removal == Removal()
-    own = replace(two_dgs(), removal=Removal(dropout=0.3))
-    assert with_robustness(own).removal == Removal(dropout=0.3)
 
 
 def test_only_stages_that_train_all_of_geometry_and_opacity_drop_splats_and_only_of_few_views() -> None:
@@ -65,9 +55,3 @@ def test_those_that_are_left_out_are_not_drawn_and_learn_nothing() -> None:
     assert gradient is not None
     assert not gradient[~kept].any()
     assert gradient[kept].any()
-
-
-@pytest.mark.parametrize("rate", [1.0, -0.1])
-def test_a_bad_rate_is_named(rate: float) -> None:
-    with pytest.raises(RecipeError, match=r"removal.dropout must be"):
-        validate(dropping(rate))

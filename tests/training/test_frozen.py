@@ -8,13 +8,11 @@ import pytest
 import torch
 
 from gs2d.config.protocols import GENERIC
-from gs2d.config.recipe import Exposure, GradDensify, Recipe
+from gs2d.config.recipe import Exposure, Recipe
 from gs2d.core.splats import Splats
-from gs2d.errors import RecipeError
 from gs2d.training.blended_sums import blended_sums
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
-from gs2d.training.whole_steps import WholeSteps
 from train_toys import backends, compared, make_scene, random_splats, short
 
 SCENE = make_scene()
@@ -102,30 +100,6 @@ def test_who_is_drawn_where_a_picture_is_wrong_counts_what_hides_it() -> None:
         assert torch.equal(part, all_of_it[:45])
 
 
-def test_densification_keeps_its_budget_of_what_is_in_training() -> None:
-    recipe = short()
-    first = recipe.stages[0]
-    assert isinstance(first.densify, GradDensify)
-    tight = replace(first, densify=replace(first.densify, max_splats=50, grad_threshold=1e-9))
-    own, frozen = random_splats(45), random_splats(30, seed=1)
-    splats = trainer_of(replace(recipe, stages=(tight,)), own, frozen, backends()[-1]).run()
-    assert 45 < len(splats) <= 50
-
-
-def test_iterations_in_one_piece_are_not_for_what_has_frozen_splats() -> None:
-    own, frozen = random_splats(45), random_splats(30, seed=1)
-    found = []
-    for others in (frozen, None):
-        whole = trainer_of(short(), own, others, backends()[-1])._whole
-        found.append(WholeSteps(whole, whole, short().stages[0])._possible)
-    assert found == [False, True]
-
-
-def test_frozen_splats_must_have_the_degree_of_the_recipe() -> None:
-    with pytest.raises(RecipeError, match="frozen splats must have the recipe's SH degree, got 1, the recipe trains 3"):
-        trainer_of(short(), random_splats(20), random_splats(5, degree=1), backends()[-1])
-
-
 def test_a_part_without_a_dense_start_begins_with_the_splats_that_it_is_given() -> None:
     own, frozen = random_splats(45), random_splats(30, seed=1)
     asked: list[int] = []
@@ -160,17 +134,3 @@ def test_given_exposures_are_taken_as_they_are_and_stay() -> None:
     assert again is not None
     assert torch.equal(again.transforms(), before)
     assert torch.equal(again.transform(2), before[2])
-
-
-def test_given_exposures_are_seen_in_training() -> None:
-    found = [
-        trainer_of(GIVEN, random_splats(40), None, backends()[-1], exposures=given).run()
-        for given in (transforms(), 2 * transforms())
-    ]
-    assert not same(*found)
-
-
-@pytest.mark.parametrize("given", [None, torch.zeros(2, 3, 4)])
-def test_exposures_that_are_to_be_given_must_be(given: torch.Tensor | None) -> None:
-    with pytest.raises(RecipeError, match="a transform of each of 6 training views, got (none|2)"):
-        trainer_of(GIVEN, random_splats(40), None, backends()[-1], exposures=given)

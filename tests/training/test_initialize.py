@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d.core.transforms import quats_to_matrices
 from gs2d.data.scene import PointCloud, Scene
 from gs2d.errors import DataError, ProtocolError
-from gs2d.training.initialize import Initial, initial_splats, random_rotations, usable_points
+from gs2d.training.initialize import Initial, initial_splats, usable_points
 
 
 def start(scene: Scene, *, near: float = 0.1, degree: int = 3, count: int = 500, seed: int = 0) -> Initial:
@@ -41,13 +40,6 @@ def test_points_give_places_colours_opacity_and_scales(scene: Scene) -> None:
     assert splats.shN.shape == (4, 15, 3)
 
 
-def test_coincident_points_get_the_floor(scene: Scene) -> None:
-    splats = start(with_points(scene, [[0, 0, 0]] * 4)).splats
-    torch.testing.assert_close(splats.scales, torch.full((4, 2), math.sqrt(1e-7)))
-    tiny = replace(with_points(scene, [[0, 0, 0]] * 4), extent=0.01)
-    torch.testing.assert_close(start(tiny).splats.scales, torch.full((4, 2), 1e-6))
-
-
 def test_points_that_no_camera_sees_or_that_touch_one_or_are_not_finite_are_dropped(scene: Scene) -> None:
     beside_camera = scene.train[0].camera.center + 0.05
     good = [[0, 0, 0], [0.1, 0, 0]]
@@ -72,13 +64,6 @@ def test_without_points_they_are_random_in_the_bounds_and_grey(scene: Scene) -> 
     assert not torch.equal(start(bare, seed=1).splats.means, splats.means)
 
 
-def test_rotations_are_uniform_and_not_of_one_orthant() -> None:
-    quats = random_rotations(4000, torch.Generator().manual_seed(0))
-    torch.testing.assert_close(quats.norm(dim=1), torch.ones(4000, dtype=torch.float64))
-    # every entry of a uniform R has mean 0 and variance 1/3: 4000 of them average to within 0.04 (4.4 sigma)
-    assert quats_to_matrices(quats).mean(dim=0).abs().max() < 0.04
-
-
 def test_a_near_that_swallows_the_scene_says_so(scene: Scene) -> None:
     with pytest.raises(ProtocolError, match="near = 50"):
         start(scene, near=50.0)
@@ -88,8 +73,3 @@ def test_points_that_are_all_behind_the_cameras_are_a_data_error(scene: Scene) -
     one = replace(with_points(scene, [[9.0, 0, 1], [10.0, 0, 1]]), train=scene.train[:1])
     with pytest.raises(DataError, match="fewer than 2"):
         start(one)
-
-
-def test_lower_degrees_hold_fewer_coefficients(scene: Scene) -> None:
-    assert start(scene, degree=0).splats.shN.shape[1] == 0
-    assert start(scene, degree=1).splats.shN.shape[1] == 3

@@ -19,7 +19,7 @@ from gs2d.training.multiview import ImageFiles, draw_turn, find_neighbours
 from gs2d.training.targets import Targets
 from gs2d.training.trainer import Trainer
 from saved_states import reload, saved
-from train_toys import VIEWS, WIDE, compared, same, short
+from train_toys import WIDE, compared, same, short
 
 
 def ring(angles: list[float], distance: float = 3.0) -> Scene:
@@ -42,17 +42,6 @@ def test_neighbours_are_the_nearest_views_within_the_angle_and_the_baselines() -
     assert found[4] == (2, 5)  # 30 degrees away and 40; 50 is too many
     assert find_neighbours(ring([0, 1, 30, 10, 60, 20]), replace(settings, neighbours=1))[0] == (3,)
     assert find_neighbours(ring([0, 1, 30, 10]), replace(settings, max_baseline=0.3))[0] == (3,)  # 30: 0.52
-
-
-def test_two_cameras_at_one_place_are_no_neighbours() -> None:
-    found = find_neighbours(ring([0, 0, 20]), MultiView(min_baseline=0.0))
-    assert found[:2] == ((2,), (2,))
-
-
-def test_a_view_may_have_no_neighbour_but_not_every_view() -> None:
-    assert find_neighbours(ring([0, 20, 180]), MultiView())[2] == ()
-    with pytest.raises(DataError, match="no training view of ring has a neighbour .* --set multiview.max_angle"):
-        find_neighbours(ring([0, 120, 240]), MultiView())
 
 
 def test_a_scene_without_neighbours_is_refused_before_anything_is_trained(scene: Scene) -> None:
@@ -79,17 +68,6 @@ def test_an_iteration_draws_from_the_seed_the_stage_and_the_iteration_alone() ->
     assert drawn(2**63 - 1, 2, 10**6)[1].shape == (WIDE.patches,)  # the largest seed there is
 
 
-def test_the_state_s_generator_draws_what_it_draws_without(scene: Scene) -> None:
-    with_, without = Trainer(scene, compared(), GENERIC, backend="reference"), None
-    without = Trainer(scene, short(), GENERIC, backend="reference")
-    for trainer in (with_, without):
-        trainer.enter(0)
-        for _ in range(2):
-            trainer.step()
-    assert torch.equal(with_.state.generator.get_state(), without.state.generator.get_state())
-    assert same(with_.splats, without.splats)  # nothing is compared yet
-
-
 # -- photographs --------------------------------------------------------------------------------------------------
 def test_patches_that_touch_what_is_masked_or_transparent_are_not_asked() -> None:
     rng = np.random.default_rng(0)
@@ -108,17 +86,6 @@ def test_patches_that_touch_what_is_masked_or_transparent_are_not_asked() -> Non
     expected[2:7, 4:9] = False
     expected[13:18, 10:15] = False
     assert np.array_equal(clear, expected)
-
-
-def test_photographs_beyond_the_room_are_made_anew(scene: Scene) -> None:
-    targets = Targets(scene.train, (0.0, 0.0, 0.0), use_masks=False)
-    kept, none = ImageFiles(scene.train, WIDE), ImageFiles(scene.train, WIDE, limit_bytes=0)
-    for index in (0, 1, 0):
-        a, b = (images.of(index, targets[index]) for images in (kept, none))
-        assert torch.equal(a.grey, b.grey)
-        assert torch.equal(a.textured, b.textured)
-    assert kept.of(0, targets[0]) is kept.of(0, targets[0])
-    assert none.of(0, targets[0]) is not none.of(0, targets[0])
 
 
 # -- training -----------------------------------------------------------------------------------------------------
@@ -161,16 +128,6 @@ def test_a_resumed_training_gives_the_same_bytes(scene: Scene, backend: str) -> 
             trainer.step()
         state = reload(saved(trainer))
         assert same(Trainer(scene, compared(), GENERIC, backend=backend, state=state).run(), end), stage
-
-
-def test_a_view_without_neighbours_trains_without_these_losses(scene: Scene) -> None:
-    lonely = replace(scene, train=(*scene.train[:2], scene.train[4]))  # at 0, 60 and 240 degrees
-    trainer = Trainer(lonely, compared(), GENERIC, backend="reference")
-    trainer.enter(0)
-    assert trainer._whole._neighbours == ((1,), (0,), ())
-    found = trainer._whole.evaluate(trainer.state, trainer.recipe.stages[0], 9, 2)
-    assert set(found.losses) == {"l1", "ssim", "normal_consistency"}
-    assert VIEWS == 6
 
 
 def test_the_neighbour_s_depth_is_rendered_as_the_splats_are_now(scene: Scene) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d.config.presets import two_dgs, two_dgs_r
+from gs2d.config.presets import two_dgs_r
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import LossTerm, Recipe
 from gs2d.config.robust import Removal
@@ -35,11 +35,6 @@ def test_the_background_changes_at_the_end_of_stages_that_train_opacity() -> Non
     assert {another_background(recipe, surface, before + 1 + i) for i in range(len(BACKGROUNDS))} == set(BACKGROUNDS)
     for stage in (appearance, refine):
         assert another_background(recipe, stage, stage.iterations) is None
-
-
-@pytest.mark.parametrize("recipe", [two_dgs(), robust(backdrop=True)])
-def test_the_paper_s_recipes_and_unlit_backdrops_keep_one_background(recipe: Recipe) -> None:
-    assert another_background(recipe, recipe.stages[0], recipe.stages[0].iterations) is None
 
 
 def opacity_gradient(iterations: range, *, channels: int) -> float:

@@ -17,7 +17,6 @@ from gs2d.data.scene import Scene
 from gs2d.errors import RecipeError
 from gs2d.render.backends import PLAIN
 from gs2d.training.adam import adam_step
-from gs2d.training.cached_objective import is_cacheable
 from gs2d.training.densify.densifier import Densifier
 from gs2d.training.parallel import ONE_PROCESS
 from gs2d.training.state import Moments, TrainState
@@ -129,18 +128,6 @@ def test_a_step_of_four_views_is_a_step_of_adam_with_the_memory_of_four() -> Non
     )  # torch counts steps in float32
 
 
-def test_one_process_notes_nothing_and_others_do_when_their_number_changes() -> None:
-    state = TrainState(random_splats(3), torch.Generator())
-    state.trained_by(1)
-    assert "processes" not in state.state_dict()
-    state.trained_by(2)
-    state.stage, state.step = 1, 30
-    state.trained_by(2)
-    state.trained_by(1)
-    again = TrainState.from_state_dict(state.state_dict())
-    assert again.processes == [(0, 0, 2), (1, 30, 1)]
-
-
 def test_a_run_goes_on_with_another_number_of_processes(scene: Scene) -> None:
     """2, then 1, then 2: the schedule is one of views, and each of them is in it once."""
     _, heard = trained(short(), Batch(2))
@@ -150,16 +137,6 @@ def test_a_run_goes_on_with_another_number_of_processes(scene: Scene) -> None:
     assert state.processes == [(0, 0, 2), (0, 4, 1), (0, 7, 2)]
     assert [at[:2] for at in heard["losses"]][:3] == [("surface", 9), ("surface", 10), ("appearance", 2)]
     assert state.stage == 3
-
-
-def test_iterations_that_are_done_in_one_have_one_size_and_one_densification(scene: Scene) -> None:
-    """``short`` densifies in 3, 6 and 9 and limits opacity in 5."""
-    trainer = Trainer(scene, short(), GENERIC, backend="reference", processes=Batch(4))
-    stage, found = trainer.recipe.stages[0], []
-    while trainer.state.step < stage.iterations:
-        found.append(list(trainer._iterations(stage)))
-        trainer.state.step = found[-1][-1]
-    assert found == [[1, 2, 3, 4], [5], [6, 7, 8], [9, 10]]
 
 
 class Guest(Densifier):
@@ -184,14 +161,3 @@ def test_densifiers_that_cannot_share_an_iteration_are_refused(
     with pytest.raises(RecipeError, match=says):
         Trainer(scene, recipe, GENERIC, backend="reference", processes=Batch(2))
     Trainer(scene, recipe, GENERIC, backend="reference")
-
-
-def test_a_cache_of_views_must_be_worth_it_in_each_process() -> None:
-    class Caches:
-        caches_views = True
-
-    stage = short().stages[1]
-    long = Stage(stage.name, 24, stage.train, stage.losses)
-    given: dict[str, Any] = {"backend": Caches(), "views": 6}
-    assert is_cacheable(short(), long, **given, processes=2)
-    assert not is_cacheable(short(), long, **given, processes=3)

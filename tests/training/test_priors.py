@@ -15,14 +15,13 @@ from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import LearningRates, Recipe
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.data.priors import MapFiles, ObservedPoints, PriorDepth
-from gs2d.data.scene import Scene, View
+from gs2d.data.scene import Scene
 from gs2d.errors import DataError
 from gs2d.losses.priors import MetricDepth, PointDepths, RelativeDepths
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
 from gs2d.training.initialize import initial_splats, turned_to
 from gs2d.training.priors import (
-    line_of,
     metric_depths,
     plan_depths,
     plan_normals,
@@ -187,14 +186,6 @@ def test_relative_maps_are_brought_to_the_points_and_tell_what_they_are_linear_i
     assert isinstance(metric_depths(made.train[0], plan_depths(made, rendered), rendered), RelativeDepths)
 
 
-def test_there_is_no_line_through_few_points_equal_values_or_the_wrong_way() -> None:
-    depth = np.linspace(1, 2, 20)
-    assert line_of(1 / depth, depth, "disparity") == pytest.approx((1, 0), abs=1e-6)
-    assert line_of(1 / depth[:9], depth[:9], "disparity") is None
-    assert line_of(np.full(20, 3.0), depth, "disparity") is None
-    assert line_of(depth, depth, "disparity") is None
-
-
 # -- normals --------------------------------------------------------------------------------------------------------
 def facing(scene: Scene, flip: tuple[int, int, int]) -> Scene:
     """Normals that look straight at the camera, in other axes."""
@@ -260,28 +251,6 @@ def test_splats_on_known_depths_lie_in_their_surface(scene: Scene) -> None:
     assert turned_to(up, others)[1].tolist() == [0, 1, 0, 0]
 
 
-def test_places_that_are_masked_or_transparent_are_not_started_from(scene: Scene) -> None:
-    made = mapped(scene, lambda _, depth: np.full_like(depth, 3.0))
-    mask = np.zeros((SIZE, SIZE), dtype=bool)
-    mask[4, 5] = True
-    first = made.train[0]
-    masked = replace(View.from_arrays(first.name, first.camera, first.image(), mask), maps=first.maps)
-    cloud = with_known_points(replace(made, train=(masked,), points=None), with_depth_prior(short(), "sensor")).points
-    assert cloud is not None
-    assert np.allclose(first.camera.project(cloud.points)[0], [[5.5, 4.5]])
-
-
-def test_without_a_scale_or_where_the_recipe_says_so_the_capture_s_points_are_the_start(scene: Scene) -> None:
-    made, recipe = cases(scene)["sensor"]
-    assert recipe.depth_prior is not None
-    off = replace(recipe, depth_prior=replace(recipe.depth_prior, start=False))
-    assert with_known_points(made, off) is made
-    assert with_known_points(made, short()) is made
-    for source in ("sparse", "relative"):
-        made, recipe = cases(scene)[source]
-        assert with_known_points(made, recipe) is made
-
-
 # -- training -------------------------------------------------------------------------------------------------------
 def cases(scene: Scene) -> dict[str, tuple[Scene, Recipe]]:
     relative = mapped(scene, lambda _, depth: np.where(depth > 0, 3 / np.where(depth > 0, depth, 1) + 1, 0))
@@ -327,18 +296,6 @@ def test_known_depths_bring_the_splats_nearer_to_the_surface(scene: Scene) -> No
     assert error(eager(with_depth_prior(plain, "sensor", 2.0))) < 0.85 * error(plain)
 
 
-def test_the_loss_falls_with_the_share_of_the_run(scene: Scene) -> None:
-    made, recipe = cases(scene)["sensor"]
-    recipe = eager(recipe)
-    assert recipe.depth_prior is not None
-    recipe = replace(recipe, depth_prior=replace(recipe.depth_prior, decay_steps=20, final_factor=0.01))
-    trainer = Trainer(made, recipe, GENERIC, backend="reference")
-    trainer.enter(0)
-    stage, whole = trainer.recipe.stages[0], trainer._whole
-    first, later = (whole.evaluate(trainer.state, stage, iteration, 0).losses["depth_prior"] for iteration in (1, 3))
-    assert later / first == pytest.approx(0.01 ** (2 / 20))
-
-
 @pytest.mark.parametrize("source", ["sparse", "relative"])
 def test_a_resumed_training_gives_the_same_bytes(scene: Scene, backend: str, source: str) -> None:
     made, recipe = cases(scene)[source]
@@ -351,30 +308,6 @@ def test_a_resumed_training_gives_the_same_bytes(scene: Scene, backend: str, sou
         trainer.step()
     state = reload(saved(trainer))
     assert same(Trainer(made, recipe, GENERIC, backend=backend, state=state).run(), end)
-
-
-def test_a_view_of_which_nothing_is_known_trains_without(scene: Scene) -> None:
-    made, recipe = cases(scene)["sensor"]
-    made = replace(made, train=(scene.train[0], *made.train[1:]))
-    trainer = Trainer(made, eager(recipe), GENERIC, backend="reference")
-    trainer.enter(0)
-    stage = trainer.recipe.stages[0]
-    for index, expected in ((0, False), (1, True)):
-        assert ("depth_prior" in trainer._whole.evaluate(trainer.state, stage, 1, index).losses) is expected
-
-
-def test_what_is_known_beyond_the_room_is_made_anew(scene: Scene) -> None:
-    from gs2d.training.priors import Priors
-
-    made, recipe = cases(scene)["sensor"]
-    kept, none = Priors(made, recipe), Priors(made, recipe, limit_bytes=0)
-    for index in (0, 1):
-        a, b = (p.at(index, torch.float32)[0] for p in (kept, none))
-        assert isinstance(a, MetricDepth)
-        assert isinstance(b, MetricDepth)
-        assert torch.equal(a.disparity, b.disparity)
-    assert kept.at(0, torch.float32)[0] is kept.at(0, torch.float32)[0]
-    assert none.at(0, torch.float32)[0] is not none.at(0, torch.float32)[0]
 
 
 def test_normals_are_trained_by_maps(scene: Scene, backend: str) -> None:

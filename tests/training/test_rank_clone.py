@@ -8,7 +8,7 @@ import torch
 from gs2d.config.recipe import CloneInPlace, RankByError
 from gs2d.errors import DivergedError
 from gs2d.render.api import rasterize
-from gs2d.training.rank_clone import clone_in_place, halved_opacity, rank_by_error, worst
+from gs2d.training.rank_clone import clone_in_place, rank_by_error, worst
 from gs2d.training.state import TrainState
 from train_toys import full_state, make_scene, random_splats
 
@@ -18,13 +18,6 @@ def test_the_worst_are_the_largest_and_ties_go_by_index() -> None:
     assert worst(errors, 40).tolist() == [1, 2]
     assert worst(errors, 100).tolist() == [1, 2, 4, 3, 0]
     assert worst(torch.ones(5000), 10).tolist() == list(range(500))  # many: an unstable sort would mix them
-
-
-@pytest.mark.parametrize(
-    ("percent", "count", "expected"), [(1, 100, 1), (1, 101, 2), (1, 1, 1), (30, 10, 3), (0.7, 1000, 7), (50, 3, 2)]
-)
-def test_the_count_is_the_share_rounded_up(percent: float, count: int, expected: int) -> None:
-    assert len(worst(torch.arange(count).double(), percent)) == expected
 
 
 def test_ranking_sums_over_views_and_writes_the_group() -> None:
@@ -62,14 +55,6 @@ def test_preserve_gives_both_the_opacity_that_transmits_the_same_twice() -> None
     torch.testing.assert_close((1 - new[[0, 3, 6]]) ** 2, 1 - old[[0, 3, 6]], rtol=1e-5, atol=1e-7)
     assert torch.equal(state.splats.opacity_logits[7:], state.splats.opacity_logits[[0, 3, 6]])
     assert torch.equal(state.splats.opacity_logits[[1, 2, 4, 5]], before.opacity_logits[[1, 2, 4, 5]])
-
-
-def test_halved_opacity_is_right_from_almost_0_to_almost_1() -> None:
-    # o = 0.75: 1 - sqrt(0.25) = 0.5, logit 0
-    assert halved_opacity(torch.tensor([1.0986123]))[0].item() == pytest.approx(0.0, abs=1e-6)
-    extreme = torch.tensor([-30.0, 30.0], dtype=torch.float64)
-    # o = e^-30: half of it. 1 - o = e^-30: 1 - e^-15
-    assert halved_opacity(extreme).tolist() == pytest.approx([-30 - 0.6931472, 15.0], abs=1e-6)
 
 
 def test_preserve_hardly_changes_the_image_and_copy_does() -> None:

@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from fake_backends import lacking
-from gs2d.config.presets import appearance, refine, surface, two_dgs, with_exposure, with_robustness
+from gs2d.config.presets import appearance, two_dgs, with_exposure, with_robustness
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe, validate
 from gs2d.config.robust import DenseStart, Removal, StartFit
 from gs2d.config.schedule import scale_schedule
-from gs2d.core.camera import Camera, look_at
+from gs2d.core.camera import Camera
 from gs2d.core.sh import rgb_to_sh0
 from gs2d.core.splats import Splats
 from gs2d.data.scene import PointCloud, View
@@ -30,7 +30,7 @@ from gs2d.training.initialize import initial_splats
 from gs2d.training.plane_sweep import start_points, sweep_views
 from gs2d.training.point_gains import point_gains
 from gs2d.training.robust import Robustness
-from gs2d.training.seen_area import inside_fraction, mostly_unseen, shown_weights, shrunk, whole_weights
+from gs2d.training.seen_area import mostly_unseen
 from gs2d.training.trainer import Trainer
 from gs2d.training.trial import Witness, missed
 from train_toys import full_state, make_scene, random_splats
@@ -65,20 +65,6 @@ def test_a_sweep_finds_the_depth_of_a_textured_wall_and_says_nothing_of_a_bare_o
     assert (bare > 0).mean() < 0.1
 
 
-def test_a_sweep_is_the_same_whatever_is_compared_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gs2d.training.plane_sweep.PLANES_AT_ONCE", 5)
-    for one, other in zip(sweep_views(wall(), SMALL).depths, swept_wall().depths, strict=True):  # type: ignore[attr-defined]
-        np.testing.assert_array_equal(one, other)
-
-
-def test_what_a_sweep_frees_is_given_back_while_it_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    given_back: list[int] = []
-    monkeypatch.setattr("gs2d.training.plane_sweep.trim", lambda: given_back.append(1))
-    monkeypatch.setattr("gs2d.training.plane_sweep.TRIM_EVERY", 2)
-    views = len(sweep_views(wall(), SMALL).views)
-    assert len(given_back) == 2 * (views // 2 + 1)  # photographs shrunk, and depths found
-
-
 def test_training_starts_on_the_wall_facing_the_cameras() -> None:
     cloud = start_points(wall(), swept_wall(), SMALL)  # type: ignore[arg-type]
     assert len(cloud) > 200
@@ -86,17 +72,6 @@ def test_training_starts_on_the_wall_facing_the_cameras() -> None:
     assert cloud.normals is not None
     turned = np.abs(cloud.normals).sum(axis=1) > 0
     assert np.median(np.abs(cloud.normals[turned][:, 2])) > 0.9
-
-
-def test_sparse_points_start_splats_where_no_swept_one_is_near() -> None:
-    scene = wall()
-    assert scene.points is not None
-    alone = np.array([[0.0, 0.0, 9.0]])
-    more = replace(scene, points=PointCloud(np.concatenate([scene.points.points, alone])))
-    cloud = start_points(more, swept_wall(), SMALL)  # type: ignore[arg-type]
-    assert (cloud.points == alone).all(axis=1).sum() == 1
-    assert len(cloud) - len(start_points(scene, swept_wall(), SMALL)) == 1  # type: ignore[arg-type]
-    assert len(cloud) < len(scene.points) + sum((d > 0).sum() for d in swept_wall().depths)  # type: ignore[attr-defined]
 
 
 def test_a_sparse_point_far_from_swept_ones_starts_a_splat_as_large_as_among_sparse_ones() -> None:
@@ -127,14 +102,6 @@ def test_pixels_that_a_mask_leaves_out_have_no_depth() -> None:
     assert (sweep.depths[2][:, 36:] > 0).any()
 
 
-def test_at_most_so_many_photographs_are_swept() -> None:
-    """Those that are chosen, and those that they are compared with: a depth counts where another agrees."""
-    sweep = sweep_views(wall(), replace(SMALL, max_views=2, neighbours=1))
-    swept = {index for index, neighbours in enumerate(sweep.neighbours) if neighbours}
-    assert swept == {0, 4, *sweep.neighbours[0], *sweep.neighbours[4]}
-    assert len(swept) < 5
-
-
 # -- free space -----------------------------------------------------------------------------------------------------
 @pytest.fixture
 def maps() -> FreeSpaceMaps:
@@ -144,29 +111,6 @@ def maps() -> FreeSpaceMaps:
 def test_splats_before_the_wall_are_in_free_space_and_those_on_it_or_behind_are_not(maps: FreeSpaceMaps) -> None:
     splats = splat_at((0.5, 0, 2.0), (0.5, 0, 0.97 * WALL), (0.5, 0, WALL), (0.5, 0, 6.0), (0.5, 0, -2.0))
     assert (maps.against(splats) > 0).tolist() == [True, False, False, False, False]
-
-
-def test_before_what_is_not_known_only_what_is_nearer_than_anything_known_is_free(maps: FreeSpaceMaps) -> None:
-    # Nearest known depth 4, floor 0.8 of it, free below 0.9 of that: 2.88; the bare part is at x < -1.2.
-    splats = splat_at((-1.6, 0, 3.3), (-1.6, 0, 2.0))
-    assert (maps.against(splats) > 0).tolist() == [False, True]
-
-
-def test_a_ball_around_each_camera_is_free_also_behind_it(maps: FreeSpaceMaps, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Radius 0.5 x 0.8 x 4 = 1.6.
-    assert (maps.against(splat_at((0.0, 0, -1.0), (0.0, 0, -1.9))) > 0).tolist() == [True, False]
-    monkeypatch.setattr("gs2d.training.free_space.BALL", 0.0)
-    without = FreeSpaceMaps(swept_wall())  # type: ignore[arg-type]
-    assert without.against(splat_at((0.0, 0, -1.0))).tolist() == [0]
-
-
-def test_a_large_splat_is_looked_at_by_its_ends_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    beside = (4.5, 0.0, 3.2)  # out of every image; its left end, 3 world units away, is before the wall
-    large, small = splat_at(beside, scale=3.0), splat_at(beside)
-    monkeypatch.setattr("gs2d.training.free_space.BALL", 0.0)
-    maps = FreeSpaceMaps(swept_wall())  # type: ignore[arg-type]
-    assert maps.against(small).tolist() == [0]
-    assert maps.against(large).item() > 0
 
 
 def test_the_images_that_see_through_a_splat_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -220,18 +164,6 @@ def test_fog_that_one_image_was_trained_with_goes() -> None:
     against = torch.zeros(len(foggy), dtype=torch.int32)
     against[-1] = 1
     assert not missed(foggy, against, learned, RASTER, BACKEND).any()
-
-
-def test_pixels_that_do_not_count_miss_nothing_and_exposures_are_applied() -> None:
-    splats, witnesses = wall_of_splats()
-    against = torch.ones(len(splats), dtype=torch.int32)
-    masked = [replace(one, usable=torch.zeros_like(one.usable)) for one in witnesses]
-    assert not missed(splats, against, masked, RASTER, BACKEND).any()
-    half = torch.eye(3, 4) * 0.5
-    darker = [replace(one, color=0.5 * one.color, exposure=half) for one in witnesses]
-    as_before = missed(splats, against, witnesses, RASTER, BACKEND)
-    assert as_before.any()
-    assert torch.equal(missed(splats, against, darker, RASTER, BACKEND), as_before)
 
 
 # -- in training ----------------------------------------------------------------------------------------------------
@@ -316,13 +248,6 @@ def test_a_capture_without_observations_is_refused_in_one_line() -> None:
         Trainer(make_scene(), short(), GENERIC, backend="auto")
 
 
-def test_a_scene_of_fog_alone_is_left_as_it_is() -> None:
-    robust, state = Robustness(wall(), short(), RASTER, BACKEND), full_state(4)
-    state.splats.means[:] = torch.tensor([0.5, 0.0, 1.8])
-    assert robust.remove(state, short().stages[0], 10) == []
-    assert len(state.splats) == 4
-
-
 # -- how much of a splat is photographed ------------------------------------------------------------------------------
 def walls_of(*rows: tuple[float, float, float, float, float]) -> Splats:
     """Opaque splats that face the cameras: x, z, both scales, opacity."""
@@ -336,19 +261,6 @@ def cameras_of_the_wall() -> list[Camera]:
     return [view.camera for view in wall().train]
 
 
-def aside() -> Camera:
-    """A camera that looks at the right of the wall, which no other shows."""
-    place, up = np.array([-0.8, 0.0, 0.0]), np.array([0.0, -1.0, 0.0])
-    return look_at(place, np.array([9.0, 0.0, WALL]), up, width=WIDTH, height=HEIGHT, fx=40.0)
-
-
-def test_a_splat_alone_in_the_picture_is_seen_whole() -> None:
-    splats = walls_of((0.1, WALL, 0.2, 0.1, 0.8))
-    for camera in cameras_of_the_wall():
-        shown, whole = shown_weights(splats, camera, RASTER, BACKEND), whole_weights(splats, camera)
-        assert shown.item() == pytest.approx(whole.item(), rel=0.06)  # the blending ends at three deviations
-
-
 def test_large_splats_of_which_only_a_border_is_photographed_are_found() -> None:
     beside = (9.0, WALL, 3.0, 3.0, 0.99)  # pictures end at x = 3.2 at the most
     behind = (0.2, 2 * WALL, 1.0, 1.0, 0.99)
@@ -356,32 +268,6 @@ def test_large_splats_of_which_only_a_border_is_photographed_are_found() -> None
     splats = walls_of(before, beside, behind)
     found = mostly_unseen(splats, cameras_of_the_wall(), RASTER, BACKEND)
     assert found.tolist() == [False, True, False]  # what is behind another hides nothing
-
-
-def test_one_photograph_that_shows_a_splat_is_enough_and_small_ones_stay(monkeypatch: pytest.MonkeyPatch) -> None:
-    cameras = cameras_of_the_wall()
-    beside = walls_of((9.0, WALL, 3.0, 3.0, 0.99))
-    assert mostly_unseen(beside, cameras, RASTER, BACKEND).tolist() == [True]
-    assert mostly_unseen(beside, [*cameras, aside()], RASTER, BACKEND).tolist() == [False]
-    monkeypatch.setattr("gs2d.training.seen_area.LARGE", 20.0)
-    assert mostly_unseen(beside, cameras, RASTER, BACKEND).tolist() == [False]
-
-
-def test_what_lies_within_the_pictures_is_counted_over_all_of_them() -> None:
-    cameras = cameras_of_the_wall()
-    near, half = (0.0, WALL, 0.1, 0.1, 0.9), (cameras[0].center[0], 1.0, 1e-3, 1e-3, 0.9)
-    assert inside_fraction(walls_of(near, half), cameras).tolist() == [1.0, 1.0]
-    assert inside_fraction(walls_of((0.0, -2.0, 0.1, 0.1, 0.9)), cameras).tolist() == [0.0]
-    left, right = cameras[0], aside()
-    wide = walls_of((4.0, WALL, 4.0, 0.1, 0.9))
-    parts = [inside_fraction(wide, [camera]).item() for camera in (left, right)]
-    assert 0 < max(parts) < inside_fraction(wide, [left, right]).item() <= 1
-
-
-def test_small_pictures_are_looked_at() -> None:
-    camera = cameras_of_the_wall()[0]
-    assert (shrunk(camera, 24).width, shrunk(camera, 24).height) == (24, 18)
-    assert (shrunk(camera, 200).width, shrunk(camera, 200).fx) == (WIDTH, camera.fx)
 
 
 def test_what_is_hardly_photographed_is_proposed_at_the_end_of_each_fifth() -> None:
@@ -426,17 +312,6 @@ def test_what_has_the_colour_of_the_background_does_not_decay() -> None:
     assert state.splats.opacities == pytest.approx(torch.tensor([0.8, 0.8, 0.72]), abs=1e-6)
 
 
-def test_frozen_opacity_does_not_decay() -> None:
-    recipe = short(dense_start=None)
-    robust, state = Robustness(wall(), recipe, RASTER, BACKEND), full_state(4)
-    state.splats.sh0[:] = 1.0
-    before = state.splats.opacity_logits.clone()
-    robust.decay(state, refine(), 10, PLAIN)
-    assert torch.equal(state.splats.opacity_logits, before)
-    robust.decay(state, surface(), 10, PLAIN)
-    assert not torch.equal(state.splats.opacity_logits, before)
-
-
 # -- exposures by points --------------------------------------------------------------------------------------------
 def test_gains_come_out_of_the_colours_of_points() -> None:
     gains = (0.7, 0.85, 1.0, 0.9, 0.8)
@@ -448,10 +323,6 @@ def test_gains_come_out_of_the_colours_of_points() -> None:
     same = point_gains(wall())
     assert same is not None
     assert same.spread < 0.01
-
-
-def test_a_capture_without_observations_says_nothing_of_gains() -> None:
-    assert point_gains(make_scene()) is None
 
 
 def test_exposures_begin_with_the_gains_of_points_where_the_recipe_says_so() -> None:
@@ -482,14 +353,6 @@ def test_a_backdrop_is_unlit_where_nearly_all_that_is_bare_has_one_dark_colour(
     assert found is not None
     assert found.is_unlit == unlit
     assert (found.alike > 0.9) if most == 0 else (found.alike < EVEN / 2)
-
-
-def test_photographs_with_alpha_or_without_known_points_have_no_backdrop() -> None:
-    assert find_backdrop(make_scene()) is None
-    view = wall().train[0]
-    opaque = np.concatenate([view.image(), np.full((HEIGHT, WIDTH, 1), 255, np.uint8)], axis=2)
-    cut_out = View.from_arrays(view.name, view.camera, opaque)
-    assert find_backdrop(replace(wall(), train=(cut_out, *wall().train[1:]))) is None
 
 
 # -- what cannot be trained with ------------------------------------------------------------------------------------
