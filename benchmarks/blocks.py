@@ -45,10 +45,10 @@ from gs2d.pipeline.blocks.cells import Cells
 from gs2d.pipeline.blocks.merged import MERGED
 from gs2d.pipeline.blocks.split import read_split
 from gs2d.pipeline.events import Notice
-from gs2d.pipeline.finished import open_job
-from gs2d.pipeline.job import Job
-from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.train import train
+from gs2d.pipeline.prepare.finished import open_job
+from gs2d.pipeline.prepare.job import Job
+from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.train.train_run import train
 from gs2d.render.api import rasterize
 from gs2d.synthetic.flight import Flight, write_flight
 

@@ -28,7 +28,7 @@ from gs2d.io.run_dir import SPLATS, RunFolder
 from gs2d.io.splat_ply import read_splats
 from gs2d.kernels.library import describe_library
 from gs2d.pipeline.events import ignore
-from gs2d.pipeline.job import reload_job
+from gs2d.pipeline.prepare.job import reload_job
 
 CASES = {
     "lego": Case("lego", "nerf_synthetic_lego", downscale=2),

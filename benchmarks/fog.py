@@ -33,10 +33,10 @@ from gs2d.core.splats import Splats
 from gs2d.data import Scene, View, load_scene
 from gs2d.evaluation.hidden_points import HiddenPoints, hidden_points, total
 from gs2d.evaluation.images import image_metrics, psnr_float
-from gs2d.pipeline.exposure import Transforms, named, photographed
-from gs2d.pipeline.job import fit_recipe, with_backdrop
-from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.predicted_exposure import metered, with_predicted
+from gs2d.pipeline.prepare.job import fit_recipe, with_backdrop
+from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
+from gs2d.pipeline.prepare.run_exposures import Transforms, named, photographed
 from gs2d.render.api import rasterize
 from gs2d.render.exposure import fit_exposure
 from gs2d.render.types import RasterSettings

@@ -35,8 +35,8 @@ from gs2d.errors import Gs2dError
 from gs2d.geo.fit import fit_places
 from gs2d.io.run_dir import open_run
 from gs2d.pipeline.georeference import georeference_run
-from gs2d.pipeline.job import reload_job
-from gs2d.pipeline.options import GeoreferenceOptions
+from gs2d.pipeline.prepare.job import reload_job
+from gs2d.pipeline.prepare.options import GeoreferenceOptions
 from gs2d.synthetic.flight import Flight, write_flight
 
 NOISES = (0.0, 0.02, 0.5, 2.0, 5.0)  # m, along each axis

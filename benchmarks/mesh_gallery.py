@@ -20,7 +20,7 @@ from gs2d.core.mesh import Mesh
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, RunFolder
 from gs2d.pipeline.events import ignore
-from gs2d.pipeline.job import reload_job
+from gs2d.pipeline.prepare.job import reload_job
 from gs2d.report.mesh_images import mesh_images
 
 SHADES = 64  # of clay: a third of the bytes, and nobody sees it

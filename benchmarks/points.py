@@ -21,7 +21,7 @@ from gs2d.data.scene import Scene
 from gs2d.evaluation.surface import distances_to_mesh
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, open_run
-from gs2d.pipeline.job import reload_job
+from gs2d.pipeline.prepare.job import reload_job
 
 WITHIN = (0.5, 1.0, 2.0, 5.0)  # px
 

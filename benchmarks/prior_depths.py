@@ -24,7 +24,7 @@ from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import SPLATS, open_run
 from gs2d.io.splat_ply import read_splats
 from gs2d.meshing.raycast import cast_camera
-from gs2d.pipeline.job import Job, reload_job
+from gs2d.pipeline.prepare.job import Job, reload_job
 from gs2d.render.api import rasterize
 
 WITHIN = (0.01, 0.03)

@@ -32,13 +32,13 @@ from benchmarks.sampler import Rule, Sampler, Seconds
 from benchmarks.timing import machine, peak_probe
 from gs2d.kernels.library import load
 from gs2d.pipeline.demo import SCHEDULE_SCALE, demo
-from gs2d.pipeline.options import DemoOptions, TrainOptions
-from gs2d.pipeline.train import train
+from gs2d.pipeline.prepare.options import DemoOptions, TrainOptions
+from gs2d.pipeline.train.train_run import train
 
 PHASES = (
     *RUN_PHASES,
     Rule("photograph the demo scene", (("synthetic/capture.py", "write_demo_capture"),)),
-    Rule("evaluate", (("pipeline/evaluate.py", "evaluate_run"),)),
+    Rule("evaluate", (("pipeline/finish/evaluate.py", "evaluate_run"),)),
 )
 PARTS = (
     Rule("rasterizer", (("render/cpu.py", ""), ("render/cpu_cached.py", ""))),

@@ -24,9 +24,9 @@ from gs2d.core.json_files import write_json
 from gs2d.core.splats import Splats
 from gs2d.errors import Gs2dError
 from gs2d.pipeline.events import ignore
-from gs2d.pipeline.job import Job, prepare_job
-from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.threads import use_threads
+from gs2d.pipeline.prepare.job import Job, prepare_job
+from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.prepare.threads import use_threads
 from gs2d.training import events
 from gs2d.training.exposure import Exposures
 from gs2d.training.state import TrainState
@@ -167,9 +167,9 @@ def score_splats(job: Job, splats: Splats, learned: Exposures | None = None) -> 
     """Return what :func:`score` does, of splats with the exposures that were learned with them."""
     # Here, while the clocks stand still: a training does not need them.
     from benchmarks.street_runs import summary_of
-    from gs2d.pipeline.exposure import named
-    from gs2d.pipeline.predicted_exposure import metered, with_predicted
-    from gs2d.pipeline.scoring import score_views
+    from gs2d.pipeline.finish.scoring import score_views
+    from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
+    from gs2d.pipeline.prepare.run_exposures import named
 
     views = job.scene.test or job.scene.train
     brightness = metered(splats, job.settings, job.backend)
@@ -186,9 +186,9 @@ def score_splats(job: Job, splats: Splats, learned: Exposures | None = None) -> 
 def surface(job: Job, state: TrainState, spec: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Return how good the mesh is and the seconds that making it took, where there is a true surface."""
     from gs2d.config.surface_protocols import VISIBLE_SURFACE
+    from gs2d.pipeline.finish.truth import OfficialTruth, choose_truth, read_truth, score_surface
     from gs2d.pipeline.in_memory import Trained, extract_mesh
-    from gs2d.pipeline.options import EvaluateOptions
-    from gs2d.pipeline.truth import OfficialTruth, choose_truth, read_truth, score_surface
+    from gs2d.pipeline.prepare.options import EvaluateOptions
     from gs2d.training.per_image import scene_now
 
     given = None if spec["ground_truth"] is None else Path(spec["ground_truth"])

@@ -31,8 +31,8 @@ from gs2d.errors import BackendError
 from gs2d.io.formats.registry import LAYOUTS, read_splats, write_layout, written_bytes
 from gs2d.io.formats.sog import read_level
 from gs2d.io.run_dir import open_run
-from gs2d.pipeline.finished import finished_splats
-from gs2d.pipeline.job import Job, reload_job
+from gs2d.pipeline.prepare.finished import finished_splats
+from gs2d.pipeline.prepare.job import Job, reload_job
 from gs2d.render.api import rasterize
 
 Draw = Callable[[Splats], list[np.ndarray]]

@@ -33,7 +33,7 @@ from benchmarks.sampler import CostSampler, Rule
 
 PHASES = (
     *RUN_PHASES,
-    Rule("log of changes", (("pipeline/changes.py", ""),)),
+    Rule("log of changes", (("pipeline/train/changes.py", ""),)),
     Rule("imports", (("importlib._bootstrap>", ""),)),
 )
 _ADDING = ("add", "_add_chunk", "_blend_colors", "_change", "_view_arrays", "_volume_arrays")  # a view to a volume
@@ -63,8 +63,8 @@ def measure(arguments: argparse.Namespace, capture: Path, out: Path) -> dict[str
     """One run, sampled; the process must be fresh."""
     began = time.perf_counter(), time.process_time()
     with CostSampler(PHASES, PARTS) as costs:
-        from gs2d.pipeline.options import TrainOptions
-        from gs2d.pipeline.train import train
+        from gs2d.pipeline.prepare.options import TrainOptions
+        from gs2d.pipeline.train.train_run import train
 
         run = train(
             TrainOptions(

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from benchmarks.sampler import Rule
 
-RUN_LOGGER, LOOP = "pipeline/run_logger.py", "training/trainer.py"
+RUN_LOGGER, LOOP = "pipeline/train/run_logger.py", "training/trainer.py"
 RUN_PHASES = (  # names that a version of the code does not have are found nowhere in it
-    Rule("read the capture", (("pipeline/job.py", "prepare_job"), ("pipeline/job.py", "reload_job"))),
+    Rule("read the capture", (("pipeline/prepare/job.py", "prepare_job"), ("pipeline/prepare/job.py", "reload_job"))),
     Rule("PSNR curve", ((RUN_LOGGER, "_probe_psnr"),)),
-    Rule("pictures", (("pipeline/render.py", "draw_stage"),)),
+    Rule("pictures", (("pipeline/finish/run_images.py", "draw_stage"),)),
     Rule("score a stage", ((RUN_LOGGER, "_score_stage"), (RUN_LOGGER, "_score_entry"))),
     Rule("checkpoints", ((RUN_LOGGER, "_save"),)),
     Rule("initial splats", ((LOOP, "_new_state"),)),
     Rule("rank by E_i", (("training/rank_clone.py", "rank_by_error"),)),
     Rule("fill the stage 2 cache", (("training/cached_objective.py", "choose_objective"),)),
-    Rule("mesh", (("pipeline/mesh.py", "extract_mesh"),)),
-    Rule("report", (("pipeline/report.py", "report_run"),)),
+    Rule("mesh", (("pipeline/finish/run_mesh.py", "extract_mesh"),)),
+    Rule("report", (("pipeline/finish/run_report.py", "report_run"),)),
     Rule("training iterations", ((LOOP, "step"),)),
     Rule("enter a stage", ((LOOP, "enter"),)),
 )

@@ -21,7 +21,7 @@ from gs2d.core.splats import Splats
 from gs2d.evaluation.images import psnr_8bit
 from gs2d.io.run_dir import open_run
 from gs2d.io.splat_ply import read_splats
-from gs2d.pipeline.job import Job, reload_job
+from gs2d.pipeline.prepare.job import Job, reload_job
 from gs2d.render.api import rasterize
 from gs2d.training.objective import visible_mask
 

@@ -34,15 +34,15 @@ from gs2d.io.run_dir import MESH, METRICS, PAGE, REPORT, SPLATS
 from gs2d.meshing.depth_maps import depth_map
 from gs2d.meshing.evidence import gather, pixels
 from gs2d.pipeline.events import ignore
-from gs2d.pipeline.exposure import read_exposures
-from gs2d.pipeline.finished import open_job
-from gs2d.pipeline.job import Job
-from gs2d.pipeline.mesh import fusion_frame
-from gs2d.pipeline.predicted_exposure import metered, with_predicted
+from gs2d.pipeline.finish.run_images import render_view
+from gs2d.pipeline.finish.run_mesh import fusion_frame
+from gs2d.pipeline.finish.run_subject import sights, surface_reach
+from gs2d.pipeline.finish.scoring import score_views
+from gs2d.pipeline.prepare.finished import open_job
+from gs2d.pipeline.prepare.job import Job
+from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
+from gs2d.pipeline.prepare.run_exposures import read_exposures
 from gs2d.pipeline.reconstruct import CAPTURE, FEW
-from gs2d.pipeline.render import render_view
-from gs2d.pipeline.scoring import score_views
-from gs2d.pipeline.subject import sights, surface_reach
 from gs2d.render.api import rasterize
 from gs2d.sfm.images import find_photos
 from gs2d.sfm.workspace import POSES_JSON

@@ -30,7 +30,7 @@ from gs2d.data.masks import find_masks_in
 from gs2d.errors import DataError, Gs2dError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, open_run
-from gs2d.pipeline.job import reload_job
+from gs2d.pipeline.prepare.job import reload_job
 
 HALF = 0.5  # of the photographs that have a face in frame, which must have it in the mask
 GOAL = 0.98  # of the area

@@ -36,12 +36,12 @@ from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, open_run
 from gs2d.meshing.raycast import Hits, cast_camera
 from gs2d.meshing.texture import bilinear
-from gs2d.pipeline.exposure import NONE, Transforms, as_scene, read_exposures
-from gs2d.pipeline.finished import finished_splats
-from gs2d.pipeline.job import reload_job
-from gs2d.pipeline.opened import read_scene
-from gs2d.pipeline.options import TextureOptions
-from gs2d.pipeline.texture import textured_mesh
+from gs2d.pipeline.finish.run_texture import textured_mesh
+from gs2d.pipeline.prepare.finished import finished_splats
+from gs2d.pipeline.prepare.job import reload_job
+from gs2d.pipeline.prepare.opened import read_scene
+from gs2d.pipeline.prepare.options import TextureOptions
+from gs2d.pipeline.prepare.run_exposures import NONE, Transforms, as_scene, read_exposures
 
 SAMPLES = 2  # rays a pixel along each axis
 

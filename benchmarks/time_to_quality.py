@@ -64,8 +64,8 @@ from gs2d.data import Scene
 from gs2d.data.scene import PointCloud
 from gs2d.errors import DataError, Gs2dError
 from gs2d.pipeline.events import ignore
-from gs2d.pipeline.job import Job, prepare_job
-from gs2d.pipeline.truth import choose_truth
+from gs2d.pipeline.finish.truth import choose_truth
+from gs2d.pipeline.prepare.job import Job, prepare_job
 from gs2d.synthetic.capture import write_demo_capture
 
 DEMO, PEER = "demo", "opensplat"

@@ -65,6 +65,15 @@ INSIDE = {
         "image_files photo_formats": 2,
         "arrays exr float_tiff": 1,
     },
+    "pipeline": {
+        "blocks demo in_memory orthophoto reconstruct": 6,
+        "train": 5,
+        "finish": 4,
+        "georeference look truth_official": 3,
+        "prepare": 2,
+        "attempts": 1,
+        "events": 0,
+    },
     "render": {
         "tensor_api": 7,
         "api": 6,
@@ -148,7 +157,7 @@ def import_graph() -> dict[str, set[str]]:
 
 def test_no_module_imports_itself_by_way_of_others() -> None:
     graph = import_graph()
-    assert "gs2d.pipeline.train" in graph["gs2d.experiments.jobs"], "an import inside a function counts too"
+    assert "gs2d.pipeline.train.train_run" in graph["gs2d.experiments.jobs"], "an import inside a function counts too"
     try:
         graphlib.TopologicalSorter(graph).prepare()
     except graphlib.CycleError as error:

@@ -121,7 +121,7 @@ def test_every_set_path_that_a_message_prints_exists_in_a_recipe_whose_stages_ha
     found = printed_paths()
     assert len(found) > 8
     for module, path in found:
-        if module == "gs2d.pipeline.options":  # help text: an example for the default recipe
+        if module == "gs2d.pipeline.prepare.options":  # help text: an example for the default recipe
             assert apply_overrides(base, [f"{path}=2000"]) != base
             continue
         words = re.sub(r"^(\{\}|STAGE)(?=\.)", "mine", path).split(".")

@@ -12,8 +12,8 @@ import torch
 from benchmarks.gpu.bench import ROOT, Bench
 from benchmarks.gpu.capture import SYNTHETIC, write_capture
 from gs2d.pipeline.events import Phase, StageDone
-from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.train import train
+from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.train.train_run import train
 
 RECIPE = "2dgs-r"  # the paper's, three stages; goals of seconds are its
 STAGE = ("name", "iterations", "seconds", "splats", "bytes", "train", "test", "after_clone")

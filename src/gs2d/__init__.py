@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from gs2d.losses.api import compute_losses
     from gs2d.losses.reference import normals_from_depth
     from gs2d.pipeline.in_memory import Trained, evaluate, extract_mesh, train
-    from gs2d.pipeline.options import MeshOptions, TrainOptions
+    from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
     from gs2d.render.api import rasterize, splat_errors
     from gs2d.render.backends import backend_report, get_backend, register_backend
     from gs2d.render.tensor_api import rasterize_2dgs
@@ -86,7 +86,7 @@ _HOME = {
     "Gs2dError": "gs2d.errors",
     "LossTerm": "gs2d.config.recipe",
     "Mesh": "gs2d.core.mesh",
-    "MeshOptions": "gs2d.pipeline.options",
+    "MeshOptions": "gs2d.pipeline.prepare.options",
     "Protocol": "gs2d.config.protocols",
     "RasterSettings": "gs2d.render.types",
     "Recipe": "gs2d.config.recipe",
@@ -94,7 +94,7 @@ _HOME = {
     "Scene": "gs2d.data.scene",
     "Splats": "gs2d.core.splats",
     "Stage": "gs2d.config.recipe",
-    "TrainOptions": "gs2d.pipeline.options",
+    "TrainOptions": "gs2d.pipeline.prepare.options",
     "Trained": "gs2d.pipeline.in_memory",
     "Trainer": "gs2d.training.trainer",
     "backend_report": "gs2d.render.backends",

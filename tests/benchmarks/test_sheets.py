@@ -13,7 +13,7 @@ from benchmarks import sheets
 from ball_runs import options
 from gs2d.core.splats import Splats
 from gs2d.io.splat_ply import read_splats, write_splats
-from gs2d.pipeline.train import train
+from gs2d.pipeline.train.train_run import train
 from tiny import write_capture
 
 

@@ -10,8 +10,8 @@ from benchmarks.street_runs import measure_mesh, score_run
 
 from ball_runs import options
 from gs2d.pipeline.events import ignore
-from gs2d.pipeline.finished import open_job
-from gs2d.pipeline.train import train
+from gs2d.pipeline.prepare.finished import open_job
+from gs2d.pipeline.train.train_run import train
 from tiny import write_capture
 
 

@@ -192,8 +192,8 @@ def test_masks_that_leave_nothing_to_learn_from_are_an_error(
 
 def test_a_mask_that_leaves_nothing_of_one_view_is_noted(tmp_path: Path) -> None:
     from gs2d.pipeline.events import Event
-    from gs2d.pipeline.job import prepare_job
-    from gs2d.pipeline.options import TrainOptions
+    from gs2d.pipeline.prepare.job import prepare_job
+    from gs2d.pipeline.prepare.options import TrainOptions
 
     masked_colmap(tmp_path / "capture", (1,))
     heard: list[Event] = []

@@ -14,8 +14,8 @@ from cli_runs import TINY, one_line, spawn
 from gs2d.cli import run
 from gs2d.config.presets import RECIPES
 from gs2d.data.image_files import read_image
-from gs2d.pipeline.job import prepare_job
-from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.prepare.job import prepare_job
+from gs2d.pipeline.prepare.options import TrainOptions
 from tiny import write_ball_mesh, write_capture
 
 

@@ -55,7 +55,7 @@ def test_a_full_disk_stops_training_with_one_line_and_leaves_nothing(capture: Pa
 def test_a_fault_of_ours_is_exit_code_1_with_a_traceback_only_for_debug(
     trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gs2d.pipeline import report
+    from gs2d.pipeline.finish import run_report as report
 
     def broken(_path: Path, _on_event: object) -> Path:
         raise ZeroDivisionError("a bug")
@@ -73,7 +73,7 @@ def test_a_fault_of_ours_is_exit_code_1_with_a_traceback_only_for_debug(
 def test_ctrl_c_exits_with_130_and_says_how_to_go_on(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gs2d.pipeline import run_logger as recorder
+    from gs2d.pipeline.train.train_run import run_logger as recorder
 
     put = recorder.RunLogger._score_stage
 
@@ -130,7 +130,7 @@ def test_an_interrupt_that_somebody_swallowed_is_heard_at_the_next_event(
             os.kill(os.getpid(), number)
             time.sleep(5)
 
-    monkeypatch.setattr("gs2d.pipeline.finished.use_threads", swallowing)
+    monkeypatch.setattr("gs2d.pipeline.prepare.finished.use_threads", swallowing)
     assert run(["render", str(trained), "--out", str(tmp_path / "out")]) == 130
     assert capsys.readouterr().err == "interrupted\n"
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -211,7 +211,7 @@ def test_ctrl_c_before_the_first_iteration_leaves_nothing_and_says_so(
 def test_out_of_memory_names_the_remedy(
     error: Exception, trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gs2d.pipeline import report
+    from gs2d.pipeline.finish import run_report as report
 
     def hungry(_path: Path, _on_event: object) -> Path:
         raise error
@@ -227,7 +227,7 @@ def test_out_of_memory_names_the_remedy(
 def test_no_more_threads_is_not_taken_for_no_more_memory(
     error: Exception, trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gs2d.pipeline import report
+    from gs2d.pipeline.finish import run_report as report
 
     def crowded(_path: Path, _on_event: object) -> Path:
         raise error
@@ -240,7 +240,7 @@ def test_no_more_threads_is_not_taken_for_no_more_memory(
 def test_an_os_error_that_the_user_can_mend_is_one_line(
     trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gs2d.pipeline import report
+    from gs2d.pipeline.finish import run_report as report
 
     def denied(path: Path, _on_event: object) -> Path:
         raise PermissionError(13, "Permission denied", str(path / "report.html"))

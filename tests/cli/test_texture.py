@@ -117,7 +117,7 @@ def test_a_mesh_that_cannot_be_simplified_so_far_is_said(
     ball: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """As one of many pieces, of which each keeps some triangles."""
-    monkeypatch.setattr("gs2d.pipeline.texture.simplified", lambda mesh, _faces: mesh)
+    monkeypatch.setattr("gs2d.pipeline.finish.run_texture.simplified", lambda mesh, _faces: mesh)
     assert run(["mesh", str(ball), "--texture", "--faces", "4", "--texture-size", "64", "--threads", "1"]) == 0
     assert "note simplified to 2,304 triangles, as near as it comes to --faces 4" in capsys.readouterr().err
 

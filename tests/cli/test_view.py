@@ -27,7 +27,7 @@ from gs2d.data import View
 from gs2d.errors import DataError
 from gs2d.io.formats.registry import LAYOUTS, write_layout
 from gs2d.io.meshes import glb_bytes, read_mesh, write_textured
-from gs2d.pipeline.view import images_route, open_viewer, serve
+from gs2d.pipeline.look.view import images_route, open_viewer, serve
 from gs2d.viewer.server import PageServer
 from tiny import write_ball_mesh
 

@@ -19,8 +19,8 @@ from gs2d.errors import DataError
 from gs2d.evaluation.surface import evaluate_surface
 from gs2d.io.meshes import read_points, write_mesh
 from gs2d.pipeline.events import Event, Notice, ignore
-from gs2d.pipeline.options import EvaluateOptions
-from gs2d.pipeline.truth import OfficialTruth, Truth, choose_truth, score_surface
+from gs2d.pipeline.finish.truth import OfficialTruth, Truth, choose_truth, score_surface
+from gs2d.pipeline.prepare.options import EvaluateOptions
 from official_captures import T_MM, write_dtu_capture, write_log, write_points, write_tnt_capture
 from oracle_scenes import grid_mesh, moved
 
@@ -158,7 +158,7 @@ def test_the_visible_surface_has_its_headline_at_a_quarter_of_a_per_cent_of_the_
 ) -> None:
     """Squares of 2 x 2: diagonal 2.83, thresholds 0.0071, 0.0141, 0.0283; 0.01 apart is between the first two."""
     root, _, _ = write_tnt_capture(tmp_path, "Shed")
-    monkeypatch.setattr("gs2d.pipeline.truth.evaluate_surface", partial(evaluate_surface, samples=4000))
+    monkeypatch.setattr("gs2d.pipeline.finish.truth.evaluate_surface", partial(evaluate_surface, samples=4000))
     write_mesh(root / "mesh_gt.ply", flat(0.0))
     np.save(root / "mesh_gt_seen.npy", np.full(800, 9))
     truth = choose_truth(None, root, ignore)

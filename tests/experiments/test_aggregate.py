@@ -21,7 +21,7 @@ from gs2d.experiments.paper import check_folder, paper
 from gs2d.experiments.plan import commands_of, make_plan, paper_command
 from gs2d.experiments.scenes import find_scenes
 from gs2d.experiments.tables import DTU, NERF_SYNTHETIC, PAPER_TABLES, TNT, Claim
-from gs2d.pipeline.options import TrainOptions, values
+from gs2d.pipeline.prepare.options import TrainOptions, values
 from paper_cells import make_cell, make_row
 from tiny import write_ball_mesh, write_capture
 

@@ -23,7 +23,7 @@ from gs2d.io.run_dir import open_run
 from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.blocks.split import read_split
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.part import FROZEN, OWN, read_start
+from gs2d.pipeline.prepare.part import FROZEN, OWN, read_start
 from gs2d.synthetic.flight import Flight, write_flight
 
 

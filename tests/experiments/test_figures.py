@@ -19,11 +19,11 @@ from gs2d.errors import RunError
 from gs2d.experiments.figures import coverage, error_positions, map_limits, rank_run, write_figures
 from gs2d.experiments.render import coverage_rows
 from gs2d.io.run_dir import RunFolder, load_tensors
-from gs2d.pipeline.changes import SAMPLE, mean_changes, take_snapshot
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.job import reload_job
-from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.train import train
+from gs2d.pipeline.prepare.job import reload_job
+from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.train.changes import SAMPLE, mean_changes, take_snapshot
+from gs2d.pipeline.train.train_run import train
 from gs2d.report.plots import Panel, compared, read_history
 from tiny import write_capture
 

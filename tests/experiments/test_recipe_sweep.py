@@ -22,7 +22,7 @@ from gs2d.experiments.deviations import deviations_of
 from gs2d.experiments.options import SweepOptions
 from gs2d.experiments.paper import paper
 from gs2d.experiments.plan import make_plan, paper_command
-from gs2d.pipeline.options import values
+from gs2d.pipeline.prepare.options import values
 from paper_cells import TINY, draw_nothing
 from tiny import write_capture
 

@@ -17,7 +17,7 @@ from gs2d.experiments import reconstruct as module
 from gs2d.experiments.options import ReconstructAnywhereOptions
 from gs2d.experiments.reconstruct import reconstruct, tasks_of
 from gs2d.pipeline import reconstruct as steps
-from gs2d.pipeline.options import ReconstructOptions, values
+from gs2d.pipeline.prepare.options import ReconstructOptions, values
 from room_photos import Room
 
 

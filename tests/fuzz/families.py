@@ -151,7 +151,7 @@ def as_ascii(name: str) -> Callable[[Path], object]:
 def read_splats_everywhere(root: Path) -> None:
     """As `gs2d info`, `gs2d export` and `--init` do."""
     from gs2d.io.formats.registry import LAYOUTS, read_splat_file, read_splats, read_surfels, write_layout
-    from gs2d.pipeline.info import describe_file
+    from gs2d.pipeline.look.info import describe_file
 
     (path,) = (p for p in root.iterdir() if p.is_file())
     describe_file(path)
@@ -239,7 +239,7 @@ def _stream(root: Path) -> None:
 def read_stream(root: Path) -> None:
     """As `gs2d info` and `--init` do."""
     from gs2d.io.formats.registry import read_splat_file
-    from gs2d.pipeline.info import describe_file
+    from gs2d.pipeline.look.info import describe_file
 
     describe_file(root / "lod-meta.json")
     read_splat_file(root / "lod-meta.json")
@@ -283,8 +283,8 @@ def _pyramid(root: Path, order: str, ragged: bool) -> None:
 def read_surface(root: Path) -> None:
     """As `gs2d info` and `gs2d evaluate --mesh-gt` do."""
     from gs2d.io.meshes import FOREIGN, read_mesh, read_points
-    from gs2d.pipeline.info import describe_file
-    from gs2d.pipeline.truth import read_truth
+    from gs2d.pipeline.finish.truth import read_truth
+    from gs2d.pipeline.look.info import describe_file
 
     (path,) = (p for p in root.iterdir() if p.suffix != ".npy")
     describe_file(path)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.prepare.options import TrainOptions
 
 SMALL = ("init_points=150", "surface.densify.max_splats=250")
 SCALE = 0.001  # 30 + 10 + 20 iterations

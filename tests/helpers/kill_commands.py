@@ -30,12 +30,12 @@ from gs2d.errors import DataError, Gs2dError
 from gs2d.experiments.options import SweepOptions
 from gs2d.experiments.paper import paper
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.export import export_run
-from gs2d.pipeline.mesh import mesh_run
-from gs2d.pipeline.options import ReconstructOptions, Training
-from gs2d.pipeline.page import page_run
-from gs2d.pipeline.report import report_run
-from gs2d.pipeline.train import train
+from gs2d.pipeline.finish.export import export_run
+from gs2d.pipeline.finish.run_mesh import mesh_run
+from gs2d.pipeline.finish.run_report import report_run
+from gs2d.pipeline.look.page import page_run
+from gs2d.pipeline.prepare.options import ReconstructOptions, Training
+from gs2d.pipeline.train.train_run import train
 from room_photos import write_room
 from tiny import write_capture
 
@@ -276,7 +276,7 @@ class Reconstruct(Command):
                 raise SystemExit("the search for the cameras failed")
 
     def _search(self) -> None:
-        from gs2d.pipeline import sfm
+        from gs2d.pipeline.prepare import pose_finding as sfm
 
         real = sfm.solve
 
@@ -311,7 +311,7 @@ class Reconstruct(Command):
 
     def act(self, folder: Path) -> None:
         """The capture and the run."""
-        from gs2d.pipeline import sfm
+        from gs2d.pipeline.prepare import pose_finding as sfm
 
         def again(request: Any, *_: Any) -> Any:
             try:

@@ -26,7 +26,7 @@ def make_row(name: str, *cells: Cell, paper: Mapping[str, Any] | None = None) ->
 
 def draw_nothing(patch: pytest.MonkeyPatch) -> None:
     """No reports and figures, which draw curves for seconds and have tests of their own."""
-    for module in ("train", "report"):
+    for module in ("train.train_run", "finish.run_report"):
         patch.setattr(f"gs2d.pipeline.{module}.report_run", lambda path, *_: path)
     patch.setattr("gs2d.experiments.figures.write_figures", _draw_labels)
 

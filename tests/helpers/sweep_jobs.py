@@ -7,7 +7,7 @@ import signal
 from pathlib import Path
 
 from gs2d.experiments.jobs import Job
-from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.prepare.options import TrainOptions
 
 
 def make_jobs(folder: Path, keys: dict[str, tuple[str, ...]]) -> tuple[Job, ...]:

@@ -243,7 +243,7 @@ def do(case: str, many: Any) -> Any:
 
 def main() -> None:
     """Do the cases of the command line."""
-    from gs2d.pipeline.processes import connected
+    from gs2d.pipeline.train.process_group import connected
 
     torch.set_num_threads(1)
     cases, folder = sys.argv[1].split(","), Path(sys.argv[2])

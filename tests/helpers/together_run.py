@@ -11,7 +11,7 @@ import os
 import sys
 
 import gs2d.cli
-import gs2d.pipeline.train as pipeline
+import gs2d.pipeline.train.train_run as pipeline
 from gs2d.io.splat_ply import write_splats
 from gs2d.training.trainer import Trainer
 

@@ -18,12 +18,12 @@ from gs2d.io.run_dir import RunFolder
 from gs2d.kernels.library import available_variants
 from gs2d.meshing.tsdf import Add, Volume, integrator
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.finished import finished_splats
-from gs2d.pipeline.job import reload_job, with_fused_depth
-from gs2d.pipeline.mesh import extract_mesh, mesh_run
-from gs2d.pipeline.options import MeshOptions, TrainOptions
-from gs2d.pipeline.same_run import check_same_run
-from gs2d.pipeline.train import train
+from gs2d.pipeline.finish.run_mesh import extract_mesh, mesh_run
+from gs2d.pipeline.prepare.finished import finished_splats
+from gs2d.pipeline.prepare.job import reload_job, with_fused_depth
+from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
+from gs2d.pipeline.train.same_run import check_same_run
+from gs2d.pipeline.train.train_run import train
 from gs2d.render.backends import Backend, get_backend
 from tiny import RADIUS, write_capture
 
@@ -57,7 +57,7 @@ def test_voxels_that_nobody_asked_for_are_as_large_as_memory_needs(
 ) -> None:
     fine = mesh_run(run, MeshOptions(), out=tmp_path / "fine.ply", threads=1)
     allowed = fine["volume_bytes"] // 3
-    monkeypatch.setattr("gs2d.pipeline.mesh.memory_budget", lambda: allowed)
+    monkeypatch.setattr("gs2d.pipeline.finish.run_mesh.memory_budget", lambda: allowed)
     heard: list[Event] = []
     coarse = mesh_run(run, MeshOptions(), out=tmp_path / "coarse.ply", threads=1, on_event=heard.append)
     assert coarse["volume_bytes"] <= allowed
@@ -73,7 +73,7 @@ def test_a_training_whose_mesh_does_not_fit_has_it_in_larger_voxels_from_the_sam
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Training and mesh in one command: the depth maps that scoring kept were closed after the voxels that failed."""
-    monkeypatch.setattr("gs2d.pipeline.mesh._volume_bytes", lambda _options: 400 << 10)
+    monkeypatch.setattr("gs2d.pipeline.finish.run_mesh._volume_bytes", lambda _options: 400 << 10)
     capture, heard = write_capture(tmp_path / "ball", size=32), list[Event]()
     overrides = ("init_points=400", "surface.iterations=40", "surface.densify.max_splats=400")
     run = train(TrainOptions(scene=capture, out=tmp_path / "run", recipe="2dgs", schedule_scale=0.002, threads=1,

@@ -8,7 +8,7 @@ import pytest
 
 from ball_runs import options
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.train import train
+from gs2d.pipeline.train.train_run import train
 from tiny import write_capture
 
 

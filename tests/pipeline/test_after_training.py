@@ -16,25 +16,25 @@ from gs2d.errors import DataError
 from gs2d.io.run_dir import RunFolder
 from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.events import Event, MissingFile
-from gs2d.pipeline.train import train
+from gs2d.pipeline.train.train_run import train
 
 LATER = {  # of a training, with what is missing then
-    "run_logger.write_exposures": "learned cameras and exposures",
-    "run_logger.write_poses": "learned cameras and exposures",
-    "run_logger.write_photometries": "learned cameras and exposures",
-    "run_logger.score_views": "scores of train views, stage refine",
-    "run_logger.split_metrics": "scores of train views, stage refine",
-    "run_logger.report_losses": "what the losses say of stage refine",
-    "run_logger.draw_stage": "pictures of stage refine",
-    "run_logger.StageDone": "scores of stage refine",
-    "mesh.fusion_frame": "mesh.ply",
-    "verdict.measures.Collector._measure": "verdict.json",
-    "train.meshed_subject": "mesh.ply",
-    "train.extract_mesh": "mesh.ply",
-    "train.keep_facts": "mesh.ply",
-    "train.page_run": "scene.html",
-    "train.write_verdict": "verdict.json",
-    "train.report_run": "report.html",
+    "train.run_logger.write_exposures": "learned cameras and exposures",
+    "train.run_logger.write_poses": "learned cameras and exposures",
+    "train.run_logger.write_photometries": "learned cameras and exposures",
+    "train.run_logger.score_views": "scores of train views, stage refine",
+    "train.run_logger.split_metrics": "scores of train views, stage refine",
+    "train.run_logger.report_losses": "what the losses say of stage refine",
+    "train.run_logger.draw_stage": "pictures of stage refine",
+    "train.run_logger.StageDone": "scores of stage refine",
+    "finish.run_mesh.fusion_frame": "mesh.ply",
+    "finish.verdict.measures.Collector._measure": "verdict.json",
+    "train.train_run.meshed_subject": "mesh.ply",
+    "train.train_run.extract_mesh": "mesh.ply",
+    "train.train_run.keep_facts": "mesh.ply",
+    "train.train_run.page_run": "scene.html",
+    "train.train_run.write_verdict": "verdict.json",
+    "train.train_run.report_run": "report.html",
 }
 ERRORS = (DataError("the points are gone"), ZeroDivisionError("a fault"))
 
@@ -80,7 +80,7 @@ def test_a_step_that_fails_after_training_is_named_and_costs_no_splats(
 def test_a_training_whose_views_cannot_be_scored_has_its_splats(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gs2d.pipeline.run_logger.score_views", failing(DataError("no points")))
+    monkeypatch.setattr("gs2d.pipeline.train.run_logger.score_views", failing(DataError("no points")))
     heard: list[Event] = []
     run = train(options(capture, tmp_path / "run", page=False), heard.append)
     assert len(read_splats(run.file("splats.ply"))) > 0

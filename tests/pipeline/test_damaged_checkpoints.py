@@ -14,9 +14,9 @@ import torch
 from ball_runs import Stop, comparable, options
 from gs2d.io.run_dir import CheckpointFile, RunFolder, load_tensors, save_tensors
 from gs2d.pipeline.events import Event, Notice, Step, ignore
-from gs2d.pipeline.job import Job, prepare_job
-from gs2d.pipeline.resume import ResumePoint, choose_start
-from gs2d.pipeline.train import train
+from gs2d.pipeline.prepare.job import Job, prepare_job
+from gs2d.pipeline.train.resume import ResumePoint, choose_start
+from gs2d.pipeline.train.train_run import train
 
 UNSEEN = {("key",), ("state", "entered")}  # a text is as good as any
 

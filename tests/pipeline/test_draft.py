@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-import gs2d.pipeline.quality as module
+import gs2d.pipeline.prepare.quality as module
 from ball_runs import options
 from gs2d.config.presets import get_recipe
 from gs2d.errors import RecipeError
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.quality import Quality, by_quality
-from gs2d.pipeline.train import train
+from gs2d.pipeline.prepare.quality import Quality, by_quality
+from gs2d.pipeline.train.train_run import train
 
 
 @pytest.fixture(autouse=True)

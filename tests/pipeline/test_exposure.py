@@ -21,18 +21,18 @@ from gs2d.experiments import figures
 from gs2d.experiments.figures import rank_run
 from gs2d.io.run_dir import EXPOSURE, RunFolder
 from gs2d.pipeline.demo import demo
-from gs2d.pipeline.evaluate import evaluate_run
 from gs2d.pipeline.events import Event, Notice, Step, ignore
-from gs2d.pipeline.exposure import matched_by_halves, read_exposures
-from gs2d.pipeline.finished import open_job
-from gs2d.pipeline.job import build_recipe, prepare_job
-from gs2d.pipeline.options import DemoOptions, EvaluateOptions, TextureOptions, TrainOptions
-from gs2d.pipeline.paths import orbit_cameras
-from gs2d.pipeline.render import render_run, render_view
-from gs2d.pipeline.report import report_run
-from gs2d.pipeline.scoring import score_views
-from gs2d.pipeline.texture import _images
-from gs2d.pipeline.train import train
+from gs2d.pipeline.finish.camera_paths import orbit_cameras
+from gs2d.pipeline.finish.evaluate import evaluate_run
+from gs2d.pipeline.finish.run_images import render_run, render_view
+from gs2d.pipeline.finish.run_report import report_run
+from gs2d.pipeline.finish.run_texture import _images
+from gs2d.pipeline.finish.scoring import score_views
+from gs2d.pipeline.prepare.finished import open_job
+from gs2d.pipeline.prepare.job import build_recipe, prepare_job
+from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, TextureOptions, TrainOptions
+from gs2d.pipeline.prepare.run_exposures import matched_by_halves, read_exposures
+from gs2d.pipeline.train.train_run import train
 from gs2d.synthetic import capture as toy
 from gs2d.synthetic.perturb_exposure import GAINS, random_gains, with_gains
 from tiny import ball_cameras

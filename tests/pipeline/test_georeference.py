@@ -23,8 +23,8 @@ from gs2d.io.georeference import georeference_of_file, read_georeference, write_
 from gs2d.io.meshes import read_mesh, write_mesh
 from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.georeference import georeference_run
-from gs2d.pipeline.options import GeoreferenceOptions
-from gs2d.pipeline.train import train
+from gs2d.pipeline.prepare.options import GeoreferenceOptions
+from gs2d.pipeline.train.train_run import train
 from tiny import ball_cameras, write_ball_mesh, write_capture
 
 SCALE, TURN = 4.0, Rotation.from_euler("z", 37, degrees=True).as_matrix()

@@ -15,7 +15,7 @@ from gs2d.errors import DataError, ProtocolError, RecipeError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.in_memory import Trained
-from gs2d.pipeline.options import MeshOptions
+from gs2d.pipeline.prepare.options import MeshOptions
 
 
 @pytest.fixture(scope="module")

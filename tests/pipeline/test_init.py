@@ -9,10 +9,10 @@ import pytest
 
 from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.io.formats.registry import write_layout
-from gs2d.pipeline.job import prepare_job
-from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.same_run import check_same_run
-from gs2d.pipeline.train import train
+from gs2d.pipeline.prepare.job import prepare_job
+from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.train.same_run import check_same_run
+from gs2d.pipeline.train.train_run import train
 from tiny import write_capture
 from train_toys import random_splats
 

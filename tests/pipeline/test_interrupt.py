@@ -15,8 +15,8 @@ from ball_runs import Stop, comparable, options
 from gs2d.errors import DiskError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.interruption import SAME, HeldSignals
-from gs2d.pipeline.train import train
+from gs2d.pipeline.train.interruption import SAME, HeldSignals
+from gs2d.pipeline.train.train_run import train
 from gs2d.training.trainer import Trainer
 
 

@@ -20,16 +20,16 @@ from gs2d.errors import DataError, DiskError, ProtocolError, RecipeError, RunErr
 from gs2d.io.meshes import read_mesh, write_mesh
 from gs2d.io.run_dir import RunFolder, open_run
 from gs2d.io.splat_ply import read_splats, write_splats
-from gs2d.pipeline.evaluate import evaluate_run
 from gs2d.pipeline.events import Event, StageDone, Step
-from gs2d.pipeline.export import export_run
-from gs2d.pipeline.mesh import mesh_run
-from gs2d.pipeline.options import EvaluateOptions, MeshOptions, TrainOptions
-from gs2d.pipeline.page import page_run
-from gs2d.pipeline.paths import orbit_cameras
-from gs2d.pipeline.render import file_name, file_names, render_run
-from gs2d.pipeline.report import report_run
-from gs2d.pipeline.train import train
+from gs2d.pipeline.finish.camera_paths import orbit_cameras
+from gs2d.pipeline.finish.evaluate import evaluate_run
+from gs2d.pipeline.finish.export import export_run
+from gs2d.pipeline.finish.run_images import file_name, file_names, render_run
+from gs2d.pipeline.finish.run_mesh import mesh_run
+from gs2d.pipeline.finish.run_report import report_run
+from gs2d.pipeline.look.page import page_run
+from gs2d.pipeline.prepare.options import EvaluateOptions, MeshOptions, TrainOptions
+from gs2d.pipeline.train.train_run import train
 from tiny import ball_cameras, write_ball_mesh
 
 
@@ -256,7 +256,7 @@ def test_a_rendering_is_not_written_over_a_photograph(
     def plain(views: Sequence[View]) -> list[str]:
         return [Path(view.name).stem for view in views]  # as in captures without sub-folders
 
-    monkeypatch.setattr("gs2d.pipeline.render.file_names", plain)
+    monkeypatch.setattr("gs2d.pipeline.finish.run_images.file_names", plain)
     image = capture / "test" / "r_0.png"
     before = image.read_bytes()
     with pytest.raises(RunError, match=r"--out would write over the capture's photograph .*r_0\.png"):
@@ -268,7 +268,7 @@ def test_a_rendering_is_not_written_over_a_photograph(
 def test_a_rendering_that_fails_leaves_none_of_its_pictures_and_no_folder(
     undisturbed: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from gs2d.pipeline import render
+    from gs2d.pipeline.finish import run_images as render
 
     write = render.write_image
 

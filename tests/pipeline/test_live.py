@@ -24,11 +24,11 @@ from gs2d.cli import run
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline import live as module
 from gs2d.pipeline.events import Event, Notice, Phase, Step, ignore
-from gs2d.pipeline.job import Job, prepare_job
-from gs2d.pipeline.live import Live
-from gs2d.pipeline.train import train
+from gs2d.pipeline.prepare.job import Job, prepare_job
+from gs2d.pipeline.train import live as module
+from gs2d.pipeline.train.live import Live
+from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Progress, StageEntering
 from gs2d.training.state import TrainState
 

@@ -16,11 +16,11 @@ from gs2d.core.splats import Splats
 from gs2d.data.scene import View
 from gs2d.evaluation.images import ImageMetrics
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline import mesh as surface
-from gs2d.pipeline import run_logger as recorder
-from gs2d.pipeline.mesh import mesh_run
-from gs2d.pipeline.scoring import SeenView, score_views
-from gs2d.pipeline.train import train
+from gs2d.pipeline.finish import run_mesh as surface
+from gs2d.pipeline.finish.run_mesh import mesh_run
+from gs2d.pipeline.finish.scoring import SeenView, score_views
+from gs2d.pipeline.train import run_logger as recorder
+from gs2d.pipeline.train.train_run import train
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
 

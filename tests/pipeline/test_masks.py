@@ -21,11 +21,11 @@ from gs2d.data import load_scene
 from gs2d.errors import DataError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.events import Notice
+from gs2d.pipeline.finish.run_subject import sights
 from gs2d.pipeline.in_memory import Trained, evaluate, extract_mesh, train
-from gs2d.pipeline.job import reload_job, scene_digest
-from gs2d.pipeline.masks import with_masks, without_masked_points
-from gs2d.pipeline.options import MeshOptions
-from gs2d.pipeline.subject import sights
+from gs2d.pipeline.prepare.capture_masks import with_masks, without_masked_points
+from gs2d.pipeline.prepare.job import reload_job, scene_digest
+from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.render.backends import get_backend
 from gs2d.training.trainer import raster_settings
 from tiny import ball_cameras, ball_image
@@ -86,7 +86,7 @@ def test_fusion_and_the_subject_leave_masked_pixels_out(tmp_path: Path) -> None:
         settings = raster_settings(protocol, scene.extent, 3)
         return Trained(opaque, scene, protocol, settings, get_backend("cpu"))
 
-    from gs2d.pipeline.mesh import fusion_frame
+    from gs2d.pipeline.finish.run_mesh import fusion_frame
     from gs2d.render.api import rasterize
 
     view = scene.train[0]

@@ -15,7 +15,7 @@ from gs2d.core.camera import look_at
 from gs2d.data import Scene, View
 from gs2d.data.cache import TRIM_EVERY, DecodedImage, ImageCache
 from gs2d.kernels.buffer_pool import BufferPool
-from gs2d.pipeline.memory import release
+from gs2d.pipeline.prepare.memory_budget import release
 
 HOLES = """
 import os, sys

@@ -12,11 +12,11 @@ import pytest
 from ball_runs import options
 from gs2d.core.memory_limit import MemoryLimit
 from gs2d.errors import DataError
-from gs2d.pipeline import memory as module
 from gs2d.pipeline.events import Notice
-from gs2d.pipeline.job import prepare_job
-from gs2d.pipeline.memory import check_memory
-from gs2d.pipeline.train import train
+from gs2d.pipeline.prepare import memory_budget as module
+from gs2d.pipeline.prepare.job import prepare_job
+from gs2d.pipeline.prepare.memory_budget import check_memory
+from gs2d.pipeline.train.train_run import train
 from tiny import write_capture
 
 GB = 10**9

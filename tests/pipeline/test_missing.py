@@ -13,11 +13,11 @@ from ball_runs import options
 from gs2d.core.files import disk_error
 from gs2d.errors import DiskError, ProtocolError
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline import train as train_module
 from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.events import Event, MissingFile
-from gs2d.pipeline.report import report_run
-from gs2d.pipeline.train import train
+from gs2d.pipeline.finish.run_report import report_run
+from gs2d.pipeline.train import train_run as train_module
+from gs2d.pipeline.train.train_run import train
 
 MADE = ("mesh.ply", "report.html", "scene.html")
 
@@ -41,23 +41,29 @@ def finished(undisturbed: RunFolder, tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("place", "error", "what", "reason", "command"),
     [
-        ("train.extract_mesh", ProtocolError("no depth"), "mesh.ply", "no depth", "gs2d mesh {run}"),
-        ("train.extract_mesh", MemoryError("much"), "mesh.ply", "out of memory", "gs2d mesh {run}"),
+        ("train.train_run.extract_mesh", ProtocolError("no depth"), "mesh.ply", "no depth", "gs2d mesh {run}"),
+        ("train.train_run.extract_mesh", MemoryError("much"), "mesh.ply", "out of memory", "gs2d mesh {run}"),
         (
-            "train.report_run",
+            "train.train_run.report_run",
             OSError("broken data stream"),
             "report.html",
             "fault in gs2d: OSError: broken data stream",
             "gs2d report {run}",
         ),
         (
-            "train.page_run",
+            "train.train_run.page_run",
             ZeroDivisionError(),
             "scene.html",
             "fault in gs2d: ZeroDivisionError: no message",
             "gs2d page {run}",
         ),
-        ("run_logger.draw_stage", ValueError("x"), "pictures of stage refine", "fault in gs2d: ValueError: x", None),
+        (
+            "train.run_logger.draw_stage",
+            ValueError("x"),
+            "pictures of stage refine",
+            "fault in gs2d: ValueError: x",
+            None,
+        ),
     ],
 )
 def test_what_cannot_be_made_is_said_and_leaves_the_others(
@@ -88,7 +94,7 @@ def test_a_report_without_its_mesh_says_so(capture: Path, finished: Path, monkey
 
 def test_a_full_disk_ends_the_run_all_the_same(capture: Path, finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     full = disk_error(finished / "report.html", OSError(errno.ENOSPC, "No space left on device"))
-    monkeypatch.setattr("gs2d.pipeline.train.report_run", failing(full))
+    monkeypatch.setattr("gs2d.pipeline.train.train_run.report_run", failing(full))
     with pytest.raises(DiskError, match="No space left"):
         train(options(capture, finished, resume=True))
 

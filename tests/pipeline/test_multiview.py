@@ -11,9 +11,9 @@ import pytest
 from ball_runs import SMALL, Stop, comparable, options
 from gs2d.errors import DataError
 from gs2d.pipeline.events import Event, Step, ignore
-from gs2d.pipeline.job import prepare_job
-from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.train import train
+from gs2d.pipeline.prepare.job import prepare_job
+from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.train.train_run import train
 
 WIDE = (  # for few cameras, far apart, and pictures of a few pixels
     *("multiview.max_angle=80", "multiview.max_baseline=2", "multiview.radius=1", "multiview.occluded=50"),

@@ -18,7 +18,7 @@ from gs2d.core.mesh import Mesh
 from gs2d.io.georeference import write_georeference
 from gs2d.io.meshes import write_mesh
 from gs2d.pipeline import orthophoto
-from gs2d.pipeline.train import train
+from gs2d.pipeline.train.train_run import train
 from tiny import RADIUS, write_ball_mesh, write_capture
 
 tifffile = pytest.importorskip("tifffile")

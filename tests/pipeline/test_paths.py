@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gs2d.core.camera import Camera, look_at
-from gs2d.pipeline.paths import flight_cameras, orbit_cameras, photographed_arc, stops, tour
+from gs2d.pipeline.finish.camera_paths import flight_cameras, orbit_cameras, photographed_arc, stops, tour
 from tiny import ball_cameras
 
 UP = np.array([0.0, 0.0, 1.0])

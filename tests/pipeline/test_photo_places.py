@@ -9,9 +9,9 @@ import pytest
 
 from gs2d.data.exif import Taken
 from gs2d.errors import DataError
-from gs2d.pipeline.options import PosesOptions
-from gs2d.pipeline.photo_places import places_of
-from gs2d.pipeline.sfm import _matching, asked_for
+from gs2d.pipeline.prepare.options import PosesOptions
+from gs2d.pipeline.prepare.photo_places import places_of
+from gs2d.pipeline.prepare.pose_finding import _matching, asked_for
 from gs2d.sfm.images import Photo
 
 DEGREE = 111_195.0  # m of latitude, about

@@ -16,11 +16,11 @@ from gs2d.config.presets import get_recipe
 from gs2d.core.photometry import CameraPhotometry
 from gs2d.errors import RecipeError, RunError
 from gs2d.io.run_dir import PHOTOMETRY, REPORT, SPLATS, RunFolder
-from gs2d.pipeline.evaluate import evaluate_run
 from gs2d.pipeline.events import Event, Notice, ignore
-from gs2d.pipeline.exposure import as_scene, photographed
-from gs2d.pipeline.job import build_recipe, reload_job
-from gs2d.pipeline.train import train
+from gs2d.pipeline.finish.evaluate import evaluate_run
+from gs2d.pipeline.prepare.job import build_recipe, reload_job
+from gs2d.pipeline.prepare.run_exposures import as_scene, photographed
+from gs2d.pipeline.train.train_run import train
 
 EARLY = (*SMALL, "photometry.start=5", "photometry.rate=0.02")
 

@@ -24,10 +24,10 @@ from gs2d.config.serialize import apply_overrides
 from gs2d.core import memory_limit
 from gs2d.data import load_scene
 from gs2d.errors import DataError, RecipeError
-from gs2d.pipeline import estimate as module
-from gs2d.pipeline import plan as plan_module
-from gs2d.pipeline import train as train_module
-from gs2d.pipeline.estimate import (
+from gs2d.pipeline.events import Event, Notice
+from gs2d.pipeline.prepare import estimate as module
+from gs2d.pipeline.prepare import plan as plan_module
+from gs2d.pipeline.prepare.estimate import (
     DOUBT,
     GROWTH,
     PROGRAM_BYTES,
@@ -40,10 +40,10 @@ from gs2d.pipeline.estimate import (
     start_of,
     training_work,
 )
-from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.options import PlanOptions, TrainOptions
-from gs2d.pipeline.plan import plan
-from gs2d.pipeline.train import train
+from gs2d.pipeline.prepare.options import PlanOptions, TrainOptions
+from gs2d.pipeline.prepare.plan import plan
+from gs2d.pipeline.train import train_run as train_module
+from gs2d.pipeline.train.train_run import train
 from gs2d.render.backends import get_backend
 from gs2d.synthetic.flight import Flight, write_flight
 from train_toys import backends

@@ -18,15 +18,15 @@ from gs2d.core import memory_limit
 from gs2d.data import load_scene
 from gs2d.data.prepared import SUFFIX, Stored
 from gs2d.errors import DataError, RecipeError
-from gs2d.pipeline import photographs
 from gs2d.pipeline.events import Event, Notice, Phase
-from gs2d.pipeline.finished import open_job
-from gs2d.pipeline.memory import use_memory
-from gs2d.pipeline.mesh import mesh_run
-from gs2d.pipeline.options import MeshOptions, TrainOptions
-from gs2d.pipeline.photographs import PREPARED
-from gs2d.pipeline.report import report_run
-from gs2d.pipeline.train import train
+from gs2d.pipeline.finish.run_mesh import mesh_run
+from gs2d.pipeline.finish.run_report import report_run
+from gs2d.pipeline.prepare import photographs
+from gs2d.pipeline.prepare.finished import open_job
+from gs2d.pipeline.prepare.memory_budget import use_memory
+from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
+from gs2d.pipeline.prepare.photographs import PREPARED
+from gs2d.pipeline.train.train_run import train
 from gs2d.synthetic.flight import Flight, write_flight
 from gs2d.training.trainer import Trainer
 
@@ -163,7 +163,7 @@ def test_a_budget_bounds_caches_and_refuses_photographs_that_are_too_large(
     whole = memory_limit.memory_limit()
     assert whole is not None
     assert memory_limit.memory_budget() == whole.bytes // 2
-    monkeypatch.setattr("gs2d.pipeline.memory.ITERATION_BYTES", 1 << 40)  # at no downscale
+    monkeypatch.setattr("gs2d.pipeline.prepare.memory_budget.ITERATION_BYTES", 1 << 40)  # at no downscale
     with pytest.raises(DataError, match=r"photographs of up to .* of 1 GiB \(--memory\)"):
         train(options(capture, tmp_path / "run", "auto", memory=1.0))
 

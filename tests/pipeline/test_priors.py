@@ -19,9 +19,9 @@ from gs2d.config.presets import with_depth_prior
 from gs2d.errors import DataError, RecipeError
 from gs2d.io.run_dir import REPORT, RunFolder
 from gs2d.pipeline.events import Event, MissingFile, Notice, Step, ignore
-from gs2d.pipeline.job import build_recipe, prepare_job
-from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.train import train
+from gs2d.pipeline.prepare.job import build_recipe, prepare_job
+from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.train.train_run import train
 from tiny import RADIUS, SIZE, ball_cameras
 
 EAGER = (*SMALL, "depth_prior.opacity=0.05")

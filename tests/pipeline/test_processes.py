@@ -15,9 +15,9 @@ import together_run
 from gs2d.core.processes import Place
 from gs2d.io.run_dir import RunFolder, load_tensors
 from gs2d.pipeline.events import ignore
-from gs2d.pipeline.job import prepare_job
-from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.processes import memory_of
+from gs2d.pipeline.prepare.job import prepare_job
+from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.train.process_group import memory_of
 from process_runs import ITERATIONS, in_processes, torchrun, words
 from tiny import write_capture
 

@@ -15,10 +15,10 @@ from gs2d.data import load_scene
 from gs2d.errors import RecipeError, RunError
 from gs2d.io.run_dir import POSES, RunFolder
 from gs2d.pipeline.events import Event, Notice, ignore
-from gs2d.pipeline.job import build_recipe, reload_job
-from gs2d.pipeline.options import TextureOptions
-from gs2d.pipeline.texture import _views
-from gs2d.pipeline.train import train
+from gs2d.pipeline.finish.run_texture import _views
+from gs2d.pipeline.prepare.job import build_recipe, reload_job
+from gs2d.pipeline.prepare.options import TextureOptions
+from gs2d.pipeline.train.train_run import train
 from gs2d.report.sections.poses import poses_section
 
 EARLY = (*SMALL, "poses.start=5", "intrinsics.start=5", "intrinsics.rate=0.01")

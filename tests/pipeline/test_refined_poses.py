@@ -20,17 +20,17 @@ from gs2d.errors import RecipeError, RunError
 from gs2d.evaluation.images import mean_metrics
 from gs2d.io.run_dir import POSES, RunFolder
 from gs2d.pipeline.demo import demo
-from gs2d.pipeline.evaluate import evaluate_run
 from gs2d.pipeline.events import Event, Notice, Step, ignore
-from gs2d.pipeline.finished import open_job
-from gs2d.pipeline.job import build_recipe, prepare_job, reload_job
-from gs2d.pipeline.options import DemoOptions, EvaluateOptions, TextureOptions, TrainOptions
-from gs2d.pipeline.refined_poses import aligned, how_far
-from gs2d.pipeline.render import render_run, render_view, shown_cameras
-from gs2d.pipeline.report import report_run
-from gs2d.pipeline.scoring import score_views
-from gs2d.pipeline.texture import _views
-from gs2d.pipeline.train import train
+from gs2d.pipeline.finish.evaluate import evaluate_run
+from gs2d.pipeline.finish.run_images import render_run, render_view, shown_cameras
+from gs2d.pipeline.finish.run_report import report_run
+from gs2d.pipeline.finish.run_texture import _views
+from gs2d.pipeline.finish.scoring import score_views
+from gs2d.pipeline.prepare.finished import open_job
+from gs2d.pipeline.prepare.job import build_recipe, prepare_job, reload_job
+from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, TextureOptions, TrainOptions
+from gs2d.pipeline.prepare.run_poses import aligned, how_far
+from gs2d.pipeline.train.train_run import train
 from gs2d.report.sections.poses import poses_section
 from gs2d.synthetic import capture as toy
 from gs2d.synthetic.perturb_poses import TRUTH, disturbed

@@ -15,8 +15,8 @@ from ball_runs import SMALL, Stop, comparable, options, spawn
 from gs2d.errors import DiskError, RunError
 from gs2d.io.run_dir import RunFolder, load_tensors, open_run
 from gs2d.pipeline.events import Event, Notice, StageDone, Step, ignore
-from gs2d.pipeline.job import prepare_job
-from gs2d.pipeline.train import train
+from gs2d.pipeline.prepare.job import prepare_job
+from gs2d.pipeline.train.train_run import train
 
 
 @pytest.mark.parametrize("stop_after", [3, 13, 30, 37, 41, 59])
@@ -154,7 +154,7 @@ def test_a_run_that_fails_at_once_leaves_no_empty_cache(
     def failing(*_args: Any) -> None:
         raise Stop
 
-    monkeypatch.setattr("gs2d.pipeline.train.choose_start", failing)
+    monkeypatch.setattr("gs2d.pipeline.train.train_run.choose_start", failing)
     with pytest.raises(Stop):
         train(options(capture, tmp_path / "run", cache=tmp_path / "deep" / "cache"))
     assert list(tmp_path.iterdir()) == []

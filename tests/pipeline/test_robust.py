@@ -24,10 +24,10 @@ from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.job import fit_recipe, reload_job, settled
-from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.predicted_exposure import metered, with_predicted
-from gs2d.pipeline.same_run import check_same_run
+from gs2d.pipeline.prepare.job import fit_recipe, reload_job, settled
+from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
+from gs2d.pipeline.train.same_run import check_same_run
 from gs2d.render.api import rasterize
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
@@ -132,7 +132,7 @@ def test_a_part_can_be_left_out_or_changed_by_its_name() -> None:
 
 
 def test_an_unknown_word_is_refused() -> None:
-    from gs2d.pipeline.job import check_train_options
+    from gs2d.pipeline.prepare.job import check_train_options
 
     with pytest.raises(RecipeError, match="--robust must be one of auto, on, off, got maybe"):
         check_train_options(options(robust="maybe"))

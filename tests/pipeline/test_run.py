@@ -24,12 +24,12 @@ from gs2d.errors import DataError, DiskError, DivergedError, ProtocolError, Reci
 from gs2d.io.run_dir import RunFolder
 from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.demo import demo
-from gs2d.pipeline.estimate import full_iterations
 from gs2d.pipeline.events import Event, Notice, Phase, Step, duration, ignore
-from gs2d.pipeline.job import prepare_job
-from gs2d.pipeline.options import DemoOptions
-from gs2d.pipeline.render import render_run
-from gs2d.pipeline.train import pretraining_notices, train
+from gs2d.pipeline.finish.run_images import render_run
+from gs2d.pipeline.prepare.estimate import full_iterations
+from gs2d.pipeline.prepare.job import prepare_job
+from gs2d.pipeline.prepare.options import DemoOptions
+from gs2d.pipeline.train.train_run import pretraining_notices, train
 from tiny import write_capture
 
 

@@ -10,7 +10,7 @@ from gs2d.core.camera import look_at
 from gs2d.core.splats import Splats
 from gs2d.data.scene import View
 from gs2d.evaluation.images import ImageMetrics
-from gs2d.pipeline.scoring import (
+from gs2d.pipeline.finish.scoring import (
     CLEAR,
     SeenView,
     mean_psnr,

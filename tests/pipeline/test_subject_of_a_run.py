@@ -19,14 +19,14 @@ from gs2d.errors import DataError, ProtocolError, RunError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import PAGE, RunFolder
 from gs2d.io.splat_ply import read_splats
-from gs2d.pipeline.believed import sky_direction
 from gs2d.pipeline.events import Notice
-from gs2d.pipeline.export import export_run
-from gs2d.pipeline.finished import finished_splats
-from gs2d.pipeline.job import reload_job
-from gs2d.pipeline.mesh import SEVERAL, extract_mesh, fusion_frame, mesh_run
-from gs2d.pipeline.options import MeshOptions
-from gs2d.pipeline.subject import meshed_subject, subject_line, within
+from gs2d.pipeline.finish.believed import sky_direction
+from gs2d.pipeline.finish.export import export_run
+from gs2d.pipeline.finish.run_mesh import SEVERAL, extract_mesh, fusion_frame, mesh_run
+from gs2d.pipeline.finish.run_subject import meshed_subject, subject_line, within
+from gs2d.pipeline.prepare.finished import finished_splats
+from gs2d.pipeline.prepare.job import reload_job
+from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.render.api import rasterize
 from gs2d.report.sections.subject import subject_section
 from wall_scene import wall

@@ -12,17 +12,17 @@ import pytest
 from gs2d.errors import DataError, RunError
 from gs2d.evaluation.surface import evaluate_surface
 from gs2d.io.run_dir import RunFolder, open_run
-from gs2d.pipeline.evaluate import evaluate_run
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.mesh import mesh_run
-from gs2d.pipeline.options import EvaluateOptions, MeshOptions
+from gs2d.pipeline.finish.evaluate import evaluate_run
+from gs2d.pipeline.finish.run_mesh import mesh_run
+from gs2d.pipeline.prepare.options import EvaluateOptions, MeshOptions
 from tiny import write_ball_mesh
 
 
 @pytest.fixture
 def beside(undisturbed: RunFolder, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
     """A copy of the run whose capture has a true mesh beside its photographs; and that capture."""
-    monkeypatch.setattr("gs2d.pipeline.truth.evaluate_surface", partial(evaluate_surface, samples=2000))
+    monkeypatch.setattr("gs2d.pipeline.finish.truth.evaluate_surface", partial(evaluate_surface, samples=2000))
     run, folder = tmp_path / "run", tmp_path / "ball"
     shutil.copytree(undisturbed.path, run)
     shutil.copytree(capture, folder)

@@ -18,8 +18,8 @@ from gs2d.core.json_files import write_json
 from gs2d.data import View
 from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.verdict.judge import Finding, judge
-from gs2d.pipeline.verdict.measures import (
+from gs2d.pipeline.finish.verdict.judge import Finding, judge
+from gs2d.pipeline.finish.verdict.measures import (
     Measures,
     ViewMeasures,
     blur_of,

@@ -12,8 +12,8 @@ from PIL import Image
 
 from gs2d.core.camera import Camera
 from gs2d.data.readers.colmap import read_images
-from gs2d.pipeline.options import PosesOptions
-from gs2d.pipeline.sfm import find_poses
+from gs2d.pipeline.prepare.options import PosesOptions
+from gs2d.pipeline.prepare.pose_finding import find_poses
 from gs2d.sfm.assemble import merged
 from room_photos import room_cameras, room_image, textures
 

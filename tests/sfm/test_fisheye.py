@@ -18,8 +18,8 @@ from gs2d.data import load_scene
 from gs2d.data.image_files import read_mask
 from gs2d.data.readers.colmap import read_cameras, read_images
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.options import PosesOptions
-from gs2d.pipeline.sfm import find_poses
+from gs2d.pipeline.prepare.options import PosesOptions
+from gs2d.pipeline.prepare.pose_finding import find_poses
 from gs2d.sfm import as_fisheye, colmap_worker
 from gs2d.sfm.fisheye import Circle, circle_of, named_fisheye, small_if_dark
 from gs2d.sfm.images import Photo, camera_groups, find_photos, fisheye_hints, read_photos

@@ -29,8 +29,8 @@ from gs2d.data import load_scene
 from gs2d.data.readers.colmap import read_cameras, read_images
 from gs2d.errors import DataError
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.options import PosesOptions
-from gs2d.pipeline.sfm import find_poses
+from gs2d.pipeline.prepare.options import PosesOptions
+from gs2d.pipeline.prepare.pose_finding import find_poses
 from gs2d.sfm.images import Photo, camera_groups, find_photos, panorama_groups, read_photos
 from gs2d.sfm.panoramas import meets_itself
 from gs2d.training.plane_sweep import start_points, sweep_views

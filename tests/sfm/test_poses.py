@@ -23,8 +23,8 @@ from gs2d.data import load_scene
 from gs2d.data.image_files import read_image
 from gs2d.data.readers.colmap import read_images
 from gs2d.pipeline.events import Event, Notice, Phase
-from gs2d.pipeline.options import PosesOptions
-from gs2d.pipeline.sfm import find_poses
+from gs2d.pipeline.prepare.options import PosesOptions
+from gs2d.pipeline.prepare.pose_finding import find_poses
 from room_photos import FOCAL, SIZE, UP, Room, room_image, textures, write_room
 
 

@@ -19,10 +19,10 @@ from gs2d.cli import commands, run
 from gs2d.cli.parser import parse
 from gs2d.config.presets import DEFAULT_RECIPE, get_recipe
 from gs2d.io.run_dir import open_run
-from gs2d.pipeline import quality as quality_module
 from gs2d.pipeline import reconstruct as module
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.options import ReconstructOptions, Training, values
+from gs2d.pipeline.prepare import quality as quality_module
+from gs2d.pipeline.prepare.options import ReconstructOptions, Training, values
 from gs2d.pipeline.reconstruct import FEW, poses_options, reconstruct, train_options
 from room_photos import Room, write_room
 from tiny import write_capture

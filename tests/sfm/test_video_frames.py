@@ -15,8 +15,8 @@ from gs2d.cli import run
 from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.options import PosesOptions
-from gs2d.pipeline.sfm import find_poses
+from gs2d.pipeline.prepare.options import PosesOptions
+from gs2d.pipeline.prepare.pose_finding import find_poses
 from gs2d.sfm.video_frames import choose, look_into, sharpness_of, take
 from room_photos import write_room
 

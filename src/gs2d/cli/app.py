@@ -88,7 +88,7 @@ def run(argv: Sequence[str]) -> int:
             check_address_space()
         actions = importlib.import_module("gs2d.cli.handlers")
         if isinstance(command, _HEAVY):
-            importlib.import_module("gs2d.pipeline.train")  # torch and all: see `interrupts`
+            importlib.import_module("gs2d.pipeline.train.train_run")  # torch and all: see `interrupts`
         with interruptible:
             actions.execute(command, console)
             console.flush()

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from gs2d.config.arguments import Arg
 from gs2d.experiments.options import BlocksOptions, PaperOptions, ReconstructAnywhereOptions, SweepOptions
-from gs2d.pipeline.options import (
+from gs2d.pipeline.prepare.options import (
     BoxOption,
     DemoOptions,
     EvaluateOptions,

@@ -15,7 +15,7 @@ from gs2d.cli.console import Console
 from gs2d.cli.tables import say_where_it_is, score_rows, show_run, show_surface
 from gs2d.core.processes import here
 from gs2d.errors import ProtocolError, RecipeError
-from gs2d.pipeline.options import MeshOptions, TextureOptions, values
+from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions, values
 
 
 def execute(command: Common, console: Console) -> None:
@@ -45,7 +45,7 @@ def execute(command: Common, console: Console) -> None:
     }
     try:
         if isinstance(command, c.Mesh | c.Render | c.Evaluate | c.Report):  # who trains does so itself
-            from gs2d.pipeline.memory import use_memory
+            from gs2d.pipeline.prepare.memory_budget import use_memory
 
             use_memory(command.memory)
         actions[type(command)](command, console)
@@ -55,8 +55,8 @@ def execute(command: Common, console: Console) -> None:
 
 def plan(command: c.Plan, console: Console) -> None:
     """``gs2d plan``."""
-    from gs2d.pipeline.estimate import set_words
-    from gs2d.pipeline.plan import plan as make_plan
+    from gs2d.pipeline.prepare.estimate import set_words
+    from gs2d.pipeline.prepare.plan import plan as make_plan
 
     found = make_plan(command, console.on_event)
     console.close()
@@ -91,7 +91,7 @@ def _listed(value: object) -> tuple[object, ...]:
 
 def train(command: c.Train, console: Console) -> None:
     """``gs2d train``."""
-    from gs2d.pipeline.train import train as run_training
+    from gs2d.pipeline.train.train_run import train as run_training
 
     run = run_training(command, console.on_event)
     console.close()
@@ -119,7 +119,7 @@ def demo(command: c.Demo, console: Console) -> None:
 
 def mesh(command: c.Mesh, console: Console) -> None:
     """``gs2d mesh``."""
-    from gs2d.pipeline.mesh import mesh_run
+    from gs2d.pipeline.finish.run_mesh import mesh_run
 
     options = MeshOptions(**values(MeshOptions, command))
     if command.texture:
@@ -144,7 +144,7 @@ def mesh(command: c.Mesh, console: Console) -> None:
 
 
 def _textured_mesh(command: c.Mesh, mesh_options: Any, console: Console) -> None:
-    from gs2d.pipeline.texture import texture_run
+    from gs2d.pipeline.finish.run_texture import texture_run
 
     if command.splats is not None:
         raise ProtocolError("--splats has no texture, which is of the run's own mesh; leave --texture out")
@@ -174,7 +174,7 @@ def _refuse_texture_options(command: c.Mesh) -> None:
 
 def render(command: c.Render, console: Console) -> None:
     """``gs2d render``."""
-    from gs2d.pipeline.render import render_run
+    from gs2d.pipeline.finish.run_images import render_run
 
     result = render_run(
         command.run,
@@ -199,7 +199,7 @@ def render(command: c.Render, console: Console) -> None:
 
 def view(command: c.View, console: Console) -> None:
     """``gs2d view``: until Ctrl-C."""
-    from gs2d.pipeline.view import open_viewer, serve
+    from gs2d.pipeline.look.view import open_viewer, serve
 
     server, shown = open_viewer(command.path, command.port, console.on_event)
     try:
@@ -214,7 +214,7 @@ def view(command: c.View, console: Console) -> None:
 
 def page(command: c.Page, console: Console) -> None:
     """``gs2d page``."""
-    from gs2d.pipeline.page import page_run
+    from gs2d.pipeline.look.page import page_run
 
     result = page_run(command.path, command.out, sh_degree=command.sh_degree, on_event=console.on_event)
     console.close()
@@ -224,7 +224,7 @@ def page(command: c.Page, console: Console) -> None:
 
 def evaluate(command: c.Evaluate, console: Console) -> None:
     """``gs2d evaluate``."""
-    from gs2d.pipeline.evaluate import evaluate_run
+    from gs2d.pipeline.finish.evaluate import evaluate_run
 
     result = evaluate_run(command.run, command, console.on_event, threads=command.threads)
     console.close()
@@ -244,7 +244,7 @@ def evaluate(command: c.Evaluate, console: Console) -> None:
 
 def export(command: c.Export, console: Console) -> None:
     """``gs2d export``."""
-    from gs2d.pipeline.export import export_run
+    from gs2d.pipeline.finish.export import export_run
 
     result = export_run(
         command.run, command.out, command.layout, bbox=command.bbox, georeferenced=command.georeferenced
@@ -292,7 +292,7 @@ def orthophoto(command: c.Orthophoto, console: Console) -> None:
 
 def report(command: c.Report, console: Console) -> None:
     """``gs2d report``."""
-    from gs2d.pipeline.report import report_run
+    from gs2d.pipeline.finish.run_report import report_run
 
     path = report_run(command.run, console.on_event)
     console.say(str(path))
@@ -347,7 +347,7 @@ def reconstruct(command: c.Reconstruct, console: Console) -> None:
 def poses(command: c.Poses, console: Console) -> None:
     """``gs2d poses``."""
     from gs2d.cli.poses import poses_lines
-    from gs2d.pipeline.sfm import find_poses
+    from gs2d.pipeline.prepare.pose_finding import find_poses
 
     result = find_poses(command, console.on_event)
     console.close()
@@ -377,7 +377,7 @@ def info(command: c.Info, console: Console) -> None:
     """``gs2d info``."""
     from gs2d.data.archive import is_archive
     from gs2d.io.run_dir import is_run, open_run
-    from gs2d.pipeline.info import describe_capture, describe_file
+    from gs2d.pipeline.look.info import describe_capture, describe_file
 
     path: Path = command.path
     if is_run(path):

@@ -8,7 +8,7 @@ import gs2d
 from gs2d.cli.arguments import NAMES, Option, about, options_of
 from gs2d.cli.commands import Common
 from gs2d.cli.layout import entries, terminal_width, wrapped
-from gs2d.pipeline.options import CommonTraining, Finding, HowItRuns, Training
+from gs2d.pipeline.prepare.options import CommonTraining, Finding, HowItRuns, Training
 
 _SLOGAN = "Photographs in; a surface mesh and a scene of 2D Gaussian splats out."
 _FIRST_DAY = (

@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 from gs2d.cli.arguments import NAMES, fields_of, options_of
 from gs2d.cli.commands import Common
 from gs2d.core.missing import where_it_ends
-from gs2d.pipeline.options import HowItRuns
+from gs2d.pipeline.prepare.options import HowItRuns
 
 HELP_WORDS = ("-h", "--help", "--help-all")
 _ALIKE = 0.6  # difflib's ratio from which a word is proposed

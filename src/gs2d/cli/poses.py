@@ -10,7 +10,7 @@ _MAX_LINES = 12  # of photographs without a place; poses.json has them all
 
 def poses_lines(result: dict[str, Any]) -> list[str]:
     """Return the outcome in lines for people."""
-    from gs2d.pipeline.sfm import placed_line
+    from gs2d.pipeline.prepare.pose_finding import placed_line
 
     lines = [
         placed_line(result),

@@ -36,14 +36,14 @@ from gs2d.pipeline.blocks.settle import (
 )
 from gs2d.pipeline.blocks.split import CELLS, SEAMS, read_split, split_model, start_file
 from gs2d.pipeline.events import Notice, OnEvent, ignore
-from gs2d.pipeline.exposure import read_exposures
-from gs2d.pipeline.finished import finished_splats
-from gs2d.pipeline.job import check_train_options, protocol_from_json
-from gs2d.pipeline.memory import use_memory
-from gs2d.pipeline.options import CommonTraining, Part, TrainOptions, values
-from gs2d.pipeline.same_run import difference
-from gs2d.pipeline.threads import use_threads
-from gs2d.pipeline.train import train
+from gs2d.pipeline.prepare.finished import finished_splats
+from gs2d.pipeline.prepare.job import check_train_options, protocol_from_json
+from gs2d.pipeline.prepare.memory_budget import use_memory
+from gs2d.pipeline.prepare.options import CommonTraining, Part, TrainOptions, values
+from gs2d.pipeline.prepare.run_exposures import read_exposures
+from gs2d.pipeline.prepare.threads import use_threads
+from gs2d.pipeline.train.same_run import difference
+from gs2d.pipeline.train.train_run import train
 from gs2d.training.trainer import raster_settings
 
 BLOCKS_JSON = "blocks.json"  # in the job folder: what was settled

@@ -20,11 +20,11 @@ from gs2d.data import View
 from gs2d.errors import Gs2dError
 from gs2d.io.run_dir import RunFolder, load_tensors, make_folder, open_run
 from gs2d.pipeline.events import Notice, OnEvent, counted, ignore
-from gs2d.pipeline.exposure import photographed, read_exposures
-from gs2d.pipeline.finished import finished_splats
-from gs2d.pipeline.job import Job, reload_job
-from gs2d.pipeline.render import choose_views, fraction_of_group, render_view, splatted
-from gs2d.pipeline.resume import stage_end
+from gs2d.pipeline.finish.run_images import choose_views, fraction_of_group, render_view, splatted
+from gs2d.pipeline.prepare.finished import finished_splats
+from gs2d.pipeline.prepare.job import Job, reload_job
+from gs2d.pipeline.prepare.run_exposures import photographed, read_exposures
+from gs2d.pipeline.train.resume import stage_end
 from gs2d.render.api import splat_errors
 from gs2d.render.exposure import identity
 from gs2d.report.images import ERROR_TOP, error_image, error_scale, highlight_image, valid_image

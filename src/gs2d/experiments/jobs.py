@@ -13,7 +13,7 @@ from typing import Any
 from gs2d.experiments.tasks import Task
 from gs2d.io.run_dir import MESH, SPLATS, RunFolder
 from gs2d.pipeline.events import Event, MissingFile, OnEvent
-from gs2d.pipeline.options import EvaluateOptions, TrainOptions
+from gs2d.pipeline.prepare.options import EvaluateOptions, TrainOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,8 +89,8 @@ def train_and_evaluate(job: Job, on_event: OnEvent) -> dict[str, str]:
     Gs2dError
         The run itself failed.
     """
-    from gs2d.pipeline.evaluate import evaluate_run
-    from gs2d.pipeline.train import train
+    from gs2d.pipeline.finish.evaluate import evaluate_run
+    from gs2d.pipeline.train.train_run import train
 
     missing: list[MissingFile] = []
 

@@ -1,4 +1,4 @@
-"""What `gs2d paper` and `gs2d sweep` are asked to do, as `pipeline/options.py` has it of the other verbs."""
+"""What `gs2d paper` and `gs2d sweep` are asked to do, as `pipeline/prepare/options.py` has it of the other verbs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from gs2d.config.arguments import Arg
 from gs2d.errors import RecipeError
-from gs2d.pipeline.options import CommonTraining, Overrides, ReconstructOptions, Resources, paths_of
+from gs2d.pipeline.prepare.options import CommonTraining, Overrides, ReconstructOptions, Resources, paths_of
 
 SWEEP = "sweep"  # the name of a table of chosen recipes
 

@@ -23,7 +23,7 @@ from gs2d.experiments.options import PaperOptions, SweepOptions, TableOptions
 from gs2d.experiments.scenes import FoundScene, find_scenes
 from gs2d.experiments.tables import PAPER_TABLES, PaperTable, recipe_table
 from gs2d.io.run_dir import versions
-from gs2d.pipeline.options import EvaluateOptions, TrainOptions
+from gs2d.pipeline.prepare.options import EvaluateOptions, TrainOptions
 
 
 @dataclass(frozen=True)

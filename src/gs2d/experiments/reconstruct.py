@@ -20,7 +20,7 @@ from gs2d.experiments.options import ReconstructAnywhereOptions
 from gs2d.experiments.tasks import Task, failures
 from gs2d.io.run_dir import REPORT, SPLATS, RunFolder, is_run, remove_made
 from gs2d.pipeline.events import OnEvent, ignore
-from gs2d.pipeline.options import ReconstructOptions, values
+from gs2d.pipeline.prepare.options import ReconstructOptions, values
 from gs2d.pipeline.reconstruct import CAPTURE, CLUSTER, check_reconstruct, find_cameras, train_found
 from gs2d.pipeline.reconstruct import reconstruct as reconstruct_here
 from gs2d.sfm.workspace import POSES_JSON

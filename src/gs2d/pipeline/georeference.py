@@ -23,8 +23,8 @@ from gs2d.geo.positions import Positions, WorldFrame, in_frame, matched, read_po
 from gs2d.io.georeference import read_georeference, write_georeference
 from gs2d.io.run_dir import GEOREFERENCE, POSES, RunFolder, open_run
 from gs2d.pipeline.events import OnEvent, counted, ignore
-from gs2d.pipeline.job import reload_job
-from gs2d.pipeline.options import GeoreferenceOptions
+from gs2d.pipeline.prepare.job import reload_job
+from gs2d.pipeline.prepare.options import GeoreferenceOptions
 
 SOURCES = ("gps", "positions", "control", "known_distance", "markers")
 _FEWEST = 3  # places of photographs

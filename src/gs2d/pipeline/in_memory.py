@@ -25,15 +25,15 @@ from gs2d.errors import DataError, ProtocolError
 from gs2d.evaluation.images import ImageMetrics, mean_metrics
 from gs2d.evaluation.lpips import Lpips
 from gs2d.pipeline.events import ignore
-from gs2d.pipeline.exposure import named
-from gs2d.pipeline.job import resolve
-from gs2d.pipeline.mesh import fused
-from gs2d.pipeline.opened import open_capture
-from gs2d.pipeline.options import MeshOptions, Robust, TrainOptions
-from gs2d.pipeline.predicted_exposure import metered, with_predicted
-from gs2d.pipeline.progress_bar import progress_bar
-from gs2d.pipeline.scoring import score_views
-from gs2d.pipeline.subject import subject_in, wants_subject
+from gs2d.pipeline.finish.run_mesh import fused
+from gs2d.pipeline.finish.run_subject import subject_in, wants_subject
+from gs2d.pipeline.finish.scoring import score_views
+from gs2d.pipeline.prepare.job import resolve
+from gs2d.pipeline.prepare.opened import open_capture
+from gs2d.pipeline.prepare.options import MeshOptions, Robust, TrainOptions
+from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
+from gs2d.pipeline.prepare.run_exposures import named
+from gs2d.pipeline.train.progress_bar import progress_bar
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 from gs2d.training.per_image import scene_now
@@ -89,7 +89,7 @@ def train(
 ) -> Trained:
     """Train splats in memory, as ``gs2d train`` does, without writing a run folder.
 
-    ``gs2d.pipeline.train.train`` writes one, with checkpoints, metrics, a mesh and a report;
+    ``gs2d.pipeline.train.train_run.train`` writes one, with checkpoints, metrics, a mesh and a report;
     :class:`gs2d.Trainer` is the loop alone, one iteration at a time.
 
     Parameters

@@ -22,12 +22,12 @@ from gs2d.io.run_dir import MESH, open_run
 from gs2d.meshing.raycast import Hits, cast_down
 from gs2d.meshing.texture import Texels, surface_colors
 from gs2d.pipeline.events import OnEvent, Phase, ignore
-from gs2d.pipeline.exposure import Transforms, read_exposures
-from gs2d.pipeline.finished import open_job
-from gs2d.pipeline.job import Job
-from gs2d.pipeline.options import OrthophotoOptions
-from gs2d.pipeline.placed import place_of
-from gs2d.pipeline.texture import photographs
+from gs2d.pipeline.finish.placed import place_of
+from gs2d.pipeline.finish.run_texture import photographs
+from gs2d.pipeline.prepare.finished import open_job
+from gs2d.pipeline.prepare.job import Job
+from gs2d.pipeline.prepare.options import OrthophotoOptions
+from gs2d.pipeline.prepare.run_exposures import Transforms, read_exposures
 
 ELEVATION = "_elevation"  # after the name of the orthophoto
 MAX_CELLS = 36_000_000  # a colour's choice takes about 70 bytes a cell: 2.5 GB

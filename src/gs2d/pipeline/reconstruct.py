@@ -18,8 +18,10 @@ from gs2d.io.run_dir import LOCK, MESH, TEXTURED, RunFolder, check_claim, is_run
 from gs2d.meshing.texture import required
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import PLACED, TEXTURED_TOO, TRAINED, Notice, OnEvent, Plan, ignore
-from gs2d.pipeline.job import check_train_options, recipe_of
-from gs2d.pipeline.options import (
+from gs2d.pipeline.finish.run_texture import PACKAGES as TEXTURE_PACKAGES
+from gs2d.pipeline.finish.run_texture import texture_run
+from gs2d.pipeline.prepare.job import check_train_options, recipe_of
+from gs2d.pipeline.prepare.options import (
     Finding,
     HowItRuns,
     PosesOptions,
@@ -29,11 +31,9 @@ from gs2d.pipeline.options import (
     TrainOptions,
     values,
 )
-from gs2d.pipeline.quality import at_quality, quality_of
-from gs2d.pipeline.sfm import asked_for, check_poses_options, find_poses, placed_line
-from gs2d.pipeline.texture import PACKAGES as TEXTURE_PACKAGES
-from gs2d.pipeline.texture import texture_run
-from gs2d.pipeline.train import check_viewer, train
+from gs2d.pipeline.prepare.pose_finding import asked_for, check_poses_options, find_poses, placed_line
+from gs2d.pipeline.prepare.quality import at_quality, quality_of
+from gs2d.pipeline.train.train_run import check_viewer, train
 from gs2d.sfm.colmap import check_installed
 from gs2d.sfm.images import find_photos
 from gs2d.sfm.video_frames import is_video, look_into

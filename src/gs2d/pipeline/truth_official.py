@@ -19,7 +19,7 @@ from gs2d.errors import DataError
 from gs2d.evaluation.dtu import Silhouette, evaluate_dtu, read_dtu_truth
 from gs2d.evaluation.surface import write_clouds
 from gs2d.evaluation.tanks_and_temples import Alignment, evaluate_tnt, read_tnt_truth, read_trajectory
-from gs2d.pipeline.job import Job
+from gs2d.pipeline.prepare.job import Job
 
 
 def score_dtu(mesh: Mesh, scene: SceneFacts, files: Mapping[str, Path], job: Job, folder: Path) -> dict[str, Any]:

@@ -32,7 +32,7 @@ from gs2d.io.levels import halved
 from gs2d.io.meshes import glb_bytes, read_points
 from gs2d.io.ply_format import read_ply, write_ply
 from gs2d.io.splat_ply import read_gaussians, write_splats
-from gs2d.pipeline.info import describe_file
+from gs2d.pipeline.look.info import describe_file
 from splat_scenes import a_scene
 
 C0 = 0.28209479177387814

@@ -20,7 +20,7 @@ from gs2d.io.formats.registry import is_splat_file, read_splat_file
 from gs2d.io.formats.sog import read_sog, write_sog
 from gs2d.io.formats.sog_palette import codebook, nearest_code, palette
 from gs2d.io.gaussians import FLAT_LOG_SCALE, Gaussians, sigmoid
-from gs2d.pipeline.info import describe_file
+from gs2d.pipeline.look.info import describe_file
 from splat_scenes import a_scene, turned_by
 
 

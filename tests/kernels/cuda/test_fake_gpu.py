@@ -81,12 +81,12 @@ assert {"adam_step", "splat_errors", "blend_vjp_learning", "running_counts"} <= 
 WHOLE_PATH = """
 from functools import partial
 from gs2d.evaluation.surface import evaluate_surface
-from gs2d.pipeline import truth
-from gs2d.pipeline.evaluate import evaluate_run
-from gs2d.pipeline.mesh import mesh_run
-from gs2d.pipeline.render import render_run
-from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.train import train
+from gs2d.pipeline.finish import truth
+from gs2d.pipeline.finish.evaluate import evaluate_run
+from gs2d.pipeline.finish.run_mesh import mesh_run
+from gs2d.pipeline.finish.run_images import render_run
+from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.train.train_run import train
 import tiny
 
 launched = fake_gpu.install(guard, emulator)

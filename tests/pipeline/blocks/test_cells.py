@@ -8,7 +8,7 @@ import torch
 
 from gs2d.errors import RunError
 from gs2d.pipeline.blocks.cells import Cells, cut, spread_of, weighted_quantile
-from gs2d.pipeline.part import inside
+from gs2d.pipeline.prepare.part import inside
 
 RNG = np.random.default_rng(0)
 PLACES = RNG.normal(size=(4000, 3)) * [10.0, 5.0, 1.0] + [100.0, -7.0, 3.0]

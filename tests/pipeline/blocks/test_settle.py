@@ -13,9 +13,9 @@ from gs2d.config.protocols import GENERIC
 from gs2d.errors import DataError
 from gs2d.pipeline.blocks import settle as module
 from gs2d.pipeline.blocks.settle import Settled, capture_digest, fitting_partition, seam_recipe
-from gs2d.pipeline.estimate import Estimate, Range
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.prepare.estimate import Estimate, Range
+from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.render.backends import get_backend
 from train_toys import backends, make_scene
 

@@ -21,19 +21,19 @@ from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.blocks.settle import Settled, block_folder, coarse_folder, partition_folder, seam_folder
 from gs2d.pipeline.blocks.split import SEAMS, merge, read_split, split_seams, start_file
 from gs2d.pipeline.events import OnEvent
-from gs2d.pipeline.exposure import read_exposures, write_exposures
-from gs2d.pipeline.finished import finished_splats
-from gs2d.pipeline.job import Job
-from gs2d.pipeline.memory import release
-from gs2d.pipeline.mesh import MeshFrames
-from gs2d.pipeline.options import MeshOptions, TrainOptions
-from gs2d.pipeline.part import OWN, read_start
-from gs2d.pipeline.photographs import with_prepared
-from gs2d.pipeline.predicted_exposure import metered, with_predicted
-from gs2d.pipeline.render import choose_views, draw_stage
-from gs2d.pipeline.scoring import PeakMemory, score_views, split_metrics
-from gs2d.pipeline.train import finish
-from gs2d.pipeline.verdict.measures import Collector
+from gs2d.pipeline.finish.run_images import choose_views, draw_stage
+from gs2d.pipeline.finish.run_mesh import MeshFrames
+from gs2d.pipeline.finish.scoring import PeakMemory, score_views, split_metrics
+from gs2d.pipeline.finish.verdict.measures import Collector
+from gs2d.pipeline.prepare.finished import finished_splats
+from gs2d.pipeline.prepare.job import Job
+from gs2d.pipeline.prepare.memory_budget import release
+from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
+from gs2d.pipeline.prepare.part import OWN, read_start
+from gs2d.pipeline.prepare.photographs import with_prepared
+from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
+from gs2d.pipeline.prepare.run_exposures import read_exposures, write_exposures
+from gs2d.pipeline.train.train_run import finish
 from gs2d.training.trainer import raster_settings
 
 MERGED, SEAM_VIEWS = "merged.ply", "seams.json"  # in the job folder: all blocks, and the photographs of their seams

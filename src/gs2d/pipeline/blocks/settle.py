@@ -26,11 +26,11 @@ from gs2d.data.archive import is_archive
 from gs2d.errors import DataError, RecipeError
 from gs2d.pipeline.blocks.cells import spread_of
 from gs2d.pipeline.blocks.split import Block
-from gs2d.pipeline.estimate import Estimate, estimate, expected_splats, limit_of
 from gs2d.pipeline.events import Notice, OnEvent
-from gs2d.pipeline.job import check_train_options, resolve
-from gs2d.pipeline.opened import open_capture
-from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.prepare.estimate import Estimate, estimate, expected_splats, limit_of
+from gs2d.pipeline.prepare.job import check_train_options, resolve
+from gs2d.pipeline.prepare.opened import open_capture
+from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.render.backends import Backend
 
 FORMAT = 1

@@ -18,8 +18,8 @@ from gs2d.data import Scene, View
 from gs2d.errors import DataError, RunError
 from gs2d.pipeline.blocks.cells import Cells, cut, spread_of
 from gs2d.pipeline.events import Notice, OnEvent, counted
-from gs2d.pipeline.exposure import Transforms
-from gs2d.pipeline.part import FROZEN, OWN, write_start
+from gs2d.pipeline.prepare.part import FROZEN, OWN, write_start
+from gs2d.pipeline.prepare.run_exposures import Transforms
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 from gs2d.training.seen_area import shown_weights, shrunk

@@ -1,0 +1,1 @@
+"""Results of trained splats: images, scores, mesh, texture, exports and report."""

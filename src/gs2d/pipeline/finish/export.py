@@ -1,0 +1,56 @@
+"""The splats of a run in another layout."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from gs2d.errors import RunError
+from gs2d.io.formats.registry import ENDINGS, LAYOUTS, layout_of, read_splats, write_layout, written_bytes
+from gs2d.io.run_dir import MESH, open_run
+from gs2d.pipeline.finish.placed import place_of, placed_splats, say_where
+from gs2d.pipeline.finish.run_subject import within
+from gs2d.pipeline.prepare.finished import checked_output, finished_splats
+from gs2d.pipeline.prepare.options import Box
+
+
+def export_run(
+    path: Path, out: Path, layout: str | None = None, *, bbox: Box | None = None, georeferenced: bool = False
+) -> dict[str, Any]:
+    """Write the splats of a run, or of a file of flat splats, in another layout.
+
+    Parameters
+    ----------
+    layout : str or None
+        A name of ``io.formats.registry.LAYOUTS``; None: by the ending of ``out``.
+    bbox : six floats, optional
+        Only the splats with their centres in this box, x0 y0 z0 x1 y1 z1, world units of the run.
+    georeferenced : bool
+        In metres of the world, less an offset that is said in the file and beside it.
+    """
+    layout = layout or layout_of(Path(out))
+    if layout is None:
+        raise RunError(
+            f"splats are written as {', '.join(ENDINGS).replace('/', '')} files, got --out {out}; choose such a name "
+            "(meshes are written by `gs2d mesh RUN`: .ply, with --texture .glb or .obj)"
+        )
+    if layout not in LAYOUTS:
+        raise RunError(LAYOUTS.unknown(layout))
+    path, out = Path(path), checked_output(path, out, LAYOUTS.get(layout).ending, f"layout {layout} is")
+    if out.resolve() == (path / MESH).resolve():
+        raise RunError(f"--out {out} is the mesh of the run, which stays as it is; choose another name")
+    if path.is_file() and out.resolve() == path.resolve():
+        raise RunError(f"--out {out} is the file that is read; choose another name")
+    notes: list[str] = []
+    if path.is_file():
+        splats = read_splats(path, notes.append)
+    else:
+        run = open_run(path)
+        run.sweep()
+        splats = finished_splats(run)
+    splats = splats if bbox is None else within(splats, bbox)
+    place = place_of(path, asked=georeferenced)
+    notes += write_layout(out, splats if place is None else placed_splats(splats, place), layout)
+    told = {} if place is None else say_where(out, place)
+    size = written_bytes(out, layout)
+    return {"file": str(out), "splats": len(splats), "bytes": size, "layout": layout, "notes": notes, **told}

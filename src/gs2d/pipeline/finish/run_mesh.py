@@ -1,0 +1,416 @@
+"""The mesh of a run: depth maps of the training views, fused."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import torch
+
+from gs2d.core.files import disk_error, is_full
+from gs2d.core.georeference import Georeference
+from gs2d.core.memory_limit import memory_budget
+from gs2d.core.splats import Splats
+from gs2d.data import View
+from gs2d.data.reach import Reach
+from gs2d.data.subject import LARGEST, Subject, checked_box
+from gs2d.errors import ProtocolError, RunError
+from gs2d.evaluation.images import ImageMetrics
+from gs2d.io.meshes import read_mesh, write_mesh
+from gs2d.io.run_dir import (
+    MESH,
+    PAGE,
+    SURFACE,
+    TEXTURED,
+    RunFolder,
+)
+from gs2d.meshing.depth_maps import RenderedView, Spool, depth_map
+from gs2d.meshing.extract import Extraction, extract, extract_unbounded
+from gs2d.meshing.slabs import SLAB_BYTES
+from gs2d.meshing.tsdf import VolumeTooLargeError
+from gs2d.pipeline.attempts import again, attempted
+from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
+from gs2d.pipeline.finish.believed import sky_direction, sky_of, surface_reach, within_reach
+from gs2d.pipeline.finish.placed import placed_mesh, placed_output, say_where
+from gs2d.pipeline.finish.run_report import report_again
+from gs2d.pipeline.finish.run_subject import OPAQUE, meshed_subject
+from gs2d.pipeline.finish.scoring import SeenView
+from gs2d.pipeline.look.page import page_run
+from gs2d.pipeline.prepare.finished import checked_output, open_job
+from gs2d.pipeline.prepare.job import Job, RenderedScene
+from gs2d.pipeline.prepare.memory_budget import release, release_buffers
+from gs2d.pipeline.prepare.options import MeshOptions
+from gs2d.render.api import rasterize
+from gs2d.render.types import RenderOutput
+
+ONE_SURFACE = 0.02  # of the depth: where mean and median differ by more, a pixel sees several surfaces
+SEVERAL = 0.25  # weight of such a pixel
+KEPT = (  # of what is said of a mesh, in metrics.json
+    *("vertices", "faces", "voxel", "truncation", "depth_limit", "depth", "unbounded"),
+    *("pixels", "faces_per_pixel", "area_unsupported", "area_apart"),
+)
+VOLUME_BYTES = 4 << 30  # of the fused volume, where it is not known how much memory there is
+LEAST_SLAB_BYTES = 32 << 20  # less, and preparing views again for each slab takes most of the time
+MOSTLY_CUT = 0.5  # part of the depth left out from which the user is told
+COARSER = 3  # times that larger voxels are tried: the size that fits is a guess
+
+
+class MeshFrames:
+    """Depth maps of the training views, kept in a temporary file while others look at the same renderings.
+
+    Its :meth:`visit` is for :func:`~gs2d.pipeline.finish.scoring.score_views`.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self._job, self._reach, self._up = job, surface_reach(job), sky_direction(job)
+        self.spool = Spool()
+
+    def visit(self, seen: SeenView, scores: ImageMetrics) -> None:
+        """Keep what is fused of a training view; without any one of them, the mesh renders all again.
+
+        Raises
+        ------
+        DiskError
+            The disk is full.
+        """
+        if seen.split != "train":
+            return
+        try:
+            frame = fusion_frame(
+                self._job, seen.view, seen.output, self._job.protocol.fused_depth, self._reach, self._up
+            )
+            self.spool.append(depth_map(frame))
+        except Exception as error:  # must not cost the scores; the mesh meets and reports it
+            if is_full(error):
+                raise
+
+    @property
+    def complete(self) -> bool:
+        """Whether every training view was seen."""
+        return len(self.spool) == len(self._job.scene.train)
+
+    def __enter__(self) -> MeshFrames:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.spool.close()
+
+
+def extract_mesh(
+    job: Job,
+    splats: Splats,
+    options: MeshOptions,
+    out: Path,
+    on_event: OnEvent,
+    *,
+    subject: Subject | None = None,
+    seen: MeshFrames | None = None,
+    place: Georeference | None = None,
+) -> dict[str, Any]:
+    """Render depth of all training views, fuse it, write the mesh: of the subject, or of everything.
+
+    Parameters
+    ----------
+    seen : MeshFrames, optional
+        Depth maps of these splats, by the protocol's kind of depth; where they are complete, nothing is rendered.
+    place : Georeference, optional
+        Where the run is in the world: the file is in local metres then.
+
+    Returns
+    -------
+    dict
+        File, counts and the limits that were used.
+    """
+    if not out.parent.is_dir():
+        raise disk_error(out, FileNotFoundError(2, "No such file or directory"))
+    result = fused(job, splats, options, on_event, subject=subject, seen=seen)
+    release_buffers()
+    write_mesh(out, result.mesh if place is None else placed_mesh(result.mesh, place))
+    told = {} if place is None else say_where(out, place)
+    limits = asdict(result.limits)
+    return {
+        "file": str(out),
+        "vertices": len(result.mesh.vertices),
+        "faces": len(result.mesh.faces),
+        "depth": options.depth or job.protocol.fused_depth,
+        "unbounded": options.unbounded,
+        "levels": result.levels,
+        "fused_by": result.backend,
+        **limits,
+        "blocks": result.blocks,
+        "volume_bytes": result.volume_bytes,
+        "components": result.components,
+        "faces_removed": result.faces_removed,
+        **_cleaned_facts(result),
+        **told,
+    }
+
+
+def fused(
+    job: RenderedScene,
+    splats: Splats,
+    options: MeshOptions,
+    on_event: OnEvent,
+    *,
+    subject: Subject | None = None,
+    seen: MeshFrames | None = None,
+) -> Extraction:
+    """Render depth of all training views and fuse it; arguments as of :func:`extract_mesh`, which writes the mesh."""
+    if not len(splats):
+        raise ProtocolError("a scene with splats was expected, got none; train longer or check the cameras")
+    check_mesh_options(options)
+    depth = options.depth or job.protocol.fused_depth
+    usable = seen is not None and seen.complete and depth == job.protocol.fused_depth and not options.whole_scene
+
+    def frames() -> Iterable[RenderedView] | Spool:
+        return (
+            seen.spool
+            if seen is not None and usable
+            else _frames(job, splats, depth, on_event, whole=options.whole_scene)
+        )
+
+    result = _extract_that_fits(job, frames, options, on_event, subject)
+    if seen is not None:
+        seen.spool.close()  # its room on the disk
+    if subject is None and result.limits.cut_fraction > MOSTLY_CUT:
+        on_event(Notice(_cut_text(result, options)))
+    return result
+
+
+def _cleaned_facts(result: Extraction) -> dict[str, Any]:
+    """Return what was left of the surface, where it was made to hold what the views saw."""
+    if result.cleaned is None:
+        return {}
+    found = result.cleaned
+    return {
+        "pixels": round(found.pixels),
+        "faces_per_pixel": len(result.mesh.faces) / max(found.pixels, 1.0),
+        "area_unsupported": found.unsupported,
+        "area_apart": found.small,
+    }
+
+
+def _cut_text(result: Extraction, options: MeshOptions) -> str:
+    """Return what was left out, and the option that brings it back."""
+    part = f"{result.limits.cut_fraction:.0%} of the depth lies"
+    if options.unbounded:
+        limit = result.limits.depth_limit
+        return (
+            f"{part} beyond {limit:.4g} world units, where these cameras no longer tell depth; --depth-limit widens it"
+        )
+    return (
+        f"{part} outside the fused box: the scene has a background that is not in the mesh; --unbounded takes all of "
+        "it, --bbox or --depth-limit widen the box"
+    )
+
+
+def check_mesh_options(options: MeshOptions) -> None:
+    """Raise for limits that are none, before anything is rendered."""
+    for name in ("voxel", "truncation", "depth_limit", "max_gib"):
+        value = getattr(options, name)
+        if value is not None and not (value > 0 and math.isfinite(value)):
+            unit = "GiB" if name == "max_gib" else "world units"
+            raise ProtocolError(f"--{name.replace('_', '-')} must be a positive number of {unit}, got {value}")
+        if value is not None and name != "max_gib" and not 1 / LARGEST <= value <= LARGEST:
+            bounds = f"between {1 / LARGEST:g} and {LARGEST:g} world units"
+            raise ProtocolError(f"--{name.replace('_', '-')} must be {bounds}, got {value:g}")
+    if options.bbox is not None:
+        checked_box(options.bbox, "--bbox")
+    if options.keep_components is not None and options.keep_components < 0:
+        raise ProtocolError(f"--keep-components must be a whole number >= 0 (0 = all), got {options.keep_components}")
+
+
+def _extract_that_fits(
+    job: RenderedScene,
+    frames: Callable[[], Iterable[RenderedView] | Spool],
+    options: MeshOptions,
+    on_event: OnEvent,
+    subject: Subject | None,
+) -> Extraction:
+    """Extract a mesh; where nobody says how large its voxels are, they are as large as memory needs."""
+    free = options.voxel is None and options.max_gib is None and job.protocol.fusion.voxel is None
+    for _ in range(COARSER * free):
+        try:
+            return _extract(job, frames(), options, on_event, subject)
+        except VolumeTooLargeError as error:
+            on_event(Notice(f"{error}; the mesh has such voxels (--max-gib or --memory allow more)"))
+            options = replace(options, voxel=error.voxel)
+    return _extract(job, frames(), options, on_event, subject)
+
+
+def _extract(
+    job: RenderedScene,
+    frames: Iterable[RenderedView] | Spool,
+    options: MeshOptions,
+    on_event: OnEvent,
+    subject: Subject | None,
+) -> Extraction:
+    fusion = job.protocol.fusion
+    keep = fusion.clusters if options.keep_components is None else options.keep_components
+    # A box or a voxel of the user's own makes the protocol's other limits meaningless.
+    bbox = None if options.bbox is None else np.asarray(options.bbox, np.float64).reshape(2, 3)
+    bbox = bbox if subject is None else subject.box
+    own = bbox is not None or options.unbounded
+    fuse_frames = extract_unbounded if options.unbounded else partial(extract, by_evidence=fusion.subject)
+    if isinstance(frames, Spool):
+        on_event(Phase("fusing", 0))
+    result = fuse_frames(
+        frames,
+        bbox=bbox,
+        voxel=options.voxel if own else options.voxel or fusion.voxel,
+        truncation=options.truncation or (None if own or options.voxel else fusion.truncation),
+        depth_limit=options.depth_limit if own else options.depth_limit or fusion.depth_limit,
+        min_weight=SEVERAL if fusion.subject else 1.0,  # of one pixel
+        keep=keep or None,
+        max_bytes=_volume_bytes(options),
+        slab_bytes=_slab_bytes(),
+        threads=torch.get_num_threads(),
+        backend=job.backend,
+    )
+    if not len(result.mesh.faces):
+        on_event(Notice("the mesh is empty: no surface was covered well enough"))
+    return result
+
+
+def _volume_bytes(options: MeshOptions) -> int:
+    """Return how large the volume may be.
+
+    It is fused a slab at a time, but the surface is in memory: while it is joined and cleaned it takes about half of
+    what the whole volume would.
+    """
+    if options.max_gib is not None:
+        return int(options.max_gib * 2**30)
+    budget = memory_budget()
+    return VOLUME_BYTES if budget is None else budget
+
+
+def _slab_bytes() -> int:
+    """Return how much of it may be in memory at a time."""
+    budget = memory_budget()
+    return SLAB_BYTES if budget is None else min(SLAB_BYTES, max(LEAST_SLAB_BYTES, budget // 32))
+
+
+def _frames(
+    job: RenderedScene, splats: Splats, depth: str, on_event: OnEvent, *, whole: bool
+) -> Iterator[RenderedView]:
+    """Yield what is fused of each training view; of the ``whole`` scene the sky may be a ceiling, and stays."""
+    views, settings = job.scene.train, replace(job.settings, with_distortion=False).for_depths(depth)
+    reach, up = surface_reach(job), None if whole else sky_direction(job)
+    for view in counted(views, "rendering depth", len(views), on_event):
+        with torch.no_grad():
+            output = rasterize(splats, view.camera, settings, backend=job.backend)
+        yield fusion_frame(job, view, output, depth, reach, up)
+    release(job.scene)  # photographs were looked at for where they are known
+    on_event(Phase("fusing", 0))
+
+
+def fusion_frame(
+    job: RenderedScene,
+    view: View,
+    output: RenderOutput,
+    depth: str,
+    reach: Reach | None = None,
+    up: np.ndarray | None = None,
+) -> RenderedView:
+    """Return what fusion takes of a view: depth of a kind and colour, where it is covered well enough.
+
+    Depth beyond ``reach``, and of the sky where its direction ``up`` is known, is infinite: the view sees past all
+    surfaces there.
+    """
+    sky = np.zeros(output.alpha.shape, bool) if up is None else sky_of(job, view, up)
+    valid = (output.alpha >= OPAQUE).cpu().numpy() | sky
+    mask = view.object_mask() if job.protocol.use_mask_in_fusion else None
+    # Beyond the photograph, and where it is ignored, nothing has said how far the surface is.
+    for pixels in (mask, view.usable(masks=job.protocol.use_mask_in_fusion)):
+        if pixels is not None:
+            valid = valid & pixels
+    depths = output.depth(depth).cpu().numpy()
+    if job.protocol.fusion.subject:
+        valid = valid * np.maximum(confidence(output), sky)
+    past = sky if reach is None else sky | ~within_reach(reach, view.camera, depths)
+    depths = np.where(past, np.float32(np.inf), depths)
+    color = surface_color(output, job).cpu().numpy()
+    return RenderedView(view.camera, depths, color, valid)
+
+
+def confidence(output: RenderOutput) -> np.ndarray:
+    """Return how much the depths [H, W] count: less where the light of a pixel ends at several depths.
+
+    Such pixels lie at the outline of a thing, in fog, or on a surface without texture, whose splats lie loosely.
+    """
+    mean, median = output.depth_mean, output.depth_median
+    return np.where(((mean - median).abs() <= ONE_SURFACE * median).cpu().numpy(), 1.0, SEVERAL)
+
+
+def surface_color(output: RenderOutput, job: RenderedScene) -> torch.Tensor:
+    """Colour without the background that shows through, [H, W, 3] in [0, 1]."""
+    alpha = output.alpha[..., None]
+    background = output.color.new_tensor(job.settings.background)
+    return ((output.color - (1 - alpha) * background) / alpha.clamp(min=1e-3)).clamp(0, 1)
+
+
+def mesh_run(
+    path: Path,
+    options: MeshOptions = MeshOptions(),  # noqa: B008 (frozen)
+    on_event: OnEvent = ignore,
+    *,
+    out: Path | None = None,
+    splats_file: Path | None = None,
+    threads: int | None = None,
+    georeferenced: bool = False,
+) -> dict[str, Any]:
+    """Extract the mesh of a finished run; returns its file, counts and limits.
+
+    Parameters
+    ----------
+    splats_file : Path or None
+        Mesh the splats of this file instead of the run's, into ``out``.
+    georeferenced : bool
+        Write ``out`` in metres of the world; without options it is the run's mesh.ply, which is not made again.
+    """
+    path, out = Path(path), None if out is None else checked_output(path, out)
+    place = placed_output(path, out, MESH) if georeferenced else None
+    if place is not None and out is not None and _is_own(options, splats_file) and (path / MESH).exists():
+        mesh = read_mesh(path / MESH)
+        write_mesh(out, placed_mesh(mesh, place))
+        return {"file": str(out), "vertices": len(mesh.vertices), "faces": len(mesh.faces), **say_where(out, place)}
+    run, job, splats = open_job(path, threads, on_event, splats_file=splats_file, out=out)
+    if splats_file is not None and out is not None and out.resolve() == run.file(MESH).resolve():
+        raise RunError(f"--out {out} is the mesh of the run, which is that of its own splats; choose another name")
+    if out is not None and out.resolve() != run.file(MESH).resolve():
+        subject = meshed_subject(run, job, splats, options, on_event)
+        return extract_mesh(job, splats, options, out, on_event, subject=subject, place=place)
+    with run.locked():
+        subject = meshed_subject(run, job, splats, options, on_event)
+        result = extract_mesh(job, splats, options, run.file(MESH), on_event, subject=subject)
+        if run.metrics().get("surface"):  # was of the mesh before
+            run.write_metrics({**run.metrics(), "surface": None})
+            shutil.rmtree(run.file(SURFACE), ignore_errors=True)
+        keep_facts(run, result)
+        if run.file(TEXTURED).exists():
+            run.file(TEXTURED).unlink()
+            on_event(Notice(f"{TEXTURED} was of the mesh before: removed"))
+    if options.subject_box is not None and run.file(PAGE).exists():  # it opens at the subject
+        with attempted(PAGE, again("page", run.path), on_event):
+            page_run(run.path, on_event=on_event, job=job)
+    report_again(run, on_event)
+    return result
+
+
+def _is_own(options: MeshOptions, splats_file: Path | None) -> bool:
+    """Whether nothing but the mesh that the run has is asked for."""
+    return options == MeshOptions() and splats_file is None
+
+
+def keep_facts(run: RunFolder, result: Mapping[str, Any]) -> None:
+    """Write what is said of a run's mesh into ``metrics.json``, beside the scores."""
+    run.write_metrics({**run.metrics(), "mesh": {name: result[name] for name in KEPT if name in result}})

@@ -1,0 +1,39 @@
+"""The report of a run, written again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gs2d.core.camera import Camera
+from gs2d.io.run_dir import (
+    REPORT,
+    RunFolder,
+    open_run,
+)
+from gs2d.pipeline.attempts import again, attempted, reason_of
+from gs2d.pipeline.events import MissingFile, OnEvent, ignore
+from gs2d.pipeline.finish.run_images import shown_cameras
+
+
+def report_run(path: Path, on_event: OnEvent = ignore) -> Path:
+    """Write the report of a run; a section that fails says so, and a ``MissingFile`` event is sent."""
+    from gs2d.report.write import write_report
+
+    run = open_run(Path(path))
+    run.sweep()
+    command = again("report", run.path)
+
+    def failed(section: str, error: Exception) -> None:
+        on_event(MissingFile(f"{section} in {REPORT}", reason_of(error), command, error))
+
+    cameras: list[Camera] = []
+    with attempted(f"cameras of the pictures in {REPORT}", command, on_event):
+        cameras = shown_cameras(run)
+    write_report(run.path, cameras=cameras, on_failure=failed)
+    return run.file(REPORT)
+
+
+def report_again(run: RunFolder, on_event: OnEvent) -> None:
+    """Write the report of a run that has changed."""
+    with attempted(REPORT, again("report", run.path), on_event):
+        report_run(run.path, on_event)

@@ -1,0 +1,197 @@
+"""The textured mesh of a run: its surface, with colours from the photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gs2d.core.files import check_writable
+from gs2d.core.images import to_uint8
+from gs2d.core.memory import trim
+from gs2d.core.mesh import Mesh
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import up_direction
+from gs2d.data import View
+from gs2d.errors import ProtocolError, RunError
+from gs2d.io.meshes import read_mesh, write_textured, written_files
+from gs2d.io.run_dir import MESH, TEXTURED, RunFolder
+from gs2d.meshing.texture import (
+    MAX_SIZE,
+    MIN_SIZE,
+    Baked,
+    ColorSource,
+    bake,
+    required,
+    simplified,
+    texture_size,
+    unwrap,
+)
+from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
+from gs2d.pipeline.finish.placed import placed_output, placed_textured, say_where
+from gs2d.pipeline.finish.run_mesh import fused, mesh_run
+from gs2d.pipeline.finish.run_report import report_again
+from gs2d.pipeline.finish.run_subject import OPAQUE, meshed_subject
+from gs2d.pipeline.prepare.finished import open_job
+from gs2d.pipeline.prepare.job import Job
+from gs2d.pipeline.prepare.opened import read_scene
+from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions
+from gs2d.pipeline.prepare.run_exposures import NONE, Transforms, as_scene, read_exposures
+from gs2d.render.api import rasterize
+
+PACKAGES = ("xatlas",)  # of the extra `texture`
+PASSES = ("colouring the texture", "comparing the colours")
+
+
+def texture_run(
+    path: Path,
+    options: TextureOptions = TextureOptions(),  # noqa: B008 (frozen)
+    mesh_options: MeshOptions = MeshOptions(),  # noqa: B008 (frozen)
+    on_event: OnEvent = ignore,
+    *,
+    out: Path | None = None,
+    threads: int | None = None,
+    georeferenced: bool = False,
+) -> dict[str, Any]:
+    """Write the mesh of a finished run with a texture; returns its files and counts.
+
+    The mesh is ``mesh.ply`` of the run as it is, unless some mesh option is given or it is not there: then it is
+    extracted anew, and takes the place of ``mesh.ply`` if ``out`` is None.
+    """
+    check_texture_options(options)
+    for package in PACKAGES:
+        required(package)  # before minutes are spent
+    path = Path(path)
+    place = placed_output(path, out, TEXTURED) if georeferenced else None
+    target = path / TEXTURED if out is None else Path(out)
+    files = written_files(target)
+    if not target.parent.is_dir() and out is not None:
+        raise RunError(f"--out {out} must be in a folder that exists; make {target.parent} first")
+    if out is not None:
+        for file in files:
+            check_writable(file)
+    if out is None and (mesh_options != MeshOptions() or not (path / MESH).exists()):
+        mesh_run(path, mesh_options, on_event, threads=threads)
+        mesh_options = MeshOptions()
+    run, job, splats = open_job(path, threads, on_event)
+    for view in job.scene.views:
+        if view.path is not None and view.path.resolve() in {file.resolve() for file in files}:
+            raise RunError(f"--out {target} would write over the photograph {view.name}; choose another name")
+    mesh = _mesh(run, job, splats, mesh_options, on_event)
+    baked = textured_mesh(job, splats, mesh, options, on_event, exposures=read_exposures(run, job.recipe))
+    up = up_direction([view.camera for view in job.scene.train])
+    if place is None:
+        write_textured(target, baked.mesh, up=up)
+    else:
+        write_textured(target, placed_textured(baked.mesh, place), up=np.array([0.0, 0.0, 1.0]))
+    if target.resolve() == run.file(TEXTURED).resolve():
+        report_again(run, on_event)
+    told = {} if place is None else say_where(target, place)
+    return {
+        "files": [str(file) for file in files],
+        "faces": len(baked.mesh.faces),
+        "faces_before": len(mesh.faces),
+        "vertices": len(baked.mesh.vertices),
+        "texture_size": len(baked.mesh.texture),
+        "charts": baked.charts,
+        "texels": baked.texels,
+        "texels_unseen": baked.unseen,
+        "texture_from": options.texture_from,
+        "bytes": sum(file.stat().st_size for file in files),
+        **told,
+    }
+
+
+def textured_mesh(
+    job: Job,
+    splats: Splats,
+    mesh: Mesh,
+    options: TextureOptions,
+    on_event: OnEvent = ignore,
+    *,
+    exposures: Transforms = NONE,
+) -> Baked:
+    """Simplify a mesh of a run, cut it into charts and colour them.
+
+    Photographs whose exposure is known are taken back to the mean exposure first.
+    """
+    on_event(Phase("cutting the surface into charts", 0))
+    views, small = _views(job, options, on_event), simplified(mesh, options.faces)
+    if len(small.faces) > options.faces:
+        on_event(
+            Notice(f"simplified to {len(small.faces):,} triangles, as near as it comes to --faces {options.faces}")
+        )
+    size = options.texture_size or texture_size(small, [view.camera for view in views])
+    images = partial(_images, job, views, splats, options, exposures, on_event)
+    return bake(unwrap(small, size), images, size, threads=torch.get_num_threads())
+
+
+def check_texture_options(options: TextureOptions) -> None:
+    """Raise for numbers that make no texture."""
+    if options.faces < 4:
+        raise ProtocolError(f"--faces must be a whole number >= 4, got {options.faces}")
+    if options.texture_downscale is not None and options.texture_downscale < 1:
+        raise ProtocolError(f"--texture-downscale must be a whole number >= 1, got {options.texture_downscale}")
+    if options.texture_size is not None and not MIN_SIZE <= options.texture_size <= MAX_SIZE:
+        raise ProtocolError(f"--texture-size must be {MIN_SIZE} to {MAX_SIZE} texels, got {options.texture_size}")
+
+
+def _mesh(run: RunFolder, job: Job, splats: Splats, options: MeshOptions, on_event: OnEvent) -> Mesh:
+    """Return the run's mesh as it is, or one of its own for other options."""
+    if options == MeshOptions() and run.file(MESH).exists():
+        return read_mesh(run.file(MESH))
+    subject = meshed_subject(run, job, splats, options, on_event)
+    mesh = fused(job, splats, options, on_event, subject=subject).mesh
+    trim()
+    return mesh
+
+
+def _views(job: Job, options: TextureOptions, on_event: OnEvent) -> Sequence[View]:
+    """Return the training views, in another size if one is asked for, from where those of the job are."""
+    if options.texture_downscale in (None, job.downscale) or job.scene.root is None:
+        return job.scene.train
+    scene = read_scene(
+        job.scene.root, job.scene.format, options.texture_downscale or 1, job.protocol, on_event, job.scene.masks
+    )
+    zooms = {view.name: view.zoom for view in job.scene.train if view.zoom is not None}
+    return scene.with_poses({view.name: view.camera.T_cam_world for view in job.scene.train}, zooms).train
+
+
+def _images(
+    job: Job,
+    views: Sequence[View],
+    splats: Splats,
+    options: TextureOptions,
+    exposures: Transforms,
+    on_event: OnEvent,
+    factor: int,
+) -> Iterator[ColorSource]:
+    """Yield the views, or renderings of the splats from them, smaller by ``factor``."""
+    if options.texture_from == "photographs":
+        yield from photographs(job, views, exposures, on_event, factor)
+        return
+    for view in counted(views, PASSES[factor > 1], len(views), on_event):
+        camera = view.camera.downscaled(factor)
+        with torch.no_grad():
+            output = rasterize(splats, camera, job.settings, backend=job.backend)
+        shown = (output.alpha >= OPAQUE).cpu().numpy()
+        yield ColorSource(camera, to_uint8(output.color.clamp(0, 1).cpu().numpy()), shown)
+
+
+def photographs(
+    job: Job, views: Sequence[View], exposures: Transforms, on_event: OnEvent, factor: int
+) -> Iterator[ColorSource]:
+    """Yield photographs in the mean exposure of a run, smaller by ``factor``."""
+    for view in counted(views, PASSES[factor > 1], len(views), on_event):
+        yield ColorSource(view.camera, as_scene(view, exposures), usable_pixels(view, job)).shrunk(factor)
+
+
+def usable_pixels(view: View, job: Job) -> np.ndarray | None:
+    """Return the pixels that show the surface: not masked out, and on the object if fusion looked only there."""
+    masks = [view.mask(), view.object_mask() if job.protocol.use_mask_in_fusion else None]
+    given = [mask for mask in masks if mask is not None]
+    return np.logical_and.reduce(given) if given else None

@@ -1,0 +1,188 @@
+"""``gs2d page``: the splats of a run, or of a file, as one file for any browser."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gs2d.core.camera import Camera, look_at
+from gs2d.core.georeference import Georeference
+from gs2d.core.missing import where_it_ends
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import focus_point, up_direction
+from gs2d.data import View
+from gs2d.data.subject import Subject, read_subject
+from gs2d.errors import DataError, RunError
+from gs2d.io.formats.registry import read_splats
+from gs2d.io.georeference import georeference_of_file, read_georeference
+from gs2d.io.run_dir import PAGE, RunFolder, is_run, open_run
+from gs2d.pipeline.events import Notice, OnEvent, Phase, ignore
+from gs2d.pipeline.prepare.finished import finished_splats
+from gs2d.pipeline.prepare.job import Job, reload_job
+from gs2d.render.types import RasterSettings
+from gs2d.viewer.web import PageScene, Seen, write_page
+
+MAX_VIEWS = 100  # photographs that one can step through
+SUFFIXES = (".html", ".htm")
+LARGE = 50_000_000  # bytes, from which phones take long, and mail refuses
+
+
+def page_run(
+    path: Path,
+    out: Path | None = None,
+    *,
+    sh_degree: int = 3,
+    on_event: OnEvent = ignore,
+    job: Job | None = None,
+) -> dict[str, Any]:
+    """Write the page of a run or of a file of splats.
+
+    Parameters
+    ----------
+    path : Path
+    out : Path or None
+        None: ``scene.html`` in the run, or beside the file.
+    sh_degree : int
+        0 to 3: how much of the colours' dependence on the direction is stored.
+    on_event : callable
+    job : Job or None
+        What defines the run, where it is at hand; None: it is read.
+
+    Returns
+    -------
+    dict
+        ``file``, ``splats``, ``sh_degree``, ``views``, ``bytes``.
+    """
+    path = Path(path)
+    of_run = path.is_dir() or is_run(path)
+    out = (path / PAGE if of_run else path.with_suffix(".html")) if out is None else Path(out)
+    if out.suffix.lower() not in SUFFIXES:
+        raise RunError(f"--out must name an .html file, which is what is written, got {out}")
+    if not 0 <= sh_degree <= 3:
+        raise RunError(f"--sh-degree must be 0, 1, 2 or 3, got {sh_degree}")
+    content = page_content(path, on_event, job)
+    if content.run is not None:
+        content.run.sweep()
+    on_event(Phase("writing the page", 0))
+    written = write_page(out, content.splats, content.scene, sh_degree=sh_degree)
+    if written["bytes"] > LARGE:
+        on_event(Notice(f"{written['bytes'] / 1e6:.0f} MB are much for a page: --sh-degree 1 or 0 makes it smaller"))
+    return {"file": str(out), "views": len(content.scene.views), **written}
+
+
+@dataclass(frozen=True, eq=False)
+class PageContent:
+    """Splats, and what a page shows around them.
+
+    Attributes
+    ----------
+    splats : Splats
+    scene : PageScene
+    photographs : sequence of View
+        Those of ``scene.views``, in order; empty where the capture is not there.
+    run : RunFolder or None
+        None: the splats are a file's.
+    """
+
+    splats: Splats
+    scene: PageScene
+    photographs: Sequence[View]
+    run: RunFolder | None
+
+
+def page_content(path: Path, on_event: OnEvent = ignore, job: Job | None = None) -> PageContent:
+    """Return what a page shows of a run (defined by ``job``, where it is at hand) or of a file of splats."""
+    run = open_run(path) if path.is_dir() or is_run(path) else None
+    if run is not None:
+        splats = finished_splats(run)
+        definition = run.definition()
+        title = definition.get("title") or definition["scene"]["name"]
+        try:
+            job = job or reload_job(run, on_event)
+        except (RunError, DataError) as error:
+            on_event(Notice(f"without the cameras of the photographs: {error}"))
+    else:
+        if not path.exists():
+            raise DataError(f"expected a run folder or a file of splats at {path}, found nothing{where_it_ends(path)}")
+        splats, title = read_splats(path, lambda text: on_event(Notice(text))), path.stem
+    photographs = [] if job is None else some_views(job.scene.train)
+    scene = page_scene(
+        title,
+        photographs,
+        settings_without_run(splats) if job is None else job.settings,
+        splats.means.cpu().numpy(),
+        subject=_subject(path, on_event) if run is not None and photographs else None,
+        world=_world_of(path, on_event),
+    )
+    return PageContent(splats, scene, photographs, run)
+
+
+def page_scene(
+    title: str,
+    photographs: Sequence[View],
+    settings: RasterSettings,
+    centers: np.ndarray,
+    *,
+    subject: Subject | None = None,
+    world: Georeference | None = None,
+) -> PageScene:
+    """Return what a page shows around splats near ``centers`` [N, 3]; without photographs it is seen from aside."""
+    cameras = [view.camera for view in photographs]
+    focus, unit = _focus(cameras, centers)
+    up = up_direction(cameras) if cameras else np.array([0.0, 0.0, 1.0])
+    seen = [Seen(view.name, view.camera) for view in photographs]
+    if not seen:
+        eye = focus + np.array([2.0, -2.5, 1.5]) * unit
+        seen = [Seen("from aside", look_at(eye, focus, up, width=4, height=3, fx=4.0))]
+    return PageScene(title, seen, settings, focus, unit, up, subject, world)
+
+
+def some_views(views: Sequence[View]) -> list[View]:
+    """Return at most MAX_VIEWS of the views, evenly spaced."""
+    count = min(len(views), MAX_VIEWS)
+    return [views[i] for i in np.linspace(0, len(views) - 1, count).round().astype(int)]
+
+
+def settings_without_run(splats: Splats) -> RasterSettings:
+    """Of splats without a run: over white, near plane at a hundredth of what they spread over."""
+    spread = float((splats.means - splats.means.median(dim=0).values).norm(dim=1).median()) if len(splats) else 1.0
+    near = max(0.01 * spread, 1e-9)
+    return RasterSettings(near=near, far=1e4 * near, background=(1.0, 1.0, 1.0), sh_degree=splats.sh_degree)
+
+
+def _focus(cameras: Sequence[Camera], centers: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return what to look at, and about how far away it is seen from (without cameras: the spread of the splats)."""
+    centers = centers[np.isfinite(centers).all(axis=1)]
+    if len(cameras) > 1:
+        focus = focus_point(list(cameras))
+    else:
+        focus = np.asarray(np.median(centers, axis=0) if len(centers) else np.zeros(3), np.float64)
+    points = np.array([camera.center for camera in cameras]) if cameras else centers
+    unit = float(np.median(np.linalg.norm(points - focus, axis=1))) if len(points) else 1.0
+    return focus, unit if unit > 1e-12 and math.isfinite(unit) else 1.0
+
+
+def _world_of(path: Path, on_event: OnEvent) -> Georeference | None:
+    """Return how the splats of a run or a file lie in the world, to measure in metres; None where that is not known."""
+    try:
+        if is_run(path):
+            return read_georeference(path)
+        told = georeference_of_file(path)
+        return None if told is None else told.of_local_files()
+    except DataError as error:
+        on_event(Notice(f"distances are in units of the capture: {error}"))
+        return None
+
+
+def _subject(folder: Path, on_event: OnEvent) -> Subject | None:
+    """Return what the run says that it is about; None where it says nothing, or its file is damaged, which is told."""
+    try:
+        return read_subject(folder)
+    except DataError as error:
+        on_event(Notice(f"the page opens at what the cameras look at: {error}"))
+        return None

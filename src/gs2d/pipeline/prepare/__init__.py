@@ -1,0 +1,1 @@
+"""Before training: options, captures, priors and memory are checked and become one job; finished runs are opened."""

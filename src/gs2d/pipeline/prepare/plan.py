@@ -1,0 +1,44 @@
+"""``gs2d plan``: what training on a capture takes, and whether it fits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from gs2d.data.archive import is_archive, unpacked_for_a_moment
+from gs2d.errors import DataError
+from gs2d.pipeline.events import OnEvent, ignore
+from gs2d.pipeline.prepare.estimate import Estimate, estimate
+from gs2d.pipeline.prepare.job import check_train_options, read_init, resolve
+from gs2d.pipeline.prepare.memory_budget import use_memory
+from gs2d.pipeline.prepare.opened import open_capture
+from gs2d.pipeline.prepare.options import PlanOptions
+from gs2d.pipeline.prepare.quality import by_quality
+from gs2d.pipeline.prepare.threads import use_threads
+
+
+def plan(options: PlanOptions, on_event: OnEvent = ignore) -> Estimate:
+    """Estimate a training: the capture is read as ``gs2d train`` does, nothing is trained or written.
+
+    Raises
+    ------
+    Gs2dError
+        The capture cannot be read, or training on it does not fit into memory or on the disk.
+    """
+    if is_archive(options.scene):
+        with unpacked_for_a_moment(options.scene) as folder:
+            return plan(replace(options, scene=folder), on_event)
+    check_train_options(options)
+    use_threads(options.threads)
+    use_memory(options.memory)
+    training = by_quality(options, on_event)
+    start = None if options.init is None else len(read_init(options.init, on_event)[0])
+    recipe, opened = resolve(training, open_capture(training, on_event), on_event)
+    found = estimate(
+        opened.scene, recipe, opened.backend, downscale=opened.downscale, prepare=options.prepare, start=start
+    )
+    if options.disk is not None and found.disk > options.disk * 2**30:
+        raise DataError(
+            f"{found.photographs:,} photographs take about {found.disk / 2**30:.2g} GiB of disk, got "
+            f"{options.disk:g} GiB that --disk allows; use a larger --downscale, or allow more"
+        )
+    return found

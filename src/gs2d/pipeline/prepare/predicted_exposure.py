@@ -1,0 +1,151 @@
+"""The exposure that a view nobody photographed would have: what photographs nearby say, and what the camera would see.
+
+A camera on automatic chooses by what it sees. So photographs of nearly the same view have nearly the same exposure, and
+a view on which more light falls has a shorter one: over the training photographs, the logarithm of an exposure falls in
+a straight line with that of the scene's brightness in its picture. How far either holds is asked of the training
+photographs themselves, each predicted from the others (leave one out): where neighbours say nothing, the prediction is
+the mean exposure, and where brightness says nothing beyond them, it is left out. No test photograph is looked at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
+from gs2d.data import Scene, View
+from gs2d.pipeline.prepare.run_exposures import Transforms
+from gs2d.render.api import rasterize
+from gs2d.render.backends import Backend
+from gs2d.render.exposure import identity
+from gs2d.render.types import RasterSettings
+
+NEIGHBOURS = 5  # training photographs that a prediction is made of
+CLOSE = 0.02  # added to distances, in extents: poses are never quite the same, and one photograph is no mean
+GREY = 0.5
+WORTH = 0.9  # brightness is believed where what it leaves unsaid (variance) is less than that of what neighbours do
+ENOUGH = 8  # training photographs, for a line of two numbers to be more than chance
+METERED = 256  # px of the longer side of a picture whose brightness is looked at; smaller ones widen thin splats
+LUMA = (0.299, 0.587, 0.114)
+DARK = 0.02  # added to a brightness: a picture of nothing has a logarithm too
+LEAST_GAIN = 0.05
+
+Brightness = Callable[[View], float]
+
+
+def metered(splats: Splats, settings: RasterSettings, backend: Backend) -> Brightness:
+    """Return a function that tells how bright the scene is in a view: the mean of its picture, in the mean exposure."""
+
+    def brightness(view: View) -> float:
+        camera = view.camera
+        small = METERED / max(camera.width, camera.height)
+        if small < 1:
+            camera = camera.resized(max(1, round(small * camera.width)), max(1, round(small * camera.height)))
+        with torch.no_grad():
+            color = rasterize(splats, camera, settings, backend=backend).color
+        return float((color.clamp_min(0).mean(dim=(0, 1)).double().cpu() * torch.tensor(LUMA).double()).sum())
+
+    return brightness
+
+
+def with_predicted(transforms: Transforms, scene: Scene, brightness: Brightness | None = None) -> Transforms:
+    """Return the transforms of training photographs with predicted ones of the test views, by name.
+
+    Parameters
+    ----------
+    transforms : mapping of name to Tensor [3, 4]
+        Of the training photographs; empty where a run learns none, and then nothing is added.
+    scene : Scene
+    brightness : callable, optional
+        How bright the scene is in a view (:func:`metered`); without it neighbours alone decide.
+    """
+    if not transforms or not scene.test:
+        return transforms
+    cameras = [view.camera for view in scene.train]
+    offsets = torch.stack([transforms[view.name] for view in scene.train]).double()
+    offsets = offsets - identity(offsets)
+    greys = (GREY * offsets[:, :, :3].sum(dim=2) + offsets[:, :, 3]).mean(dim=1).numpy()  # [V] what grey gains
+    around = np.stack([_weights(camera, cameras, scene.extent, without=i) for i, camera in enumerate(cameras)])
+    trust = _trust(around @ greys, greys)
+    meter = None
+    if brightness is not None and len(cameras) >= ENOUGH:
+        seen = np.array([brightness(view) for view in scene.train])
+        meter = _Meter.fitted(seen, 1 + greys / GREY, around, trust)
+    predicted = dict(transforms)
+    for view in scene.test:
+        weights = _weights(view.camera, cameras, scene.extent)
+        mean = (torch.from_numpy(weights)[:, None, None] * offsets).sum(dim=0)
+        transform = identity(mean) + trust * mean
+        if meter is not None and brightness is not None:
+            own = 1 + float((GREY * transform[:, :3].sum(dim=1) + transform[:, 3] - GREY).mean()) / GREY
+            transform = transform * (meter.gain(brightness(view), weights) / max(own, LEAST_GAIN))
+        predicted[view.name] = transform.to(transforms[scene.train[0].name])
+    return predicted
+
+
+@dataclass(frozen=True)
+class _Meter:
+    """A camera's automatic: log gain = level + slope (log brightness - middle), and what neighbours have beside it."""
+
+    level: float
+    slope: float
+    middle: float
+    beside: np.ndarray  # [V] log gains of the training views less the line
+    trust: float  # in what neighbours have beside it
+
+    def gain(self, brightness: float, weights: np.ndarray) -> float:
+        """Return the gain of a view so bright, whose neighbours have weights [V]."""
+        line = self.level + self.slope * (np.log(max(brightness, 0.0) + DARK) - self.middle)
+        return float(np.exp(line + self.trust * (weights @ self.beside)))
+
+    @classmethod
+    def fitted(cls, brightness: np.ndarray, gains: np.ndarray, around: np.ndarray, trust: float) -> _Meter | None:
+        """Return the line of training views, or None where it predicts no better than neighbours alone.
+
+        Parameters
+        ----------
+        brightness, gains : ndarray [V]
+        around : ndarray [V, V]
+            Weights of the others in a prediction of each.
+        trust : float
+            In what neighbours say without it.
+        """
+        x, y = np.log(np.maximum(brightness, 0.0) + DARK), np.log(np.maximum(gains, LEAST_GAIN))
+        middle, level = float(x.mean()), float(y.mean())
+        spread = float(((x - middle) ** 2).sum())
+        if spread <= 1e-9:
+            return None
+        slope = min(0.0, float(((x - middle) * (y - level)).sum()) / spread)  # more light: a shorter exposure
+        leverage = 1 / len(x) + (x - middle) ** 2 / spread
+        beside = y - level - slope * (x - middle)
+        left_out = beside / np.maximum(1 - leverage, 1e-6)  # of each view, from the line of the others
+        own = _trust(around @ beside, beside)
+        unsaid = np.mean((left_out - own * (around @ beside)) ** 2)
+        by_neighbours = np.mean((y - trust * (around @ y)) ** 2)
+        return cls(level, slope, middle, beside, own) if unsaid < WORTH * by_neighbours else None
+
+
+def _trust(predicted: np.ndarray, found: np.ndarray) -> float:
+    """How much of a prediction to believe, in [0, 1]: the least-squares factor over training views, each left out."""
+    if len(found) < 3:
+        return 0.0
+    return float(np.clip((predicted @ found) / max(predicted @ predicted, 1e-12), 0.0, 1.0))
+
+
+def _weights(camera: Camera, cameras: Sequence[Camera], extent: float, *, without: int | None = None) -> np.ndarray:
+    """Weights [V] of the training views in a prediction; they sum to 1."""
+    if len(cameras) == 1 and without is not None:
+        return np.zeros(1)
+    centers = np.stack([other.center for other in cameras])
+    forwards = np.stack([other.forward for other in cameras])
+    distance = np.linalg.norm(centers - camera.center, axis=1) / extent + (1 - forwards @ camera.forward)
+    if without is not None:
+        distance[without] = np.inf
+    near = np.argsort(distance, kind="stable")[: min(NEIGHBOURS, len(cameras) - (without is not None))]
+    weights = np.zeros(len(cameras))
+    weights[near] = 1 / (distance[near] + CLOSE) ** 2
+    return np.asarray(weights / weights.sum())

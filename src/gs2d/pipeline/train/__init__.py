@@ -1,0 +1,1 @@
+"""Run a training in a run folder: log, checkpoints, stages, interruption and resume."""

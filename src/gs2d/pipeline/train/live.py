@@ -1,0 +1,118 @@
+"""``--viewer``: the page of a training while it runs. No bit of the result depends on it, and training never waits.
+
+The training thread copies the splats at events at which the state is whole, if a browser has asked lately, has fetched
+the last copy, and the last copy is long enough ago. A thread of the server packs the copy when a browser fetches it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+import time
+from collections.abc import Mapping
+
+import numpy as np
+
+from gs2d.core.splats import Splats
+from gs2d.errors import DataError
+from gs2d.pipeline.events import Event, Notice, OnEvent, Phase, Step
+from gs2d.pipeline.look.page import page_scene, some_views
+from gs2d.pipeline.look.view import images_route
+from gs2d.pipeline.prepare.job import Job
+from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.training import events as train_events
+from gs2d.training.state import TrainState
+from gs2d.viewer.server import Answer, PageServer
+from gs2d.viewer.web import Packed, Served, pack, served_page, splats_answer
+
+WATCHED = 5.0  # s after a question of a page, which asks every second, during which it counts as open
+MIN_SECONDS = 2.0  # between two copies
+MAX_FRACTION = 0.03  # of one thread's time that copying and packing may take
+
+
+class Live:
+    """Serves a training that is about to begin.
+
+    Raises
+    ------
+    BackendError
+        The port is taken.
+    """
+
+    def __init__(self, job: Job, options: TrainOptions, tell: OnEvent) -> None:
+        self._tell = tell
+        self._lock = threading.Lock()  # of the copy and of what is packed
+        self._copy: Splats | None = None
+        self._packed: Packed | None = None
+        self._version = 0
+        self._asked = -math.inf  # when a page asked last
+        self._copy_at, self._copied = 0.0, 0.0
+        self._phase, self._total, self._status, self._psnr = "", 0, "training begins", ""
+        self._told = False
+        views = some_views(job.scene.train)
+        points = np.zeros((0, 3)) if job.scene.points is None else job.scene.points.points
+        self._scene = page_scene(options.title or job.scene.name, views, job.settings, points)
+        page = served_page(self._scene, Served(has_images=True, is_live=True))
+        routes = {
+            "": lambda _: Answer("text/html; charset=utf-8", [page]),
+            "state": self._answer_state,
+            "splats": self._answer_splats,
+            "image": images_route(views, job.settings.background),
+        }
+        self._server = PageServer(options.viewer_port, routes, option="--viewer-port")
+        tell(Notice(f"watch it at {self._server.url}"))
+
+    # -- the training thread -------------------------------------------------------------------------------------------
+    def on_event(self, event: Event) -> None:
+        """Pass an event of the pipeline on; the page shows what is being done."""
+        if isinstance(event, Phase):
+            self._phase, self._total, self._status = event.name, event.total, event.name
+        elif isinstance(event, Step) and event.detail:
+            self._status = f"{self._phase} {event.done:,}/{self._total:,}  {event.detail}{self._psnr}"
+        self._tell(event)
+        failure = self._server.failure
+        if failure is not None and not self._told:
+            self._told = True
+            self._tell(Notice(f"the viewer failed, training goes on: {type(failure).__name__}: {failure}"))
+
+    def on_training_event(self, event: train_events.Event, state: TrainState, psnr: float | None) -> None:
+        """Copy the splats if it is time to; the state is whole at every event. ``psnr`` is that of the probe views."""
+        self._psnr = "" if psnr is None else f"  PSNR {psnr:.2f} dB"
+        now = time.monotonic()
+        if not isinstance(event, train_events.Progress | train_events.StageStarted) or now < self._copy_at:
+            return
+        if now - self._asked > WATCHED or self._server.failure is not None:
+            return
+        try:
+            copy = Splats(**{name: tensor.detach().to("cpu", copy=True) for name, tensor in state.splats.items()})
+        except (MemoryError, RuntimeError) as error:  # RuntimeError: torch has no memory for it
+            self._server.failure = error
+            return
+        with self._lock:  # nobody packs now: _copy_at is infinite meanwhile
+            self._copy, self._packed = copy, None
+            self._version += 1
+            self._copied, self._copy_at = time.monotonic() - now, math.inf  # until it was fetched
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._server.close()
+
+    # -- the server's threads ------------------------------------------------------------------------------------------
+    def _answer_state(self, _: Mapping[str, str]) -> Answer:
+        self._asked = time.monotonic()
+        state = {"version": self._version, "status": self._status}
+        return Answer("application/json", [json.dumps(state).encode()])
+
+    def _answer_splats(self, _: Mapping[str, str]) -> Answer:
+        with self._lock:
+            if self._copy is not None:
+                began = time.thread_time()  # of this thread: it waits where the cores are busy
+                settings = self._scene.settings
+                self._packed = pack(self._copy, self._scene.focus, settings.sh_degree, settings.alpha_min)
+                self._copy = None
+                taken = self._copied + time.thread_time() - began
+                self._copy_at = time.monotonic() + max(MIN_SECONDS, taken / MAX_FRACTION)
+            if self._packed is None:
+                raise DataError("there are no splats yet")
+            return splats_answer(self._packed)

@@ -1,0 +1,284 @@
+"""Where training starts: at a checkpoint, after the stages of another run or of a cache, or from nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gs2d.core.files import sweep
+from gs2d.errors import RunError, ShapeError
+from gs2d.io.run_dir import (
+    CheckpointFile,
+    RunFolder,
+    is_run,
+    load_tensors,
+    make_folder,
+    open_run,
+    remove_made,
+    save_tensors,
+)
+from gs2d.io.run_schema import METRICS_SHAPE, check_shape
+from gs2d.pipeline.events import Notice, OnEvent
+from gs2d.pipeline.prepare.job import Job
+from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.training.resumable import check_resumable
+from gs2d.training.state import TrainState
+
+
+@dataclass(frozen=True, eq=False)
+class ResumePoint:
+    """Where training starts.
+
+    Attributes
+    ----------
+    state : TrainState or None
+        None = from nothing.
+    seconds : float
+        Training time already spent in the stage that is under way.
+    peak_memory : int
+        Bytes, of that stage so far.
+    at_entry : dict
+        Scores taken after the entry actions of that stage.
+    """
+
+    state: TrainState | None = None
+    seconds: float = 0.0
+    peak_memory: int = 0
+    at_entry: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class FinishedStage:
+    """The end of a stage that another run trained: its checkpoint, metrics and log up to there."""
+
+    index: int
+    payload: dict[str, Any]
+    metrics: list[dict[str, Any]]
+    log: bytes
+    source: str
+
+
+def choose_start(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEvent) -> ResumePoint:
+    """Return the furthest valid start; the log and the metrics are cut to it.
+
+    Raises
+    ------
+    RunError
+        ``start_from`` has no stage in common with this run, or no checkpoint is readable.
+    """
+    if run.checkpoints():
+        start = _resume(run, job, on_event)
+        if options.cache is not None:
+            _keep_scored(run, options.cache)
+        return start
+    run.events.cut(0)
+    found = [
+        stage
+        for stage in (
+            _from_run(job, options.start_from) if options.start_from else None,
+            _from_cache(job, options.cache, on_event) if options.cache else None,
+        )
+        if stage is not None
+    ]
+    if not found:
+        run.write_metrics({"stages": [], "surface": None})
+        return ResumePoint()
+    return _adopt(run, job, max(found, key=lambda stage: stage.index), on_event)
+
+
+def check_sources(job: Job, options: TrainOptions) -> None:
+    """Raise what would be raised for ``start_from`` and ``cache``, before the run that is to be overwritten goes."""
+    if options.start_from is not None:
+        if options.start_from.resolve() == options.out.resolve():
+            raise RunError(f"--from and --out are the same run, {options.out}; take another --out")
+        _from_run(job, options.start_from)
+    if options.cache is not None:
+        remove_made(make_folder(options.cache))
+
+
+def _resume(run: RunFolder, job: Job, on_event: OnEvent) -> ResumePoint:
+    checkpoints = run.checkpoints()
+    for checkpoint in reversed(checkpoints):
+        try:
+            payload = _read(checkpoint.path)
+            state = _state_at(checkpoint, payload, job)
+        except RunError as error:
+            on_event(Notice(f"{error}; going back to the checkpoint before it"))
+            continue
+        run.events.cut(payload["events_bytes"])
+        finished = checkpoint.stage_index + (checkpoint.iteration is None)
+        metrics = run.metrics()
+        unchanged = finished == len(job.recipe.stages)  # then what is said of the mesh still holds
+        of_mesh: dict[str, Any] = {name: metrics[name] for name in ("surface", "mesh") if unchanged and name in metrics}
+        run.write_metrics({"stages": metrics["stages"][:finished], "surface": None, **of_mesh})
+        on_event(Notice(f"resuming after {checkpoint.path.stem}"))
+        extra = json.loads(payload["extra"])
+        return ResumePoint(state, extra["seconds"], extra["peak_memory"], extra["at_entry"])
+    raise RunError(f"no checkpoint in {run.path} is readable; train again with --overwrite")
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Return what a checkpoint holds: all of it is there, and of the types that ``RunLogger`` writes."""
+    payload = load_tensors(path)
+    try:
+        size, extra = payload["events_bytes"], json.loads(payload["extra"])
+        seconds, peak, at_entry = extra["seconds"], extra["peak_memory"], extra["at_entry"]
+        whole = isinstance(size, int) and isinstance(peak, int) and min(size, peak) >= 0
+        whole = whole and isinstance(seconds, int | float) and 0 <= seconds < math.inf and isinstance(at_entry, dict)
+        if not (whole and isinstance(payload["key"], str) and isinstance(payload["state"], dict)):
+            raise ValueError("a value of another type")
+    except (LookupError, TypeError, ValueError, RecursionError) as error:
+        raise _unreadable(path, f"{type(error).__name__}: {error}") from error
+    return payload
+
+
+def _unreadable(path: Path, reason: str) -> RunError:
+    return RunError(f"{path} is not a readable checkpoint ({' '.join(reason.split())[:300]}); delete it")
+
+
+def _state(path: Path, payload: dict[str, Any]) -> TrainState:
+    """Return the state in a checkpoint that was read."""
+    try:
+        return TrainState.from_state_dict(payload["state"])
+    except RunError as error:
+        raise _unreadable(path, str(error)) from error
+
+
+def _state_at(checkpoint: CheckpointFile, payload: dict[str, Any], job: Job) -> TrainState:
+    """Return the state in a checkpoint of this run, if it is where its name says and training can go on from it."""
+    state, ended = _state(checkpoint.path, payload), checkpoint.iteration is None
+    place = (checkpoint.stage_index + ended, 0 if ended else checkpoint.iteration)
+    try:
+        check_resumable(state, job.recipe, len(job.scene.train))
+    except (RunError, ShapeError) as error:
+        raise _unreadable(checkpoint.path, str(error)) from error
+    if (state.stage, state.step) != place:
+        raise _unreadable(checkpoint.path, f"it holds stage {state.stage}, iteration {state.step}")
+    return state
+
+
+def _adopt(run: RunFolder, job: Job, stage: FinishedStage, on_event: OnEvent) -> ResumePoint:
+    """Make another run's finished stages this run's own."""
+    name = job.recipe.stages[stage.index].name
+    run.events.append_text(stage.log)
+    run.write_metrics({"stages": [{**m, "reused_from": stage.source} for m in stage.metrics], "surface": None})
+    payload = {k: v for k, v in stage.payload.items() if k != "events_bytes"}
+    run.save_checkpoint(stage.index, name, None, payload)
+    on_event(Notice(f"stages up to {name!r} are taken from {stage.source}"))
+    return ResumePoint(_state(Path(stage.source), stage.payload))
+
+
+def _from_run(job: Job, path: Path) -> FinishedStage:
+    """Return the furthest stage that another run has in common with this one."""
+    other = open_run(path)
+    ends = [c for c in other.checkpoints() if c.iteration is None]
+    for checkpoint in reversed(ends):
+        index = checkpoint.stage_index
+        if index >= len(job.recipe.stages):
+            continue
+        payload = _read(checkpoint.path)
+        metrics = other.metrics()["stages"]
+        if payload["key"] == job.stage_key(index) and len(metrics) > index:
+            _state_at(checkpoint, payload, job)
+            log = other.events.read_bytes(payload["events_bytes"])
+            return FinishedStage(index, payload, metrics[: index + 1], log, str(path))
+    have = ", ".join(c.stage for c in ends) or "none"
+    raise RunError(
+        f"--from {path} has no finished stage in common with this run (its stages: {have}); scene, protocol, "
+        "downscale, seed, backend, versions and the stages' settings must be the same"
+    )
+
+
+# -- the stage cache ------------------------------------------------------------------------------------------
+def _cache_file(folder: Path, key: str) -> Path:
+    return folder / f"{key[:32]}.pt"
+
+
+def _from_cache(job: Job, folder: Path, on_event: OnEvent) -> FinishedStage | None:
+    """Return the furthest stage that the cache has; what is damaged in it goes, and is trained and kept again."""
+    sweep(folder)
+    for index in reversed(range(len(job.recipe.stages))):
+        key = job.stage_key(index)
+        path = _cache_file(folder, key)
+        if path.exists():
+            try:
+                return _cached(job, index, path, key)
+            except RunError as error:
+                on_event(Notice(f"{error}: done, that stage is trained again"))
+                with contextlib.suppress(OSError):
+                    path.unlink()
+    return None
+
+
+def _cached(job: Job, index: int, path: Path, key: str) -> FinishedStage:
+    """Return what a file of the cache holds.
+
+    Raises
+    ------
+    RunError
+        It is damaged.
+    """
+    payload = _read(path)
+    end = CheckpointFile(path, index, job.recipe.stages[index].name, None)
+    _state_at(end, payload, job)
+    try:
+        metrics, log = json.loads(payload.pop("metrics")), payload.pop("log").encode()
+    except (LookupError, TypeError, AttributeError, ValueError, RecursionError) as error:
+        raise _unreadable(path, f"{type(error).__name__}: {error}") from error
+    check_shape(path, {"stages": metrics}, METRICS_SHAPE, "delete it")
+    if payload["key"] != key or len(metrics) != index + 1:
+        raise _unreadable(path, "it is of another stage")
+    return FinishedStage(index, payload, metrics, log, str(path))
+
+
+def stage_end(run: RunFolder, job: Job, index: int) -> TrainState | None:
+    """Return the state at the end of a stage: from the run's own checkpoint, or from where the stage was taken.
+
+    None where neither is there any more.
+
+    Raises
+    ------
+    RunError
+        The run's own checkpoint is broken.
+    """
+    for checkpoint in run.checkpoints():
+        if (checkpoint.stage_index, checkpoint.iteration) == (index, None):
+            return _state_at(checkpoint, _read(checkpoint.path), job)
+    stages = run.metrics()["stages"]
+    source = Path(stages[index].get("reused_from") or "") if len(stages) > index else Path()
+    key = job.stage_key(index)
+    paths = [_cache_file(source.parent, key)] if source.suffix == ".pt" else []
+    if is_run(source):
+        ends = RunFolder(source).checkpoints()
+        paths = [c.path for c in ends if (c.stage_index, c.iteration) == (index, None)]
+    for path in paths:
+        with contextlib.suppress(RunError):  # somebody else's: gone or broken, it is not there
+            payload = _read(path)
+            if payload["key"] == key:
+                return _state(path, payload)
+    return None
+
+
+def _keep_scored(run: RunFolder, folder: Path) -> None:
+    """Keep the last stage that a killed process had scored but not kept; remove what it left half-written."""
+    sweep(folder)
+    stages = run.metrics()["stages"]
+    ends = [c for c in run.checkpoints() if c.iteration is None and c.stage_index < len(stages)]
+    for end in ends[-1:]:
+        if "reused_from" not in stages[end.stage_index]:  # that is whose it is
+            with contextlib.suppress(RunError):  # damaged: training goes on from the one before
+                put_in_cache(folder, run, end.stage_index, _read(end.path))
+
+
+def put_in_cache(folder: Path, run: RunFolder, index: int, payload: dict[str, Any]) -> None:
+    """Keep a finished and scored stage for other runs."""
+    make_folder(folder)
+    path = _cache_file(folder, payload["key"])
+    if not path.exists():
+        log = run.events.read_bytes(payload["events_bytes"]).decode()
+        stages = [{k: v for k, v in m.items() if k != "reused_from"} for m in run.metrics()["stages"][: index + 1]]
+        save_tensors(path, {**payload, "metrics": json.dumps(stages), "log": log})
