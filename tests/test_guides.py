@@ -10,13 +10,11 @@ import pytest
 import torch
 
 import gs2d
-from gs2d.cli.commands import COMMANDS
 from gs2d.config.presets import RECIPES
 from tiny import write_capture
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 ROOT = DOCS.parent
-PAGES = sorted([*DOCS.rglob("*.md"), *ROOT.glob("*.md"), *(ROOT / "benchmarks").rglob("*.md")])
 
 
 def run_blocks(page: Path, least: int) -> dict[str, Any]:
@@ -28,13 +26,6 @@ def run_blocks(page: Path, least: int) -> dict[str, Any]:
         lines = block.string[: block.start()].count("\n") + 1
         exec(compile("\n" * lines + block.group(1), str(page), "exec"), names)  # line numbers are those of the page
     return names
-
-
-def test_the_readme_names_the_two_commands_that_set_themselves_up() -> None:
-    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
-    for target in ("demo", "test"):
-        assert any(line.startswith(f"make {target} ") for line in lines), target
-        assert f"\n{target}: " in (ROOT / "Makefile").read_text(encoding="utf-8")
 
 
 def test_the_program_of_the_python_guide_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -97,15 +88,6 @@ def test_the_recipes_of_the_concepts_page_are_recipes() -> None:
     assert names["two_dgs_r"].stages == RECIPES["2dgs-r"]().stages
 
 
-def test_links_to_files_of_the_repository_lead_somewhere() -> None:
-    dead = []
-    for page in PAGES:
-        text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
-        targets = re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text)
-        dead += [(page.name, each) for each in targets if "://" not in each and not (page.parent / each).exists()]
-    assert not dead
-
-
 def test_files_that_the_architecture_names_are_there() -> None:
     named = set(re.findall(r"[\w/]+\.py\b", (DOCS / "architecture.md").read_text(encoding="utf-8")))
     there = [path.as_posix() for folder in ("src", "tests") for path in (ROOT / folder).rglob("*.py")]
@@ -121,9 +103,3 @@ def test_citation_and_changelog_are_of_the_version() -> None:
     released = re.findall(r"^## \[(.*)\] - (.*)$", changelog, re.M)
     assert released[0] == (dated[1], dated[2])
     assert re.findall(r"^## (.*)$", changelog, re.M)[0] == "[Unreleased]"
-
-
-def test_one_page_names_every_command() -> None:
-    text = (DOCS / "guides" / "commands.md").read_text(encoding="utf-8")
-    names = {command.__name__.lower() for command in COMMANDS}
-    assert {name for name in names if f"gs2d {name}" not in text} == set()

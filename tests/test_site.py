@@ -36,60 +36,8 @@ navigation = module("navigation")
 PAGES: list[str] = navigation.pages()
 
 
-def headings(page: str) -> set[str]:
-    """Return the anchors of a page's headings, as GitHub and the site make them."""
-    text = re.sub(r"^```.*?^```$", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.M | re.S)
-    titles = [re.sub(r"[`*]|\[([^]]*)\]\([^)]*\)", r"\1", title) for title in re.findall(r"^#+ (.+)$", text, re.M)]
-    return {re.sub(r"[^\w\- ]", "", title.strip().lower()).replace(" ", "-") for title in titles}
-
-
 def test_every_page_is_in_the_navigation() -> None:
     assert navigation.missing() == [], "add them to docs/README.md or docs/notebook/README.md"
-
-
-def test_the_navigation_names_a_page_that_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "docs" / "guides").mkdir(parents=True)
-    (tmp_path / "README.md").write_text("# Home\n")
-    (tmp_path / "docs" / "README.md").write_text(
-        "# All\n\n## Guides\n\n- [one](guides/one.md#part), [home](../README.md)\n"
-    )
-    for name in ("one", "two"):
-        (tmp_path / "docs" / "guides" / f"{name}.md").write_text(f"# {name}\n")
-    monkeypatch.setattr(navigation, "ROOT", tmp_path)
-    assert navigation.parts("docs/README.md") == [("Guides", ["docs/guides/one.md"])]
-    assert navigation.missing() == ["docs/guides/two.md"]
-
-
-def test_the_parts_of_the_site_are_the_headings_of_its_contents() -> None:
-    trees = "".join(navigation.toctrees("README.md"))
-    for title, below in navigation.parts("docs/README.md"):
-        assert f":caption: {title}\n" in trees
-        assert below
-    assert "/docs/notebook/README\n" in trees
-    assert "/docs/notebook/libraries\n" not in trees  # one level deeper
-    assert "/docs/notebook/libraries\n" in "".join(navigation.toctrees("docs/notebook/README.md"))
-
-
-def test_links_to_headings_lead_to_headings() -> None:
-    dead = []
-    for page in PAGES:
-        text = re.sub(r"^```.*?^```$", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.M | re.S)
-        for target, anchor in re.findall(r"\]\(([^)#\s]*)#([^)\s]+)\)", text):
-            if "://" not in target and (not target or target.endswith(".md")):
-                goal = (ROOT / page).parent.joinpath(target).resolve() if target else ROOT / page
-                if anchor not in headings(goal.relative_to(ROOT).as_posix()):
-                    dead.append(f"{page} links to {target}#{anchor}")
-    assert not dead
-
-
-def test_every_picture_is_on_a_page() -> None:
-    texts = "".join((ROOT / page).read_text(encoding="utf-8") for page in PAGES)
-    pictures = [
-        path for path in (ROOT / "docs" / "images").iterdir() if path.suffix in (".png", ".svg", ".jpg", ".webp")
-    ]
-    assert len(pictures) > 5
-    assert [path.name for path in pictures if f"images/{path.name})" not in texts] == []
-    assert [path.name for path in pictures if path.stat().st_size > 500_000] == []
 
 
 def test_each_known_fault_names_tests_that_exist() -> None:
