@@ -17,16 +17,6 @@ def test_a_point_is_hidden_by_a_surface_clearly_nearer_and_by_no_other() -> None
     assert hidden_points(depth, POINTS) == HiddenPoints(shown=4, hidden=1)
 
 
-def test_the_fraction_of_depth_is_a_parameter() -> None:
-    assert hidden_points(np.full((1, 4), 9.4), POINTS, nearer=0.9).hidden == 0
-
-
-def test_the_share_of_no_points_is_unknown_and_not_zero() -> None:
-    nothing = PointsInView(np.zeros((0, 2)), np.zeros(0))
-    assert hidden_points(np.ones((1, 4)), nothing).fraction is None
-    assert HiddenPoints(shown=4, hidden=1).fraction == 0.25
-
-
 def test_views_are_pooled_by_points() -> None:
     assert total([HiddenPoints(10, 1), HiddenPoints(0, 0), HiddenPoints(30, 3)]) == HiddenPoints(40, 4)
 

@@ -100,19 +100,6 @@ def test_heads_of_another_network_are_refused_in_one_line(vgg_file: Path, name: 
     assert "\n" not in str(caught.value)
 
 
-def test_heads_alone_name_the_missing_network_and_a_network_alone_the_missing_heads(vgg_file: Path) -> None:
-    with pytest.raises(DataError, match=r"lack features\.0\.weight .*vgg16-397923af\.pth"):
-        load_lpips(HEADS / "vgg.pth")
-    with pytest.raises(DataError, match=r"lack lin0\.model\.1\.weight .*weights/v0\.1/vgg\.pth"):
-        load_lpips(vgg_file)
-
-
-def test_the_network_goes_to_the_device_of_the_images(vgg_file: Path) -> None:
-    network = load_lpips([vgg_file, HEADS / "vgg.pth"])
-    assert network.to("meta").device == torch.device("meta")
-    assert network.device == torch.device("cpu")
-
-
 def test_both_lpips_figures_are_of_the_8_bit_image_and_named(vgg_file: Path) -> None:
     """A change below half a level of 255 vanishes in the 8-bit image, so that LPIPS does not see it."""
     network = load_lpips([vgg_file, HEADS / "vgg.pth"])

@@ -20,12 +20,6 @@ def test_the_nearest_come_first_and_what_is_missing_is_infinitely_far() -> None:
     assert distances[:, 0].tolist() == [pytest.approx(0.1), np.inf]
 
 
-def test_a_cloud_of_no_points_has_no_nearest() -> None:
-    distances, index = Cloud(POINTS[:0]).nearest(POINTS)
-    assert np.isinf(distances).all()
-    assert index.tolist() == [[0]] * 3
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_what_is_not_finite_is_refused(bad: float) -> None:
     broken = np.array([[0.0, bad, 0]])

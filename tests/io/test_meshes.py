@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +11,9 @@ import pytest
 import trimesh
 
 from gs2d.core.mesh import Mesh
-from gs2d.errors import DataError, DiskError
+from gs2d.errors import DataError
 from gs2d.io.meshes import glb_bytes, read_mesh, triangulate, write_mesh
 from gs2d.io.ply_format import write_ply
-from gs2d.io.splat_ply import ply_kind
 from surface_shapes import tetrahedron
 
 
@@ -31,31 +29,11 @@ def test_a_mesh_comes_back(tmp_path: Path, dtype: type, colors: bool) -> None:
     assert (back.colors is None) if mesh.colors is None else np.array_equal(back.colors, mesh.colors)
 
 
-def test_a_mesh_file_has_only_the_vertex_list_on_faces_and_colours_on_vertices(tmp_path: Path) -> None:
-    write_mesh(tmp_path / "a.ply", tetrahedron())
-    header = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0].decode().splitlines()
-    assert header[1] == "format binary_little_endian 1.0"
-    assert header[-5:] == [
-        "property uchar red",
-        "property uchar green",
-        "property uchar blue",
-        "element face 4",
-        "property list uchar int vertex_indices",
-    ]
-
-
 def test_trimesh_reads_our_mesh(tmp_path: Path) -> None:
     write_mesh(tmp_path / "a.ply", tetrahedron())
     back = trimesh.load(tmp_path / "a.ply", process=False)
     assert back.volume == pytest.approx(1 / 6)  # positive: the faces look outward
     assert back.visual.vertex_colors[1].tolist() == [255, 4, 5, 255]
-
-
-def test_an_empty_mesh_comes_back_empty(tmp_path: Path) -> None:
-    write_mesh(tmp_path / "x.ply", Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)))
-    mesh = read_mesh(tmp_path / "x.ply")
-    assert (len(mesh.vertices), len(mesh.faces)) == (0, 0)
-    assert ply_kind(tmp_path / "x.ply") == "mesh"
 
 
 def test_a_face_that_names_no_vertex_is_a_data_error(tmp_path: Path) -> None:
@@ -69,13 +47,6 @@ def test_points_are_no_mesh(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", {"vertex": np.zeros(3, [(name, "f4") for name in "xyz"])})
     with pytest.raises(DataError, match="without faces"):
         read_mesh(tmp_path / "a.ply")
-
-
-def test_a_failed_write_leaves_nothing_behind(tmp_path: Path) -> None:
-    with pytest.raises(DiskError):
-        write_mesh(tmp_path / "no such folder" / "a.ply", tetrahedron())
-    write_mesh(tmp_path / "a.ply", tetrahedron())
-    assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
 
 
 def test_polygons_become_fans() -> None:
@@ -103,15 +74,6 @@ def test_other_formats_come_back_as_trimesh_writes_them(tmp_path: Path, name: st
     np.testing.assert_array_equal(back.vertices[back.faces], mesh.vertices[mesh.faces])
 
 
-def test_the_colours_of_an_obj_file_are_read(tmp_path: Path) -> None:
-    mesh = tetrahedron()
-    colored = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
-    colored.export(tmp_path / "a.obj")
-    back = read_mesh(tmp_path / "a.obj")
-    assert back.colors is not None
-    np.testing.assert_array_equal(back.colors, mesh.colors)
-
-
 @pytest.mark.parametrize(
     "text",
     ["v 0 0\n", "v 0 0 0\nf 1 2 x\n", "v 0 0 0\nf 1 2 3\n", "v 0 0 0\n", f"v 0 0 0\nf 1 1 {'9' * 30}\n"],  # no int64
@@ -120,12 +82,6 @@ def test_a_broken_obj_is_a_data_error(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.obj").write_text(text)
     with pytest.raises(DataError):
         read_mesh(tmp_path / "a.obj")
-
-
-def test_real_meshes_are_read(shared: Callable[[str], Path]) -> None:
-    mesh = read_mesh(shared("rendered_bottle") / "mesh_gt.ply")
-    assert (len(mesh.vertices), len(mesh.faces)) == (20341, 40670)
-    assert np.allclose(mesh.vertices.min(0), [-0.9, -0.9, -0.85], atol=1e-3)
 
 
 def test_a_coloured_mesh_becomes_a_glb_with_its_colours(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ import torch
 
 import gs2d
 from gs2d.errors import DataError, DiskError
-from gs2d.io.formats.registry import LAYOUTS, write_layout
+from gs2d.io.formats.registry import write_layout
 from gs2d.io.meshes import read_mesh
 
 
@@ -34,17 +33,6 @@ def mesh() -> gs2d.Mesh:
     return gs2d.Mesh(vertices, np.array([[0, 1, 2]], np.int32), np.full((3, 3), 200, np.uint8))
 
 
-@pytest.fixture
-def lossy() -> Iterator[None]:
-    @gs2d.register_format("centres", ending=".xyz")
-    def write_xyz(path: Path, splats: gs2d.Splats) -> tuple[str, ...]:
-        np.savetxt(path, splats.means.numpy())
-        return ("only the centres were written",)
-
-    yield
-    del LAYOUTS._things["centres"]
-
-
 @pytest.mark.parametrize(
     ("name", "layout"), [("a.ply", "3dgs"), ("a.compressed.ply", "compressed"), ("A.SPZ", "spz"), ("a.splat", "splat")]
 )
@@ -55,14 +43,6 @@ def test_the_ending_chooses_the_format_and_read_splats_reads_it(
     write_layout(tmp_path / "exported", splats, layout)
     assert (tmp_path / name).read_bytes() == (tmp_path / "exported").read_bytes()
     assert len(gs2d.read_splats(tmp_path / name)) == len(splats)
-
-
-def test_the_official_layout_holds_every_bit(splats: gs2d.Splats, tmp_path: Path) -> None:
-    splats.save(str(tmp_path / "a.ply"), layout="2dgs")
-    gs2d.write_splats(tmp_path / "b.ply", splats)
-    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
-    again = gs2d.read_splats(tmp_path / "a.ply")
-    assert all(torch.equal(tensor, getattr(again, name)) for name, tensor in splats.items())
 
 
 @pytest.mark.parametrize(
@@ -79,12 +59,6 @@ def test_a_name_that_no_format_has_is_refused_and_nothing_is_written(
     with pytest.raises(DataError, match=message):
         splats.save(tmp_path / name, layout=layout)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.usefixtures("lossy")
-def test_what_a_format_cannot_hold_is_a_warning(splats: gs2d.Splats, tmp_path: Path) -> None:
-    with pytest.warns(UserWarning, match="a.xyz: only the centres were written"):
-        splats.save(tmp_path / "a.xyz")
 
 
 def test_a_mesh_is_saved_by_its_ending(mesh: gs2d.Mesh, tmp_path: Path) -> None:

@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 
 from gs2d.data.image_files import write_image
-from gs2d.errors import BackendError, DataError, DiskError
-from gs2d.io.video import check_video, write_video
+from gs2d.errors import BackendError, DiskError
+from gs2d.io.video import write_video
 
 real = pytest.mark.skipif(shutil.which("ffprobe") is None, reason="no ffmpeg here")
 WIDTH, HEIGHT = 48, 32
@@ -70,12 +70,6 @@ def test_an_mp4_video_has_all_frames_at_its_rate_as_every_player_takes_them(fram
         assert abs(error.mean()) < 2  # no other matrix of colours, no other range
 
 
-@real
-def test_of_an_odd_side_the_last_row_or_column_is_left_out(tmp_path: Path) -> None:
-    write_video(tmp_path / "a.mp4", write_frames(tmp_path / "odd", 49, 33), fps=30)
-    assert (probed(tmp_path / "a.mp4")["width"], probed(tmp_path / "a.mp4")["height"]) == (48, 32)
-
-
 def test_a_webp_video_has_all_frames_at_its_rate(frames: list[Path], tmp_path: Path) -> None:
     told: list[int] = []
     write_video(tmp_path / "a.webp", frames, fps=30, on_frame=told.append)
@@ -106,18 +100,6 @@ def test_whoever_stops_leaves_no_file_and_an_older_one_as_it_was(frames: list[Pa
     assert (tmp_path / name).read_text() == "older"
 
 
-@pytest.mark.parametrize("name", [pytest.param("a.mp4", marks=real), "a.webp"])
-def test_frames_of_two_sizes_and_a_folder_that_is_not_there_are_said(
-    frames: list[Path], tmp_path: Path, name: str
-) -> None:
-    with pytest.raises(DiskError, match="create it first"):
-        write_video(tmp_path / "none" / name, frames, fps=30)
-    write_image(frames[2], np.zeros((8, 8, 3), np.uint8))
-    with pytest.raises(DataError, match=r"frames of one size were expected, got \(48, 32\) and \(8, 8\) .*0002\.png"):
-        write_video(tmp_path / name, frames, fps=30)
-    assert [path.name for path in tmp_path.iterdir()] == ["frames"]
-
-
 def a_program(folder: Path, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """An ffmpeg that does what ``text`` says."""
     folder.mkdir()
@@ -144,23 +126,3 @@ def test_what_ffmpeg_says_last_is_told(
     with pytest.raises(error, match=said):
         write_video(tmp_path / "a.mp4", frames, fps=30)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bin", "frames"]
-
-
-def test_what_makes_no_video_is_said_before_anything_is_rendered(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with pytest.raises(DataError, match=r"\.mp4 or \.webp file, got a\.avi"):
-        check_video(Path("a.avi"), 30, 10)
-    with pytest.raises(DataError, match=r"--fps must be 0\.1 to 240 frames a second, got nan"):
-        check_video(Path("a.webp"), float("nan"), 10)
-    with pytest.raises(DataError, match="at least 2 frames, got 1"):
-        check_video(Path("a.webp"), 30, 1)
-    a_program(tmp_path / "bin", "exit 0", monkeypatch)
-    with pytest.raises(BackendError, match=r"a\.mp4 needs ffmpeg, and .*bin/ffmpeg was built without libx264; install"):
-        check_video(Path("a.mp4"), 30, 2)
-    assert check_video(Path("a"), 30, 2) == Path("a.webp")
-
-
-@real
-def test_a_name_without_an_ending_is_an_mp4_where_ffmpeg_is() -> None:
-    assert check_video(Path("of 50 % -it"), 30, 2) == Path("of 50 % -it.mp4")

@@ -127,35 +127,6 @@ def test_gradients_are_those_of_finite_differences(case: Case) -> None:
     assert torch.autograd.gradcheck(values, (d.requires_grad_(), n.requires_grad_()), eps=1e-7, atol=1e-6)
 
 
-def test_a_view_without_a_pixel_to_ask_has_loss_zero_and_no_gradient() -> None:
-    camera, draws = replace(HERE, width=3, height=3), torch.rand(5)
-    image = prepare_image(torch.rand(3, 3, 3), None, MultiView(patches=5))  # smaller than a patch of 7 px
-    neighbour = Neighbour(image, image, camera, torch.ones(3, 3), draws, MultiView(patches=5))
-    depth, normal = torch.ones(3, 3, requires_grad=True), torch.full((3, 3, 3), torch.nan, requires_grad=True)
-    views = ViewPair(depth, normal, image.textured, camera, neighbour)
-    loss = photometric(views) + geometric(views)
-    assert loss.item() == 0
-    assert all(not g.any() for g in torch.autograd.grad(loss, (depth, normal)))
-
-
-def test_pixels_are_asked_once_each_and_evenly_and_all_of_them_where_they_are_few() -> None:
-    candidates = torch.zeros(6, 7, dtype=torch.bool)
-    candidates[1:5, 2:6] = True  # 16 pixels
-    where = set(candidates.flatten().nonzero().flatten().tolist())
-    g, seen = torch.Generator().manual_seed(0), torch.zeros(42)
-    for _ in range(400):
-        index, chosen = choose_pixels(candidates, torch.rand(4, generator=g))
-        assert chosen.all()
-        assert len(set(index.tolist())) == 4
-        assert set(index.tolist()) <= where
-        seen[index] += 1
-    assert float(seen[candidates.flatten()].min()) > 60  # 100 each
-    index, chosen = choose_pixels(candidates, torch.rand(200, generator=g))
-    assert set(index[chosen].tolist()) == where
-    assert int(chosen.sum()) == 16
-    assert not choose_pixels(torch.zeros(6, 7, dtype=torch.bool), torch.rand(4))[1].any()
-
-
 def test_the_mean_runs_over_all_pixels_that_are_not_masked_whatever_the_number_asked(case: Case) -> None:
     depth = case.depth + 0.02
     everything = replace(case.neighbour, draws=torch.full((2000,), 0.5, dtype=torch.float64))

@@ -66,21 +66,6 @@ def test_a_point_between_pixels_is_compared_with_the_plane_through_them() -> Non
     )
 
 
-def test_many_points_weigh_as_much_as_a_whole_picture_and_few_less() -> None:
-    depth = torch.full((2, 2), 2.0).double()
-    for count, expected in ((MIN_POINTS // 2, 0.5), (MIN_POINTS, 1.0), (3 * MIN_POINTS, 1.0)):
-        many = points([[0, 1, 2, 3]] * count, [[1.0, 0, 0, 0]] * count, [1.0] * count)
-        assert depth_prior(Prior(many, noise=1e-9), depth, HIT[:2, :2]).item() == pytest.approx(expected)
-
-
-def test_a_point_at_the_edge_of_what_was_hit_is_not_asked() -> None:
-    depth, alpha = torch.full((2, 2), 2.0).double(), HIT[:2, :2].clone()
-    alpha[1, 1] = 0.0
-    asked = points([[0, 1, 2, 3], [0, 1, 2, 2]], [[0.25] * 4] * 2, [1.0, 1.0])
-    assert depth_prior(Prior(asked, noise=1e-9), depth, alpha).item() == pytest.approx(1 / MIN_POINTS)
-    assert depth_prior(Prior(points([], [], [])), depth, alpha).item() == 0
-
-
 def test_errors_that_are_to_be_expected_cost_their_square() -> None:
     truth = torch.ones(4, 5).double()
     for depth, expected in ((1.05, 0.05**2 / 0.2), (0.9, 0.05), (1.5, 0.45)):  # noise 0.1: e^2 / 0.2, then e - 0.05
@@ -161,19 +146,3 @@ def test_a_fifth_of_wrong_pixels_hardly_moves_the_fit() -> None:
     assert shift.item() == pytest.approx(1, abs=0.04)
     plain, _ = fit_line(x, y, torch.ones_like(x), rounds=1)
     assert abs(plain.item() - 2) > 0.1
-
-
-def test_a_map_that_runs_the_other_way_says_nothing() -> None:
-    depth = 1 + torch.rand(12, 13).double()
-    relative = RelativeDepths(depth, depth > 0, "disparity")  # larger where farther: no disparity
-    assert aligned(relative, depth, depth > 0).valid.sum() == 0
-    assert depth_prior(Prior(relative), depth, torch.ones_like(depth)).item() == 0
-
-
-def test_where_nothing_was_hit_nothing_breaks() -> None:
-    nothing, relative = torch.zeros(4, 5).double().requires_grad_(), torch.rand(4, 5).double()
-    for prior in (valid(HIT), RelativeDepths(relative, HIT > 0, "depth"), points([[0, 1, 5, 6]], [[0.25] * 4], [1.0])):
-        loss = depth_prior(Prior(prior), nothing, torch.zeros(4, 5))
-        assert loss.item() == 0
-        (gradient,) = torch.autograd.grad(loss, [nothing])
-        assert (gradient == 0).all()

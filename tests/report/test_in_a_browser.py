@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 from browser import Page, browser, require_browser
-from gs2d.io.run_dir import PAGE, SPLATS
-from gs2d.report.links import links, size_text
-from gs2d.report.terms import TERMS, glossary, titles_of
 from gs2d.report.write import write_report
 from report_runs import fabricate
 
@@ -65,19 +61,6 @@ def test_pictures_enlarge_in_all_their_pixels_and_step_by_keys(page: Page) -> No
     assert not page.ask(LARGE)
 
 
-def test_a_pair_enlarges_with_its_line(page: Page) -> None:
-    page.click(".wipe .larger")
-    assert page.ask(LARGE)
-    x, y = page.middle("dialog .wipe .both")
-    wide = page.ask("document.querySelector('dialog .wipe .both').getBoundingClientRect().width")
-    assert wide > page.ask("document.querySelector('main .wipe .both').getBoundingClientRect().width")
-    page.drag((x, y), (x + 0.25 * wide, y))
-    at = "parseFloat(document.querySelector('dialog .wipe .both').style.getPropertyValue('--at'))"
-    assert page.ask(at) == pytest.approx(75, abs=1)
-    page.key("Escape")
-    assert not page.ask(LARGE)
-
-
 def test_a_phone_reads_it_without_moving_sideways_and_wipes_by_finger(page: Page) -> None:
     page.size(375, 812, phone=True)
     try:
@@ -90,39 +73,3 @@ def test_a_phone_reads_it_without_moving_sideways_and_wipes_by_finger(page: Page
         assert small == 0  # everything that can be pressed has a name
     finally:
         page.size(1600, 1000)
-
-
-def test_without_its_script_photograph_and_rendering_stand_side_by_side(tmp_path: Path) -> None:
-    require_browser()
-    write_report(fabricate(tmp_path / "run"))
-    with browser() as page:
-        page.send("Emulation.setScriptExecutionDisabled", value=True)
-        page.send("Page.navigate", url=f"file://{tmp_path}/run/report.html")
-        page.until("document.readyState === 'complete' && document.querySelector('.wipe')")
-        both = "[...document.querySelectorAll('.wipe .both img')].slice(0, 2)"
-        a, b = page.ask(f"{both}.map((i) => i.getBoundingClientRect()).map((r) => [r.x, r.right, r.y])")
-        assert a[1] <= b[0]
-        assert a[2] == b[2]
-
-
-# -- what needs no browser ---------------------------------------------------------------------------------------------
-def test_only_files_that_exist_are_linked_with_their_sizes(tmp_path: Path) -> None:
-    assert "There are no files" in links(tmp_path)
-    (tmp_path / PAGE).write_bytes(b"x" * 1_234_567)
-    (tmp_path / SPLATS).write_bytes(b"x" * 17)
-    text = links(tmp_path)
-    assert text.count("href=") == 2
-    assert 'href="scene.html"' in text
-    assert "1.23 MB" in text
-    assert "17 bytes" in text
-    assert text.index("scene.html") < text.index("splats.ply")
-    assert [size_text(n) for n in (999, 1000, 999_400, 12_345_678)] == ["999 bytes", "1 kB", "999 kB", "12.3 MB"]
-
-
-def test_every_metric_of_the_tables_is_explained() -> None:
-    columns = ["PSNR, dB (test)", "SSIM (train)", "LPIPS (test)", "Splats", "Peak memory, MB", "Precision", "Recall"]
-    assert set(titles_of([*columns, "F-score", "Iterations"])) == {*columns, "F-score"}
-    text = glossary()
-    for term in ("PSNR", "SSIM", "F-score", "Normal consistency", "Chamfer distance"):
-        assert f"<dt>{term}</dt>" in text
-        assert term in TERMS

@@ -8,14 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import ExifTags, Image
+from PIL import Image
 
-from gs2d.data.image_files import read_image, write_image
+from gs2d.data.image_files import write_image
 from gs2d.errors import BackendError
 from gs2d.io.video import write_video
 from gs2d.report.html import image_tag
-from gs2d.sfm.image_copies import copy_images
-from gs2d.sfm.images import find_photos, read_photos
 
 SIDES = (1, 7, 64, 256, 257, 300, 360, 361, 520, 700)
 
@@ -37,25 +35,6 @@ def test_noise_of_any_size_becomes_a_picture_of_the_report(side: int, width: int
     assert shown.shape[1] == min(side, width)
     if side <= width:  # not shrunk: the noise itself, but for the loss of the compression
         assert np.abs(shown.astype(float) - image).mean() < 12
-
-
-@pytest.mark.parametrize("side", [16, 300, 700])
-def test_noise_behind_an_alpha_channel_too(side: int) -> None:
-    assert decoded(image_tag(noise(side, side, 4), alt="noise", width=960)).shape == (side, side, 3)
-
-
-@pytest.mark.parametrize("side", [33, 300])
-def test_noisy_photographs_are_turned_and_shrunk(side: int, tmp_path: Path) -> None:
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = 6
-    (tmp_path / "photos").mkdir()
-    for i in range(3):
-        image = Image.fromarray(noise(side, side + i))
-        image.save(tmp_path / "photos" / f"{i}.jpg", quality=95, exif=exif)
-    photos = list(read_photos(find_photos(tmp_path / "photos")[0], tmp_path / "photos", threads=1))
-    done = list(copy_images(photos, tmp_path / "out", max_size=side, link=False, threads=1))
-    assert done == ["turned", "resized", "resized"]
-    assert read_image(tmp_path / "out" / "0.jpg").shape == (side, side, 3)
 
 
 @pytest.mark.parametrize("ending", [".webp", ".mp4"])
