@@ -4,21 +4,16 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from ball_runs import SMALL, Stop, comparable, options
-from gs2d.config.presets import get_recipe, with_exposure
 from gs2d.data import View
 from gs2d.data.image_files import read_image, write_image
 from gs2d.data.subject import OBJECT, read_subject
 from gs2d.errors import RunError
-from gs2d.experiments import figures
-from gs2d.experiments.figures import rank_run
 from gs2d.io.run_dir import EXPOSURE, RunFolder
 from gs2d.pipeline.demo import demo
 from gs2d.pipeline.events import Event, Notice, Step, ignore
@@ -29,13 +24,11 @@ from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.finish.run_texture import _images
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.finished import open_job
-from gs2d.pipeline.prepare.job import build_recipe, prepare_job
 from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, TextureOptions, TrainOptions
-from gs2d.pipeline.prepare.run_exposures import matched_by_halves, read_exposures
+from gs2d.pipeline.prepare.run_exposures import read_exposures
 from gs2d.pipeline.train.train_run import train
 from gs2d.synthetic import capture as toy
 from gs2d.synthetic.perturb_exposure import GAINS, random_gains, with_gains
-from tiny import ball_cameras
 
 EARLY = (*SMALL, "exposure.start=5", "exposure.rate=0.2")  # so that 60 iterations show something
 
@@ -123,21 +116,6 @@ def test_matched_scores_are_beside_the_plain_ones_where_they_are_asked_for(run: 
     assert "matched in colour to the other half" in " ".join(run.file("report.html").read_text().split())
 
 
-def test_no_pixel_is_matched_by_itself() -> None:
-    # The left half of the photograph is the rendering x 0.5, the right x 0.8: each half gets the other's factor.
-    rng = np.random.default_rng(0)
-    image = rng.integers(60, 200, (20, 20, 3)).astype(np.uint8)
-    factors = np.where(np.arange(20) < 10, 0.5, 0.8)[None, :, None]
-    view = View.from_arrays("a", ball_cameras(1, 20)[0], np.rint(image * factors).astype(np.uint8))
-    color, target = torch.from_numpy(image / 255.0), torch.from_numpy(view.target((0, 0, 0))).double()
-    matched = matched_by_halves(view, color, target, None, (0.0, 0.0, 0.0))
-    assert torch.allclose(matched[:, :10], 0.8 * color[:, :10], atol=0.02)
-    assert torch.allclose(matched[:, 10:], 0.5 * color[:, 10:], atol=0.02)
-    mask = torch.ones(20, 20, dtype=torch.bool)
-    mask[:, 10:] = False  # nothing to learn from on the right: the left half stays as it is
-    assert torch.equal(matched_by_halves(view, color, target, mask, (0.0, 0.0, 0.0))[:, :10], color[:, :10])
-
-
 def test_any_view_can_be_rendered_in_the_exposure_of_a_photograph(run: RunFolder, tmp_path: Path) -> None:
     render_run(run.path, orbit=2, out=tmp_path, exposure_of="train/r_1.png")
     _, job, splats = open_job(run.path, 1, ignore)
@@ -158,13 +136,6 @@ def test_any_view_can_be_rendered_in_the_exposure_of_a_photograph(run: RunFolder
         render_run(run.path, exposure_of="train/r_9.png")
 
 
-def test_a_run_without_exposures_has_none_to_render_in(undisturbed: RunFolder) -> None:
-    assert not undisturbed.file(EXPOSURE).exists()
-    assert "Exposure of the photographs" not in undisturbed.file("report.html").read_text()
-    with pytest.raises(RunError, match="learned none; train with --exposure"):
-        render_run(undisturbed.path, exposure_of="train/r_1.png")
-
-
 def test_the_texture_takes_photographs_in_the_exposure_of_the_scene(run: RunFolder) -> None:
     _, job, splats = open_job(run.path, 1, ignore)
     transforms = read_exposures(run, job.recipe)
@@ -174,24 +145,6 @@ def test_the_texture_takes_photographs_in_the_exposure_of_the_scene(run: RunFold
         inside = view.image()[..., 3] > 0
         expected = 255 * np.clip((view.image()[inside][:, :3] / 255 - b[:, 0]) @ np.linalg.inv(A).T, 0, 1)
         assert np.abs(image.image[inside][:, :3] - expected).max() <= 0.51
-
-
-def test_figures_of_e_i_compare_in_the_exposures_that_were_found(
-    run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    copy = RunFolder(tmp_path / "copy")
-    shutil.copytree(run.path, copy.path)
-    _, job, _ = open_job(run.path, 1, ignore)
-    found = rank_run(copy, job).errors
-    data = json.loads(copy.file(EXPOSURE).read_text())
-    for entry in data["photographs"]:
-        entry["transform"] = np.eye(3, 4).tolist()
-    copy.file(EXPOSURE).write_text(json.dumps(data))
-    as_if_one = rank_run(copy, job).errors
-    monkeypatch.setattr(figures, "read_exposures", lambda *_: {})
-    plain = rank_run(copy, job).errors
-    assert torch.allclose(as_if_one, plain, rtol=1e-3, atol=1e-3)
-    assert not torch.allclose(found, plain, rtol=1e-3, atol=1e-3)
 
 
 def test_a_stopped_run_resumes_to_the_same_splats_and_exposures(run: RunFolder, varied: Path, tmp_path: Path) -> None:
@@ -205,22 +158,6 @@ def test_a_stopped_run_resumes_to_the_same_splats_and_exposures(run: RunFolder, 
     resumed = train(learning(varied, tmp_path / "run", resume=True))
     assert comparable(resumed)[0] == comparable(run)[0]
     assert resumed.file(EXPOSURE).read_bytes() == run.file(EXPOSURE).read_bytes()
-
-
-def test_stages_are_not_shared_between_runs_with_and_without_exposures(varied: Path, tmp_path: Path) -> None:
-    plain = prepare_job(options(varied, tmp_path / "a"), ignore)
-    with_them = prepare_job(learning(varied, tmp_path / "b"), ignore)
-    assert plain.stage_key(0) != with_them.stage_key(0)
-    same_stages = replace(with_them, recipe=replace(with_them.recipe, exposure=None))
-    assert same_stages.stage_key(0) != with_them.stage_key(0)
-
-
-def test_the_flag_leaves_a_recipe_with_exposures_alone() -> None:
-    rest = {"schedule_scale": 0.1, "seed": 3, "overrides": ()}
-    flagged = build_recipe("2dgs-r", exposure=True, **rest)  # type: ignore[arg-type]
-    assert flagged.exposure is not None
-    assert with_exposure(flagged) is flagged
-    assert get_recipe("2dgs-r").exposure is None
 
 
 def test_a_lost_or_damaged_file_of_exposures_is_named_with_its_remedy(run: RunFolder, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from gs2d.core.georeference import Georeference
 from gs2d.geo.projection import Projection, to_enu
 from gs2d.io.formats.registry import read_splat_file
 from gs2d.io.georeference import georeference_of_file, read_georeference, write_georeference
-from gs2d.io.meshes import read_mesh, write_mesh
+from gs2d.io.meshes import read_mesh
 from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.georeference import georeference_run
 from gs2d.pipeline.prepare.options import GeoreferenceOptions
@@ -298,24 +298,6 @@ def test_splats_a_million_metres_away_come_back_to_a_millimetre(
     assert exact > 1e-3 or len(set(which)) == len(expected)
 
 
-def test_a_file_that_knows_where_it_is_keeps_that(run: Path, tmp_path: Path) -> None:
-    g, first, second = placed(run), tmp_path / "a.ply", tmp_path / "b.ply"
-    assert gs2d(["export", str(run), "--out", str(first), "--layout", "2dgs", "--georeferenced", "--quiet"]) == 0
-    assert gs2d(["export", str(first), "--out", str(second), "--layout", "2dgs", "--quiet"]) == 0
-    said = georeference_of_file(second)
-    assert said is not None
-    assert said.origin.tolist() == g.origin.tolist()
-    assert (read_splats(second).means == read_splats(first).means).all()
-
-
-def test_without_the_option_a_run_s_files_have_the_run_s_coordinates(run: Path, tmp_path: Path) -> None:
-    placed(run)
-    out = tmp_path / "a.ply"
-    assert gs2d(["export", str(run), "--out", str(out), "--layout", "2dgs", "--quiet"]) == 0
-    assert out.read_bytes() == (run / "splats.ply").read_bytes()
-    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["a.ply"]
-
-
 def test_the_mesh_a_million_metres_away_comes_back_to_a_millimetre(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -330,49 +312,6 @@ def test_the_mesh_a_million_metres_away_comes_back_to_a_millimetre(
     assert (run / "mesh.ply").read_bytes() == before
     assert gs2d(["info", str(out)]) == 0
     assert "EPSG:32632" in capsys.readouterr().out
-
-
-def test_no_georeference_and_no_file_to_write_are_one_line(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["export", str(run), "--out", str(tmp_path / "a.ply"), "--georeferenced"]
-    assert "position in the world of" in error_of(words, capsys)
-    assert not (tmp_path / "a.ply").exists()
-    placed(run)
-    assert "needs --out" in error_of(["mesh", str(run), "--georeferenced"], capsys)
-    (run / "georeference.json").write_text("{}")
-    assert "was damaged" in error_of(words, capsys)
-
-
-def test_the_prj_file_is_read_by_pyproj(run: Path, tmp_path: Path) -> None:
-    pyproj = pytest.importorskip("pyproj")
-    placed(run)
-    assert gs2d(["export", str(run), "--out", str(tmp_path / "a.ply"), "--georeferenced", "--quiet"]) == 0
-    crs = pyproj.CRS.from_wkt((tmp_path / "a.prj").read_text())
-    assert crs.to_epsg(min_confidence=50) == 32632
-
-
-def test_a_textured_mesh_says_where_it_is(tmp_path: Path) -> None:
-    from gs2d.core.mesh import TexturedMesh
-    from gs2d.io.georeference import stamp
-    from gs2d.io.meshes import write_textured
-
-    trimesh = pytest.importorskip("trimesh")
-    g = Georeference(1.0, np.eye(3), np.zeros(3), np.array([5e5, 5e6, 10.0]), "a test", epsg=32632)
-    mesh = TexturedMesh(
-        np.eye(3, dtype=np.float32), np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32),
-        np.zeros((3, 2), np.float32), np.zeros((4, 4, 3), np.uint8),
-    )  # fmt: skip
-    for name in ("a.glb", "a.obj"):
-        write_textured(tmp_path / name, mesh)
-        assert georeference_of_file(tmp_path / name) is None
-        assert stamp(tmp_path / name, g)
-        said = georeference_of_file(tmp_path / name)
-        assert said is not None
-        assert said.origin.tolist() == g.origin.tolist()
-        assert trimesh.load_mesh(tmp_path / name).faces.shape == (1, 3)  # still a mesh to others
-    write_mesh(tmp_path / "a.ply", read_mesh(tmp_path / "a.obj"))
-    assert georeference_of_file(tmp_path / "a.ply") is None
 
 
 @pytest.mark.parametrize("name", ["mesh.glb", "mesh.obj"])

@@ -11,7 +11,7 @@ import pytest
 
 import gs2d
 from ball_runs import SCALE, SMALL
-from gs2d.errors import DataError, ProtocolError, RecipeError
+from gs2d.errors import DataError, RecipeError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.in_memory import Trained
@@ -56,13 +56,6 @@ def test_splats_from_elsewhere_are_scored_and_meshed_with_their_scene(trained: T
     assert half.vertices[:, 2].min() >= -1e-6
 
 
-def test_events_and_progress_reach_the_caller(capture: Path) -> None:
-    events: list[Any] = []
-    gs2d.train(capture, "2dgs", schedule_scale=0.001, backend="cpu", on_event=events.append)
-    names = {type(event).__name__ for event in events}
-    assert {"StageStarted", "Progress"} <= names
-
-
 def test_mistakes_are_named_before_anything_is_trained(trained: Trained) -> None:
     scene = trained.scene
     with pytest.raises(RecipeError, match="no recipe '2dgz'"):
@@ -86,12 +79,3 @@ def test_a_total_of_iterations_is_trained_and_shown(capture: Path, capsys: pytes
     assert {"StageStarted", "Progress"} <= {type(event).__name__ for event in events}
     with pytest.raises(RecipeError, match=r"iterations and schedule_scale both set .*, got 41 and 0.5; give one"):
         gs2d.train(capture, "2dgs-r", iterations=41, schedule_scale=0.5, **small)
-
-
-def test_a_mesh_has_the_voxel_that_was_asked_for(trained: Trained) -> None:
-    coarse = gs2d.extract_mesh(trained, voxel=0.2)
-    assert 0 < len(coarse.faces) < len(gs2d.extract_mesh(trained).faces)
-    same = gs2d.extract_mesh(trained, options=gs2d.MeshOptions(voxel=0.2))
-    assert np.array_equal(coarse.vertices, same.vertices)
-    with pytest.raises(ProtocolError, match=r"voxel was given twice, as 0.1 and in options as 0.2; leave one out"):
-        gs2d.extract_mesh(trained, voxel=0.1, options=gs2d.MeshOptions(voxel=0.2))

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from ball_runs import Stop, comparable, options
+from ball_runs import comparable, options
 from gs2d.errors import DiskError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.events import Event, Notice
@@ -73,17 +73,6 @@ def test_a_run_interrupted_before_its_first_checkpoint_resumes_to_the_same_bytes
     assert stages == comparable(undisturbed)[2]
 
 
-@pytest.mark.parametrize("iteration", [6, 31])
-def test_the_log_of_a_run_that_was_interrupted_is_that_of_an_undisturbed_one(
-    iteration: int, capture: Path, undisturbed: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as patch:
-        interrupted_at(patch, {iteration})
-        with pytest.raises(KeyboardInterrupt):
-            train(options(capture, tmp_path / "run"))
-    assert comparable(train(options(capture, tmp_path / "run", resume=True))) == comparable(undisturbed)
-
-
 def test_a_checkpoint_that_cannot_be_saved_is_said_and_the_interrupt_acts_all_the_same(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -97,16 +86,6 @@ def test_a_checkpoint_that_cannot_be_saved_is_said_and_the_interrupt_acts_all_th
         train(options(capture, tmp_path / "run", checkpoint_every=10_000), heard.append)
     assert any("no checkpoint at iteration" in event.text for event in heard if isinstance(event, Notice))
     assert not (tmp_path / "run").exists()
-
-
-def test_signals_act_as_before_when_training_fails(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    before = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr(Trainer, "step", lambda _self: (_ for _ in ()).throw(Stop))
-    with pytest.raises(Stop):
-        train(options(capture, tmp_path / "run"))
-    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_second_signal_acts_at_once_unless_it_is_the_first_one_again(monkeypatch: pytest.MonkeyPatch) -> None:

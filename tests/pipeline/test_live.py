@@ -154,47 +154,12 @@ def test_nothing_is_copied_without_a_page_or_too_soon_or_before_the_last_copy_wa
     assert version_of(live) == 2
 
 
-def test_copies_take_a_small_share_of_the_time(live: Live, splats: Splats, monkeypatch: pytest.MonkeyPatch) -> None:
-    pack = module.pack
-
-    def work(*arguments: Any) -> Any:
-        end = time.thread_time() + 0.1
-        while time.thread_time() < end:
-            pass
-        return pack(*arguments)
-
-    monkeypatch.setattr(module, "pack", work)
-    monkeypatch.setattr(module, "MAX_FRACTION", 0.01)
-    version_of(live)
-    live.on_training_event(progress(), state_of(splats), None)
-    live._answer_splats({})
-    assert live._copy_at - time.monotonic() == pytest.approx(10.0, abs=3.0)  # 0.1 s is a hundredth of that
-
-
 def test_a_viewer_that_fails_is_told_once_and_training_goes_on(live: Live, heard: list[Event]) -> None:
     live._server.failure = OSError("no memory")
     for _ in range(2):
         live.on_event(Phase("scoring", 3))
     told = [event.text for event in heard if isinstance(event, Notice)]
     assert told[1:] == ["the viewer failed, training goes on: OSError: no memory"]
-
-
-def test_a_copy_without_memory_stops_no_training(live: Live, splats: Splats, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: Any, **__: Any) -> torch.Tensor:
-        raise RuntimeError("not enough memory")
-
-    version_of(live)
-    monkeypatch.setattr(torch.Tensor, "to", fail)
-    live.on_training_event(progress(), state_of(splats), None)
-    assert str(live._server.failure) == "not enough memory"
-
-
-def test_the_page_says_what_is_done(live: Live, splats: Splats) -> None:
-    live.on_event(Phase("training 2dgs-r", 6000))
-    live.on_training_event(progress(), state_of(splats), 24.318)
-    live.on_event(Step(1200, "surface 1,200/3,000  52,787 splats"))
-    state = json.loads(bytes(live._answer_state({}).parts[0]))
-    assert state["status"] == "training 2dgs-r 1,200/6,000  surface 1,200/3,000  52,787 splats  PSNR 24.32 dB"
 
 
 @pytest.mark.parametrize(

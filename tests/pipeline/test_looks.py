@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from ball_runs import comparable, options
+from ball_runs import options
 from gs2d.core.camera import look_at
 from gs2d.core.splats import Splats
 from gs2d.data.scene import View
@@ -78,33 +77,9 @@ def test_stages_before_the_last_are_scored_on_some_training_views_and_say_so(
     assert few.file("splats.ply").read_bytes() == undisturbed.file("splats.ply").read_bytes()
 
 
-def test_where_training_views_are_compared_all_of_them_score_every_stage(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Else a stage after the first would look better or worse for being scored on other views."""
-    monkeypatch.setattr(recorder, "EARLY_VIEWS", 2)
-    run = train(replace(options(capture, tmp_path / "run"), protocol="dtu"))
-    stages = run.metrics()["stages"]
-    assert len(stages) == 3
-    assert all("views" not in stage["train"] for stage in stages)
-    assert "views" not in stages[2]["after_clone"]["train"]
-
-
 def test_the_mesh_of_what_was_rendered_for_the_scores_is_that_of_rendering_again(
     few: RunFolder, tmp_path: Path
 ) -> None:
     shutil.copytree(few.path, tmp_path / "run")
     mesh_run(tmp_path / "run")
     assert (tmp_path / "run" / "mesh.ply").read_bytes() == few.file("mesh.ply").read_bytes()
-
-
-def test_a_stage_that_was_not_the_last_in_the_run_it_is_taken_from_is_scored_on_all_views(
-    few: RunFolder, capture: Path, tmp_path: Path
-) -> None:
-    taken = train(options(capture, tmp_path / "taken", recipe="2dgs", start_from=few.path))
-    trained = train(options(capture, tmp_path / "trained", recipe="2dgs"))
-    (entry,) = taken.metrics()["stages"]
-    assert entry["reused_from"] == str(few.path)
-    assert entry["seconds"] == few.metrics()["stages"][0]["seconds"]
-    assert comparable(taken)[2] == comparable(trained)[2]
-    assert taken.file("mesh.ply").read_bytes() == trained.file("mesh.ply").read_bytes()

@@ -14,7 +14,7 @@ from PIL import Image
 
 from capture_writers import ColmapModel, ring, small_colmap
 from gs2d.cli import run
-from gs2d.config.protocols import GENERIC, PROTOCOLS
+from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import LossTerm, Recipe, Stage
 from gs2d.core.splats import Splats
 from gs2d.data import load_scene
@@ -23,7 +23,7 @@ from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.events import Notice
 from gs2d.pipeline.finish.run_subject import sights
 from gs2d.pipeline.in_memory import Trained, evaluate, extract_mesh, train
-from gs2d.pipeline.prepare.capture_masks import with_masks, without_masked_points
+from gs2d.pipeline.prepare.capture_masks import without_masked_points
 from gs2d.pipeline.prepare.job import reload_job, scene_digest
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.render.backends import get_backend
@@ -130,17 +130,6 @@ def test_points_that_lie_in_masked_pixels_alone_start_nothing(tmp_path: Path) ->
     scene = without_masked_points(load_scene(tmp_path, test_every=0, masked="off"), GENERIC, said.append)
     assert scene.points is not None
     assert len(scene.points) == 7
-
-
-def test_a_protocol_that_passes_masks_over_says_so_unless_they_are_asked_for(tmp_path: Path) -> None:
-    root, said = write_ball(tmp_path, 0), list[Any]()
-    protocol = PROTOCOLS["tnt"]
-    assert not with_masks(protocol, load_scene(root), said.append).use_mask_in_training
-    assert said == [Notice("the protocol tnt trains on masked pixels too (--masked ignore leaves them out)")]
-    assert with_masks(protocol, load_scene(root, masked="ignore"), said.append).use_mask_in_training
-    assert with_masks(protocol, load_scene(root, masks=root / "masks"), said.append).use_mask_in_training
-    assert with_masks(protocol, load_scene(root, masked="empty"), said.append) is protocol
-    assert len(said) == 1
 
 
 def test_masks_that_leave_nothing_are_told_and_all_of_them_refused(tmp_path: Path) -> None:

@@ -9,29 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from gs2d.core.camera import look_at
 from gs2d.data import Scene, View
-from gs2d.data.cache import TRIM_EVERY, DecodedImage, ImageCache
-from gs2d.kernels.buffer_pool import BufferPool
+from gs2d.data.cache import DecodedImage, ImageCache
 from gs2d.pipeline.prepare.memory_budget import release
-
-HOLES = """
-import os, sys
-from gs2d.core.memory import trim
-
-def resident():
-    return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
-blocks = [bytearray(60_000) for _ in range(2000)]  # below what is mapped alone: 120 MB of heap
-kept = blocks[::40]
-del blocks
-before = resident()
-done = trim()
-print(done, before - resident())
-"""
-
 
 KEPT = """
 import resource, sys
@@ -65,17 +47,6 @@ def test_what_an_iteration_frees_serves_the_next_one_until_it_is_given_back() ->
     assert int(rounds["not"][0]) > 10_000  # what it is for
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the resident memory is read from /proc")
-def test_the_holes_between_what_stays_go_back_to_the_system() -> None:
-    found = subprocess.run(
-        [sys.executable, "-c", HOLES], capture_output=True, text=True, check=True, env=dict(os.environ)
-    )
-    done, freed = found.stdout.split()
-    if done == "False":
-        pytest.skip("this C library has no malloc_trim")
-    assert int(freed) > 80e6
-
-
 def test_a_scene_that_forgets_its_pictures_decodes_them_again(tmp_path: Path) -> None:
     cache, decoded = ImageCache(1 << 20), []
     camera = look_at(np.array([0.0, 0.0, -3.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]), width=4, height=4, fx=5.0)
@@ -96,24 +67,3 @@ def test_a_scene_that_forgets_its_pictures_decodes_them_again(tmp_path: Path) ->
     assert (cache.nbytes, len(cache)) == (0, 0)
     assert scene.views[1].image()[0, 0, 0] == 2
     assert len(decoded) == 3
-
-
-def test_what_decoding_left_goes_back_however_a_picture_was_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    given_back: list[int] = []
-    monkeypatch.setattr("gs2d.data.cache.trim", lambda: given_back.append(1))
-    cache = ImageCache(1 << 20)
-    for name in range(40):
-        for _ in range(3):  # held pictures are not decoded again
-            cache.get(name, lambda: DecodedImage(np.zeros((4, 4, 3), np.uint8)))
-    assert len(given_back) == 40 // TRIM_EVERY
-
-
-def test_buffers_that_nobody_holds_are_given_up() -> None:
-    pool = BufferPool(min_bytes=1024)
-    held = pool.empty((1024,), torch.float32)
-    held[:] = 7
-    pool.empty((2048,), torch.float32)  # dropped at once
-    assert pool.free_bytes >= 8192
-    pool.clear()
-    assert pool.free_bytes == 0
-    assert bool((held == 7).all())

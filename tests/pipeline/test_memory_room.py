@@ -48,21 +48,6 @@ def test_what_cannot_fit_is_refused_with_the_number_and_a_remedy_that_works(monk
     assert needed < 0.6 * 0.95 * GB  # caches have room beside it
 
 
-def test_what_fits_is_not_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    limited(monkeypatch, 16, 0.35)
-    check_memory(scene(5888, 3926), 1, on_host=True)
-    limited(monkeypatch, 1.3, 0.35)
-    check_memory(scene(5888, 3926), 1, on_host=False)  # the host only decodes
-    monkeypatch.setattr(module, "memory_limit", lambda: None)
-    check_memory(scene(10**5, 10**5), 1, on_host=True)
-
-
-def test_where_not_even_decoding_fits_no_downscale_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    limited(monkeypatch, 0.5, 0.45)
-    with pytest.raises(DataError, match="smaller files of the photographs"):
-        check_memory(scene(20000, 10000), 1, on_host=True)
-
-
 def test_a_training_that_nobody_said_the_size_of_shrinks_its_photographs_until_they_fit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,7 +16,6 @@ from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.events import Event, MissingFile
 from gs2d.pipeline.finish.run_report import report_run
-from gs2d.pipeline.train import train_run as train_module
 from gs2d.pipeline.train.train_run import train
 
 MADE = ("mesh.ply", "report.html", "scene.html")
@@ -84,12 +83,6 @@ def test_what_cannot_be_made_is_said_and_leaves_the_others(
     assert missing[0].command == (command and command.format(run=finished))
     assert missing[0].error is error
     assert {name for name in MADE if (finished / name).exists()} == set(MADE) - {what}
-
-
-def test_a_report_without_its_mesh_says_so(capture: Path, finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(train_module, "extract_mesh", failing(ProtocolError("depth was expected, got none")))
-    train(options(capture, finished, resume=True))
-    assert "There is no mesh.ply" in (finished / "report.html").read_text()
 
 
 def test_a_full_disk_ends_the_run_all_the_same(capture: Path, finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:

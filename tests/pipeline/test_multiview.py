@@ -10,8 +10,7 @@ import pytest
 
 from ball_runs import SMALL, Stop, comparable, options
 from gs2d.errors import DataError
-from gs2d.pipeline.events import Event, Step, ignore
-from gs2d.pipeline.prepare.job import prepare_job
+from gs2d.pipeline.events import Event, Step
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.train.train_run import train
 
@@ -46,10 +45,3 @@ def test_cameras_that_all_look_elsewhere_are_refused_and_leave_nothing(capture: 
     with pytest.raises(DataError, match="no training view of ball has a neighbour within multiview.max_angle = 0.1"):
         train(comparing(capture, tmp_path / "run", overrides=narrow))
     assert not (tmp_path / "run").exists()
-
-
-def test_how_views_are_compared_decides_which_stages_are_shared(capture: Path, tmp_path: Path) -> None:
-    job = prepare_job(comparing(capture, tmp_path / "a"), ignore)
-    other = prepare_job(comparing(capture, tmp_path / "b", overrides=(*SMALL, *WIDE[:-1])), ignore)
-    assert job.stage_key(0) != other.stage_key(0)
-    assert job.stage_key(0) == prepare_job(comparing(capture, tmp_path / "c"), ignore).stage_key(0)

@@ -14,10 +14,7 @@ from PIL import Image
 from ball_runs import options as training
 from gs2d.cli import run as gs2d
 from gs2d.core.georeference import Georeference
-from gs2d.core.mesh import Mesh
 from gs2d.io.georeference import write_georeference
-from gs2d.io.meshes import write_mesh
-from gs2d.pipeline import orthophoto
 from gs2d.pipeline.train.train_run import train
 from tiny import RADIUS, write_ball_mesh, write_capture
 
@@ -79,32 +76,6 @@ def test_heights_and_colours_lie_where_the_ball_is(run: Path, capsys: pytest.Cap
     assert np.abs(image[middle, :3] - expected[middle]).mean() < 8
     assert told["cells"] == known.sum()
     assert told["cells_unseen"] < 0.05 * told["cells"]
-
-
-def test_the_resolution_is_that_of_the_photographs_if_nobody_says_one(run: Path, tmp_path: Path) -> None:
-    result = orthophoto.orthophoto_run(run, tmp_path / "map.tif")
-    pixel = SCALE * (3.0 - RADIUS) * 2 * np.tan(0.35) / 64  # of a camera on the place beneath it
-    assert pixel < result["resolution"] < 3 * pixel
-    assert result["resolution"] in (0.25, 0.5, 1.0)
-    assert [Path(file).name for file in result["files"]] == ["map.tif", "map_elevation.tif"]
-    assert not (run / "orthophoto.tif").exists()
-
-
-def test_cells_that_no_photograph_sees_have_the_mesh_s_colours(run: Path) -> None:
-    plate = np.array([[-4.0, -4, -0.9], [4, -4, -0.9], [4, 4, -0.9], [-4, 4, -0.9]])  # wider than all photographs
-    green = np.tile(np.array([[10, 200, 30]], dtype=np.uint8), (4, 1))
-    lid = plate + np.array([0, 0, 4.0])  # above all cameras, which see its lower side
-    vertices = np.concatenate([plate, lid])
-    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], dtype=np.int32)
-    write_mesh(run / "mesh.ply", Mesh(vertices, faces, np.concatenate([green, green])))
-    with pytest.raises(Exception, match="photographs that see the mesh were expected"):
-        orthophoto.orthophoto_run(run)
-    write_mesh(run / "mesh.ply", Mesh(vertices[:4], faces[:2], green))
-    result = orthophoto.orthophoto_run(run)
-    image = np.asarray(Image.open(run / "orthophoto.tif"))
-    known = (image == (10, 200, 30, 255)).all(axis=-1)
-    assert result["cells_unseen"] == pytest.approx(known.sum(), abs=2)
-    assert 0 < result["cells_unseen"] < result["cells"]
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from gs2d.data.exif import Taken
 from gs2d.errors import DataError
 from gs2d.pipeline.prepare.options import PosesOptions
 from gs2d.pipeline.prepare.photo_places import places_of
-from gs2d.pipeline.prepare.pose_finding import _matching, asked_for
+from gs2d.pipeline.prepare.pose_finding import _matching
 from gs2d.sfm.images import Photo
 
 DEGREE = 111_195.0  # m of latitude, about
@@ -45,22 +45,6 @@ def test_photographs_without_a_place_are_said_and_kept() -> None:
     )
 
 
-def test_places_within_a_receiver_s_error_are_not_used_and_that_is_said() -> None:
-    places = places_of(line(30, 0.5), None)
-    assert places.known == 0
-    assert "positions of photographs are not used: they are within 4." in places.notes[0]
-
-
-def test_photographs_that_know_nothing_say_nothing() -> None:
-    assert places_of([photo("a.jpg"), photo("b.jpg")], None).notes == ()
-
-
-def test_a_height_that_one_of_them_lacks_is_no_height_of_all() -> None:
-    photos = [photo("a.jpg", (47.0, 8.0, 500.0)), photo("b.jpg", (47.001, 8.0, float("nan")))]
-    heights = [place[2] for place in places_of(photos, None).metres if place is not None]
-    assert heights == [0.0, 0.0]
-
-
 def test_a_list_of_places_is_taken_instead_of_what_the_files_say(tmp_path: Path) -> None:
     (tmp_path / "places.csv").write_text("name,x,y,z\nsub/000.jpg,1,2,3\nsub/001.jpg,4,5,6\n")
     photos = [photo("sub/000.jpg", (47.0, 8.0, 0.0)), photo("sub/001.jpg"), photo("sub/002.jpg")]
@@ -83,9 +67,3 @@ def test_which_pairs_are_compared_depends_on_how_many_know_their_place() -> None
     assert _matching(options("sequential"), 200, most) == "sequential"
     with pytest.raises(DataError, match="--matching spatial needs photographs that know where they were taken, none"):
         _matching(options("spatial"), 3, places_of([photo("a.jpg")] * 3, None))
-
-
-def test_a_list_of_places_is_remembered_by_its_whole_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    options = PosesOptions(photos=Path("a"), out=Path("b"), positions=Path("places.csv"))
-    assert asked_for(options)["positions"] == str(tmp_path / "places.csv")

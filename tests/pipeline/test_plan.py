@@ -7,7 +7,6 @@ import re
 import shlex
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,34 +18,21 @@ from gs2d.cli.parser import parse
 from gs2d.config.densify import Densify
 from gs2d.config.presets import get_recipe
 from gs2d.config.recipe import Stage
-from gs2d.config.robust import Removal
 from gs2d.config.serialize import apply_overrides
 from gs2d.core import memory_limit
-from gs2d.data import load_scene
-from gs2d.errors import DataError, RecipeError
+from gs2d.errors import DataError
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.prepare import estimate as module
 from gs2d.pipeline.prepare import plan as plan_module
 from gs2d.pipeline.prepare.estimate import (
-    DOUBT,
-    GROWTH,
     PROGRAM_BYTES,
-    TRIAL_ITERATIONS,
     budget_overrides,
-    estimate,
-    expected_splats,
-    rasterizer_speed,
-    rounded,
-    start_of,
-    training_work,
 )
 from gs2d.pipeline.prepare.options import PlanOptions, TrainOptions
 from gs2d.pipeline.prepare.plan import plan
 from gs2d.pipeline.train import train_run as train_module
 from gs2d.pipeline.train.train_run import train
-from gs2d.render.backends import get_backend
 from gs2d.synthetic.flight import Flight, write_flight
-from train_toys import backends
 
 
 @pytest.fixture(autouse=True)
@@ -130,40 +116,6 @@ def test_a_plan_is_of_the_training_that_train_would_do(
     assert asked[0] == asked[1]
 
 
-def test_a_plan_takes_a_second_at_most_for_the_speed_of_the_machine() -> None:
-    for name in backends():
-        backend = get_backend(name)
-        rasterizer_speed(backend)  # loads the library
-        begun = time.perf_counter()
-        seconds = rasterizer_speed(backend)
-        assert 0 < seconds < 1
-        assert time.perf_counter() - begun < 10  # a busy machine is slower
-
-
-def test_splats_at_the_end_are_those_at_the_start_times_growth_but_for_a_budget() -> None:
-    recipe = get_recipe("2dgs")
-    found = expected_splats(recipe, 1000)
-    assert (found.least, found.expected, found.most) == tuple(1000 * factor for factor in GROWTH)
-    limited = expected_splats(apply_overrides(recipe, ("surface.densify.max_splats=2500",)), 1000)
-    assert (limited.expected, limited.most) == (2500, 2500)
-    frozen = expected_splats(apply_overrides(recipe, ("surface.densify=null",)), 1000)
-    assert (frozen.least, frozen.most) == (1000, 1000)
-    once = expected_splats(apply_overrides(recipe, ("surface.densify.start=500", "surface.densify.stop=601")), 1000)
-    assert once.most == 2000  # one densification doubles at most
-
-
-def test_a_dense_start_goes_with_the_photographs_and_another_with_the_points(capture: Path) -> None:
-    scene = load_scene(capture, test_every=0)
-    assert scene.points is not None
-    assert start_of(scene, get_recipe("2dgs")) == len(scene.points)
-    assert start_of(replace(scene, points=None), get_recipe("2dgs")) == get_recipe("2dgs").init_points
-    best = get_recipe("best")
-    bare = replace(scene, points=None)
-    assert start_of(bare, best) == round(64 * 48 / 9 * 12**0.5)
-    assert start_of(replace(bare, train=scene.train[:3]), best) == round(64 * 48 / 9 * 3**0.5)
-    assert start_of(scene, best) - start_of(bare, best) == pytest.approx(len(scene.points) / 2, abs=1)
-
-
 def test_a_budget_is_set_in_each_stage_that_takes_one_whatever_it_is_called() -> None:
     first, *rest = get_recipe("2dgs-r-absgs-d").stages
     moving = Stage("move", 100, losses=first.losses, densify=Densify("relocation", {"max_splats": 9, "stop": 50}))
@@ -229,31 +181,3 @@ def test_a_training_with_limits_says_its_plan_before_it_begins(capture: Path, tm
         train(TrainOptions(scene=capture, out=tmp_path / "run", recipe="2dgs", schedule_scale=0.01, memory=3.0), stop)
     assert any(text.startswith("memory: ") and "of 3 GiB allowed" in text for text in heard)
     assert any(text.startswith("time: ") for text in heard)
-
-
-def test_figures_for_people_have_two_digits() -> None:
-    assert [rounded(value) for value in (0.3, 7, 1234, 98_765)] == [0, 7, 1200, 99_000]
-
-
-def test_a_memory_that_is_none_is_refused(capture: Path) -> None:
-    with pytest.raises(RecipeError, match=r"--memory must be 0.5 GiB or more, got 0"):
-        plan(planned(capture, memory=0.0))
-
-
-def test_time_grows_with_pixels_iterations_and_trials_of_removal(
-    capture: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scene, recipe = load_scene(capture, test_every=0), apply_overrides(get_recipe("2dgs"), ("surface.densify=null",))
-    work = training_work(scene, recipe, 1000)
-    longer = replace(recipe, stages=(replace(recipe.stages[0], iterations=2 * recipe.iterations),))
-    assert training_work(scene, longer, 1000) == pytest.approx(2 * work)
-    assert training_work(load_scene(capture, downscale=2, test_every=0), recipe, 0) == pytest.approx(
-        training_work(scene, recipe, 0) / 4
-    )
-    removing = replace(recipe, removal=Removal(every=recipe.iterations + 1))  # five trials, at the ends of parts
-    trials = 5 * TRIAL_ITERATIONS * 12 / 24  # of 12 photographs half the witnesses
-    assert training_work(scene, removing, 0) == pytest.approx(training_work(scene, recipe, 0) * (1 + trials / 30_000))
-    monkeypatch.setattr(module, "rasterizer_speed", lambda _: 1e-6)
-    found = estimate(scene, recipe, get_backend(backends()[-1]), start=1000)
-    assert found.training.expected == pytest.approx(work * 1e-6)
-    assert found.training.most == pytest.approx(DOUBT * work * 1e-6)

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from gs2d.cli.app import run as main
 from gs2d.config.presets import get_recipe
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe
@@ -17,7 +16,7 @@ from gs2d.config.schedule import scale_schedule
 from gs2d.core import memory_limit
 from gs2d.data import load_scene
 from gs2d.data.prepared import SUFFIX, Stored
-from gs2d.errors import DataError, RecipeError
+from gs2d.errors import DataError
 from gs2d.pipeline.events import Event, Notice, Phase
 from gs2d.pipeline.finish.run_mesh import mesh_run
 from gs2d.pipeline.finish.run_report import report_run
@@ -134,22 +133,6 @@ def test_a_run_that_was_broken_off_while_it_prepared_goes_on(
     assert {path: path.stat().st_mtime_ns for path in (out / PREPARED).iterdir()} == times
 
 
-def test_limits_that_are_none_are_refused_in_one_line(
-    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(RecipeError, match=r"--memory must be 0.5 GiB or more, got 0.1"):
-        train(options(capture, tmp_path / "run", "auto", memory=0.1))
-    for words, said in (
-        (["--disk", "-1"], "--disk must be a positive number of GiB, got -1"),
-        (["--prepare", "always", "--disk", "1e-6"], "prepared photographs need about"),
-    ):
-        assert main(["train", str(capture), "--out", str(tmp_path / "run"), *words]) == 2
-        error = capsys.readouterr().err
-        assert said in error
-        assert error.count("\n") == 1
-    assert not (tmp_path / "run").exists()
-
-
 def test_a_budget_bounds_caches_and_refuses_photographs_that_are_too_large(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -166,9 +149,3 @@ def test_a_budget_bounds_caches_and_refuses_photographs_that_are_too_large(
     monkeypatch.setattr("gs2d.pipeline.prepare.memory_budget.ITERATION_BYTES", 1 << 40)  # at no downscale
     with pytest.raises(DataError, match=r"photographs of up to .* of 1 GiB \(--memory\)"):
         train(options(capture, tmp_path / "run", "auto", memory=1.0))
-
-
-def test_the_recipes_tried_here_look_at_many_views_at_once() -> None:
-    """Else equal bytes would say little of them."""
-    best = get_recipe("best")
-    assert best.dense_start is not None or best.multiview is not None

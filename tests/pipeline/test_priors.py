@@ -15,11 +15,9 @@ import pytest
 from PIL import Image
 
 from ball_runs import SMALL, Stop, comparable, options
-from gs2d.config.presets import with_depth_prior
-from gs2d.errors import DataError, RecipeError
+from gs2d.errors import DataError
 from gs2d.io.run_dir import REPORT, RunFolder
-from gs2d.pipeline.events import Event, MissingFile, Notice, Step, ignore
-from gs2d.pipeline.prepare.job import build_recipe, prepare_job
+from gs2d.pipeline.events import Event, MissingFile, Notice, Step
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.train.train_run import train
 from tiny import RADIUS, SIZE, ball_cameras
@@ -78,12 +76,6 @@ def test_a_run_logs_measures_and_shows_what_was_known(run: RunFolder) -> None:
     assert "rendered normals" in report
 
 
-def test_a_run_without_priors_says_nothing_about_them(undisturbed: RunFolder) -> None:
-    assert not (undisturbed.path / "renders" / "losses").exists()
-    assert "Known depths" not in undisturbed.file(REPORT).read_text()
-    assert not any("losses" in stage for stage in undisturbed.metrics()["stages"])
-
-
 def test_a_stopped_run_resumes_to_the_same_bytes(run: RunFolder, valid: Path, tmp_path: Path) -> None:
     def listen(event: Event) -> None:
         if isinstance(event, Step) and event.done >= 21 and "loss" in event.detail:
@@ -92,24 +84,6 @@ def test_a_stopped_run_resumes_to_the_same_bytes(run: RunFolder, valid: Path, tm
     with pytest.raises(Stop):
         train(knowing(valid, tmp_path / "run"), listen)
     assert comparable(train(knowing(valid, tmp_path / "run", resume=True))) == comparable(run)
-
-
-def test_what_is_known_decides_which_stages_are_shared_and_is_said(valid: Path, tmp_path: Path) -> None:
-    said: list[str] = []
-    job = prepare_job(knowing(valid, tmp_path / "a"), lambda e: said.append(e.text) if isinstance(e, Notice) else None)
-    assert "known depths: maps of a sensor in 6 of 6 training views, 4" in " ".join(said)
-    assert "known normals: 6 of 6 training views, axes opengl" in said
-    assert "depth maps: 6 of 8 views have one in depths (--depth-prior uses them)" in said
-    plain = prepare_job(options(valid, tmp_path / "b"), ignore)
-    assert job.stage_key(0) != plain.stage_key(0)
-    changed = tmp_path / "changed"
-    shutil.copytree(valid, changed)
-    path = changed / "depths" / "train" / "r_0.png"
-    values = np.array(Image.open(path))
-    values[values > 0] += 1
-    Image.fromarray(values).save(path)
-    assert prepare_job(knowing(changed, tmp_path / "c"), ignore).images_digest != job.images_digest
-    assert prepare_job(options(changed, tmp_path / "d"), ignore).images_digest == plain.images_digest
 
 
 def test_maps_of_a_run_that_is_resumed_must_be_the_same(valid: Path, tmp_path: Path) -> None:
@@ -164,22 +138,3 @@ def test_names_that_are_no_utf_8_and_hold_escape_sequences_have_known_depths_too
     assert len(stages[-1]["losses"]["depth_prior"]["by_view"]) == 6
     assert (tmp_path / "run" / REPORT).exists()
     assert not any(isinstance(event, MissingFile) for event in heard)
-
-
-def test_a_capture_without_depths_is_refused_and_leaves_nothing(capture: Path, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="or have depth maps in depths/ or depth_file_path"):
-        train(options(capture, tmp_path / "run", depth_prior="auto"))
-    assert not (tmp_path / "run").exists()
-
-
-def test_the_option_takes_a_source() -> None:
-    rest: dict[str, Any] = {"schedule_scale": 0.1, "seed": 3, "overrides": ()}
-    flagged = build_recipe("2dgs-r", depth_prior="auto", **rest)
-    assert with_depth_prior(flagged) == flagged
-    assert flagged.depth_prior is not None
-    assert flagged.depth_prior.decay_steps == 3000
-    chosen = build_recipe("2dgs-r", depth_prior="sparse", **rest).depth_prior
-    assert chosen == replace(flagged.depth_prior, source="sparse")
-    assert [any(t.kind == "depth_prior" for t in s.losses) for s in flagged.stages] == [True, False, True]
-    with pytest.raises(RecipeError, match="depth_prior is null, but loss 'depth_prior' needs it"):
-        build_recipe("2dgs", depth_prior="auto", **{**rest, "overrides": ("depth_prior=null",)})

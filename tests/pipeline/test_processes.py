@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import signal
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,12 +11,7 @@ import pytest
 import ball_runs
 import gs2d.cli
 import together_run
-from gs2d.core.processes import Place
 from gs2d.io.run_dir import RunFolder, load_tensors
-from gs2d.pipeline.events import ignore
-from gs2d.pipeline.prepare.job import prepare_job
-from gs2d.pipeline.prepare.options import TrainOptions
-from gs2d.pipeline.train.process_group import memory_of
 from process_runs import ITERATIONS, in_processes, torchrun, words
 from tiny import write_capture
 
@@ -111,21 +105,6 @@ def test_other_commands_are_refused_by_process_0(
     assert gs2d.cli.run(["mesh", "runs/x"]) == 2
     line = "error: gs2d mesh runs in one process, got 2; gs2d train is for torchrun\n"
     assert capsys.readouterr().err == (line if rank == "0" else "")
-
-
-def test_the_key_of_a_stage_knows_how_many_trained_it(capture: Path, tmp_path: Path) -> None:
-    job = prepare_job(TrainOptions(scene=capture, out=tmp_path, recipe="2dgs"), ignore)
-    two = replace(job, processes=2)
-    assert job.stage_key(0) == job.stage_key(0, []) != two.stage_key(0)
-    assert two.stage_key(0) == job.stage_key(0, [(0, 0, 2)]) != job.stage_key(0, [(0, 0, 2), (0, 4, 1)])
-
-
-def test_processes_of_a_machine_share_its_memory() -> None:
-    assert memory_of(Place(), None) is None
-    assert memory_of(Place(), 8.0) == 8.0
-    assert memory_of(Place(5, 8, 1, 4), 8.0) == 2.0
-    part, half = memory_of(Place(1, 4, 1, 4), None), memory_of(Place(1, 2, 1, 2), None)
-    assert part is None or half == pytest.approx(2 * part)
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from pathlib import Path
 
@@ -12,14 +11,13 @@ import pytest
 
 from ball_runs import SMALL, options
 from gs2d.data import load_scene
-from gs2d.errors import RecipeError, RunError
+from gs2d.errors import RunError
 from gs2d.io.run_dir import POSES, RunFolder
 from gs2d.pipeline.events import Event, Notice, ignore
 from gs2d.pipeline.finish.run_texture import _views
-from gs2d.pipeline.prepare.job import build_recipe, reload_job
+from gs2d.pipeline.prepare.job import reload_job
 from gs2d.pipeline.prepare.options import TextureOptions
 from gs2d.pipeline.train.train_run import train
-from gs2d.report.sections.poses import poses_section
 
 EARLY = (*SMALL, "poses.start=5", "intrinsics.start=5", "intrinsics.rate=0.01")
 
@@ -73,13 +71,6 @@ def test_photographs_of_another_size_have_it_too(run: RunFolder) -> None:
         assert view.camera.fx == pytest.approx(here.camera.fx / 2)
 
 
-def test_the_report_says_it(run: RunFolder) -> None:
-    shown = poses_section(run.file(POSES), {})
-    assert "Focal lengths became" in shown
-    assert "times those of the capture" in shown
-    assert re.search(r"Of the lens is left, .*k1 [+-]0\.\d{4}, k2 [+-]\d\.\d{4};", shown)
-
-
 def test_a_file_without_focal_lengths_is_refused(run: RunFolder, tmp_path: Path) -> None:
     copy = RunFolder(Path(shutil.copytree(run.path, tmp_path / "run")))
     data = json.loads(copy.file(POSES).read_text())
@@ -91,8 +82,3 @@ def test_a_file_without_focal_lengths_is_refused(run: RunFolder, tmp_path: Path)
         copy.file(POSES).write_text(json.dumps(data))
         with pytest.raises(RunError, match=words):
             reload_job(copy, ignore)
-
-
-def test_the_option_and_its_opposite_contradict_each_other() -> None:
-    with pytest.raises(RecipeError, match="--refine-cameras and --set intrinsics=null contradict"):
-        build_recipe("2dgs", schedule_scale=1.0, seed=0, overrides=("intrinsics=null",), intrinsics=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +11,9 @@ import pytest
 import torch
 
 from ball_runs import SMALL, Stop, comparable, options
-from gs2d.config.presets import get_recipe, with_poses
-from gs2d.core.camera import Camera
-from gs2d.core.transforms import camera_extent, common_motion, perturb_pose, similarity_motions
+from gs2d.core.transforms import perturb_pose
 from gs2d.data import load_scene
-from gs2d.errors import RecipeError, RunError
+from gs2d.errors import RunError
 from gs2d.evaluation.images import mean_metrics
 from gs2d.io.run_dir import POSES, RunFolder
 from gs2d.pipeline.demo import demo
@@ -27,14 +24,12 @@ from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.finish.run_texture import _views
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.finished import open_job
-from gs2d.pipeline.prepare.job import build_recipe, prepare_job, reload_job
+from gs2d.pipeline.prepare.job import reload_job
 from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, TextureOptions, TrainOptions
 from gs2d.pipeline.prepare.run_poses import aligned, how_far
 from gs2d.pipeline.train.train_run import train
-from gs2d.report.sections.poses import poses_section
 from gs2d.synthetic import capture as toy
-from gs2d.synthetic.perturb_poses import TRUTH, disturbed
-from tiny import ball_cameras
+from gs2d.synthetic.perturb_poses import TRUTH
 
 EARLY = (*SMALL, "poses.start=5", "poses.rate=0.01")  # so that 60 iterations show something
 
@@ -72,32 +67,6 @@ def test_the_demo_s_training_cameras_are_off_and_the_true_ones_beside_them(
     plain.rename(tmp_path / "demo" / "capture")
     with pytest.raises(RunError, match="made without --vary-poses; resume with the same options"):
         demo(DemoOptions(out=tmp_path / "demo", resume=True, vary_poses=True))
-
-
-def test_a_disturbance_has_its_size_and_no_motion_in_common() -> None:
-    cameras = ball_cameras(60, 20)
-    off = disturbed(cameras, 3)
-    middle = np.zeros(3)
-    far = [how_far(a, b, middle, 1.0) for a, b in zip(cameras, off, strict=True)]
-    distance = np.mean([np.linalg.norm(camera.center) for camera in cameras])
-    assert np.sqrt(np.mean([f["degrees"] ** 2 for f in far])) == pytest.approx(0.5, rel=0.2)
-    assert np.sqrt(np.mean([f["shift"] ** 2 for f in far])) == pytest.approx(0.005 * distance, rel=0.2)
-    extent = camera_extent(cameras)
-    J = similarity_motions(np.stack([camera.T_cam_world for camera in cameras]), extent)
-    steps = np.stack([b.T_cam_world @ np.linalg.inv(a.T_cam_world) for a, b in zip(cameras, off, strict=True)])
-    small = np.stack([steps[:, 2, 1], steps[:, 0, 2], steps[:, 1, 0], *steps[:, :3, 3].T / extent], axis=1)
-    assert np.abs(common_motion(small, J)).max() < 2e-5  # to first order
-
-
-def test_how_far_a_camera_moved_is_said_in_degrees_extents_and_pixels() -> None:
-    camera = Camera(100, 100, 200.0, 200.0, 50.0, 50.0, np.eye(4))
-    ahead = np.array([0.0, 0.0, 4.0])
-    aside = perturb_pose(camera, torch.tensor([0, 0, 0, 0.04, 0, 0], dtype=torch.float64))
-    assert how_far(camera, aside, ahead, 2.0) == pytest.approx({"degrees": 0, "shift": 0.02, "pixels": 2}, abs=1e-9)
-    turned = perturb_pose(camera, torch.tensor([0, 0, 0.01, 0, 0, 0], dtype=torch.float64))
-    assert how_far(camera, turned, ahead, 2.0)["degrees"] == pytest.approx(np.degrees(0.01))
-    behind = how_far(camera, aside, -ahead, 2.0)["pixels"]
-    assert behind == pytest.approx(200 * 0.04 / 0.2)  # nothing nearer than a tenth of the extent
 
 
 def test_the_poses_lie_beside_the_run_as_transforms_that_can_be_loaded(
@@ -190,29 +159,6 @@ def test_a_stopped_run_resumes_to_the_same_splats_and_poses(run: RunFolder, capt
     assert resumed.file(POSES).read_bytes() == run.file(POSES).read_bytes()
 
 
-def test_stages_are_not_shared_between_runs_with_and_without_poses(capture: Path, tmp_path: Path) -> None:
-    plain = prepare_job(options(capture, tmp_path / "a"), ignore)
-    with_them = prepare_job(learning(capture, tmp_path / "b"), ignore)
-    assert plain.stage_key(0) != with_them.stage_key(0)
-    same_stages = replace(with_them, recipe=replace(with_them.recipe, poses=None))
-    assert same_stages.stage_key(0) != with_them.stage_key(0)
-
-
-def test_stages_of_another_run_bring_their_poses(run: RunFolder, capture: Path, tmp_path: Path) -> None:
-    taken = train(learning(capture, tmp_path / "taken", start_from=run.path))
-    assert all(stage["reused_from"] == str(run.path) for stage in taken.metrics()["stages"])
-    assert taken.file(POSES).read_bytes() == run.file(POSES).read_bytes()
-
-
-def test_the_flag_leaves_a_recipe_with_poses_alone_and_goes_with_the_other() -> None:
-    rest = {"schedule_scale": 0.1, "seed": 3, "overrides": ()}
-    flagged = build_recipe("2dgs-r", poses=True, **rest)  # type: ignore[arg-type]
-    assert with_poses(flagged) is flagged
-    both = build_recipe("2dgs-r", poses=True, exposure=True, **rest)  # type: ignore[arg-type]
-    assert both.name == "2dgs-r-exposure-poses"
-    assert get_recipe("2dgs-r").poses is None
-
-
 def test_a_lost_or_damaged_file_of_poses_is_named_with_its_remedy(run: RunFolder, tmp_path: Path) -> None:
     copy = RunFolder(tmp_path / "copy")
     shutil.copytree(run.path, copy.path)
@@ -239,17 +185,3 @@ def test_the_report_shows_how_far_the_cameras_moved(run: RunFolder) -> None:
     frames = [frame for frame in json.loads(run.file(POSES).read_text())["frames"] if frame["split"] == "train"]
     most = max(frames, key=lambda frame: frame["moved"]["pixels"])
     assert f"most in {most['name']} ({most['moved']['pixels']:.2f} pixels)" in page
-
-
-def test_the_report_speaks_of_test_views_where_there_are_some(tmp_path: Path) -> None:
-    perturb_pose = {"pixels": 1.0, "degrees": 0.1, "shift": 0.01}
-    path = tmp_path / "poses.json"
-    path.write_text(json.dumps({"frames": [{"name": "a.png", "split": "train", "moved": perturb_pose}]}))
-    assert "Test views keep the cameras of the capture" in poses_section(path, {"test": {"psnr": 30.0}})
-    assert "Test views" not in poses_section(path, {"test": None})
-
-
-@pytest.mark.parametrize(("option", "field"), [("--exposure", "exposure"), ("--refine-poses", "poses")])
-def test_an_option_and_an_override_that_takes_it_back_contradict_each_other(option: str, field: str) -> None:
-    with pytest.raises(RecipeError, match=f"{option} and --set {field}=null contradict each other"):
-        build_recipe("2dgs-r", schedule_scale=0.1, seed=0, overrides=(f"{field}=null",), **{field: True})  # type: ignore[arg-type]

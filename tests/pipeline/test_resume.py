@@ -13,9 +13,8 @@ import pytest
 
 from ball_runs import SMALL, Stop, comparable, options, spawn
 from gs2d.errors import DiskError, RunError
-from gs2d.io.run_dir import RunFolder, load_tensors, open_run
-from gs2d.pipeline.events import Event, Notice, StageDone, Step, ignore
-from gs2d.pipeline.prepare.job import prepare_job
+from gs2d.io.run_dir import RunFolder, open_run
+from gs2d.pipeline.events import Event, Notice, StageDone, Step
 from gs2d.pipeline.train.train_run import train
 
 
@@ -124,42 +123,6 @@ def test_a_cache_gives_the_same_bytes_without_training_the_shared_stages(
     assert len(list(cache.glob("*.pt"))) == 3
 
 
-def test_a_stage_that_a_killed_process_had_no_time_to_keep_is_kept_by_the_one_that_goes_on(
-    capture: Path, tmp_path: Path
-) -> None:
-    cache, given = tmp_path / "cache", {"recipe": "2dgs", "cache": tmp_path / "cache"}
-    train(options(capture, tmp_path / "run", **given))
-    (kept,) = cache.iterdir()
-    before = load_tensors(kept)
-    kept.rename(cache / f".{kept.name}.gs2d.tmp")  # the process is killed before the rename
-    train(options(capture, tmp_path / "run", resume=True, **given))
-    assert list(cache.iterdir()) == [kept]
-    after = load_tensors(kept)
-    assert after.keys() == before.keys()
-    assert [after[name] for name in ("key", "log", "metrics")] == [before[name] for name in ("key", "log", "metrics")]
-
-
-def test_a_cache_that_cannot_be_is_said_before_anything_trains(capture: Path, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("no folder")
-    heard: list[Event] = []
-    with pytest.raises(DiskError, match="file"):
-        train(options(capture, tmp_path / "run", cache=tmp_path / "file"), heard.append)
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
-    assert not any(isinstance(event, Step) and "loss" in event.detail for event in heard)
-
-
-def test_a_run_that_fails_at_once_leaves_no_empty_cache(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def failing(*_args: Any) -> None:
-        raise Stop
-
-    monkeypatch.setattr("gs2d.pipeline.train.train_run.choose_start", failing)
-    with pytest.raises(Stop):
-        train(options(capture, tmp_path / "run", cache=tmp_path / "deep" / "cache"))
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_another_seed_or_setting_does_not_take_a_stage_from_the_cache(capture: Path, tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     first = options(capture, tmp_path / "a", recipe="2dgs", cache=cache)
@@ -169,22 +132,6 @@ def test_another_seed_or_setting_does_not_take_a_stage_from_the_cache(capture: P
     train(replace(first, out=tmp_path / "d", downscale=2))
     assert len(list(cache.glob("*.pt"))) == 4
     assert all("reused_from" not in open_run(tmp_path / x).metrics()["stages"][0] for x in "abcd")
-
-
-def test_runs_share_stages_with_and_without_cached_views_up_to_the_one_that_uses_them(
-    capture: Path, tmp_path: Path
-) -> None:
-    jobs = [
-        prepare_job(
-            options(capture, tmp_path, overrides=(*SMALL, f"appearance.iterations={iterations}"), **more), ignore
-        )
-        for iterations in (11, 12)  # six views: cached from twelve iterations
-        for more in ({}, {"stage2_cache_mb": 0})
-    ]
-    with_cache = jobs[0].backend.name == "cpu"
-    same_key = [[a.stage_key(i) == b.stage_key(i) for i in range(3)] for a, b in (jobs[:2], jobs[2:])]
-    assert same_key == [[True] * 3, [True, not with_cache, not with_cache]]
-    assert [job.definition()["stage2_cache_bytes"] for job in jobs] == [1 << 30, 0, 1 << 30, 0]
 
 
 def test_a_run_starts_from_the_stages_it_shares_with_another(
@@ -217,14 +164,6 @@ def test_an_overwrite_that_has_nothing_to_start_from_keeps_the_old_run(
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
-def test_starting_from_a_run_that_shares_no_stage_is_an_error_that_leaves_nothing(
-    capture: Path, undisturbed: RunFolder, tmp_path: Path
-) -> None:
-    with pytest.raises(RunError, match=r"no finished stage in common .* \(its stages: surface, appearance, refine\)"):
-        train(options(capture, tmp_path / "run", start_from=undisturbed.path, seed=5))
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_the_same_seed_gives_the_same_bytes(capture: Path, undisturbed: RunFolder, tmp_path: Path) -> None:
     again = train(options(capture, tmp_path / "again", checkpoint_every=1000))
     assert again.file("splats.ply").read_bytes() == undisturbed.file("splats.ply").read_bytes()
@@ -243,12 +182,3 @@ def test_a_finished_run_whose_checkpoints_were_deleted_is_never_touched_by_resum
             train(options(capture, copy, resume=True, **changes))
         for name in ("splats.ply", "mesh.ply", "metrics.json", "report.html"):
             assert (copy / name).read_bytes() == undisturbed.file(name).read_bytes()
-
-
-def test_resuming_a_finished_run_keeps_the_scores_of_its_mesh(
-    capture: Path, undisturbed: RunFolder, tmp_path: Path
-) -> None:
-    run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
-    surface = {"chamfer": 0.5, "thresholds": []}
-    run.write_metrics({**run.metrics(), "surface": surface})
-    assert train(options(capture, run.path, resume=True)).metrics()["surface"] == surface

@@ -21,17 +21,13 @@ from gs2d.config.serialize import to_json
 from gs2d.core.camera import look_at
 from gs2d.data.priors import ObservedPoints
 from gs2d.data.scene import Scene, View
-from gs2d.errors import DataError, RecipeError, RunError
+from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.prepare.job import fit_recipe, reload_job, settled
 from gs2d.pipeline.prepare.options import TrainOptions
-from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
+from gs2d.pipeline.prepare.predicted_exposure import with_predicted
 from gs2d.pipeline.train.same_run import check_same_run
-from gs2d.render.api import rasterize
-from gs2d.render.backends import get_backend
-from gs2d.render.types import RasterSettings
-from train_toys import random_splats
 
 COUNT = 12
 
@@ -124,20 +120,6 @@ def test_what_was_decided_is_said() -> None:
         settled(options(robust="on"), EMPTY, GENERIC, said.append)
 
 
-def test_a_part_can_be_left_out_or_changed_by_its_name() -> None:
-    recipe = fit_recipe(options(overrides=("dense_start=null", "removal.every=70")), EQUAL, GENERIC, print)
-    assert recipe.dense_start is None
-    assert recipe.removal is not None
-    assert recipe.removal.every == 70
-
-
-def test_an_unknown_word_is_refused() -> None:
-    from gs2d.pipeline.prepare.job import check_train_options
-
-    with pytest.raises(RecipeError, match="--robust must be one of auto, on, off, got maybe"):
-        check_train_options(options(robust="maybe"))
-
-
 # -- the exposure of a view that nobody photographed ----------------------------------------------------------------
 def predicted(gains: np.ndarray) -> float:
     """The gain that the last view of the ring would have, by those of the others."""
@@ -154,11 +136,6 @@ def test_where_neighbours_have_similar_exposures_a_view_between_them_has_theirs(
     assert predicted(gains) == pytest.approx(gains[-1], abs=0.05)
 
 
-def test_where_neighbours_say_nothing_a_view_has_the_mean_exposure() -> None:
-    gains = 1 + 0.3 * (-1.0) ** np.arange(24)  # each is the opposite of its neighbours
-    assert predicted(gains) == pytest.approx(1.0, abs=1e-6)
-
-
 def by_meter(gains: np.ndarray, seen: np.ndarray) -> float:
     """The gain that the last view of the ring would have, where the scene is so bright in each view."""
     scene = ring(gains, test=1)
@@ -169,53 +146,11 @@ def by_meter(gains: np.ndarray, seen: np.ndarray) -> float:
     return float(found[scene.test[0].name][0, 0])
 
 
-def test_the_meter_reads_the_mean_of_a_picture() -> None:
-    """Over the background, in the scene's own exposure, whatever the size of the photograph."""
-    wide = look_at(np.array([3.0, 0, 0]), np.zeros(3), np.array([0.0, 0, 1]), width=400, height=300, fx=400.0)
-    view = View.from_arrays("0", wide, np.zeros((300, 400, 3), np.uint8))
-    splats, backend = random_splats(40), get_backend("reference")
-    settings = RasterSettings(background=(0.2, 0.4, 0.6))
-    color = rasterize(splats, wide, settings, backend=backend).color.clamp_min(0)
-    luma = float((color @ torch.tensor([0.299, 0.587, 0.114])).mean())
-    assert metered(splats, settings, backend)(view) == pytest.approx(luma, rel=0.02)
-    assert luma != pytest.approx(0.299 * 0.2 + 0.587 * 0.4 + 0.114 * 0.6, rel=0.05)
-
-
 def test_where_exposures_follow_what_the_camera_sees_a_view_has_that_of_its_brightness() -> None:
     seen = 0.4 + 0.2 * np.sin(1.7 * np.arange(24) ** 2)  # as if by chance: neighbours say nothing
     gains = (seen + 0.02) ** -0.8
     gains /= gains[:-1].mean()
     assert by_meter(gains, seen) == pytest.approx(gains[-1], rel=0.02)
-
-
-def test_what_neighbours_have_beside_the_brightness_is_added_to_it() -> None:
-    seen = 0.4 + 0.2 * np.sin(1.7 * np.arange(24) ** 2)
-    gains = (seen + 0.02) ** -0.8 * (1 + 0.3 * np.cos(np.linspace(0, 2 * np.pi, 24, endpoint=False)))
-    gains /= gains[:-1].mean()
-    assert by_meter(gains, seen) == pytest.approx(gains[-1], rel=0.08)
-
-
-def test_a_brightness_that_says_nothing_is_left_out() -> None:
-    gains = 1 + 0.3 * np.cos(np.linspace(0, 2 * np.pi, 24, endpoint=False))
-    by_chance = 0.4 + 0.2 * np.sin(1.7 * np.arange(24) ** 2)
-    assert by_meter(gains, by_chance) == predicted(gains)
-    assert by_meter(gains, np.full(24, 0.5)) == predicted(gains)
-
-
-def test_exposures_that_rise_with_brightness_are_no_automatic() -> None:
-    seen = 0.4 + 0.2 * np.sin(1.7 * np.arange(24) ** 2)
-    gains = seen / seen[:-1].mean()
-    assert by_meter(gains, seen) == predicted(gains)
-
-
-def test_a_run_without_exposures_predicts_none() -> None:
-    assert with_predicted({}, ring(np.ones(4), test=1)) == {}
-
-
-def test_another_robustness_is_refused_by_the_name_of_its_option(undisturbed: RunFolder) -> None:
-    job = reload_job(undisturbed, lambda _: None)
-    with pytest.raises(RunError, match="was made with --robust off, and would go on with on; resume with --robust off"):
-        check_same_run(undisturbed, replace(job, recipe=with_robustness(job.recipe)))
 
 
 def test_another_removal_makes_another_stage_and_another_run(undisturbed: RunFolder, tmp_path: Path) -> None:
@@ -244,9 +179,3 @@ def test_splats_in_the_colour_of_an_unlit_backdrop_are_proposed_and_those_of_a_w
     assert protocol.background == pytest.approx((0.5 * brightness,) * 3, abs=0.02)
     (line,) = [event.text for event in heard if isinstance(event, Notice) and event.text.startswith("background")]
     assert ("are removed" in line) == proposed
-
-
-def test_a_backdrop_of_many_colours_is_none() -> None:
-    recipe, _ = settled(options(), ring(np.linspace(0.0, 1.6, COUNT)), GENERIC, lambda _: None)
-    assert recipe.removal is not None
-    assert not recipe.removal.backdrop

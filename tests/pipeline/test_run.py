@@ -10,12 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
-from ball_runs import Stop, comparable, options
+from ball_runs import Stop, options
 from capture_writers import small_colmap
-from gs2d.config.presets import get_recipe
-from gs2d.config.protocols import get_protocol
 from gs2d.data.build import Capture
 from gs2d.data.image_files import read_image
 from gs2d.data.readers.registry import READERS
@@ -24,9 +21,8 @@ from gs2d.errors import DataError, DiskError, DivergedError, ProtocolError, Reci
 from gs2d.io.run_dir import RunFolder
 from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.demo import demo
-from gs2d.pipeline.events import Event, Notice, Phase, Step, duration, ignore
+from gs2d.pipeline.events import Event, Notice, Phase, Step, ignore
 from gs2d.pipeline.finish.run_images import render_run
-from gs2d.pipeline.prepare.estimate import full_iterations
 from gs2d.pipeline.prepare.job import prepare_job
 from gs2d.pipeline.prepare.options import DemoOptions
 from gs2d.pipeline.train.train_run import pretraining_notices, train
@@ -132,11 +128,6 @@ def test_a_full_disk_before_the_first_checkpoint_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_recipe_that_names_an_unknown_group_fails_before_the_capture_is_read(tmp_path: Path) -> None:
-    with pytest.raises(RecipeError, match="no earlier action writes the row group"):
-        train(options(tmp_path / "missing", tmp_path / "run", overrides=("refine.train.means=nobody",)))
-
-
 @pytest.mark.parametrize(
     ("changes", "got"),
     [
@@ -157,10 +148,6 @@ def test_numbers_out_of_range_are_refused(capture: Path, tmp_path: Path, changes
     assert list(tmp_path.iterdir()) == []
 
 
-def test_training_leaves_the_threads_of_torch_as_asked(capture: Path, undisturbed: RunFolder) -> None:
-    assert torch.get_num_threads() == 1
-
-
 def test_the_demo_makes_its_capture_trains_scores_the_surface_and_reports(tmp_path: Path) -> None:
     out = tmp_path / "demo"
     few = {"train_views": 3, "test_views": 1, "size": 24}
@@ -176,13 +163,6 @@ def test_the_demo_makes_its_capture_trains_scores_the_surface_and_reports(tmp_pa
     again = demo(replace(small, resume=True))  # the capture is taken as it is
     assert again.file("splats.ply").read_bytes() == before
     assert again.metrics()["surface"] is not None
-
-
-def test_the_demo_does_not_replace_a_run_of_another_kind(undisturbed: RunFolder) -> None:
-    before = comparable(undisturbed)
-    with pytest.raises(RunError, match="holds a run that is not a demo"):
-        demo(DemoOptions(out=undisturbed.path))
-    assert comparable(undisturbed) == before
 
 
 def test_the_user_is_told_where_training_starts_and_what_was_skipped(capture: Path, tmp_path: Path) -> None:
@@ -211,25 +191,6 @@ def test_the_user_is_told_where_training_starts_and_what_was_skipped(capture: Pa
     assert not (tmp_path / "run").exists()  # nothing was saved yet
 
 
-def test_a_near_plane_that_cuts_most_sparse_points_away_is_named_before_training(tmp_path: Path) -> None:
-    small_colmap(tmp_path / "capture")
-    near = {name: replace(get_protocol("generic"), near=near) for name, near in (("far", 3.9), ("right", 0.1))}
-    for name, protocol in near.items():
-        heard: list[Event] = []
-        prepare_job(options(tmp_path / "capture", tmp_path / "run", protocol=protocol), heard.append)
-        cuts = [e.text for e in heard if isinstance(e, Notice) and "of the sparse points" in e.text]
-        assert bool(cuts) == (name == "far")
-        assert all(re.match(r"near plane at 3\.9 cuts away \d+% of", text) for text in cuts)
-
-
-def test_iterations_on_smaller_photographs_count_for_less_in_an_estimate() -> None:
-    recipe = get_recipe("2dgs-60k")
-    first, more = recipe.stages
-    assert full_iterations(recipe) == 60_000
-    smaller = replace(recipe, stages=(replace(first, downscale=4, halve_at=(8_000, 20_000)), more))
-    assert full_iterations(smaller) == 8_000 / 16 + 12_000 / 4 + 10_000 + 30_000
-
-
 def test_two_lines_are_told_before_training_and_the_estimate_changes_no_byte(
     undisturbed: RunFolder, capture: Path, tmp_path: Path
 ) -> None:
@@ -245,22 +206,6 @@ def test_two_lines_are_told_before_training_and_the_estimate_changes_no_byte(
     details = [event.text for event in told if event.detail]
     assert details
     assert [event["text"] for event in run.events.read() if event["kind"] == "notice"] == details
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [
-        (0.4, "0 s"),
-        (89, "89 s"),
-        (91, "2 min"),
-        (5399, "90 min"),
-        (5400, "1.5 h"),
-        (36001, "10 h"),
-        (172_800, "2.0 days"),
-    ],
-)
-def test_times_are_told_as_people_say_them(seconds: float, text: str) -> None:
-    assert duration(seconds) == text
 
 
 @pytest.mark.parametrize(("every", "test"), [(0, 0), (2, 4), (3, 3)])

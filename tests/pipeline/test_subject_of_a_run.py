@@ -12,18 +12,15 @@ import pytest
 import torch
 
 from gs2d.config.protocols import PROTOCOLS
-from gs2d.data import View
 from gs2d.data.reach import Reach
 from gs2d.data.subject import OBJECT, read_subject
-from gs2d.errors import DataError, ProtocolError, RunError
+from gs2d.errors import ProtocolError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import PAGE, RunFolder
-from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.events import Notice
 from gs2d.pipeline.finish.believed import sky_direction
-from gs2d.pipeline.finish.export import export_run
 from gs2d.pipeline.finish.run_mesh import SEVERAL, extract_mesh, fusion_frame, mesh_run
-from gs2d.pipeline.finish.run_subject import meshed_subject, subject_line, within
+from gs2d.pipeline.finish.run_subject import meshed_subject, subject_line
 from gs2d.pipeline.prepare.finished import finished_splats
 from gs2d.pipeline.prepare.job import reload_job
 from gs2d.pipeline.prepare.options import MeshOptions
@@ -100,17 +97,6 @@ def test_depth_that_is_loose_counts_less_and_depth_of_the_sky_is_infinite(undist
     assert np.isinf(fusion_frame(generic, view, output, "median", near).depth).all()
 
 
-def test_the_sky_is_searched_where_photographs_alone_say_what_is_empty(undisturbed: RunFolder) -> None:
-    job = replace(reload_job(undisturbed, lambda _: None), scene=wall())
-    generic = replace(job, protocol=PROTOCOLS["generic"])
-    assert sky_direction(job) is None  # data sets have limits of their own
-    assert sky_direction(replace(generic, scene=replace(wall(), observe=None))) is None
-    view = wall().train[0]
-    opaque = np.concatenate([view.image(), np.full((*view.image().shape[:2], 1), 255, np.uint8)], axis=2)
-    views = (View.from_arrays(view.name, view.camera, opaque),)
-    assert sky_direction(replace(generic, scene=replace(wall(), train=views))) is None
-
-
 def test_a_new_subject_is_in_the_page_and_what_is_said_of_the_mesh_in_the_metrics(
     undisturbed: RunFolder, tmp_path: Path
 ) -> None:
@@ -126,18 +112,3 @@ def test_a_new_subject_is_in_the_page_and_what_is_said_of_the_mesh_in_the_metric
     run.file(PAGE).unlink()
     mesh_run(run.path, MeshOptions(voxel=0.05, subject_box=BOX))
     assert not run.file(PAGE).exists()  # whoever wanted none gets none
-
-
-def test_splats_are_exported_within_a_box(undisturbed: RunFolder, tmp_path: Path) -> None:
-    splats = finished_splats(undisturbed)
-    means = splats.means.sort(dim=0).values
-    low, high = means[len(means) // 4].tolist(), means[-1].add(1).tolist()
-    result = export_run(undisturbed.path, tmp_path / "part.ply", "2dgs", bbox=(*low, *high))
-    part = read_splats(tmp_path / "part.ply")
-    expected = (splats.means >= torch.tensor(low)).all(dim=1)
-    assert 0 < result["splats"] == int(expected.sum()) < len(splats)
-    assert torch.equal(part.means, splats.means[expected])
-    with pytest.raises(RunError, match="got none of"):
-        within(splats, (100, 100, 100, 101, 101, 101))
-    with pytest.raises(DataError, match="--bbox must be a lower corner and a higher one"):
-        within(splats, (1, 0, 0, 0, 1, 1))

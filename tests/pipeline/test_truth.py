@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gs2d.errors import DataError, RunError
+from gs2d.errors import RunError
 from gs2d.evaluation.surface import evaluate_surface
 from gs2d.io.run_dir import RunFolder, open_run
 from gs2d.pipeline.events import Event, Notice
@@ -60,9 +60,3 @@ def test_without_a_mesh_a_truth_that_was_asked_for_is_an_error_and_one_that_was_
     heard: list[Event] = []
     evaluate_run(run, EvaluateOptions(), heard.append)
     assert any("the surface is not scored: no mesh.ply" in e.text for e in heard if isinstance(e, Notice))
-
-
-def test_a_folder_without_a_ground_truth_is_refused(beside: tuple[Path, Path], tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(DataError, match="must hold the official ground truth of a scene of DTU or Tanks and Temples"):
-        evaluate_run(beside[0], EvaluateOptions(ground_truth=tmp_path / "empty"))

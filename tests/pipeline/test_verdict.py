@@ -11,21 +11,18 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d.cli.verdict import WIDTH, verdict_lines
 from gs2d.config import grades
 from gs2d.core.camera import look_at
 from gs2d.core.json_files import write_json
 from gs2d.data import View
-from gs2d.errors import DataError, RunError
+from gs2d.errors import DataError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.finish.verdict.judge import Finding, judge
 from gs2d.pipeline.finish.verdict.measures import (
     Measures,
     ViewMeasures,
     blur_of,
-    measures_from_json,
     neighbours_of,
-    placed_images,
 )
 from gs2d.report.sections.verdict import grade_of, verdict_section
 
@@ -88,14 +85,6 @@ def test_recorded_captures_get_the_grade_that_a_person_gives(name: str) -> None:
     assert any(finding.advice for finding in verdict.findings) == (grade != "good")
 
 
-def test_a_good_run_asks_for_nothing_whatever_its_photographs_lack() -> None:
-    rows = tuple(replace(view, blur=0.6 + (view.name == "t3.jpg"), degrees=30.0) for view in views())
-    verdict = judge(Measures(rows, placed=24, count=24))
-    assert verdict.grade == "good"
-    assert {finding.grade for finding in verdict.findings} == {"good"}
-    assert not any(finding.advice for finding in verdict.findings)
-
-
 @pytest.mark.parametrize(
     ("psnr", "grade"), [(25.0, "good"), (24.99, "usable"), (20.0, "usable"), (19.99, "poor"), (16.7, "poor")]
 )
@@ -122,12 +111,6 @@ def test_a_single_bad_view_is_named_with_advice(change: dict[str, Any], name: st
     assert finding.advice
 
 
-def test_longer_training_is_advised_only_where_new_views_follow_the_training_views() -> None:
-    low, apart = Measures(views(train=23.0, test=21.0)), Measures(views(train=30.0, test=21.0))
-    assert "train longer" in found(low, "new views").advice
-    assert "longer training will not help" in found(apart, "new views").advice
-
-
 def test_lost_photographs_are_named_and_many_of_them_are_not_good() -> None:
     few, many = (Measures(views(), placed, 24, ("lost.jpg",)) for placed in (23, 10))
     assert (judge(few).grade, judge(many).grade) == ("good", "usable")
@@ -147,31 +130,6 @@ def test_what_was_not_measured_is_reported_and_lowers_nothing() -> None:
     assert judge(Measures((), 24, 24)).grade is None
 
 
-def test_every_limit_has_its_reason_and_its_order() -> None:
-    for limit in grades.LIMITS.values():
-        assert limit.why
-        assert [limit.grade(value) for value in (limit.good, limit.usable)] == ["good", "usable"]
-        if np.isfinite(limit.usable):
-            assert limit.grade(2 * limit.usable - limit.good) == "poor"
-
-
-@pytest.mark.parametrize("width", [WIDTH, 40])
-def test_the_verdict_fits_the_terminal_in_words(width: int) -> None:
-    near = {"next": "a_long_name_of_a_photograph.jpg", "degrees": 40.0}
-    measures = Measures(views(test=18.0, psnr=12.5, hidden=500, blur=3.0, **near), 18, 24, ("lost.jpg",))
-    lines = verdict_lines(judge(measures).to_json(), width)
-    assert max(map(len, lines)) <= width
-    assert lines[0].startswith("Verdict: POOR.")
-    assert "What to do next:" in lines
-
-
-def test_measures_are_the_same_after_their_file() -> None:
-    measures = Measures(views(next="b", degrees=3.0), 1, 2, ("c",))
-    assert measures_from_json(json.loads(json.dumps(measures.to_json()))) == measures
-    with pytest.raises(RunError, match="expected measures"):
-        measures_from_json({"views": 3})
-
-
 # -- measures ----------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("sigma", [1.2, 1.5, 3.0])
 @pytest.mark.parametrize("direction", ["both", "rows"])
@@ -182,12 +140,6 @@ def test_the_blur_of_a_step_is_its_width_whatever_its_height(sigma: float, direc
     image = (0.5 + 0.1 * edge[:, None] + 0.1 * across[None, :])[..., None].expand(-1, -1, 3)
     assert blur_of(image) == pytest.approx(sigma, rel=0.12)
     assert blur_of(0.3 * image) == pytest.approx(blur_of(image) or 0.0, rel=1e-4)
-
-
-def test_a_picture_without_edges_or_pixels_has_no_blur() -> None:
-    assert blur_of(torch.full((20, 20, 3), 0.5)) is None
-    assert blur_of(torch.rand(20, 20, 3), torch.zeros(20, 20, dtype=torch.bool)) is None
-    assert blur_of(torch.rand(2, 2, 3)) is None
 
 
 def ring(degrees: list[float], *, inwards: bool = True) -> list[View]:
@@ -206,20 +158,6 @@ def test_the_next_camera_is_the_one_nearest_in_direction_and_a_test_view_is_nobo
     near = neighbours_of(train, test, np.array([0, 0, 0.5]))
     assert {name: other for name, (other, _) in near.items()} == {"0": "1", "1": "0", "2": "1", "3": "2", "new": "2"}
     np.testing.assert_allclose([degrees for _, degrees in near.values()], [10, 10, 15, 65, 5], atol=1e-6)
-
-
-def test_cameras_that_look_outwards_have_no_subject_around_which_to_be_near() -> None:
-    assert neighbours_of(ring([0, 90, 180, 270], inwards=False), [], np.zeros(3)) == {}
-    assert neighbours_of(ring([0]), []) == {}
-
-
-def test_placed_photographs_are_those_of_the_capture(tmp_path: Path) -> None:
-    assert placed_images(None) == placed_images(tmp_path) == (None, None, ())
-    rows = [{"source": "a.jpg", "placed": True}, {"source": "b.jpg", "placed": False}]
-    write_json(tmp_path / "poses.json", {"placed": 1, "count": 2, "photographs": rows})
-    assert placed_images(tmp_path) == (1, 2, ("b.jpg",))
-    write_json(tmp_path / "poses.json", {"frames": []})  # another program's
-    assert placed_images(tmp_path) == (None, None, ())
 
 
 # -- in a run and its report -------------------------------------------------------------------------------------------

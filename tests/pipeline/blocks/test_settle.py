@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gs2d.config.partition import CoarseModel, Partition
+from gs2d.config.partition import Partition
 from gs2d.config.presets import get_recipe
 from gs2d.config.protocols import GENERIC
 from gs2d.errors import DataError
@@ -60,16 +60,6 @@ def test_there_are_as_many_blocks_as_memory_needs_with_the_coarse_model_beside_e
     assert found.blocks - min(found.grid) < 6  # not a row more than that takes
 
 
-def test_photographs_make_blocks_too_where_the_start_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    partition = Partition(photographs=2, coarse=CoarseModel(max_splats=500))
-    found = fitting(monkeypatch, DataError("6 photographs start from too many splats"), partition)
-    assert found is not None
-    assert found.blocks >= 3
-    assert found.coarse.max_splats == 500
-    texts = [event.text for event in TOLD if isinstance(event, Notice)]
-    assert "not in one training: 6 photographs start from too many splats" in texts
-
-
 def test_a_capture_is_known_by_its_cameras_points_and_split() -> None:
     one = capture_digest(SCENE)
     assert capture_digest(make_scene()) == one
@@ -104,11 +94,3 @@ def test_seams_settle_as_a_block_does() -> None:
     assert stage.lr.settled_at(1_000) == pytest.approx(block.lr.settled_at(17_000))
     assert stage.lr.settled_at(2_000) == pytest.approx(block.lr.settled_at(20_000)) == 0.1
     assert stage.lr.sh0 == block.lr.sh0
-
-
-@pytest.mark.parametrize(("photographs", "iterations"), [(0.5, 2_000), (1.0, 2_000), (3.0, 6_000), (50.0, 20_000)])
-def test_each_photograph_of_a_seam_is_looked_at_as_often_until_that_is_a_block(
-    photographs: float, iterations: int
-) -> None:
-    (stage,) = seam_recipe(get_recipe("best"), Partition(seam_schedule=0.1), photographs).stages
-    assert stage.iterations == iterations
