@@ -69,18 +69,3 @@ def test_an_archive_that_cannot_train_leaves_nothing(tmp_path: Path, capsys: pyt
     assert train(tmp_path / "a.zip", tmp_path / "deep" / "run") == 2
     assert "must hold transforms_train.json" in one_line(capsys.readouterr().err)
     assert sorted(p.name for p in tmp_path.rglob("*")) == ["a.zip"]
-
-
-def test_info_looks_into_an_archive_and_leaves_nothing(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "temporary").mkdir()
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
-    path = packed(capture, tmp_path / "a.zip", "ball/")
-    assert run(["info", str(path), "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
-    assert (facts["capture"], facts["format"], facts["training views"]) == (str(path), "blender", 3)
-    path.write_bytes(path.read_bytes()[:1000])
-    assert run(["info", str(path)]) == 2
-    assert "must be a whole ZIP file" in one_line(capsys.readouterr().err)
-    assert list((tmp_path / "temporary").iterdir()) == []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import struct
 from collections.abc import Callable
@@ -11,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cli_runs import TINY, one_line, spawn
+from cli_runs import TINY, one_line
 from gs2d.cli import run
-from tiny import ball_cameras, ball_image, write_ball_mesh, write_capture
+from tiny import ball_cameras, ball_image, write_capture
 
 
 def missing(folder: Path) -> None:
@@ -128,27 +127,6 @@ def test_a_capture_that_cannot_be_read_gives_one_line_and_exit_code_2_and_leaves
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_photograph_with_a_damaged_exif_block_is_read_without_a_word(tmp_path: Path) -> None:
-    from PIL import Image
-
-    write_capture(tmp_path / "capture", train=3, test=1)
-    for path in (tmp_path / "capture" / "train").iterdir():
-        exif = b"Exif\0\0II*\0\x08\0\0\0\xff\xff"  # 65535 entries, of which none follows
-        Image.open(path).convert("RGB").save(path.with_suffix(".jpg"), exif=exif)
-        path.unlink()
-    done = spawn(["info", str(tmp_path / "capture")])
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "training views: 3" in done.stdout
-
-
-def test_the_colmap_capture_of_these_tests_is_good_when_nothing_is_broken(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    colmap(tmp_path / "capture")
-    assert run(["info", str(tmp_path / "capture"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["points"] == 20
-
-
 @pytest.mark.parametrize(
     ("start", "said"),
     [
@@ -190,17 +168,6 @@ def test_masks_that_leave_nothing_to_learn_from_are_an_error(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_mask_that_leaves_nothing_of_one_view_is_noted(tmp_path: Path) -> None:
-    from gs2d.pipeline.events import Event
-    from gs2d.pipeline.prepare.job import prepare_job
-    from gs2d.pipeline.prepare.options import TrainOptions
-
-    masked_colmap(tmp_path / "capture", (1,))
-    heard: list[Event] = []
-    prepare_job(TrainOptions(scene=tmp_path / "capture", out=tmp_path / "run"), heard.append)
-    assert any("masks of 1 of 3 views leave no pixel, first 1.png: nothing is learned" in str(e) for e in heard)
-
-
 @pytest.mark.parametrize(
     ("more", "named"),
     [
@@ -228,29 +195,6 @@ def test_options_that_make_no_sense_give_one_line_and_leave_nothing(
     assert run(["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", *TINY, *more]) == 2
     assert named.lower() in one_line(capsys.readouterr().err).lower()
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("more", "named"),
-    [(["--schedule-scale", "0"], "--schedule-scale"), (["--seed", "-1"], "seed"), (["--threads", "0"], "--threads")],
-)
-def test_the_demo_refuses_what_makes_no_sense_before_it_takes_a_photograph(
-    more: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def photographed(*_words: object, **_options: object) -> None:
-        raise AssertionError("the demo began to take photographs")
-
-    monkeypatch.setattr("gs2d.pipeline.demo.write_demo_capture", photographed)
-    assert run(["demo", "--out", str(tmp_path / "run"), "--quiet", *more]) == 2
-    assert named in one_line(capsys.readouterr().err)
-    (tmp_path / "mine.txt").write_text("mine")
-    assert run(["demo", "--out", str(tmp_path), "--quiet"]) == 2
-    assert "mine.txt" in one_line(capsys.readouterr().err)
-    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
-    (tmp_path / "capture").mkdir()
-    (tmp_path / "mine.txt").rename(tmp_path / "capture" / "mine.txt")
-    assert run(["demo", "--out", str(tmp_path), "--quiet"]) == 2
-    assert "capture must be a demo's" in one_line(capsys.readouterr().err)
 
 
 @pytest.mark.parametrize(
@@ -304,26 +248,6 @@ def test_a_command_on_what_is_no_run_says_what_it_found(
     assert run([command, str(tmp_path)]) == 2
     assert "found a folder without run.json" in one_line(capsys.readouterr().err)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_ply_of_another_kind_is_named(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    copy = tmp_path / "run"
-    shutil.copytree(trained, copy)
-    write_ball_mesh(tmp_path / "mesh.ply")
-    shutil.copy(tmp_path / "mesh.ply", copy / "splats.ply")
-    assert run(["export", str(copy), "--out", str(tmp_path / "x.ply")]) == 2
-    assert "mesh" in one_line(capsys.readouterr().err)
-    assert not (tmp_path / "x.ply").exists()
-    (tmp_path / "text.ply").write_text("hello")
-    assert run(["evaluate", str(trained), "--ground-truth", str(tmp_path / "text.ply"), "--quiet"]) == 2
-    assert "text.ply" in one_line(capsys.readouterr().err)
-
-
-def test_exporting_into_a_folder_that_does_not_exist_is_one_line(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(["export", str(trained), "--out", str(tmp_path / "no" / "x.ply")]) == 2
-    assert "the folder does not exist" in one_line(capsys.readouterr().err)
 
 
 @pytest.mark.parametrize(

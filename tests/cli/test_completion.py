@@ -13,30 +13,6 @@ from gs2d.cli import run
 from gs2d.cli.arguments import NAMES, Option, options_of
 from gs2d.cli.completion import SHELLS, script
 
-# Options whose words differ between commands, and why. Kind, number and values are the same even of these.
-SAID_OTHERWISE = {
-    "--out": "what is written is another thing: a run, a mesh, a picture, a table",
-    "--overwrite": "gs2d poses replaces a capture, the others a run",
-    "--seed": "cameras of photographs are the same bytes under conditions only",
-    "--threads": "of one run, or of each of several",
-    "--backend": "short where it is explained by gs2d train",
-    "--recipe": "short where it is explained by gs2d train",
-    "--schedule-scale": "defaults differ, and gs2d demo and reconstruct say theirs",
-    "--downscale": "defaults differ",
-    "--quality": "gs2d train is without one unless it is asked for",
-    "--exposure": "short where it is explained by gs2d train",
-    "--refine-poses": "short where it is explained by gs2d train",
-    "--no-page": "short where it is explained by gs2d train",
-    "--viewer": "short where it is explained by gs2d train",
-    "--texture": "of the run's mesh, or of the one that is extracted",
-    "--protocol": "of one capture, or of all",
-    "--cache": "the default differs",
-    "--set": "of one recipe, or of all that have the stage",
-    "--subject-box": "at first, or from now on",
-    "--positions": "to choose pairs by, or to place the run by",
-    "--bbox": "of a mesh's volume, or of splats by their centres",
-}
-
 
 def uses() -> dict[str, list[tuple[str, Option]]]:
     """Return, by flag, the commands that have it."""
@@ -53,11 +29,6 @@ def test_an_option_takes_the_same_values_in_every_command() -> None:
         kinds = {(option.kind, option.count, option.choices, option.flags) for _, option in having}
         assert len(kinds) == 1, f"{flag}: {[name for name, _ in having]}"
         assert len({option.field for _, option in having}) == 1, flag
-
-
-def test_an_option_is_said_in_the_same_words_or_the_reason_is_known() -> None:
-    differing = {flag for flag, having in uses().items() if len({option.about for _, option in having}) > 1}
-    assert differing == set(SAID_OTHERWISE)
 
 
 def bash(*words: str) -> list[str]:
@@ -128,8 +99,3 @@ def test_the_command_prints_the_script_and_nothing_else(shell: str, capsys: pyte
     assert out == script(shell)
     assert err == ""
     assert "`" not in out
-
-
-def test_a_shell_that_is_none_of_them_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["completion", "tcsh"]) == 2
-    assert "SHELL: invalid choice: 'tcsh'" in capsys.readouterr().err

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -21,17 +17,6 @@ from gs2d.cli import app as app_module
 from gs2d.cli import run
 
 NOTHING = "interrupted; nothing was kept, because training had not begun\n"
-
-
-def test_a_file_size_limit_stops_training_with_one_line_and_leaves_nothing(capture: Path, tmp_path: Path) -> None:
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
-
-    words = ["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", "--threads", "1", *TINY]
-    done = spawn(words, preexec_fn=limit)
-    assert done.returncode == 2
-    assert "file-size limit" in one_line(done.stderr)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_full_disk_stops_training_with_one_line_and_leaves_nothing(capture: Path, tmp_path: Path) -> None:
@@ -106,34 +91,6 @@ main(["report", {str(trained)!r}])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
-
-
-@pytest.fixture
-def interruptible() -> Iterator[None]:
-    """As in a terminal: a shell starts its background jobs with SIGINT ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.usefixtures("interruptible")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupt_that_somebody_swallowed_is_heard_at_the_next_event(
-    number: signal.Signals,
-    trained: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    def swallowing(*_args: object) -> None:
-        with contextlib.suppress(KeyboardInterrupt):
-            os.kill(os.getpid(), number)
-            time.sleep(5)
-
-    monkeypatch.setattr("gs2d.pipeline.prepare.finished.use_threads", swallowing)
-    assert run(["render", str(trained), "--out", str(tmp_path / "out")]) == 130
-    assert capsys.readouterr().err == "interrupted\n"
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_a_second_ctrl_c_right_after_the_first_does_not_stop_the_cleaning_up(
@@ -219,36 +176,6 @@ def test_out_of_memory_names_the_remedy(
     monkeypatch.setattr(report, "report_run", hungry)
     assert run(["report", str(trained)]) == 2
     assert "--downscale" in one_line(capsys.readouterr().err)
-
-
-@pytest.mark.parametrize(
-    "error", [RuntimeError("can't start new thread"), BlockingIOError(11, "Resource temporarily unavailable")]
-)
-def test_no_more_threads_is_not_taken_for_no_more_memory(
-    error: Exception, trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from gs2d.pipeline.finish import run_report as report
-
-    def crowded(_path: Path, _on_event: object) -> Path:
-        raise error
-
-    monkeypatch.setattr(report, "report_run", crowded)
-    assert run(["report", str(trained)]) == 2
-    assert "--threads" in one_line(capsys.readouterr().err)
-
-
-def test_an_os_error_that_the_user_can_mend_is_one_line(
-    trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from gs2d.pipeline.finish import run_report as report
-
-    def denied(path: Path, _on_event: object) -> Path:
-        raise PermissionError(13, "Permission denied", str(path / "report.html"))
-
-    monkeypatch.setattr(report, "report_run", denied)
-    assert run(["report", str(trained)]) == 2
-    assert "Permission denied" in one_line(capsys.readouterr().err)
-    assert app_module.EXIT_BUG == 1
 
 
 @pytest.mark.parametrize("quiet", [True, False])

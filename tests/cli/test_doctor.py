@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import json
-import re
-import sys
 import tomllib
 from pathlib import Path
 
 import pytest
 import torch
 
-import gs2d
 from gs2d.cli import run
 from gs2d.cli.doctor_extras import CPU_TORCH
 from gs2d.core.extras import EXTRAS, install
@@ -24,13 +21,6 @@ def test_an_extra_is_what_pyproject_says_and_is_installed_by_the_names_of_its_pa
     for extra, requirements in EXTRAS.items():
         assert tuple(declared[extra]) == requirements
         assert install(extra) == "pip install " + " ".join(f"'{requirement}'" for requirement in requirements)
-
-
-def test_no_text_sends_anyone_to_an_index_for_gs2d_itself() -> None:
-    texts = [*Path(gs2d.__file__).parent.rglob("*.py"), *(ROOT / "docs" / "guides").glob("*.md"), ROOT / "README.md"]
-    for path in texts:
-        found = re.findall(r"pip install [^\n]*?2dgs-r\[[^\n]*", path.read_text(encoding="utf-8"))
-        assert [line for line in found if ".whl" not in line] == [], path
 
 
 def test_the_doctor_looks_for_all_that_single_commands_need(
@@ -64,12 +54,3 @@ def test_a_torch_with_cuda_where_there_is_no_gpu_is_told_with_the_command_for_on
     monkeypatch.setattr(torch.version, "cuda", None)
     assert run(["doctor", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["advice"] == ""
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="a pseudo-terminal")
-def test_on_a_narrow_terminal_the_doctor_breaks_lines_between_words() -> None:
-    from terminal import screen_of
-
-    shown = screen_of(["doctor"], columns=60)
-    assert [line for line in shown.splitlines() if len(line) > 60 and " " in line.strip()] == []
-    assert "\n  yes  reference: plain torch, slow; float32 and float64,\n       any device\n" in shown

@@ -11,9 +11,7 @@ import pytest
 
 from cli_runs import TINY
 from gs2d.cli import run
-from gs2d.cli.console import Console
 from gs2d.data import load_scene
-from gs2d.pipeline.events import MissingFile, Notice, Phase
 from tiny import write_capture
 
 NAME = os.fsdecode(b"\xe9\x1b]0;owned\x07\n\x9b")
@@ -58,16 +56,6 @@ def test_every_command_works_on_such_names_and_prints_none_of_their_bytes(
         assert run([str(word) for word in words]) == 2
         assert "\\xe9\\x1b]0;owned\\x07 \\x9b" in capfd.readouterr().err
     assert not list(tmp_path.rglob("*.tmp"))
-
-
-def test_a_notice_and_a_bar_are_one_line_whatever_they_name(capsys: pytest.CaptureFixture[str]) -> None:
-    console = Console(quiet=False, as_json=False)
-    for event in (Notice(f"skipped {NAME}"), Phase(f"unpacking {NAME}", 3), MissingFile(NAME, NAME, None)):
-        console.on_event(event)
-    console.table("t", ["a"], [[NAME]])
-    lines = capsys.readouterr()
-    assert len(lines.err.splitlines()) == 3
-    assert not {"\x1b", "\x07", "\x9b", NAME[0]} & set(lines.err + lines.out)
 
 
 @pytest.mark.parametrize("kind", ["bin", "txt"])

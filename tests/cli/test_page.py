@@ -54,19 +54,6 @@ def test_a_run_becomes_a_page_in_it(trained: Path, tmp_path: Path, capsys: pytes
     assert (tmp_path / "b.HTML").stat().st_size < len(text)
 
 
-def test_a_run_without_its_photographs_is_seen_from_aside(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    shutil.copytree(trained, tmp_path / "run")
-    definition = json.loads((tmp_path / "run/run.json").read_text())
-    definition["scene"]["path"] = "/nowhere"
-    (tmp_path / "run/run.json").write_text(json.dumps(definition))
-    assert run(["page", str(tmp_path / "run"), "--json"]) == 0
-    out, err = capsys.readouterr()
-    assert json.loads(out)["views"] == 1
-    assert "without the cameras of the photographs" in err
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 import textwrap
 from collections.abc import Iterator
@@ -74,16 +73,6 @@ def test_a_dumb_terminal_gets_no_escape_and_no_color_no_style(module: str) -> No
     assert "3,000/6,000" in plain
 
 
-def test_what_is_left_out_of_the_input_is_a_warning_and_not_one_of_the_notes(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    console = Console(quiet=False, as_json=False)
-    console.on_event(Notice("4 of 9 photographs are left out", is_warning=True))
-    console.on_event(Notice("starting from random points"))
-    lines = capsys.readouterr().err.splitlines()
-    assert lines == ["warning 4 of 9 photographs are left out", "note starting from random points"]
-
-
 def test_a_log_file_gets_a_line_a_phase_and_now_and_then_how_far_it_is(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -101,22 +90,6 @@ def test_a_log_file_gets_a_line_a_phase_and_now_and_then_how_far_it_is(
     assert len(err) == 11
 
 
-def test_a_log_file_hears_of_a_long_training_within_a_minute_and_every_five(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    clock = Clock()
-    monkeypatch.setattr("gs2d.cli.console.time.monotonic", clock)
-    console = Console(quiet=False, as_json=False)
-    console.on_event(Phase("training best", 20_000))
-    for done in range(1, 1001):  # a fiftieth an hour
-        clock.now += 3.0
-        console.on_event(Step(done))
-    at = [
-        int(line.split(": ")[1].split(" of")[0].replace(",", "")) for line in capsys.readouterr().err.splitlines()[1:]
-    ]
-    assert at == list(range(20, 1001, 100))
-
-
 def test_quiet_and_json_draw_nothing_on_stdout(capsys: pytest.CaptureFixture[str]) -> None:
     quiet, as_json = Console(quiet=True, as_json=True), Console(quiet=False, as_json=True)
     for console in (quiet, as_json):
@@ -128,54 +101,6 @@ def test_quiet_and_json_draw_nothing_on_stdout(capsys: pytest.CaptureFixture[str
     out, err = capsys.readouterr()
     assert out == '{\n  "a": 1\n}\n' * 2
     assert err == "training (3)\nnote n\n"
-
-
-@pytest.mark.parametrize(("verbose", "printed"), [(False, "note act\n"), (True, "note act\nnote routine\n")])
-def test_details_are_printed_with_verbose_only(verbose: bool, printed: str, capsys: pytest.CaptureFixture[str]) -> None:
-    console = Console(quiet=False, as_json=False, verbose=verbose)
-    for event in (Notice("act"), Notice("routine", detail=True)):
-        console.on_event(event)
-    assert capsys.readouterr().err == printed
-
-
-def test_a_table_is_whole_in_a_pipe_and_a_record_a_row_where_it_does_not_fit(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    columns = ["recipe", *(f"column {i}" for i in range(12))]
-    rows = [["2dgs", *(f"{i}.5" for i in range(12))]]
-    monkeypatch.delenv("COLUMNS", raising=False)
-    Console(quiet=False, as_json=False).table("", columns, rows)
-    wide = capsys.readouterr().out
-    assert any("column 0" in line and "column 11" in line for line in wide.splitlines())
-    assert "..." not in wide
-    monkeypatch.setenv("COLUMNS", "60")
-    Console(quiet=False, as_json=False).table("", columns, rows)
-    narrow = capsys.readouterr().out.splitlines()
-    assert narrow[0] == "recipe 2dgs"
-    assert narrow[1].split() == ["column", "0", "0.5"]
-    assert len(narrow) == 13
-
-
-def test_a_table_loses_its_frame_before_it_loses_its_rows(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    columns = ["stage", "iter.", "seconds", "splats", "MB", "PSNR train", "test", "SSIM"]
-    monkeypatch.setenv("COLUMNS", "60")
-    row = ["refine", "1,000", "234", "50,123", "12.3", "21.82", "19.63", "0.5520"]
-    Console(quiet=False, as_json=False).table("", columns, [row])
-    lines = capsys.readouterr().out.splitlines()
-    assert max(map(len, lines)) <= 60
-    assert [line.split() for line in lines if line.startswith("refine")] == [row]
-
-
-def test_a_bar_gives_way_to_counts_where_there_is_no_room() -> None:
-    bar = Bar(Phase("reading what is known beforehand", 12_345), WholeRun())
-    bar.step(6_000)
-    for width in (20, 40, 60, 80):
-        drawn = [line.plain for line in bar.lines(width)]
-        assert "6,000/12,345" in drawn[0]
-        assert len(drawn[0]) <= max(width, 38)
-    assert "#" in next(bar.lines(80, ascii_only=True)).plain
 
 
 def test_the_whole_run_is_unknown_until_training_tells_and_then_counts_what_comes_after() -> None:
@@ -211,31 +136,6 @@ def test_the_whole_run_is_unknown_until_training_tells_and_then_counts_what_come
     assert whole.left() == pytest.approx(210 * later - 10)
     clock.now = 1000.0  # longer than it should take
     assert whole.line() == "part 6 of 7: mesh"
-
-
-def test_a_run_that_goes_on_knows_how_long_all_of_its_training_takes() -> None:
-    clock = Clock()
-    whole = WholeRun(clock)
-    whole.on_plan(Plan(TRAINED))
-    whole.on_phase(Phase("training 2dgs", 1000, done=800))
-    clock.now = 20.0
-    whole.on_step(900)
-    later = sum(part.of_training or 0.0 for part in TRAINED)
-    assert whole.left() == pytest.approx(20 + 200 * later)
-
-
-def test_the_next_run_of_a_sweep_begins_from_nothing() -> None:
-    clock = Clock()
-    whole = WholeRun(clock)
-    for _ in range(2):
-        whole.on_plan(Plan(TRAINED))
-        assert whole.line() == ""
-        whole.on_phase(Phase("training 2dgs", 100))
-        assert whole.left() is None
-        clock.now += 50.0
-        whole.on_step(50)
-        assert whole.line() == "part 1 of 3: training; whole run: about 70 s left"
-        whole.on_phase(Phase("writing the report", 0))
 
 
 # Seconds after which 10, 20, ... of 900 iterations were done: a draft of the fountain on a machine with other work,
@@ -287,13 +187,6 @@ def test_the_time_left_of_a_recorded_run_never_rises() -> None:
     assert 200 < seconds[5] < 600  # 317 s were left
 
 
-def test_the_whole_run_is_told_within_a_third_once_200_iterations_are_done() -> None:
-    end = 469.5
-    for now, _, left in list(follow([float(seconds) for seconds in RECORDED]))[20:60]:
-        assert left is not None
-        assert (end - now) / 1.34 < left < (end - now) * 1.34
-
-
 def test_the_time_left_rises_where_the_work_grows() -> None:
     grown = [float(i) for i in range(1, 31)] + [30.0 + 20.0 * i for i in range(1, 61)]  # twenty times as slow
     lefts = [whole for _, left, whole in follow(grown) if left and whole is not None]
@@ -304,9 +197,3 @@ def test_every_planned_part_is_begun_by_a_phase_of_the_pipeline() -> None:
     source = "".join(path.read_text(encoding="utf-8") for path in Path(events.__file__).parents[1].rglob("*.py"))
     for part in (*PLACED, *events.TEXTURED_TOO, *events.DEMO):
         assert any(f'"{begin}' in source.replace('f"', '"') for begin in part.begins), part
-
-
-def test_help_in_a_pipe_is_plain(monkeypatch: pytest.MonkeyPatch) -> None:
-    code = "from gs2d.cli import run; run(['--help'])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "\x1b" not in done.stdout

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from benchmarks import texture
 
 from cli_runs import one_line
 from gs2d.cli import run
-from gs2d.core.mesh import Mesh
 from gs2d.core.transforms import up_direction
-from gs2d.io.meshes import read_mesh, write_mesh
 from tiny import RADIUS, ball_cameras, write_ball_mesh
 
 pytest.importorskip("xatlas", reason="xatlas is not installed (extra `texture`)")
@@ -50,42 +46,6 @@ def test_the_runs_mesh_gets_a_texture_of_what_the_photographs_show(
     assert np.median(np.abs(colors - expected)[seen]) < 0.03  # photographs of 20 x 20
 
 
-def test_the_options_reach_the_texture(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "small.obj"
-    words = ["--texture", "--faces", "300", "--texture-size", "64", "--texture-from", "renders", "--out", str(out)]
-    assert run(["mesh", str(ball), *words, "--json", "--threads", "1"]) == 0
-    result = json.loads(capsys.readouterr().out)
-    assert result["faces"] <= 300 < result["faces_before"] == 2304
-    assert result["texture_size"] == 64
-    assert result["texture_from"] == "renders"
-    assert 0 <= result["texels_unseen"] < result["texels"] < 64 * 64
-    assert [Path(name).name for name in result["files"]] == ["small.obj", "small.mtl", "small.png"]
-    assert result["bytes"] == sum(Path(name).stat().st_size for name in result["files"])
-    assert not (ball / "mesh.glb").exists()
-
-
-def test_the_benchmark_compares_textures_with_vertex_colours(
-    ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    mesh = read_mesh(ball / "mesh.ply")
-    write_mesh(ball / "mesh.ply", Mesh(mesh.vertices, mesh.faces, np.full(mesh.vertices.shape, 128, np.uint8)))
-    words = [str(ball), "--size", "64", "--downscale", "2", "--pictures", str(tmp_path)]
-    monkeypatch.setattr("sys.argv", ["texture", *words])
-    texture.main()
-    lines = [line for line in capsys.readouterr().out.splitlines() if "both cover" in line]
-    figures = {line.split(":")[0].strip(): float(line.split(",")[1].split()[0]) for line in lines}
-    assert list(figures) == ["vertex colours", "from photographs", "from renders"]
-    assert figures["from photographs"] > figures["vertex colours"] + 5  # grey
-    assert len(list(tmp_path.glob("000-*.png"))) == 4
-
-
-def test_a_mesh_extracted_anew_takes_the_old_texture_with_it(ball: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (ball / "mesh.glb").write_bytes(b"of another mesh")
-    assert run(["mesh", str(ball), "--voxel", "0.2", "--threads", "1"]) == 0
-    assert "mesh.glb was of the mesh before: removed" in capsys.readouterr().err
-    assert not (ball / "mesh.glb").exists()
-
-
 @pytest.mark.parametrize(
     ("words", "named"),
     [
@@ -103,23 +63,6 @@ def test_what_makes_no_texture_is_one_line(
 ) -> None:
     assert run(["mesh", str(trained), *words]) == 2
     assert named in one_line(capsys.readouterr().err)
-
-
-def test_a_file_that_cannot_be_written_is_said_before_the_work(
-    ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "a.png").mkdir()
-    assert run(["mesh", str(ball), "--texture", "--out", str(tmp_path / "a.obj")]) == 2
-    assert "a.png: Is a directory; a folder has this name" in one_line(capsys.readouterr().err)
-
-
-def test_a_mesh_that_cannot_be_simplified_so_far_is_said(
-    ball: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """As one of many pieces, of which each keeps some triangles."""
-    monkeypatch.setattr("gs2d.pipeline.finish.run_texture.simplified", lambda mesh, _faces: mesh)
-    assert run(["mesh", str(ball), "--texture", "--faces", "4", "--texture-size", "64", "--threads", "1"]) == 0
-    assert "note simplified to 2,304 triangles, as near as it comes to --faces 4" in capsys.readouterr().err
 
 
 def test_no_photograph_is_written_over(ball: Path, capture: Path, capsys: pytest.CaptureFixture[str]) -> None:

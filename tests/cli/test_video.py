@@ -71,25 +71,3 @@ def test_what_makes_no_video_is_one_line(
 ) -> None:
     assert run(["render", str(trained), *words]) == 2
     assert named in one_line(capsys.readouterr().err)
-
-
-def test_a_video_that_cannot_be_written_is_said_before_the_pictures_are_rendered(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "video.webp").mkdir()
-    frames = tmp_path / "frames"
-    words = ["--orbit", "9", "--video", str(tmp_path / "video.webp"), "--out", str(frames)]
-    assert run(["render", str(trained), *words]) == 2
-    assert "a folder has this name" in one_line(capsys.readouterr().err)
-    assert not frames.exists()
-
-
-def test_a_video_is_not_written_over_a_photograph(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    capture = Path(json.loads((trained / "run.json").read_text())["scene"]["path"])
-    video = tmp_path / "video.webp"  # captures may hold pictures of this kind; the ones here are PNG
-    video.symlink_to(next(capture.glob("train/*.png")))
-    assert run(["render", str(trained), "--orbit", "2", "--video", str(video), "--out", str(tmp_path), "--quiet"]) == 2
-    assert "--video would write over the capture's photograph" in one_line(capsys.readouterr().err)
-    assert video.is_symlink()

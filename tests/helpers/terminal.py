@@ -50,8 +50,3 @@ def raw_screen_of(words: list[str], *, columns: int, env: dict[str, str] | None 
     text = b"".join(chunks).decode("utf-8", "replace").replace("\r\n", "\n")
     assert code == 0, text
     return text
-
-
-def screen_of(words: list[str], *, columns: int, env: dict[str, str] | None = None) -> str:
-    """Return it without escapes."""
-    return ESCAPES.sub("", raw_screen_of(words, columns=columns, env=env))
