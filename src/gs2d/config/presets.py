@@ -322,7 +322,7 @@ def best_surface(*, name: str = "best-surface") -> Recipe:
     """Return ``best`` with neighbouring photographs compared in its last fifth, and a start that is not fitted.
 
     Chamfer before dB: a fitted start has better colours, and more splats that lie a little off
-    (docs/notebook/best-surface.md).
+    (docs/notebook/best.md).
     """
     recipe = best()
     assert recipe.dense_start is not None
