@@ -9,8 +9,6 @@ from typing import Any
 
 import pytest
 from benchmarks.gpu import __main__ as command
-from benchmarks.gpu import bench as bench_module
-from benchmarks.gpu import correctness
 
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.compile import KERNEL, compile_text
@@ -57,23 +55,6 @@ def test_correctness_compares_with_the_reference_and_says_what_each_tool_found(t
     assert results["memcheck"]["clean"]
     assert [line for line in results["memcheck"]["last_lines"] if line.startswith("not run:")]
     assert "collected" in results["tests"]["summary"]
-
-
-@pytest.mark.parametrize(
-    ("part", "wrong"),
-    [({"clean": True, "exit": 0}, 0), ({"skipped": "no tool"}, 0), ({"clean": False}, 1), ({"exit": 1}, 1)],
-)
-def test_what_is_wrong_on_a_gpu_is_the_exit_status(part: dict[str, Any], wrong: int) -> None:
-    assert correctness.wrong({"registers": {"architecture": "sm_90"}, "memcheck": part}) == bool(wrong)
-    assert correctness.wrong({"parity": {"failed": "RuntimeError: no"}})
-
-
-def test_a_failing_part_is_recorded_and_loses_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
-    def broken() -> dict[str, Any]:
-        raise RuntimeError("CUDA error: out of memory\nmore words")
-
-    assert bench_module.attempt("kernels", broken) == {"failed": "RuntimeError: CUDA error: out of memory"}
-    assert "kernels: RuntimeError" in capsys.readouterr().err
 
 
 def test_the_probes_compile_for_the_newest_and_the_oldest_architecture() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from benchmarks import quality_run, time_to_quality
-from benchmarks.quality_run import Clocks
 from benchmarks.street_runs import Process
 from PIL import Image
 
@@ -71,39 +69,3 @@ def test_the_command_trains_scores_and_draws(
     assert 0 <= run["surface"]["f_scores"]["0.0025"] <= run["surface"]["f_scores"]["0.01"] <= 1
     assert "| still | 2dgs | 0.001 |" in capsys.readouterr().out
     assert np.asarray(Image.open(figure)).shape[1] > 1000
-
-
-def test_a_training_that_was_cut_off_goes_on_to_the_same_splats_with_its_seconds(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    args = time_to_quality.parse(words(capture, tmp_path, "--points", "3"))
-    spec = time_to_quality.specification(capture, 1, "2dgs", 0.001, 0, args)
-    seen: dict[str, np.ndarray] = {}
-
-    def surface(job: Any, state: Any, *_: Any) -> dict[str, Any]:
-        seen[place.name] = state.splats.means.numpy().copy()
-        return {"surface": None}
-
-    monkeypatch.setattr(quality_run, "surface", surface)
-    place = tmp_path / "whole"
-    place.mkdir()
-    whole = quality_run.train(spec, place, Clocks(time.time()))
-    place = tmp_path / "cut"
-    place.mkdir()
-    score, count = quality_run.score, []
-
-    def cut_off(*arguments: Any) -> dict[str, Any]:
-        count.append(1)
-        if len(count) == 2:
-            raise KeyboardInterrupt
-        return score(*arguments)
-
-    monkeypatch.setattr(quality_run, "score", cut_off)
-    with pytest.raises(KeyboardInterrupt):
-        quality_run.train(spec, place, Clocks(time.time() - 1000.0))
-    monkeypatch.setattr(quality_run, "score", score)
-    went_on = quality_run.train(spec, place, Clocks(time.time()))
-    assert (seen["cut"] == seen["whole"]).all()
-    assert [point["iterations"] for point in went_on["course"]] == [10, 20]
-    assert [point["images"] for point in went_on["course"]] == [point["images"] for point in whole["course"]]
-    assert 1000.0 < went_on["course"][0]["seconds"] < went_on["course"][1]["seconds"] < went_on["seconds"] < 1100.0

@@ -64,23 +64,6 @@ def test_sparse_points_project_to_where_they_were_seen(
     assert errors_px(scene, root, shift=0.5).mean() > mean  # half a pixel of convention would show
 
 
-def test_text_and_binary_files_of_one_model_agree(shared: Shared) -> None:
-    root = shared("sceaux_castle")
-    binary = read_images(root / "sparse/0", "bin", observations=True)
-    text = read_images(root / "sparse_txt", "txt", observations=True)
-    binary, text = sorted(binary, key=lambda i: i.name), sorted(text, key=lambda i: i.name)
-    assert [i.name for i in binary] == [i.name for i in text]
-    for a, b in zip(binary, text, strict=True):
-        np.testing.assert_allclose(a.T_cam_world, b.T_cam_world, atol=1e-12)
-        np.testing.assert_allclose(a.observations, b.observations, atol=1e-6)
-        np.testing.assert_array_equal(a.point_ids, b.point_ids)
-    p, q = read_points(root / "sparse/0", "bin"), read_points(root / "sparse_txt", "txt")
-    order_p, order_q = np.argsort(p.ids), np.argsort(q.ids)
-    np.testing.assert_array_equal(p.ids[order_p], q.ids[order_q])
-    np.testing.assert_allclose(p.xyz[order_p], q.xyz[order_q], atol=1e-12)
-    np.testing.assert_array_equal(p.rgb[order_p], q.rgb[order_q])
-
-
 def test_a_simple_radial_lens_explains_the_observations_in_the_distorted_photographs(shared: Shared) -> None:
     root = shared("sceaux_castle")
     scene = load_scene(root)
@@ -158,15 +141,6 @@ def test_the_fox_s_epipolar_geometry_holds_after_undistortion(shared: Shared) ->
         assert undistorted < 0.6 * raw
 
 
-def test_fox_loads_whole_with_its_missing_frames_reported(shared: Shared) -> None:
-    scene = load_scene(shared("fox_instant_ngp"), downscale=4)
-    assert scene.format == "nerfstudio"
-    assert len(scene.skipped) == 17
-    assert scene.train[0].image().shape == (240, 135, 3)
-    # instant-ngp scales a capture to about the unit box: aabb_scale 4.
-    assert np.abs(scene.bounds).max() < 8
-
-
 def test_the_bottle_s_depth_maps_agree_with_its_cameras(shared: Shared) -> None:
     """Back-projected ground-truth depth of test view 0, seen from test view 1, falls on that view's silhouette."""
     root = shared("rendered_bottle")
@@ -183,17 +157,3 @@ def test_the_bottle_s_depth_maps_agree_with_its_cameras(shared: Shared) -> None:
     pixels, _ = b.camera.project(world)
     j, i = pixels.astype(int).T
     assert (b.alpha()[i, j] > 0).mean() > 0.999
-
-
-@pytest.mark.parametrize("name", ["dtu_scan24", "strecha_fountain_P11"])
-def test_points_are_known_by_the_photographs_that_show_them(shared: Shared, name: str) -> None:
-    scene = load_scene(shared(name), downscale=4)
-    assert scene.observe is not None
-    observed = scene.observe()
-    assert set(observed.seen) == {view.name for view in scene.views}
-    assert observed.track.min() >= 1
-    for view in scene.train[::5]:
-        pixels, depth = view.camera.project(observed.points[observed.seen[view.name]])
-        size = (view.camera.width, view.camera.height)
-        inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels <= size).all(axis=1)
-        assert inside.mean() > 0.99

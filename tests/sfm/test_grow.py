@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -18,7 +17,7 @@ from gs2d.cli import run
 from gs2d.sfm import search, steps
 from gs2d.sfm.grow import grow_all
 from gs2d.sfm.search import forget, go_on
-from gs2d.sfm.steps import Snapshots, Steps
+from gs2d.sfm.steps import Steps
 from gs2d.sfm.workspace import workspace
 from room_photos import write_room
 
@@ -82,44 +81,6 @@ def test_a_model_grows_on_from_its_snapshot(
     again: list[int] = []
     grow_all(pycolmap, database, options, done, "grown", again.append, often=True)  # all is done
     assert again == [COUNT]
-
-
-class Model:
-    """What is written as a model."""
-
-    def __init__(self, text: str) -> None:
-        self.text = text
-
-    def write(self, folder: str) -> None:
-        (Path(folder) / "points").write_text(self.text)
-
-
-def test_snapshots_come_no_oftener_than_their_writing_allows_and_one_is_always_whole(tmp_path: Path) -> None:
-    """Writing takes 2 s here, of which 30 times must go by; at first 20 s."""
-    now = 0.0
-
-    class Slow(Model):
-        def write(self, folder: str) -> None:
-            nonlocal now
-            super().write(folder)
-            now += 2.0
-
-    done = Steps(tmp_path)
-    snapshots = Snapshots(done, "s", clock=lambda: now)
-    written = []
-    for second in range(0, 200, 5):
-        now = max(now, float(second))
-        before = done.names("s")
-        snapshots.offer(lambda second=second: Slow(str(second)))  # type: ignore[misc]
-        if done.names("s") != before or written:
-            written.append(second)
-    texts = sorted(int((tmp_path / name / "points").read_text()) for name in done.names("s"))
-    assert written[0] == 20
-    assert texts == [85, 150]
-    os.utime(tmp_path / done.names("s")[0], ns=(1, 1))
-    assert snapshots.newest() == done.names("s")[1]
-    snapshots.clear()
-    assert done.names("s") == []
 
 
 # -- what is kept of a search ------------------------------------------------------------------------------------------

@@ -201,20 +201,6 @@ def test_the_workplace_of_a_capture_that_is_in_place_goes(tmp_path: Path, left: 
     assert (out / "poses.json").exists()
 
 
-def test_the_workplace_of_no_capture_or_of_a_living_process_stays(tmp_path: Path) -> None:
-    work, out = tmp_path / ".room.poses", tmp_path / "room"
-    work.mkdir()
-    sweep_workspace(out)
-    assert work.exists()
-    out.mkdir()
-    (out / "poses.json").write_text("{}")
-    with RunFolder(work).locked():
-        sweep_workspace(out)
-        assert work.exists()
-    sweep_workspace(out)
-    assert not work.exists()
-
-
 def test_two_commands_do_not_make_the_same_capture(tmp_path: Path) -> None:
     work = tmp_path / ".room.poses"
     work.mkdir()
@@ -225,17 +211,3 @@ def test_two_commands_do_not_make_the_same_capture(tmp_path: Path) -> None:
     ):
         raise AssertionError("both have it")
     assert work.is_dir()  # theirs
-
-
-@pytest.mark.parametrize("below", [".", "images"])
-def test_training_on_photographs_without_cameras_names_this_command(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], below: str
-) -> None:
-    photos = tmp_path / "photos" / below
-    photos.mkdir(parents=True)
-    for i in range(3):
-        (photos / f"{i}.JPG").touch()
-    assert run(["train", str(tmp_path / "photos"), "--out", str(tmp_path / "run"), "--quiet"]) == 2
-    line = one_line(capsys.readouterr().err)
-    assert f"got 3 photographs without any; `gs2d reconstruct {photos} --out RUN` makes a run" in line
-    assert not (tmp_path / "run").exists()

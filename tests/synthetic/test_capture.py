@@ -185,16 +185,6 @@ def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(capture: Pa
     assert reports == [(k + 1, TRAIN + TEST) for k in range(TRAIN + TEST)]
 
 
-def test_another_seed_gives_another_scene_and_other_cameras(scene: ToyScene) -> None:
-    other = build_scene(1)
-    assert len(other.patch.faces) == len(scene.patch.faces)
-    assert not np.array_equal(other.patch.vertices, scene.patch.vertices)
-    assert not np.array_equal(other.parts[0].texture, scene.parts[0].texture)
-    assert not np.array_equal(
-        demo_cameras(0, 2, 0, 32)["train"][1].T_cam_world, demo_cameras(1, 2, 0, 32)["train"][1].T_cam_world
-    )
-
-
 def test_a_capture_that_failed_is_not_taken_for_a_capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full_disk(path: Path, image: np.ndarray) -> None:
         raise DiskError(f"cannot write {path}: No space left on device")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import replace
 
 import numpy as np
@@ -120,22 +119,6 @@ def test_a_pixel_that_stops_on_the_last_bit_of_a_chunk_stays_stopped(emulator: E
     assert float(grads["opacity_logits"][31:].abs().max()) == 0
 
 
-def test_culling_inside_tiles_changes_no_bit_of_the_image_and_no_gradient(emulator: Emulator) -> None:
-    case = many_tiles()
-    exact = render(emulator, case.splats, case.camera, SETTINGS)
-    everything = render(emulator, case.splats, case.camera, SETTINGS, exact_masks=False)
-    for name in (*IMAGES, "radii"):
-        assert torch.equal(getattr(exact, name), getattr(everything, name)), name
-    cotangents = random_cotangents(np.random.default_rng(1), case.camera)
-    a = gradients(emulator, case.splats, case.camera, cotangents, 4)
-    b = gradients(emulator, case.splats, case.camera, cotangents, 4, exact_masks=False)
-    # The lengths of the lists change the order of the blocks, and so that of the additions. The most is 1.1e-5, the
-    # quaternion of one splat; eight orders of the same lists, nothing culled, differ by up to 1.0e-5. In a fixed order
-    # no bit depends on culling: test_kernels_variants.py, "deterministic".
-    for name in a:
-        assert float((a[name] - b[name]).norm()) <= 3e-5 * float(a[name].norm()), name
-
-
 def test_the_order_of_threads_warps_and_blocks_does_not_change_images(emulator: Emulator) -> None:
     """A missing barrier would."""
     case = many_tiles()
@@ -160,34 +143,6 @@ def test_many_tiles_agree_with_the_reference(emulator: Emulator) -> None:
         difference = (getattr(low, name).double() - getattr(high, name)).abs()
         assert quantile(difference, 0.5) < 1e-6, name
         assert quantile(difference, 0.999) < 2e-3, name
-
-
-def test_more_than_32767_tiles_use_wide_keys(emulator: Emulator) -> None:
-    """3200 x 3200 px are 40000 tiles; only the lists are made, and each names the splats that lie there."""
-    launched = []
-
-    class ListsOnly:
-        def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure) -> None:
-            launched.append(name)
-            if not name.startswith("blend"):
-                emulator.launch(name, blocks, threads, arguments)
-
-    camera = front_camera(3200, 3200, 1600.0)
-
-    def at(x: float, y: float) -> Splats:  # at depth 2, some 2 px wide
-        return splat(((x - 1600) / 800, (y - 1600) / 800, 2.0), (1e-3, 1e-3))
-
-    scene = stack(at(3195.0, 3195.0), at(5.0, 5.0), at(3100.0, 8.0), at(3195.0, 3196.0))
-    view = cuda._view(camera, replace(SETTINGS, sh_degree=0))
-    frame = cuda.forward(ListsOnly(), view, [t for _, t in scene.items()])
-    assert "emit_entries_32" in launched
-    assert "find_ranges_32" in launched
-    filled = {
-        tile: [int(entry) >> 8 for entry in frame.entries[begin:end]]
-        for tile, (begin, end) in enumerate(frame.ranges[:-1].tolist())
-        if end > begin
-    }
-    assert filled == {39999: [0, 3], 0: [1], 3100 // 16: [2]}
 
 
 def test_what_would_read_beyond_an_array_is_refused(emulator: Emulator) -> None:

@@ -58,15 +58,6 @@ def test_the_stream_is_asked_for_at_each_launch() -> None:
     assert [done.stream for done in driver.launches] == [1, 2, 3]
 
 
-def test_a_file_is_loaded_once_for_all_of_its_kernels() -> None:
-    driver = FakeDriver()
-    launcher = fake_driver.launcher(driver)
-    for name in ("emit_entries_16", "find_ranges_16", "emit_entries_16", "project_splats", "find_ranges_16"):
-        launcher.launch(name, 1, 128, numbers())
-    assert driver.loaded == [b"\x7fELFcuda/emit.cusm_90", b"\x7fELFcuda/project.cusm_90"]
-    assert driver.names == ["emit_entries_16", "find_ranges_16", "project_splats"]
-
-
 def test_dynamic_shared_memory_beyond_48_kib_is_asked_for_once() -> None:
     driver = FakeDriver()
     launcher = fake_driver.launcher(driver, index=1)

@@ -60,20 +60,3 @@ def test_kernels_and_python_agree_where_every_field_lies(name: str, monkeypatch:
     headers = {key: value for key, value in compile.sources().items() if key.endswith(".h")}
     # the structures alone: kernels, and what only they use, are not wanted again
     compile.compile_text(text + "\n" + "\n".join(lines), name, "compute_75", headers=headers)
-
-
-@pytest.mark.parametrize(
-    ("fields", "what"), [("int a, c; void* b;", "b is elsewhere"), ("int a; void* b; int d;", "it is larger")]
-)
-def test_a_field_in_another_place_or_one_too_many_is_found(fields: str, what: str) -> None:
-    class Known(ctypes.Structure):
-        _fields_ = (("b", ctypes.c_void_p), ("a", ctypes.c_int32)) if "else" in what else (
-            ("a", ctypes.c_int32), ("b", ctypes.c_void_p))  # fmt: skip
-
-    try:
-        compile.nvrtc_version()
-    except BackendError as error:
-        pytest.skip(str(error))
-    text = f"namespace gs2d {{ struct Known {{ {fields} }}; }}\n"
-    with pytest.raises(BackendError, match="static assertion failed"):
-        compile.compile_text(text + "\n".join(assertions("Known", Known)), "known.cu", "compute_75")
