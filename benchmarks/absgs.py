@@ -24,15 +24,15 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.config.presets import ABSGS_DEFAULT
+from gs2d.contrib.lab.aggregate import Cell, read_cell
+from gs2d.contrib.lab.execute import execute
+from gs2d.contrib.lab.jobs import Job
+from gs2d.contrib.lab.options import PaperOptions
+from gs2d.contrib.lab.plan import make_job, trained_recipe
+from gs2d.contrib.lab.scenes import FoundScene, find_scenes
 from gs2d.core.files import atomic_write
 from gs2d.core.json_files import write_json
 from gs2d.errors import Gs2dError
-from gs2d.experiments.aggregate import Cell, read_cell
-from gs2d.experiments.execute import execute
-from gs2d.experiments.jobs import Job
-from gs2d.experiments.options import PaperOptions
-from gs2d.experiments.plan import make_job, trained_recipe
-from gs2d.experiments.scenes import FoundScene, find_scenes
 from gs2d.io.run_dir import machine, versions
 from gs2d.pipeline.events import Event, Notice
 

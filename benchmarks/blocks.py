@@ -29,21 +29,21 @@ import torch
 from PIL import Image
 
 from gs2d.config.partition import make_partition
+from gs2d.contrib.lab.blocks import blocks
+from gs2d.contrib.lab.cells import Cells
+from gs2d.contrib.lab.merged import MERGED
+from gs2d.contrib.lab.options import BlocksOptions
+from gs2d.contrib.lab.split import read_split
 from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
 from gs2d.core.splats import Splats
 from gs2d.data.scene import View
 from gs2d.errors import Gs2dError
 from gs2d.evaluation.surface import evaluate_surface
-from gs2d.experiments.blocks import blocks
-from gs2d.experiments.options import BlocksOptions
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import SPLATS
 from gs2d.io.splat_ply import read_splats
 from gs2d.meshing.raycast import cast_camera
-from gs2d.pipeline.blocks.cells import Cells
-from gs2d.pipeline.blocks.merged import MERGED
-from gs2d.pipeline.blocks.split import read_split
 from gs2d.pipeline.events import Notice
 from gs2d.pipeline.prepare.finished import open_job
 from gs2d.pipeline.prepare.job import Job

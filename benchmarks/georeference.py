@@ -28,13 +28,13 @@ from typing import Any
 
 import numpy as np
 
+from gs2d.contrib.survey.find_georeference import georeference_run
+from gs2d.contrib.survey.fit import fit_places
 from gs2d.core.camera import Camera
 from gs2d.core.georeference import CHECK, LEFT_OUT, Georeference
 from gs2d.data import View, load_scene
 from gs2d.errors import Gs2dError
-from gs2d.geo.fit import fit_places
 from gs2d.io.run_dir import open_run
-from gs2d.pipeline.georeference import georeference_run
 from gs2d.pipeline.prepare.job import reload_job
 from gs2d.pipeline.prepare.options import GeoreferenceOptions
 from gs2d.synthetic.flight import Flight, write_flight

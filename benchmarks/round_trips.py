@@ -25,11 +25,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 
+from gs2d.contrib.formats.sog import read_level
 from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.errors import BackendError
 from gs2d.io.formats.registry import LAYOUTS, read_splats, write_layout, written_bytes
-from gs2d.io.formats.sog import read_level
 from gs2d.io.run_dir import open_run
 from gs2d.pipeline.prepare.finished import finished_splats
 from gs2d.pipeline.prepare.job import Job, reload_job

@@ -14,7 +14,7 @@ from gs2d.errors import BackendError
 from gs2d.kernels.library import load
 from gs2d.report import plots
 
-CURVES_ARE_LOOKED_AT = ("report", "experiments/test_figures.py")
+CURVES_ARE_LOOKED_AT = ("report", "contrib/lab/test_figures.py")
 
 
 def pytest_collection_finish() -> None:

@@ -24,8 +24,8 @@ from usd_server import Server
 
 from capture_writers import small_blender, small_colmap, small_dtu, small_nerfstudio
 from foreign_writers import Lens, small_alicevision, small_metashape, small_opensfm
+from gs2d.contrib.formats import usd
 from gs2d.core.splats import Splats
-from gs2d.io.formats import usd
 
 Files = dict[str, bytes]
 
@@ -229,7 +229,7 @@ def _gltf_text(root: Path) -> None:
 
 def _stream(root: Path) -> None:
     """A tree of a few leaves in some levels."""
-    from gs2d.io.formats import sog_streamed
+    from gs2d.contrib.formats import sog_streamed
     from gs2d.io.formats.registry import write_layout
 
     with mock.patch.object(sog_streamed, "_LEAF", 20), mock.patch.object(sog_streamed, "_FILE", 30):
@@ -432,9 +432,9 @@ def _georeferenced(root: Path) -> None:
 
 def read_places(root: Path) -> None:
     """As `gs2d georeference` reads its tables, and whatever reads a file in local metres what that says of itself."""
+    from gs2d.contrib.survey.control import read_control
+    from gs2d.data.positions import matched, read_positions
     from gs2d.errors import DataError
-    from gs2d.geo.control import read_control
-    from gs2d.geo.positions import matched, read_positions
     from gs2d.io.georeference import georeference_of_file
 
     refused: Exception | None = None
@@ -463,8 +463,8 @@ def _official(root: Path) -> None:
 
 
 def read_official(root: Path) -> None:
+    from gs2d.contrib.lab.evaluate_tnt import read_crop, read_trajectory, read_transform
     from gs2d.errors import DataError
-    from gs2d.evaluation.tanks_and_temples import read_crop, read_trajectory, read_transform
 
     refused: Exception | None = None
     reads = {"crop.json": read_crop, "trans.txt": read_transform, "a.log": read_trajectory}

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.cli.app import _MENDABLE
+from gs2d.contrib.formats import usd_process
 from gs2d.errors import Gs2dError
-from gs2d.io.formats import usd_process
 
 SECONDS = 20
 MEMORY = 512 << 20  # bytes, of the whole process

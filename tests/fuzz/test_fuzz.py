@@ -24,8 +24,8 @@ from drive import try_case  # noqa: E402
 from families import FAMILIES  # noqa: E402
 from guard import outcome  # noqa: E402
 
+from gs2d.contrib.formats import usd  # noqa: E402
 from gs2d.errors import DataError  # noqa: E402
-from gs2d.io.formats import usd  # noqa: E402
 
 LEAST = 12  # inputs a family, whatever the time
 SLOW = {"run-files": 6}

@@ -23,7 +23,7 @@ from typing import Any
 
 
 class Server:
-    """Stands for ``gs2d.io.formats.usd._read_apart``."""
+    """Stands for ``gs2d.contrib.formats.usd._read_apart``."""
 
     def __init__(self, process: str, good: bytes, wait: int) -> None:
         self._wait = wait

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gs2d.experiments.options import BlocksOptions
+from gs2d.contrib.lab.options import BlocksOptions
 from gs2d.synthetic.flight import Flight, write_flight
 
 WORDS = (

@@ -26,9 +26,9 @@ from typing import Any
 
 from ball_runs import comparable, options
 from gs2d.config.registry import Registry
+from gs2d.contrib.lab.options import SweepOptions
+from gs2d.contrib.lab.paper import paper
 from gs2d.errors import DataError, Gs2dError
-from gs2d.experiments.options import SweepOptions
-from gs2d.experiments.paper import paper
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.finish.export import export_run
 from gs2d.pipeline.finish.run_mesh import mesh_run

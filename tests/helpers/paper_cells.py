@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from gs2d.experiments.aggregate import FIGURES, Cell, Row
-from gs2d.experiments.tables import TNT
+from gs2d.contrib.lab.aggregate import FIGURES, Cell, Row
+from gs2d.contrib.lab.tables import TNT
 
 TINY = ["--schedule-scale", "0.0005", "--set", "init_points=100", "--set", "surface.densify.max_splats=150"]
 
@@ -28,7 +28,7 @@ def draw_nothing(patch: pytest.MonkeyPatch) -> None:
     """No reports and figures, which draw curves for seconds and have tests of their own."""
     for module in ("train.train_run", "finish.run_report"):
         patch.setattr(f"gs2d.pipeline.{module}.report_run", lambda path, *_: path)
-    patch.setattr("gs2d.experiments.figures.write_figures", _draw_labels)
+    patch.setattr("gs2d.contrib.lab.figures.write_figures", _draw_labels)
 
 
 def _draw_labels(runs: Mapping[str, Path], out: Path, *_: object, maps: Sequence[str]) -> tuple[Path, ...]:

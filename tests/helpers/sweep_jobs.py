@@ -6,7 +6,7 @@ import os
 import signal
 from pathlib import Path
 
-from gs2d.experiments.jobs import Job
+from gs2d.contrib.lab.jobs import Job
 from gs2d.pipeline.prepare.options import TrainOptions
 
 

@@ -33,11 +33,11 @@ import pytest
 from PIL import Image, ImageDraw
 
 from browser import browser, require_browser
+from gs2d.contrib.formats.sog import read_level
 from gs2d.core.camera import look_at
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import transform_splats
 from gs2d.io.formats.registry import LAYOUTS, read_splats, write_layout
-from gs2d.io.formats.sog import read_level
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
 from npm import VERSIONS, forget, package

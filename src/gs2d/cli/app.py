@@ -35,11 +35,11 @@ from gs2d.cli.commands import (
 from gs2d.cli.console import Console, show_help
 from gs2d.cli.interrupts import INTERRUPTED, Interruptible
 from gs2d.cli.parser import HELP_WORDS, UsageError, check_inputs, parse
+from gs2d.contrib.lab.options import TableOptions
 from gs2d.core.memory_limit import address_space, check_address_space
 from gs2d.core.processes import here
 from gs2d.core.text import printable
 from gs2d.errors import Gs2dError
-from gs2d.experiments.options import TableOptions
 
 OK, EXIT_BUG, EXIT_USAGE, INCOMPLETE, NOBODY_READS = 0, 1, 2, 3, 141
 _MENDABLE = {

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from gs2d.config.arguments import Arg
-from gs2d.experiments.options import BlocksOptions, PaperOptions, ReconstructAnywhereOptions, SweepOptions
+from gs2d.contrib.lab.options import BlocksOptions, PaperOptions, ReconstructAnywhereOptions, SweepOptions
 from gs2d.pipeline.prepare.options import (
     BoxOption,
     DemoOptions,

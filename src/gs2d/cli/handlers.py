@@ -101,7 +101,7 @@ def train(command: c.Train, console: Console) -> None:
 
 def blocks(command: c.Blocks, console: Console) -> None:
     """``gs2d blocks``."""
-    from gs2d.experiments.blocks import blocks as run_blocks
+    from gs2d.contrib.lab.blocks import blocks as run_blocks
 
     run = run_blocks(command, console.on_event)
     console.close()
@@ -260,7 +260,7 @@ def export(command: c.Export, console: Console) -> None:
 
 def georeference(command: c.Georeference, console: Console) -> None:
     """``gs2d georeference``."""
-    from gs2d.pipeline.georeference import georeference_run
+    from gs2d.contrib.survey.find_georeference import georeference_run
 
     found = georeference_run(command.run, command, console.on_event)
     console.close()
@@ -276,7 +276,7 @@ def georeference(command: c.Georeference, console: Console) -> None:
 
 def orthophoto(command: c.Orthophoto, console: Console) -> None:
     """``gs2d orthophoto``."""
-    from gs2d.pipeline.orthophoto import orthophoto_run
+    from gs2d.contrib.survey.orthophoto import orthophoto_run
 
     result = orthophoto_run(command.run, command.out, command, console.on_event, threads=command.threads)
     console.close()
@@ -325,15 +325,15 @@ def recipes(command: c.Recipes, console: Console) -> None:
 
 def table(command: c.Paper | c.Sweep, console: Console) -> None:
     """``gs2d paper`` and ``gs2d sweep``."""
-    from gs2d.cli.paper import show_table
+    from gs2d.contrib.lab.show_table import show_table
 
     show_table(command, console)
 
 
 def reconstruct(command: c.Reconstruct, console: Console) -> None:
     """``gs2d reconstruct``: then the figures, the files and the next command."""
+    from gs2d.contrib.lab.reconstruct import reconstruct as run_all
     from gs2d.core.json_files import read_json
-    from gs2d.experiments.reconstruct import reconstruct as run_all
     from gs2d.io.run_dir import PAGE
     from gs2d.pipeline.reconstruct import CAPTURE
     from gs2d.sfm.workspace import POSES_JSON

@@ -1,19 +1,23 @@
-"""Names that stand for things, and the packages that add to them: the doors of gs2d. Pure Python; never imports torch.
+"""The extension points of gs2d: named objects, registered by gs2d, by programs and by installed packages.
 
-Losses, readers, densifiers, recipes, backends and export formats are each one :class:`Registry`. Whoever adds one
-decorates it, or names it as an entry point of an installed package; the built-in ones are registered in the same way.
+Each kind (loss, reader of captures, command, ...) is one :class:`Registry`. A decorator registers an object; an
+installed package names it as an entry point. ``gs2d.contrib`` is registered by the entry points of gs2d itself. Pure
+Python; never imports torch.
 """
 
 from __future__ import annotations
 
 import difflib
+import functools
+import tomllib
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cached_property
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, distributions, entry_points
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from gs2d.errors import Gs2dError, PluginWarning
@@ -23,6 +27,8 @@ __all__ = ["Register", "Registry", "absent_guests", "did_you_mean"]
 T = TypeVar("T")
 Register = TypeVar("Register")
 _ABSENT = ContextVar("absent guests", default=False)
+_PACKAGE = Path(__file__).resolve().parents[1]
+_DISTRIBUTION, _CONTRIB = "2dgs-r", "gs2d.contrib."
 
 
 @contextmanager
@@ -62,11 +68,18 @@ class Registry(Generic[T]):
         error: type[Gs2dError] = Gs2dError,
     ) -> None:
         self.what, self.group, self._error = what, group, error
-        self._homes = {} if builtin is None else dict(builtin)
+        self._core = {} if builtin is None else dict(builtin)
         self._things: dict[str, T] = {}
 
-    def register(self, name: str) -> Callable[[Register], Register]:
-        """Return a decorator that registers what it decorates under a name.
+    @cached_property
+    def _homes(self) -> dict[str, str]:
+        """Modules of gs2d that register a name when they are imported: those of the core, then those of contrib."""
+        return self._core | {entry.name: entry.module for entry in contrib_entries() if entry.group == self.group}
+
+    def register(self, name: str, *, module: str | None = None) -> Callable[[Register], Register]:
+        """Return a decorator that registers an object under a name.
+
+        ``module`` is where the object is defined, if its ``__module__`` does not say so.
 
         Raises
         ------
@@ -75,8 +88,8 @@ class Registry(Generic[T]):
         """
 
         def registered(thing: Register) -> Register:
-            module = getattr(thing, "__module__", "")
-            if self._homes.get(name, module) != module:
+            home = module or getattr(thing, "__module__", "")
+            if self._homes.get(name, home) != home:
                 raise self._error(f"{self.what} {name!r} is one of gs2d's own; give yours another name")
             holder = self._things.get(name)
             if holder is not None and holder is not thing:
@@ -171,7 +184,8 @@ class Registry(Generic[T]):
     def _offered(self) -> dict[str, EntryPoint]:
         """Entry points of installed packages by name; of a name that is taken the first package keeps it."""
         offered: dict[str, EntryPoint] = {}
-        for entry in sorted(entry_points(group=self.group), key=_package):
+        guests = [entry for entry in entry_points(group=self.group) if not entry.value.startswith(_CONTRIB)]
+        for entry in sorted(guests, key=_package):
             taken = "gs2d" if entry.name in self._homes else None
             if entry.name in offered and offered[entry.name].value != entry.value:
                 taken = _package(offered[entry.name])
@@ -193,6 +207,24 @@ class Registry(Generic[T]):
                 f"{type(error).__name__}: {reason}; mend or uninstall that package"
             ) from error
         return self._things.setdefault(name, thing)
+
+
+@functools.cache
+def contrib_entries() -> tuple[EntryPoint, ...]:
+    """Return the entry points of gs2d's own ``contrib``: () where that folder was removed.
+
+    They come from the metadata of the installed package. A clone that is not installed has them in pyproject.toml.
+    """
+    if not (_PACKAGE / "contrib").is_dir():
+        return ()
+    for installed in distributions(name=_DISTRIBUTION):
+        if Path(str(installed.locate_file("gs2d"))).resolve() == _PACKAGE:
+            return tuple(entry for entry in installed.entry_points if entry.value.startswith(_CONTRIB))
+    file = _PACKAGE.parents[1] / "pyproject.toml"
+    if not file.is_file():
+        return ()
+    groups = tomllib.loads(file.read_text(encoding="utf-8"))["project"].get("entry-points", {})
+    return tuple(EntryPoint(name, value, group) for group, names in groups.items() for name, value in names.items())
 
 
 def did_you_mean(name: str, names: Sequence[str]) -> str:

@@ -16,9 +16,6 @@ from gs2d.data.file_names import IMAGES, in_any_case
 from gs2d.data.masks import Masks, without_masks
 from gs2d.data.readers.colmap import MODEL_FOLDERS, model_folder, read_colmap
 from gs2d.data.readers.dtu import CAMERA_FILES, camera_archives, read_dtu
-from gs2d.data.readers.meshroom import read_alicevision, scene_file
-from gs2d.data.readers.metashape import camera_file, read_metashape
-from gs2d.data.readers.opensfm import read_opensfm, reconstruction_file
 from gs2d.data.readers.registry import READERS, Reader, register_reader
 from gs2d.data.readers.transforms import CAMERAS, TRAIN, read_blender, read_nerfstudio
 from gs2d.data.scene import Scene
@@ -33,6 +30,7 @@ class _Reader:
 
     holds: Callable[[Path], object]
     make: Callable[[Path], Capture]
+    looks_for: str
 
     def detect(self, path: Path) -> bool:
         return bool(self.holds(path))
@@ -44,6 +42,8 @@ class _Reader:
 class _Colmap:
     """COLMAP keeps smaller photographs beside the large ones."""
 
+    looks_for = f"cameras.bin and images.bin (or .txt) in {', '.join(MODEL_FOLDERS)} (COLMAP)"
+
     def detect(self, path: Path) -> bool:
         return model_folder(path) is not None
 
@@ -51,19 +51,16 @@ class _Colmap:
         return read_colmap(path, downscale)
 
 
-def _register(name: str, holds: Callable[[Path], object], make: Callable[[Path], Capture]) -> None:
-    made: Callable[[], _Reader] = partial(_Reader, holds, make)
+def _register(name: str, holds: Callable[[Path], object], make: Callable[[Path], Capture], looks_for: str) -> None:
+    made: Callable[[], _Reader] = partial(_Reader, holds, make, looks_for)
     made.__module__ = __name__
     register_reader(name)(made)
 
 
-_register("blender", lambda root: in_any_case(root, TRAIN).is_file(), read_blender)
-_register("nerfstudio", lambda root: in_any_case(root, CAMERAS).is_file(), read_nerfstudio)
-_register("dtu", camera_archives, read_dtu)
+_register("blender", lambda root: in_any_case(root, TRAIN).is_file(), read_blender, f"{TRAIN} (Blender)")
+_register("nerfstudio", lambda root: in_any_case(root, CAMERAS).is_file(), read_nerfstudio, f"{CAMERAS} (nerfstudio)")
+_register("dtu", camera_archives, read_dtu, f"{' or '.join(CAMERA_FILES)} (DTU)")
 register_reader("colmap")(_Colmap)
-_register("opensfm", reconstruction_file, read_opensfm)
-_register("metashape", camera_file, read_metashape)
-_register("alicevision", scene_file, read_alicevision)
 
 _PROJECTS = {  # files of other tools that do not hold cameras in the open
     ".psx": "in Metashape, File > Export > Export Cameras as Agisoft XML (cameras.xml)",
@@ -84,9 +81,12 @@ def detect_format(path: str | os.PathLike[str]) -> str:
         Missing or empty folder, or no known layout; lists what was looked for.
     """
     root = _folder(path)
+    looked_for = []
     for name, make in READERS.working():
-        if make().detect(root):
+        reader = make()
+        if reader.detect(root):
             return name
+        looked_for.append(getattr(reader, "looks_for", ""))
     held = sorted(entry.name + ("/" if entry.is_dir() else "") for entry in root.iterdir())
     if not held:
         raise DataError(f"{root} must hold a capture, got an empty folder{instead(root, 'capture')}")
@@ -103,10 +103,9 @@ def detect_format(path: str | os.PathLike[str]) -> str:
         raise DataError(
             f"{root} must hold cameras, got {_images(images)} photographs without any{instead(root, 'capture')}"
         )
+    *others, last = filter(None, looked_for)
     raise DataError(
-        f"{root} must hold transforms_train.json (Blender), transforms.json (nerfstudio), {' or '.join(CAMERA_FILES)} "
-        f"(DTU), cameras.bin and images.bin (or .txt) in {', '.join(MODEL_FOLDERS)} (COLMAP), reconstruction.json "
-        "(OpenSfM, OpenDroneMap), cameras.xml (Metashape) or cameras.sfm (Meshroom); "
+        f"{root} must hold {', '.join(others)} or {last}; "
         f"got {', '.join(held[:8])}{' ...' if len(held) > 8 else ''}{hint}"
     )
 

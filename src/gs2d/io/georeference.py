@@ -17,13 +17,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
+from gs2d.contrib.formats.gltf import EXTENSION, UPRIGHT
+from gs2d.contrib.formats.usd import ENDINGS as USD_ENDINGS
+from gs2d.contrib.formats.usd import stamp_usd, usd_georeference
 from gs2d.core.files import atomic_write
 from gs2d.core.georeference import Georeference
 from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import DataError
-from gs2d.io.formats.gltf import EXTENSION, UPRIGHT
-from gs2d.io.formats.usd import ENDINGS as USD_ENDINGS
-from gs2d.io.formats.usd import stamp_usd, usd_georeference
 from gs2d.io.ply_format import read_ply_comments
 from gs2d.io.run_dir import GEOREFERENCE
 

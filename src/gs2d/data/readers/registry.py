@@ -13,11 +13,14 @@ from gs2d.errors import DataError
 
 __all__ = ["READERS", "Reader", "register_reader"]
 
-FORMATS = ("blender", "nerfstudio", "dtu", "colmap", "opensfm", "metashape", "alicevision")
+_CORE = ("blender", "nerfstudio", "dtu", "colmap")
 
 
 class Reader(Protocol):
-    """How a format of captures is recognised and read. A class is registered; it is made without arguments."""
+    """How a format of captures is recognised and read. A class is registered; it is made without arguments.
+
+    An attribute ``looks_for`` names the files for a message: "cameras.xml (Metashape)".
+    """
 
     def detect(self, path: Path) -> bool:
         """Whether a folder holds a capture of this format; looks at names, and opens little."""
@@ -32,7 +35,7 @@ class Reader(Protocol):
 
 
 READERS: Registry[Callable[[], Reader]] = Registry(
-    "format", "gs2d.readers", builtin=dict.fromkeys(FORMATS, "gs2d.data.load"), error=DataError
+    "format", "gs2d.readers", builtin=dict.fromkeys(_CORE, "gs2d.data.load"), error=DataError
 )
 """Names of formats -> classes of readers; in the order in which a folder is looked at."""
 

@@ -11,18 +11,18 @@ from pathlib import Path
 import numpy as np
 
 from gs2d.config.registry import Registry
+from gs2d.contrib.formats.antimatter import read_splat, write_splat
+from gs2d.contrib.formats.compressed_ply import read_compressed_ply, write_compressed_ply
+from gs2d.contrib.formats.gltf import read_gltf, write_gltf
+from gs2d.contrib.formats.sog import read_sog, write_sog
+from gs2d.contrib.formats.sog_streamed import INDEX, streamed_bytes, write_streamed_sog
+from gs2d.contrib.formats.usd import ENDINGS as USD_ENDINGS
+from gs2d.contrib.formats.usd import read_usd, write_usd
 from gs2d.core.missing import instead
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.io import splat_ply
-from gs2d.io.formats.compressed_ply import read_compressed_ply, write_compressed_ply
-from gs2d.io.formats.gltf import read_gltf, write_gltf
-from gs2d.io.formats.sog import read_sog, write_sog
-from gs2d.io.formats.sog_streamed import INDEX, streamed_bytes, write_streamed_sog
-from gs2d.io.formats.splat import read_splat, write_splat
 from gs2d.io.formats.spz import read_spz, write_spz
-from gs2d.io.formats.usd import ENDINGS as USD_ENDINGS
-from gs2d.io.formats.usd import read_usd, write_usd
 from gs2d.io.gaussians import NO_SCALE, Gaussians, Tell, logit
 from gs2d.io.splat_ply import ply_kind, read_gaussians
 

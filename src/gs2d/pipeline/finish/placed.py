@@ -11,10 +11,10 @@ import numpy as np
 
 from gs2d.core.georeference import Georeference
 from gs2d.core.mesh import Mesh, TexturedMesh
+from gs2d.core.projection import wkt_of
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import transform_splats
 from gs2d.errors import RunError
-from gs2d.geo.projection import wkt_of
 from gs2d.io.georeference import georeference_of_file, read_georeference, stamp, write_sidecars
 from gs2d.io.run_dir import open_run
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from gs2d.config.datasets import DataSet, SceneFacts
 from gs2d.config.surface_protocols import VISIBLE_SURFACE
+from gs2d.contrib.lab.truth_official import score_dtu, score_tnt
 from gs2d.core.mesh import Mesh
 from gs2d.data.arrays import read_npy
 from gs2d.data.benchmarks import MESH_TRUTHS, find_truth, recognise
@@ -23,7 +24,6 @@ from gs2d.io.splat_ply import ply_kind
 from gs2d.pipeline.events import Notice, OnEvent, Phase
 from gs2d.pipeline.prepare.job import Job
 from gs2d.pipeline.prepare.options import EvaluateOptions
-from gs2d.pipeline.truth_official import score_dtu, score_tnt
 
 APART = 0.05  # of the truth's diagonal: farther, and it is hardly the same surface in the same frame
 SEEN_SUFFIX = "_seen.npy"  # beside FILE.ply: FILE_seen.npy, how many views see each face

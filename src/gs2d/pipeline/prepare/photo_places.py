@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from gs2d.data.positions import Positions, in_frame, matched, read_positions
 from gs2d.errors import DataError
-from gs2d.geo.positions import Positions, in_frame, matched, read_positions
 from gs2d.sfm.images import Photo
 
 Place = tuple[float, float, float]

@@ -1,0 +1,246 @@
+"""glTF 2.0 with ``KHR_gaussian_splatting`` (release candidate of February 2026): 3D Gaussians, ours flat ones.
+
+Its one kernel is the projected ellipsoid: a disk is written with a thickness that does not show. Attributes are
+float32 and not raw: unit quaternions, linear scales, linear opacities; spherical harmonics are those of 3DGS. glTF has
+y up. As SplatTransform (PlayCanvas, MIT) does with a PLY, a half turn about z takes our coordinates there, which
+changes signs alone; a file that knows where it is in the world (``gs2d.io.georeference``) has z up before that.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gs2d.contrib.formats.gltf_document import GltfDocument, node_matrices, read_document
+from gs2d.core.files import atomic_write
+from gs2d.core.growth import check_growth
+from gs2d.core.sh import C0
+from gs2d.errors import DataError
+from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, log_scales_of, logit, sigmoid, to_byte, unit_quats
+from gs2d.io.meshes import LINEAR_U16
+
+EXTENSION = "KHR_gaussian_splatting"
+UPRIGHT = (0.0, 0.5**0.5, 0.5**0.5, 0.0)  # of the node, x y z w: after the half turn, z up becomes y up
+_FROM_GLTF = np.diag([-1.0, -1.0, 1.0, 1.0])
+_FROM_GLTF_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+_FLOAT, _USHORT, _VERTICES = 5126, 5123, 34962
+_KNOWN = {EXTENSION, "KHR_mesh_quantization"}
+
+
+def write_gltf(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
+    """Write a .glb file, atomically.
+
+    Raises
+    ------
+    DiskError
+        If the file could not be written.
+    """
+    count = len(gaussians)
+    attributes = _attributes(gaussians)
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    at = 0
+    for name, (array, kind) in attributes.items():
+        views.append({"buffer": 0, "byteOffset": at, "byteLength": array.nbytes, "target": _VERTICES})
+        accessors.append({"bufferView": len(accessors), "count": count, **kind})
+        if name == "POSITION":
+            accessors[-1] |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()} if count else {}
+        at += array.nbytes
+    splatting = {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "sortingMethod": "cameraDistance",
+        "projection": "perspective",
+    }
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "gs2d"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+    }
+    if count:  # glTF has no empty lists
+        indices = {name: i for i, name in enumerate(attributes)}
+        primitive = {"attributes": indices, "mode": 0, "extensions": {EXTENSION: splatting}}
+        document |= {
+            "meshes": [{"primitives": [primitive]}],
+            "accessors": accessors,
+            "bufferViews": views,
+            "buffers": [{"byteLength": at}],
+        }
+    else:
+        document["nodes"] = [{"extras": {EXTENSION: "no splats"}}]
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    size = 12 + 8 + len(text) + (8 + at if count else 0)
+    with atomic_write(path) as file:
+        file.write(struct.pack("<4sII", b"glTF", 2, size) + struct.pack("<I4s", len(text), b"JSON") + text)
+        if count:
+            file.write(struct.pack("<I4s", at, b"BIN\0"))
+        for array, _ in attributes.values() if count else ():
+            file.write(array.data)
+
+
+def _attributes(gaussians: Gaussians) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
+    """Return arrays as they are written, every row of them aligned to 4 bytes, and what their accessors say."""
+    g = gaussians.half_turned_about_z()
+    color = np.full((len(g), 4), 65535, "<u2")  # for who draws the points alone
+    color[:, :3] = LINEAR_U16[to_byte(255.0 * (0.5 + C0 * g.sh0.astype(np.float64)))]
+    opacity = sigmoid(g.opacity_logits)
+    color[:, 3] = np.rint(65535.0 * opacity)
+    scales = np.exp(np.clip(g.log_scales.astype(np.float64), -80.0, 88.0))
+    floats = {
+        "ROTATION": (unit_quats(g.quats)[:, [1, 2, 3, 0]], "VEC4"),
+        "SCALE": (scales, "VEC3"),
+        "OPACITY": (opacity, "SCALAR"),
+    }
+    for i, (degree, place) in enumerate(_places(g.sh_degree)):
+        floats[f"SH_DEGREE_{degree}_COEF_{place}"] = (g.sh0 if i == 0 else g.shN[:, i - 1], "VEC3")
+    found: dict[str, tuple[np.ndarray, dict[str, Any]]] = {
+        "POSITION": (np.ascontiguousarray(g.means, "<f4"), {"componentType": _FLOAT, "type": "VEC3"}),
+        "COLOR_0": (color, {"componentType": _USHORT, "type": "VEC4", "normalized": True}),
+    }
+    for name, (values, kind) in floats.items():
+        array = np.ascontiguousarray(values, "<f4")
+        found[f"{EXTENSION}:{name}"] = (array, {"componentType": _FLOAT, "type": kind})
+    return found
+
+
+def _places(degree: int) -> list[tuple[int, int]]:
+    """Degrees and places in them of the harmonics up to a degree, in order."""
+    return [(level, place) for level in range(degree + 1) for place in range(2 * level + 1)]
+
+
+def read_gltf(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Gaussians, str]:
+    """Read all splats of a .glb or .gltf file's scene, and say in words what they are.
+
+    ``tell`` receives a sentence on SH bands above degree 3, which are left out.
+
+    Raises
+    ------
+    DataError
+        Missing, no glTF, without splats, or with what splats do not have.
+    """
+    document = read_document(path)
+    required = document.json.get("extensionsRequired", [])
+    beyond = set(map(str, required)) - _KNOWN if isinstance(required, list) else set()
+    if beyond:
+        raise DataError(f"{path}: glTF that needs {EXTENSION} alone was expected, it needs {', '.join(sorted(beyond))}")
+    # What knows where it is has z up.
+    turn = _FROM_GLTF_Z_UP if document.extra("georeference") is not None else _FROM_GLTF
+    with document.reading():
+        found = list(_primitives(document))
+        total = sum(document.bytes_of(index) for _, attributes in found for index in attributes.values())
+        check_growth(path, document.packed_bytes() if found else 0, total, "splats")
+        parts = [_placed(path, _gaussians(document, attributes, tell), turn @ matrix) for matrix, attributes in found]
+    if not parts and "meshes" not in document.json and EXTENSION in document.json.get("extensionsUsed", ()):
+        return _none(), "glTF"
+    if not parts:
+        mesh = gltf_mesh(path)
+        got = "glTF without" if mesh is None else f"a mesh of {mesh['triangles']:,} triangles"
+        raise DataError(
+            f"{path}: Gaussian splats ({EXTENSION}) were expected, got {got}; give the splats.ply of a run or another "
+            "file of splats"
+        )
+    return Gaussians.joined(parts), "glTF"
+
+
+def gltf_mesh(path: str | os.PathLike[str]) -> dict[str, int | str] | None:
+    """Return the numbers of vertices and triangles of a .glb or .gltf file, and its colours; None without a mesh.
+
+    Raises
+    ------
+    DataError
+        Missing, or no glTF.
+    """
+    document = read_document(path)
+    vertices = triangles = 0
+    colors = "none"
+    with document.reading():
+        accessors = document.json.get("accessors", [])
+        for _, mesh in node_matrices(document):
+            for primitive in document.json["meshes"][mesh]["primitives"]:
+                if primitive.get("mode", 4) != 4:  # points, lines and strips
+                    continue
+                attributes = primitive["attributes"]
+                vertices += accessors[attributes["POSITION"]]["count"]
+                triangles += accessors[primitive.get("indices", attributes["POSITION"])]["count"] // 3
+                if "TEXCOORD_0" in attributes and document.json.get("textures"):
+                    colors = "texture"
+                elif "COLOR_0" in attributes and colors == "none":
+                    colors = "of the vertices"
+    return {"vertices": vertices, "triangles": triangles, "colours": colors} if triangles else None
+
+
+def _none() -> Gaussians:
+    shapes = ((0, 3), (0, 4), (0, 3), (0,), (0, 3), (0, 0, 3))
+    return Gaussians(*(np.zeros(shape, np.float32) for shape in shapes))
+
+
+def _primitives(document: GltfDocument) -> Iterator[tuple[np.ndarray, dict[str, int]]]:
+    """Yield the transform of every splat primitive in the scene, and its accessors by name without the prefix."""
+    for matrix, mesh in node_matrices(document):
+        for primitive in document.json["meshes"][mesh]["primitives"]:
+            splatting = primitive.get("extensions", {}).get(EXTENSION)
+            if splatting is None:
+                continue
+            attributes = {str(n).removeprefix(f"{EXTENSION}:"): index for n, index in primitive["attributes"].items()}
+            compressed = splatting.get("extensions")
+            if not compressed and ("kernel" not in splatting or "ROTATION" not in attributes):
+                raise DataError(
+                    f"{document.path}: splats of {EXTENSION} were expected as its release candidate has them, got an "
+                    "early draft (no kernel, or no attribute ROTATION); export the file again with a newer program, or "
+                    "as PLY"
+                )
+            if compressed or splatting["kernel"] != "ellipse":
+                more = ", ".join(sorted(splatting.get("extensions", {}))) or repr(splatting["kernel"])
+                raise DataError(
+                    f"{document.path}: splats with the kernel 'ellipse' and no compression were expected, got {more}; "
+                    "convert the file to a PLY"
+                )
+            yield matrix, attributes
+
+
+def _gaussians(document: GltfDocument, attributes: dict[str, int], tell: Tell) -> Gaussians:
+    """Return one primitive in its own frame."""
+    degree = max((int(name.split("_")[2]) for name in attributes if name.startswith("SH_DEGREE_")), default=0)
+    if not 0 <= degree <= 8:
+        raise DataError(f"{document.path}: SH degree 0 to 3 was expected, got {degree}; export it with three bands")
+    means = document.array(attributes["POSITION"], "VEC3")
+    quats = document.array(attributes["ROTATION"], "VEC4")
+    scales = document.array(attributes["SCALE"], "VEC3")
+    opacities = document.array(attributes["OPACITY"], "SCALAR")[:, 0]
+    harmonics = [
+        document.array(attributes[f"SH_DEGREE_{level}_COEF_{place}"], "VEC3") for level, place in _places(degree)
+    ]
+    if len({len(array) for array in (means, quats, scales, opacities, *harmonics)}) != 1:
+        raise DataError(f"{document.path}: as many values in each attribute of splats were expected; export it again")
+    if (scales < 0).any() or (opacities < 0).any() or (opacities > 1).any():  # NaN is left out later
+        raise DataError(f"{document.path}: scales from 0 and opacities of 0 to 1 were expected; export it again")
+    return Gaussians(
+        means,
+        np.ascontiguousarray(quats[:, [3, 0, 1, 2]]),
+        log_scales_of(scales),
+        logit(opacities),
+        harmonics[0],
+        drawn_bands(document.path, np.stack([*harmonics[1:]], axis=1), tell)
+        if degree
+        else np.zeros((len(means), 0, 3), np.float32),
+    )
+
+
+def _placed(path: str | os.PathLike[str], g: Gaussians, matrix: np.ndarray) -> Gaussians:
+    """Return splats in our coordinates; the half turn is a matter of signs, and exact."""
+    if np.allclose(matrix, _FROM_GLTF, rtol=0, atol=1e-6):
+        return g.half_turned_about_z()
+    try:
+        return g.placed(matrix)
+    except ValueError as error:
+        raise DataError(f"{Path(path)}: {error} of the nodes of splats; bake it into them") from error

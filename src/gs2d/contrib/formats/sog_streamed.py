@@ -1,0 +1,231 @@
+"""The streamed form of SOG, written: levels of detail in chunks of space, which a viewer loads as it needs them.
+
+``lod-meta.json`` has a tree of boxes. Each leaf says for every level which splats of which data set of SOG are in it
+(file, offset, count); level 0 is the finest. The folders of data sets lie beside it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gs2d.contrib.formats.compressed_ply import morton_order
+from gs2d.contrib.formats.levels import halved
+from gs2d.contrib.formats.sog import packed_sog
+from gs2d.core.files import atomic_write, disk_error
+from gs2d.io.gaussians import Gaussians, unit_quats
+
+INDEX = "lod-meta.json"
+LEVELS = 4  # at least: 1, 1/2, 1/4 and 1/8 of the splats
+_MOST_LEVELS, _COARSEST = 8, 250_000  # more levels until one has no more splats than that
+_LEAF = 16_384  # splats of the finest level in a leaf, at most
+_FILE = 131_072  # splats in a data set, about
+_REACH = 3.0  # standard deviations that a box has room for
+_PARTS = ("means_l", "means_u", "scales", "quats", "sh0", "shN_centroids", "shN_labels")
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """One level of detail: its splats by leaf, in each in Morton order, and where each leaf begins."""
+
+    gaussians: Gaussians
+    ends: np.ndarray  # [L + 1]
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Smallest and largest coordinates [L, 3] of what the splats of each leaf cover; infinite where it has none."""
+        g, leaves = self.gaussians, len(self.ends) - 1
+        turn = Rotation.from_quat(unit_quats(g.quats)[:, [1, 2, 3, 0]]).as_matrix()
+        reach = _REACH * np.sqrt(np.square(turn * np.exp(g.log_scales[:, None].astype(np.float64))).sum(axis=2))
+        low, high = np.full((leaves, 3), np.inf), np.full((leaves, 3), -np.inf)
+        leaf = np.repeat(np.arange(leaves), np.diff(self.ends))
+        np.minimum.at(low, leaf, g.means - reach)
+        np.maximum.at(high, leaf, g.means + reach)
+        return low, high
+
+
+def write_streamed_sog(path: str | os.PathLike[str], gaussians: Gaussians, *, levels: int | None = None) -> None:
+    """Write a ``lod-meta.json`` and the folders of its data sets beside it.
+
+    The index is written last, atomically: what it refers to is there, whenever it is read. What an older index of the
+    same name referred to is removed after that. Nothing else in the folder is touched.
+
+    Parameters
+    ----------
+    path : path
+        Its folder is made where it is missing.
+    gaussians : Gaussians
+        Disks.
+    levels : int, optional
+        Each has half of the splats of the one before. By default 4, or as many more (8 at most) as the coarsest needs
+        to have no more than 250,000 splats.
+
+    Raises
+    ------
+    ValueError
+        ``levels`` is below 1.
+    DiskError
+    """
+    path = Path(path)
+    wanted = _levels_for(len(gaussians)) if levels is None else levels
+    if wanted < 1:
+        raise ValueError(f"levels must be 1 or more, got {levels}")
+    older = _listed(path)
+    tree, cells = _divided(gaussians.means)
+    made = list(_made(gaussians, cells, int(cells.max(initial=0)) + 1, wanted))
+    with _new_folders(path) as folder:
+        index = _written(path.parent, folder, made)
+        bounds = [level.bounds() for level in made]
+        low, high = (f([ends[k] for ends in bounds], axis=0) for k, f in ((0, np.min), (1, np.max)))
+        index["tree"] = _node(tree, low, high, index.pop("leaves"))
+        with atomic_write(path, "w") as file:
+            file.write(json.dumps(index, separators=(",", ":")))
+    for name in older:
+        _remove(path.parent / name)
+
+
+def streamed_bytes(path: Path) -> int:
+    """Return the bytes of a stream: its index, and all data sets that it refers to."""
+    folders = [path.parent / name for name in _listed(path)]
+    return path.stat().st_size + sum(file.stat().st_size for folder in folders for file in folder.iterdir())
+
+
+def _levels_for(count: int) -> int:
+    return next(n for n in range(LEVELS, _MOST_LEVELS + 1) if count >> (n - 1) <= _COARSEST or n == _MOST_LEVELS)
+
+
+def _divided(means: np.ndarray) -> tuple[Any, np.ndarray]:
+    """Return a tree of pairs whose ends are numbers of leaves, and the leaf of each splat [N]: halves, by medians."""
+    cells, numbers = np.zeros(len(means), int), itertools.count()
+
+    def divide(rows: np.ndarray) -> Any:
+        if len(rows) <= _LEAF:
+            cells[rows] = leaf = next(numbers)
+            return leaf
+        some = means[rows]
+        axis = int(np.argmax(np.quantile(some, 0.95, axis=0) - np.quantile(some, 0.05, axis=0)))  # strays do not count
+        order = np.argsort(some[:, axis], kind="stable")
+        return divide(rows[order[: len(rows) // 2]]), divide(rows[order[len(rows) // 2 :]])
+
+    return divide(np.arange(len(means))), cells
+
+
+def _made(g: Gaussians, cells: np.ndarray, leaves: int, levels: int) -> Iterator[_Level]:
+    for level in range(levels):
+        if level:
+            g, cells = halved(g, cells)
+        order = morton_order(g.means)
+        order = order[np.argsort(cells[order], kind="stable")]
+        yield _Level(g.rows(order), np.searchsorted(cells[order], np.arange(leaves + 1)))
+
+
+def _written(home: Path, folder: str, levels: list[_Level]) -> dict[str, Any]:
+    """Write the data sets; return the index, with the places of each leaf by level as ``leaves``."""
+    names: list[str] = []
+    leaves: list[dict[str, dict[str, int]]] = [{} for _ in levels[0].ends[1:]]
+    for number, level in enumerate(levels):
+        first = 0
+        while first < len(leaves):
+            begin = level.ends[first]
+            last = max(first + 1, int(np.searchsorted(level.ends, begin + _FILE)))  # the first leaf that is over it
+            last = min(last, len(leaves))
+            name = folder.format(level=number, file=len(names))
+            _write_set(home / name, level.gaussians.rows(np.arange(begin, level.ends[last])))
+            for leaf in range(first, last):
+                offset, count = int(level.ends[leaf] - begin), int(level.ends[leaf + 1] - level.ends[leaf])
+                leaves[leaf][str(number)] = {"file": len(names), "offset": offset, "count": count}
+            names.append(f"{name}/meta.json")
+            first = last
+    counts = [len(level.gaussians) for level in levels]
+    return {
+        "version": 1,
+        "asset": {"generator": "gs2d"},
+        "count": sum(counts),
+        "counts": counts,
+        "lodLevels": len(levels),
+        "filenames": names,
+        "leaves": leaves,
+    }
+
+
+def _write_set(folder: Path, g: Gaussians) -> None:
+    try:
+        folder.mkdir()
+    except OSError as error:
+        raise disk_error(folder, error) from error
+    for name, data in packed_sog(g).items():
+        with atomic_write(folder / name) as file:
+            file.write(data)
+
+
+def _node(tree: Any, low: np.ndarray, high: np.ndarray, leaves: list[dict[str, dict[str, int]]]) -> dict[str, Any]:
+    if isinstance(tree, int):
+        ends = (low[tree], high[tree]) if np.isfinite(low[tree]).all() else (np.zeros(3), np.zeros(3))
+        bound = {key: [float(f"{value:.7g}") for value in end] for key, end in zip(("min", "max"), ends, strict=True)}
+        return {"bound": bound, "lods": leaves[tree]}
+    children = [_node(child, low, high, leaves) for child in tree]
+    bound = {
+        key: [float(value) for value in merge([child["bound"][key] for child in children], axis=0)]
+        for key, merge in (("min", np.min), ("max", np.max))
+    }
+    return {"bound": bound, "children": children}
+
+
+@contextlib.contextmanager
+def _new_folders(path: Path) -> Iterator[str]:
+    """Yield a pattern for names of new folders beside ``path``, which go again where the body fails."""
+    made = False
+    try:
+        if not path.parent.is_dir():
+            path.parent.mkdir()
+            made = True
+        there = os.listdir(path.parent)
+    except OSError as error:
+        raise disk_error(path.parent, error) from error
+    ours = (tail for tail in itertools.chain([""], (f"-{n}" for n in itertools.count(2))))
+    tail = next(t for t in ours if not any(_numbered(name, t) for name in there))
+    try:
+        yield "{level}_{file}" + tail
+    except BaseException:
+        for name in os.listdir(path.parent):
+            if name not in there and _numbered(name, tail):
+                _remove(path.parent / name)
+        if made:
+            with contextlib.suppress(OSError):
+                path.parent.rmdir()
+        raise
+
+
+def _numbered(name: str, tail: str) -> bool:
+    """Whether a name is that of a data set with this tail."""
+    if not name.endswith(tail):
+        return False
+    parts = name[: len(name) - len(tail)].split("_")
+    return len(parts) == 2 and all(part.isdecimal() for part in parts)
+
+
+def _listed(path: Path) -> list[str]:
+    """Return the folders of data sets that an index beside which they lie refers to; none where it is none."""
+    try:
+        names = json.loads(path.read_bytes())["filenames"]
+        folders = [name.removesuffix("/meta.json") for name in names if name.endswith("/meta.json")]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return []
+    return [name for name in folders if name and name == os.path.basename(name) and name not in (".", "..")]
+
+
+def _remove(folder: Path) -> None:
+    """Remove the files of a data set, and its folder if nothing else is in it."""
+    for name in (*(f"{part}.webp" for part in _PARTS), "meta.json"):
+        with contextlib.suppress(OSError):
+            (folder / name).unlink()
+    with contextlib.suppress(OSError):
+        folder.rmdir()

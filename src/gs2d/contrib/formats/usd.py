@@ -1,0 +1,294 @@
+"""OpenUSD: a ParticleField with the kernel of Gaussian surflets, which is the 2D Gaussian itself (extra ``usd``).
+
+The schema (UsdVol of OpenUSD 26.03) has centres, rotations, linear scales, linear opacities and spherical harmonics as
+3DGS orders them. Scales and opacities as training has them, logarithms and logits, stand beside them as user
+properties, so that what comes back is the same to the bit; they count where they agree with the schema's. The third
+scale says nothing of a surflet; programs that take all fields for ellipsoids find a thickness there that does not show.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gs2d.contrib.formats import usd_process
+from gs2d.core.extras import install
+from gs2d.core.files import atomic_write, disk_error
+from gs2d.errors import BackendError, DataError
+from gs2d.io.gaussians import (
+    Gaussians,
+    Tell,
+    drawn_bands,
+    log_scales_of,
+    logit,
+    sigmoid,
+    unit_quats,
+    with_thickness,
+)
+
+ENDINGS = (".usd", ".usdc", ".usda", ".usdz")
+_APIS = (
+    "PositionAttribute", "OrientationAttribute", "ScaleAttribute", "OpacityAttribute", "KernelGaussianSurflet",
+    "SphericalHarmonicsAttribute",
+)  # fmt: skip
+_OWN = "userProperties:gs2d:"
+_ADDRESSES = 3 << 30  # bytes of address space for OpenUSD's libraries and threads
+_RATIO = 20  # bytes of addresses for one of the file, beyond ``_ADDRESSES``
+_SECONDS, _RATE = 10, 1 << 20  # of a processor for any file, and bytes of a larger one a second
+_WAIT = 10  # times that, on a machine that is busy
+_AGREE = 2e-6  # relative: rounding of exp and log is less
+
+
+def required_usd() -> Any:
+    """Return the package pxr, OpenUSD's.
+
+    Raises
+    ------
+    BackendError
+        It is not installed.
+    """
+    try:
+        for name in ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdVol", "Vt"):
+            importlib.import_module(f"pxr.{name}")
+        return importlib.import_module("pxr")
+    except ModuleNotFoundError as error:
+        raise BackendError(f"OpenUSD needs {error.name}, which is not installed; {install('usd')}") from error
+
+
+def write_usd(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
+    """Write a binary OpenUSD file, atomically; the same bytes for the same splats.
+
+    The stage says z-up and metres, which is so of georeferenced splats alone: coordinates are written as they are.
+
+    Raises
+    ------
+    BackendError
+        Without OpenUSD.
+    DiskError
+        If the file could not be written.
+    """
+    pxr = required_usd()
+    stage = pxr.Usd.Stage.CreateInMemory("splats.usdc")
+    pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.z)
+    pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    prim = pxr.UsdVol.ParticleField.Define(stage, "/Splats").GetPrim()
+    stage.SetDefaultPrim(prim)
+    for api in _APIS:
+        getattr(pxr.UsdVol, f"ParticleField{api}API").Apply(prim)
+    for name, value in _schema_values(pxr, gaussians).items():
+        prim.GetAttribute(name).Set(value)
+    own = {
+        "logScales": ("float2[]", pxr.Vt.Vec2fArray, gaussians.log_scales[:, :2]),
+        "opacityLogits": ("float[]", pxr.Vt.FloatArray, gaussians.opacity_logits),
+        "quaternions": ("float4[]", pxr.Vt.Vec4fArray, gaussians.quats),
+    }
+    for name, (kind, array, values) in own.items():
+        attribute = prim.CreateAttribute(_OWN + name, pxr.Sdf.ValueTypeNames.Find(kind), custom=True)
+        attribute.Set(_vt(array, values))
+    stage.GetRootLayer().customLayerData = {"creator": "gs2d"}
+    _save(pxr, Path(path), stage.GetRootLayer())
+
+
+def _vt(kind: Any, values: np.ndarray) -> Any:
+    return kind.FromNumpy(np.ascontiguousarray(values, np.float32)) if len(values) else kind()
+
+
+def _schema_values(pxr: Any, g: Gaussians) -> dict[str, Any]:
+    """Return the attributes of the schema."""
+    scales = _schema_scales(g.log_scales)
+    harmonics = np.concatenate([g.sh0[:, None], g.shN], axis=1).reshape(-1, 3)
+    reach = 3.0 * scales.max(axis=1, keepdims=True, initial=0.0)
+    low, high = ((g.means + sign * reach).astype(np.float64) for sign in (-1, 1))
+    finite = np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1)
+    box = np.stack([low[finite].min(axis=0), high[finite].max(axis=0)]) if finite.any() else np.zeros((2, 3))
+    return {
+        "positions": _vt(pxr.Vt.Vec3fArray, g.means),
+        "orientations": _vt(pxr.Vt.QuatfArray, _schema_quats(g.quats)),
+        "scales": _vt(pxr.Vt.Vec3fArray, scales),
+        "opacities": _vt(pxr.Vt.FloatArray, _schema_opacities(g.opacity_logits)),
+        "radiance:sphericalHarmonicsDegree": g.sh_degree,
+        "radiance:sphericalHarmonicsCoefficients": _vt(pxr.Vt.Vec3fArray, harmonics),
+        "extent": _vt(pxr.Vt.Vec3fArray, box),
+    }
+
+
+def _schema_scales(log_scales: np.ndarray) -> np.ndarray:
+    return np.exp(np.clip(log_scales.astype(np.float64), -100.0, 88.0)).astype(np.float32)
+
+
+def _schema_opacities(logits: np.ndarray) -> np.ndarray:
+    return sigmoid(logits).astype(np.float32)
+
+
+def _schema_quats(quats: np.ndarray) -> np.ndarray:
+    """(x, y, z, w) of length 1, as they lie in the memory of USD's quaternions."""
+    return unit_quats(quats)[:, [1, 2, 3, 0]].astype(np.float32)
+
+
+def _save(pxr: Any, path: Path, layer: Any) -> None:
+    """Write a layer; OpenUSD wants names with its endings and writes by itself, hence the folder."""
+    with tempfile.TemporaryDirectory(prefix="gs2d-usd-") as home:
+        made = Path(home, "splats.usdc")
+        try:
+            written = layer.Export(str(made))
+        except pxr.Tf.ErrorException as error:
+            raise disk_error(made, OSError(None, " ".join(str(error).split())[:200])) from error
+        if not written:
+            raise disk_error(made, OSError(None, "OpenUSD could not write"))
+        with open(made, "rb") as source, atomic_write(path) as file:
+            while block := source.read(1 << 20):
+                file.write(block)
+
+
+def stamp_usd(path: Path, told: str, epsg: int | None, offset: tuple[float, float, float]) -> None:
+    """Let a file written here say where it is: JSON for gs2d, EPSG code and offset for others, in its layer's data."""
+    pxr = required_usd()
+    layer = pxr.Sdf.Layer.OpenAsAnonymous(str(path))
+    place: dict[str, Any] = {"georeference": told, "offset": pxr.Gf.Vec3d(*offset)}
+    data = dict(layer.customLayerData)
+    layer.customLayerData = {**data, "gs2d": place if epsg is None else {**place, "epsg": epsg}}
+    _save(pxr, path, layer)
+
+
+def usd_georeference(path: str | os.PathLike[str]) -> str | None:
+    """Return the JSON in which a file says where it is; None where it does not, or is none that can be read."""
+    try:
+        return _ask(path)[0].get("georeference")
+    except DataError:
+        return None  # whoever reads the splats says what is wrong with it
+
+
+def read_usd(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Gaussians, str]:
+    """Read all particle fields of an OpenUSD file, in the frame of its stage: Gaussians, and their kernels in words.
+
+    Fields of surflets are flat whatever their third scale says. ``tell`` receives a sentence on SH bands above degree
+    3, which are left out.
+
+    Raises
+    ------
+    DataError
+        Missing, no OpenUSD, without such fields, or with a kernel or a transform that splats do not have.
+    BackendError
+        Without OpenUSD.
+    """
+    facts, data = _ask(path)
+    fields, at = [], 0
+    for fact in facts["fields"]:
+        arrays = {}
+        for name, width in fact["arrays"].items():
+            size = fact["count"] * width
+            arrays[name] = np.frombuffer(data, "<f4", size, at).reshape(fact["count"], width)
+            at += 4 * size
+        fields.append(_gaussians(path, fact, arrays, tell))
+    if not fields:
+        raise DataError(f"{os.fspath(path)}: a ParticleField was expected, the stage has none; export splats to it")
+    kernels = sorted({fact["kernel"] for fact in facts["fields"]})
+    return Gaussians.joined(fields), "OpenUSD, " + " and ".join(f"{kernel}s" for kernel in kernels)
+
+
+def _ask(path: str | os.PathLike[str]) -> tuple[dict[str, Any], memoryview]:
+    """Return what a process of its own reads: facts, and the bytes of the arrays."""
+    required_usd()
+    try:
+        size = os.stat(path).st_size
+        with open(path, "rb"):
+            pass
+    except OSError as error:
+        raise DataError(f"cannot read {os.fspath(path)}: {error.strerror or error}") from error
+    most, seconds = _ADDRESSES + _RATIO * size, _SECONDS + size // _RATE
+    try:
+        status, said = _read_apart(os.path.abspath(path), most, seconds)
+    except subprocess.TimeoutExpired as error:
+        raise DataError(
+            f"{os.fspath(path)}: OpenUSD that is read in {error.timeout:.0f} s was expected; do not trust the file"
+        ) from error
+    line, _, _ = said.partition(b"\n")
+    try:
+        facts = json.loads(line)
+    except ValueError:
+        raise DataError(
+            f"{os.fspath(path)}: OpenUSD was expected, its reader broke on it (status {status}); copy or "
+            "export the file again"
+        ) from None
+    if "error" in facts:
+        raise DataError(f"{os.fspath(path)}: {facts['error']}")
+    data = memoryview(said)[len(line) + 1 :]
+    return facts, data
+
+
+def _read_apart(path: str, most: int, seconds: int) -> tuple[int, bytes]:
+    """Return exit status and stdout of ``usd_process`` with so many bytes of addresses and seconds of a processor."""
+    words = [sys.executable, "-P", usd_process.__file__, path, str(most), str(seconds)]
+    # One thread: each takes addresses, which are counted.
+    environment = {**os.environ, "PXR_WORK_THREAD_LIMIT": "1", "MALLOC_ARENA_MAX": "1", "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(words, capture_output=True, timeout=_WAIT * seconds, env=environment)
+    return done.returncode, done.stdout
+
+
+def _gaussians(
+    path: str | os.PathLike[str], fact: dict[str, Any], arrays: dict[str, np.ndarray], tell: Tell
+) -> Gaussians:
+    """Return one field; what it does not say is as the schema has it."""
+    where, count = f"{path}: {fact['path']}", fact["count"]
+    if fact["kernel"] not in ("surflet", "ellipsoid"):
+        raise DataError(f"{where}: a kernel of Gaussian surflets or ellipsoids was expected, got {fact['kernel']}")
+    opacities = arrays.get("opacities", np.ones((count, 1), np.float32))
+    if ((opacities < 0) | (opacities > 1)).any():  # NaN is left out later
+        raise DataError(f"{where}: opacities of 0 to 1 were expected; export the file again")
+    scales = arrays.get("scales", np.ones((count, 3), np.float32))
+    if (scales < 0).any():
+        raise DataError(f"{where}: scales of 0 or more were expected; export the file again")
+    quats = arrays.get("orientations", np.tile(np.array([0, 0, 0, 1], np.float32), (count, 1)))
+    harmonics = arrays.get("harmonics", np.zeros((count, 3), np.float32))
+    harmonics = harmonics.reshape(count, harmonics.shape[1] // 3, 3)
+    log_scales = log_scales_of(scales)
+    raw = Gaussians(
+        arrays.get("positions", np.zeros((0, 3), np.float32)).copy(),
+        np.ascontiguousarray(quats[:, [3, 0, 1, 2]]),
+        log_scales,
+        logit(opacities[:, 0]),
+        harmonics[:, 0].copy(),
+        drawn_bands(path, harmonics[:, 1:], tell).copy(),
+    )
+    exact = _exact(raw, scales, opacities[:, 0], quats, arrays)
+    if fact["kernel"] == "surflet":
+        exact = replace(exact, log_scales=with_thickness(exact.log_scales[:, :2]))
+    return _placed(where, exact, np.array(fact["matrix"]))
+
+
+def _exact(
+    g: Gaussians, scales: np.ndarray, opacities: np.ndarray, quats: np.ndarray, own: dict[str, np.ndarray]
+) -> Gaussians:
+    """Take what training had where the schema's values say the same, splat for splat: others may have changed them."""
+    log_scales, logits, rotations = g.log_scales, g.opacity_logits, g.quats
+    with np.errstate(over="ignore", invalid="ignore"):  # of numbers that no training had
+        if "logScales" in own:
+            same = np.isclose(_schema_scales(own["logScales"]), scales[:, :2], rtol=_AGREE, atol=0)
+            log_scales = np.concatenate([np.where(same, own["logScales"], log_scales[:, :2]), log_scales[:, 2:]], 1)
+        if "opacityLogits" in own:
+            same = np.isclose(_schema_opacities(own["opacityLogits"][:, 0]), opacities, rtol=0, atol=_AGREE)
+            logits = np.where(same, own["opacityLogits"][:, 0], logits)
+        if "quaternions" in own:
+            same = np.isclose(_schema_quats(own["quaternions"]), quats, rtol=0, atol=_AGREE).all(axis=1, keepdims=True)
+            rotations = np.where(same, own["quaternions"], rotations)
+    return Gaussians(g.means, rotations, log_scales, logits, g.sh0, g.shN)
+
+
+def _placed(where: str, g: Gaussians, matrix: np.ndarray) -> Gaussians:
+    """Return a field in the frame of the stage."""
+    if np.array_equal(matrix, np.eye(4)):
+        return g
+    try:
+        return g.placed(matrix)
+    except ValueError as error:
+        raise DataError(f"{where}: {error}; bake the transform into the splats") from error

@@ -1,0 +1,1 @@
+"""Experiments: tables of many runs, blocks, clusters, official evaluations."""

@@ -1,0 +1,392 @@
+"""``gs2d blocks``: a coarse model, the blocks that it is cut into, and the merged scene, as a list of tasks.
+
+coarse -> partition -> blocks, side by side -> merge -> seams -> finish. Each is a value that any process can do, with
+its state in the job folder; what is done is not done again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from gs2d.config.partition import Partition, from_json, make_partition
+from gs2d.config.serialize import from_json as recipe_from_json
+from gs2d.contrib.lab.execute import execute
+from gs2d.contrib.lab.merged import MERGED, SEAM_VIEWS, finish_merged, read_seam_views, write_merged, write_result
+from gs2d.contrib.lab.options import BlocksOptions
+from gs2d.contrib.lab.settle import (
+    Settled,
+    block_folder,
+    block_recipe,
+    coarse_downscale,
+    coarse_folder,
+    coarse_recipe,
+    fitting_partition,
+    open_settled,
+    partition_folder,
+    seam_folder,
+    seam_recipe,
+    settle,
+)
+from gs2d.contrib.lab.split import CELLS, SEAMS, read_split, split_model, start_file
+from gs2d.contrib.lab.tasks import Task, failures
+from gs2d.core.json_files import read_json, write_json
+from gs2d.errors import RecipeError, RunError
+from gs2d.io.run_dir import LOCK, REPORT, SPLATS, RunFolder, check_claim, is_run, make_folder, open_run
+from gs2d.pipeline.events import Notice, OnEvent, ignore
+from gs2d.pipeline.prepare.finished import finished_splats
+from gs2d.pipeline.prepare.job import check_train_options, protocol_from_json
+from gs2d.pipeline.prepare.memory_budget import use_memory
+from gs2d.pipeline.prepare.options import CommonTraining, Part, TrainOptions, values
+from gs2d.pipeline.prepare.run_exposures import read_exposures
+from gs2d.pipeline.prepare.threads import use_threads
+from gs2d.pipeline.train.same_run import difference
+from gs2d.pipeline.train.train_run import train
+from gs2d.training.trainer import raster_settings
+
+BLOCKS_JSON = "blocks.json"  # in the job folder: what was settled
+COARSE, PARTITION, MERGE, FINISH = "coarse", "partition", "merge", "finish"
+SETTLED: dict[str, Any] = {  # what options have already decided: recipe and protocol are as they will be trained
+    **{"robust": "off", "exposure": False, "no_exposure": False, "test_every": None},
+    **{"depth_prior": None, "normal_prior": False, "overrides": (), "schedule_scale": 1.0},
+}
+RETRIES = 2  # of what is killed: another time it may have the memory
+
+
+# -- tasks -------------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, kw_only=True)
+class BlocksTask(Task):
+    """A task of one job folder.
+
+    Attributes
+    ----------
+    options : TrainOptions
+        As one training of everything would have it, but for recipe and protocol, which ``blocks.json`` has.
+    block : str
+        Name of the block, where it is of one.
+    """
+
+    options: TrainOptions
+    block: str = ""
+
+    def with_threads(self, threads: int) -> BlocksTask:
+        """Return the task on so many CPU threads."""
+        return replace(self, options=replace(self.options, threads=threads))
+
+    def training(self, **changes: Any) -> TrainOptions:
+        """Return the options of a training with the settled protocol."""
+        use_threads(self.options.threads)
+        use_memory(self.memory)
+        data = settled_of(self.options.out)
+        settled: dict[str, Any] = {"protocol": protocol_from_json(data["protocol"]), "memory": self.memory}
+        return replace(self.options, **{**settled, **SETTLED, "part": Part(), **changes})
+
+    def partition(self) -> Partition:
+        """Return the partition of the job."""
+        return from_json(settled_of(self.options.out)["partition"])
+
+    def settled(self, on_event: OnEvent) -> Settled:
+        """Return what is settled, with the scene."""
+        data = settled_of(self.options.out)
+        found = open_settled(self.training(), recipe_from_json(data["recipe"]), on_event)
+        check_capture(self.options.out, data, found.capture)
+        return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoarseTask(BlocksTask):
+    """Train the coarse model of everything."""
+
+    def work(self, on_event: OnEvent) -> dict[str, Any]:
+        """Train, or go on."""
+        settled, partition = self.settled(on_event), self.partition()
+        downscale = coarse_downscale(settled.scene, partition, self.options.downscale or 1)
+        recipe, out = coarse_recipe(settled.recipe, partition), coarse_folder(self.options.out)
+        run = train(self.training(recipe=recipe, downscale=downscale, out=out), on_event)
+        return {"stages": run.metrics()["stages"]}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartitionTask(BlocksTask):
+    """Cut the coarse model into blocks."""
+
+    def work(self, on_event: OnEvent) -> dict[str, Any]:
+        """Cut."""
+        out, settled = self.options.out, self.settled(on_event)
+        coarse = open_run(coarse_folder(out))
+        make_folder(partition_folder(out))
+        splats = finished_splats(coarse).to(settled.backend.device)
+        found = split_model(
+            splats,
+            settled.scene,
+            self.partition(),
+            raster_settings(settled.protocol, settled.scene.extent, settled.recipe.sh_degree),
+            settled.backend,
+            partition_folder(out),
+            on_event,
+            read_exposures(coarse, settled.recipe),
+        )
+        return {"blocks": {block.name: len(block.views) for block in found.blocks}}
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlockTask(BlocksTask):
+    """Train one block, with the coarse model frozen around it."""
+
+    def is_done(self) -> bool:
+        """Return whether it is trained, or was found to need no training."""
+        done = self.outcome()
+        splats = block_folder(self.options.out, self.block) / SPLATS
+        return done["state"] == "done" and (bool(done.get("skipped")) or splats.exists())
+
+    def work(self, on_event: OnEvent) -> dict[str, Any]:
+        """Train, or go on."""
+        out, partition = self.options.out, self.partition()
+        split = read_split(partition_folder(out))
+        blocks = {block.name: block for block in split.blocks}
+        if self.block not in blocks:
+            raise RunError(f"{partition_folder(out)} has no block {self.block}; delete the folder and run this again")
+        block = blocks[self.block]
+        if block.skipped:
+            return {"skipped": block.skipped}
+        whole = recipe_from_json(settled_of(out)["recipe"])
+        part = Part(
+            views=block.views,
+            splats=coarse_folder(out) / SPLATS,
+            start=start_file(partition_folder(out), self.block),
+            region=split.cells.region(split.cells.names.index(self.block)),
+            extent=block.extent if partition.extent == "block" else None,
+            prepared=out,
+        )
+        recipe, folder = block_recipe(whole, partition, block), block_folder(out, self.block)
+        run = train(self.training(recipe=recipe, out=folder, part=part), on_event)
+        return {"stages": run.metrics()["stages"]}
+
+
+@dataclass(frozen=True, kw_only=True)
+class MergeTask(BlocksTask):
+    """Crop each block to its cell and join them."""
+
+    def work(self, on_event: OnEvent) -> dict[str, Any]:
+        """Merge."""
+        return write_merged(self.settled(on_event), self.options, self.partition(), on_event)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeamsTask(BlocksTask):
+    """Let what lies at seams learn once more, with all else frozen, and write the scene."""
+
+    def work(self, on_event: OnEvent) -> dict[str, Any]:
+        """Train, or go on; write."""
+        out, settled, partition = self.options.out, self.settled(on_event), self.partition()
+        views = read_seam_views(out)
+        if views:
+            start = start_file(partition_folder(out), SEAMS)
+            part = Part(views=views, splats=out / MERGED, start=start, prepared=out)
+            trained = [len(block.views) for block in read_split(partition_folder(out)).blocks if not block.skipped]
+            recipe = seam_recipe(settled.recipe, partition, len(views) * len(trained) / max(1, sum(trained)))
+            train(self.training(recipe=recipe, out=seam_folder(out), part=part), on_event)
+        return {"splats": write_result(settled, self.options, partition, on_event)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FinishTask(BlocksTask):
+    """Score and mesh the merged scene, write its page and report."""
+
+    def work(self, on_event: OnEvent) -> dict[str, Any]:
+        """Finish."""
+        settled = self.settled(on_event)
+        return finish_merged(settled, self.options, on_event)
+
+
+def tasks_of(options: TrainOptions, partition: Partition, memory: float | None) -> list[BlocksTask]:
+    """Return the tasks of a job, each behind what it needs."""
+    out, jobs = options.out, options.out / "jobs"
+
+    def common(name: str, after: Sequence[str] = ()) -> dict[str, Any]:
+        return {"name": name, "record": jobs / f"{name}.json", "after": tuple(after), "retries": RETRIES}
+
+    names = [f"block-{name}" for name in partition.names]
+    whole: dict[str, Any] = {"options": options, "alone": True, "memory": options.memory}
+    coarse, cells = coarse_folder(out) / SPLATS, partition_folder(out) / CELLS
+    merged = (out / MERGED, out / SEAM_VIEWS)
+    starts = {name: start_file(partition_folder(out), name) for name in partition.names}
+    return [
+        CoarseTask(**common(COARSE), **whole, outputs=(coarse,)),
+        PartitionTask(**common(PARTITION, [COARSE]), **whole, inputs=(coarse,), outputs=(cells, *starts.values())),
+        *(
+            BlockTask(
+                **common(task, [PARTITION]),
+                options=options,
+                memory=memory,
+                block=name,
+                inputs=(coarse, cells, starts[name]),
+            )
+            for task, name in zip(names, partition.names, strict=True)
+        ),
+        MergeTask(**common(MERGE, names), **whole, inputs=(coarse, cells), outputs=merged),
+        SeamsTask(**common(SEAMS, [MERGE]), **whole, inputs=merged, outputs=(out / SPLATS,)),
+        FinishTask(**common(FINISH, [SEAMS]), **whole, inputs=(out / SPLATS,), outputs=(out / REPORT,)),
+    ]
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+def blocks(options: BlocksOptions, on_event: OnEvent = ignore) -> RunFolder:
+    """Train a capture in blocks, as many as are needed; the job folder is the run of the merged scene.
+
+    Given again after an interruption of any kind it goes on, and ends with the same bytes.
+
+    Raises
+    ------
+    Gs2dError
+        Anything that the user can mend; what was done stays.
+    """
+    partition = make_partition(options.blocks, options.partition)
+    if options.slots is not None and options.slots < 1:
+        raise RecipeError(f"--slots must be a whole number >= 1, got {options.slots}")
+    training = training_of(options)
+    check_train_options(training)
+    check_job_folder(options.out)
+    use_threads(options.threads)
+    share = _share(options.memory, None if options.cluster else options.slots)  # on a cluster: of each machine
+    use_memory(share)
+    begun = (options.out / BLOCKS_JSON).exists()
+    if not begun and is_run(options.out):  # there were no blocks
+        return _one_training(options, training, on_event)
+    settled = settle(training, on_event)
+    if not partition.grid and begun:
+        found = settled_of(options.out)["partition"]
+        partition = replace(from_json(found), **_asked(partition))
+    elif not partition.grid:
+        fitting = fitting_partition(settled, training, partition, on_event)
+        if fitting is None:
+            return _one_training(options, training, on_event)
+        partition = fitting
+    if partition.blocks == 1:
+        return _one_training(options, training, on_event)
+    use_memory(options.memory)
+    definition = settled.definition(training, partition)
+    if begun:
+        check_same_job(options.out, definition)
+    tasks = tasks_of(replace(training, recipe="", resume=True), partition, share)
+
+    def write() -> None:
+        if not (options.out / BLOCKS_JSON).exists():
+            write_json(options.out / BLOCKS_JSON, definition)
+        check_same_job(options.out, definition)
+
+    execute(
+        tasks,
+        options.out,
+        on_event,
+        slots=options.slots,
+        threads=options.threads,
+        backend=options.backend,
+        cluster=options.cluster,
+        before=write,
+    )
+    _check_all_done(tasks)
+    return RunFolder(options.out)
+
+
+def _one_training(options: BlocksOptions, training: TrainOptions, on_event: OnEvent) -> RunFolder:
+    """Train without blocks."""
+    if options.cluster is not None:
+        on_event(Notice("one training, without blocks: it runs on this machine, not on the cluster"))
+    return train(training, on_event)
+
+
+def training_of(options: BlocksOptions) -> TrainOptions:
+    """Return the options of one training of everything."""
+    return TrainOptions(
+        scene=options.scene,
+        out=options.out,
+        format=options.format,
+        masks=options.masks,
+        downscale=options.downscale,
+        schedule_scale=options.schedule_scale,
+        backend=options.backend,
+        seed=options.seed,
+        threads=options.threads,
+        resume=True,
+        memory=options.memory,
+        disk=options.disk,
+        prepare=options.prepare,
+        **values(CommonTraining, options),
+    )
+
+
+def check_job_folder(out: Path) -> None:
+    """Refuse a folder that holds something else."""
+    if (out / BLOCKS_JSON).exists():
+        return
+    check_claim(out, resume=True, overwrite=False, allowed=(LOCK, "jobs"))
+
+
+def settled_of(out: Path) -> dict[str, Any]:
+    """Return what ``blocks.json`` of a job folder holds.
+
+    Raises
+    ------
+    DataError, RunError
+        Missing, or changed by hand.
+    """
+    found = read_json(out / BLOCKS_JSON)
+    if isinstance(found, dict) and found.keys() >= {"recipe", "protocol", "partition"}:
+        return found
+    raise RunError(f"{out / BLOCKS_JSON} must hold recipe, protocol and partition, got something else; restore it")
+
+
+def check_same_job(out: Path, definition: dict[str, Any]) -> None:
+    """Refuse to go on with another definition.
+
+    Raises
+    ------
+    RunError
+        Names the first thing that differs.
+    """
+    before = settled_of(out)
+    for name, value in definition.items():
+        old = before.get(name)
+        if name == "capture":
+            check_capture(out, before, value["digest"])
+        elif old != value:
+            raise RunError(
+                f"{out} was begun with another {name}{difference(old, value)}; go on with the same options, or choose "
+                "another --out"
+            )
+
+
+def check_capture(out: Path, before: dict[str, Any], digest: str) -> None:
+    """Refuse to go on with another capture than ``blocks.json`` says."""
+    old = before.get("capture")
+    if not isinstance(old, dict) or old.get("digest") != digest:
+        where = old.get("path") if isinstance(old, dict) else "the capture"
+        raise RunError(
+            f"{out} was begun with another capture: photographs, cameras or points of {where} changed; restore them, "
+            "or choose another --out"
+        )
+
+
+def _asked(partition: Partition) -> dict[str, Any]:
+    """Return what was asked for of a partition whose grid is open, without what memory decided when it was begun."""
+    decided = ("grid", "splats", "coarse")
+    return {name: value for name, value in vars(partition).items() if name not in decided}
+
+
+def _share(memory: float | None, slots: int | None) -> float | None:
+    return None if memory is None else max(memory / (slots or 1), 0.5)
+
+
+def _check_all_done(tasks: Sequence[Task]) -> None:
+    failed = failures(tasks)
+    own = {name: reason for name, reason in failed.items() if not reason.startswith("not begun: ")} or failed
+    if own:
+        name, reason = next(iter(own.items()))
+        more = f" (and {len(own) - 1} more, in {tasks[0].record.parent})" if len(own) > 1 else ""
+        raise RunError(f"{name} failed: {reason}{more}; what is done is kept: mend that and run the command again")
+
+
+__all__ = ["BLOCKS_JSON", "blocks", "tasks_of"]

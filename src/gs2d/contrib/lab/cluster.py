@@ -1,0 +1,377 @@
+"""Tasks of a list on the machines of a Ray cluster, which share a disk.
+
+Ray decides where a task is done and does it again where a machine is lost. What tasks read and leave lies on the shared
+disk; through Ray go the task itself, what it tells, and what became of it, a few hundred bytes each.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import pickle
+import secrets
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gs2d
+from gs2d.contrib.lab import cluster_worker
+from gs2d.contrib.lab.cluster_task import Begun, token_file
+from gs2d.contrib.lab.schedule import Executor
+from gs2d.contrib.lab.tasks import AnyTask, Task
+from gs2d.core.extras import install
+from gs2d.errors import BackendError
+from gs2d.pipeline.events import Event, MissingFile, Notice, OnEvent, Phase, StageDone, Step
+
+RETRIES = 2  # of a task whose machine or process is lost, at least
+CONNECT_SECONDS, TCP_SECONDS = 60.0, 5.0
+POLL_SECONDS, GOODBYE_SECONDS = 0.5, 15.0
+# ray.init tries for minutes, and in C++, where nothing ends it but the end of its process.
+PROBE = """
+import logging, os, sys
+try:
+    import ray
+    ray.init(address=sys.argv[1], log_to_driver=False, logging_level=logging.CRITICAL)
+except BaseException as error:
+    print(type(error).__name__, " ".join(str(error).split()), sep=": ", flush=True)
+    os._exit(1)
+ray.shutdown()
+"""
+
+
+# -- the way to the cluster --------------------------------------------------------------------------------------------
+def check_address(address: str) -> None:
+    """Refuse what is no address of a cluster, or leads to nobody."""
+    if address == "auto":
+        return
+    host, _, port = address.rpartition(":")
+    if "/" in address or not host or not (port.isdecimal() and 0 < int(port) < 1 << 16):
+        raise BackendError(
+            f"--cluster must be auto, or HOST:PORT as `ray start --head` prints it, got {address!r}; this machine must "
+            "be one of the cluster's"
+        )
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=TCP_SECONDS).close()
+    except OSError as error:
+        raise BackendError(
+            f"no Ray cluster at {address} ({error.strerror or error}); start one with `ray start --head`, or check the "
+            "address"
+        ) from None
+
+
+def check_cluster(address: str) -> None:
+    """Connect to a cluster in another process, which is ended when it takes too long.
+
+    Raises
+    ------
+    BackendError
+        No Ray answers, or one of another version.
+    """
+    try:
+        probe = subprocess.run(
+            [sys.executable, "-c", PROBE, address], capture_output=True, text=True, timeout=CONNECT_SECONDS
+        )
+    except subprocess.TimeoutExpired:
+        raise BackendError(
+            f"no Ray cluster answers at {address} within {CONNECT_SECONDS:.0f} s; check the address, and that this "
+            "machine is one of the cluster's (`ray status`)"
+        ) from None
+    if probe.returncode:
+        said = (probe.stdout.splitlines() or [f"exit code {probe.returncode}"])[-1]
+        raise BackendError(
+            f"no Ray cluster can be used at {address}: {said[:300]}; start one with `ray start --head`, join it from "
+            "this machine with `ray start --address HOST:PORT`"
+        )
+
+
+def connect(address: str) -> tuple[Any, bool]:
+    """Return the ``ray`` module, connected, and whether the connection is ours to close."""
+    try:
+        import ray
+    except ImportError:
+        raise BackendError(f"--cluster needs Ray, which is not installed; {install('cluster')}") from None
+    if ray.is_initialized():  # by a program that calls gs2d
+        return ray, False
+    check_address(address)
+    check_cluster(address)
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            ray.init(address=address, log_to_driver=False, logging_level=logging.CRITICAL)
+    except Exception as error:
+        raise BackendError(f"no Ray cluster can be used at {address}: {' '.join(str(error).split())[:300]}") from None
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, before)  # Ray takes it, and would leave without a word
+    return ray, True
+
+
+# -- what a task takes -------------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class Shares:
+    """What a task takes of a machine.
+
+    Attributes
+    ----------
+    cores : int
+        CPU threads of a task.
+    alone : int
+        CPU threads of a task beside which nothing runs.
+    gpus : int
+        0 or 1.
+    """
+
+    cores: int
+    alone: int
+    gpus: int
+
+    def of(self, task: Task) -> dict[str, Any]:
+        """Return the resources of a task as Ray names them."""
+        gpus = self.gpus if task.gpu else 0
+        found: dict[str, Any] = {"num_cpus": self.alone if task.alone else self.cores, "num_gpus": gpus}
+        return found if task.memory is None else {**found, "memory": int(task.memory * 2**30)}
+
+
+def shares(
+    nodes: Sequence[Mapping[str, float]], backend: str, slots: int | None, threads: int | None, address: str
+) -> Shares:
+    """Return what tasks take of machines with such resources (``CPU``, ``GPU``, ``memory``).
+
+    Raises
+    ------
+    BackendError
+        No machine has a CPU, or the GPU that is needed.
+    """
+    gpus = int(backend == "cuda" or (backend == "auto" and any(node.get("GPU", 0) >= 1 for node in nodes)))
+    able = [node for node in nodes if node.get("CPU", 0) >= 1 and node.get("GPU", 0) >= gpus]
+    if not able:
+        there = f"{len(nodes)} with {_sum(nodes, 'CPU'):g} CPUs and {_sum(nodes, 'GPU'):g} GPUs"
+        raise BackendError(
+            f"the cluster at {address} must have a machine with a CPU{' and a GPU' if gpus else ''} for tasks, got "
+            f"{there}; start them with `ray start --address`, or choose another --backend"
+        )
+    cores = int(min(node["CPU"] for node in able))
+    if threads is not None:
+        return Shares(threads, threads, gpus)
+    each = cores // int(max(node["GPU"] for node in able)) if gpus else cores
+    if slots is not None:
+        each = min(each, int(_sum(able, "CPU")) // slots)
+    return Shares(max(1, each), cores, gpus)
+
+
+def _sum(nodes: Sequence[Mapping[str, float]], name: str) -> float:
+    return sum(node.get(name, 0.0) for node in nodes)
+
+
+def check_room(nodes: Sequence[Mapping[str, float]], taken: Mapping[str, Any], name: str) -> None:
+    """Refuse a task that no machine has room for: Ray would wait for ever."""
+    asked = {"CPU": taken["num_cpus"], "GPU": taken["num_gpus"], "memory": taken.get("memory", 0)}
+    if not any(all(node.get(key, 0) >= value for key, value in asked.items()) for node in nodes):
+        memory = f" and {asked['memory'] / 2**30:.3g} GiB" if asked["memory"] else ""
+        there = "; ".join(
+            f"{node.get('CPU', 0):g} CPUs, {node.get('GPU', 0):g} GPUs, {node.get('memory', 0) / 2**30:.3g} GiB"
+            for node in nodes
+        )
+        raise BackendError(
+            f"no machine of the cluster has room for {name}, which takes {asked['CPU']} CPUs, {asked['GPU']} GPUs"
+            f"{memory}: there is {there}; give less --threads or --memory"
+        )
+
+
+# -- the executor ------------------------------------------------------------------------------------------------------
+def cluster_executor(
+    address: str, folder: Path, tasks: Sequence[Task], *, slots: int | None, threads: int | None, backend: str
+) -> OnCluster[Any]:
+    """Return the executor that does tasks of a list on a cluster.
+
+    Raises
+    ------
+    BackendError
+        The cluster cannot be had, or has no room.
+    """
+    ray, owned = connect(address)
+    try:
+        nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        taken = shares(nodes, backend, slots, threads, address)
+        for task in tasks:
+            check_room(nodes, taken.of(task), task.name)
+        return OnCluster(ray, folder, taken, slots or len(tasks), ray.shutdown if owned else lambda: None)
+    except BaseException:
+        if owned:
+            ray.shutdown()
+        raise
+
+
+class OnCluster(Executor[AnyTask]):
+    """A Ray task for each task, in a process of its own."""
+
+    def __init__(self, ray: Any, folder: Path, taken: Shares, slots: int, leave: Callable[[], None]) -> None:
+        from ray.util.queue import Queue
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+        self._ray, self._folder, self._taken, self._slots, self._leave = ray, folder, taken, slots, leave
+        ray.cloudpickle.register_pickle_by_value(cluster_worker)
+        self._remote = ray.remote(max_calls=1)(cluster_worker.do_on_worker)
+        # Where this command runs: with another machine it would be lost.
+        here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
+        self._queue = Queue(actor_options={"num_cpus": 0, "scheduling_strategy": here})
+        self._running: dict[Any, AnyTask] = {}
+        self._progress: dict[str, Progress] = {}
+        self._token, self._stopped = secrets.token_hex(8), False
+
+    def fitted(self, task: AnyTask) -> AnyTask:
+        """Return a task on as many CPU threads as it takes of a machine."""
+        return task.with_threads(self._taken.of(task)["num_cpus"])
+
+    def running(self) -> Sequence[AnyTask]:
+        """Return the tasks that Ray has, those that wait for room too."""
+        return list(self._running.values())
+
+    def has_room(self) -> bool:
+        """Return whether Ray may have another task; where there is no room it waits there."""
+        return len(self._running) < self._slots
+
+    def start(self, task: AnyTask) -> None:
+        """Give a task to Ray."""
+        token_file(self._folder, self._token).touch()
+        order = {
+            "name": task.name,
+            "task": pickle.dumps(task),
+            "version": gs2d.__version__,
+            "folder": str(self._folder),
+            "token": self._token,
+            "cwd": os.getcwd(),
+        }
+        remote = self._remote.options(
+            name=task.name,
+            max_retries=_retries(task),
+            scheduling_strategy="SPREAD",
+            **self._taken.of(task),
+        )
+        self._running[remote.remote(order, self._queue)] = task
+
+    def wait(self, on_event: OnEvent) -> list[tuple[AnyTask, bool]]:
+        """Wait for a task to end, and pass on what all of them tell.
+
+        Raises
+        ------
+        BackendError
+            A machine cannot do any task, because of what it has or does not see.
+        """
+        refs = list(self._running)
+        self._ray.wait(refs, num_returns=1, timeout=POLL_SECONDS)
+        ready, _ = self._ray.wait(refs, num_returns=len(refs), timeout=0)
+        for name, event in self._told():
+            self._pass_on(name, event, on_event)
+        for ref, task in self._running.items():  # Ray begins a task without end that the memory is too small for
+            if ref not in ready and self._progress.get(task.name, Progress()).begun > 1 + _retries(task):
+                self._ray.cancel(ref, force=True)
+        ended = []
+        for ref in ready:
+            task = self._running[ref]
+            outcome = self._outcome(ref, task)
+            if outcome["state"] == "refused":
+                raise BackendError(outcome["reason"])
+            del self._running[ref]
+            self._progress.pop(task.name, None)
+            with contextlib.suppress(OSError):
+                os.listdir(task.record.parent)  # NFS looks again for what others wrote
+            if "reason" in outcome:
+                on_event(Notice(f"{task.name} failed: {outcome['reason']}"))
+            ended.append((task, outcome["state"] == "failed"))
+        return ended
+
+    def _told(self) -> list[tuple[str, Event | Begun]]:
+        """Return what tasks have told since the last time."""
+        size = self._queue.size()
+        return list(self._queue.get_nowait_batch(size)) if size else []
+
+    def _outcome(self, ref: Any, task: AnyTask) -> dict[str, Any]:
+        """Return what became of a task that Ray says has ended."""
+        try:
+            return dict(self._ray.get(ref))
+        except Exception as error:  # its last machine is lost, too, or it could not be begun
+            kind = type(error).__name__
+            lost = "its process or its machine was lost again and again, or had no memory left"
+            words = " ".join(str(error).split())[-200:]
+            reason = f"{lost} ({kind})" if kind in LOST else f"{kind}: {words}"
+            task.write("failed", reason=reason, **task.facts())
+            return task.outcome()
+
+    def _pass_on(self, name: str, event: Event | Begun, on_event: OnEvent) -> None:
+        """Pass on what a task tells, with its name."""
+        at = self._progress.setdefault(name, Progress())
+        if isinstance(event, Begun):
+            if at.host:
+                on_event(Notice(f"{name}: its process or its machine ({at.host}) was lost; it goes on on {event.host}"))
+            else:
+                on_event(Notice(f"{name} begins on {event.host}"))
+            at.host, at.begun = event.host, at.begun + 1
+        elif isinstance(event, Phase):
+            at.phase, at.total, at.done = event.name, event.total, event.done
+        elif isinstance(event, Step):
+            at.done = event.done
+        elif isinstance(event, Notice) and not event.text.startswith(f"{name} failed: "):  # said when it has ended
+            on_event(Notice(f"{name}: {event.text}", event.detail))
+        elif isinstance(event, StageDone):
+            on_event(Notice(f"{name}: {event.line()}"))
+        elif isinstance(event, MissingFile):
+            on_event(event)
+
+    def detail(self) -> str:
+        """Return how far each task is that has begun."""
+        return ", ".join(f"{name}{at.words()}" for name, at in self._progress.items() if at.host)
+
+    def stop(self) -> None:
+        """Cancel what is running, first so that it can keep a checkpoint, and leave the cluster; once."""
+        if self._stopped:
+            return
+        self._stopped = True
+        refs = list(self._running)
+        try:
+            for force in (False, True) if refs else ():
+                for ref in refs:
+                    with contextlib.suppress(Exception):  # one that has just ended
+                        self._ray.cancel(ref, force=force)
+                _, refs = self._ray.wait(refs, num_returns=len(refs), timeout=GOODBYE_SECONDS) if refs else ([], [])
+                if not refs:
+                    break
+        finally:
+            with contextlib.suppress(OSError):
+                token_file(self._folder, self._token).unlink()
+            with contextlib.suppress(Exception):
+                self._queue.shutdown(force=True)
+            self._leave()
+
+
+LOST = ("WorkerCrashedError", "NodeDiedError", "OutOfMemoryError", "LocalRayletDiedError", "TaskCancelledError")
+
+
+def _retries(task: Task) -> int:
+    return max(task.retries, RETRIES)
+
+
+@dataclass
+class Progress:
+    """How far a task is, on which machine."""
+
+    host: str = ""
+    begun: int = 0
+    phase: str = ""
+    total: int = 0
+    done: int = 0
+
+    def words(self) -> str:
+        """Return it in a few words: `` (surface 40 %)``."""
+        if not self.phase:
+            return ""
+        return f" ({self.phase} {100 * self.done // self.total} %)" if self.total else f" ({self.phase})"

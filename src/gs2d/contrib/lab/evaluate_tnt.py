@@ -1,0 +1,535 @@
+"""Precision, recall and F-score of Tanks and Temples (Knapitsch et al. 2017), in the official steps.
+
+1. Point set of the reconstruction: mesh vertices and face centroids, as the official script takes them (so the score
+   depends on the triangulation, not on area alone).
+2. Start: the similarity that takes the capture's camera centres to those of the official log, moved into the scan's
+   frame by ``_trans.txt``. Our own cameras are used, never a second trajectory file that may be in another frame.
+3. Three stages of iterative closest points with scale, both clouds cut to the crop volume.
+4. Both clouds cut and thinned to tau / 2; precision and recall are the parts nearer than tau.
+
+The self-check says whether the alignment can be believed; a wrong log or transform gives a low score, not an error.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gs2d.config.surface_protocols import TNT_SURFACE, IcpStage, TntSurface
+from gs2d.contrib.lab.alignment import IcpResult, icp, uniform_downsample, voxel_downsample
+from gs2d.core.checks import check_shapes
+from gs2d.core.images import natural_key
+from gs2d.core.json_files import read_json
+from gs2d.core.mesh import Mesh
+from gs2d.core.similarity import RobustFit, apply, ransac_similarity, rotation_degrees, similarity_scale
+from gs2d.errors import DataError
+from gs2d.evaluation.nearest import Cloud
+from gs2d.evaluation.surface import ScoredClouds
+from gs2d.io.meshes import read_points
+
+# -- the crop volume ---------------------------------------------------------------------------------------------------
+_PLANES = {0: (1, 2), 1: (0, 2), 2: (0, 1)}  # the two axes of the polygon, by the axis it is drawn out along
+_CHUNK = 1 << 21
+
+
+@dataclass(frozen=True, eq=False)
+class CropVolume:
+    """What counts, in the frame of the ground truth.
+
+    Attributes
+    ----------
+    axis : int
+        0, 1 or 2: the axis that the polygon is drawn out along.
+    low, high : float
+        Range along it, both ends included.
+    polygon : ndarray [n, 2]
+        Corners in the two other axes, in ascending order of axis; even-odd rule.
+    """
+
+    axis: int
+    low: float
+    high: float
+    polygon: np.ndarray
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Which points [P, 3] lie inside, bool [P]."""
+        check_shapes({"points": (points, "P 3")})
+        u, v = _PLANES[self.axis]
+        inside = (points[:, self.axis] >= self.low) & (points[:, self.axis] <= self.high)
+        rows = np.flatnonzero(inside)
+        for start in range(0, len(rows), _CHUNK):
+            part = rows[start : start + _CHUNK]
+            inside[part] = self._in_polygon(points[part, u].astype(np.float64), points[part, v].astype(np.float64))
+        return np.asarray(inside)
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Return the points inside."""
+        return np.asarray(points[self.contains(points)])
+
+    def _in_polygon(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Whether an odd number of edges is crossed on the way from (u, v) to u = -infinity."""
+        odd = np.zeros(len(u), bool)
+        for (u0, v0), (u1, v1) in zip(self.polygon, np.roll(self.polygon, -1, axis=0), strict=True):
+            crosses = (v0 < v) != (v1 < v)
+            if not crosses.any():
+                continue
+            odd[crosses] ^= u0 + (v[crosses] - v0) / (v1 - v0) * (u1 - u0) < u[crosses]
+        return odd
+
+
+def box(low: np.ndarray, high: np.ndarray) -> CropVolume:
+    """Return the axis-aligned box between two corners [3]."""
+    (x0, y0, z0), (x1, y1, z1) = low, high
+    return CropVolume(2, float(z0), float(z1), np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], np.float64))
+
+
+def read_crop(path: Path) -> CropVolume:
+    """Read ``SCENE.json`` of Tanks and Temples (Open3D's SelectionPolygonVolume)."""
+    data = read_json(path)
+    try:
+        axis = "XYZ".index(str(data["orthogonal_axis"]).upper())
+        low, high = float(data["axis_min"]), float(data["axis_max"])
+        corners = np.asarray(data["bounding_polygon"], dtype=np.float64)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise DataError(
+            f"{path} must hold orthogonal_axis (X, Y or Z), axis_min, axis_max and bounding_polygon, "
+            f"got another entry ({error}); copy it again from the ground truth"
+        ) from error
+    if corners.ndim != 2 or corners.shape[0] < 3 or corners.shape[1] != 3 or not np.isfinite(corners).all():
+        raise DataError(f"{path}: bounding_polygon must hold three corners [x, y, z] or more, got {corners.shape}")
+    if not low < high:
+        raise DataError(f"{path}: axis_min must be below axis_max, got {low:g} and {high:g}")
+    return CropVolume(axis, low, high, corners[:, list(_PLANES[axis])])
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
+class TntTruth:
+    """What a mesh of one scene is compared with.
+
+    Attributes
+    ----------
+    scene : str
+    points : ndarray [P, 3]
+        The laser scan, m.
+    crop : CropVolume
+        In the scan's frame.
+    T_truth_log : ndarray [4, 4]
+        ``SCENE_trans.txt``: from the frame of the log to that of the scan.
+    trajectory : ndarray [n, 4, 4]
+        ``SCENE_COLMAP_SfM.log``: camera-to-world matrices of all photographs, in order.
+    """
+
+    scene: str
+    points: np.ndarray
+    crop: CropVolume
+    T_truth_log: np.ndarray
+    trajectory: np.ndarray
+
+
+def read_tnt_truth(scene: str, files: Mapping[str, Path]) -> TntTruth:
+    """Read the ground truth of a scene from its four ``files`` (keys as ``data.benchmarks.tnt_truth_files``).
+
+    Raises
+    ------
+    DataError
+        A file is missing or broken; names it.
+    """
+    points = np.asarray(read_points(files["scan"]).points)
+    crop = read_crop(files["crop"])
+    if not crop.contains(points).any():
+        raise DataError(f"{files['crop']} must hold part of the scan {files['scan'].name}, got none; copy both again")
+    return TntTruth(scene, points, crop, read_transform(files["transform"]), read_trajectory(files["log"]))
+
+
+def read_transform(path: Path) -> np.ndarray:
+    """Return a 4x4 matrix of numbers in four lines (``SCENE_trans.txt``)."""
+    rows = _number_rows(path)
+    if len(rows) != 4 or any(len(row) != 4 for row in rows):
+        raise DataError(f"{path} must hold four lines of four numbers, got {len(rows)} lines; copy it again")
+    T = np.array(rows)
+    if not np.isfinite(T).all() or abs(np.linalg.det(T)) < 1e-12:
+        raise DataError(f"{path} must hold a finite transform, got {T.round(4).tolist()}; copy it again")
+    return T
+
+
+def read_trajectory(path: Path) -> np.ndarray:
+    """Camera-to-world matrices [n, 4, 4] of a ``.log`` file: a line of three whole numbers, then the matrix, each."""
+    rows = _number_rows(path)
+    if not rows or len(rows) % 5 or any(len(row) != (3 if i % 5 == 0 else 4) for i, row in enumerate(rows)):
+        raise DataError(
+            f"{path} must hold a line of three numbers and four of four for each camera, "
+            f"got {len(rows)} lines; copy it again"
+        )
+    poses = np.array([row for i, row in enumerate(rows) if i % 5], dtype=np.float64).reshape(-1, 4, 4)
+    if not np.isfinite(poses).all():
+        raise DataError(f"{path} must hold finite cameras, got NaN or infinity; copy it again")
+    return poses
+
+
+def _number_rows(path: Path) -> list[list[float]]:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        return [[float(word) for word in line.split()] for line in lines if line.strip()]
+    except OSError as error:
+        raise DataError(f"cannot read {path}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise DataError(f"{path} must hold numbers only, got: {error}; copy it again") from error
+
+
+def match_cameras(names: Sequence[str], count: int, where: str = "the log") -> tuple[np.ndarray, np.ndarray]:
+    """Which of the named photographs belong to which of ``count`` entries of a log: indices [m], [m].
+
+    As many as entries: in order of their names (``frame_2`` before ``frame_10``). Else by the number in the name, the
+    first photograph being 1 (``000001.jpg``) as Tanks and Temples counts, or 0 if there is a number 0.
+
+    Raises
+    ------
+    DataError
+        Neither is possible.
+    """
+    order = np.array(sorted(range(len(names)), key=lambda i: natural_key(names[i])), np.int64)
+    if len(names) == count:
+        return order, np.arange(count)
+    numbers = [re.search(r"(\d+)\D*$", Path(names[i]).stem) for i in order]
+    if not all(numbers):
+        raise DataError(f"{where} has {count} cameras, the capture {len(names)}, and their names have no numbers")
+    counted = np.array([int(number.group(1)) for number in numbers if number], np.int64)
+    first = min(1, int(counted.min()))
+    entries = counted - first
+    inside = (entries >= 0) & (entries < count)
+    if inside.sum() < 3 or len(np.unique(entries)) < len(entries):
+        raise DataError(
+            f"{where} has {count} cameras, the capture {len(names)}, numbered {counted.min()} to "
+            f"{counted.max()}; take the log of the same photographs"
+        )
+    return order[inside], entries[inside]
+
+
+# -- the score ---------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class StageReport:
+    """One stage of the alignment: distances in m; None where nothing was paired."""
+
+    voxel: float | None
+    threshold: float
+    points: int
+    fraction_before: float
+    fraction: float
+    rms_before: float | None
+    rms: float | None
+    iterations: int
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """The self-check.
+
+    Attributes
+    ----------
+    ok : bool
+        Whether the score can be believed.
+    messages : tuple of str
+        What is odd, one line each.
+    cameras : int
+        Cameras that were matched with the log.
+    camera_fraction : float
+        Part of them that agree within the protocol's threshold.
+    camera_rms, camera_worst : float
+        m, of those.
+    scale : float
+        From the capture to the scan, in the end.
+    shift : float or None
+        How far the stages moved the mesh, rms, in tau.
+    shift_scale, shift_degrees : float
+        By how much they changed its size, and turned it.
+    transform_alone : float or None
+        tau. How far off the mesh would be (rms) had ``_trans.txt`` alone been used.
+    stages : tuple of StageReport
+    T_truth_mesh : ndarray [4, 4]
+    """
+
+    ok: bool
+    messages: tuple[str, ...]
+    cameras: int
+    camera_fraction: float
+    camera_rms: float
+    camera_worst: float
+    scale: float
+    shift: float | None
+    shift_scale: float
+    shift_degrees: float
+    transform_alone: float | None
+    stages: tuple[StageReport, ...]
+    T_truth_mesh: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class TntScore:
+    """The score of one scene; distances in m. None, with ``reason``, where there was nothing to measure.
+
+    Attributes
+    ----------
+    tau : float
+    precision, recall, f_score : float or None
+    accuracy, completeness, chamfer : float or None
+        Mean distance from the reconstruction to the scan, back, and the mean of the two (not part of the protocol).
+    mesh_points, truth_points : int
+        Points that were scored.
+    alignment : Alignment
+    clouds : ScoredClouds
+        The scored points with their distances.
+    reason : str or None
+    """
+
+    tau: float
+    precision: float | None
+    recall: float | None
+    f_score: float
+    accuracy: float | None
+    completeness: float | None
+    chamfer: float | None
+    mesh_points: int
+    truth_points: int
+    alignment: Alignment
+    clouds: ScoredClouds
+    reason: str | None = None
+
+
+def evaluate_tnt(
+    mesh: Mesh,
+    names: Sequence[str],
+    centers: np.ndarray,
+    truth: TntTruth,
+    tau: float,
+    *,
+    published: np.ndarray | None = None,
+    protocol: TntSurface = TNT_SURFACE,
+    seed: int = 0,
+    workers: int | None = None,
+) -> TntScore:
+    """Score a mesh.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        In the capture's frame.
+    names : sequence of str
+        Of all photographs of the capture.
+    centers : ndarray [n, 3]
+        Their camera centres, in the capture's frame.
+    truth : TntTruth
+    tau : float
+        m.
+    published : ndarray [m, 4, 4], optional
+        The log that came with the photographs: checked against the cameras, never used.
+    workers : int, optional
+        Threads that look for nearest points; default: all.
+
+    Raises
+    ------
+    DataError
+        The cameras cannot be matched with the log.
+    """
+    source = point_set(mesh)
+    fit, frame_notes = _camera_fit(names, centers, truth, published, protocol, seed)
+    target = truth.crop.apply(truth.points).astype(np.float64)
+    start = T = fit.T_target_source
+    reports: list[StageReport] = []
+    for stage in protocol.stages:
+        step, report = _stage(source, target, T, truth, stage, tau, protocol, workers)
+        T = step.T_target_source @ T
+        reports.append(report)
+    moved = truth.crop.apply(apply(T, source))
+    alignment = _check(fit, start, T, moved, truth, tau, tuple(reports), frame_notes, protocol)
+    return _score(moved, target, tau, alignment, protocol, workers)
+
+
+def point_set(mesh: Mesh) -> np.ndarray:
+    """Vertices and face centroids [P + F, 3]: what the official script compares."""
+    vertices = mesh.vertices.astype(np.float64)
+    return np.concatenate([vertices, vertices[mesh.faces].mean(axis=1)]) if len(mesh.faces) else vertices
+
+
+def _camera_fit(
+    names: Sequence[str],
+    centers: np.ndarray,
+    truth: TntTruth,
+    published: np.ndarray | None,
+    protocol: TntSurface,
+    seed: int,
+) -> tuple[RobustFit, list[str]]:
+    """From the capture to the scan by camera centres; what is odd about the frames."""
+    ours, entries = match_cameras(names, len(truth.trajectory), f"{truth.scene}_COLMAP_SfM.log")
+    targets = apply(truth.T_truth_log, truth.trajectory[entries, :3, 3])
+    try:
+        fit = ransac_similarity(
+            centers[ours], targets, threshold=protocol.camera_threshold, sample=protocol.camera_sample, seed=seed
+        )
+    except DataError as error:
+        raise DataError(f"{truth.scene}_COLMAP_SfM.log does not fit the capture's cameras: {error}") from error
+    notes = []
+    if published is not None and len(published) == len(names):
+        gap, spread = _frame_gap(names, centers, published), float(np.linalg.norm(np.ptp(centers, axis=0)))
+        if gap > 0.01 * spread:
+            notes.append(
+                f"{truth.scene}_COLMAP_SfM.log beside the photographs is in another frame than their cameras (median "
+                f"distance {gap / spread:.0%} of their spread): the cameras were used instead"
+            )
+    return fit, notes
+
+
+def _frame_gap(names: Sequence[str], centers: np.ndarray, published: np.ndarray) -> float:
+    """Median distance of cameras from those of a log, in the order of text (as logs are written) or of numbers."""
+    orders = [sorted(range(len(names)), key=key) for key in (lambda i: names[i], lambda i: natural_key(names[i]))]
+    return min(float(np.median(np.linalg.norm(published[:, :3, 3] - centers[order], axis=1))) for order in orders)
+
+
+def _stage(
+    source: np.ndarray,
+    target: np.ndarray,
+    T: np.ndarray,
+    truth: TntTruth,
+    stage: IcpStage,
+    tau: float,
+    protocol: TntSurface,
+    workers: int | None,
+) -> tuple[IcpResult, StageReport]:
+    """One stage on the cropped and thinned clouds."""
+    moved = truth.crop.apply(apply(T, source))
+    if stage.voxel is None:
+        thin_source = uniform_downsample(moved, protocol.max_points)
+        thin_target = uniform_downsample(target, protocol.max_points)
+    else:
+        thin_source = voxel_downsample(moved, stage.voxel * tau)
+        thin_target = voxel_downsample(target, stage.voxel * tau)
+    step = icp(
+        thin_source,
+        thin_target,
+        threshold=stage.threshold * tau,
+        iterations=stage.iterations,
+        fraction_change=protocol.fraction_change,
+        rms_change=protocol.rms_change,
+        workers=workers,
+    )
+    report = StageReport(
+        None if stage.voxel is None else stage.voxel * tau,
+        stage.threshold * tau,
+        len(thin_source),
+        step.fraction_before,
+        step.fraction,
+        step.rms_before,
+        step.rms,
+        step.iterations,
+    )
+    return step, report
+
+
+def _check(
+    fit: RobustFit,
+    start: np.ndarray,
+    T: np.ndarray,
+    moved: np.ndarray,
+    truth: TntTruth,
+    tau: float,
+    stages: tuple[StageReport, ...],
+    messages: list[str],
+    protocol: TntSurface,
+) -> Alignment:
+    """Whether the alignment can be believed, and why not."""
+    change = T @ np.linalg.inv(start)
+    shift = _rms_between(moved, np.linalg.inv(change), tau)  # where they are now against where they were
+    alone = _rms_between(moved, truth.T_truth_log @ np.linalg.inv(T), tau)
+    scale = similarity_scale(change)
+    log, transform = f"{truth.scene}_COLMAP_SfM.log", f"{truth.scene}_trans.txt"
+    wrong = []
+    if fit.fraction < protocol.min_camera_fraction:
+        wrong.append(
+            f"only {fit.fraction:.0%} of the cameras agree with {log} within {protocol.camera_threshold:g} m: "
+            "is it the log of these photographs?"
+        )
+    apart = not stages or stages[0].fraction < protocol.min_fraction
+    if apart or shift is None or shift > protocol.max_shift or abs(scale - 1) > protocol.max_scale_change:
+        what = (
+            f"{stages[0].fraction if stages else 0:.0%} of the mesh lies within {protocol.stages[0].threshold:g} tau "
+            f"of the scan, after a shift of {'no' if shift is None else f'{shift:.1f}'} tau and a scale of {scale:.4f}"
+        )
+        trap = (
+            f"the cameras fit {log}, the surface does not fit the scan: take {log} and {transform} from the official "
+            "ground truth (TNT_GOF has a log of the same name, which for Truck is in another frame)"
+        )
+        wrong.append(f"{what}; {trap if fit.fraction >= protocol.min_camera_fraction else 'the alignment failed'}")
+    elif alone is not None and alone > protocol.max_shift:
+        messages = [
+            *messages,
+            f"the capture is not in the frame of {log} (as Truck of TNT_GOF): {transform} alone would misplace the "
+            f"mesh by {alone:.0f} tau; it was aligned by its cameras",
+        ]
+    return Alignment(
+        ok=not wrong,
+        messages=(*wrong, *messages),
+        cameras=len(fit.inliers),
+        camera_fraction=fit.fraction,
+        camera_rms=fit.rms,
+        camera_worst=fit.worst,
+        scale=similarity_scale(T),
+        shift=shift,
+        shift_scale=scale,
+        shift_degrees=rotation_degrees(change),
+        transform_alone=alone,
+        stages=stages,
+        T_truth_mesh=T,
+    )
+
+
+def _rms_between(points: np.ndarray, T: np.ndarray, unit: float) -> float | None:
+    """How far a transform moves points, rms, in units; None without points."""
+    if not len(points):
+        return None
+    few = uniform_downsample(points, 100_000)
+    return float(np.sqrt(np.square(apply(T, few) - few).sum(axis=1).mean()) / unit)
+
+
+def _score(
+    moved: np.ndarray,
+    target: np.ndarray,
+    tau: float,
+    alignment: Alignment,
+    protocol: TntSurface,
+    workers: int | None,
+) -> TntScore:
+    """Precision, recall and F of the cropped clouds."""
+    ours = voxel_downsample(moved, protocol.score_voxel * tau)
+    theirs = voxel_downsample(target, protocol.score_voxel * tau)
+    if not len(theirs):
+        raise DataError("a scan with points inside the crop volume was expected, got none; copy both again")
+    if not len(ours):
+        clouds = ScoredClouds(ours, np.zeros(0), theirs, np.full(len(theirs), np.inf), tau)
+        why = "no part of the mesh lies inside the crop volume"
+        return TntScore(tau, None, 0.0, 0.0, None, None, None, 0, len(theirs), alignment, clouds, why)
+    accuracy, _ = Cloud(theirs, workers=workers).nearest(ours)
+    completeness, _ = Cloud(ours, workers=workers).nearest(theirs)
+    accuracy, completeness = accuracy[:, 0], completeness[:, 0]
+    precision, recall = float((accuracy < tau).mean()), float((completeness < tau).mean())
+    return TntScore(
+        tau=tau,
+        precision=precision,
+        recall=recall,
+        f_score=f_score(precision, recall),
+        accuracy=float(accuracy.mean()),
+        completeness=float(completeness.mean()),
+        chamfer=float(accuracy.mean() + completeness.mean()) / 2,
+        mesh_points=len(ours),
+        truth_points=len(theirs),
+        alignment=alignment,
+        clouds=ScoredClouds(ours, accuracy, theirs, completeness, tau),
+    )
+
+
+def f_score(precision: float, recall: float) -> float:
+    """Harmonic mean, 0 where both are."""
+    return 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0

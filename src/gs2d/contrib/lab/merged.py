@@ -1,0 +1,188 @@
+"""The merged scene of all blocks as a run of its own: splats, scores, mesh, page and report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gs2d.config.partition import Partition
+from gs2d.config.partition import to_json as partition_json
+from gs2d.contrib.lab.settle import Settled, block_folder, coarse_folder, partition_folder, seam_folder
+from gs2d.contrib.lab.split import SEAMS, merge, read_split, split_seams, start_file
+from gs2d.core.json_files import read_json, write_json
+from gs2d.core.memory import hold
+from gs2d.core.splats import Splats
+from gs2d.data import Scene
+from gs2d.errors import RunError
+from gs2d.io.run_dir import SPLATS, RunFolder, is_run, open_run
+from gs2d.io.splat_ply import read_splats, write_splats
+from gs2d.pipeline.attempts import attempted
+from gs2d.pipeline.events import OnEvent
+from gs2d.pipeline.finish.run_images import choose_views, draw_stage
+from gs2d.pipeline.finish.run_mesh import MeshFrames
+from gs2d.pipeline.finish.scoring import PeakMemory, score_views, split_metrics
+from gs2d.pipeline.finish.verdict.measures import Collector
+from gs2d.pipeline.prepare.finished import finished_splats
+from gs2d.pipeline.prepare.job import Job
+from gs2d.pipeline.prepare.memory_budget import release
+from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
+from gs2d.pipeline.prepare.part import OWN, read_start
+from gs2d.pipeline.prepare.photographs import with_prepared
+from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
+from gs2d.pipeline.prepare.run_exposures import read_exposures, write_exposures
+from gs2d.pipeline.train.train_run import finish
+from gs2d.training.trainer import raster_settings
+
+MERGED, SEAM_VIEWS = "merged.ply", "seams.json"  # in the job folder: all blocks, and the photographs of their seams
+STAGE = "blocks"  # the one stage of a merged run in metrics.json
+
+
+def merged_splats(out: Path) -> Splats:
+    """Return the splats of all blocks, each cropped to its cell.
+
+    Raises
+    ------
+    RunError
+        A block is not finished.
+    """
+    split = read_split(partition_folder(out))
+    coarse = finished_splats(open_run(coarse_folder(out)))
+    trained = [block.name for block in split.blocks if not block.skipped]
+    splats = {name: finished_splats(open_run(block_folder(out, name))) for name in trained}
+    rows = {name: read_start(start_file(partition_folder(out), name))[0] for name in trained}
+    return merge(coarse, split, splats, rows)
+
+
+def write_merged(settled: Settled, options: TrainOptions, partition: Partition, on_event: OnEvent) -> dict[str, Any]:
+    """Write the merged splats, and what of them learns once more: ``MERGED``, ``seams.npz``, ``seams.json``.
+
+    Returns
+    -------
+    dict
+        ``splats``, and ``views``: how many photographs show a seam.
+    """
+    out, splats, views = options.out, merged_splats(options.out), tuple[str, ...]()
+    if partition.seam > 0 and partition.seam_schedule > 0:
+        views = split_seams(
+            splats.to(settled.backend.device),
+            read_split(partition_folder(out)),
+            settled.scene,
+            partition,
+            raster_settings(settled.protocol, settled.scene.extent, settled.recipe.sh_degree),
+            settled.backend,
+            partition_folder(out),
+            on_event,
+            read_exposures(open_run(coarse_folder(out)), settled.recipe),
+        )
+    write_splats(out / MERGED, splats)
+    write_json(out / SEAM_VIEWS, {"views": list(views)})
+    return {"splats": len(splats), "views": len(views)}
+
+
+def read_seam_views(out: Path) -> tuple[str, ...]:
+    """Return the views that see the seams of a job's merged scene.
+
+    Raises
+    ------
+    DataError, RunError
+        Missing, or changed by hand.
+    """
+    found = read_json(out / SEAM_VIEWS)
+    views = found.get("views") if isinstance(found, dict) else None
+    if not isinstance(views, list) or not all(isinstance(view, str) for view in views):
+        raise RunError(f"{out / SEAM_VIEWS} must list views by name, got something else; delete it, and {MERGED} too")
+    return tuple(views)
+
+
+def write_result(settled: Settled, options: TrainOptions, partition: Partition, on_event: OnEvent) -> int:
+    """Write the merged scene as a run, its seams as they have learned; returns its splats."""
+    run, splats = RunFolder(options.out), read_splats(options.out / MERGED)
+    if read_seam_views(options.out):
+        rows, _ = read_start(start_file(partition_folder(options.out), SEAMS))
+        rest = splats.rows(torch.from_numpy(rows != OWN))
+        splats = rest.followed_by(finished_splats(open_run(seam_folder(options.out))))
+    job = merged_job(settled, options, settled.scene)
+    title = {"title": options.title or settled.scene.name, "schedule_scale": options.schedule_scale}
+    run.write_definition({**job.definition(), **title, "partition": partition_json(partition)})
+    if settled.recipe.exposure is not None:
+        coarse = open_run(coarse_folder(options.out))
+        write_exposures(run, read_exposures(coarse, settled.recipe), on_event)
+    run.events.cut(0)
+    write_splats(run.file(SPLATS), splats)
+    return len(splats)
+
+
+def merged_job(settled: Settled, options: TrainOptions, scene: Scene) -> Job:
+    """Return the merged scene as other commands find it."""
+    settings = raster_settings(settled.protocol, scene.extent, settled.recipe.sh_degree)
+    return Job(
+        settled.recipe,
+        settled.protocol,
+        scene,
+        settled.backend,
+        settings,
+        options.downscale or 1,
+        settled.capture,
+        options.stage2_cache_mb << 20,
+    )
+
+
+def finish_merged(settled: Settled, options: TrainOptions, on_event: OnEvent) -> dict[str, Any]:
+    """Score the merged scene, mesh it, write its page, verdict and report; returns its entry of ``metrics.json``."""
+    run, memory = RunFolder(options.out), PeakMemory()
+    if not run.file(SPLATS).exists():
+        raise RunError(f"{options.out} must have {SPLATS} by now, got none; run the command again")
+    disk = None if options.disk is None else int(options.disk * 2**30)
+    scene = with_prepared(
+        settled.scene, options.out, options.prepare, on_event, disk=disk, threads=options.threads, shared=True
+    )
+    job = merged_job(settled, options, scene)
+    splats = read_splats(run.file(SPLATS)).to(job.backend.device)
+    brightness = metered(splats, job.settings, job.backend)
+    exposures = with_predicted(read_exposures(run, job.recipe), scene, brightness)
+    entry = {**_spent(options.out), "splats": len(splats), "bytes": splats.nbytes}
+    collected = Collector(scene)
+    hold()
+    with MeshFrames(job) as frames:
+        for split, views in (("train", scene.train), ("test", scene.test)):
+            scores = score_views(
+                splats,
+                views,
+                job.settings,
+                job.backend,
+                name=f"scoring {split} views",
+                on_event=on_event,
+                exposures=exposures,
+                split=split,
+                visitors=[frames.visit, collected.visit],
+            )
+            entry |= split_metrics(scores, split)
+        shown = choose_views(scene, options.shown_views)
+        with attempted(f"pictures of {STAGE}", None, on_event):
+            draw_stage(run, job, shown, STAGE, splats, None, exposures)
+        release(scene)
+        entry["peak_memory_bytes"] = max(entry["peak_memory_bytes"], memory.read())
+        run.write_metrics({"stages": [entry], "surface": None})
+        mesh = MeshOptions(subject_box=options.subject_box, whole_scene=options.whole_scene)
+        finish(run, job, splats, mesh, on_event, frames, collected, with_page=options.page)
+    return entry
+
+
+def _spent(out: Path) -> dict[str, Any]:
+    """Return the iterations and seconds of everything that was trained, and the most memory of one training."""
+    stages = [stage for run in _trained(out) for stage in run.metrics()["stages"]]
+    return {
+        "name": STAGE,
+        "iterations": sum(stage["iterations"] for stage in stages),
+        "seconds": round(sum(stage["seconds"] for stage in stages), 3),
+        "peak_memory_bytes": max((stage.get("peak_memory_bytes") or 0 for stage in stages), default=0),
+    }
+
+
+def _trained(out: Path) -> Iterable[RunFolder]:
+    split = read_split(partition_folder(out))
+    folders = [block_folder(out, block.name) for block in split.blocks if not block.skipped]
+    return [RunFolder(path) for path in (coarse_folder(out), *folders, seam_folder(out)) if is_run(path)]

@@ -1,0 +1,254 @@
+"""One of the paper's tables, or a table of chosen recipes: plan, train and score, aggregate, write table and page."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from gs2d.config.surface_protocols import DTU_SURFACE, TNT_SURFACE, VISIBLE_SURFACE
+from gs2d.contrib.lab.aggregate import FIGURES, ClaimResult, Results, Row, check_claims, read_cell
+from gs2d.contrib.lab.deviations import deviations_of
+from gs2d.contrib.lab.execute import execute
+from gs2d.contrib.lab.options import PaperOptions, SweepOptions, TableOptions
+from gs2d.contrib.lab.plan import Plan, commands_of, make_plan, paper_command
+from gs2d.contrib.lab.render import to_csv, to_latex, to_markdown, write_page
+from gs2d.contrib.lab.scenes import FoundScene
+from gs2d.contrib.lab.tables import DTU, TNT, PaperRow, PaperTable
+from gs2d.contrib.lab.tasks import failures
+from gs2d.core.files import atomic_write
+from gs2d.core.json_files import read_json, write_json
+from gs2d.errors import RunError
+from gs2d.io.run_dir import machine, make_folder, versions
+from gs2d.pipeline.events import Notice, OnEvent, ignore
+
+ABOUT = "about.json"
+FIXED = ("table", "protocol", "schedule_scale", "downscale", "backend", "overrides")  # of all runs in a folder
+
+
+@dataclass(frozen=True)
+class PaperResult:
+    """What came out.
+
+    Attributes
+    ----------
+    files : tuple of Path
+        table.json first.
+    results : Results
+    checked : tuple of ClaimResult
+    failures : dict
+        Job -> reason, of runs that failed.
+    unfinished : int
+        Runs that are not there yet (tabulated without training).
+    """
+
+    table: PaperTable
+    files: tuple[Path, ...]
+    results: Results
+    checked: tuple[ClaimResult, ...]
+    failures: dict[str, str]
+    unfinished: int
+
+
+def paper(options: PaperOptions | SweepOptions, on_event: OnEvent = ignore) -> PaperResult:
+    """Train what a table needs and is not there, and write the table.
+
+    A run that fails leaves its cells empty, with the reason; the others go on.
+
+    Raises
+    ------
+    Gs2dError
+        The options or the data folder are wrong, or another process works in the folder; nothing is trained then.
+    """
+    asked = make_plan(options)
+    check_folder(asked)
+    plan = with_other_rows(asked)
+    others = [row.name for row in plan.table.rows if row not in asked.table.rows]
+    if others:
+        on_event(Notice(f"{options.out} has rows of earlier commands, which stay: {', '.join(others)}"))
+    if options.train:
+        if options.lpips_weights is not None:
+            from gs2d.evaluation.lpips import load_lpips  # loads torch
+
+            load_lpips(options.lpips_weights)  # a wrong file is said now, not after hours of training
+        execute(
+            plan.jobs,
+            options.out,
+            on_event,
+            slots=options.slots,
+            threads=options.threads,
+            backend=options.backend,
+            cluster=options.cluster,
+            before=lambda: write_json(options.out / ABOUT, about(plan, None, ())),
+            after_job=lambda _job: tabulate(plan, images=False),
+        )
+    return tabulate(plan, on_event)
+
+
+def with_other_rows(plan: Plan) -> Plan:
+    """Return a sweep's plan with the rows of earlier commands too: none takes them away."""
+    options, path = plan.options, plan.options.out / ABOUT
+    if not isinstance(options, SweepOptions) or not path.exists():
+        return plan
+    found = _about(path).get("recipes")
+    if not isinstance(found, list):
+        raise RunError(f"{path} must list the recipes of its sweep, got {found!r}; choose another --out")
+    names = tuple(dict.fromkeys([*map(str, found), *options.recipes]))
+    return plan if names == options.recipes else make_plan(replace(options, recipes=names))
+
+
+def check_folder(plan: Plan) -> None:
+    """Refuse a folder whose runs were made for something else."""
+    path = plan.options.out / ABOUT
+    if plan.options.out.is_file():
+        raise RunError(f"--out must be a folder, {plan.options.out} is a file")
+    if not path.exists():
+        return
+    before, after = _about(path).get("options"), json.loads(json.dumps(_defining(plan.options)))
+    if not isinstance(before, dict):
+        raise RunError(f"{path} must be one that gs2d paper or sweep wrote, got another file; choose another --out")
+    for name, value in after.items():
+        if before.get(name) != value:
+            raise RunError(
+                f"{plan.options.out} holds a table made with {name} = {before.get(name)}, now {value}; "
+                "choose another --out (--cache may stay: stages that are the same are taken from there)"
+            )
+
+
+def _about(path: Path) -> dict[str, Any]:
+    """Return what ``about.json`` of a folder holds."""
+    found = read_json(path)
+    if isinstance(found, dict):
+        return found
+    raise RunError(f"{path} must be one that gs2d paper or sweep wrote, got another file; choose another --out")
+
+
+def _defining(options: TableOptions) -> dict[str, Any]:
+    return {name: getattr(options, name) for name in FIXED}
+
+
+# -- tabulating ------------------------------------------------------------------------------------------------------
+def tabulate(plan: Plan, on_event: OnEvent = ignore, *, images: bool = True) -> PaperResult:
+    """Write table.json, .md, .csv, .tex, about.json and (with ``pictures``) index.html, from the runs as they are."""
+    unfinished = sum(job.outcome()["state"] not in ("done", "failed") for job in plan.jobs)
+    results = Results(tuple(_row(plan, row) for row in plan.table.rows))
+    checked = check_claims(plan.table, results)
+    deviations = deviations_of(plan.options, plan.scenes, plan.table, results)
+    out, facts = plan.options.out, about(plan, results, checked)
+    make_folder(out)
+    commands = [line for job in plan.jobs for line in commands_of(job)]
+    write_json(out / "table.json", [row_json(row, results, deviations) for row in results.rows])
+    write_json(out / ABOUT, {**facts, "deviations": deviations})
+    texts = {
+        "table.md": to_markdown(plan.table, results, checked, deviations, [facts["command"], *commands]),
+        "table.csv": to_csv(results),
+        "table.tex": to_latex(plan.table, results),
+    }
+    for name, text in texts.items():
+        with atomic_write(out / name, "w") as file:
+            file.write(text)
+    files = [out / name for name in ("table.json", *texts, ABOUT)]
+    if images:
+        files.append(write_page(plan.table, results, checked, deviations, commands, facts, out, on_event))
+    return PaperResult(plan.table, tuple(files), results, checked, failures(plan.jobs), unfinished)
+
+
+def _row(plan: Plan, row: PaperRow) -> Row:
+    cells, commands = [], []
+    for scene in plan.scenes if row.recipe is not None else ():
+        for seed in plan.options.seeds:
+            job = plan.cells[str(row.recipe), scene.name, seed]
+            cells.append(
+                read_cell(
+                    job.train.out,
+                    scene=scene.name,
+                    data_set=scene.data_set,
+                    seed=seed,
+                    test_on=scene.protocol.test_on,
+                    record=job.outcome(),
+                    conventions=scene.protocol.metrics,
+                )
+            )
+            commands += commands_of(job)
+    paper_figures = {data_set: dict(figures) for data_set, figures in row.paper.items()}
+    return Row(row.name, row.recipe, paper_figures, row.note, tuple(cells), tuple(commands))
+
+
+def row_json(row: Row, results: Results, deviations: Sequence[str]) -> dict[str, Any]:
+    """Return a row of table.json."""
+    return {
+        "name": row.name,
+        "recipe": row.recipe,
+        "mean": results.mean(row),
+        "mean_over": {name: results.scenes(name) if row.cells else [] for name in FIGURES},
+        "spread": results.spread(row),
+        "reasons": results.reasons(row),
+        "data_sets": {d: {"mean": results.mean(row, d), "spread": results.spread(row, d)} for d in results.data_sets},
+        "scenes": [cell.to_json() for cell in row.cells],
+        "paper": row.paper,
+        "note": row.note,
+        "deviations": list(deviations) if row.recipe is not None else [],
+        "commands": list(row.commands),
+    }
+
+
+def about(plan: Plan, results: Results | None, checked: Sequence[ClaimResult]) -> dict[str, Any]:
+    """Return what the whole table was made with."""
+    options = plan.options
+    return {
+        "table": plan.table.name,
+        "title": plan.table.title,
+        "recipes": [row.recipe for row in plan.table.trained],
+        "options": _defining(options),
+        "data": str(options.data),
+        "scenes": {scene.name: {"data_set": scene.data_set, **_scene_facts(scene)} for scene in plan.scenes},
+        "protocols": {name: numbers_of(protocol) for name, protocol in _protocols(plan).items()},
+        "seeds": list(options.seeds),
+        "spread": "standard deviation over seeds of the mean over scenes",
+        "claims": [claim.to_json() for claim in checked],
+        "failures": failures(plan.jobs) if results is not None else {},
+        "command": paper_command(options),
+        "versions": versions(),
+        "machine": machine(),
+        "written": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+    }
+
+
+def _protocols(plan: Plan) -> dict[str, Any]:
+    """Return the protocols of the scenes, and those that surfaces are scored by."""
+    found: dict[str, Any] = {scene.protocol.name: scene.protocol for scene in plan.scenes}
+    surfaces = {DTU: ("surface: dtu", DTU_SURFACE), TNT: ("surface: tnt", TNT_SURFACE)}
+    for scene in plan.scenes:
+        if scene.scored:
+            name, protocol = surfaces.get(scene.data_set, ("surface: visible", VISIBLE_SURFACE))
+            found[name] = protocol
+    return found
+
+
+def numbers_of(protocol: Any, within: str = "") -> dict[str, str]:
+    """Return every number of a protocol in words, by the name of its field, those of its parts with a dot."""
+    found: dict[str, str] = {}
+    for field in fields(protocol):
+        value, name = getattr(protocol, field.name), within + field.name
+        if is_dataclass(value):
+            found |= numbers_of(value, f"{name}.")
+        elif name != "name":
+            found[name] = _words(value)
+    return found
+
+
+def _words(value: Any) -> str:
+    if value is None:
+        return "derived"
+    if is_dataclass(value):
+        return ", ".join(f"{name} {text}" for name, text in numbers_of(value).items())
+    return "; ".join(map(_words, value)) if isinstance(value, tuple) else str(value)
+
+
+def _scene_facts(scene: FoundScene) -> dict[str, Any]:
+    truth = "found beside it" if scene.scored and scene.truth is None else scene.truth and str(scene.truth)
+    facts = {"path": str(scene.path), "format": scene.format, "downscale": scene.downscale, "ground_truth": truth}
+    return {**facts, "missing": list(scene.missing), "protocol": asdict(scene.protocol)}

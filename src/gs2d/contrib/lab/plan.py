@@ -1,0 +1,173 @@
+"""What a table needs before a photograph is read: its scenes, its recipes, and the run of each of them.
+
+`gs2d paper` and `gs2d sweep` are two plans of one machine: recipes x scenes x seeds become jobs, which differ in who
+names the recipes.
+"""
+
+from __future__ import annotations
+
+import itertools
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+from gs2d.config.presets import get_recipe
+from gs2d.config.recipe import Recipe, validate
+from gs2d.config.recipe_files import short_name
+from gs2d.config.schedule import scale_schedule
+from gs2d.config.serialize import apply_overrides, to_json
+from gs2d.contrib.lab.jobs import Job, stage_keys
+from gs2d.contrib.lab.options import PaperOptions, SweepOptions, TableOptions
+from gs2d.contrib.lab.scenes import FoundScene, find_scenes
+from gs2d.contrib.lab.tables import PAPER_TABLES, PaperTable, recipe_table
+from gs2d.errors import RecipeError
+from gs2d.io.run_dir import versions
+from gs2d.pipeline.prepare.options import EvaluateOptions, TrainOptions
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A table's work: its scenes, and the job of every (recipe of a row, scene, seed)."""
+
+    options: PaperOptions | SweepOptions
+    table: PaperTable
+    scenes: tuple[FoundScene, ...]
+    cells: Mapping[tuple[str, str, int], Job]
+
+    @property
+    def jobs(self) -> tuple[Job, ...]:
+        """Each once: rows whose recipes train the same share theirs."""
+        return tuple({job.name: job for job in self.cells.values()}.values())
+
+
+def make_plan(options: PaperOptions | SweepOptions) -> Plan:
+    """Decide everything that can be decided, and can be wrong, before a photograph is read."""
+    table = _table(options)
+    if not options.seeds or len(set(options.seeds)) != len(options.seeds):
+        raise RecipeError(
+            f"--seeds must be different whole numbers, got {', '.join(map(str, options.seeds)) or 'none'}"
+        )
+    for name in ("downscale", "threads", "slots"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise RecipeError(f"--{name} must be a whole number >= 1, got {value}")
+    scenes = find_scenes(options.data, options.scenes, protocol=options.protocol, truths=options.truth)
+    recipes = {row.recipe: trained_recipe(row.recipe, options) for row in table.rows if row.recipe is not None}
+    _check_overrides(options.overrides, [get_recipe(name) for name in recipes])
+    cells = {
+        (name, scene.name, seed): make_job(options, scene, name, recipe, seed)
+        for scene, seed, (name, recipe) in itertools.product(scenes, options.seeds, recipes.items())
+    }
+    return Plan(options, table, scenes, cells)
+
+
+def _table(options: PaperOptions | SweepOptions) -> PaperTable:
+    """Return the rows that are asked for."""
+    if isinstance(options, SweepOptions):
+        if not options.recipes:
+            raise RecipeError("`gs2d sweep` needs the name of a recipe or more; `gs2d recipes` lists them")
+        for name in options.recipes:
+            get_recipe(name)  # a name that is wrong is said before anything is looked for
+        return recipe_table(options.recipes)
+    if options.table not in PAPER_TABLES:
+        raise RecipeError(f"no table {options.table!r} in the paper; there is {', '.join(PAPER_TABLES)}")
+    return PAPER_TABLES[options.table]
+
+
+def trained_recipe(name: str, options: TableOptions) -> Recipe:
+    """Return a named recipe at the schedule and with the changes of the options."""
+    recipe = scale_schedule(get_recipe(name), options.schedule_scale)
+    return validate(apply_overrides(recipe, fitting_overrides(recipe, options.overrides)))
+
+
+def fitting_overrides(recipe: Recipe, overrides: Sequence[str]) -> tuple[str, ...]:
+    """Return the overrides that speak of the recipe itself or of a stage that it has."""
+    stages = {stage.name for stage in recipe.stages}
+    heads = {text: text.partition("=")[0].split(".") for text in overrides}
+    return tuple(text for text in overrides if len(heads[text]) == 1 or heads[text][0] in stages)
+
+
+def _check_overrides(overrides: Sequence[str], recipes: Sequence[Recipe]) -> None:
+    for text in overrides:
+        if not any(fitting_overrides(recipe, (text,)) for recipe in recipes):
+            stages = dict.fromkeys(stage.name for recipe in recipes for stage in recipe.stages)
+            raise RecipeError(f"--set {text} fits no recipe of the table; their stages are {', '.join(stages)}")
+
+
+def make_job(options: TableOptions, scene: FoundScene, name: str, recipe: Recipe, seed: int) -> Job:
+    """Return the run of a recipe (``trained_recipe`` of the name) on a scene."""
+    downscale = options.downscale or scene.downscale
+    train = TrainOptions(
+        scene=scene.path,
+        out=options.out / "runs" / f"{scene.name}-{short_name(name)}-s{seed}",
+        recipe=name,
+        protocol=scene.protocol.name if options.protocol == "auto" else options.protocol,
+        robust="auto" if isinstance(options, SweepOptions) else "off",  # the paper has none of it
+        backend=options.backend,
+        format=scene.format,
+        downscale=downscale,
+        schedule_scale=options.schedule_scale,
+        overrides=fitting_overrides(recipe, options.overrides),
+        seed=seed,
+        resume=True,
+        cache=options.cache or options.out / "cache",
+        threads=options.threads,
+        page=False,  # of dozens of runs nobody looks at each, and it is as large as the splats
+    )
+    evaluate = None
+    if scene.scored or options.lpips_weights is not None:
+        evaluate = EvaluateOptions(ground_truth=scene.truth, lpips_weights=options.lpips_weights)
+    facts = (str(scene.path.resolve()), scene.protocol, downscale, seed, options.backend, versions()["2dgs-r"])
+    return Job(
+        name=train.out.name,
+        record=options.out / "jobs" / f"{train.out.name}.json",
+        train=train,
+        evaluate=evaluate,
+        stage_keys=stage_keys((*map(repr, facts), recipe.init_points, recipe.sh_degree), to_json(recipe)["stages"]),
+        wanted=tuple(_wanted(scene, options)),
+    )
+
+
+def _wanted(scene: FoundScene, options: TableOptions) -> Iterator[str]:
+    """Yield what is scored: a run that was scored without it is scored again."""
+    if scene.scored:
+        yield f"surface: {scene.truth.resolve() if scene.truth else 'official'}"
+    if options.lpips_weights is not None:
+        yield f"lpips: {options.lpips_weights.resolve()}"
+
+
+# -- the commands that do it -------------------------------------------------------------------------------------------
+def paper_command(options: PaperOptions | SweepOptions) -> str:
+    """Return the command that makes a table."""
+    words = ["sweep", *options.recipes] if isinstance(options, SweepOptions) else ["paper", options.table]
+    said = ("table", "recipes", "slots", "threads", "cluster", "train", "quiet", "verbose", "json", "debug")
+    return _command(words, options, said)
+
+
+def commands_of(job: Job) -> list[str]:
+    """Return the `gs2d train` and `gs2d evaluate` lines that do what a job does."""
+    words = ["train", str(job.train.scene), "--out", str(job.train.out), "--recipe", str(job.train.recipe)]
+    lines = [_command(words, job.train, ("scene", "out", "recipe", "resume"))]
+    if job.evaluate is not None:
+        lines.append(_command(["evaluate", str(job.train.out)], job.evaluate, ()))
+    return lines
+
+
+def _command(words: Sequence[str], options: Any, said: Sequence[str]) -> str:
+    """Return a command line: its first words, and each option that is not at its default, but for those ``said``."""
+    line = ["gs2d", *words]
+    for field in fields(options):
+        value = getattr(options, field.name)
+        if field.name in said or value == field.default:
+            continue
+        flag = "--" + field.name.replace("_", "-")
+        if field.name == "overrides":
+            line += [word for text in value for word in ("--set", text)]
+        elif field.name == "seeds":  # one number alone would be a count
+            line += [flag, ",".join(map(str, value)) + ("," if len(value) == 1 else "")]
+        elif value is False:
+            line.append(f"--no-{flag[2:]}")
+        else:
+            line += [flag, *map(str, value if isinstance(value, tuple) else (value,))]
+    return shlex.join(line)

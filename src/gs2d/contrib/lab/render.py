@@ -1,0 +1,406 @@
+"""A table as a page, Markdown, CSV and LaTeX: what was measured, and the paper's figures beside.
+
+Page and Markdown are templates (``templates/``); what they show of a data set is a :class:`Part`.
+"""
+
+from __future__ import annotations
+
+import csv
+import functools
+import io
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jinja2
+from markupsafe import Markup
+
+from gs2d.config.presets import about_recipe, get_recipe
+from gs2d.contrib.lab.aggregate import FIGURES, Cell, ClaimResult, Results, Row
+from gs2d.contrib.lab.tables import LOWER_IS_BETTER, METRICS, PaperTable, printed
+from gs2d.core.files import atomic_write
+from gs2d.data.image_files import read_image
+from gs2d.errors import Gs2dError
+from gs2d.io.run_dir import RENDERS
+from gs2d.pipeline.events import OnEvent, ignore
+from gs2d.report.html import drawing, image_tag, page
+from gs2d.report.sections.pictures import read_index
+
+DIGITS = {"fscore": 3, "chamfer": 3, "psnr": 2, "ssim": 4, "lpips": 4, "bytes": 2, "seconds": 0}
+TITLES = {**METRICS, "bytes": "MB", "seconds": "s"}
+COSTS = ("bytes", "seconds")  # shown without a spread and without a best
+RUN_METRICS = ("psnr", "ssim", "lpips", "fscore", "chamfer")
+RUN_HEADS = ["row", "scene", "seed", *(METRICS[m] for m in RUN_METRICS), "splats", "PSNR at the clone", "MB", "s"]
+IMAGES = {"color": "Colour", "normal": "Normals", "error": "Error"}
+IMAGE_WIDTH = 300  # px
+FIGURE_TITLES = {
+    "traces": "Mean coverage K_a and mean opacity over the iterations",
+    "changes": "How much each attribute changes an iteration",
+}
+MAP_TITLE = "E_i, the colour error of each splat, and the high-error splats"
+
+
+def shown(metric: str, value: float | None) -> str:
+    """Return a figure with its digits (bytes as MB), or a dash."""
+    if value is None:
+        return "-"
+    value = value / 1e6 if metric == "bytes" else value
+    digits = DIGITS[metric]
+    if metric == "chamfer" and abs(value) < 0.1:  # world units, not millimetres
+        digits = 5
+    if metric == "seconds" and abs(value) < 10:
+        digits = 1
+    return f"{value:.{digits}f}"
+
+
+# -- what is shown of a data set ---------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class Figure:
+    """A figure as it is shown: the mean ("" in rows that are quoted), its spread over seeds, the paper's; "": none."""
+
+    text: str
+    spread: str
+    paper: str
+    best: bool
+
+    @property
+    def measured(self) -> str:
+        """The mean with its spread."""
+        return f"{self.text} ± {self.spread}" if self.spread else self.text
+
+    @property
+    def markdown(self) -> str:
+        """As a cell in Markdown."""
+        ours = f"**{self.measured}**" if self.best else self.measured
+        return f"{ours} {f'({self.paper})' if self.paper else ''}".strip() or "-"
+
+
+@dataclass(frozen=True)
+class ShownRow:
+    """A row of a part; ``about``: what is trained for it, or whose figures they are."""
+
+    name: str
+    quoted: bool
+    about: str
+    figures: tuple[Figure, ...]
+
+
+@dataclass(frozen=True)
+class Part:
+    """The part of a table that a data set has: what was measured, or the paper's figures alone.
+
+    Attributes
+    ----------
+    data_set : str
+    trained : bool
+    columns : tuple of str
+        Metrics.
+    rows : tuple of ShownRow
+    scenes : list of str
+        Those that the means are taken over.
+    """
+
+    data_set: str
+    trained: bool
+    columns: tuple[str, ...]
+    rows: tuple[ShownRow, ...]
+    scenes: list[str]
+
+    @property
+    def heads(self) -> list[str]:
+        """The columns as they are called; an arrow says which way is better."""
+        arrows = {m: "" if m in COSTS else " ↓" if m in LOWER_IS_BETTER else " ↑" for m in TITLES}
+        return [TITLES[metric] + arrows[metric] for metric in self.columns]
+
+    @property
+    def quoted_cells(self) -> list[list[str]]:
+        """The paper's figures alone, with the names of the rows before them."""
+        return [[row.name, *(figure.paper or "-" for figure in row.figures)] for row in self.rows]
+
+
+def parts_of(table: PaperTable, results: Results) -> list[Part]:
+    """Return a part for each data set that was trained, then one for each other one of the paper's."""
+    untrained = [data_set for data_set in table.columns if data_set not in results.data_sets]
+    return [_part(table, results, data_set) for data_set in (*results.data_sets, *untrained)]
+
+
+def _part(table: PaperTable, results: Results, data_set: str) -> Part:
+    columns, trained = list(table.columns.get(data_set, ())), data_set in results.data_sets
+    means = {row.name: results.mean(row, data_set) for row in results.rows}
+    if trained:  # what else was measured
+        have = {name for mean in means.values() for name, value in mean.items() if value is not None}
+        more = ("fscore", "psnr", "ssim", "lpips", "chamfer")
+        columns += [*(name for name in more if name in have and name not in columns), *COSTS]
+    tops = {metric: _best(metric, [mean[metric] for mean in means.values()]) for metric in columns}
+    rows = []
+    for row in results.rows:
+        paper = row.paper.get(data_set, {})
+        if not (row.of(data_set) or paper):
+            continue
+        spread, is_measured = results.spread(row, data_set), bool(row.of(data_set))
+        figures = []
+        for metric in columns:
+            text = shown(metric, means[row.name][metric]) if is_measured else ""
+            around = "" if metric in COSTS or spread[metric] is None else shown(metric, spread[metric])
+            quoted = printed(metric, data_set, paper[metric]) if metric in paper else ""
+            figures.append(Figure(text, around, quoted, best=is_measured and text == tops[metric]))
+        about = "; ".join(filter(None, (row.note, about_row(row))))
+        rows.append(ShownRow(row.name, row.recipe is None, about, tuple(figures)))
+    return Part(data_set, trained, tuple(columns), tuple(rows), results.scenes("psnr", data_set))
+
+
+def _best(metric: str, means: Sequence[float | None]) -> str:
+    """Return the best of several figures as it is shown: rows that look alike are marked alike; "" without one."""
+    known = [value for value in means if value is not None]
+    if metric in COSTS or len(known) < 2:
+        return ""
+    return shown(metric, (min if metric in LOWER_IS_BETTER else max)(known))
+
+
+def about_row(row: Row) -> str:
+    """Return what is trained for a row: the name of one of the paper's says what the table is about."""
+    if row.recipe is None:
+        return ""
+    about = about_recipe(row.recipe)
+    return about if row.name == row.recipe else about.partition(": ")[2] or about
+
+
+def claim_text(claim: ClaimResult) -> str:
+    """Return one line about a claim: its steps with differences and spread."""
+    if claim.holds == "unknown":
+        return claim.reason
+    steps = claim.steps
+    if claim.kind == "flat":
+        steps = (max(steps, key=lambda step: abs(step.difference)),)
+    words = []
+    for step in steps:
+        spread = "" if step.spread is None else f" ± {shown(claim.metric, step.spread)}"
+        seeds = f", {step.seeds_with_sign} of {step.seeds} seeds" if step.seeds > 1 else ""
+        sign = "+" if step.difference >= 0 else ""
+        words.append(f"{step.lower} → {step.upper}: {sign}{shown(claim.metric, step.difference)}{spread}{seeds}")
+    prefix = "largest difference: " if claim.kind == "flat" else ""
+    return prefix + "; ".join(words)
+
+
+def deviations_title(table: PaperTable) -> str:
+    """Return what stands above the deviations."""
+    return "How this differs from the paper" if table.of_paper else "What to know about these figures"
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+@functools.cache
+def _templates() -> jinja2.Environment:
+    env = jinja2.Environment(
+        loader=jinja2.PackageLoader("gs2d.contrib.lab"),
+        autoescape=jinja2.select_autoescape(["html"], default=False),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    env.globals |= {"claim_text": claim_text, "deviations_title": deviations_title, "METRICS": METRICS}
+    return env
+
+
+def to_markdown(
+    table: PaperTable,
+    results: Results,
+    checked: Sequence[ClaimResult],
+    deviations: Sequence[str],
+    commands: Sequence[str],
+) -> str:
+    """Return the whole result as Markdown."""
+    values = {"table": table, "checked": checked, "deviations": deviations, "commands": commands}
+    return _templates().get_template("table.md").render(values, parts=parts_of(table, results))
+
+
+def to_csv(results: Results) -> str:
+    """Return one line for each row, data set, scene and seed, and one with the mean of each data set.
+
+    The paper's figures have columns where some row has any.
+    """
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    quoted = METRICS if any(row.paper for row in results.rows) else ()
+    writer.writerow(["row", "recipe", "data_set", "scene", "seed", *FIGURES, *(f"paper_{m}" for m in quoted)])
+    for row in results.rows:
+        for data_set in dict.fromkeys([*(c.data_set for c in row.cells), *row.paper]):
+            place, paper = (row.name, row.recipe, data_set), [row.paper.get(data_set, {}).get(m) for m in quoted]
+            for cell in row.of(data_set):
+                figures = [cell.figures[name] for name in FIGURES]
+                writer.writerow([*place, cell.scene, cell.seed, *figures, *[None] * len(paper)])
+            if row.of(data_set) or any(paper):  # else another method, of which the paper has nothing here
+                writer.writerow([*place, "mean", None, *results.mean(row, data_set).values(), *paper])
+    return out.getvalue()
+
+
+_TEX = str.maketrans(
+    {
+        **{c: f"\\{c}" for c in "&%_#${}"},
+        "\\": r"\textbackslash{}",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        "<": r"\textless{}",
+        ">": r"\textgreater{}",
+        "±": r"$\pm$",
+        "↓": r"$\downarrow$",
+        "↑": r"$\uparrow$",
+    }
+)
+
+
+def to_latex(table: PaperTable, results: Results) -> str:
+    """Return ``booktabs`` tables in one float: the measured figures, the paper's in small print below.
+
+    Data sets that nothing was trained on follow with the paper's figures alone.
+    """
+    lines = ["% \\usepackage{booktabs}", "\\begin{table}", "  \\centering"]
+    for part in parts_of(table, results):
+        heads = [part.data_set, *(head.replace(" ↑", "↑").replace(" ↓", "↓") for head in part.heads)]
+        lines += [f"  \\begin{{tabular}}{{l{'c' * len(part.columns)}}}", "    \\toprule"]
+        lines += ["    " + " & ".join(head.translate(_TEX) for head in heads) + r" \\", "    \\midrule"]
+        for row in part.rows:
+            papers = [f"\\footnotesize({figure.paper})" if figure.paper else "" for figure in row.figures]
+            ours = [figure.measured.translate(_TEX) for figure in row.figures]
+            ours = [f"\\textbf{{{text}}}" if f.best else text for f, text in zip(row.figures, ours, strict=True)]
+            if not any(ours):
+                ours, papers = [figure or "-" for figure in papers], []
+            lines.append(f"    {row.name.translate(_TEX)} & " + " & ".join(ours) + r" \\")
+            if any(papers):
+                lines.append("     & " + " & ".join(papers) + r" \\")
+        lines += ["    \\bottomrule", "  \\end{tabular}", "  \\par\\medskip"]
+    quoted = " In brackets: the figures of the paper." if table.of_paper else ""
+    caption = f"{table.title}.{quoted}".translate(_TEX)
+    lines += [f"  \\caption{{{caption}}}", f"  \\label{{{table.label}-measured}}", "\\end{table}", ""]
+    return "\n".join(lines)
+
+
+# -- the page ----------------------------------------------------------------------------------------------------------
+def write_page(
+    table: PaperTable,
+    results: Results,
+    checked: Sequence[ClaimResult],
+    deviations: Sequence[str],
+    commands: Sequence[str],
+    about: dict[str, Any],
+    out: Path,
+    on_event: OnEvent = ignore,
+) -> Path:
+    """Write ``index.html`` into a folder."""
+    template = _templates().get_template("page.html")
+    body = template.render(
+        table=table,
+        parts=parts_of(table, results),
+        checked=checked,
+        known=[claim for claim in checked if claim.holds != "unknown"],
+        deviations=deviations,
+        scenes=side_by_side(results),
+        changes=own_figures(results, out, on_event),
+        run_heads=RUN_HEADS,
+        runs=[_run(row, cell) for row in results.rows for cell in row.cells],
+        about=about,
+        commands=commands,
+    )
+    path = out / "index.html"
+    with atomic_write(path, "w") as file:
+        file.write(page(f"{table.title} - {table.command}", [body]))
+    return path
+
+
+def _run(row: Row, cell: Cell) -> list[str | Markup]:
+    """Return a row of the table of all runs, with the reason where there are no figures."""
+    figures: list[str | Markup] = [shown(metric, cell.figures[metric]) for metric in RUN_METRICS]
+    if cell.figures["psnr"] is None:
+        figures = [Markup('-<span class="why">{}</span>').format(cell.reasons.get("psnr", "")), *"----"]
+    splats = f"{cell.details['splats']:,}" if "splats" in cell.details else "-"
+    costs = [shown(name, cell.figures[name]) for name in COSTS]
+    return [row.name, cell.scene, str(cell.seed), *figures, splats, at_the_clone(cell), *costs]
+
+
+def at_the_clone(cell: Cell) -> str:
+    """Return PSNR just before the clone, just after it, and at the end."""
+    for before, after in itertools.pairwise(cell.details.get("stages", [])):
+        if "psnr_after_clone" in after:
+            return " → ".join(shown("psnr", v) for v in (before["psnr"], after["psnr_after_clone"], after["psnr"]))
+    return "-"
+
+
+def side_by_side(results: Results) -> list[dict[str, Any]]:
+    """Return one view of each scene, by every trained row: its name, and a list of pictures of each kind."""
+    found: list[dict[str, Any]] = []
+    for scene, runs in _runs_by_scene(results).items():
+        index = read_index(next(iter(runs.values())) / RENDERS) if runs else {"views": [None]}
+        for view in (index or {"views": []})["views"][:1]:
+            found.append({"name": scene, "view": view, "runs": list(runs)})
+            if view is None:
+                continue
+            photo = next(iter(runs.values())) / RENDERS / "photos" / f"{view.get('file', '')}.png"
+            found[-1]["images"] = images = {}
+            for what, title in IMAGES.items():
+                first = _image(photo, f"{scene}: photograph") if what == "color" else Markup("<div></div>")
+                others = [(name, _last_image(run, view.get("file", ""), what)) for name, run in runs.items()]
+                images[title] = [first, *(_image(p, f"{scene}, {name}: {title.lower()}") for name, p in others)]
+    return found
+
+
+def _runs_by_scene(results: Results) -> dict[str, dict[str, Path]]:
+    """Scene -> row -> the run of the first seed that has pictures."""
+    found: dict[str, dict[str, Path]] = {}
+    for row in results.rows:
+        for cell in sorted(row.cells, key=lambda cell: cell.seed):
+            runs = found.setdefault(cell.scene, {})
+            if (cell.run / RENDERS / "index.json").exists():
+                runs.setdefault(row.name, cell.run)
+    return found
+
+
+def _last_image(run: Path, file: str, what: str) -> Path:
+    """Return a picture after the last stage that was drawn."""
+    stages = (read_index(run / RENDERS) or {"stages": []})["stages"]
+    return run / RENDERS / (stages[-1] if stages else "none") / f"{file}.{what}.png"
+
+
+def _image(path: Path, alt: str) -> Markup:
+    found = image_tag(read_image(path), alt=alt, width=IMAGE_WIDTH) if path.exists() else '<div class="soft">none</div>'
+    return Markup(found)
+
+
+def own_figures(results: Results, out: Path, on_event: OnEvent) -> list[dict[str, Any]]:
+    """Return the paper's figures of each scene: K_a and opacity, traces of the attributes, a map of E_i."""
+    from gs2d.contrib.lab.figures import coverage, write_figures  # loads torch
+
+    found = []
+    ranking = {row.name for row in results.rows if row.recipe is not None and _ranks(row.recipe)}
+    for scene, runs in _runs_by_scene(results).items():
+        maps = [name for name in runs if name in ranking][-1:]  # they need the photographs: one is enough
+        section: dict[str, Any] = {"name": scene, "error": "", "drawings": [], "coverage": []}
+        try:
+            if runs:
+                paths = write_figures(runs, out / "figures" / scene, on_event, maps=maps)
+                section["drawings"] = [_drawing(path) for path in paths]
+                section["coverage"] = coverage_rows(coverage(runs))
+        except Gs2dError as error:
+            section["error"] = str(error)
+        if any(section[key] for key in ("error", "drawings", "coverage")):
+            found.append(section)
+    return found
+
+
+def coverage_rows(means: Mapping[str, Sequence[float]]) -> list[list[str]]:
+    """Return mean K_a and opacity of each row after stage 1, and both at the end."""
+    forms = (".2e", ".3f", ".2e", ".3f")
+    return [[name, *(f"{v:{form}}" for v, form in zip(values, forms, strict=True))] for name, values in means.items()]
+
+
+def _ranks(recipe: str) -> bool:
+    """Whether a recipe ranks splats by their error."""
+    return any(stage.name == "appearance" for stage in get_recipe(recipe).stages)
+
+
+def _drawing(path: Path) -> Markup:
+    title = FIGURE_TITLES.get(path.stem, MAP_TITLE)
+    if path.suffix == ".svg":
+        return Markup(drawing(path.read_text(encoding="utf-8"), title))
+    return Markup(image_tag(read_image(path), title, alt=title, width=1400))

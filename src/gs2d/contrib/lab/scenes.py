@@ -1,0 +1,196 @@
+"""The scenes under a folder, the protocol of each, and the ground truth that lies beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from gs2d.config.datasets import DATASETS, DataSet, SceneFacts
+from gs2d.config.protocols import Protocol, get_protocol
+from gs2d.contrib.lab.tables import DTU, NERF_SYNTHETIC, TNT
+from gs2d.data import detect_format
+from gs2d.data.benchmarks import DEPTH, MESH_TRUTHS, find_truth, missing_lines, protocol_of, recognise, subfolders
+from gs2d.errors import DataError
+
+PAPER_NAMES = {"dtu": DTU, "tnt": TNT, "nerf-synthetic": NERF_SYNTHETIC, "mip-nerf-360": "Mip-NeRF 360"}
+OFFICIAL = ("dtu", "tnt")  # evaluators that need several files
+
+
+@dataclass(frozen=True)
+class FoundScene:
+    """A capture.
+
+    Attributes
+    ----------
+    name : str
+        Its folder's name.
+    path : Path
+    format : str
+    protocol : Protocol
+    downscale : int
+        What its protocol divides the image size by.
+    data_set : str
+        By the paper's name; "other (PROTOCOL)" for captures that are no scene of a known data set.
+    scene : str
+        The data set's name of it; the folder's for others.
+    truth : Path or None
+        Ground truth to give to the evaluation; None: none, or what it finds itself.
+    scored : bool
+        Whether there is a ground truth.
+    missing : tuple of str
+        One line for each piece of the capture, and of the ground truth, that a scene of a known data set lacks.
+    """
+
+    name: str
+    path: Path
+    format: str
+    protocol: Protocol
+    downscale: int
+    data_set: str
+    scene: str
+    truth: Path | None
+    scored: bool
+    missing: tuple[str, ...]
+
+
+def find_scenes(
+    data: Path, names: Sequence[str] = (), *, protocol: str = "auto", truths: Path | None = None
+) -> tuple[FoundScene, ...]:
+    """Return the captures at or under a folder, sorted by name.
+
+    Parameters
+    ----------
+    data : Path
+        A capture, or a folder that holds captures (up to ``DEPTH`` levels down).
+    names : sequence of str
+        Only these; "lego" also finds a folder "nerf_synthetic_lego".
+    protocol : str
+        A name, or "auto": by data set and format of each capture.
+    truths : Path, optional
+        Folder of ground truths: ``NAME.ply``, ``NAME.obj``, ``NAME/mesh_gt.ply``, or the official files of DTU and
+        Tanks and Temples.
+
+    Raises
+    ------
+    DataError, ProtocolError
+        No captures, or a name that is not there.
+    """
+    named = None if protocol == "auto" else get_protocol(protocol)
+    if not data.is_dir():
+        raise DataError(
+            f"--data must be a folder of captures, got {'a file' if data.exists() else 'nothing'} at {data}"
+        )
+    if truths is not None and not truths.is_dir():
+        raise DataError(f"--truth must be a folder of true surfaces, found none at {truths}")
+    captures = dict(sorted(_captures(data, DEPTH).items()))
+    broken = unreadable(data)
+    if not captures:
+        why = f"; {'; '.join(broken.values())}" if broken else ""
+        raise DataError(
+            f"{data} must be a capture or hold captures (Blender, nerfstudio, DTU, COLMAP), found none{why}"
+        )
+    if names:
+        chosen = dict.fromkeys(_match(want, captures, data, broken) for want in names)
+        captures = {name: captures[name] for name in chosen}
+    return tuple(_look_at(name, path.resolve(), named, truths) for name, path in captures.items())
+
+
+def _captures(folder: Path, depth: int) -> dict[str, Path]:
+    """Name -> folder of the captures at or below a folder; a capture's own folders are not searched."""
+    if _is_capture(folder):
+        return {folder.resolve().name: folder}
+    found: dict[str, Path] = {}
+    for inner in subfolders(folder) if depth else ():
+        for name, path in _captures(inner, depth - 1).items():
+            if name in found:
+                raise DataError(f"{found[name]} and {path} have the same name; give --data one of them")
+            found[name] = path
+    return found
+
+
+def unreadable(folder: Path, depth: int = DEPTH) -> dict[str, str]:
+    """Name -> what is missing first, of folders that are scenes of known data sets but have no cameras."""
+    if _is_capture(folder):
+        return {}
+    lines = missing_lines(folder)
+    found = {folder.resolve().name: lines[0]} if lines else {}
+    for inner in subfolders(folder) if depth else ():
+        found |= unreadable(inner, depth - 1)
+    return found
+
+
+def _is_capture(folder: Path) -> bool:
+    try:
+        detect_format(folder)
+    except DataError:
+        return False
+    return True
+
+
+def _match(want: str, captures: dict[str, Path], data: Path, broken: dict[str, str]) -> str:
+    """Return the capture that a name means."""
+    close = _named(want, list(captures))
+    if len(close) != 1:
+        why = "".join(f"; {name}: {broken[name]}" for name in _named(want, list(broken)))
+        raise DataError(f"no scene {want!r} in {data}; there is {', '.join(captures)}{why}")
+    return close[0]
+
+
+def _named(want: str, names: Sequence[str]) -> list[str]:
+    """Return the names that are, or else end in, what is wanted."""
+    close = [name for name in names if name.lower() == want.lower()]
+    return close or [name for name in names if name.lower().endswith(f"_{want.lower()}")]
+
+
+def _look_at(name: str, path: Path, named: Protocol | None, truths: Path | None) -> FoundScene:
+    kind = detect_format(path)
+    protocol = named or protocol_of(path, kind, truths)
+    known = recognise(path, truths)
+    if known is not None and protocol.name not in {scene.protocol for scene in known[0].scenes}:
+        known = None  # a capture that only happens to have the name of a scene, or is treated as something else
+    if known is None:
+        data_set = f"other ({protocol.name})"
+        truth = _plain_truth(name, path, truths)
+        return FoundScene(name, path, kind, protocol, protocol.downscale, data_set, name, truth, truth is not None, ())
+    dataset, facts = known
+    truth, scored = _truth_of(dataset, facts, name, path, truths)
+    missing = missing_lines(path)
+    if not scored:
+        missing += tuple(piece.line() for piece in find_truth(dataset, facts, path, truths)[1])
+    place = (PAPER_NAMES[dataset.name], facts.name)
+    downscale = facts.downscale if named is None else protocol.downscale
+    return FoundScene(name, path, kind, protocol, downscale, *place, truth, scored, missing)
+
+
+def _truth_of(
+    dataset: DataSet, facts: SceneFacts, name: str, path: Path, truths: Path | None
+) -> tuple[Path | None, bool]:
+    """Return what to give to the evaluation of a scene of a known data set, and whether it will find a ground truth."""
+    if dataset.evaluator in OFFICIAL:
+        files, lacking = find_truth(dataset, facts, path, truths)
+        if files and not lacking:
+            return truths, True
+    own = _plain_truth(name, path, truths) or _plain_truth(facts.name, path, truths)
+    return own, own is not None
+
+
+def _plain_truth(name: str, capture: Path, folder: Path | None) -> Path | None:
+    """Return a mesh or a cloud of points, in a folder or beside the capture."""
+    candidates = [capture / file for file in MESH_TRUTHS]
+    if folder is not None:
+        own = [folder / f"{name}.ply", folder / f"{name}.obj", *(folder / name / file for file in MESH_TRUTHS)]
+        candidates = [*own, *candidates]
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def missing_scenes(scenes: Sequence[FoundScene]) -> dict[str, tuple[list[str], int]]:
+    """Return data set -> (scenes that were not given, how many it has), for the data sets of which some were given."""
+    found: dict[str, tuple[list[str], int]] = {}
+    for key, data_set in PAPER_NAMES.items():
+        have = {scene.scene for scene in scenes if scene.data_set == data_set}
+        known = [facts.name for facts in DATASETS[key].scenes]
+        absent = [name for name in known if name not in have]
+        if have and absent:
+            found[data_set] = (absent, len(known))
+    return found

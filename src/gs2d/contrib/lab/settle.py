@@ -1,0 +1,264 @@
+"""What all blocks have in common, settled before anything is trained: recipe, protocol, capture, grid."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gs2d.config.densify import Densify
+from gs2d.config.partition import Partition, grid_for
+from gs2d.config.partition import to_json as partition_json
+from gs2d.config.protocols import Protocol
+from gs2d.config.recipe import ALL, GradDensify, Recipe, validate
+from gs2d.config.schedule import longer_steps, scale_schedule
+from gs2d.config.serialize import to_json
+from gs2d.contrib.lab.cells import spread_of
+from gs2d.contrib.lab.split import Block
+from gs2d.core.memory_limit import memory_budget
+from gs2d.core.missing import instead
+from gs2d.core.text import name_bytes
+from gs2d.data import Scene
+from gs2d.data.archive import is_archive
+from gs2d.errors import DataError, RecipeError
+from gs2d.pipeline.events import Notice, OnEvent
+from gs2d.pipeline.prepare.estimate import Estimate, estimate, expected_splats, limit_of
+from gs2d.pipeline.prepare.job import check_train_options, resolve
+from gs2d.pipeline.prepare.opened import open_capture
+from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.render.backends import Backend
+
+FORMAT = 1
+SEAM_RATES = 0.3  # of a block's iterations, its last: by their rates seams learn. Full ones undo more than they mend
+COARSE_PART = 3  # of the splats that fit, at least, are the blocks': the coarse model has a third at most
+
+
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """What all blocks have in common.
+
+    Attributes
+    ----------
+    scene : Scene
+    recipe : Recipe
+        As one training of everything would have it.
+    protocol : Protocol
+        With the near plane and the background of the whole.
+    backend : Backend
+    capture : str
+        A hash of cameras, points, and sizes and times of files: whether the capture is still what it was.
+    """
+
+    scene: Scene
+    recipe: Recipe
+    protocol: Protocol
+    backend: Backend
+    capture: str
+
+    def definition(self, options: TrainOptions, partition: Partition) -> dict[str, Any]:
+        """Return what is written down and compared when the command is given again."""
+        return {
+            "format": FORMAT,
+            "capture": {"path": str(options.scene.resolve()), "digest": self.capture, "format": self.scene.format},
+            "downscale": (options.downscale or 1),
+            "partition": partition_json(partition),
+            "recipe": to_json(self.recipe),
+            "protocol": json.loads(json.dumps(asdict(self.protocol))),
+            "seed": self.recipe.seed,
+            "backend": self.backend.name,
+        }
+
+
+def settle(options: TrainOptions, on_event: OnEvent) -> Settled:
+    """Read the headers of a capture and settle what all blocks have in common; nothing is written."""
+    check_train_options(options)
+    if is_archive(options.scene):
+        remedy = instead(options.scene, "capture")
+        raise DataError(f"blocks need the folder of a capture, got the file {options.scene}{remedy}")
+    opened = open_capture(replace(options, downscale=options.downscale or 1), on_event)
+    recipe, resolved = resolve(options, opened, on_event)
+    if recipe.poses is not None:
+        raise RecipeError(
+            "blocks need cameras that stay where they are, got a recipe that refines poses; refine them in a run of "
+            "its own, or leave --refine-poses out"
+        )
+    if recipe.photometry is not None:
+        raise RecipeError(
+            "blocks need cameras whose light is known, got a recipe that learns vignetting or response; leave "
+            "--vignetting and --response out"
+        )
+    protocol = replace(resolved.protocol, near=resolved.protocol.near_for(opened.scene.extent))
+    return Settled(opened.scene, recipe, protocol, opened.backend, capture_digest(opened.scene))
+
+
+def open_settled(options: TrainOptions, recipe: Recipe, on_event: OnEvent) -> Settled:
+    """Read the headers of a capture for a recipe and a protocol (of the options) that are settled."""
+    opened = open_capture(replace(options, downscale=options.downscale or 1), on_event)
+    return Settled(opened.scene, recipe, opened.protocol, opened.backend, capture_digest(opened.scene))
+
+
+def capture_digest(scene: Scene) -> str:
+    """Return a hash of what a scene is made of: cameras, points, and names, sizes and times of photographs.
+
+    Raises
+    ------
+    DataError
+        A photograph is gone.
+    """
+    digest = hashlib.sha256()
+    for split, views in (("train", scene.train), ("test", scene.test)):
+        for view in views:
+            camera = view.camera
+            numbers = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
+            digest.update(name_bytes(f"{split} {view.name}"))
+            digest.update(np.array(numbers, np.float64).tobytes() + np.asarray(camera.T_cam_world).tobytes())
+            if view.path is None:
+                continue
+            try:
+                stat = view.path.stat()
+            except OSError as error:
+                raise DataError(f"image {view.path} cannot be read: {error.strerror or error}") from error
+            digest.update(f"{stat.st_size} {stat.st_mtime_ns}".encode())
+    if scene.points is not None:
+        digest.update(np.ascontiguousarray(scene.points.points).tobytes())
+    return digest.hexdigest()
+
+
+# -- the grid ----------------------------------------------------------------------------------------------------------
+def fitting_partition(
+    settled: Settled, options: TrainOptions, partition: Partition, on_event: OnEvent
+) -> Partition | None:
+    """Return the partition with as many blocks as memory needs; None where everything fits into one training."""
+    found: Estimate | None = None
+    recipe = settled.recipe
+    try:
+        found = estimate(
+            settled.scene, recipe, settled.backend, downscale=(options.downscale or 1), prepare=options.prepare
+        )
+    except DataError as error:
+        on_event(Notice(f"not in one training: {error}"))
+    if found is not None and found.max_splats is None:
+        on_event(Notice("one training of everything fits into memory: no blocks (--blocks 3x3 makes some)"))
+        return None
+    room = partition.splats if found is None or found.max_splats is None else found.max_splats
+    coarse = replace(partition.coarse, max_splats=max(2, min(partition.coarse.max_splats, room // COARSE_PART)))
+    trained = max(2, min(partition.splats, room - coarse.max_splats))
+    photographs = math.ceil(len(settled.scene.train) / partition.photographs)
+    count = max(2, photographs)
+    if found is not None:
+        wanted = expected_splats(recipe, found.start).expected * (1 + 2 * partition.margin) ** 2
+        count = max(count, math.ceil(wanted / trained))
+    points = settled.scene.points
+    centers = np.array([view.camera.center for view in settled.scene.train])
+    spread = spread_of(centers, None if points is None else points.points)
+    grid = grid_for(count, [float(side) for side in spread.sides], partition.flat)
+    allowed = memory_budget()
+    on_event(
+        Notice(
+            f"blocks: {'x'.join(map(str, grid))}, of {trained:,} splats at most in "
+            f"{'the memory there is' if allowed is None else f'{allowed / 2**30:.3g} GiB'}"
+        )
+    )
+    return replace(partition, grid=grid, splats=trained, coarse=coarse)
+
+
+# -- recipes -----------------------------------------------------------------------------------------------------------
+def with_budget(recipe: Recipe, splats: int) -> Recipe:
+    """Return the recipe with no more than so many splats, where it densifies by numbers that are known."""
+
+    def kept(densify: GradDensify | Densify | None) -> GradDensify | Densify | None:
+        if isinstance(densify, GradDensify):
+            return replace(densify, max_splats=min(splats, densify.max_splats or splats))
+        if densify is not None and "max_splats" in densify.options:
+            most = min(splats, int(densify.options["max_splats"]))
+            return replace(densify, options={**densify.options, "max_splats": most})
+        return densify
+
+    return replace(recipe, stages=tuple(replace(stage, densify=kept(stage.densify)) for stage in recipe.stages))
+
+
+def budget_of(recipe: Recipe) -> int | None:
+    """Return the splats that a recipe allows everything; None: any number."""
+    limits = (limit_of(stage.densify) for stage in recipe.stages if stage.densify is not None)
+    return next((limit for limit in limits if limit is not None), None)
+
+
+def coarse_recipe(recipe: Recipe, partition: Partition) -> Recipe:
+    """Return the recipe of the coarse model."""
+    coarse = partition.coarse
+    value = scale_schedule(recipe, coarse.schedule)
+    value = longer_steps(value, coarse.schedule) if recipe.removal is not None else value
+    return validate(with_budget(value, coarse.max_splats))
+
+
+def coarse_downscale(scene: Scene, partition: Partition, downscale: int) -> int:
+    """Return by how much photographs are shrunk for the coarse model, in all."""
+    longer = max(max(view.camera.width, view.camera.height) for view in scene.views)
+    return downscale * max(1, round(longer / partition.coarse.side))
+
+
+def block_recipe(recipe: Recipe, partition: Partition, block: Block) -> Recipe:
+    """Return the recipe of a block: from splats whose colours have all degrees, in exposures that are settled.
+
+    Its budget is its share of that of everything, by how much of all that is seen lies in it.
+    """
+    whole = budget_of(recipe)
+    most = partition.splats if whole is None else min(partition.splats, math.ceil(whole * block.weight))
+    exposure = None if recipe.exposure is None else replace(recipe.exposure, initial="given")
+    stages = tuple(replace(stage, sh_interval=0) for stage in recipe.stages)
+    dense = recipe.dense_start if partition.start == "dense" else None
+    dense = (
+        None if dense is None else replace(dense, required=False)
+    )  # where it finds nothing there is the coarse model
+    value = replace(recipe, stages=stages, exposure=exposure, dense_start=dense)
+    return validate(with_budget(value, max(2, most)))
+
+
+def seam_recipe(recipe: Recipe, partition: Partition, photographs: float) -> Recipe:
+    """Return the recipe by which splats at seams learn once more: by the last rates of a block; none comes or goes.
+
+    ``photographs`` is how many show a seam, in those of a mean block: each is looked at as often, whatever it is, until
+    the seams have as many iterations as a block.
+    """
+    part = min(1.0, partition.seam_schedule * max(1.0, photographs))
+    block, stage = recipe.stages[0], scale_schedule(recipe, part).stages[0]
+    start = round((1 - SEAM_RATES) * block.iterations)
+    stage = replace(
+        stage,
+        name="seams",
+        train=dict.fromkeys(ALL, "all"),
+        losses=tuple(replace(term, start=0) for term in stage.losses),
+        lr=block.lr.over_again(start, block.iterations, stage.iterations),
+        densify=None,
+        on_enter=(),
+        sh_interval=0,
+        downscale=1,
+        halve_at=(),
+    )
+    exposure = None if recipe.exposure is None else replace(recipe.exposure, initial="given")
+    return validate(replace(recipe, stages=(stage,), exposure=exposure, dense_start=None, removal=None))
+
+
+def seam_folder(out: Path) -> Path:
+    """Return the run folder of the seams."""
+    return out / "seams"
+
+
+def coarse_folder(out: Path) -> Path:
+    """Return the run folder of the coarse model."""
+    return out / "coarse"
+
+
+def partition_folder(out: Path) -> Path:
+    """Return where cells and beginnings of blocks are."""
+    return out / "partition"
+
+
+def block_folder(out: Path, name: str) -> Path:
+    """Return the run folder of a block."""
+    return out / "blocks" / name

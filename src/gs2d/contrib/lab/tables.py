@@ -1,0 +1,135 @@
+"""The tables of the 2DGS-R paper as values, read from ``paper_tables.toml``; and tables of recipes that somebody chose.
+
+Rows without a recipe are quoted: other methods, which this project does not train. What the paper says a table shows
+is here too, as :class:`Claim` values that can be checked against any rows. Pure Python; never imports torch.
+"""
+
+from __future__ import annotations
+
+import itertools
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from types import MappingProxyType
+from typing import Any
+
+from gs2d.config.presets import TABLES
+from gs2d.config.recipe_files import short_name
+from gs2d.contrib.lab.options import SWEEP
+from gs2d.errors import RecipeError
+
+TNT, NERF_SYNTHETIC, DTU = "TnT", "NeRF-Synthetic", "DTU"  # the data sets, as they are called in every result
+METRICS: Mapping[str, str] = MappingProxyType(
+    {"fscore": "F-score", "chamfer": "Chamfer", "psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS"}
+)
+LOWER_IS_BETTER = frozenset({"chamfer", "lpips", "bytes", "seconds"})
+
+
+@dataclass(frozen=True)
+class Claim:
+    """Something the paper says a table shows, in a form that rows can be checked against.
+
+    Attributes
+    ----------
+    text : str
+        The claim in words.
+    metric : str
+        A key of METRICS, or "surface": F-score, or the Chamfer distance (smaller is better) where that is the data
+        set's figure.
+    rows : tuple of str
+        Labels: from worst to best ("ascending"), the best last ("best"), or all alike ("flat").
+    kind : str
+    within : float or None
+        For "flat": largest difference between any two rows. It is a little more than the paper's own.
+    """
+
+    text: str
+    metric: str
+    rows: tuple[str, ...]
+    kind: str = "ascending"
+    within: float | None = None
+
+
+@dataclass(frozen=True)
+class PaperRow:
+    """A row: ``recipe`` None is quoted only; ``paper`` has what the paper prints, data set -> metric -> figure."""
+
+    name: str
+    recipe: str | None
+    paper: Mapping[str, Mapping[str, float]]
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class PaperTable:
+    """A table; ``label`` is its LaTeX label in the paper, ``columns`` has the paper's metrics by data set."""
+
+    name: str
+    title: str
+    label: str
+    columns: Mapping[str, tuple[str, ...]]
+    rows: tuple[PaperRow, ...]
+    claims: tuple[Claim, ...] = ()
+
+    @property
+    def trained(self) -> tuple[PaperRow, ...]:
+        """The rows that have a recipe."""
+        return tuple(row for row in self.rows if row.recipe is not None)
+
+    @property
+    def of_paper(self) -> bool:
+        """Whether it is the paper's; else its rows are compared with each other only."""
+        return self.name != SWEEP
+
+    @property
+    def command(self) -> str:
+        """What makes it."""
+        return f"gs2d paper {self.name}" if self.of_paper else "gs2d sweep"
+
+
+def recipe_table(recipes: Sequence[str]) -> PaperTable:
+    """Return a table with a row for each recipe, by its short name, and nothing of the paper.
+
+    Raises
+    ------
+    RecipeError
+        Two files have recipes of one short name.
+    """
+    names = list(dict.fromkeys(recipes))
+    shown = [short_name(name) for name in names]
+    for first, second in itertools.combinations(range(len(names)), 2):
+        if shown[first] == shown[second]:
+            raise RecipeError(
+                f"each recipe of a sweep needs a name of its own, got {shown[first]!r} from {names[first]} and from "
+                f"{names[second]}; rename one"
+            )
+    rows = tuple(PaperRow(row, name, {}) for row, name in zip(shown, names, strict=True))
+    return PaperTable(SWEEP, "Recipes compared", "tab:sweep", {}, rows)
+
+
+def _read(name: str, table: Mapping[str, Any], notes: Mapping[str, str]) -> PaperTable:
+    """Return a table of the file."""
+    columns = {data_set: tuple(metrics) for data_set, metrics in table["columns"].items()}
+    rows = []
+    for line in table["rows"].splitlines():
+        row, *groups = (part.strip() for part in line.split("|"))
+        paper = {}
+        for (data_set, metrics), group in zip(columns.items(), groups, strict=True):
+            figures = zip(metrics, group.split(), strict=True)
+            paper[data_set] = {metric: float(figure) for metric, figure in figures if figure != "-"}
+        rows.append(PaperRow(row, TABLES[name].get(row), paper, notes.get(row, "")))
+    claims = tuple(Claim(**{**claim, "rows": tuple(claim["rows"])}) for claim in table["claims"])
+    return PaperTable(name, table["title"], table["label"], columns, tuple(rows), claims)
+
+
+_FILE = tomllib.loads((files("gs2d.contrib.lab") / "paper_tables.toml").read_text(encoding="utf-8"))
+PAPER_TABLES: Mapping[str, PaperTable] = MappingProxyType(
+    {name: _read(name, table, _FILE["notes"]) for name, table in _FILE["tables"].items()}
+)
+
+
+def printed(metric: str, data_set: str, figure: float) -> str:
+    """Return a figure of the paper with the digits that it prints."""
+    digits = {"psnr": 2, "chamfer": 2, "fscore": 2 if data_set == TNT else 3}.get(metric, 3)
+    return f"{figure:.{digits}f}"

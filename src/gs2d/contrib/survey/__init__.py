@@ -1,0 +1,1 @@
+"""Real-world coordinates of a run, and orthophotos."""

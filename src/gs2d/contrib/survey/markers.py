@@ -1,0 +1,116 @@
+"""Printed ArUco markers of a known side, found in the photographs by OpenCV (extra ``markers``): they tell scale."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gs2d.contrib.survey.triangulate import triangulate
+from gs2d.core.extras import install, required
+from gs2d.data import View
+from gs2d.data.image_files import read_image
+from gs2d.errors import BackendError, DataError
+
+DICTIONARIES = {
+    **{f"{n}x{n}_{count}": f"DICT_{n}X{n}_{count}" for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)},
+    "aruco_original": "DICT_ARUCO_ORIGINAL",
+    "apriltag_36h11": "DICT_APRILTAG_36h11",
+}
+MAX_PIXELS = 3.0  # distance of a corner from the image of its point, from which a marker is not believed
+MAX_PLANARITY = 0.1  # of its side, by which a corner may lie off the others' parallelogram
+
+
+@dataclass(frozen=True, eq=False)
+class Marker:
+    """A marker in the run: its corners [4, 3], its mean side in units of the run, and in how many photographs it is."""
+
+    number: int
+    corners: np.ndarray
+    side: float
+    photographs: int
+
+
+def required_cv2() -> Any:
+    """Return the package cv2, with ArUco.
+
+    Raises
+    ------
+    BackendError
+        It is not installed, or without ArUco.
+    """
+    cv2 = required("markers", "cv2", "--markers")
+    if not hasattr(getattr(cv2, "aruco", None), "ArucoDetector"):
+        raise BackendError(
+            f"--markers needs OpenCV 4.7 or newer with ArUco, got {cv2.__version__}; {install('markers')}"
+        )
+    return cv2
+
+
+def detector(dictionary: str) -> Any:
+    """Return OpenCV's detector of a dictionary."""
+    cv2 = required_cv2()
+    if dictionary not in DICTIONARIES:
+        raise DataError(f"--marker-dictionary must be one of {', '.join(DICTIONARIES)}, got {dictionary}")
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARIES[dictionary]))
+    return cv2.aruco.ArucoDetector(known, parameters)
+
+
+def detected(found: Any, view: View) -> dict[int, np.ndarray]:
+    """Return the markers of a photograph: corners [4, 2] px from the outer corner, by number.
+
+    ``found`` is the detector. What is there twice is left out: which is which, nobody can tell.
+    """
+    if view.path is None:
+        return {}
+    image = read_image(view.path)
+    grey = np.ascontiguousarray(image[:, :, :3].mean(axis=2).astype(np.uint8))
+    corners, numbers, _ = found.detectMarkers(grey)
+    if numbers is None:
+        return {}
+    every = [int(number) for number in np.ravel(numbers)]
+    return {  # OpenCV's origin is the middle of the first pixel
+        number: np.asarray(c, np.float64).reshape(4, 2) + 0.5
+        for number, c in zip(every, corners, strict=True)
+        if every.count(number) == 1
+    }
+
+
+def in_run(seen: Iterable[tuple[View, dict[int, np.ndarray]]]) -> tuple[list[Marker], list[str]]:
+    """Return the markers that two or more photographs show, and a sentence for each that was left out."""
+    by_number: dict[int, list[tuple[View, np.ndarray]]] = {}
+    for view, markers in seen:
+        for number, corners in markers.items():
+            by_number.setdefault(number, []).append((view, corners))
+    kept: list[Marker] = []
+    left: list[str] = []
+    for number, marks in sorted(by_number.items()):
+        if len(marks) < 2:
+            left.append(f"marker {number} is in one photograph only")
+            continue
+        try:
+            corners, worst = _corners(number, marks)
+        except DataError as error:
+            left.append(str(error))
+            continue
+        sides = np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1)
+        bend = float(np.linalg.norm(corners[0] - corners[1] + corners[2] - corners[3]))
+        if worst > MAX_PIXELS or bend > MAX_PLANARITY * sides.mean():
+            left.append(f"marker {number} moved between photographs, or is there twice ({worst:.1f} px off)")
+            continue
+        kept.append(Marker(number, corners, float(sides.mean()), len(marks)))
+    return kept, left
+
+
+def _corners(number: int, marks: Sequence[tuple[View, np.ndarray]]) -> tuple[np.ndarray, float]:
+    """Return the four corners in the run, and the largest median distance of one from its marks, px."""
+    views = [view for view, _ in marks]
+    points = [
+        triangulate(views, np.array([corners[k] for _, corners in marks]), f"corner {k} of marker {number}")
+        for k in range(4)
+    ]
+    return np.array([point.point for point in points]), max(float(np.median(point.pixels)) for point in points)

@@ -1,0 +1,173 @@
+"""A run from straight above, in metres of the world: an orthophoto and an elevation model as GeoTIFF."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gs2d.contrib.survey.geotiff import NO_DATA, write_geotiff
+from gs2d.core.extras import required
+from gs2d.core.files import check_writable
+from gs2d.core.georeference import Georeference
+from gs2d.core.mesh import Mesh
+from gs2d.errors import ProtocolError, RunError
+from gs2d.io.meshes import read_mesh
+from gs2d.io.run_dir import MESH, open_run
+from gs2d.meshing.raycast import Hits, cast_down
+from gs2d.meshing.texture import Texels, surface_colors
+from gs2d.pipeline.events import OnEvent, Phase, ignore
+from gs2d.pipeline.finish.placed import place_of
+from gs2d.pipeline.finish.run_texture import photographs
+from gs2d.pipeline.prepare.finished import open_job
+from gs2d.pipeline.prepare.job import Job
+from gs2d.pipeline.prepare.options import OrthophotoOptions
+from gs2d.pipeline.prepare.run_exposures import Transforms, read_exposures
+
+ELEVATION = "_elevation"  # after the name of the orthophoto
+MAX_CELLS = 36_000_000  # a colour's choice takes about 70 bytes a cell: 2.5 GB
+_AUTO_SIDE = 4_000  # cells, of a raster whose resolution nobody says
+_NICE = (1.0, 2.0, 2.5, 5.0, 10.0)  # times a power of ten: resolutions that nobody says
+
+
+@dataclass(frozen=True)
+class Raster:
+    """Where the cells of a raster lie.
+
+    Attributes
+    ----------
+    corner : (float, float), metres
+        x and y of the upper left corner, local.
+    step : float, metres
+    size : (int, int)
+        Rows and columns.
+    """
+
+    corner: tuple[float, float]
+    step: float
+    size: tuple[int, int]
+
+
+def orthophoto_run(
+    path: Path,
+    out: Path | None = None,
+    options: OrthophotoOptions = OrthophotoOptions(),  # noqa: B008 (frozen)
+    on_event: OnEvent = ignore,
+    *,
+    threads: int | None = None,
+) -> dict[str, Any]:
+    """Write the orthophoto of a georeferenced run, and beside it its elevation model; returns files and counts.
+
+    The surface is the run's mesh; a cell shows the highest of it, in the colours of the photographs that see it best,
+    or in those of the mesh where none does.
+    """
+    required("geo", "tifffile", "a GeoTIFF")  # before minutes are spent
+    path = Path(path)
+    place = place_of(open_run(path).path, asked=True)
+    assert place is not None
+    target = path / "orthophoto.tif" if out is None else Path(out)
+    if target.suffix.lower() not in (".tif", ".tiff"):
+        raise RunError(f"--out must end in .tif or .tiff, got {target.name}")
+    files = target, target.with_name(target.stem + ELEVATION + target.suffix)
+    for file in files:
+        check_writable(file)
+    if not (path / MESH).is_file():
+        raise RunError(f"{path} has no {MESH}, which is looked at from above; write it with `gs2d mesh {path}`")
+    mesh = read_mesh(path / MESH)
+    if not len(mesh.faces):
+        raise RunError(f"{path / MESH} has no triangles to look at; extract it again with `gs2d mesh {path}`")
+    run, job, _ = open_job(path, threads, on_event)
+    local = place.to_local(mesh.vertices)
+    raster = _raster(local, options.resolution, _pixel(job, mesh) * place.scale)
+    on_event(Phase("looking from above", 0))
+    hits = cast_down(local, mesh.faces, raster.corner, raster.step, raster.size)
+    colors, unseen = _colors(job, mesh, hits, read_exposures(run, job.recipe), on_event)
+    _write(files, colors, _elevations(local, mesh, hits, place), raster, place)
+    return {
+        "files": [str(file) for file in files],
+        "resolution": raster.step,
+        "rows": raster.size[0],
+        "columns": raster.size[1],
+        "cells": int((hits.face >= 0).sum()),
+        "cells_unseen": unseen,
+        "frame": place.frame,
+        "epsg": place.epsg,
+    }
+
+
+def _pixel(job: Job, mesh: Mesh) -> float:
+    """Size of a pixel on the surface, world units: the median over the surface of what its nearest view has."""
+    some = mesh.vertices[:: max(1, len(mesh.vertices) // 2_000)].astype(np.float64)
+    size = np.full(len(some), np.inf)
+    for view in job.scene.train:
+        camera = view.camera
+        pixels, depth = camera.project(some)
+        shown = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+        size = np.where(shown, np.minimum(size, depth / camera.fx), size)
+    known = np.isfinite(size)
+    if not known.any():
+        raise RunError("photographs that show the mesh were expected, none does; is it of this capture?")
+    return float(np.median(size[known]))
+
+
+def _raster(local: np.ndarray, resolution: float | None, pixel: float) -> Raster:
+    """Return the raster over a surface, on whole multiples of its step; by default as fine as the photographs are."""
+    low, high = local[:, :2].min(axis=0), local[:, :2].max(axis=0)
+    if resolution is None:
+        least = max(pixel, float((high - low).max()) / _AUTO_SIDE)
+        power = 10.0 ** math.floor(math.log10(least))
+        resolution = next(nice * power for nice in _NICE if nice * power >= least * (1 - 1e-9))
+    if not (math.isfinite(resolution) and resolution > 0):
+        raise ProtocolError(f"--resolution must be metres above 0, got {resolution:g}")
+    first, last = np.floor(low / resolution), np.ceil(high / resolution)
+    columns, rows = np.maximum(last - first, 1)
+    if rows * columns > MAX_CELLS:
+        finest = math.sqrt(float(np.prod(high - low)) / MAX_CELLS)
+        raise ProtocolError(
+            f"--resolution {resolution:g} makes {rows * columns:,.0f} cells, at most {MAX_CELLS:,} are written; "
+            f"take {finest:.2g} m or more"
+        )
+    corner = float(first[0] * resolution), float(last[1] * resolution)
+    return Raster(corner, resolution, (int(rows), int(columns)))
+
+
+def _colors(job: Job, mesh: Mesh, hits: Hits, exposures: Transforms, on_event: OnEvent) -> tuple[np.ndarray, int]:
+    """Return colours [H, W, 4] uint8 with alpha 0 where there is no surface, and how many cells no photograph sees."""
+    height, width = hits.face.shape
+    index = np.flatnonzero(hits.face.reshape(-1) >= 0)
+    texels = Texels(
+        width,
+        index.astype(np.int32),
+        hits.face.reshape(-1)[index],
+        np.ascontiguousarray(hits.weights.reshape(-1, 3)[index, :2]),
+    )
+    images = partial(photographs, job, job.scene.train, exposures, on_event)
+    found, seen = surface_colors(mesh, texels, images, threads=torch.get_num_threads())
+    if mesh.colors is not None and not seen.all():
+        found[~seen] = np.rint(texels.interpolated(mesh.colors, mesh.faces))[~seen].astype(np.uint8)
+    image = np.zeros((height * width, 4), dtype=np.uint8)
+    image[index, :3] = found
+    image[index, 3] = 255
+    return image.reshape(height, width, 4), int((~seen).sum())
+
+
+def _elevations(local: np.ndarray, mesh: Mesh, hits: Hits, place: Georeference) -> np.ndarray:
+    """Return heights in the world [H, W] float32, metres; NO_DATA where there is no surface."""
+    heights = np.full(hits.face.shape, NO_DATA, dtype=np.float32)
+    hit = hits.face >= 0
+    corners = local[mesh.faces[hits.face[hit]], 2]  # [M, 3]
+    heights[hit] = (corners * hits.weights[hit]).sum(axis=1) + place.origin[2]
+    return heights
+
+
+def _write(
+    files: tuple[Path, Path], colors: np.ndarray, heights: np.ndarray, raster: Raster, place: Georeference
+) -> None:
+    corner = raster.corner[0] + float(place.origin[0]), raster.corner[1] + float(place.origin[1])
+    for file, image in zip(files, (colors, heights), strict=True):
+        write_geotiff(file, image, corner=corner, step=raster.step, epsg=place.epsg, frame=place.frame)

@@ -1,1 +1,0 @@
-"""Many runs from one plan: sweeps, the paper's tables and figures."""

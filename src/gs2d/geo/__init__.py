@@ -1,1 +1,0 @@
-"""Where a run is in the world: positions of photographs, control points, markers, and the similarity that they tell."""

@@ -1,0 +1,161 @@
+"""Our files in other people's programs, from npm: a validator, and a converter both ways (viewers: test_viewers.py)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gs2d.contrib.formats.gltf import EXTENSION
+from gs2d.core.splats import Splats
+from gs2d.io.formats.registry import read_splat_file, write_layout
+from gs2d.io.gaussians import Gaussians, unit_quats
+from npm import forget, node, package, splat_transform
+from splat_scenes import a_scene, turned_by
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _nothing_is_left() -> Iterator[None]:
+    yield
+    forget()
+
+
+_VALIDATE = """
+const validator = require("gltf-validator"), fs = require("fs");
+validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[1]))).then(r => console.log(JSON.stringify(r)));
+"""
+
+
+def validated(path: Path) -> list[dict[str, object]]:
+    """What Khronos' validator says of a file; the extension is new to it."""
+    package("gltf-validator")
+    report = json.loads(node(_VALIDATE, str(path)))
+    found: list[dict[str, object]] = report["issues"]["messages"]
+    return [message for message in found if message["code"] != "UNSUPPORTED_EXTENSION"]
+
+
+def test_khronos_validator_finds_nothing_but_names_that_it_does_not_know_yet(tmp_path: Path) -> None:
+    for count, degree in ((0, 0), (30, 0), (30, 3)):
+        path = tmp_path / f"{count}_{degree}.glb"
+        write_layout(path, a_scene(count, degree), "gltf")
+        pointer = f"/meshes/0/primitives/0/attributes/{EXTENSION}:"
+        beyond = [
+            message
+            for message in validated(path)
+            if message["code"] != "MESH_PRIMITIVE_INVALID_ATTRIBUTE" or not str(message["pointer"]).startswith(pointer)
+        ]
+        assert beyond == []
+        # With names of an application's own, which it does look at, nothing is left.
+        path.write_bytes(path.read_bytes().replace(f'"{EXTENSION}:'.encode(), b'"_' + b"S" * len(EXTENSION)))
+        assert validated(path) == []
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) - 4])
+    assert validated(path) != []  # it does look
+
+
+def near(found: Gaussians, splats: Splats, **within: float) -> None:
+    """Compare Gaussians, whatever their order, with the splats that were written."""
+    from scipy.spatial import cKDTree
+
+    ours = Gaussians.of(splats)
+    distance, match = cKDTree(ours.means).query(found.means)
+    assert sorted(match.tolist()) == list(range(len(ours)))
+    same = ours.rows(match)
+    assert distance.max() <= within.get("means", 1e-6)
+    assert turned_by(found.quats, same.quats).max() <= within.get("quats", 0.1)
+    assert np.abs(found.log_scales[:, :2] - same.log_scales[:, :2]).max() <= within.get("scales", 1e-5)
+    assert np.abs(found.sh0 - same.sh0).max() <= within.get("sh0", 1e-6)
+    assert np.abs(found.shN - same.shN).max() <= within.get("shN", 1e-6)
+
+
+def test_the_field_s_converter_makes_the_same_glb_of_a_ply(tmp_path: Path) -> None:
+    splats = a_scene(200)
+    splats.opacity_logits.clamp_(-8, 8)
+    write_layout(tmp_path / "a.ply", splats, "3dgs")
+    splat_transform(tmp_path / "a.ply", tmp_path / "theirs.glb")
+    write_layout(tmp_path / "ours.glb", splats, "gltf")
+    theirs, ours = (read_splat_file(tmp_path / f"{name}.glb").gaussians for name in ("theirs", "ours"))
+    np.testing.assert_array_equal(theirs.means, ours.means)
+    np.testing.assert_array_equal(theirs.shN, ours.shN)
+    assert np.abs(np.abs((unit_quats(theirs.quats) * unit_quats(ours.quats)).sum(axis=1)) - 1).max() < 1e-6
+    near(theirs, splats)
+
+
+def test_the_field_s_converter_and_we_read_each_other_s_sog(tmp_path: Path) -> None:
+    splats = a_scene(900, 3)
+    write_layout(tmp_path / "a.ply", splats, "3dgs")
+    splat_transform(tmp_path / "a.ply", tmp_path / "theirs.sog")
+    splat_transform(tmp_path / "theirs.sog", tmp_path / "theirs.ply")
+    bits = {"means": 2e-4, "scales": 0.1, "quats": 2.0}
+    ours, theirs = (read_splat_file(tmp_path / f"theirs.{end}").gaussians for end in ("sog", "ply"))
+    # Its writer gives one base colour in fifty of random splats its lowest code; its reader reads that as ours does.
+    near(ours, splats, **bits, sh0=10.0, shN=1.0)
+    for name in ("means", "log_scales", "sh0", "shN"):
+        np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), atol=1e-6, err_msg=name)
+    assert turned_by(ours.quats, theirs.quats).max() < 0.05
+    write_layout(tmp_path / "ours.sog", splats, "sog")
+    splat_transform(tmp_path / "ours.sog", tmp_path / "back.ply")
+    back = read_splat_file(tmp_path / "back.ply").gaussians
+    near(back, splats, **bits, sh0=0.1, shN=0.03)
+    ours = read_splat_file(tmp_path / "ours.sog").gaussians
+    np.testing.assert_allclose(back.means, ours.means, atol=1e-6)
+    np.testing.assert_allclose(back.shN, ours.shN, atol=1e-6)
+    np.testing.assert_allclose(back.sh0, ours.sh0, atol=1e-6)
+    assert turned_by(back.quats, ours.quats).max() < 0.05
+
+
+def test_the_field_s_converter_and_we_read_each_other_s_spz_of_version_4(tmp_path: Path) -> None:
+    pytest.importorskip("zstandard")
+    splats = a_scene(300, 2)
+    splats.opacity_logits.clamp_(-5, 5)  # of an opaque byte the converter makes an infinite logit
+    write_layout(tmp_path / "a.ply", splats, "3dgs")
+    splat_transform(tmp_path / "a.ply", tmp_path / "theirs.spz")
+    theirs = read_splat_file(tmp_path / "theirs.spz")
+    assert theirs.kind == "SPZ version 4"
+    write_layout(tmp_path / "ours.spz", splats, "spz4")
+    splat_transform(tmp_path / "ours.spz", tmp_path / "back.ply")
+    bits = {"means": 3e-4, "scales": 0.04, "quats": 0.3, "sh0": 0.015}
+    near(read_splat_file(tmp_path / "back.ply").gaussians, splats, **bits, shN=0.05)
+
+
+def test_the_finest_level_of_the_converter_s_stream_is_all_of_the_splats(tmp_path: Path) -> None:
+    splats = a_scene(700, 1)
+    write_layout(tmp_path / "a.ply", splats, "3dgs")
+    (tmp_path / "lods").mkdir()
+    path = tmp_path / "lods" / "lod-meta.json"
+    splat_transform(tmp_path / "a.ply", "-l", "0", tmp_path / "a.ply", "-F", "50%", "-l", "1", path)
+    found = read_splat_file(path)
+    assert (found.kind, len(found.gaussians)) == ("streamed SOG, its finest level", 700)
+
+
+def test_the_field_s_converter_reads_our_streams_and_writes_the_same_kind_of_index(tmp_path: Path) -> None:
+    """It reads no index, but every data set that one refers to."""
+    splats = a_scene(900, 1)
+    path = tmp_path / "ours" / "lod-meta.json"
+    write_layout(path, splats, "streamed")
+    ours = json.loads(path.read_text())
+    assert len(ours["filenames"]) == 4
+    for number, name in enumerate(ours["filenames"]):
+        splat_transform(path.parent / name, tmp_path / "back.ply")
+        back = read_splat_file(tmp_path / "back.ply").gaussians
+        same = read_splat_file(path.parent / name).gaussians
+        assert len(back) == ours["counts"][number]
+        for what in ("means", "log_scales", "sh0", "shN"):
+            np.testing.assert_allclose(getattr(back, what), getattr(same, what), atol=1e-6, err_msg=what)
+        (tmp_path / "back.ply").unlink()
+    write_layout(tmp_path / "a.ply", splats, "3dgs")
+    (tmp_path / "theirs").mkdir()
+    splat_transform(
+        tmp_path / "a.ply", "-l", "0", tmp_path / "a.ply", "-F", "50%", "-l", "1", tmp_path / "theirs" / "lod-meta.json"
+    )
+    theirs = json.loads((tmp_path / "theirs" / "lod-meta.json").read_text())
+    assert set(ours) == set(theirs)
+    leaf, other = ours["tree"], theirs["tree"]
+    assert set(leaf) == set(other) == {"bound", "lods"}
+    assert set(leaf["bound"]) == set(other["bound"])
+    assert set(leaf["lods"]["0"]) == set(other["lods"]["0"])

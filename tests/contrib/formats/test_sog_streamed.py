@@ -1,0 +1,171 @@
+"""Streams of SOG that we write: every level in the leaves of space it belongs to, and nothing of the user's touched."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gs2d.contrib.formats import sog_streamed
+from gs2d.contrib.formats.sog import read_level, read_sog
+from gs2d.contrib.formats.sog_streamed import write_streamed_sog
+from gs2d.errors import DataError, DiskError
+from gs2d.io.formats.registry import layout_of, read_splat_file, write_layout, written_bytes
+from gs2d.io.gaussians import Gaussians, sigmoid
+from splat_scenes import a_scene
+
+
+@pytest.fixture(autouse=True)
+def _small_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sog_streamed, "_LEAF", 100)
+    monkeypatch.setattr(sog_streamed, "_FILE", 300)
+
+
+def leaves(node: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    if "lods" in node:
+        yield node
+    for child in node.get("children", []):
+        for axis in range(3):  # a box holds its children's
+            assert node["bound"]["min"][axis] <= child["bound"]["min"][axis]
+            assert node["bound"]["max"][axis] >= child["bound"]["max"][axis]
+        yield from leaves(child)
+
+
+def test_each_leaf_has_its_part_of_every_level_in_its_box(tmp_path: Path) -> None:
+    splats = a_scene(1000, 1)
+    path = tmp_path / "scene" / "lod-meta.json"
+    write_layout(path, splats, "streamed")
+    index = json.loads(path.read_text())
+    assert index["lodLevels"] == 4
+    assert index["counts"][0] == 1000
+    assert all(half <= whole / 2 + 16 for whole, half in zip(index["counts"], index["counts"][1:], strict=False))
+    assert index["count"] == sum(index["counts"])
+    sets = [read_sog(path.parent / name)[0] for name in index["filenames"]]
+    assert len(sets) > 6
+    assert max(len(g) for g in sets) <= 400
+    found = list(leaves(index["tree"]))
+    assert len(found) == 16
+    seen = [np.zeros(len(g), int) for g in sets]
+    for leaf in found:
+        assert list(leaf["lods"]) == ["0", "1", "2", "3"]
+        for place in leaf["lods"].values():
+            rows = np.arange(place["offset"], place["offset"] + place["count"])
+            seen[place["file"]][rows] += 1
+            g = sets[place["file"]].rows(rows)
+            reach = 3 * np.exp(g.log_scales.max(axis=1, keepdims=True))  # of the largest of three standard deviations
+            assert (g.means - reach <= np.array(leaf["bound"]["max"])).all()
+            assert (g.means >= np.array(leaf["bound"]["min"]) - 1e-3).all()
+            assert (g.means <= np.array(leaf["bound"]["max"]) + 1e-3).all()
+    assert all((times == 1).all() for times in seen)  # every splat of every set is in one leaf
+    assert written_bytes(path, "streamed") == sum(f.stat().st_size for f in path.parent.rglob("*") if f.is_file())
+
+
+def test_the_finest_level_is_the_scene_and_each_other_has_half_of_the_one_before(tmp_path: Path) -> None:
+    splats = a_scene(700, 2)
+    path = tmp_path / "lod-meta.json"
+    write_layout(path, splats, "streamed")
+    file = read_splat_file(path)
+    assert (file.kind, len(file.gaussians), file.surfels is not None) == ("streamed SOG, its finest level", 700, True)
+    ours = Gaussians.of(splats)
+    order, same = np.lexsort(file.gaussians.means.T.round(2)), np.lexsort(ours.means.T.round(2))
+    assert np.abs(file.gaussians.means[order].mean(axis=0) - ours.means[same].mean(axis=0)).max() < 1e-3
+    counts = [len(read_level(path, level)) for level in range(4)]
+    assert counts[0] == 700
+    assert 350 <= counts[1] <= 360
+    assert 87 <= counts[3] <= 110
+    assert len(read_level(path, 9)) == counts[3]
+    mass = [float((sigmoid(g.opacity_logits) * np.exp(g.log_scales[:, :2].sum(axis=1))).sum()) for g in map(
+        lambda level: read_level(path, level), (0, 1))]  # fmt: skip
+    assert mass[1] == pytest.approx(mass[0], rel=0.1)
+
+
+def test_more_splats_have_more_levels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sog_streamed, "_COARSEST", 20)
+    for count, levels in ((150, 4), (300, 5), (2561, 8), (9000, 8)):  # 300 / 2^4 = 18
+        assert sog_streamed._levels_for(count) == levels
+    path = tmp_path / "lod-meta.json"
+    write_streamed_sog(path, Gaussians.of(a_scene(50, 0)), levels=1)
+    assert json.loads(path.read_text())["counts"] == [50]
+    with pytest.raises(ValueError, match="levels must be 1 or more, got 0"):
+        write_streamed_sog(path, Gaussians.of(a_scene(50, 0)), levels=0)
+
+
+def test_writing_again_removes_what_the_older_index_referred_to_and_nothing_else(tmp_path: Path) -> None:
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    (folder / "1_0").mkdir()
+    (folder / "1_0" / "mine.txt").write_text("mine")
+    path = folder / "lod-meta.json"
+    write_layout(path, a_scene(300, 1), "streamed")
+    first = {f.relative_to(folder) for f in folder.rglob("*")}
+    assert not any(name.parts[0] == "0_0" for name in first)  # names that are all free: none like that of the user's
+    (folder / "0_0-2" / "note.txt").write_text("a note")
+    write_layout(path, a_scene(200, 1, seed=5), "streamed")
+    assert len(read_splat_file(path).gaussians) == 200
+    assert (folder / "1_0" / "mine.txt").read_text() == "mine"
+    assert [f.name for f in (folder / "0_0-2").iterdir()] == ["note.txt"]
+    names = {f.name for f in folder.iterdir() if f.is_dir()}
+    listed = {name.split("/")[0] for name in json.loads(path.read_text())["filenames"]}
+    assert names == listed | {"1_0", "0_0-2"}
+
+
+def test_an_index_that_names_other_folders_removes_nothing_of_them(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "meta.json").write_text("{}")
+    path = tmp_path / "out" / "lod-meta.json"
+    for names in (["../other/meta.json"], "x", None, [3]):
+        path.write_text(json.dumps({"filenames": names}))
+        write_layout(path, a_scene(20, 0), "streamed")
+        assert (other / "meta.json").exists()
+
+
+def test_a_failure_leaves_the_older_stream_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "scene" / "lod-meta.json"
+    calls = []
+
+    def breaks(g: Gaussians) -> dict[str, bytes]:
+        calls.append(len(g))
+        if len(calls) > 2:
+            raise OSError(28, "No space left on device")
+        return {"meta.json": b"{}", "quats.webp": b"x"}
+
+    with monkeypatch.context() as patch:
+        patch.setattr(sog_streamed, "packed_sog", breaks)
+        with pytest.raises(OSError, match="No space"):
+            write_layout(path, a_scene(900, 0), "streamed")
+        assert not path.parent.exists()
+    write_layout(path, a_scene(150, 0), "streamed")
+    before = {f.relative_to(tmp_path): f.read_bytes() for f in tmp_path.rglob("*") if f.is_file()}
+    with monkeypatch.context() as patch:
+        calls.clear()
+        patch.setattr(sog_streamed, "packed_sog", breaks)
+        with pytest.raises(OSError, match="No space"):
+            write_layout(path, a_scene(900, 0), "streamed")
+    assert {f.relative_to(tmp_path): f.read_bytes() for f in tmp_path.rglob("*") if f.is_file()} == before
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DiskError, match="cannot write .*file"):
+        write_layout(tmp_path / "file" / "lod-meta.json", a_scene(9, 0), "streamed")
+    with pytest.raises(DiskError, match="the folder does not exist: create it first"):
+        write_layout(tmp_path / "none" / "none" / "lod-meta.json", a_scene(9, 0), "streamed")
+
+
+def test_the_same_splats_are_the_same_bytes(tmp_path: Path) -> None:
+    written = []
+    for name in ("a", "b"):
+        write_layout(tmp_path / name / "lod-meta.json", a_scene(400, 1), "streamed")
+        written.append({f.relative_to(tmp_path / name): f.read_bytes() for f in (tmp_path / name).rglob("*.*")})
+    assert written[0] == written[1]
+
+
+def test_one_name_alone_is_that_of_a_stream(tmp_path: Path) -> None:
+    assert layout_of(tmp_path / "LOD-meta.json") == "streamed"
+    assert layout_of(tmp_path / "a-lod-meta.json") is None
+    (tmp_path / "lod-meta.json").write_text('{"filenames": [], "tree": {}}')
+    with pytest.raises(DataError, match="no chunk of the finest level"):
+        read_splat_file(tmp_path / "lod-meta.json")

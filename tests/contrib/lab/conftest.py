@@ -1,0 +1,36 @@
+"""What tests of the cluster share."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from types import ModuleType
+
+import pytest
+
+from fake_ray import FakeQueue, FakeRay
+from gs2d.contrib.lab import cluster as module
+from gs2d.contrib.lab import cluster_task
+from room_photos import Room, found_room
+
+
+@pytest.fixture
+def ray(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeRay]:
+    fake, queue, strategies = FakeRay(), ModuleType("ray.util.queue"), ModuleType("ray.util.scheduling_strategies")
+    queue.Queue = FakeQueue  # type: ignore[attr-defined]
+    strategies.NodeAffinitySchedulingStrategy = lambda node, soft: (node, soft)  # type: ignore[attr-defined]
+    for name, part in (("ray", fake), ("ray.util.queue", queue), ("ray.util.scheduling_strategies", strategies)):
+        monkeypatch.setitem(sys.modules, name, part)
+    monkeypatch.setattr(module, "check_address", lambda _address: None)
+    monkeypatch.setattr(module, "check_cluster", lambda _address: None)
+    monkeypatch.setattr(cluster_task, "WAIT_SECONDS", 0.1)
+    monkeypatch.setattr(module, "GOODBYE_SECONDS", 0.1)
+    yield fake
+    assert not fake.is_connected, "the connection was left open"
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Room:
+    """Twelve photographs of a room, and their cameras."""
+    pytest.importorskip("pycolmap")
+    return found_room(tmp_path_factory.mktemp("room"))

@@ -1,0 +1,118 @@
+"""`--cluster` on a real Ray cluster: three nodes of this machine, two of them lost in the middle."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from flown import digest, tiny_blocks, write_tiny_flight
+from gs2d.contrib.lab.blocks import blocks
+from ray_commands import begin, blocks_words, cluster_of, lose, read_until
+from room_photos import Room
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timeout(600),
+    pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (the extra `cluster`)"),
+]
+SCHEDULE = 0.004  # 120 iterations a block: seconds in which a node can be lost
+
+
+@pytest.fixture(scope="module")
+def nodes() -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A head without CPUs and two nodes with one each; the program, and the address."""
+    with cluster_of(2) as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny_flight(tmp_path_factory.mktemp("flight") / "capture")
+
+
+@pytest.fixture(scope="module")
+def straight(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("straight") / "job"
+    blocks(tiny_blocks(capture, out, schedule_scale=SCHEDULE))
+    return out
+
+
+def test_nodes_are_lost_in_the_middle_and_no_byte_changes(
+    nodes: tuple[subprocess.Popen[str], str], capture: Path, straight: Path, tmp_path: Path
+) -> None:
+    cluster, address = nodes
+    with begin(blocks_words(capture, tmp_path / "job", address, SCHEDULE)) as process:
+        said = read_until(process, "block-0-1 begins on")
+        lose(cluster)
+        said += process.communicate()[1]
+    assert process.returncode == 0, said
+    assert "was lost; it goes on on" in said
+    for line in said.splitlines():  # nothing of Ray's own
+        assert line.startswith(("jobs (9)", "jobs: ", "note ")), said
+    for name in ("splats.ply", "mesh.ply"):
+        assert digest(tmp_path / "job" / name) == digest(straight / name)
+
+
+def test_an_interrupted_command_goes_on_to_the_same_bytes(
+    nodes: tuple[subprocess.Popen[str], str], capture: Path, straight: Path, tmp_path: Path
+) -> None:
+    words = [*blocks_words(capture, tmp_path / "job", nodes[1], SCHEDULE), "--verbose"]
+    with begin(words) as process:
+        read_until(process, "block-0-0: starting from")
+        process.send_signal(signal.SIGINT)
+        said = process.communicate()[1]
+    assert process.returncode == 130, said
+    assert said.splitlines()[-1].startswith("interrupted")
+    assert "Traceback" not in said
+    assert not (tmp_path / "job" / "splats.ply").exists()
+    with begin(words) as process:
+        said = process.communicate()[1]
+    assert process.returncode == 0, said
+    assert "coarse begins" not in said  # that was done
+    assert digest(tmp_path / "job" / "splats.ply") == digest(straight / "splats.ply")
+
+
+def test_another_version_on_the_nodes_is_one_line(
+    nodes: tuple[subprocess.Popen[str], str], capture: Path, tmp_path: Path
+) -> None:
+    with begin(blocks_words(capture, tmp_path / "job", nodes[1], SCHEDULE), "gs2d.__version__ = '9.9'") as process:
+        said = process.communicate()[1]
+    assert process.returncode == 2, said
+    assert "this command 9.9; install the same version on all machines" in said.splitlines()[-1]
+    assert "Traceback" not in said
+
+
+def test_an_address_without_a_cluster_is_one_line(capture: Path, tmp_path: Path) -> None:
+    with begin([*blocks_words(capture, tmp_path / "job", "127.0.0.1:1", SCHEDULE), "--quiet"]) as process:
+        said = process.communicate()[1]
+    assert process.returncode == 2, said
+    assert len(said.splitlines()) == 1
+    assert said.startswith("error: no Ray cluster at 127.0.0.1:1 (Connection refused); start one with")
+
+
+def test_photographs_become_a_run_though_the_machine_of_the_training_is_lost(
+    nodes: tuple[subprocess.Popen[str], str], room: Room, tmp_path: Path
+) -> None:
+    cluster, address = nodes
+    words = ["reconstruct", str(room.photos), "--threads", "1", "--downscale", "4", "--recipe", "2dgs", "--robust"]
+    words += ["off", "--schedule-scale", "0.005", "--checkpoint-every", "20", "--no-page"]
+    words += ["--set", "init_points=100", "--set", "surface.densify.max_splats=150"]
+    with begin([*words, "--verbose", "--out", str(tmp_path / "run"), "--cluster", address]) as process:
+        said = read_until(process, "training begins on")
+        said += read_until(process, "training: starting from")
+        lose(cluster)
+        said += process.communicate()[1]
+    assert process.returncode == 0, said
+    assert "cameras: 12 of 12 photographs have a place" in said
+    assert "training: its process or its machine" in said
+    shutil.copytree(tmp_path / "run/capture", tmp_path / "here/capture")
+    with begin([*words, "--out", str(tmp_path / "here"), "--resume"]) as process:
+        said = process.communicate()[1]
+    assert process.returncode == 0, said
+    assert digest(tmp_path / "here/splats.ply") == digest(tmp_path / "run/splats.ply")

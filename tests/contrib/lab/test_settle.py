@@ -1,0 +1,96 @@
+"""How many blocks memory needs, and whether a capture is what it was."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from gs2d.config.partition import Partition
+from gs2d.config.presets import get_recipe
+from gs2d.config.protocols import GENERIC
+from gs2d.contrib.lab import settle as module
+from gs2d.contrib.lab.settle import Settled, capture_digest, fitting_partition, seam_recipe
+from gs2d.errors import DataError
+from gs2d.pipeline.events import Event, Notice
+from gs2d.pipeline.prepare.estimate import Estimate, Range
+from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.render.backends import get_backend
+from train_toys import backends, make_scene
+
+SCENE = make_scene()
+SETTLED = Settled(SCENE, get_recipe("best"), GENERIC, get_backend(backends()[-1]), "digest")
+OPTIONS = TrainOptions(scene=Path("capture"), out=Path("job"))
+PLAN = Estimate(
+    photographs=6, pixels=1, trained_pixels=1, downscale=1, iterations=1, start=1_000_000, splats=Range(1, 2, 3),
+    max_splats=None, memory=Range(1, 2, 3), allowed=None, prepared=False, disk=1, temporary=1, training=Range(1, 2, 3),
+    seconds=Range(1, 2, 3),
+)  # fmt: skip
+
+
+def fitting(monkeypatch: pytest.MonkeyPatch, plan: Estimate | DataError, partition: Partition) -> Partition | None:
+    def planned(*_: object, **__: object) -> Estimate:
+        if isinstance(plan, DataError):
+            raise plan
+        return plan
+
+    monkeypatch.setattr(module, "estimate", planned)
+    return fitting_partition(SETTLED, OPTIONS, partition, lambda event: TOLD.append(event))
+
+
+TOLD: list[Event] = []
+
+
+def test_there_are_no_blocks_where_one_training_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert fitting(monkeypatch, PLAN, Partition()) is None
+    assert isinstance(TOLD[-1], Notice)
+    assert TOLD[-1].text.startswith("one training of everything fits into memory: no blocks")
+
+
+def test_there_are_as_many_blocks_as_memory_needs_with_the_coarse_model_beside_each(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """4 million splats are expected, times (1 + 2 x 0.25)^2 for the margin: 9; 1.5 fit beside 0.75 of the coarse."""
+    found = fitting(monkeypatch, replace(PLAN, max_splats=2_250_000), Partition(margin=0.25))
+    assert found is not None
+    assert found.coarse.max_splats == 750_000  # a third
+    assert found.splats == 1_500_000
+    assert found.blocks >= 6
+    assert found.blocks - min(found.grid) < 6  # not a row more than that takes
+
+
+def test_a_capture_is_known_by_its_cameras_points_and_split() -> None:
+    one = capture_digest(SCENE)
+    assert capture_digest(make_scene()) == one
+    first = SCENE.train[0]
+    turned = first.camera.T_cam_world.copy()
+    turned[0, 3] += 1e-9
+    assert capture_digest(replace(SCENE, train=(first.at(turned), *SCENE.train[1:]))) != one
+    assert capture_digest(replace(SCENE, train=SCENE.train[1:], test=SCENE.train[:1])) != one
+    assert SCENE.points is not None
+    assert capture_digest(replace(SCENE, points=None)) != one
+
+
+def test_seams_learn_by_the_last_rates_of_a_block_and_nothing_comes_or_goes() -> None:
+    recipe = get_recipe("2dgs-r")
+    block = recipe.stages[0]
+    (stage,) = seam_recipe(recipe, Partition(seam_schedule=0.1), 1.0).stages
+    assert stage.iterations == 3_000
+    assert stage.densify is None
+    assert stage.lr.means_at(0) == pytest.approx(block.lr.means_at(21_000))
+    assert stage.lr.means_at(3_000) == pytest.approx(block.lr.means_final)
+    assert stage.lr.settled_at(1) == stage.lr.settled_at(3_000) == 1.0
+    assert stage.lr.opacity_logits == block.lr.opacity_logits
+    assert set(stage.train.values()) == {"all"}
+    assert all(term.start == 0 for term in stage.losses)
+
+
+def test_seams_settle_as_a_block_does() -> None:
+    recipe = get_recipe("best")
+    block = recipe.stages[0]
+    (stage,) = seam_recipe(recipe, Partition(seam_schedule=0.1), 1.0).stages
+    assert stage.lr.settled_at(0) == block.lr.settled_at(14_000) == 1.0
+    assert stage.lr.settled_at(1_000) == pytest.approx(block.lr.settled_at(17_000))
+    assert stage.lr.settled_at(2_000) == pytest.approx(block.lr.settled_at(20_000)) == 0.1
+    assert stage.lr.sh0 == block.lr.sh0
