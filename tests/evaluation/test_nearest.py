@@ -23,7 +23,7 @@ def test_the_nearest_come_first_and_what_is_missing_is_infinitely_far() -> None:
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_what_is_not_finite_is_refused(bad: float) -> None:
     broken = np.array([[0.0, bad, 0]])
-    with pytest.raises(DataError, match="finite points were expected"):
+    with pytest.raises(DataError, match="finite"):
         Cloud(broken)
-    with pytest.raises(DataError, match="finite queries were expected"):
+    with pytest.raises(DataError, match="queries"):
         Cloud(POINTS).nearest(broken)

@@ -80,7 +80,7 @@ def test_a_3dgs_file_a_mesh_and_points_are_told_apart(tmp_path: Path) -> None:
 
 def test_published_3dgs_and_compressed_files_are_named(shared: Callable[[str], Path]) -> None:
     folder = shared("gaussians_plush_dog")
-    with pytest.raises(DataError, match="3DGS splats with three scales"):
+    with pytest.raises(DataError, match="splats"):
         read_splats(folder / "point_cloud_29999_clean.ply")
     with pytest.raises(DataError, match="compressed PLY"):
         read_splats(folder / "point_cloud_29999_clean.compressed.ply")
@@ -90,7 +90,7 @@ def test_published_3dgs_and_compressed_files_are_named(shared: Callable[[str], P
 def test_missing_splat_properties_are_named(tmp_path: Path) -> None:
     rows = np.zeros(1, dtype=[(name, "f4") for name in ("x", "y", "z", "scale_0", "scale_1", "opacity")])
     write_ply(tmp_path / "a.ply", {"vertex": rows})
-    with pytest.raises(DataError, match=r"f_dc_0, .* rot_3 are missing"):
+    with pytest.raises(DataError, match="f_dc_0"):
         read_splats(tmp_path / "a.ply")
 
 

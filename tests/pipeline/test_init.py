@@ -36,14 +36,14 @@ def test_a_run_starts_from_the_file_and_resumes_with_it_alone(options: TrainOpti
     check_same_run(run, job)
     other = prepare_job(replace(options, init=None), lambda event: None)
     assert other.stage_key(0) != job.stage_key(0)
-    with pytest.raises(RunError, match="was made with another --init: another file, or none"):
+    with pytest.raises(RunError, match="--init"):
         check_same_run(run, other)
 
 
 def test_what_cannot_start_a_training_is_one_line(options: TrainOptions, tmp_path: Path) -> None:
-    with pytest.raises(RecipeError, match="--init starts from splats, --from takes finished stages"):
+    with pytest.raises(RecipeError, match="--init"):
         prepare_job(replace(options, start_from=tmp_path), lambda event: None)
-    with pytest.raises(DataError, match="--init must be a file of splats, got the folder"):
+    with pytest.raises(DataError, match="--init"):
         prepare_job(replace(options, init=tmp_path), lambda event: None)
     with pytest.raises(DataError, match=r"none.ply"):
         prepare_job(replace(options, init=tmp_path / "none.ply"), lambda event: None)

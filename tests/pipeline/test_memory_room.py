@@ -64,7 +64,7 @@ def test_a_training_that_nobody_said_the_size_of_shrinks_its_photographs_until_t
     assert told.startswith("photographs of up to 0.000576 megapixels need about")
     assert told.endswith("(the control group (memory.max)): they are shrunk by 2, as by --downscale 2")
     assert len(notices) == len(set(notices))
-    with pytest.raises(DataError, match="use --downscale 2, or raise the limit"):
+    with pytest.raises(DataError, match="--downscale"):
         prepare_job(replace(mine, downscale=1), heard.append)
 
 

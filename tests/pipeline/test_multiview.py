@@ -42,6 +42,6 @@ def test_a_run_that_compares_views_resumes_to_the_same_bytes_and_logs_its_loss(c
 
 def test_cameras_that_all_look_elsewhere_are_refused_and_leave_nothing(capture: Path, tmp_path: Path) -> None:
     narrow = (*SMALL, "multiview.max_angle=0.1")
-    with pytest.raises(DataError, match="no training view of ball has a neighbour within multiview.max_angle = 0.1"):
+    with pytest.raises(DataError, match="max_angle"):
         train(comparing(capture, tmp_path / "run", overrides=narrow))
     assert not (tmp_path / "run").exists()

@@ -52,7 +52,7 @@ def test_a_list_of_places_is_taken_instead_of_what_the_files_say(tmp_path: Path)
     assert places.metres[0] == (1, 2, 3)
     assert "have no position" in places.notes[0]
     (tmp_path / "others.csv").write_text("name,x,y,z\nother.jpg,1,2,3\n")
-    with pytest.raises(DataError, match=r"must name the photographs, got none of 3, such as sub/000.jpg \(its first"):
+    with pytest.raises(DataError, match="photographs"):
         places_of(photos, tmp_path / "others.csv")
 
 
@@ -65,5 +65,5 @@ def test_which_pairs_are_compared_depends_on_how_many_know_their_place() -> None
     assert _matching(options("auto"), 200, most) == "spatial"
     assert _matching(options("auto"), 200, few) == "similar"
     assert _matching(options("sequential"), 200, most) == "sequential"
-    with pytest.raises(DataError, match="--matching spatial needs photographs that know where they were taken, none"):
+    with pytest.raises(DataError, match="--matching"):
         _matching(options("spatial"), 3, places_of([photo("a.jpg")] * 3, None))

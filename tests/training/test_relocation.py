@@ -142,11 +142,11 @@ def test_a_run_that_relocates_resumes_to_the_same_bytes(scene: Scene, backend: s
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"max_splats": 0}, "stage 'surface': densify.options.max_splats must be an integer >= 1, got 0"),
-        ({"rounds": 0}, "densify.options.rounds must be an integer >= 1, got 0"),
-        ({"growing": 1.5}, "densify.options.growing must be at most 1, got 1.5"),
-        ({"noise": -1.0}, "densify.options.noise must be a finite number >= 0, got -1"),
-        ({"budget": 3}, "densifier 'relocation' does not take the options"),
+        ({"max_splats": 0}, "densify.options.max_splats"),
+        ({"rounds": 0}, "densify.options.rounds"),
+        ({"growing": 1.5}, "densify.options.growing"),
+        ({"noise": -1.0}, "densify.options.noise"),
+        ({"budget": 3}, "relocation"),
     ],
 )
 def test_wrong_options_are_refused_before_training(scene: Scene, options: dict[str, object], message: str) -> None:

@@ -74,17 +74,17 @@ def test_wrong_archives_are_errors(tmp_path: Path) -> None:
     path = tmp_path / "cameras_sphere.npz"
     whole = path.read_bytes()
     path.write_bytes(whole[:300])
-    with pytest.raises(DataError, match=r"cameras_sphere\.npz must be a numpy"):
+    with pytest.raises(DataError, match=r"cameras_sphere\.npz"):
         load_scene(tmp_path)
     np.savez(path, world_mat_0=np.eye(4))
-    with pytest.raises(DataError, match="world_mat_i and scale_mat_i of every view, got 1 and 0"):
+    with pytest.raises(DataError, match="world_mat_i"):
         load_scene(tmp_path)
     np.savez(path, world_mat_0=np.eye(3), scale_mat_0=np.eye(4))
-    with pytest.raises(DataError, match="world_mat_0 must be a 4x4 matrix"):
+    with pytest.raises(DataError, match="world_mat_0"):
         load_scene(tmp_path)
     matrices = {f"{k}_mat_{i}": np.eye(4) for k in ("world", "scale") for i in (0, 1)}
     np.savez(path, **{**matrices, "scale_mat_1": 2 * np.eye(4)})
-    with pytest.raises(DataError, match="must be the same finite matrix"):
+    with pytest.raises(DataError, match="finite"):
         load_scene(tmp_path)
 
 

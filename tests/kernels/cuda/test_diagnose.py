@@ -118,7 +118,7 @@ def test_a_device_newer_than_the_compiler_takes_the_newest_code_of_its_major_ver
     assert nvrtc.architecture_for((9, 0)) == "sm_90"
     assert nvrtc.architecture_for((12, 1)) == "sm_120"
     assert nvrtc.architecture_for((7, 5)) == "sm_75"
-    with pytest.raises(BackendError, match=r"7\.5 or more \(Turing, 2018\), got 7\.0"):
+    with pytest.raises(BackendError, match="Turing"):
         nvrtc.architecture_for((7, 0))
 
 
@@ -136,5 +136,5 @@ def test_a_device_of_an_unknown_major_version_gets_ptx_of_the_newest_known(monke
     monkeypatch.setattr(nvrtc, "_nvrtc", lambda: Compiler)
     assert nvrtc.architecture_for((13, 0)) == "compute_120"
     monkeypatch.setattr(Compiler, "known", (90, 100))
-    with pytest.raises(BackendError, match=r"from sm_90, the GPU has compute capability 8\.0"):
+    with pytest.raises(BackendError, match="sm_90"):
         nvrtc.architecture_for((8, 0))
