@@ -6,8 +6,13 @@ import io
 
 import torch
 
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import Recipe
+from gs2d.core.splats import Splats
+from gs2d.data.scene import Scene
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
+from train_toys import same
 
 
 def reload(data: bytes) -> TrainState:
@@ -18,3 +23,15 @@ def saved(trainer: Trainer) -> bytes:
     file = io.BytesIO()
     torch.save(trainer.state.state_dict(), file)
     return file.getvalue()
+
+
+def resumed_everywhere(scene: Scene, recipe: Recipe, backend: str, every: int = 5) -> Splats:
+    """Train, resume from the state at each ``every``-th event, and return what all of them end with."""
+    saves: list[bytes] = []
+    trainer = Trainer(
+        scene, recipe, GENERIC, backend=backend, progress_every=1, on_event=lambda _: saves.append(saved(trainer))
+    )
+    end = trainer.run()
+    for data in saves[::every]:
+        assert same(Trainer(scene, recipe, GENERIC, backend=backend, state=reload(data)).run(), end)
+    return end

@@ -17,8 +17,8 @@ from gs2d.training.blended_sums import blended_sums
 from gs2d.training.densify.by_error import MultiViewErrorDensifier
 from gs2d.training.objective import ViewResidual
 from gs2d.training.trainer import Trainer
-from saved_states import reload, saved
-from train_toys import SIZE, VIEWS, random_splats, same, short
+from saved_states import resumed_everywhere
+from train_toys import SIZE, VIEWS, random_splats, short
 
 
 def by_error(views: int = 3, power: float = 1.0) -> Recipe:
@@ -88,10 +88,4 @@ def test_who_is_drawn_where_pictures_are_wrong_is_asked_first(scene: Scene, back
 
 
 def test_a_run_that_grows_by_error_resumes_to_the_same_bytes(scene: Scene, backend: str) -> None:
-    recipe, saves = by_error(views=2), []
-    trainer = Trainer(
-        scene, recipe, GENERIC, backend=backend, progress_every=1, on_event=lambda event: saves.append(saved(trainer))
-    )
-    end = trainer.run()
-    for data in saves[::5]:
-        assert same(Trainer(scene, recipe, GENERIC, backend=backend, state=reload(data)).run(), end)
+    resumed_everywhere(scene, by_error(views=2), backend)

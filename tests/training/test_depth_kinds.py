@@ -11,8 +11,8 @@ from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import LossTerm, Recipe
 from gs2d.data.scene import Scene
 from gs2d.training.trainer import Trainer
-from saved_states import reload, saved
-from train_toys import same, short
+from saved_states import resumed_everywhere
+from train_toys import short
 
 
 def by_depth(recipe: Recipe, kind: str, *kinds_of_loss: str) -> Recipe:
@@ -50,12 +50,4 @@ def test_losses_by_it_have_other_gradients_than_by_the_median(scene: Scene, back
 
 
 def test_a_resumed_training_gives_the_same_bytes(scene: Scene, backend: str) -> None:
-    recipe = by_depth(short(), "transmittance", "normal_consistency")
-    whole = Trainer(scene, recipe, GENERIC, backend=backend)
-    whole.enter(0)
-    for _ in range(7):
-        whole.step()
-    again = Trainer(scene, recipe, GENERIC, backend=backend, state=reload(saved(whole)))
-    for trainer in (whole, again):
-        trainer.run()
-    assert same(whole.splats, again.splats)
+    resumed_everywhere(scene, by_depth(short(), "transmittance", "normal_consistency"), backend, every=12)

@@ -12,7 +12,7 @@ from gs2d.config.recipe import LossTerm, Recipe
 from gs2d.data.scene import Scene, View
 from gs2d.errors import RecipeError
 from gs2d.training.trainer import Trainer
-from saved_states import reload, saved
+from saved_states import resumed_everywhere
 from train_toys import SIZE, compared, same, short, train
 
 
@@ -70,14 +70,9 @@ def test_stages_look_at_the_size_that_they_say_and_scores_at_the_full_one(scene:
 
 
 def test_a_run_of_several_sizes_resumes_to_the_same_bytes(scene: Scene, backend: str) -> None:
-    recipe, saves = at_half(short(), 0, 2), []
+    recipe = at_half(short(), 0, 2)
     recipe = replace(recipe, stages=(replace(recipe.stages[0], halve_at=(5,)), *recipe.stages[1:]))
-    trainer = Trainer(
-        scene, recipe, GENERIC, backend=backend, progress_every=2, on_event=lambda event: saves.append(saved(trainer))
-    )
-    end = trainer.run()
-    for data in saves[::3]:
-        assert same(Trainer(scene, recipe, GENERIC, backend=backend, state=reload(data)).run(), end)
+    resumed_everywhere(scene, recipe, backend)
 
 
 def test_photographs_that_would_be_too_small_are_refused_before_training(scene: Scene) -> None:

@@ -18,7 +18,7 @@ from gs2d.render.api import rasterize
 from gs2d.training.multiview import ImageFiles, draw_turn, find_neighbours
 from gs2d.training.targets import Targets
 from gs2d.training.trainer import Trainer
-from saved_states import reload, saved
+from saved_states import resumed_everywhere
 from train_toys import WIDE, compared, same, short
 
 
@@ -113,21 +113,8 @@ def test_both_losses_are_there_once_they_have_started_and_move_depths(scene: Sce
 
 
 def test_a_resumed_training_gives_the_same_bytes(scene: Scene, backend: str) -> None:
-    whole = Trainer(scene, compared(), GENERIC, backend=backend)
-    end = whole.run()
+    end = resumed_everywhere(scene, compared(), backend, every=12)
     assert not same(end, Trainer(scene, short(), GENERIC, backend=backend).run())
-    for stage, stop in ((0, 8), (2, 3)):
-        trainer = Trainer(scene, compared(), GENERIC, backend=backend)
-        for index in range(stage):
-            trainer.enter(index)
-            for _ in range(trainer.recipe.stages[index].iterations):
-                trainer.step()
-            trainer._finish(trainer.recipe.stages[index])
-        trainer.enter(stage)
-        for _ in range(stop):
-            trainer.step()
-        state = reload(saved(trainer))
-        assert same(Trainer(scene, compared(), GENERIC, backend=backend, state=state).run(), end), stage
 
 
 def test_the_neighbour_s_depth_is_rendered_as_the_splats_are_now(scene: Scene) -> None:
