@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from gs2d.core.camera import Camera, look_at
-from gs2d.meshing import texture as baking
 from gs2d.meshing.agreement import agree
 from gs2d.meshing.raycast import cast_camera
 from gs2d.meshing.texture import ColorSource, bake
@@ -110,27 +108,3 @@ def test_photographs_leave_no_seam_where_they_end() -> None:
     texture = bake(flat_atlas(grid_plane(16)), listed(images), SIZE, threads=1).mesh.texture[8:-8, 8:-8].astype(int)
     assert max(np.abs(np.diff(texture, axis=k)).max() for k in (0, 1)) <= 2  # of 50 between photographs
     assert np.ptp(texture) <= 8
-
-
-def test_the_table_of_samples_stays_within_its_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    images = photographs(6)
-    images[1] = with_plate(images[1], 1.0, (220, 40, 40))
-    whole = errors(images)
-    tables: list[int] = []
-    monkeypatch.setattr(
-        baking, "agree", lambda samples: tables.append(sum(t.nbytes for t in samples)) or agree(samples)
-    )
-    monkeypatch.setattr(baking, "TABLE_BYTES", 6 * 4 * 300)
-    thinned = errors(images)
-    assert 0 < tables[0] <= 6 * 4 * 300
-    assert thinned.mean() < whole.mean() + 2
-
-
-def test_gains_of_photographs_that_share_no_points_are_one() -> None:
-    samples = [np.zeros((40, 4), np.uint8) for _ in range(2)]
-    samples[0][:20] = (100, 100, 100, 255)
-    samples[1][20:] = (50, 50, 50, 255)
-    found = agree(samples)
-    np.testing.assert_allclose(found.gains, 1)
-    np.testing.assert_allclose(found.colors, np.repeat([[100.0] * 3, [50.0] * 3], 20, axis=0))
-    assert [int((s[:, 3] == 255).sum()) for s in samples] == [20, 20]

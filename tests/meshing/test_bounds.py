@@ -82,14 +82,6 @@ def test_a_bbox_is_fused_whole() -> None:
     assert lim.depth_limit == pytest.approx(8.0)  # the camera at y = -5 looks along y: the far face is 8 deep
 
 
-def test_points_cut_the_derived_box() -> None:
-    points = np.array([[0, -0.2, -0.2], [50, 0.2, 0.2]])
-    lim = derive_limits([sample(line(1000, 0, 100), np.full(1000, 5.0))], [CAMERA], resolution=98, points=points)
-    assert lim.upper[0] == pytest.approx(50 + 0.25 * 98)
-    with pytest.raises(ProtocolError, match="beside it"):
-        derive_limits([sample(line(1000, 0, 100), np.full(1000, 5.0))], [CAMERA], points=points + 1000)
-
-
 @pytest.mark.parametrize(
     "options",
     [
@@ -108,14 +100,6 @@ def test_limits_that_make_no_sense_are_refused_in_one_line(options: dict) -> Non
     with pytest.raises(ProtocolError) as error:
         derive_limits([sample(line(100, 0, 1), np.ones(100))], [CAMERA], **options)
     assert "\n" not in str(error.value)
-
-
-def test_no_depth_at_all_is_refused() -> None:
-    empty = depth_map(RenderedView(CAMERA, np.zeros((64, 64))))
-    with pytest.raises(ProtocolError, match="got none"):
-        limits_of([empty])
-    with pytest.raises(ProtocolError, match="got none"):
-        derive_limits([], [])
 
 
 # noise
@@ -138,13 +122,6 @@ def noise_of(maps: list[DepthMap]) -> float | None:
     return depth_noise(maps, [sample_depths(m) for m in maps], limits_of(maps))
 
 
-def test_exact_maps_do_not_disagree() -> None:
-    maps = orbit_maps(0.0)
-    noise = noise_of(maps)
-    assert noise is not None
-    assert noise < 0.2 * limits_of(maps).voxel  # the curvature within a pixel
-
-
 def test_disagreement_is_as_large_as_the_error() -> None:
     """The difference of two errors of sigma has standard deviation sqrt(2) sigma; 75 % of its positive half lie below
     1.15 times that, 1.63 sigma. Slanted surface adds to it."""
@@ -165,13 +142,6 @@ def test_occlusion_is_no_disagreement() -> None:
     noise = noise_of(maps)
     assert noise is not None
     assert noise < 0.01
-
-
-def test_one_view_gives_no_estimate_and_leaves_the_truncation() -> None:
-    maps = orbit_maps(0.02)[:1]
-    assert noise_of(maps) is None
-    lim = limits_of(maps)
-    assert widen_truncation(lim, None) is lim
 
 
 def test_the_truncation_is_twenty_times_the_noise_within_five_and_twenty_voxels_and_a_40th_of_the_box() -> None:

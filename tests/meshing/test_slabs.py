@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gs2d.core.camera import look_at
-from gs2d.meshing.bounds import FusionBounds, derive_limits, sample_depths
+from gs2d.meshing.bounds import derive_limits, sample_depths
 from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
 from gs2d.meshing.marching_cubes import marching_cubes
-from gs2d.meshing.sampling import DepthSampler, make_sampler
 from gs2d.meshing.slabs import fused_surface, slabs
 from gs2d.meshing.tsdf import block_bytes, find_blocks, fuse, fuse_blocks
 from surface_shapes import orbit, sphere_depth
@@ -42,30 +40,6 @@ def test_the_mesh_of_slabs_is_that_of_the_whole_volume(colored: bool, fraction: 
     assert (parts.colors is None) == (whole.colors is None) == (not colored)
     if colored:
         np.testing.assert_array_equal(parts.colors, whole.colors)
-
-
-def test_views_that_see_nothing_of_a_slab_are_not_prepared(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = []
-    for shift in (-6.0, 0.0, 6.0):  # three cameras in a row along x, each over a wall of its own
-        camera = look_at([shift, 0, 0], [shift, 0, 1], [0, -1, 0], width=24, height=24, fx=24.0)
-        seen.append(depth_map(RenderedView(camera, np.full((24, 24), 2.0))))
-    limits = derive_limits([sample_depths(item) for item in seen], [item.camera for item in seen], voxel=0.1)
-    blocks = find_blocks(seen, limits, threads=1)
-    whole = marching_cubes(fuse(seen, limits, threads=1))
-    prepared: list[float] = []
-
-    def recorded(item: DepthMap, limits: FusionBounds) -> DepthSampler:
-        prepared.append(float(item.camera.center[0]))
-        return make_sampler(item, limits)
-
-    monkeypatch.setattr("gs2d.meshing.tsdf.make_sampler", recorded)
-    count = len(list(slabs(blocks, 1)))
-    parts = fused_surface(seen, limits, blocks, slab_bytes=1, threads=1)
-    assert count >= 9  # of which each camera sees a third or less
-    assert set(prepared) == {-6.0, 0.0, 6.0}
-    assert len(prepared) <= count + 3  # two cameras may see the one between them; none sees all
-    np.testing.assert_array_equal(parts.vertices, whole.vertices)
-    np.testing.assert_array_equal(parts.faces, whole.faces)
 
 
 def test_no_slab_takes_more_memory_than_it_may_unless_it_is_one_layer(monkeypatch: pytest.MonkeyPatch) -> None:

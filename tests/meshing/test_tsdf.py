@@ -178,18 +178,6 @@ def test_memory_is_bounded_and_the_error_names_a_voxel_that_fits() -> None:
     assert 0.3 * max_bytes < volume.nbytes <= max_bytes
 
 
-@pytest.mark.parametrize("voxel", [1e-3, 1e-6])
-def test_a_voxel_that_is_far_too_small_is_refused_at_once(voxel: float) -> None:
-    """To count blocks of 1e-6 world units voxels would take for ever, and all memory. Two errors later a voxel fits."""
-    frames = maps(sphere_frames(orbit(10, 3.0)))
-    max_bytes = 1500 * block_bytes(False)
-    for least in ("at least ", ""):
-        with pytest.raises(ProtocolError, match=rf"need {least}[\d.e+]+ GiB; use a voxel of about") as error:
-            fuse(frames, limits(1.3, voxel), max_bytes=max_bytes)
-        voxel = float(str(error.value).split("voxel of about ")[1].split(" ")[0])
-    assert 0.3 * max_bytes < fuse(frames, limits(1.3, voxel), max_bytes=max_bytes, threads=1).nbytes <= max_bytes
-
-
 def test_a_spool_gives_back_what_it_was_given_as_often_as_asked() -> None:
     camera = orbit(1, 3.0)[0]
     depth = sphere_depth(camera, 1.0)
@@ -208,17 +196,6 @@ def test_a_spool_gives_back_what_it_was_given_as_often_as_asked() -> None:
                 for name in ("depth", "color", "weight"):
                     a, b = getattr(item, name), getattr(expected, name)
                     assert (a is None and b is None) or np.array_equal(a, b), name
-
-
-def test_extract_takes_a_generator_and_derives_everything() -> None:
-    cameras = orbit(30, 3.0)
-    result = extract((frame for frame in sphere_frames(cameras)), resolution=60, threads=1)
-    assert is_closed_manifold(result.mesh)
-    assert result.frames == 30
-    assert result.components == 1
-    assert result.limits.voxel == pytest.approx(2 / 60, rel=0.1)
-    radius = np.linalg.norm(result.mesh.vertices, axis=1)
-    assert np.abs(radius - 1).max() < 0.6 * result.limits.voxel
 
 
 def test_an_orbit_at_uneven_distances_keeps_the_whole_scene() -> None:

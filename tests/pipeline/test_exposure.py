@@ -9,22 +9,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ball_runs import SMALL, Stop, comparable, options
+from ball_runs import SMALL, options
 from gs2d.data import View
 from gs2d.data.image_files import read_image, write_image
 from gs2d.data.subject import OBJECT, read_subject
 from gs2d.errors import RunError
 from gs2d.io.run_dir import EXPOSURE, RunFolder
 from gs2d.pipeline.demo import demo
-from gs2d.pipeline.events import Event, Notice, Step, ignore
+from gs2d.pipeline.events import Event, Notice, ignore
 from gs2d.pipeline.finish.camera_paths import orbit_cameras
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.finish.run_images import render_run, render_view
 from gs2d.pipeline.finish.run_report import report_run
-from gs2d.pipeline.finish.run_texture import _images
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.finished import open_job
-from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, TextureOptions, TrainOptions
+from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, TrainOptions
 from gs2d.pipeline.prepare.run_exposures import read_exposures
 from gs2d.pipeline.train.train_run import train
 from gs2d.synthetic import capture as toy
@@ -134,30 +133,6 @@ def test_any_view_can_be_rendered_in_the_exposure_of_a_photograph(run: RunFolder
     assert np.abs(255 * output.color.clamp(0, 1).numpy() - expected).max() > 2
     with pytest.raises(RunError, match="r_9"):
         render_run(run.path, exposure_of="train/r_9.png")
-
-
-def test_the_texture_takes_photographs_in_the_exposure_of_the_scene(run: RunFolder) -> None:
-    _, job, splats = open_job(run.path, 1, ignore)
-    transforms = read_exposures(run, job.recipe)
-    views = job.scene.train[:2]
-    for view, image in zip(views, _images(job, views, splats, TextureOptions(), transforms, ignore, 1), strict=True):
-        A, b = np.split(transforms[view.name].double().numpy(), [3], axis=1)
-        inside = view.image()[..., 3] > 0
-        expected = 255 * np.clip((view.image()[inside][:, :3] / 255 - b[:, 0]) @ np.linalg.inv(A).T, 0, 1)
-        assert np.abs(image.image[inside][:, :3] - expected).max() <= 0.51
-
-
-def test_a_stopped_run_resumes_to_the_same_splats_and_exposures(run: RunFolder, varied: Path, tmp_path: Path) -> None:
-    def listen(event: Event) -> None:
-        if isinstance(event, Step) and event.done >= 37 and "loss" in event.detail:  # in the second stage
-            raise Stop
-
-    with pytest.raises(Stop):
-        train(learning(varied, tmp_path / "run"), listen)
-    assert not (tmp_path / "run" / EXPOSURE).exists()
-    resumed = train(learning(varied, tmp_path / "run", resume=True))
-    assert comparable(resumed)[0] == comparable(run)[0]
-    assert resumed.file(EXPOSURE).read_bytes() == run.file(EXPOSURE).read_bytes()
 
 
 def test_a_lost_or_damaged_file_of_exposures_is_named_with_its_remedy(run: RunFolder, tmp_path: Path) -> None:

@@ -13,11 +13,11 @@ import pytest
 
 from ball_runs import Stop, options
 from gs2d.data import View
-from gs2d.errors import DataError, DiskError, ProtocolError, RunError
+from gs2d.errors import DataError, DiskError, RunError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RunFolder, open_run
 from gs2d.io.splat_ply import read_splats, write_splats
-from gs2d.pipeline.events import Event, StageDone, Step
+from gs2d.pipeline.events import Event, StageDone
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.finish.export import export_run
 from gs2d.pipeline.finish.run_images import file_names, render_run
@@ -38,36 +38,6 @@ def test_meshing_again_keeps_to_the_box_and_the_voxel(undisturbed: RunFolder, tm
     assert result["vertices"] == len(mesh.vertices)
     if len(mesh.vertices):
         assert mesh.vertices.min(axis=0)[2] > -0.2
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"voxel": -1.0},
-        {"voxel": 0.0},
-        {"truncation": 0.0},
-        {"depth_limit": float("nan")},
-        {"keep_components": -1},
-        {"bbox": (1, 1, 1, 0, 0, 0)},
-    ],
-)
-def test_meshing_with_senseless_limits_is_refused_before_anything_is_rendered(
-    undisturbed: RunFolder, tmp_path: Path, bad: dict[str, Any]
-) -> None:
-    heard: list[Event] = []
-    with pytest.raises((ProtocolError, DataError), match=f"--{next(iter(bad)).replace('_', '-')} must be"):
-        mesh_run(undisturbed.path, MeshOptions(**bad), heard.append, out=tmp_path / "x.ply")
-    assert list(tmp_path.iterdir()) == []
-    assert not any(isinstance(event, Step) for event in heard)
-
-
-@pytest.mark.parametrize("name", ["protocol", "raster", "backend", "downscale"])
-def test_a_damaged_definition_is_named_when_the_run_is_used(undisturbed: RunFolder, tmp_path: Path, name: str) -> None:
-    copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
-    data = json.loads((copy / "run.json").read_text())
-    (copy / "run.json").write_text(json.dumps({key: value for key, value in data.items() if key != name}))
-    with pytest.raises(RunError, match=name):
-        render_run(copy)
 
 
 @pytest.mark.parametrize(("text", "kind"), [("splats.ply", "splats"), ("bad", "vertex indices below 1")])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import socket
 import subprocess
 import sys
 import threading
@@ -19,8 +18,7 @@ import pytest
 import torch
 
 from ball_runs import comparable, options
-from cli_runs import TINY, one_line
-from gs2d.cli import run
+from cli_runs import TINY
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.io.run_dir import RunFolder
@@ -160,29 +158,6 @@ def test_a_viewer_that_fails_is_told_once_and_training_goes_on(live: Live, heard
         live.on_event(Phase("scoring", 3))
     told = [event.text for event in heard if isinstance(event, Notice)]
     assert told[1:] == ["the viewer failed, training goes on: OSError: no memory"]
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--viewer-port", "9000"], "--viewer-port belongs to --viewer, which was not given; give both"),
-        (["--viewer", "--viewer-port", "0"], "--viewer-port must be 1 to 65535, got 0"),
-        (["--viewer", "--viewer-port", "{taken}"], "a free port on 127.0.0.1 was expected, port {taken}"),
-    ],
-)
-@pytest.mark.parametrize("command", ["train", "demo"])
-def test_a_port_that_cannot_be_had_is_refused_before_the_work(
-    command: str, words: list[str], message: str, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = str(taken.getsockname()[1])
-        scene = [str(capture)] if command == "train" else []
-        words = [word.format(taken=port) for word in words]
-        assert run([command, *scene, "--out", str(tmp_path / "run"), "--quiet", *words]) == 2
-    assert message.format(taken=port) in one_line(capsys.readouterr().err)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_watched_command_ends_when_the_work_is_done(capture: Path, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import torch
 from ball_runs import SMALL, options
 from gs2d.core.photometry import CameraPhotometry
 from gs2d.errors import RunError
-from gs2d.io.run_dir import PHOTOMETRY, REPORT, SPLATS, RunFolder
+from gs2d.io.run_dir import PHOTOMETRY, REPORT, RunFolder
 from gs2d.pipeline.events import Event, Notice, ignore
 from gs2d.pipeline.prepare.job import reload_job
 from gs2d.pipeline.prepare.run_exposures import as_scene, photographed
@@ -62,21 +62,6 @@ def test_what_is_rendered_and_taken_back_are_each_other_s_inverse(run: RunFolder
     assert np.array_equal(back[..., 3], given[..., 3])
     assert (back[..., :3] >= given[..., :3]).all()
     assert back[0, :, :3].sum() >= given[0, :, :3].sum()
-
-
-def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(run: RunFolder, tmp_path: Path) -> None:
-    copy = RunFolder(Path(shutil.copytree(run.path, tmp_path / "run")))
-    for name in (SPLATS, PHOTOMETRY):
-        copy.file(name).unlink()
-    capture = Path(run.definition()["scene"]["path"])
-    for last in copy.checkpoints()[1:]:
-        last.path.unlink()
-    changes = {"vignetting": True, "response": True, "overrides": EARLY, "resume": True}
-    resumed = train(options(capture, copy.path, **changes))
-    assert resumed.file(SPLATS).read_bytes() == run.file(SPLATS).read_bytes()
-    assert resumed.file(PHOTOMETRY).read_bytes() == run.file(PHOTOMETRY).read_bytes()
-    with pytest.raises(RunError, match="another"):
-        train(options(capture, copy.path, vignetting=True, overrides=EARLY, resume=True))
 
 
 def test_a_damaged_file_is_one_line_that_says_what_to_do(run: RunFolder, tmp_path: Path) -> None:

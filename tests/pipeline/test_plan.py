@@ -21,7 +21,6 @@ from gs2d.config.recipe import Stage
 from gs2d.config.serialize import apply_overrides
 from gs2d.core import memory_limit
 from gs2d.errors import DataError
-from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.prepare import estimate as module
 from gs2d.pipeline.prepare import plan as plan_module
 from gs2d.pipeline.prepare.estimate import (
@@ -166,18 +165,3 @@ def test_what_cannot_fit_is_refused_in_one_line_and_leaves_nothing(
     assert "photographs" in ran.stderr
     assert ran.stderr.count("\n") == 1
     assert not out.exists()
-
-
-def test_a_training_with_limits_says_its_plan_before_it_begins(capture: Path, tmp_path: Path) -> None:
-    heard: list[str] = []
-
-    def stop(event: Event) -> None:
-        if isinstance(event, Notice):
-            heard.append(event.text)
-        if getattr(event, "name", "").startswith("training"):
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(TrainOptions(scene=capture, out=tmp_path / "run", recipe="2dgs", schedule_scale=0.01, memory=3.0), stop)
-    assert any(text.startswith("memory: ") and "of 3 GiB allowed" in text for text in heard)
-    assert any(text.startswith("time: ") for text in heard)

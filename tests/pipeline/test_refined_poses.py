@@ -19,7 +19,7 @@ from gs2d.io.run_dir import POSES, RunFolder
 from gs2d.pipeline.demo import demo
 from gs2d.pipeline.events import Event, Notice, Step, ignore
 from gs2d.pipeline.finish.evaluate import evaluate_run
-from gs2d.pipeline.finish.run_images import render_run, render_view, shown_cameras
+from gs2d.pipeline.finish.run_images import render_run, render_view
 from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.finish.run_texture import _views
 from gs2d.pipeline.finish.scoring import score_views
@@ -110,17 +110,6 @@ def test_everybody_takes_the_cameras_that_were_found(run: RunFolder, capture: Pa
     assert texture[0].camera.width == job.scene.train[0].camera.width // 2
 
 
-def test_pictures_of_training_views_are_drawn_from_where_they_were_taken(capture: Path, tmp_path: Path) -> None:
-    alone = tmp_path / "alone"
-    shutil.copytree(capture, alone)
-    (alone / "transforms_test.json").write_text('{"camera_angle_x": 0.7, "frames": []}')
-    made = train(learning(alone, tmp_path / "run"))
-    found = {
-        tuple(np.array(frame["T_cam_world"]).ravel()) for frame in json.loads(made.file(POSES).read_text())["frames"]
-    }
-    assert all(tuple(camera.T_cam_world.ravel()) in found for camera in shown_cameras(made))
-
-
 def test_aligned_scores_are_beside_the_plain_ones_where_they_are_asked_for(run: RunFolder) -> None:
     plain = run.metrics()["stages"][-1]
     assert "test_aligned" not in plain
@@ -177,11 +166,3 @@ def test_a_lost_or_damaged_file_of_poses_is_named_with_its_remedy(run: RunFolder
         evaluate_run(copy.path)
     report_run(copy.path)
     assert "poses.json is missing" in copy.file("report.html").read_text()
-
-
-def test_the_report_shows_how_far_the_cameras_moved(run: RunFolder) -> None:
-    page = " ".join(run.file("report.html").read_text().split())
-    assert "Where the photographs were taken" in page
-    frames = [frame for frame in json.loads(run.file(POSES).read_text())["frames"] if frame["split"] == "train"]
-    most = max(frames, key=lambda frame: frame["moved"]["pixels"])
-    assert f"most in {most['name']} ({most['moved']['pixels']:.2f} pixels)" in page

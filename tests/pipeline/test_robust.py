@@ -95,31 +95,6 @@ def test_training_is_robust_where_protocol_and_capture_allow_it(
     assert (recipe.stages[0].lr.sh0 > LearningRates().sh0) == robust  # a tenth of the schedule: longer steps
 
 
-def test_what_was_decided_is_said() -> None:
-    said: list[Event] = []
-    fit_recipe(options(), VARIED, GENERIC, said.append)
-    fit_recipe(options(), BLIND, GENERIC, said.append)
-    fit_recipe(options(), EMPTY, GENERIC, said.append)
-    assert [event.text for event in said if isinstance(event, Notice)] == [
-        "exposures of the photographs: 0.80 to 1.20 times their mean; learned for each",
-        "no dense start and no known free space: the capture does not say which points its images show",
-        f"no dense start and no known free space: {LACKS}",
-    ]
-    faces = replace(BLIND, train=tuple(replace(view, is_face=True) for view in BLIND.train))
-    fit_recipe(options(refine_cameras=True, robust="off"), faces, GENERIC, said.append)
-    fit_recipe(options(refine_cameras=True, vignetting=True, robust="off"), faces, GENERIC, said.append)
-    assert [event.text for event in said[-2:] if isinstance(event, Notice)] == [
-        f"{COUNT} faces of panoramas or fisheyes: of their lenses nothing is learned",
-        f"{COUNT} faces of panoramas or fisheyes: of their lenses and vignetting nothing is learned",
-    ]
-    guessed = replace(EQUAL, observe=lambda: replace(EQUAL.observe(), guessed="no tracks"))  # type: ignore[misc]
-    said.clear()
-    assert fit_recipe(options(), guessed, GENERIC, said.append).removal is not None
-    assert said == [Notice("sparse points are projected into the images: no tracks")]
-    with pytest.raises(DataError, match="--robust"):
-        settled(options(robust="on"), EMPTY, GENERIC, said.append)
-
-
 # -- the exposure of a view that nobody photographed ----------------------------------------------------------------
 def predicted(gains: np.ndarray) -> float:
     """The gain that the last view of the ring would have, by those of the others."""

@@ -16,10 +16,10 @@ from gs2d.data.reach import Reach
 from gs2d.data.subject import OBJECT, read_subject
 from gs2d.errors import ProtocolError
 from gs2d.io.meshes import read_mesh
-from gs2d.io.run_dir import PAGE, RunFolder
+from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.events import Notice
 from gs2d.pipeline.finish.believed import sky_direction
-from gs2d.pipeline.finish.run_mesh import SEVERAL, extract_mesh, fusion_frame, mesh_run
+from gs2d.pipeline.finish.run_mesh import SEVERAL, extract_mesh, fusion_frame
 from gs2d.pipeline.finish.run_subject import meshed_subject, subject_line
 from gs2d.pipeline.prepare.finished import finished_splats
 from gs2d.pipeline.prepare.job import reload_job
@@ -95,20 +95,3 @@ def test_depth_that_is_loose_counts_less_and_depth_of_the_sky_is_infinite(undist
     assert not np.isinf(fusion_frame(generic, view, output, "median", None, up).depth)[18:].any()
     near = Reach(view.camera.center, 3.0)
     assert np.isinf(fusion_frame(generic, view, output, "median", near).depth).all()
-
-
-def test_a_new_subject_is_in_the_page_and_what_is_said_of_the_mesh_in_the_metrics(
-    undisturbed: RunFolder, tmp_path: Path
-) -> None:
-    run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
-    for options, rewritten in ((MeshOptions(voxel=0.05), False), (MeshOptions(voxel=0.05, subject_box=BOX), True)):
-        run.file(PAGE).write_text("of before")
-        result = mesh_run(run.path, options)
-        assert (run.file(PAGE).read_text() != "of before") == rewritten
-        said = run.metrics()["mesh"]
-        assert (said["faces"], said["voxel"]) == (result["faces"], 0.05)
-        assert "file" not in said
-    assert run.metrics()["stages"]
-    run.file(PAGE).unlink()
-    mesh_run(run.path, MeshOptions(voxel=0.05, subject_box=BOX))
-    assert not run.file(PAGE).exists()  # whoever wanted none gets none

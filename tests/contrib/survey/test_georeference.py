@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 from PIL import ExifTags, Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -312,22 +311,3 @@ def test_the_mesh_a_million_metres_away_comes_back_to_a_millimetre(
     assert (run / "mesh.ply").read_bytes() == before
     assert gs2d(["info", str(out)]) == 0
     assert "EPSG:32632" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("name", ["mesh.glb", "mesh.obj"])
-def test_the_textured_mesh_a_million_metres_away_comes_back_to_a_millimetre(
-    run: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip("xatlas")
-    g, out = placed(run), tmp_path / name
-    words = ["--texture", "--texture-size", "256", "--faces", "100000", "--georeferenced"]
-    assert gs2d(["mesh", str(run), "--out", str(out), *words]) == 0
-    assert "less the offset 1000123 6000456 789" in capsys.readouterr().out
-    said = georeference_of_file(out)
-    assert said is not None
-    assert (said.epsg, said.origin.tolist()) == (32632, g.origin.tolist())
-    (geometry,) = trimesh.load_scene(out, process=False).geometry.values()  # in the file's own axes, z up
-    expected = np.unique(g.to_world(read_mesh(run / "mesh.ply").vertices) - g.origin, axis=0)
-    away = cKDTree(expected).query(said.to_world(np.asarray(geometry.vertices)) - g.origin)[0]
-    assert away.max() < 1e-3
-    assert len(np.unique(np.round(geometry.vertices, 3), axis=0)) == len(np.unique(np.round(expected, 3), axis=0))
