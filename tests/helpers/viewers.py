@@ -1,26 +1,11 @@
-"""Viewers of other people from npm, in a headless browser: our files from a camera of ours, beside our own rendering.
-
-::
-
-    PYTHONPATH=src python tests/helpers/viewers.py RUN --out FOLDER [--up 0 0 1] [--viewers spark babylon]
-
-Writes the splats of a run, or of a file of splats, in every layout that a viewer says it reads, turned so that what is
-up is -y, as viewers take it; opens each file in each of them and prints a row of Markdown for it: PSNR against gs2d's
-own rendering from the same camera (both over white), and which axis of the splats is up there. A stream is shown by
-PlayCanvas's engine at each of its levels, beside our rendering of that level, and by SuperSplat's viewer near and far,
-coloured by level. FOLDER/viewers.jpg and FOLDER/viewers-levels.jpg have all pictures, FOLDER/shots each one. Needs npm
-and Chromium, and says so where it cannot have them.
-"""
+"""Viewers of other people from npm, in a headless browser: our files beside our own rendering, from one camera."""
 
 from __future__ import annotations
 
-import argparse
 import functools
 import http.server
 import json
 import math
-import sys
-import tempfile
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -29,18 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
-from PIL import Image, ImageDraw
 
-from browser import browser, require_browser
-from gs2d.contrib.formats.sog import read_level
+from browser import browser
 from gs2d.core.camera import look_at
 from gs2d.core.splats import Splats
-from gs2d.core.transforms import transform_splats
-from gs2d.io.formats.registry import LAYOUTS, read_splats, write_layout
+from gs2d.io.formats.registry import LAYOUTS, write_layout
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
-from npm import VERSIONS, forget, package
+from npm import VERSIONS, package
 
 WIDTH, HEIGHT = 480, 360
 FRAMES = 20  # drawn before the picture is taken: sorting is done beside drawing
@@ -48,7 +29,6 @@ PATIENCE = 240.0  # s: the frames are drawn without a GPU
 
 # How a viewer's frame lies to that of the splats: factors of x, y, z. The last one is left-handed, as its viewer is.
 AS_IT_IS, ABOUT_X, ABOUT_Z, LEFT = (1, 1, 1), (1, -1, -1), (-1, -1, 1), (1, -1, 1)
-WORDS = {AS_IT_IS: "+y", ABOUT_X: "-y", ABOUT_Z: "-y", LEFT: "-y"}  # which axis of the splats is up there
 
 
 @dataclass(frozen=True)
@@ -342,112 +322,3 @@ def written(splats: Splats, layouts: Sequence[str], folder: Path) -> None:
 def psnr(image: np.ndarray, other: np.ndarray) -> float:
     """Between two pictures in [0, 1], dB."""
     return float(-10 * np.log10(max(np.square(image - other).mean(), 1e-20)))
-
-
-def upright(splats: Splats, up: Sequence[float]) -> Splats:
-    """Return splats turned so that ``up`` is -y."""
-    from scipy.spatial.transform import Rotation
-
-    turn, _ = Rotation.align_vectors([[0.0, -1.0, 0.0]], [up])
-    return transform_splats(splats, 1.0, turn.as_matrix(), np.zeros(3))
-
-
-def camera_for(splats: Splats, distance: float = 2.2) -> Camera:
-    """Return a camera that has all of the splats in its picture, from a little above."""
-    means = splats.means.detach().numpy().astype(np.float64)
-    low, high = np.percentile(means, [1, 99], axis=0)
-    centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
-    eye = centre + distance * radius * np.array([0.49, -0.37, -0.79])
-    return Camera(tuple(eye.tolist()), tuple(centre.tolist()))
-
-
-def _sheet(path: Path, shots: dict[str, np.ndarray], columns: int, width: int) -> None:
-    """Write pictures side by side, each with its name."""
-    height = width * HEIGHT // WIDTH
-    rows = -(-len(shots) // columns)
-    sheet = Image.new("RGB", (columns * width, rows * (height + 14)), "white")
-    for i, (name, shot) in enumerate(shots.items()):
-        x, y = i % columns * width, i // columns * (height + 14)
-        small = Image.fromarray((shot * 255).round().astype(np.uint8)).resize((width, height), Image.Resampling.LANCZOS)
-        sheet.paste(small, (x, y))
-        ImageDraw.Draw(sheet).text((x + 4, y + height), name, fill="black")
-    sheet.save(path, quality=80)
-
-
-def _all_shots(names: Sequence[str], splats: Splats, folder: Path, address: str) -> dict[str, np.ndarray]:
-    """Open every file in every viewer; rows of Markdown are printed."""
-    camera = camera_for(splats)
-    shots = {"gs2d": camera.drawn(splats)}
-    print("| viewer | file | PSNR to gs2d, dB | axis of the splats that is up there |\n|---|---|---|---|")
-    for name in names:
-        viewer = VIEWERS[name]
-        for layout, frame in viewer.frames.items():
-            try:
-                shot = drawn_by(viewer, layout, camera, folder, address)
-            except ViewerError as error:
-                print(f"| {viewer.version} | `{layout}` | not opened: {str(error)[:120]} | |", flush=True)
-                continue
-            print(f"| {viewer.version} | `{layout}` | {psnr(shot, shots['gs2d']):.1f} | {WORDS[frame]} |", flush=True)
-            shots[f"{name}: {layout}"] = shot
-    return shots
-
-
-def _level_shots(splats: Splats, folder: Path, address: str) -> dict[str, np.ndarray]:
-    """Show a stream at each of its levels, and coloured by level from near and far."""
-    camera, stream = camera_for(splats), folder / file_of("streamed")
-    shots = {}
-    print("\n| level | splats | PlayCanvas to gs2d's rendering of the level, dB | to that of all splats, dB |\n"
-          "|---|---|---|---|")  # fmt: skip
-    for level, count in enumerate(json.loads(stream.read_text(encoding="utf-8"))["counts"]):
-        shot = drawn_by(VIEWERS["playcanvas"], "streamed", camera, folder, address, level=level)
-        own = camera.drawn(read_level(stream, level).to_surfels(stream))
-        row = f"| {level} | {count:,} | {psnr(shot, own):.1f} | {psnr(shot, camera.drawn(splats)):.1f} |"
-        print(row, flush=True)
-        shots[f"PlayCanvas, level {level}: {count:,} splats"] = shot
-    for words, distance in (("near", 1.2), ("far", 12.0)):
-        shots[f"SuperSplat, levels in colours, {words}"] = drawn_by(
-            VIEWERS["supersplat"], "streamed", camera_for(splats, distance), folder, address, colorize=True
-        )
-    return shots
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Write the pictures and print the tables of a run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--up", type=float, nargs=3, default=(0.0, 0.0, 1.0))
-    parser.add_argument("--viewers", nargs="+", choices=list(VIEWERS), default=list(VIEWERS))
-    options = parser.parse_args(argv)
-    splats = upright(read_splats(options.run / "splats.ply" if options.run.is_dir() else options.run), options.up)
-    (options.out / "shots").mkdir(parents=True, exist_ok=True)
-    try:
-        require_browser()
-        with tempfile.TemporaryDirectory(prefix="gs2d-viewers-") as home:
-            folder = Path(home)
-            for name in options.viewers:
-                installed(VIEWERS[name], folder)
-            written(splats, sorted({each for name in options.viewers for each in VIEWERS[name].frames}), folder)
-            with served(folder) as address:
-                shots = _all_shots(options.viewers, splats, folder, address)
-                levels = (
-                    _level_shots(splats, folder, address)
-                    if {"playcanvas", "supersplat"} <= set(options.viewers)
-                    else {}
-                )
-    except pytest.skip.Exception as reason:
-        print(f"error: {reason.msg}", file=sys.stderr)
-        return 2
-    finally:
-        forget()
-    for name, shot in (shots | levels).items():
-        place = options.out / "shots" / f"{name.replace(': ', '-').replace(', ', '-').replace(' ', '_')}.png"
-        Image.fromarray((shot * 255).round().astype(np.uint8)).save(place)
-    _sheet(options.out / "viewers.jpg", shots, 6, 220)
-    if levels:
-        _sheet(options.out / "viewers-levels.jpg", levels, 3, 300)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -25,9 +25,6 @@ from foreign_writers import (
     metashape_document,
     metashape_similarity,
     metashape_transform,
-    opensfm_camera,
-    opensfm_reconstruction,
-    points,
     poses,
     small_alicevision,
     small_metashape,
@@ -121,45 +118,6 @@ def test_each_projection_of_opensfm_becomes_its_lens(tmp_path: Path) -> None:
             of(model)
 
 
-def test_opendronemap_keeps_its_reconstruction_in_a_folder_beside_the_photographs(tmp_path: Path) -> None:
-    small_opensfm(tmp_path, where="opensfm")
-    assert detect_format(tmp_path) == "opensfm"
-    assert len(load_scene(tmp_path).views) == 9
-    assert len(load_scene(tmp_path / "opensfm").views) == 9  # the folder itself
-
-
-def test_of_several_reconstructions_the_largest_is_read_and_the_others_are_named(tmp_path: Path) -> None:
-    write_images(tmp_path / "images", poses())
-    every = list(poses().items())
-    parts = [dict(every[:2]), dict(every[2:8]), dict(every[8:])]
-    value = [opensfm_reconstruction(opensfm_camera(OFF_CENTRE), part) for part in parts]
-    (tmp_path / "reconstruction.json").write_text(json.dumps(value))
-    scene = load_scene(tmp_path, test_every=0)
-    assert [v.name for v in scene.train] == [name for name, _ in every[2:8]]
-    assert scene.notes[0] == (
-        "reconstruction.json holds 3 reconstructions that do not hang together: the one of 6 photographs is read, not "
-        "those of 2, 1"
-    )
-
-
-def test_masks_of_opensfm_are_those_of_colmap(tmp_path: Path) -> None:
-    small_opensfm(tmp_path)
-    (tmp_path / "masks").mkdir()
-    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
-    mask[:10] = 255
-    Image.fromarray(mask).save(tmp_path / "masks" / "a_1.jpg.png")
-    scene = load_scene(tmp_path)
-    assert "masks: 1 of 9 views have one in masks (white = keep); the other 8 are whole" in scene.notes
-    np.testing.assert_array_equal(scene.train[0].mask(), mask > 0)
-
-
-@pytest.mark.parametrize("labels", ["{}", "{}.jpg", "{}.JPG", "card/shots/{}.JPG"])
-def test_metashape_names_photographs_by_labels_of_any_kind(tmp_path: Path, labels: str) -> None:
-    small_metashape(tmp_path, labels=labels)
-    scene = load_scene(tmp_path)
-    assert (len(scene.views), scene.skipped) == (9, ())
-
-
 def test_cameras_of_metashape_without_a_place_are_skipped_and_named(tmp_path: Path) -> None:
     more = (
         "<camera id='90' sensor_id='0' label='lost'><orientation>1</orientation></camera>"
@@ -176,41 +134,6 @@ def test_cameras_of_metashape_without_a_place_are_skipped_and_named(tmp_path: Pa
         "off: switched off in Metashape",
         "gone: listed in cameras.xml, but there is no such file",
     )
-
-
-def test_the_similarity_of_a_component_wins_and_other_components_are_left_out(tmp_path: Path) -> None:
-    write_images(tmp_path / "images", poses())
-    every = list(poses().items())
-    away = (1.0, np.eye(3), np.array([100.0, 0.0, 0.0]))
-    cameras = "".join(
-        f"<camera id='{i}' sensor_id='0' component_id='{int(i == 8)}' label='{name}'>"
-        f"<transform>{metashape_transform(T)}</transform></camera>"
-        for i, (name, T) in enumerate(every)
-    )
-    components = (
-        f"<components next_id='2'><component id='1'>{metashape_similarity(away)}</component>"
-        f"<component id='0'>{metashape_similarity()}</component></components>"
-    )
-    text = metashape_document(
-        metashape_calibration(OFF_CENTRE), cameras, components=components, transform=metashape_similarity(away)
-    )
-    (tmp_path / "cameras.xml").write_text(text)
-    scene = load_scene(tmp_path, test_every=0)
-    assert scene.skipped == ("a_8.jpg: in another component",)
-    for view, (_, T) in zip(scene.train, every, strict=False):
-        np.testing.assert_allclose(view.camera.T_cam_world, T, atol=1e-9)
-
-
-def test_without_a_transform_the_frame_is_that_of_the_chunk(tmp_path: Path) -> None:
-    write_images(tmp_path / "images", poses())
-    same = (1.0, np.eye(3), np.zeros(3))
-    cameras = "".join(
-        f"<camera id='{i}' sensor_id='0' label='{name}'><transform>{metashape_transform(T, same)}</transform></camera>"
-        for i, (name, T) in enumerate(poses().items())
-    )
-    (tmp_path / "doc.xml").write_text(metashape_document(metashape_calibration(OFF_CENTRE), cameras, transform=""))
-    for view in load_scene(tmp_path).views:
-        np.testing.assert_allclose(view.camera.T_cam_world, poses()[view.name], atol=1e-12)
 
 
 def test_a_geocentric_chunk_becomes_metres_east_north_and_up(tmp_path: Path) -> None:
@@ -266,23 +189,6 @@ def test_affinity_and_skew_of_metashape_by_its_formulas(tmp_path: Path) -> None:
         v = HEIGHT * 0.5 + (BENT.cy - HEIGHT / 2) + yd * f
         bent = k.lens.distort(np.array([0.3, -0.2]))
         np.testing.assert_allclose((bent[0] * k.fx + k.cx, bent[1] * k.fy + k.cy), (u, v), rtol=1e-12)
-
-
-def test_points_beside_metashape_s_cameras_are_used_if_the_cameras_see_them(tmp_path: Path) -> None:
-    small_metashape(tmp_path)
-    assert load_scene(tmp_path).points is None
-    write_points(tmp_path / "mesh_gt.ply")  # what a result is scored against
-    assert load_scene(tmp_path).points is None
-    write_points(tmp_path / "cloud 1.ply")
-    np.testing.assert_allclose(load_scene(tmp_path).points.points, points()[0])
-    write_points(tmp_path / "cloud 2.ply")
-    scene = load_scene(tmp_path)
-    assert scene.points is None
-    assert "no sparse points: cloud 1.ply, cloud 2.ply are there; call the one to start from points.ply" in scene.notes
-    write_points(tmp_path / "points.ply", offset=500.0)
-    scene = load_scene(tmp_path)
-    assert scene.points is None
-    assert any(note.startswith("no sparse points: two cameras see 0% of those of points.ply") for note in scene.notes)
 
 
 @pytest.mark.parametrize("version", [(1, 0, 0), (1, 2, 0), (1, 2, 1), (1, 2, 2), (1, 2, 4), (1, 2, 5), (1, 2, 14)])

@@ -15,7 +15,6 @@ from gs2d.core.splats import Splats
 from gs2d.io.gaussians import Gaussians, sigmoid
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
-from splat_scenes import a_scene
 
 UP = np.array([0.0, -1.0, 0.0])
 
@@ -55,48 +54,6 @@ def test_two_disks_become_one_with_their_area_centre_covariance_and_mean_colour(
     camera = look_at(np.array([0.05, 0, -1.0]), np.array([0.05, 0, 1.0]), UP, width=64, height=64, fx=200.0)
     normal = rasterize(one.to_surfels("a"), camera, RasterSettings(sh_degree=1)).normal[32, 32]
     assert abs(float(normal[2])) > 0.1  # it lies in the plane of the two, and is seen
-
-
-def test_a_disk_that_would_be_more_than_opaque_is_larger() -> None:
-    """Two in one place: 2 * 0.9 * 0.01 less 0.9^2 * 0.01^2 / 0.02, over 0.01."""
-    one, _ = halved(disks([[0.0, 0, 1], [0.0, 0, 1]], alpha=0.9), np.zeros(2, int))
-    np.testing.assert_allclose(sigmoid(one.opacity_logits), 0.999, rtol=1e-4)
-    np.testing.assert_allclose(np.exp(one.log_scales[0, :2]), 0.1 * math.sqrt(1.395 / 0.999), rtol=1e-4)
-
-
-def test_alike_disks_are_merged_before_others() -> None:
-    """Six in a row, 0.1 apart but for one far behind: of three mergings each pairs like with like."""
-    g = disks([[0.0, 0, 1], [0.1, 0, 1], [0.2, 0, 1], [0.3, 0, 1], [0.25, 0, 1.6], [0.35, 0, 1.6]])
-    g.sh0[:2] = 2.0
-    found, _ = halved(g, np.zeros(6, int))
-    order = np.lexsort((found.means[:, 0], found.means[:, 2]))
-    np.testing.assert_allclose(found.means[order], [[0.05, 0, 1], [0.25, 0, 1], [0.3, 0, 1.6]], atol=1e-6)
-    np.testing.assert_allclose(found.sh0[order, 0], [2, 0, 0], atol=1e-6)
-
-
-def test_what_is_small_and_faint_goes_first() -> None:
-    g = disks([[x, 0, 1] for x in (0.0, 0.1, 0.2, 0.3, 5.0, 5.001)])
-    g.log_scales[4:, :2] = math.log(0.001)
-    g.opacity_logits[4:] = -4.0
-    g.sh0[4] = 3.0  # its colour differs, but who sees it
-    found, _ = halved(g, np.zeros(6, int))
-    assert len(found) == 3
-    assert (np.abs(found.means[:, 0] - 5.0) < 0.01).sum() == 1
-
-
-def test_splats_of_different_cells_stay_apart() -> None:
-    g = Gaussians.of(a_scene(400, 1))
-    cells = np.arange(400) % 2
-    found, places = halved(g, cells)
-    assert len(found) == 200
-    for cell in (0, 1):
-        alone, _ = halved(g.rows(cells == cell), np.zeros(200, int))
-        assert (places == cell).sum() > 50
-        assert len(alone) == 100
-    lone, places = halved(g.rows(np.arange(3)), np.array([0, 1, 2]))
-    np.testing.assert_array_equal(lone.means, g.means[:3])
-    assert places.tolist() == [0, 1, 2]
-    assert len(halved(g.rows(np.arange(0)), np.zeros(0, int))[0]) == 0
 
 
 @pytest.mark.usefixtures("native")

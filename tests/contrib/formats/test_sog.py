@@ -16,7 +16,6 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from gs2d.contrib.formats.sog import read_sog, write_sog
-from gs2d.contrib.formats.sog_palette import codebook, nearest_code, palette
 from gs2d.errors import DataError
 from gs2d.io.formats.registry import is_splat_file, read_splat_file
 from gs2d.io.gaussians import FLAT_LOG_SCALE, Gaussians, sigmoid
@@ -105,29 +104,6 @@ def test_sog_holds_what_its_page_says_within_its_bits(tmp_path: Path, degree: in
     first = (tmp_path / "a.sog").read_bytes()
     write_sog(tmp_path / "b.sog", g)
     assert (tmp_path / "b.sog").read_bytes() == first
-
-
-def test_many_splats_share_a_palette_and_look_alike(tmp_path: Path) -> None:
-    splats = a_scene(3000, 1)
-    g = Gaussians.of(splats)
-    write_sog(tmp_path / "a.sog", g)
-    assert json.loads(members(tmp_path / "a.sog")["meta.json"])["shN"]["count"] == 2048
-    back, _ = read_sog(tmp_path / "a.sog")
-    same = g.rows(cKDTree(g.means).query(back.means)[1])
-    error = np.square(back.shN - same.shN).mean() / np.square(same.shN).mean()
-    assert error < 0.2  # of random numbers in 9 dimensions
-
-
-def test_a_codebook_has_what_is_rare_too() -> None:
-    values = np.concatenate([np.linspace(0, 1, 10_000), [100.0], np.full(5000, -7.0)])
-    codes = codebook(values)
-    assert len(codes) == 256
-    assert (np.diff(codes) >= 0).all()
-    found = codes[nearest_code(values, codes)]
-    assert np.abs(found - values).max() < 0.01
-    assert codebook(np.array([2.0, 1.0])).tolist() == [1.0] + [2.0] * 255
-    rows, labels = palette(np.repeat(np.eye(4), 600, axis=0))
-    np.testing.assert_array_equal(rows[labels], np.repeat(np.eye(4), 600, axis=0))
 
 
 def test_a_folder_and_the_finest_level_of_a_stream_are_read(tmp_path: Path) -> None:

@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 
 from gs2d.contrib.formats import sog_streamed
-from gs2d.contrib.formats.sog import read_level, read_sog
-from gs2d.contrib.formats.sog_streamed import write_streamed_sog
-from gs2d.errors import DataError, DiskError
-from gs2d.io.formats.registry import layout_of, read_splat_file, write_layout, written_bytes
-from gs2d.io.gaussians import Gaussians, sigmoid
+from gs2d.contrib.formats.sog import read_sog
+from gs2d.errors import DiskError
+from gs2d.io.formats.registry import read_splat_file, write_layout, written_bytes
+from gs2d.io.gaussians import Gaussians
 from splat_scenes import a_scene
 
 
@@ -64,36 +63,6 @@ def test_each_leaf_has_its_part_of_every_level_in_its_box(tmp_path: Path) -> Non
     assert written_bytes(path, "streamed") == sum(f.stat().st_size for f in path.parent.rglob("*") if f.is_file())
 
 
-def test_the_finest_level_is_the_scene_and_each_other_has_half_of_the_one_before(tmp_path: Path) -> None:
-    splats = a_scene(700, 2)
-    path = tmp_path / "lod-meta.json"
-    write_layout(path, splats, "streamed")
-    file = read_splat_file(path)
-    assert (file.kind, len(file.gaussians), file.surfels is not None) == ("streamed SOG, its finest level", 700, True)
-    ours = Gaussians.of(splats)
-    order, same = np.lexsort(file.gaussians.means.T.round(2)), np.lexsort(ours.means.T.round(2))
-    assert np.abs(file.gaussians.means[order].mean(axis=0) - ours.means[same].mean(axis=0)).max() < 1e-3
-    counts = [len(read_level(path, level)) for level in range(4)]
-    assert counts[0] == 700
-    assert 350 <= counts[1] <= 360
-    assert 87 <= counts[3] <= 110
-    assert len(read_level(path, 9)) == counts[3]
-    mass = [float((sigmoid(g.opacity_logits) * np.exp(g.log_scales[:, :2].sum(axis=1))).sum()) for g in map(
-        lambda level: read_level(path, level), (0, 1))]  # fmt: skip
-    assert mass[1] == pytest.approx(mass[0], rel=0.1)
-
-
-def test_more_splats_have_more_levels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sog_streamed, "_COARSEST", 20)
-    for count, levels in ((150, 4), (300, 5), (2561, 8), (9000, 8)):  # 300 / 2^4 = 18
-        assert sog_streamed._levels_for(count) == levels
-    path = tmp_path / "lod-meta.json"
-    write_streamed_sog(path, Gaussians.of(a_scene(50, 0)), levels=1)
-    assert json.loads(path.read_text())["counts"] == [50]
-    with pytest.raises(ValueError, match="levels must be 1 or more, got 0"):
-        write_streamed_sog(path, Gaussians.of(a_scene(50, 0)), levels=0)
-
-
 def test_writing_again_removes_what_the_older_index_referred_to_and_nothing_else(tmp_path: Path) -> None:
     folder = tmp_path / "scene"
     folder.mkdir()
@@ -111,18 +80,6 @@ def test_writing_again_removes_what_the_older_index_referred_to_and_nothing_else
     names = {f.name for f in folder.iterdir() if f.is_dir()}
     listed = {name.split("/")[0] for name in json.loads(path.read_text())["filenames"]}
     assert names == listed | {"1_0", "0_0-2"}
-
-
-def test_an_index_that_names_other_folders_removes_nothing_of_them(tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    other = tmp_path / "other"
-    other.mkdir()
-    (other / "meta.json").write_text("{}")
-    path = tmp_path / "out" / "lod-meta.json"
-    for names in (["../other/meta.json"], "x", None, [3]):
-        path.write_text(json.dumps({"filenames": names}))
-        write_layout(path, a_scene(20, 0), "streamed")
-        assert (other / "meta.json").exists()
 
 
 def test_a_failure_leaves_the_older_stream_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -153,19 +110,3 @@ def test_a_failure_leaves_the_older_stream_as_it_was(tmp_path: Path, monkeypatch
         write_layout(tmp_path / "file" / "lod-meta.json", a_scene(9, 0), "streamed")
     with pytest.raises(DiskError, match="the folder does not exist: create it first"):
         write_layout(tmp_path / "none" / "none" / "lod-meta.json", a_scene(9, 0), "streamed")
-
-
-def test_the_same_splats_are_the_same_bytes(tmp_path: Path) -> None:
-    written = []
-    for name in ("a", "b"):
-        write_layout(tmp_path / name / "lod-meta.json", a_scene(400, 1), "streamed")
-        written.append({f.relative_to(tmp_path / name): f.read_bytes() for f in (tmp_path / name).rglob("*.*")})
-    assert written[0] == written[1]
-
-
-def test_one_name_alone_is_that_of_a_stream(tmp_path: Path) -> None:
-    assert layout_of(tmp_path / "LOD-meta.json") == "streamed"
-    assert layout_of(tmp_path / "a-lod-meta.json") is None
-    (tmp_path / "lod-meta.json").write_text('{"filenames": [], "tree": {}}')
-    with pytest.raises(DataError, match="no chunk of the finest level"):
-        read_splat_file(tmp_path / "lod-meta.json")

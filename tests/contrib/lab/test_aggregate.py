@@ -10,20 +10,19 @@ from typing import Any
 
 import pytest
 
-from gs2d.cli.commands import Paper, Train
+from gs2d.cli.commands import Train
 from gs2d.cli.parser import parse
 from gs2d.config.protocols import MetricConventions
 from gs2d.contrib.lab.aggregate import Cell, Results, check_claim, read_cell
-from gs2d.contrib.lab.deviations import deviations_of, opacity_resets
-from gs2d.contrib.lab.options import PaperOptions, SweepOptions, parse_seeds
-from gs2d.contrib.lab.paper import check_folder, paper
-from gs2d.contrib.lab.plan import commands_of, make_plan, paper_command
+from gs2d.contrib.lab.deviations import deviations_of
+from gs2d.contrib.lab.options import PaperOptions
+from gs2d.contrib.lab.plan import commands_of, make_plan
 from gs2d.contrib.lab.scenes import find_scenes
 from gs2d.contrib.lab.tables import DTU, NERF_SYNTHETIC, PAPER_TABLES, TNT, Claim
-from gs2d.errors import DataError, RecipeError, RunError
+from gs2d.errors import DataError
 from gs2d.pipeline.prepare.options import TrainOptions, values
 from paper_cells import make_cell, make_row
-from tiny import write_ball_mesh, write_capture
+from tiny import write_capture
 
 # Scene a (30 dB) at both seeds, scene b (20 dB) at seed 0 only: the seeds differ by 0.2 dB, not by (30.2 - 25) dB.
 UNEVEN = (make_cell("a", 0, psnr=30.0), make_cell("b", 0, psnr=20.0), make_cell("a", 1, psnr=30.2))
@@ -35,14 +34,6 @@ def test_a_seed_that_lacks_a_scene_is_no_spread_and_does_not_weigh_the_mean() ->
     results = Results((row,))
     assert results.spread(row)["psnr"] is None
     assert results.mean(row)["psnr"] == pytest.approx((30.1 + 20.0) / 2)  # not (30 + 20 + 30.2) / 3
-
-
-def test_an_order_is_judged_at_the_seeds_that_have_every_scene() -> None:
-    high = [replace(c, figures={**c.figures, "psnr": (c.figures["psnr"] or 0) + 1}) for c in UNEVEN[:2]]
-    worse = replace(UNEVEN[2], figures={**UNEVEN[2].figures, "psnr": 0.0})  # seed 1, without scene b
-    rows = (make_row("low", *UNEVEN), make_row("high", *high, worse))
-    claim = check_claim(Claim("claim", "psnr", ("low", "high")), rows, TNT)
-    assert (claim.holds, claim.steps[0].seeds, claim.steps[0].difference) == ("yes", 1, 1.0)
 
 
 def test_distances_in_different_units_have_no_common_mean() -> None:
@@ -72,25 +63,6 @@ def test_training_views_are_not_averaged_with_test_views() -> None:
     assert results.scenes("bytes") == ["scan24", "lego", "ship"]
     assert results.mean(row, DTU)["psnr"] == 35.0
     assert results.scenes("psnr", DTU) == ["scan24"]
-
-
-def test_f_scores_of_different_protocols_have_no_common_mean() -> None:
-    surfaces = {"Barn": "tnt", "lego": "visible-surface"}
-    cells = [replace(make_cell(n, fscore=0.5), details={"surface": {"evaluator": e}}) for n, e in surfaces.items()]
-    row = make_row("row", *cells)
-    results = Results((row,))
-    assert results.mean(row)["fscore"] is None
-    assert results.scenes("fscore") == []
-    assert results.reasons(row)["fscore"].endswith("no common mean: protocol tnt; protocol visible-surface")
-
-
-def test_rows_that_have_no_run_in_common_say_so() -> None:
-    full = make_row("full", make_cell("a", psnr=1.0), make_cell("b", psnr=2.0))
-    first = make_row("first", make_cell("a", psnr=1.0), make_cell("b"))
-    second = make_row("second", make_cell("a"), make_cell("b", psnr=2.0))
-    results = Results((full, first, second))
-    assert results.mean(full)["psnr"] is None
-    assert results.reasons(full)["psnr"] == "no scene and seed that every row has"
 
 
 def test_a_run_whose_surface_could_not_be_scored_keeps_its_pictures_scores(tmp_path: Path) -> None:
@@ -134,16 +106,6 @@ def test_a_score_that_its_own_check_does_not_believe_is_a_deviation() -> None:
     assert not any("E_i" in line or "AbsGS" in line for line in plain)  # one stage: nothing was left open
 
 
-def test_resets_that_a_short_schedule_has_not_are_a_deviation() -> None:
-    # Every 3000 iterations while splats are added, which is until half of stage 1: 3000, 6000, 9000, 12000 of 15000.
-    assert (opacity_resets(1.0), opacity_resets(0.3), opacity_resets(0.1)) == (4, 1, 0)
-    options = PaperOptions(table="modules", data=Path("data"), out=Path("out"), schedule_scale=0.1)
-    lines = deviations_of(options, (), PAPER_TABLES["modules"], Results(()))
-    assert "opacity is reset 0 times in stage 1, in the paper 4 times: the interval is not scaled" in lines
-    # 100 000 sqrt(0.1) = 31 622.8
-    assert "captures without points start from 31,623 random ones, not from 100,000" in lines
-
-
 def test_pieces_that_captures_lack_are_deviations_and_those_without_cameras_are_named(tmp_path: Path) -> None:
     for name in ("lego", "ship"):
         write_capture(tmp_path / name, train=3, test=2, size=8)
@@ -168,26 +130,6 @@ def test_pieces_that_captures_lack_are_deviations_and_those_without_cameras_are_
         find_scenes(tmp_path / "ship")
 
 
-def test_what_the_official_scripts_do_otherwise_is_a_deviation(tmp_path: Path) -> None:
-    options = PaperOptions(table="k", data=tmp_path, out=Path("out"))
-    lines = deviations_of(options, (), PAPER_TABLES["k"], Results(()))
-    assert any(line.startswith("the rasterizer is gs2d's own") for line in lines)
-    assert not any(line.startswith("DTU") for line in lines)  # nothing of it is trained
-    write_capture(tmp_path / "lego", train=3, test=2, size=8)
-    scan = replace(find_scenes(tmp_path)[0], data_set=DTU)
-    lines = deviations_of(options, (scan,), PAPER_TABLES["k"], Results(()))
-    assert any(line.startswith("DTU: distortion has no weight") for line in lines)
-
-
-def test_another_weight_of_distortion_than_the_papers_is_a_deviation(tmp_path: Path) -> None:
-    write_capture(tmp_path / "ball", train=2, test=1, size=8)
-    options = PaperOptions(table="regularisation", data=tmp_path, out=tmp_path / "out")
-    scenes = find_scenes(tmp_path)
-    line = "ball: alpha with distortion is 1000, their protocol's; the paper's 100/10 is of TnT"
-    assert line in deviations_of(options, scenes, PAPER_TABLES["regularisation"], Results(()))
-    assert line not in deviations_of(options, scenes, PAPER_TABLES["modules"], Results(()))
-
-
 def test_the_printed_commands_are_the_ones_that_were_run(tmp_path: Path) -> None:
     write_capture(tmp_path / "a b" / "bäll", train=2, test=1, size=8)
     options = PaperOptions(
@@ -208,52 +150,3 @@ def test_the_printed_commands_are_the_ones_that_were_run(tmp_path: Path) -> None
         command = parse(words[1:])
         assert isinstance(command, Train)
         assert values(TrainOptions, command) == values(TrainOptions, replace(job.train, resume=False))
-
-
-@pytest.mark.parametrize("seeds", [(0,), (1,), (7,), (0, 1, 2), (4, 2)])
-def test_the_command_on_the_page_has_the_seeds_that_were_run(seeds: tuple[int, ...]) -> None:
-    words = shlex.split(paper_command(PaperOptions(table="k", data=Path("a b"), out=Path("out"), seeds=seeds)))
-    given = words[words.index("--seeds") + 1] if "--seeds" in words else "0"
-    assert parse_seeds((given,)) == seeds
-    assert words[words.index("--data") + 1] == "a b"
-
-
-def test_the_command_on_the_page_is_one_that_the_program_takes_whatever_it_was_to_print() -> None:
-    given = parse(
-        ["paper", "k", "--data", "a b", "--out", "out", "--scenes", "c", "--downscale", "2", "--quiet", "--json"]
-    )
-    assert isinstance(given, Paper)
-    told = parse(shlex.split(paper_command(given))[1:])
-    assert told == replace(given, quiet=False, json=False)
-
-
-def test_rows_of_the_paper_have_nothing_of_robust_training(tmp_path: Path) -> None:
-    """What `auto` makes of photographs of no data set would be called 2DGS here."""
-    write_capture(tmp_path / "ball", train=2, test=1, size=8)
-    shared: Any = {"data": tmp_path / "ball", "out": tmp_path / "out"}
-    (row,) = {job.train.robust for job in make_plan(PaperOptions(table="freeze", **shared)).jobs}
-    (own,) = {job.train.robust for job in make_plan(SweepOptions(recipes=("2dgs",), **shared)).jobs}
-    assert (row, own) == ("off", "auto")
-
-
-@pytest.mark.parametrize("name", ["downscale", "threads", "slots"])
-def test_zero_is_not_taken_for_the_default(name: str) -> None:
-    options = replace(PaperOptions(table="k", data=Path("data"), out=Path("out")), **{name: 0})
-    with pytest.raises(RecipeError, match=f"--{name} must be a whole number >= 1, got 0"):
-        make_plan(options)
-
-
-def test_what_is_scored_is_part_of_the_job_and_a_strange_folder_is_refused(tmp_path: Path) -> None:
-    write_capture(tmp_path / "ball", train=2, test=1, size=8)
-    options = PaperOptions(table="modules", data=tmp_path / "ball", out=tmp_path / "out")
-    assert make_plan(options).jobs[0].wanted == ()
-    write_ball_mesh(tmp_path / "ball" / "mesh_gt.ply", rings=4)
-    plan = make_plan(replace(options, lpips_weights=tmp_path / "vgg.pth"))
-    truth, weights = (tmp_path / "ball" / "mesh_gt.ply").resolve(), (tmp_path / "vgg.pth").resolve()
-    assert plan.jobs[0].wanted == (f"surface: {truth}", f"lpips: {weights}")
-    (tmp_path / "out").mkdir()
-    with pytest.raises(DataError, match="LPIPS weights not found"):  # before anything is trained
-        paper(replace(options, lpips_weights=tmp_path / "vgg.pth"))
-    (tmp_path / "out" / "about.json").write_text("{}")
-    with pytest.raises(RunError, match="must be one that gs2d paper or sweep wrote, got another file"):
-        check_folder(plan)

@@ -14,7 +14,6 @@ import pytest
 import torch
 
 from flown import digest, tiny_blocks, write_tiny_flight
-from gs2d.cli import run
 from gs2d.config.partition import Partition
 from gs2d.contrib.lab import blocks as module
 from gs2d.contrib.lab.blocks import blocks
@@ -22,7 +21,7 @@ from gs2d.contrib.lab.split import read_split
 from gs2d.errors import DataError, Gs2dError, RecipeError, RunError
 from gs2d.io.run_dir import open_run
 from gs2d.io.splat_ply import read_splats
-from gs2d.pipeline.events import Event, Notice
+from gs2d.pipeline.events import Event
 from gs2d.pipeline.prepare.part import FROZEN, OWN, read_start
 from gs2d.synthetic.flight import Flight, write_flight
 
@@ -70,19 +69,6 @@ def test_each_block_trained_its_own_splats_and_photographs_with_the_rest_frozen(
     assert sum(block.core for block in split.blocks) == len(coarse)
 
 
-def test_the_merged_scene_has_of_each_block_what_lies_in_its_cell(straight: Path) -> None:
-    split, merged = read_split(straight / "partition"), read_splats(straight / "merged.ply")
-    owners = split.cells.owners(merged.means.numpy())
-    assert (np.diff(owners) >= 0).all()  # block after block
-    for cell, block in enumerate(split.blocks):
-        trained = read_splats(straight / "blocks" / block.name / "splats.ply")
-        inside = torch.from_numpy(split.cells.owners(trained.means.numpy()) == cell)
-        expected = trained.rows(inside)
-        part = merged.rows(torch.from_numpy(owners == cell))
-        assert torch.equal(part.means[: len(expected)], expected.means)
-        assert torch.equal(part.shN[: len(expected)], expected.shN)
-
-
 def test_what_lies_at_seams_learns_once_more_and_nothing_else(straight: Path) -> None:
     split, merged = read_split(straight / "partition"), read_splats(straight / "merged.ply")
     end = read_splats(straight / "splats.ply")
@@ -97,13 +83,6 @@ def test_what_lies_at_seams_learns_once_more_and_nothing_else(straight: Path) ->
     assert torch.equal(end.means[rest:], learned.means)
     assert len(learned) == own.sum()
     assert not torch.equal(learned.sh0, merged.sh0[own])
-
-
-def test_a_finished_job_does_nothing_again(capture: Path, straight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "train", lambda *_: pytest.fail("trained again"))
-    before = {path: path.stat().st_mtime_ns for path in straight.rglob("*") if path.is_file() and path.name != ".lock"}
-    blocks(tiny_blocks(capture, straight))
-    assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
 class StoppedError(BaseException):
@@ -135,23 +114,6 @@ def test_a_job_that_is_broken_off_in_a_block_ends_with_the_same_bytes(
     assert not (tmp_path / "job/splats.ply").exists()
     blocks(options)
     assert digest(tmp_path / "job/splats.ply") == digest(straight / "splats.ply")
-
-
-@pytest.mark.slow
-def test_a_job_that_is_broken_off_again_and_again_ends_with_the_same_bytes(
-    capture: Path, straight: Path, tmp_path: Path
-) -> None:
-    options, stops, done = tiny_blocks(capture, tmp_path / "job", threads=2), 0, False
-    for events in (0, 3, *([30, 45] * 4), 10_000):
-        try:
-            blocks(options, stopping_after(events))
-            done = True
-        except StoppedError:
-            stops += 1
-    assert done
-    assert stops >= 6
-    assert digest(tmp_path / "job/splats.ply") == digest(straight / "splats.ply")
-    assert digest(tmp_path / "job/mesh.ply") == digest(straight / "mesh.ply")
 
 
 def test_a_damaged_beginning_of_a_block_is_one_line_and_is_made_again_when_it_is_deleted(
@@ -244,36 +206,6 @@ def test_what_cannot_be_done_is_one_line_and_leaves_nothing(
     with pytest.raises(RecipeError, match=text):
         blocks(tiny_blocks(capture, tmp_path / "job", **changes))
     assert not (tmp_path / "job").exists()
-
-
-def test_a_folder_with_something_else_is_left_alone(capture: Path, tmp_path: Path) -> None:
-    (tmp_path / "job").mkdir()
-    (tmp_path / "job/thesis.tex").write_text("x")
-    with pytest.raises(RunError, match=r"--out must be new, empty or a run; .* holds other files \(thesis.tex\)"):
-        blocks(tiny_blocks(capture, tmp_path / "job"))
-    assert [path.name for path in (tmp_path / "job").iterdir()] == ["thesis.tex"]
-
-
-def test_the_command_says_it_in_one_line_with_exit_code_2(
-    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(["blocks", str(capture), "--out", str(tmp_path / "job"), "--blocks", "0x3"]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line.startswith("error: --blocks must be auto")
-
-
-@pytest.mark.slow
-def test_one_training_where_everything_fits(capture: Path, tmp_path: Path) -> None:
-    told: list[str] = []
-    options = tiny_blocks(capture, tmp_path / "job", blocks="auto")
-    blocks(options, lambda event: told.append(event.text) if isinstance(event, Notice) else None)
-    assert any("no blocks" in text for text in told)
-    assert not (tmp_path / "job/blocks.json").exists()
-    (stage,) = open_run(tmp_path / "job").metrics()["stages"]
-    assert stage["name"] == "surface"
-    before = digest(tmp_path / "job/splats.ply")
-    blocks(options)  # finished: nothing is planned or cut now
-    assert digest(tmp_path / "job/splats.ply") == before
 
 
 @pytest.mark.slow

@@ -14,16 +14,14 @@ import pytest
 import gs2d
 from fake_ray import FakeQueue, FakeRay
 from gs2d.cli import run
-from gs2d.contrib.lab import cluster as module
-from gs2d.contrib.lab import cluster_task
 from gs2d.contrib.lab import jobs as jobs_module
-from gs2d.contrib.lab.cluster import Shares, check_address, check_room, shares
-from gs2d.contrib.lab.cluster_task import Begun, Told, token_file
+from gs2d.contrib.lab.cluster import Shares, shares
+from gs2d.contrib.lab.cluster_task import token_file
 from gs2d.contrib.lab.cluster_worker import do_on_worker
 from gs2d.contrib.lab.execute import execute
 from gs2d.contrib.lab.jobs import Job
 from gs2d.contrib.lab.tasks import failures
-from gs2d.errors import BackendError, DataError
+from gs2d.errors import DataError
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
 from sweep_jobs import make_jobs
 from tiny import write_capture
@@ -90,15 +88,6 @@ def test_a_task_takes_a_gpu_where_the_backend_uses_one_and_its_part_of_the_cores
     assert shares(nodes, backend, slots, threads, "x") == expected
 
 
-def test_a_cluster_without_what_is_needed_is_one_line() -> None:
-    with pytest.raises(BackendError, match=r"must have a machine with a CPU and a GPU for tasks, got 1 with 8 CPUs"):
-        shares([{"CPU": 8.0}], "cuda", None, None, "x")
-    with pytest.raises(BackendError, match="no machine of the cluster has room for a, which takes 9 CPUs"):
-        check_room([{"CPU": 8.0}, {"CPU": 4.0}], {"num_cpus": 9, "num_gpus": 0}, "a")
-    with pytest.raises(BackendError, match="2 GiB: there is 8 CPUs, 0 GPUs, 1 GiB"):
-        check_room([{"CPU": 8.0, "memory": 2.0**30}], {"num_cpus": 1, "num_gpus": 0, "memory": 2**31}, "a")
-
-
 # -- what becomes of it ------------------------------------------------------------------------------------------------
 def test_what_a_task_tells_comes_back_with_its_name(ray: FakeRay, tmp_path: Path, trained: list[Job]) -> None:
     jobs = make_jobs(tmp_path, {"a": ("1",), "bad": ("2",)})
@@ -111,14 +100,6 @@ def test_what_a_task_tells_comes_back_with_its_name(ray: FakeRay, tmp_path: Path
     assert not list((tmp_path / "jobs").glob("*.token"))
 
 
-def test_a_finished_list_needs_no_cluster(ray: FakeRay, tmp_path: Path, trained: list[Job]) -> None:
-    jobs = make_jobs(tmp_path, {"bad": ("1",)})
-    (tmp_path / "jobs").mkdir()
-    jobs[0].write("done")
-    heard_of(jobs, tmp_path)
-    assert ray.asked == {}
-
-
 def test_a_task_whose_machines_are_lost_fails_and_the_others_go_on(
     ray: FakeRay, tmp_path: Path, trained: list[Job]
 ) -> None:
@@ -128,38 +109,6 @@ def test_a_task_whose_machines_are_lost_fails_and_the_others_go_on(
     reason = "its process or its machine was lost again and again, or had no memory left (WorkerCrashedError)"
     assert failures(jobs) == {"a": reason}
     assert jobs[1].outcome()["state"] == "done"
-
-
-def test_a_second_beginning_is_told_as_a_machine_that_was_lost(ray: FakeRay, tmp_path: Path) -> None:
-    executor: Any = module.cluster_executor("auto", _listed(tmp_path), (), slots=1, threads=1, backend="cpu")
-    heard: list[str] = []
-
-    def listen(event: Any) -> None:
-        heard.append(event.text)
-
-    executor._pass_on("a", Begun("one"), listen)
-    executor._pass_on("a", Begun("two"), listen)
-    executor._pass_on("a", Phase("surface", 200), listen)
-    executor._pass_on("a", Step(50), listen)
-    executor.stop()
-    assert heard == ["a begins on one", "a: its process or its machine (one) was lost; it goes on on two"]
-    assert executor.detail() == "a (surface 25 %)"
-
-
-def test_a_task_that_ray_begins_again_and_again_is_given_up(ray: FakeRay, tmp_path: Path) -> None:
-    ray.never.add("a")
-    (task,) = make_jobs(_listed(tmp_path), {"a": ()})
-    executor: Any = module.cluster_executor("auto", tmp_path, (task,), slots=1, threads=1, backend="cpu")
-    executor.start(task)
-    for _ in range(3):
-        executor._queue.put_nowait(("a", Begun("one")))
-    assert executor.wait(lambda _event: None) == []
-    assert ray.cancelled == []
-    executor._queue.put_nowait(("a", Begun("one")))
-    ended = executor.wait(lambda _event: None) + executor.wait(lambda _event: None)
-    executor.stop()
-    assert ended == [(task, True)]
-    assert "lost again and again, or had no memory left" in failures((task,))["a"]
 
 
 def test_an_interrupt_cancels_what_runs_first_gently(ray: FakeRay, tmp_path: Path) -> None:
@@ -211,78 +160,6 @@ def test_a_machine_that_does_not_see_the_folder_says_so(stays: Path) -> None:
     assert found["state"] == "refused"
     assert f"of the cluster does not see {stays}; --out, and the capture, must lie on a disk" in found["reason"]
     assert task.outcome()["state"] == "new"
-
-
-def test_a_machine_without_gs2d_says_so(stays: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (task,) = make_jobs(stays, {"a": ()})
-    order = order_of(task, stays)
-    monkeypatch.setitem(sys.modules, "gs2d", None)
-    found = do_on_worker(order, None)
-    assert found["state"] == "refused"
-    assert "cannot import gs2d" in found["reason"]
-
-
-def test_a_refusal_ends_the_command_with_its_line(
-    ray: FakeRay, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_capture(tmp_path / "ball", train=2, test=1, size=8)
-    monkeypatch.setattr(gs2d, "__version__", "9.9")
-    monkeypatch.setattr(module.cluster_worker, "do_on_worker", lambda *_: {"state": "refused", "reason": "no, 9.9"})
-    words = ["--data", str(tmp_path / "ball"), "--out", str(tmp_path / "out"), "--cluster", "auto", "--quiet"]
-    assert run(["sweep", "2dgs", *words]) == 2
-    assert capsys.readouterr().err.splitlines() == ["error: no, 9.9"]
-
-
-def test_a_task_waits_for_the_process_of_a_machine_that_was_cut_off(
-    stays: Path, monkeypatch: pytest.MonkeyPatch, trained: list[Job]
-) -> None:
-    monkeypatch.setattr(cluster_task, "WAIT_SECONDS", 0.1)
-    (task,) = make_jobs(stays, {"a": ()})
-    locks = iter([False, False, True])
-    monkeypatch.setattr(cluster_task, "try_lock", lambda _file: False)
-    queue = FakeQueue({"num_cpus": 0})
-    found = do_on_worker(order_of(task, stays), queue)
-    assert found["state"] == "failed"
-    assert "another process of the cluster still works on it" in found["reason"]
-    monkeypatch.setattr(cluster_task, "WAIT_SECONDS", 5.0)
-    monkeypatch.setattr(cluster_task, "try_lock", lambda _file: next(locks))
-    assert do_on_worker(order_of(task, stays), queue)["state"] == "done"
-    assert [job.name for job in trained] == ["a"]
-
-
-def test_steps_are_told_once_a_second_and_a_lost_listener_harms_nobody() -> None:
-    queue = FakeQueue({"num_cpus": 0})
-    tell = Told("a", queue)
-    for done in range(100):
-        tell(Step(done))
-    tell(Notice("odd"))
-    assert queue.items[0] == ("a", Step(0))
-    assert queue.items[-1] == ("a", Notice("odd"))
-    assert len(queue.items) <= 5
-    Told("a", None)(Notice("to nobody"))
-
-
-# -- the address, and no Ray -------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("address", ["local", "ray://host:10001", "host", "host:", ":6379", "host:x", "host:70000"])
-def test_what_is_no_address_is_one_line(address: str) -> None:
-    with pytest.raises(BackendError, match="--cluster must be auto, or HOST:PORT"):
-        check_address(address)
-
-
-def test_an_address_where_nobody_listens_is_one_line() -> None:
-    with pytest.raises(BackendError, match=r"no Ray cluster at 127.0.0.1:1 \(Connection refused\)"):
-        check_address("127.0.0.1:1")
-
-
-def test_what_does_not_answer_as_ray_is_given_up_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "PROBE", "import time; time.sleep(60)")
-    monkeypatch.setattr(module, "CONNECT_SECONDS", 0.5)
-    with pytest.raises(BackendError, match="no Ray cluster answers at h:1 within"):
-        module.check_cluster("h:1")
-    monkeypatch.setattr(module, "PROBE", "import sys; print('RuntimeError: Version mismatch'); sys.exit(1)")
-    monkeypatch.setattr(module, "CONNECT_SECONDS", 30.0)
-    with pytest.raises(BackendError, match="no Ray cluster can be used at h:1: RuntimeError: Version mismatch; "):
-        module.check_cluster("h:1")
 
 
 def test_without_ray_the_command_says_what_to_install(

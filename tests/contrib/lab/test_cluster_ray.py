@@ -78,24 +78,6 @@ def test_an_interrupted_command_goes_on_to_the_same_bytes(
     assert digest(tmp_path / "job" / "splats.ply") == digest(straight / "splats.ply")
 
 
-def test_another_version_on_the_nodes_is_one_line(
-    nodes: tuple[subprocess.Popen[str], str], capture: Path, tmp_path: Path
-) -> None:
-    with begin(blocks_words(capture, tmp_path / "job", nodes[1], SCHEDULE), "gs2d.__version__ = '9.9'") as process:
-        said = process.communicate()[1]
-    assert process.returncode == 2, said
-    assert "this command 9.9; install the same version on all machines" in said.splitlines()[-1]
-    assert "Traceback" not in said
-
-
-def test_an_address_without_a_cluster_is_one_line(capture: Path, tmp_path: Path) -> None:
-    with begin([*blocks_words(capture, tmp_path / "job", "127.0.0.1:1", SCHEDULE), "--quiet"]) as process:
-        said = process.communicate()[1]
-    assert process.returncode == 2, said
-    assert len(said.splitlines()) == 1
-    assert said.startswith("error: no Ray cluster at 127.0.0.1:1 (Connection refused); start one with")
-
-
 def test_photographs_become_a_run_though_the_machine_of_the_training_is_lost(
     nodes: tuple[subprocess.Popen[str], str], room: Room, tmp_path: Path
 ) -> None:

@@ -13,11 +13,9 @@ from gs2d.contrib.lab.evaluate_tnt import (
     box,
     match_cameras,
     read_crop,
-    read_tnt_truth,
     read_trajectory,
     read_transform,
 )
-from gs2d.data.benchmarks import tnt_truth_files
 from gs2d.errors import DataError
 
 ARROW = [[0, 0], [4, 0], [4, 4], [2, 1], [0, 4]]  # not convex: the notch reaches down to (2, 1)
@@ -70,15 +68,6 @@ def test_a_broken_crop_volume_is_named(tmp_path: Path, change: dict, message: st
     assert "Barn.json" in str(caught.value)
 
 
-def test_a_log_is_a_list_of_camera_to_world_matrices(tmp_path: Path) -> None:
-    path = tmp_path / "Barn_COLMAP_SfM.log"
-    path.write_text("0 0 0\n1 0 0 5\n0 1 0 6\n0 0 1 7\n0 0 0 1\n1 1 0\n0 -1 0 1.5e1\n1 0 0 0\n0 0 1 0\n0 0 0 1\n")
-    poses = read_trajectory(path)
-    assert poses.shape == (2, 4, 4)
-    np.testing.assert_array_equal(poses[:, :3, 3], [[5, 6, 7], [15, 0, 0]])
-    np.testing.assert_array_equal(poses[1, :2, :2], [[0, -1], [1, 0]])
-
-
 @pytest.mark.parametrize(
     "text", ["", "0 0 0\n1 0 0 5\n", "0 0\n" + "1 0 0 5\n" * 4, "a b c\n", "0 0 0\n" + "nan 0 0 0\n" * 4]
 )
@@ -103,11 +92,6 @@ def test_a_transform_is_four_lines_of_four_numbers(tmp_path: Path) -> None:
         read_transform(tmp_path / "none.txt")
 
 
-def test_a_missing_file_of_the_truth_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"Barn\.ply"):
-        read_tnt_truth("Barn", {what: tmp_path / name for what, name in tnt_truth_files("Barn").items()})
-
-
 def test_photographs_are_matched_with_the_log_by_order_or_by_number() -> None:
     names = ["000003.jpg", "000001.jpg", "000002.jpg"]
     ours, entries = match_cameras(names, 3)
@@ -120,20 +104,3 @@ def test_photographs_are_matched_with_the_log_by_order_or_by_number() -> None:
         match_cameras(names, 2)
     with pytest.raises(DataError, match="have no numbers"):
         match_cameras(["a.jpg", "b.jpg", "c.jpg"], 5)
-
-
-def test_photographs_named_without_leading_zeros_are_matched_as_people_count() -> None:
-    """As text frame_10 comes before frame_2, and every camera but the first would be another photograph's."""
-    names = [f"frame_{n}.jpg" for n in (1, 10, 11, 2, 3, 4, 5, 6, 7, 8, 9)]
-    ours, entries = match_cameras(names, 11)
-    assert [names[i] for i in ours] == [f"frame_{n}.jpg" for n in range(1, 12)]
-    assert entries.tolist() == list(range(11))
-    ours, entries = match_cameras(names, 20)
-    assert [names[i] for i in ours] == [f"frame_{n}.jpg" for n in range(1, 12)]
-    assert entries.tolist() == list(range(11))
-
-
-def test_a_photograph_with_the_number_zero_is_the_first() -> None:
-    ours, entries = match_cameras(["0.jpg", "2.jpg", "12.jpg"], 13)
-    assert ours.tolist() == [0, 1, 2]
-    assert entries.tolist() == [0, 2, 12]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import signal
 import subprocess
@@ -15,17 +14,14 @@ from typing import Any
 
 import pytest
 
-from gs2d.cli import run
 from gs2d.contrib.lab import execute as execute_module
 from gs2d.contrib.lab import jobs as jobs_module
 from gs2d.contrib.lab.execute import execute
-from gs2d.contrib.lab.jobs import Job, stage_keys
-from gs2d.contrib.lab.schedule import startable
+from gs2d.contrib.lab.jobs import Job
 from gs2d.contrib.lab.tasks import failures
-from gs2d.errors import BackendError, DataError, RunError
+from gs2d.errors import DataError, RunError
 from gs2d.pipeline.events import Notice, OnEvent
 from sweep_jobs import fail_or_die, make_jobs
-from tiny import write_capture
 
 HELPERS = str(Path(__file__).resolve().parents[2] / "helpers")
 
@@ -54,14 +50,6 @@ def test_a_job_that_fails_does_not_stop_the_rest_and_is_tried_again_by_the_next_
     assert failures(jobs) == {}
 
 
-def test_a_fault_of_ours_is_written_down_with_its_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jobs_module, "train_and_evaluate", lambda *_: 1 / 0)
-    (job,) = make_jobs(tmp_path, {"a": ()})
-    execute((job,), tmp_path)
-    assert job.outcome()["reason"] == "ZeroDivisionError: division by zero"
-    assert "test_execute.py" in job.outcome()["traceback"]
-
-
 def test_a_finished_job_is_scored_again_when_more_is_wanted_and_done_again_when_its_run_is_gone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -86,22 +74,6 @@ def test_a_finished_job_is_scored_again_when_more_is_wanted_and_done_again_when_
     (tmp_path / "runs" / "a" / "splats.ply").unlink()
     run_that_wants("surface: x")
     assert len(done) == 3
-
-
-def test_a_job_that_was_trained_and_could_not_be_scored_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def train(job: Job, _on_event: OnEvent) -> dict[str, str]:
-        if job.name == "trained":
-            job.train.out.mkdir(parents=True)
-            (job.train.out / "splats.ply").touch()
-        raise DataError("the log does not fit")
-
-    monkeypatch.setattr(jobs_module, "train_and_evaluate", train)
-    jobs = make_jobs(tmp_path, {"trained": ("1",), "not": ("2",)})
-    execute(jobs, tmp_path)
-    assert [job.outcome()["trained"] for job in jobs] == [True, False]
-    assert set(failures(jobs)) == {"trained", "not"}
 
 
 # -- one command at a time ---------------------------------------------------------------------------------------------
@@ -140,50 +112,6 @@ def test_a_folder_that_another_command_works_in_is_refused_and_taken_over_when_i
     assert jobs[1].outcome()["state"] == "running"
     execute(jobs, tmp_path)
     assert done == ["b", "c"]
-
-
-def test_the_refusal_is_one_line_of_the_command_and_changes_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_capture(tmp_path / "ball", train=2, test=1, size=8)
-    words = ["--data", str(tmp_path / "ball"), "--out", str(tmp_path / "out"), "--quiet"]
-    codes: list[int] = []
-
-    def train(*_: object) -> dict[str, str]:
-        codes.append(run(["sweep", "2dgs-r", *words]))
-        about = json.loads((tmp_path / "out" / "about.json").read_text())
-        assert about["recipes"] == ["2dgs"]  # nothing of the command that was refused
-        return {}
-
-    monkeypatch.setattr(jobs_module, "train_and_evaluate", train)
-    run(["sweep", "2dgs", *words])
-    assert codes == [2]
-    first = capsys.readouterr().err.splitlines()[0]
-    assert first.startswith(f"error: {tmp_path / 'out'} is ")
-    assert "another process; wait for it or choose another --out" in first
-
-
-# -- several at once ---------------------------------------------------------------------------------------------------
-def test_keys_are_equal_as_far_as_the_stages_are() -> None:
-    a, b = stage_keys(["lego", 0], ["surface", "x"]), stage_keys(["lego", 0], ["surface", "y"])
-    assert a[0] == b[0]
-    assert a[1] != b[1]
-    assert stage_keys(["lego", 1], ["surface"])[0] != a[0]
-
-
-def test_a_job_waits_while_another_one_trains_a_stage_of_its(tmp_path: Path) -> None:
-    first, second, third = make_jobs(tmp_path, {"a": ("s", "x"), "b": ("s", "y"), "c": ("r",)})
-    assert startable([second], [first]) is None
-    assert startable([second, third], [first]) == third
-    first.train.out.mkdir(parents=True)
-    stage = {"name": "surface", "iterations": 1, "seconds": 1, "splats": 1, "bytes": 1}
-    (first.train.out / "metrics.json").write_text(json.dumps({"stages": [stage]}))
-    assert startable([second], [first]) == second  # takes it from the cache
-
-
-def test_slots_must_be_a_number_of_processes(tmp_path: Path) -> None:
-    with pytest.raises(BackendError, match="--slots must be a whole number >= 1, got 0"):
-        execute((), tmp_path, slots=0)
 
 
 class Context:

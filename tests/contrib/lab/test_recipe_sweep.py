@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import shlex
 from collections.abc import Iterator
@@ -12,17 +11,8 @@ from pathlib import Path
 import pytest
 
 from gs2d.cli import run
-from gs2d.cli.commands import Sweep
-from gs2d.cli.parser import parse
 from gs2d.config.presets import get_recipe
 from gs2d.config.serialize import to_json
-from gs2d.contrib.lab import jobs as jobs_module
-from gs2d.contrib.lab.aggregate import Results
-from gs2d.contrib.lab.deviations import deviations_of
-from gs2d.contrib.lab.options import SweepOptions
-from gs2d.contrib.lab.paper import paper
-from gs2d.contrib.lab.plan import make_plan, paper_command
-from gs2d.pipeline.prepare.options import values
 from paper_cells import TINY, draw_nothing
 from tiny import write_capture
 
@@ -52,22 +42,6 @@ def test_the_table_has_a_row_for_each_recipe_with_its_figures(swept: tuple[Path,
         assert "2dgs-r" in (swept[0] / name).read_text()
 
 
-def test_nothing_of_the_paper_stands_in_it(swept: tuple[Path, list[str], int]) -> None:
-    out = swept[0]
-    assert "paper" not in (out / "table.tex").read_text()
-    assert "paper_psnr" not in next(csv.reader((out / "table.csv").read_text().splitlines()))
-    for name in ("table.md", "index.html"):
-        text = (out / name).read_text()
-        assert "What to know about these figures" in text
-        assert "the schedule is 0.0005 of the paper" in text  # what a recipe is defined by
-        phrases = ("claims", "In brackets", "In small print", "differs from", "paper&#39;s figure", "RTX 4090")
-        for phrase in (*phrases, "gs2d paper"):
-            assert phrase not in text
-    assert "2DGS with normal consistency 0.05: the paper&#39;s baseline" in (out / "index.html").read_text()
-    assert '<p class="lead">2 recipes on 1 scene. Trained at 0.0005 of the schedule' in (out / "index.html").read_text()
-    assert json.loads((out / "about.json").read_text())["claims"] == []
-
-
 def test_another_recipe_adds_a_row_and_trains_only_what_is_new(swept: tuple[Path, list[str], int]) -> None:
     out, _, written = swept
     assert (out / "runs" / "ball-2dgs-s0" / "splats.ply").stat().st_mtime_ns == written
@@ -76,42 +50,6 @@ def test_another_recipe_adds_a_row_and_trains_only_what_is_new(swept: tuple[Path
     about = json.loads((out / "about.json").read_text())
     assert about["recipes"] == ["2dgs", "2dgs-r"]
     assert shlex.split(about["command"])[:4] == ["gs2d", "sweep", "2dgs", "2dgs-r"]
-
-
-def test_the_rows_that_were_there_are_named_and_the_same_command_does_nothing_again(
-    swept: tuple[Path, list[str], int], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    draw_nothing(monkeypatch)
-    monkeypatch.setattr(jobs_module, "train_and_evaluate", lambda *_: pytest.fail("trained again"))
-    words = [word for word in swept[1] if word != "--quiet"]
-    assert run([*words, "--json"]) == 0
-    said = capsys.readouterr()
-    assert [row["name"] for row in json.loads(said.out)["rows"]] == ["2dgs", "2dgs-r"]
-    assert f"{swept[0]} has rows of earlier commands, which stay: 2dgs" in said.err
-
-
-def test_the_table_of_what_is_there_can_be_written_while_a_command_trains(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_capture(tmp_path / "ball", train=2, test=1, size=8)
-    mine = SweepOptions(recipes=("2dgs",), data=tmp_path / "ball", out=tmp_path / "out")
-    found: list[int] = []
-
-    def train(*_: object) -> dict[str, str]:
-        found.append(paper(replace(mine, train=False)).unfinished)
-        return {}
-
-    monkeypatch.setattr(jobs_module, "train_and_evaluate", train)
-    assert paper(mine).unfinished == 0
-    assert found == [1]
-
-
-def test_a_recipe_that_is_named_twice_is_trained_once(tmp_path: Path) -> None:
-    write_capture(tmp_path / "ball", train=2, test=1, size=8)
-    recipes = ("2dgs-r", "2dgs", "2dgs-r")
-    plan = make_plan(SweepOptions(recipes=recipes, data=tmp_path, out=tmp_path / "out", seeds=(4,)))
-    assert [row.name for row in plan.table.rows] == ["2dgs-r", "2dgs"]
-    assert [job.name for job in plan.jobs] == ["ball-2dgs-r-s4", "ball-2dgs-s4"]
 
 
 @pytest.mark.parametrize(
@@ -144,33 +82,6 @@ def test_a_folder_holds_a_sweep_or_a_table_of_the_paper(
     (line,) = capsys.readouterr().err.splitlines()
     kinds = ("modules", "sweep") if first == "paper" else ("sweep", "modules")
     assert "holds a table made with table = {}, now {}; choose another --out".format(*kinds) in line
-
-
-def test_the_printed_command_is_the_one_that_was_given() -> None:
-    options = SweepOptions(
-        recipes=("2dgs", "2dgs-r"),
-        data=Path("a b"),
-        out=Path("out"),
-        scenes=("lego", "ship"),
-        seeds=(3,),
-        schedule_scale=0.1,
-        downscale=2,
-        protocol="generic",
-        cache=Path("c"),
-        overrides=("surface.iterations=9",),
-    )
-    command = parse(shlex.split(paper_command(options))[1:])
-    assert isinstance(command, Sweep)
-    assert values(SweepOptions, command) == values(SweepOptions, options)
-
-
-def test_scenes_that_only_the_paper_would_need_are_not_missed(tmp_path: Path) -> None:
-    write_capture(tmp_path / "lego", train=2, test=1, size=8)
-    options = SweepOptions(recipes=("2dgs-r",), data=tmp_path, out=tmp_path / "out")
-    plan = make_plan(options)
-    lines = deviations_of(options, plan.scenes, plan.table, Results(()))
-    assert not any("of its 8 scenes are not here" in line or "the paper does not say" in line for line in lines)
-    assert "1 seed (0)" in lines
 
 
 def test_recipes_of_files_are_rows_by_their_short_names(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,21 +12,15 @@ from cli_runs import TINY, one_line
 from fake_ray import FakeRay
 from gs2d.cli import run
 from gs2d.contrib.lab import reconstruct as module
-from gs2d.contrib.lab.options import ReconstructAnywhereOptions
-from gs2d.contrib.lab.reconstruct import reconstruct, tasks_of
-from gs2d.errors import DataError
+from gs2d.contrib.lab.reconstruct import tasks_of
 from gs2d.pipeline import reconstruct as steps
-from gs2d.pipeline.prepare.options import ReconstructOptions, values
+from gs2d.pipeline.prepare.options import ReconstructOptions
 from room_photos import Room
 
 
 def words_for(photos: Path, out: Path, *words: str) -> list[str]:
     common = ["--out", str(out), "--threads", "1", "--downscale", "8", "--quiet", *TINY]
     return ["reconstruct", str(photos), *common, "--cluster", "auto", *words]
-
-
-def options_for(photos: Path, out: Path, **changes: object) -> ReconstructAnywhereOptions:
-    return replace(ReconstructAnywhereOptions(photos=photos, out=out, cluster="auto", threads=1), **changes)  # type: ignore[arg-type]
 
 
 def test_two_tasks_leave_the_run_that_the_command_here_leaves(
@@ -89,39 +82,3 @@ def test_cameras_are_replaced_once_though_the_machine_was_lost_after_it(
     task.work(lambda _: None)
     task.work(lambda _: None)  # the second process takes what the first has left
     assert seen == [(True, False), (False, True)]
-
-
-def test_photographs_without_cameras_are_one_line_and_nothing_is_left(
-    ray: FakeRay, room: Room, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object) -> None:
-        raise DataError("expected photographs that overlap, got none; take more")
-
-    monkeypatch.setattr(steps, "find_poses", fail)
-    assert run(words_for(room.photos, tmp_path / "runs/a")) == 2
-    assert "expected photographs that overlap, got none; take more" in capsys.readouterr().err.splitlines()[-1]
-    assert not (tmp_path / "runs").exists()
-
-
-def test_a_viewer_of_a_cluster_is_refused(
-    ray: FakeRay, room: Room, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(words_for(room.photos, tmp_path / "run", "--viewer")) == 2
-    assert "--viewer shows a training of this machine, got it with --cluster" in one_line(capsys.readouterr().err)
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_cluster_without_room_is_one_line_and_nothing_is_left(
-    ray: FakeRay, room: Room, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(words_for(room.photos, tmp_path / "run", "--memory", "64")) == 2
-    assert "no machine of the cluster has room for cameras" in one_line(capsys.readouterr().err)
-    assert not (tmp_path / "run").exists()
-
-
-def test_without_a_cluster_it_is_done_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[ReconstructOptions] = []
-    monkeypatch.setattr(module, "reconstruct_here", lambda options, _: seen.append(options))
-    options = options_for(tmp_path / "photos", tmp_path / "run", cluster=None, seed=3)
-    reconstruct(options)
-    assert seen == [ReconstructOptions(**values(ReconstructOptions, options))]

@@ -13,7 +13,7 @@ from gs2d.config.protocols import GENERIC
 from gs2d.contrib.lab import settle as module
 from gs2d.contrib.lab.settle import Settled, capture_digest, fitting_partition, seam_recipe
 from gs2d.errors import DataError
-from gs2d.pipeline.events import Event, Notice
+from gs2d.pipeline.events import Event
 from gs2d.pipeline.prepare.estimate import Estimate, Range
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.render.backends import get_backend
@@ -40,12 +40,6 @@ def fitting(monkeypatch: pytest.MonkeyPatch, plan: Estimate | DataError, partiti
 
 
 TOLD: list[Event] = []
-
-
-def test_there_are_no_blocks_where_one_training_fits(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert fitting(monkeypatch, PLAN, Partition()) is None
-    assert isinstance(TOLD[-1], Notice)
-    assert TOLD[-1].text.startswith("one training of everything fits into memory: no blocks")
 
 
 def test_there_are_as_many_blocks_as_memory_needs_with_the_coarse_model_beside_each(
@@ -84,13 +78,3 @@ def test_seams_learn_by_the_last_rates_of_a_block_and_nothing_comes_or_goes() ->
     assert stage.lr.opacity_logits == block.lr.opacity_logits
     assert set(stage.train.values()) == {"all"}
     assert all(term.start == 0 for term in stage.losses)
-
-
-def test_seams_settle_as_a_block_does() -> None:
-    recipe = get_recipe("best")
-    block = recipe.stages[0]
-    (stage,) = seam_recipe(recipe, Partition(seam_schedule=0.1), 1.0).stages
-    assert stage.lr.settled_at(0) == block.lr.settled_at(14_000) == 1.0
-    assert stage.lr.settled_at(1_000) == pytest.approx(block.lr.settled_at(17_000))
-    assert stage.lr.settled_at(2_000) == pytest.approx(block.lr.settled_at(20_000)) == 0.1
-    assert stage.lr.sh0 == block.lr.sh0

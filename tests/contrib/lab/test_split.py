@@ -6,13 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 
 from gs2d.config.partition import Partition
 from gs2d.config.presets import get_recipe
 from gs2d.config.recipe import Exposure
-from gs2d.contrib.lab.settle import block_recipe, budget_of, coarse_recipe, with_budget
+from gs2d.contrib.lab.settle import block_recipe, budget_of, with_budget
 from gs2d.contrib.lab.split import Block, Split, choose_views, merge, read_split, split_model, start_file
 from gs2d.core.splats import Splats
 from gs2d.pipeline.events import Event, Notice, ignore
@@ -39,17 +38,6 @@ def test_photographs_that_show_enough_of_a_block_are_its_and_the_best_others_up_
     assert chosen.tolist() == [0, 1, 3, 4, 5]  # who shows nothing of it never is
     chosen, floor = choose_views(shares, Partition(min_share=0.1, min_views=1))
     assert (chosen.tolist(), floor) == ([0, 3], [])
-
-
-def test_the_share_of_a_photograph_is_that_of_its_alpha(tmp_path: Path) -> None:
-    """With one block everything is its: all photographs, all that is seen, nothing frozen."""
-    splats = random_splats(80, seed=3)
-    found = splits(splats, tmp_path, Partition(grid=(1, 1)))
-    (block,) = found.blocks
-    assert block.views == tuple(view.name for view in SCENE.train)
-    assert (block.floor, block.frozen, block.core) == (0, 0, 80)
-    assert block.weight == pytest.approx(1)
-    assert 40 < block.own <= 80
 
 
 def test_blocks_overlap_by_their_margin_and_freeze_what_lies_around(tmp_path: Path) -> None:
@@ -112,12 +100,3 @@ def test_recipes_of_a_block_have_a_share_of_the_budget_given_exposures_and_all_d
     assert found.exposure.initial == "given"
     assert [stage.sh_interval for stage in found.stages] == [0]
     assert budget_of(block_recipe(get_recipe("best"), Partition(grid=(2, 2), splats=77), BLOCK)) == 77
-
-
-def test_the_recipe_of_the_coarse_model_is_shorter_and_has_its_budget() -> None:
-    recipe = get_recipe("2dgs")
-    found = coarse_recipe(recipe, Partition())
-    assert found.iterations == 9_000
-    assert budget_of(found) == 1_000_000
-    assert budget_of(recipe) is None
-    assert budget_of(coarse_recipe(with_budget(recipe, 500), Partition())) == 500

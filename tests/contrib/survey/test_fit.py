@@ -70,12 +70,6 @@ def test_places_on_a_line_and_places_without_heights_need_an_up() -> None:
             fit_places(given, told, None)
 
 
-def test_the_same_place_for_all_is_refused() -> None:
-    source, target = places()
-    with pytest.raises(DataError, match="have the same"):
-        fit_places(source, np.tile(target[:1], (40, 1)), TURN[2])
-
-
 def cameras(up: tuple[float, float, float], roll: float = 0.0) -> list[Camera]:
     made = []
     for k in range(24):

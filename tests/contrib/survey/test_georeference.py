@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -187,18 +186,6 @@ def test_a_known_distance_and_up(run: Path) -> None:
     assert lying.rotation @ (1.0, 0.0, 0.0) == pytest.approx((0, 0, 1), abs=1e-12)
 
 
-def test_remove_and_show(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert gs2d(["georeference", str(run), "--known-distance", "0", "0", "0", "-1e-1", "0", "0", "0.5"]) == 0
-    assert "scale: 5 m a unit" in capsys.readouterr().out
-    assert gs2d(["info", str(run), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["georeference"]["scale"] == 5
-    assert gs2d(["georeference", str(run), "--remove"]) == 0
-    assert not (run / "georeference.json").exists()
-    capsys.readouterr()
-    assert gs2d(["georeference", str(run), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["georeference"] is None
-
-
 @pytest.mark.parametrize(
     ("words", "text"),
     [
@@ -227,25 +214,6 @@ def test_bad_input_is_one_line(
     Path("control.csv").write_text("name,x,y,z,photo,u,v\nA,1,2,3,nowhere.jpg,1,1\nB,2,2,3,nowhere.jpg,1,1\n")
     line = error_of(["georeference", str(run), "--quiet", *words], capsys)
     assert any(part in line for part in text.split("|")), line
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("", "empty"),
-        ("a,b\n1,2\n", "name is missing"),
-        ("name,lat,lon,height\nr_1.png,95,8,0\n", "latitude and longitude"),
-        ("name,lat,lon,height\nr_1.png,47,8,0\nr_1.png,47,8,0\n", "already"),
-        ("name,lat,lon,height\nr_1.png,47,eight,0\n", "a number was expected for lon"),
-        ("name,lat,lon\nother.png,47,8\n", "must place 3 photographs"),
-        ("name,x,y,z\ntrain/r_0,1,2,3\ntrain/r_1,2,2,3\ntrain/r_2,2,5,3\n", "--epsg"),
-    ],
-)
-def test_bad_tables_are_one_line(
-    run: Path, tmp_path: Path, text: str, expected: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "p.csv").write_text(text)
-    assert expected in error_of(["georeference", str(run), "--positions", str(tmp_path / "p.csv")], capsys)
 
 
 # files

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import math
 import struct
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,12 +17,12 @@ from gs2d.contrib.formats import compressed_ply
 from gs2d.contrib.formats.antimatter import read_splat, write_splat
 from gs2d.contrib.formats.compressed_ply import read_compressed_ply, write_compressed_ply
 from gs2d.core.sh import sh_basis
-from gs2d.errors import BackendError, DataError, DiskError
-from gs2d.io.formats.registry import LAYOUTS, layout_of, read_splat_file, read_surfels, write_layout
+from gs2d.errors import DataError
+from gs2d.io.formats.registry import LAYOUTS, layout_of, read_splat_file, write_layout
 from gs2d.io.formats.spz import read_spz, write_spz
 from gs2d.io.gaussians import FLAT_LOG_SCALE, Gaussians, sigmoid, unit_quats
 from gs2d.io.ply_format import read_ply, write_ply
-from gs2d.io.splat_ply import read_gaussians, write_splats
+from gs2d.io.splat_ply import read_gaussians
 from splat_scenes import a_scene, turned_by
 
 C0 = 0.28209479177387814
@@ -238,14 +237,6 @@ def test_a_compressed_ply_comes_back_within_its_bits(tmp_path: Path) -> None:
     assert np.abs(sigmoid(back.opacity_logits) - sigmoid(same.opacity_logits)).max() <= 0.5001 / 255
 
 
-def test_neighbours_share_a_chunk(tmp_path: Path) -> None:
-    splats = a_scene(4096, degree=0)
-    write_compressed_ply(tmp_path / "a.ply", Gaussians.of(splats))
-    chunk = read_ply(tmp_path / "a.ply").elements["chunk"].properties
-    spans = [np.asarray(chunk[f"max_{a}"]) - np.asarray(chunk[f"min_{a}"]) for a in "xyz"]
-    assert np.mean(np.prod(spans, axis=0)) < 4**3 / 5  # 16 chunks; in any order it would be all of the box
-
-
 # -- all of them -----------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("layout", LAYOUTS.builtin)
 @pytest.mark.parametrize("n", [0, 1, 257])
@@ -258,26 +249,6 @@ def test_every_layout_is_read_back_as_flat_splats(tmp_path: Path, layout: str, n
     assert file.gaussians.sh_degree == (
         0 if layout == "splat" or (layout in ("gltf", "sog", "streamed") and n == 0) else 2
     )
-
-
-def test_three_dimensional_gaussians_are_told_from_disks(tmp_path: Path, shared: Callable[[str], Path]) -> None:
-    file = read_splat_file(shared("gaussians_plush_dog") / "point_cloud_29999_clean.ply")
-    assert (file.kind, file.surfels) == ("3dgs (three scales, for viewers)", None)
-    write_spz(tmp_path / "a.spz", file.gaussians)
-    file = read_splat_file(tmp_path / "a.spz")
-    assert (file.kind, file.surfels) == ("SPZ version 3", None)
-    with pytest.raises(DataError, match=r"a\.spz: flat splats were expected, got 3D Gaussians with three scales"):
-        file.gaussians.to_surfels(tmp_path / "a.spz")
-
-
-def test_infinite_logits_of_other_programs_are_opaque_and_empty(tmp_path: Path) -> None:
-    splats = a_scene(3, 0)
-    splats.opacity_logits[:2] = torch.tensor([math.inf, -math.inf])
-    write_splats(tmp_path / "a.ply", splats, layout="3dgs")
-    back, _ = read_surfels(tmp_path / "a.ply")
-    assert back.opacities[0] > 1 - 1e-7
-    assert back.opacities[1] < 1e-20
-    assert back.opacity_logits[2] == splats.opacity_logits[2]
 
 
 @pytest.mark.parametrize(
@@ -293,23 +264,6 @@ def test_infinite_logits_of_other_programs_are_opaque_and_empty(tmp_path: Path) 
 )
 def test_the_ending_says_the_layout(name: str, layout: str | None) -> None:
     assert layout_of(Path(name)) == layout
-
-
-def test_spz_is_a_tenth_of_the_plain_ply(tmp_path: Path) -> None:
-    splats = a_scene(2000)
-    write_splats(tmp_path / "a.ply", splats, layout="3dgs")
-    write_spz(tmp_path / "a.spz", Gaussians.of(splats))
-    write_compressed_ply(tmp_path / "a.compressed.ply", Gaussians.of(splats))
-    size = {path.name: path.stat().st_size for path in tmp_path.iterdir()}
-    assert size["a.spz"] < size["a.ply"] / 5  # of random numbers; of a real scene a ninth
-    assert size["a.compressed.ply"] < size["a.ply"] / 3.9
-
-
-@pytest.mark.parametrize("layout", ["compressed", "spz", "splat", "spz4", "usd", "gltf", "sog"])
-def test_a_failed_write_leaves_nothing_behind(tmp_path: Path, layout: str) -> None:
-    with pytest.raises(DiskError, match="the folder does not exist"):
-        write_layout(tmp_path / "no" / f"a{LAYOUTS.get(layout).ending}", a_scene(5), layout)
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("layout", ["compressed", "spz", "splat", "spz4", "usd", "gltf", "sog"])
@@ -407,20 +361,6 @@ def test_spz_of_version_4_that_cannot_be_is_one_line(tmp_path: Path, at: int, va
     assert "\n" not in str(caught.value)
 
 
-def test_without_zstandard_version_4_says_what_brings_it_and_version_3_works(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "zstandard", None)
-    words = "SPZ of version 4 needs zstandard, which is not installed; pip install 'zstandard>=0.22'"
-    with pytest.raises(BackendError, match=words):
-        write_spz(tmp_path / "a.spz", Gaussians.of(a_scene(3)), version=4)
-    assert not (tmp_path / "a.spz").exists()
-    write_spz(tmp_path / "a.spz", Gaussians.of(a_scene(3)))
-    assert read_spz(tmp_path / "a.spz")[1] == 3
-    with pytest.raises(DataError, match=r"cannot read .*b.spz: No such file"):
-        read_splat_file(tmp_path / "b.spz")
-
-
 def test_a_compressed_ply_whose_parts_do_not_fit_is_named(tmp_path: Path) -> None:
     write_compressed_ply(tmp_path / "a.ply", Gaussians.of(a_scene(300)))
     parts = {
@@ -443,22 +383,3 @@ def test_a_compressed_ply_whose_parts_do_not_fit_is_named(tmp_path: Path) -> Non
         45,  # one is at the other end
         ("b.ply: 255 of 300 splats have NaN or infinity (means) and were left out",),
     )
-
-
-def test_numbers_that_are_no_splats_are_named(tmp_path: Path) -> None:
-    (tmp_path / "a.splat").write_bytes(struct.pack("<6f8B", 0, 0, 0, 1, -1, 1, *range(8)))
-    with pytest.raises(DataError, match="positive scales were expected; is it a .splat file"):
-        read_splat_file(tmp_path / "a.splat")
-    (tmp_path / "a.splat").write_bytes(struct.pack("<6f8B", math.nan, 0, 0, 1, 1, 1, *range(8)))
-    with pytest.raises(DataError, match=r"finite numbers were expected, 1 of 1 splats have NaN or infinity \(means\)"):
-        read_splat_file(tmp_path / "a.splat")
-
-
-@pytest.mark.parametrize(("kind", "faces"), [("a mesh", 1), ("a point cloud", 0)])
-def test_what_holds_no_splats_to_start_from_is_named(tmp_path: Path, kind: str, faces: int) -> None:
-    path = tmp_path / "x.ply"
-    header = f"ply\nformat ascii 1.0\nelement vertex 3\n{''.join(f'property float {c}' + chr(10) for c in 'xyz')}"
-    header += f"element face {faces}\nproperty list uchar int vertex_indices\nend_header\n"
-    path.write_text(header + "0 0 0\n1 0 0\n0 1 0\n" + "3 0 1 2\n" * faces)
-    with pytest.raises(DataError, match=f"must hold splats to start from, of 2DGS or 3DGS, got {kind}; give the"):
-        read_surfels(path)
