@@ -1,4 +1,4 @@
-"""Focal lengths and what is left of the lens, learned with the splats and the poses (docs/math.md, "Intrinsics").
+"""Focal lengths and the residual lens, learned with splats and poses (docs/math.md, "Focal lengths and lens").
 
 Photographs that share a camera share five numbers: the focal lengths are exp(a) times those that the capture says, the
 principal point is moved by b and c focal lengths, and k1, k2 are the lens that is left (``core/residual_lens.py``) in
