@@ -15,7 +15,6 @@ from capture_writers import ColmapModel, small_blender, small_colmap, small_dtu,
 from gs2d.config.datasets import get_dataset
 from gs2d.data import detect_format, load_scene
 from gs2d.data.benchmarks import describe, find_scenes, missing_lines, protocol_of, recognise
-from gs2d.errors import DataError
 
 
 def write_dtu_2dgs(data: Path) -> Path:
@@ -167,31 +166,6 @@ def test_a_file_that_is_taken_away_is_named_in_one_line(tmp_path: Path, layout: 
     told = [line for line in missing_lines(root) if _names(line, Path(file).name)]  # what `gs2d train` says of it
     unread = purpose or (layout == "mip-nerf-360" and "/images/" in file)
     assert told == ([] if unread else [line])
-
-
-@pytest.mark.parametrize(
-    ("layout", "files"),
-    [
-        ("dtu-neus", ["cameras_sphere.npz"]),
-        ("tnt", ["sparse/0/cameras.bin"]),
-        ("nerf-synthetic", ["transforms_train.json"]),
-        ("mip-nerf-360", ["sparse/0/images.bin", "sparse/0/cameras.bin"]),
-    ],
-)
-def test_a_scene_of_a_data_set_without_its_cameras_says_where_to_get_them(
-    tmp_path: Path, layout: str, files: list[str]
-) -> None:
-    root = LAYOUTS[layout][2](tmp_path)
-    for file in files:
-        (root / file).unlink()
-    with pytest.raises(DataError, match="missing") as caught:
-        detect_format(root)
-    assert "\n" not in str(caught.value)
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine/notes.txt").write_text("")
-    with pytest.raises(DataError) as plain:
-        detect_format(tmp_path / "mine")
-    assert "known data set" not in str(plain.value)
 
 
 def _names(line: str, name: str) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ import pytest
 from PIL import Image
 
 from capture_writers import ColmapModel, opengl_camera_to_world, ring
-from foreign_writers import metashape_document, metashape_transform, opensfm_reconstruction, poses
 from gs2d.core.camera import Camera
 from gs2d.data import Scene, load_scene
 from gs2d.data.faces import FACES, field_of_view
@@ -117,17 +115,6 @@ def test_masks_go_along_and_downscaled_faces_agree_too(tmp_path: Path) -> None:
     assert_faces_agree(scene, 3.0)
 
 
-def test_panoramas_of_opensfm_are_cut_too(tmp_path: Path) -> None:
-    shots = poses(4)
-    camera = {"projection_type": "spherical", "width": WIDTH, "height": WIDTH // 2}
-    for name, T in shots.items():
-        write_panorama(tmp_path / "images" / name, Camera(8, 8, 8.0, 8.0, 4.0, 4.0, T))
-    (tmp_path / "reconstruction.json").write_text(json.dumps([opensfm_reconstruction(camera, shots)]))
-    scene = load_scene(tmp_path)
-    assert len(scene.views) == 24
-    assert_faces_agree(scene, 12.0)  # JPEG
-
-
 @pytest.mark.parametrize("kind", ["bin", "txt"])
 def test_panoramas_of_a_colmap_model_are_cut_too(tmp_path: Path, kind: str) -> None:
     model = ColmapModel(cameras={1: ("EQUIRECTANGULAR", WIDTH, WIDTH // 2, (WIDTH, WIDTH // 2))})
@@ -144,26 +131,6 @@ def test_panoramas_of_a_colmap_model_are_cut_too(tmp_path: Path, kind: str) -> N
         model.write(tmp_path / "sparse/0", kind)
         with pytest.raises(DataError, match=words):
             load_scene(tmp_path)
-
-
-@pytest.mark.parametrize("calibrated", [False, True])
-def test_spherical_cameras_of_metashape_are_cut_too(tmp_path: Path, calibrated: bool) -> None:
-    shots, size = poses(4), f"<resolution width='{WIDTH}' height='{WIDTH // 2}'/>"
-    cameras = ""
-    for i, (name, T) in enumerate(shots.items()):
-        write_panorama(tmp_path / "images" / name, Camera(8, 8, 8.0, 8.0, 4.0, 4.0, T))
-        pose = f"<transform>{metashape_transform(T)}</transform>"
-        cameras += f"<camera id='{i}' sensor_id='0' label='{name[:-4]}'>{pose}</camera>"
-    stated = f"<calibration type='spherical' class='adjusted'>{size}</calibration>" if calibrated else ""
-    text = metashape_document(stated, cameras, kind="spherical")
-    path = tmp_path / "cameras.xml"
-    path.write_text(text if calibrated else re.sub("<resolution[^>]*>", size, text, count=1))
-    scene = load_scene(tmp_path)
-    assert len(scene.views) == 24
-    assert_faces_agree(scene, 12.0)  # JPEG
-    path.write_text(re.sub("<resolution[^>]*>", "", text))
-    with pytest.raises(DataError, match="resolution"):
-        load_scene(tmp_path)
 
 
 def write_fisheyes(root: Path, k: Intrinsics, params: tuple[float, ...], model: str = "OPENCV_FISHEYE") -> None:

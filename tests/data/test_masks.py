@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -81,31 +80,6 @@ def test_what_masked_cannot_change_is_said(tmp_path: Path, masked: str) -> None:
     said = [note for note in load_scene(tmp_path / "bare", masked=masked).notes if note.startswith("masks:")]
     none = f"masks: none of 9 views has one in masks (a/b.jpg.png for a/b.jpg): --masked {masked} changes nothing"
     assert said == ([] if masked == "off" else [none])  # without masks none is used: what was asked for
-
-
-@pytest.mark.parametrize("files", [True, False])
-def test_empty_cuts_out_of_dtu_by_masks_that_are_named_and_not_by_its_silhouettes(tmp_path: Path, files: bool) -> None:
-    small_dtu(tmp_path)
-    rgba = np.full((30, 40, 4), 200, np.uint8)
-    rgba[:, :10, 3] = 0
-    write(tmp_path / "image" / "000000.png", rgba)
-    if not files:
-        shutil.rmtree(tmp_path / "mask")
-    left = np.where(np.arange(40) < 15, 255, 0).astype(np.uint8)[None].repeat(30, axis=0)
-    write(tmp_path / "mine" / "000000.png", left)
-    view, other = load_scene(tmp_path, masks=tmp_path / "mine", masked="empty").views[:2]
-    alpha, whole, kept = view.alpha(), other.alpha(), view.object_mask()
-    silhouette = load_scene(tmp_path).views[0].object_mask()
-    assert alpha is not None
-    assert whole is not None
-    assert kept is not None
-    assert silhouette is not None
-    assert np.array_equal(alpha, left / 255)  # the photograph's own alpha stays a silhouette
-    assert (whole == 1).all()
-    assert np.array_equal(kept, silhouette & (left > 0))
-    assert kept.any()
-    assert not kept.all()
-    assert silhouette[:, 15:].any()  # so the test can fail
 
 
 def test_empty_makes_an_alpha_channel_of_the_mask_in_every_view(tmp_path: Path) -> None:

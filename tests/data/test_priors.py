@@ -183,17 +183,3 @@ def test_points_are_known_by_the_photographs_that_were_found_to_show_them(tmp_pa
     assert sorted(observed.seen[names[0]].tolist()) == [0, 1]
     assert observed.seen[names[1]].tolist() == [1]
     assert observed.seen[names[2]].tolist() == []
-
-
-def test_what_photographs_show_is_read_once_until_it_is_forgotten(tmp_path: Path) -> None:
-    small_colmap(tmp_path)
-    scene = load_scene(tmp_path, test_every=0)
-    first = scene.observe()
-    assert scene.observe() is first
-    scene.forget()
-    again = scene.observe()
-    assert again is not first
-    np.testing.assert_array_equal(again.points, first.points)
-    assert {name: rows.tolist() for name, rows in again.seen.items()} == {
-        name: rows.tolist() for name, rows in first.seen.items()
-    }

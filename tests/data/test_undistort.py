@@ -32,17 +32,6 @@ def test_perspective_distortion_worked_by_hand() -> None:
     np.testing.assert_allclose(lens.distort(np.array([0.5, 0.25])), [0.534375, 0.2671875], rtol=1e-14)
 
 
-def test_full_opencv_divides_and_fisheye_and_fov_bend_the_angle() -> None:
-    lens = Lens("perspective", (0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
-    # r = 1: (1 + 0.6) / (1 + 1.5)
-    np.testing.assert_allclose(lens.distort(np.array([1.0, 0.0])), [0.64, 0.0], rtol=1e-14)
-    t = math.pi / 4  # r = 1
-    fisheye = Lens("fisheye", (0.1, 0.01)).distort(np.array([0.6, 0.8]))
-    np.testing.assert_allclose(fisheye, np.array([0.6, 0.8]) * t * (1 + 0.1 * t**2 + 0.01 * t**4), rtol=1e-14)
-    fov = Lens("fov", (0.5,)).distort(np.array([0.0, 2.0]))
-    np.testing.assert_allclose(fov, [0.0, math.atan(4 * math.tan(0.25)) / 0.5], rtol=1e-14)
-
-
 def test_parameters_of_each_colmap_model_are_in_colmap_s_order() -> None:
     def of(model: str, *params: float) -> Intrinsics:
         return colmap_intrinsics("camera 1", model, 40, 30, params)

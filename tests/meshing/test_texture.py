@@ -12,7 +12,7 @@ from benchmarks.texture import image, psnr
 
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.errors import DiskError, ProtocolError
-from gs2d.io.meshes import read_mesh, write_textured
+from gs2d.io.meshes import write_textured
 from gs2d.meshing import texture as atlas_module
 from gs2d.meshing.texture import (
     FEATHER,
@@ -196,24 +196,6 @@ def test_other_programs_open_the_files_with_their_texture(tmp_path: Path, name: 
     top, bottom = loaded.vertices[:, 1] > 0.5, loaded.vertices[:, 1] < -0.5
     assert (colors[top] == (250, 0, 0)).all()
     assert (colors[bottom] == (0, 0, 250)).all()
-
-
-def test_an_obj_file_is_not_torn_at_the_seams_of_its_texture(tmp_path: Path) -> None:
-    mesh = textured()
-    split = TexturedMesh(
-        mesh.vertices[mesh.faces].reshape(-1, 3),
-        mesh.normals[mesh.faces].reshape(-1, 3),
-        np.arange(mesh.faces.size, dtype=np.int32).reshape(-1, 3),
-        mesh.uv[mesh.faces].reshape(-1, 2),
-        mesh.texture,
-    )
-    write_textured(tmp_path / "a.obj", split)
-    lines = (tmp_path / "a.obj").read_text().splitlines()
-    assert sum(line.startswith("v ") for line in lines) == len(mesh.vertices)
-    read = read_mesh(tmp_path / "a.obj")
-    np.testing.assert_array_equal(read.vertices[read.faces], mesh.vertices[mesh.faces])
-    assert {path.name for path in tmp_path.iterdir()} == {"a.obj", "a.mtl", "a.png"}
-    assert "map_Kd a.png" in (tmp_path / "a.mtl").read_text()
 
 
 def test_an_obj_file_its_material_and_its_texture_are_replaced_all_three_or_not_at_all(

@@ -10,20 +10,17 @@ import pytest
 from cascade_scenes import BALL, GROUND, cascade_of, outdoor_frames, volumes_of
 from gs2d.core.camera import look_at
 from gs2d.errors import ProtocolError
-from gs2d.meshing.bounds import sample_depths
 from gs2d.meshing.depth_maps import RenderedView, depth_map
 from gs2d.meshing.extract import Extraction, extract_unbounded
 from gs2d.meshing.marching_cubes import components
 from gs2d.meshing.tsdf import block_bytes
 from gs2d.meshing.unbounded import (
-    STEP,
     cascade_marching_cubes,
-    derive_cascade,
     find_cascade_blocks,
     fuse_cascade,
     fused_cascade_surface,
 )
-from surface_shapes import edge_uses, is_closed_manifold, orbit, rays, signed_volume, sphere_depth
+from surface_shapes import edge_uses, is_closed_manifold, rays, signed_volume
 
 
 # -- joins -------------------------------------------------------------------------------------------------------------
@@ -128,25 +125,6 @@ def test_a_sky_makes_no_shell_and_the_ground_reaches_far_out(sky: str) -> None:
     assert (away < 0.6 * result.limits.voxel * np.maximum(1, 2 * distance / (result.limits.side / 2))).all()
     assert result.mesh.colors is not None
     assert (result.mesh.colors == 128).all()
-
-
-def test_the_innermost_cube_holds_the_nearer_half_and_the_given_limits_are_kept() -> None:
-    cameras = orbit(12, 3.0)
-    samples = [sample_depths(depth_map(RenderedView(c, sphere_depth(c, 1.0)))) for c in cameras]
-    cascade = derive_cascade(samples, cameras, resolution=100)
-    assert cascade.voxels % STEP == 0
-    assert cascade.half < 1.4
-    given = derive_cascade(samples, cameras, bbox=np.array([[-1, -1, -1], [1, 3, 1]]), voxel=0.1, truncation=0.3)
-    assert given.levels[0].voxel == 0.1
-    assert given.center == (0.0, 1.0, 0.0)
-    assert given.half == pytest.approx(3.2)  # 40 voxels, made up to 64
-    assert [level.truncation for level in given.levels] == pytest.approx([0.3 * 2**k for k in range(len(given.levels))])
-    with pytest.raises(ProtocolError, match="voxel must be positive"):
-        derive_cascade(samples, cameras, voxel=-1.0)
-    with pytest.raises(ProtocolError, match="depth_limit must exceed"):
-        derive_cascade(samples, cameras, depth_limit=0.1)
-    with pytest.raises(ProtocolError, match="at least one seen pixel"):
-        derive_cascade([], cameras)
 
 
 def test_memory_of_all_levels_together_is_bounded_and_the_error_names_a_voxel_that_fits() -> None:

@@ -5,54 +5,14 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
-import torch
 
 from ball_runs import options
-from gs2d.core.camera import look_at
-from gs2d.core.splats import Splats
-from gs2d.data.scene import View
-from gs2d.evaluation.images import ImageMetrics
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.finish import run_mesh as surface
 from gs2d.pipeline.finish.run_mesh import mesh_run
-from gs2d.pipeline.finish.scoring import SeenView, score_views
 from gs2d.pipeline.train import run_logger as recorder
 from gs2d.pipeline.train.train_run import train
-from gs2d.render.backends import get_backend
-from gs2d.render.types import RasterSettings
-
-
-def test_whoever_visits_sees_each_view_once_with_its_photograph_and_its_scores() -> None:
-    splats = Splats(
-        means=torch.zeros(1, 3),
-        quats=torch.tensor([[1.0, 0, 0, 0]]),
-        log_scales=torch.full((1, 2), -1.0),
-        opacity_logits=torch.zeros(1),
-        sh0=torch.zeros(1, 1, 3),
-        shN=torch.zeros(1, 0, 3),
-    )
-    camera = look_at(np.array([0.0, 0.0, -3.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]), width=12, height=12, fx=14.0)
-    mask = np.arange(12)[:, None].repeat(12, axis=1) < 6
-    image = np.full((12, 12, 3), 51, np.uint8)
-    views = [View.from_arrays("a", camera, image), View.from_arrays("b", camera, image, mask=mask)]
-    visits: list[tuple[SeenView, ImageMetrics]] = []
-    scores = score_views(
-        *(splats, views, RasterSettings(sh_degree=0), get_backend("reference")),
-        name="",
-        on_event=lambda event: None,
-        split="test",
-        visitors=[lambda seen, metrics: visits.append((seen, metrics))],
-    )
-    assert [(seen.view.name, seen.split) for seen, _ in visits] == [("a", "test"), ("b", "test")]
-    assert [metrics for _, metrics in visits] == [scores["a"], scores["b"]]
-    for seen, _ in visits:
-        assert torch.equal(seen.image, seen.output.color)
-        assert float(seen.target.unique()) == pytest.approx(0.2)
-        assert float(seen.output.depth_median.max()) == pytest.approx(3.0, abs=0.1)
-    assert visits[0][0].mask is None
-    assert torch.equal(visits[1][0].mask, torch.from_numpy(mask))
 
 
 @pytest.fixture(scope="module")

@@ -9,24 +9,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from gs2d.config.protocols import PROTOCOLS
-from gs2d.data.reach import Reach
 from gs2d.data.subject import OBJECT, read_subject
 from gs2d.errors import ProtocolError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.events import Notice
-from gs2d.pipeline.finish.believed import sky_direction
-from gs2d.pipeline.finish.run_mesh import SEVERAL, extract_mesh, fusion_frame
+from gs2d.pipeline.finish.run_mesh import extract_mesh
 from gs2d.pipeline.finish.run_subject import meshed_subject, subject_line
 from gs2d.pipeline.prepare.finished import finished_splats
 from gs2d.pipeline.prepare.job import reload_job
 from gs2d.pipeline.prepare.options import MeshOptions
-from gs2d.render.api import rasterize
 from gs2d.report.sections.subject import subject_section
-from wall_scene import wall
 
 BOX = (-0.5, -0.6, -0.7, 0.5, 0.6, 0.7)
 
@@ -68,30 +63,3 @@ def test_a_box_of_the_user_becomes_the_subject_and_limits_the_mesh(undisturbed: 
         assert meshed_subject(run, generic, splats, options, said.append) is None
         with pytest.raises(ProtocolError, match="exclude each other"):
             meshed_subject(run, generic, splats, replace(options, subject_box=BOX), said.append)
-
-
-def test_depth_that_is_loose_counts_less_and_depth_of_the_sky_is_infinite(undisturbed: RunFolder) -> None:
-    job = replace(reload_job(undisturbed, lambda _: None), scene=wall())
-    generic = replace(job, protocol=PROTOCOLS["generic"])
-    view = generic.scene.train[0]
-    with torch.no_grad():
-        output = rasterize(finished_splats(undisturbed), view.camera, job.settings, backend=job.backend)
-    at = torch.ones_like(output.alpha)
-    mean = torch.where(torch.arange(at.shape[1]) < 24, 4.0, 5.0).expand_as(at)
-    output = replace(output, alpha=at, depth_mean=mean, depth_median=4 * at)
-    loose = fusion_frame(generic, view, output, "median")
-    assert (loose.depth == 4).all()  # the plain part of the wall too
-    np.testing.assert_array_equal(loose.valid, np.where(mean.numpy() == 4, 1, SEVERAL))
-    assert fusion_frame(job, view, output, "median").valid.all()  # of a data set: all alike
-    plain = (np.abs(view.image().astype(int) - 128) <= 1).all(axis=2)  # the left third
-    rays = np.array([-1.0, 0, 0])  # were the plain third above the cameras, it would be the sky
-    found = fusion_frame(generic, view, output, "median", None, rays)
-    assert np.isinf(found.depth)[plain].mean() > 0.8
-    assert np.isinf(found.depth)[~plain].mean() < 0.1
-    assert (found.valid[np.isinf(found.depth)] == 1).all()
-    up = sky_direction(generic)
-    assert up is not None
-    np.testing.assert_allclose(up, [0, -1, 0], atol=0.1)
-    assert not np.isinf(fusion_frame(generic, view, output, "median", None, up).depth)[18:].any()
-    near = Reach(view.camera.center, 3.0)
-    assert np.isinf(fusion_frame(generic, view, output, "median", near).depth).all()

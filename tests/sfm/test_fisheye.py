@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,13 +19,11 @@ from gs2d.data.readers.colmap import read_cameras, read_images
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.prepare.options import PosesOptions
 from gs2d.pipeline.prepare.pose_finding import find_poses
-from gs2d.sfm import as_fisheye, colmap_worker
+from gs2d.sfm import as_fisheye
 from gs2d.sfm.fisheye import Circle, circle_of, named_fisheye, small_if_dark
-from gs2d.sfm.images import Photo, camera_groups, find_photos, fisheye_hints, read_photos
-from gs2d.sfm.lens import ASKED, CIRCLE, NAME
+from gs2d.sfm.images import Photo, find_photos, read_photos
 from gs2d.sfm.lens_probe import probe
 from gs2d.sfm.masks import copy_masks
-from gs2d.sfm.steps import Steps
 
 SIZE = (400, 300)
 F = 150.0
@@ -102,23 +99,6 @@ def photos_of(root: Path, images: dict[str, np.ndarray]) -> list[Photo]:
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(image).save(root / name)
     return list(read_photos(find_photos(root)[0], root, threads=1))
-
-
-def test_each_camera_has_its_own_hint(tmp_path: Path) -> None:
-    photos = photos_of(
-        tmp_path,
-        {**{f"a/{i}.png": round_picture(200, 150, 149, seed=i) for i in range(2)}, "b/0.png": mottled(),
-         "c/0.png": mottled(seed=1)},
-    )  # fmt: skip
-    photos[3] = replace(photos[3], taken=replace(photos[3].taken, made_by=("GoPro", "HERO9 Black", "", "", "")))
-    groups = camera_groups(photos, [photo.size for photo in photos], "auto")
-    hints, lines = fisheye_hints(photos, groups, [False] * 3, "auto")
-    assert [hint for hint, _ in hints] == [CIRCLE, "", NAME]
-    assert hints[0][1] is not None
-    assert lines == ["2 photographs are round: what is beyond their circle is masked, and teaches nothing"]
-    asked, _ = fisheye_hints(photos, groups, [False] * 3, "OPENCV_FISHEYE")
-    assert [(hint, circle is not None) for hint, circle in asked] == [(ASKED, True), (ASKED, False), (ASKED, False)]
-    assert fisheye_hints(photos, groups, [False] * 3, "OPENCV") == ([("", None)] * 3, [])
 
 
 def test_what_is_beyond_the_circle_is_masked_beside_what_the_user_masks(tmp_path: Path) -> None:
@@ -233,63 +213,6 @@ def test_a_camera_is_doubted_by_what_its_photographs_made_of_it(
     assert as_fisheye._is_doubted(piece, 1, 10) is is_doubted
     assert as_fisheye._is_doubted(piece, 2, 10)
     assert as_fisheye._is_doubted(None, 1, 10)
-
-
-# -- which model is believed -------------------------------------------------------------------------------------------
-def model_of(photographs: int, observations: int, *, lens: Any) -> Any:
-    return SimpleNamespace(
-        num_reg_images=lambda: photographs, compute_num_observations=lambda: observations, cameras={1: lens}
-    )
-
-
-def test_a_model_of_fisheyes_is_believed_where_it_explains_as_much(pycolmap: Any) -> None:
-    lens = pycolmap.Camera(model="SIMPLE_RADIAL_FISHEYE", width=400, height=300, params=[F, 200, 150, 0.02])
-    folds = pycolmap.Camera(model="SIMPLE_RADIAL_FISHEYE", width=400, height=300, params=[F, 200, 150, -0.4])
-    before = model_of(10, 5000, lens=lens)
-    assert as_fisheye.is_better(model_of(9, 5000, lens=lens), before)
-    assert not as_fisheye.is_better(model_of(8, 9000, lens=lens), before)
-    assert not as_fisheye.is_better(model_of(10, 4900, lens=lens), before)
-    assert not as_fisheye.is_better(model_of(10, 9000, lens=folds), before)
-    assert as_fisheye.is_better(model_of(3, 100, lens=lens), None)
-
-
-def row(params: list[float] | None, *, why: str = "doubt") -> dict[str, Any]:
-    """What ``as_fisheye`` finds of a camera."""
-    found = {"camera": 1, "photographs": 16, "why": why, "plain": 0.842, "bent": 0.988, "probed": 382.0}
-    return {**found, "focal": 382.0, "model": "SIMPLE_RADIAL_FISHEYE", "params": params}
-
-
-@pytest.mark.parametrize("better", [True, False])
-def test_cameras_are_placed_once_more_as_fisheyes_and_the_better_model_stays(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, better: bool
-) -> None:
-    done: list[str] = []
-    steps, suspected = Steps(tmp_path), [row([382.0, 200, 150, 0])]
-    before = SimpleNamespace(
-        camera_id=1, model=SimpleNamespace(name="SIMPLE_RADIAL"), params=[1], has_prior_focal_length=0
-    )
-
-    def tried(_p: Any, _r: Any, _s: Any, _say: Any, name: str) -> tuple[list[str], int]:
-        done.append(f"placed {name}")
-        return [f"{name}-0"], 3
-
-    monkeypatch.setattr(colmap_worker, "_tried", tried)
-    monkeypatch.setattr(Steps, "read", lambda _s, _p, name: name)
-    monkeypatch.setattr(as_fisheye, "suspects", lambda *_: suspected)
-    monkeypatch.setattr(as_fisheye, "cameras_of", lambda *_: [before])
-    monkeypatch.setattr(as_fisheye, "fisheyes", lambda *_: [])
-    monkeypatch.setattr(as_fisheye, "verify_anew", lambda *_: done.append("verified"))
-    monkeypatch.setattr(as_fisheye, "is_better", lambda *_: better)
-    monkeypatch.setattr(as_fisheye, "put_back", lambda *_: done.append("put back"))
-    colmap_worker._first_round(None, {}, steps, lambda **_: None)
-    assert done == ["placed ", "verified", "placed as fisheyes, ", *([] if better else ["put back"])]
-    assert steps.facts("first") == ["as fisheyes, -0" if better else "-0"]
-    (told,) = steps.facts("fisheyes") or ()
-    assert told["params"] == (suspected[0]["params"] if better else None)
-    done.clear()
-    (tmp_path / "first.json").unlink()  # as if it had been ended here
-    colmap_worker._first_round(None, {}, steps, lambda **_: None)
-    assert "verified" not in done
 
 
 # -- whole searches ----------------------------------------------------------------------------------------------------

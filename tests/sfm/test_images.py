@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,10 +12,9 @@ from gs2d.core.camera import look_at
 from gs2d.data.image_files import read_image
 from gs2d.data.photo_formats import HEIF
 from gs2d.errors import DataError
-from gs2d.sfm import compare
 from gs2d.sfm.image_copies import copy_images
 from gs2d.sfm.images import Photo, camera_groups, find_photos, in_order_taken, read_photos, turn
-from gs2d.sfm.pairs import chosen, near_pairs, neighbour_pairs, similar_pairs
+from gs2d.sfm.pairs import near_pairs, neighbour_pairs, similar_pairs
 from gs2d.sfm.upright import up_direction
 
 DETAILS = ExifTags.IFD.Exif
@@ -153,18 +151,6 @@ def test_a_folder_without_photographs_is_one_line_with_a_remedy(tmp_path: Path, 
     assert "\n" not in str(caught.value)
 
 
-def test_a_damaged_exif_block_is_no_exif_block(tmp_path: Path) -> None:
-    for i in range(3):
-        image(tmp_path / f"{i}.jpg", orientation=6, model="phone")
-    path = tmp_path / "0.jpg"
-    raw = path.read_bytes()
-    at = raw.index(b"Exif\0\0") + 6
-    path.write_bytes(raw[:at] + b"XX" + raw[at + 2 :])  # neither II nor MM
-    first, second, _ = photos_of(tmp_path)
-    assert (first.orientation, first.size, first.taken.made_by[1]) == (1, (24, 16), "")
-    assert (second.orientation, second.size, second.taken.made_by[1]) == (6, (16, 24), "phone")
-
-
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_picture_is_turned_as_pillow_turns_it(tmp_path: Path, orientation: int) -> None:
     image(tmp_path / "a.png", orientation=orientation)
@@ -205,16 +191,6 @@ def test_a_photograph_that_exif_turns_is_stored_upright_and_keeps_its_focal_leng
             if name == "0.jpg":
                 assert ours.getexif()[ExifTags.Base.Model] == "phone"
                 assert float(ours.getexif().get_ifd(DETAILS)[ExifTags.Base.FocalLength]) == 4.25
-
-
-def test_sixteen_bits_and_other_formats_become_png_of_eight(tmp_path: Path) -> None:
-    root = tmp_path / "photos"
-    image(root / "0.jpg")
-    image(root / "1.bmp")
-    Image.fromarray(np.full((16, 24), 40_000, np.uint16)).save(root / "2.tif")
-    assert stage(root, tmp_path / "images") == ["copied", "converted", "converted"]
-    with Image.open(tmp_path / "images/2.tif.png") as file:
-        assert (file.format, file.mode, file.getpixel((0, 0))) == ("PNG", "RGB", (156,) * 3)  # 40000 / 257 = 155.6
 
 
 def test_photographs_of_one_folder_size_camera_and_focal_length_share_a_camera(tmp_path: Path) -> None:
@@ -293,13 +269,6 @@ def test_near_photographs_are_on_the_same_line_and_on_the_next_ones() -> None:
     assert all(i < j for i, j in pairs)
 
 
-@pytest.mark.parametrize(("count", "most"), [(1000, 13_000), (5000, 70_000)])
-def test_pairs_of_many_photographs_grow_as_the_photographs_do(count: int, most: int) -> None:
-    places = flight(count // 50, 50)
-    picked = chosen({"next": neighbour_pairs(count, 3), "near": near_pairs(places, 20)})
-    assert 10 * count < len(picked) < most
-
-
 def test_the_order_is_that_of_the_clocks_where_they_all_run(tmp_path: Path) -> None:
     """A counter of names that began again at 0001, as cameras do after 9999."""
     for name, second in (("DSC_9998", 1), ("DSC_9999", 2), ("DSC_0001", 3), ("DSC_0002", 4)):
@@ -310,33 +279,3 @@ def test_the_order_is_that_of_the_clocks_where_they_all_run(tmp_path: Path) -> N
     assert by == "time"
     image(tmp_path / "DSC_0003.jpg")
     assert in_order_taken(photos_of(tmp_path)) == ([0, 1, 2, 3, 4], "name")
-
-
-def test_where_places_are_known_fewer_are_compared_and_those_without_one_lose_nothing(tmp_path: Path) -> None:
-    """Of 60 photographs numbers 7 and 30 know no place: all that they would have without places they have with them."""
-    rng = np.random.default_rng(0)
-    features = [rng.integers(0, 255, (80, 128), dtype=np.uint8) for _ in range(60)]
-    database = SimpleNamespace(
-        read_all_images=lambda: [SimpleNamespace(name=f"{i}", image_id=i) for i in range(60)],
-        read_descriptors=lambda i: SimpleNamespace(data=features[i]),
-        close=lambda: None,
-    )
-    pycolmap = SimpleNamespace(Database=SimpleNamespace(open=lambda _path: database))
-    places = [None if i in (7, 30) else place for i, place in enumerate(flight(6, 10))]
-    request = {"in_order": [f"{i}" for i in range(60)], "overlap": 6, "neighbours": 16, "ordered_by": "time", "seed": 0}
-    picked = {}
-    for matching in ("similar", "spatial"):
-        (tmp_path / matching).mkdir()
-        request |= {"matching": matching, "places": places, "database": str(tmp_path / matching / "database.db")}
-        picked[matching] = compare._pairs(pycolmap, request, lambda **_: None)
-    assert len(picked["spatial"]) < 0.8 * len(picked["similar"])
-    assert list(picked["spatial"].reasons) == ["near in space", "next to each other by time", "that look alike"]
-
-    def chosen_by(number: int, matching: str) -> set[tuple[int, int]]:
-        following = {(i, j) for i, j in neighbour_pairs(60, 6) if number in (i, j)}
-        assert following <= set(picked[matching].pairs)
-        return {pair for pair in picked[matching].pairs if number in pair}
-
-    for number in (7, 30):
-        assert len(chosen_by(number, "spatial")) >= 16
-        assert len(chosen_by(number, "similar")) >= 16

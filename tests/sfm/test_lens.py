@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from gs2d.sfm.lens import BENT, MODELS, Trial, apply, choose, doubts, models_to_try, try_lenses
+from gs2d.sfm.lens import BENT, MODELS, Trial, apply, choose, doubts, try_lenses
 from synthetic_model import HEIGHT, WIDTH, synthetic_model
 
 F, CX, CY = 520.0, 320.0, 240.0
@@ -101,16 +101,3 @@ def test_the_fisheye_that_took_the_photographs_is_found(pycolmap: Any, model: st
     camera = piece.camera(1)
     assert camera.model.name == "OPENCV_FISHEYE"
     assert camera.focal_length_x == camera.focal_length_y == pytest.approx(280, rel=0.02)
-
-
-def test_a_lens_that_was_asked_for_is_compared_with_simpler_ones_as_it_is(pycolmap: Any) -> None:
-    """Pixels that are not square: asked for, two focal lengths are free; the doubt and all figures are said."""
-    piece = synthetic_model(pycolmap, "OPENCV", (F, 1.15 * F, CX, CY, 0.0, 0.0, 0.0, 0.0))
-    trials = try_lenses(pycolmap, piece, asked="OPENCV", seed=0, threads=1, on_done=lambda _: None)
-    assert (
-        [t.model for t in trials] == models_to_try("OPENCV") == ["SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"]
-    )
-    asked = trials[-1]
-    assert asked.cameras[1][1] / asked.cameras[1][0] == pytest.approx(1.15, rel=0.01)
-    assert asked.error < 0.6 < trials[0].error
-    assert asked.doubts[0].startswith("fx / fy is 0.8")

@@ -16,8 +16,8 @@ from gs2d.data.readers.colmap import ColmapImage, ColmapPoints
 from gs2d.errors import BackendError, DataError, RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.sfm.colmap import Facts, Group, Request, Solved, check_installed, solve
-from gs2d.sfm.model import SfmModel, check_any, why_not_placed
-from gs2d.sfm.workspace import check_out, put_in_place, sweep_workspace, workspace
+from gs2d.sfm.model import SfmModel, why_not_placed
+from gs2d.sfm.workspace import check_out, put_in_place, workspace
 
 
 def piece(*names: str) -> SfmModel:
@@ -50,24 +50,6 @@ def test_the_reason_for_a_photograph_without_a_place(name: str, expected: str) -
     assert why_not_placed(name, PIECES, facts) == expected
     refused = why_not_placed(name, PIECES, facts, {name: "it was taken out"})
     assert refused == (expected if name == "y" else "it was taken out")  # a piece of its own says more
-
-
-@pytest.mark.parametrize(
-    ("facts", "expected"),
-    [
-        (Facts({"a": 10, "b": 20, "c": 900}, {("a", "c"): 20}), "got 20 features in the median photograph"),
-        (Facts(dict.fromkeys("abc", 900), {}), r"got no two that show the same points \(of 3 photographs\)"),
-        (Facts(dict.fromkeys("abc", 900), {("a", "b"): 80}), r"1 pairs show the same points \(up to 80\), but none"),
-        (
-            Facts(dict.fromkeys("abcdefg", 900), {("a", "b"): 80, ("c", "d"): 500, ("d", "e"): 90}),
-            "at most 3 of 7 that show the same points as one another: the steps between them are too large",
-        ),
-    ],
-)
-def test_no_model_at_all_says_at_which_step_it_ended(facts: Facts, expected: str) -> None:
-    with pytest.raises(DataError, match=expected):
-        check_any([], facts, Path("photos"))
-    check_any(PIECES, facts, Path("photos"))
 
 
 # -- the worker --------------------------------------------------------------------------------------------------------
@@ -181,24 +163,6 @@ def test_what_a_killed_command_left_is_removed_and_an_older_capture_comes_back(t
         assert [path.name for path in work.iterdir()] == [".lock"]
     assert (tmp_path / "room" / "poses.json").read_text() == "mine"
     assert [path.name for path in tmp_path.iterdir()] == ["room"]
-
-
-@pytest.mark.parametrize(
-    ("left", "stays"),
-    [
-        (["database.db", "images/0.jpg"], False),  # killed while the workplace was removed
-        (["search.json", "database.db"], False),  # killed between the rename and the word that the search is over
-        (["search.json", "capture/images/0.jpg"], True),  # another capture is being made, to replace this one
-    ],
-)
-def test_the_workplace_of_a_capture_that_is_in_place_goes(tmp_path: Path, left: list[str], stays: bool) -> None:
-    work, out = tmp_path / ".room.poses", tmp_path / "room"
-    for path in (*(work / name for name in left), out / "poses.json"):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("{}")
-    sweep_workspace(out)
-    assert work.exists() == stays
-    assert (out / "poses.json").exists()
 
 
 def test_two_commands_do_not_make_the_same_capture(tmp_path: Path) -> None:

@@ -203,17 +203,6 @@ def test_a_search_that_was_interrupted_goes_on_and_ends_in_the_same_bytes(
         assert (out / same).read_bytes() == (room.capture / same).read_bytes()
 
 
-def test_all_cameras_are_placed_at_once_where_that_is_asked_for(room: Room, tmp_path: Path) -> None:
-    """No focal length is known here: the pairs tell it."""
-    found = find_poses(PosesOptions(photos=room.photos, out=tmp_path / "capture", threads=2, mapper="global"), Kept())
-    assert (found["placed"], found["options"]["mapper"]) == (12, "global")
-    truth = {name: camera.T_cam_world for name, camera in room.cameras.items()}
-    centers, degrees, _ = pose_errors(poses_of(tmp_path / "capture"), truth)
-    assert centers < 0.01
-    assert degrees < 0.6
-    assert found["cameras"][0]["focal_px"] == pytest.approx(FOCAL, rel=0.02)
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL], ids=["term", "kill"])

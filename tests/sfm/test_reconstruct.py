@@ -17,13 +17,11 @@ import pytest
 from cli_runs import TINY, one_line
 from gs2d.cli import commands, run
 from gs2d.cli.parser import parse
-from gs2d.config.presets import DEFAULT_RECIPE, get_recipe
 from gs2d.io.run_dir import open_run
 from gs2d.pipeline import reconstruct as module
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.prepare import quality as quality_module
 from gs2d.pipeline.prepare.options import ReconstructOptions, Training, values
-from gs2d.pipeline.reconstruct import FEW, poses_options, reconstruct, train_options
+from gs2d.pipeline.reconstruct import poses_options, reconstruct, train_options
 from room_photos import Room, write_room
 from tiny import write_capture
 
@@ -247,22 +245,3 @@ def test_every_option_of_train_is_one_of_reconstruct() -> None:
     assert values(Training, training) == values(Training, command.training)
     assert (training.recipe, training.test_every, training.learns_exposure) == ("2dgs", 5, True)
     assert poses_options(command).cameras == "each"
-
-
-@pytest.mark.parametrize(("quality", "downscale"), [("draft", 4), ("normal", 2), ("full", 1)])
-def test_the_size_of_the_pictures_is_by_the_quality(
-    room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quality: str, downscale: int
-) -> None:
-    sides = {"draft": 50, "normal": 95, "full": 10_000}  # of 200x200: 4, 2.1 and less than 1 times smaller
-    qualities = {name: {"cpu": quality_module.Quality(9, side)} for name, side in sides.items()}
-    monkeypatch.setattr(quality_module, "QUALITIES", qualities)
-    asked: list[Any] = []
-    monkeypatch.setattr(module, "train", lambda options, _: asked.append(options) or open_run(tmp_path))
-    out = started(room, tmp_path)
-    options = ReconstructOptions(photos=room.photos, out=out, resume=True, quality=quality)
-    with pytest.raises(Exception, match="expected a run folder"):
-        reconstruct(options)
-    assert asked[0].downscale == downscale
-    assert asked[0].schedule_scale == 9 / get_recipe(DEFAULT_RECIPE).iterations
-    assert asked[0].test_every == 0
-    assert FEW > 12

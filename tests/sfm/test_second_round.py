@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from gs2d.sfm import second_round
 from gs2d.sfm.second_round import MIN_SEEN, refuse_unsupported
 from synthetic_model import synthetic_model
 
@@ -57,46 +55,3 @@ def test_photographs_that_agree_with_each_other_only_are_taken_out(pycolmap: Any
     assert refused["008.jpg"].startswith("only 0 points of known place agree")
     assert f"expected {MIN_SEEN} or more" in refused["008.jpg"]
     assert piece.num_reg_images() == 8
-
-
-def test_one_that_passed_supports_the_next(pycolmap: Any) -> None:
-    """What 011 shows is seen by 009 and 010 only: it has a place where one of them is settled and the other passes."""
-
-    def lonely() -> Any:
-        piece = synthetic_model(pycolmap, "SIMPLE_PINHOLE", LENS)
-        for number in sorted(piece.point3D_ids()):
-            track = piece.point3D(number).track
-            seen = {piece.image(e.image_id).name: (e.image_id, e.point2D_idx) for e in track.elements}
-            apart = seen.keys() - {"009.jpg", "010.jpg", "011.jpg"} if number % 2 else {"011.jpg"} & seen.keys()
-            for name in sorted(apart):
-                if piece.exists_point3D(number):
-                    piece.delete_observation(*seen[name])
-        return piece
-
-    assert refuse_unsupported(lonely(), ["011.jpg"]) == {}
-    assert refuse_unsupported(lonely(), ["010.jpg", "011.jpg"]) == {}
-    assert refuse_unsupported(lonely(), ["009.jpg", "010.jpg", "011.jpg"]) == {}
-
-
-def test_photographs_with_very_many_features_are_compared_without_guidance(
-    pycolmap: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """COLMAP's guided matching lays each feature of one photograph beside each of the other: 5 GB for 27,000."""
-    path = tmp_path / "database.db"
-    database = pycolmap.Database.open(str(path))
-    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 100.0, 100, 100)
-    camera_id = database.write_camera(camera)
-    for name, features in (("a", 10), ("b", 400), ("c", 500)):
-        image = database.write_image(pycolmap.Image(name=name, camera_id=camera_id))
-        database.write_keypoints(image, np.zeros((features, 2), np.float32))
-    database.close()
-    asked: list[tuple[bool, list[str]]] = []
-
-    def match(_path: str, matching: Any, chosen: Any, *_: Any) -> None:
-        asked.append((matching.guided_matching, Path(chosen.match_list_path).read_text().splitlines()))
-
-    monkeypatch.setattr(pycolmap, "match_image_pairs", match)
-    monkeypatch.setattr(second_round, "GUIDED_BYTES", 2 * second_round.BYTES_A_PAIR * 10 * 500)
-    request = {"database": str(path), "threads": 2, "seed": 0}
-    second_round.match_again(pycolmap, request, [("a", "b"), ("b", "c"), ("a", "c")])
-    assert asked == [(True, ["a b", "a c"]), (False, ["b c"])]

@@ -63,21 +63,6 @@ def test_rows_outside_the_group_and_attributes_outside_the_stage_keep_their_bits
     assert not state.moments["sh0"].mean[~state.groups["g"]].any()
 
 
-def test_a_row_group_trains_as_its_rows_would_alone() -> None:
-    state, alone = fresh_state(), fresh_state()
-    mask = torch.tensor([1, 0, 1, 1, 0, 0, 0, 1, 1], dtype=torch.bool)
-    state.groups["g"] = mask
-    alone.splats = alone.splats.rows(mask)
-    grouped, whole = Stage("s", 5, train={"shN": "g"}), Stage("s", 5, train={"shN": "all"})
-    begin_stage(state, grouped)
-    begin_stage(alone, whole)
-    for i in range(5):
-        grads = gradients(state, i)
-        adam_step(state, grouped, grads, LR)
-        adam_step(alone, whole, {"shN": grads["shN"][mask]}, LR)
-    assert torch.equal(state.splats.shN[mask], alone.splats.shN)
-
-
 def test_a_skipped_attribute_keeps_its_bits_and_its_count() -> None:
     state, stage = fresh_state(), Stage("s", 1)
     begin_stage(state, stage)

@@ -21,7 +21,6 @@ from gs2d.errors import DataError
 from gs2d.evaluation.images import psnr_float
 from gs2d.pipeline.train.run_logger import start_text
 from gs2d.render.api import rasterize
-from gs2d.training import start_fit
 from gs2d.training.events import Initialised
 from gs2d.training.plane_sweep import Sweep, start_points, sweep_views
 from gs2d.training.start_fit import fit_start
@@ -96,21 +95,6 @@ def recipe(settings: DenseStart, iterations: int = 6) -> Recipe:
     made = scale_schedule(two_dgs(), iterations / 30_000)
     stage = replace(made.stages[0], densify=None, sh_interval=0)
     return replace(made, stages=(stage,), sh_degree=2, dense_start=settings)
-
-
-def test_colours_are_those_of_least_squares_over_the_views_that_see_a_splat() -> None:
-    rng = torch.Generator().manual_seed(0)
-    true = 0.2 * torch.randn(1, 9, 3, generator=rng, dtype=torch.float64)
-    directions = torch.nn.functional.normalize(torch.randn(30, 3, generator=rng, dtype=torch.float64), dim=1)
-    basis = start_fit.sh_basis(directions, 2)
-    colors = basis @ true[0]  # minus 1/2
-    gram, right = (basis.T @ basis)[None], (basis.T @ colors)[None]
-    exact = start_fit._solved(gram, right, StartFit(sh_degree=2, ridge=0.0))
-    torch.testing.assert_close(exact, true, atol=1e-7, rtol=0)
-    damped = start_fit._solved(gram, right, StartFit(sh_degree=2, ridge=1e9))
-    assert damped[0, 1:].abs().max() < 1e-6
-    mean = (basis[:, :1] * colors).sum(dim=0) / (basis[:, 0] ** 2).sum()
-    torch.testing.assert_close(damped[0, 0], mean, atol=1e-6, rtol=0)
 
 
 def test_a_fitted_start_looks_more_like_the_photographs_than_an_unfitted_one() -> None:

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 
 import train_toys
 from gs2d.config.densify import DENSIFIERS, Densify, register_densifier
@@ -125,18 +124,3 @@ def test_large_splats_are_pruned_after_densification_and_in_a_stage_that_does_no
     trainer.splats.log_scales.fill_(math.log(2 * large))
     with pytest.raises(DivergedError, match="iteration"):
         trainer.step()
-
-
-@pytest.mark.parametrize("absolute", [False, True])
-def test_gs2ds_own_by_name_train_the_same_bytes_as_by_their_fields(absolute: bool) -> None:
-    recipe = train_toys.short()
-    given = recipe.stages[0].densify
-    assert isinstance(given, GradDensify)
-    fields = to_json(recipe)["stages"][0]["densify"] | {"absolute": absolute, "reset_at": tuple(given.reset_at)}
-    name = "absolute-gradient" if absolute else "gradient"
-    by_name = Densify(name, {key: value for key, value in fields.items() if key != "absolute"})
-    splats: list[dict[str, Tensor]] = []
-    for densify in (replace(given, absolute=absolute), by_name):
-        made = replace(recipe, stages=(replace(recipe.stages[0], densify=densify),))
-        splats.append(dict(train_toys.train(train_toys.make_scene(), made)[0].splats.items()))
-    assert all(torch.equal(splats[0][name], splats[1][name]) for name in splats[0])

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gs2d.config.presets import with_depth_prior, with_normal_prior
-from gs2d.config.priors import DepthPrior, NormalPrior
+from gs2d.config.priors import DepthPrior
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import LearningRates, Recipe
 from gs2d.core.transforms import quats_to_matrices
@@ -24,11 +24,8 @@ from gs2d.training.initialize import initial_splats, turned_to
 from gs2d.training.priors import (
     metric_depths,
     plan_depths,
-    plan_normals,
     plane_normals,
-    points_in,
     with_known_points,
-    world_normals,
 )
 from gs2d.training.trainer import Trainer
 from saved_states import resumed_everywhere
@@ -99,14 +96,6 @@ def test_a_capture_without_anything_known_is_refused(scene: Scene) -> None:
         Trainer(scene, with_normal_prior(short()), GENERIC, backend="reference")
 
 
-def test_points_of_few_photographs_or_large_errors_are_not_trusted(scene: Scene) -> None:
-    view = scene.train[0]
-    assert len(points_in(view, observed(scene).observe(), DepthPrior()).depth) > 30  # type: ignore[misc]
-    for doubtful in (observed(scene, error=2.5), observed(scene, track=2)):
-        with pytest.raises(DataError, match="photographs"):
-            plan_depths(doubtful, DepthPrior())
-
-
 def test_points_are_where_the_camera_sees_them_with_the_pixels_around(scene: Scene) -> None:
     both, view = observed(scene), scene.train[2]
     plan = plan_depths(both, DepthPrior())
@@ -120,21 +109,6 @@ def test_points_are_where_the_camera_sees_them_with_the_pixels_around(scene: Sce
     places = {(round(a, 6), round(b, 6)): d for (a, b), d in zip(pixels.tolist(), depth.tolist(), strict=True)}
     for a, b, d in zip(x.tolist(), y.tolist(), valid.depth.tolist(), strict=True):
         assert places[(round(a, 6), round(b, 6))] == pytest.approx(d)
-
-
-# -- units, scales and shifts ---------------------------------------------------------------------------------------
-def test_whole_numbers_are_thousandths_unless_the_capture_or_the_recipe_says_otherwise(scene: Scene) -> None:
-    def disparity(whole: bool, unit: float | None, of_file: float | None) -> float:
-        made = mapped(scene, lambda _, depth: np.full_like(depth, 4.0), whole=whole, unit=of_file)
-        settings = DepthPrior("sensor", unit=unit)
-        valid = metric_depths(made.train[0], plan_depths(made, settings), settings)
-        assert isinstance(valid, MetricDepth)
-        return float(valid.disparity[0, 0])
-
-    assert disparity(True, None, None) == pytest.approx(250)
-    assert disparity(False, None, None) == pytest.approx(0.25)
-    assert disparity(True, None, 0.5) == pytest.approx(0.5)
-    assert disparity(True, 2.0, 0.5) == pytest.approx(0.125)
 
 
 def test_a_sensor_s_unit_is_fitted_to_the_points_where_cameras_come_from_photographs(scene: Scene) -> None:
@@ -195,16 +169,6 @@ def facing(scene: Scene, flip: tuple[int, int, int]) -> Scene:
         for view in scene.train
     ]
     return replace(scene, train=tuple(views))
-
-
-def test_the_axes_of_normal_maps_are_those_in_which_surfaces_face_the_camera(scene: Scene) -> None:
-    for axes, flip in (("opencv", (1, 1, 1)), ("opengl", (1, -1, -1))):
-        made = facing(scene, flip)
-        assert plan_normals(made, NormalPrior()) == axes
-        normals = world_normals(made.train[1], axes, torch.float64)
-        assert np.allclose(normals.directions[3, 4], -made.train[1].camera.forward)
-    with pytest.raises(DataError, match="camera"):
-        plan_normals(facing(scene, (1, 1, 1)), NormalPrior(axes="opengl"))
 
 
 # -- the start ------------------------------------------------------------------------------------------------------

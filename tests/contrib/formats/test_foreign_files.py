@@ -24,7 +24,6 @@ from gs2d.errors import DataError
 from gs2d.io.formats.registry import LAYOUTS, read_splat_file, read_splats, write_layout
 from gs2d.io.formats.spz import read_spz, write_spz
 from gs2d.io.gaussians import Gaussians
-from gs2d.io.meshes import read_points
 from gs2d.io.ply_format import read_ply, write_ply
 from gs2d.io.splat_ply import write_splats
 from gs2d.pipeline.look.info import describe_file
@@ -110,42 +109,6 @@ def test_half_floats_declared_as_ushort_are_decoded(tmp_path: Path, layout: str)
     back = read_splats(path)
     for name, tensor in splats.items():
         np.testing.assert_array_equal(getattr(back, name).numpy(), tensor.numpy().astype(np.float16))
-
-
-RGB = np.array([[0.0, 0.2, 1.0], [0.4, 0.6, 0.8]])
-
-
-@pytest.mark.parametrize("names", ["red green blue", "diffuse_red diffuse_green diffuse_blue", "r g b"])
-@pytest.mark.parametrize(
-    ("dtype", "scale"), [("u1", 255), ("<u2", 65535), ("<u2", 255), ("<f4", 1), ("<f4", 255), ("<f8", 65535)]
-)
-def test_colours_of_points_are_read_whatever_they_count_to(
-    tmp_path: Path, names: str, dtype: str, scale: float
-) -> None:
-    rows = np.zeros(2, [(name, "<f4") for name in "xyz"] + [(name, dtype) for name in names.split()])
-    for i, name in enumerate(names.split()):
-        rows[name] = RGB[:, i] * scale
-    write_ply(tmp_path / "a.ply", {"vertex": rows})
-    colors = read_points(tmp_path / "a.ply").colors
-    assert colors is not None
-    np.testing.assert_array_equal(colors, np.rint(255 * RGB))
-
-
-# -- units -----------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("layout", [name for name in LAYOUTS.builtin if not name.startswith("spz")])
-def test_disks_stay_disks_in_a_scene_of_small_units(tmp_path: Path, layout: str) -> None:
-    """An extent of 4e-6 units, disks of 1e-8: a third of a percent of the thickness of a scene in units."""
-    splats = a_scene(3000 if layout == "streamed" else 300, 1)
-    splats.means *= 1e-6
-    splats.log_scales += math.log(1e-6)
-    path = tmp_path / f"a{LAYOUTS.get(layout).ending}"
-    write_layout(path, splats, layout)
-    file = read_splat_file(path)
-    assert file.surfels is not None
-    scales = np.exp(file.gaussians.log_scales.astype(np.float64))
-    assert (scales[:, 2] <= 0.03 * scales[:, :2].min(axis=1)).mean() > 0.98
-    ours, theirs = (np.sort(means, axis=0) for means in (splats.means.numpy(), file.gaussians.means))
-    assert np.abs(ours - theirs).max() < 1e-8
 
 
 # -- numbers that are not finite -------------------------------------------------------------------------------

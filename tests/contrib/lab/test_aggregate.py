@@ -17,9 +17,7 @@ from gs2d.contrib.lab.aggregate import Cell, Results, check_claim, read_cell
 from gs2d.contrib.lab.deviations import deviations_of
 from gs2d.contrib.lab.options import PaperOptions
 from gs2d.contrib.lab.plan import commands_of, make_plan
-from gs2d.contrib.lab.scenes import find_scenes
 from gs2d.contrib.lab.tables import DTU, NERF_SYNTHETIC, PAPER_TABLES, TNT, Claim
-from gs2d.errors import DataError
 from gs2d.pipeline.prepare.options import TrainOptions, values
 from paper_cells import make_cell, make_row
 from tiny import write_capture
@@ -104,30 +102,6 @@ def test_a_score_that_its_own_check_does_not_believe_is_a_deviation() -> None:
     assert lines.count(f"Truck: {frame}") == 1
     plain = deviations_of(options, (), PAPER_TABLES["regularisation"], Results((make_row("row", cell),)))
     assert not any("E_i" in line or "AbsGS" in line for line in plain)  # one stage: nothing was left open
-
-
-def test_pieces_that_captures_lack_are_deviations_and_those_without_cameras_are_named(tmp_path: Path) -> None:
-    for name in ("lego", "ship"):
-        write_capture(tmp_path / name, train=3, test=2, size=8)
-        (tmp_path / name / "transforms_val.json").write_text('{"camera_angle_x": 1, "frames": []}')
-    (tmp_path / "lego" / "test" / "r_1.png").unlink()
-    (tmp_path / "ship" / "transforms_train.json").unlink()
-    scenes = find_scenes(tmp_path)
-    assert [scene.name for scene in scenes] == ["lego"]
-    options = PaperOptions(table="modules", data=tmp_path, out=Path("out"))
-    lines = deviations_of(options, scenes, PAPER_TABLES["modules"], Results(()))
-    (photo,) = [line for line in lines if "r_1.png" in line]
-    assert photo.startswith(f"lego: {(tmp_path / 'lego' / 'test' / 'r_1.png').resolve()} is missing (for testing): get")
-    (ship,) = [line for line in lines if line.startswith("ship")]
-    assert ship.startswith(f"ship is not trained: {tmp_path / 'ship' / 'transforms_train.json'} is missing (for train")
-    with pytest.raises(
-        DataError, match=r"no scene 'ship' in .*; there is lego; ship: .*transforms_train\.json is miss"
-    ):
-        find_scenes(tmp_path, ("ship",))
-    with pytest.raises(
-        DataError, match=r"found none; .*transforms_train\.json is missing .* get it from nerf_synthetic"
-    ):
-        find_scenes(tmp_path / "ship")
 
 
 def test_the_printed_commands_are_the_ones_that_were_run(tmp_path: Path) -> None:

@@ -11,10 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from flown import digest, tiny_blocks, write_tiny_flight
-from gs2d.config.partition import Partition
 from gs2d.contrib.lab import blocks as module
 from gs2d.contrib.lab.blocks import blocks
 from gs2d.contrib.lab.split import read_split
@@ -67,22 +65,6 @@ def test_each_block_trained_its_own_splats_and_photographs_with_the_rest_frozen(
         assert definition["scene"]["test"] == 0
         assert definition["raster"] == open_run(straight).definition()["raster"]
     assert sum(block.core for block in split.blocks) == len(coarse)
-
-
-def test_what_lies_at_seams_learns_once_more_and_nothing_else(straight: Path) -> None:
-    split, merged = read_split(straight / "partition"), read_splats(straight / "merged.ply")
-    end = read_splats(straight / "splats.ply")
-    rows, _ = read_start(straight / "partition/seams.npz")
-    own = torch.from_numpy(rows == OWN)
-    assert 0 < own.sum() < len(merged) / 2
-    assert (split.cells.distance_to_seam(merged.means.numpy()[own]) < Partition().seam * split.cells.side).all()
-    rest = int((~own).sum())
-    assert torch.equal(end.means[:rest], merged.means[~own])
-    assert torch.equal(end.shN[:rest], merged.shN[~own])
-    learned = read_splats(straight / "seams/splats.ply")
-    assert torch.equal(end.means[rest:], learned.means)
-    assert len(learned) == own.sum()
-    assert not torch.equal(learned.sh0, merged.sh0[own])
 
 
 class StoppedError(BaseException):

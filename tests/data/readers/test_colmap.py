@@ -61,22 +61,6 @@ def test_the_largest_model_is_read_and_a_note_gives_the_sizes_of_the_others(tmp_
     assert "the model sparse/0 is read" in load_scene(tmp_path).notes[0]
 
 
-@pytest.mark.parametrize("kind", ["bin", "txt"])
-def test_files_and_folders_of_a_model_may_be_called_by_other_cases(tmp_path: Path, kind: str) -> None:
-    small_colmap(tmp_path, kind=kind)
-    model = tmp_path / "sparse/0"
-    for old, new in (("cameras", "Cameras"), ("images", "IMAGES"), ("points3D", "points3d")):
-        (model / f"{old}.{kind}").rename(model / f"{new}.{kind}")
-    for old, new in (("sparse", "Sparse"), ("images", "Images")):
-        (tmp_path / old).rename(tmp_path / new)
-    for name in ("Masks", "Depths"):
-        write_image_of(tmp_path / name / "3.png")
-    scene = load_scene(tmp_path)
-    assert scene.points is not None
-    assert (len(scene.views), len(scene.points), scene.masks.found) == (9, 20, 1)
-    assert any(note.startswith("depth maps: 1 of 9") for note in scene.notes)
-
-
 def test_images_in_sub_folders_keep_their_whole_name(tmp_path: Path) -> None:
     cameras = ring(4)
     model = ColmapModel(cameras={1: ("SIMPLE_PINHOLE", 40, 30, (35.0, 20.0, 15.0))})
@@ -270,19 +254,6 @@ def test_a_model_without_observations_has_its_points_projected_into_the_images(t
     scene = load_scene(tmp_path)
     assert scene.unobserved() == ""
     assert scene.observed(guessed=False).seen["8.png"].tolist() == [2]  # type: ignore[union-attr]
-
-
-def test_broken_observations_and_a_lack_of_points_are_reasons_and_no_errors(tmp_path: Path) -> None:
-    small_colmap(tmp_path, kind="txt")
-    path = tmp_path / "sparse/0/images.txt"
-    path.write_text(path.read_text().replace("1.5 2.5 -1\n", "1.5 2.5\n", 1))
-    scene = load_scene(tmp_path)
-    assert "images.txt line 5" in scene.unobserved()
-    assert scene.observed() is not None
-    (tmp_path / "sparse/0/points3D.txt").unlink()
-    scene = load_scene(tmp_path)
-    assert "must hold sparse points in points3D.txt, got none" in scene.unobserved()
-    assert scene.observed() is None
 
 
 def test_a_camera_model_that_cannot_be_undistorted_names_camera_model_and_remedy(tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from gs2d.contrib.formats import compressed_ply
 from gs2d.contrib.formats.antimatter import read_splat, write_splat
 from gs2d.contrib.formats.compressed_ply import read_compressed_ply, write_compressed_ply
 from gs2d.core.sh import sh_basis
@@ -21,7 +20,6 @@ from gs2d.errors import DataError
 from gs2d.io.formats.registry import LAYOUTS, layout_of, read_splat_file, write_layout
 from gs2d.io.formats.spz import read_spz, write_spz
 from gs2d.io.gaussians import FLAT_LOG_SCALE, Gaussians, sigmoid, unit_quats
-from gs2d.io.ply_format import read_ply, write_ply
 from gs2d.io.splat_ply import read_gaussians
 from splat_scenes import a_scene, turned_by
 
@@ -199,27 +197,6 @@ def test_a_file_of_supersplat_is_read_as_the_plain_one_beside_it(shared: Callabl
     assert (packed.sh_degree, packed.is_flat, plain.is_flat) == (3, False, False)
 
 
-def test_our_words_are_those_of_supersplat_for_the_same_splats(
-    shared: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    name = shared("gaussians_plush_dog") / "point_cloud_29999_clean"
-    plain, theirs = read_gaussians(f"{name}.ply"), read_ply(f"{name}.compressed.ply")
-    match = cKDTree(plain.means).query(read_compressed_ply(f"{name}.compressed.ply").means)[1]
-    monkeypatch.setattr(compressed_ply, "morton_order", lambda means: np.arange(len(means)))
-    write_compressed_ply(tmp_path / "a.ply", plain.rows(match))
-    ours = read_ply(tmp_path / "a.ply")
-    assert list(ours.elements) == list(theirs.elements)
-    for element in theirs.elements:
-        a, b = ours.elements[element].properties, theirs.elements[element].properties
-        assert list(a) == list(b)
-        for key in b:
-            differ = np.asarray(a[key]).astype(float) != np.asarray(b[key]).astype(float)
-            if element == "chunk":
-                np.testing.assert_allclose(a[key], b[key], rtol=1e-6, atol=1e-6)
-            else:
-                assert differ.mean() <= (1e-3 if element == "sh" else 0), key  # float32 there, float64 here
-
-
 def test_a_compressed_ply_comes_back_within_its_bits(tmp_path: Path) -> None:
     splats = a_scene(1000)
     g = Gaussians.of(splats)
@@ -359,27 +336,3 @@ def test_spz_of_version_4_that_cannot_be_is_one_line(tmp_path: Path, at: int, va
     with pytest.raises(DataError, match=words) as caught:
         read_splat_file(tmp_path / "a.spz")
     assert "\n" not in str(caught.value)
-
-
-def test_a_compressed_ply_whose_parts_do_not_fit_is_named(tmp_path: Path) -> None:
-    write_compressed_ply(tmp_path / "a.ply", Gaussians.of(a_scene(300)))
-    parts = {
-        name: np.rec.fromarrays(list(e.properties.values()), names=list(e.properties))
-        for name, e in read_ply(tmp_path / "a.ply").elements.items()
-    }
-    write_ply(tmp_path / "b.ply", {**parts, "chunk": parts["chunk"][:1]})
-    with pytest.raises(DataError, match="2 chunks for 300 splats were expected, got 1"):
-        read_splat_file(tmp_path / "b.ply")
-    write_ply(tmp_path / "b.ply", {**parts, "sh": parts["sh"][:1]})
-    with pytest.raises(DataError, match="SH coefficients for 300 splats were expected, got 45 for 1"):
-        read_splat_file(tmp_path / "b.ply")
-    write_ply(tmp_path / "b.ply", {**parts, "chunk": parts["chunk"][["min_x", "max_x"]]})
-    with pytest.raises(DataError, match="the property min_y of a compressed PLY is missing"):
-        read_splat_file(tmp_path / "b.ply")
-    parts["chunk"]["min_x"][0] = np.nan
-    write_ply(tmp_path / "b.ply", parts)
-    file = read_splat_file(tmp_path / "b.ply")  # the splats of its chunk
-    assert (len(file.gaussians), file.notes) == (
-        45,  # one is at the other end
-        ("b.ply: 255 of 300 splats have NaN or infinity (means) and were left out",),
-    )

@@ -208,36 +208,3 @@ def test_tiles_beyond_32767_are_blended_as_any_other(emulator: Emulator) -> None
     assert float((near_color - torch.tensor(SETTINGS.background)).abs().max()) > 0.3
     assert float((far_color - near_color).abs().max()) < 1e-3  # a float at 3200 px has 2e-4 px
     assert relative_error(far_means, near_means.double()) < 1e-2
-
-
-def test_the_highest_splat_ids_are_read_and_written_where_they_are(emulator: Emulator) -> None:
-    """Ids up to 2^24 - 1 fill the entry's 24 bits (negative as int32). Arrays are moved instead of being that long."""
-    case = many_tiles()
-    count = len(case.splats)
-    base = (1 << 24) - count
-    parameters = [t for _, t in case.splats.items()]
-    frame = cuda_passes.forward(emulator, cuda_passes.view_of(case.camera, SETTINGS), parameters)
-    shift = torch.tensor((base << 8) - (1 << 32) if base << 8 >= 1 << 31 else base << 8, dtype=torch.int64)
-    moved = (frame.entries.to(torch.int64) + shift).to(torch.int32)
-    assert bool((moved < 0).all())
-
-    class Moved:
-        """Pointers to rows of splats stand ``base`` rows before their arrays."""
-
-        def launch(self, name: str, blocks: int, threads: int, arguments: Any, shared_bytes: int = 0) -> None:
-            if name.startswith("blend_vjp"):
-                arguments.entries = moved.data_ptr()
-                for field, row_bytes in (("records", 64), ("gradients", 64), ("extras", 16)):
-                    setattr(arguments, field, getattr(arguments, field) - row_bytes * base)
-            emulator.launch(name, blocks, threads, arguments, shared_bytes)
-
-    upstream: dict[str, Tensor | None] = dict.fromkeys((*cuda_passes.IMAGES, "depth_transmittance"))
-    upstream["color"] = color_cotangent(case)["color"].float()
-    results = []
-    for launcher in (emulator, Moved()):
-        means = torch.empty_like(case.splats.means)
-        wanted = cuda_passes.Wanted({**dict.fromkeys(cuda_passes.PARAMETERS), "means": means, "probe": None})
-        cuda_passes.backward(launcher, frame, parameters, upstream, wanted)
-        results.append(means)
-    assert bool(results[0].any())
-    assert torch.equal(*results)

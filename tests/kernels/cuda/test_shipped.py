@@ -9,7 +9,6 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -19,7 +18,6 @@ import gs2d
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import compile as nvrtc
 from gs2d.kernels.cuda import shipped
-from gs2d.kernels.cuda.diagnose import Facts, describe, missing
 
 ROOT = Path(__file__).resolve().parents[3]
 pytestmark = pytest.mark.timeout(280)
@@ -86,19 +84,6 @@ def test_a_warm_cache_needs_no_compiler(tmp_path: Path, monkeypatch: pytest.Monk
     nvrtc.cubin("cuda/slots.cu", arch, tmp_path)
     monkeypatch.setattr(nvrtc, "compile_source", lambda name, arch: pytest.fail("compiled again"))
     assert nvrtc.cubin("cuda/slots.cu", arch, tmp_path).code == b"compiled"
-
-
-def test_with_kernels_of_the_package_only_the_driver_is_asked_for() -> None:
-    h200 = ("NVIDIA H200", (9, 0))
-    facts = Facts("2.15.0", (12, 8), nvrtc_error="no library", driver=(12, 4), devices=(h200,), shipped=(12, 8))
-    assert missing(facts) is None
-    assert describe(facts) == "NVIDIA H200 (sm_90); driver CUDA 12.4, kernels of the package"
-    lacking = missing(replace(facts, shipped=(13, 0)))
-    assert lacking is not None
-    assert "supports CUDA 12.4, but gs2d is of CUDA 13.0" in lacking.reason
-    lacking = missing(replace(facts, shipped=None))
-    assert lacking is not None
-    assert "NVRTC is not here" in lacking.reason
 
 
 def script() -> ModuleType:
