@@ -20,11 +20,9 @@ import numpy as np
 import torch
 from mutations import Mutation
 from PIL import Image
-from usd_server import Server
 
 from capture_writers import small_blender, small_colmap, small_dtu, small_nerfstudio
 from foreign_writers import Lens, small_alicevision, small_metashape, small_opensfm
-from gs2d.contrib.formats import usd
 from gs2d.core.splats import Splats
 
 Files = dict[str, bytes]
@@ -195,23 +193,12 @@ def Xform "World"
 """
 
 
-def _usd_seeds() -> list[Files]:
-    _usd_server()  # started here, where nobody looks at what is started
-    return written(_splats("usd", "a.usd"), lambda root: (root / "a.usda").write_text(_FIELD))()
-
-
-@cache
-def _usd_server() -> Server:
-    return Server(usd.usd_process.__file__, _FIELD.encode(), usd._WAIT)
-
-
-def read_usd_once(root: Path) -> None:
-    """As `--init` does: each reading is a process, here forked from one that has OpenUSD loaded."""
+def read_usd(root: Path) -> None:
+    """As `--init` does: each reading is a process."""
     from gs2d.io.formats.registry import read_surfels
 
     (path,) = (p for p in root.iterdir() if p.is_file())
-    with mock.patch.object(usd, "_read_apart", _usd_server().read):
-        read_surfels(path, lambda _: None)
+    read_surfels(path, lambda _: None)
 
 
 def _gltf_text(root: Path) -> None:
@@ -378,29 +365,6 @@ def _exr(name: str, channels: str, compression: str, dtype: type = np.float32) -
     return write
 
 
-def _prepared(root: Path) -> None:
-    from gs2d.data.cache import DecodedImage
-    from gs2d.data.prepared import write_prepared
-
-    pixels = np.random.default_rng(0).integers(0, 256, (12, 16, 3)).astype(np.uint8)
-    mask = pixels[..., 0] > 100
-    write_prepared(root / "a.prepared", "a" * 64, DecodedImage(pixels, mask, ~mask, mask))
-
-
-def read_kept(root: Path) -> None:
-    """As training does, which makes the picture anew where that is None."""
-    from gs2d.data.prepared import read_prepared
-    from gs2d.errors import DataError
-
-    found = read_prepared(root / "a.prepared", "a" * 64)
-    if found is None:
-        raise DataError("it is made anew")
-    assert found.image.dtype == np.uint8
-    assert found.image.ndim == 3
-    for mask in (found.mask, found.object_mask, found.valid):
-        assert mask is None or (mask.dtype == bool and mask.shape == found.image.shape[:2])
-
-
 # -- places in the world -----------------------------------------------------------------------------------------------
 _PLACE = {
     "format": 1, "method": "positions", "scale": 2.5, "rotation": [[0, -1, 0], [1, 0, 0], [0, 0, 1]], "epsg": 32632,
@@ -558,7 +522,8 @@ _ALL = (
     Family("sog", written(_splats("sog", "a.sog")), {".sog": m.either(m.of_zip(_SOG), m.of_zip(_SOG), m.of_bytes)},
            read_splats_everywhere),
     Family("sog-streamed", written(_stream), {".json": _JSON, ".webp": m.of_bytes}, read_stream),
-    Family("usd", _usd_seeds, {".usd": m.of_bytes, ".usda": m.either(_TEXT, _TEXT, m.of_bytes)}, read_usd_once),
+    Family("usd", written(_splats("usd", "a.usd"), lambda root: (root / "a.usda").write_text(_FIELD)),
+           {".usd": m.of_bytes, ".usda": m.either(_TEXT, _TEXT, m.of_bytes)}, read_usd),
     Family("npy", written(_array("depth.npy", np.ones((8, 9))), _array("normal.npy", np.ones((8, 9, 3)) / 3**0.5)),
            {".npy": m.of_npy}, read_map),
     Family("seen-counts", written(_counted), {".npy": m.of_npy}, read_surface),
@@ -573,8 +538,6 @@ _ALL = (
         _exr("a.exr", "Z", "RLE_COMPRESSION"), _exr("a.exr", "RGB", "NO_COMPRESSION"),
         _exr("a.exr", "RGB", "DWAA_COMPRESSION", np.float16), _exr("a.exr", "Y", "B44_COMPRESSION", np.float16)),
         {".exr": m.of_bytes}, read_picture),
-    Family("prepared", written(_prepared), {".prepared": m.either(m.of_prepared, m.of_prepared, m.of_bytes)},
-           read_kept),
     Family("places", written(lambda root: [(root / name).write_text(text) for name, text in _TABLES.items()],
                              _georeferenced),
            {".csv": _TEXT, ".txt": _TEXT, ".json": _JSON, ".ply": m.of_ply, ".obj": _TEXT, ".glb": m.of_glb},

@@ -14,7 +14,6 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable
-from hashlib import sha256
 from random import Random
 from typing import Any
 
@@ -277,23 +276,6 @@ def of_png(rng: Random, data: bytes) -> bytes:
             )
         out += struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
     return bytes(out)
-
-
-def of_prepared(rng: Random, data: bytes) -> bytes:
-    """The JSON in the second line changes, or the pictures behind it, with the right checksum of these."""
-    at = data.index(b"\n") + 1
-    end = data.index(b"\n", at)
-    head, payload = data[at:end], data[end + 1 :]
-    if rng.random() < 0.4:
-        sizes = json.loads(head)["parts"]
-        first = sizes[0][1]
-        picture = of_png(rng, payload[:first])
-        head = head.replace(json.dumps(sizes[0]).encode(), json.dumps([sizes[0][0], len(picture)]).encode())
-        payload = picture + payload[first:]
-    else:
-        head = of_json(rng, head)
-    head = re.sub(rb'"sha256": "[0-9a-f]{64}"', b'"sha256": "%s"' % sha256(payload).hexdigest().encode(), head)
-    return data[:at] + head + b"\n" + payload
 
 
 def of_ply(rng: Random, data: bytes) -> bytes:
