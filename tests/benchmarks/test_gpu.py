@@ -15,7 +15,6 @@ from gs2d.kernels.cuda.compile import KERNEL, compile_text
 
 ROOT = Path(__file__).resolve().parents[2]
 pytestmark = [
-    pytest.mark.timeout(280),
     pytest.mark.skipif(shutil.which("g++") is None, reason="no g++ here, which runs the CUDA kernels on the CPU"),
 ]
 

@@ -89,7 +89,7 @@ sys.meta_path.insert(0, Press())
 from gs2d.cli import main
 main(["report", {str(trained)!r}])
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
 
 
@@ -131,9 +131,7 @@ def test_a_stdout_that_takes_nothing_is_no_fault_of_ours(
         reader, file = os.pipe()
         os.close(reader)
     try:
-        done = subprocess.run(
-            [sys.executable, "-m", "gs2d", *words], stdout=file, stderr=subprocess.PIPE, text=True, timeout=100
-        )
+        done = subprocess.run([sys.executable, "-m", "gs2d", *words], stdout=file, stderr=subprocess.PIPE, text=True)
     finally:
         os.close(file)
     assert done.returncode == code

@@ -19,8 +19,6 @@ PLUGIN = Path(__file__).parents[1] / "plugin"
 SOURCE = Path(errors.__file__).parents[1]  # the source tree, or where the wheel was installed
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 
-pytestmark = pytest.mark.timeout(600)
-
 
 @pytest.fixture(scope="module")
 def gs2d(tmp_path_factory: pytest.TempPathFactory) -> Run:

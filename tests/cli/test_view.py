@@ -112,7 +112,7 @@ def test_it_serves_until_ctrl_c_and_ends_with_130(trained: Path) -> None:
                 break
         assert json.loads("".join(lines))["url"].startswith("http://127.0.0.1:")
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=60)
+        out, err = process.communicate(timeout=600)
     assert process.returncode == 130
     assert out == ""
     assert err.splitlines()[-1] == "interrupted"

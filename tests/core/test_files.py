@@ -105,7 +105,7 @@ def test_a_disk_that_fills_up_is_one_line_and_leaves_nothing_behind(tmp_path: Pa
     source = Path(__file__).resolve().parents[2] / "src"
     done = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path / "out"), body],
-        capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(source)}, check=False, timeout=120,
+        capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(source)}, check=False,
     )  # fmt: skip
     assert done.returncode == 7, done.stderr
     assert done.stdout.count("\n") == 1
@@ -123,7 +123,7 @@ def kill_while_writing(path: Path) -> None:
     source = Path(__file__).resolve().parents[2] / "src"
     done = subprocess.run(
         [sys.executable, "-c", code, str(path)],
-        env={**os.environ, "PYTHONPATH": str(source)}, check=False, timeout=120,
+        env={**os.environ, "PYTHONPATH": str(source)}, check=False,
     )  # fmt: skip
     assert done.returncode == -signal.SIGKILL
 

@@ -1,8 +1,8 @@
 """Two seconds of mutated inputs of every family, always from the same first one, and every input that was a finding.
 
-``GS2D_FUZZ_SECONDS=0`` throws a dozen inputs a family. ``make fuzz`` throws new ones for an hour a family; what it finds
-goes into ``findings/FAMILY/`` as the changed file alone (``drive.py --keep`` writes it; "__" stands for "/" in its name,
-behind a number and "--").
+``GS2D_FUZZ_SECONDS=0`` throws a dozen inputs a family. ``make fuzz`` throws new ones for an hour a family; what it
+finds goes into ``findings/FAMILY/`` as the changed file alone (``drive.py --keep`` writes it; "__" stands for "/" in
+its name, behind a number and "--").
 """
 
 from __future__ import annotations

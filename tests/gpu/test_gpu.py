@@ -26,7 +26,7 @@ from gs2d.training import events
 from gs2d.training.targets import DeviceTargets
 from render_scenes import IMAGES, contraction, random_camera, random_cotangents, random_splats
 
-pytestmark = [pytest.mark.gpu, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.gpu
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
 
 

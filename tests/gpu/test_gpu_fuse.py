@@ -10,7 +10,7 @@ from gs2d.meshing.bounds import derive_limits, sample_depths
 from gs2d.meshing.tsdf import fuse
 from gs2d.render.backends import Backend
 
-pytestmark = [pytest.mark.gpu, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.gpu
 
 
 @pytest.mark.parametrize("colored", [True, False])

@@ -24,6 +24,5 @@ def spawn(words: list[str], **kwargs: object) -> subprocess.CompletedProcess[str
         [sys.executable, "-m", "gs2d", *words],
         capture_output=True,
         text=True,
-        timeout=200,
         **kwargs,  # type: ignore[call-overload]
     )

@@ -41,4 +41,4 @@ def torchrun(*command: str) -> subprocess.CompletedProcess[str]:
     """Run a command by the real launcher."""
     program = [sys.executable, "-m", "torch.distributed.run", "--standalone", *command]
     own = {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
-    return subprocess.run(program, env={**os.environ, **own}, capture_output=True, text=True, timeout=280, check=False)
+    return subprocess.run(program, env={**os.environ, **own}, capture_output=True, text=True, check=False)

@@ -29,7 +29,7 @@ def cluster_of(count: int) -> Iterator[tuple[subprocess.Popen[str], str]]:
     ) as process:
         assert process.stdout is not None
         yield process, process.stdout.readline().strip()
-        process.communicate(timeout=60)
+        process.communicate(timeout=600)
 
 
 def lose(cluster: subprocess.Popen[str], *which: int) -> None:

@@ -43,7 +43,7 @@ def raw_screen_of(words: list[str], *, columns: int, env: dict[str, str] | None 
         )
         os.close(theirs)
         reader.start()
-        code = process.wait(timeout=200)
+        code = process.wait(timeout=600)
         reader.join(timeout=20)
     finally:
         os.close(ours)

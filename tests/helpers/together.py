@@ -199,7 +199,7 @@ def launch(size: int, words: Sequence[str]) -> list[subprocess.Popen[str]]:
     ]
 
 
-def ended(processes: Sequence[subprocess.Popen[str]], seconds: float = 120) -> list[tuple[int, str]]:
+def ended(processes: Sequence[subprocess.Popen[str]], seconds: float = 600) -> list[tuple[int, str]]:
     """Wait for processes; exit code and stderr of each."""
     said = [process.communicate(timeout=seconds)[1] for process in processes]
     return [(process.returncode, text) for process, text in zip(processes, said, strict=True)]

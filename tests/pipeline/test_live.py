@@ -33,7 +33,7 @@ from gs2d.training.state import TrainState
 
 def fetch(url: str, path: str) -> tuple[Any, bytes]:
     """Headers and body of an answer."""
-    with urllib.request.urlopen(url.replace("/?", f"/{path}?"), timeout=20) as answer:
+    with urllib.request.urlopen(url.replace("/?", f"/{path}?"), timeout=120) as answer:
         return answer.headers, answer.read()
 
 
@@ -162,7 +162,7 @@ def test_a_viewer_that_fails_is_told_once_and_training_goes_on(live: Live, heard
 
 def test_a_watched_command_ends_when_the_work_is_done(capture: Path, tmp_path: Path) -> None:
     words = ["train", str(capture), "--out", str(tmp_path / "run"), "--threads", "1", "--viewer", *TINY]
-    done = subprocess.run([sys.executable, "-m", "gs2d", *words], capture_output=True, text=True, timeout=200)
+    done = subprocess.run([sys.executable, "-m", "gs2d", *words], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "watch" in done.stderr
     assert "Traceback" not in done.stderr

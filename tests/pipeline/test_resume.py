@@ -60,7 +60,7 @@ def test_a_killed_process_resumes_to_the_same_splats_byte_for_byte(
     process.communicate()
     assert not (tmp_path / "run" / "splats.ply").exists()
     again = spawn(capture, tmp_path / "run", "--resume")
-    assert again.communicate(timeout=250)[1] == b""
+    assert again.communicate(timeout=600)[1] == b""
     assert again.returncode == 0
     assert comparable(open_run(tmp_path / "run")) == comparable(undisturbed)
 

@@ -227,7 +227,6 @@ def searched(root: Path, **options: Any) -> tuple[dict[str, Any], list[str]]:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 def test_round_photographs_of_185_degrees_are_placed_masked_and_cut_into_faces(colmap: None, tmp_path: Path) -> None:
     """Measured with 16 of 800 px: 0.4 mm of a room of 4 m; before, 27 cm and no doubt was said."""
     truth = write_photographs(tmp_path / "photos", "fisheye", count=8, width=480, angle=185, fits="height", off=(8, -6))
@@ -254,7 +253,6 @@ def test_round_photographs_of_185_degrees_are_placed_masked_and_cut_into_faces(c
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 @pytest.mark.parametrize("camera_model", ["auto", "OPENCV_FISHEYE"])
 def test_photographs_that_a_fisheye_fills_are_known_by_what_they_show(
     colmap: None, tmp_path: Path, camera_model: str

@@ -188,7 +188,6 @@ def test_training_starts_on_the_walls_where_faces_of_different_panoramas_agree(
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 def test_panoramas_become_a_run(colmap: None, tmp_path: Path) -> None:
     write_photographs(tmp_path / "photos", "panorama", count=6, width=384)
     words = ["--threads", "2", "--quality", "draft", "--schedule-scale", "0.002", "--test-every", "3", "--quiet"]

@@ -217,7 +217,7 @@ def test_an_interrupted_command_leaves_no_process_and_what_the_next_one_goes_on_
     while not (work / "database.db").exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.02)
     process.send_signal(number)
-    _, error = process.communicate(timeout=60)
+    _, error = process.communicate(timeout=600)
     if number == signal.SIGTERM:
         assert process.returncode == 130
         assert error.splitlines()[-1] == "interrupted"

@@ -16,7 +16,7 @@ from gs2d.io.gaussians import Gaussians, unit_quats
 from npm import forget, node, package, splat_transform
 from splat_scenes import a_scene, turned_by
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -14,7 +14,7 @@ from npm import forget
 from splat_scenes import a_ball
 from viewers import VIEWERS, Camera, ViewerError, drawn_by, file_of, installed, psnr, served, written
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900), pytest.mark.usefixtures("native")]
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("native")]
 CAMERA = Camera((0.6, -0.8, -3.0), (0.0, 0.0, 0.0))
 REFUSED = {("spark", "spz4"), ("kellogg", "spz")}  # read by their documentation; these versions do not
 BLANK = {("kellogg", "compressed")}  # of so few splats; of the guide's bottle it shows all

@@ -18,7 +18,6 @@ from room_photos import Room
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.timeout(600),
     pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (the extra `cluster`)"),
 ]
 SCHEDULE = 0.004  # 120 iterations a block: seconds in which a node can be lost

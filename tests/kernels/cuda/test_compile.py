@@ -12,8 +12,6 @@ from gs2d.errors import BackendError
 from gs2d.kernels.cuda import compile as nvrtc_compile
 from gs2d.kernels.cuda.compile import ARCHITECTURES, compile_source, cubin, source_names
 
-pytestmark = pytest.mark.timeout(120)
-
 
 def _absent() -> str:
     try:

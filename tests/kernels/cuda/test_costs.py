@@ -18,7 +18,6 @@ from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.arguments import OrderArguments, fill
 from gs2d.render import cuda_passes
 
-pytestmark = pytest.mark.timeout(280)
 # Own launches, device launches, torch operations, allocations. A tile more than 256 in the image is a launch more. The
 # operation is the order of the views, on the host, once in an epoch.
 LIMITS = {

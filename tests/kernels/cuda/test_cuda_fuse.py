@@ -14,8 +14,6 @@ from gs2d.meshing.bounds import derive_limits, sample_depths
 from gs2d.meshing.sampling import make_sampler
 from gs2d.meshing.tsdf import Volume, add_in_numpy, add_on_gpu, block_grid, invalid_volume, touched_blocks
 
-pytestmark = pytest.mark.timeout(120)
-
 
 @pytest.mark.parametrize("colored", [True, False])
 def test_the_kernel_leaves_the_field_of_numpy_in_every_bit(emulator: emulate.Emulator, colored: bool) -> None:

@@ -14,7 +14,6 @@ from gs2d.config.multiview import MultiView
 from gs2d.kernels.cuda.multiview import compare_views
 from two_views import Scenario, in_torch, scenario
 
-pytestmark = pytest.mark.timeout(120)
 FEW = MultiView(patches=61, radius=2, texture=0.03, occluded=4.0)  # not a multiple of a block
 
 

@@ -39,8 +39,6 @@ from gs2d.training.targets import DeviceTargets, Targets
 from gs2d.training.trainer import Trainer
 from render_scenes import front_camera, splat, stack
 
-pytestmark = pytest.mark.timeout(170)
-
 
 @pytest.fixture
 def emulated(emulator: Emulator, monkeypatch: pytest.MonkeyPatch) -> Backend:

@@ -11,8 +11,6 @@ from torch import Tensor
 
 import emulate
 
-pytestmark = pytest.mark.timeout(120)
-
 
 class _Arrays(ctypes.Structure):
     _fields_ = (("input", ctypes.c_void_p), ("output", ctypes.c_void_p))

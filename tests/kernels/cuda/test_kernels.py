@@ -17,8 +17,6 @@ from gs2d.render.api import rasterize
 from kernel_cases import SETTINGS, Case, cases, double, gradients, many_tiles, quantile, render
 from render_scenes import IMAGES, front_camera, random_cotangents, splat, stack
 
-pytestmark = pytest.mark.timeout(120)  # a kernel that does not end
-
 
 def test_images_and_radii_agree_with_the_reference_on_random_scenes(emulator: Emulator) -> None:
     differences: dict[str, list[Tensor]] = {name: [] for name in IMAGES}

@@ -8,8 +8,6 @@ from typing import Any
 import pytest
 from benchmarks import cuda_loops
 
-pytestmark = pytest.mark.timeout(170)
-
 LISTING = """
 	.section	.text.outer,"ax",@progbits
 .L_x_0:

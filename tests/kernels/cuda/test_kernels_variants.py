@@ -19,7 +19,6 @@ from gs2d.render import cuda, cuda_passes, reference
 from kernel_cases import SETTINGS, Case, crossing_tiles, double, many_tiles
 from render_scenes import IMAGES, contraction, front_camera, random_cotangents, requiring_grad, splat, stack
 
-pytestmark = pytest.mark.timeout(120)
 COLORS = ("sh0", "shN")
 
 

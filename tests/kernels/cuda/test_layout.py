@@ -16,7 +16,6 @@ from gs2d.kernels import multiview
 from gs2d.kernels import tsdf as fusion
 from gs2d.kernels.cuda import arguments, compile
 
-pytestmark = pytest.mark.timeout(120)
 KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )?(\w+)\((\w+)(<float>)? ')
 CAMERA = {name: f"camera.{name}" for name in ("R", "t", "center", "fx", "fy", "cx", "cy")}  # of View
 

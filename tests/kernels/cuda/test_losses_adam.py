@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import pytest
 import torch
 from torch import Tensor
 from torch.optim.adam import adam
@@ -12,7 +11,6 @@ from torch.optim.adam import adam
 import emulate
 from gs2d.kernels.cuda.adam import AdamUpdate, adam_step
 
-pytestmark = pytest.mark.timeout(120)
 WRITTEN = ("parameter", "mean", "square")
 BETAS = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-15}
 SHAPES = {"means": (3,), "quats": (4,), "log_scales": (2,), "opacity_logits": (), "sh0": (1, 3), "shN": (15, 3)}

@@ -18,8 +18,6 @@ from gs2d.render import cuda
 from kernel_cases import SETTINGS, many_tiles
 from render_scenes import IMAGES, contraction, random_cotangents, requiring_grad
 
-pytestmark = pytest.mark.timeout(120)
-
 
 @contextmanager
 def fresh_memory(*, poisoned: bool) -> Iterator[None]:

@@ -20,7 +20,6 @@ from gs2d.kernels.cuda import compile as nvrtc
 from gs2d.kernels.cuda import shipped
 
 ROOT = Path(__file__).resolve().parents[3]
-pytestmark = pytest.mark.timeout(280)
 
 
 def folder_with(folder: Path, architectures: tuple[str, ...], **changes: object) -> Path:

@@ -18,7 +18,6 @@ from gs2d.kernels.cuda.sort import (
     pieces_of,
 )
 
-pytestmark = pytest.mark.timeout(170)
 SEEDS = (0, 7)  # ascending; shuffled
 
 

@@ -31,8 +31,6 @@ from gs2d.training import trainer as loop
 from gs2d.training.densify.gradient import GradientDensifier
 from gs2d.training.trainer import Trainer
 
-pytestmark = pytest.mark.timeout(170)
-
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
