@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from torch import Tensor
@@ -17,17 +19,27 @@ from gs2d.render.backends import Backend, CudaBackend, get_backend
 from gs2d.render.types import Features, RasterSettings, RenderOutput
 
 
-@pytest.fixture(params=["reference", "cpu", "emulated", pytest.param("cuda", marks=pytest.mark.gpu)])
-def backend(request: pytest.FixtureRequest) -> Backend:
-    """Every available backend; the ones that cannot run here skip with their reason.
+@pytest.fixture
+def backend_named(request: pytest.FixtureRequest) -> Callable[[str], Backend]:
+    """A backend by name; one that cannot run here skips with its reason.
 
     ``cuda`` takes tensors in host memory, as the tests make them, and gives its results back there; ``emulated`` runs
     the same kernels on the CPU.
     """
-    if request.param == "emulated":
-        return _emulated(request.getfixturevalue("emulator"))
-    found = _available(request.param)
-    return _from_host(found) if request.param == "cuda" else found
+
+    def named(name: str) -> Backend:
+        if name == "emulated":
+            return _emulated(request.getfixturevalue("emulator"))
+        found = _available(name)
+        return _from_host(found) if name == "cuda" else found
+
+    return named
+
+
+@pytest.fixture(params=["reference", "cpu", "emulated", pytest.param("cuda", marks=pytest.mark.gpu)])
+def backend(request: pytest.FixtureRequest, backend_named: Callable[[str], Backend]) -> Backend:
+    """Every available backend."""
+    return backend_named(request.param)
 
 
 @pytest.fixture
@@ -37,10 +49,9 @@ def cpu() -> Backend:
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
-def native(request: pytest.FixtureRequest) -> Backend:
+def native(request: pytest.FixtureRequest, backend_named: Callable[[str], Backend]) -> Backend:
     """A backend of kernels, to be compared with the reference on many scenes: the native one, and a real GPU."""
-    found = _available(request.param)
-    return _from_host(found) if request.param == "cuda" else found
+    return backend_named(request.param)
 
 
 @pytest.fixture(scope="session")

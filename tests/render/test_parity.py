@@ -7,70 +7,41 @@ Frobenius norm on scenes in which every decision keeps a margin.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-import render_oracle
-from gs2d.core.camera import Camera
-from gs2d.core.splats import ATTRIBUTES, Splats
+from gs2d.core.splats import ATTRIBUTES
 from gs2d.render import reference, reference_errors
 from gs2d.render.backends import Backend
-from gs2d.render.types import RasterSettings
-from render_scenes import IMAGES, KINDS, contraction, random_camera, random_cotangents, random_splats, requiring_grad
-
-SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
+from kernel_cases import SETTINGS, Case, cases, cases_with_margins, double, gradients, quantile
+from render_scenes import IMAGES, random_camera, random_cotangents, random_splats
 
 
-@dataclass(frozen=True)
-class Case:
-    """One random scene, float32."""
-
-    seed: int
-    splats: Splats
-    camera: Camera
+@pytest.fixture(params=["cpu", "emulated", pytest.param("cuda", marks=pytest.mark.gpu)])
+def native(request: pytest.FixtureRequest, backend_named: Callable[[str], Backend]) -> Backend:
+    return backend_named(request.param)
 
 
-def cases(count: int, kinds: tuple[str, ...] = KINDS) -> Iterator[Case]:
-    """Every third seed has small splats, every third large ones and many layers."""
-    for seed in range(count):
-        rng = np.random.default_rng(seed)
-        camera = random_camera(rng)
-        splats = random_splats(rng, camera, int(rng.integers(1, 60)), kinds)
-        splats = replace(splats, log_scales=splats.log_scales + 0.7 * (seed % 3))
-        yield Case(seed, splats.to(dtype=torch.float32), camera)
+@pytest.fixture
+def part(request: pytest.FixtureRequest) -> int:
+    """The emulator takes one in so many cases: it is slow."""
+    return 8 if "emulated" in request.node.callspec.id else 1
 
 
 @pytest.fixture(scope="module")
 def clear_cases() -> list[Case]:
-    """Small scenes in which no decision is within 1e-4 of its threshold (ties of depth excluded)."""
-    clear = []
-    for case in cases(220, tuple(kind for kind in KINDS if kind != "twins")):
-        camera = case.camera.resized(min(case.camera.width, 8), min(case.camera.height, 8))
-        splats = case.splats.rows(torch.arange(min(len(case.splats), 12)))
-        if render_oracle.render(splats, camera, SETTINGS).margin >= 1e-4:
-            clear.append(Case(case.seed, splats, camera))
-    assert len(clear) >= 60
-    return clear
+    return cases_with_margins(220)
 
 
-def double(splats: Splats) -> Splats:
-    return splats.to(dtype=torch.float64)
-
-
-def quantile(values: Tensor, q: float) -> float:
-    """Without torch's limit on the size."""
-    return float(np.quantile(values.numpy(), q))
-
-
-def test_images_and_radii_agree_on_random_scenes(native: Backend) -> None:
+def test_images_and_radii_agree_on_random_scenes(native: Backend, part: int) -> None:
     differences: dict[str, list[Tensor]] = {name: [] for name in IMAGES}
     radii = []
-    for case in cases(120):
+    for case in cases(120 // part):
         low = native.rasterize(case.splats, case.camera, SETTINGS)
         high = reference.rasterize(double(case.splats), case.camera, SETTINGS)
         for name in IMAGES:
@@ -88,7 +59,7 @@ def test_images_and_radii_agree_on_random_scenes(native: Backend) -> None:
         assert quantile(merged, 0.999) < 1e-4, name
         assert flips < 2e-4, (name, flips)
     merged = torch.cat(radii)
-    assert len(merged) > 2000
+    assert len(merged) > 2000 // part
     assert float((merged > 1e-3).double().mean()) <= 2e-3
 
 
@@ -119,11 +90,11 @@ def test_a_larger_image_with_many_tiles_and_layers_agrees(native: Backend) -> No
     ],
     ids=str,
 )
-def test_every_setting_is_used_alike(native: Backend, change: dict[str, float]) -> None:
+def test_every_setting_is_used_alike(native: Backend, part: int, change: dict[str, float]) -> None:
     settings = replace(SETTINGS, **change)  # type: ignore[arg-type]
     differences = []
     moved = 0.0
-    for case in cases(20):
+    for case in cases(20 // part):
         low = native.rasterize(case.splats, case.camera, settings)
         high = reference.rasterize(double(case.splats), case.camera, settings)
         default = reference.rasterize(double(case.splats), case.camera, SETTINGS)
@@ -131,25 +102,25 @@ def test_every_setting_is_used_alike(native: Backend, change: dict[str, float]) 
             differences.append((getattr(low, name).double() - getattr(high, name)).abs().flatten())
         moved += float((high.color - default.color).abs().sum() + (high.distortion - default.distortion).abs().sum())
     assert quantile(torch.cat(differences), 0.998) < 1e-4
-    assert moved > 1  # the setting matters here
+    assert moved > 1 / part  # the setting matters here
 
 
 @pytest.mark.parametrize("columns", [2, 4])
 def test_gradients_agree_where_every_decision_has_a_margin(
-    native: Backend, clear_cases: list[Case], columns: int
+    native: Backend, part: int, clear_cases: list[Case], columns: int
 ) -> None:
     """Random cotangents on all images at once; relative Frobenius norm per attribute."""
     errors: dict[str, list[float]] = {name: [] for name in (*ATTRIBUTES, "signed", "absolute")}
-    for case in clear_cases[columns // 4 :: 2]:
+    for case in clear_cases[columns // 4 :: 2 * part]:
         cotangents = random_cotangents(np.random.default_rng(case.seed), case.camera)
-        low = gradients(native, case.splats, case.camera, cotangents, columns)
-        high = gradients(None, double(case.splats), case.camera, cotangents, columns)
+        low = gradients(native.rasterize, case.splats, case.camera, cotangents, columns)
+        high = gradients(reference.rasterize, double(case.splats), case.camera, cotangents, columns)
         for name, expected in high.items():
             norm = float(expected.norm())
             if norm > 1e-3:
                 errors[name].append(float((low[name].double() - expected).norm()) / norm)
     for name, values in errors.items():
-        assert len(values) >= 20 or (name == "absolute" and columns == 2), name
+        assert len(values) >= 20 // part or (name == "absolute" and columns == 2), name
         if values:
             assert np.median(values) < 1e-5, (name, np.median(values))
             assert np.quantile(values, 0.9) < 1e-4, (name, np.quantile(values, 0.9))
@@ -157,43 +128,26 @@ def test_gradients_agree_where_every_decision_has_a_margin(
 
 
 @pytest.mark.parametrize("name", IMAGES)
-def test_gradients_of_each_image_alone_agree(native: Backend, clear_cases: list[Case], name: str) -> None:
+def test_gradients_of_each_image_alone_agree(native: Backend, part: int, clear_cases: list[Case], name: str) -> None:
     """So that a wrong sign in a small channel is not drowned by a large one."""
     errors = []
-    for case in clear_cases[:20]:
+    for case in clear_cases[: 20 // part]:
         cotangents = {name: random_cotangents(np.random.default_rng(case.seed), case.camera)[name]}
-        low = gradients(native, case.splats, case.camera, cotangents, 4)
-        high = gradients(None, double(case.splats), case.camera, cotangents, 4)
+        low = gradients(native.rasterize, case.splats, case.camera, cotangents, 4)
+        high = gradients(reference.rasterize, double(case.splats), case.camera, cotangents, 4)
         a = torch.cat([low[attribute].double().flatten() for attribute in ATTRIBUTES])
         b = torch.cat([high[attribute].flatten() for attribute in ATTRIBUTES])
         if float(b.norm()) > 1e-3:
             errors.append(float((a - b).norm() / b.norm()))
-    assert len(errors) >= 10, name
+    assert len(errors) >= 10 // part, name
     assert np.median(errors) < 2e-5, errors
     assert max(errors) < 2e-3, errors
 
 
-def gradients(
-    backend: Backend | None, splats: Splats, camera: Camera, cotangents: dict[str, Tensor], columns: int
-) -> dict[str, Tensor]:
-    """Vector-Jacobian products of all parameters and the probe; None is the reference."""
-    scene = requiring_grad(splats)
-    probe = torch.zeros(len(splats), columns, dtype=splats.dtype, requires_grad=True)
-    run = reference.rasterize if backend is None else backend.rasterize
-    contraction(run(scene, camera, SETTINGS, probe), cotangents).backward()
-    grads = {name: tensor.grad for name, tensor in scene.items()}
-    assert probe.grad is not None
-    grads["signed"] = probe.grad[:, :2]
-    if columns == 4:
-        grads["absolute"] = probe.grad[:, 2:]
-    assert all(grad is not None and bool(grad.isfinite().all()) for grad in grads.values())
-    return {name: grad for name, grad in grads.items() if grad is not None}
-
-
 @pytest.mark.parametrize("occlusion", [False, True])
-def test_splat_errors_agree(native: Backend, occlusion: bool) -> None:
+def test_splat_errors_agree(native: Backend, part: int, occlusion: bool) -> None:
     relative = []
-    for case in cases(40):
+    for case in cases(40 // part):
         rng = np.random.default_rng(case.seed)
         H, W = case.camera.height, case.camera.width
         image = torch.tensor(rng.uniform(size=(H, W, 3)), dtype=torch.float32)

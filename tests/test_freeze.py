@@ -1,0 +1,46 @@
+"""Upper limits on what users have to learn: commands, options, recipes and the fields of a recipe.
+
+A commit that raises a limit states in its message what the addition replaces.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass
+from typing import Any, get_args, get_type_hints
+
+import gs2d
+from gs2d.cli.arguments import NAMES, options_of
+from gs2d.config.recipe import Recipe
+
+
+def nested(kind: Any) -> set[type]:
+    """Return the dataclasses within a type: itself, of its arguments, and of its fields."""
+    if not (isinstance(kind, type) and is_dataclass(kind)):
+        return set().union(*(nested(part) for part in get_args(kind)))
+    hints = get_type_hints(kind)
+    return {kind}.union(*(nested(hints[field.name]) for field in fields(kind)))
+
+
+def counted() -> dict[str, int]:
+    """Return the counts, from the parser and the registries."""
+    options = [(name, option) for name, command in NAMES.items() for option in options_of(command)]
+    return {
+        "commands": len(NAMES),
+        "options of all commands": len(options),
+        "options by name": len({option.name for _, option in options if option.flags}),
+        "recipes": len(gs2d.list_recipes()),
+        "fields of recipes": sum(len(fields(kind)) for kind in nested(Recipe)),
+    }
+
+
+LIMITS = {
+    "commands": 21,
+    "options of all commands": 392,
+    "options by name": 108,
+    "recipes": 24,
+    "fields of recipes": 171,
+}
+
+
+def test_there_are_no_more_than_the_limits() -> None:
+    assert {what: count for what, count in counted().items() if count > LIMITS[what]} == {}
