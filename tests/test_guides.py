@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import gs2d
+from gs2d.cli.arguments import NAMES, options_of
 from gs2d.config.presets import RECIPES
 from tiny import write_capture
 
@@ -103,3 +104,71 @@ def test_citation_and_changelog_are_of_the_version() -> None:
     released = re.findall(r"^## \[(.*)\] - (.*)$", changelog, re.M)
     assert released[0] == (dated[1], dated[2])
     assert re.findall(r"^## (.*)$", changelog, re.M)[0] == "[Unreleased]"
+
+
+# The pages for users: what they say of options, defaults and files is compared with the program.
+NO_USER_PAGES = {"CHANGELOG", "kernels", "math"}
+USER_PAGES = [page for folder in ("..", ".", "guides", "tutorials") for page in sorted((DOCS / folder).glob("*.md"))]
+USER_PAGES = [page for page in USER_PAGES if page.stem not in NO_USER_PAGES]
+OPTIONS = {name: {flag: option for option in options_of(kind) for flag in option.flags} for name, kind in NAMES.items()}
+ALL_OPTIONS = {flag: option for options in OPTIONS.values() for flag, option in options.items()}
+COMMON = {"--help", "--help-all", "--version"}
+
+
+def commands_of(text: str) -> list[list[str]]:
+    """Return the words of each gs2d command on a page, in blocks of code and between backticks."""
+    shell = "".join(re.findall(r"^```sh\n(.*?)^```$", text, re.M | re.S)).replace("\\\n", " ").splitlines()
+    spoken = re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```$", "", text, flags=re.M | re.S))
+    found = [re.split(r"\s#|\s&&|\||>|\$\(", line)[0].split() for line in [*shell, *spoken]]
+    return [words[words.index("gs2d") + 1 :] for words in found if "gs2d" in words and words[-1] != "gs2d"]
+
+
+@pytest.mark.parametrize("page", USER_PAGES, ids=lambda page: page.stem)
+def test_commands_on_a_page_exist_with_their_options(page: Path) -> None:
+    wrong = []
+    for name, *words in commands_of(page.read_text(encoding="utf-8")):
+        if re.fullmatch(r"[a-z]+", name):
+            known = {*OPTIONS.get(name, {}), *COMMON}
+            wrong += [] if name in NAMES else [name]
+            wrong += [f"{name} {word}" for word in words if word.startswith("--") and word.rstrip(".,") not in known]
+    assert not wrong
+
+
+@pytest.mark.parametrize("page", USER_PAGES, ids=lambda page: page.stem)
+def test_options_between_backticks_exist(page: Path) -> None:
+    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+    named = set(re.findall(r"`(--[a-z][\w-]*)", text))
+    foreign = {"--iterations", "--aarch64", "--gpus", "--disable-usage-stats"}  # of other programs
+    assert named - ALL_OPTIONS.keys() - COMMON - foreign == set()
+
+
+@pytest.mark.parametrize("page", USER_PAGES, ids=lambda page: page.stem)
+def test_defaults_that_a_page_states_are_those_of_the_program(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for flag, value in re.findall(r"`(--[\w-]+)[^`]*`(?:[^`(]*\(|, )default:? ([\d.,]*\d|`[\w-]+`)", text):
+        assert str(ALL_OPTIONS[flag].default) in (value.strip("`").replace(",", ""), value + ".0"), flag
+    for flag, block in re.findall(r"`(--[\w-]+)`[^\n]*\n((?:(?:[-|].*|  .*|)\n)+)", text):
+        for value in re.findall(r"^[-|] `([\w-]+)` \(default\)", block, re.M):
+            assert ALL_OPTIONS[flag].default in (value, None), flag
+
+
+def test_files_that_the_pages_name_are_there() -> None:
+    written = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "src").rglob("*.py"))
+    foreign = {"crisp.py", "metrics.py"}  # of a tutorial, of the official code
+    missing = []
+    for page in USER_PAGES:
+        text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+        for path in re.findall(r"`([\w/.-]+\.(?:py|sh|h|toml))`", text):
+            if path not in foreign and not [
+                *ROOT.glob(path),
+                *(ROOT / "src").rglob(path),
+                *(ROOT / "tests").rglob(path),
+            ]:
+                missing.append((page.name, path))
+    table = re.findall(
+        r"^\| ((?:`[\w./]+`(?:, )?)+) \|", (DOCS / "guides" / "runs.md").read_text(encoding="utf-8"), re.M
+    )
+    names = re.findall(r"`([\w.]+)/?`", " ".join(table))
+    assert len(names) > 15
+    assert [name for name in names if f'"{name}"' not in written] == []
+    assert missing == []
