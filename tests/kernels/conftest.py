@@ -1,9 +1,10 @@
-"""What the kernels' tests share: every library this machine can run, and the rasterizer tests' scenes."""
+"""What the kernels' tests share: every library this machine can run, and the emulator of the CUDA kernels."""
 
 from __future__ import annotations
 
 import pytest
 
+import emulate
 from gs2d.errors import BackendError
 from gs2d.kernels.library import Library, available_variants, load
 
@@ -40,3 +41,9 @@ def any_native(request: pytest.FixtureRequest) -> Library:
         pytest.skip(str(error))
     library.use_threads(2)
     return library
+
+
+@pytest.fixture(scope="session")
+def emulator() -> emulate.Emulator:
+    """A launcher that runs the package's CUDA kernels on the CPU."""
+    return emulate.Emulator()

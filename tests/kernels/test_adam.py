@@ -1,17 +1,21 @@
-"""The native Adam against torch's fused Adam: all rows, some rows, any number of threads; and what is not finite."""
+"""The native and the CUDA Adam (emulated) against torch's fused Adam: all rows, some rows, any number of threads."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
+from emulate import Emulator
 from gs2d.errors import ShapeError
 from gs2d.kernels.adam import AdamUpdate, adam_step, first_not_finite
-from gs2d.kernels.library import Library
+from gs2d.kernels.cuda import adam as cuda
+from gs2d.kernels.library import Library, load
 
 WRITTEN = ("parameter", "mean", "square")
 BETAS = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-15}
@@ -48,18 +52,42 @@ def equal(a: AdamUpdate, b: AdamUpdate) -> bool:
     return all(torch.equal(getattr(a, name), getattr(b, name)) for name in WRITTEN)
 
 
-def test_it_takes_torchs_fused_step(any_native: Library) -> None:
-    """1000 rows of 45 are several pieces of 8192 elements; 1001 of 1 end within a vector."""
-    dtype = any_native.dtype
-    updates = [attribute(1000 + (shape == ()), shape, dtype, seed=k) for k, shape in enumerate(SHAPES)]
+@pytest.fixture(params=["native", "emulated"])
+def step(request: pytest.FixtureRequest) -> Callable[..., None]:
+    """A step on each device."""
+    if request.param == "native":
+        return partial(adam_step, **BETAS, library=load())
+    return partial(cuda.adam_step, **BETAS, launcher=request.getfixturevalue("emulator"))
+
+
+def assert_torchs_step(step: Callable[..., None], count: int, dtype: torch.dtype = torch.float32) -> None:
+    """To the last digits: torch contracts differently from one processor to another."""
+    updates = [attribute(count + (shape == ()), shape, dtype, seed=k) for k, shape in enumerate(SHAPES)]
     before, expected = [copied(u) for u in updates], [by_torch(u) for u in updates]
-    adam_step(updates, **BETAS, library=any_native)
+    step(updates)
     digits = 5e-7 if dtype == torch.float32 else 1e-15
     for found, wanted, start in zip(updates, expected, before, strict=True):
         for name in WRITTEN:
             a, b, old = (getattr(update, name) for update in (found, wanted, start))
             assert bool(((a - b).abs() <= digits * (b.abs() + old.abs())).all()), name
             assert bool((a != old).any()), name
+
+
+def test_it_takes_torchs_fused_step(any_native: Library) -> None:
+    """1000 rows of 45 are several pieces of 8192 elements; 1001 of 1 end within a vector."""
+    assert_torchs_step(partial(adam_step, **BETAS, library=any_native), 1000, any_native.dtype)
+
+
+def test_the_cuda_kernel_takes_torchs_fused_step(emulator: Emulator) -> None:
+    """70 rows of 45 are several blocks of 512; the others end within one."""
+    assert_torchs_step(partial(cuda.adam_step, **BETAS, launcher=emulator), 70)
+
+
+def test_a_step_whose_iteration_overflowed_changes_nothing(emulator: Emulator) -> None:
+    start = attribute(20, (4,), torch.float32)
+    stopped = copied(start)
+    cuda.adam_step([stopped], **BETAS, launcher=emulator, skip=torch.tensor(1, dtype=torch.int32))
+    assert equal(stopped, start)
 
 
 def test_the_bits_do_not_depend_on_threads(native: Library) -> None:
@@ -75,26 +103,26 @@ def test_the_bits_do_not_depend_on_threads(native: Library) -> None:
 @pytest.mark.parametrize("compact", [False, True])
 @pytest.mark.parametrize("shape", [(), (3,), (15, 3)])
 def test_only_the_rows_that_are_named_are_written_and_as_they_would_be_alone(
-    native: Library, shape: tuple[int, ...], compact: bool
+    step: Callable[..., None], shape: tuple[int, ...], compact: bool
 ) -> None:
-    start = attribute(400, shape, torch.float32)
-    mask = torch.arange(400) % 3 == 1
+    start = attribute(100, shape, torch.float32)
+    mask = torch.arange(100) % 3 == 1
     rows = mask.nonzero().squeeze(1)
     alone = AdamUpdate(
         start.parameter[rows], start.mean[rows], start.square[rows], start.gradient[rows], start.rate, start.step
     )
-    adam_step([alone], **BETAS, library=native)
+    step([alone])
     expected = copied(start)
     for name in WRITTEN:
         getattr(expected, name)[rows] = getattr(alone, name)
     found = copied(
         replace(start, rows=rows, compact=compact, gradient=start.gradient[rows] if compact else start.gradient)
     )
-    adam_step([found], **BETAS, library=native)
+    step([found])
     assert equal(found, expected)
     if not compact:
         masked = copied(replace(start, trained=mask))
-        adam_step([masked], **BETAS, library=native)
+        step([masked])
         assert equal(masked, expected)
 
 

@@ -1,4 +1,4 @@
-"""What the CUDA tests share: the emulator with all kernels, and the rasterizer tests' scenes on the path."""
+"""What the CUDA tests share: scenes with a margin, and what a torch without CUDA lacks."""
 
 from __future__ import annotations
 
@@ -9,15 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
-import emulate
 import fake_gpu
 import kernel_cases
-
-
-@pytest.fixture(scope="session")
-def emulator() -> emulate.Emulator:
-    """A launcher that runs the package's kernels on the CPU."""
-    return emulate.Emulator()
 
 
 @pytest.fixture(scope="session")
