@@ -1,4 +1,4 @@
-"""The comparison of two views against the formulas in torch: on every instruction set, and the emulated CUDA kernels."""
+"""The comparison of two views against the formulas in torch: every instruction set, and the emulated CUDA kernels."""
 
 from __future__ import annotations
 
