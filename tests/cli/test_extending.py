@@ -1,4 +1,4 @@
-"""docs/extending.md reads the package of tests/plugin aloud, which test_plugin.py installs and uses."""
+"""docs/extending.md shows the code of tests/plugin, which test_plugin.py installs and uses."""
 
 from __future__ import annotations
 
@@ -16,5 +16,5 @@ def test_every_example_of_the_page_is_a_piece_of_the_package() -> None:
     assert len(examples) == 10
     for language, example in examples:
         assert example in (code if language == "python" else entries), example
-    doors = re.findall(r"^@gs2d.register_(\w+)", code, flags=re.MULTILINE)
-    assert doors == ["loss", "loss", "loss", "reader", "densifier", "recipe", "backend", "format"]
+    kinds = re.findall(r"^@gs2d.register_(\w+)", code, flags=re.MULTILINE)
+    assert kinds == ["loss", "loss", "loss", "reader", "densifier", "recipe", "backend", "format"]

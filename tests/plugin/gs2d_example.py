@@ -1,4 +1,4 @@
-"""One of each door of gs2d, from another package; docs/extending.md reads it aloud."""
+"""One example of each extension point of gs2d, in a package of its own; docs/extending.md shows it piece by piece."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def outside(output, view):
 
 @gs2d.register_loss("example-brightness")
 class Brightness:
-    """Compare the mean brightness with that of the photograph, which is found once."""
+    """Compare the mean brightness with that of the photograph, computed once before training."""
 
     title = "Brightness of the photographs"
     figure = "error of brightness, levels of 255"
