@@ -80,7 +80,10 @@ VARIANTS = {
 }
 
 
-@pytest.mark.parametrize("variant", list(VARIANTS))
+@pytest.mark.parametrize(
+    "variant",
+    ["plain", "poses", *(pytest.param(v, marks=pytest.mark.slow) for v in VARIANTS if v not in ("plain", "poses"))],
+)
 def test_three_stages_give_the_cpu_backends_scene_within_rounding(
     emulated: Backend, scene: Scene, variant: str
 ) -> None:
@@ -98,20 +101,6 @@ def test_three_stages_give_the_cpu_backends_scene_within_rounding(
         assert float((a - b).norm()) <= 5e-3 * float(a.norm()), name
     moved = gpu.splats.means - on_gpu.splats[0].means[:1]
     assert float(moved.abs().max()) > 0
-
-
-def test_frozen_attributes_and_rows_stay_bit_identical(emulated: Backend, scene: Scene) -> None:
-    trainer, recorder = train_toys.train(scene, train_toys.short(), backend=emulated)
-    before, after = (recorder.at(kind, "appearance") for kind in (events.StageStarted, events.StageFinished))
-    for name in ("means", "quats", "log_scales", "opacity_logits"):
-        assert torch.equal(getattr(before, name), getattr(after, name)), name
-    changed = (before.sh0 != after.sh0).flatten(1).any(dim=1)
-    high = trainer.state.groups["high_error"][: len(changed)]
-    assert bool(changed.any())
-    assert not bool((changed & ~high).any())
-    start, end = recorder.at(events.StageStarted, "refine"), trainer.splats
-    assert torch.equal(start.opacity_logits, end.opacity_logits)
-    assert not torch.equal(start.means, end.means)
 
 
 WAITS = {
@@ -214,7 +203,7 @@ def test_a_loss_that_is_not_finite_stops_training_at_the_next_report(
         trainer.step()
 
 
-@pytest.mark.parametrize(("slack", "variant"), [(1.25, "plain"), (0.5, "plain"), (0.5, "multiview")])
+@pytest.mark.parametrize(("slack", "variant"), [(1.25, "plain"), (0.5, "multiview")])
 def test_without_waiting_for_the_number_of_pairs_training_gives_the_same_bits(
     emulated: Backend, scene: Scene, slack: float, variant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -298,14 +287,6 @@ def test_each_view_has_room_for_its_own_pairs_and_for_splats_that_were_added(mon
     assert budget.room(small) == pytest.approx(220_000, abs=1)
 
 
-def test_cameras_that_are_new_each_time_do_not_fill_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cuda_budget, "MAX_VIEWS", 10)
-    budget = cuda_budget.PairBudget()
-    for k in range(25):
-        budget.learn(Rendering(7, 10, bytes([k])), 100)
-    assert len(budget._of_view) <= 10
-
-
 def test_a_fault_that_a_kernel_left_is_one_line_with_a_remedy_where_torch_meets_it() -> None:
     class Broken:
         def synchronize(self) -> None:
@@ -355,21 +336,6 @@ def test_photographs_wait_as_bytes_and_become_the_targets_of_the_cpu() -> None:
             assert target.mask is None or torch.equal(target.mask, expected.mask)  # type: ignore[arg-type]
     assert pinned == [72, 24]  # the third, image and mask; the fourth does not fit any more and is read each time
     assert sorted(targets._kept) == [0, 1, 2]
-
-
-def test_memory_that_the_system_does_not_lock_is_done_without() -> None:
-    asked = []
-
-    def refuse(tensor: Tensor) -> Tensor:
-        asked.append(tensor.nbytes)
-        raise RuntimeError("CUDA error: out of memory")
-
-    options: dict[str, Any] = {"use_masks": False, "device": torch.device("cpu"), "limit_bytes": 0, "pin": refuse}
-    targets = DeviceTargets(image_scene(), (0.0, 0.0, 0.0), **options)
-    for index in range(4):
-        assert targets[index].image.shape == (4, 6, 3)
-    assert asked == [72]  # not asked again
-    assert targets._kept == {}
 
 
 def test_a_state_on_a_device_is_saved_in_host_memory_and_moves_whole() -> None:
