@@ -7,7 +7,6 @@ import pytest
 from gs2d.config.partition import (
     CoarseModel,
     Partition,
-    check_partition,
     from_json,
     grid_for,
     make_partition,
@@ -27,12 +26,6 @@ def test_a_grid_is_two_or_three_numbers() -> None:
 def test_what_is_no_grid_is_refused(text: str) -> None:
     with pytest.raises(RecipeError, match="--blocks must be auto, or two or three whole numbers of 1 or more"):
         parse_grid(text)
-
-
-def test_blocks_are_named_by_their_place() -> None:
-    assert Partition(grid=(2, 2)).names == ("0-0", "0-1", "1-0", "1-1")
-    assert Partition(grid=(1, 1, 2)).names == ("0-0-0", "0-0-1")
-    assert Partition().names == ()
 
 
 def test_fields_are_changed_by_name_and_come_back_from_json() -> None:
@@ -63,11 +56,6 @@ def test_what_cannot_be_cut_by_is_one_line(change: str, text: str) -> None:
     with pytest.raises(RecipeError, match=text) as error:
         make_partition("2x2", (change,))
     assert "\n" not in str(error.value)
-
-
-def test_there_are_not_more_blocks_than_folders_that_anyone_wants() -> None:
-    with pytest.raises(RecipeError, match="at most 10,000 blocks"):
-        check_partition(Partition(grid=(101, 100)))
 
 
 def test_open_grids_have_cells_about_as_long_as_wide_and_a_third_axis_where_it_is_high() -> None:

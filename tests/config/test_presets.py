@@ -6,20 +6,16 @@ from dataclasses import replace
 
 import pytest
 
-from gs2d.config.multiview import MultiView
 from gs2d.config.presets import (
     DEPTH_WEIGHT,
-    MULTIVIEW_WEIGHT,
     RECIPES,
     TABLES,
     get_recipe,
     with_depth_prior,
-    with_exposure,
-    with_multiview,
     with_normal_prior,
 )
 from gs2d.config.priors import DepthPrior, NormalPrior
-from gs2d.config.recipe import ALL, CloneInPlace, Exposure, GradDensify, LossTerm, RankByError, Recipe, Stage, validate
+from gs2d.config.recipe import ALL, CloneInPlace, GradDensify, RankByError, Recipe, Stage, validate
 from gs2d.errors import RecipeError
 
 
@@ -104,16 +100,6 @@ def frozen(stage: Stage) -> set[str]:
     return set(ALL) - set(stage.train)
 
 
-def test_freeze_rows() -> None:
-    rows = {row: frozen(get_recipe(name).stages[2]) for row, name in TABLES["freeze"].items()}
-    assert rows == {
-        "(,)": set(),
-        "(alpha,SHs)": {"opacity_logits", "sh0", "shN"},
-        "(SHs)": {"sh0", "shN"},
-        "(alpha)": {"opacity_logits"},
-    }
-
-
 def test_module_rows() -> None:
     def facts(recipe: Recipe) -> tuple[bool, bool, bool]:
         last = recipe.stages[-1]
@@ -126,11 +112,6 @@ def test_module_rows() -> None:
     assert facts(rows["(III)"]) == (True, True, False)
     assert facts(rows["(IV)"]) == (True, True, True)
     assert rows["(IV)"].stages == get_recipe("2dgs-r").stages
-
-
-def test_k_rows_rank_that_share() -> None:
-    for row, name in TABLES["k"].items():
-        assert get_recipe(name).stages[1].on_enter == (RankByError(top_percent=float(row.removeprefix("K="))),)
 
 
 def test_absgs_rows_densify_in_stage_3_instead_of_the_clone() -> None:
@@ -150,36 +131,9 @@ def test_absgs_rows_densify_in_stage_3_instead_of_the_clone() -> None:
     assert adjusted.densify.percent_dense < d.percent_dense
 
 
-def test_a_weight_of_zero_leaves_the_term_out() -> None:
-    assert all(term.weight != 0 for name in RECIPES for s in get_recipe(name).stages for term in s.losses)
-    assert LossTerm("normal_consistency", 0.0) not in get_recipe("2dgs-no-nc").stages[0].losses
-
-
 def test_an_unknown_name_suggests_a_near_one() -> None:
     with pytest.raises(RecipeError, match="2dgs-r-k10"):
         get_recipe("2dgs-r-k100")
-
-
-@pytest.mark.parametrize("base", ["2dgs", "2dgs-60k", "2dgs-r"])
-def test_views_are_compared_by_the_recipes_that_say_so_with_normal_consistency_and_without_densification(
-    base: str,
-) -> None:
-    plain, comparing = get_recipe(base), with_multiview(get_recipe(base))
-    assert plain.multiview is None
-    assert comparing.multiview == MultiView()
-    starts = {"surface": 15_000, "continue": 0, "refine": 0}
-    for before, after in zip(plain.stages, comparing.stages, strict=True):
-        expected = weights(before)
-        if before.name in starts:  # not in stage 2, which trains colours alone
-            expected |= {"multiview_photometric": (MULTIVIEW_WEIGHT, starts[before.name])}
-        assert weights(after) == expected
-        assert replace(after, losses=before.losses) == before
-    settings = MultiView(depth_downscale=2)
-    late = with_multiview(plain, 0.6, 0.02, every=2, last=0.2, multiview=settings)
-    assert late.multiview == settings
-    found = [term for term in late.stages[0].losses if term.kind == "multiview_geometric"]
-    assert found == [LossTerm("multiview_geometric", 0.02, round(0.8 * plain.stages[0].iterations), every=2)]
-    assert [name for name in RECIPES if get_recipe(name).multiview] == ["best-surface", "2dgs-multiview"]
 
 
 @pytest.mark.parametrize("base", ["2dgs", "2dgs-60k", "2dgs-r"])
@@ -196,19 +150,3 @@ def test_known_depths_are_compared_while_all_splats_move(base: str) -> None:
     assert validate(both) == with_normal_prior(both)
     starts = [t.start for s in both.stages for t in s.losses if t.kind == "normal_prior"]
     assert starts == [7_000, 0][: len(starts)]
-
-
-def test_without_normal_consistency_there_is_no_stage_to_compare_views_in() -> None:
-    with pytest.raises(RecipeError, match="multiview is set, but no loss"):
-        validate(with_multiview(get_recipe("2dgs-no-nc")))
-
-
-@pytest.mark.parametrize("base", ["2dgs", "2dgs-60k", "2dgs-r"])
-def test_with_exposures_view_dependence_comes_later(base: str) -> None:
-    plain, learning = get_recipe(base), with_exposure(get_recipe(base))
-    assert plain.exposure is None
-    assert learning.exposure == Exposure()
-    assert [stage.sh_interval for stage in learning.stages] == [3 * stage.sh_interval for stage in plain.stages]
-    intervals = [stage.sh_interval for stage in plain.stages]
-    stages = (replace(s, sh_interval=k) for s, k in zip(learning.stages, intervals, strict=True))
-    assert replace(learning, name=base, exposure=None, stages=tuple(stages)) == plain

@@ -12,10 +12,8 @@ from gs2d.config.datasets import (
     TNT_SCENES,
     get_dataset,
 )
-from gs2d.config.presets import get_recipe
-from gs2d.config.protocols import DTU, GENERIC, NERF_SYNTHETIC, PROTOCOLS, TNT, TNT_LARGE, get_protocol, protocol_for
+from gs2d.config.protocols import DTU, GENERIC, PROTOCOLS, TNT_LARGE, get_protocol, protocol_for
 from gs2d.config.recipe import LossTerm
-from gs2d.config.surface_protocols import DTU_SURFACE, TNT_SURFACE, VISIBLE_SURFACE
 from gs2d.errors import ProtocolError
 
 
@@ -39,15 +37,6 @@ def test_depth_is_median_on_dtu_and_tnt_and_mean_elsewhere() -> None:
     }
 
 
-def test_table_1_writes_its_distortion_weight_100_or_10_by_scene_type() -> None:
-    assert (TNT.distortion_weight, TNT_LARGE.distortion_weight) == (100.0, 10.0)
-
-
-def test_near_is_absolute_in_the_papers_protocols_and_relative_elsewhere() -> None:
-    assert DTU.near_for(5.0) == 0.2
-    assert GENERIC.near_for(5.0) == pytest.approx(0.05)  # 1 % of the extent
-
-
 def test_terms_take_what_they_leave_open_from_the_protocol() -> None:
     terms = (LossTerm("l1", 0.8), LossTerm("distortion", None, 3000), LossTerm("ssim", 0.2, depth="mean"))
     assert TNT_LARGE.resolve(terms) == (
@@ -55,19 +44,6 @@ def test_terms_take_what_they_leave_open_from_the_protocol() -> None:
         LossTerm("distortion", 10.0, 3000, "median"),
         LossTerm("ssim", 0.2, depth="mean"),
     )
-
-
-def test_terms_of_weight_zero_are_dropped() -> None:
-    assert GENERIC.resolve((LossTerm("l1", 1.0), LossTerm("distortion", 0.0))) == (LossTerm("l1", 1.0, depth="mean"),)
-
-
-def test_the_distortion_rows_get_the_weight_of_each_scene_type() -> None:
-    terms = get_recipe("2dgs-distortion").stages[0].losses
-    assert [t.weight for t in DTU.resolve(terms)] == [0.8, 0.2, 0.05, 1000.0]
-
-
-def test_only_nerf_synthetic_is_white() -> None:
-    assert [name for name, p in PROTOCOLS.items() if p.white] == ["nerf-synthetic"]
 
 
 def test_dtu_is_trained_with_its_background_and_measured_on_training_views() -> None:
@@ -98,10 +74,6 @@ def test_unknown_names_say_what_exists() -> None:
 
 def test_a_format_of_a_reader_from_elsewhere_has_the_generic_protocol() -> None:
     assert protocol_for("of-a-guest") is GENERIC
-
-
-def test_nerf_synthetic_masks_are_in_its_alpha_not_in_the_loss() -> None:
-    assert not NERF_SYNTHETIC.use_mask_in_training
 
 
 # data sets
@@ -142,10 +114,3 @@ def test_every_scene_names_a_protocol_that_exists() -> None:
         for scene in dataset.scenes:
             assert scene.protocol in PROTOCOLS
             assert (scene.tau is not None) == (dataset is TNT_SCENES)
-
-
-def test_the_three_stages_of_tanks_and_temples_are_in_units_of_tau() -> None:
-    assert [(s.voxel, s.threshold) for s in TNT_SURFACE.stages] == [(1.0, 80.0), (0.5, 20.0), (None, 2.0)]
-    assert (TNT_SURFACE.score_voxel, TNT_SURFACE.max_points) == (0.5, 4_000_000)
-    assert (DTU_SURFACE.density, DTU_SURFACE.max_distance, DTU_SURFACE.dilation) == (0.2, 20, 24)
-    assert (VISIBLE_SURFACE.samples, VISIBLE_SURFACE.fractions) == (200_000, (0.0025, 0.005, 0.01))

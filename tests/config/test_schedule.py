@@ -7,15 +7,10 @@ from dataclasses import replace
 
 import pytest
 
-from gs2d.config.presets import RECIPES, get_recipe, with_exposure, with_poses
+from gs2d.config.presets import RECIPES, get_recipe, with_poses
 from gs2d.config.recipe import ALL, GradDensify, LearningRates, validate
 from gs2d.config.schedule import count_densifications, fit_schedule, longer_steps, scale_schedule
 from gs2d.errors import RecipeError
-
-
-def test_factor_1_is_the_recipe_itself() -> None:
-    recipe = get_recipe("2dgs-r")
-    assert scale_schedule(recipe, 1.0) is recipe
 
 
 def test_a_tenth_scales_lengths_starts_sh_interval_and_horizon() -> None:
@@ -84,35 +79,6 @@ def test_rates_are_stretched_in_shorter_schedules_where_a_stage_says_so() -> Non
     assert longer.lr == replace(stage.lr, means_decay_steps=60_000)
 
 
-def test_the_end_over_which_rates_settle_goes_with_the_schedule() -> None:
-    recipe = get_recipe("2dgs")
-    stage = replace(recipe.stages[0], lr=LearningRates(settle_start=20_000, settle_steps=10_000, settle_factor=0.2))
-    lr = scale_schedule(replace(recipe, stages=(stage,)), 0.01).stages[0].lr
-    assert (lr.settle_start, lr.settle_steps, lr.settle_factor) == (200, 100, 0.2)
-    assert [lr.settled_at(i) for i in (1, 200, 250, 300, 400)] == pytest.approx([1, 1, 0.6, 0.2, 0.2])
-    assert scale_schedule(recipe, 0.01).stages[0].lr.settled_at(300) == 1
-
-
-def test_sizes_of_photographs_go_with_the_schedule() -> None:
-    recipe = get_recipe("2dgs")
-    stage = replace(recipe.stages[0], downscale=4, halve_at=(3_000, 9_000))
-    scaled = scale_schedule(replace(recipe, stages=(stage,)), 0.1).stages[0]
-    assert (scaled.downscale, scaled.halve_at) == (4, (300, 900))
-
-
-def test_a_longer_schedule_keeps_the_official_resets() -> None:
-    densify = scale_schedule(get_recipe("2dgs"), 2.0).stages[0].densify
-    assert densify == replace(GradDensify(), start=1000, stop=30_000)
-
-
-def test_the_random_start_shrinks_with_the_square_root() -> None:
-    assert scale_schedule(get_recipe("2dgs"), 0.25).init_points == 50_000
-    assert scale_schedule(get_recipe("2dgs"), 1e-4).init_points == 10_000
-    assert scale_schedule(get_recipe("2dgs"), 4.0).init_points == 100_000
-    few = replace(get_recipe("2dgs"), init_points=500)
-    assert scale_schedule(few, 0.1).init_points == 500
-
-
 @pytest.mark.parametrize("name", RECIPES)
 @pytest.mark.parametrize("factor", [0.1, 0.03, 0.01, 1e-4])
 def test_every_recipe_scales_to_something_valid_with_the_same_stages(name: str, factor: float) -> None:
@@ -130,28 +96,6 @@ def test_every_recipe_scales_to_something_valid_with_the_same_stages(name: str, 
 def test_a_factor_must_be_positive_and_finite(factor: float) -> None:
     with pytest.raises(RecipeError, match="--schedule-scale must be"):
         scale_schedule(get_recipe("2dgs"), factor)
-
-
-def test_views_are_compared_from_the_scaled_end_of_densification_on() -> None:
-    for factor in (1.0, 0.1, 0.05, 0.03):
-        surface = scale_schedule(get_recipe("2dgs-multiview"), factor).stages[0]
-        (start,) = (term.start for term in surface.losses if term.kind == "multiview_photometric")
-        assert surface.densify is not None
-        assert start == surface.densify.stop == round(15_000 * factor)
-
-
-def test_exposures_wait_for_colours_by_the_count_of_iterations() -> None:
-    recipe = with_exposure(get_recipe("2dgs"))
-    # start: 500 of 30,000; a tenth of the schedule waits 200, not 50; at most a sixth of its 3000, 1200 or 300.
-    facts = {factor: scale_schedule(recipe, factor).exposure for factor in (1.0, 0.5, 0.1, 0.04, 0.01)}
-    assert {f: (e.decay_steps, e.start) for f, e in facts.items() if e is not None} == {
-        1.0: (30_000, 500),
-        0.5: (15_000, 250),
-        0.1: (3_000, 200),
-        0.04: (1_200, 200),
-        0.01: (300, 50),
-    }
-    assert all(e is not None and (e.rate, e.rate_final, e.prior) == (0.05, 0.001, 0.001) for e in facts.values())
 
 
 def test_poses_take_longer_steps_where_they_have_fewer_turns() -> None:
@@ -187,10 +131,6 @@ def test_a_schedule_fits_its_total_exactly(name: str, total: int) -> None:
         assert abs(after.iterations - max(1, before.iterations * total / recipe.iterations)) <= 1
     assert fit_schedule(recipe, recipe.iterations) is recipe
     assert fit_schedule(recipe, 3000 * len(recipe.stages)).stages[0].densify != recipe.stages[0].densify
-
-
-def test_a_total_in_thousandths_is_the_same_schedule_as_the_factor() -> None:
-    assert fit_schedule(get_recipe("2dgs-r"), 6000) == scale_schedule(get_recipe("2dgs-r"), 0.1)
 
 
 @pytest.mark.parametrize("total", [2, 0, -5, 6_000_001, 100.0, True])
