@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
-from benchmarks import street, street_runs
-from benchmarks.street_runs import Process, reconstruct_command, watch_process
+from benchmarks import street_runs
+from benchmarks.street_runs import Process, watch_process
 from PIL import Image
 
 
@@ -30,15 +29,6 @@ def test_a_process_is_watched_with_its_children_and_what_it_took_before_a_file_w
     assert 0.4 <= took.cpu_seconds_before <= took.cpu_seconds - 0.35
     assert took.seconds >= 1.0
     assert took.peak_rss_bytes > 60 << 20
-
-
-# -- a capture -----------------------------------------------------------------------------------------------------
-def test_test_views_are_asked_for_only_where_reconstruct_would_hold_none_out() -> None:
-    few = reconstruct_command(Path("p"), 23, Path("r"), "draft")
-    assert few == ["reconstruct", "p", "--out", "r", "--quality", "draft", "--test-every", "8"]
-    assert "--test-every" not in reconstruct_command(Path("p"), 24, Path("r"), "draft")
-    own = reconstruct_command(Path("p"), 11, Path("r"), "draft", ["--test-every", "4"])
-    assert own.count("--test-every") == 1
 
 
 @pytest.fixture
@@ -77,45 +67,3 @@ def test_photographs_alone_are_used_and_a_finished_run_is_not_repeated(
     street_runs.run_reconstruct(source, folder, "draft", ["--exposure"])  # another command is another run
     assert len(started) == 3
     assert started[0][1:3] == ["-m", "gs2d"]
-
-
-# -- the table -----------------------------------------------------------------------------------------------------
-def row(capture: str, **changes: Any) -> dict[str, Any]:
-    test = {"views": 2, "psnr": 21.0, "ssim": 0.7, "worst_psnr": 18.0, "worst_view": "b"}
-    return {
-        "capture": capture,
-        "exit_code": 0,
-        "poses": {"placed": 11, "photographs": 12},
-        "seconds": 120.0,
-        "cpu_seconds": 90.0,
-        "cpu_seconds_before": 30.0,
-        "estimate": {"least": 60.0, "most": 240.0},
-        "training_seconds": 90.0,
-        "scores": {"test": test, "train": test | {"psnr": 25.0}, "hidden": {"share": 0.0125}},
-        "mesh": {"faces": 12345},
-        "peak_rss_bytes": 1.5e9,
-        **changes,
-    }
-
-
-def test_rows_are_written_as_they_are_there_and_a_failed_run_shows_in_the_exit_code(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    results, out = tmp_path / "results.json", tmp_path / "out"
-    for folder in ("fox_instant_ngp/images", "monstree/images"):
-        (tmp_path / "data" / folder).mkdir(parents=True)
-
-    def measured(source: Path, folder: Path, quality: str, extra: Any) -> dict[str, Any]:
-        assert (quality, list(extra)) == ("normal", ["--exposure"])
-        if folder.name == "monstree":  # the row of fox is safe by now
-            assert [r["capture"] for r in json.loads(results.read_text())["rows"]] == ["fox"]
-        return row(folder.name, exit_code=int(folder.name == "monstree"))
-
-    monkeypatch.setattr(street, "measure_run", measured)
-    words = ["--data", str(tmp_path / "data"), "--out", str(out), "--results", str(results), "--quality", "normal"]
-    words += ["--options=--exposure"]
-    assert street.main([*words, "--captures", "monstree", "fox"]) == 1
-    assert [r["capture"] for r in json.loads(results.read_text())["rows"]] == ["fox", "monstree"]
-    assert (out / "normal.md").read_text().count("\n| ") == 2
-    with pytest.raises(SystemExit, match="2"):
-        street.main([*words, "--captures", "bust"])  # its folder is not there

@@ -7,9 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from skimage.feature import SIFT, match_descriptors
 
-from gs2d.core.camera import Camera
 from gs2d.data import Scene, load_scene
 from gs2d.data.image_files import read_image
 from gs2d.data.readers.colmap import model_folder, read_images, read_points
@@ -100,45 +98,6 @@ def test_undistorted_photographs_show_each_point_where_the_pinhole_camera_sees_i
     wrong = np.mean([patch(raw, pixels[i]) @ patch(raw, projected[i]) / 49 for i in chosen])
     assert right > 0.75
     assert wrong < 0.3
-
-
-def epipolar_px(a: Camera, b: Camera, pixels_a: np.ndarray, pixels_b: np.ndarray) -> np.ndarray:
-    """Distance of pixels in b to the epipolar lines of their partners in a, px."""
-    T = b.T_cam_world @ np.linalg.inv(a.T_cam_world)
-    t = T[:3, 3]
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    F = np.linalg.inv(b.K).T @ cross @ T[:3, :3] @ np.linalg.inv(a.K)
-    lines = np.c_[pixels_a, np.ones(len(pixels_a))] @ F.T
-    return np.abs((lines * np.c_[pixels_b, np.ones(len(pixels_b))]).sum(axis=1)) / np.linalg.norm(lines[:, :2], axis=1)
-
-
-def features(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    detector = SIFT(upsampling=1, n_octaves=4)
-    detector.detect_and_extract(image.astype(np.float32).mean(axis=2) / 255)
-    # skimage returns (row, column) of pixel centres at whole numbers.
-    return detector.positions[:, ::-1] + 0.5, detector.descriptors
-
-
-def test_the_fox_s_epipolar_geometry_holds_after_undistortion(shared: Shared) -> None:
-    """Matches between photographs lie on the epipolar lines of our cameras, and clearly less so without the lens.
-
-    Measured: 0.36, 0.57, 0.58 px undistorted, 2.2, 1.2, 1.3 px as photographed.
-    """
-    scene = load_scene(shared("fox_instant_ngp"), test_every=0)
-    assert (len(scene.train), len(scene.skipped)) == (50, 17)
-    for first, second in ((20, 24), (36, 40), (12, 20)):
-        a, b = scene.train[first], scene.train[second]
-        medians = []
-        for image_a, image_b in ((a.image(), b.image()), (read_image(a.path), read_image(b.path))):
-            (pa, da), (pb, db) = features(image_a), features(image_b)
-            pairs = match_descriptors(da, db, max_ratio=0.6, cross_check=True)
-            distance = epipolar_px(a.camera, b.camera, pa[pairs[:, 0]], pb[pairs[:, 1]])
-            distance = distance[distance < 10]  # the rest are wrong matches
-            assert len(distance) > 25
-            medians.append(np.median(distance))
-        undistorted, raw = medians
-        assert undistorted < 0.8
-        assert undistorted < 0.6 * raw
 
 
 def test_the_bottle_s_depth_maps_agree_with_its_cameras(shared: Shared) -> None:

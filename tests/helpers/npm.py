@@ -10,18 +10,7 @@ from pathlib import Path
 
 import pytest
 
-VERSIONS = {
-    "gltf-validator": "2.0.0-dev.3.10",
-    "@playcanvas/splat-transform": "2.7.1",
-    "babylonjs": "9.28.0",
-    "babylonjs-loaders": "9.28.0",
-    "fflate": "0.8.2",
-    "three": "0.187.0",
-    "@sparkjsdev/spark": "2.2.0",
-    "@mkkellogg/gaussian-splats-3d": "0.4.7",
-    "playcanvas": "2.23.3",
-    "@playcanvas/supersplat-viewer": "1.36.2",
-}
+VERSIONS = {"gltf-validator": "2.0.0-dev.3.10", "@playcanvas/splat-transform": "2.7.1"}
 
 
 def package(name: str) -> Path:

@@ -27,18 +27,3 @@ def turned_by(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Degrees between rotations."""
     dot = np.abs((unit_quats(a) * unit_quats(b)).sum(axis=1))
     return np.degrees(2 * np.arccos(np.clip(dot, 0, 1)))
-
-
-def a_ball() -> Splats:
-    """Disks on a ball, in colours by place and by where they are seen from; the background is white."""
-    splats = a_scene(3000, 1, seed=4)
-    generator = torch.Generator().manual_seed(2)
-    normal = torch.nn.functional.normalize(torch.randn((3000, 3), generator=generator), dim=1)
-    splats.means[:] = normal * 0.8
-    quats = torch.stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], torch.zeros(3000)], dim=1)  # turns z to it
-    splats.quats[:] = quats
-    splats.log_scales[:] = torch.randn((3000, 2), generator=generator) * 0.2 - 3.0
-    splats.opacity_logits[:] = 3.0
-    splats.sh0[:, 0] = normal * 1.2
-    splats.shN[:] = torch.randn((3000, 3, 3), generator=generator) * 0.1
-    return splats

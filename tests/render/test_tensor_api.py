@@ -178,21 +178,6 @@ def test_channels_of_one_pass_are_those_of_three_at_a_time(backend: Backend, cha
         assert_close(ours, theirs, rtol=1e-4, atol=1e-5 * float(theirs.abs().max()), msg=name)
 
 
-@pytest.mark.parametrize("names", [("colors",), ("opacities", "viewmats")])
-def test_further_channels_learn_whatever_else_does(backend: Backend, names: tuple[str, ...]) -> None:
-    """Also where no image but that of the colours has a gradient, and nothing or only a camera learns beside them."""
-    scene = Scene(channels=6)
-    one_pass, parts = scene.learning(*names), scene.learning(*names)
-    for given, chosen in ((one_pass, backend), (parts, three_at_a_time(backend))):
-        render(given, backend=chosen).colors.square().sum().backward()
-    for name in names:
-        found, expected = one_pass[name].grad, parts[name].grad
-        assert found is not None
-        assert expected is not None
-        assert expected.any()
-        assert_close(found, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()), msg=name)
-
-
 def test_an_empty_scene_of_many_channels_is_its_background(backend: Backend) -> None:
     given = Scene(channels=9, count=12).learning()
     names = ("means", "quats", "scales", "opacities", "colors")
@@ -280,22 +265,6 @@ def test_the_ends_of_opacity_and_scale_are_drawn_and_learn(backend: Backend) -> 
     assert float(drawn.alphas.detach().max()) > 0.3  # by the low-pass filter
     assert dot.grad is not None
     assert dot.grad.isfinite().all()
-
-
-def test_what_is_not_finite_is_not_drawn_and_has_no_gradient(cpu: Backend) -> None:
-    scene = Scene()
-    for name in ("means", "quats", "scales", "opacities", "colors"):
-        given = scene.learning()
-        with torch.no_grad():
-            given[name][0] = torch.nan
-        out = render(given, backend=cpu)
-        contraction(out).backward()
-        assert all(image.isfinite().all() for image in out), name
-        for other in ("means", "scales", "opacities", "colors"):
-            gradient = given[other].grad
-            assert gradient is not None
-            assert gradient.isfinite().all(), (name, other)
-            assert not gradient[0].any()
 
 
 BAD: dict[str, tuple[dict[str, Any], str]] = {

@@ -1,4 +1,4 @@
-"""Our files in other people's programs, from npm: a validator, and a converter both ways (viewers: test_viewers.py)."""
+"""Our files in other people's programs, from npm: a validator, and a converter both ways."""
 
 from __future__ import annotations
 
