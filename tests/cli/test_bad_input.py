@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import shutil
-import struct
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
+from PIL import Image
 
+from capture_writers import small_colmap
 from cli_runs import TINY, one_line
 from gs2d.cli import run
-from tiny import ball_cameras, ball_image, write_capture
+from tiny import write_capture
 
 
 def missing(folder: Path) -> None:
@@ -23,39 +23,15 @@ def empty(folder: Path) -> None:
     folder.mkdir()
 
 
-def colmap(folder: Path, model: int = 1) -> None:
-    """A COLMAP capture of the ball: PINHOLE (1) or another camera model."""
-    cameras = ball_cameras(3)
-    (folder / "images").mkdir(parents=True)
-    (folder / "sparse" / "0").mkdir(parents=True)
-    c = cameras[0]
-    params = [c.fx, c.fy, c.cx, c.cy] + [0.0] * (12 if model == 11 else 0)
-    head = struct.pack("<QiiQQ", 1, 1, model, c.width, c.height)
-    (folder / "sparse/0/cameras.bin").write_bytes(head + struct.pack(f"<{len(params)}d", *params))
-    from PIL import Image
-    from scipy.spatial.transform import Rotation
-
-    body = struct.pack("<Q", len(cameras))
-    for i, camera in enumerate(cameras):
-        Image.fromarray(ball_image(camera)[..., :3]).save(folder / "images" / f"{i}.png")
-        x, y, z, w = Rotation.from_matrix(camera.rotation).as_quat()
-        body += struct.pack("<i7di", i + 1, w, x, y, z, *camera.T_cam_world[:3, 3], 1)
-        body += f"{i}.png".encode() + b"\0" + struct.pack("<Q", 0)
-    (folder / "sparse/0/images.bin").write_bytes(body)
-    points = struct.pack("<Q", 20)
-    for i, xyz in enumerate(np.random.default_rng(0).normal(size=(20, 3)) * 0.4):
-        points += struct.pack("<Q3d3BdQ", i + 1, *xyz, 200, 100, 50, 0.5, 0)
-    (folder / "sparse/0/points3D.bin").write_bytes(points)
-
-
 def truncated_images_bin(folder: Path) -> None:
-    colmap(folder)
+    small_colmap(folder)
     path = folder / "sparse/0/images.bin"
     path.write_bytes(path.read_bytes()[:-20])
 
 
 def unsupported_camera(folder: Path) -> None:
-    colmap(folder, model=11)  # RAD_TAN_THIN_PRISM_FISHEYE
+    params = (35.0, 36.0, 18.5, 16.25, *[0.0] * 12)
+    small_colmap(folder, cameras={7: ("RAD_TAN_THIN_PRISM_FISHEYE", 40, 30, params)})
 
 
 def wrong_json_key(folder: Path) -> None:
@@ -148,14 +124,11 @@ def test_a_plane_sweep_that_finds_nothing_is_told_in_one_line_and_leaves_no_run(
 
 
 def masked_colmap(folder: Path, black: tuple[int, ...]) -> None:
-    """The ball in COLMAP's layout with masks, of which some are black; view 0 is the test view."""
-    from PIL import Image
-
-    colmap(folder)
+    """COLMAP's layout with masks, of which some are black; view 0 is the test view."""
+    small_colmap(folder, count=3)
     (folder / "masks").mkdir()
-    for i, camera in enumerate(ball_cameras(3)):
-        value = 0 if i in black else 255
-        Image.new("L", (camera.width, camera.height), value).save(folder / "masks" / f"{i}.png")
+    for i in range(3):
+        Image.new("L", (40, 30), 0 if i in black else 255).save(folder / "masks" / f"{i}.png")
 
 
 @pytest.mark.parametrize("black", [(0, 1, 2), (1, 2)])

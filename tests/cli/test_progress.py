@@ -12,8 +12,7 @@ import pytest
 from gs2d.cli.bar import Bar
 from gs2d.cli.console import Console
 from gs2d.cli.whole import WholeRun
-from gs2d.pipeline import events
-from gs2d.pipeline.events import PLACED, TRAINED, Notice, Phase, Plan, Step
+from gs2d.pipeline.events import TRAINED, Notice, Phase, Plan, Step
 from terminal import ESCAPES, raw_screen_of
 
 DRAWN = textwrap.dedent(
@@ -103,41 +102,6 @@ def test_quiet_and_json_draw_nothing_on_stdout(capsys: pytest.CaptureFixture[str
     assert err == "training (3)\nnote n\n"
 
 
-def test_the_whole_run_is_unknown_until_training_tells_and_then_counts_what_comes_after() -> None:
-    clock = Clock()
-    whole = WholeRun(clock)
-    whole.on_plan(Plan((*PLACED, *TRAINED)))
-    assert whole.line() == ""
-    whole.on_phase(Phase("finding features", 10))
-    assert whole.line() == "part 2 of 7: features"
-    whole.on_phase(Phase("reading photographs", 10))  # of another part before: within this one
-    whole.on_step(5)
-    assert whole.line() == "part 2 of 7: features"
-    whole.on_plan(Plan(TRAINED))  # of `train` within `reconstruct`
-    clock.now = 100.0
-    whole.on_phase(Phase("training 2dgs", 1000))
-    clock.now = 102.0
-    whole.on_step(10)
-    assert whole.line() == "part 5 of 7: training"  # too early
-    clock.now = 200.0
-    whole.on_step(500)  # as long again
-    later = sum(part.of_training or 0.0 for part in TRAINED)
-    assert whole.left() == pytest.approx(100 + 200 * later)
-    whole.on_phase(Phase("scoring test views", 8))  # within training: not a step of it
-    whole.on_step(8)
-    assert whole.line().startswith("part 5 of 7: training; whole run: about ")
-    whole.on_phase(Phase("training 2dgs", 1000, done=500))  # a later stage: the same training
-    clock.now = 310.0
-    whole.on_step(1000)
-    assert whole.left() == pytest.approx(210 * later)
-    whole.on_phase(Phase("rendering depth", 40))
-    assert whole.left() == pytest.approx(210 * later)
-    clock.now = 320.0
-    assert whole.left() == pytest.approx(210 * later - 10)
-    clock.now = 1000.0  # longer than it should take
-    assert whole.line() == "part 6 of 7: mesh"
-
-
 # Seconds after which 10, 20, ... of 900 iterations were done: a draft of the fountain on a machine with other work,
 # where each fifth line or so comes 7 s late. Then scores, mesh (95 s), page and report (7 s each).
 RECORDED = """
@@ -191,9 +155,3 @@ def test_the_time_left_rises_where_the_work_grows() -> None:
     grown = [float(i) for i in range(1, 31)] + [30.0 + 20.0 * i for i in range(1, 61)]  # twenty times as slow
     lefts = [whole for _, left, whole in follow(grown) if left and whole is not None]
     assert max(lefts[40:60]) > 2 * min(lefts[20:30])
-
-
-def test_every_planned_part_is_begun_by_a_phase_of_the_pipeline() -> None:
-    source = "".join(path.read_text(encoding="utf-8") for path in Path(events.__file__).parents[1].rglob("*.py"))
-    for part in (*PLACED, *events.TEXTURED_TOO, *events.DEMO):
-        assert any(f'"{begin}' in source.replace('f"', '"') for begin in part.begins), part
