@@ -19,8 +19,7 @@ from gs2d.training.densify.gradient import (
     no_statistics,
 )
 from gs2d.training.state import Moments, TrainState
-from slow_densify import densify_step_by_step
-from train_toys import full_state, random_splats
+from train_toys import random_splats
 
 
 def statistics_of(signed: torch.Tensor, absolute: torch.Tensor, count: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -206,47 +205,3 @@ def test_screen_size_never_prunes() -> None:
     state = state_of([(0.09, 0.09)], [0.5], [0.0], [1.0])
     assert run(state, iteration=14_900) == DensifyCounts(0, 0, 0, 0)
     assert isinstance(state.splats, Splats)
-
-
-def crowd(n: int, seed: int) -> TrainState:
-    """Splats of every fate: small and large, faint and bright, with and without a reason to grow."""
-    state = full_state(n, seed)
-    g = torch.Generator().manual_seed(seed + 1)
-    state.splats.log_scales = torch.empty(n, 2).uniform_(math.log(0.002), math.log(0.2), generator=g)
-    state.splats.opacity_logits = torch.randn(n, generator=g) - 2.0
-    signed, absolute = (5e-4 * torch.rand(n, generator=g) for _ in range(2))
-    state.statistics = statistics_of(signed, absolute, torch.randint(0, 3, (n,), generator=g).float())
-    return state
-
-
-def bytes_of(state: TrainState) -> dict[str, bytes]:
-    """Everything with rows, and the generator."""
-    tensors = dict(state.splats.items()) | state.groups | {"generator": state.generator.get_state()}
-    for name, moments in state.moments.items():
-        tensors |= {f"mean of {name}": moments.mean, f"square of {name}": moments.square}
-    assert state.statistics is not None
-    return {name: tensor.numpy().tobytes() for name, tensor in (tensors | state.statistics).items()}
-
-
-@pytest.mark.parametrize("n", [7, 1000, 40_000])
-@pytest.mark.parametrize(
-    "densify",
-    [
-        GradDensify(),
-        GradDensify(absolute=True, abs_threshold=3e-4, split_count=3),
-        GradDensify(max_splats=1100),
-        GradDensify(max_splats=30_000, split_count=3),
-        GradDensify(grad_threshold=1.0, opacity_cull=0.0),  # nothing happens before the first reset
-    ],
-    ids=["plain", "absolute", "limited", "a-budget", "idle"],
-)
-@pytest.mark.parametrize("iteration", [600, 3050])
-def test_one_pass_leaves_the_bytes_that_one_step_after_another_does(
-    n: int, densify: GradDensify, iteration: int
-) -> None:
-    fast = crowd(n, seed=n)
-    slow = TrainState.from_state_dict(fast.state_dict())
-    assert run(fast, densify, iteration) == densify_step_by_step(
-        slow, densify, iteration=iteration, extent=1.0, white=False
-    )
-    assert bytes_of(fast) == bytes_of(slow)
