@@ -41,9 +41,11 @@ def images_of(run: Path, view: int, stage: str | None, kinds: Sequence[str]) -> 
 
 
 def strip(run: Path, view: int, stage: str | None, size: int) -> list[np.ndarray]:
-    """The pictures of one view of a run, uint8 [size, size, 3] each."""
+    """Return the images of one view of a run, ``size`` px high: uint8 [size, W, 3] each."""
     images = images_of(run, view, stage, ("color", "normal", "depth"))
-    return [np.asarray(Image.fromarray(p).resize((size, size), Image.Resampling.LANCZOS)) for p in images]
+    shapes = [(round(size * image.shape[1] / image.shape[0]), size) for image in images]
+    pairs = zip(images, shapes, strict=True)
+    return [np.asarray(Image.fromarray(image).resize(shape, Image.Resampling.LANCZOS)) for image, shape in pairs]
 
 
 def main() -> None:
