@@ -57,7 +57,7 @@ def edges_camera() -> Recipe:
     """2dgs-60k in the official code's reading of normals beside empty pixels."""
 
     def changed(term: LossTerm) -> LossTerm:
-        return replace(term, edges="camera") if term.kind == "normal_consistency" else term
+        return replace(term, options={"edges": "camera"}) if term.kind == "normal_consistency" else term
 
     recipe = get_recipe("2dgs-60k")
     stages = (replace(stage, losses=tuple(map(changed, stage.losses))) for stage in recipe.stages)

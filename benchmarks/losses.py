@@ -100,7 +100,7 @@ def torch_ssim_value(frame: Frame) -> None:
 
 def normal_step(frame: Frame) -> None:
     """Normal consistency, native, forward and backward."""
-    value = ops.normal_consistency(frame.normal, frame.depth, frame.alpha, frame.camera)
+    value = ops.normal_consistency(frame.normal, frame.depth, frame.alpha, ops.NormalOptions(frame.camera))
     torch.autograd.grad(0.05 * value, (frame.normal, frame.depth))
 
 

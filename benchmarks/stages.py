@@ -139,7 +139,7 @@ def loss_step(output: RenderOutput, workload: Workload) -> Callable[[], float]:
     def step() -> float:
         start = time.perf_counter()
         l1, ssim, _ = ops.photometric(leaves["color"], target, None, mean)
-        normal = ops.normal_consistency(leaves["normal"], leaves["depth_mean"], alpha, camera)
+        normal = ops.normal_consistency(leaves["normal"], leaves["depth_mean"], alpha, ops.NormalOptions(camera))
         total = 0.8 * l1 - 0.2 * ssim + 0.05 * normal + 100.0 * ops.masked_mean(leaves["distortion"], None)
         torch.autograd.grad(total, list(leaves.values()))
         return 1e3 * (time.perf_counter() - start)

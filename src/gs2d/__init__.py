@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from gs2d.errors import Gs2dError
     from gs2d.io.formats.registry import read_splats, register_format, write_splats
     from gs2d.io.meshes import write_mesh
-    from gs2d.losses.api import compute_losses
+    from gs2d.losses.api import Loss, LossView, compute_losses
     from gs2d.losses.reference import normals_from_depth
     from gs2d.pipeline.in_memory import Trained, evaluate, extract_mesh, train
     from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
@@ -40,7 +40,9 @@ __version__ = "0.2.0"  # the one place: pyproject.toml reads it from here
 __all__ = [
     "Camera",
     "Gs2dError",
+    "Loss",
     "LossTerm",
+    "LossView",
     "Mesh",
     "MeshOptions",
     "Protocol",
@@ -84,7 +86,9 @@ __all__ = [
 _HOME = {
     "Camera": "gs2d.core.camera",
     "Gs2dError": "gs2d.errors",
+    "Loss": "gs2d.losses.api",
     "LossTerm": "gs2d.config.recipe",
+    "LossView": "gs2d.losses.api",
     "Mesh": "gs2d.core.mesh",
     "MeshOptions": "gs2d.pipeline.prepare.options",
     "Protocol": "gs2d.config.protocols",

@@ -80,9 +80,11 @@ def test_overrides_reach_every_level() -> None:
 def test_every_field_of_a_loss_is_written_and_can_be_set() -> None:
     plain = to_json(get_recipe("2dgs"))["stages"][0]["losses"][2]
     assert plain.keys() == {entry.name for entry in fields(LossTerm)}
-    said = {"edges": "camera", "where": "object", "edge_power": 2.0, "every": 2}
-    overrides = [f"surface.losses.normal_consistency.{name}={value}" for name, value in said.items()]
-    assert to_json(apply_overrides(get_recipe("2dgs"), overrides))["stages"][0]["losses"][2] == plain | said
+    said = {"edges": "camera", "edge_power": 2.0}
+    overrides = [f"surface.losses.normal_consistency.options.{name}={value}" for name, value in said.items()]
+    overrides += ["surface.losses.normal_consistency.every=2"]
+    found = to_json(apply_overrides(get_recipe("2dgs"), overrides))["stages"][0]["losses"][2]
+    assert found == plain | {"options": said, "every": 2}
 
 
 def test_overrides_that_are_not_named_stay_as_they_were() -> None:

@@ -19,6 +19,7 @@ from gs2d.core.splats import Splats
 from gs2d.kernels.cuda import losses as ops
 from gs2d.kernels.cuda.adam import AdamUpdate, adam_step
 from gs2d.kernels.cuda.multiview import compare_views
+from gs2d.kernels.losses import NormalOptions
 from gs2d.render import cuda
 from gs2d.render.cuda_step import Stepper
 from gs2d.render.pair_budget import PairBudget, Rendering
@@ -89,14 +90,10 @@ def losses(emulator: Emulator, case: Case) -> dict[str, Tensor]:
                 x,
                 depth,
                 alpha,
-                camera,
-                m,
-                per_splat=form,
-                edges=edges,
-                weights=y[..., 0].contiguous(),
+                NormalOptions(camera, m, y[..., 0].contiguous(), at_camera=form, per_splat=form),
                 launcher=emulator,
             )
-            for form, edges in ((False, "undefined"), (True, "camera"))
+            for form in (False, True)
         )
         total = sum(known) + sum(values) + normals + ops.masked_mean(depth, m, launcher=emulator)
         total.backward()

@@ -11,6 +11,7 @@ from gs2d.core.camera import Camera, look_at
 from gs2d.errors import BackendError
 from gs2d.kernels import losses as ops
 from gs2d.kernels.library import Library, available_variants, load
+from gs2d.kernels.losses import NormalOptions
 from gs2d.losses import reference
 
 SIZES = [(1, 1), (2, 9), (5, 3), (11, 16), (37, 53), (70, 21)]
@@ -102,8 +103,8 @@ def test_normal_consistency_and_its_gradients_are_those_of_the_reference(
     weights = torch.rand(size, generator=torch.Generator().manual_seed(1)) if weighted else None
     found_in = [image.float().requires_grad_() for image in images]
     exact_in = [image.detach().double().requires_grad_() for image in found_in]
-    form = {"per_splat": per_splat, "edges": edges, "weights": weights}
-    value = ops.normal_consistency(*found_in, camera, valid, **form, library=library)
+    how = NormalOptions(camera, valid, weights, edges == "camera", per_splat)
+    value = ops.normal_consistency(*found_in, how, library=library)
     function = reference.normal_consistency_per_splat if per_splat else reference.normal_consistency
     exact = function(*exact_in, camera, valid, edges=edges, weights=weights)
     assert value.item() == pytest.approx(exact.item(), abs=1e-6)
@@ -146,10 +147,12 @@ def test_the_native_formulas_pass_a_float64_gradient_check(double: Library, mask
     camera = make_camera(*size)
     inputs = (normal.requires_grad_(), torch.where(depth > 0, depth, 2.5).requires_grad_(), alpha.requires_grad_())
     assert torch.autograd.gradcheck(
-        lambda *x: ops.normal_consistency(*x, camera, valid, per_splat=True, library=double), inputs
+        lambda *x: ops.normal_consistency(*x, NormalOptions(camera, valid, per_splat=True), library=double), inputs
     )
+    how = NormalOptions(camera, valid)
     assert torch.autograd.gradcheck(  # alpha is detached in this form
-        lambda n, d: ops.normal_consistency(n, d, alpha.detach(), camera, valid, library=double), inputs[:2]
+        lambda n, d: ops.normal_consistency(n, d, alpha.detach(), how, library=double),
+        inputs[:2],
     )
     assert torch.autograd.gradcheck(lambda x: ops.masked_mean(x, valid, library=double), (inputs[2],))
     weights, empty = geometry(*size, seed=5)[2], geometry(*size, seed=6, empty=0.3)[1] == 0
@@ -158,10 +161,7 @@ def test_the_native_formulas_pass_a_float64_gradient_check(double: Library, mask
             n,
             torch.where(empty, 0.0, d),
             alpha.detach(),
-            camera,
-            valid,
-            edges="camera",
-            weights=weights,
+            NormalOptions(camera, valid, weights, at_camera=True),
             library=double,
         ),
         inputs[:2],
@@ -174,13 +174,13 @@ def everything(library: Library, height: int = 150, width: int = 41) -> list[Ten
     normal, depth, alpha, _ = geometry(height, width, seed=7)
     leaves = [image.float().requires_grad_() for image in (rendered, normal, depth, alpha)]
     x, n, z, a = leaves
-    y = target.float()
+    y, camera = target.float(), make_camera(height, width)
     values = [
         *ops.photometric(x, y, mask, library=library),
         *ops.photometric(x, y, library=library),
-        ops.normal_consistency(n, z, a, make_camera(height, width), mask, library=library),
-        ops.normal_consistency(n, z, a, make_camera(height, width), per_splat=True, library=library),
-        ops.normal_consistency(n, z, a, make_camera(height, width), edges="camera", weights=y[..., 0], library=library),
+        ops.normal_consistency(n, z, a, NormalOptions(camera, mask), library=library),
+        ops.normal_consistency(n, z, a, NormalOptions(camera, per_splat=True), library=library),
+        ops.normal_consistency(n, z, a, NormalOptions(camera, weights=y[..., 0], at_camera=True), library=library),
         ops.masked_mean(a, mask, library=library),
     ]
     return [*values, *torch.autograd.grad(sum(values), leaves), ops.blur(y, library=library)]
@@ -229,10 +229,10 @@ def test_nan_at_a_valid_pixel_reaches_the_loss(library: Library) -> None:
         images = [image.float() for image in geometry(20, 20)[:3]]
         images[1][images[1] == 0] = 2.5
         images[bad][7, 8] = float("nan")
-        assert ops.normal_consistency(*images, camera, library=library).isnan()
+        assert ops.normal_consistency(*images, NormalOptions(camera), library=library).isnan()
         assert reference.normal_consistency(*images, camera).isnan()
         images[1][7, 7] = 0  # beside it
-        assert ops.normal_consistency(*images, camera, edges="camera", library=library).isnan()
+        assert ops.normal_consistency(*images, NormalOptions(camera, at_camera=True), library=library).isnan()
         assert reference.normal_consistency(*images, camera, edges="camera").isnan()
 
 

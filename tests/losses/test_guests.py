@@ -20,7 +20,8 @@ from gs2d.data.scene import Scene, View
 from gs2d.errors import RecipeError
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.library import available_variants
-from gs2d.losses.api import LossView, compute_losses
+from gs2d.kernels.losses import LossOperations
+from gs2d.losses.api import Loss, Losses, LossView, compute_losses
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RenderOutput
 from gs2d.training import events
@@ -40,7 +41,7 @@ def blackness(output: RenderOutput, view: LossView, power: float = 1.0) -> Tenso
     return output.color.clamp_min(1e-6).pow(power).mean()
 
 
-class Mean:
+class Mean(Loss):
     """The mean colour of each photograph, found once."""
 
     def __init__(self, only: int) -> None:
@@ -56,7 +57,7 @@ class Mean:
 
 def losses_of(terms: list[LossTerm]) -> dict[str, Tensor]:
     output, camera, target = make_output(5, 6), make_camera(6, 5), torch.rand(5, 6, 3, dtype=torch.float64)
-    return compute_losses(output, target, None, camera, terms, iteration=1, depth_kind="mean", backend="reference")
+    return compute_losses(output, LossView(target, camera), terms, backend="reference")
 
 
 def test_a_function_is_a_loss_with_its_options_and_weight() -> None:
@@ -85,7 +86,7 @@ def test_a_class_is_prepared_for_the_scene_and_may_leave_a_view_out() -> None:
 
 @pytest.mark.parametrize("kind", ["depth_prior", "normal_prior"])
 def test_losses_on_known_maps_are_classes_too_and_ask_for_their_data(kind: str) -> None:
-    with pytest.raises(RecipeError, match=f"loss '{kind}' has data of its own; pass what prepared"):
+    with pytest.raises(RecipeError, match=f"loss '{kind}' must be prepared for a scene"):
         losses_of([LossTerm(kind, 0.1)])
 
 
@@ -95,7 +96,7 @@ def test_options_that_a_loss_does_not_take_stop_before_training() -> None:
     stage = replace(recipe.stages[0], losses=(*recipe.stages[0].losses, LossTerm("mean", 1.0)))
     with pytest.raises(RecipeError, match="loss 'mean' does not take the options {}: .*only"):
         train_toys.train(train_toys.make_scene(), replace(recipe, stages=(stage,)))
-    with pytest.raises(RecipeError, match="loss 'mean' has data of its own"):
+    with pytest.raises(RecipeError, match="loss 'mean' must be prepared for a scene"):
         losses_of([LossTerm("mean", 1.0, options={"only": 1})])
 
 
@@ -151,7 +152,7 @@ def test_a_loss_gets_the_neighbour_that_it_needs() -> None:
 
 def test_a_loss_of_two_views_needs_a_recipe_that_compares_views() -> None:
     recipe, _ = with_guest(train_toys.short(), needs=["neighbour"])
-    with pytest.raises(RecipeError, match="loss 'kept' needs a second view, but the recipe's multiview is null; set"):
+    with pytest.raises(RecipeError, match="multiview is null, but loss 'kept' needs it; set"):
         train_toys.train(train_toys.make_scene(), recipe)
 
 
@@ -159,3 +160,34 @@ def test_a_loss_of_two_views_needs_a_recipe_that_compares_views() -> None:
 def test_an_unknown_need_is_refused(needs: Sequence[str]) -> None:
     with pytest.raises(RecipeError, match="needs of loss 'kept' must be a list of silhouette, distortion"):
         register_loss("kept", needs=needs)
+
+
+def test_a_class_must_be_a_loss() -> None:
+    register_loss("bare")(type("Bare", (), {}))
+    with pytest.raises(RecipeError, match="loss 'bare' must be a function or a subclass of gs2d.losses.api.Loss"):
+        losses_of([LossTerm("bare", 1.0)])
+
+
+class Fused(Loss):
+    """The mean colour, with forms for a backend with fused operations and for an iteration in one piece."""
+
+    only_color = True
+
+    def __call__(self, output: RenderOutput, view: LossView) -> Tensor:
+        return output.color.mean()
+
+    def fused(self, output: RenderOutput, view: LossView, operations: LossOperations) -> Tensor:
+        return operations.masked_mean(output.color.mean(dim=2), view.mask)
+
+    def in_step(self, term: LossTerm, *, opaque: bool) -> dict[str, float]:
+        return {"l1": 1.0}
+
+
+def test_a_guest_has_a_fused_form_and_may_train_from_cached_views(native: None) -> None:
+    register_loss("own")(Fused)
+    term = LossTerm("own", 1.0)
+    view, output = LossView(torch.rand(5, 6, 3), make_camera(6, 5)), make_output(5, 6, dtype=torch.float32)
+    found, plain = (compute_losses(output, view, [term], backend=name)["own"] for name in ("cpu", "reference"))
+    assert found.item() == pytest.approx(plain.item(), rel=1e-6)
+    assert type(found.grad_fn.next_functions[0][0]).__name__ != "MeanBackward0"
+    assert Losses([term])[term].only_color

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -10,21 +9,21 @@ import pytest
 import torch
 from torch import Tensor
 
-from gs2d.config.losses import LOSS_KINDS
-from gs2d.config.multiview import MULTIVIEW_KINDS, MultiView
-from gs2d.config.priors import PRIOR_KINDS
-from gs2d.config.recipe import LossTerm
+from gs2d.config.losses import LOSSES
+from gs2d.config.multiview import MultiView
+from gs2d.config.priors import DepthPrior, NormalPrior
+from gs2d.config.recipe import LossTerm, Recipe, Stage
 from gs2d.core.camera import Camera
 from gs2d.errors import BackendError, RecipeError, ShapeError
 from gs2d.losses import reference
-from gs2d.losses.api import FUSED, LossFunction, compute_losses, loss_of, target_maps
+from gs2d.losses.api import Losses, LossView, compute_losses, losses_of, target_maps
 from gs2d.losses.multiview import Neighbour, prepare_image
 from gs2d.losses.priors import MetricDepth, NormalTarget, Prior
 from gs2d.render.types import RenderOutput
-from gs2d.training.prior_losses import DepthPriorLoss, NormalPriorLoss
 from loss_images import make_camera, make_output
 
-KINDS = (*LOSS_KINDS, *PRIOR_KINDS)
+KINDS = LOSSES.builtin
+PRIORS = ("depth_prior", "normal_prior")
 OFFICIAL = (
     LossTerm("l1", 0.8),
     LossTerm("ssim", 0.2),
@@ -44,21 +43,12 @@ def one_loss(
     backend: str = "reference",
 ) -> Tensor:
     """A loss of weight 1; silhouette: the first channel of the target; second view: the target, a step aside."""
-    losses = compute_losses(
-        output,
-        target,
-        mask,
-        camera,
-        [LossTerm(kind, 1.0)],
-        iteration=1,
-        depth_kind=depth,
-        backend=backend,
-        silhouette=target[..., 0],
-        neighbour=one_neighbour(target, mask, camera),
-        index=0,
-        functions=prior_losses(target),
-    )
-    return losses[kind]
+    terms, neighbour = [LossTerm(kind, 1.0)], one_neighbour(target, mask, camera)
+    view = LossView(target, camera, mask, index=0, depth_kind=depth, silhouette=target[..., 0], neighbour=neighbour)
+    losses = Losses(terms)
+    if kind in PRIORS:
+        losses[terms[0]]._priors = OnePrior(target)  # type: ignore[attr-defined]
+    return compute_losses(output, view, terms, backend=backend, losses=losses)[kind]
 
 
 class OnePrior:
@@ -70,14 +60,6 @@ class OnePrior:
 
     def of(self, *_: object) -> Prior:
         return self._prior
-
-
-def prior_losses(target: Tensor) -> dict[tuple[str, str], LossFunction]:
-    """The losses with data of their own, as training has prepared them."""
-    made = {"depth_prior": DepthPriorLoss(), "normal_prior": NormalPriorLoss()}
-    for loss in made.values():
-        loss._priors = OnePrior(target)  # type: ignore[assignment]
-    return {loss_of(LossTerm(kind, 1.0)): loss for kind, loss in made.items()}
 
 
 def one_neighbour(target: Tensor, mask: Tensor | None, camera: Camera) -> Neighbour:
@@ -142,7 +124,7 @@ def test_a_view_without_valid_pixels_has_loss_zero_except_for_the_constant_of_ss
 
 
 @pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in MULTIVIEW_KINDS])  # test_multiview.py
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if "multiview" not in kind])  # test_multiview.py
 def test_every_reference_loss_passes_a_float64_gradient_check(kind: str, masked: bool) -> None:
     height, width = 6, 7
     output, camera = make_output(height, width, seed=1), make_camera(width, height)
@@ -150,7 +132,7 @@ def test_every_reference_loss_passes_a_float64_gradient_check(kind: str, masked:
     target = torch.rand(height, width, 3, generator=g, dtype=torch.float64)
     mask = torch.rand(height, width, generator=g) < 0.85 if masked else None
     images = {name: image for name, image in vars(output).items() if name not in ("radii", "normal_without_pose_grad")}
-    if kind in ("normal_consistency", *PRIOR_KINDS):  # alpha is detached there, which finite differences cannot know
+    if kind in ("normal_consistency", *PRIORS):  # alpha is detached there, which finite differences cannot know
         images["alpha"] = images["alpha"].detach()
 
     def loss(*values: Tensor) -> Tensor:
@@ -170,9 +152,7 @@ def test_the_official_total_is_the_sum_of_the_weighted_terms_that_have_started(
     target = torch.rand(12, 15, 3)
 
     def losses(iteration: int) -> dict[str, float]:
-        values = compute_losses(
-            output, target, None, camera, OFFICIAL, iteration=iteration, depth_kind="mean", backend=backend
-        )
+        values = compute_losses(output, LossView(target, camera, iteration=iteration), OFFICIAL, backend=backend)
         return {kind: value.item() for kind, value in values.items()}
 
     assert list(losses(3000)) == ["l1", "ssim"]  # "active when iteration > start"
@@ -189,8 +169,8 @@ def test_a_term_that_names_its_depth_overrides_the_protocol() -> None:
     output, camera, target = make_output(8, 9), make_camera(9, 8), torch.zeros(8, 9, 3, dtype=torch.float64)
 
     def value(term: LossTerm, depth_kind: str) -> float:
-        args = (output, target, None, camera, [term])
-        losses = compute_losses(*args, iteration=1, depth_kind=depth_kind, backend="reference")
+        view = LossView(target, camera, depth_kind=depth_kind)
+        losses = compute_losses(output, view, [term], backend="reference")
         return losses["normal_consistency"].item()
 
     plain = LossTerm("normal_consistency", 1.0)
@@ -211,8 +191,8 @@ def test_a_term_says_how_normals_are_taken_beside_empty_pixels(
     output = replace(output, depth_mean=depth)
     function = getattr(reference, kind)
     for edges in ("undefined", "camera"):
-        term = LossTerm(kind, 1.0, edges=edges)
-        found = compute_losses(output, target, None, camera, [term], iteration=1, depth_kind="mean", backend=backend)
+        term = LossTerm(kind, 1.0, options={"edges": edges})
+        found = compute_losses(output, LossView(target, camera), [term], backend=backend)
         expected = function(output.normal, depth, output.alpha, camera, edges=edges)
         assert found[kind].item() == pytest.approx(expected.item(), rel=1e-5)
     assert function(output.normal, depth, output.alpha, camera).item() != pytest.approx(expected.item(), rel=1e-3)
@@ -229,9 +209,9 @@ def test_a_term_of_the_object_alone_pays_for_no_cover_of_the_empty_background(
     alpha[2:6, 3:7] = 1
     gradients = {}
     for where in ("image", "object"):
-        terms = [LossTerm("normal_consistency", 1.0, where=where)]
-        choices: dict[str, Any] = {"iteration": 1, "depth_kind": "mean", "backend": backend, "silhouette": alpha}
-        value = compute_losses(output, target, None, camera, terms, **choices)["normal_consistency"]
+        terms = [LossTerm("normal_consistency", 1.0, options={"where": where})]
+        view = LossView(target, camera, silhouette=alpha)
+        value = compute_losses(output, view, terms, backend=backend)["normal_consistency"]
         (gradients[where],) = torch.autograd.grad(value, output.normal)
     empty = alpha[1:-1, 1:-1] == 0  # of those with a normal
     inner = {where: gradient[1:-1, 1:-1] for where, gradient in gradients.items()}
@@ -248,9 +228,9 @@ def test_a_term_counts_less_at_edges_of_the_photograph_and_can_be_asked_of_the_o
         request.getfixturevalue("native")
     output, camera, target = make_output(8, 9, dtype=torch.float32), make_camera(9, 8), torch.rand(8, 9, 3)
     alpha = torch.rand(8, 9)
-    term = LossTerm("normal_consistency", 1.0, where="object", edge_power=2.0)
-    choices: dict[str, Any] = {"iteration": 1, "depth_kind": "mean", "backend": backend, "silhouette": alpha}
-    found = compute_losses(output, target, None, camera, [term], **choices)["normal_consistency"]
+    term = LossTerm("normal_consistency", 1.0, options={"where": "object", "edge_power": 2.0})
+    view = LossView(target, camera, silhouette=alpha)
+    found = compute_losses(output, view, [term], backend=backend)["normal_consistency"]
     weights = reference.edge_weights(target, 2.0) * (alpha > 0.5)
     expected = reference.normal_consistency(output.normal, output.depth_mean, output.alpha, camera, weights=weights)
     assert found.item() == pytest.approx(expected.item(), rel=1e-5)
@@ -258,11 +238,8 @@ def test_a_term_counts_less_at_edges_of_the_photograph_and_can_be_asked_of_the_o
 
 def test_terms_of_one_kind_add_up() -> None:
     output, camera, target = make_output(8, 9), make_camera(9, 8), torch.zeros(8, 9, 3, dtype=torch.float64)
-    args = (output, target, None, camera)
-    one, two = (
-        compute_losses(*args, [LossTerm("l1", 0.5)] * n, iteration=1, depth_kind="mean", backend="reference")
-        for n in (1, 2)
-    )
+    view = LossView(target, camera)
+    one, two = (compute_losses(output, view, [LossTerm("l1", 0.5)] * n, backend="reference") for n in (1, 2))
     assert two["l1"].item() == pytest.approx(2 * one["l1"].item())
 
 
@@ -277,19 +254,12 @@ def test_terms_of_one_kind_add_up() -> None:
     ],
 )
 def test_a_wrong_argument_is_refused_in_one_line(change: dict[str, object], error: type[Exception], words: str) -> None:
-    arguments: dict[str, object] = {
-        "output": make_output(8, 9),
-        "target": torch.zeros(8, 9, 3, dtype=torch.float64),
-        "mask": None,
-        "camera": make_camera(9, 8),
-        "terms": [LossTerm("l1", 1.0)],
-        "iteration": 1,
-        "depth_kind": "mean",
-        "backend": "reference",
-    }
-    call: Callable[..., object] = compute_losses
+    view: dict[str, Any] = {"target": torch.zeros(8, 9, 3, dtype=torch.float64), "camera": make_camera(9, 8)}
+    choices: dict[str, Any] = {"terms": [LossTerm("l1", 1.0)], "backend": "reference"}
+    for name, value in change.items():
+        (choices if name in choices else view)[name] = value
     with pytest.raises(error, match=words) as caught:
-        call(**(arguments | change))
+        compute_losses(make_output(8, 9), LossView(**view), **choices)
     assert "\n" not in str(caught.value)
 
 
@@ -298,18 +268,8 @@ def test_a_cache_of_another_target_is_refused(native: None) -> None:
     target, other = torch.rand(8, 9, 3), torch.rand(8, 9, 3)
 
     def ssim(of: Tensor | None) -> float:
-        terms = [LossTerm("ssim", 1.0)]
-        losses = compute_losses(
-            output,
-            target,
-            None,
-            camera,
-            terms,
-            iteration=1,
-            depth_kind="mean",
-            backend="cpu",
-            target_cache=maps[of],
-        )
+        view = LossView(target, camera, maps=maps[of])
+        losses = compute_losses(output, view, [LossTerm("ssim", 1.0)], backend="cpu")
         return losses["ssim"].item()
 
     maps = {target: target_maps(target), other: target_maps(other), None: None}
@@ -321,17 +281,59 @@ def test_a_cache_of_another_target_is_refused(native: None) -> None:
         ssim(target)
 
 
-def test_the_fused_kinds_are_some_of_gs2ds_own() -> None:
-    assert set(FUSED) < set(LOSS_KINDS)
-
-
 def test_a_silhouette_term_without_an_alpha_channel_says_so_or_is_left_out_where_none_is_required() -> None:
     output, camera, alpha = make_output(5, 6), make_camera(6, 5), torch.rand(5, 6)
-    given = (output, torch.rand(5, 6, 3), None, camera)
-    choices: dict[str, Any] = {"iteration": 1, "depth_kind": "mean", "backend": "reference"}
+    view = LossView(torch.rand(5, 6, 3), camera)
     with pytest.raises(RecipeError, match="alpha channel, got one without"):
-        compute_losses(*given, [LossTerm("silhouette", 0.1)], **choices)
-    terms = [LossTerm("l1", 1.0), LossTerm("silhouette", 0.1, required=False)]
-    assert set(compute_losses(*given, terms, **choices)) == {"l1"}
-    found = compute_losses(*given, terms, **choices, silhouette=alpha)
+        compute_losses(output, view, [LossTerm("silhouette", 0.1)], backend="reference")
+    terms = [LossTerm("l1", 1.0), LossTerm("silhouette", 0.1, options={"required": False})]
+    assert set(compute_losses(output, view, terms, backend="reference")) == {"l1"}
+    found = compute_losses(output, replace(view, silhouette=alpha), terms, backend="reference")
     torch.testing.assert_close(found["silhouette"], 0.1 * (output.alpha - alpha).abs().mean())
+
+
+def trained_with(*terms: LossTerm, **settings: Any) -> Recipe:
+    return Recipe("r", (Stage("s", 1, losses=(LossTerm("l1", 1.0), *terms)),), **settings)
+
+
+@pytest.mark.parametrize(
+    ("term", "words"),
+    [
+        (
+            LossTerm("ssim", 1.0, options={"where": "object"}),
+            "loss 'ssim' does not take the options {'where': 'object'",
+        ),
+        (
+            LossTerm("normal_consistency", 1.0, options={"edges": "centre"}),
+            "loss 'normal_consistency': edges must be one of undefined, camera; got 'centre'",
+        ),
+        (
+            LossTerm("normal_consistency_per_splat", 1.0, options={"where": "alpha"}),
+            "loss 'normal_consistency_per_splat': where must be one of image, object; got 'alpha'",
+        ),
+        (LossTerm("normal_consistency", 1.0, options={"edge_power": -1.0}), "edge_power must be a finite number >= 0"),
+        (LossTerm("silhouette", 1.0, options={"required": "no"}), "required must be true or false, got 'no'"),
+    ],
+)
+def test_each_loss_checks_its_options(term: LossTerm, words: str) -> None:
+    with pytest.raises(RecipeError) as caught:
+        losses_of(trained_with(term))
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["depth_prior", "normal_prior", "multiview_geometric"])
+def test_a_loss_and_the_settings_that_it_needs_come_together(kind: str) -> None:
+    name = "multiview" if "multiview" in kind else kind
+    settings = {"multiview": MultiView(), "depth_prior": DepthPrior(), "normal_prior": NormalPrior()}
+    with pytest.raises(RecipeError, match=f"{name} is null, but loss '{kind}' needs it"):
+        losses_of(trained_with(LossTerm(kind, 0.1)))
+    with pytest.raises(RecipeError, match=f"{name} is set, but no loss uses it"):
+        losses_of(trained_with(**{name: settings[name]}))
+    assert losses_of(trained_with(LossTerm(kind, 0.1), **{name: settings[name]}))
+
+
+def test_losses_between_views_are_of_one_depth() -> None:
+    pair = (LossTerm("multiview_photometric", 1.0, depth="median"), LossTerm("multiview_geometric", 1.0))
+    with pytest.raises(RecipeError, match="so of one depth; got median and the protocol's"):
+        losses_of(trained_with(*pair, multiview=MultiView()))

@@ -30,7 +30,7 @@ def outside(output, view):
 
 
 @gs2d.register_loss("example-brightness")
-class Brightness:
+class Brightness(gs2d.Loss):
     """Compare the mean brightness with that of the photograph, computed once before training."""
 
     title = "Brightness of the photographs"

@@ -21,7 +21,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import perturb_pose
 from gs2d.errors import ShapeError
-from gs2d.losses.api import compute_losses
+from gs2d.losses.api import LossView, compute_losses
 from gs2d.losses.reference import normal_consistency, normal_consistency_per_splat
 from gs2d.render import pose_gradient as camera_gradient
 from gs2d.render import reference
@@ -239,8 +239,8 @@ def test_20_normal_consistency_knows_that_both_normals_turn_with_the_camera(kind
         lens, pose = learning(camera)
         output = change(rasterize(splats, lens, backend="reference"))
         target = torch.zeros_like(output.color)
-        options: dict[str, Any] = {"iteration": 1, "depth_kind": "mean", "backend": "reference"}
-        compute_losses(output, target, mask, lens, (LossTerm(kind, 1.0),), **options)[kind].backward()
+        view = LossView(target, lens, mask)
+        compute_losses(output, view, (LossTerm(kind, 1.0),), backend="reference")[kind].backward()
         return along_motions(pose.grad, camera)
 
     assert_close(found(), along_motions(expected.grad, camera), rtol=1e-9, atol=1e-12)

@@ -90,7 +90,7 @@ def test_what_a_term_needs_is_not_made_in_an_iteration_without_it(
 
 
 def test_a_resumed_training_gives_the_same_bytes_whatever_the_terms_say(scene: Scene, backend: str) -> None:
-    said = {"every": 2, "where": "object", "edge_power": 2.0, "edges": "camera"}
+    said = {"every": 2, "options": {"where": "object", "edge_power": 2.0, "edges": "camera"}}
     recipe, made = with_terms(short(), normal_consistency=said), cut_out(scene)
     end = Trainer(made, recipe, GENERIC, backend=backend).run()
     assert not same(end, Trainer(made, short(), GENERIC, backend=backend).run())
@@ -105,7 +105,7 @@ def test_the_object_is_where_the_photograph_s_alpha_says_else_the_rendered_one(
     scene: Scene, backend: str, has_alpha: bool
 ) -> None:
     made = cut_out(scene) if has_alpha else scene
-    recipe = with_terms(short(), normal_consistency={"start": 0, "where": "object"})
+    recipe = with_terms(short(), normal_consistency={"start": 0, "options": {"where": "object"}})
     trainer = entered(made, recipe, backend)
     camera = made.train[0].camera
     with torch.no_grad():

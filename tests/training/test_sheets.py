@@ -33,7 +33,7 @@ class Outcome:
 
 def recipe_with(where: str) -> Recipe:
     def changed(term: LossTerm) -> LossTerm:
-        return replace(term, weight=WEIGHT, where=where) if term.kind == "normal_consistency" else term
+        return replace(term, weight=WEIGHT, options={"where": where}) if term.kind == "normal_consistency" else term
 
     recipe = scale_schedule(get_recipe("2dgs"), SCHEDULE)
     (stage,) = recipe.stages

@@ -199,7 +199,7 @@ def test_the_protocol_sets_near_background_and_open_losses(scene: Scene) -> None
     assert (settings.near, settings.background, settings.sh_degree) == (0.2, (1.0, 1.0, 1.0), 2)
     assert raster_settings(GENERIC, 5.0, 3).near == pytest.approx(0.05)
     stage = Stage("s", 1, losses=(*PHOTOMETRIC, LossTerm("distortion", None)))
-    small, large = (replace(GENERIC, distortion_weight=w) for w in (1.0, 10.0))
+    small, large = (replace(GENERIC, loss_weights={"distortion": w}) for w in (1.0, 10.0))
     values = [
         event.losses["distortion"]
         for protocol in (small, large)

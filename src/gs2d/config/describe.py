@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 
 from gs2d.config.densify import Densify
-from gs2d.config.recipe import ALL, CloneInPlace, GradDensify, LearningRates, LossTerm, RankByError, Recipe, Stage
+from gs2d.config.recipe import ALL, CloneInPlace, GradDensify, LearningRates, RankByError, Recipe, Stage
 from gs2d.config.robust import FEW_VIEWS
 
 
@@ -106,7 +106,9 @@ def _describe_stage(stage: Stage) -> Iterator[str]:
     for term in stage.losses:
         weight = "the protocol's weight" if term.weight is None else f"{term.weight:g}"
         since = f" after iteration {term.start:,}" if term.start else ""
-        yield f"loss {term.kind}: {weight}{since}{_describe_choices(term)}"
+        every = f", every {term.every} iterations" if term.every > 1 else ""
+        options = "".join(f", {name}={value}" for name, value in term.options.items())
+        yield f"loss {term.kind}: {weight}{since}{every}{options}"
     if isinstance(stage.densify, Densify):
         given = ", ".join(f"{name}={value}" for name, value in stage.densify.options.items())
         yield f"densifies by {stage.densify.name}{f' ({given})' if given else ''}"
@@ -114,15 +116,6 @@ def _describe_stage(stage: Stage) -> Iterator[str]:
         yield from _describe_densify(stage.densify)
     else:
         yield "no densification"
-
-
-def _describe_choices(term: LossTerm) -> str:
-    said = [f"every {term.every} iterations"] if term.every > 1 else []
-    said += ["of the object alone"] if term.where == "object" else []
-    said += ["empty pixels at the camera's centre"] if term.edges == "camera" else []
-    said += [f"by (1 - image gradient)^{term.edge_power:g}"] if term.edge_power else []
-    said += ["where photographs have an alpha channel"] if not term.required else []
-    return "".join(f", {words}" for words in said)
 
 
 def _describe_densify(d: GradDensify) -> Iterator[str]:

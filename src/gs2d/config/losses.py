@@ -5,24 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from gs2d.config.multiview import MULTIVIEW_KINDS
-from gs2d.config.priors import PRIOR_KINDS
 from gs2d.config.registry import Register, Registry
 from gs2d.errors import RecipeError
 
-LOSS_KINDS = (
-    *("l1", "ssim", "l2", "normal_consistency", "normal_consistency_per_splat", "distortion", "silhouette"),
-    *MULTIVIEW_KINDS,
-)
+MODULES = {
+    "gs2d.losses.terms": (
+        *("l1", "ssim", "l2", "normal_consistency", "normal_consistency_per_splat", "distortion", "silhouette"),
+        *("multiview_photometric", "multiview_geometric"),
+    ),
+    "gs2d.training.prior_losses": ("depth_prior", "normal_prior"),
+}
 NEEDS = ("silhouette", "distortion", "neighbour")
 """What a loss may need that is computed or loaded only on request."""
 LOSSES: Registry[Any] = Registry(
     "loss",
     "gs2d.losses",
-    builtin=dict.fromkeys(LOSS_KINDS, "gs2d.losses.api") | dict.fromkeys(PRIOR_KINDS, "gs2d.training.prior_losses"),
+    builtin={kind: module for module, kinds in MODULES.items() for kind in kinds},
     error=RecipeError,
 )
-"""Kinds of loss -> a function of images, or a class with data of its own (``gs2d.losses.api``)."""
+"""Kinds of loss -> a function of images, or a subclass of ``gs2d.losses.api.Loss``."""
 
 
 def register_loss(name: str, *, needs: Sequence[str] = ()) -> Callable[[Register], Register]:
@@ -41,8 +42,8 @@ def register_loss(name: str, *, needs: Sequence[str] = ()) -> Callable[[Register
     -------
     callable
         Decorates a function ``(output, view, **options)`` that returns a scalar Tensor, unweighted, or None to skip the
-        view: ``output`` is a RenderOutput (images [H, W, C]), ``view`` a ``gs2d.losses.api.LossView``. Or a class whose
-        constructor takes the options, with ``prepare(scene, recipe, device)`` and ``__call__(output, view)``.
+        view: ``output`` is a RenderOutput (images [H, W, C]), ``view`` a ``gs2d.losses.api.LossView``. Or a subclass of
+        ``gs2d.losses.api.Loss``, whose constructor takes the options.
 
     Raises
     ------

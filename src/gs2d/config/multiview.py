@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gs2d.config.validate import integer, number, require
 
-MULTIVIEW_KINDS = ("multiview_photometric", "multiview_geometric")
-"""Losses of gs2d that need a second view."""
 LARGEST = {"patches": 1_000_000, "radius": 50, "depth_downscale": 16}  # more is a slip
 
 
@@ -56,21 +53,8 @@ class MultiView:
         return 2 * self.radius + 1
 
 
-def check_multiview(where: str, multiview: MultiView | None, kinds: Sequence[str], *, guests: bool) -> None:
-    """Raise RecipeError for an invalid value, or if it does not fit the losses.
-
-    With ``guests``, some of the losses are from elsewhere: they may need a second view.
-    """
-    asked = [kind for kind in kinds if kind in MULTIVIEW_KINDS]
-    if multiview is None:
-        require(
-            not asked, f"{where} is null, but loss {asked[0] if asked else ''!r} needs it; take a recipe *-multiview"
-        )
-        return
-    require(
-        bool(asked) or guests,
-        f"{where} is set, but no loss is {' or '.join(MULTIVIEW_KINDS)}; take a recipe *-multiview",
-    )
+def check_multiview(where: str, multiview: MultiView) -> None:
+    """Raise RecipeError for an invalid value."""
     for name in ("patches", "radius", "neighbours", "depth_downscale"):
         integer(f"{where}.{name}", getattr(multiview, name), low=1)
     for name, largest in LARGEST.items():

@@ -270,8 +270,8 @@ def best(
     (:func:`with_few_views`).
     """
     part = iterations / OFFICIAL_ITERATIONS
-    consistency = LossTerm("normal_consistency", nc, round(NC_START * part), where="object")
-    silhouette = LossTerm("silhouette", SILHOUETTE, required=False)
+    consistency = LossTerm("normal_consistency", nc, round(NC_START * part), options={"where": "object"})
+    silhouette = LossTerm("silhouette", SILHOUETTE, options={"required": False})
     l2 = (LossTerm("l2", squares, round(SQUARES_START * iterations)),) if squares > 0 else ()
     stage = Stage(
         "surface",

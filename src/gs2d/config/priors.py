@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gs2d.config.validate import integer, number, one_of, require
 
-PRIOR_KINDS = ("depth_prior", "normal_prior")
-"""Losses that need something known beforehand of a view."""
 SOURCES = ("auto", "sparse", "sensor", "relative")
 SPACES = ("auto", "disparity", "depth")
 ALIGNMENTS = ("points", "rendered")
@@ -95,15 +92,12 @@ def _decayed(final_factor: float, fraction: float) -> float:
     return math.exp(min(max(fraction, 0.0), 1.0) * math.log(final_factor))
 
 
-def check_priors(where: str, depth: DepthPrior | None, normal: NormalPrior | None, kinds: Sequence[str]) -> None:
-    """Raise RecipeError for a value that cannot be trained with, losses (their kinds) that lack it, or none for it."""
+def check_priors(where: str, depth: DepthPrior | None, normal: NormalPrior | None) -> None:
+    """Raise RecipeError for an invalid value."""
     for name, value in (("depth_prior", depth), ("normal_prior", normal)):
-        at, asked = f"{where}: {name}", name in kinds
-        require(value is not None or not asked, f"{at} is null, but loss {name!r} needs it; take a recipe without it")
+        at = f"{where}: {name}"
         if value is None:
             continue
-        option = name.replace("_", "-")
-        require(asked, f"{at} is set, but no loss is {name!r}; take a recipe made with --{option}")
         fraction = number(f"{at}.final_factor", value.final_factor, low=0.0)
         require(0 < fraction <= 1, f"{at}.final_factor must be in (0, 1], got {fraction}")
         integer(f"{at}.decay_steps", value.decay_steps, low=1)

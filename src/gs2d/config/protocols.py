@@ -8,11 +8,11 @@ Pure Python; never imports torch.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from gs2d.config.recipe import LossTerm
-from gs2d.errors import ProtocolError
+from gs2d.errors import ProtocolError, RecipeError
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 RELATIVE_NEAR = 0.01  # [d] of the extent, where a protocol names no near
@@ -73,8 +73,8 @@ class Protocol:
     name : str
     depth : str
         "mean", "median" or "transmittance": depth of surface normals and of fusion, where a loss names none.
-    distortion_weight : float
-        Weight of a distortion loss that names none (Table 1 of the 2DGS-R paper).
+    loss_weights : mapping of kind to float
+        Weights of losses that name none (Table 1 of the 2DGS-R paper).
     background : tuple of 3 floats
         Colour behind everything, in [0, 1].
     near : float or None
@@ -97,7 +97,7 @@ class Protocol:
 
     name: str
     depth: str
-    distortion_weight: float
+    loss_weights: Mapping[str, float] = field(hash=False)
     background: tuple[float, float, float] = BLACK  # [c] unless asked for white
     near: float | None = None
     near_plane_policy: str = "draw"
@@ -125,22 +125,27 @@ class Protocol:
         return self.depth if self.fusion.depth is None else self.fusion.depth
 
     def resolve(self, terms: Sequence[LossTerm]) -> tuple[LossTerm, ...]:
-        """Loss terms with the weights and depths that they left open; terms of weight 0 are dropped."""
-        resolved = (
-            replace(
-                term,
-                weight=self.distortion_weight if term.weight is None else term.weight,
-                depth=self.depth if term.depth is None else term.depth,
-            )
-            for term in terms
-        )
+        """Return the terms with the weights and depths that they leave open; terms of weight 0 are dropped.
+
+        Raises
+        ------
+        RecipeError
+            If neither a term nor the protocol has a weight.
+        """
+        resolved = []
+        for term in terms:
+            weight = self.loss_weights.get(term.kind) if term.weight is None else term.weight
+            if weight is None:
+                kinds = ", ".join(self.loss_weights)
+                raise RecipeError(f"loss {term.kind!r} needs a weight; protocol {self.name!r} has one for {kinds} only")
+            resolved.append(replace(term, weight=weight, depth=self.depth if term.depth is None else term.depth))
         return tuple(term for term in resolved if term.weight)
 
 
 DTU = Protocol(
     "dtu",
     depth="median",  # [s] depth_ratio 1
-    distortion_weight=1000.0,  # [s] lambda_dist 1000
+    loss_weights={"distortion": 1000.0},  # [s] lambda_dist 1000
     near=0.2,  # [c] rasterizer
     near_plane_policy="cull",  # [d] objects: no splat has business at the camera
     downscale=2,  # [s] -r 2, [r]
@@ -153,7 +158,7 @@ DTU = Protocol(
 TNT = Protocol(
     "tnt",  # Barn, Caterpillar, Ignatius, Truck
     depth="median",  # [s] depth_ratio 1
-    distortion_weight=100.0,  # [s] printed (not executed); [r] Table 1 "100"
+    loss_weights={"distortion": 100.0},  # [s] printed (not executed); [r] Table 1 "100"
     near=0.2,  # [c]
     near_plane_policy="box",  # [c] forward.cu, compute_aabb
     downscale=2,  # [s] -r 2, [r]
@@ -164,13 +169,13 @@ TNT = Protocol(
 TNT_LARGE = replace(
     TNT,
     name="tnt-large",  # Meetingroom, Courthouse
-    distortion_weight=10.0,  # [s] printed (not executed); [r] Table 1 "10"
+    loss_weights={"distortion": 10.0},  # [s] printed (not executed); [r] Table 1 "10"
     fusion=FusionLimits(voxel=0.006, truncation=0.024, depth_limit=4.5, clusters=1),  # [s]
 )
 NERF_SYNTHETIC = Protocol(
     "nerf-synthetic",
     depth="mean",  # [s] depth_ratio stays 0
-    distortion_weight=1000.0,  # [2dgs] bounded scenes; the script uses none
+    loss_weights={"distortion": 1000.0},  # [2dgs] bounded scenes; the script uses none
     background=WHITE,  # [s] --white_background
     near=0.2,  # [c]
     near_plane_policy="cull",  # [d] else white sheets grow over the white background, also with the official box
@@ -182,7 +187,7 @@ NERF_SYNTHETIC = Protocol(
 MIP_NERF_360 = Protocol(
     "mip-nerf-360",
     depth="mean",  # [s] depth_ratio stays 0
-    distortion_weight=100.0,  # [2dgs] unbounded scenes; the script uses none
+    loss_weights={"distortion": 100.0},  # [2dgs] unbounded scenes; the script uses none
     near=0.2,  # [c]
     near_plane_policy="box",  # [c]
     downscale=4,  # [s] images_4 outdoors (images_2 indoors)
@@ -192,7 +197,7 @@ MIP_NERF_360 = Protocol(
 GENERIC = Protocol(
     "generic",
     depth="mean",  # [d] as 2DGS advises for scenes that are not object-centred
-    distortion_weight=100.0,  # [2dgs] unbounded scenes
+    loss_weights={"distortion": 100.0},  # [2dgs] unbounded scenes
     near=None,  # [d] 0.2 is meaningless in a frame of unknown size
     test_every=8,  # [c] --eval
     fusion=FusionLimits(subject=True),  # [d] people photograph things, and want them without the forest behind

@@ -16,7 +16,7 @@ from typing import Any
 
 from gs2d.config.densify import Densify
 from gs2d.config.losses import LOSSES
-from gs2d.config.multiview import MULTIVIEW_KINDS, MultiView, check_multiview
+from gs2d.config.multiview import MultiView, check_multiview
 from gs2d.config.priors import DepthPrior, NormalPrior, check_priors
 from gs2d.config.robust import DenseStart, Removal, check_robust
 from gs2d.config.validate import group, integer, number, one_of, require
@@ -30,9 +30,6 @@ MU, SIGMA, ALPHA, SH = ("means",), ("quats", "log_scales"), ("opacity_logits",),
 ALL = MU + SIGMA + ALPHA + SH
 LARGEST_SEED = 2**63 - 1  # torch takes no larger one
 DEPTH_KINDS = ("mean", "median", "transmittance")
-NORMAL_KINDS = ("normal_consistency", "normal_consistency_per_splat")
-EDGES = ("undefined", "camera")
-WHERE = ("image", "object")
 
 
 @dataclass(frozen=True)
@@ -44,33 +41,23 @@ class LossTerm:
     kind : str
         "l1", "ssim" (1 - SSIM), "l2" (the mean squared difference), "normal_consistency",
         "normal_consistency_per_splat" (the paper's Eq. 7 form), "distortion", "silhouette" (alpha against that of the
-        photographs: see ``required``), or, in a recipe with ``multiview``, "multiview_photometric" (1 - NCC of warped
-        patches), "multiview_geometric" (round trip, px); with ``depth_prior`` "depth_prior" (relative error of depth),
+        photographs), or, in a recipe with ``multiview``, "multiview_photometric" (1 - NCC of warped patches),
+        "multiview_geometric" (round trip, px); with ``depth_prior`` "depth_prior" (relative error of depth),
         with ``normal_prior`` "normal_prior" (1 - cosine); or one that a package or a program has registered
         (docs/extending.md).
     weight : float or None
-        None, for "distortion" only: the protocol's weight (Table 1 of the paper writes it 100/10).
+        None: the protocol's weight of this kind (Table 1 of the paper writes that of "distortion" 100/10).
     start : int
         Iterations of the stage without this term.
     depth : "mean", "median", "transmittance" or None
         Depth that surface normals come from; None takes the protocol's.
     options : mapping of str to values of JSON
-        Of a registered loss: the keyword arguments that its function, or the constructor of its class, takes.
-    edges : "undefined" or "camera"
-        Of normal consistency, beside empty pixels: depths make no normal there, or one as in the official code, where
-        empty pixels lie at the camera's centre.
-    where : "image" or "object"
-        Of normal consistency: asked of all pixels, or of those of the object alone, so that what covers the empty
-        background earns nothing. The object is where the photograph's alpha is above 1/2; of photographs without
-        alpha each pixel counts by the rendered one, which sheets of white can still grow by.
-    edge_power : float
-        Of normal consistency: each pixel counts (1 - g) ** edge_power, g in [0, 1] the gradient of the photograph,
-        for depth may jump where colours do. 0: all alike.
+        Keyword arguments of the loss, which are checked before training: ``edges``, ``where`` and ``edge_power`` of
+        both normal consistencies, ``required`` of "silhouette" (``gs2d.losses.terms``); those of other losses are
+        what their function or constructor takes.
     every : int
         Iterations of which one has this term (those that it divides); the others cost nothing for it. The weight is as
         written, not multiplied by ``every``.
-    required : bool
-        Of silhouette: whether photographs must have an alpha channel; if not, those without do without the term.
 
     Raises
     ------
@@ -83,11 +70,7 @@ class LossTerm:
     start: int = 0
     depth: str | None = None
     options: Mapping[str, Any] = field(default_factory=dict, hash=False)
-    edges: str = "undefined"
-    where: str = "image"
-    edge_power: float = 0.0
     every: int = 1
-    required: bool = True
 
     def __post_init__(self) -> None:
         LOSSES.check(self.kind)
@@ -450,7 +433,7 @@ class Recipe:
         Raises
         ------
         RecipeError
-            If a stage does not exist or has this kind of loss already, or the loss needs settings that are missing.
+            If a stage does not exist or has this kind of loss already.
 
         Examples
         --------
@@ -496,10 +479,9 @@ def validate(recipe: Recipe) -> Recipe:
         require(recipe.poses is not None, f"{where}: intrinsics learn with poses, got poses=null; set both or neither")
         fixed = "views are compared by the intrinsics that the capture says"
         require(recipe.multiview is None, f"{where}: intrinsics cannot learn with multiview: {fixed}; leave one out")
-    kinds = [term.kind for stage in recipe.stages for term in stage.losses]
-    guests = any(kind not in LOSSES.builtin for kind in kinds)
-    check_multiview(f"{where}: multiview", recipe.multiview, kinds, guests=guests)
-    check_priors(where, recipe.depth_prior, recipe.normal_prior, kinds)
+    if recipe.multiview is not None:
+        check_multiview(f"{where}: multiview", recipe.multiview)
+    check_priors(where, recipe.depth_prior, recipe.normal_prior)
     if recipe.fused_depth is not None:
         one_of(f"{where}: fused_depth", recipe.fused_depth, DEPTH_KINDS)
     check_robust(where, recipe.dense_start, recipe.removal)
@@ -563,35 +545,13 @@ def _check_stage(where: str, stage: Stage, groups: list[str]) -> None:
 def _check_losses(where: str, stage: Stage) -> None:
     kinds = [term.kind for term in stage.losses]
     for term in stage.losses:
-        guest = term.kind not in LOSSES.builtin
-        require(guest or not term.options, f"{where}: loss {term.kind!r} takes no options, got {dict(term.options)}")
         require(kinds.count(term.kind) == 1, f"{where}: loss {term.kind!r} is there twice; add up the weights")
-        if term.weight is None:
-            require(
-                term.kind == "distortion",
-                f"{where}: loss {term.kind!r} needs a weight; only distortion may leave it to the protocol",
-            )
-        else:
+        if term.weight is not None:
             number(f"{where}: weight of loss {term.kind!r}", term.weight, low=0.0)
         integer(f"{where}: start of loss {term.kind!r}", term.start, low=0)
         if term.depth is not None:
             one_of(f"{where}: depth of loss {term.kind!r}", term.depth, DEPTH_KINDS)
         integer(f"{where}: every of loss {term.kind!r}", term.every, low=1)
-        one_of(f"{where}: edges of loss {term.kind!r}", term.edges, EDGES)
-        one_of(f"{where}: where of loss {term.kind!r}", term.where, WHERE)
-        number(f"{where}: edge_power of loss {term.kind!r}", term.edge_power, low=0.0)
-        for name in ("edges", "where", "edge_power"):
-            plain = getattr(term, name) == getattr(LossTerm, name)
-            message = f"loss {term.kind!r} takes no {name}; only {' and '.join(NORMAL_KINDS)} do"
-            require(plain or term.kind in NORMAL_KINDS, f"{where}: {message}")
-        message = f"required of loss {term.kind!r} must be true, got false; only silhouette may be left out"
-        require(term.required or term.kind == "silhouette", f"{where}: {message}")
-    compared = {term.depth or "the protocol's" for term in stage.losses if term.kind in MULTIVIEW_KINDS}
-    require(
-        len(compared) <= 1,
-        f"{where}: the losses between views are of one rendering of the neighbour, so of one depth; "
-        f"got {' and '.join(sorted(compared))}",
-    )
     if stage.iterations > 0:
         active = [term for term in stage.losses if term.weight != 0 and term.start == 0 and term.every == 1]
         message = "no loss is active from the first iteration and in every one"

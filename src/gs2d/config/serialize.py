@@ -56,7 +56,8 @@ def apply_overrides(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
     overrides : sequence of str
         ``field=value`` for the recipe (``seed=3``) and ``stage.field=value`` for a stage. Deeper fields are reached by
         more dots: ``surface.densify.grad_threshold=1e-4``, ``refine.lr.sh0=0.001``; losses by their kind,
-        ``surface.losses.normal_consistency.weight=0.1``; entry actions by their name,
+        ``surface.losses.normal_consistency.weight=0.1``, their options by
+        ``surface.losses.normal_consistency.options.where=object``; entry actions by their name,
         ``refine.on_enter.clone_in_place.opacity=preserve``; ``refine.train.means=null`` freezes an attribute.
         Values are JSON; what is not JSON is taken as a string.
 
@@ -108,6 +109,8 @@ def _set(data: dict[str, Any], words: list[str], value: Any, override: str) -> N
             node = _entry(node, word, override)
         elif isinstance(node, dict) and last and words[max(depth - 1, 0)] == "train" and depth > 0:
             _set_trained(node, word, value)  # validate() knows the attributes
+        elif isinstance(node, dict) and last and words[max(depth - 1, 0)] == "options" and depth > 0:
+            node[word] = value  # the loss or the densifier knows its options
         elif isinstance(node, dict) and word in node:
             if last:
                 node[word] = value

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -48,6 +48,39 @@ class LossOperations:
     masked_mean: Callable[..., Tensor]
     blur: Callable[[Tensor], Tensor] | None = None
     compare_views: Callable[..., tuple[Tensor, Tensor]] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class NormalOptions:
+    """What normal consistency compares, and how.
+
+    Attributes
+    ----------
+    camera : Camera
+    mask : Tensor [H, W] bool or None
+        False = ignore this pixel.
+    weights : Tensor [H, W] or None
+        By which each pixel's part is multiplied; a constant.
+    at_camera : bool
+        Whether empty pixels lie at the camera's centre: ``edges`` of ``losses.reference.normals_from_depth``.
+    per_splat : bool
+        The paper's form, mean(alpha - <n, N>), instead of the official mean(1 - alpha <n, N>) with alpha detached.
+    """
+
+    camera: Camera
+    mask: Tensor | None = None
+    weights: Tensor | None = None
+    at_camera: bool = False
+    per_splat: bool = False
+
+    def check(self, normal: Tensor, depth: Tensor, alpha: Tensor) -> None:
+        """Raise ShapeError for images of other sizes."""
+        shapes = {"depth": (depth, "H W"), "normal": (normal, "H W 3"), "alpha": (alpha, "H W")}
+        shapes |= {} if self.mask is None else {"mask": (self.mask, "H W")}
+        sizes = check_shapes(shapes | ({} if self.weights is None else {"weights": (self.weights, "H W")}))
+        camera = self.camera
+        if (camera.height, camera.width) != (sizes["H"], sizes["W"]):
+            raise ShapeError(f"camera is {camera.width}x{camera.height}, but depth is {sizes['W']}x{sizes['H']}")
 
 
 def _call(library: Library, name: str, *arguments: Any) -> None:
@@ -203,23 +236,20 @@ class _NormalConsistency(torch.autograd.Function):
         normal: Tensor,
         depth: Tensor,
         alpha: Tensor,
-        mask: Tensor | None,
-        weights: Tensor | None,
-        camera: Camera,
-        per_splat: bool,
-        edges: str,
+        how: NormalOptions,
         expected: float,
         wanted: bool,
         library: Library,
     ) -> Tensor:
+        camera = how.camera
         gradients = [torch.empty_like(x) if wanted else None for x in (normal, depth)]
-        gradients.append(torch.empty_like(alpha) if wanted and per_splat else None)
+        gradients.append(torch.empty_like(alpha) if wanted and how.per_splat else None)
         intrinsics = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
         rotation = torch.tensor(camera.rotation, dtype=torch.float64).contiguous()
         value = torch.empty(1, dtype=torch.float64)
         ctx.expected = expected if expected != 0 else 1.0
-        inputs = (normal, depth, alpha, mask, weights, intrinsics, rotation)
-        sizes = (camera.height, camera.width, int(per_splat), int(edges == "camera"), ctx.expected)
+        inputs = (normal, depth, alpha, how.mask, how.weights, intrinsics, rotation)
+        sizes = (camera.height, camera.width, int(how.per_splat), int(how.at_camera), ctx.expected)
         _call(library, "gs2d_normal_consistency", *inputs, *sizes, *gradients, value)
         ctx.save_for_backward(*gradients)
         return value[0].to(normal.dtype)
@@ -230,19 +260,15 @@ class _NormalConsistency(torch.autograd.Function):
         gradients = ctx.saved_tensors
         if not torch.equal(cotangent, torch.tensor(ctx.expected, dtype=torch.float64).to(cotangent.dtype)):
             gradients = tuple(None if g is None else g * (cotangent / ctx.expected) for g in gradients)
-        return (*gradients, *[None] * 8)
+        return (*gradients, *[None] * 4)
 
 
 def normal_consistency(
     normal: Tensor,
     depth: Tensor,
     alpha: Tensor,
-    camera: Camera,
-    mask: Tensor | None = None,
+    how: NormalOptions,
     *,
-    weights: Tensor | None = None,
-    edges: str = "undefined",
-    per_splat: bool = False,
     expected: float = 0.05,
     library: Library | None = None,
 ) -> Tensor:
@@ -255,15 +281,7 @@ def normal_consistency(
     depth : Tensor [H, W] world units
         0 where nothing was hit.
     alpha : Tensor [H, W]
-    camera : Camera
-    mask : Tensor [H, W] bool, optional
-        False = ignore this pixel.
-    weights : Tensor [H, W], optional
-        By which each pixel's part is multiplied; a constant.
-    edges : "undefined" or "camera"
-        See ``losses.reference.normals_from_depth``.
-    per_splat : bool
-        The paper's form, mean(alpha - <n, N>), instead of the official mean(1 - alpha <n, N>) with alpha detached.
+    how : NormalOptions
     expected : float
         Cotangent that the backward pass will probably see; another costs a multiplication of the gradients.
     library : Library, optional
@@ -274,21 +292,12 @@ def normal_consistency(
         Shapes that differ, or another dtype or device than the library takes.
     """
     library = library or ready_library()
-    shapes = {"depth": (depth, "H W"), "normal": (normal, "H W 3"), "alpha": (alpha, "H W")}
-    if mask is not None:
-        shapes["mask"] = (mask, "H W")
-    if weights is not None:
-        shapes["weights"] = (weights, "H W")
-    sizes = check_shapes(shapes)
-    if (camera.height, camera.width) != (sizes["H"], sizes["W"]):
-        raise ShapeError(f"camera is {camera.width}x{camera.height}, but depth is {sizes['W']}x{sizes['H']}")
+    how.check(normal, depth, alpha)
     _arrays(library, normal=normal, depth=depth, alpha=alpha)
     images = (normal.contiguous(), depth.contiguous(), alpha.contiguous())
-    if weights is not None:
-        (weights,) = _arrays(library, weights=weights)
-    wanted = _wanted(normal, depth, alpha)
-    arguments = (_mask_bytes(mask), weights, camera, per_splat, edges, expected, wanted, library)
-    value: Tensor = _NormalConsistency.apply(*images, *arguments)
+    weights = None if how.weights is None else _arrays(library, weights=how.weights)[0]
+    how = replace(how, mask=_mask_bytes(how.mask), weights=weights)
+    value: Tensor = _NormalConsistency.apply(*images, how, expected, _wanted(normal, depth, alpha), library)
     return value
 
 

@@ -11,11 +11,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gs2d.config.recipe import EDGES
 from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
 
+EDGES = ("undefined", "camera")
 WINDOW_RADIUS = 5  # px: 11 taps
 WINDOW_SIGMA = 1.5  # px
 SSIM_C1 = 0.01**2

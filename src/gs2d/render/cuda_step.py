@@ -165,11 +165,8 @@ def _key(step: WholeStep) -> tuple[object, ...]:
         width,
         len(splats),
         step.photograph.shape[2],
-        "normal_consistency" in step.weights,
-        "silhouette" in step.weights,
-        step.depth,
-        step.at_camera,
-        step.of_object,
+        step.losses.silhouette is not None,
+        None if step.losses.normals is None else step.losses.normals[1:],  # without the weight
         0 if step.rows is None else step.rows.data_ptr(),
         tuple([(name, tensor.data_ptr()) for name, tensor in step.gathered.items()]),
         tuple([tensor.data_ptr() for _, tensor in splats.items()]),
@@ -233,11 +230,11 @@ class _Plan:
 
     @property
     def _has_normals(self) -> bool:
-        return "normal_consistency" in self._step.weights and not self._only_colors
+        return self._step.losses.normals is not None and not self._only_colors
 
     @property
     def _has_silhouette(self) -> bool:
-        return "silhouette" in self._step.weights and not self._only_colors
+        return self._step.losses.silhouette is not None and not self._only_colors
 
     def _sums(self) -> None:
         """Of gradients: rows of the splats, which the last reader clears."""
@@ -424,14 +421,15 @@ class _Plan:
             Work(f"photometric_vjp_{kind}", blocks, THREADS, second),
         ]
         self._normals: structures.NormalArguments | None = None
-        if self._has_normals:
+        wanted = self._step.losses.normals
+        if wanted is not None and not self._only_colors:
             normals = structures.NormalArguments(
-                height=self._height, width=self._width, per_splat=0, at_camera=int(self._step.at_camera)
+                height=self._height, width=self._width, per_splat=0, at_camera=int(wanted.at_camera)
             )
-            depth = self._pixels[f"depth_{self._step.depth}"]
+            depth = self._pixels[f"depth_{wanted.depth}"]
             structures.fill(normals, normal=self._pixels["normal"], depth=depth, alpha=self._pixels["alpha"])
             structures.fill(normals, g_normal=self._pixels["g_normal"], g_depth=self._pixels["g_depth"])
-            if self._step.of_object and channels == 3:
+            if wanted.of_object and channels == 3:
                 structures.fill(normals, weights=self._pixels["alpha"])
             tiles = -(-self._width // NORMAL_W) * -(-self._height // NORMAL_H)
             works.append(Work("normal_consistency_vjp", tiles, THREADS, normals))
@@ -456,9 +454,9 @@ class _Plan:
         self._fill_lists(blend)
         images = ("color", "alpha", "normal", "depth_mean", "final_T")
         structures.fill(blend, **{name: self._pixels[name] for name in images}, g_color=self._pixels["g_color"])
-        if self._has_normals:
+        if step.losses.normals is not None:
             structures.fill(blend, g_normal=self._pixels["g_normal"])
-            structures.fill(blend, **{f"g_depth_{step.depth}": self._pixels["g_depth"]})
+            structures.fill(blend, **{f"g_depth_{step.losses.normals.depth}": self._pixels["g_depth"]})
         if self._has_silhouette:
             structures.fill(blend, g_alpha=self._pixels["g_alpha"])
         structures.fill(blend, gradients=self._gradient_rows, extras=self._extras, learns=step.rows)
@@ -535,17 +533,17 @@ class _Plan:
             arguments.mask, arguments.photograph.bytes = mask, photograph
         one = np.float32(1 / max(3 * step.valid, 1))
         second = self._comparing[1]
-        second.l1_scale = np.float32(step.weights.get("l1", 0.0)) * one
-        second.ssim_scale = -np.float32(step.weights.get("ssim", 0.0)) * one
-        second.l2_scale = np.float32(step.weights.get("l2", 0.0)) * one
+        second.l1_scale = np.float32(step.losses.l1) * one
+        second.ssim_scale = -np.float32(step.losses.ssim) * one
+        second.l2_scale = np.float32(step.losses.l2) * one
         if self._normals is not None:
-            normals = self._normals
+            normals, wanted = self._normals, step.losses.normals
+            assert wanted is not None
             normals.mask = mask
-            normals.object = photograph if step.of_object and step.photograph.shape[2] == 4 else None
+            normals.object = photograph if wanted.of_object and step.photograph.shape[2] == 4 else None
             normals.fx, normals.fy, normals.cx, normals.cy = view.fx, view.fy, view.cx, view.cy
             normals.rotation = view.R
-            weight = np.float32(step.weights["normal_consistency"])
-            normals.scale = weight * np.float32(1 / max(step.valid, 1))
+            normals.scale = np.float32(wanted.weight) * np.float32(1 / max(step.valid, 1))
         if self._silhouette is not None:
             self._silhouette.mask, self._silhouette.object = mask, photograph
-            self._silhouette.scale = np.float32(step.weights["silhouette"]) / np.float32(max(step.valid, 1))
+            self._silhouette.scale = np.float32(step.losses.silhouette or 0.0) / np.float32(max(step.valid, 1))

@@ -12,7 +12,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.render.types import RasterSettings
 
-__all__ = ["Learned", "WholeStep"]
+__all__ = ["Learned", "StepLosses", "StepNormals", "WholeStep"]
 
 
 class Learned(NamedTuple):
@@ -36,9 +36,48 @@ class Learned(NamedTuple):
     trained: Tensor | None
 
 
+class StepNormals(NamedTuple):
+    """Normal consistency in the form of the official code.
+
+    Attributes
+    ----------
+    weight : float
+    depth : "mean" or "median"
+        Depth that the normals come from.
+    at_camera : bool
+        Whether empty pixels lie at the camera's centre (``losses.reference.normals_from_depth``).
+    of_object : bool
+        Whether only the object counts: by the image's alpha, else the rendered one.
+    """
+
+    weight: float
+    depth: str
+    at_camera: bool
+    of_object: bool
+
+
+class StepLosses(NamedTuple):
+    """The losses of an iteration.
+
+    Attributes
+    ----------
+    l1, ssim, l2 : float
+        Weights.
+    silhouette : float or None
+        Weight, for images with alpha; None: no such loss.
+    normals : StepNormals or None
+    """
+
+    l1: float = 0.0
+    ssim: float = 0.0
+    l2: float = 0.0
+    silhouette: float | None = None
+    normals: StepNormals | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class WholeStep:
-    """An iteration with the losses that every backend has fused; all tensors are on the device of the splats.
+    """An iteration of training; all tensors are on the device of the splats.
 
     Attributes
     ----------
@@ -54,13 +93,8 @@ class WholeStep:
     valid : int
         Pixels that count.
     background : 3 floats
-    weights : mapping of kind to float
-        Of "l1", "ssim", "l2", "normal_consistency" and, of photographs with alpha, "silhouette": those that are active.
-    depth : "mean" or "median"
-        That normals come from, and ``at_camera``: see ``LossTerm.edges``.
-    at_camera : bool
-    of_object : bool
-        Whether normals are asked for on the object alone: by the photograph's alpha, else the rendered one.
+    losses : StepLosses
+        Those that are active.
     rows : Tensor [N] bool or None
         The splats of which anything learns; None: all of them.
     learned : mapping of attribute to Learned
@@ -77,10 +111,7 @@ class WholeStep:
     mask: Tensor | None
     valid: int
     background: tuple[float, float, float]
-    weights: Mapping[str, float]
-    depth: str
-    at_camera: bool
-    of_object: bool
+    losses: StepLosses
     rows: Tensor | None
     learned: Mapping[str, Learned]
     betas: tuple[float, float, float]

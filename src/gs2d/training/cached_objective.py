@@ -10,6 +10,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from gs2d.config.recipe import Recipe, Stage
+from gs2d.losses.api import Losses
 from gs2d.render.backends import Backend
 from gs2d.render.cpu_cached import CachedView
 from gs2d.render.types import RenderOutput
@@ -17,7 +18,6 @@ from gs2d.training.objective import FullRender, Objective, StepResult
 from gs2d.training.state import TrainState
 
 COLORS = frozenset({"sh0", "shN"})
-OF_COLOR = frozenset({"l1", "ssim", "l2"})  # losses that see nothing but the colour image
 MIN_FRACTION = 0.5  # of the views: a cache for fewer saves little of a stage, and takes its memory all the same
 WORTH = 2  # visits per view from which filling, about two forward passes, is repaid
 
@@ -36,7 +36,7 @@ def is_cacheable(recipe: Recipe, stage: Stage, *, backend: Backend, views: int, 
         and "all" not in groups
         and stage.densify is None
         and not stage.halve_at
-        and OF_COLOR.issuperset(term.kind for term in stage.losses)
+        and all(loss.only_color for _, loss in Losses(stage.losses))
         and stage.active_sh_degree(1, recipe.sh_degree) == stage.active_sh_degree(stage.iterations, recipe.sh_degree)
         and stage.iterations >= WORTH * views * processes
     )

@@ -12,32 +12,16 @@ import numpy as np
 import torch
 
 from gs2d.config.multiview import MultiView
-from gs2d.config.recipe import Recipe, Stage
+from gs2d.config.recipe import Recipe
 from gs2d.core.camera import Camera
 from gs2d.core.memory_limit import cache_bytes
 from gs2d.data.scene import Scene, View
-from gs2d.errors import DataError, RecipeError
-from gs2d.losses.api import needs_of
+from gs2d.errors import DataError
 from gs2d.losses.multiview import PatchImage, prepare_image
 from gs2d.training.targets import Target
 
 PATCH_BYTES = 1 << 29  # of photographs as patches, that are kept
 SAMPLES = 2000  # points that say how far away is what a camera looks at
-
-
-def is_compared(stage: Stage, iteration: int) -> bool:
-    """Whether a stage compares views at an iteration."""
-    return any("neighbour" in needs_of(term) and term.weight and term.is_active(iteration) for term in stage.losses)
-
-
-def check_compared(recipe: Recipe) -> None:
-    """Raise RecipeError if a loss needs a second view and the recipe does not say how views are compared."""
-    terms = [term for stage in recipe.stages for term in stage.losses if "neighbour" in needs_of(term)]
-    if terms and recipe.multiview is None:
-        raise RecipeError(
-            f"loss {terms[0].kind!r} needs a second view, but the recipe's multiview is null; set it: "
-            "replace(recipe, multiview=MultiView())"
-        )
 
 
 def find_neighbours(scene: Scene, settings: MultiView) -> tuple[tuple[int, ...], ...]:

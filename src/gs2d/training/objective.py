@@ -18,7 +18,7 @@ from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DivergedError
 from gs2d.kernels.reference import finite
-from gs2d.losses.api import LossFunction, LossReport, LossView, compute_losses, loss_of, needs_of, prepared
+from gs2d.losses.api import LossReport, LossView, compute_losses, losses_of
 from gs2d.losses.multiview import Neighbour
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backends import Backend
@@ -27,7 +27,7 @@ from gs2d.render.photometry import Shading, photograph
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.training.dropout import dropout_rate, dropped_out, kept_splats
 from gs2d.training.exposure import apply_exposure
-from gs2d.training.multiview import PATCH_BYTES, ImageFiles, check_compared, draw_turn, find_neighbours, is_compared
+from gs2d.training.multiview import PATCH_BYTES, ImageFiles, draw_turn, find_neighbours
 from gs2d.training.opaque import another_background
 from gs2d.training.poses import pose_rate
 from gs2d.training.state import TrainState
@@ -139,13 +139,12 @@ class FullRender:
         self.frozen = frozen
         self.targets = targets
         self._background = torch.tensor(protocol.background, device=backend.device)
-        check_compared(recipe)
+        self.losses = losses_of(recipe)
         if recipe.multiview is not None:
             self._neighbours = find_neighbours(scene, recipe.multiview)
             limit = 0 if scene.ahead else PATCH_BYTES
             self._images = ImageFiles(scene.train, recipe.multiview, limit_bytes=limit)
-        device, terms = torch.device(backend.device), {loss_of(term): term for s in recipe.stages for term in s.losses}
-        self._functions = {known_by: prepared(term, scene, recipe, device) for known_by, term in terms.items()}
+        self.losses.prepare(scene, recipe, torch.device(backend.device))
 
     def settings(
         self, stage: Stage, iteration: int, background: tuple[float, float, float] | None = None
@@ -156,7 +155,7 @@ class FullRender:
         settings = replace(
             raster_settings(self.protocol, self.scene.extent, degree),
             background=background or self.protocol.background,
-            with_distortion=any("distortion" in needs_of(term) for term in active),
+            with_distortion=bool(self.losses.needing("distortion", active)),
             with_transmittance_depth=False,
         )
         return settings.for_depths(*(term.depth or self.protocol.depth for term in active))
@@ -286,27 +285,19 @@ class FullRender:
         self, state: TrainState, stage: Stage, iteration: int, index: int, splats: Splats
     ) -> Neighbour | None:
         """Return the view that view ``index`` is compared with in an iteration, rendered; None: with none."""
-        settings = self.recipe.multiview
-        if settings is None or not is_compared(stage, iteration):
+        settings, terms = self.recipe.multiview, self.losses.needing("neighbour", stage.losses)
+        if settings is None or not any(term.weight and term.is_active(iteration) for term in terms):
             return None
         turn = draw_turn(self.recipe, state.stage, iteration, self._neighbours[index], settings)
         if turn is None:
             return None
         camera, other = self.camera(state, turn.neighbour), turn.neighbour
-        kind = next((term.depth for term in stage.losses if "neighbour" in needs_of(term) and term.depth), None)
-        kind = kind or self.protocol.depth
+        kind = next((term.depth for term in terms if term.depth), self.protocol.depth)
         bare = replace(self.settings(stage, iteration), sh_degree=0, with_distortion=False).for_depths(kind)
         small = camera.resized(*(-(-n // settings.depth_downscale) for n in (camera.width, camera.height)))
         depth = rasterize(self.drawn(splats), small, bare, backend=self.backend).depth(kind)
         here, there = (self._images.of(i, self.targets[i]) for i in (index, other))
         return Neighbour(here, there, camera, depth, turn.draws.to(depth.device, non_blocking=True), settings)
-
-    @property
-    def reporters(self) -> dict[str, LossFunction]:
-        """The losses with something to say in the report, by name: their kind, with options where one is not enough."""
-        told = {known_by: loss for known_by, loss in self._functions.items() if hasattr(loss, "report")}
-        kinds = [kind for kind, _ in told]
-        return {kind if kinds.count(kind) == 1 else f"{kind} {given}": loss for (kind, given), loss in told.items()}
 
     @torch.no_grad()
     def report(
@@ -315,10 +306,16 @@ class FullRender:
         """Return what the losses say of training view ``index`` as it is now."""
         camera, target = self.camera(state, index), self.targets[index]
         output = rasterize(self.drawn(state.splats), camera, settings, backend=backend)
-        view = LossView(target.image, target.mask, camera, depth_kind=self.protocol.depth, index=index)
-        view.silhouette = target.silhouette
-        said = {name: loss.report(output, view) for name, loss in self.reporters.items()}  # type: ignore[attr-defined]
-        return {name: found for name, found in said.items() if found is not None}
+        view = LossView(
+            target.image,
+            camera,
+            target.mask,
+            index=index,
+            depth_kind=self.protocol.depth,
+            silhouette=target.silhouette,
+        )
+        reports = {name: loss.report(output, view) for name, loss in self.losses.reporters.items()}
+        return {name: report for name, report in reports.items() if report is not None}
 
     def differentiate(
         self,
@@ -357,22 +354,23 @@ class FullRender:
             output = replace(output, color=color)
         if lens is not None:  # what the rendering does not reach teaches nothing
             output = replace(output, color=torch.where(inside[..., None], output.color, target.image))
-        terms = compute_losses(
-            output,
+        view = LossView(
             target.image,
-            target.mask,
             camera,
-            [t for t in self.protocol.resolve(stage.losses) if neighbour is not None or "neighbour" not in needs_of(t)],
+            target.mask,
             iteration=iteration,
+            run_iteration=sum(earlier.iterations for earlier in self.recipe.stages[: state.stage]) + iteration,
+            index=index,
             depth_kind=self.protocol.depth,
-            backend=self.backend,
-            target_cache=target.maps,
             silhouette=target.silhouette,
             neighbour=neighbour,
-            index=index,
-            run_iteration=sum(earlier.iterations for earlier in self.recipe.stages[: state.stage]) + iteration,
-            functions=self._functions,
+            maps=target.maps,
         )
+        resolved = self.protocol.resolve(stage.losses)
+        if neighbour is None:
+            compared = self.losses.needing("neighbour", resolved)
+            resolved = tuple(term for term in resolved if term not in compared)
+        terms = compute_losses(output, view, resolved, backend=self.backend, losses=self.losses)
         if transform is not None:
             assert self.recipe.exposure is not None
             terms["exposure"] = self.recipe.exposure.prior * (transform - identity(transform)).square().sum()

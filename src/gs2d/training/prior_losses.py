@@ -12,7 +12,7 @@ from gs2d.config.losses import register_loss
 from gs2d.config.recipe import Recipe
 from gs2d.data.scene import Scene
 from gs2d.errors import RecipeError
-from gs2d.losses.api import LossReport, LossView
+from gs2d.losses.api import Loss, LossReport, LossView
 from gs2d.losses.priors import Depths, PointDepths, Prior, RelativeDepths, aligned, depth_prior, normal_prior
 from gs2d.render.types import RenderOutput
 from gs2d.training.priors import Priors
@@ -21,7 +21,7 @@ HIT = 0.5  # least alpha of a pixel whose depth or normal is reported
 POINT_RADIUS = 0.004  # of a point in the report, as a fraction of the picture's width
 
 
-class _PriorLoss:
+class _PriorLoss(Loss):
     """What both share: the priors of the views, read when they are asked for."""
 
     _priors: Priors
@@ -36,6 +36,7 @@ class _PriorLoss:
 class DepthPriorLoss(_PriorLoss):
     """Relative error of depths where they are known (docs/math.md, "Priors")."""
 
+    settings = "depth_prior"
     title = "Known depths"
     figure = "relative error of depth, %"
 
@@ -65,6 +66,7 @@ class DepthPriorLoss(_PriorLoss):
 class NormalPriorLoss(_PriorLoss):
     """1 - cosine of normals where they are known (docs/math.md, "Priors")."""
 
+    settings = "normal_prior"
     title = "Known normals"
     figure = "angle between normals, degrees"
 

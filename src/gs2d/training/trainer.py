@@ -21,7 +21,7 @@ from gs2d.core.splats import Splats
 from gs2d.data.cache import ReadAhead
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError, RecipeError, RunError
-from gs2d.losses.api import LossFunction, LossReport, needs_of, target_maps
+from gs2d.losses.api import Loss, LossReport, losses_of, target_maps
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events, per_image
@@ -130,6 +130,9 @@ class Trainer:
         if not scene.train:
             raise DataError(f"scene {scene.name} has no training views")
         self.scene, self.recipe, self.protocol = scene, validate(recipe), protocol
+        self._losses = losses_of(self.recipe)
+        for stage in self.recipe.stages:
+            protocol.resolve(stage.losses)  # each loss has a weight
         self.backend = backend if isinstance(backend, Backend) else get_backend(backend)
         self._on_event, self._between, self._progress_every = on_event, between, progress_every
         self.processes = processes
@@ -185,9 +188,9 @@ class Trainer:
         return self.state.stage >= len(self.recipe.stages)
 
     @property
-    def loss_reporters(self) -> Mapping[str, LossFunction]:
+    def loss_reporters(self) -> Mapping[str, Loss]:
         """The losses of the recipe that have something to say in the report, by name."""
-        return self._whole.reporters
+        return self._whole.losses.reporters
 
     def report_losses(self, index: int) -> dict[str, LossReport]:
         """Return what those losses say of training view ``index`` as it is now."""
@@ -419,7 +422,7 @@ class Trainer:
             with_silhouettes=is_opaque(self.recipe)
             or self.recipe.exposure is not None
             or self.recipe.photometry is not None
-            or any("silhouette" in needs_of(term) for stage in self.recipe.stages for term in stage.losses),
+            or any("silhouette" in loss.needs for _, loss in self._losses),
             dtype=dtype,
             device=device,
             limit_bytes=limit_bytes if limit_bytes is not None else 0 if scene.ahead else TARGET_BYTES,

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
+from typing import Any
 
 from torch import Tensor
 
 from gs2d.config.recipe import LossTerm, Stage
 from gs2d.render.types import RasterSettings
-from gs2d.render.whole_step import Learned, WholeStep
+from gs2d.render.whole_step import Learned, StepLosses, WholeStep
 from gs2d.training.adam import lr_at
 from gs2d.training.densify.densifier import Densifier
 from gs2d.training.objective import FullRender, Objective, learning_rows
@@ -18,15 +19,13 @@ from gs2d.training.state import TrainState
 
 __all__ = ["WholeSteps"]
 
-KINDS = frozenset({"l1", "ssim", "l2", "normal_consistency", "silhouette"})
 NOTHING: Mapping[str, Tensor] = MappingProxyType({})
 
 
 class WholeSteps:
-    """The iterations of a stage whose losses are a photograph's L1, SSIM and L2, normal consistency, silhouettes.
+    """The iterations of a stage that a backend does in one piece: those whose losses allow it (``Loss.in_step``).
 
-    Weights of pixels but those of the object, a second view, or anything that is learned of photographs and cameras
-    are not for here: :class:`~gs2d.training.objective.FullRender` does all of it.
+    Nothing may be learned of images and cameras; :class:`~gs2d.training.objective.FullRender` does everything else.
 
     Parameters
     ----------
@@ -49,21 +48,16 @@ class WholeSteps:
             return False
         active = [term for term in self._terms if term.is_active(iteration)]
         gathered = NOTHING if densifier is None else densifier.gathers(state, iteration)
-        if gathered is None or not _is_plain(active):
+        if gathered is None:
             return False
         photograph = self._whole.targets.photograph(index)
         if photograph is None:
             return False
         opaque = photograph.image.shape[2] == 3
-        if opaque:
-            active = [term for term in active if term.required]
-            if any(term.kind == "silhouette" for term in active):
-                return False
+        losses = self._losses(active, opaque=opaque)
         stage, whole = self._stage, self._whole
         learned = self._learned(state, iteration)
-        normals = next((term for term in active if term.kind == "normal_consistency"), None)
-        depth = "mean" if normals is None else normals.depth or whole.protocol.depth
-        if not learned or depth not in ("mean", "median"):
+        if losses is None or not learned:
             return False
         step = WholeStep(
             splats=state.splats,
@@ -73,10 +67,7 @@ class WholeSteps:
             mask=photograph.mask,
             valid=photograph.valid,
             background=whole.protocol.background,
-            weights={term.kind: float(term.weight or 0.0) for term in active},
-            depth=depth,
-            at_camera=normals is not None and normals.edges == "camera",
-            of_object=normals is not None and normals.where == "object",
+            losses=losses,
             rows=None if gathered else self._learning_rows(state),
             learned=learned,
             betas=(stage.lr.beta1, stage.lr.beta2, stage.lr.eps),
@@ -87,6 +78,16 @@ class WholeSteps:
         for name in learned:
             state.moments[name].steps += 1
         return True
+
+    def _losses(self, active: Sequence[LossTerm], *, opaque: bool) -> StepLosses | None:
+        """Return what the active losses add to the step; None if a step cannot have them."""
+        fields: dict[str, Any] = {}
+        for term in active:
+            added = self._whole.losses[term].in_step(term, opaque=opaque)
+            if added is None or not fields.keys().isdisjoint(added):
+                return None
+            fields |= added
+        return StepLosses(**fields)
 
     def _learned(self, state: TrainState, iteration: int) -> dict[str, Learned]:
         rates, stage, found = lr_at(self._stage.lr, iteration, self._whole.scene.extent), self._stage, {}
@@ -116,14 +117,3 @@ class WholeSteps:
 
 def _differ(a: Tensor, b: Tensor) -> bool:
     return a is not b
-
-
-def _is_plain(terms: list[LossTerm]) -> bool:
-    """Whether all terms are of the kinds that are done in one piece: each once, edges of photographs like the rest."""
-    kinds = [term.kind for term in terms]
-    return (
-        KINDS.issuperset(kinds)
-        and len(kinds) == len(set(kinds))
-        and not {"l1", "ssim"}.isdisjoint(kinds)
-        and all(term.edge_power == 0 and not term.options for term in terms)
-    )

@@ -12,6 +12,7 @@ from torch import Tensor
 import emulate
 from gs2d.core.camera import Camera, look_at
 from gs2d.kernels.cuda import losses as ops
+from gs2d.kernels.losses import NormalOptions
 from gs2d.losses import reference
 
 # Smaller than the window; a row and a strip of 128 reals (43 pixels) and of 32 rows begun and passed.
@@ -89,7 +90,8 @@ def test_nan_at_a_valid_pixel_reaches_the_value(emulator: emulate.Emulator) -> N
     normal, depth, alpha, _ = geometry(6, 5)
     depth[3, 2] = float("nan")
     depth[2:5, 1:4] = torch.where(depth[2:5, 1:4] == 0, 1.0, depth[2:5, 1:4])
-    assert bool(ops.normal_consistency(normal, depth, alpha, make_camera(6, 5), launcher=emulator).isnan())
+    seen = NormalOptions(make_camera(6, 5))
+    assert bool(ops.normal_consistency(normal, depth, alpha, seen, launcher=emulator).isnan())
     assert bool(ops.masked_mean(x[..., 0], launcher=emulator).isnan())
 
 
@@ -100,7 +102,8 @@ def test_without_a_valid_pixel_values_and_gradients_are_0(emulator: emulate.Emul
     l1, ssim, l2 = ops.photometric(x, y, nothing, launcher=emulator)
     normal, depth, alpha, _ = geometry(7, 6)
     mean = ops.masked_mean(x[..., 0], nothing, launcher=emulator)
-    consistency = ops.normal_consistency(normal, depth, alpha, make_camera(7, 6), nothing, launcher=emulator)
+    seen = NormalOptions(make_camera(7, 6), nothing)
+    consistency = ops.normal_consistency(normal, depth, alpha, seen, launcher=emulator)
     assert [l1.item(), ssim.item(), l2.item(), mean.item(), consistency.item()] == [0.0] * 5
     (gradient,) = torch.autograd.grad(l1 + ssim + l2 + mean, x)
     assert not gradient.any()
@@ -118,8 +121,8 @@ def test_normal_consistency_and_its_gradients_are_those_of_the_reference(
     weights = torch.rand(size, generator=torch.Generator().manual_seed(1)) if weighted else None
     found_in = [image.requires_grad_() for image in images]
     exact_in = [image.detach().double().requires_grad_() for image in images]
-    form = {"per_splat": per_splat, "edges": edges, "weights": weights}
-    value = ops.normal_consistency(*found_in, camera, valid, **form, launcher=emulator)
+    how = NormalOptions(camera, valid, weights, edges == "camera", per_splat)
+    value = ops.normal_consistency(*found_in, how, launcher=emulator)
     function = reference.normal_consistency_per_splat if per_splat else reference.normal_consistency
     exact = function(*exact_in, camera, valid, edges=edges, weights=weights)
     assert value.item() == pytest.approx(exact.item(), abs=1e-6)
@@ -162,7 +165,8 @@ def test_values_and_gradients_do_not_depend_on_the_order_of_threads(emulator: em
     ):
         z, depth = x.clone().requires_grad_(), images[1].clone().requires_grad_()
         values = ops.photometric(z, y, mask, launcher=launcher)
-        consistency = ops.normal_consistency(images[0], depth, images[2], make_camera(37, 44), mask, launcher=launcher)
+        seen = NormalOptions(make_camera(37, 44), mask)
+        consistency = ops.normal_consistency(images[0], depth, images[2], seen, launcher=launcher)
         mean = ops.masked_mean(x[..., 0], mask, launcher=launcher)
         results.append((*values, consistency, mean, *torch.autograd.grad(sum(values) + consistency, (z, depth))))
     for others in results[1:]:

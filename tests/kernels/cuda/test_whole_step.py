@@ -94,32 +94,28 @@ def two_sizes(scene: Scene) -> Scene:
     return replace(scene, train=tuple(small))
 
 
+def with_options(recipe: Recipe, **options: str) -> Recipe:
+    """Return the recipe with these options of normal consistency."""
+    stages = []
+    for stage in recipe.stages:
+        terms = (replace(t, options=options) if t.kind.startswith("normal") else t for t in stage.losses)
+        stages.append(replace(stage, losses=tuple(terms)))
+    return replace(recipe, stages=tuple(stages))
+
+
 def at_camera(recipe: Recipe) -> Recipe:
     """Normals of depth as in the official code."""
-    stages = (
-        replace(
-            stage,
-            losses=tuple(replace(t, edges="camera") if t.kind.startswith("normal") else t for t in stage.losses),
-        )
-        for stage in recipe.stages
-    )
-    return replace(recipe, stages=tuple(stages))
+    return with_options(recipe, edges="camera")
 
 
 def of_object(recipe: Recipe) -> Recipe:
     """Normal consistency of the object alone, as in ``best``."""
-    stages = (
-        replace(
-            stage, losses=tuple(replace(t, where="object") if t.kind.startswith("normal") else t for t in stage.losses)
-        )
-        for stage in recipe.stages
-    )
-    return replace(recipe, stages=tuple(stages))
+    return with_options(recipe, where="object")
 
 
 def with_silhouettes(recipe: Recipe) -> Recipe:
     """Alpha of the photographs that have one kept, as in ``best``."""
-    return with_term(recipe, LossTerm("silhouette", 0.1, required=False))
+    return with_term(recipe, LossTerm("silhouette", 0.1, options={"required": False}))
 
 
 def with_squares(recipe: Recipe) -> Recipe:

@@ -109,8 +109,9 @@ def _weights(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
     """Scenes whose protocol weighs distortion otherwise than the paper's "100/10", in tables with such rows."""
     if not any("100/10" in row.name for row in table.rows):
         return
-    for weight in dict.fromkeys(scene.protocol.distortion_weight for scene in scenes if scene.data_set != TNT):
-        names = ", ".join(s.name for s in scenes if s.data_set != TNT and s.protocol.distortion_weight == weight)
+    weighed = [(s.name, s.protocol.loss_weights["distortion"]) for s in scenes if s.data_set != TNT]
+    for weight in dict.fromkeys(weight for _, weight in weighed):
+        names = ", ".join(name for name, found in weighed if found == weight)
         yield f"{names}: alpha with distortion is {weight:g}, their protocol's; the paper's 100/10 is of TnT"
 
 

@@ -8,6 +8,7 @@ not needed). The formulas are in ``kernels/core/losses.h``; ``losses.reference``
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,6 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
 from gs2d.kernels.cuda.arguments import (
@@ -27,6 +27,7 @@ from gs2d.kernels.cuda.arguments import (
     PhotometricVjpArguments,
     fill,
 )
+from gs2d.kernels.losses import NormalOptions
 
 if TYPE_CHECKING:
     from gs2d.kernels.cuda.launch import Launcher
@@ -191,17 +192,16 @@ def photometric(
     return l1, ssim, l2
 
 
-def _normal_arguments(
-    images: Sequence[Tensor | None], camera: Camera, per_splat: bool, at_camera: bool, **more: Tensor | None
-) -> NormalArguments:
-    normal, depth, alpha, mask, weights = images
+def _normal_arguments(images: Sequence[Tensor], how: NormalOptions, **more: Tensor | None) -> NormalArguments:
+    normal, depth, alpha = images
+    camera = how.camera
     arguments = NormalArguments(
-        height=camera.height, width=camera.width, per_splat=int(per_splat), at_camera=int(at_camera)
+        height=camera.height, width=camera.width, per_splat=int(how.per_splat), at_camera=int(how.at_camera)
     )
     for name in ("fx", "fy", "cx", "cy"):
         setattr(arguments, name, float(getattr(camera, name)))
     arguments.rotation[:] = np.asarray(camera.rotation).ravel().tolist()
-    fill(arguments, normal=normal, depth=depth, alpha=alpha, mask=mask, weights=weights, **more)
+    fill(arguments, normal=normal, depth=depth, alpha=alpha, mask=how.mask, weights=how.weights, **more)
     return arguments
 
 
@@ -212,51 +212,42 @@ class _NormalConsistency(torch.autograd.Function):
         normal: Tensor,
         depth: Tensor,
         alpha: Tensor,
-        mask: Tensor | None,
-        weights: Tensor | None,
-        camera: Camera,
-        per_splat: bool,
-        at_camera: bool,
+        how: NormalOptions,
         launcher: Launcher,
     ) -> Tensor:
         blocks = -(-depth.numel() // MEAN_PIXELS)
         partials = depth.new_empty(2, blocks)
         if blocks > 0:
-            images = (normal, depth, alpha, mask, weights)
-            arguments = _normal_arguments(images, camera, per_splat, at_camera, partials=partials)
+            arguments = _normal_arguments((normal, depth, alpha), how, partials=partials)
             launcher.launch("normal_consistency", blocks, THREADS, arguments)
-        means = _finish(launcher, partials, complement=not per_splat and weights is None)
-        ctx.launcher, ctx.camera, ctx.per_splat, ctx.at_camera = launcher, camera, per_splat, at_camera
-        ctx.save_for_backward(normal, depth, alpha, mask, weights, means)
+        means = _finish(launcher, partials, complement=not how.per_splat and how.weights is None)
+        ctx.launcher, ctx.how = launcher, how
+        ctx.save_for_backward(normal, depth, alpha, means)
         return means[1].clone()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
         *images, means = ctx.saved_tensors
-        want = [*ctx.needs_input_grad[:2], ctx.needs_input_grad[2] and ctx.per_splat]
-        gradients = [torch.empty_like(x) if w else None for x, w in zip(images[:3], want, strict=True)]
-        blocks = -(-ctx.camera.width // NORMAL_W) * -(-ctx.camera.height // NORMAL_H)
+        want = [*ctx.needs_input_grad[:2], ctx.needs_input_grad[2] and ctx.how.per_splat]
+        gradients = [torch.empty_like(x) if w else None for x, w in zip(images, want, strict=True)]
+        blocks = -(-ctx.how.camera.width // NORMAL_W) * -(-ctx.how.camera.height // NORMAL_H)
         if images[1].numel() > 0:
             g_normal, g_depth, g_alpha = gradients
             given = _cotangent(cotangent)
             outputs = {"g_normal": g_normal, "g_depth": g_depth, "g_alpha": g_alpha}
             outputs |= {"means": means, "cotangent": given}
-            arguments = _normal_arguments(images, ctx.camera, ctx.per_splat, ctx.at_camera, **outputs)
+            arguments = _normal_arguments(images, ctx.how, **outputs)
             ctx.launcher.launch("normal_consistency_vjp", blocks, THREADS, arguments)
-        return (*gradients, *[None] * 6)
+        return (*gradients, None, None)
 
 
 def normal_consistency(
     normal: Tensor,
     depth: Tensor,
     alpha: Tensor,
-    camera: Camera,
-    mask: Tensor | None = None,
+    how: NormalOptions,
     *,
-    weights: Tensor | None = None,
-    edges: str = "undefined",
-    per_splat: bool = False,
     expected: float = 0.05,
     launcher: Launcher,
 ) -> Tensor:
@@ -269,15 +260,7 @@ def normal_consistency(
     depth : Tensor [H, W] float32, world units
         0 where nothing was hit.
     alpha : Tensor [H, W] float32
-    camera : Camera
-    mask : Tensor [H, W] bool, optional
-        False = ignore this pixel.
-    weights : Tensor [H, W] float32, optional
-        By which each pixel's part is multiplied; a constant.
-    edges : "undefined" or "camera"
-        See ``losses.reference.normals_from_depth``.
-    per_splat : bool
-        The paper's form, mean(alpha - <n, N>), instead of the official mean(1 - alpha <n, N>) with alpha detached.
+    how : NormalOptions
     expected : float
         Not needed here.
     launcher : Launcher
@@ -289,16 +272,12 @@ def normal_consistency(
         Shapes that differ, or another dtype or device.
     """
     del expected
-    shapes = {"depth": (depth, "H W"), "normal": (normal, "H W 3"), "alpha": (alpha, "H W")}
-    shapes |= {} if weights is None else {"weights": (weights, "H W")}
-    sizes = check_shapes(shapes | ({} if mask is None else {"mask": (mask, "H W")}))
-    if (camera.height, camera.width) != (sizes["H"], sizes["W"]):
-        raise ShapeError(f"camera is {camera.width}x{camera.height}, but depth is {sizes['W']}x{sizes['H']}")
+    how.check(normal, depth, alpha)
     ready(normal=normal, depth=depth, alpha=alpha)
-    images = (normal.contiguous(), depth.contiguous(), alpha.contiguous(), _mask_of(mask, normal.device))
-    if weights is not None:
-        _, weights = ready(normal=normal, weights=weights)
-    value: Tensor = _NormalConsistency.apply(*images, weights, camera, per_splat, edges == "camera", launcher)
+    weights = None if how.weights is None else ready(normal=normal, weights=how.weights)[1]
+    how = replace(how, mask=_mask_of(how.mask, normal.device), weights=weights)
+    images = (normal.contiguous(), depth.contiguous(), alpha.contiguous())
+    value: Tensor = _NormalConsistency.apply(*images, how, launcher)
     return value
 
 

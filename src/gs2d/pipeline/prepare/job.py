@@ -38,6 +38,7 @@ from gs2d.data.subject import check_subject_box
 from gs2d.errors import DataError, ProtocolError, RecipeError, RunError, ShapeError
 from gs2d.io.formats.registry import read_surfels
 from gs2d.io.run_dir import RUN_JSON, RunFolder, versions
+from gs2d.losses.api import losses_of
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
 from gs2d.pipeline.prepare.capture_masks import without_masked_points
 from gs2d.pipeline.prepare.opened import SHOWN_SKIPS, Opened, open_capture, read_scene
@@ -238,7 +239,8 @@ def build_recipe(
     ):
         if wanted and getattr(value, field) is None:
             raise RecipeError(f"{option} and --set {field}=null contradict each other, got both; leave one out")
-    return validate(value)
+    losses_of(validate(value))  # which know their options
+    return value
 
 
 def check_train_options(options: TrainOptions) -> Recipe:

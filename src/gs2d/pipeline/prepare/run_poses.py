@@ -18,7 +18,7 @@ from gs2d.core.transforms import focus_point, perturb_pose
 from gs2d.data import Scene, View
 from gs2d.errors import DataError, RunError, ShapeError
 from gs2d.io.run_dir import POSES, SPLATS, RunFolder
-from gs2d.losses.api import compute_losses
+from gs2d.losses.api import LossView, compute_losses
 from gs2d.pipeline.events import Notice, OnEvent, counted
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
@@ -227,11 +227,11 @@ def aligned(
         motion = torch.zeros(6, dtype=torch.float64, requires_grad=True)
         optimizer = torch.optim.Adam([motion], lr=RATE)
         decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (RATE_FINAL / RATE) ** (1 / STEPS))
-        for step in range(1, STEPS + 1):
+        for _ in range(STEPS):
             camera = perturb_pose(view.camera, motion * unit)
             output = rasterize(splats, camera, settings, backend=backend)
-            options: dict[str, Any] = {"iteration": step, "depth_kind": "mean", "backend": backend}
-            loss = sum(compute_losses(output, target, mask, camera, PHOTOMETRIC, **options).values())
+            compared = LossView(target, camera, mask)
+            loss = sum(compute_losses(output, compared, PHOTOMETRIC, backend=backend).values())
             optimizer.zero_grad()
             if isinstance(loss, torch.Tensor) and loss.requires_grad:
                 loss.backward()

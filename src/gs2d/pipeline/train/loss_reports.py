@@ -32,8 +32,8 @@ def report_losses(run: RunFolder, trainer: Trainer, views: Sequence[View]) -> di
         return {}
     found: dict[str, dict[str, Any]] = {
         name: {
-            "title": str(getattr(loss, "title", name)),
-            "figure": str(getattr(loss, "figure", name)),
+            "title": loss.title,
+            "figure": loss.figure or name,
             "by_view": {},
             "shown": [],
         }
