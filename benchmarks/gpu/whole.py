@@ -18,7 +18,7 @@ from gs2d.kernels.cuda import launch
 from gs2d.render.cuda_step import Stepper
 from gs2d.render.pair_budget import PairBudget, Rendering
 from gs2d.render.types import RasterSettings
-from gs2d.render.whole_step import Learned, WholeStep
+from gs2d.render.whole_step import Learned, StepLosses, StepNormals, WholeStep
 from gs2d.training import objective, trainer
 
 WAYS = ("autograd", "launches", "graph")
@@ -49,10 +49,12 @@ def _step(bench: Bench, splats: Splats, camera: Camera, channels: int) -> None:
         mask=None,
         valid=camera.height * camera.width,
         background=(0.0, 0.0, 0.0),
-        weights={"l1": 0.8, "ssim": 0.2, "normal_consistency": 0.05} | ({"silhouette": 0.1} if channels == 4 else {}),
-        depth="mean",
-        at_camera=False,
-        of_object=True,
+        losses=StepLosses(
+            0.8,
+            0.2,
+            silhouette=0.1 if channels == 4 else None,
+            normals=StepNormals(0.05, "mean", at_camera=False, of_object=True),
+        ),
         rows=None,
         learned=learned,
         betas=(0.9, 0.999, 1e-15),

@@ -24,7 +24,7 @@ from gs2d.render import cuda
 from gs2d.render.cuda_step import Stepper
 from gs2d.render.pair_budget import PairBudget, Rendering
 from gs2d.render.types import PLAIN_COLORS, Features, RasterSettings
-from gs2d.render.whole_step import Learned, WholeStep
+from gs2d.render.whole_step import Learned, StepLosses, StepNormals, WholeStep
 from kernel_cases import SETTINGS, Case, many_tiles
 from render_scenes import contraction, random_cotangents
 
@@ -136,6 +136,7 @@ def whole_steps(emulator: Emulator, case: Case) -> dict[str, Tensor]:
             if names is None or name in names
         }
         gathered = {name: torch.zeros(count) for name in ("signed", "count", *(("absolute",) if absolute else ()))}
+        more = {"l2": 10.0, "silhouette": 0.1} if channels == 4 else {}
         step = WholeStep(
             splats=splats,
             camera=case.camera,
@@ -144,11 +145,7 @@ def whole_steps(emulator: Emulator, case: Case) -> dict[str, Tensor]:
             mask=torch.rand(height, width, generator=g) < 0.8,
             valid=height * width,
             background=(0.1, 0.5, 0.2),
-            weights={"l1": 0.8, "ssim": 0.2, "normal_consistency": 0.05}
-            | ({"silhouette": 0.1, "l2": 10.0} if channels == 4 else {}),
-            depth="mean",
-            at_camera=False,
-            of_object=True,
+            losses=StepLosses(0.8, 0.2, normals=StepNormals(0.05, "mean", at_camera=False, of_object=True), **more),
             rows=None if names is None else torch.arange(count) % 3 == 0,
             learned=learned,
             betas=(0.9, 0.999, 1e-15),
