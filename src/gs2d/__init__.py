@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from gs2d.render.backends import backend_report, get_backend, register_backend
     from gs2d.render.tensor_api import rasterize_2dgs
     from gs2d.render.types import RasterSettings, RenderOutput
+    from gs2d.report.sections.registry import register_section
     from gs2d.training.trainer import Trainer
 
 __version__ = "0.2.0"  # the one place: pyproject.toml reads it from here
@@ -76,6 +77,7 @@ __all__ = [
     "register_loss",
     "register_reader",
     "register_recipe",
+    "register_section",
     "rgb_to_sh0",
     "splat_errors",
     "train",
@@ -121,6 +123,7 @@ _HOME = {
     "register_loss": "gs2d.config.losses",
     "register_reader": "gs2d.data.readers.registry",
     "register_recipe": "gs2d.config.presets",
+    "register_section": "gs2d.report.sections.registry",
     "rgb_to_sh0": "gs2d.core.sh",
     "splat_errors": "gs2d.render.api",
     "train": "gs2d.pipeline.in_memory",

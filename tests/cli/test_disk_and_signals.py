@@ -184,11 +184,11 @@ def test_what_could_not_be_made_is_exit_code_3_and_names_the_command_that_makes_
         raise ValueError("broken data stream")
 
     copy = Path(shutil.copytree(trained, tmp_path / "run"))
-    monkeypatch.setattr("gs2d.report.write.curve_section", broken)
+    monkeypatch.setattr("gs2d.report.sections.training.curves", broken)
     assert run(["report", str(copy), "--json", *["--quiet"] * quiet]) == app_module.INCOMPLETE == 3
     out, err = capsys.readouterr()
     said = "fault in gs2d: ValueError: broken data stream"
-    assert json.loads(out)["missing"] == [{"what": "curves in report.html", "reason": said}]
+    assert json.loads(out)["missing"] == [{"what": "section training in report.html", "reason": said}]
     last = err.splitlines()[-1]
-    assert last == f"not made: curves in report.html{f' ({said})' * quiet}; again: gs2d report {copy}"
+    assert last == f"not made: section training in report.html{f' ({said})' * quiet}; again: gs2d report {copy}"
     assert err.count(said) == 1

@@ -96,12 +96,12 @@ def events() -> list[dict[str, Any]]:
     return lines
 
 
-def write_renders(folder: Path, size: int) -> None:
+def write_renders(folder: Path, width: int, height: int) -> None:
     rng = np.random.default_rng(1)
     views = []
     for k, split in enumerate(("test", "train")):
         eye = np.array([(2.5, -1.5, 2.0), (-2.0, 2.0, 1.5)][k])
-        camera = look_at(eye, np.zeros(3), np.array([0, 0, 1.0]), width=size, height=size, fx=1.2 * size)
+        camera = look_at(eye, np.zeros(3), np.array([0, 0, 1.0]), width=width, height=height, fx=1.2 * width)
         hits = cast_camera(KNOT.vertices, KNOT.faces, camera)
         alpha = (hits.face >= 0).astype(np.float32)
         normal = KNOT.normals[KNOT.faces[hits.face, 0]] * alpha[..., None]
@@ -125,8 +125,8 @@ def write_renders(folder: Path, size: int) -> None:
     write_json(folder / "renders" / "index.json", index)
 
 
-def fabricate(folder: Path, *, size: int = 48) -> Path:
-    """A whole run."""
+def fabricate(folder: Path, *, size: int = 48, height: int | None = None) -> Path:
+    """A whole run; photographs are square without a height."""
     folder.mkdir(parents=True)
     write_json(folder / "run.json", definition())
     surface = {
@@ -138,7 +138,7 @@ def fabricate(folder: Path, *, size: int = 48) -> Path:
     }
     write_json(folder / "metrics.json", {"stages": [stage_entry(k) for k in range(3)], "surface": surface})
     (folder / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events()) + '{"kind": "st')
-    write_renders(folder, size)
+    write_renders(folder, size, height or size)
     colors = np.clip(127 + 120 * KNOT.normals, 0, 255).astype(np.uint8)
     write_mesh(folder / "mesh.ply", Mesh(KNOT.vertices, KNOT.faces.astype(np.int32), colors))
     return folder

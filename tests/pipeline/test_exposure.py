@@ -152,7 +152,6 @@ def test_a_lost_or_damaged_file_of_exposures_is_named_with_its_remedy(run: RunFo
 def test_the_report_shows_the_exposures(run: RunFolder) -> None:
     page = " ".join(run.file("report.html").read_text().split())
     assert "Exposure of the photographs" in page
-    assert "A middle grey of the scene is" in page
     entries = json.loads(run.file(EXPOSURE).read_text())["photographs"]
     darkest = min(entries, key=lambda entry: sum(entry["grey"]))
-    assert f"times as bright in {darkest['name']} (the darkest)" in page
+    assert f"{darkest['name']} is the darkest" in page

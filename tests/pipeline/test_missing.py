@@ -114,19 +114,19 @@ def test_a_section_that_fails_loses_no_other_section(
     undisturbed: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
-    monkeypatch.setattr("gs2d.report.write.curve_section", failing(RuntimeError("no curve today")))
+    monkeypatch.setattr("gs2d.report.sections.training.curves", failing(RuntimeError("no curve today")))
     (copy / "renders" / "index.json").write_text("{")
     heard: list[Event] = []
     report_run(copy, heard.append)
     whats = [event.what for event in heard if isinstance(event, MissingFile)]
     assert whats == [
         "cameras of the pictures in report.html",
-        "pictures at the top in report.html",
-        "pictures of the stages in report.html",
-        "curves in report.html",
+        "comparison with a photograph in report.html",
+        "section views in report.html",
+        "section training in report.html",
     ]
     assert {event.command for event in heard if isinstance(event, MissingFile)} == {f"gs2d report {copy}"}
     text = (copy / "report.html").read_text()
-    assert "The curves could not be made: no curve today" in text
-    assert "What was run" in text
-    assert "The mesh, " in text
+    assert "The section training could not be made: no curve today" in text
+    assert "Settings" in text
+    assert "Drag to turn" in text

@@ -21,6 +21,7 @@ from gs2d.pipeline.finish.run_subject import meshed_subject, subject_line
 from gs2d.pipeline.prepare.finished import finished_splats
 from gs2d.pipeline.prepare.job import reload_job
 from gs2d.pipeline.prepare.options import MeshOptions
+from gs2d.report.record import read_record
 from gs2d.report.sections.subject import subject_section
 
 BOX = (-0.5, -0.6, -0.7, 0.5, 0.6, 0.7)
@@ -29,7 +30,7 @@ BOX = (-0.5, -0.6, -0.7, 0.5, 0.6, 0.7)
 def test_training_writes_the_subject_and_only_the_generic_protocol_meshes_it(undisturbed: RunFolder) -> None:
     subject = read_subject(undisturbed.path)
     assert subject is not None
-    shown = subject_section(undisturbed.path)  # in the report: words, the box and the picture
+    shown = str(subject_section(read_record(undisturbed.path)))  # in the report: words, the box and the picture
     assert subject.why in shown
     assert subject_line(subject, meshed=True).endswith("--scene takes everything")
     assert "the mesh is of everything" in subject_line(subject, meshed=False)

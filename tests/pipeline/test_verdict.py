@@ -24,7 +24,8 @@ from gs2d.pipeline.finish.verdict.measures import (
     blur_of,
     neighbours_of,
 )
-from gs2d.report.sections.verdict import grade_of, verdict_section
+from gs2d.report.record import RunRecord
+from gs2d.report.sections.verdict import verdict_section
 
 
 def views(train: float = 29.0, test: float = 27.0, **changes: Any) -> tuple[ViewMeasures, ...]:
@@ -91,7 +92,6 @@ def test_recorded_captures_get_the_grade_that_a_person_gives(name: str) -> None:
 def test_new_views_are_graded_by_their_psnr(psnr: float, grade: str) -> None:
     measures = Measures(views(train=psnr + 1, test=psnr))
     assert found(measures, "new views").grade == judge(measures).grade == grade
-    assert grade_of(psnr, "test") == grade
 
 
 @pytest.mark.parametrize(
@@ -163,14 +163,15 @@ def test_the_next_camera_is_the_one_nearest_in_direction_and_a_test_view_is_nobo
 # -- in a run and its report -------------------------------------------------------------------------------------------
 def test_the_report_begins_with_the_verdict(tmp_path: Path) -> None:
     path = tmp_path / "verdict.json"
-    assert verdict_section(path) == ""
+    run = RunRecord(tmp_path, {})
+    assert verdict_section(run) is None
     write_json(path, {"verdict": judge(Measures(views(test=18.0))).to_json()})
-    html = verdict_section(path)
+    html = str(verdict_section(run))
     assert '<span class="grade poor">poor</span>' in html
-    assert "What to do or to photograph next" in html
+    assert "Take more photographs" in html
     write_json(path, {"verdict": {"grade": "good"}})
     with pytest.raises(DataError, match=r"verdict\.json must hold a verdict"):
-        verdict_section(path)
+        verdict_section(run)
 
 
 def test_a_run_has_a_verdict_of_every_view(undisturbed: RunFolder) -> None:
@@ -181,4 +182,4 @@ def test_a_run_has_a_verdict_of_every_view(undisturbed: RunFolder) -> None:
         assert np.mean([row["psnr"] for row in rows]) == pytest.approx(last[split]["psnr"], abs=1e-6)
         assert all(row["blur"] > 0 for row in rows)
     assert data["verdict"]["grade"] in grades.GRADES
-    assert "<h2>Verdict</h2>" in undisturbed.file("report.html").read_text()
+    assert "<summary>Verdict</summary>" in undisturbed.file("report.html").read_text()

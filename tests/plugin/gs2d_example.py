@@ -106,3 +106,11 @@ def write_xyz(path, splats):
     """Write the centres as text."""
     np.savetxt(path, splats.means.detach().cpu().numpy(), fmt="%.6g")
     return ("only the centres were written",)
+
+
+@gs2d.register_section("example-seed", title="Seed of the run")
+def seed(run):
+    """Show the seed and the last score."""
+    if not run.stages:
+        return None
+    return f"<p>Seed {run.definition['seed']}, {run.last['train']['psnr']:.1f} dB on training views.</p>"

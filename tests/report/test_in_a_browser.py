@@ -1,8 +1,9 @@
-"""The report in a browser: pictures wipe and enlarge by mouse, finger and keys, and phones can read it."""
+"""The report in a browser: it fits three widths, and its images and mesh react to mouse, finger and keys."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -43,22 +44,73 @@ def test_the_line_between_photograph_and_rendering_follows_mouse_and_arrow_keys(
     assert both[1] == "none"
 
 
-def test_pictures_enlarge_in_all_their_pixels_and_step_by_keys(page: Page) -> None:
-    page.click(".hero.first .hero button.zoom")
+def test_images_enlarge_to_their_full_size_and_step_by_keys(page: Page) -> None:
+    page.ask("document.querySelector('details#views').open = true")
+    page.click(".shots button.zoom")
     assert page.ask(LARGE)
     first = page.ask("document.querySelector('dialog p').textContent")
-    assert first.startswith("Normal, refine of test/r_0")
+    assert first.startswith("Colour, after surface")
     # not the JPEG in the report: the file in the run's folder
-    page.until("document.querySelector('dialog .stage img').src.endsWith('renders/refine/test__r_0.normal.png')")
+    page.until("document.querySelector('dialog .stage img').src.endsWith('renders/surface/test__r_0.color.png')")
     page.key("ArrowRight")
     assert page.ask("document.querySelector('dialog p').textContent") != first
     page.key("Escape")
     assert not page.ask(LARGE)
-    page.ask("document.querySelector('.hero.first .hero button.zoom').focus()")
+    page.ask("document.querySelector('.shots button.zoom').focus()")
     page.key("Enter")
     assert page.ask(LARGE)
     page.click("dialog .close")
     assert not page.ask(LARGE)
+
+
+def test_the_mesh_turns_by_mouse_and_keys_and_is_drawn(page: Page) -> None:
+    page.until("document.querySelector('.mesh').dataset.drawn")
+    drawn = "document.querySelector('.mesh').dataset.drawn"
+    first = page.ask(drawn)
+    x, y = page.middle(".mesh canvas")
+    page.drag((x, y), (x + 60, y + 20))
+    page.until(f"{drawn} !== '{first}'")
+    turned = page.ask(drawn)
+    page.ask("document.querySelector('.mesh canvas').focus()")
+    page.key("ArrowLeft")
+    page.until(f"{drawn} !== '{turned}'")
+    page.click(".mesh .shape")
+    assert page.ask("document.querySelector('.mesh .shape').getAttribute('aria-pressed')") == "true"
+    page.middle(".mesh canvas")
+    box = page.ask("(() => {const b = document.querySelector('.mesh canvas').getBoundingClientRect();"
+                   "return [b.x, b.y, b.right, b.bottom]})()")  # fmt: skip
+    left, top, right, bottom = map(int, box)
+    assert page.image()[top:bottom, left:right].std() > 0.02
+
+
+CUT_OFF = """[...document.querySelectorAll('main *')].filter((e) => {
+  const b = e.getBoundingClientRect();
+  if (!b.width || !b.height || getComputedStyle(e).visibility === 'hidden') return false;
+  const window = document.documentElement.clientWidth;
+  return b.left < -1 || b.right > window + 1 || (e.clientWidth && e.scrollWidth > e.clientWidth + 1);
+}).map((e) => e.outerHTML.slice(0, 120))"""
+EMPTY = """[...document.querySelectorAll('main img, main figure, main td')].filter((e) => e.checkVisibility() &&
+  (!e.getBoundingClientRect().height || (e.matches('td') && !e.textContent.trim()))
+).map((e) => e.outerHTML.slice(0, 120))"""
+
+
+@pytest.mark.parametrize("height", [48, 72], ids=["square", "portrait"])
+def test_the_report_fits_the_window(height: int, tmp_path: Path) -> None:
+    require_browser()
+    write_report(fabricate(tmp_path / "run", height=height))
+    with browser() as page:
+        for width in (390, 820, 1400):
+            page.size(width, 800, phone=width < 800)
+            page.open(f"file://{tmp_path}/run/report.html")
+            page.until("document.querySelector('.mesh').dataset.drawn")
+            assert page.ask("document.documentElement.scrollHeight") <= 8 * 800
+            for part in (".verdict", ".wipe .both", ".mesh canvas"):  # on the first screen
+                bottom = page.ask(f"document.querySelector('{part}').getBoundingClientRect().bottom")
+                assert bottom <= 800, (part, width)
+            for opened in ("false", "true"):
+                page.ask(f"document.querySelectorAll('details').forEach((d) => (d.open = {opened}))")
+                assert page.ask(CUT_OFF) == [], width
+                assert page.ask(EMPTY) == [], width
 
 
 def test_a_phone_reads_it_without_moving_sideways_and_wipes_by_finger(page: Page) -> None:
@@ -66,10 +118,14 @@ def test_a_phone_reads_it_without_moving_sideways_and_wipes_by_finger(page: Page
     try:
         assert page.ask("document.documentElement.scrollWidth") <= 375
         x, y = page.middle(".wipe .both")
+        wide = page.ask("document.querySelector('.wipe .both').getBoundingClientRect().width")
         page.fingers(((x, y), (x + 100, y)))
-        assert page.ask(AT) == pytest.approx(50 + 100 * 100 / 343, abs=2)
+        assert page.ask(AT) == pytest.approx(50 + 100 * 100 / wide, abs=2)
         small = page.ask("[...document.querySelectorAll('main button, main summary')].filter((e) => "
                          "!e.textContent.trim() && !e.getAttribute('aria-label')).length")  # fmt: skip
         assert small == 0  # everything that can be pressed has a name
     finally:
         page.size(1600, 1000)
+
+
+# -- what needs no browser ---------------------------------------------------------------------------------------------

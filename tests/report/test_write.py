@@ -1,29 +1,40 @@
-"""The report: self-contained, complete, honest about what is missing; and the colours of its pictures."""
+"""The report: one file, complete, clear about what is missing; and the colours of its images."""
 
 from __future__ import annotations
 
+import base64
+import gzip
 import html
+import io
 import json
 import re
+from collections.abc import Callable
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from gs2d.core.camera import Camera
+from gs2d.core.camera import Camera, look_at
 from gs2d.core.json_files import write_json
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.errors import DataError, RunError
 from gs2d.io.meshes import write_textured
 from gs2d.report import mesh_images as report_mesh
+from gs2d.report import mesh_view as report_view
+from gs2d.report.mesh_view import MeshView, mesh_view
 from gs2d.report.plots import curves, read_history
+from gs2d.report.record import RunRecord, read_record
 from gs2d.report.sections import surface as report_surface
-from gs2d.report.sections.surface import surface_scores
-from gs2d.report.write import RunRecord, stage_table, verdict, write_report
-from report_runs import definition, events, fabricate, scores, stage_entry
+from gs2d.report.sections.registry import SECTIONS
+from gs2d.report.sections.results import results_section
+from gs2d.report.sections.surface import surface_section
+from gs2d.report.write import write_report
+from report_runs import KNOT, definition, events, fabricate, stage_entry
 
 VOID = {"meta", "img", "br", "input"}
 
@@ -63,132 +74,163 @@ def text_of(page: str) -> str:
     return html.unescape(re.sub(r"<[^>]+>", " ", re.sub(r"<(style|script)>.*?</\\1>", "", page, flags=re.S)))
 
 
-def record(**changes: object) -> RunRecord:
-    values = {
-        "path": Path("run"),
-        "definition": definition(),
-        "stages": tuple(stage_entry(k) for k in range(3)),
-        "surface": None,
-        "surface_reason": None,
-        "events": [],
-    }
-    return RunRecord(**(values | changes))  # type: ignore[arg-type]
+def record(**changes: Any) -> RunRecord:
+    return replace(RunRecord(Path("run"), definition(), tuple(stage_entry(k) for k in range(3))), **changes)
 
 
 # -- the whole page ----------------------------------------------------------------------------------------------------
-def test_the_report_is_one_well_formed_file_that_needs_nothing_else(run: Path, page: str) -> None:
+def test_the_report_is_one_well_formed_file_that_loads_nothing_else(run: Path, page: str) -> None:
     parser = Nesting()
     parser.feed(page)
     assert parser.open == []
-    assert parser.count["script"] == 1  # its own, inline
+    assert parser.count["script"] == 2  # its own, and the mesh
     assert "link" not in parser.count
     assert all(source.startswith("data:image/") for source in parser.sources)
-    assert parser.links == ["mesh.ply", "metrics.json", "run.json", "events.jsonl"]  # what is there, relative
+    assert parser.links == ["mesh.ply", "metrics.json", "run.json", "events.jsonl"]
     assert "url(" not in page
     assert "http" not in re.sub(r'"data:[^"]*"', "", page)
     assert (run / "report.html").stat().st_size < 8_000_000
     assert not list(run.glob(".*tmp"))
 
 
-def test_names_from_files_cannot_break_the_page(page: str) -> None:
-    assert "still <life>" not in page
-    assert "still &lt;life&gt;" in page
+def test_every_image_decodes(page: str) -> None:
+    images = re.findall(r'src="data:image/jpeg;base64,([^"]+)"', page)
+    # The pair and the mesh at the top, the pair of the second view; per view 3 stages x 5 kinds less the colour of the
+    # last stage, which is in the pair, and less the first stage, where nothing was ranked.
+    assert len(images) == 2 + 1 + 2 + 2 * (15 - 1 - 1)
+    for data in images:
+        with Image.open(io.BytesIO(base64.b64decode(data))) as image:
+            image.load()
+            assert image.width in (48, 640)
 
 
-def test_an_empty_run_says_in_words_what_is_missing(tmp_path: Path) -> None:
+def test_the_first_screen_has_the_verdict_three_numbers_and_the_next_command(run: Path, page: str) -> None:
+    first = " ".join(text_of(page[: page.index("<details")]).split())
+    for words in ("still <life>", "27.4 dB PSNR on new views", "20,200 splats, 4.7 MB", "3 min training"):
+        assert words in first
+    assert f"Next: gs2d view {run}" in first
+    assert "triangles" in first
+    write_json(run / "verdict.json", {"verdict": {"grade": "good", "headline": "It worked.", "findings": []}})
+    first = text_of(write_report(run).read_text().partition("<details")[0])
+    (run / "verdict.json").unlink()
+    assert " ".join(first.split()).endswith(f"Next: gs2d view {run}")
+    assert "good" in first
+    assert "It worked." in first
+
+
+def test_an_unfinished_run_says_what_is_missing(tmp_path: Path) -> None:
     write_json(tmp_path / "run.json", definition())
     text = text_of(write_report(tmp_path).read_text())
     for words in (
-        "No stage of 2dgs-r is finished and scored yet",
-        "metrics.json has no finished stage yet",
-        "The surface was not scored",
+        "Training is not finished: surface, appearance, refine missing.",
+        "No stage is finished yet",
         "There is no mesh.ply",
-        "renders/ holds no pictures",
-        "events.jsonl is missing or empty",
+        "renders/ holds no images",
+        "events.jsonl holds no training steps",
+        f"gs2d mesh {tmp_path}",
     ):
         assert words in text
+    assert "Surface scores" not in text
 
 
-def test_a_lost_picture_is_named_where_it_should_be(tmp_path: Path) -> None:
-    run = fabricate(tmp_path / "run", size=16)
-    (run / "renders" / "appearance" / "test__r_0.normal.png").unlink()
-    (run / "renders" / "photos" / "train__r_1.png").unlink()
-    text = text_of(write_report(run).read_text())
-    assert "not rendered for appearance" in text
-    assert "no photograph in renders/photos" in text
-    assert "no splats were ranked by error up to this stage" in text  # stage surface, as fabricated
+def test_settings_are_listed_and_names_from_files_are_escaped(page: str) -> None:
+    text = " ".join(text_of(page).split())
+    for words in ("2dgs-r", "nerf-synthetic", "still <life>", "cpu (AVX2)", "a processor & <its> makers", "torch 2.4"):
+        assert words in text
+    assert "40 training, 8 test" in text
+    assert "Seed 7" in text
+    assert "Depth, after refine, 1.5 to 4.25 world units" in text
+    assert "colours in [0, 1] 0 0.2 and more" in text
+    assert "still <life>" not in page
 
 
-def test_a_folder_that_is_no_run_is_an_error_and_broken_files_are_named(tmp_path: Path) -> None:
+def test_a_folder_that_is_no_run_is_an_error_and_a_broken_file_loses_only_its_part(tmp_path: Path) -> None:
     with pytest.raises(RunError):
         write_report(tmp_path)
     run = fabricate(tmp_path / "run", size=16)
     (run / "renders" / "index.json").write_text("{")
     failed: list[tuple[str, Exception]] = []
     text = text_of(write_report(run, on_failure=lambda part, error: failed.append((part, error))).read_text())
-    assert [part for part, _ in failed] == ["pictures at the top", "pictures of the stages"]
+    assert [part for part, _ in failed] == ["comparison with a photograph", "section views"]
     assert all(isinstance(error, DataError) and "index.json" in str(error) for _, error in failed)
-    assert "The pictures of the stages could not be made: " in text
+    assert "The section views could not be made: " in text
     (run / "run.json").write_text("{")
     with pytest.raises(DataError, match=r"run\.json"):
         write_report(run)
 
 
-# -- sentences and tables ----------------------------------------------------------------------------------------------
-def test_the_verdict_states_gain_and_price() -> None:
-    # 27.35 - 26.50 = 0.85 dB; 4686400 / 4640000 = 1.010; (20 + 45) / 100 = 65 %.
-    text = text_of(verdict(record()))
-    assert "2dgs-r reaches  27.35 dB  PSNR on the test views (SSIM 0.9094)" in text
-    assert "0.85 dB more than after its first stage (surface), for +1.0 % storage and +65 % training time." in text
+# -- sections ----------------------------------------------------------------------------------------------------------
+def test_the_order_of_the_sections_is_that_of_the_registry(page: str) -> None:
+    shown = re.findall(r'<details class="section" id="(\w+)"', page)
+    assert shown == [name for name in SECTIONS if name in shown]
+    assert shown[0] == "results"
+    assert {"views", "training", "surface", "files", "settings", "terms"} <= set(shown)
 
 
-def test_the_verdict_does_not_hide_a_loss_or_an_unfinished_run() -> None:
-    worse = {**stage_entry(1), "test": scores(26.1)}
-    text = text_of(verdict(record(stages=(stage_entry(0), worse))))
-    assert "0.40 dB less than after its first stage" in text
-    assert "Not finished: refine." in text
+def test_the_table_of_results_marks_the_best_and_has_no_empty_row() -> None:
+    table = str(results_section(record()))
+    assert '<td class="best">27.35</td>' in table
+    assert table.count('class="best"') == 4  # PSNR and SSIM of both splits, once each
+    assert "LPIPS" not in table
+    assert "Transparent" not in table
+    counted = {**stage_entry(2), "transparent": {"part": 0.0123, "view": "b.jpg", "worst": 0.2}}
+    assert "<td>1.2</td>" in str(results_section(record(stages=(counted,))))
 
 
-def test_surface_figures_are_shown_or_their_absence_explained() -> None:
+def test_a_run_without_test_views_shows_its_training_views() -> None:
+    stages = tuple({**stage_entry(k), "test": None, "test_reason": "the scene has no test views"} for k in range(3))
+    assert record(stages=stages).split == "train"
+    table = str(results_section(record(stages=stages)))
+    assert "(new views)" not in table
+    assert "28.35" in table
+
+
+def test_surface_scores_are_shown_or_the_reason_why_there_are_none() -> None:
     row = {"threshold": 0.02, "precision": 0.91, "recall": 0.84, "f_score": 0.8736}
     surface = {"thresholds": [row], "chamfer": 0.0123, "truth_hidden": 0.4459, "novel": 3}
-    table = surface_scores({**surface, "ground_truth": "/somewhere/else/true.ply"}, None)
+    table = str(surface_section(record(surface={**surface, "ground_truth": "/somewhere/else/true.ply"})))
     assert "<td>0.02</td><td>0.9100</td><td>0.8400</td><td>0.8736</td>" in table
     assert "<td>Chamfer distance</td><td>0.0123</td>" in table
     assert '<td>Truth hidden</td><td>44.6 %</td><td class="text">share of the true surface that fewer' in table
     assert "<td>True surface</td><td>true.ply</td>" in table  # no folder of this machine
-    assert "<td>Novel</td><td>3</td>" in table  # a later version's figure is shown, unexplained
-    assert "harmonic mean" in table
-    assert "The surface was not scored: no camera saw it." in surface_scores(None, "no camera saw it")
+    assert "<td>Novel</td><td>3</td>" in table  # a figure of a later version
+    assert "The surface was not scored: no camera saw it." in str(
+        surface_section(record(surface_reason="no camera saw it"))
+    )
+    assert surface_section(record()) is None
 
 
-def test_the_picture_of_a_score_and_the_doubts_about_it_are_in_the_report(tmp_path: Path) -> None:
+def test_the_image_of_a_score_and_its_alignment_check_are_in_the_report(tmp_path: Path) -> None:
     (tmp_path / "surface").mkdir()
     Image.new("RGB", (960, 640), (40, 150, 80)).save(tmp_path / "surface" / "surface.png")
     surface: dict[str, Any] = {"chamfer": 0.8, "evaluator": "tnt", "files": {"picture": "surface/surface.png"}}
-    sound = surface_scores(
-        {**surface, "self_check": {"ok": True, "messages": ["aligned by its cameras"]}}, None, tmp_path
-    )
+    check = {"ok": True, "messages": ["aligned by its cameras"]}
+    sound = str(surface_section(record(path=tmp_path, surface={**surface, "self_check": check})))
     assert sound.count("data:image/jpeg") == 1
-    assert "green where the other one is near" in sound
-    assert "Do not believe" not in sound
+    assert "green where the other surface is close" in sound
+    assert "not reliable" not in sound
     assert "aligned by its cameras" in sound
-    wrong = {"ok": False, "messages": ["only 40% of the cameras agree"]}
-    text = surface_scores({**surface, "self_check": wrong}, None, tmp_path / "elsewhere")
-    assert "Do not believe these figures, their own check failed: only 40% of the cameras agree" in text
+    check = {"ok": False, "messages": ["only 40% of the cameras agree"]}
+    text = str(surface_section(record(path=tmp_path / "elsewhere", surface={**surface, "self_check": check})))
+    assert "These scores are not reliable: only 40% of the cameras agree" in text
     assert "data:image/jpeg" not in text
 
 
-def test_every_figure_of_a_surface_score_is_explained_in_the_report() -> None:
+def test_every_figure_of_a_surface_score_has_a_label() -> None:
     from dataclasses import fields
 
     from gs2d.evaluation.surface import SurfaceScore
 
-    valid = {field.name for field in fields(SurfaceScore)} - {
-        "scores",
-        "clouds",
-    }  # tables and point clouds, not figures
+    valid = {field.name for field in fields(SurfaceScore)} - {"scores", "clouds"}  # tables and point clouds
     assert valid <= set(report_surface._MEANINGS)
+
+
+def test_a_run_with_a_title_has_it_as_the_heading() -> None:
+    assert record().title == "still <life>"
+    assert record(definition={**definition(), "title": "gs2d demo"}).title == "gs2d demo"
+
+
+# -- curves ------------------------------------------------------------------------------------------------------------
 
 
 def test_there_is_a_curve_for_each_figure_with_its_stages_named() -> None:
@@ -198,7 +240,7 @@ def test_there_is_a_curve_for_each_figure_with_its_stages_named() -> None:
         "PSNR, dB",
         "Splats",
         "Mean opacity",
-        "Mean Kₐ = s_u s_v, square world units",
+        "Mean splat area, square world units",
     ]
     for svg in drawn.values():
         assert svg.startswith("<?xml")
@@ -206,6 +248,9 @@ def test_there_is_a_curve_for_each_figure_with_its_stages_named() -> None:
             assert f"<!-- {stage} -->" in svg  # matplotlib writes the text of its paths as comments
     assert "<!-- 27.35 -->" in drawn["PSNR, dB"]
     assert "<!-- normal_consistency -->" in drawn["Loss terms, weighted"]
+
+
+# -- colours -----------------------------------------------------------------------------------------------------------
 
 
 # -- the mesh ----------------------------------------------------------------------------------------------------------
@@ -245,28 +290,55 @@ def test_the_mesh_is_shown_with_its_texture() -> None:
     np.testing.assert_allclose(color[10, 2], 1.0)  # beside it: white
 
 
-def test_the_report_shows_the_textured_mesh_beside_the_clay(tmp_path: Path) -> None:
+def test_a_broken_texture_loses_only_the_view_of_the_mesh(tmp_path: Path) -> None:
     run = fabricate(tmp_path / "run", size=16)
-    before = write_report(run).read_text()
     write_textured(run / "mesh.glb", square_with_texture())
-    text = write_report(run).read_text()
-    assert "as clay and in its vertex colours" in text_of(before)
-    assert "as clay and with its texture" in text_of(text)
-    assert text.count("the mesh with its texture") >= 2
+    assert "triangles" in text_of(write_report(run).read_text())
     (run / "mesh.glb").write_bytes(b"not a mesh, of some length")
-    assert "a .glb file as `gs2d mesh --texture` writes it was expected" in text_of(write_report(run).read_text())
+    assert "a .glb file as <code>gs2d mesh --texture</code> writes it was expected" in write_report(run).read_text()
 
 
-def test_figures_of_metrics_json_are_in_the_page_word_for_word(run: Path, page: str) -> None:
-    metrics = json.loads((run / "metrics.json").read_text())
-    shown = text_of(page)
-    assert json.dumps(metrics["surface"], indent=2).splitlines()[1].strip() in shown
+def unpacked(view: MeshView) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray]:
+    """Return facts, faces, vertices and colours as the page decodes them."""
+    facts, data = json.loads(view.facts), gzip.decompress(base64.b64decode(view.data))
+    faces = np.frombuffer(data, np.uint32, 3 * facts["faces"]).reshape(-1, 3)
+    rest = data[faces.nbytes :]
+    steps = np.frombuffer(rest, np.uint16, 3 * facts["vertices"]).reshape(-1, 3)
+    colors = np.frombuffer(rest[steps.nbytes :], np.uint8).reshape(-1, 3)
+    return facts, faces, np.array(facts["low"]) + steps / 65535 * np.array(facts["size"]), colors
 
 
-def test_transparent_pixels_have_a_column_and_the_worst_view_where_they_were_counted() -> None:
-    counted = {**stage_entry(2), "transparent": {"part": 0.0123, "view": "b.jpg", "worst": 0.2}}
-    text = text_of(stage_table(record(stages=(counted,))))
-    assert "Transparent, %" in text
-    assert "1.2" in text
-    assert "b.jpg ( 20.0 %)" in text.replace("(20", "( 20")
-    assert "ransparent" not in text_of(stage_table(record()))
+def test_the_mesh_of_the_page_is_that_of_the_run(run: Path) -> None:
+    camera = look_at(np.array([3.0, 0, 0]), np.zeros(3), np.array([0, 0, 1.0]), width=30, height=20, fx=30)
+    view = mesh_view(run, [camera])
+    assert isinstance(view, MeshView)
+    facts, faces, vertices, colors = unpacked(view)
+    np.testing.assert_array_equal(faces, KNOT.faces)
+    np.testing.assert_allclose(vertices, KNOT.vertices, atol=1e-4)
+    assert len(colors) == len(vertices)
+    np.testing.assert_allclose(facts["eye"], camera.center, atol=1e-6)
+    assert view.image.shape[1] == 640
+
+
+def test_a_large_mesh_is_simplified_for_the_page_and_keeps_its_colours(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(report_view, "SHOWN_FACES", 1000)
+    view = mesh_view(run, ())
+    assert isinstance(view, MeshView)
+    _, faces, vertices, colors = unpacked(view)
+    assert view.faces == len(KNOT.faces)
+    assert len(faces) == view.shown <= 1000
+    assert faces.max() < len(vertices) == len(colors)
+    assert colors.std() > 10
+
+
+def test_a_section_that_returns_nothing_is_left_out(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sections: dict[str, Callable[[RunRecord], str | None]] = {
+        "empty": lambda _: None,
+        "seed": lambda _: "<p>7</p>",
+    }
+    monkeypatch.setattr("gs2d.report.write.SECTIONS", SimpleNamespace(working=sections.items))
+    text = write_report(run).read_text()
+    assert re.findall(r'<details class="section" id="(\w+)"', text) == ["seed"]
+    assert read_record(run).last["name"] == "refine"

@@ -9,8 +9,8 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from gs2d.cli.whole import Countdown, WholeRun
-from gs2d.core.text import printable
-from gs2d.pipeline.events import Phase, duration
+from gs2d.core.text import duration, printable
+from gs2d.pipeline.events import Phase
 
 _WIDEST, _LEAST = 32, 6  # columns of a bar; with fewer there is none
 _FULL, _EMPTY = "\u2501", "\u2500"

@@ -6,7 +6,8 @@ import math
 import time
 from collections.abc import Callable
 
-from gs2d.pipeline.events import Part, Phase, Plan, duration
+from gs2d.core.text import duration
+from gs2d.pipeline.events import Part, Phase, Plan
 
 GREW = (2.0, 60.0)  # an estimate of more than so many times what is shown, and so many seconds: the work grew
 _TRAINING = "training"

@@ -46,3 +46,12 @@ def _spelled(found: re.Match[str]) -> str:
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's message, or the name of its class where it has none."""
     return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def duration(seconds: float) -> str:
+    """Return a time with its unit: "40 s", "12 min", "3.5 h", "2.1 days"."""
+    for unit, size, until in (("s", 1, 90), ("min", 60, 90 * 60), ("h", 3600, 48 * 3600)):
+        if seconds < until:
+            digits = 1 if unit == "h" and seconds < 10 * size else 0
+            return f"{seconds / size:.{digits}f} {unit}"
+    return f"{seconds / 86400:.1f} days"

@@ -186,12 +186,3 @@ def counted(items: Sequence[T] | Iterable[T], name: str, total: int, on_event: O
     for done, item in enumerate(items, start=1):
         yield item
         on_event(Step(done))
-
-
-def duration(seconds: float) -> str:
-    """Return a time as people say it: "40 s", "12 min", "3.5 h", "2.1 days"."""
-    for unit, size, until in (("s", 1, 90), ("min", 60, 90 * 60), ("h", 3600, 48 * 3600)):
-        if seconds < until:
-            digits = 1 if unit == "h" and seconds < 10 * size else 0
-            return f"{seconds / size:.{digits}f} {unit}"
-    return f"{seconds / 86400:.1f} days"

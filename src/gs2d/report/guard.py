@@ -1,15 +1,16 @@
-"""The parts of the report, each tried by itself: one that fails is said in its place."""
+"""Runs the parts of the report one by one, so that a part that fails does not lose the others."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TypeVar
 
 from gs2d.core.files import is_full
 from gs2d.core.memory import trim
-from gs2d.report.html import missing
 
+T = TypeVar("T")
 OnFailure = Callable[[str, Exception], None]
-"""Is told the name of a part and why it is not there."""
+"""Receives the name of a part that failed, and its error."""
 
 
 class Guard:
@@ -18,14 +19,14 @@ class Guard:
     Parameters
     ----------
     on_failure : callable or None
-        Is told what failed; None: only the page says so.
+        Receives the name and the error of each part that fails.
     """
 
     def __init__(self, on_failure: OnFailure | None) -> None:
         self._on_failure = on_failure
 
-    def __call__(self, name: str, build: Callable[[], str]) -> str:
-        """Return what ``build`` returns, or one sentence where it raises; a full disk is no matter of one part."""
+    def __call__(self, name: str, build: Callable[[], T]) -> T | str:
+        """Return the result of ``build``, or a sentence if it raises; a full disk is raised."""
         try:
             return build()
         except Exception as error:
@@ -34,6 +35,6 @@ class Guard:
             if self._on_failure is not None:
                 self._on_failure(name, error)
             why = " ".join(str(error).split()) or type(error).__name__
-            return missing(f"The {name} could not be made: {why}")
+            return f"The {name} could not be made: {why}"
         finally:
-            trim()  # pictures were decoded and meshes drawn
+            trim()  # images and meshes were in memory

@@ -1,6 +1,6 @@
-"""The look of the report: templates, and pictures, drawings and scales as data URLs for them.
+"""HTML of the report: templates, and images and drawings as data URLs.
 
-Templates, style sheet and script lie in ``templates``; ``macros.html`` has what several of them share.
+Templates, style sheet and scripts are in ``templates``; ``macros.html`` has the shared macros.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import functools
 import io
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +16,7 @@ from urllib.parse import quote
 
 import jinja2
 import numpy as np
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from PIL import Image
 
 from gs2d.config.grades import GRADES
@@ -25,20 +26,18 @@ from gs2d.core.text import name_bytes
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two pictures of one view, to be wiped one over the other.
+    """Two images of one view with a movable line between them.
 
     Attributes
     ----------
     images : two ndarrays [H, W, 3 or 4]
-        What is shown left of the line, and right of it.
+        Left and right of the line.
     names : two str
-        What they are.
     title : str
-        What of.
     full : two str
-        Where the same pictures lie in all their pixels, seen from the report; shown enlarged where they are there.
+        Paths of the full-size images relative to the report; shown when the pair is enlarged.
     width : int
-        px at most, of each.
+        Largest width in the report, px.
     """
 
     images: tuple[np.ndarray, np.ndarray]
@@ -54,18 +53,18 @@ class Pair:
 
 
 def render(template: str, **values: Any) -> Markup:
-    """Return a template of ``templates`` filled in; text among the values is escaped, :class:`Markup` is not."""
+    """Render a template of ``templates``. Text is escaped, :class:`Markup` is not."""
     return Markup(environment().get_template(template).render(values).strip("\n"))
 
 
 def macro(template: str, name: str, *values: Any, **named: Any) -> Markup:
-    """Return what one macro of a template makes of values."""
+    """Return the result of a macro of a template."""
     return Markup(getattr(environment().get_template(template).module, name)(*values, **named))
 
 
 @functools.cache
 def environment() -> jinja2.Environment:
-    """Return where the templates are found: everything is escaped, and a name without a value is an error."""
+    """Return the template environment: values are escaped, undefined names are errors."""
     env = jinja2.Environment(
         loader=jinja2.PackageLoader("gs2d.report"),
         autoescape=True,
@@ -74,17 +73,18 @@ def environment() -> jinja2.Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
+    env.filters["code"] = _with_code
     env.globals |= {"GRADES": GRADES, "hexes": _hexes, "jpeg": _jpeg, "quoted": _quoted, "svg_source": _svg_source}
     return env
 
 
 def page(title: str, body: Sequence[str]) -> str:
-    """Return a whole document of parts that are HTML already; it needs nothing from elsewhere."""
+    """Return a self-contained document whose body consists of the given HTML."""
     return environment().get_template("page.html").render(title=title, body=[Markup(part) for part in body])
 
 
 def missing(text: str) -> Markup:
-    """Return in words what is not there."""
+    """Return a box that says what is missing."""
     return macro("macros.html", "missing", text)
 
 
@@ -94,7 +94,7 @@ def image_tag(image: np.ndarray, caption: str = "", *, alt: str, width: int = 36
     Parameters
     ----------
     full : str, optional
-        The same picture in all its pixels, beside the report: what is shown enlarged where it is there.
+        Path of the full-size image relative to the report; shown when the image is enlarged.
     """
     return macro("macros.html", "figure", image, caption, alt, width, full)
 
@@ -104,8 +104,13 @@ def drawing(svg: str, title: str) -> Markup:
     return macro("macros.html", "drawing", svg, title)
 
 
+def _with_code(text: str) -> Markup:
+    """Return text as HTML with its commands in backticks as code."""
+    return Markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", str(escape(text))))
+
+
 def _quoted(path: object) -> str:
-    """Return a path as a part of an address; the bytes of a name that is not UTF-8 stay as they are."""
+    """Return a path percent-encoded for a URL; bytes that are not UTF-8 are kept."""
     return quote(name_bytes(str(path)))
 
 

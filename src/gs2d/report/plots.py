@@ -1,4 +1,4 @@
-"""Curves of a run for the report, and of several runs side by side: losses, PSNR, K_a, opacity, changes; SVG text."""
+"""Training curves as SVG: losses, PSNR, splat count, opacity, area; for one run or several side by side."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def curves(history: History, stage_psnr: Mapping[str, float], split: str) -> dic
     for name, title, log in (
         ("splats", "Splats", False),
         ("mean_opacity", "Mean opacity", False),
-        ("mean_area", "Mean Kₐ = s_u s_v, square world units", True),
+        ("mean_area", "Mean splat area, square world units", True),
     ):
         if name in history.series:
             drawn[title] = _figure(history, {"": name}, log=log)

@@ -11,6 +11,7 @@ import pytest
 
 from gs2d.data.image_files import write_image
 from gs2d.errors import DataError
+from gs2d.report.record import RunRecord
 from gs2d.report.sections.capture import capture_section
 
 FOUND: dict[str, Any] = {
@@ -38,8 +39,8 @@ def capture(folder: Path, found: dict[str, Any]) -> Path:
 
 def test_photographs_without_a_place_the_lens_and_the_picture_are_in_the_report(tmp_path: Path) -> None:
     capture(tmp_path / "capture", FOUND)
-    html = capture_section(tmp_path, {})
-    assert "2 of 3 photographs have a place; 1,234 points" in html
+    html = str(capture_section(RunRecord(tmp_path, {})))
+    assert "2 of 3 photographs have a camera. There are 1,234 sparse points" in html
     assert "&lt;c&gt;.jpg" in html
     assert "21 matches with a.jpg at best" in html
     assert "Lens: SIMPLE_RADIAL 1.393 px on observations held out" in html
@@ -50,25 +51,25 @@ def test_photographs_without_a_place_the_lens_and_the_picture_are_in_the_report(
 def test_a_capture_beside_the_run_is_found_by_its_path_and_all_placed_leaves_no_table(tmp_path: Path) -> None:
     found = {**FOUND, "placed": 2, "count": 2, "photographs": FOUND["photographs"][:2]}
     there = capture(tmp_path / "elsewhere", found)
-    html = capture_section(tmp_path / "run", {"scene": {"path": str(there)}})
+    html = str(capture_section(RunRecord(tmp_path / "run", {"scene": {"path": str(there)}})))
     assert "2 of 2 photographs" in html
-    assert "without a place" not in html
+    assert "without a camera" not in html
 
 
 def test_cameras_from_elsewhere_have_no_section(tmp_path: Path) -> None:
-    assert capture_section(tmp_path, {"scene": {"path": str(tmp_path)}}) == ""
-    assert capture_section(tmp_path, {}) == ""
+    assert capture_section(RunRecord(tmp_path, {"scene": {"path": str(tmp_path)}})) is None
+    assert capture_section(RunRecord(tmp_path, {})) is None
 
 
 def test_a_capture_of_before_lenses_were_compared_says_what_it_has(tmp_path: Path) -> None:
     capture(tmp_path / "capture", {name: value for name, value in FOUND.items() if name != "lens"})
-    assert "2 of 3 photographs" in capture_section(tmp_path, {})
+    assert "2 of 3 photographs" in str(capture_section(RunRecord(tmp_path, {})))
 
 
 def test_a_picture_that_is_gone_is_said_and_a_broken_file_is_an_error(tmp_path: Path) -> None:
     folder = capture(tmp_path / "capture", FOUND)
     (folder / "poses.png").unlink()
-    assert "poses.png does not show" in capture_section(tmp_path, {})
+    assert "poses.png cannot be shown" in str(capture_section(RunRecord(tmp_path, {})))
     (folder / "poses.json").write_text("{}")
-    with pytest.raises(DataError, match=r"poses\.json"):
-        capture_section(tmp_path, {})
+    with pytest.raises(DataError, match=r"poses\.json must be as `gs2d poses` writes it, got another entry"):
+        capture_section(RunRecord(tmp_path, {}))

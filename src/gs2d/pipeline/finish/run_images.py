@@ -44,6 +44,7 @@ from gs2d.pipeline.prepare.run_exposures import NONE, Transforms, exposed, expos
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.report.gallery import read_index
 from gs2d.report.images import (
     depth_image,
     depth_limits,
@@ -52,7 +53,6 @@ from gs2d.report.images import (
     normal_image,
     valid_image,
 )
-from gs2d.report.sections.pictures import read_index
 
 INDEX = "index.json"
 LONGEST_NAME = 180  # bytes; file systems take 255, and a picture's kind and a temporary suffix come after it

@@ -1,4 +1,4 @@
-"""The exposures of the photographs in the report: what a run's ``exposure.json`` says, as a plot and in words."""
+"""Learned exposures of the photographs, from ``exposure.json``."""
 
 from __future__ import annotations
 
@@ -7,33 +7,31 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 
 from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
+from gs2d.io.run_dir import EXPOSURE
 from gs2d.report.html import missing, render
 from gs2d.report.plots import INK, plot_by_image, svg_text
+from gs2d.report.record import RunRecord
+from gs2d.report.sections.registry import register_section
 
-GREY = 0.5  # the scene's colour whose picture is shown
+GREY = 0.5  # colour of the scene whose image is plotted
 _CHANNELS = {"red": "#d0463b", "green": "#3f9a5f", "blue": "#3f86d6"}
 
 
-def exposure_section(path: Path, last_stage: Mapping[str, Any]) -> Markup:
-    """Plot and sentences (HTML) about ``exposure.json``.
-
-    Parameters
-    ----------
-    path : Path
-        The file; it may be missing.
-    last_stage : mapping
-        Entry of metrics.json.
-    """
+@register_section("exposure", title="Exposure of the photographs")
+def exposure_section(run: RunRecord) -> str | None:
+    """Return the darkest and brightest photograph and a plot; None where the recipe learns no exposure."""
+    if not run.recipe.get("exposure"):
+        return None
+    path = run.path / EXPOSURE
     if not path.exists():
         return missing(f"{path.name} is missing: it is written when training is finished.")
     names, gains = _gains(path)
     low, high = int(gains.mean(axis=1).argmin()), int(gains.mean(axis=1).argmax())
     dark, bright = ({"name": names[row], "gain": gains[row].mean()} for row in (low, high))
-    return render("exposure.html", dark=dark, bright=bright, matched=_matched(last_stage), plot=_plot(gains))
+    return render("exposure.html", dark=dark, bright=bright, matched=_matched(run.last), plot=_plot(gains))
 
 
 def _matched(stage: Mapping[str, Any]) -> dict[str, float] | None:

@@ -1,30 +1,23 @@
-"""The report about where a run is in the world: scale, place, what was left out, and how far control points lie off."""
+"""World coordinates: scale, position, and residuals of control points."""
 
 from __future__ import annotations
-
-from pathlib import Path
-
-from markupsafe import Markup
 
 from gs2d.core.georeference import CHECK, FITTED, LEFT_OUT, Residual
 from gs2d.io.georeference import read_georeference
 from gs2d.report.html import render
+from gs2d.report.record import RunRecord
+from gs2d.report.sections.registry import register_section
 
 SHOWN = 12  # residuals: check points first, then the largest
 _ORDER = (CHECK, LEFT_OUT, FITTED)
 
 
-def georeference_section(run: Path) -> Markup:
-    """Return what ``georeference.json`` of a run says (HTML); empty where it has none.
-
-    Raises
-    ------
-    DataError
-        The file is damaged.
-    """
-    found = read_georeference(run)
+@register_section("georeference", title="World coordinates")
+def georeference_section(run: RunRecord) -> str | None:
+    """Return the georeference and the largest residuals; None where the run has none."""
+    found = read_georeference(run.path)
     if found is None:
-        return Markup()
+        return None
     first, *lines = found.lines()
     shown = sorted(found.residuals, key=lambda residual: (_ORDER.index(residual.role), -residual.distance))[:SHOWN]
     rest = len(found.residuals) - len(shown)

@@ -1,18 +1,21 @@
-"""The vignetting and the response of the cameras in the report: what a run's ``photometry.json`` says, in words."""
+"""Learned vignetting and response of the cameras, from ``photometry.json``."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from markupsafe import Markup
-
 from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
+from gs2d.io.run_dir import PHOTOMETRY
 from gs2d.report.html import missing, render
+from gs2d.report.record import RunRecord
+from gs2d.report.sections.registry import register_section
 
 
-def photometry_section(path: Path) -> Markup:
-    """Table (HTML) of the cameras of ``photometry.json``, which may be missing."""
+@register_section("photometry", title="Vignetting and response of the cameras")
+def photometry_section(run: RunRecord) -> str | None:
+    """Return one line per camera; None where the recipe learns neither."""
+    if not run.recipe.get("photometry"):
+        return None
+    path = run.path / PHOTOMETRY
     if not path.exists():
         return missing(f"{path.name} is missing: it is written when training is finished.")
     try:

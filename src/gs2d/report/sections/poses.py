@@ -1,4 +1,4 @@
-"""The refined poses in the report: what a run's ``poses.json`` says, as a plot and in words."""
+"""Refined cameras, from ``poses.json``."""
 
 from __future__ import annotations
 
@@ -7,27 +7,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 
 from gs2d.core.camera import Zoom
 from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
+from gs2d.io.run_dir import POSES
 from gs2d.report.html import missing, render
 from gs2d.report.plots import INK, plot_by_image, svg_text
+from gs2d.report.record import RunRecord
+from gs2d.report.sections.registry import register_section
 
 MEASURES = ("pixels", "degrees", "shift")
 
 
-def poses_section(path: Path, last_stage: Mapping[str, Any]) -> Markup:
-    """Plot and sentences (HTML) about ``poses.json``.
-
-    Parameters
-    ----------
-    path : Path
-        The file; it may be missing.
-    last_stage : mapping
-        Entry of metrics.json.
-    """
+@register_section("poses", title="Refined cameras")
+def poses_section(run: RunRecord) -> str | None:
+    """Return how far the cameras moved, with a plot; None where the recipe refines none."""
+    if not run.recipe.get("poses"):
+        return None
+    path = run.path / POSES
     if not path.exists():
         return missing(f"{path.name} is missing: it is written when training is finished.")
     names, far, zooms = _moved(path)
@@ -38,8 +36,8 @@ def poses_section(path: Path, last_stage: Mapping[str, Any]) -> Markup:
         degrees=mean[1],
         percent=100 * mean[2],
         most={"name": names[most], "pixels": far[most, 0]},
-        has_test=bool(last_stage.get("test")),
-        aligned=_aligned(last_stage),
+        has_test=bool(run.last.get("test")),
+        aligned=_aligned(run.last),
         plot=_plot(far[:, 0]),
         zooms=[] if zooms is None else [f"{scale:.4f}" for scale in sorted({zooms[:, 0].min(), zooms[:, 0].max()})],
         lenses=[] if zooms is None else [f"k1 {k1:+.4f}, k2 {k2:+.4f}" for k1, k2 in _bent(zooms)],

@@ -1,4 +1,4 @@
-"""The picture of a subject: cameras, sparse points and the box, from above and from the side."""
+"""The subject: its box among cameras and sparse points, from above and from the side."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from markupsafe import Markup
 
 from gs2d.core.camera import Camera
 from gs2d.core.files import atomic_write
@@ -14,10 +13,12 @@ from gs2d.data.image_files import read_image
 from gs2d.data.subject import OBJECT, Subject, read_subject
 from gs2d.io.run_dir import RENDERS
 from gs2d.report.html import render
+from gs2d.report.record import RunRecord
+from gs2d.report.sections.registry import register_section
 
 IMAGE = "subject.png"
 MAX_POINTS = 8000
-SPAN = 1.3  # times the farthest camera's or corner's distance from the middle: what the picture shows
+SPAN = 1.3  # radius of the drawing, relative to the farthest camera or corner
 _CAMERA, _BOX = "#d62728", "#111111"
 
 
@@ -59,18 +60,13 @@ def plane_axes(up: np.ndarray) -> np.ndarray:
     return np.stack([right, np.cross(up, right), up])
 
 
-def subject_section(run: Path) -> Markup:
-    """Return what the cameras look at, in words and as a picture; nothing for runs of before it was found.
-
-    Raises
-    ------
-    DataError
-        ``subject.json`` or the picture is damaged.
-    """
-    subject = read_subject(run)
+@register_section("subject", title="Subject")
+def subject_section(run: RunRecord) -> str | None:
+    """Return the box of the subject and its drawing; None where the run has no subject."""
+    subject = read_subject(run.path)
     if subject is None:
-        return Markup()
-    drawn = run / RENDERS / IMAGE
+        return None
+    drawn = run.path / RENDERS / IMAGE
     return render(
         "subject.html",
         is_object=subject.kind == OBJECT,

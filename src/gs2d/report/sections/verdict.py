@@ -1,46 +1,45 @@
-"""The verdict in the report: its first section, from ``verdict.json``."""
+"""The measures behind the verdict, and advice."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from jinja2 import UndefinedError
-from markupsafe import Markup
 
-from gs2d.config.grades import LIMITS, NEW, TRAINED
 from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
+from gs2d.io.run_dir import VERDICT
 from gs2d.report.html import render
+from gs2d.report.record import RunRecord
+from gs2d.report.sections.registry import register_section
 
 
-def verdict_section(path: Path) -> Markup:
-    """Return grade, findings and advice (HTML); empty where there is no verdict.
-
-    Parameters
-    ----------
-    path : Path
-        ``verdict.json``.
+def read_verdict(run: Path) -> Mapping[str, Any] | None:
+    """Return the verdict in ``verdict.json`` of a run folder, or None where there is none.
 
     Raises
     ------
     DataError
-        It is broken.
+        If the file is broken.
     """
+    path = run / VERDICT
     if not path.exists():
-        return Markup()
+        return None
+    data = read_json(path)
+    verdict = data.get("verdict") if isinstance(data, Mapping) else None
+    findings = verdict.get("findings") if isinstance(verdict, Mapping) else None
+    if not isinstance(findings, list) or not all(isinstance(finding, Mapping) for finding in findings):
+        raise DataError(f"{path} must hold a verdict as gs2d writes it, got something else")
+    return dict(verdict)
+
+
+@register_section("verdict", title="Verdict")
+def verdict_section(run: RunRecord) -> str | None:
+    """Return the findings as a table, then the advice."""
+    verdict = read_verdict(run.path)
     try:
-        data = read_json(path)["verdict"]
-        return Markup() if data is None else render("verdict.html", verdict=data)
-    except (KeyError, TypeError, ValueError, UndefinedError) as error:
-        raise DataError(f"{path} must hold a verdict as gs2d writes it, got another entry ({error})") from error
-
-
-def grade_of(psnr: float, split: str) -> str:
-    """Return the grade of a mean PSNR."""
-    return LIMITS[NEW if split == "test" else TRAINED].grade(psnr)
-
-
-def scaled(value: Any, factor: float) -> float | None:
-    """Return a figure in another unit; None for what is no number."""
-    return value * factor if isinstance(value, int | float) else None
+        return None if verdict is None else render("verdict.html", verdict=verdict)
+    except (TypeError, ValueError, UndefinedError) as error:
+        raise DataError(f"{run.path / VERDICT} must hold a verdict as gs2d writes it: {error}") from error

@@ -1,4 +1,4 @@
-// Pictures that enlarge, and pairs of them with a line that wipes between. No network, no libraries.
+// Images that enlarge, and pairs with a line between them that moves. No network, no libraries.
 "use strict";
 document.documentElement.classList.add("js");
 
@@ -15,7 +15,7 @@ function wipes(figure) {
     both.setPointerCapture(e.pointerId);
     follow(e);
     range.focus({ preventScroll: true });
-    e.preventDefault(); // no text is selected, no picture dragged
+    e.preventDefault(); // no text is selected, no image dragged
   };
   both.onpointermove = (e) => both.hasPointerCapture(e.pointerId) && follow(e);
   range.oninput = show;
@@ -34,7 +34,7 @@ function open(i) {
 }
 
 function larger(img) {
-  // The whole picture from the run's folder; the one in this file where the folder is elsewhere.
+  // The full image from the run folder, or the one in this file where the folder is missing.
   const made = new Image();
   made.alt = img.alt;
   made.src = img.src;
@@ -56,13 +56,13 @@ function largerWipe(figure) {
     full.src = img.dataset.full;
   }
   const img = figure.querySelector("img");
-  // As large as the window lets it be, also where the picture has fewer pixels.
+  // As large as the window, even if the image has fewer pixels.
   copy.style.width = `min(100%, calc((100dvh - 6rem) * ${img.naturalWidth / img.naturalHeight || 1.5}))`;
   wipes(copy);
   return copy;
 }
 
-for (const figure of document.querySelectorAll("main figure")) {
+for (const figure of document.querySelectorAll("main figure:not(.mesh)")) {
   const i = all.length, img = figure.querySelector("img");
   if (!img) continue;
   if (figure.matches(".wipe")) {

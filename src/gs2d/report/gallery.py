@@ -1,0 +1,140 @@
+"""The rendered views of a run, read from ``renders/``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gs2d.core.images import composite
+from gs2d.core.json_files import read_json
+from gs2d.data.image_files import read_image
+from gs2d.errors import DataError
+from gs2d.io.run_dir import RENDERS
+from gs2d.report.html import Pair
+
+PHOTOS = "photos"
+
+
+@dataclass(frozen=True)
+class ShownView:
+    """A rendered view; ``file`` is the stem of its file names, ``depth_limits`` are in world units."""
+
+    name: str
+    file: str
+    split: str
+    depth_limits: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """The views and stages that ``renders/`` holds."""
+
+    folder: Path
+    views: tuple[ShownView, ...]
+    stages: tuple[str, ...]
+
+    def photo(self, view: ShownView) -> np.ndarray | None:
+        """Return the photograph of a view, or None."""
+        return _read(self.folder / PHOTOS / f"{view.file}.png")
+
+    def rendering(self, stage: str, view: ShownView, kind: str) -> np.ndarray | None:
+        """Return a rendering of a view, or None."""
+        return _read(self.folder / stage / f"{view.file}.{kind}.png")
+
+    def beside(self, view: ShownView, stage: str = PHOTOS, kind: str = "") -> str:
+        """Return the path of an image relative to the report."""
+        return f"{RENDERS}/{stage}/{view.file}.{kind}.png" if kind else f"{RENDERS}/{stage}/{view.file}.png"
+
+
+def _read(path: Path) -> np.ndarray | None:
+    return read_image(path) if path.is_file() else None
+
+
+def read_gallery(renders: Path) -> Gallery | None:
+    """Return the gallery, or None where there is no ``index.json``.
+
+    Raises
+    ------
+    DataError
+        If the index is broken.
+    """
+    data = read_index(renders)
+    if data is None:
+        return None
+    views = tuple(
+        ShownView(
+            view["name"],
+            view.get("file", view["name"]),
+            str(view.get("split", "")),
+            tuple(view["depth_limits"]) if view.get("depth_limits") else None,
+        )
+        for view in data["views"]
+    )
+    return Gallery(renders, views, tuple(data["stages"]))
+
+
+def read_index(renders: Path) -> dict[str, Any] | None:
+    """Return ``index.json`` with its checked lists ``views`` and ``stages``, or None where there is none.
+
+    Raises
+    ------
+    DataError
+        If it is broken.
+    """
+    path = renders / "index.json"
+    if not path.is_file():
+        return None
+    data = read_json(path)
+    if isinstance(data, dict):
+        views, stages = data.get("views", []), data.get("stages", [])
+        if _are(views, _is_view) and _are(stages, lambda stage: isinstance(stage, str)):
+            return {**data, "views": views, "stages": stages}
+    raise DataError(
+        f"{path} must hold the lists views and stages as gs2d writes them, got something else; "
+        "delete it (the report then has no pictures of views), or train again with --overwrite"
+    )
+
+
+def _are(values: Any, holds: Callable[[Any], bool]) -> bool:
+    return isinstance(values, list) and all(map(holds, values))
+
+
+def _is_view(entry: Any) -> bool:
+    if not (isinstance(entry, dict) and isinstance(entry.get("name"), str)):
+        return False
+    limits = entry.get("depth_limits")
+    known = limits is None or (_are(limits, lambda value: isinstance(value, int | float)) and len(limits) == 2)
+    words = all(isinstance(entry.get(name, ""), str) for name in ("file", "split"))
+    return known and words and isinstance(entry.get("camera", {}), dict)
+
+
+def compared(gallery: Gallery, view: ShownView, *, width: int = 800) -> Pair | None:
+    """Return the photograph of a view and its rendering after the last stage, or None where one is missing."""
+    if not gallery.stages:
+        return None
+    stage = gallery.stages[-1]
+    photo, color = gallery.photo(view), gallery.rendering(stage, view, "color")
+    if photo is None or color is None or photo.shape[:2] != color.shape[:2]:
+        return None
+    split = f" ({view.split} view)" if view.split else ""
+    return Pair(
+        (photo, color),
+        ("photograph", "rendering"),
+        title=f"{view.name}{split}, {psnr_text(color, photo)}",
+        full=(gallery.beside(view), gallery.beside(view, stage, "color")),
+        width=width,
+    )
+
+
+def psnr_text(image: np.ndarray, photo: np.ndarray | None) -> str:
+    """Return the PSNR of two 8-bit images as text; empty where their sizes differ."""
+    if photo is None or image.shape[:2] != photo.shape[:2]:
+        return ""
+    white = (1.0, 1.0, 1.0)
+    difference = composite(image, white).astype(np.float64) - composite(photo, white)
+    squared = float(np.mean(difference**2))
+    return "equal" if squared == 0 else f"{-10 * np.log10(squared):.2f} dB"

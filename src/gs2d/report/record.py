@@ -1,0 +1,102 @@
+"""What a run folder says about itself, read once for all sections of the report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gs2d.core.camera import Camera
+from gs2d.io.run_dir import open_run
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """A run, as the sections of its report read it.
+
+    Attributes
+    ----------
+    path : Path
+        The run folder.
+    definition : dict
+        ``run.json``.
+    stages : tuple of dict
+        Entries of ``metrics.json``, one per finished stage.
+    surface : dict or None
+        Surface metrics; ``surface_reason`` says why there are none.
+    surface_reason : str or None
+    events : list of dict
+        ``events.jsonl``.
+    cameras : sequence of Camera
+        Cameras of the rendered views.
+    """
+
+    path: Path
+    definition: dict[str, Any]
+    stages: tuple[dict[str, Any], ...] = ()
+    surface: dict[str, Any] | None = None
+    surface_reason: str | None = None
+    events: Sequence[dict[str, Any]] = ()
+    cameras: Sequence[Camera] = ()
+
+    @property
+    def last(self) -> Mapping[str, Any]:
+        """Return the entry of the last finished stage; empty where there is none."""
+        return self.stages[-1] if self.stages else {}
+
+    @property
+    def split(self) -> str:
+        """Return the split that scores are about: "test" where there are test views, else "train"."""
+        return "test" if any(stage.get("test") for stage in self.stages) else "train"
+
+    @property
+    def recipe(self) -> Mapping[str, Any]:
+        """Return the recipe of ``run.json``; empty where it has none."""
+        recipe = self.definition.get("recipe")
+        return recipe if isinstance(recipe, Mapping) else {}
+
+    @property
+    def unfinished(self) -> list[str]:
+        """Return the names of the stages that are planned but not finished."""
+        done = [stage["name"] for stage in self.stages]
+        return [name for name in map(name_of, self.recipe.get("stages", ())) if name not in done]
+
+    @property
+    def title(self) -> str:
+        """Return the heading of the report."""
+        scene = self.definition.get("scene")
+        return str(self.definition.get("title") or name_of(scene or self.path.name))
+
+
+def read_record(folder: Path, cameras: Sequence[Camera] = ()) -> RunRecord:
+    """Read what the report needs of a run folder.
+
+    Raises
+    ------
+    RunError
+        If the folder is not a run.
+    DataError
+        If a file is not JSON.
+    """
+    run = open_run(folder)
+    metrics = run.metrics()
+    return RunRecord(
+        path=Path(folder),
+        definition=run.definition(),
+        stages=tuple(metrics.get("stages") or ()),
+        surface=metrics.get("surface"),
+        surface_reason=metrics.get("surface_reason"),
+        events=run.events.read(),
+        cameras=cameras,
+    )
+
+
+def name_of(value: Any) -> str:
+    """Return the name of an entry of ``run.json``, which is an object with a name or the name itself."""
+    return str(value.get("name", "unnamed") if isinstance(value, Mapping) else value)
+
+
+def number(value: Any) -> float | None:
+    """Return a value if it is a number, else None."""
+    return value if isinstance(value, int | float) and not isinstance(value, bool) else None

@@ -1,0 +1,38 @@
+"""The files of a run: links, purpose and size."""
+
+from __future__ import annotations
+
+from gs2d.io.run_dir import EVENTS, EXPOSURE, MESH, METRICS, PAGE, PHOTOMETRY, POSES, RUN_JSON, SPLATS, TEXTURED
+from gs2d.report.html import macro
+from gs2d.report.record import RunRecord
+from gs2d.report.sections.registry import register_section
+
+FILES = {  # the most useful first
+    PAGE: "the splats as a page for any browser",
+    MESH: "the mesh with vertex colours, for MeshLab, Blender and CloudCompare",
+    TEXTURED: "the mesh with a texture, for Windows, macOS, Blender and the web",
+    SPLATS: "the splats, as 2DGS PLY",
+    METRICS: "all scores",
+    RUN_JSON: "settings, machine and versions",
+    EVENTS: "training log",
+    EXPOSURE: "exposure of each photograph",
+    POSES: "refined cameras",
+    PHOTOMETRY: "vignetting and response of each camera",
+}
+
+
+@register_section("files", title="Files")
+def files_section(run: RunRecord) -> str | None:
+    """Return links to the files that exist."""
+    found = [(name, words, run.path / name) for name, words in FILES.items() if (run.path / name).is_file()]
+    if not found:
+        return None
+    return macro("lists.html", "files", [(name, words, size_text(path.stat().st_size)) for name, words, path in found])
+
+
+def size_text(count: int) -> str:
+    """Return a number of bytes with its unit, to three significant digits at most."""
+    for unit, step in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= step:
+            return f"{count / step:.3g} {unit}" if count < 999.5 * step else f"{count / step:.0f} {unit}"
+    return f"{count} bytes"

@@ -1,0 +1,41 @@
+"""The settings of the run, its machine and versions."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from gs2d.report.html import render
+from gs2d.report.record import RunRecord, name_of
+from gs2d.report.sections.registry import register_section
+
+
+@register_section("settings", title="Settings")
+def settings_section(run: RunRecord) -> str | None:
+    """Return the definition of the run in short, then ``run.json`` and ``metrics.json`` in full."""
+    raw = {
+        "run.json": json.dumps(run.definition, indent=2, ensure_ascii=False),
+        "metrics.json": json.dumps({"stages": run.stages, "surface": run.surface}, indent=2, ensure_ascii=False),
+    }
+    return render("settings.html", facts=_facts(run.definition), raw=raw)
+
+
+def _facts(definition: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return names and values; what ``run.json`` does not have is left out."""
+    scene, backend = definition.get("scene"), definition.get("backend")
+    pairs = [(name.capitalize(), name_of(definition[name])) for name in ("recipe", "protocol") if name in definition]
+    if isinstance(scene, Mapping):
+        pairs.append(("Capture", f"{scene.get('name')} ({scene.get('format', 'unknown format')})"))
+        pairs.append(("Views", f"{scene.get('train', '?')} training, {scene.get('test', '?')} test"))
+        pairs += [("Skipped", ", ".join(map(str, scene["skipped"])))] if scene.get("skipped") else []
+    if backend:
+        details = backend.get("details") if isinstance(backend, Mapping) else ""
+        pairs.append(("Backend", name_of(backend) + (f" ({details})" if details else "")))
+    for name in ("seed", "downscale", "created"):
+        pairs += [(name.capitalize(), str(definition[name]))] if definition.get(name) is not None else []
+    for name in ("machine", "versions"):
+        values = definition.get(name)
+        if isinstance(values, Mapping):
+            pairs.append((name.capitalize(), ", ".join(f"{key} {value}" for key, value in values.items())))
+    return pairs
