@@ -26,9 +26,10 @@ from gs2d.errors import Gs2dError
 from gs2d.pipeline.events import ignore
 from gs2d.pipeline.prepare.job import Job, prepare_job
 from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.prepare.run_exposures import NONE, Transforms
 from gs2d.pipeline.prepare.threads import use_threads
 from gs2d.training import events
-from gs2d.training.exposure import Exposures
+from gs2d.training.learned.learned_table import LearnedTable
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
 
@@ -160,20 +161,20 @@ def _save(file: Path, state: TrainState, spent: Spent, course: list[dict[str, An
 
 def score(job: Job, state: TrainState) -> dict[str, Any]:
     """Return the scores of the test views (of the training views where there are none), and the size of the scene."""
-    return score_splats(job, state.splats, state.exposures)
+    learned = LearnedTable(job.recipe, job.scene).by_name(state.learned, "exposure")
+    return score_splats(job, state.splats, learned)
 
 
-def score_splats(job: Job, splats: Splats, learned: Exposures | None = None) -> dict[str, Any]:
+def score_splats(job: Job, splats: Splats, learned: Transforms = NONE) -> dict[str, Any]:
     """Return what :func:`score` does, of splats with the exposures that were learned with them."""
     # Here, while the clocks stand still: a training does not need them.
     from benchmarks.street_runs import summary_of
     from gs2d.pipeline.finish.scoring import score_views
     from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
-    from gs2d.pipeline.prepare.run_exposures import named
 
     views = job.scene.test or job.scene.train
     brightness = metered(splats, job.settings, job.backend)
-    exposures = with_predicted(named(job.scene.train, learned), job.scene, brightness)
+    exposures = with_predicted(learned, job.scene, brightness)
     scores = score_views(
         splats, views, job.settings, job.backend, name="", on_event=ignore, exposures=exposures, split="test"
     )
@@ -189,7 +190,6 @@ def surface(job: Job, state: TrainState, spec: dict[str, Any], folder: Path) -> 
     from gs2d.pipeline.finish.truth import OfficialTruth, choose_truth, read_truth, score_surface
     from gs2d.pipeline.in_memory import Trained, extract_mesh
     from gs2d.pipeline.prepare.options import EvaluateOptions
-    from gs2d.training.per_image import scene_now
 
     given = None if spec["ground_truth"] is None else Path(spec["ground_truth"])
     root = job.scene.root or Path(".")
@@ -197,7 +197,7 @@ def surface(job: Job, state: TrainState, spec: dict[str, Any], folder: Path) -> 
     if truth is None or isinstance(truth, OfficialTruth):  # an official one has no F at a fraction of its size
         return {"surface": None}
     start = time.process_time()
-    scene = scene_now(state, job.scene)
+    scene = LearnedTable(job.recipe, job.scene).scene_now(state.learned)
     mesh = extract_mesh(Trained(state.splats, scene, job.protocol, job.settings, job.backend, job.recipe))
     seconds = time.process_time() - start
     found = score_surface(mesh, truth, job, EvaluateOptions(), ignore, folder=folder / "surface")

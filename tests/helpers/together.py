@@ -30,7 +30,7 @@ from gs2d.core.processes import Place
 from gs2d.errors import Gs2dError
 from gs2d.training import events
 from gs2d.training.objective import StepResult
-from gs2d.training.parallel import OF_A_VIEW, OneProcess, Turn
+from gs2d.training.parallel import OneProcess, Turn
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
 from train_toys import backends, compared, make_scene, short
@@ -51,17 +51,17 @@ class Batch(OneProcess):
         idle: Callable[[], StepResult],
         *,
         rows: Tensor | None,
-        of_views: bool,
+        learned: Mapping[str, tuple[int, ...]],
     ) -> tuple[StepResult, Sequence[Mapping[str, Tensor]]]:
         self.results = [_own_signal(one(turn)) for turn in turns]
         total: dict[str, Tensor] = {}
         for result in self.results:
-            for name in result.gradients.keys() - OF_A_VIEW.keys():
+            for name in result.gradients:
                 own = result.gradients[name]
                 own = own if rows is None or result.rows is not None else own[rows]
                 total[name] = total[name] + own if name in total else own.clone()
         mean = {name: tensor / len(turns) for name, tensor in total.items()}
-        each = [{k: v for k, v in result.gradients.items() if k in OF_A_VIEW} for result in self.results]
+        each = [result.learned for result in self.results]
         return replace(self.results[0], gradients=mean, rows=rows), each
 
     def gather(self, statistics: Any, result: StepResult, add: Callable[[Any, StepResult], Any]) -> None:

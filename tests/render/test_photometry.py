@@ -12,7 +12,7 @@ from torch import Tensor
 from gs2d.core.camera import Camera
 from gs2d.core.photometry import CameraPhotometry, reach_of, squared_radii
 from gs2d.render.exposure import expose, identity
-from gs2d.render.photometry import Shading, bend, photograph, remove_photometry, vignetting
+from gs2d.render.photometry import bend, remove_photometry, show, squares_of, vignetting
 
 CAMERA = Camera(8, 6, 10.0, 10.0, 4.0, 3.0, np.eye(4))
 
@@ -55,19 +55,16 @@ def test_a_picture_of_half_the_size_has_the_same_light() -> None:
     assert np.allclose(small, large - 2 * 0.25 / (10 * reach) ** 2, atol=1e-6)
 
 
+def photograph(color: Tensor, transform: Tensor, numbers: Tensor, squares: Tensor, *cover: Tensor) -> Tensor:
+    falloff, curve = numbers * numbers.new_tensor([1, 1, 1, 0]), numbers * numbers.new_tensor([0, 0, 0, 1])
+    return show(expose(show(color, falloff, squares, *cover), transform, *cover), curve, None, *cover)
+
+
 def test_in_the_mean_exposure_and_response_a_picture_keeps_its_colours_at_the_principal_point() -> None:
-    color = random(6, 8, 3) * 1.4 - 0.2
-    photometry = CameraPhotometry((0.4, 0.0, 0.1), 0.5)
-    shading = Shading.of(photometry, CAMERA, color)
-    level = Shading(shading.numbers, torch.zeros_like(shading.squares))
-    assert torch.allclose(photograph(color, identity(color), shading=level), color)
-    seen = photograph(color, identity(color), shading=shading)
-    assert (seen[0, 0] < color.clamp(min=0)[0, 0] + 1e-12).all()
-
-
-def test_without_a_camera_s_light_it_is_the_exposure_to_the_bit() -> None:
-    color, transform = random(5, 4, 3).float(), identity(random(1).float()) * 1.2
-    assert torch.equal(photograph(color, transform), expose(color, transform))
+    color, numbers = random(6, 8, 3) * 1.4 - 0.2, torch.tensor([0.4, 0.0, 0.1, 0.0], dtype=torch.float64)
+    squares = squares_of(CAMERA, 0.5, color)
+    assert torch.allclose(show(color, numbers, torch.zeros_like(squares)), color)
+    assert (show(color, numbers, squares)[0, 0] < color.clamp(min=0)[0, 0] + 1e-12).all()
 
 
 def test_gradients_are_those_of_differences() -> None:
@@ -76,21 +73,15 @@ def test_gradients_are_those_of_differences() -> None:
     numbers = torch.tensor([0.3, -0.2, 0.1, 0.6], dtype=torch.float64, requires_grad=True)
     squares = torch.from_numpy(squared_radii(CAMERA, 0.5)).double()
 
-    def seen(c: Tensor, t: Tensor, n: Tensor) -> Tensor:
-        return photograph(c, t, shading=Shading(n, squares))
-
-    assert torch.autograd.gradcheck(seen, (color, transform, numbers))
+    assert torch.autograd.gradcheck(lambda c, t, n: photograph(c, t, n, squares), (color, transform, numbers))
 
 
-def test_a_ceiling_is_one_behind_the_curve_and_the_background_stays() -> None:
+def test_the_background_stays() -> None:
     color, background = random(6, 8, 3, seed=3), torch.ones(3, dtype=torch.float64)
     coverage = torch.ones(6, 8, dtype=torch.float64)
     coverage[:, 4:] = 0
-    shown = color * coverage[..., None] + (1 - coverage[..., None])  # over white
-    shading = Shading.of(CameraPhotometry((0.2, 0.0, 0.0), 0.5, 1.0), CAMERA, color)
-    clipped = torch.ones(6, 8, 3, dtype=torch.bool)
-    seen = photograph(shown, 3 * identity(color), coverage, background, clipped=clipped, shading=shading)
-    assert float(seen.max()) <= 1 + 1e-12
+    over_white, numbers = color * coverage[..., None] + (1 - coverage[..., None]), random(4)
+    seen = photograph(over_white, 3 * identity(color), numbers, squares_of(CAMERA, 0.5, color), coverage, background)
     assert torch.allclose(seen[:, 4:], torch.ones(6, 4, 3, dtype=torch.float64))
 
 
@@ -98,7 +89,8 @@ def test_a_photograph_is_taken_back_to_the_colours_of_the_scene() -> None:
     scene = 0.2 + 0.5 * random(6, 8, 3, seed=4)
     transform = identity(scene) + torch.tensor([[0.1, 0.02, 0.0, 0.03]] * 3, dtype=torch.float64)
     photometry = CameraPhotometry((0.3, 0.1, 0.0), 0.5, 0.5)
-    taken = photograph(scene, transform, shading=Shading.of(photometry, CAMERA, scene))
+    numbers = torch.tensor([0.3, 0.1, 0.0, 0.5], dtype=torch.float64)
+    taken = photograph(scene, transform, numbers, squares_of(CAMERA, 0.5, scene))
     image = np.rint(255 * taken.numpy()).astype(np.uint8)
     back = remove_photometry(image, transform.numpy(), photometry, CAMERA)
     assert np.abs(back / 255.0 - scene.numpy()).max() < 4 / 255  # one step of the photograph, through steep curves

@@ -125,12 +125,11 @@ def transforms() -> torch.Tensor:
 
 def test_given_exposures_are_taken_as_they_are_and_stay() -> None:
     trainer = trainer_of(GIVEN, random_splats(40), None, backends()[-1], exposures=transforms())
-    assert trainer.state.exposures is not None
-    assert torch.allclose(trainer.state.exposures.transforms(), transforms(), atol=1e-7)
-    before = trainer.state.exposures.transforms().clone()
+    rows = trainer.state.learned["exposure"]
+    before = {name: found.clone() for name, found in trainer.learned.by_name(trainer.state.learned, "exposure").items()}
+    assert torch.allclose(torch.stack([*before.values()]), transforms(), atol=1e-7)
     trainer.run()
-    assert torch.equal(trainer.state.exposures.transforms(), before)
-    again = TrainState.from_state_dict(trainer.state.state_dict()).exposures
-    assert again is not None
-    assert torch.equal(again.transforms(), before)
-    assert torch.equal(again.transform(2), before[2])
+    after = trainer.learned.by_name(trainer.state.learned, "exposure")
+    assert all(torch.equal(after[name], before[name]) for name in before)
+    again = TrainState.from_state_dict(trainer.state.state_dict()).learned["exposure"]
+    assert torch.equal(again.values, rows.values)

@@ -92,8 +92,8 @@ def test_views_that_learn_are_moved_once_a_turn(two: dict[str, list[Any]]) -> No
     """19 iterations of six views, in pairs and alone: none is left out, none counted twice."""
     state = two["learning"][0]["state"]
     assert state["processes"] == [[0, 0, 2]]
-    assert sum(state["exposures"]["steps"]) == 17  # from the third on
-    assert sum(state["poses"]["steps"]) >= 8
+    assert sum(state["learned"]["exposure"]["steps"]) == 17  # from the third on
+    assert sum(state["learned"]["poses"]["steps"]) >= 8
     assert state["moments"]["means"]["steps"] <= 5  # views of the last stage: of five that count as five
 
 

@@ -9,29 +9,27 @@ import numpy as np
 import pytest
 import torch
 
-from fake_backends import lacking
 from gs2d.config.presets import surface, with_photometry
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Exposure, LearningRates, Photometry, Recipe
 from gs2d.config.serialize import from_json, to_json
 from gs2d.core.camera import look_at
-from gs2d.core.photometry import CameraPhotometry, reach_of
+from gs2d.core.photometry import CameraPhotometry
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import camera_extent
 from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.data.undistort import Intrinsics, Lens
-from gs2d.errors import RecipeError, RunError
+from gs2d.errors import RecipeError
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.exposure import identity
-from gs2d.render.photometry import Shading, photograph
 from gs2d.render.types import RasterSettings
 from gs2d.synthetic.perturb_exposure import random_gains
-from gs2d.training import per_image
-from gs2d.training.exposure import apply_exposure
-from gs2d.training.photometry import Photometries, photometry_step
+from gs2d.training.learned.appearance import shown, shown_splats
+from gs2d.training.learned.quantity import ImagePoints
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
-from train_toys import SIZE, VIEWS, backends, random_splats, same, short
+from learned_rows import Learner, begun
+from train_toys import SIZE, VIEWS, backends, random_splats, short
 
 needs_cpu = pytest.mark.skipif("cpu" not in backends(), reason="the native library is not built")
 
@@ -49,18 +47,22 @@ def seen_through(views: tuple[View, ...], cameras: int) -> list[View]:
 
 
 # -- one update ---------------------------------------------------------------------------------------------------
-def test_photographs_of_one_camera_share_its_light_and_the_first_step_is_the_rate(scene: Scene) -> None:
-    made = Photometries.start(seen_through(scene.train, 2))
-    assert made.group == [0, 1, 0, 1, 0, 1]
-    recipe = replace(short(), photometry=Photometry())
-    photometry_step(made, 2, torch.tensor([5.0, -5.0, 1.0, -1.0], dtype=torch.float64), recipe, 0.01)
-    found = made.photometry(0)
-    assert found == made.photometry(4)
-    assert found.falloff == pytest.approx((-0.01, 0.01, -0.01))
-    assert found.shift == pytest.approx(0.005)  # half of the photographs are its own, and the mean is taken off
-    assert made.photometry(1).falloff == (0, 0, 0)
-    assert made.photometry(1).shift == pytest.approx(-0.005)
-    assert made.steps == [1, 0]
+def test_photographs_of_one_camera_share_its_light(scene: Scene) -> None:
+    views = replace(scene, train=tuple(seen_through(scene.train, 2)))
+    made = Learner(replace(short(), photometry=Photometry()), views)
+    assert made.table.quantities["vignetting"].row_of == [0, 1, 0, 1, 0, 1]
+    made.step("vignetting", 2, [5.0, -5.0, 1.0], 0.01)
+    made.step("response", 2, [-1.0], 0.01)
+    seen = [view.photometry for view in made.table.scene_now(made.rows).train]
+    assert seen[0] == seen[2] == seen[4]
+    assert seen[0] is not None
+    assert seen[1] is not None
+    assert seen[0].falloff == pytest.approx((-0.01, 0.01, -0.01))
+    assert seen[0].shift == pytest.approx(0.005)  # half of the photographs are its own, and the mean is taken off
+    assert seen[1].falloff == (0, 0, 0)
+    assert seen[1].shift == pytest.approx(-0.005)
+    only = replace(short(), photometry=Photometry(response=False))
+    assert [*Learner(only, views).rows] == ["vignetting"]
 
 
 def test_of_faces_of_a_panorama_the_response_alone_is_learned(scene: Scene) -> None:
@@ -69,20 +71,9 @@ def test_of_faces_of_a_panorama_the_response_alone_is_learned(scene: Scene) -> N
         seen = replace(scene, train=tuple(replace(view, is_face=is_face) for view in views))
         trainer = Trainer(seen, quick(), GENERIC, backend="reference")
         trainer.run()
-        state = trainer.state
-        assert state.photometries is not None
-        assert bool(state.photometries.offsets[:, :3].any()) is not is_face
-        assert bool(state.photometries.offsets[:, 3].all())
-
-
-def test_only_what_the_recipe_learns_moves_and_within_limits(scene: Scene) -> None:
-    made = Photometries.start(scene.train)
-    recipe = replace(short(), photometry=Photometry(response=False))
-    for _ in range(30):
-        photometry_step(made, 0, torch.full((4,), -1.0, dtype=torch.float64), recipe, 0.1)
-    assert made.offsets[0].tolist() == [1.0, 1.0, 1.0, 0.0]
-    photometry_step(made, 0, torch.full((4,), -1.0, dtype=torch.float64), recipe, 0.0)
-    assert made.steps[0] == 30
+        learned = trainer.state.learned
+        assert bool(learned["vignetting"].values.any()) is not is_face
+        assert bool(learned["response"].values.all())
 
 
 def test_a_recipe_says_what_is_learned() -> None:
@@ -101,29 +92,27 @@ def test_the_gradient_of_a_camera_s_numbers_is_that_of_the_whole_loss(scene: Sce
     trainer = Trainer(views, recipe, GENERIC, backend="reference", dtype=torch.float64)
     trainer.enter(0)
     state, stage = trainer.state, recipe.stages[0]
-    assert state.photometries is not None
-    assert state.exposures is not None
-    state.exposures.offsets += 0.1 * torch.randn(VIEWS, 3, 4, generator=state.generator, dtype=torch.float64)
-    state.photometries.offsets += torch.tensor([[0.3, -0.1, 0.1, 0.5], [0.1, 0.1, 0.0, -0.2]], dtype=torch.float64)
+    state.learned["exposure"].values += 0.1 * torch.randn(VIEWS, 3, 4, generator=state.generator, dtype=torch.float64)
+    state.learned["vignetting"].values += torch.tensor([[0.3, -0.1, 0.1], [0.1, 0.1, 0.0]], dtype=torch.float64)
+    state.learned["response"].values += torch.tensor([[0.5], [-0.2]], dtype=torch.float64)
     found = trainer._whole.evaluate(state, stage, 1, 2)
-    assert found.losses["photometry"] == pytest.approx(0.001 * (0.09 + 0.01 + 0.01 + 0.35**2))  # (0.5 + 0.2) / 2
-    for column in range(4):
+    assert found.losses["vignetting"] == pytest.approx(0.001 * (0.09 + 0.01 + 0.01))
+    assert found.losses["response"] == pytest.approx(0.001 * 0.35**2)  # (0.5 + 0.2) / 2
+    for name, column in (("vignetting", 0), ("vignetting", 1), ("vignetting", 2), ("response", 0)):
         values = []
         for step in (1e-6, -1e-6):
-            state.photometries.offsets[0, column] += step
+            state.learned[name].values[0, column] += step
             values.append(sum(float(v) for v in trainer._whole.evaluate(state, stage, 1, 2).losses.values()))
-            state.photometries.offsets[0, column] -= step
+            state.learned[name].values[0, column] -= step
         slope = (values[0] - values[1]) / 2e-6
-        assert float(found.gradients["photometry"][column]) == pytest.approx(slope, rel=1e-3, abs=1e-9), column
+        assert float(found.learned[name][column]) == pytest.approx(slope, rel=1e-3, abs=1e-9), (name, column)
 
 
 def test_cameras_that_stay_as_they_are_leave_splats_the_same_but_for_rounding(scene: Scene, backend: str) -> None:
     still = Photometry(rate=1e-30, rate_final=1e-30, start=0)
     plain, learned = (Trainer(scene, replace(short(), photometry=p), GENERIC, backend=backend) for p in (None, still))
     before, after = plain.run(), learned.run()
-    assert "photometries" not in plain.state.state_dict()
-    assert learned.state.photometries is not None
-    assert sum(learned.state.photometries.steps) == 10 + 4 + 5
+    assert sum(learned.state.learned["vignetting"].steps) == 10 + 4 + 5
     assert len(before) == len(after)
     assert torch.allclose(before.means, after.means, atol=1e-3)
 
@@ -133,65 +122,14 @@ def test_errors_are_ranked_as_the_camera_shows_the_splats(scene: Scene) -> None:
     splats, view = random_splats(40, seed=1), scene.train[0]
     image, settings = torch.from_numpy(view.target((0.0, 0.0, 0.0))), RasterSettings()
     plain = splat_errors(splats, view.camera, image, settings, backend="reference")
-    dim, changed = apply_exposure(splats, view.camera, 0.5 * torch.eye(3, 4), settings, CameraPhotometry())
-    found = splat_errors(dim, view.camera, image / 2, changed, backend="reference")
+    darker, dim, even = (
+        shown_splats(splats, view.camera, {"vignetting": torch.tensor(falloff), "exposure": gain * torch.eye(3, 4)}, 3)
+        for falloff, gain in (((0.5, 0.0, 0.0), 1.0), ((0.0, 0.0, 0.0), 0.5), ((0.0, 0.0, 0.0), 1.0))
+    )
+    found = splat_errors(dim, view.camera, image / 2, replace(settings, sh_degree=0), backend="reference")
     assert torch.allclose(found, plain / 2, rtol=1e-4, atol=1e-4)
-    dark = CameraPhotometry((1.0, 0.0, 0.0), reach_of([view.camera]))
-    darker, _ = apply_exposure(splats, view.camera, torch.eye(3, 4), settings, dark)
-    even, _ = apply_exposure(splats, view.camera, torch.eye(3, 4), settings)
     assert (darker.sh0 <= even.sh0 + 1e-6).all()
     assert (darker.sh0 < even.sh0 - 0.01).any()
-
-
-# -- resuming -----------------------------------------------------------------------------------------------------
-def test_resuming_from_any_event_gives_the_same_splats_and_cameras(scene: Scene) -> None:
-    kept: list[dict[str, object]] = []
-    backend = backends()[-1]
-    trainer = Trainer(
-        scene,
-        quick(),
-        GENERIC,
-        backend=backend,
-        progress_every=1,
-        on_event=lambda _: kept.append(trainer.state.state_dict()),
-    )
-    end = trainer.run()
-    assert trainer.state.photometries is not None
-    found = trainer.state.photometries.offsets
-    assert found.abs().max() > 0.001
-    for data in kept[:: 3 if backend == "cpu" else 7]:
-        resumed = Trainer(scene, quick(), GENERIC, backend=backend, state=TrainState.from_state_dict(data))
-        assert same(resumed.run(), end)
-        assert resumed.state.photometries is not None
-        assert torch.equal(resumed.state.photometries.offsets, found)
-
-
-def test_a_state_with_the_cameras_of_other_views_or_broken_ones_is_refused(scene: Scene) -> None:
-    recipe = replace(short(), photometry=Photometry())
-    state = TrainState(random_splats(5), torch.Generator())
-    with pytest.raises(RunError, match="vignetting and response of 6 views, as recipe and scene say, got 0"):
-        Trainer(scene, recipe, GENERIC, backend="reference", state=state)
-    state = per_image.start(state, recipe, scene)
-    assert state.photometries is not None
-    assert state.photometries.reach == [reach_of([view.camera for view in scene.train])]
-    state.photometries.offsets[0, 0] = math.nan
-    with pytest.raises(RunError, match="photometries hold NaN or infinity"):
-        TrainState.from_state_dict(state.state_dict())
-    state.photometries.offsets[0, 0] = 0
-    state.photometries.group[0] = 3
-    with pytest.raises(RunError, match="must number its cameras from 0"):
-        TrainState.from_state_dict(state.state_dict())
-
-
-def test_an_update_that_a_device_cancelled_is_none(scene: Scene) -> None:
-    recipe = replace(short(), photometry=Photometry(start=0))
-    state = per_image.start(TrainState(random_splats(5), torch.Generator()), recipe, scene)
-    gradients = {"photometry": torch.ones(4, dtype=torch.float64)}
-    per_image.update(state, recipe, 1, 0, gradients, lacking(1))
-    assert state.photometries is not None
-    assert state.photometries.steps == [0]
-    per_image.update(state, recipe, 1, 0, gradients, lacking(0))
-    assert state.photometries.steps == [1]
 
 
 # -- what it is worth ---------------------------------------------------------------------------------------------
@@ -213,8 +151,8 @@ def taken(lights: tuple[CameraPhotometry, ...], gains: np.ndarray) -> tuple[Scen
         camera = look_at(place, aside, up, width=SIZE, height=SIZE, fx=30.0)
         with torch.no_grad():
             color = rasterize(truth, camera, RasterSettings(), backend="reference").color
-            transform = identity(color) * torch.from_numpy(gains[i]).float()[:, None]
-            color = photograph(color, transform, shading=Shading.of(lights[number], camera, color))
+            exposure = {"exposure": identity(color) * torch.from_numpy(gains[i]).float()[:, None]}
+            color = shown(color, exposure | light_of(lights[number]), ImagePoints(camera))
         view = View.from_arrays(f"{i:03d}.png", camera, np.rint(255 * color.clamp(0, 1).numpy()).astype(np.uint8))
         views.append(replace(view, intrinsics=Intrinsics(SIZE, SIZE, 30.0 + number, 30.0, SIZE / 2, SIZE / 2)))
     scene = Scene(
@@ -229,12 +167,18 @@ def taken(lights: tuple[CameraPhotometry, ...], gains: np.ndarray) -> tuple[Scen
     return scene, truth
 
 
+def light_of(camera: CameraPhotometry) -> dict[str, torch.Tensor]:
+    """Numbers of a camera's light."""
+    falloff = torch.tensor(camera.falloff) / camera.reach ** torch.tensor([2.0, 4.0, 6.0])
+    return {"vignetting": falloff, "response": torch.tensor([camera.shift])}
+
+
 def learned(scene: Scene, truth: Splats, recipe: Recipe) -> tuple[float, list[CameraPhotometry | None]]:
     """PSNR of the test photographs after a training from the true splats, and what was found of the cameras."""
-    state = per_image.start(TrainState(truth.clone(), torch.Generator().manual_seed(0)), recipe, scene)
+    state = begun(TrainState(truth.clone(), torch.Generator().manual_seed(0)), recipe, scene)
     trainer = Trainer(scene, recipe, GENERIC, backend="cpu", state=state)
     trainer.run()
-    now = per_image.scene_now(trainer.state, scene)
+    now = trainer.scene_now()
     return held_out_psnr(now, trainer), [view.photometry for view in now.test]
 
 
@@ -278,8 +222,8 @@ def held_out_psnr(scene: Scene, trainer: Trainer) -> float:
     for view in scene.test:
         with torch.no_grad():
             color = rasterize(trainer.splats, view.camera, trainer.settings, backend="cpu").color
-            shading = None if view.photometry is None else Shading.of(view.photometry, view.camera, color)
-            color = photograph(color, identity(color), shading=shading)
+            known = {} if view.photometry is None else light_of(view.photometry)
+            color = shown(color, known, ImagePoints(view.camera))
         target = torch.from_numpy(view.target(GENERIC.background))
         errors.append(float((color.clamp(0, 1) - target).square().mean()))
     return float(-10 * np.log10(np.mean(errors)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from dataclasses import replace
 from typing import Any
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from fake_backends import lacking
 from gs2d.config.presets import get_recipe, surface, with_intrinsics, with_multiview
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import IntrinsicsRefinement, LearningRates, LossTerm, PoseRefinement, Recipe, Stage, validate
@@ -21,14 +19,14 @@ from gs2d.core.residual_lens import through_lens
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene, View
 from gs2d.data.undistort import Intrinsics, Lens
-from gs2d.errors import DivergedError, RecipeError, RunError
+from gs2d.errors import RecipeError
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
-from gs2d.training import per_image
+from gs2d.training.learned.camera_intrinsics import CameraIntrinsics
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
-from gs2d.training.zooms import Zooms, zoom_rate, zoom_step
-from train_toys import backends, make_scene, random_splats, same, short
+from learned_rows import Learner, begun
+from train_toys import backends, make_scene, random_splats, short
 
 needs_cpu = pytest.mark.skipif("cpu" not in backends(), reason="the native library is not built")
 
@@ -60,13 +58,12 @@ def test_the_gradient_is_that_of_the_whole_loss_by_focal_length_principal_point_
     for backend in backends():
         dtype = torch.float64 if backend == "reference" else torch.float32
         state = TrainState(random_splats(60, seed=1, dtype=dtype), torch.Generator().manual_seed(0))
-        state = per_image.start(state, recipe, scene)
-        assert state.zooms is not None
-        begun = torch.tensor([0.0, 0.0, 0.0, 0.01, -0.02], dtype=torch.float64)  # samples lie between pixels
-        state.zooms.offsets[:] = begun
+        rows = begun(state, recipe, scene).learned["intrinsics"]
+        start = torch.tensor([0.0, 0.0, 0.0, 0.01, -0.02], dtype=torch.float64)  # samples lie between pixels
+        rows.values[:] = start
         trainer = Trainer(scene, recipe, GENERIC, backend=backend, state=state)
         trainer.enter(0)
-        found[backend] = trainer._whole.evaluate(state, stage, 1, 2).gradients["zoom"]
+        found[backend] = trainer._whole.evaluate(state, stage, 1, 2).learned["intrinsics"]
         if backend != "reference":
             largest = float(found["reference"].abs().max())
             torch.testing.assert_close(found[backend], found["reference"], rtol=2e-3, atol=2e-3 * largest)
@@ -77,12 +74,12 @@ def test_the_gradient_is_that_of_the_whole_loss_by_focal_length_principal_point_
         for k in range(5):
             values = []
             for sign in (1, -1):
-                state.zooms.offsets[:] = begun
-                state.zooms.offsets[:, k] += sign * step
+                rows.values[:] = start
+                rows.values[:, k] += sign * step
                 there = whole.camera(state, 2)
                 output = rasterize(state.splats, there, whole.settings(stage, 1), backend=backend)
-                values.append(float(sum(whole.differentiate(state, stage, 1, 2, there, output, {})[0].values())))
-            state.zooms.offsets[:] = begun
+                values.append(float(sum(whole.differentiate(state, stage, 1, 2, there, output, {}).losses.values())))
+            rows.values[:] = start
             slope = (values[0] - values[1]) / (2 * step)
             assert slope == pytest.approx(float(found[backend][k]), rel=1e-3, abs=1e-5)
 
@@ -93,16 +90,24 @@ def test_photographs_of_one_camera_share_a_focal_length_and_the_first_step_is_th
         Intrinsics(64, 64, 70.0, 70.0, 32.0, 32.0, Lens("fov", (0.9,))),
     )
     views = [replace(view, intrinsics=second if index == 1 else first) for index, view in enumerate(scene.train)]
-    made = Zooms.start(views)
-    assert made.group == [0, 1, 0, 0, 0, 0]
-    zoom_step(made, 3, torch.tensor([-5.0, 1.0, -1.0, 2.0, 2.0], dtype=torch.float64), quick(), 0.01)
-    assert made.zoom(0) == made.zoom(3) == Zoom(pytest.approx(math.exp(0.01)), 0.0, 0.0)
-    assert made.zoom(1) == Zoom()
-    everything, corner = quick(principal_point=True, distortion=True), made.corners[1]
+    seen = replace(scene, train=tuple(views))
+    made = Learner(quick(principal_point=True, distortion=True), seen)
+    quantity = made.table.quantities["intrinsics"]
+    assert isinstance(quantity, CameraIntrinsics)
+    assert quantity.row_of == [0, 1, 0, 0, 0, 0]
+    corner = quantity.corners[1]
     assert corner == pytest.approx(2 * (views[1].camera.width / views[1].camera.fx / 2) ** 2)
-    zoom_step(made, 1, torch.tensor([5.0, 1.0, -1.0, 2.0, -2.0], dtype=torch.float64), everything, 0.01)
-    assert made.zoom(1) == pytest.approx((math.exp(-0.01), -0.01, 0.01, -0.01 / corner, 0.01 / corner**2))
-    assert made.steps == [1, 1]
+    made.step("intrinsics", 1, [5.0, 1.0, -1.0, 2.0, -2.0], 0.01)
+    values = made.rows["intrinsics"].values
+    assert quantity.zoom(values, 1) == pytest.approx((math.exp(-0.01), -0.01, 0.01, -0.01 / corner, 0.01 / corner**2))
+    assert quantity.zoom(values, 0) == quantity.zoom(values, 3) == Zoom()
+
+
+def test_only_the_numbers_that_the_recipe_names_are_learned(scene: Scene) -> None:
+    for recipe, moves in ((quick(), 1), (quick(distortion=True), 3), (quick(principal_point=True), 3)):
+        trainer = Trainer(scene, recipe, GENERIC, backend=backends()[-1])
+        trainer.run()
+        assert int(trainer.state.learned["intrinsics"].values.count_nonzero()) == moves
 
 
 def test_faces_of_a_panorama_keep_their_intrinsics_while_their_poses_learn(scene: Scene) -> None:
@@ -110,11 +115,9 @@ def test_faces_of_a_panorama_keep_their_intrinsics_while_their_poses_learn(scene
     for views, stays in ((faces, True), (scene, False)):
         trainer = Trainer(views, quick(distortion=True), GENERIC, backend="reference")
         trainer.run()
-        state = trainer.state
-        assert state.zooms is not None
-        assert state.poses is not None
-        assert bool((state.zooms.offsets == 0).all()) is stays
-        assert bool(state.poses.offsets.any())
+        learned = trainer.state.learned
+        assert bool((learned["intrinsics"].values == 0).all()) is stays
+        assert bool(learned["poses"].values.any())
 
 
 def test_the_camera_s_numbers_are_those_of_its_size(scene: Scene) -> None:
@@ -126,11 +129,7 @@ def test_the_camera_s_numbers_are_those_of_its_size(scene: Scene) -> None:
     assert (half.fx, half.fy, half.cx, half.cy) == pytest.approx((again.fx, again.fy, again.cx, again.cy))
 
 
-def test_they_learn_where_poses_do_and_faster_in_short_schedules() -> None:
-    recipe = quick()
-    assert [zoom_rate(recipe, 0, i) > 0 for i in (1, 2, 3, 4)] == [False, False, True, True]
-    assert zoom_rate(recipe, 1, 1) == 0  # only colours learn
-    assert zoom_rate(short(), 0, 5) == 0
+def test_they_learn_faster_in_short_schedules() -> None:
     tenth = scale_schedule(with_intrinsics(get_recipe("2dgs")), 0.1).intrinsics
     assert tenth is not None
     assert tenth.rate == pytest.approx(IntrinsicsRefinement().rate * math.sqrt(10))
@@ -154,58 +153,11 @@ def test_what_cannot_be_learned_is_refused() -> None:
         validate(replace(recipe, intrinsics=IntrinsicsRefinement(distortion="k1")))  # type: ignore[arg-type]
 
 
-def test_resuming_from_any_event_gives_the_same_splats_and_focal_lengths(scene: Scene) -> None:
-    kept: list[bytes] = []
-
-    def save(_: object) -> None:
-        file = io.BytesIO()
-        torch.save(trainer.state.state_dict(), file)
-        kept.append(file.getvalue())
-
-    recipe = quick(distortion=True)
-    trainer = Trainer(scene, recipe, GENERIC, backend=backends()[-1], progress_every=1, on_event=save)
-    end = trainer.run()
-    assert trainer.state.zooms is not None
-    assert trainer.state.zooms.offsets[:, 0].abs().max() > 1e-3
-    assert not trainer.state.zooms.offsets[:, 1:3].any()  # principal points stay
-    assert trainer.state.zooms.offsets[:, 3:].abs().min() > 1e-4
-    for data in kept[::5]:
-        state = TrainState.from_state_dict(torch.load(io.BytesIO(data), weights_only=True))
-        resumed = Trainer(scene, recipe, GENERIC, backend=backends()[-1], state=state)
-        assert same(resumed.run(), end)
-        assert resumed.state.zooms is not None
-        assert torch.equal(resumed.state.zooms.offsets, trainer.state.zooms.offsets)
-
-
-def test_a_state_of_other_views_or_a_gradient_that_is_not_finite_is_refused(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    state = per_image.start(TrainState(random_splats(5), torch.Generator()), replace(quick(), intrinsics=None), scene)
-    with pytest.raises(RunError, match="focal lengths of 6 views, as recipe and scene say, got 0"):
-        Trainer(scene, quick(), GENERIC, backend="reference", state=state)
-    trainer = Trainer(scene, quick(start=0), GENERIC, backend=backends()[-1])
-    trainer.enter(0)
-    monkeypatch.setattr(Zooms, "gradient", lambda *_: torch.full((5,), torch.nan))
-    with pytest.raises(DivergedError, match="the gradient of focal length is NaN or infinite"):
-        trainer.step()
-
-
-def test_an_update_that_was_cancelled_on_the_device_changes_nothing(scene: Scene) -> None:
-    state = per_image.start(TrainState(random_splats(5), torch.Generator()), quick(), scene)
-    assert state.zooms is not None
-    gradients = {"zoom": torch.ones(5, dtype=torch.float64)}
-    per_image.update(state, replace(quick(), exposure=None), 5, 1, gradients, lacking(1))
-    assert not any(state.zooms.steps)
-    per_image.update(state, replace(quick(), exposure=None), 5, 1, gradients, lacking(0))
-    assert sum(state.zooms.steps) == 1
-
-
 def test_test_photographs_of_the_same_camera_get_its_focal_length(scene: Scene) -> None:
     whole = replace(scene, test=(replace(scene.train[0], name="t.png"),))
-    state = per_image.start(TrainState(random_splats(5), torch.Generator()), quick(), whole)
-    assert state.zooms is not None
-    state.zooms.offsets[:, 0] = 0.1
-    now = per_image.scene_now(state, whole)
+    made = Learner(quick(), whole)
+    made.rows["intrinsics"].values[:, 0] = 0.1
+    now = made.table.scene_now(made.rows)
     assert now.test[0].camera.fx == pytest.approx(whole.test[0].camera.fx * math.exp(0.1))
     assert now.train[3].zoom == now.test[0].zoom
     assert np.array_equal(now.test[0].camera.T_cam_world, whole.test[0].camera.T_cam_world)
@@ -237,13 +189,15 @@ def test_the_focal_length_of_a_scene_that_is_known_is_found_to_the_last_digits()
     recipe = Recipe("one", (stage,), poses=PoseRefinement(**learned), intrinsics=settings)
     trainer = Trainer(scene, recipe, GENERIC, backend="cpu", init=truth)
     trainer.enter(0)
-    state, zooms = trainer.state, trainer.state.zooms
-    assert zooms is not None
+    state, quantity = trainer.state, trainer.learned.quantities["intrinsics"]
+    assert isinstance(quantity, CameraIntrinsics)
+    rows = state.learned["intrinsics"]
     for iteration in range(1, 121):
         index = iteration % 16
         found = trainer._whole.evaluate(state, replace(stage, sh_interval=0), iteration, index)
-        zoom_step(zooms, index, found.gradients["zoom"], recipe, zoom_rate(recipe, 0, iteration))
-    assert 1.02 * zooms.zoom(0).scale == pytest.approx(1.0, abs=3e-4)
+        rates = {"intrinsics": trainer.learned.learning(0, iteration)["intrinsics"]}
+        trainer.learned.update(state.learned, index, found.learned, rates, trainer.backend)
+    assert 1.02 * quantity.zoom(rows.values, 0).scale == pytest.approx(1.0, abs=3e-4)
 
 
 @needs_cpu
@@ -256,7 +210,7 @@ def test_a_focal_length_that_is_two_per_cent_off_is_found_with_the_scene_and_the
     intrinsics = IntrinsicsRefinement(rate=3e-3, rate_final=1.5e-4, start=20, decay_steps=1500)
     trainer = Trainer(scene, Recipe("one", (stage,), poses=poses, intrinsics=intrinsics), GENERIC, init=truth)
     trainer.run()
-    now = per_image.scene_now(trainer.state, scene)
+    now = trainer.scene_now()
     assert now.train[0].camera.fx / 50 == pytest.approx(1.0, abs=0.006)
 
 
@@ -285,14 +239,16 @@ def test_the_lens_of_a_scene_that_is_known_is_found_with_its_focal_length() -> N
     recipe = Recipe("one", (stage,), poses=PoseRefinement(**learned), intrinsics=settings)
     trainer = Trainer(scene, recipe, GENERIC, backend="cpu", init=truth)
     trainer.enter(0)
-    state, zooms = trainer.state, trainer.state.zooms
-    assert zooms is not None
+    state, quantity = trainer.state, trainer.learned.quantities["intrinsics"]
+    assert isinstance(quantity, CameraIntrinsics)
+    rows = state.learned["intrinsics"]
     before = residual_of(trainer, state, stage)
     for iteration in range(1, 241):
         index = iteration % 16
         found = trainer._whole.evaluate(state, replace(stage, sh_interval=0), iteration, index)
-        zoom_step(zooms, index, found.gradients["zoom"], recipe, zoom_rate(recipe, 0, iteration))
-    found_lens, corner = zooms.zoom(0), zooms.corners[0]
+        rates = {"intrinsics": trainer.learned.learning(0, iteration)["intrinsics"]}
+        trainer.learned.update(state.learned, index, found.learned, rates, trainer.backend)
+    found_lens, corner = quantity.zoom(rows.values, 0), quantity.corners[0]
     for square in (0.1, 0.2, corner):  # what it does to the picture, rather than its two numbers, is told apart well
         wanted = 1 + LENS[0] * square + LENS[1] * square**2
         got = (1 + found_lens.k1 * square + found_lens.k2 * square**2) * found_lens.scale
@@ -324,7 +280,7 @@ def test_a_lens_is_found_with_the_scene_and_new_views_gain(seed: int) -> None:
         trainer = Trainer(scene, recipe, GENERIC, init=truth)
         splats = trainer.run()
         errors = []
-        for view in per_image.scene_now(trainer.state, scene).test:
+        for view in trainer.scene_now().test:
             with torch.no_grad():
                 color = rasterize(splats, view.camera, trainer.settings, backend="cpu").color
             valid = view.valid()
@@ -354,14 +310,3 @@ def test_photographs_of_a_lens_that_was_found_are_straightened_wherever_they_are
     assert np.array_equal(mask, reached)
     assert np.array_equal(wide.at(camera.T_cam_world).image(), wide.image())  # once, however often it is moved
     assert there.downscaled(2).image().shape == (15, 20, 3)
-
-
-def test_checkpoints_of_before_there_were_lenses_are_read(scene: Scene) -> None:
-    made = Zooms.start(scene.train)
-    data = made.state_dict()
-    for name in ("offsets", "mean", "square"):
-        data[name] = torch.full((1, 3), 0.5, dtype=torch.float64)
-    del data["corners"]
-    again = Zooms.from_state_dict(data)
-    again.check()
-    assert again.offsets.tolist() == [[0.5, 0.5, 0.5, 0.0, 0.0]]

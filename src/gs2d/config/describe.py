@@ -13,33 +13,7 @@ from gs2d.config.robust import FEW_VIEWS
 def describe_recipe(recipe: Recipe) -> Iterator[str]:
     """Lines that say what is trained."""
     yield f"{recipe.name}: {recipe.iterations:,} iterations, SH degree {recipe.sh_degree}, seed {recipe.seed}"
-    if recipe.exposure is not None:
-        e = recipe.exposure
-        yield (
-            f"exposures: a colour transform for each photograph after iteration {e.start:,}, "
-            f"rate {e.rate:g} to {e.rate_final:g} over {e.decay_steps:,} iterations, prior {e.prior:g}"
-        )
-    if recipe.photometry is not None:
-        c = recipe.photometry
-        what = " and ".join(name for name in ("vignetting", "response") if getattr(c, name))
-        yield (
-            f"photometry: {what} of each camera after iteration {c.start:,}, rate {c.rate:g} to {c.rate_final:g} over "
-            f"{c.decay_steps:,} iterations, prior {c.prior:g}"
-        )
-    if recipe.poses is not None:
-        p = recipe.poses
-        yield (
-            f"poses: a motion for each training camera after iteration {p.start:,}, rate {p.rate:g} to "
-            f"{p.rate_final:g} (rad, shares of the extent) over {p.decay_steps:,} iterations, while all splats move"
-        )
-    if recipe.intrinsics is not None:
-        i = recipe.intrinsics
-        learned = ["focal length", *["principal point"] * i.principal_point, *["lens"] * i.distortion]
-        what = " and ".join(filter(None, (", ".join(learned[:-1]), learned[-1])))
-        yield (
-            f"intrinsics: the {what} of each camera after iteration {i.start:,}, rate {i.rate:g} to {i.rate_final:g} "
-            f"over {i.decay_steps:,} iterations, with the poses"
-        )
+    yield from _describe_learned(recipe)
     if recipe.multiview is not None:
         m = recipe.multiview
         where = f"one of {m.neighbours} nearby views within {m.max_angle:g} degrees"
@@ -61,6 +35,26 @@ def describe_recipe(recipe: Recipe) -> Iterator[str]:
         yield f"{number}. {stage.name}: {stage.iterations:,} iterations"
         for line in _describe_stage(stage):
             yield f"     {line}"
+
+
+def _describe_learned(recipe: Recipe) -> Iterator[str]:
+    intrinsics = recipe.intrinsics
+    lens = ["focal length"]
+    if intrinsics is not None:
+        lens += [*["principal point"] * intrinsics.principal_point, *["lens"] * intrinsics.distortion]
+    words = {
+        "exposure": "a colour transform for each image",
+        "poses": "a motion (rad, shares of the extent) for each training camera, while all splats move",
+        "intrinsics": f"{', '.join(lens)} of each camera, with the poses",
+        "vignetting": "falloff of light of each camera",
+        "response": "response curve of each camera",
+    }
+    for name, learning in recipe.quantities.items():
+        prior = f", prior {learning.prior:g}" if hasattr(learning, "prior") else ""
+        yield (
+            f"{name}: {words.get(name, 'registered quantity')}; after iteration {learning.start:,}, rate "
+            f"{learning.rate:g} to {learning.rate_final:g} over {learning.decay_steps:,} iterations{prior}"
+        )
 
 
 def _describe_priors(recipe: Recipe) -> Iterator[str]:

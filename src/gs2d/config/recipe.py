@@ -18,13 +18,13 @@ from gs2d.config.densify import Densify
 from gs2d.config.losses import LOSSES
 from gs2d.config.multiview import MultiView, check_multiview
 from gs2d.config.priors import DepthPrior, NormalPrior, check_priors
+from gs2d.config.quantities import QUANTITIES, Learning, Quantity
+from gs2d.config.quantities import Exposure as Exposure  # a field's type: whoever reads a recipe finds it here
+from gs2d.config.quantities import IntrinsicsRefinement as IntrinsicsRefinement
+from gs2d.config.quantities import Photometry as Photometry
+from gs2d.config.quantities import PoseRefinement as PoseRefinement
 from gs2d.config.robust import DenseStart, Removal, check_robust
 from gs2d.config.validate import group, integer, number, one_of, require
-from gs2d.config.views import Exposure as Exposure  # a field's type: whoever reads a recipe finds it here
-from gs2d.config.views import IntrinsicsRefinement as IntrinsicsRefinement
-from gs2d.config.views import Photometry as Photometry
-from gs2d.config.views import PoseRefinement as PoseRefinement
-from gs2d.config.views import check_exposure, check_intrinsics, check_photometry, check_poses
 
 MU, SIGMA, ALPHA, SH = ("means",), ("quats", "log_scales"), ("opacity_logits",), ("sh0", "shN")
 ALL = MU + SIGMA + ALPHA + SH
@@ -386,6 +386,8 @@ class Recipe:
         Learns focal lengths and lenses with the poses; None: those of the capture.
     photometry : Photometry or None
         Learns vignetting and response of the cameras; None: neither.
+    learned : tuple of Quantity
+        Further quantities of images and cameras that are learned: registered ones, by name.
 
     Examples
     --------
@@ -410,6 +412,21 @@ class Recipe:
     fused_depth: str | None = None
     intrinsics: IntrinsicsRefinement | None = None
     photometry: Photometry | None = None
+    learned: tuple[Quantity, ...] = ()
+
+    @property
+    def quantities(self) -> dict[str, Learning]:
+        """What is learned of images and cameras: settings by the name of the quantity, in the order of application."""
+        light = self.photometry
+        settings = {
+            "intrinsics": self.intrinsics,
+            "poses": self.poses,
+            "vignetting": light if light is not None and light.vignetting else None,
+            "exposure": self.exposure,
+            "response": light if light is not None and light.response else None,
+        }
+        known: dict[str, Learning] = {name: value for name, value in settings.items() if value is not None}
+        return known | {quantity.name: quantity for quantity in self.learned}
 
     @property
     def iterations(self) -> int:
@@ -466,19 +483,23 @@ def validate(recipe: Recipe) -> Recipe:
     require(recipe.sh_degree in (0, 1, 2, 3), f"{where}: sh_degree must be 0, 1, 2 or 3, got {recipe.sh_degree!r}")
     integer(f"{where}: init_points", recipe.init_points, low=1)
     require(recipe.init_points < 2**31, f"{where}: init_points must be at most 2^31 - 1, got {recipe.init_points}")
-    if recipe.exposure is not None:
-        check_exposure(f"{where}: exposure", recipe.exposure)
-    if recipe.photometry is not None:
-        check_photometry(f"{where}: photometry", recipe.photometry)
+    for name in ("exposure", "photometry", "poses", "intrinsics"):
+        if (settings := getattr(recipe, name)) is not None:
+            settings.check(f"{where}: {name}")
     if recipe.poses is not None:
-        check_poses(f"{where}: poses", recipe.poses)
         learns = any(stage.moves_all for stage in recipe.stages)
         require(learns, f"{where}: poses learn while the means of all splats do, and no stage trains those")
     if recipe.intrinsics is not None:
-        check_intrinsics(f"{where}: intrinsics", recipe.intrinsics)
         require(recipe.poses is not None, f"{where}: intrinsics learn with poses, got poses=null; set both or neither")
         fixed = "views are compared by the intrinsics that the capture says"
         require(recipe.multiview is None, f"{where}: intrinsics cannot learn with multiview: {fixed}; leave one out")
+    learned = [quantity.name for quantity in recipe.learned]
+    for quantity in recipe.learned:
+        name = quantity.name
+        quantity.check(f"{where}: learned {name!r}")
+        require(learned.count(name) == 1, f"{where}: learned {name!r} is there twice; leave one out")
+        setting = "photometry" if name in ("vignetting", "response") else name
+        require(name not in QUANTITIES.builtin, f"{where}: {name!r} must not be in learned; set {setting} instead")
     if recipe.multiview is not None:
         check_multiview(f"{where}: multiview", recipe.multiview)
     check_priors(where, recipe.depth_prior, recipe.normal_prior)

@@ -19,16 +19,8 @@ from typing import TypeVar
 
 from gs2d.config.densify import Densify
 from gs2d.config.priors import DepthPrior, NormalPrior
-from gs2d.config.recipe import (
-    Exposure,
-    GradDensify,
-    IntrinsicsRefinement,
-    LearningRates,
-    Photometry,
-    PoseRefinement,
-    Recipe,
-    Stage,
-)
+from gs2d.config.quantities import Learning
+from gs2d.config.recipe import GradDensify, LearningRates, Recipe, Stage
 from gs2d.errors import RecipeError
 
 MIN_DENSIFICATIONS = 10
@@ -37,8 +29,7 @@ RESET_MARGIN = 200  # iterations of densification that a reset must leave
 MIN_INIT_POINTS = 10_000
 LONGER = 0.25  # power of 1 / factor by which steps are longer: docs/notebook/floaters.md
 VIEWS_WAIT = 200  # iterations before exposures and poses are learned, where the schedule has them
-OfViews = TypeVar("OfViews", Exposure, PoseRefinement, IntrinsicsRefinement, Photometry)
-OfCameras = TypeVar("OfCameras", PoseRefinement, IntrinsicsRefinement, Photometry)
+Learned = TypeVar("Learned", bound=Learning)
 Prior = TypeVar("Prior", DepthPrior, NormalPrior)
 MAX_SCALE = 100.0  # six million iterations of 2DGS-R: more is a slip of the keyboard
 
@@ -105,6 +96,7 @@ def _scale(recipe: Recipe, factor: float, of_stages: Sequence[float]) -> Recipe:
         poses=None if recipe.poses is None else _scale_poses(recipe.poses, factor),
         intrinsics=None if recipe.intrinsics is None else _scale_poses(recipe.intrinsics, factor),
         photometry=None if recipe.photometry is None else _scale_poses(recipe.photometry, factor),
+        learned=tuple(_scale_poses(quantity, factor) for quantity in recipe.learned),
         depth_prior=None if recipe.depth_prior is None else _scale_prior(recipe.depth_prior, factor),
         normal_prior=None if recipe.normal_prior is None else _scale_prior(recipe.normal_prior, factor),
     )
@@ -131,17 +123,17 @@ def _scale_prior(prior: Prior, factor: float) -> Prior:
     return replace(prior, decay_steps=_scaled(prior.decay_steps, factor))
 
 
-def _scale_views(learned: OfViews, factor: float) -> OfViews:
+def _scale_views(learned: Learned, factor: float) -> Learned:
     """Splats become a scene, and leave the grey they start from, by the count of iterations, not by its share."""
     decay_steps = _scaled(learned.decay_steps, factor)
     least = min(learned.start, VIEWS_WAIT, decay_steps // 6)
     return replace(learned, decay_steps=decay_steps, start=max(least, round(learned.start * factor)))
 
 
-def _scale_poses(poses: OfCameras, factor: float) -> OfCameras:
+def _scale_poses(learned: Learned, factor: float) -> Learned:
     """Scale the steps of cameras: one moves when its image has its turn, and takes longer steps with fewer."""
     longer = 1 / math.sqrt(factor)
-    return replace(_scale_views(poses, factor), rate=poses.rate * longer, rate_final=poses.rate_final * longer)
+    return replace(_scale_views(learned, factor), rate=learned.rate * longer, rate_final=learned.rate_final * longer)
 
 
 def _scale_stage(stage: Stage, factor: float) -> Stage:

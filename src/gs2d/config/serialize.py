@@ -129,8 +129,10 @@ def _set_trained(train: dict[str, Any], attribute: str, rows: Any) -> None:
 
 
 def _entry(entries: list[Any], word: str, override: str) -> Any:
-    """Return the loss of a kind, or the action of a name."""
-    tags = [str(entry.get("kind", entry.get(ACTION_KEY))) if isinstance(entry, dict) else "?" for entry in entries]
+    """Return the loss of a kind, or the action or the learned quantity of a name."""
+    keys = ("kind", ACTION_KEY, "name")
+    known = [entry if isinstance(entry, dict) else {} for entry in entries]
+    tags = [next((str(entry[key]) for key in keys if key in entry), "?") for entry in known]
     if word not in tags:
         raise RecipeError(f"override {override!r}: no entry {word!r}; there is {', '.join(tags) or 'none'}")
     return entries[tags.index(word)]

@@ -32,11 +32,9 @@ from gs2d.pipeline.prepare.job import resolve
 from gs2d.pipeline.prepare.opened import open_capture
 from gs2d.pipeline.prepare.options import MeshOptions, Robust, TrainOptions
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
-from gs2d.pipeline.prepare.run_exposures import named
 from gs2d.pipeline.train.progress_bar import progress_bar
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
-from gs2d.training.per_image import scene_now
 from gs2d.training.trainer import Trainer, raster_settings
 
 __all__ = ["Trained", "evaluate", "extract_mesh", "train"]
@@ -155,9 +153,8 @@ def train(
         scene, rules, chosen = opened.scene, opened.protocol, opened.backend
         trainer = Trainer(scene, fitted, rules, backend=chosen, on_event=tell)
         trainer.run()
-    exposures = named(scene.train, trainer.state.exposures)
-    found = scene_now(trainer.state, scene)
-    return Trained(trainer.splats, found, rules, trainer.settings, chosen, trainer.recipe, exposures)
+    exposures = trainer.learned.by_name(trainer.state.learned, "exposure")
+    return Trained(trainer.splats, trainer.scene_now(), rules, trainer.settings, chosen, trainer.recipe, exposures)
 
 
 def _finished(

@@ -33,8 +33,6 @@ def expose(
     transform: Tensor,
     coverage: Tensor | None = None,
     background: Tensor | None = None,
-    *,
-    clipped: Tensor | None = None,
 ) -> Tensor:
     """Return a rendered picture as a camera with this transform would have taken it.
 
@@ -50,8 +48,6 @@ def expose(
         Alpha in [0, 1] of what the camera saw; without it the whole picture. Not differentiated.
     background : Tensor [3], optional
         Needed with ``coverage``.
-    clipped : Tensor [H, W, 3] bool, optional
-        Where the photograph is at its ceiling, which says "this bright or brighter": there at most 1.
 
     Returns
     -------
@@ -62,10 +58,8 @@ def expose(
     if coverage is not None:
         assert background is not None
         arrays |= {"coverage": (coverage, "H W"), "background": (background, "3")}
-    if clipped is not None:
-        arrays["clipped"] = (clipped, "H W 3")
     check_shapes(arrays)
-    exposed: Tensor = _Expose.apply(color, transform, coverage, background, clipped)
+    exposed: Tensor = _Expose.apply(color, transform, coverage, background)
     return exposed
 
 
@@ -77,35 +71,26 @@ class _Expose(torch.autograd.Function):
         transform: Tensor,
         coverage: Tensor | None,
         background: Tensor | None,
-        clipped: Tensor | None,
     ) -> Tensor:
         ctx.library = library_for(color)
-        arguments = (color, transform, coverage, background, clipped)
-        image, over = _exposed(*arguments) if ctx.library is None else native.exposed(ctx.library, *arguments)
-        ctx.save_for_backward(color, transform, coverage, background, over)
-        return image
+        arguments = (color, transform, coverage, background)
+        ctx.save_for_backward(*arguments)
+        return _exposed(*arguments) if ctx.library is None else native.exposed(ctx.library, *arguments)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         arguments = (upstream, *ctx.saved_tensors)
         gradients = _gradients(*arguments) if ctx.library is None else native.gradients(ctx.library, *arguments)
-        return (*gradients, None, None, None)
+        return (*gradients, None, None)
 
 
-def _exposed(
-    color: Tensor, transform: Tensor, coverage: Tensor | None, background: Tensor | None, clipped: Tensor | None
-) -> tuple[Tensor, Tensor | None]:
-    """Return the picture, and where it was cut to 1 [H, W, 3]; by torch."""
+def _exposed(color: Tensor, transform: Tensor, coverage: Tensor | None, background: Tensor | None) -> Tensor:
+    """Return the image; by torch."""
     if coverage is None or background is None:
-        image = _apply(color, transform[:, :3]) + transform[:, 3]
-    else:
-        behind = (1 - coverage[..., None]) * background.to(color.dtype)
-        image = _apply(color - behind, transform[:, :3]) + coverage[..., None] * transform[:, 3] + behind
-    if clipped is None:
-        return image, None
-    over = clipped & (image > 1)
-    return torch.where(over, 1.0, image), over
+        return _apply(color, transform[:, :3]) + transform[:, 3]
+    behind = (1 - coverage[..., None]) * background.to(color.dtype)
+    return _apply(color - behind, transform[:, :3]) + coverage[..., None] * transform[:, 3] + behind
 
 
 def _gradients(
@@ -114,10 +99,8 @@ def _gradients(
     transform: Tensor,
     coverage: Tensor | None,
     background: Tensor | None,
-    over: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """Those of ``color`` and ``transform``; by torch."""
-    upstream = upstream if over is None else torch.where(over, 0.0, upstream)
     light, weight = color, torch.ones_like(color[..., 0])
     if coverage is not None and background is not None:
         light, weight = color - (1 - coverage[..., None]) * background.to(color.dtype), coverage

@@ -28,9 +28,8 @@ class _Image(ctypes.Structure):
 def plain_tensors(library: Library, **tensors: Tensor | None) -> list[Tensor | None]:
     """Return the tensors, contiguous, or ShapeError for one that native code cannot read."""
     for name, tensor in tensors.items():
-        dtype = torch.bool if name in ("clipped", "over") else library.dtype
-        if tensor is not None and (not tensor.is_cpu or tensor.dtype != dtype):
-            raise ShapeError(f"{name} must be {dtype} on the cpu, got {tensor.dtype} on {tensor.device}")
+        if tensor is not None and (not tensor.is_cpu or tensor.dtype != library.dtype):
+            raise ShapeError(f"{name} must be {library.dtype} on the cpu, got {tensor.dtype} on {tensor.device}")
     return [None if tensor is None else tensor.detach().contiguous() for tensor in tensors.values()]
 
 
@@ -46,29 +45,22 @@ def _image(color: Tensor, transform: Tensor, coverage: Tensor | None, background
 
 
 def exposed(
-    library: Library,
-    color: Tensor,
-    transform: Tensor,
-    coverage: Tensor | None,
-    background: Tensor | None,
-    clipped: Tensor | None,
-) -> tuple[Tensor, Tensor | None]:
-    """Return the picture, and where it was cut to 1 [H, W, 3]; arguments as of ``gs2d.render.exposure.expose``.
+    library: Library, color: Tensor, transform: Tensor, coverage: Tensor | None, background: Tensor | None
+) -> Tensor:
+    """Return the image; arguments as of ``gs2d.render.exposure.expose``.
 
     Raises
     ------
     ShapeError
         If a tensor has another dtype, or is not on the CPU.
     """
-    plain, cover, ceiling = plain_tensors(library, color=color, coverage=coverage, clipped=clipped)
+    plain, cover = plain_tensors(library, color=color, coverage=coverage)
     assert plain is not None
     out = torch.empty_like(plain)
-    over = None if ceiling is None else torch.empty_like(ceiling)
     image = _image(plain, transform, cover, background)
     function = library.function("gs2d_expose", None, (ctypes.c_void_p,) * 4)
-    pointers = [None if tensor is None else tensor.data_ptr() for tensor in (ceiling, out, over)]
-    function(ctypes.byref(image), *pointers)
-    return out, over
+    function(ctypes.byref(image), None, out.data_ptr(), None)
+    return out
 
 
 def gradients(
@@ -78,16 +70,14 @@ def gradients(
     transform: Tensor,
     coverage: Tensor | None,
     background: Tensor | None,
-    over: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """Those of ``color`` [H, W, 3] and ``transform`` [3, 4]."""
-    given, plain, cover, cut = plain_tensors(library, upstream=upstream, color=color, coverage=coverage, over=over)
+    given, plain, cover = plain_tensors(library, upstream=upstream, color=color, coverage=coverage)
     assert given is not None
     assert plain is not None
     to_color, sums = torch.empty_like(plain), (ctypes.c_double * 12)()
     image = _image(plain, transform, cover, background)
     function = library.function("gs2d_expose_vjp", ctypes.c_int, (ctypes.c_void_p,) * 5)
-    pointers = [None if tensor is None else tensor.data_ptr() for tensor in (cut, given, to_color)]
-    if function(ctypes.byref(image), *pointers, sums) != 0:
+    if function(ctypes.byref(image), None, given.data_ptr(), to_color.data_ptr(), sums) != 0:
         raise MemoryError("no memory for the sums of an exposure's gradient")
     return to_color, torch.tensor(list(sums), dtype=torch.float64).reshape(3, 4).to(transform.dtype)

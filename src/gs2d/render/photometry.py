@@ -6,7 +6,6 @@ response shows the scene's own colours.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -16,33 +15,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gs2d.core.camera import Camera
-from gs2d.core.checks import check_shapes
 from gs2d.core.photometry import CameraPhotometry, squared_radii
 from gs2d.kernels.library import library_for
 from gs2d.render import photometry_native as native
-from gs2d.render.exposure import expose, remove_exposure
-
-
-@dataclass(frozen=True, eq=False)
-class Shading:
-    """A camera's vignetting and response, for one picture.
-
-    Attributes
-    ----------
-    numbers : Tensor [4]
-        a, b and c of the falloff, and s of the response.
-    squares : Tensor [H, W]
-        Squared radii.
-    """
-
-    numbers: Tensor
-    squares: Tensor
-
-    @classmethod
-    def of(cls, photometry: CameraPhotometry, camera: Camera, like: Tensor) -> Shading:
-        """Return that of a camera's picture, of the type and on the device of ``like``."""
-        numbers = torch.tensor([*photometry.falloff, photometry.shift]).to(like)
-        return cls(numbers, squares_of(camera, photometry.reach, like))
+from gs2d.render.exposure import remove_exposure
 
 
 def squares_of(camera: Camera, reach: float, like: Tensor) -> Tensor:
@@ -55,36 +31,6 @@ def squares_of(camera: Camera, reach: float, like: Tensor) -> Tensor:
 def _squares(size: tuple[Any, ...], reach: float, device: torch.device, dtype: torch.dtype) -> Tensor:
     width, height, fx, fy, cx, cy = size
     return torch.from_numpy(squared_radii(Camera(width, height, fx, fy, cx, cy, np.eye(4)), reach)).to(device, dtype)
-
-
-def photograph(
-    color: Tensor,
-    transform: Tensor,
-    coverage: Tensor | None = None,
-    background: Tensor | None = None,
-    *,
-    clipped: Tensor | None = None,
-    shading: Shading | None = None,
-) -> Tensor:
-    """Return a rendered picture as a camera took it: :func:`gs2d.render.exposure.expose` with a camera's shading.
-
-    A colour times what vignetting leaves of it, in the exposure of the photograph, by the camera's response. Without
-    ``shading`` these are the bits of ``expose``. Where the photograph has an alpha channel the response acts where it
-    is opaque: of an edge nobody knows the two colours.
-
-    Returns
-    -------
-    Tensor [H, W, 3]
-        Differentiable in ``color``, ``transform`` and the numbers of ``shading``.
-    """
-    if shading is None:
-        return expose(color, transform, coverage, background, clipped=clipped)
-    check_shapes({"color": (color, "H W 3"), "squares": (shading.squares, "H W"), "numbers": (shading.numbers, "4")})
-    falloff, shift = shading.numbers[:3], shading.numbers[3:]
-    arriving = show(color, torch.cat([falloff, torch.zeros_like(shift)]), shading.squares, coverage, background)
-    # The curve takes 1 to 1 and never turns, so a ceiling before it is one behind it.
-    exposed = expose(arriving, transform, coverage, background, clipped=clipped)
-    return show(exposed, torch.cat([torch.zeros_like(falloff), shift]), None, coverage, background)
 
 
 def show(

@@ -7,6 +7,8 @@ their order and size: the same for any number of threads, and after any resume.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from torch import Tensor
 
 from gs2d.config.recipe import Recipe, Stage
@@ -105,5 +107,5 @@ class CachedViews:
         unseen = color.new_empty(0)  # the losses of such a stage look at nothing else
         output = RenderOutput(color, unseen, unseen, unseen, unseen, unseen, unseen)
         camera = self._whole.camera(state, index)  # of a stage that moves no splats: it stands still
-        losses, gradients = self._whole.differentiate(state, stage, iteration, index, camera, output, leaves)
-        return StepResult(losses, gradients, None, None, self.rows)
+        found = self._whole.differentiate(state, stage, iteration, index, camera, output, leaves)
+        return replace(found, rows=self.rows)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Protocol as Interface
 
 import torch
@@ -13,28 +13,22 @@ from torch import Tensor
 from gs2d.config.protocols import Protocol
 from gs2d.config.recipe import Recipe, Stage
 from gs2d.core.camera import Camera
-from gs2d.core.residual_lens import straightened, through_lens
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DivergedError
-from gs2d.kernels.reference import finite
 from gs2d.losses.api import LossReport, LossView, compute_losses, losses_of
 from gs2d.losses.multiview import Neighbour
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backends import Backend
-from gs2d.render.exposure import identity
-from gs2d.render.photometry import Shading, photograph
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.training.dropout import dropout_rate, dropped_out, kept_splats
-from gs2d.training.exposure import apply_exposure
+from gs2d.training.learned.appearance import shown, shown_splats
+from gs2d.training.learned.learned_table import LearnedTable, first_not_finite_quantity
+from gs2d.training.learned.quantity import ImagePoints
 from gs2d.training.multiview import PATCH_BYTES, ImageFiles, draw_turn, find_neighbours
 from gs2d.training.opaque import another_background
-from gs2d.training.poses import pose_rate
 from gs2d.training.state import TrainState
 from gs2d.training.targets import Target, TargetSource
-from gs2d.training.zooms import Zooms, zoom_rate
-
-_ALL = 0.999  # of the pixels that a sample is made of count, or it does not
 
 
 def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> RasterSettings:
@@ -70,13 +64,13 @@ class StepResult:
     losses : mapping of kind to float or Tensor []
         Weighted. Tensors on a GPU: to read them is to wait for it.
     gradients : mapping of attribute to Tensor
-        Like the attributes; only of ``rows``, in their order, where those are given. Where exposures are learned also
-        "exposure" [3, 4], of the photograph's transform; where poses are, "pose" [6], of the camera's motion; where
-        focal lengths are, "zoom" [5]; where vignetting and response are, "photometry" [4], of its camera.
+        Like the attributes; only of ``rows``, in their order, where those are given.
     signal : Tensor [N, 2] or [N, 4], or None
     radii : Tensor [N] px or None
         None where nothing was projected.
     rows : Tensor [M] int64 or None
+    learned : mapping of name to Tensor
+        Gradients of what is learned of the image and its camera (``gs2d.training.learned``).
     """
 
     losses: Mapping[str, float | Tensor]
@@ -84,6 +78,7 @@ class StepResult:
     signal: Tensor | None
     radii: Tensor | None
     rows: Tensor | None = None
+    learned: Mapping[str, Tensor] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +129,9 @@ class FullRender:
         backend: Backend,
         targets: TargetSource,
         frozen: Splats | None = None,
+        learned: LearnedTable | None = None,
     ) -> None:
+        self.learned = learned or LearnedTable(recipe, scene)
         self.scene, self.recipe, self.protocol, self.backend = scene, recipe, protocol, backend
         self.frozen = frozen
         self.targets = targets
@@ -175,34 +172,14 @@ class FullRender:
             splats = dropped_out(splats, kept_splats(self.recipe, state.stage, iteration, len(splats), rate))
         return self.drawn(splats)
 
-    def learns(self, state: TrainState, iteration: int) -> bool:
-        """Whether cameras learn in an iteration."""
-        return any(rate(self.recipe, state.stage, iteration) > 0 for rate in (pose_rate, zoom_rate))
+    def camera(self, state: TrainState, index: int, *, learning: Collection[str] = ()) -> Camera:
+        """Return the camera of training view ``index`` where it is now; with gradients of what is ``learning``."""
+        return self.learned.camera(state.learned, index, self.scene.train[index].camera, learning)
 
-    def camera(self, state: TrainState, index: int, *, learns: bool = False) -> Camera:
-        """Return the camera of training view ``index`` where it is now; with ``learns`` it gets a gradient."""
-        camera = self.scene.train[index].camera
-        if state.zooms is not None:
-            camera = state.zooms.camera(index, camera, learns=learns and not self.scene.train[index].is_face)
-        return camera if state.poses is None else state.poses.camera(index, camera, learns=learns)
-
-    def _lens(self, zooms: Zooms, index: int, camera: Camera) -> Tensor | None:
-        """Return the lens through which a rendering is to be seen; None where there is none."""
-        settings = self.recipe.intrinsics
-        return None if settings is None or not settings.distortion else zooms.lens(index, camera)
-
-    def _straight(self, state: TrainState, index: int, camera: Camera) -> Target:
-        """Return the photograph of a view without what training has found to be left of its lens."""
-        target, lens = self.targets[index], None if state.zooms is None else state.zooms.zoom(index).lens
-        if lens is None:
-            return target
-        image, mask = straightened(target.image, camera, lens)
-        silhouette = target.silhouette
-        if target.mask is not None:
-            mask = mask & (straightened(target.mask[..., None].to(image), camera, lens)[0][..., 0] > _ALL)
-        if silhouette is not None:
-            silhouette = straightened(silhouette[..., None], camera, lens)[0][..., 0]
-        return Target(image, mask, None, silhouette)
+    def _seen(self, state: TrainState, index: int) -> tuple[Camera, Target]:
+        """Return the camera of a view and its photograph, as a rendering of that camera would show it."""
+        camera = self.camera(state, index)
+        return camera, self.learned.target(state.learned, index, camera, self.targets[index])
 
     def evaluate(
         self, state: TrainState, stage: Stage, iteration: int, index: int, probe: Tensor | None = None
@@ -210,7 +187,7 @@ class FullRender:
         """Render one view; loss and gradients, checked to be finite (DivergedError; not on a GPU)."""
         splats = state.splats
         leaves = Splats(**{k: t.detach().requires_grad_(k in stage.train) for k, t in splats.items()})
-        camera = self.camera(state, index, learns=self.learns(state, iteration))
+        camera = self.camera(state, index, learning=self.learned.learning(state.stage, iteration))
         another = another_background(self.recipe, stage, iteration)
         if another is not None and self.targets[index].silhouette is not None:
             another = None
@@ -223,8 +200,9 @@ class FullRender:
         output = rasterize(drawn, camera, settings, backend=self.backend, screen_probe=of_all, gradient_rows=rows)
         neighbour = self.neighbour_of(state, stage, iteration, index, splats)
         given = (index, camera, output, dict(leaves.items()), neighbour)
-        losses, gradients = self.differentiate(state, stage, iteration, *given)
-        return StepResult(losses, gradients, None if probe is None else _gradient(probe), output.radii[: len(splats)])
+        found = self.differentiate(state, stage, iteration, *given)
+        signal = None if probe is None else _gradient(probe)
+        return replace(found, signal=signal, radii=output.radii[: len(splats)])
 
     def _with_frozen(self, rows: Tensor | None, count: int, camera: Camera) -> Tensor | None:
         """Return the rows [N + frozen] that have gradients, of those [N] among ``count`` splats in training."""
@@ -236,14 +214,11 @@ class FullRender:
     @torch.no_grad()
     def residual(self, state: TrainState, stage: Stage, iteration: int, index: int) -> ViewResidual:
         """Render view ``index`` as it is trained on at an iteration (from 1), beside its photograph."""
-        camera = self.camera(state, index)
-        target = self._straight(state, index, camera)
+        camera, target = self._seen(state, index)
         settings = replace(self.settings(stage, iteration), with_distortion=False)
         color = rasterize(self.drawn(state.splats), camera, settings, backend=self.backend).color
-        if state.exposures is not None or state.photometries is not None:
-            given = (self._transform(state, index, color), target.silhouette, self._background)
-            shading = self._shading(state, index, camera, color)
-            color = photograph(color, *given, clipped=clipped_pixels(target), shading=shading)
+        numbers = self.learned.numbers(state.learned, index, color)
+        color = shown(color, numbers, self._points(camera, target), clipped_pixels(target))
         error = (color - target.image).abs().mean(dim=2)
         error = error if target.mask is None else error * target.mask
         return ViewResidual(error, camera, settings, self.frozen)
@@ -253,32 +228,17 @@ class FullRender:
         self, state: TrainState, index: int, splats: Splats, settings: RasterSettings, *, occlusion: bool
     ) -> Tensor:
         """Return the inner sum of E_i of splats [N] in training view ``index``, in the colours that it shows."""
-        camera = self.camera(state, index)
-        target = self._straight(state, index, camera)
-        splats, settings = self.photographed(state, index, splats, camera, settings)
+        camera, target = self._seen(state, index)
+        if self.learned.changes_color:
+            numbers = self.learned.numbers(state.learned, index, splats.means)
+            splats = shown_splats(splats, camera, numbers, settings.sh_degree)
+            settings = replace(settings, sh_degree=0)
         given = {"backend": self.backend, "mask": target.mask, "occlusion": occlusion}
         return splat_errors(splats, camera, target.image, settings, **given)  # type: ignore[arg-type]
 
-    def _transform(self, state: TrainState, index: int, like: Tensor) -> Tensor:
-        """Return the exposure of a view [3, 4]; the mean one where none are learned."""
-        return identity(like) if state.exposures is None else state.exposures.transform(index)
-
-    def _shading(
-        self, state: TrainState, index: int, camera: Camera, like: Tensor, *, learns: bool = False
-    ) -> Shading | None:
-        """Return the vignetting and the response of a view's camera, where they are learned."""
-        found = state.photometries
-        return None if found is None else found.shading(index, camera, like, learns=learns)
-
-    def photographed(
-        self, state: TrainState, index: int, splats: Splats, camera: Camera, settings: RasterSettings
-    ) -> tuple[Splats, RasterSettings]:
-        """Return the splats in the colours that training view ``index`` shows, and settings to draw them with."""
-        if state.exposures is None and state.photometries is None:
-            return splats, settings
-        transform = self._transform(state, index, splats.means)
-        photometry = None if state.photometries is None else state.photometries.photometry(index)
-        return apply_exposure(splats, camera, transform, settings, photometry)
+    def _points(self, camera: Camera, target: Target) -> ImagePoints:
+        """Return the pixels of a photograph."""
+        return ImagePoints(camera, target.silhouette, None if target.silhouette is None else self._background)
 
     @torch.no_grad()
     def neighbour_of(
@@ -327,12 +287,11 @@ class FullRender:
         output: RenderOutput,
         leaves: Mapping[str, Tensor],
         neighbour: Neighbour | None = None,
-    ) -> tuple[dict[str, float | Tensor], dict[str, Tensor]]:
+    ) -> StepResult:
         """Weighted loss terms of a rendered view, and the gradients of the leaves that the stage trains.
 
-        Where exposures are learned, colours are compared in that of the photograph, and "exposure" is among both; so is
-        "photometry" where vignetting and response are; where
-        the camera that ``output`` was seen by learns, "pose" is among the gradients.
+        Colours are compared as the photograph shows them. What is learned of the image and of its camera has gradients,
+        too; that of the camera if it is the one that ``output`` was rendered by.
 
         Raises
         ------
@@ -340,20 +299,13 @@ class FullRender:
             If one of them is not finite. On a GPU nothing is looked at here, because a look waits for the device; the
             trainer looks at losses and parameters together, before anything is reported or saved.
         """
-        target = self.targets[index]
-        lens = None if state.zooms is None else self._lens(state.zooms, index, camera)
-        if lens is not None:
-            seen_through, inside = through_lens(output.color, camera, lens)
-            output = replace(output, color=seen_through)
-        transform = None if state.exposures is None else state.exposures.transform(index).requires_grad_()
-        shading = self._shading(state, index, camera, output.color, learns=True)
-        if transform is not None or shading is not None:
-            seen = self._transform(state, index, output.color) if transform is None else transform
-            given = (seen, target.silhouette, self._background)
-            color = photograph(output.color, *given, clipped=clipped_pixels(target), shading=shading)
+        target, at = self.targets[index], self._points(camera, self.targets[index])
+        numbers = self.learned.leaves(state.learned, index, camera, output.color)
+        if numbers:
+            color = shown(output.color, numbers, at, clipped_pixels(target))
+            if at.inside is not None:  # what the rendering does not reach teaches nothing
+                color = torch.where(at.inside[..., None], color, target.image)
             output = replace(output, color=color)
-        if lens is not None:  # what the rendering does not reach teaches nothing
-            output = replace(output, color=torch.where(inside[..., None], output.color, target.image))
         view = LossView(
             target.image,
             camera,
@@ -371,12 +323,7 @@ class FullRender:
             compared = self.losses.needing("neighbour", resolved)
             resolved = tuple(term for term in resolved if term not in compared)
         terms = compute_losses(output, view, resolved, backend=self.backend, losses=self.losses)
-        if transform is not None:
-            assert self.recipe.exposure is not None
-            terms["exposure"] = self.recipe.exposure.prior * (transform - identity(transform)).square().sum()
-        if shading is not None:
-            assert self.recipe.photometry is not None
-            terms["photometry"] = self.recipe.photometry.prior * shading.numbers[:4].square().sum()
+        terms |= self.learned.penalties(numbers, index)
         loss = torch.stack(list(terms.values())).sum()
         watched = not is_async(loss.device)
         values: dict[str, float | Tensor] = {
@@ -387,22 +334,12 @@ class FullRender:
         if loss.requires_grad:  # not where no splat is in the picture
             loss.backward()
         gradients = {name: _gradient(tensor) for name, tensor in leaves.items() if name in stage.train}
-        if transform is not None:
-            gradients["exposure"] = _gradient(transform)
+        learned = self.learned.gradients(numbers, index, camera)
         broken = first_not_finite(gradients, self.backend) if watched else None
-        if state.photometries is not None and shading is not None:
-            # In the host's memory, as a pose's.
-            gradients["photometry"] = state.photometries.gradient(index, shading, self.scene.train[index])
-            broken = broken if finite(gradients["photometry"]) else "the vignetting or the response of a camera"
-        if state.poses is not None and camera.pose is not None:
-            gradients["pose"] = state.poses.gradient(camera)  # in the host's memory, on a GPU too
-            broken = broken if finite(gradients["pose"]) else "pose"
-        if state.zooms is not None and camera.intrinsics is not None:
-            gradients["zoom"] = state.zooms.gradient(camera, self.scene.train[index].camera, lens)
-            broken = broken if finite(gradients["zoom"]) else "focal length"
+        broken = broken or first_not_finite_quantity(learned, waits=False)
         if broken is not None:
             raise diverged(stage, iteration, f"the gradient of {broken}")
-        return values, gradients
+        return StepResult(values, gradients, None, None, learned=learned)
 
 
 def no_view(state: TrainState, stage: Stage, probe: Tensor | None) -> StepResult:

@@ -30,8 +30,6 @@ from gs2d.training.state import TrainState
 
 T = TypeVar("T")
 Statistics = Mapping[str, Tensor]
-# Gradients that are of one view, and are not averaged.
-OF_A_VIEW = {"exposure": (3, 4), "pose": (6,), "zoom": (5,), "photometry": (4,)}
 FAILED = "gs2d/failed"  # key of the store: a process has said why it ended
 
 
@@ -91,9 +89,9 @@ class OneProcess:
         idle: Callable[[], StepResult],
         *,
         rows: Tensor | None,
-        of_views: bool,
+        learned: Mapping[str, tuple[int, ...]],
     ) -> tuple[StepResult, Sequence[Mapping[str, Tensor]]]:
-        """Return the gradients of the mean loss of some views, and those that are of one view, view by view.
+        """Return the gradients of the mean loss of some views, and the learned gradients of each view.
 
         Parameters
         ----------
@@ -105,18 +103,18 @@ class OneProcess:
             The result of a process without a view: zeros.
         rows : Tensor [M] int64, or None
             Gradients of splats may come of these rows alone; then all do.
-        of_views : bool
-            Whether anything is learned of single views.
+        learned : mapping of name to shape
+            What is learned of images and cameras: shape of a row.
 
         Returns
         -------
         StepResult
             ``losses``, ``signal`` and ``radii`` are of this process's own view (:meth:`mean_losses`, :meth:`gather`).
         sequence of mapping
-            "exposure", "pose", "zoom" and "photometry" of each view, where there are any.
+            ``StepResult.learned`` of each view.
         """
         result = one(turns[0])
-        return result, (result.gradients,)
+        return result, (result.learned,)
 
     def gather(self, statistics: Statistics, result: StepResult, add: Callable[[Statistics, StepResult], Any]) -> None:
         """Add what a densifier gathers of each view of the iteration to tensors, in place: ``add`` does it for one."""
@@ -264,12 +262,12 @@ class ManyProcesses(OneProcess):
         idle: Callable[[], StepResult],
         *,
         rows: Tensor | None,
-        of_views: bool,
+        learned: Mapping[str, tuple[int, ...]],
     ) -> tuple[StepResult, Sequence[Mapping[str, Tensor]]]:
         """Return the gradients of the mean loss of some views, of which this process renders one."""
         rank = self.place.rank
         result = one(turns[rank]) if rank < len(turns) else idle()
-        splats = {name: tensor for name, tensor in result.gradients.items() if name not in OF_A_VIEW}
+        splats = dict(result.gradients)
         if rows is not None and result.rows is None:
             splats = {name: tensor[rows] for name, tensor in splats.items()}
         splats = {name: tensor.contiguous() for name, tensor in splats.items()}
@@ -279,25 +277,20 @@ class ManyProcesses(OneProcess):
                 work.wait()
         for tensor in splats.values():
             tensor.div_(len(turns))
-        each = self.of_views(result.gradients)[: len(turns)] if of_views else [{}] * len(turns)
+        each = self._of_views(result.learned, learned)[: len(turns)] if learned else [{}] * len(turns)
         return replace(result, gradients=splats, rows=rows), each
 
-    def of_views(self, gradients: Mapping[str, Tensor]) -> list[dict[str, Tensor]]:
-        """Return the gradients of what is learned of one view, of all processes; the same bits."""
-        own = torch.zeros(sum(1 + math.prod(shape) for shape in OF_A_VIEW.values()), dtype=torch.float64)
-        places, start = {}, 0
-        for name, shape in OF_A_VIEW.items():
-            places[name], start = (start, start + 1 + math.prod(shape)), start + 1 + math.prod(shape)
-            if name in gradients:
-                own[slice(*places[name])] = torch.cat([own.new_ones(1), gradients[name].double().cpu().flatten()])
-        like = next(tensor for name, tensor in gradients.items() if name not in OF_A_VIEW)
+    def _of_views(self, own: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]]) -> list[dict[str, Tensor]]:
+        """Return the learned gradients of the views of all processes, float64 in host memory; the same bits."""
+        parts = []
+        for name, shape in shapes.items():  # whether there is a gradient, then its numbers
+            numbers = own[name].double().cpu().flatten() if name in own else torch.zeros(math.prod(shape)).double()
+            parts += [numbers.new_tensor([float(name in own)]), numbers]
         found = []
-        for view in self._all(own):
-            parts = {name: view[slice(*at)] for name, at in places.items()}
-            of_view = {name: part[1:].reshape(OF_A_VIEW[name]) for name, part in parts.items() if part[0] > 0}
-            if "exposure" in of_view:
-                of_view["exposure"] = of_view["exposure"].to(like)
-            found.append(of_view)
+        for view in self._all(torch.cat(parts)):
+            pieces = view.split([len(part) for part in parts])
+            known = zip(shapes.items(), pieces[::2], pieces[1::2], strict=True)
+            found.append({name: numbers.reshape(shape) for (name, shape), has, numbers in known if has > 0})
         return found
 
     def gather(self, statistics: Statistics, result: StepResult, add: Callable[[Statistics, StepResult], Any]) -> None:
@@ -348,9 +341,9 @@ def _tensors(state: TrainState) -> Iterator[Tensor]:
             yield state.moments[name].square
     for named in (state.groups, state.statistics or {}):
         yield from (named[name] for name in sorted(named))
-    for _, learned in state.of_views():
-        yield learned.offsets
-        yield learned.square
+    for rows in state.learned.values():
+        yield rows.values
+        yield rows.square
 
 
 def _checksum(tensor: Tensor) -> int:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from gs2d.config.recipe import GradDensify, Recipe
 from gs2d.errors import RunError
-from gs2d.training import per_image
 from gs2d.training.densify.gradient import no_statistics
+from gs2d.training.learned.learned_table import LearnedTable
 from gs2d.training.state import TrainState
 
 
-def check_resumable(state: TrainState, recipe: Recipe, views: int) -> None:
+def check_resumable(state: TrainState, recipe: Recipe, views: int, learned: LearnedTable) -> None:
     """Raise unless training of a recipe, on so many training views, can go on from a state."""
     state.check()
     if state.splats.sh_degree != recipe.sh_degree:
@@ -23,7 +23,7 @@ def check_resumable(state: TrainState, recipe: Recipe, views: int) -> None:
         raise RunError(
             f"the checkpoint waits for training view {last}, but the scene has {views}; is it of another scene?"
         )
-    per_image.check(state, recipe, views)
+    learned.check(state.learned)
     _check_stage(state, recipe)
 
 

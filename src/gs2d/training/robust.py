@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -18,11 +19,14 @@ from gs2d.data.scene import Scene
 from gs2d.errors import DataError
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
-from gs2d.training import events, per_image
+from gs2d.training import events
 from gs2d.training.backdrop import in_color
 from gs2d.training.background_sphere import sphere_points
 from gs2d.training.free_space import FreeSpaceMaps
 from gs2d.training.initialize import Initial
+from gs2d.training.learned.appearance import shown
+from gs2d.training.learned.learned_table import LearnedTable
+from gs2d.training.learned.quantity import ImagePoints
 from gs2d.training.opaque import is_opaque
 from gs2d.training.parallel import ONE_PROCESS, OneProcess
 from gs2d.training.plane_sweep import SmallView, Sweep, start_points, sweep_views
@@ -89,7 +93,7 @@ class Robustness:
         frozen: Splats | None = None,
     ) -> None:
         self._processes, self._frozen = processes, frozen
-        self.scene, self._given, self._recipe = scene, scene, recipe
+        self.scene, self._learned, self._recipe = scene, LearnedTable(recipe, scene), recipe
         self._raster, self._backend = raster, backend
         self._free: FreeSpaceMaps | None = None
         self._images: Sequence[SmallView] = ()
@@ -188,24 +192,23 @@ class Robustness:
         assert self._free is not None
         against = self._free.against(splats)
         if last:
-            cameras = [view.camera for view in per_image.scene_now(state, self._given).train]
+            cameras = [view.camera for view in self._learned.scene_now(state.learned).train]
             against = against.maximum(mostly_unseen(splats, cameras, self._raster, self._backend).to(against))
         if self._removal.backdrop:
             against = against.maximum(in_color(splats, self._raster.background).to(against))
         return against
 
     def _witnesses(self, state: TrainState, rows: range) -> Iterator[Witness]:
-        views = per_image.scene_now(state, self._given).train
+        views = self._learned.scene_now(state.learned).train
         for row in rows:
             image, device = self._images[row], state.splats.device
             height, width = image.size
             (fx, _, cx), (_, fy, cy), _ = image.K.tolist()
-            yield Witness(
-                Camera(width, height, fx, fy, cx, cy, views[row].camera.T_cam_world),
-                image.color.permute(1, 2, 0).to(device),
-                torch.from_numpy(image.usable).to(device),
-                None if state.exposures is None else state.exposures.transform(row),
-            )
+            camera = Camera(width, height, fx, fy, cx, cy, views[row].camera.T_cam_world)
+            color = image.color.permute(1, 2, 0).to(device)
+            numbers = self._learned.numbers(state.learned, row, color)
+            photographed = partial(shown, numbers=numbers, at=ImagePoints(camera))
+            yield Witness(camera, color, torch.from_numpy(image.usable).to(device), photographed)
 
     @torch.no_grad()
     def decay(self, state: TrainState, stage: Stage, iteration: int, backend: Backend) -> None:

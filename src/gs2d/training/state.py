@@ -12,10 +12,7 @@ from torch import Tensor
 from gs2d.core.checks import check_shapes
 from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import RunError, ShapeError
-from gs2d.training.exposure import Exposures
-from gs2d.training.photometry import Photometries
-from gs2d.training.poses import Poses
-from gs2d.training.zooms import Zooms
+from gs2d.training.learned.learned_rows import LearnedRows
 
 FORMAT = 1  # of the state dict
 # What a mapping that is no state, or one with other values in it, makes of the steps of reading it.
@@ -66,16 +63,10 @@ class TrainState:
         Whether the entry actions of the stage are done.
     queue : list of int
         Training views that are still to come in this epoch; the next is the last.
-    exposures : Exposures or None
-        Colour transforms of the training views, where the recipe learns them.
-    poses : Poses or None
-        Motions of the training cameras, where the recipe learns them.
+    learned : dict of name to LearnedRows
+        What the recipe learns of images and cameras (``gs2d.training.learned``).
     processes : list of (stage, step, count)
         The number of processes from this stage and step on; empty for one process throughout.
-    zooms : Zooms or None
-        Their focal lengths, where the recipe learns them.
-    photometries : Photometries or None
-        Their vignetting and response, where the recipe learns them.
     """
 
     splats: Splats
@@ -87,21 +78,8 @@ class TrainState:
     step: int = 0
     entered: bool = False
     queue: list[int] = field(default_factory=list)
-    exposures: Exposures | None = None
-    poses: Poses | None = None
+    learned: dict[str, LearnedRows] = field(default_factory=dict)
     processes: list[tuple[int, int, int]] = field(default_factory=list)
-    zooms: Zooms | None = None
-    photometries: Photometries | None = None
-
-    def of_views(self) -> list[tuple[str, Exposures | Poses | Zooms | Photometries]]:
-        """Return what is learned of photographs and cameras, by name; empty where the recipe learns nothing of them."""
-        learned = {
-            "exposures": self.exposures,
-            "poses": self.poses,
-            "zooms": self.zooms,
-            "photometries": self.photometries,
-        }
-        return [(name, it) for name, it in learned.items() if it is not None]
 
     def trained_by(self, count: int) -> None:
         """Note the number of processes that train from here on: the result depends on it."""
@@ -132,11 +110,8 @@ class TrainState:
             "entered": self.entered,
             "queue": list(self.queue),
             "generator": self.generator.get_state(),
-            **({} if self.exposures is None else {"exposures": self.exposures.state_dict()}),
-            **({} if self.poses is None else {"poses": self.poses.state_dict()}),
-            **({} if not self.processes else {"processes": [list(since) for since in self.processes]}),
-            **({} if self.zooms is None else {"zooms": self.zooms.state_dict()}),
-            **({} if self.photometries is None else {"photometries": self.photometries.state_dict()}),
+            "learned": {name: rows.state_dict() for name, rows in self.learned.items()},
+            "processes": [list(since) for since in self.processes],
         }
 
     @classmethod
@@ -169,14 +144,11 @@ class TrainState:
                 int(data["step"]),
                 bool(data["entered"]),
                 [int(index) for index in data["queue"]],
-                Exposures.from_state_dict(data["exposures"]) if "exposures" in data else None,
-                Poses.from_state_dict(data["poses"]) if "poses" in data else None,
-                [(int(stage), int(step), int(count)) for stage, step, count in data.get("processes", ())],
-                Zooms.from_state_dict(data["zooms"]) if "zooms" in data else None,
-                Photometries.from_state_dict(data["photometries"]) if "photometries" in data else None,
+                {name: LearnedRows.from_state_dict(rows) for name, rows in data["learned"].items()},
+                [(int(stage), int(step), int(count)) for stage, step, count in data["processes"]],
             )
             state.check()
-            numbers = dict(state.splats.items()) | {name: it.offsets for name, it in state.of_views()}
+            numbers = dict(state.splats.items()) | {name: rows.values for name, rows in state.learned.items()}
             for name, tensor in numbers.items():
                 if not bool(tensor.isfinite().all()):
                     raise RunError(f"checkpoint is broken ({name} hold NaN or infinity); train again")
@@ -186,15 +158,16 @@ class TrainState:
         return state
 
     def move_to(self, device: torch.device | str) -> None:
-        """Move all tensors to a device; the generator stays on the CPU, so that its draws do not depend on it."""
+        """Move all tensors but ``learned`` to a device.
+
+        The generator stays on the CPU, so that its draws do not depend on the device.
+        """
         self.splats = self.splats.to(device)
         for moments in self.moments.values():
             moments.mean, moments.square = moments.mean.to(device), moments.square.to(device)
         self.groups = {name: mask.to(device) for name, mask in self.groups.items()}
         if self.statistics is not None:
             self.statistics = {k: v.to(device) for k, v in self.statistics.items()}
-        if self.exposures is not None:
-            self.exposures.move_to(device)
 
     def check(self) -> None:
         """Raise unless everything has the same N, the types that training writes, and counts that can be.
@@ -226,14 +199,14 @@ class TrainState:
             expected = torch.bool if name in groups else tensor.dtype if name in statistics else dtype
             if tensor.dtype != expected or not dtype.is_floating_point:
                 raise ShapeError(f"{name} must be {expected}, got {tensor.dtype}")
-        for _, learned in self.of_views():
-            learned.check()
+        for name, rows in self.learned.items():
+            rows.check(name)
         self._check_counts()
 
     def _check_counts(self) -> None:
         """Raise RunError for a count below zero."""
         steps = [moments.steps for moments in self.moments.values()]
-        learned = [learned.steps for _, learned in self.of_views()]
+        learned = [rows.steps for rows in self.learned.values()]
         least = min([self.stage, self.step, *steps, *self.queue, *(count for counts in learned for count in counts)])
         if least < 0:
             raise RunError(f"counts of iterations and views must be 0 or more, got {least}; train again")

@@ -24,12 +24,13 @@ from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.losses.api import Loss, LossReport, losses_of, target_maps
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
-from gs2d.training import events, per_image
+from gs2d.training import events
 from gs2d.training.adam import adam_step, begin_stage, lr_at
 from gs2d.training.blended_sums import blended_sums
 from gs2d.training.cached_objective import choose_objective
 from gs2d.training.densify.densifier import Densifier, Surroundings, densifier_of
 from gs2d.training.initialize import initial_splats, splats_as_start
+from gs2d.training.learned.learned_table import LearnedTable, first_not_finite_quantity
 from gs2d.training.objective import (
     FullRender,
     Objective,
@@ -148,12 +149,14 @@ class Trainer:
         if self._frozen is not None and self._frozen.sh_degree != self.recipe.sh_degree:
             degrees = f"{self._frozen.sh_degree}, the recipe trains {self.recipe.sh_degree}"
             raise RecipeError(f"frozen splats must have the recipe's SH degree, got {degrees}; set sh_degree")
+        self.learned = LearnedTable(self.recipe, scene)
         self._robust = Robustness(scene, begins, self.settings, self.backend, processes, self._frozen)
         if state is not None:
-            check_resumable(state, self.recipe, len(scene.train))
+            check_resumable(state, self.recipe, len(scene.train), self.learned)
         self.state = processes.share(lambda: self._new_state(dtype, init, exposures) if state is None else state)
         self.state.trained_by(processes.size)
         self.state.move_to(self.backend.device)
+        self.learned.move_to(self.state.learned, self.backend.device)
         self._robust.move_to(self.backend.device)
         self._learner = self.backend.for_training()
         self._densifiers = [densifier_of(stage.densify, self._surroundings(stage)) for stage in self.recipe.stages]
@@ -181,6 +184,10 @@ class Trainer:
     def settings(self) -> RasterSettings:
         """The rasterizer's constants at the full SH degree, for evaluation and fusion."""
         return raster_settings(self.protocol, self.scene.extent, self.recipe.sh_degree)
+
+    def scene_now(self) -> Scene:
+        """Return the scene with what was learned of its images and cameras."""
+        return self.learned.scene_now(self.state.learned)
 
     @property
     def done(self) -> bool:
@@ -317,7 +324,8 @@ class Trainer:
             adam_step(state, stage, result.gradients, lr, **options)  # type: ignore[arg-type]
         for turn, gradients in zip(turns, of_views, strict=True):
             self._robust.decay(state, stage, turn.iteration, self._learner)
-            per_image.update(state, self.recipe, turn.iteration, turn.index, gradients, self._learner)
+            rates = self.learned.learning(state.stage, turn.iteration)
+            self.learned.update(state.learned, turn.index, gradients, rates, self._learner)
         return result, happened
 
     def _evaluate(
@@ -330,7 +338,7 @@ class Trainer:
             lambda turn: objective.evaluate(state, stage, turn.iteration, turn.index, probe),
             lambda: no_view(state, stage, probe),
             rows=objective.rows,
-            of_views=bool(state.of_views()),
+            learned=self.learned.shapes,
         )
 
     def _learn_at_once(self, stage: Stage, turns: Sequence[Turn], densifier: Densifier | None) -> bool:
@@ -347,7 +355,8 @@ class Trainer:
             if name in stage.train and parameter.numel() > 0:
                 self.state.moments[name].steps -= len(turns)
         for turn in turns:
-            per_image.rollback(self.state, self.recipe, turn.iteration, turn.index)
+            rates = self.learned.learning(self.state.stage, turn.iteration)
+            self.learned.rollback(self.state.learned, turn.index, rates)
 
     def _check_shared(self) -> None:
         """Raise RecipeError for a stage that several processes cannot train."""
@@ -394,7 +403,9 @@ class Trainer:
         self._downscale, self._objective, self._whole_steps = downscale, None, None
         scene = self.scene.downscaled(downscale)
         self._targets: TargetSource = self._make_targets(scene, self._target_bytes)
-        self._whole = FullRender(scene, self.recipe, self.protocol, self._learner, self._targets, self._frozen)
+        self._whole = FullRender(
+            scene, self.recipe, self.protocol, self._learner, self._targets, self._frozen, self.learned
+        )
 
     def _make_targets(self, scene: Scene, limit_bytes: int | None) -> TargetSource:
         """Return the photographs, where the splats are."""
@@ -420,8 +431,7 @@ class Trainer:
             use_masks=use_masks,
             maps=partial(target_maps, backend=self.backend) if keeps else None,
             with_silhouettes=is_opaque(self.recipe)
-            or self.recipe.exposure is not None
-            or self.recipe.photometry is not None
+            or self.learned.changes_color
             or any("silhouette" in loss.needs for _, loss in self._losses),
             dtype=dtype,
             device=device,
@@ -435,7 +445,9 @@ class Trainer:
             found = splats_as_start(init, sh_degree=self.recipe.sh_degree, dtype=dtype)
             self._pending = [events.Initialised(len(found), "splats", 0)]
         assert found is not None
-        return per_image.start(TrainState(found, generator), self.recipe, self.scene, exposures)
+        state = TrainState(found, generator)
+        state.learned = self.learned.start(found.means, {"exposure": exposures})
+        return state
 
     def _started(self, dtype: torch.dtype, generator: torch.Generator) -> Splats:
         """Return the first splats as the recipe has them, of the places that are to be trained."""
@@ -488,7 +500,7 @@ class Trainer:
         frozen = {"means", "quats", "log_scales", "opacity_logits"}.isdisjoint(stage.train)
         if frozen or self.protocol.near_plane_policy == "draw":
             return 0
-        views = self.processes.part(per_image.scene_now(self.state, self.scene).train)
+        views = self.processes.part(self.scene_now().train)
         seen = self.processes.any(visible_mask(self.state.splats, views, self.settings, self.backend))
         unseen = int((~seen).sum())
         if unseen == len(self.state.splats):
@@ -521,5 +533,7 @@ class Trainer:
         broken = first_not_finite(parameters, self.backend)
         if broken is not None:
             raise diverged(stage, self.state.step, broken)
-        if what := per_image.find_nonfinite(self.state):
-            raise diverged(stage, self.state.step, what)
+        values = {name: rows.values for name, rows in self.state.learned.items()}
+        broken = first_not_finite_quantity(values, waits=True)
+        if broken is not None:
+            raise diverged(stage, self.state.step, f"learned {broken}")

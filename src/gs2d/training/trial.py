@@ -8,7 +8,7 @@ than speak against it. Fog before a camera, learned by heart from one image, is 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import torch
@@ -35,14 +35,14 @@ class Witness:
     color : Tensor [H, W, 3] in [0, 1]
     usable : Tensor [H, W] bool
         Pixels that count.
-    exposure : Tensor [3, 4] or None
-        What training applies to a rendering of this view.
+    shown : callable
+        Returns a rendering [H, W, 3] as this image shows it.
     """
 
     camera: Camera
     color: Tensor
     usable: Tensor
-    exposure: Tensor | None
+    shown: Callable[[Tensor], Tensor] = lambda color: color
 
 
 def missed(
@@ -99,6 +99,4 @@ def missed(
 
 def _errors(color: Tensor, witness: Witness) -> Tensor:
     """Return squared errors [H, W] of a rendering, 0 where the image does not count."""
-    if witness.exposure is not None:
-        color = color @ witness.exposure[:, :3].T + witness.exposure[:, 3]
-    return (color - witness.color).square().sum(dim=2) * witness.usable
+    return (witness.shown(color) - witness.color).square().sum(dim=2) * witness.usable

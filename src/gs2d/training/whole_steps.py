@@ -44,7 +44,7 @@ class WholeSteps:
 
     def learn(self, state: TrainState, iteration: int, index: int, densifier: Densifier | None) -> bool:
         """Do an iteration; False: it is of another kind, and nothing was done."""
-        if not self._possible or state.of_views():
+        if not self._possible or state.learned:
             return False
         active = [term for term in self._terms if term.is_active(iteration)]
         gathered = NOTHING if densifier is None else densifier.gathers(state, iteration)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +23,12 @@ from gs2d.pipeline.events import Notice, OnEvent, counted, ignore
 from gs2d.pipeline.finish.run_images import choose_views, fraction_of_group, render_view, splatted
 from gs2d.pipeline.prepare.finished import finished_splats
 from gs2d.pipeline.prepare.job import Job, reload_job
-from gs2d.pipeline.prepare.run_exposures import photographed, read_exposures
+from gs2d.pipeline.prepare.run_exposures import numbers_of, photographed, read_exposures
 from gs2d.pipeline.train.resume import stage_end
 from gs2d.render.api import splat_errors
-from gs2d.render.exposure import identity
 from gs2d.report.images import ERROR_TOP, error_image, error_scale, highlight_image, valid_image
 from gs2d.report.plots import Panel, compared, read_history
-from gs2d.training.exposure import apply_exposure
+from gs2d.training.learned.appearance import shown_splats
 from gs2d.training.rank_clone import worst
 from gs2d.training.state import TrainState
 
@@ -174,9 +173,9 @@ def rank_run(run: RunFolder, job: Job, on_event: OnEvent = ignore) -> Ranking:
     for view in counted(views, "errors of each splat", len(views), on_event):
         seen, settings = splats, job.settings
         if view.name in transforms or view.photometry is not None:  # those of the end: after stage 1 they hardly move
-            known = view.name in transforms
-            transform = transforms[view.name].to(splats.means) if known else identity(splats.means)
-            seen, settings = apply_exposure(splats, view.camera, transform, settings, view.photometry)
+            numbers = numbers_of(view, transforms, splats.means)
+            seen = shown_splats(splats, view.camera, numbers, settings.sh_degree)
+            settings = replace(settings, sh_degree=0)
         image = torch.from_numpy(view.target(job.settings.background)).to(splats.means)
         mask = view.usable(masks=job.protocol.use_mask_in_training)
         errors = splat_errors(

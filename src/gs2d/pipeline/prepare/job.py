@@ -54,7 +54,6 @@ from gs2d.render.types import RasterSettings
 from gs2d.training.backdrop import find_backdrop
 from gs2d.training.cached_objective import is_cacheable
 from gs2d.training.initialize import usable_points
-from gs2d.training.photometry import Photometries
 from gs2d.training.point_gains import point_gains
 from gs2d.training.robust import check_free_space
 from gs2d.training.trainer import raster_settings
@@ -317,7 +316,7 @@ def fit_recipe(options: TrainOptions, scene: Scene, protocol: Protocol, on_event
         on_event(
             Notice(f"exposures of the photographs: {least:.2f} to {most:.2f} times their mean; {what}", detail=True)
         )
-    if options.response and len(Photometries.start(scene.train).reach) == 1:
+    if options.response and len({view.file_intrinsics() for view in scene.train}) == 1:
         on_event(Notice("--response learns by what cameras differ: of one camera, as here, it learns nothing"))
     faces = sum(view.is_face for view in scene.train)
     if faces and (options.refine_cameras or options.vignetting):

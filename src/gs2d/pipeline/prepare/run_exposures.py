@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from difflib import get_close_matches
 from types import MappingProxyType
 
@@ -17,10 +17,11 @@ from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import EXPOSURE, RunFolder
 from gs2d.pipeline.events import Notice, OnEvent
 from gs2d.pipeline.prepare.job import Job
-from gs2d.render.exposure import expose, fit_exposure, identity
-from gs2d.render.photometry import Shading, photograph, remove_photometry
+from gs2d.render.exposure import expose, fit_exposure
+from gs2d.render.photometry import remove_photometry
 from gs2d.render.types import RenderOutput
-from gs2d.training.exposure import Exposures
+from gs2d.training.learned.appearance import shown
+from gs2d.training.learned.quantity import ImagePoints
 
 Transforms = Mapping[str, Tensor]
 """Transform [3, 4] by the name of the training view; empty where a run learns none."""
@@ -31,13 +32,6 @@ ABOUT = (
     "the mean over the photographs is the identity; grey: what the scene's (0.5, 0.5, 0.5) becomes"
 )
 GREY = 0.5
-
-
-def named(views: Sequence[View], exposures: Exposures | None) -> Transforms:
-    """Return the transforms of training views by their names."""
-    if exposures is None:
-        return NONE
-    return {view.name: transform for view, transform in zip(views, exposures.transforms().detach(), strict=True)}
 
 
 def write_exposures(run: RunFolder, transforms: Transforms, on_event: OnEvent) -> None:
@@ -83,11 +77,18 @@ def photographed(view: View, color: Tensor, transforms: Transforms, background: 
 
     In the exposure of the photograph, and with the vignetting and the response of its camera.
     """
-    if view.name not in transforms and view.photometry is None:
-        return color
-    transform = transforms[view.name].to(color) if view.name in transforms else identity(color)
-    shading = None if view.photometry is None else Shading.of(view.photometry, view.camera, color)
-    return photograph(color, transform, *over(view, color, background), shading=shading)
+    numbers = numbers_of(view, transforms, color)
+    return shown(color, numbers, ImagePoints(view.camera, *over(view, color, background))) if numbers else color
+
+
+def numbers_of(view: View, transforms: Transforms, like: Tensor) -> dict[str, Tensor]:
+    """Return what is known of the photograph of a view, by the name of the quantity."""
+    exposure = {"exposure": transforms[view.name].to(like)} if view.name in transforms else {}
+    if view.photometry is None:
+        return exposure
+    (a, b, c), reach, shift = view.photometry
+    falloff = like.new_tensor([a / reach**2, b / reach**4, c / reach**6])
+    return {"vignetting": falloff, **exposure, "response": like.new_tensor([shift])}
 
 
 def as_scene(view: View, transforms: Transforms) -> np.ndarray:

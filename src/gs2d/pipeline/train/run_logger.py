@@ -13,7 +13,7 @@ from typing import Any
 
 from gs2d.config.recipe import CloneInPlace, Stage
 from gs2d.core.splats import Splats
-from gs2d.data import View
+from gs2d.data import Scene, View
 from gs2d.errors import DivergedError, Gs2dError
 from gs2d.evaluation.images import ImageMetrics
 from gs2d.io.run_dir import SPLATS, VERDICT, RunFolder, load_tensors
@@ -39,7 +39,7 @@ from gs2d.pipeline.prepare.job import Job
 from gs2d.pipeline.prepare.memory_budget import release_buffers
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
-from gs2d.pipeline.prepare.run_exposures import Transforms, named, write_exposures
+from gs2d.pipeline.prepare.run_exposures import Transforms, write_exposures
 from gs2d.pipeline.prepare.run_photometry import write_photometries
 from gs2d.pipeline.prepare.run_poses import NONE, found_poses, write_poses
 from gs2d.pipeline.train.changes import Snapshot, mean_changes, take_snapshot
@@ -48,7 +48,6 @@ from gs2d.pipeline.train.loss_reports import report_losses
 from gs2d.pipeline.train.resume import ResumePoint, put_in_cache
 from gs2d.render.types import RenderOutput
 from gs2d.training import events as train_events
-from gs2d.training.per_image import scene_now
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
 
@@ -233,7 +232,7 @@ class RunLogger:
         """Mean PSNR over a few fixed views (test views where there are any)."""
         self._stop_clock()
         scene = self._job.scene  # by neighbours alone: what the camera would see costs a rendering of every photograph
-        exposures = with_predicted(named(scene.train, self._state.exposures), scene)
+        exposures = with_predicted(self._found_exposures, scene)
         psnr = mean_psnr(splats, self._now(self._probes), self._settings, self._job.backend, exposures)
         self._start_clock()
         return psnr
@@ -294,9 +293,9 @@ class RunLogger:
         """Write the splats and what belongs to them, before anything that is made of them can fail."""
         run, job, state = self._run, self._job, self._state
         with attempted("learned cameras and exposures", None, self._on_event):
-            now = scene_now(state, job.scene)
+            now = self._scene_now
             poses = NONE if job.recipe.poses is None else found_poses(job.scene, now)
-            write_exposures(run, named(job.scene.train, state.exposures), self._on_event)
+            write_exposures(run, self._found_exposures, self._on_event)
             write_poses(run, job.scene, poses, self._on_event)
             write_photometries(run, now, self._on_event)
         write_splats(run.file(SPLATS), state.splats)
@@ -395,18 +394,28 @@ class RunLogger:
         return self._job.settings
 
     @property
+    def _scene_now(self) -> Scene:
+        assert self._trainer is not None
+        return self._trainer.scene_now()
+
+    @property
+    def _found_exposures(self) -> Transforms:
+        assert self._trainer is not None
+        return self._trainer.learned.by_name(self._state.learned, "exposure")
+
+    @property
     def _exposures(self) -> Transforms:
         at = (self._state.stage, self._state.step)
         if self._predicted is None or self._predicted[0] != at:
             scene, brightness = self._job.scene, metered(self._drawn, self._settings, self._job.backend)
-            found = with_predicted(named(scene.train, self._state.exposures), scene, brightness)
+            found = with_predicted(self._found_exposures, scene, brightness)
             self._predicted = (at, found)
         return self._predicted[1]
 
     def _now(self, views: Sequence[View]) -> list[View]:
         """Return views of the capture from where their cameras are now."""
         scene = self._job.scene
-        now = dict(zip(map(id, scene.views), scene_now(self._state, scene).views, strict=True))
+        now = dict(zip(map(id, scene.views), self._scene_now.views, strict=True))
         return [now.get(id(view), view) for view in views]
 
     @property

@@ -230,7 +230,6 @@ def train_stages(
 
     The splats are written before they are scored. ``visitors`` see every view of the finished splats.
     """
-    from gs2d.training.per_image import scene_now
     from gs2d.training.trainer import Trainer
 
     recorder = RunLogger(run, job, options, start, on_event, visitors)
@@ -261,8 +260,7 @@ def train_stages(
     recorder.begin(trainer)
     with recorder.ending_well():
         trainer.run()
-    state = trainer.state
-    return state.splats, scene_now(state, job.scene)
+    return trainer.splats, trainer.scene_now()
 
 
 def keeping_details(on_event: OnEvent, details: list[str]) -> OnEvent:

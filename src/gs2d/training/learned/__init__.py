@@ -1,0 +1,1 @@
+"""Quantities of images and cameras that are learned with the splats: exposure, poses, intrinsics and more."""

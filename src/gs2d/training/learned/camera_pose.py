@@ -1,0 +1,70 @@
+"""Poses: one rigid motion for each training camera (docs/math.md, "Poses")."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gs2d.config.quantities import QUANTITIES, Learning
+from gs2d.core.camera import Camera
+from gs2d.core.transforms import common_motion, se3_exp, similarity_motions
+from gs2d.data.scene import Scene
+from gs2d.training.learned.quantity import LearnedQuantity
+
+
+@QUANTITIES.register("poses")
+class CameraPose(LearnedQuantity):
+    """A motion xi_k of each camera: it is at se3_exp(xi_k) T_k, T_k its pose in the capture.
+
+    xi = P theta: P takes out of the free numbers theta of all cameras what one similarity of the whole scene (a motion,
+    a scale) would do to all of them, which no image could show. So the scene stays in the frame of the capture. A row
+    is a rotation vector, rad, and a shift in extents of the scene, in the frame of the camera.
+    """
+
+    shape = (6,)
+    changes_color = False
+    needs_moving_splats = True
+
+    def __init__(self, settings: Learning, scene: Scene) -> None:
+        super().__init__(settings, scene)
+        self.given = np.stack([view.camera.T_cam_world for view in scene.train])
+        self.extent = scene.extent
+
+    @cached_property
+    def _by_similarity(self) -> np.ndarray:
+        return similarity_motions(self.given, self.extent)
+
+    def numbers(self, values: Tensor, index: int) -> Tensor:
+        """Return the motion of a camera [6]: rotation vector, rad, and shift, world units."""
+        theta, J = values.numpy(), self._by_similarity
+        own = theta[index] - J[index] @ common_motion(theta, J)
+        return torch.from_numpy(np.concatenate([own[:3], own[3:] * self.extent]))
+
+    def pose(self, values: Tensor, index: int) -> Tensor:
+        """Return T_cam_world of a camera [4, 4] float64, a new tensor."""
+        return se3_exp(self.numbers(values, index)) @ torch.from_numpy(self.given[index])
+
+    def camera(self, values: Tensor, index: int, camera: Camera, *, learns: bool) -> Camera:
+        """Return the camera of a view at its pose; with ``learns`` the pose gets a gradient."""
+        pose: Any = self.pose(values, index)
+        return replace(camera, T_cam_world=pose.requires_grad_() if learns else pose)
+
+    def gradient(self, leaf: Tensor | None, index: int, camera: Camera) -> Tensor | None:
+        """Return that of a motion [6], rad and extents, at where the camera is, from the gradient of its pose."""
+        pose = camera.pose
+        if pose is None:
+            return None
+        if pose.grad is None:  # no splat is in the image
+            return torch.zeros(6, dtype=torch.float64)
+        by = pose.grad @ pose.detach().T  # T moves to (1 + D) T: the gradient of D
+        turn = (by[2, 1] - by[1, 2], by[0, 2] - by[2, 0], by[1, 0] - by[0, 1])
+        return torch.stack([*turn, *(by[:3, 3] * self.extent)])
+
+    def place(self, values: Tensor, scene: Scene) -> Scene:
+        """Return the scene with its training cameras at their poses."""
+        return scene.with_poses({view.name: self.pose(values, k).numpy() for k, view in enumerate(scene.train)})

@@ -1,0 +1,192 @@
+"""All that a recipe learns of images and cameras, as the training loop sees it: one table and one Adam."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+import torch
+from torch import Tensor
+
+from gs2d.config.quantities import QUANTITIES, Learning, Quantity
+from gs2d.config.recipe import Recipe
+from gs2d.core.camera import Camera
+from gs2d.data.scene import Scene
+from gs2d.errors import RecipeError, RunError
+from gs2d.kernels.reference import finite
+from gs2d.render.backends import Backend
+from gs2d.training.learned.learned_rows import LearnedRows
+from gs2d.training.learned.quantity import LearnedQuantity
+from gs2d.training.targets import Target
+
+Rows = Mapping[str, LearnedRows]
+"""The rows of each quantity (``TrainState.learned``)."""
+
+
+class LearnedTable:
+    """The quantities of a recipe on a scene. Their rows are in the state of training.
+
+    Parameters
+    ----------
+    recipe : Recipe
+    scene : Scene
+        With the cameras of the capture, at full size.
+
+    Attributes
+    ----------
+    quantities : dict of name to LearnedQuantity
+        In the order in which they are applied.
+
+    Raises
+    ------
+    RecipeError
+        If a quantity is of a package that cannot be imported, or does not take its options.
+    """
+
+    def __init__(self, recipe: Recipe, scene: Scene) -> None:
+        self._stages, self._scene = recipe.stages, scene
+        self.quantities = {name: _quantity(name, settings, scene) for name, settings in recipe.quantities.items()}
+
+    @property
+    def changes_color(self) -> bool:
+        """Whether photographs have other colours than the scene."""
+        return any(quantity.changes_color for quantity in self.quantities.values())
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of a row of each quantity."""
+        return {name: quantity.shape for name, quantity in self.quantities.items()}
+
+    # -- rows ------------------------------------------------------------------------------------------------------
+    def start(self, like: Tensor, given: Mapping[str, Tensor | None]) -> dict[str, LearnedRows]:
+        """Return the rows that training starts from; ``given`` are those that another training has found.
+
+        Raises
+        ------
+        RecipeError
+            If the recipe needs given rows and gets none, or for another number of views.
+        """
+        found = {}
+        for name, quantity in self.quantities.items():
+            values = quantity.begin(given.get(name))
+            found[name] = LearnedRows.start(values.to(like) if quantity.on_device else values)
+        return found
+
+    def check(self, rows: Rows) -> None:
+        """Raise RunError unless there are rows of each quantity, and of nothing else."""
+        for name in {**self.quantities, **rows}:
+            have = len(rows[name]) if name in rows else 0
+            need = self.quantities[name].rows if name in self.quantities else 0
+            if have != need or (need and tuple(rows[name].values.shape[1:]) != self.quantities[name].shape):
+                raise RunError(
+                    f"the checkpoint must have {need} rows of {name!r}, as recipe and scene say, got {have}; start a "
+                    "new run"
+                )
+
+    def move_to(self, rows: Rows, device: torch.device | str) -> None:
+        """Move the rows that are stored beside the splats to their device."""
+        for name, quantity in self.quantities.items():
+            if quantity.on_device:
+                rows[name].move_to(device)
+
+    def learning(self, stage: int, iteration: int) -> dict[str, float]:
+        """Return the learning rates of the quantities that are learned in an iteration (from 1) of a stage."""
+        of_run = sum(earlier.iterations for earlier in self._stages[:stage]) + iteration
+        found = {}
+        for name, quantity in self.quantities.items():
+            if quantity.learns and (self._stages[stage].moves_all or not quantity.needs_moving_splats):
+                found[name] = quantity.settings.rate_at(of_run)
+        return {name: rate for name, rate in found.items() if rate > 0}
+
+    def update(
+        self, rows: Rows, index: int, gradients: Mapping[str, Tensor], rates: Mapping[str, float], backend: Backend
+    ) -> None:
+        """Update the rows of a view, unless the device has cancelled the iteration."""
+        for name, rate in rates.items():
+            quantity = self.quantities[name]
+            if name not in gradients or not (quantity.on_device or backend.is_whole()):
+                continue
+            rows[name].adam_step(
+                quantity.row_of[index],
+                gradients[name],
+                quantity.rates(rate, index),
+                quantity.settings,
+                assign=backend.assign if quantity.on_device else Tensor.copy_,
+                limit=quantity.limit,
+            )
+
+    def rollback(self, rows: Rows, index: int, rates: Mapping[str, float]) -> None:
+        """Take back the count of an update that was cancelled on the device."""
+        for name in rates:
+            if self.quantities[name].on_device:
+                rows[name].steps[self.quantities[name].row_of[index]] -= 1
+
+    # -- one view ----------------------------------------------------------------------------------------------------
+    def camera(self, rows: Rows, index: int, given: Camera, learning: Collection[str] = ()) -> Camera:
+        """Return the camera of a training view as it is now; of quantities in ``learning`` with a gradient."""
+        for name, quantity in self.quantities.items():
+            given = quantity.camera(rows[name].values, index, given, learns=name in learning)
+        return given
+
+    def target(self, rows: Rows, index: int, camera: Camera, target: Target) -> Target:
+        """Return the photograph of a training view as a rendering of ``camera`` would show it."""
+        for name, quantity in self.quantities.items():
+            target = quantity.target(rows[name].values, index, camera, target)
+        return target
+
+    def leaves(self, rows: Rows, index: int, camera: Camera, like: Tensor) -> dict[str, Tensor]:
+        """Return the tensors that ``appearance.shown`` applies to a rendering; gradients of the loss go to them."""
+        found = {
+            name: quantity.leaf(rows[name].values, index, camera, like) for name, quantity in self.quantities.items()
+        }
+        return {name: leaf for name, leaf in found.items() if leaf is not None}
+
+    def numbers(self, rows: Rows, index: int, like: Tensor) -> dict[str, Tensor]:
+        """Return the numbers of a view by which photographs have other colours than the scene."""
+        return {
+            name: quantity.numbers(rows[name].values, index).to(like)
+            for name, quantity in self.quantities.items()
+            if quantity.changes_color
+        }
+
+    def penalties(self, leaves: Mapping[str, Tensor], index: int) -> dict[str, Tensor]:
+        """Return the terms of the loss on the numbers of a view."""
+        found = {name: self.quantities[name].penalty(leaf, index) for name, leaf in leaves.items()}
+        return {name: term for name, term in found.items() if term is not None}
+
+    def gradients(self, leaves: Mapping[str, Tensor], index: int, camera: Camera) -> dict[str, Tensor]:
+        """Return the gradients of the rows of a view, after the backward pass."""
+        found = {name: quantity.gradient(leaves.get(name), index, camera) for name, quantity in self.quantities.items()}
+        return {name: gradient for name, gradient in found.items() if gradient is not None}
+
+    def by_name(self, rows: Rows, name: str) -> dict[str, Tensor]:
+        """Return the numbers of a quantity by the name of the training view; empty where it is not learned."""
+        if name not in self.quantities:
+            return {}
+        views, quantity = self._scene.train, self.quantities[name]
+        return {view.name: quantity.numbers(rows[name].values, index) for index, view in enumerate(views)}
+
+    # -- afterwards ----------------------------------------------------------------------------------------------------
+    def scene_now(self, rows: Rows) -> Scene:
+        """Return the scene with what was learned of its views."""
+        scene = self._scene
+        for name, quantity in self.quantities.items():
+            scene = quantity.place(rows[name].values, scene)
+        return scene
+
+
+def first_not_finite_quantity(tensors: Mapping[str, Tensor], *, waits: bool) -> str | None:
+    """Return the first quantity with a NaN or an infinity; None if all are finite.
+
+    ``waits``: also tensors on a GPU are looked at.
+    """
+    seen = ((name, tensor) for name, tensor in tensors.items() if waits or tensor.device.type == "cpu")
+    return next((name for name, tensor in seen if not finite(tensor)), None)
+
+
+def _quantity(name: str, settings: Learning, scene: Scene) -> LearnedQuantity:
+    options = settings.options if isinstance(settings, Quantity) else {}
+    try:
+        made: LearnedQuantity = QUANTITIES.get(name)(settings, scene, **options)
+    except TypeError as error:
+        raise RecipeError(f"quantity {name!r} does not take the options {dict(options)}: {error}") from error
+    return made

@@ -1,0 +1,179 @@
+"""What all learned quantities have in common: one Adam, one schedule, cancelled updates, resuming, refusals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from fake_backends import lacking
+from gs2d.config.presets import surface
+from gs2d.config.protocols import GENERIC
+from gs2d.config.quantities import Exposure, IntrinsicsRefinement, Learning, Photometry, PoseRefinement, Quantity
+from gs2d.config.recipe import Recipe
+from gs2d.config.serialize import apply_overrides, from_json, to_json
+from gs2d.data.scene import Scene
+from gs2d.errors import DivergedError, RecipeError, RunError
+from gs2d.training.learned.camera_pose import CameraPose
+from gs2d.training.learned.learned_table import LearnedTable
+from gs2d.training.state import TrainState
+from gs2d.training.trainer import Trainer
+from learned_rows import Learner, begun
+from train_toys import VIEWS, backends, random_splats, same, short
+
+NAMES = ("intrinsics", "poses", "vignetting", "exposure", "response")
+
+
+def everything(**changes: float) -> Recipe:
+    """``short`` with all quantities from its third iteration on."""
+    given = {"start": 2, "decay_steps": 10, "rate": 1e-2, "rate_final": 1e-3, **changes}
+    return replace(
+        short(),
+        exposure=Exposure(**given),  # type: ignore[arg-type]
+        poses=PoseRefinement(**given),  # type: ignore[arg-type]
+        intrinsics=IntrinsicsRefinement(**given, distortion=True),  # type: ignore[arg-type]
+        photometry=Photometry(**given),  # type: ignore[arg-type]
+    )
+
+
+def test_quantities_come_in_the_order_in_which_light_becomes_a_photograph() -> None:
+    assert tuple(everything().quantities) == NAMES
+    assert tuple(replace(everything(), photometry=Photometry(response=False)).quantities) == NAMES[:-1]
+    assert short().quantities == {}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_first_step_of_a_row_is_the_rate_and_the_second_is_adam_s(scene: Scene, name: str) -> None:
+    made = Learner(everything(), scene)
+    quantity, rows = made.table.quantities[name], made.rows[name]
+    row, shape = quantity.row_of[1], quantity.shape
+    made.step(name, 1, torch.full(shape, 3.0), 0.1)
+    rates = torch.as_tensor(quantity.rates(0.1, 1)).to(rows.values).expand(shape)
+    assert torch.allclose(rows.values[row], -rates)
+    others = [other for other in range(len(rows)) if other != row]
+    assert not rows.values[others].any()
+    assert [rows.steps[k] for k in (row, *others)] == [1, *[0] * len(others)]
+    made.step(name, 1, torch.full(shape, -1.0), 0.1)
+    b1, b2 = quantity.settings.beta1, quantity.settings.beta2
+    mean = (b1 * (1 - b1) * 3 - (1 - b1)) / (1 - b1**2)
+    square = (b2 * (1 - b2) * 9 + (1 - b2)) / (1 - b2**2)
+    assert torch.allclose(rows.values[row], -rates - rates * mean / math.sqrt(square), rtol=1e-5)
+
+
+def test_rates_decay_over_the_whole_run_after_the_start() -> None:
+    settings = Learning(rate=0.1, rate_final=0.001, decay_steps=100, start=5)
+    assert settings.rate_at(50) == pytest.approx(0.01)  # the geometric mean, half way
+    assert settings.rate_at(100) == settings.rate_at(500) == pytest.approx(0.001)
+    assert settings.rate_at(5) == 0 < settings.rate_at(6)
+
+
+def test_cameras_are_learned_where_all_splats_move_and_light_always(scene: Scene) -> None:
+    table = LearnedTable(everything(), scene)
+    assert table.learning(0, 2) == {}
+    assert set(table.learning(0, 3)) == set(NAMES)
+    assert table.learning(0, 3)["poses"] > table.learning(0, 4)["poses"]
+    assert set(table.learning(1, 1)) == {"vignetting", "exposure", "response"}  # only colours are trained
+    assert table.learning(2, 1) == pytest.approx(dict.fromkeys(NAMES, 1e-3))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_update_that_a_device_cancelled_is_none(scene: Scene, name: str) -> None:
+    made = Learner(everything(), scene)
+    made.step(name, 1, torch.ones(made.table.shapes[name]), 0.1, lacking(1))
+    made.table.rollback(made.rows, 1, {name: 0.1} if sum(made.rows[name].steps) else {})
+    assert not any(made.rows[name].steps)
+    assert not made.rows[name].values.any()
+    made.step(name, 1, torch.ones(made.table.shapes[name]), 0.1, lacking(0))
+    assert sum(made.rows[name].steps) == 1
+
+
+def test_rows_stay_within_their_limits(scene: Scene) -> None:
+    made = Learner(everything(), scene)
+    for _ in range(30):
+        made.step("vignetting", 0, [-1.0, 1.0, -1.0], 0.1)
+    assert made.rows["vignetting"].values[0].tolist() == [1.0, -1.0, 1.0]
+
+
+def test_resuming_from_any_event_gives_the_same_splats_and_rows(scene: Scene) -> None:
+    kept: list[dict[str, object]] = []
+    recipe, backend = everything(), backends()[-1]
+    trainer = Trainer(
+        scene,
+        recipe,
+        GENERIC,
+        backend=backend,
+        progress_every=1,
+        on_event=lambda _: kept.append(trainer.state.state_dict()),
+    )
+    end = trainer.run()
+    found = trainer.state.learned
+    assert all(rows.values.abs().max() > 1e-4 for name, rows in found.items() if name != "response")  # of one camera
+    for data in kept[:: 3 if backend == "cpu" else 9]:
+        resumed = Trainer(scene, recipe, GENERIC, backend=backend, state=TrainState.from_state_dict(data))
+        assert same(resumed.run(), end)
+        for name, rows in resumed.state.learned.items():
+            assert torch.equal(rows.values, found[name].values), name
+            assert rows.steps == found[name].steps
+
+
+def test_bytes_do_not_depend_on_the_number_of_threads(scene: Scene) -> None:
+    ends, before = [], torch.get_num_threads()
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            trainer = Trainer(scene, everything(), GENERIC, backend=backends()[-1])
+            ends.append((trainer.run(), trainer.state.learned))
+    finally:
+        torch.set_num_threads(before)
+    assert same(ends[0][0], ends[1][0])
+    assert all(torch.equal(ends[0][1][name].values, ends[1][1][name].values) for name in NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_state_with_other_rows_or_broken_ones_is_refused(scene: Scene, name: str) -> None:
+    state = begun(TrainState(random_splats(5), torch.Generator()), everything(), scene)
+    rows = state.learned.pop(name)
+    with pytest.raises(RunError, match=rf"must have \d rows of '{name}', as recipe and scene say, got 0"):
+        Trainer(scene, everything(), GENERIC, backend="reference", state=state)
+    state.learned = {name: rows}
+    with pytest.raises(RunError, match=rf"must have 0 rows of '{name}', as recipe and scene say, got {len(rows)}"):
+        Trainer(scene, short(), GENERIC, backend="reference", state=state)
+    rows.values.view(-1)[0] = torch.nan
+    with pytest.raises(RunError, match=f"{name} hold NaN or infinity"):
+        TrainState.from_state_dict(state.state_dict())
+    rows.values, rows.steps = torch.zeros(len(rows), 1, 7, dtype=torch.float64), rows.steps
+    with pytest.raises(RunError, match="checkpoint is broken"):
+        TrainState.from_state_dict(state.state_dict())
+
+
+def test_numbers_that_are_not_finite_end_training(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = Trainer(scene, everything(start=0), GENERIC, backend=backends()[-1])
+    trainer.enter(0)
+    monkeypatch.setattr(CameraPose, "gradient", lambda *_: torch.full((6,), torch.nan))
+    with pytest.raises(DivergedError, match="the gradient of poses is NaN or infinite"):
+        trainer.step()
+    trainer.state.learned["vignetting"].values[0, 0] = torch.nan
+    with pytest.raises(DivergedError, match="learned vignetting is NaN or infinite"):
+        trainer._check_parameters(trainer.recipe.stages[0], ())
+
+
+# -- what a recipe says --------------------------------------------------------------------------------------------
+def test_a_recipe_names_registered_quantities_once() -> None:
+    recipe = Recipe("one", (surface(),))
+    with pytest.raises(RecipeError, match=r"quantity must be one of intrinsics, poses.*got 'warmth'"):
+        Quantity("warmth")
+    twice = replace(recipe, learned=(Quantity("exposure"),))
+    with pytest.raises(RecipeError, match="'exposure' must not be in learned; set exposure instead"):
+        from_json(to_json(twice))
+    with pytest.raises(RecipeError, match="'response' must not be in learned; set photometry instead"):
+        from_json(to_json(replace(recipe, learned=(Quantity("response"),))))
+    changed = apply_overrides(replace(recipe, exposure=Exposure()), ["exposure.start=7"])
+    assert changed.exposure == Exposure(start=7)
+
+
+def test_every_row_belongs_to_a_view(scene: Scene) -> None:
+    made = Learner(everything(), scene)
+    assert len(made.rows["exposure"]) == len(made.rows["poses"]) == VIEWS
+    assert len(made.rows["intrinsics"]) == len(made.rows["vignetting"]) == 1  # one camera took all
