@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from gs2d.config.recipe import GradDensify, Recipe
+from gs2d.data.scene import Scene
 from gs2d.errors import RunError
 from gs2d.training.densify.gradient import no_statistics
 from gs2d.training.learned.learned_table import LearnedTable
 from gs2d.training.state import TrainState
 
 
-def check_resumable(state: TrainState, recipe: Recipe, views: int, learned: LearnedTable) -> None:
-    """Raise unless training of a recipe, on so many training views, can go on from a state."""
+def check_resumable(state: TrainState, recipe: Recipe, scene: Scene) -> None:
+    """Raise unless training of a recipe on a scene can go on from a state."""
     state.check()
     if state.splats.sh_degree != recipe.sh_degree:
         raise RunError(
@@ -18,12 +19,12 @@ def check_resumable(state: TrainState, recipe: Recipe, views: int, learned: Lear
             f"{recipe.sh_degree}; start a new run"
         )
     _check_place(state, recipe)
-    last = max(state.queue, default=0)
+    last, views = max(state.queue, default=0), len(scene.train)
     if last >= views:
         raise RunError(
             f"the checkpoint waits for training view {last}, but the scene has {views}; is it of another scene?"
         )
-    learned.check(state.learned)
+    LearnedTable(recipe, scene).check(state.learned)
     _check_stage(state, recipe)
 
 

@@ -152,7 +152,7 @@ class Trainer:
         self.learned = LearnedTable(self.recipe, scene)
         self._robust = Robustness(scene, begins, self.settings, self.backend, processes, self._frozen)
         if state is not None:
-            check_resumable(state, self.recipe, len(scene.train), self.learned)
+            check_resumable(state, self.recipe, scene)
         self.state = processes.share(lambda: self._new_state(dtype, init, exposures) if state is None else state)
         self.state.trained_by(processes.size)
         self.state.move_to(self.backend.device)
@@ -324,8 +324,8 @@ class Trainer:
             adam_step(state, stage, result.gradients, lr, **options)  # type: ignore[arg-type]
         for turn, gradients in zip(turns, of_views, strict=True):
             self._robust.decay(state, stage, turn.iteration, self._learner)
-            rates = self.learned.learning(state.stage, turn.iteration)
-            self.learned.update(state.learned, turn.index, gradients, rates, self._learner)
+            learning = self.learned.learning(state.stage, turn.iteration)
+            self.learned.update(state.learned, turn.index, gradients, learning, self._learner)
         return result, happened
 
     def _evaluate(

@@ -153,7 +153,7 @@ def _state_at(checkpoint: CheckpointFile, payload: dict[str, Any], job: Job) -> 
     state, ended = _state(checkpoint.path, payload), checkpoint.iteration is None
     place = (checkpoint.stage_index + ended, 0 if ended else checkpoint.iteration)
     try:
-        check_resumable(state, job.recipe, len(job.scene.train))
+        check_resumable(state, job.recipe, job.scene)
     except (RunError, ShapeError) as error:
         raise _unreadable(checkpoint.path, str(error)) from error
     if (state.stage, state.step) != place:
