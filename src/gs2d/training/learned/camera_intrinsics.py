@@ -1,4 +1,4 @@
-"""Intrinsics: focal length, principal point and residual lens of each camera (docs/math.md, "Focal lengths and lens")."""
+"""Focal length, principal point and residual lens of each camera (docs/math.md, "Focal lengths and lens")."""
 
 from __future__ import annotations
 
