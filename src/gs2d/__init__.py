@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from gs2d.data.readers.registry import register_reader
     from gs2d.data.scene import Scene
     from gs2d.errors import Gs2dError
-    from gs2d.io.formats.registry import read_splats, register_format, write_splats
+    from gs2d.io.formats.registry import read_splats, register_format, register_splat_reader, write_splats
     from gs2d.io.meshes import write_mesh
     from gs2d.losses.api import Loss, LossView, compute_losses
     from gs2d.losses.reference import normals_from_depth
@@ -78,6 +78,7 @@ __all__ = [
     "register_reader",
     "register_recipe",
     "register_section",
+    "register_splat_reader",
     "rgb_to_sh0",
     "splat_errors",
     "train",
@@ -124,6 +125,7 @@ _HOME = {
     "register_reader": "gs2d.data.readers.registry",
     "register_recipe": "gs2d.config.presets",
     "register_section": "gs2d.report.sections.registry",
+    "register_splat_reader": "gs2d.io.formats.registry",
     "rgb_to_sh0": "gs2d.core.sh",
     "splat_errors": "gs2d.render.api",
     "train": "gs2d.pipeline.in_memory",

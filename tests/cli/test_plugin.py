@@ -94,6 +94,8 @@ def test_later_commands_find_the_package_and_export_writes_its_format(gs2d: Run,
     said = gs2d("export", trained, "--out", tmp_path / "a.xyz")
     assert "centres" in said.stdout + said.stderr
     assert len((tmp_path / "a.xyz").read_text().splitlines()) == 58
+    gs2d("export", tmp_path / "a.xyz", "--out", tmp_path / "a.ply")
+    assert "splats: 58" in gs2d("info", tmp_path / "a.ply").stdout
 
 
 def test_a_run_goes_on_with_the_recipe_from_a_file(gs2d: Run, trained: Path) -> None:

@@ -8,6 +8,7 @@ import torch
 import gs2d
 from gs2d.config.densify import Densify
 from gs2d.errors import DivergedError
+from gs2d.io.gaussians import Gaussians
 from gs2d.losses.api import LossReport
 from gs2d.render.backends import CpuBackend
 from gs2d.training.densify.densifier import Densifier
@@ -114,3 +115,14 @@ def seed(run):
     if not run.stages:
         return None
     return f"<p>Seed {run.definition['seed']}, {run.last['train']['psnr']:.1f} dB on training views.</p>"
+
+
+@gs2d.register_splat_reader("example-xyz", endings=(".xyz",))
+def read_xyz(path, tell):
+    """Read centres from text, as grey disks of one size."""
+    means = np.loadtxt(path, dtype=np.float32, ndmin=2)
+    tell("only the centres were read")
+    count, ones = len(means), np.ones((len(means), 1), np.float32)
+    flat, quats = ones * [-4.0, -4.0, -40.0], ones * [1.0, 0.0, 0.0, 0.0]
+    empty = np.zeros((count, 0, 3), np.float32)
+    return Gaussians(means, np.float32(quats), np.float32(flat), ones[:, 0], 0 * means, empty), "text"

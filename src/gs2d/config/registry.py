@@ -153,9 +153,9 @@ class Registry(Generic[T]):
         """Return the names that are not gs2d's own."""
         return tuple(name for name in self.names() if name not in self._homes)
 
-    def working(self) -> Iterator[tuple[str, T]]:
-        """Names and things; of a package that cannot be imported a PluginWarning says so, and it is left out."""
-        for name in self.names():
+    def working(self, names: Sequence[str] | None = None) -> Iterator[tuple[str, T]]:
+        """Yield names (default: all) with their objects; one that cannot be imported is a PluginWarning instead."""
+        for name in self.names() if names is None else names:
             try:
                 yield name, self.get(name)
             except Gs2dError as error:

@@ -13,17 +13,15 @@ from __future__ import annotations
 import json
 import shutil
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, Any
 
-from gs2d.contrib.formats.gltf import EXTENSION, UPRIGHT
-from gs2d.contrib.formats.usd import ENDINGS as USD_ENDINGS
-from gs2d.contrib.formats.usd import stamp_usd, usd_georeference
 from gs2d.core.files import atomic_write
 from gs2d.core.georeference import Georeference
 from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import DataError
+from gs2d.io.formats.registry import LAYOUTS, layout_of, reader_of
 from gs2d.io.ply_format import read_ply_comments
 from gs2d.io.run_dir import GEOREFERENCE
 
@@ -61,28 +59,36 @@ def write_georeference(run: Path, georeference: Georeference) -> Path:
 
 
 def stamp(path: Path, georeference: Georeference) -> bool:
-    """Let a file in local metres say where it is, in itself; False where its format has no room for that.
-
-    Whoever wrote the file need not know of georeferences, so that every format of the kind can be stamped.
-    """
+    """Write a georeference into a file in local metres; False where its format has no room for that."""
     path = Path(path)
     kind = path.suffix.lower()
-    if kind == ".usd":
-        x, y, z = (float(value) for value in georeference.origin)
-        stamp_usd(path, _json(georeference), georeference.epsg, (x, y, z))
+    layout = layout_of(path)
+    own = None if layout is None else LAYOUTS.get(layout).stamp
+    if own is not None:
+        own(path, georeference)
         return True
-    if kind not in (".ply", ".obj", ".glb"):
+    if kind == ".glb":
+        stamp_glb(path, georeference)
+        return True
+    if kind not in (".ply", ".obj"):
         return False
     with open(path, "rb") as old, atomic_write(path) as new:
         if kind == ".ply":
             new.write(old.readline() + old.readline())  # "ply", "format ..."
             new.writelines(f"comment {line}\n".encode() for line in _comments(georeference))
-        elif kind == ".obj":
-            new.writelines(f"# {line}\n".encode() for line in _comments(georeference))
         else:
-            new.write(_stamped_glb_head(old, georeference))
+            new.writelines(f"# {line}\n".encode() for line in _comments(georeference))
         shutil.copyfileobj(old, new, 1 << 20)
     return True
+
+
+def stamp_glb(
+    path: Path, georeference: Georeference, change: Callable[[dict[str, Any]], None] = lambda document: None
+) -> None:
+    """Write a georeference into the extras of a .glb file's asset; ``change`` edits its JSON document too."""
+    with open(path, "rb") as old, atomic_write(path) as new:
+        new.write(_stamped_glb_head(old, georeference, change))
+        shutil.copyfileobj(old, new, 1 << 20)
 
 
 def _comments(georeference: Georeference) -> list[str]:
@@ -90,22 +96,22 @@ def _comments(georeference: Georeference) -> list[str]:
     x, y, z = georeference.origin
     epsg = [] if georeference.epsg is None else [f"epsg {georeference.epsg}"]
     frame = f"frame {georeference.frame}, metres"
-    return [*epsg, f"offset {x:.17g} {y:.17g} {z:.17g}", frame, _COMMENT + _json(georeference)]
+    return [*epsg, f"offset {x:.17g} {y:.17g} {z:.17g}", frame, _COMMENT + georeference_text(georeference)]
 
 
-def _stamped_glb_head(old: IO[bytes], georeference: Georeference) -> bytes:
+def _stamped_glb_head(old: IO[bytes], georeference: Georeference, change: Callable[[dict[str, Any]], None]) -> bytes:
     """Return the header and the JSON of a .glb file, with a georeference in the extras of its asset."""
     magic, version, length, size, kind = _GLB.unpack(old.read(_GLB.size))
     document = json.loads(old.read(size))
-    if EXTENSION in document.get("extensionsUsed", ()):
-        document["nodes"][0]["rotation"] = UPRIGHT  # splats, whose z is up now
+    change(document)
     document["asset"]["extras"] = {**(document["asset"].get("extras") or {}), _KEY: _short(georeference)}
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     return _GLB.pack(magic, version, length + len(text) - size, len(text), kind) + text
 
 
-def _json(georeference: Georeference) -> str:
+def georeference_text(georeference: Georeference) -> str:
+    """Return the JSON in which a file in local metres says where it is."""
     return json.dumps(_short(georeference), separators=(",", ":"), allow_nan=False)
 
 
@@ -172,7 +178,8 @@ def _told(path: Path) -> Any:
         return _after_mark([line[1:].strip() for line in lines if line.startswith("#")])
     if kind == ".glb":
         return _of_glb(path)
-    return usd_georeference(path) if kind in USD_ENDINGS else None
+    reader = reader_of(path)
+    return None if reader is None or reader.georeference is None else reader.georeference(path)
 
 
 def _after_mark(lines: Sequence[str]) -> str | None:

@@ -13,8 +13,10 @@ import numpy as np
 
 from gs2d.core.json_files import atomic_write
 from gs2d.core.sh import C0
+from gs2d.core.splats import Splats
 from gs2d.errors import DataError
-from gs2d.io.gaussians import Gaussians, log_scales_of, logit_of_byte, sigmoid, to_byte, unit_quats
+from gs2d.io.formats.registry import register_format, register_splat_reader
+from gs2d.io.gaussians import Gaussians, Tell, log_scales_of, logit_of_byte, sigmoid, to_byte, unit_quats
 
 _RECORD = np.dtype([("position", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 
@@ -70,3 +72,13 @@ def read_splat(path: str | os.PathLike[str]) -> Gaussians:
         ((color - 0.5) / C0).astype(np.float32),
         np.zeros((len(rows), 0, 3), np.float32),
     )
+
+
+@register_format("splat", ending=".splat")
+def _write(path: Path, splats: Splats) -> None:
+    write_splat(path, Gaussians.of(splats))
+
+
+@register_splat_reader("splat", endings=(".splat",))
+def _read(path: str | os.PathLike[str], _: Tell) -> tuple[Gaussians, str]:
+    return read_splat(path), ".splat"

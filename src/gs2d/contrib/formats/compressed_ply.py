@@ -11,11 +11,14 @@ from __future__ import annotations
 import math
 import os
 import warnings
+from pathlib import Path
 
 import numpy as np
 
 from gs2d.core.sh import C0
+from gs2d.core.splats import Splats
 from gs2d.errors import DataError
+from gs2d.io.formats.registry import register_format, register_splat_reader
 from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, logit_of_byte, sigmoid, to_byte, unit_quats
 from gs2d.io.ply_format import PlyElement, PlyFile, read_ply, write_ply
 
@@ -234,3 +237,13 @@ def _sh(path: object, element: PlyElement | None, n: int) -> np.ndarray:
     rest = np.stack(columns, axis=1).astype(np.float64)
     fraction = np.where(rest == 0, 0.0, np.where(rest == 255, 1.0, (rest + 0.5) / 256.0))
     return ((fraction - 0.5) * 8.0).astype(np.float32).reshape(n, 3, count // 3).transpose(0, 2, 1)
+
+
+@register_format("compressed", ending=".compressed.ply")
+def _write(path: Path, splats: Splats) -> tuple[str, ...]:
+    return write_compressed_ply(path, Gaussians.of(splats))
+
+
+@register_splat_reader("compressed", ply_kind="compressed")
+def _read(path: str | os.PathLike[str], tell: Tell) -> tuple[Gaussians, str]:
+    return read_compressed_ply(path, tell), "compressed PLY"

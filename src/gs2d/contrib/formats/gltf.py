@@ -20,10 +20,14 @@ import numpy as np
 
 from gs2d.contrib.formats.gltf_document import GltfDocument, node_matrices, read_document
 from gs2d.core.files import atomic_write
+from gs2d.core.georeference import Georeference
 from gs2d.core.growth import check_growth
 from gs2d.core.sh import C0
+from gs2d.core.splats import Splats
 from gs2d.errors import DataError
+from gs2d.io.formats.registry import register_format, register_splat_reader
 from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, log_scales_of, logit, sigmoid, to_byte, unit_quats
+from gs2d.io.georeference import stamp_glb
 from gs2d.io.meshes import LINEAR_U16
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -244,3 +248,21 @@ def _placed(path: str | os.PathLike[str], g: Gaussians, matrix: np.ndarray) -> G
         return g.placed(matrix)
     except ValueError as error:
         raise DataError(f"{Path(path)}: {error} of the nodes of splats; bake it into them") from error
+
+
+def _stamp(path: Path, georeference: Georeference) -> None:
+    """Write a georeference into a .glb file; splats get the node rotation of a scene whose z is up."""
+
+    def set_upright(document: dict[str, Any]) -> None:
+        if EXTENSION in document.get("extensionsUsed", ()):
+            document["nodes"][0]["rotation"] = UPRIGHT
+
+    stamp_glb(path, georeference, set_upright)
+
+
+@register_format("gltf", ending=".glb", stamp=_stamp)
+def _write(path: Path, splats: Splats) -> None:
+    write_gltf(path, Gaussians.of(splats))
+
+
+register_splat_reader("gltf", endings=(".glb", ".gltf"), mesh=gltf_mesh)(read_gltf)

@@ -27,7 +27,9 @@ from gs2d.contrib.formats.compressed_ply import morton_order
 from gs2d.contrib.formats.sog_palette import codebook, nearest_code, palette
 from gs2d.core.files import atomic_write
 from gs2d.core.growth import check_entries, check_growth
+from gs2d.core.splats import Splats
 from gs2d.errors import DataError
+from gs2d.io.formats.registry import register_format, register_splat_reader
 from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, logit_of_byte, sigmoid, to_byte, unit_quats
 
 _ROW = 64  # rows of the palette side by side in its picture
@@ -367,3 +369,11 @@ def _places(tree: Any, wanted: int) -> list[tuple[int, int, int]]:
         if len(found) > _MOST_CHUNKS or len(waiting) > _MOST_CHUNKS:
             raise ValueError(f"at most {_MOST_CHUNKS} chunks were expected")
     return [(file, offset, count) for (file, offset), count in sorted(found.items())]
+
+
+@register_format("sog", ending=".sog")
+def _write(path: Path, splats: Splats) -> None:
+    write_sog(path, Gaussians.of(splats))
+
+
+register_splat_reader("sog", endings=(".sog", "/meta.json", "/lod-meta.json"))(read_sog)

@@ -22,6 +22,8 @@ from gs2d.contrib.formats.compressed_ply import morton_order
 from gs2d.contrib.formats.levels import halved
 from gs2d.contrib.formats.sog import packed_sog
 from gs2d.core.files import atomic_write, disk_error
+from gs2d.core.splats import Splats
+from gs2d.io.formats.registry import register_format
 from gs2d.io.gaussians import Gaussians, unit_quats
 
 INDEX = "lod-meta.json"
@@ -229,3 +231,8 @@ def _remove(folder: Path) -> None:
             (folder / name).unlink()
     with contextlib.suppress(OSError):
         folder.rmdir()
+
+
+@register_format("streamed", ending=f"/{INDEX}", size=streamed_bytes)
+def _write(path: Path, splats: Splats) -> None:
+    write_streamed_sog(path, Gaussians.of(splats))

@@ -24,7 +24,10 @@ import numpy as np
 from gs2d.contrib.formats import usd_process
 from gs2d.core.extras import install
 from gs2d.core.files import atomic_write, disk_error
+from gs2d.core.georeference import Georeference
+from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, DataError
+from gs2d.io.formats.registry import register_format, register_splat_reader
 from gs2d.io.gaussians import (
     Gaussians,
     Tell,
@@ -35,6 +38,7 @@ from gs2d.io.gaussians import (
     unit_quats,
     with_thickness,
 )
+from gs2d.io.georeference import georeference_text
 
 ENDINGS = (".usd", ".usdc", ".usda", ".usdz")
 _APIS = (
@@ -150,13 +154,15 @@ def _save(pxr: Any, path: Path, layer: Any) -> None:
                 file.write(block)
 
 
-def stamp_usd(path: Path, told: str, epsg: int | None, offset: tuple[float, float, float]) -> None:
-    """Let a file written here say where it is: JSON for gs2d, EPSG code and offset for others, in its layer's data."""
+def stamp_usd(path: Path, georeference: Georeference) -> None:
+    """Write a georeference into the layer's data: JSON for gs2d, EPSG code and offset for other programs."""
     pxr = required_usd()
     layer = pxr.Sdf.Layer.OpenAsAnonymous(str(path))
-    place: dict[str, Any] = {"georeference": told, "offset": pxr.Gf.Vec3d(*offset)}
-    data = dict(layer.customLayerData)
-    layer.customLayerData = {**data, "gs2d": place if epsg is None else {**place, "epsg": epsg}}
+    offset = pxr.Gf.Vec3d(*map(float, georeference.origin))
+    place: dict[str, Any] = {"georeference": georeference_text(georeference), "offset": offset}
+    if georeference.epsg is not None:
+        place["epsg"] = georeference.epsg
+    layer.customLayerData = {**dict(layer.customLayerData), "gs2d": place}
     _save(pxr, path, layer)
 
 
@@ -292,3 +298,11 @@ def _placed(where: str, g: Gaussians, matrix: np.ndarray) -> Gaussians:
         return g.placed(matrix)
     except ValueError as error:
         raise DataError(f"{where}: {error}; bake the transform into the splats") from error
+
+
+@register_format("usd", ending=".usd", stamp=stamp_usd)
+def _write(path: Path, splats: Splats) -> None:
+    write_usd(path, Gaussians.of(splats))
+
+
+register_splat_reader("usd", endings=ENDINGS, georeference=usd_georeference)(read_usd)

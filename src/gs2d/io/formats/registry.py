@@ -1,4 +1,4 @@
-"""Splats in every format that is written, by name, and what a file of splats holds."""
+"""Splat files by format: the writers and the readers that are registered, and what a file of splats holds."""
 
 from __future__ import annotations
 
@@ -7,17 +7,12 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from gs2d.config.registry import Registry
-from gs2d.contrib.formats.antimatter import read_splat, write_splat
-from gs2d.contrib.formats.compressed_ply import read_compressed_ply, write_compressed_ply
-from gs2d.contrib.formats.gltf import read_gltf, write_gltf
-from gs2d.contrib.formats.sog import read_sog, write_sog
-from gs2d.contrib.formats.sog_streamed import INDEX, streamed_bytes, write_streamed_sog
-from gs2d.contrib.formats.usd import ENDINGS as USD_ENDINGS
-from gs2d.contrib.formats.usd import read_usd, write_usd
+from gs2d.core.georeference import Georeference
 from gs2d.core.missing import instead
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
@@ -32,26 +27,73 @@ Reader = Callable[[str | os.PathLike[str], Tell], tuple[Gaussians, str]]
 
 @dataclass(frozen=True)
 class Layout:
-    """A format of splats: its name's ending, and a writer that says what the format could not hold.
+    """A format in which splats are written.
 
-    An ending that begins with / is a whole name, of a file with others beside it.
+    Attributes
+    ----------
+    ending : str
+        Ending of the file names. One that begins with / is a whole name, of a file with others beside it.
+    write : callable
+        Writes a file and returns a sentence for each thing that the format cannot store.
+    stamp : callable or None
+        Writes a georeference into a file; None: as for other files of that ending.
+    size : callable or None
+        Returns the bytes of all files that belong to a written one; None: it is one file.
     """
 
     ending: str
     write: Writer
+    stamp: Callable[[Path, Georeference], None] | None = None
+    size: Callable[[Path], int] | None = None
 
 
-_NAMES = ("2dgs", "3dgs", "compressed", "spz", "spz4", "splat", "usd", "gltf", "sog", "streamed")
+@dataclass(frozen=True)
+class SplatReader:
+    """A format from which splats are read.
+
+    Attributes
+    ----------
+    endings : tuple of str
+        Endings of the file names; one that begins with / is a whole name.
+    read : callable
+        Takes a path and a function that receives notes; returns the Gaussians, and the kind of file in words ("2dgs"
+        for flat splats).
+    ply_kind : str or None
+        Reads the PLY files that ``splat_ply.ply_kind`` calls so.
+    georeference : callable or None
+        Returns the JSON text in which a file says where it is in the world, or None.
+    mesh : callable or None
+        Returns the facts of a mesh in a file that holds one instead of splats, or None.
+    """
+
+    endings: tuple[str, ...]
+    read: Reader
+    ply_kind: str | None = None
+    georeference: Callable[[Path], str | None] | None = None
+    mesh: Callable[[Path], dict[str, Any] | None] | None = None
+
+
 LAYOUTS: Registry[Layout] = Registry(
     "layout",
     "gs2d.formats",
-    builtin=dict.fromkeys(_NAMES, __name__),
+    builtin=dict.fromkeys(("3dgs", "2dgs", "spz", "spz4"), __name__),
     error=DataError,
 )
-"""Names of formats that splats are written in."""
+"""Names of formats that splats are written in. Of two with one ending, the first is chosen by a file's name."""
+
+SPLAT_READERS: Registry[SplatReader] = Registry(
+    "splat reader", "gs2d.splat_readers", builtin={"spz": __name__}, error=DataError
+)
+"""Names of formats, other than PLY of 2DGS and 3DGS, that splats are read from."""
 
 
-def register_format(name: str, *, ending: str) -> Callable[[Writer], Writer]:
+def register_format(
+    name: str,
+    *,
+    ending: str,
+    stamp: Callable[[Path, Georeference], None] | None = None,
+    size: Callable[[Path], int] | None = None,
+) -> Callable[[Writer], Writer]:
     """Return a decorator that registers an export format, for ``Splats.save`` and ``gs2d export``.
 
     Parameters
@@ -60,6 +102,8 @@ def register_format(name: str, *, ending: str) -> Callable[[Writer], Writer]:
         Name of the layout, for ``layout=`` and ``--layout``; must not be taken.
     ending : str
         Ending of the file names, with its dot; one that begins with / is a whole file name.
+    stamp, size : callable, optional
+        As in ``Layout``, for formats that hold georeferences or consist of several files.
 
     Returns
     -------
@@ -82,15 +126,49 @@ def register_format(name: str, *, ending: str) -> Callable[[Writer], Writer]:
     """
 
     def registered(write: Writer) -> Writer:
-        LAYOUTS.register(name)(Layout(ending, write))
+        LAYOUTS.register(name, module=write.__module__)(Layout(ending, write, stamp, size))
         return write
 
     return registered
 
 
-@register_format("2dgs", ending=".ply")
-def _write_2dgs(path: Path, splats: Splats) -> None:
-    splat_ply.write_splats(path, splats, layout="2dgs")
+def register_splat_reader(
+    name: str,
+    *,
+    endings: tuple[str, ...] = (),
+    ply_kind: str | None = None,
+    georeference: Callable[[Path], str | None] | None = None,
+    mesh: Callable[[Path], dict[str, Any] | None] | None = None,
+) -> Callable[[Reader], Reader]:
+    """Return a decorator that registers a reader of splat files, for ``read_splats`` and every command that reads them.
+
+    Parameters
+    ----------
+    name : str
+        Name of the format; must not be taken by another reader.
+    endings : tuple of str
+        Endings of the file names, with their dots; one that begins with / is a whole file name.
+    ply_kind, georeference, mesh : optional
+        As in ``SplatReader``.
+
+    Returns
+    -------
+    callable
+        Decorates a function ``(path, tell)`` that returns ``gs2d.io.gaussians.Gaussians`` and the kind of file in
+        words, and calls ``tell`` with a sentence on each thing that it left out.
+
+    Raises
+    ------
+    DataError
+        From the decorator: the name is taken.
+    """
+
+    def registered(read: Reader) -> Reader:
+        reader = SplatReader(endings, read, ply_kind, georeference, mesh)
+        SPLAT_READERS.register(name, module=read.__module__)(reader)
+        return read
+
+    return registered
 
 
 @register_format("3dgs", ending=".ply")
@@ -98,9 +176,9 @@ def _write_3dgs(path: Path, splats: Splats) -> None:
     splat_ply.write_splats(path, splats, layout="3dgs")
 
 
-@register_format("compressed", ending=".ply")
-def _write_compressed(path: Path, splats: Splats) -> tuple[str, ...]:
-    return write_compressed_ply(path, Gaussians.of(splats))
+@register_format("2dgs", ending=".ply")
+def _write_2dgs(path: Path, splats: Splats) -> None:
+    splat_ply.write_splats(path, splats, layout="2dgs")
 
 
 @register_format("spz", ending=".spz")
@@ -113,42 +191,15 @@ def _write_spz4(path: Path, splats: Splats) -> tuple[str, ...]:
     return write_spz(path, Gaussians.of(splats), version=4)
 
 
-@register_format("splat", ending=".splat")
-def _write_splat(path: Path, splats: Splats) -> None:
-    write_splat(path, Gaussians.of(splats))
+@register_splat_reader("spz", endings=(".spz",))
+def _read_spz(path: str | os.PathLike[str], tell: Tell) -> tuple[Gaussians, str]:
+    gaussians, version = read_spz(path, tell)
+    return gaussians, f"SPZ version {version}"
 
 
-@register_format("usd", ending=".usd")
-def _write_usd(path: Path, splats: Splats) -> None:
-    write_usd(path, Gaussians.of(splats))
-
-
-@register_format("gltf", ending=".glb")
-def _write_gltf(path: Path, splats: Splats) -> None:
-    write_gltf(path, Gaussians.of(splats))
-
-
-@register_format("sog", ending=".sog")
-def _write_sog(path: Path, splats: Splats) -> None:
-    write_sog(path, Gaussians.of(splats))
-
-
-@register_format("streamed", ending=f"/{INDEX}")
-def _write_streamed(path: Path, splats: Splats) -> None:
-    write_streamed_sog(path, Gaussians.of(splats))
-
-
-_BY_ENDING = (
-    (".compressed.ply", "compressed"),
-    (".ply", "3dgs"),
-    (".spz", "spz"),
-    (".splat", "splat"),
-    (".usd", "usd"),
-    (".glb", "gltf"),
-    (".sog", "sog"),
-    (f"/{INDEX}", "streamed"),
-)
-ENDINGS = tuple(ending for ending, _ in _BY_ENDING)
+def endings() -> tuple[str, ...]:
+    """Return the endings of file names that gs2d writes splats to, each once."""
+    return tuple(dict.fromkeys(layout.ending for _, layout in LAYOUTS.working(LAYOUTS.builtin)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,12 +216,13 @@ class SplatFile:
 
 
 def layout_of(path: Path) -> str | None:
-    """Return the layout that a file is written in by its name, gs2d's own first, or None."""
+    """Return the layout that a file is written in by the longest ending that fits its name, gs2d's own first."""
     name = f"/{path.name}".lower()
-    for ending, layout in _BY_ENDING:
-        if name.endswith(ending):
-            return layout
-    return next((layout for layout, guest in LAYOUTS.working() if name.endswith(guest.ending)), None)
+    for names in (LAYOUTS.builtin, LAYOUTS.guests()):
+        fits = [(key, layout.ending) for key, layout in LAYOUTS.working(names) if name.endswith(layout.ending)]
+        if fits:
+            return max(fits, key=lambda fit: len(fit[1]))[0]
+    return None
 
 
 def write_layout(path: Path, splats: Splats, layout: str) -> tuple[str, ...]:
@@ -211,8 +263,8 @@ def write_splats(path: str | os.PathLike[str], splats: Splats, *, layout: str | 
     path = Path(path)
     chosen = layout_of(path) if layout is None else layout
     if chosen is None:
-        endings = ", ".join(ENDINGS).replace("/", "")
-        raise DataError(f"splats are written as {endings}, got {path}; choose such a name, or give a layout")
+        known = ", ".join(endings()).replace("/", "")
+        raise DataError(f"splats are written as {known}, got {path}; choose such a name, or give a layout")
     ending = LAYOUTS.get(chosen).ending
     if not f"/{path.name}".lower().endswith(ending):
         raise DataError(
@@ -225,44 +277,29 @@ def write_splats(path: str | os.PathLike[str], splats: Splats, *, layout: str | 
 
 def written_bytes(path: Path, layout: str) -> int:
     """Return the bytes of what was written, of all files that belong to it."""
-    return streamed_bytes(path) if layout == "streamed" else path.stat().st_size
-
-
-def _read_spz(path: str | os.PathLike[str], tell: Tell) -> tuple[Gaussians, str]:
-    gaussians, version = read_spz(path, tell)
-    return gaussians, f"SPZ version {version}"
-
-
-def _read_splat(path: str | os.PathLike[str], _: Tell) -> tuple[Gaussians, str]:
-    return read_splat(path), ".splat"
+    size = LAYOUTS.get(layout).size
+    return path.stat().st_size if size is None else size(path)
 
 
 def _read_ply(path: str | os.PathLike[str], tell: Tell) -> tuple[Gaussians, str]:
     kind = ply_kind(path)
-    if kind == "compressed":
-        return read_compressed_ply(path, tell), "compressed PLY"
+    for _, reader in SPLAT_READERS.working():
+        if reader.ply_kind == kind:
+            return reader.read(path, tell)
     if kind == "3dgs":
         return read_gaussians(path, tell), "3dgs (three scales, for viewers)"
     return Gaussians.of(splat_ply.read_splats(path, tell)), "2dgs"  # names another kind
 
 
-_READERS: tuple[tuple[tuple[str, ...], Reader], ...] = (
-    ((".spz",), _read_spz),
-    ((".splat",), _read_splat),
-    (USD_ENDINGS, read_usd),
-    ((".glb", ".gltf"), read_gltf),
-    ((".sog", "/meta.json", "/lod-meta.json"), read_sog),
-)  # of what is no PLY, by the ends of names
-
-
-def _reader_of(path: str | os.PathLike[str]) -> Reader | None:
+def reader_of(path: str | os.PathLike[str]) -> SplatReader | None:
+    """Return the reader of a file that is no PLY by its name, or None."""
     name = str(Path(path).absolute()).lower().replace(os.sep, "/")
-    return next((read for endings, read in _READERS if name.endswith(endings)), None)
+    return next((reader for _, reader in SPLAT_READERS.working() if name.endswith(reader.endings)), None)
 
 
 def is_splat_file(path: str | os.PathLike[str]) -> bool:
     """Whether a file is one of splats that are no PLY, by its ending."""
-    return _reader_of(path) is not None
+    return reader_of(path) is not None
 
 
 def read_splat_file(path: str | os.PathLike[str]) -> SplatFile:
@@ -277,7 +314,8 @@ def read_splat_file(path: str | os.PathLike[str]) -> SplatFile:
         Missing, broken, or no splats.
     """
     notes: list[str] = []
-    gaussians, kind = (_reader_of(path) or _read_ply)(path, notes.append)
+    reader = reader_of(path)
+    gaussians, kind = _read_ply(path, notes.append) if reader is None else reader.read(path, notes.append)
     gaussians = _finite(_mended(gaussians), path, notes.append)
     flat = kind == "2dgs" or gaussians.is_flat
     return SplatFile(kind, gaussians, gaussians.disks() if flat else None, tuple(dict.fromkeys(notes)))

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.errors import RunError
-from gs2d.io.formats.registry import ENDINGS, LAYOUTS, layout_of, read_splats, write_layout, written_bytes
+from gs2d.io.formats.registry import LAYOUTS, endings, layout_of, read_splats, write_layout, written_bytes
 from gs2d.io.run_dir import MESH, open_run
 from gs2d.pipeline.finish.placed import place_of, placed_splats, say_where
 from gs2d.pipeline.finish.run_subject import within
@@ -31,7 +31,7 @@ def export_run(
     layout = layout or layout_of(Path(out))
     if layout is None:
         raise RunError(
-            f"splats are written as {', '.join(ENDINGS).replace('/', '')} files, got --out {out}; choose such a name "
+            f"splats are written as {', '.join(endings()).replace('/', '')} files, got --out {out}; choose such a name "
             "(meshes are written by `gs2d mesh RUN`: .ply, with --texture .glb or .obj)"
         )
     if layout not in LAYOUTS:

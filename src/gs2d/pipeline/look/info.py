@@ -5,18 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from gs2d.contrib.formats.gltf import gltf_mesh
 from gs2d.core.missing import belongs_to_run, instead
 from gs2d.data import detect_format, load_scene
 from gs2d.data.archive import is_archive, unpacked_for_a_moment
 from gs2d.data.benchmarks import missing_lines
 from gs2d.errors import DataError
-from gs2d.io.formats.registry import is_splat_file, read_splat_file
+from gs2d.io.formats.registry import is_splat_file, read_splat_file, reader_of
 from gs2d.io.georeference import georeference_of_file
 from gs2d.io.meshes import FOREIGN, read_mesh, read_points
 from gs2d.io.splat_ply import ply_kind
 
-_OF_MODELS = (".ply", ".glb", ".gltf", *FOREIGN)
+_OF_MODELS = (".ply", *FOREIGN)
 
 
 def describe_capture(path: Path) -> dict[str, Any]:
@@ -65,7 +64,8 @@ def describe_file(path: Path) -> dict[str, Any]:
 
 
 def _facts_of(path: Path, size: int) -> dict[str, Any]:
-    if path.suffix.lower() in (".glb", ".gltf") and (mesh := gltf_mesh(path)) is not None:
+    reader = reader_of(path)
+    if reader is not None and reader.mesh is not None and (mesh := reader.mesh(path)) is not None:
         return {**mesh, "bytes": size}
     kind = "mesh" if path.suffix.lower() in FOREIGN else "splats" if is_splat_file(path) else ply_kind(path)
     if kind == "mesh":
