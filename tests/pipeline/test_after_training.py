@@ -28,7 +28,7 @@ LATER = {  # of a training, with what is missing then
     "train.run_logger.draw_stage": "pictures of stage refine",
     "train.run_logger.StageDone": "scores of stage refine",
     "finish.run_mesh.fusion_frame": "mesh.ply",
-    "finish.verdict.measures.Collector._measure": "verdict.json",
+    "finish.verdict.Collector._measure": "verdict.json",
     "train.train_run.meshed_subject": "mesh.ply",
     "train.train_run.extract_mesh": "mesh.ply",
     "train.train_run.keep_facts": "mesh.ply",

@@ -24,7 +24,7 @@ from gs2d.pipeline.events import OnEvent
 from gs2d.pipeline.finish.run_images import choose_views, draw_stage
 from gs2d.pipeline.finish.run_mesh import MeshFrames
 from gs2d.pipeline.finish.scoring import PeakMemory, score_views, split_metrics
-from gs2d.pipeline.finish.verdict.measures import Collector
+from gs2d.pipeline.finish.verdict import Collector
 from gs2d.pipeline.prepare.finished import finished_splats
 from gs2d.pipeline.prepare.job import Job
 from gs2d.pipeline.prepare.memory_budget import release

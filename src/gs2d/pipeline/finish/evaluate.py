@@ -17,8 +17,7 @@ from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Notice, OnEvent, ignore
 from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.scoring import score_views, split_metrics
-from gs2d.pipeline.finish.verdict.file import write_verdict
-from gs2d.pipeline.finish.verdict.measures import Collector
+from gs2d.pipeline.finish.verdict import Collector, write_verdict
 from gs2d.pipeline.prepare.finished import open_job
 from gs2d.pipeline.prepare.options import EvaluateOptions
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted

@@ -32,8 +32,7 @@ from gs2d.pipeline.finish.run_mesh import MeshFrames, extract_mesh, keep_facts
 from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.finish.run_subject import meshed_subject
 from gs2d.pipeline.finish.scoring import Visitor
-from gs2d.pipeline.finish.verdict.file import write_verdict
-from gs2d.pipeline.finish.verdict.measures import Collector
+from gs2d.pipeline.finish.verdict import Collector, write_verdict
 from gs2d.pipeline.look.page import page_run
 from gs2d.pipeline.prepare.estimate import estimate
 from gs2d.pipeline.prepare.job import Job, check_train_options, prepare_job, recipe_of

@@ -1,0 +1,277 @@
+"""The verdict on a run: a grade, the measures behind it, and advice; ``verdict.json``.
+
+The grade is the worse of two measures: PSNR of new views (of training views where none was held out), and floaters.
+What was not measured is listed and does not change the grade.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from gs2d.config import grades
+from gs2d.config.grades import GOOD, POOR, USABLE
+from gs2d.config.serialize import decode
+from gs2d.core.json_files import read_json, write_json
+from gs2d.data import Scene
+from gs2d.errors import DataError, RecipeError, RunError
+from gs2d.evaluation.hidden_points import hidden_points
+from gs2d.evaluation.images import ImageMetrics
+from gs2d.io.run_dir import VERDICT, RunFolder
+from gs2d.io.run_schema import VERDICT_SHAPE, check_shape
+from gs2d.pipeline.finish.scoring import SeenView
+from gs2d.pipeline.prepare.job import Job
+from gs2d.sfm.workspace import POSES_JSON
+
+FORMAT = 3
+NAMED = 3  # views that a sentence names; verdict.json has all
+HEADLINES: Mapping[str | None, str] = {
+    GOOD: "New views look like photographs of the scene.",
+    USABLE: "The scene is recognisable but has visible flaws.",
+    POOR: "Parts of the scene are wrong or foggy.",
+    None: "Nothing was measured.",
+}
+UNCHECKED = "The training photographs are reproduced {}; new views were not checked."
+NOT_MEASURED = "not measured"
+
+
+# -- measures ----------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class ViewMeasures:
+    """One view of the finished splats.
+
+    Attributes
+    ----------
+    name, split : str
+    psnr : float or None
+        dB, of 8-bit images.
+    points, hidden : int or None
+        Sparse points that a test view shows, and those of them that its rendering hides.
+    """
+
+    name: str
+    split: str
+    psnr: float | None = None
+    points: int | None = None
+    hidden: int | None = None
+
+
+@dataclass(frozen=True)
+class Measures:
+    """The input of a verdict.
+
+    Attributes
+    ----------
+    views : tuple of ViewMeasures
+    placed, count : int or None
+        Photographs with a camera and all photographs, where ``gs2d poses`` found the cameras.
+    lost : tuple of str
+        Names of the photographs without a camera.
+    """
+
+    views: tuple[ViewMeasures, ...]
+    placed: int | None = None
+    count: int | None = None
+    lost: tuple[str, ...] = ()
+
+
+class Collector:
+    """Measures each view while it is scored; pass :meth:`visit` to ``scoring.score_views``.
+
+    Attributes
+    ----------
+    failure : Exception or None
+        The error that stopped the measuring; scoring goes on.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._views: dict[str, ViewMeasures] = {}
+        self.failure: Exception | None = None
+        self._observed = scene.observed(guessed=False)  # None: floaters cannot be counted
+
+    @property
+    def views(self) -> tuple[ViewMeasures, ...]:
+        """Return the views measured so far."""
+        return tuple(self._views.values())
+
+    def visit(self, seen: SeenView, scores: ImageMetrics) -> None:
+        """Measure a view."""
+        if self.failure is not None:
+            return
+        try:
+            self._views[seen.view.name] = self._measure(seen, scores)
+        except Exception as error:
+            self.failure = error
+
+    def _measure(self, seen: SeenView, scores: ImageMetrics) -> ViewMeasures:
+        view, psnr = seen.view, scores.psnr.value
+        measured = ViewMeasures(view.name, seen.split, psnr if psnr is not None and math.isfinite(psnr) else None)
+        if seen.split != "test" or self._observed is None:
+            return measured
+        points = self._observed.in_view(view.name, view.camera)
+        hidden = hidden_points(seen.output.depth("median").cpu().numpy(), points).hidden
+        return replace(measured, points=len(points.depth), hidden=hidden)
+
+
+def placed_images(capture: Path | None) -> tuple[int | None, int | None, tuple[str, ...]]:
+    """Return photographs with a camera, all photographs, and the names without one; None where unknown."""
+    path = None if capture is None else capture / POSES_JSON
+    if path is None or not path.is_file():
+        return None, None, ()
+    data = read_json(path)
+    try:
+        lost = tuple(str(row["source"]) for row in data["photographs"] if not row["placed"])
+        return int(data["placed"]), int(data["count"]), lost
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return None, None, ()  # a file of this name by another program
+
+
+# -- judging -----------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class Finding:
+    """One measure: its name, grade (None: not graded), value in words, meaning, advice, and the views it is about."""
+
+    name: str
+    grade: str | None
+    figure: str
+    text: str
+    advice: str = ""
+    views: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A grade, a sentence, and the findings."""
+
+    grade: str | None
+    headline: str
+    findings: tuple[Finding, ...]
+
+
+def judge(measures: Measures) -> Verdict:
+    """Return the verdict: the worse grade of image quality and floaters."""
+    quality = _quality(measures)
+    findings = (*quality, _floaters(measures), *_placed(measures))
+    graded = any(finding.grade is not None for finding in quality)
+    grade = grades.worst([f.grade for f in findings if f.grade is not None]) if graded else None
+    headline = HEADLINES[grade]
+    if grade is not None and quality[0].grade is None:
+        headline = UNCHECKED.format({GOOD: "well", USABLE: "with visible flaws", POOR: "poorly"}[grade])
+    return Verdict(grade, headline, findings)
+
+
+def _quality(measures: Measures) -> list[Finding]:
+    """Judge the mean PSNR of test views, or of training views where none was held out."""
+    test = [(view.psnr, view.name) for view in measures.views if view.split == "test" and view.psnr is not None]
+    train = [view.psnr for view in measures.views if view.split == "train" and view.psnr is not None]
+    trained = fmean(train) if train else None
+    if not test:
+        text = "All photographs trained. `--test-every 8` holds out every eighth photograph to check new views."
+        new = Finding("new views", None, NOT_MEASURED, text)
+        if trained is None:
+            return [new]
+        grade = grades.TRAINING_VIEWS.grade(trained)
+        advice = "" if grade == GOOD else _train_longer(trained)
+        return [new, Finding("training views", grade, f"{trained:.1f} dB", "Mean PSNR of training views.", advice)]
+    psnr, (low, name) = fmean(value for value, _ in test), min(test)
+    grade, advice = grades.NEW_VIEWS.grade(psnr), ""
+    if grade != GOOD and trained is not None and trained - psnr <= grades.OVERFIT:
+        advice = _train_longer(trained)
+    elif grade != GOOD or grades.NEW_VIEWS.grade(low) == POOR:
+        advice = f"Take more photographs near what {name} shows; longer training will not help there."
+    figure = f"{psnr:.1f} dB" + (f", worst {low:.1f} dB" if len(test) > 1 else "")
+    text = f"Mean PSNR of {len(test)} held-out photograph{'s' * (len(test) > 1)}; {name} is the worst."
+    return [Finding("new views", grade, figure, text, advice, (name,))]
+
+
+def _train_longer(psnr: float) -> str:
+    return (
+        f"Training views have only {psnr:.1f} dB. Train longer or on larger images (--quality, or --schedule-scale and "
+        "--downscale), unless something moved or the light changed between the photographs."
+    )
+
+
+def _floaters(measures: Measures) -> Finding:
+    """Judge the share of sparse points of test views that the rendering hides.
+
+    If every test view is good, the limit is higher: mirrors and glass have points behind their surface.
+    """
+    shares = {view.name: (view.hidden or 0, view.points) for view in measures.views if view.points}
+    shown = sum(points for _, points in shares.values())
+    if not shown:
+        text = "Needs test views and the sparse points that each photograph shows."
+        return Finding("floaters", None, NOT_MEASURED, text)
+    new = [view.psnr for view in measures.views if view.split == "test" and view.psnr is not None]
+    limit = grades.BEHIND if new and grades.NEW_VIEWS.grade(min(new)) == GOOD else grades.FLOATERS
+    hidden = sum(hidden for hidden, _ in shares.values())
+    grade = limit.grade(hidden / shown)
+    bad = {name: part / points for name, (part, points) in shares.items() if limit.grade(part / points) != GOOD}
+    views = tuple(sorted(bad, key=lambda name: -bad[name]))
+    advice = "" if grade == GOOD else f"Take more photographs near {_some(views)}, in the same light."
+    text = "Sparse points of new views that the rendering hides behind floaters or a misplaced surface."
+    return Finding("floaters", grade, f"{100 * hidden / shown:.1f} % of {shown:,} points", text, advice, views)
+
+
+def _placed(measures: Measures) -> list[Finding]:
+    """Report the photographs without a camera."""
+    placed, count, lost = measures.placed, measures.count, measures.lost
+    if placed is None or not count:
+        return []
+    text = "Photographs with a camera" + (f"; without one: {_some(lost)}." if lost else ".")
+    advice = ""
+    if placed < grades.PLACED * count and lost:
+        advice = f"Take more photographs between {_some(lost)} and the others, each overlapping the previous one."
+    return [Finding("placed", None, f"{placed} of {count} photographs", text, advice, lost)]
+
+
+def _some(names: Sequence[str]) -> str:
+    """Return the first names in words."""
+    more = len(names) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+# -- verdict.json ------------------------------------------------------------------------------------------------------
+def write_verdict(run: RunFolder, job: Job, collected: Collector) -> dict[str, Any]:
+    """Judge a run and write ``verdict.json``; without newly measured views, judge the earlier measures again.
+
+    Raises
+    ------
+    RunError
+        If the views were scored but never measured.
+    DiskError
+    """
+    if collected.failure is not None:
+        raise collected.failure
+    measures = Measures(collected.views, *placed_images(job.scene.root)) if collected.views else _measured_before(run)
+    data = {"format": FORMAT, "verdict": asdict(judge(measures)), "measured": asdict(measures)}
+    write_json(run.file(VERDICT), data)
+    return data
+
+
+def read_verdict(run: RunFolder) -> dict[str, Any] | None:
+    """Return the verdict of a run, or None where there is none that can be read."""
+    try:
+        return dict(_read(run)["verdict"]) if run.file(VERDICT).exists() else None
+    except (DataError, RunError):
+        return None
+
+
+def _read(run: RunFolder) -> dict[str, Any]:
+    path = run.file(VERDICT)
+    data: dict[str, Any] = read_json(path)
+    check_shape(path, data, VERDICT_SHAPE, "delete it; `gs2d evaluate RUN` writes it again")
+    return data
+
+
+def _measured_before(run: RunFolder) -> Measures:
+    if not run.file(VERDICT).exists():
+        raise RunError("the run was interrupted between scoring and measuring; `gs2d evaluate RUN` measures it")
+    try:
+        measures: Measures = decode(_read(run)["measured"], Measures, "measured")
+        return measures
+    except (KeyError, RecipeError) as error:
+        raise RunError(f"{run.file(VERDICT)} must hold measures as gs2d writes them; delete it ({error})") from error
