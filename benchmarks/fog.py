@@ -36,7 +36,7 @@ from gs2d.evaluation.images import image_metrics, psnr_float
 from gs2d.pipeline.prepare.job import fit_recipe, with_backdrop
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
-from gs2d.pipeline.prepare.run_exposures import Transforms, named, photographed
+from gs2d.pipeline.prepare.run_exposures import Transforms, photographed
 from gs2d.render.api import rasterize
 from gs2d.render.exposure import fit_exposure
 from gs2d.render.types import RasterSettings
@@ -85,7 +85,7 @@ def measure(scene: Scene, trainer: Trainer) -> dict[str, Any]:
     """The figures of a trained scene."""
     settings, splats = trainer.settings, trainer.splats
     brightness = metered(splats, settings, trainer.backend)
-    transforms = with_predicted(named(scene.train, trainer.state.exposures), scene, brightness)
+    transforms = with_predicted(trainer.learned.by_name(trainer.state.learned, "exposure"), scene, brightness)
     tests = [_score(scene, view, splats, settings, transforms) for view in scene.test]
     by_view = [score["psnr"] for score in tests]
     chosen = scene.train[:: max(1, len(scene.train) // TRAINING_VIEWS)]

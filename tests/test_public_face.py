@@ -20,7 +20,14 @@ FACE = (
     *("load_scene", "train", "Trainer", "Recipe", "Stage", "get_recipe", "list_recipes", "compute_losses"),
     *("rasterize", "rasterize_2dgs", "splat_errors", "read_splats", "write_splats", "extract_mesh", "evaluate"),
     *("Camera", "Splats", "Scene", "Mesh", "MeshOptions", "TrainOptions", "Protocol", "LossTerm"),
-    *("register_loss", "register_densifier", "register_recipe", "register_reader", "register_backend"),
+    *(
+        "register_loss",
+        "register_densifier",
+        "register_quantity",
+        "register_recipe",
+        "register_reader",
+        "register_backend",
+    ),
     *("register_format", "register_section", "perturb_pose", "rgb_to_sh0", "normals_from_depth", "write_mesh"),
 )
 

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from gs2d.config.losses import register_loss
     from gs2d.config.presets import get_recipe, list_recipes, register_recipe
     from gs2d.config.protocols import Protocol
+    from gs2d.config.quantities import Quantity, register_quantity
     from gs2d.config.recipe import LossTerm, Recipe, Stage
     from gs2d.core.camera import Camera, look_at
     from gs2d.core.mesh import Mesh
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from gs2d.render.tensor_api import rasterize_2dgs
     from gs2d.render.types import RasterSettings, RenderOutput
     from gs2d.report.sections.registry import register_section
+    from gs2d.training.learned.quantity import LearnedQuantity
     from gs2d.training.trainer import Trainer
 
 __version__ = "0.2.0"  # the one place: pyproject.toml reads it from here
@@ -41,12 +43,14 @@ __version__ = "0.2.0"  # the one place: pyproject.toml reads it from here
 __all__ = [
     "Camera",
     "Gs2dError",
+    "LearnedQuantity",
     "Loss",
     "LossTerm",
     "LossView",
     "Mesh",
     "MeshOptions",
     "Protocol",
+    "Quantity",
     "RasterSettings",
     "Recipe",
     "RenderOutput",
@@ -75,6 +79,7 @@ __all__ = [
     "register_densifier",
     "register_format",
     "register_loss",
+    "register_quantity",
     "register_reader",
     "register_recipe",
     "register_section",
@@ -90,11 +95,13 @@ _HOME = {
     "Camera": "gs2d.core.camera",
     "Gs2dError": "gs2d.errors",
     "Loss": "gs2d.losses.api",
+    "LearnedQuantity": "gs2d.training.learned.quantity",
     "LossTerm": "gs2d.config.recipe",
     "LossView": "gs2d.losses.api",
     "Mesh": "gs2d.core.mesh",
     "MeshOptions": "gs2d.pipeline.prepare.options",
     "Protocol": "gs2d.config.protocols",
+    "Quantity": "gs2d.config.quantities",
     "RasterSettings": "gs2d.render.types",
     "Recipe": "gs2d.config.recipe",
     "RenderOutput": "gs2d.render.types",
@@ -122,6 +129,7 @@ _HOME = {
     "register_densifier": "gs2d.config.densify",
     "register_format": "gs2d.io.formats.registry",
     "register_loss": "gs2d.config.losses",
+    "register_quantity": "gs2d.config.quantities",
     "register_reader": "gs2d.data.readers.registry",
     "register_recipe": "gs2d.config.presets",
     "register_section": "gs2d.report.sections.registry",

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 
 from gs2d import errors
 from gs2d.kernels.library import available_variants
@@ -67,6 +68,9 @@ def test_a_run_uses_all_of_them_and_says_so(trained: Path) -> None:
     losses = next(event["losses"] for event in events if "losses" in event)
     assert losses["example-contrast"] > 0
     assert losses["example-outside"] > 0  # the photographs have an alpha channel
+    assert losses["example-tint"] > 0
+    state = torch.load(sorted((trained / "checkpoints").glob("*.pt"))[-1], weights_only=True)["state"]
+    assert state["learned"]["example-tint"]["values"].abs().max() > 0.005
     pruned = [event for event in events if event["kind"] == "densify"]
     assert [(event["iteration"], event["splats"]) for event in pruned] == [(3, 58)]
 
@@ -108,9 +112,13 @@ def test_a_run_goes_on_with_the_recipe_from_a_file(gs2d: Run, trained: Path) -> 
     assert "resuming after" in said.stdout + said.stderr
 
 
-def test_a_wrong_option_of_a_guest_is_one_line(gs2d: Run, trained: Path) -> None:
-    wrong = ("--recipe", "example-2dgs", "--set", 'surface.densify.options={"when": 3}')
+@pytest.mark.parametrize(
+    ("field", "guest"),
+    [("surface.densify", "densifier 'example-prune'"), ("learned.example-tint", "quantity 'example-tint'")],
+)
+def test_a_wrong_option_of_a_guest_is_one_line(gs2d: Run, trained: Path, field: str, guest: str) -> None:
+    wrong = ("--recipe", "example-2dgs", "--set", f'{field}.options={{"when": 3}}')
     out = trained.parent / "none"
     said = gs2d("train", trained.parent / "ball", "--out", out, *wrong, "--quiet", code=2).stderr
-    assert "densifier 'example-prune' does not take the options {'when': 3}" in said
+    assert f"{guest} does not take the options {{'when': 3}}" in said
     assert said.count("\n") == 1

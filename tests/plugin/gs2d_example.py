@@ -80,13 +80,28 @@ class PruneFaint(Densifier):
         return (Densified(self.surroundings.stage, iteration, 0, 0, self.count, 0, len(state.splats)),)
 
 
+@gs2d.register_quantity("example-tint")
+class Tint(gs2d.LearnedQuantity):
+    """A gain of each channel of each photograph, whose mean over all photographs is 1."""
+
+    shape = (3,)
+
+    def numbers(self, values, index):
+        return values[index] - values.mean(dim=0)
+
+    @staticmethod
+    def apply(color, numbers, at):
+        return color * (1 + numbers)
+
+
 @gs2d.register_recipe("example-2dgs")
 def recipe():
     """Like 2dgs, with losses and a densifier of this package."""
     base = gs2d.get_recipe("2dgs").with_loss(gs2d.LossTerm("example-contrast", 0.1, options={"gain": 2.0}))
     base = base.with_loss(gs2d.LossTerm("example-brightness", 0.1)).with_loss(gs2d.LossTerm("example-outside", 0.1))
     stage = replace(base.stages[0], densify=Densify("example-prune", {"at": 3, "count": 2}))
-    return replace(base, name="example-2dgs", stages=(stage, *base.stages[1:]))
+    tint = gs2d.Quantity("example-tint", rate=0.01, start=2, prior=0.001)
+    return replace(base, name="example-2dgs", learned=(tint,), stages=(stage, *base.stages[1:]))
 
 
 @gs2d.register_backend("example-checked")
