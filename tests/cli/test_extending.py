@@ -13,8 +13,20 @@ def test_every_example_of_the_page_is_a_piece_of_the_package() -> None:
     code = (ROOT / "tests" / "plugin" / "gs2d_example.py").read_text(encoding="utf-8")
     entries = (ROOT / "tests" / "plugin" / "pyproject.toml").read_text(encoding="utf-8")
     examples = re.findall(r"```(python|toml)\n(.*?)```", page, flags=re.DOTALL)
-    assert len(examples) == 10
+    assert len(examples) == 12
     for language, example in examples:
         assert example in (code if language == "python" else entries), example
     kinds = re.findall(r"^@gs2d.register_(\w+)", code, flags=re.MULTILINE)
-    assert kinds == ["loss", "loss", "loss", "reader", "densifier", "recipe", "backend", "format"]
+    assert kinds == [
+        "loss",
+        "loss",
+        "loss",
+        "reader",
+        "densifier",
+        "quantity",
+        "recipe",
+        "backend",
+        "format",
+        "section",
+        "splat_reader",
+    ]
