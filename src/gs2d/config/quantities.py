@@ -221,6 +221,13 @@ class Quantity(Learning):
     Attributes
     ----------
     name : str
+    rate, rate_final, decay_steps : float, float, int
+        The learning rate decays log-linearly from ``rate`` to ``rate_final`` over ``decay_steps`` iterations of the
+        run.
+    start : int
+        Learned when iteration of the run > start.
+    beta1, beta2, eps : float
+        Constants of Adam.
     prior : float
         Weight of the summed squares of the numbers of an image.
     options : mapping of str to values of JSON
