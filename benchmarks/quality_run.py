@@ -187,20 +187,19 @@ def score_splats(job: Job, splats: Splats, learned: Transforms = NONE) -> dict[s
 def surface(job: Job, state: TrainState, spec: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Return how good the mesh is and the seconds that making it took, where there is a true surface."""
     from gs2d.config.surface_protocols import VISIBLE_SURFACE
-    from gs2d.pipeline.finish.truth import OfficialTruth, choose_truth, read_truth, score_surface
+    from gs2d.evaluation.evaluators import VISIBLE, choose_truth, score_surface
     from gs2d.pipeline.in_memory import Trained, extract_mesh
-    from gs2d.pipeline.prepare.options import EvaluateOptions
 
     given = None if spec["ground_truth"] is None else Path(spec["ground_truth"])
     root = job.scene.root or Path(".")
-    truth = read_truth(given) if given is not None and given.is_file() else choose_truth(given, root, ignore)
-    if truth is None or isinstance(truth, OfficialTruth):  # an official one has no F at a fraction of its size
+    truth = choose_truth(given, root, lambda text: None)
+    if truth is None or truth.name != VISIBLE:  # an official one has no F at a fraction of its size
         return {"surface": None}
     start = time.process_time()
     scene = LearnedTable(job.recipe, job.scene).scene_now(state.learned)
     mesh = extract_mesh(Trained(state.splats, scene, job.protocol, job.settings, job.backend, job.recipe))
     seconds = time.process_time() - start
-    found = score_surface(mesh, truth, job, EvaluateOptions(), ignore, folder=folder / "surface")
+    found = score_surface(mesh, truth, job.scene, folder=folder / "surface", tell=lambda text: None)
     fractions = map(str, VISIBLE_SURFACE.fractions)
     return {
         "surface": {

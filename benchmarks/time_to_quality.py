@@ -63,8 +63,8 @@ from gs2d.core.json_files import write_json
 from gs2d.data import Scene
 from gs2d.data.scene import PointCloud
 from gs2d.errors import DataError, Gs2dError
+from gs2d.evaluation.evaluators import choose_truth
 from gs2d.pipeline.events import ignore
-from gs2d.pipeline.finish.truth import choose_truth
 from gs2d.pipeline.prepare.job import Job, prepare_job
 from gs2d.synthetic.capture import write_demo_capture
 
@@ -195,7 +195,7 @@ def measure(text: str, args: argparse.Namespace, keep: Any) -> None:
     base = args.out / (name if downscale == 1 else f"{name}-{downscale}")
     first = specification(capture, downscale, args.recipes[0], 1.0, args.seeds[0], args)
     job = prepare_job(train_options(first, base), ignore)
-    truth = args.ground_truth is not None or choose_truth(None, capture, ignore) is not None
+    truth = args.ground_truth is not None or choose_truth(None, capture, lambda text: None) is not None
     curves = {recipe: {"name": Path(recipe).name, "runs": []} for recipe in args.recipes}
     if args.opensplat is not None and job.scene.test:
         curves[PEER] = {"name": "OpenSplat", "runs": []}

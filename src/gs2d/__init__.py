@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from gs2d.data.readers.registry import register_reader
     from gs2d.data.scene import Scene
     from gs2d.errors import Gs2dError
+    from gs2d.evaluation.evaluators import register_evaluator
     from gs2d.io.formats.registry import read_splats, register_format, register_splat_reader, write_splats
     from gs2d.io.meshes import write_mesh
     from gs2d.losses.api import Loss, LossView, compute_losses
@@ -77,6 +78,7 @@ __all__ = [
     "read_splats",
     "register_backend",
     "register_densifier",
+    "register_evaluator",
     "register_format",
     "register_loss",
     "register_quantity",
@@ -127,6 +129,7 @@ _HOME = {
     "read_splats": "gs2d.io.formats.registry",
     "register_backend": "gs2d.render.backends",
     "register_densifier": "gs2d.config.densify",
+    "register_evaluator": "gs2d.evaluation.evaluators",
     "register_format": "gs2d.io.formats.registry",
     "register_loss": "gs2d.config.losses",
     "register_quantity": "gs2d.config.quantities",

@@ -102,6 +102,13 @@ def test_later_commands_find_the_package_and_export_writes_its_format(gs2d: Run,
     assert "splats: 58" in gs2d("info", tmp_path / "a.ply").stdout
 
 
+def test_its_evaluator_scores_the_surface(gs2d: Run, trained: Path) -> None:
+    (trained.parent / "ball" / "vertices.txt").write_text("7")
+    (trained.parent / "link" / "vertices.txt").write_text("7")
+    surface = json.loads(gs2d("evaluate", trained, "--json").stdout)["surface"]
+    assert surface["evaluator"] == "example-vertices"
+
+
 def test_a_run_goes_on_with_the_recipe_from_a_file(gs2d: Run, trained: Path) -> None:
     """What `gs2d recipes show --json` prints, and what trained the run, are one recipe."""
     file = trained.parent / "mine.json"

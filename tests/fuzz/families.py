@@ -269,8 +269,8 @@ def _pyramid(root: Path, order: str, ragged: bool) -> None:
 
 def read_surface(root: Path) -> None:
     """As `gs2d info` and `gs2d evaluate --mesh-gt` do."""
+    from gs2d.evaluation.evaluators import read_truth
     from gs2d.io.meshes import FOREIGN, read_mesh, read_points
-    from gs2d.pipeline.finish.truth import read_truth
     from gs2d.pipeline.look.info import describe_file
 
     (path,) = (p for p in root.iterdir() if p.suffix != ".npy")

@@ -141,3 +141,18 @@ def read_xyz(path, tell):
     flat, quats = ones * [-4.0, -4.0, -40.0], ones * [1.0, 0.0, 0.0, 0.0]
     empty = np.zeros((count, 0, 3), np.float32)
     return Gaussians(means, np.float32(quats), np.float32(flat), ones[:, 0], 0 * means, empty), "text"
+
+
+@gs2d.register_evaluator("example-vertices")
+class VertexCount:
+    """Compare the number of vertices with the one in vertices.txt beside the capture."""
+
+    has_thresholds = False
+
+    def find(self, capture, given, tell):
+        path = capture / "vertices.txt"
+        return int(path.read_text()) if path.is_file() else None
+
+    def score(self, mesh, truth, scene, *, folder, thresholds):
+        difference = float(abs(len(mesh.vertices) - truth))
+        return {"unit": "vertices", "chamfer": difference, "thresholds": [], "self_check": {"ok": True, "messages": []}}

@@ -16,35 +16,31 @@ from scipy.io import savemat
 from gs2d.core.mesh import Mesh
 from gs2d.data import load_scene
 from gs2d.errors import DataError
+from gs2d.evaluation.evaluators import VISIBLE, choose_truth, score_surface
 from gs2d.evaluation.surface import evaluate_surface
 from gs2d.io.meshes import read_points, write_mesh
-from gs2d.pipeline.events import Event, Notice, ignore
-from gs2d.pipeline.finish.truth import Truth, choose_truth, score_surface
-from gs2d.pipeline.prepare.options import EvaluateOptions
 from official_captures import T_MM, write_dtu_capture, write_points, write_tnt_capture
 from oracle_scenes import grid_mesh, moved
 
 FIGURES = json.loads((Path(__file__).resolve().parents[2] / "helpers" / "oracle_open3d.json").read_text())
 HEADLINE = {"evaluator", "unit", "f_score", "chamfer", "accuracy", "completeness", "mesh_points", "truth_points",
             "reason", "thresholds", "self_check", "protocol", "ground_truth", "files"}  # fmt: skip
-CPU = SimpleNamespace(device="cpu")
 
 
-def notices(heard: list[Event]) -> list[str]:
-    return [event.text for event in heard if isinstance(event, Notice)]
+def ignore(text: str) -> None:
+    pass
 
 
 def scored(mesh: Mesh, root: Path, folder: Path, given: Path | None = None, **options: Any) -> tuple[dict, list[str]]:
     """The surface entry and what the user was told."""
-    heard: list[Event] = []
+    heard: list[str] = []
     truth = choose_truth(given, root, heard.append)
     assert truth is not None
-    job: Any = SimpleNamespace(scene=load_scene(root), backend=CPU)
-    result = score_surface(mesh, truth, job, EvaluateOptions(**options), heard.append, folder=folder)
+    result = score_surface(mesh, truth, load_scene(root), folder=folder, tell=heard.append, **options)
     assert set(result) >= HEADLINE
     assert set(result["self_check"]) >= {"ok", "messages"}
     json.dumps(result, allow_nan=False)  # what metrics.json can hold
-    return result, notices(heard)
+    return result, heard
 
 
 @pytest.mark.parametrize("where", ["beside", "parent", "own"])
@@ -85,16 +81,16 @@ def test_a_scan_of_dtu_is_scored_in_millimetres(tmp_path: Path) -> None:
         assert result[name] == pytest.approx(figures[name], rel=0.02), name
     assert result["self_check"] == {"ok": True, "messages": []}
     assert result["protocol"]["max_distance"] == 20
-    assert told == ["--thresholds are not used: DTU has its own protocol"]
+    assert told == ["--thresholds are not used: the evaluator dtu has its own protocol"]
     assert (tmp_path / "surface/surface.png").is_file()
 
 
 def test_an_official_ground_truth_that_is_not_whole_is_named_file_by_file(tmp_path: Path) -> None:
     root, official, _ = write_dtu_capture(tmp_path)
     (official / "ObsMask/Plane24.mat").unlink()
-    heard: list[Event] = []
+    heard: list[str] = []
     assert choose_truth(None, root, heard.append) is None
-    (line,) = notices(heard)
+    (line,) = heard
     assert "Plane24.mat is missing (to score the surface): get it from the archive SampleSet" in line
     with pytest.raises(DataError, match=r"must hold the ground truth of scan24 \(DTU\): .*Plane24.mat is missing"):
         choose_truth(official, root, ignore)
@@ -107,10 +103,11 @@ def test_a_capture_of_nobody_s_data_set_takes_the_mesh_beside_it(tmp_path: Path)
     assert choose_truth(None, root, ignore) is None
     vertices, faces = grid_mesh(10, 1.0, lambda x, y: 0 * x)
     write_mesh(root / "mesh_gt.ply", Mesh(vertices, faces))
-    heard: list[Event] = []
+    heard: list[str] = []
     truth = choose_truth(None, root, heard.append)
-    assert isinstance(truth, Truth)
-    assert notices(heard) == [f"ground truth: {root / 'mesh_gt.ply'}"]
+    assert truth is not None
+    assert truth.name == VISIBLE
+    assert heard == [f"ground truth: {root / 'mesh_gt.ply'}"]
     with pytest.raises(DataError, match="got neither for the capture Shed; give a PLY or OBJ file"):
         choose_truth(tmp_path / "GT", root, ignore)
     assert len(scene.centers) == 60
@@ -126,13 +123,14 @@ def test_the_visible_surface_has_its_headline_at_a_quarter_of_a_per_cent_of_the_
 ) -> None:
     """Squares of 2 x 2: diagonal 2.83, thresholds 0.0071, 0.0141, 0.0283; 0.01 apart is between the first two."""
     root, _, _ = write_tnt_capture(tmp_path, "Shed")
-    monkeypatch.setattr("gs2d.pipeline.finish.truth.evaluate_surface", partial(evaluate_surface, samples=4000))
+    monkeypatch.setattr("gs2d.evaluation.evaluators.evaluate_surface", partial(evaluate_surface, samples=4000))
     write_mesh(root / "mesh_gt.ply", flat(0.0))
     np.save(root / "mesh_gt_seen.npy", np.full(800, 9))
     truth = choose_truth(None, root, ignore)
-    assert isinstance(truth, Truth)
-    job: Any = SimpleNamespace(scene=SimpleNamespace(train=(), T_metric_scene=np.eye(4)), backend=CPU)
-    result = score_surface(flat(0.01), truth, job, EvaluateOptions(), ignore, folder=tmp_path)
+    assert truth is not None
+    assert truth.name == VISIBLE
+    scene: Any = SimpleNamespace(train=(), T_metric_scene=np.eye(4))
+    result = score_surface(flat(0.01), truth, scene, folder=tmp_path, tell=ignore)
     assert set(result) >= HEADLINE
     assert result["evaluator"] == "visible-surface"
     assert [row["f_score"] for row in result["thresholds"]] == [0, 1, 1]
@@ -142,7 +140,7 @@ def test_the_visible_surface_has_its_headline_at_a_quarter_of_a_per_cent_of_the_
     assert result["self_check"] == {"ok": True, "messages": []}
     assert len(read_points(tmp_path / "recall.ply").points) == result["truth_points"]
     assert result["files"]["picture"].endswith("/surface.png")
-    far: list[Event] = []
-    elsewhere = score_surface(flat(0.5), truth, job, EvaluateOptions(), far.append, folder=tmp_path)
+    far: list[str] = []
+    elsewhere = score_surface(flat(0.5), truth, scene, folder=tmp_path, tell=far.append)
     assert not elsewhere["self_check"]["ok"]
-    assert "is it in the capture's frame" in notices(far)[-1]
+    assert "is it in the capture's frame" in far[-1]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,78 +14,143 @@ from gs2d.config.surface_protocols import DTU_SURFACE, TNT_SURFACE
 from gs2d.contrib.lab.evaluate_dtu import Silhouette, evaluate_dtu, read_dtu_truth
 from gs2d.contrib.lab.evaluate_tnt import Alignment, evaluate_tnt, read_tnt_truth, read_trajectory
 from gs2d.core.mesh import Mesh
-from gs2d.data.benchmarks import published_log
+from gs2d.data.benchmarks import find_truth, published_log, recognise
 from gs2d.data.image_files import read_mask
 from gs2d.data.readers.dtu import dtu_silhouettes
+from gs2d.data.scene import Scene
 from gs2d.errors import DataError
+from gs2d.evaluation.evaluators import register_evaluator
 from gs2d.evaluation.surface import write_clouds
-from gs2d.pipeline.prepare.job import Job
+from gs2d.io.run_dir import make_folder
 
 
-def score_dtu(mesh: Mesh, scene: SceneFacts, files: Mapping[str, Path], job: Job, folder: Path) -> dict[str, Any]:
-    """Chamfer distance, mm."""
-    truth = read_dtu_truth(scene.scan or 0, files)
-    silhouettes, T = _silhouettes(job), job.scene.T_metric_scene
-    score = evaluate_dtu(mesh, silhouettes, T, truth)
-    return {
-        "evaluator": "dtu",
-        "unit": "mm",
-        "chamfer": score.chamfer,
-        "accuracy": score.accuracy,
-        "completeness": score.completeness,
-        "f_score": None,
-        "mesh_points": score.mesh_points,
-        "truth_points": score.truth_points,
-        "dropped_mesh": score.dropped_mesh,
-        "dropped_truth": score.dropped_truth,
-        "culled": score.culled,
-        "reason": score.reason,
-        "thresholds": [],
-        "self_check": {"ok": score.ok, "messages": list(score.messages)},
-        "protocol": asdict(DTU_SURFACE),
-        "files": _written(folder, write_clouds(folder, score.clouds)),
-    }
+@dataclass(frozen=True, eq=False)
+class OfficialTruth:
+    """The files of an official ground truth.
+
+    Attributes
+    ----------
+    facts : SceneFacts
+    files : mapping of str to Path
+        Keys as ``gs2d.data.benchmarks`` names them.
+    """
+
+    facts: SceneFacts
+    files: Mapping[str, Path]
 
 
-def _silhouettes(job: Job) -> list[Silhouette]:
+def find_official(name: str, capture: Path, given: Path | None, tell: Callable[[str], None]) -> OfficialTruth | None:
+    """Return the official ground truth of a capture, if its data set has the evaluator ``name``.
+
+    Raises
+    ------
+    DataError
+        If the folder ``given`` holds not all files of this scene; names each missing file.
+    """
+    known = None if given is not None and not given.is_dir() else recognise(capture, given)
+    if known is None or known[0].evaluator != name:
+        return None
+    dataset, facts = known
+    files, missing = find_truth(dataset, facts, capture, given)
+    if not missing:
+        return OfficialTruth(facts, files)
+    if given is not None:
+        lines = "; ".join(piece.line() for piece in missing)
+        raise DataError(f"{given} must hold the ground truth of {facts.name} ({dataset.title}): {lines}")
+    for piece in missing if files else ():
+        tell(piece.line())
+    return None
+
+
+@register_evaluator("dtu")
+class DtuEvaluator:
+    """Chamfer distance of DTU, mm."""
+
+    has_thresholds = False
+
+    def find(self, capture: Path, given: Path | None, tell: Callable[[str], None]) -> OfficialTruth | None:
+        """Return the official files of a scan of DTU."""
+        return find_official("dtu", capture, given, tell)
+
+    def score(
+        self, mesh: Mesh, truth: OfficialTruth, scene: Scene, *, folder: Path, thresholds: tuple[float, ...]
+    ) -> dict[str, Any]:
+        """Compare by the official evaluation."""
+        make_folder(folder)
+        scan = read_dtu_truth(truth.facts.scan or 0, truth.files)
+        score = evaluate_dtu(mesh, _silhouettes(scene), scene.T_metric_scene, scan)
+        return {
+            "unit": "mm",
+            "ground_truth": str(truth.files["scan"]),
+            "chamfer": score.chamfer,
+            "accuracy": score.accuracy,
+            "completeness": score.completeness,
+            "f_score": None,
+            "mesh_points": score.mesh_points,
+            "truth_points": score.truth_points,
+            "dropped_mesh": score.dropped_mesh,
+            "dropped_truth": score.dropped_truth,
+            "culled": score.culled,
+            "reason": score.reason,
+            "thresholds": [],
+            "self_check": {"ok": score.ok, "messages": list(score.messages)},
+            "protocol": asdict(DTU_SURFACE),
+            "files": _written(folder, write_clouds(folder, score.clouds)),
+        }
+
+
+@register_evaluator("tnt")
+class TanksAndTemplesEvaluator:
+    """Precision, recall and F-score of Tanks and Temples at the scene's tau."""
+
+    has_thresholds = False
+
+    def find(self, capture: Path, given: Path | None, tell: Callable[[str], None]) -> OfficialTruth | None:
+        """Return the official files of a scene of Tanks and Temples."""
+        return find_official("tnt", capture, given, tell)
+
+    def score(
+        self, mesh: Mesh, truth: OfficialTruth, scene: Scene, *, folder: Path, thresholds: tuple[float, ...]
+    ) -> dict[str, Any]:
+        """Compare by the official evaluation."""
+        name, tau = truth.facts.name, truth.facts.tau
+        if tau is None:
+            raise DataError(f"a tau was expected for {name}, its data set names none")
+        make_folder(folder)
+        log = None if scene.root is None else published_log(scene.root, name)
+        score = evaluate_tnt(
+            mesh,
+            [view.name for view in scene.views],
+            np.stack([view.camera.center for view in scene.views]),
+            read_tnt_truth(name, truth.files),
+            tau,
+            published=read_trajectory(log) if log is not None and log.is_file() and log.stat().st_size else None,
+        )
+        row = {"threshold": score.tau, "precision": score.precision, "recall": score.recall, "f_score": score.f_score}
+        return {
+            "unit": "m",
+            "ground_truth": str(truth.files["scan"]),
+            **row,
+            "chamfer": score.chamfer,
+            "accuracy": score.accuracy,
+            "completeness": score.completeness,
+            "mesh_points": score.mesh_points,
+            "truth_points": score.truth_points,
+            "reason": score.reason,
+            "thresholds": [row],
+            "self_check": _alignment(score.alignment),
+            "protocol": asdict(TNT_SURFACE),
+            "files": _written(folder, write_clouds(folder, score.clouds)),
+        }
+
+
+def _silhouettes(scene: Scene) -> list[Silhouette]:
     """Return the mask files at their full size; where there are none, the views' own silhouettes."""
-    found = dtu_silhouettes(job.scene.root) if job.scene.root is not None else ()
+    found = dtu_silhouettes(scene.root) if scene.root is not None else ()
     if found:
         return [Silhouette(view.camera, read_mask(view.path)) for view in found]
-    own = [(view.camera, view.object_mask()) for view in job.scene.train]
+    own = [(view.camera, view.object_mask()) for view in scene.train]
     return [Silhouette(camera, mask) for camera, mask in own if mask is not None]
-
-
-def score_tnt(mesh: Mesh, scene: SceneFacts, files: Mapping[str, Path], job: Job, folder: Path) -> dict[str, Any]:
-    """Precision, recall and F-score at the scene's tau."""
-    if scene.tau is None:
-        raise DataError(f"a tau was expected for {scene.name}, its data set names none")
-    log = None if job.scene.root is None else published_log(job.scene.root, scene.name)
-    views = job.scene.views
-    score = evaluate_tnt(
-        mesh,
-        [view.name for view in views],
-        np.stack([view.camera.center for view in views]),
-        read_tnt_truth(scene.name, files),
-        scene.tau,
-        published=read_trajectory(log) if log is not None and log.is_file() and log.stat().st_size else None,
-    )
-    row = {"threshold": score.tau, "precision": score.precision, "recall": score.recall, "f_score": score.f_score}
-    return {
-        "evaluator": "tnt",
-        "unit": "m",
-        **row,
-        "chamfer": score.chamfer,
-        "accuracy": score.accuracy,
-        "completeness": score.completeness,
-        "mesh_points": score.mesh_points,
-        "truth_points": score.truth_points,
-        "reason": score.reason,
-        "thresholds": [row],
-        "self_check": _alignment(score.alignment),
-        "protocol": asdict(TNT_SURFACE),
-        "files": _written(folder, write_clouds(folder, score.clouds)),
-    }
 
 
 def _alignment(alignment: Alignment) -> dict[str, Any]:

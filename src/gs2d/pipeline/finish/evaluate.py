@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.errors import RunError
+from gs2d.evaluation.evaluators import check_thresholds, choose_truth, score_surface
 from gs2d.evaluation.lpips import load_lpips
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import (
@@ -14,7 +15,7 @@ from gs2d.io.run_dir import (
     VERDICT,
 )
 from gs2d.pipeline.attempts import again, attempted
-from gs2d.pipeline.events import Notice, OnEvent, ignore
+from gs2d.pipeline.events import Notice, OnEvent, Phase, ignore
 from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.scoring import score_views, split_metrics
 from gs2d.pipeline.finish.verdict import Collector, write_verdict
@@ -33,24 +34,19 @@ def evaluate_run(
     threads: int | None = None,
 ) -> dict[str, Any]:
     """Score the final splats of a run, and its mesh against a ground truth; updates ``metrics.json`` and the report."""
-    from gs2d.pipeline.finish.truth import (
-        OfficialTruth,
-        Truth,
-        check_thresholds,
-        choose_truth,
-        read_truth,
-        score_surface,
-    )
+
+    def tell(text: str) -> None:
+        on_event(Notice(text))
 
     check_thresholds(options.thresholds)
     path, given = Path(path), options.ground_truth
-    truth: Truth | OfficialTruth | None = None if given is None or given.is_dir() else read_truth(given)
+    truth = None if given is None or given.is_dir() else choose_truth(given, given.parent, tell)
     lpips = None if options.lpips_weights is None else load_lpips(options.lpips_weights)
     run, job, splats = open_job(path, threads, on_event)
     lpips = None if lpips is None else lpips.to(job.backend.device)
     result: dict[str, Any] = {"run": str(run.path), "surface": run.metrics().get("surface")}
     if truth is None and job.scene.root is not None:
-        truth = choose_truth(given, job.scene.root, on_event)
+        truth = choose_truth(given, job.scene.root, tell)
     has_mesh = run.file(MESH).exists()
     if truth is not None and not has_mesh and given is not None:
         raise RunError(f"{path} has no {MESH}; make it with `gs2d mesh {path}`")
@@ -73,8 +69,9 @@ def evaluate_run(
         result |= split_metrics(scores, split)
         result[f"{split}_views"] = {view: metrics.to_json() for view, metrics in scores.items()}
     if truth is not None and has_mesh:
-        mesh = read_mesh(run.file(MESH))
-        result["surface"] = score_surface(mesh, truth, job, options, on_event, folder=run.file(SURFACE))
+        mesh, folder, thresholds = read_mesh(run.file(MESH)), run.file(SURFACE), options.thresholds
+        on_event(Phase("scoring the surface", 0))
+        result["surface"] = score_surface(mesh, truth, job.scene, folder=folder, tell=tell, thresholds=thresholds)
     elif truth is not None:
         on_event(Notice(f"the surface is not scored: no {MESH}; make it with `gs2d mesh {path}`"))
     with run.locked():

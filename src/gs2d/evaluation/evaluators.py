@@ -1,0 +1,235 @@
+"""Ground truths of surfaces: found, read, and compared with a mesh by the evaluator that is registered for them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from gs2d.config.registry import Register, Registry
+from gs2d.config.surface_protocols import VISIBLE_SURFACE
+from gs2d.core.mesh import Mesh
+from gs2d.data.arrays import read_npy
+from gs2d.data.benchmarks import MESH_TRUTHS
+from gs2d.data.scene import Scene
+from gs2d.errors import DataError
+from gs2d.evaluation.surface import SurfaceScore, evaluate_surface, write_clouds
+from gs2d.io.meshes import FOREIGN, read_mesh, read_points
+from gs2d.io.run_dir import make_folder
+from gs2d.io.splat_ply import ply_kind
+
+Tell = Callable[[str], None]
+
+APART = 0.05  # of the truth's diagonal: farther, and it is hardly the same surface in the same frame
+VISIBLE = "visible-surface"  # the evaluator of captures that no other one knows
+SEEN_SUFFIX = "_seen.npy"  # beside FILE.ply: FILE_seen.npy, how many views see each face
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """A true surface, compared by the visible-surface protocol.
+
+    Attributes
+    ----------
+    path : Path
+    surface : Mesh, or ndarray [P, 3] of points
+    seen : ndarray [F] or None
+        How many training views see each face.
+    """
+
+    path: Path
+    surface: Mesh | np.ndarray
+    seen: np.ndarray | None
+
+
+class Evaluator(Protocol):
+    """Scores meshes against the ground truth of a data set. A class is registered; it is made without arguments.
+
+    ``has_thresholds`` says whether ``score`` uses the thresholds that a user gives.
+    """
+
+    has_thresholds: bool
+
+    def find(self, capture: Path, given: Path | None, tell: Tell) -> Any | None:
+        """Return the ground truth of a capture, or None where this evaluator has none for it.
+
+        ``given`` is the file or the folder that the user names; without one, the truth may lie beside the capture.
+        ``tell`` receives a sentence on each file that is missing. A folder that lacks files is a DataError.
+        """
+
+    def score(
+        self, mesh: Mesh, truth: Any, scene: Scene, *, folder: Path, thresholds: tuple[float, ...]
+    ) -> dict[str, Any]:
+        """Return the ``surface`` entry of ``metrics.json`` (docs/guides/runs.md); coloured clouds go to ``folder``.
+
+        The sentences of ``self_check["messages"]`` are shown to the user.
+        """
+
+
+EVALUATORS: Registry[Callable[[], Evaluator]] = Registry(
+    "evaluator", "gs2d.evaluators", builtin={VISIBLE: __name__}, error=DataError
+)
+"""Names of evaluators -> their classes."""
+
+
+def register_evaluator(name: str) -> Callable[[Register], Register]:
+    """Return a decorator that registers an evaluator of surfaces, which ``gs2d evaluate`` then uses.
+
+    Parameters
+    ----------
+    name : str
+        Name of the evaluator; must not be taken.
+
+    Returns
+    -------
+    callable
+        Decorates a class without constructor arguments that has the attribute and the methods of ``Evaluator``.
+
+    Raises
+    ------
+    DataError
+        From the decorator: the name is taken.
+    """
+    return EVALUATORS.register(name)
+
+
+@dataclass(frozen=True, eq=False)
+class FoundTruth:
+    """A ground truth, and the evaluator that found it.
+
+    Attributes
+    ----------
+    name : str
+        Of the evaluator.
+    evaluator : Evaluator
+    truth : object
+        As ``evaluator.find`` returned it.
+    """
+
+    name: str
+    evaluator: Evaluator
+    truth: Any
+
+
+def read_truth(path: Path) -> Truth:
+    """Read a ground truth: a mesh (with the counts of ``NAME_seen.npy``, if it exists) or the points of a PLY file."""
+    kind = "mesh" if path.suffix.lower() in FOREIGN else ply_kind(path)
+    if kind == "points":
+        return Truth(path, np.asarray(read_points(path).points, np.float64), None)
+    if kind != "mesh":
+        raise DataError(f"{path}: a mesh or points were expected, got {kind} splats; give the true surface")
+    mesh = read_mesh(path)
+    counts = path.with_name(path.stem + SEEN_SUFFIX)
+    if not counts.exists():
+        return Truth(path, mesh, None)
+    seen = read_npy(counts, "counts of views")
+    if seen.shape != (len(mesh.faces),):
+        raise DataError(f"{counts} must hold {len(mesh.faces)} counts (faces of {path.name}), got {list(seen.shape)}")
+    return Truth(path, mesh, seen)
+
+
+def choose_truth(given: Path | None, capture: Path, tell: Tell) -> FoundTruth | None:
+    """Return the ground truth of a capture: in a file or a folder that is given, or beside the capture.
+
+    Evaluators of data sets are asked first. Any other capture is compared with the mesh or the points that are given,
+    or with ``mesh_gt.ply``, ``mesh_gt.obj`` or ``points_gt.ply`` beside it.
+
+    Raises
+    ------
+    DataError
+        If ``given`` holds no ground truth of this capture.
+    """
+    for name, make in sorted(EVALUATORS.working(), key=lambda item: item[0] == VISIBLE):
+        evaluator = make()
+        truth = evaluator.find(capture, given, tell)
+        if truth is not None:
+            return FoundTruth(name, evaluator, truth)
+    return None
+
+
+def check_thresholds(thresholds: tuple[float, ...]) -> None:
+    """Raise for a threshold that is no distance, before anything slow happens."""
+    if not all(t > 0 and math.isfinite(t) for t in thresholds):
+        raise DataError(f"--thresholds must be positive distances, got {', '.join(map(str, thresholds))}")
+
+
+def score_surface(
+    mesh: Mesh, found: FoundTruth, scene: Scene, *, folder: Path, tell: Tell, thresholds: tuple[float, ...] = ()
+) -> dict[str, Any]:
+    """Return the ``surface`` entry of ``metrics.json`` (docs/guides/runs.md); coloured clouds go to ``folder``."""
+    if thresholds and not found.evaluator.has_thresholds:
+        tell(f"--thresholds are not used: the evaluator {found.name} has its own protocol")
+    facts = found.evaluator.score(mesh, found.truth, scene, folder=folder, thresholds=thresholds)
+    for message in facts["self_check"]["messages"]:
+        tell(message)
+    return {"evaluator": found.name, **facts}
+
+
+@EVALUATORS.register(VISIBLE)
+class VisibleSurface:
+    """Chamfer distance, precision, recall and F-score of a mesh, over what the training views see."""
+
+    has_thresholds = True
+
+    def find(self, capture: Path, given: Path | None, tell: Tell) -> Truth | None:
+        """Return a mesh or points: a file that is given, or one of ``MESH_TRUTHS`` in the folder."""
+        folder = given or capture
+        path = next((folder / name for name in MESH_TRUTHS if (folder / name).is_file()), None)
+        if path is not None:
+            tell(f"ground truth: {path}")
+        elif given is not None and not given.is_dir():
+            path = given
+        elif given is not None:
+            raise DataError(
+                f"{given} must hold the official ground truth of a scene of DTU or Tanks and Temples, or one of "
+                f"{', '.join(MESH_TRUTHS)}, got neither for the capture {capture.name}; give a PLY or OBJ file"
+            )
+        truth = None if path is None else read_truth(path)
+        if truth is not None and truth.seen is not None:
+            tell(f"which true faces count is taken from {truth.path.stem}{SEEN_SUFFIX}")
+        return truth
+
+    def score(
+        self, mesh: Mesh, truth: Truth, scene: Scene, *, folder: Path, thresholds: tuple[float, ...]
+    ) -> dict[str, Any]:
+        """Compare by the visible-surface protocol."""
+        score = evaluate_surface(
+            mesh,
+            truth.surface,
+            cameras=[view.camera for view in scene.train],
+            seen=truth.seen,
+            T_truth_mesh=scene.T_metric_scene,
+            thresholds=thresholds or None,
+        )
+        facts = asdict(replace(score, clouds=None))
+        facts.pop("clouds")
+        rows = list(facts.pop("scores"))
+        files = {}
+        if score.clouds is not None:
+            make_folder(folder)
+            files = {what: f"{folder.name}/{name}" for what, name in write_clouds(folder, score.clouds).items()}
+        is_world = np.array_equal(scene.T_metric_scene, np.eye(4))  # else the scale_mat of DTU
+        return {
+            "unit": "world units" if is_world else "mm",
+            "ground_truth": str(truth.path),
+            **{name: rows[0][name] for name in ("threshold", "precision", "recall", "f_score")},
+            **facts,
+            "thresholds": rows,
+            "self_check": _self_check(score, truth),
+            "protocol": asdict(VISIBLE_SURFACE),
+            "files": files,
+        }
+
+
+def _self_check(score: SurfaceScore, truth: Truth) -> dict[str, Any]:
+    """Whether both surfaces lie in one place at all."""
+    far = score.accuracy_median is not None and score.accuracy_median > APART * score.diagonal
+    line = (
+        f"half of the mesh is more than {APART:.0%} of the true size away from {truth.path.name}: "
+        "is it in the capture's frame, and in its units?"
+    )
+    return {"ok": not far and score.reason is None, "messages": [line] if far else []}
