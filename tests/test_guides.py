@@ -11,7 +11,16 @@ import torch
 
 import gs2d
 from gs2d.cli.arguments import NAMES, options_of
-from gs2d.config.presets import RECIPES
+from gs2d.config.presets import (
+    RECIPES,
+    with_depth_prior,
+    with_exposure,
+    with_intrinsics,
+    with_normal_prior,
+    with_robustness,
+)
+from gs2d.config.serialize import apply_overrides
+from gs2d.errors import RecipeError
 from tiny import write_capture
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -157,8 +166,10 @@ def test_files_that_the_pages_name_are_there() -> None:
     foreign = {"crisp.py", "metrics.py"}  # of a tutorial, of the official code
     missing = []
     for page in USER_PAGES:
-        text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
-        for path in re.findall(r"`([\w/.-]+\.(?:py|sh|h|toml))`", text):
+        everything = page.read_text(encoding="utf-8")
+        text = re.sub(r"^```.*?^```$", "", everything, flags=re.M | re.S)
+        measured = [f"{name.replace('.', '/')}.py" for name in re.findall(r"-m (benchmarks\.\w+)", everything)]
+        for path in [*measured, *re.findall(r"`([\w/.-]+\.(?:py|sh|h|toml))`", text)]:
             if path not in foreign and not [
                 *ROOT.glob(path),
                 *(ROOT / "src").rglob(path),
@@ -172,3 +183,25 @@ def test_files_that_the_pages_name_are_there() -> None:
     assert len(names) > 15
     assert [name for name in names if f'"{name}"' not in written] == []
     assert missing == []
+
+
+def test_fields_that_the_pages_set_are_fields_of_recipes() -> None:
+    recipes = [RECIPES[name]() for name in ("best", "2dgs-r", "2dgs-multiview")]
+    recipes.append(with_robustness(with_intrinsics(with_exposure(with_normal_prior(with_depth_prior(recipes[0]))))))
+    wrong = []
+    for page in USER_PAGES:
+        for override in re.findall(r"--set ([a-z0-9_.]+=[\w.]+)", page.read_text(encoding="utf-8")):
+            if override.endswith(("=N", "=...")) or ".crisp." in override:  # any number; the tutorial's own loss
+                continue
+            if not any(accepts(recipe, override) for recipe in recipes):
+                wrong.append((page.name, override))
+    assert not wrong
+
+
+def accepts(recipe: gs2d.Recipe, override: str) -> bool:
+    """Return whether a recipe has the field that an override sets."""
+    try:
+        apply_overrides(recipe, [override])
+    except RecipeError:
+        return False
+    return True
