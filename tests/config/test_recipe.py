@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import pytest
@@ -33,15 +31,6 @@ L1 = (LossTerm("l1", 1.0),)
 def one(**fields: object) -> Recipe:
     """A recipe of one stage "s" that is valid but for ``fields``."""
     return Recipe("r", (replace(Stage("s", 10, losses=L1), **fields),))  # type: ignore[arg-type]
-
-
-def test_recipe_modules_never_import_torch() -> None:
-    code = (
-        "import sys, gs2d.config.recipe, gs2d.config.serialize, gs2d.config.schedule, gs2d.config.presets;"
-        "import gs2d.config.protocols;"
-        "assert 'torch' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_the_rate_of_the_means_is_log_linear_and_stays_at_its_end() -> None:
@@ -129,42 +118,39 @@ def test_photographs_are_twice_as_large_after_each_iteration_that_says_so() -> N
         (Recipe("r", (Stage("s", 1, losses=L1), Stage("s", 1, losses=L1))), "two stages are called 's'"),
         (replace(one(), seed=-1), "seed"),
         (replace(one(), sh_degree=4), "sh_degree"),
-        (replace(one(), init_points=2**31), "init_points must be at most 2^31 - 1"),
-        (one(iterations=-1), "stage 's': iterations must be an integer >= 0, got -1"),
+        (replace(one(), init_points=2**31), "init_points"),
+        (one(iterations=-1), "iterations"),
         (one(losses=()), "no loss is active"),
         (one(losses=(LossTerm("l1", 1.0, start=5),)), "no loss is active"),
         (one(losses=(LossTerm("l1", -1.0),)), "weight of loss 'l1'"),
         (one(losses=(LossTerm("l1", float("nan")),)), "weight of loss 'l1'"),
         (one(losses=(*L1, *L1)), "there twice"),
-        (one(losses=(*L1, LossTerm("ssim", 1.0, depth="max"))), "depth of loss 'ssim' must be one of mean, median"),
-        (one(losses=(*L1, LossTerm("ssim", 1.0, every=0))), "every of loss 'ssim' must be an integer >= 1, got 0"),
-        (one(losses=(LossTerm("l1", 1.0, every=2),)), "no loss is active from the first iteration and in every one"),
-        (one(train={"opacity": "all"}), "stage 's': train must be one of means, quats"),
+        (one(losses=(*L1, LossTerm("ssim", 1.0, depth="max"))), "depth"),
+        (one(losses=(*L1, LossTerm("ssim", 1.0, every=0))), "every"),
+        (one(losses=(LossTerm("l1", 1.0, every=2),)), "no loss is active"),
+        (one(train={"opacity": "all"}), "quats"),
         (one(train={}), "names no attribute"),
-        (one(train={"sh0": "high_error"}), "no earlier action writes the row group 'high_error'; no action"),
-        (one(on_enter=(CloneInPlace(),)), "no earlier action writes the row group 'high_error'"),
-        (one(on_enter=(RankByError(), CloneInPlace("clones"))), "the groups written so far are high_error"),
-        (one(on_enter=(RankByError(), CloneInPlace(opacity="halve"))), "must be one of copy, preserve"),
+        (one(train={"sh0": "high_error"}), "high_error"),
+        (one(on_enter=(CloneInPlace(),)), "high_error"),
+        (one(on_enter=(RankByError(), CloneInPlace("clones"))), "high_error"),
+        (one(on_enter=(RankByError(), CloneInPlace(opacity="halve"))), "preserve"),
         (one(on_enter=(RankByError(top_percent=0.0),)), "top_percent"),
         (one(on_enter=(RankByError(top_percent=101.0),)), "top_percent"),
         (one(on_enter=(RankByError(writes="all"),)), "cannot be called 'all'"),
-        (one(moments="old"), "moments must be one of fresh, kept"),
+        (one(moments="old"), "moments"),
         (one(lr=LearningRates(sh0=-1.0)), "lr.sh0"),
         (one(lr=LearningRates(means=0.0)), "must be positive"),
-        (one(lr=LearningRates(beta2=1.0)), "stage 's': lr.beta2 must be below 1, got 1.0"),
-        (one(lr=LearningRates(means_decay_steps=0)), "stage 's': lr.means_decay_steps must be an integer >= 1, got 0"),
+        (one(lr=LearningRates(beta2=1.0)), "lr.beta2"),
+        (one(lr=LearningRates(means_decay_steps=0)), "lr.means_decay_steps"),
         (one(densify=GradDensify(every=0)), "densify.every"),
         (one(densify=GradDensify(reset_opacity=0.0)), "reset_opacity"),
         (one(densify=GradDensify(max_splats=0)), "max_splats"),
-        (
-            one(densify=GradDensify(prune_until=11)),
-            "densify.prune_until must be at most the stage's 10 iterations, got 11",
-        ),
-        (one(downscale=0), "stage 's': downscale must be an integer >= 1, got 0"),
-        (one(downscale=4, halve_at=(3, 11)), "stage 's': halve_at must lie in its 10 iterations, got 11"),
-        (one(downscale=2, halve_at=(3, 6)), "downscale must be a multiple of 4 to be halved 2 times, got 2"),
-        (one(densify=GradDensify(scale_cull_start=-1)), "densify.scale_cull_start must be an integer >= 0, got -1"),
-        (one(densify=GradDensify(reset_at_on_white=(0,))), "densify.reset_at_on_white must be an integer >= 1, got 0"),
+        (one(densify=GradDensify(prune_until=11)), "densify.prune_until"),
+        (one(downscale=0), "downscale"),
+        (one(downscale=4, halve_at=(3, 11)), "halve_at"),
+        (one(downscale=2, halve_at=(3, 6)), "multiple"),
+        (one(densify=GradDensify(scale_cull_start=-1)), "densify.scale_cull_start"),
+        (one(densify=GradDensify(reset_at_on_white=(0,))), "densify.reset_at_on_white"),
         (one(densify=GradDensify(), train={"means": "all"}), "resets or caps opacity"),
     ],
 )
@@ -175,75 +161,59 @@ def test_validate_names_the_stage_and_what_exists(recipe: Recipe, message: str) 
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "message"),
-    [
-        ("rate", 0.0, "recipe 'r': exposure.rate must be positive, got 0.0 (exposure=null leaves exposures alone)"),
-        ("rate_final", -1.0, "exposure.rate_final must be a finite number >= 0"),
-        ("prior", float("nan"), "exposure.prior must be a finite number"),
-        ("beta1", 1.0, "exposure.beta1 and recipe 'r': exposure.beta2 must be below 1"),
-        ("decay_steps", 0, "exposure.decay_steps must be an integer >= 1"),
-        ("start", -1, "exposure.start must be an integer >= 0"),
-    ],
-)
-def test_exposures_are_checked_like_the_stages(field: str, value: float, message: str) -> None:
-    recipe = replace(one(), exposure=replace(Exposure(), **{field: value}))
-    with pytest.raises(RecipeError) as caught:
-        validate(recipe)
-    assert message in str(caught.value)
-    assert validate(replace(one(), exposure=Exposure()))
+MOVING = replace(one(), stages=(Stage("s", 1, train={"means": "all"}, losses=L1),))
+WHOLE = {  # valid recipes with the part that is changed
+    "exposure": replace(one(), exposure=Exposure()),
+    "poses": replace(MOVING, poses=PoseRefinement()),
+    "multiview": replace(one(losses=(*L1, LossTerm("multiview_photometric", 0.1))), multiview=MultiView()),
+    "depth_prior": replace(one(losses=(*L1, LossTerm("depth_prior", 0.1))), depth_prior=DepthPrior()),
+}
 
 
 @pytest.mark.parametrize(
-    ("field", "value", "message"),
+    ("path", "value"),
     [
-        ("patches", 0, "recipe 'r': multiview.patches must be an integer >= 1, got 0"),
-        ("patches", 10**11, "multiview.patches must be at most 1000000, got 100000000000"),
-        ("radius", 1.5, "multiview.radius must be an integer >= 1"),
-        ("radius", 1000, "multiview.radius must be at most 50"),
-        ("depth_downscale", 0, "multiview.depth_downscale must be an integer >= 1, got 0"),
-        ("depth_downscale", 32, "multiview.depth_downscale must be at most 16, got 32"),
-        ("texture", 0.0, "multiview.texture must be positive"),
-        ("opacity", 1.0, "multiview.opacity must be below 1"),
-        ("occluded", float("inf"), "multiview.occluded must be a finite number"),
-        ("max_angle", 120.0, "multiview.max_angle must be at most 90 degrees, got 120.0"),
-        ("min_baseline", 1.0, "multiview.min_baseline must be below max_baseline, got 1.0 and 1.0"),
+        ("exposure.rate", 0.0),
+        ("exposure.rate_final", -1.0),
+        ("exposure.prior", float("nan")),
+        ("exposure.beta1", 1.0),
+        ("exposure.decay_steps", 0),
+        ("exposure.start", -1),
+        ("multiview.patches", 0),
+        ("multiview.patches", 10**11),
+        ("multiview.radius", 1.5),
+        ("multiview.radius", 1000),
+        ("multiview.depth_downscale", 0),
+        ("multiview.depth_downscale", 32),
+        ("multiview.texture", 0.0),
+        ("multiview.opacity", 1.0),
+        ("multiview.occluded", float("inf")),
+        ("multiview.max_angle", 120.0),
+        ("multiview.min_baseline", 1.0),
+        ("depth_prior.source", "lidar"),
+        ("depth_prior.final_factor", 0.0),
+        ("depth_prior.decay_steps", 0),
+        ("depth_prior.opacity", 1.0),
+        ("depth_prior.noise", 0.0),
+        ("depth_prior.min_track", 1),
+        ("depth_prior.max_error", 0.0),
+        ("depth_prior.unit", -1.0),
+        ("depth_prior.unit", 0.0),
+        ("depth_prior.space", "log"),
+        ("depth_prior.align", "prayer"),
+        ("poses.rate", 0.0),
+        ("poses.rate", 1e30),
+        ("poses.beta2", 1.0),
+        ("poses.decay_steps", 0),
+        ("poses.start", -1),
     ],
 )
-def test_comparisons_of_views_are_checked_like_the_stages(field: str, value: float, message: str) -> None:
-    compared = replace(one(losses=(*L1, LossTerm("multiview_photometric", 0.1))), multiview=MultiView())
-    with pytest.raises(RecipeError) as caught:
-        validate(replace(compared, multiview=replace(MultiView(), **{field: value})))
-    assert message in str(caught.value)
-    assert validate(compared)
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "message"),
-    [
-        (
-            "source",
-            "lidar",
-            "depth_prior.source must be one of auto, sparse, sensor, relative; got 'lidar'",
-        ),
-        ("final_factor", 0.0, "depth_prior.final_factor must be in (0, 1], got 0.0"),
-        ("decay_steps", 0, "depth_prior.decay_steps must be an integer >= 1"),
-        ("opacity", 1.0, "depth_prior.opacity must be below 1"),
-        ("noise", 0.0, "depth_prior.noise must be positive"),
-        ("min_track", 1, "depth_prior.min_track must be an integer >= 2"),
-        ("max_error", 0.0, "depth_prior.max_error must be positive"),
-        ("unit", -1.0, "depth_prior.unit must be a finite number >= 0"),
-        ("unit", 0.0, "depth_prior.unit must be positive"),
-        ("space", "log", "depth_prior.space must be one of auto, disparity, depth"),
-        ("align", "prayer", "depth_prior.align must be one of points, rendered"),
-    ],
-)
-def test_known_depths_are_checked_like_the_stages(field: str, value: object, message: str) -> None:
-    known = replace(one(losses=(*L1, LossTerm("depth_prior", 0.1))), depth_prior=DepthPrior())
-    with pytest.raises(RecipeError) as caught:
-        validate(replace(known, depth_prior=replace(DepthPrior(), **{field: value})))
-    assert message in str(caught.value)
-    assert validate(known)
+def test_the_parts_of_a_recipe_are_checked_like_its_stages(path: str, value: object) -> None:
+    part, field = path.split(".")
+    recipe = WHOLE[part]
+    assert validate(recipe) is recipe
+    with pytest.raises(RecipeError, match=path):
+        validate(replace(recipe, **{part: replace(getattr(recipe, part), **{field: value})}))
 
 
 def test_the_weight_of_a_prior_falls_log_linearly_to_its_share() -> None:
@@ -252,24 +222,6 @@ def test_the_weight_of_a_prior_falls_log_linearly_to_its_share() -> None:
     assert prior.weight_at(50) == pytest.approx(0.1)
     assert prior.weight_at(100) == prior.weight_at(1000) == pytest.approx(0.01)
     assert NormalPrior(final_factor=1.0).weight_at(7) == 1
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "message"),
-    [
-        ("rate", 0.0, "recipe 'r': poses.rate must be positive, got 0.0 (poses=null leaves cameras alone)"),
-        ("rate", 1e30, "recipe 'r': poses.rate must be at most 1 (rad, extents), got 1e+30"),
-        ("beta2", 1.0, "poses.beta1 and recipe 'r': poses.beta2 must be below 1"),
-        ("decay_steps", 0, "poses.decay_steps must be an integer >= 1"),
-        ("start", -1, "poses.start must be an integer >= 0"),
-    ],
-)
-def test_poses_are_checked_like_the_stages(field: str, value: float, message: str) -> None:
-    moving = replace(one(), stages=(Stage("s", 1, train={"means": "all"}, losses=L1),))
-    with pytest.raises(RecipeError) as caught:
-        validate(replace(moving, poses=replace(PoseRefinement(), **{field: value})))
-    assert message in str(caught.value)
-    assert validate(replace(moving, poses=PoseRefinement()))
 
 
 def test_poses_need_a_stage_that_moves_all_splats() -> None:

@@ -207,18 +207,6 @@ def test_a_cached_target_mean_changes_no_bit(library: Library, masked: bool) -> 
         assert torch.equal(found, wanted)
 
 
-def test_images_that_are_not_contiguous_are_read_right(library: Library) -> None:
-    rendered, target, mask = (image.float() if image.is_floating_point() else image for image in photographs(18, 25))
-
-    def strided(image: Tensor) -> Tensor:
-        return image.transpose(0, 1).contiguous().transpose(0, 1)
-
-    plain = ops.photometric(rendered, target, mask, library=library)
-    other = ops.photometric(strided(rendered), strided(target), strided(mask), library=library)
-    assert not strided(mask).is_contiguous()
-    assert torch.equal(torch.stack(plain), torch.stack(other))
-
-
 def test_nan_at_a_valid_pixel_reaches_the_loss(library: Library) -> None:
     rendered, target, _ = photographs(20, 20)
     x = rendered.float()

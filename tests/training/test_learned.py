@@ -21,7 +21,7 @@ from gs2d.training.learned.learned_table import LearnedTable
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
 from learned_rows import Learner, begun
-from train_toys import VIEWS, backends, random_splats, same, short
+from train_toys import backends, random_splats, same, short
 
 NAMES = ("intrinsics", "poses", "vignetting", "exposure", "response")
 
@@ -36,12 +36,6 @@ def everything(**changes: float) -> Recipe:
         intrinsics=IntrinsicsRefinement(**given, distortion=True),  # type: ignore[arg-type]
         photometry=Photometry(**given),  # type: ignore[arg-type]
     )
-
-
-def test_quantities_come_in_the_order_in_which_light_becomes_a_photograph() -> None:
-    assert tuple(everything().quantities) == NAMES
-    assert tuple(replace(everything(), photometry=Photometry(response=False)).quantities) == NAMES[:-1]
-    assert short().quantities == {}
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -171,9 +165,3 @@ def test_a_recipe_names_registered_quantities_once() -> None:
         from_json(to_json(replace(recipe, learned=(Quantity("response"),))))
     changed = apply_overrides(replace(recipe, exposure=Exposure()), ["exposure.start=7"])
     assert changed.exposure == Exposure(start=7)
-
-
-def test_every_row_belongs_to_a_view(scene: Scene) -> None:
-    made = Learner(everything(), scene)
-    assert len(made.rows["exposure"]) == len(made.rows["poses"]) == VIEWS
-    assert len(made.rows["intrinsics"]) == len(made.rows["vignetting"]) == 1  # one camera took all

@@ -9,17 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d.config.presets import surface, with_photometry
+from gs2d.config.presets import surface
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Exposure, LearningRates, Photometry, Recipe
-from gs2d.config.serialize import from_json, to_json
 from gs2d.core.camera import look_at
 from gs2d.core.photometry import CameraPhotometry
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import camera_extent
 from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.data.undistort import Intrinsics, Lens
-from gs2d.errors import RecipeError
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.exposure import identity
 from gs2d.render.types import RasterSettings
@@ -74,15 +72,6 @@ def test_of_faces_of_a_panorama_the_response_alone_is_learned(scene: Scene) -> N
         learned = trainer.state.learned
         assert bool(learned["vignetting"].values.any()) is not is_face
         assert bool(learned["response"].values.all())
-
-
-def test_a_recipe_says_what_is_learned() -> None:
-    recipe = with_photometry(short(), response=False)
-    assert from_json(to_json(recipe)) == recipe
-    with pytest.raises(RecipeError, match="must learn vignetting, response or both, got neither"):
-        from_json(to_json(replace(recipe, photometry=Photometry(vignetting=False, response=False))))
-    with pytest.raises(RecipeError, match=r"photometry\.rate must be positive, got 0"):
-        from_json(to_json(replace(recipe, photometry=Photometry(rate=0.0))))
 
 
 # -- the loss -----------------------------------------------------------------------------------------------------

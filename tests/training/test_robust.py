@@ -10,16 +10,16 @@ import pytest
 import torch
 
 from fake_backends import lacking
-from gs2d.config.presets import appearance, two_dgs, with_exposure, with_robustness
+from gs2d.config.presets import appearance, two_dgs, with_robustness
 from gs2d.config.protocols import GENERIC
-from gs2d.config.recipe import Recipe, validate
+from gs2d.config.recipe import Recipe
 from gs2d.config.robust import DenseStart, Removal, StartFit
 from gs2d.config.schedule import scale_schedule
 from gs2d.core.camera import Camera
 from gs2d.core.sh import rgb_to_sh0
 from gs2d.core.splats import Splats
 from gs2d.data.scene import PointCloud, View
-from gs2d.errors import DataError, RecipeError
+from gs2d.errors import DataError
 from gs2d.render.api import rasterize
 from gs2d.render.backends import PLAIN, get_backend
 from gs2d.render.types import RasterSettings
@@ -193,28 +193,6 @@ def test_floaters_are_removed_at_every_turn_and_that_is_an_event() -> None:
     assert not ((trainer.splats.means - torch.tensor([0.5, 0.0, 1.8])).norm(dim=1) < 0.1).any()
 
 
-def test_few_new_proposals_wait_for_the_end_of_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
-    tried: list[int] = []
-    monkeypatch.setattr(
-        "gs2d.training.robust.missed",
-        lambda splats, against, *_, **__: tried.append(int((against > 0).sum())) or against > 0,
-    )
-    recipe = short(removal=Removal(every=1))
-    robust, stage = Robustness(wall(), recipe, RASTER, BACKEND), recipe.stages[0]
-    state = full_state(1000)
-    state.splats.means[:] = torch.tensor([0.5, 0.0, WALL])
-    state.splats.means[0] = torch.tensor([0.5, 0.0, 1.8])
-    assert robust.remove(state, stage, 1) == []
-    assert tried == []  # 1 of 1,000
-    state.splats.means[:3] = torch.tensor([0.5, 0.0, 1.8])
-    robust.remove(state, stage, 1)
-    robust.remove(state, stage, 2)
-    assert tried == [3]  # they were missed, and are not tried again
-    assert state.groups["missed"].sum() == 3
-    robust.remove(state, stage, 3)
-    assert tried == [3, 3]  # but at the end of a fifth
-
-
 @pytest.mark.parametrize("behind", [True, False])
 def test_frozen_splats_stand_behind_what_is_tried(behind: bool) -> None:
     """Dark fog is missed over black, which is darker, and not where the wall behind it is drawn."""
@@ -325,17 +303,6 @@ def test_gains_come_out_of_the_colours_of_points() -> None:
     assert same.spread < 0.01
 
 
-def test_exposures_begin_with_the_gains_of_points_where_the_recipe_says_so() -> None:
-    scene = wall((0.7, 0.85, 1.0, 0.9, 0.8))
-    for initial, spread in (("points", 0.11), ("identity", 0.0)):
-        recipe = with_exposure(short(dense_start=None, removal=None))
-        assert recipe.exposure is not None
-        recipe = replace(recipe, exposure=replace(recipe.exposure, initial=initial))
-        trainer = Trainer(scene, recipe, GENERIC, backend="auto")
-        transforms = torch.stack([*trainer.learned.by_name(trainer.state.learned, "exposure").values()])
-        assert float(transforms[:, 0, 0].std(correction=0)) == pytest.approx(spread, abs=0.03)
-
-
 # -- the colour behind everything ------------------------------------------------------------------------------------
 def test_the_backdrop_is_the_colour_of_what_shows_no_sparse_points() -> None:
     found = find_backdrop(wall())
@@ -353,19 +320,3 @@ def test_a_backdrop_is_unlit_where_nearly_all_that_is_bare_has_one_dark_colour(
     assert found is not None
     assert found.is_unlit == unlit
     assert (found.alike > 0.9) if most == 0 else (found.alike < EVEN / 2)
-
-
-# -- what cannot be trained with ------------------------------------------------------------------------------------
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"dense_start": DenseStart(planes=1)}, "dense_start.planes"),
-        ({"dense_start": DenseStart(cell=0.5)}, "dense_start.cell must be at least 1 px"),
-        ({"dense_start": DenseStart(min_angle=50.0)}, "min_angle must be below max_angle"),
-        ({"removal": Removal(every=0)}, "removal.every"),
-        ({"removal": Removal(decay=1.0)}, "removal.decay must be below 1"),
-    ],
-)
-def test_values_that_mean_nothing_are_refused(changes: dict[str, object], message: str) -> None:
-    with pytest.raises(RecipeError, match=message):
-        validate(short(**changes))

@@ -13,7 +13,6 @@ import torch
 from gs2d.config.presets import get_recipe, surface, with_intrinsics, with_multiview
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import IntrinsicsRefinement, LearningRates, LossTerm, PoseRefinement, Recipe, Stage, validate
-from gs2d.config.schedule import scale_schedule
 from gs2d.core.camera import Zoom, look_at
 from gs2d.core.residual_lens import through_lens
 from gs2d.core.splats import Splats
@@ -118,22 +117,6 @@ def test_faces_of_a_panorama_keep_their_intrinsics_while_their_poses_learn(scene
         learned = trainer.state.learned
         assert bool((learned["intrinsics"].values == 0).all()) is stays
         assert bool(learned["poses"].values.any())
-
-
-def test_the_camera_s_numbers_are_those_of_its_size(scene: Scene) -> None:
-    camera = replace(scene.train[0].camera, width=40, height=30, cx=19.0, cy=16.0, fx=50.0, fy=51.0)
-    now = camera.zoomed(Zoom(1.1, 0.02, -0.01))
-    assert (now.fx, now.fy, now.cx, now.cy) == pytest.approx((55.0, 56.1, 20.0, 15.49))
-    half = camera.resized(20, 15).zoomed(Zoom(1.1, 0.02, -0.01))
-    again = now.resized(20, 15)
-    assert (half.fx, half.fy, half.cx, half.cy) == pytest.approx((again.fx, again.fy, again.cx, again.cy))
-
-
-def test_they_learn_faster_in_short_schedules() -> None:
-    tenth = scale_schedule(with_intrinsics(get_recipe("2dgs")), 0.1).intrinsics
-    assert tenth is not None
-    assert tenth.rate == pytest.approx(IntrinsicsRefinement().rate * math.sqrt(10))
-    assert tenth.start == 200
 
 
 def test_what_cannot_be_learned_is_refused() -> None:

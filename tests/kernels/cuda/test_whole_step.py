@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -22,7 +22,7 @@ from fake_driver import FakeDriver, Result
 from gs2d.config.protocols import GENERIC, Protocol
 from gs2d.config.recipe import GradDensify, LossTerm, PoseRefinement, Recipe
 from gs2d.data.scene import Scene, View
-from gs2d.errors import BackendError, RecipeError
+from gs2d.errors import BackendError
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.launch import GpuLauncher, Launcher
 from gs2d.render import cuda_step, pair_budget
@@ -226,18 +226,10 @@ def test_an_iteration_that_comes_again_is_a_graph_with_the_same_bits(
     assert 0 < launched["running_counts"] < some  # until it was a graph
 
 
-@pytest.mark.parametrize(
-    "lacks",
-    [
-        {"version": 11080},
-        {"failing": {"cuGraphInstantiate": Result.CUDA_ERROR_NOT_SUPPORTED}},
-        {"failing": {"cuGraphExecKernelNodeSetParams": Result.CUDA_ERROR_NOT_SUPPORTED}},
-    ],
-    ids=["too old", "makes none", "changes none"],
-)
-def test_a_driver_without_graphs_launches_one_by_one(emulator: Emulator, scene: Scene, lacks: dict[str, Any]) -> None:
+def test_a_driver_without_graphs_launches_one_by_one(emulator: Emulator, scene: Scene) -> None:
+    """Other refusals: tests/kernels/cuda/test_launch.py."""
     plain, some = trained(emulator, scene, brief(), "launches")
-    driver = FakeDriver(emulator=emulator, **lacks)
+    driver = FakeDriver(emulator=emulator, failing={"cuGraphExecKernelNodeSetParams": Result.CUDA_ERROR_NOT_SUPPORTED})
     found, as_many = trained(on_gpu(driver), scene, brief(), "graph")
     assert same(plain, found)
     assert some == as_many
@@ -275,59 +267,29 @@ def test_what_is_learned_of_cameras_and_densifiers_with_steps_of_their_own_go_th
     assert OfItsOwn.seen == 5
 
 
-def test_normals_of_the_object_alone_have_the_bits_of_those_that_go_through_torch(
-    emulator: Emulator, scene: Scene
-) -> None:
-    """By the alpha of the photographs that have one, of the others by the rendered one; and they are other normals."""
-    recipe, some_alpha = brief(), masked(scene)
-    parts, _ = trained(emulator, some_alpha, of_object(recipe), "autograd")
-    whole, some = trained(emulator, some_alpha, of_object(recipe), "launches")
-    assert some == 6
-    assert same(parts, whole)
-    assert not same(whole, trained(emulator, some_alpha, recipe, "launches")[0])
-
-
-def test_squares_that_come_later_have_the_bits_of_those_that_go_through_torch(emulator: Emulator, scene: Scene) -> None:
-    recipe = with_squares(brief())
-    parts, _ = trained(emulator, scene, recipe, "autograd")
-    whole, some = trained(emulator, scene, recipe, "launches")
-    assert some == 6
-    assert same(parts, whole)
-    assert not same(whole, trained(emulator, scene, brief(), "launches")[0])
-
-
-def test_silhouettes_have_the_bits_of_those_that_go_through_torch(emulator: Emulator, scene: Scene) -> None:
-    """With masks; of photographs without alpha nothing is asked, unless they must have one."""
-    recipe, some_alpha = with_silhouettes(of_object(brief())), masked(scene)
-    parts, _ = trained(emulator, some_alpha, recipe, "autograd")
-    whole, some = trained(emulator, some_alpha, recipe, "launches")
-    assert some == 6
-    assert same(parts, whole)
-    without = trained(emulator, some_alpha, of_object(brief()), "launches")[0]
-    assert not same(whole, without)
-    assert same(
-        trained(emulator, scene, recipe, "launches")[0], trained(emulator, scene, of_object(brief()), "launches")[0]
-    )
-    strict = with_term(brief(), LossTerm("silhouette", 0.1))
-    with pytest.raises(RecipeError, match="alpha channel, got one without"):
-        trained(emulator, scene, strict, "launches")
-
-
-def test_iterations_that_compare_no_views_are_done_in_one_piece(emulator: Emulator, scene: Scene) -> None:
-    """Of a recipe that compares them at its end, as ``best-surface``."""
-    recipe = brief(train_toys.compared())  # from the seventh on
-    parts, _ = trained(emulator, scene, recipe, "autograd")
-    whole, some = trained(emulator, scene, recipe, "launches")
-    assert some == 5
+@pytest.mark.parametrize("case", ["object", "squares", "silhouettes", "compared later", "in the host's memory"])
+def test_an_iteration_by_kernels_has_the_bits_of_one_through_torch(emulator: Emulator, scene: Scene, case: str) -> None:
+    """In the host's memory: where the device has no room for the bytes of the photographs."""
+    recipe, given, count, options = brief(), scene, 6, {}
+    if case == "object":
+        recipe, given = of_object(recipe), masked(scene)
+    elif case == "squares":
+        recipe = with_squares(recipe)
+    elif case == "silhouettes":
+        recipe, given = with_silhouettes(of_object(recipe)), masked(scene)
+    elif case == "compared later":
+        recipe, count = brief(train_toys.compared()), 5  # from the seventh on
+    else:
+        options = {"target_bytes": 0}
+    parts, _ = trained(emulator, given, recipe, "autograd", **options)
+    whole, some = trained(emulator, given, recipe, "launches", **options)
+    assert some == count
     assert same(parts, whole)
 
 
-@pytest.mark.parametrize("change", [lambda recipe: recipe, of_object], ids=["image", "object"])
-def test_an_iteration_asks_torch_for_nothing(
-    emulator: Emulator, scene: Scene, change: Callable[[Recipe], Recipe]
-) -> None:
+def test_an_iteration_asks_torch_for_nothing(emulator: Emulator, scene: Scene) -> None:
     """Neither an operation nor memory; only the order of the views is drawn, once in an epoch."""
-    recipe = change(brief())
+    recipe = of_object(brief())
     first = replace(recipe.stages[0], iterations=200)
     with mode("launches", emulator) as done:
         trainer = Trainer(scene, replace(recipe, stages=(first,)), GENERIC, backend=cuda_on_host(), progress_every=1000)
@@ -340,14 +302,6 @@ def test_an_iteration_asks_torch_for_nothing(
                 trainer.step()
     assert sum(done) - before == 6
     assert set(count.names) <= {"randperm", "detach"}, count.names  # detach: the number of pairs, in the host's memory
-
-
-def test_photographs_in_the_hosts_memory_come_to_the_same_place_each_time(emulator: Emulator, scene: Scene) -> None:
-    """Where the device has no room for their bytes."""
-    parts, _ = trained(emulator, scene, brief(), "autograd", target_bytes=0)
-    whole, some = trained(emulator, scene, brief(), "launches", target_bytes=0)
-    assert some == 6
-    assert same(parts, whole)
 
 
 def test_a_byte_is_the_same_number_as_by_a_division(emulator: Emulator) -> None:

@@ -61,11 +61,6 @@ def test_cameras_from_elsewhere_have_no_section(tmp_path: Path) -> None:
     assert capture_section(RunRecord(tmp_path, {})) is None
 
 
-def test_a_capture_of_before_lenses_were_compared_says_what_it_has(tmp_path: Path) -> None:
-    capture(tmp_path / "capture", {name: value for name, value in FOUND.items() if name != "lens"})
-    assert "2 of 3 photographs" in str(capture_section(RunRecord(tmp_path, {})))
-
-
 def test_a_picture_that_is_gone_is_said_and_a_broken_file_is_an_error(tmp_path: Path) -> None:
     folder = capture(tmp_path / "capture", FOUND)
     (folder / "poses.png").unlink()
