@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 from benchmarks.gpu import __main__ as command
-from benchmarks.gpu import archive
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = ROOT / "benchmarks" / "gpu" / "lent.sh"
@@ -23,33 +22,6 @@ def lent(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str
     settings = {**os.environ, "PATH": f"{BIN}:{os.environ['PATH']}", **environment}
     call = ["bash", str(SCRIPT), *arguments]
     return subprocess.run(call, env=settings, cwd="/", capture_output=True, text=True, check=False)
-
-
-def run_folder(folder: Path) -> Path:
-    """As `gs2d train` leaves one: 85 files, 60 of them deep, the report and the figures among them."""
-    for k in range(60):
-        path = folder / "runs" / "run-lego" / "renders" / "surface" / f"{k}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(os.urandom(3000))
-    for name in ("metrics.json", "report.html", "splats.ply"):
-        (folder / "runs" / "run-lego" / name).write_text(name * 100)
-    (folder / "log.txt").write_text("said")
-    (folder / "trace-1M.json.gz").write_bytes(os.urandom(50_000))
-    (folder / ".site" / "package").mkdir(parents=True)
-    (folder / ".site" / "package" / "x.json").write_text("{}")
-    return folder
-
-
-def test_one_archive_holds_what_is_worth_bringing_home(tmp_path: Path) -> None:
-    folder, home = run_folder(tmp_path / "work"), tmp_path / "out" / "part_2.tar.gz"
-    home.parent.mkdir()
-    assert archive.pack(folder, home) == []
-    with tarfile.open(home) as tar:
-        names = tar.getnames()
-    assert set(names) == {
-        "log.txt", "trace-1M.json.gz", "runs/run-lego/metrics.json", "runs/run-lego/report.html"
-    }  # fmt: skip
-    assert [path.name for path in home.parent.iterdir()] == ["part_2.tar.gz"]
 
 
 @pytest.mark.slow

@@ -12,7 +12,6 @@ import torch
 from cli_runs import one_line
 from gs2d.cli import run
 from gs2d.core.splats import Splats
-from gs2d.io.formats.registry import LAYOUTS, write_layout
 from gs2d.io.splat_ply import write_splats
 
 
@@ -29,17 +28,6 @@ def test_a_file_of_splats_becomes_a_page_beside_it(tmp_path: Path, capsys: pytes
     assert result["file"] == str(tmp_path / "cloud.html")
     assert (result["sh_degree"], result["views"]) == (1, 1)
     assert result["bytes"] == (tmp_path / "cloud.html").stat().st_size
-
-
-@pytest.mark.parametrize(("layout", "degree"), [("spz", 3), ("compressed", 3), ("splat", 0)])
-def test_a_file_of_another_format_becomes_a_page_too(
-    tmp_path: Path, layout: str, degree: int, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / f"cloud{LAYOUTS.get(layout).ending}"
-    write_layout(path, some_splats(50), layout)
-    assert run(["page", str(path), "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
-    assert (result["splats"], result["sh_degree"]) == (50, degree)
 
 
 def test_a_run_becomes_a_page_in_it(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,8 +11,7 @@ import trimesh
 
 from cli_runs import one_line
 from gs2d.cli import run
-from gs2d.core.transforms import up_direction
-from tiny import RADIUS, ball_cameras, write_ball_mesh
+from tiny import RADIUS, write_ball_mesh
 
 pytest.importorskip("xatlas", reason="xatlas is not installed (extra `texture`)")
 pytest.importorskip("fast_simplification", reason="fast-simplification is not installed (extra `texture`)")
@@ -76,13 +75,3 @@ def test_without_the_extra_the_remedy_is_named(
     monkeypatch.setitem(__import__("sys").modules, "xatlas", None)  # import raises ModuleNotFoundError
     assert run(["mesh", str(trained), "--texture"]) == 2
     assert "pip install 'xatlas>=" in one_line(capsys.readouterr().err)
-
-
-def test_up_is_across_the_horizontal_axes_of_level_cameras() -> None:
-    cameras = ball_cameras(6)
-    np.testing.assert_allclose(up_direction(cameras), [0, 0, 1], atol=1e-9)
-    # three that look down from one side: their own up vectors lean away from them
-    leaning = ball_cameras(40)[30:39:4]
-    np.testing.assert_allclose(up_direction(leaning), [0, 0, 1], atol=1e-9)
-    one = up_direction(cameras[:1])
-    np.testing.assert_allclose(one, -cameras[0].rotation[1])

@@ -14,13 +14,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from gs2d.core.mesh import TexturedMesh
-from gs2d.core.splats import Splats
 from gs2d.errors import DataError
-from gs2d.io.formats.registry import LAYOUTS, write_layout
 from gs2d.io.meshes import glb_bytes, read_mesh, write_textured
 from gs2d.pipeline.look.view import open_viewer, serve
 from gs2d.viewer.server import PageServer
@@ -68,20 +65,6 @@ def test_a_run_is_served_with_its_stages_its_mesh_and_its_cameras(trained: Path,
     server, _ = open_viewer(copy)
     assert fetch(server, "mesh")[1] == (copy / "mesh.glb").read_bytes()
     server.close()
-
-
-@pytest.mark.parametrize("layout", ["2dgs", "spz"])
-def test_a_file_of_splats_is_served(tmp_path: Path, layout: str) -> None:
-    rows = torch.Generator().manual_seed(0)
-    splats = Splats(*(torch.randn(5, *size, generator=rows) for size in ((3,), (4,), (2,), (), (1, 3), (15, 3))))
-    path = tmp_path / f"a{LAYOUTS.get(layout).ending}"
-    write_layout(path, splats, layout)
-    server, shown = open_viewer(path)
-    try:
-        assert shown == ["splats"]
-        assert json.loads(fetch(server, "splats", stage="final")[0]["X-Splats"])["splats"] == 5
-    finally:
-        server.close()
 
 
 def test_nothing_or_a_mesh_is_refused(tmp_path: Path) -> None:

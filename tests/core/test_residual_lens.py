@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gs2d.core.camera import Camera
-from gs2d.core.residual_lens import seen_at, straightened, through_lens
+from gs2d.core.residual_lens import seen_at, through_lens
 
 CAMERA = Camera(48, 36, 40.0, 42.0, 22.0, 19.0, np.eye(4))
 
@@ -32,26 +32,6 @@ def test_the_place_that_is_found_for_a_pixel_is_bent_to_it(lens: tuple[float, fl
     ideal = y * (1 + lens[0] * square + lens[1] * square**2) * focal + center
     rows, columns = np.mgrid[:36, :48] + 0.5
     np.testing.assert_allclose(ideal.numpy(), np.stack([columns, rows], axis=2), atol=1e-9)
-
-
-@pytest.mark.parametrize("lens", [(0.05, 0.0), (-0.08, 0.03)])
-def test_straightening_undoes_what_the_lens_did(lens: tuple[float, float]) -> None:
-    picture = smooth_picture()
-    bent, inside = through_lens(picture, CAMERA, torch.tensor(lens, dtype=torch.float64))
-    again, reached = straightened(bent, CAMERA, lens)
-    assert bool(inside.all()) == (lens[0] < 0)  # a picture that shows more than was rendered
-    whole = reached & (straightened(inside[..., None].double(), CAMERA, lens)[0][..., 0] > 0.999)
-    whole[[0, -1]] = whole[:, [0, -1]] = False
-    assert whole.float().mean() > 0.75
-    assert float((bent - picture).abs()[whole].max()) > 0.05
-    assert float((again - picture).abs()[whole].max()) < 0.03  # two resamplings
-
-
-def test_a_lens_that_bends_nothing_shows_the_picture_as_it_is() -> None:
-    picture = smooth_picture()
-    seen, inside = through_lens(picture, CAMERA, torch.zeros(2, dtype=torch.float64))
-    torch.testing.assert_close(seen, picture, rtol=0, atol=1e-12)
-    assert bool(inside.all())
 
 
 def test_gradients_are_those_of_lens_picture_and_intrinsics() -> None:

@@ -49,16 +49,6 @@ def test_a_sky_without_points_is_found_up_to_the_roofs(sky: float) -> None:
     assert found[ROOF - 10 : ROOF, WIDTH // 2 - 4 : WIDTH // 2 + 4].mean() < 0.1  # the tower
 
 
-def test_where_sparse_points_lie_there_is_no_sky() -> None:
-    image = castle()
-    everywhere = points_on(np.ones((HEIGHT, WIDTH), bool), every=23)
-    assert not sky_in(image, everywhere).any()
-    half = everywhere[everywhere[:, 0] > WIDTH / 2]
-    found = sky_in(image, half)
-    assert found[:ROOF, : WIDTH // 3].mean() > 0.95
-    assert found[:, 2 * WIDTH // 3 :].mean() < 0.005
-
-
 def test_smooth_parts_of_a_thing_are_not_sky() -> None:
     image = castle()
     image[ROOF + 10 : ROOF + 45, 20:100] = 0.9  # a smooth plate within the wall

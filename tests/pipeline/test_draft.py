@@ -42,12 +42,6 @@ def test_a_schedule_and_a_size_that_are_given_stay(capture: Path, tmp_path: Path
     assert by_quality(replace(asked, quality="full"), lambda _: None).schedule_scale == 1.0
 
 
-def test_without_a_quality_nothing_changes_and_nothing_is_said(capture: Path, tmp_path: Path) -> None:
-    asked, told = options(capture, tmp_path / "run"), []
-    assert by_quality(asked, told.append) is asked
-    assert told == []
-
-
 def test_a_quality_that_there_is_not_leaves_nothing(capture: Path, tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match="--quality"):
         train(options(capture, tmp_path / "run", quality="best"))

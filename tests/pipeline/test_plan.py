@@ -7,7 +7,6 @@ import re
 import shlex
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +14,12 @@ import pytest
 
 from gs2d.cli.app import run as main
 from gs2d.cli.parser import parse
-from gs2d.config.densify import Densify
-from gs2d.config.presets import get_recipe
-from gs2d.config.recipe import Stage
-from gs2d.config.serialize import apply_overrides
 from gs2d.core import memory_limit
 from gs2d.errors import DataError
 from gs2d.pipeline.prepare import estimate as module
 from gs2d.pipeline.prepare import plan as plan_module
 from gs2d.pipeline.prepare.estimate import (
     PROGRAM_BYTES,
-    budget_overrides,
 )
 from gs2d.pipeline.prepare.options import PlanOptions, TrainOptions
 from gs2d.pipeline.prepare.plan import plan
@@ -113,19 +107,6 @@ def test_a_plan_is_of_the_training_that_train_would_do(
     with pytest.raises(Asked):
         train(TrainOptions(scene=capture, out=tmp_path / "run", estimate=True, **given))
     assert asked[0] == asked[1]
-
-
-def test_a_budget_is_set_in_each_stage_that_takes_one_whatever_it_is_called() -> None:
-    first, *rest = get_recipe("2dgs-r-absgs-d").stages
-    moving = Stage("move", 100, losses=first.losses, densify=Densify("relocation", {"max_splats": 9, "stop": 50}))
-    recipe = replace(get_recipe("2dgs"), stages=(replace(first, name="coarse"), *rest, moving))
-    overrides = budget_overrides(recipe, 700)
-    limits = [getattr(stage.densify, "max_splats", None) for stage in apply_overrides(recipe, overrides).stages]
-    assert limits[:3] == [700, None, 700]
-    assert apply_overrides(recipe, overrides).stages[-1].densify == Densify(
-        "relocation", {"max_splats": 700, "stop": 50}
-    )
-    assert budget_overrides(replace(recipe, stages=(replace(first, densify=None),)), 700) == ()
 
 
 def test_a_budget_of_splats_is_named_where_as_many_as_may_come_do_not_fit(

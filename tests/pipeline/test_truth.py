@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from gs2d.errors import RunError
 from gs2d.evaluation.surface import evaluate_surface
 from gs2d.io.run_dir import RunFolder, open_run
 from gs2d.pipeline.events import Event, Notice
@@ -48,15 +47,3 @@ def test_a_true_mesh_beside_the_capture_is_used_and_meshing_again_forgets_its_sc
     mesh_run(run, MeshOptions(voxel=0.2, truncation=0.6))
     assert open_run(run).metrics()["surface"] is None
     assert not (run / "surface").exists()
-
-
-def test_without_a_mesh_a_truth_that_was_asked_for_is_an_error_and_one_that_was_found_is_told(
-    beside: tuple[Path, Path],
-) -> None:
-    run, folder = beside
-    (run / "mesh.ply").unlink()
-    with pytest.raises(RunError, match="mesh"):
-        evaluate_run(run, EvaluateOptions(ground_truth=folder / "mesh_gt.ply"))
-    heard: list[Event] = []
-    evaluate_run(run, EvaluateOptions(), heard.append)
-    assert any("the surface is not scored: no mesh.ply" in e.text for e in heard if isinstance(e, Notice))

@@ -8,11 +8,9 @@ import html
 import io
 import json
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -28,8 +26,7 @@ from gs2d.report import mesh_images as report_mesh
 from gs2d.report import mesh_view as report_view
 from gs2d.report.mesh_view import MeshView, mesh_view
 from gs2d.report.plots import curves, read_history
-from gs2d.report.record import RunRecord, read_record
-from gs2d.report.sections import surface as report_surface
+from gs2d.report.record import RunRecord
 from gs2d.report.sections.registry import SECTIONS
 from gs2d.report.sections.results import results_section
 from gs2d.report.sections.surface import surface_section
@@ -177,14 +174,6 @@ def test_the_table_of_results_marks_the_best_and_has_no_empty_row() -> None:
     assert "<td>1.2</td>" in str(results_section(record(stages=(counted,))))
 
 
-def test_a_run_without_test_views_shows_its_training_views() -> None:
-    stages = tuple({**stage_entry(k), "test": None, "test_reason": "the scene has no test views"} for k in range(3))
-    assert record(stages=stages).split == "train"
-    table = str(results_section(record(stages=stages)))
-    assert "(new views)" not in table
-    assert "28.35" in table
-
-
 def test_surface_scores_are_shown_or_the_reason_why_there_are_none() -> None:
     row = {"threshold": 0.02, "precision": 0.91, "recall": 0.84, "f_score": 0.8736}
     surface = {"thresholds": [row], "chamfer": 0.0123, "truth_hidden": 0.4459, "novel": 3}
@@ -214,20 +203,6 @@ def test_the_image_of_a_score_and_its_alignment_check_are_in_the_report(tmp_path
     text = str(surface_section(record(path=tmp_path / "elsewhere", surface={**surface, "self_check": check})))
     assert "These scores are not reliable: only 40% of the cameras agree" in text
     assert "data:image/jpeg" not in text
-
-
-def test_every_figure_of_a_surface_score_has_a_label() -> None:
-    from dataclasses import fields
-
-    from gs2d.evaluation.surface import SurfaceScore
-
-    valid = {field.name for field in fields(SurfaceScore)} - {"scores", "clouds"}  # tables and point clouds
-    assert valid <= set(report_surface._MEANINGS)
-
-
-def test_a_run_with_a_title_has_it_as_the_heading() -> None:
-    assert record().title == "still <life>"
-    assert record(definition={**definition(), "title": "gs2d demo"}).title == "gs2d demo"
 
 
 # -- curves ------------------------------------------------------------------------------------------------------------
@@ -331,14 +306,3 @@ def test_a_large_mesh_is_simplified_for_the_page_and_keeps_its_colours(
     assert len(faces) == view.shown <= 1000
     assert faces.max() < len(vertices) == len(colors)
     assert colors.std() > 10
-
-
-def test_a_section_that_returns_nothing_is_left_out(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    sections: dict[str, Callable[[RunRecord], str | None]] = {
-        "empty": lambda _: None,
-        "seed": lambda _: "<p>7</p>",
-    }
-    monkeypatch.setattr("gs2d.report.write.SECTIONS", SimpleNamespace(working=sections.items))
-    text = write_report(run).read_text()
-    assert re.findall(r'<details class="section" id="(\w+)"', text) == ["seed"]
-    assert read_record(run).last["name"] == "refine"

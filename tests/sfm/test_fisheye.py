@@ -20,7 +20,7 @@ from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.prepare.options import PosesOptions
 from gs2d.pipeline.prepare.pose_finding import find_poses
 from gs2d.sfm import as_fisheye
-from gs2d.sfm.fisheye import Circle, circle_of, named_fisheye, small_if_dark
+from gs2d.sfm.fisheye import Circle, circle_of, small_if_dark
 from gs2d.sfm.images import Photo, find_photos, read_photos
 from gs2d.sfm.lens_probe import probe
 from gs2d.sfm.masks import copy_masks
@@ -75,23 +75,6 @@ def test_darkness_of_another_shape_is_no_circle() -> None:
     assert found(framed) is None
     assert found(*statues) is None
     assert found(round_picture(200, 150, 90)) is None
-
-
-# -- names and hints ---------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(
-    ("names", "is_one"),
-    [
-        (("GoPro", "HERO9 Black", "", "3", "15"), True),
-        (("Canon", "Canon EOS R5", "EF8-15mm f/4L FISHEYE USM", "8", ""), True),
-        (("Arashi Vision", "Insta360 ONE RS", "", "", ""), True),
-        (("DJI", "OsmoAction4", "", "", ""), True),
-        (("Apple", "iPhone 15 Pro", "iPhone 15 Pro back triple camera 6.765mm f/1.78", "6.765", "24"), False),
-        (("DJI", "FC6310", "", "8.8", "24"), False),
-        (("", "", "", "", ""), False),
-    ],
-)
-def test_cameras_and_lenses_that_are_called_fisheyes(names: tuple[str, ...], is_one: bool) -> None:
-    assert named_fisheye(names) is is_one
 
 
 def photos_of(root: Path, images: dict[str, np.ndarray]) -> list[Photo]:

@@ -26,7 +26,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.json_files import read_json
 from gs2d.core.similarity import apply, umeyama
 from gs2d.data import load_scene
-from gs2d.data.readers.colmap import read_cameras, read_images
+from gs2d.data.readers.colmap import read_cameras
 from gs2d.errors import DataError
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.prepare.options import PosesOptions
@@ -128,20 +128,6 @@ def test_the_places_of_panoramas_are_found_from_photographs_alone(
     assert found["turned_worst_degrees"] < 0.1
     (camera,) = read_cameras(root / "capture/sparse/0", "bin").values()
     assert (camera.model, camera.params) == ("EQUIRECTANGULAR", (WIDTH, WIDTH / 2))
-
-
-def test_features_of_panoramas_keep_out_of_masks_which_go_along_to_the_faces(
-    panoramas: tuple[Path, dict[str, np.ndarray], list[str]],
-) -> None:
-    root = panoramas[0]
-    for image in read_images(root / "capture/sparse/0", "bin", observations=True):
-        assert image.observations is not None
-        assert image.observations[:, 1].max() < WIDTH // 2 - 59
-    scene = load_scene(root / "capture", test_every=0)
-    assert len(scene.views) == 42
-    below = {view.name: view.mask() for view in scene.views if view.name.endswith("_down.jpg")}
-    assert len(below) == 7
-    assert all(mask is not None and not mask[mask.shape[0] // 2, mask.shape[1] // 2] for mask in below.values())
 
 
 @pytest.mark.slow

@@ -13,7 +13,6 @@ import torch
 
 from browser import Page, browser, require_browser
 from gs2d.core.camera import look_at
-from gs2d.core.georeference import Georeference
 from gs2d.core.splats import Splats
 from gs2d.data.subject import Subject
 from gs2d.render.api import rasterize
@@ -224,19 +223,3 @@ def test_two_clicks_measure_a_distance_on_the_surface(page: Page) -> None:
     np.testing.assert_allclose([float(word) for word in words[4:]], [100, -199.7, 50, 100, -200.3, 50, 1.25], atol=3e-3)
     page.key("Escape")
     assert values(page, "ruler.on", "$('measurepanel').hidden") == [False, True]
-
-
-def test_a_georeferenced_page_measures_in_metres_with_the_height(page: Page, tmp_path: Path) -> None:
-    turn = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # the capture's y is up
-    world = Georeference(2.5, turn, np.zeros(3), np.zeros(3), "a test", grid_scale=0.5)
-    told = {"metres": world.metres_per_unit, "rotation": turn.flatten().tolist()}
-    page.ask(f"facts.world = {json.dumps(told)}")
-    try:
-        short, long = json.loads(page.ask("JSON.stringify(Object.values(distanceTold([0, 0, 0], [0, 0.6, 0.8])))"))
-    finally:
-        page.ask("facts.world = null")
-    assert (short, long) == ("5 m", "level 4 m, height +3 m")
-    np.testing.assert_allclose(world.ground_way(np.array([0, 0.6, 0.8])), [4, 0, 3])
-    path = tmp_path / "there.html"
-    write_page(path, two_balls(), PageScene("x", ONE_SIDE, SETTINGS, ORIGIN, 4.0, UP, world=world))
-    assert f'"world": {json.dumps(told)}' in path.read_text()

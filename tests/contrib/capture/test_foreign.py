@@ -118,24 +118,6 @@ def test_each_projection_of_opensfm_becomes_its_lens(tmp_path: Path) -> None:
             of(model)
 
 
-def test_cameras_of_metashape_without_a_place_are_skipped_and_named(tmp_path: Path) -> None:
-    more = (
-        "<camera id='90' sensor_id='0' label='lost'><orientation>1</orientation></camera>"
-        f"<camera id='91' sensor_id='0' label='off' enabled='false'><transform>{metashape_transform(np.eye(4))}"
-        "</transform></camera>"
-        f"<group id='0' label='Group 1'><camera id='92' sensor_id='0' label='gone'><transform>"
-        f"{metashape_transform(np.eye(4))}</transform></camera></group>"
-    )
-    small_metashape(tmp_path, more=more)
-    scene = load_scene(tmp_path)
-    assert len(scene.views) == 9
-    assert scene.skipped == (
-        "lost: not aligned in Metashape",
-        "off: switched off in Metashape",
-        "gone: listed in cameras.xml, but there is no such file",
-    )
-
-
 def test_a_geocentric_chunk_becomes_metres_east_north_and_up(tmp_path: Path) -> None:
     """The ring stands upright at 60 N, 0 E: there east is +y, north (-sin 60, 0, cos 60), up (cos 60, 0, sin 60)."""
     write_images(tmp_path / "images", poses())
@@ -196,22 +178,6 @@ def test_every_version_of_alicevision_s_file_has_its_own_numbers(tmp_path: Path,
     lens = BENT if version >= (1, 2, 0) else Lens(35.0, 35.0, 18.5, 16.25, (0.12, -0.05, 0.02))
     small_alicevision(tmp_path / "theirs", lens, version=version, name="sfm.json")
     assert_same_scene(load_scene(tmp_path / "theirs"), load_scene(as_colmap(tmp_path / "colmap", lens)))
-
-
-def test_views_that_meshroom_did_not_place_are_skipped_and_named(tmp_path: Path) -> None:
-    small_alicevision(tmp_path)
-    data = alicevision_scene(OFF_CENTRE, (1, 2, 8))
-    data["poses"] = data["poses"][1:]
-    data["views"][1] |= {"rigId": "3", "subPoseId": "0", "isPoseIndependant": "false"}
-    (tmp_path / "cameras.sfm").write_text(json.dumps(data))
-    (tmp_path / "images" / "a_2.jpg").unlink()
-    scene = load_scene(tmp_path)
-    assert len(scene.views) == 6
-    assert scene.skipped == (
-        "a_0.jpg: not placed by Meshroom",
-        "a_1.jpg: its camera has no pose in the rig",
-        "a_2.jpg: listed in cameras.sfm, but there is no such file",
-    )
 
 
 @pytest.mark.parametrize("marked", [True, False])

@@ -142,11 +142,3 @@ def test_several_at_once_report_what_failed_and_whose_process_died(
         "c": "no photographs",
     }
     assert sorted(heard) == [f"{name} failed: {reason}" for name, reason in failures(jobs).items()]
-
-
-@pytest.mark.slow
-def test_processes_of_their_own_train(tmp_path: Path) -> None:
-    jobs = make_jobs(tmp_path, {"a": ("1",), "b": ("2",), "c": ("3",)})
-    execute(jobs, tmp_path, slots=2, backend="cpu")
-    assert all(reason.startswith(f"{tmp_path} ") for reason in failures(jobs).values())
-    assert len(failures(jobs)) == 3

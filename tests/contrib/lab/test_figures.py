@@ -57,16 +57,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return paths
 
 
-def test_a_run_logs_changes_of_all_attributes_but_of_those_it_freezes(runs: dict[str, Path]) -> None:
-    changes = [e for e in RunFolder(runs["2DGS-R (ours)"]).events.read() if e["kind"] == "changes"]
-    assert {e["stage"] for e in changes} == {"surface", "appearance", "refine"}
-    assert all(e["over"] == 5 for e in changes)
-    for event in changes:
-        assert (event["mean"] > 0) == (event["covariance"] > 0) == (event["stage"] != "appearance")
-        assert (event["opacity"] > 0) == (event["stage"] == "surface")
-        assert event["sh"] > 0
-
-
 def test_figures_are_drawn_and_the_map_is_of_the_run_that_ranks(runs: dict[str, Path], tmp_path: Path) -> None:
     files = write_figures(runs, tmp_path / "out", views=1)
     assert [file.name for file in files] == ["traces.svg", "changes.svg", "errors-2DGS-R-ours-.png"]

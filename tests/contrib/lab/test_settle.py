@@ -11,7 +11,7 @@ from gs2d.config.partition import Partition
 from gs2d.config.presets import get_recipe
 from gs2d.config.protocols import GENERIC
 from gs2d.contrib.lab import settle as module
-from gs2d.contrib.lab.settle import Settled, capture_digest, fitting_partition, seam_recipe
+from gs2d.contrib.lab.settle import Settled, capture_digest, fitting_partition
 from gs2d.errors import DataError
 from gs2d.pipeline.events import Event
 from gs2d.pipeline.prepare.estimate import Estimate, Range
@@ -64,17 +64,3 @@ def test_a_capture_is_known_by_its_cameras_points_and_split() -> None:
     assert capture_digest(replace(SCENE, train=SCENE.train[1:], test=SCENE.train[:1])) != one
     assert SCENE.points is not None
     assert capture_digest(replace(SCENE, points=None)) != one
-
-
-def test_seams_learn_by_the_last_rates_of_a_block_and_nothing_comes_or_goes() -> None:
-    recipe = get_recipe("2dgs-r")
-    block = recipe.stages[0]
-    (stage,) = seam_recipe(recipe, Partition(seam_schedule=0.1), 1.0).stages
-    assert stage.iterations == 3_000
-    assert stage.densify is None
-    assert stage.lr.means_at(0) == pytest.approx(block.lr.means_at(21_000))
-    assert stage.lr.means_at(3_000) == pytest.approx(block.lr.means_final)
-    assert stage.lr.settled_at(1) == stage.lr.settled_at(3_000) == 1.0
-    assert stage.lr.opacity_logits == block.lr.opacity_logits
-    assert set(stage.train.values()) == {"all"}
-    assert all(term.start == 0 for term in stage.losses)

@@ -139,22 +139,6 @@ def test_spz_comes_back_in_the_same_coordinates(tmp_path: Path) -> None:
     assert (tmp_path / "b.spz").read_bytes() == first  # no time of writing in it
 
 
-def test_spz_of_version_2_is_read(tmp_path: Path) -> None:
-    """One splat, by hand: position (1, 2, -3) up and back, a quarter turn about x."""
-    x = round(math.sqrt(0.5) * 127.5 + 127.5)
-    body = b"".join(int(v * 4096).to_bytes(3, "little", signed=True) for v in (1, -2, 3))
-    body += bytes([255, 128, 128, 128, 160, 96, 0, x, 128, 128]) + bytes([128 + 64] + [128] * 8)
-    data = struct.pack("<IIIBBBB", 0x5053474E, 2, 1, 1, 12, 0, 0) + body
-    (tmp_path / "a.spz").write_bytes(gzip.compress(data))
-    g, version = read_spz(tmp_path / "a.spz")
-    assert version == 2
-    np.testing.assert_allclose(g.means, [[1, 2, -3]])
-    np.testing.assert_allclose(g.log_scales, [[0, -4, FLAT_LOG_SCALE]])  # the smallest, of no thickness
-    np.testing.assert_allclose(g.quats, [[math.sqrt(0.5), math.sqrt(0.5), 0, 0]], atol=0.006)
-    np.testing.assert_allclose(g.shN[0], [[-0.5, 0, 0], [0, 0, 0], [0, 0, 0]])  # y changes sign
-    assert sigmoid(g.opacity_logits)[0] == pytest.approx(254.5 / 255)
-
-
 def test_spz_says_in_one_line_how_many_splats_it_clipped(tmp_path: Path) -> None:
     splats = a_scene(10)
     assert write_spz(tmp_path / "a.spz", Gaussians.of(splats)) == ()  # rounding alone is not told

@@ -70,31 +70,6 @@ def test_l1_ssim_l2_and_their_gradient_are_those_of_the_reference(
         assert relative_error(found, expected) < 2e-5
 
 
-def test_ignored_pixels_have_no_influence_and_no_gradient(emulator: emulate.Emulator) -> None:
-    x, y, mask = photographs(12, 10)
-    results = []
-    for filler in (0.5, float("nan")):
-        z = torch.where(mask[..., None], x, torch.tensor(filler)).requires_grad_()
-        values = ops.photometric(z, y, mask, launcher=emulator)
-        results.append((*values, *torch.autograd.grad(sum(values), z)))
-    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
-    gradient = results[0][-1]
-    assert not gradient[~mask].any()
-    assert bool(gradient[mask].any())
-
-
-def test_nan_at_a_valid_pixel_reaches_the_value(emulator: emulate.Emulator) -> None:
-    x, y, _ = photographs(6, 5)
-    x[3, 2] = float("nan")
-    assert all(bool(v.isnan()) for v in ops.photometric(x, y, launcher=emulator))
-    normal, depth, alpha, _ = geometry(6, 5)
-    depth[3, 2] = float("nan")
-    depth[2:5, 1:4] = torch.where(depth[2:5, 1:4] == 0, 1.0, depth[2:5, 1:4])
-    seen = NormalOptions(make_camera(6, 5))
-    assert bool(ops.normal_consistency(normal, depth, alpha, seen, launcher=emulator).isnan())
-    assert bool(ops.masked_mean(x[..., 0], launcher=emulator).isnan())
-
-
 def test_without_a_valid_pixel_values_and_gradients_are_0(emulator: emulate.Emulator) -> None:
     x, y, _ = photographs(7, 6)
     nothing = torch.zeros(7, 6, dtype=torch.bool)
