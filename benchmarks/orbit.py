@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,7 @@ def orbit(run: Path, frames: int) -> list[Camera]:
     return orbit_cameras([view.camera for view in reload_job(RunFolder(run), ignore).scene.train], frames, focus)
 
 
-def main() -> None:
+def main(words: Sequence[str] | None = None) -> None:
     """Render the frames, draw the mesh from the same cameras, and write the animation."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
@@ -47,7 +48,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, nargs=2, default=[560, 480], help="of one side, px")
     parser.add_argument("--fps", type=float, default=15.0)
     parser.add_argument("--quality", type=int, default=70)
-    args = parser.parse_args()
+    args = parser.parse_args(words)
     mesh, cameras = read_mesh(args.run / MESH), orbit(args.run, args.frames)
     across, height = args.size
     width = round(height * cameras[0].width / cameras[0].height)
