@@ -45,8 +45,7 @@ from gs2d.io.run_dir import SPLATS
 from gs2d.io.splat_ply import read_splats
 from gs2d.meshing.raycast import cast_camera
 from gs2d.pipeline.events import Notice
-from gs2d.pipeline.prepare.finished import open_job
-from gs2d.pipeline.prepare.job import Job
+from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.train.train_run import train
 from gs2d.render.api import rasterize
@@ -120,7 +119,7 @@ def psnr(squares: list[np.ndarray]) -> float:
     return -10 * math.log10(float(np.concatenate(squares).mean()))
 
 
-def shown(job: Job, splats: Splats, view: View) -> tuple[np.ndarray, np.ndarray]:
+def shown(job: LoadedRun, splats: Splats, view: View) -> tuple[np.ndarray, np.ndarray]:
     """Return a rendering of a view [H, W, 3] in [0, 1], and its mean squared error in each pixel [H, W]."""
     with torch.no_grad():
         color = rasterize(splats, view.camera, job.settings, backend=job.backend).color.clamp(0, 1).numpy()
@@ -131,7 +130,7 @@ def by_distance(folder: Path, args: argparse.Namespace) -> str:
     """Return the PSNR of what lies how far from a seam, of one training and of blocks before and after their seams."""
     job_of_blocks = job_folder(folder, args)
     cells, truth = read_split(job_of_blocks / "partition").cells, read_mesh(folder / "capture/mesh_gt.ply")
-    _, job, whole = open_job(folder / "whole", args.threads, lambda _event: None)
+    _, job, whole = open_finished(folder / "whole", args.threads, lambda _event: None)
     views = job.scene.test
     distances = np.concatenate([seam_distances(view.camera, truth, cells).ravel() for view in views])
     ranges = [(low, high) for low, high in itertools.pairwise(FROM) if ((distances >= low) & (distances < high)).any()]
@@ -150,7 +149,7 @@ def measured(folder: Path, args: argparse.Namespace) -> dict[str, dict[str, floa
     job_of_blocks = job_folder(folder, args)
     cells, truth = read_split(job_of_blocks / "partition").cells, read_mesh(folder / "capture/mesh_gt.ply")
     folders = {"whole": folder / "whole", "blocks": job_of_blocks}
-    runs = {name: open_job(path, args.threads, lambda _event: None) for name, path in folders.items()}
+    runs = {name: open_finished(path, args.threads, lambda _event: None) for name, path in folders.items()}
     views = runs["whole"][1].scene.test
     distances = {view.name: seam_distances(view.camera, truth, cells) for view in views}
     drawn = sorted(views, key=lambda view: -float((distances[view.name] < args.near / 4).mean()))[:3]

@@ -28,7 +28,7 @@ from gs2d.io.run_dir import SPLATS, RunFolder
 from gs2d.io.splat_ply import read_splats
 from gs2d.kernels.library import describe_library
 from gs2d.pipeline.events import ignore
-from gs2d.pipeline.prepare.job import reload_job
+from gs2d.pipeline.prepare.loaded import reload_run
 
 CASES = {
     "lego": Case("lego", "nerf_synthetic_lego", downscale=2),
@@ -54,7 +54,7 @@ def row_of(case: Case, recipe: str, args: argparse.Namespace) -> dict[str, Any]:
         "iterations": sum(stage["iterations"] for stage in stages),
         "seconds": sum(stage["seconds"] for stage in stages),
         "train_psnr": (stages[-1].get("train") or {}).get("psnr"),
-        **score_splats(reload_job(run, ignore), read_splats(run.file(SPLATS))),
+        **score_splats(reload_run(run, ignore), read_splats(run.file(SPLATS))),
         "f_scores": [] if surface is None else [row["f_score"] for row in surface["thresholds"]],
         "chamfer": None if surface is None else surface["chamfer"],
         "made": made_by(run.definition()),

@@ -33,9 +33,9 @@ from gs2d.core.splats import Splats
 from gs2d.data import Scene, View, load_scene
 from gs2d.evaluation.hidden_points import HiddenPoints, hidden_points, total
 from gs2d.evaluation.images import image_metrics, psnr_float
-from gs2d.pipeline.prepare.job import fit_recipe, with_backdrop
-from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.prepare.options import Training
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
+from gs2d.pipeline.prepare.resolve import build_recipe, robust_and_exposure, with_backdrop
 from gs2d.pipeline.prepare.run_exposures import Transforms, photographed
 from gs2d.render.api import rasterize
 from gs2d.render.exposure import fit_exposure
@@ -67,11 +67,10 @@ VARIANTS: Mapping[str, tuple[dict[str, Any], Callable[[Recipe], Recipe]]] = {  #
 def train_variant(scene: Scene, name: str, recipe: str, scale: float, seed: int) -> tuple[Trainer, float]:
     """Train a scene with a variant; the trainer, and CPU seconds."""
     asked, change = VARIANTS[name]
-    options = TrainOptions(
-        scene=Path("."), out=Path("."), recipe=recipe, schedule_scale=scale, seed=seed, **asked
-    )  # only its recipe is used
+    training = Training(recipe=recipe, **asked)
     start = time.process_time()
-    fitted = fit_recipe(options, scene, GENERIC, lambda event: None)
+    robust, exposure = robust_and_exposure(training, scene, GENERIC, lambda event: None)
+    fitted = build_recipe(training, seed=seed, schedule_scale=scale, robust=robust, exposure=exposure)
     protocol: Protocol = GENERIC
     if name != "black background":
         fitted, protocol = with_backdrop(fitted, GENERIC, scene, lambda event: None)

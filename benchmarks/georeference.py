@@ -35,7 +35,7 @@ from gs2d.core.georeference import CHECK, LEFT_OUT, Georeference
 from gs2d.data import View, load_scene
 from gs2d.errors import Gs2dError
 from gs2d.io.run_dir import open_run
-from gs2d.pipeline.prepare.job import reload_job
+from gs2d.pipeline.prepare.loaded import reload_run
 from gs2d.pipeline.prepare.options import GeoreferenceOptions
 from gs2d.synthetic.flight import Flight, write_flight
 
@@ -75,7 +75,7 @@ def prepared(folder: Path, photographs: int, size: int) -> tuple[Path, Truth]:
 
 def views_of(run: Path) -> list[View]:
     """Return all photographs of the run."""
-    scene = reload_job(open_run(run), lambda _: None).scene
+    scene = reload_run(open_run(run), lambda _: None).scene
     return [*scene.train, *scene.test]
 
 

@@ -20,7 +20,7 @@ from gs2d.core.mesh import Mesh
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, RunFolder
 from gs2d.pipeline.events import ignore
-from gs2d.pipeline.prepare.job import reload_job
+from gs2d.pipeline.prepare.loaded import reload_run
 from gs2d.report.mesh_images import mesh_images
 
 SHADES = 64  # of clay: a third of the bytes, and nobody sees it
@@ -43,7 +43,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, nargs="+", default=[0, 4])
     parser.add_argument("--size", type=int, default=300)
     args = parser.parse_args()
-    jobs = [reload_job(RunFolder(run), ignore) for run in args.runs]
+    jobs = [reload_run(RunFolder(run), ignore) for run in args.runs]
     cameras = [jobs[0].scene.test[view].camera for view in args.views]
     named = [(job.recipe.name, read_mesh(run / MESH)) for job, run in zip(jobs, args.runs, strict=True)]
     named.append(("truth", read_mesh(args.truth)))

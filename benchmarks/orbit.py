@@ -22,7 +22,7 @@ from gs2d.io.run_dir import MESH, RunFolder
 from gs2d.pipeline.events import ignore
 from gs2d.pipeline.finish.camera_paths import orbit_cameras
 from gs2d.pipeline.finish.run_images import render_run
-from gs2d.pipeline.prepare.job import reload_job
+from gs2d.pipeline.prepare.loaded import reload_run
 from gs2d.report.mesh_images import mesh_images
 
 
@@ -36,7 +36,7 @@ def orbit(run: Path, frames: int) -> list[Camera]:
     """Return the cameras of ``gs2d render RUN --orbit FRAMES``."""
     subject = read_subject(run)
     focus = None if subject is None or subject.kind != OBJECT else subject.center
-    return orbit_cameras([view.camera for view in reload_job(RunFolder(run), ignore).scene.train], frames, focus)
+    return orbit_cameras([view.camera for view in reload_run(RunFolder(run), ignore).scene.train], frames, focus)
 
 
 def main(words: Sequence[str] | None = None) -> None:

@@ -21,7 +21,7 @@ from gs2d.data.scene import Scene
 from gs2d.evaluation.surface import distances_to_mesh
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, open_run
-from gs2d.pipeline.prepare.job import reload_job
+from gs2d.pipeline.prepare.loaded import reload_run
 
 WITHIN = (0.5, 1.0, 2.0, 5.0)  # px
 
@@ -48,7 +48,7 @@ def pixel_widths(points: np.ndarray, scene: Scene) -> np.ndarray:
 
 def measure(run: Path) -> Row:
     """Distances of the points of a run's capture to its mesh."""
-    job = reload_job(open_run(run), lambda event: None)
+    job = reload_run(open_run(run), lambda event: None)
     if job.scene.points is None:
         raise SystemExit(f"{run}: its capture has no points")
     mesh = read_mesh(run / MESH)

@@ -24,13 +24,13 @@ from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import SPLATS, open_run
 from gs2d.io.splat_ply import read_splats
 from gs2d.meshing.raycast import cast_camera
-from gs2d.pipeline.prepare.job import Job, reload_job
+from gs2d.pipeline.prepare.loaded import LoadedRun, reload_run
 from gs2d.render.api import rasterize
 
 WITHIN = (0.01, 0.03)
 
 
-def errors(splats: Splats, views: Sequence[View], mesh: Mesh, job: Job) -> np.ndarray:
+def errors(splats: Splats, views: Sequence[View], mesh: Mesh, job: LoadedRun) -> np.ndarray:
     """Errors [P] of all pixels of some views in which the mesh is seen."""
     found = []
     for view in views:
@@ -50,7 +50,7 @@ def main() -> None:
     print("| run | views | median | mean | " + " | ".join(f"within {100 * w:g} %" for w in WITHIN) + " |")
     print("|---" * (4 + len(WITHIN)) + "|")
     for run in parser.parse_args().runs:
-        job = reload_job(open_run(run), lambda event: None)
+        job = reload_run(open_run(run), lambda event: None)
         mesh, splats = read_mesh((job.scene.root or run) / "mesh_gt.ply"), read_splats(run / SPLATS)
         for split, views in (("test", job.scene.test), ("train", job.scene.train)):
             error = errors(splats, views, mesh, job)

@@ -24,7 +24,7 @@ from gs2d.core.json_files import write_json
 from gs2d.core.splats import Splats
 from gs2d.errors import Gs2dError
 from gs2d.pipeline.events import ignore
-from gs2d.pipeline.prepare.job import Job, prepare_job
+from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.prepare.run_exposures import NONE, Transforms
 from gs2d.pipeline.prepare.threads import use_threads
@@ -111,7 +111,7 @@ def marks(iterations: int, points: int) -> list[int]:
 def train(spec: dict[str, Any], folder: Path, clocks: Clocks) -> dict[str, Any]:
     """Train, score on the way and at the end, and return what the results file says of it."""
     use_threads(spec["threads"])
-    job = prepare_job(train_options(spec, folder), ignore)
+    job = prepare_run(train_options(spec, folder), ignore)
     state, course = _saved(folder / STATE, clocks)
     waiting = [mark for mark in marks(job.recipe.iterations, spec["points"]) if mark > _done(job, state)]
 
@@ -137,7 +137,7 @@ def train(spec: dict[str, Any], folder: Path, clocks: Clocks) -> dict[str, Any]:
     return {**result, **surface(job, trainer.state, spec, folder), "course": course}
 
 
-def _done(job: Job, state: TrainState | None) -> int:
+def _done(job: LoadedRun, state: TrainState | None) -> int:
     """Return the iterations that a state is after."""
     if state is None:
         return 0
@@ -159,13 +159,13 @@ def _save(file: Path, state: TrainState, spent: Spent, course: list[dict[str, An
     os.replace(temporary, file)
 
 
-def score(job: Job, state: TrainState) -> dict[str, Any]:
+def score(job: LoadedRun, state: TrainState) -> dict[str, Any]:
     """Return the scores of the test views (of the training views where there are none), and the size of the scene."""
     learned = LearnedTable(job.recipe, job.scene).by_name(state.learned, "exposure")
     return score_splats(job, state.splats, learned)
 
 
-def score_splats(job: Job, splats: Splats, learned: Transforms = NONE) -> dict[str, Any]:
+def score_splats(job: LoadedRun, splats: Splats, learned: Transforms = NONE) -> dict[str, Any]:
     """Return what :func:`score` does, of splats with the exposures that were learned with them."""
     # Here, while the clocks stand still: a training does not need them.
     from benchmarks.street_runs import summary_of
@@ -184,7 +184,7 @@ def score_splats(job: Job, splats: Splats, learned: Transforms = NONE) -> dict[s
     return {"images": summary, "splats": len(splats), "longest_splat": round(size, 4)}
 
 
-def surface(job: Job, state: TrainState, spec: dict[str, Any], folder: Path) -> dict[str, Any]:
+def surface(job: LoadedRun, state: TrainState, spec: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Return how good the mesh is and the seconds that making it took, where there is a true surface."""
     from gs2d.config.surface_protocols import VISIBLE_SURFACE
     from gs2d.evaluation.evaluators import VISIBLE, choose_truth, score_surface

@@ -31,15 +31,14 @@ from gs2d.data import View
 from gs2d.errors import BackendError
 from gs2d.io.formats.registry import LAYOUTS, read_splats, write_layout, written_bytes
 from gs2d.io.run_dir import open_run
-from gs2d.pipeline.prepare.finished import finished_splats
-from gs2d.pipeline.prepare.job import Job, reload_job
+from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats, reload_run
 from gs2d.render.api import rasterize
 
 Draw = Callable[[Splats], list[np.ndarray]]
 SAME = 1e-4  # of a colour in [0, 1]
 
 
-def pictures(splats: Splats, job: Job, views: Sequence[View]) -> list[np.ndarray]:
+def pictures(splats: Splats, job: LoadedRun, views: Sequence[View]) -> list[np.ndarray]:
     """Draw views, [H, W, 3] each, in [0, 1]."""
     placed = splats.to(job.backend.device)
     with torch.no_grad():
@@ -47,7 +46,7 @@ def pictures(splats: Splats, job: Job, views: Sequence[View]) -> list[np.ndarray
     return [image.clamp(0, 1).cpu().numpy().astype(np.float64) for image in drawn]
 
 
-def photographs(job: Job, views: Sequence[View]) -> list[np.ndarray]:
+def photographs(job: LoadedRun, views: Sequence[View]) -> list[np.ndarray]:
     """The photographs of views, over the run's background."""
     found = []
     for view in views:
@@ -113,7 +112,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--every", type=int, default=1)
     options = parser.parse_args(argv)
     run = open_run(options.run)
-    splats, job = finished_splats(run), reload_job(run, lambda event: None)
+    splats, job = finished_splats(run), reload_run(run, lambda event: None)
     views = job.scene.test if options.split == "test" and job.scene.test else job.scene.train
     views = views[:: options.every]
 

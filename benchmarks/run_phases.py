@@ -6,7 +6,10 @@ from benchmarks.sampler import Rule
 
 RUN_LOGGER, LOOP = "pipeline/train/run_logger.py", "training/trainer.py"
 RUN_PHASES = (  # names that a version of the code does not have are found nowhere in it
-    Rule("read the capture", (("pipeline/prepare/job.py", "prepare_job"), ("pipeline/prepare/job.py", "reload_job"))),
+    Rule(
+        "read the capture",
+        (("pipeline/prepare/loaded.py", "prepare_run"), ("pipeline/prepare/loaded.py", "reload_run")),
+    ),
     Rule("PSNR curve", ((RUN_LOGGER, "_probe_psnr"),)),
     Rule("pictures", (("pipeline/finish/run_images.py", "draw_stage"),)),
     Rule("score a stage", ((RUN_LOGGER, "_score_stage"), (RUN_LOGGER, "_score_entry"))),

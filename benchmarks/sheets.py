@@ -21,13 +21,13 @@ from gs2d.core.splats import Splats
 from gs2d.evaluation.images import psnr_8bit
 from gs2d.io.run_dir import open_run
 from gs2d.io.splat_ply import read_splats
-from gs2d.pipeline.prepare.job import Job, reload_job
+from gs2d.pipeline.prepare.loaded import LoadedRun, reload_run
 from gs2d.render.api import rasterize
 from gs2d.training.objective import visible_mask
 
 
 @torch.no_grad()
-def score(splats: Splats, job: Job) -> tuple[float, float, float]:
+def score(splats: Splats, job: LoadedRun) -> tuple[float, float, float]:
     """Mean and least PSNR of the test views in dB, and the mean alpha of their empty background."""
     values, covered = [], []
     for view in job.scene.test:
@@ -42,7 +42,7 @@ def score(splats: Splats, job: Job) -> tuple[float, float, float]:
 
 def report(run: Path, longer: float) -> None:
     """The figures of one run."""
-    job = reload_job(open_run(run), lambda event: None)
+    job = reload_run(open_run(run), lambda event: None)
     splats = read_splats(run / "splats.ply")
     seen = visible_mask(splats, job.scene.train, job.settings, job.backend)
     sizes = splats.scales.max(dim=1).values

@@ -41,8 +41,7 @@ from gs2d.data.image_files import read_image, write_image
 from gs2d.errors import DataError
 from gs2d.evaluation.images import ImageMetrics, image_metrics
 from gs2d.pipeline.events import ignore
-from gs2d.pipeline.prepare.finished import open_job
-from gs2d.pipeline.prepare.job import Job
+from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.run_exposures import matched_by_halves
 
 OWN_ITERATIONS = 30_000
@@ -307,7 +306,7 @@ def draw_test_views(
     return files
 
 
-def score_images(job: Job, files: Sequence[Path]) -> dict[str, Any]:
+def score_images(job: LoadedRun, files: Sequence[Path]) -> dict[str, Any]:
     """Our metrics of pictures of the test views, as they are and with colours matched."""
     plain: dict[str, ImageMetrics] = {}
     matched: dict[str, ImageMetrics] = {}
@@ -337,7 +336,7 @@ def measure_peer(
     ------
     DataError
     """
-    _, job, _ = open_job(run, None, ignore)
+    _, job, _ = open_finished(run, None, ignore)
     scene, whole = job.scene, folder / "whole.json"
     around = [canvas(view.camera) for view in scene.views]
     if not whole.exists():

@@ -38,8 +38,7 @@ from gs2d.pipeline.finish.run_images import render_view
 from gs2d.pipeline.finish.run_mesh import fusion_frame
 from gs2d.pipeline.finish.run_subject import sights, surface_reach
 from gs2d.pipeline.finish.scoring import score_views
-from gs2d.pipeline.prepare.finished import open_job
-from gs2d.pipeline.prepare.job import Job
+from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.run_exposures import read_exposures
 from gs2d.pipeline.reconstruct import CAPTURE, FEW
@@ -222,7 +221,7 @@ def score_run(path: Path) -> dict[str, Any]:
     Test views have the exposure that the training photographs around them predict, as in the run's own scores, and none
     in "test_plain".
     """
-    run, job, splats = open_job(path, None, ignore)
+    run, job, splats = open_finished(path, None, ignore)
     drawing = (job.settings, job.backend)
     exposures = with_predicted(read_exposures(run, job.recipe), job.scene, metered(splats, *drawing))
 
@@ -241,7 +240,7 @@ def score_run(path: Path) -> dict[str, Any]:
     }
 
 
-def hidden_fraction(job: Job, splats: Splats) -> dict[str, Any] | None:
+def hidden_fraction(job: LoadedRun, splats: Splats) -> dict[str, Any] | None:
     """Sparse points that the rendered median depth of test views hides; None without test views or points."""
     observed, counts = job.scene.observed(guessed=False), {}
     if observed is None or not job.scene.test:
@@ -320,7 +319,7 @@ def measure_mesh(path: Path) -> dict[str, Any]:
 
     The box is found from the splats by today's program, whatever the run's own says and whether its mesh was cut to it.
     """
-    run, job, splats = open_job(path, None, ignore)
+    run, job, splats = open_finished(path, None, ignore)
     mesh = read_mesh(run.file(MESH))
     facts: dict[str, Any] = {"faces": len(mesh.faces), "vertices": len(mesh.vertices)}
     facts["faces_per_pixel"] = round(len(mesh.faces) / max(pixels_of(job, splats, mesh), 1.0), 3)
@@ -331,7 +330,7 @@ def measure_mesh(path: Path) -> dict[str, Any]:
     return facts | {"subject": subject.kind, "share_in_subject": round(fraction_in_box(mesh, subject.box), 4)}
 
 
-def pixels_of(job: Job, splats: Splats, mesh: Mesh) -> float:
+def pixels_of(job: LoadedRun, splats: Splats, mesh: Mesh) -> float:
     """How many pixels of the training views saw a mesh: each part of it counts in the view that saw it best."""
     views = ((view, render_view(splats, view, job.settings, job.backend)) for view in job.scene.train)
     reach = surface_reach(job)

@@ -30,7 +30,7 @@ from gs2d.data.masks import find_masks_in
 from gs2d.errors import DataError, Gs2dError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, open_run
-from gs2d.pipeline.prepare.job import reload_job
+from gs2d.pipeline.prepare.loaded import reload_run
 
 HALF = 0.5  # of the photographs that have a face in frame, which must have it in the mask
 GOAL = 0.98  # of the area
@@ -108,7 +108,7 @@ def measure(run: Path, folder: Path, mesh: Path | None = None) -> dict[str, Any]
     Gs2dError
     """
     file = run / MESH if mesh is None else mesh
-    job = reload_job(open_run(run), lambda event: None)
+    job = reload_run(open_run(run), lambda event: None)
     fraction = fraction_inside(read_mesh(file), masks_of(job.scene.views, folder))
     return {"run": run.name, "mesh": file.name, **vars(fraction)}
 

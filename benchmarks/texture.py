@@ -37,9 +37,8 @@ from gs2d.io.run_dir import MESH, open_run
 from gs2d.meshing.raycast import Hits, cast_camera
 from gs2d.meshing.texture import bilinear
 from gs2d.pipeline.finish.run_texture import textured_mesh
-from gs2d.pipeline.prepare.finished import finished_splats
-from gs2d.pipeline.prepare.job import reload_job
-from gs2d.pipeline.prepare.opened import read_scene
+from gs2d.pipeline.prepare.loaded import finished_splats, reload_run
+from gs2d.pipeline.prepare.open_capture import read_scene
 from gs2d.pipeline.prepare.options import TextureOptions
 from gs2d.pipeline.prepare.run_exposures import NONE, Transforms, as_scene, read_exposures
 
@@ -130,11 +129,11 @@ def main() -> None:
     parser.add_argument("--pictures", type=Path, help="an existing folder")
     arguments = parser.parse_args()
     run = open_run(arguments.run)
-    job, splats, mesh = reload_job(run, lambda _event: None), finished_splats(run), read_mesh(run.file(MESH))
+    job, splats, mesh = reload_run(run, lambda _event: None), finished_splats(run), read_mesh(run.file(MESH))
     shrink, exposures = arguments.downscale or job.downscale, read_exposures(run, job.recipe)
     if shrink != job.downscale and job.scene.root is not None:
         scene = read_scene(job.scene.root, job.scene.format, shrink, job.protocol, lambda _event: None)
-        job = replace(job, scene=scene, downscale=shrink)
+        job = replace(job, scene=scene, resolved=replace(job.resolved, downscale=shrink))
     views = job.scene.test
     if not views:
         views = job.scene.train[:: arguments.hold_out]

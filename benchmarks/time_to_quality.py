@@ -65,7 +65,7 @@ from gs2d.data.scene import PointCloud
 from gs2d.errors import DataError, Gs2dError
 from gs2d.evaluation.evaluators import choose_truth
 from gs2d.pipeline.events import ignore
-from gs2d.pipeline.prepare.job import Job, prepare_job
+from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
 from gs2d.synthetic.capture import write_demo_capture
 
 DEMO, PEER = "demo", "opensplat"
@@ -122,7 +122,7 @@ def with_start(scene: Scene, count: int, seed: int) -> Scene:
     return replace(scene, points=PointCloud(points, np.full((count, 3), 128, dtype=np.uint8)))
 
 
-def run_opensplat(binary: Path, job: Job, scale: float, threads: int | None, folder: Path) -> dict[str, Any]:
+def run_opensplat(binary: Path, job: LoadedRun, scale: float, threads: int | None, folder: Path) -> dict[str, Any]:
     """Train the peer for a schedule, each variant unless that is done, and return the row of the better one.
 
     Raises
@@ -133,7 +133,7 @@ def run_opensplat(binary: Path, job: Job, scale: float, threads: int | None, fol
     iterations = whole_steps(scale * OWN_ITERATIONS)
     scene = with_start(job.scene, job.recipe.init_points, job.recipe.seed)
     around, background = [canvas(view.camera) for view in scene.views], job.settings.background
-    facts = {"iterations": iterations, "digest": job.images_digest, "threads": threads, "binary": str(binary)}
+    facts = {"iterations": iterations, "digest": job.resolved.scene.digest, "threads": threads, "binary": str(binary)}
     if not (folder / SPEC).exists() or json.loads((folder / SPEC).read_text()) != facts:
         shutil.rmtree(folder, ignore_errors=True)
         seen = [seen_window(view.camera, view.mask()) for view in scene.train]
@@ -194,7 +194,7 @@ def measure(text: str, args: argparse.Namespace, keep: Any) -> None:
         write_demo_capture(capture, seed=0)
     base = args.out / (name if downscale == 1 else f"{name}-{downscale}")
     first = specification(capture, downscale, args.recipes[0], 1.0, args.seeds[0], args)
-    job = prepare_job(train_options(first, base), ignore)
+    job = prepare_run(train_options(first, base), ignore)
     truth = args.ground_truth is not None or choose_truth(None, capture, lambda text: None) is not None
     curves = {recipe: {"name": Path(recipe).name, "runs": []} for recipe in args.recipes}
     if args.opensplat is not None and job.scene.test:
@@ -209,7 +209,8 @@ def measure(text: str, args: argparse.Namespace, keep: Any) -> None:
                 told(name, curves[recipe], row)
                 keep(entry)
     for scale in sorted(args.opensplat_scales or args.scales) if PEER in curves else ():
-        scaled = replace(job, recipe=scale_schedule(job.recipe, scale))
+        recipe = scale_schedule(job.recipe, scale)
+        scaled = replace(job, resolved=replace(job.resolved, recipe=recipe))
         row = run_opensplat(args.opensplat, scaled, scale, args.threads, base / f"{PEER}-{scale:g}")
         told(name, curves[PEER], row)
         keep(entry)

@@ -10,7 +10,7 @@ from benchmarks.street_runs import measure_mesh, score_run
 
 from ball_runs import options
 from gs2d.pipeline.events import ignore
-from gs2d.pipeline.prepare.finished import open_job
+from gs2d.pipeline.prepare.loaded import open_finished
 from gs2d.pipeline.train.train_run import train
 from tiny import write_capture
 
@@ -23,7 +23,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_run_is_scored_view_by_view_as_the_run_itself_was(run: Path) -> None:
     scores = score_run(run)
-    job = open_job(run, None, ignore)
+    job = open_finished(run, None, ignore)
     last = job[0].metrics()["stages"][-1]
     assert scores["test"]["psnr"] == pytest.approx(last["test"]["psnr"], abs=0.01)
     assert scores["test"]["ssim"] == pytest.approx(last["test"]["ssim"], abs=1e-3)

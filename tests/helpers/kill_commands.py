@@ -45,7 +45,6 @@ SHORT = {  # the three stages on few views: as many kinds of files as in a long 
     "schedule_scale": 0.0002,
     "overrides": FEW,
     "checkpoint_every": 2,
-    "shown_views": 1,
     "page": True,
 }
 DATED = {"report.html", "run.json", "metrics.json", "verdict.json", "events.jsonl", ".lock", "poses.json"} | {

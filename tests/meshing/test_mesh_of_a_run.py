@@ -19,10 +19,10 @@ from gs2d.kernels.library import available_variants
 from gs2d.meshing.tsdf import Add, Volume, integrator
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.finish.run_mesh import extract_mesh, mesh_run
-from gs2d.pipeline.prepare.finished import finished_splats
-from gs2d.pipeline.prepare.job import reload_job, with_fused_depth
+from gs2d.pipeline.prepare.loaded import finished_splats, reload_run
 from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
-from gs2d.pipeline.train.same_run import check_same_run
+from gs2d.pipeline.prepare.resolve import with_fused_depth
+from gs2d.pipeline.prepare.resolved import check_same_run
 from gs2d.pipeline.train.train_run import train
 from gs2d.render.backends import Backend, get_backend
 from tiny import RADIUS, write_capture
@@ -34,9 +34,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     capture = write_capture(folder / "ball", size=32)
     overrides = ("init_points=400", "surface.iterations=40", "surface.densify.max_splats=400")
     out = folder / "run"
-    options = TrainOptions(
-        scene=capture, out=out, recipe="2dgs", schedule_scale=0.002, overrides=overrides, threads=1, shown_views=0
-    )
+    options = TrainOptions(scene=capture, out=out, recipe="2dgs", schedule_scale=0.002, overrides=overrides, threads=1)
     return train(options).path
 
 
@@ -77,7 +75,7 @@ def test_a_training_whose_mesh_does_not_fit_has_it_in_larger_voxels_from_the_sam
     capture, heard = write_capture(tmp_path / "ball", size=32), list[Event]()
     overrides = ("init_points=400", "surface.iterations=40", "surface.densify.max_splats=400")
     run = train(TrainOptions(scene=capture, out=tmp_path / "run", recipe="2dgs", schedule_scale=0.002, threads=1,
-                             overrides=overrides, shown_views=0), heard.append)  # fmt: skip
+                             overrides=overrides), heard.append)  # fmt: skip
     assert any("the mesh has such voxels" in event.text for event in heard if isinstance(event, Notice))
     assert run.metrics()["mesh"]["faces"] == len(read_mesh(run.file("mesh.ply")).faces) > 10
 
@@ -88,7 +86,7 @@ def test_the_run_fuses_its_protocols_depth_and_one_of_before_that_field_still_re
     assert mesh_run(run, MeshOptions(voxel=0.05), out=tmp_path / "a.ply", threads=1)["depth"] == "median"
     assert mesh_run(run, MeshOptions(voxel=0.05, depth="mean"), out=tmp_path / "b.ply", threads=1)["depth"] == "mean"
     folder = RunFolder(run)
-    job = reload_job(folder, lambda _event: None)
+    job = reload_run(folder, lambda _event: None)
     of_recipe = with_fused_depth(job.protocol, replace(job.recipe, fused_depth="transmittance"))
     assert (of_recipe.fused_depth, job.protocol.fused_depth) == ("transmittance", "median")
     assert with_fused_depth(of_recipe, job.recipe) is of_recipe  # a recipe that says nothing changes nothing
@@ -96,11 +94,13 @@ def test_the_run_fuses_its_protocols_depth_and_one_of_before_that_field_still_re
     del definition["protocol"]["fusion"]["depth"]
     old = RunFolder(tmp_path)
     write_json(tmp_path / "run.json", definition)
-    check_same_run(old, job)
+    check_same_run(old, job.resolved)
     other = replace(job.protocol, fusion=replace(job.protocol.fusion, depth="mean"))
-    assert replace(job, protocol=other).stage_key(0) == job.stage_key(0)  # shares its stages
+    assert replace(job, resolved=replace(job.resolved, protocol=other)).stage_key(0) == job.stage_key(
+        0
+    )  # shares its stages
     with pytest.raises(RunError, match="protocol"):
-        check_same_run(old, replace(job, protocol=replace(job.protocol, near=0.3)))
+        check_same_run(old, replace(job.resolved, protocol=replace(job.protocol, near=0.3)))
 
 
 @pytest.mark.parametrize("unbounded", [False, True])
@@ -115,7 +115,7 @@ def test_a_run_is_fused_by_its_own_backend_and_says_so(
         asked.append(backend.name)
         return integrator(volumes, backend, threads)
 
-    job, splats = reload_job(RunFolder(run), lambda _event: None), finished_splats(RunFolder(run))
+    job, splats = reload_run(RunFolder(run), lambda _event: None), finished_splats(RunFolder(run))
     monkeypatch.setattr("gs2d.meshing.tsdf.integrator", recorded)
     for backend in ("reference", *(["cpu"] if available_variants() else [])):
         options = MeshOptions(unbounded=unbounded, voxel=0.05)

@@ -14,7 +14,7 @@ import torch
 from ball_runs import Stop, comparable, options
 from gs2d.io.run_dir import CheckpointFile, RunFolder, load_tensors, save_tensors
 from gs2d.pipeline.events import Event, Notice, Step, ignore
-from gs2d.pipeline.prepare.job import Job, prepare_job
+from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
 from gs2d.pipeline.train.resume import ResumePoint, choose_start
 from gs2d.pipeline.train.train_run import train
 
@@ -34,15 +34,15 @@ def stopped(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolde
 
 
 @pytest.fixture(scope="module")
-def job(capture: Path) -> Job:
-    return prepare_job(options(capture, Path("unused")), ignore)
+def job(capture: Path) -> LoadedRun:
+    return prepare_run(options(capture, Path("unused")), ignore)
 
 
-def resumed(run: RunFolder, job: Job, capture: Path, payload: dict[str, Any]) -> tuple[ResumePoint, list[str]]:
+def resumed(run: RunFolder, job: LoadedRun, capture: Path, payload: dict[str, Any]) -> tuple[ResumePoint, list[str]]:
     """Where training goes on when the last checkpoint holds ``payload``, and what is said."""
     save_tensors(run.checkpoints()[-1].path, payload)
     heard: list[Event] = []
-    start = choose_start(run, job, options(capture, run.path, resume=True), heard.append)
+    start = choose_start(run, job, heard.append)
     return start, [event.text for event in heard if isinstance(event, Notice)]
 
 
@@ -93,7 +93,12 @@ def half(tensor: torch.Tensor) -> torch.Tensor:
     ],
 )
 def test_a_checkpoint_whose_entries_do_not_fit_together_is_passed_over(
-    capture: Path, stopped: RunFolder, job: Job, tmp_path: Path, path: tuple[str, ...], change: Callable[[Any], Any]
+    capture: Path,
+    stopped: RunFolder,
+    job: LoadedRun,
+    tmp_path: Path,
+    path: tuple[str, ...],
+    change: Callable[[Any], Any],
 ) -> None:
     run = RunFolder(Path(shutil.copytree(stopped.path, tmp_path / "run")))
     payload = load_tensors(run.checkpoints()[-1].path)
@@ -134,7 +139,7 @@ def test_a_damaged_stage_of_a_cache_is_trained_again_and_kept(
 
 
 def test_a_checkpoint_under_the_name_of_another_is_passed_over(
-    capture: Path, stopped: RunFolder, job: Job, tmp_path: Path
+    capture: Path, stopped: RunFolder, job: LoadedRun, tmp_path: Path
 ) -> None:
     run = RunFolder(Path(shutil.copytree(stopped.path, tmp_path / "run")))
     last = run.checkpoints()[-1]

@@ -22,7 +22,7 @@ from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.finish.run_images import render_run, render_view
 from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.finish.scoring import score_views
-from gs2d.pipeline.prepare.finished import open_job
+from gs2d.pipeline.prepare.loaded import open_finished
 from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, TrainOptions
 from gs2d.pipeline.prepare.run_exposures import read_exposures
 from gs2d.pipeline.train.train_run import train
@@ -92,7 +92,7 @@ def test_the_transforms_lie_beside_the_run_and_their_mean_is_the_identity(run: R
 
 
 def test_training_views_are_scored_in_their_exposures_and_test_views_as_they_are(run: RunFolder) -> None:
-    _, job, splats = open_job(run.path, 1, ignore)
+    _, job, splats = open_finished(run.path, 1, ignore)
     transforms = read_exposures(run, job.recipe)
     drawing = {"settings": job.settings, "backend": job.backend, "name": "", "on_event": ignore}
     last = run.metrics()["stages"][-1]
@@ -117,7 +117,7 @@ def test_matched_scores_are_beside_the_plain_ones_where_they_are_asked_for(run: 
 
 def test_any_view_can_be_rendered_in_the_exposure_of_a_photograph(run: RunFolder, tmp_path: Path) -> None:
     render_run(run.path, orbit=2, out=tmp_path, exposure_of="train/r_1.png")
-    _, job, splats = open_job(run.path, 1, ignore)
+    _, job, splats = open_finished(run.path, 1, ignore)
     subject = read_subject(run.path)
     assert subject is not None
     focus = subject.center if subject.kind == OBJECT else None

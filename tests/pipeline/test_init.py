@@ -9,9 +9,9 @@ import pytest
 
 from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.io.formats.registry import write_layout
-from gs2d.pipeline.prepare.job import prepare_job
+from gs2d.pipeline.prepare.loaded import prepare_run
 from gs2d.pipeline.prepare.options import TrainOptions
-from gs2d.pipeline.train.same_run import check_same_run
+from gs2d.pipeline.prepare.resolved import check_same_run
 from gs2d.pipeline.train.train_run import train
 from tiny import write_capture
 from train_toys import random_splats
@@ -32,18 +32,18 @@ def test_a_run_starts_from_the_file_and_resumes_with_it_alone(options: TrainOpti
     run = train(options, told.append)
     assert any("starting from start.ply: 30 flat splats" in str(event) for event in told)
     assert len(run.definition()["init"]) == 64
-    job = prepare_job(options, lambda event: None)
-    check_same_run(run, job)
-    other = prepare_job(replace(options, init=None), lambda event: None)
+    job = prepare_run(options, lambda event: None)
+    check_same_run(run, job.resolved)
+    other = prepare_run(replace(options, init=None), lambda event: None)
     assert other.stage_key(0) != job.stage_key(0)
     with pytest.raises(RunError, match="--init"):
-        check_same_run(run, other)
+        check_same_run(run, other.resolved)
 
 
 def test_what_cannot_start_a_training_is_one_line(options: TrainOptions, tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match="--init"):
-        prepare_job(replace(options, start_from=tmp_path), lambda event: None)
+        prepare_run(replace(options, start_from=tmp_path), lambda event: None)
     with pytest.raises(DataError, match="--init"):
-        prepare_job(replace(options, init=tmp_path), lambda event: None)
+        prepare_run(replace(options, init=tmp_path), lambda event: None)
     with pytest.raises(DataError, match=r"none.ply"):
-        prepare_job(replace(options, init=tmp_path / "none.ply"), lambda event: None)
+        prepare_run(replace(options, init=tmp_path / "none.ply"), lambda event: None)

@@ -23,7 +23,7 @@ from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.events import Event, Notice, Phase, Step, ignore
-from gs2d.pipeline.prepare.job import Job, prepare_job
+from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
 from gs2d.pipeline.train import live as module
 from gs2d.pipeline.train.live import Live
 from gs2d.pipeline.train.train_run import train
@@ -76,8 +76,8 @@ def test_a_watched_training_has_the_bytes_of_an_unwatched_one(
 
 
 @pytest.fixture(scope="module")
-def job(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Job:
-    return prepare_job(options(capture, tmp_path_factory.mktemp("runs") / "run"), ignore)
+def job(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> LoadedRun:
+    return prepare_run(options(capture, tmp_path_factory.mktemp("runs") / "run"), ignore)
 
 
 @pytest.fixture
@@ -93,8 +93,8 @@ def heard() -> list[Event]:
 
 
 @pytest.fixture
-def live(job: Job, capture: Path, tmp_path: Path, heard: list[Event]) -> Iterator[Live]:
-    watched = Live(job, options(capture, tmp_path / "run", viewer=True), heard.append)
+def live(job: LoadedRun, capture: Path, tmp_path: Path, heard: list[Event]) -> Iterator[Live]:
+    watched = Live(job, heard.append)
     yield watched
     watched.close()
 

@@ -23,8 +23,8 @@ from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.events import Notice
 from gs2d.pipeline.finish.run_subject import sights
 from gs2d.pipeline.in_memory import Trained, evaluate, extract_mesh, train
-from gs2d.pipeline.prepare.capture_masks import without_masked_points
-from gs2d.pipeline.prepare.job import reload_job, scene_digest
+from gs2d.pipeline.prepare.loaded import reload_run, scene_digest
+from gs2d.pipeline.prepare.open_capture import without_masked_points
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.render.backends import get_backend
 from gs2d.training.trainer import raster_settings
@@ -156,7 +156,7 @@ def test_a_run_remembers_its_masks(tmp_path: Path, capsys: pytest.CaptureFixture
     assert run([*words, "--masked", "empty"]) in (0, 3)  # 3: there is no surface yet
     data = json.loads((tmp_path / "run" / "run.json").read_text())
     assert data["scene"]["masks"] == {"folder": str(tmp_path / "mine"), "masked": "empty"}
-    scene = reload_job(RunFolder(tmp_path / "run"), lambda _: None).scene
+    scene = reload_run(RunFolder(tmp_path / "run"), lambda _: None).scene
     assert scene.masks.found == 8
     assert scene.train[0].alpha() is not None
     capsys.readouterr()

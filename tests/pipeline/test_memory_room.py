@@ -14,7 +14,7 @@ from gs2d.core.memory_limit import MemoryLimit
 from gs2d.errors import DataError
 from gs2d.pipeline.events import Notice
 from gs2d.pipeline.prepare import memory_budget as module
-from gs2d.pipeline.prepare.job import prepare_job
+from gs2d.pipeline.prepare.loaded import prepare_run
 from gs2d.pipeline.prepare.memory_budget import check_memory
 from gs2d.pipeline.train.train_run import train
 from tiny import write_capture
@@ -57,7 +57,7 @@ def test_a_training_that_nobody_said_the_size_of_shrinks_its_photographs_until_t
     monkeypatch.setattr(module, "memory_limit", lambda: limit)
     heard: list[Any] = []
     mine = options(capture, tmp_path / "run")
-    job = prepare_job(mine, heard.append)
+    job = prepare_run(mine, heard.append)
     assert (job.downscale, job.scene.train[0].camera.width) == (2, 12)
     notices = [event.text for event in heard if isinstance(event, Notice)]
     (told,) = [text for text in notices if "megapixels" in text]
@@ -65,12 +65,12 @@ def test_a_training_that_nobody_said_the_size_of_shrinks_its_photographs_until_t
     assert told.endswith("(the control group (memory.max)): they are shrunk by 2, as by --downscale 2")
     assert len(notices) == len(set(notices))
     with pytest.raises(DataError, match="--downscale"):
-        prepare_job(replace(mine, downscale=1), heard.append)
+        prepare_run(replace(mine, downscale=1), heard.append)
 
 
 def test_what_is_gone_on_with_is_shrunk_as_it_was_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = write_capture(tmp_path / "ball", train=3, test=1, size=24)
     mine = options(capture, tmp_path / "run", schedule_scale=0.0002)
     train(replace(mine, downscale=2))
-    assert prepare_job(replace(mine, resume=True), lambda _event: None).downscale == 2
-    assert prepare_job(replace(mine, resume=True, downscale=1), lambda _event: None).downscale == 1
+    assert prepare_run(replace(mine, resume=True), lambda _event: None).downscale == 2
+    assert prepare_run(replace(mine, resume=True, downscale=1), lambda _event: None).downscale == 1

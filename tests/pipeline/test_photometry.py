@@ -16,7 +16,7 @@ from gs2d.core.photometry import CameraPhotometry
 from gs2d.errors import RunError
 from gs2d.io.run_dir import PHOTOMETRY, REPORT, RunFolder
 from gs2d.pipeline.events import Event, Notice, ignore
-from gs2d.pipeline.prepare.job import reload_job
+from gs2d.pipeline.prepare.loaded import reload_run
 from gs2d.pipeline.prepare.run_exposures import as_scene, photographed
 from gs2d.pipeline.train.train_run import train
 
@@ -39,7 +39,7 @@ def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 def test_every_view_has_the_light_of_its_camera_and_the_report_says_it(run: RunFolder) -> None:
     (camera,) = json.loads(run.file(PHOTOMETRY).read_text())["cameras"]
-    job = reload_job(run, ignore)
+    job = reload_run(run, ignore)
     assert camera["photographs"] == [view.name for view in job.scene.views]
     for view in job.scene.views:
         assert view.photometry == CameraPhotometry(tuple(camera["falloff"]), camera["reach"], 0.0)
@@ -49,7 +49,7 @@ def test_every_view_has_the_light_of_its_camera_and_the_report_says_it(run: RunF
 
 
 def test_what_is_rendered_and_taken_back_are_each_other_s_inverse(run: RunFolder) -> None:
-    view = reload_job(run, ignore).scene.train[0]
+    view = reload_run(run, ignore).scene.train[0]
     view = view.through(CameraPhotometry((0.4, 0.0, 0.0), view.photometry.reach))  # type: ignore[union-attr]
     color = torch.full((view.camera.height, view.camera.width, 3), 0.5)
     seen = photographed(replace(view), color, {}, (0.0, 0.0, 0.0))
@@ -76,6 +76,6 @@ def test_a_damaged_file_is_one_line_that_says_what_to_do(run: RunFolder, tmp_pat
     for text, words in damages.items():
         copy.file(PHOTOMETRY).write_text(text)
         with pytest.raises(RunError, match=words) as caught:
-            reload_job(copy, ignore)
+            reload_run(copy, ignore)
         assert "--resume" in str(caught.value)
         assert "\n" not in str(caught.value)

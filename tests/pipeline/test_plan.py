@@ -105,7 +105,7 @@ def test_a_plan_is_of_the_training_that_train_would_do(
     with pytest.raises(Asked):
         plan(PlanOptions(scene=capture, **given))
     with pytest.raises(Asked):
-        train(TrainOptions(scene=capture, out=tmp_path / "run", estimate=True, **given))
+        train(TrainOptions(scene=capture, out=tmp_path / "run", disk=1000.0, **given))
     assert asked[0] == asked[1]
 
 

@@ -21,10 +21,11 @@ from gs2d.pipeline.events import Event, Notice, Phase
 from gs2d.pipeline.finish.run_mesh import mesh_run
 from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.prepare import photographs
-from gs2d.pipeline.prepare.finished import open_job
+from gs2d.pipeline.prepare.loaded import open_finished
 from gs2d.pipeline.prepare.memory_budget import use_memory
 from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare.photographs import PREPARED
+from gs2d.pipeline.prepare.resolved import Execution
 from gs2d.pipeline.train.train_run import train
 from gs2d.synthetic.flight import Flight, write_flight
 from gs2d.training.trainer import Trainer
@@ -60,7 +61,7 @@ def test_splats_trained_from_prepared_photographs_have_the_bits_of_those_trained
     capture: Path, tmp_path: Path, recipe: str
 ) -> None:
     scene = load_scene(capture, test_every=0)
-    chosen = photographs.with_prepared(scene, tmp_path, "always", lambda event: None)
+    chosen = photographs.with_prepared(scene, tmp_path, Execution(prepare="always"), lambda event: None)
     assert chosen.ahead > 0
     short = scale_schedule(get_recipe(recipe), 0.0005)
     found = [Trainer(given, short, COARSE, backend="auto").run() for given in (chosen, scene)]
@@ -87,7 +88,7 @@ def test_prepared_photographs_train_to_the_same_bytes_as_photographs_in_memory(
 @pytest.mark.slow
 def test_a_run_that_is_meshed_and_reported_again_reads_what_it_has_prepared(capture: Path, tmp_path: Path) -> None:
     run = train(options(capture, tmp_path / "run", "always"))
-    _, job, _ = open_job(run.path, None, lambda event: None)
+    _, job, _ = open_finished(run.path, None, lambda event: None)
     assert all(isinstance(view.decode, Stored) for view in job.scene.views)
     use_memory(2.0)
     again = mesh_run(run.path, MeshOptions(whole_scene=True, keep_components=0), out=tmp_path / "again.ply")
@@ -96,7 +97,7 @@ def test_a_run_that_is_meshed_and_reported_again_reads_what_it_has_prepared(capt
     for file in (run.path / PREPARED).iterdir():  # whoever wants the room takes it
         file.unlink()
     (run.path / PREPARED).rmdir()
-    _, job, _ = open_job(run.path, None, lambda event: None)
+    _, job, _ = open_finished(run.path, None, lambda event: None)
     assert not any(isinstance(view.decode, Stored) for view in job.scene.views)
 
 
@@ -104,15 +105,15 @@ def test_photographs_are_prepared_by_themselves_where_they_would_not_stay_in_mem
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene, heard = load_scene(capture), []
-    assert photographs.with_prepared(scene, tmp_path, "auto", heard.append) is scene
+    assert photographs.with_prepared(scene, tmp_path, Execution(prepare="auto"), heard.append) is scene
     assert heard == []
     assert list(tmp_path.iterdir()) == []
     small = load_scene(capture, cache_bytes=12 * 64 * 48 * 3 - 1)
-    chosen = photographs.with_prepared(small, tmp_path, "auto", heard.append)
+    chosen = photographs.with_prepared(small, tmp_path, Execution(prepare="auto"), heard.append)
     assert all(isinstance(view.decode, Stored) for view in chosen.views)
     said = next(event.text for event in heard if isinstance(event, Notice))
     assert "do not stay in memory: prepared in" in said
-    assert photographs.with_prepared(small, tmp_path / "no", "never", heard.append) is small
+    assert photographs.with_prepared(small, tmp_path / "no", Execution(prepare="never"), heard.append) is small
 
 
 def test_a_run_that_was_broken_off_while_it_prepared_goes_on(

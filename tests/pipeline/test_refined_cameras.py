@@ -15,7 +15,7 @@ from gs2d.errors import RunError
 from gs2d.io.run_dir import POSES, RunFolder
 from gs2d.pipeline.events import Event, Notice, ignore
 from gs2d.pipeline.finish.run_texture import _views
-from gs2d.pipeline.prepare.job import reload_job
+from gs2d.pipeline.prepare.loaded import reload_run
 from gs2d.pipeline.prepare.options import TextureOptions
 from gs2d.pipeline.train.train_run import train
 
@@ -38,7 +38,7 @@ def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 def test_every_view_has_the_focal_length_that_was_found_and_the_file_can_be_loaded(
     run: RunFolder, capture: Path, tmp_path: Path
 ) -> None:
-    given, job = load_scene(capture), reload_job(run, ignore)
+    given, job = load_scene(capture), reload_run(run, ignore)
     zoom = job.scene.train[0].zoom
     assert zoom is not None
     assert abs(zoom.scale - 1) > 1e-3
@@ -64,7 +64,7 @@ def test_every_view_has_the_focal_length_that_was_found_and_the_file_can_be_load
 
 
 def test_photographs_of_another_size_have_it_too(run: RunFolder) -> None:
-    job = reload_job(run, ignore)
+    job = reload_run(run, ignore)
     larger = _views(job, TextureOptions(texture_downscale=2), ignore)
     for view, here in zip(larger, job.scene.train, strict=True):
         assert view.camera.width == here.camera.width // 2
@@ -81,4 +81,4 @@ def test_a_file_without_focal_lengths_is_refused(run: RunFolder, tmp_path: Path)
                 del entry["zoom"]
         copy.file(POSES).write_text(json.dumps(data))
         with pytest.raises(RunError, match=words):
-            reload_job(copy, ignore)
+            reload_run(copy, ignore)

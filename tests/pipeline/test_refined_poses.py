@@ -23,8 +23,7 @@ from gs2d.pipeline.finish.run_images import render_run, render_view
 from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.finish.run_texture import _views
 from gs2d.pipeline.finish.scoring import score_views
-from gs2d.pipeline.prepare.finished import open_job
-from gs2d.pipeline.prepare.job import reload_job
+from gs2d.pipeline.prepare.loaded import open_finished, reload_run
 from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, TextureOptions, TrainOptions
 from gs2d.pipeline.prepare.run_poses import aligned, how_far
 from gs2d.pipeline.train.train_run import train
@@ -81,14 +80,14 @@ def test_the_poses_lie_beside_the_run_as_transforms_that_can_be_loaded(
         (tmp_path / "again" / file).unlink()
     shutil.copy(run.file(POSES), tmp_path / "again/transforms.json")
     again = {view.name: view.camera for view in load_scene(tmp_path / "again").views}
-    _, job, _ = open_job(run.path, 1, ignore)
+    _, job, _ = open_finished(run.path, 1, ignore)
     for view in job.scene.views:
         np.testing.assert_allclose(again[view.name].T_cam_world, view.camera.T_cam_world, atol=1e-9)
         assert again[view.name].fx == pytest.approx(view.camera.fx)
 
 
 def test_everybody_takes_the_cameras_that_were_found(run: RunFolder, capture: Path, tmp_path: Path) -> None:
-    _, job, splats = open_job(run.path, 1, ignore)
+    _, job, splats = open_finished(run.path, 1, ignore)
     given = load_scene(capture)
     for view, before in zip(job.scene.train, given.train, strict=True):
         assert not np.array_equal(view.camera.T_cam_world, before.camera.T_cam_world)
@@ -121,7 +120,7 @@ def test_aligned_scores_are_beside_the_plain_ones_where_they_are_asked_for(run: 
 
 
 def test_a_view_is_aligned_to_where_the_splats_look_like_its_photograph(run: RunFolder) -> None:
-    _, job, splats = open_job(run.path, 1, ignore)
+    _, job, splats = open_finished(run.path, 1, ignore)
     view, drawing = job.scene.train[0], (job.settings, job.backend)
     color = render_view(splats, view, *drawing).color.clamp(0, 1).numpy()
     image = type(view).from_arrays("a", view.camera, np.rint(255 * color).astype(np.uint8))
@@ -142,7 +141,7 @@ def test_a_stopped_run_resumes_to_the_same_splats_and_poses(run: RunFolder, capt
     assert not (tmp_path / "run" / POSES).exists()
     stopped = RunFolder(tmp_path / "run")
     given = load_scene(capture).train[0].camera.T_cam_world
-    assert np.array_equal(reload_job(stopped, ignore).scene.train[0].camera.T_cam_world, given)  # not found yet
+    assert np.array_equal(reload_run(stopped, ignore).scene.train[0].camera.T_cam_world, given)  # not found yet
     resumed = train(learning(capture, tmp_path / "run", resume=True))
     assert comparable(resumed)[0] == comparable(run)[0]
     assert resumed.file(POSES).read_bytes() == run.file(POSES).read_bytes()

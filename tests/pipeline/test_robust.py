@@ -14,8 +14,8 @@ import torch
 from gs2d.config.presets import (
     with_robustness,
 )
-from gs2d.config.protocols import DTU, GENERIC
-from gs2d.config.recipe import LearningRates
+from gs2d.config.protocols import DTU, GENERIC, Protocol
+from gs2d.config.recipe import LearningRates, Recipe
 from gs2d.config.robust import Removal
 from gs2d.config.serialize import to_json
 from gs2d.core.camera import look_at
@@ -23,11 +23,14 @@ from gs2d.data.priors import ObservedPoints
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.prepare.job import fit_recipe, reload_job, settled
-from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.events import Event, Notice, OnEvent
+from gs2d.pipeline.prepare.loaded import reload_run
+from gs2d.pipeline.prepare.open_capture import OpenCapture
+from gs2d.pipeline.prepare.options import Training
 from gs2d.pipeline.prepare.predicted_exposure import with_predicted
-from gs2d.pipeline.train.same_run import check_same_run
+from gs2d.pipeline.prepare.resolve import build_recipe, resolve, robust_and_exposure
+from gs2d.pipeline.prepare.resolved import check_same_run
+from gs2d.render.backends import get_backend
 
 COUNT = 12
 
@@ -52,9 +55,21 @@ def ring(gains: np.ndarray, test: int = 0) -> Scene:
     )
 
 
-def options(**changes: object) -> TrainOptions:
-    given = {"recipe": "2dgs", **changes}
-    return TrainOptions(scene=Path("capture"), out=Path("run"), schedule_scale=0.1, **given)  # type: ignore[arg-type]
+def options(**changes: object) -> Training:
+    return Training(**{"recipe": "2dgs", **changes})  # type: ignore[arg-type]
+
+
+def fitted(training: Training, scene: Scene, protocol: Protocol, on_event: OnEvent) -> Recipe:
+    """The recipe at a tenth of its schedule."""
+    robust, exposure = robust_and_exposure(training, scene, protocol, on_event)
+    return build_recipe(training, schedule_scale=0.1, robust=robust, exposure=exposure)
+
+
+def resolved(training: Training, scene: Scene, on_event: OnEvent) -> tuple[Recipe, Protocol]:
+    """The recipe and the protocol as they are trained."""
+    capture = OpenCapture(scene, GENERIC, get_backend("reference"), 1)
+    recipe, capture = resolve(training, capture, on_event, schedule_scale=0.1)
+    return recipe, capture.protocol
 
 
 EQUAL, VARIED = ring(np.ones(COUNT)), ring(1 + 0.2 * np.sin(np.arange(COUNT)))
@@ -88,7 +103,7 @@ EMPTY = replace(EQUAL, observe=no_points)
 def test_training_is_robust_where_protocol_and_capture_allow_it(
     asked: dict[str, object], scene: Scene, protocol: object, robust: bool, exposure: bool
 ) -> None:
-    recipe = fit_recipe(options(**asked), scene, protocol, lambda _: None)  # type: ignore[arg-type]
+    recipe = fitted(options(**asked), scene, protocol, lambda _: None)  # type: ignore[arg-type]
     for part in (recipe.dense_start, recipe.removal):
         assert (part is not None) == robust
     assert (recipe.exposure is not None) == exposure
@@ -130,17 +145,17 @@ def test_where_exposures_follow_what_the_camera_sees_a_view_has_that_of_its_brig
 
 def test_another_removal_makes_another_stage_and_another_run(undisturbed: RunFolder, tmp_path: Path) -> None:
     run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
-    job = reload_job(run, lambda _: None)
-    robust = replace(job, recipe=with_robustness(job.recipe))
-    none = replace(robust, recipe=replace(robust.recipe, removal=None))
-    more = replace(robust, recipe=replace(robust.recipe, removal=Removal(dropout=0.3)))
+    job = reload_run(run, lambda _: None)
+    recipe = with_robustness(job.recipe)
+    none, more = replace(recipe, removal=None), replace(recipe, removal=Removal(dropout=0.3))
+    robust, none, more = (replace(job, resolved=replace(job.resolved, recipe=each)) for each in (recipe, none, more))
     assert len({one.stage_key(0) for one in (robust, none, more)}) == 3
     data = json.loads(run.file("run.json").read_text())
     data["recipe"] = to_json(robust.recipe)
     run.file("run.json").write_text(json.dumps(data))
     with pytest.raises(RunError, match="another"):
-        check_same_run(run, more)
-    check_same_run(run, robust)
+        check_same_run(run, more.resolved)
+    check_same_run(run, robust.resolved)
 
 
 @pytest.mark.parametrize(("brightness", "proposed"), [(1.0, False), (0.1, True)])
@@ -148,7 +163,7 @@ def test_splats_in_the_colour_of_an_unlit_backdrop_are_proposed_and_those_of_a_w
     brightness: float, proposed: bool
 ) -> None:
     heard: list[Event] = []
-    recipe, protocol = settled(options(), ring(np.full(COUNT, brightness)), GENERIC, heard.append)
+    recipe, protocol = resolved(options(), ring(np.full(COUNT, brightness)), heard.append)
     assert recipe.removal is not None
     assert recipe.removal.backdrop == proposed
     assert protocol.background == pytest.approx((0.5 * brightness,) * 3, abs=0.02)

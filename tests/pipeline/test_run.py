@@ -23,7 +23,7 @@ from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.demo import demo
 from gs2d.pipeline.events import Event, Notice, Phase, Step, ignore
 from gs2d.pipeline.finish.run_images import render_run
-from gs2d.pipeline.prepare.job import prepare_job
+from gs2d.pipeline.prepare.loaded import prepare_run
 from gs2d.pipeline.prepare.options import DemoOptions
 from gs2d.pipeline.train.train_run import pretraining_notices, train
 from tiny import write_capture
@@ -195,7 +195,7 @@ def test_two_lines_are_told_before_training_and_the_estimate_changes_no_byte(
     undisturbed: RunFolder, capture: Path, tmp_path: Path
 ) -> None:
     heard: list[Event] = []
-    run = train(replace(options(capture, tmp_path / "run"), estimate=True), heard.append)
+    run = train(options(capture, tmp_path / "run", quality="full", downscale=1), heard.append)
     assert run.file("splats.ply").read_bytes() == undisturbed.file("splats.ply").read_bytes()
     training = next(i for i, event in enumerate(heard) if isinstance(event, Phase) and event.name == "training 2dgs-r")
     told = [event for event in heard[:training] if isinstance(event, Notice)]
@@ -213,7 +213,7 @@ def test_every_so_many_th_view_is_a_test_view(tmp_path: Path, every: int, test: 
     capture = tmp_path / "capture"
     write_capture(capture, train=8, test=0, size=20)
     (capture / "transforms_train.json").rename(capture / "transforms.json")  # of nerfstudio: without a split
-    job = prepare_job(options(capture, tmp_path / "run", test_every=every), ignore)
+    job = prepare_run(options(capture, tmp_path / "run", test_every=every), ignore)
     assert (len(job.scene.train), len(job.scene.test)) == (8 - test, test)
 
 
@@ -221,7 +221,7 @@ def test_a_capture_with_a_split_of_its_own_takes_no_other(capture: Path, tmp_pat
     with pytest.raises(
         ProtocolError, match=r"--test-every is for captures without a split of their own, got .*leave it"
     ):
-        prepare_job(options(capture, tmp_path / "run", test_every=4), ignore)
+        prepare_run(options(capture, tmp_path / "run", test_every=4), ignore)
 
 
 def test_a_reader_of_a_package_may_bring_its_split(
@@ -236,13 +236,13 @@ def test_a_reader_of_a_package_may_bring_its_split(
 
     monkeypatch.setitem(READERS._things, "guest", Guest)
     chosen = options(capture, tmp_path / "run", format="guest")
-    job = prepare_job(chosen, ignore)
+    job = prepare_run(chosen, ignore)
     assert {view.name.split("/")[0] for view in job.scene.test} == {"test"}
     assert job.scene.own_split
-    told = [event.text for event in pretraining_notices(job, chosen) if isinstance(event, Notice)]
+    told = [event.text for event in pretraining_notices(job) if isinstance(event, Notice)]
     assert "--test-every" not in told[0]
     with pytest.raises(ProtocolError, match="--test-every is for captures without .*, which has one; leave it out"):
-        prepare_job(replace(chosen, test_every=4), ignore)
+        prepare_run(replace(chosen, test_every=4), ignore)
 
 
 def test_a_run_without_test_views_renders_its_training_views_and_another_training_names_its_options(
@@ -251,7 +251,7 @@ def test_a_run_without_test_views_renders_its_training_views_and_another_trainin
     """As `gs2d reconstruct` leaves it: the capture is in the run, and few photographs all train."""
     small_colmap(tmp_path / "run" / "capture")
     short = options(tmp_path / "run" / "capture", tmp_path / "run", protocol="generic", schedule_scale=0.0005)
-    train(replace(short, test_every=0, downscale=2, allowed=("capture",)))
+    train(replace(short, test_every=0, downscale=2), allowed=("capture",))
     heard: list[Event] = []
     result = render_run(tmp_path / "run", heard.append, width=31, threads=1)
     assert (result["images"], Path(result["folder"]).name) == (9, "train")

@@ -18,8 +18,7 @@ from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.events import Notice
 from gs2d.pipeline.finish.run_mesh import extract_mesh
 from gs2d.pipeline.finish.run_subject import meshed_subject, subject_line
-from gs2d.pipeline.prepare.finished import finished_splats
-from gs2d.pipeline.prepare.job import reload_job
+from gs2d.pipeline.prepare.loaded import finished_splats, reload_run
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.report.record import read_record
 from gs2d.report.sections.subject import subject_section
@@ -35,7 +34,7 @@ def test_training_writes_the_subject_and_only_the_generic_protocol_meshes_it(und
     assert subject_line(subject, meshed=True).endswith("--scene takes everything")
     assert "the mesh is of everything" in subject_line(subject, meshed=False)
     assert "data:image/jpeg;base64," in shown
-    job, splats = reload_job(undisturbed, lambda _: None), finished_splats(undisturbed)
+    job, splats = reload_run(undisturbed, lambda _: None), finished_splats(undisturbed)
     assert job.protocol.name == "nerf-synthetic"
     assert meshed_subject(undisturbed, job, splats, MeshOptions(), lambda _: None) is None
     assert [name for name, protocol in PROTOCOLS.items() if protocol.fusion.subject] == ["generic"]
@@ -43,7 +42,7 @@ def test_training_writes_the_subject_and_only_the_generic_protocol_meshes_it(und
 
 def test_a_box_of_the_user_becomes_the_subject_and_limits_the_mesh(undisturbed: RunFolder, tmp_path: Path) -> None:
     run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
-    job, splats, said = reload_job(run, lambda _: None), finished_splats(run), []
+    job, splats, said = reload_run(run, lambda _: None), finished_splats(run), []
     subject = meshed_subject(run, job, splats, MeshOptions(subject_box=BOX), said.append)
     assert subject is not None
     assert (subject.kind, subject.box.ravel().tolist()) == (OBJECT, list(BOX))

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -25,7 +26,7 @@ ACTION_KEY = "action"
 
 def to_json(recipe: Recipe) -> dict[str, Any]:
     """Return a recipe, with every field, as plain dicts, lists, numbers and strings."""
-    encoded = _encode(recipe)
+    encoded = encode(recipe)
     assert isinstance(encoded, dict)
     return encoded
 
@@ -138,17 +139,17 @@ def _entry(entries: list[Any], word: str, override: str) -> Any:
     return entries[tags.index(word)]
 
 
-def _encode(value: Any) -> Any:
-    """Return the JSON form."""
+def encode(value: Any) -> Any:
+    """Return a dataclass, with all it holds, as plain dicts, lists, numbers and strings."""
     if is_dataclass(value) and not isinstance(value, type):
-        encoded = {entry.name: _encode(getattr(value, entry.name)) for entry in fields(value)}
+        encoded = {entry.name: encode(getattr(value, entry.name)) for entry in fields(value)}
         tags = [name for name, kind in ACTIONS.items() if type(value) is kind]
         return {ACTION_KEY: tags[0], **encoded} if tags else encoded
     if isinstance(value, Mapping):
-        return {str(key): _encode(entry) for key, entry in value.items()}
+        return {str(key): encode(entry) for key, entry in value.items()}
     if isinstance(value, tuple | list):
-        return [_encode(entry) for entry in value]
-    return value
+        return [encode(entry) for entry in value]
+    return str(value) if isinstance(value, Path) else value
 
 
 def decode(value: Any, kind: Any, where: str) -> Any:
@@ -216,6 +217,8 @@ def _decode_dataclass(value: Any, kind: type, where: str) -> Any:
 def _decode_plain(value: Any, kind: Any, where: str) -> Any:
     if kind is Any:
         return value
+    if kind is Path and isinstance(value, str):
+        return Path(value)
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         with suppress(OverflowError):  # a whole number of 400 digits is none
             return float(value)
@@ -223,5 +226,5 @@ def _decode_plain(value: Any, kind: Any, where: str) -> Any:
         return int(value)
     if isinstance(value, kind) and not (kind is int and isinstance(value, bool)):
         return value
-    names = {int: "an integer", float: "a number", str: "a string", bool: "true or false"}
+    names = {Path: "a path", int: "an integer", float: "a number", str: "a string", bool: "true or false"}
     raise RecipeError(f"{where} must be {names[kind]}, got {value!r}")

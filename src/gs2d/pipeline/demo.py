@@ -9,8 +9,8 @@ from gs2d.io.run_dir import RunFolder, check_claim, is_run, open_run
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import DEMO, OnEvent, Phase, Plan, Step, ignore
 from gs2d.pipeline.finish.evaluate import evaluate_run
-from gs2d.pipeline.prepare.job import check_train_options
 from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, TrainOptions
+from gs2d.pipeline.prepare.resolve import check_options
 from gs2d.pipeline.prepare.threads import use_threads
 from gs2d.pipeline.train.train_run import check_viewer, train
 from gs2d.synthetic.capture import write_demo_capture
@@ -38,8 +38,8 @@ def demo(
             )
         overwrite = True
     training = _training(options, overwrite=overwrite)
-    check_train_options(training)  # all that can be refused, before the photographs are taken: that lasts
-    check_claim(options.out, resume=options.resume, overwrite=overwrite, allowed=training.allowed)
+    check_options(training)  # all that can be refused, before the photographs are taken: that lasts
+    check_claim(options.out, resume=options.resume, overwrite=overwrite, allowed=(CAPTURE,))
     check_viewer(training)
     use_threads(options.threads)
     on_event(Plan(DEMO))
@@ -67,7 +67,7 @@ def demo(
                 f"the photographs in {capture} were made with{'out' * varied} {option}; "
                 "resume with the same options, or start again with --overwrite"
             )
-    run = train(training, on_event)
+    run = train(training, on_event, title=TITLE, allowed=(CAPTURE,))
     truth = capture / TRUTH
     with attempted("scores of the surface", again("evaluate", run.path, "--ground-truth", truth), on_event):
         evaluate_run(run.path, EvaluateOptions(ground_truth=truth, match_poses=options.refine_poses), on_event)
@@ -99,7 +99,5 @@ def _training(options: DemoOptions, *, overwrite: bool) -> TrainOptions:
         resume=options.resume,
         overwrite=overwrite,
         schedule_scale=SCHEDULE_SCALE if options.schedule_scale is None else options.schedule_scale,
-        title=TITLE,
         page=options.page,
-        allowed=(CAPTURE,),
     )

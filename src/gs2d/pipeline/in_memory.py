@@ -9,7 +9,6 @@ import os
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 from torch import Tensor
@@ -28,10 +27,10 @@ from gs2d.pipeline.events import ignore
 from gs2d.pipeline.finish.run_mesh import fused
 from gs2d.pipeline.finish.run_subject import subject_in, wants_subject
 from gs2d.pipeline.finish.scoring import score_views
-from gs2d.pipeline.prepare.job import resolve
-from gs2d.pipeline.prepare.opened import open_capture
-from gs2d.pipeline.prepare.options import MeshOptions, Robust, TrainOptions
+from gs2d.pipeline.prepare.open_capture import capture_in_memory
+from gs2d.pipeline.prepare.options import MeshOptions, Robust, Training
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
+from gs2d.pipeline.prepare.resolve import resolve
 from gs2d.pipeline.train.progress_bar import progress_bar
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
@@ -133,23 +132,18 @@ def train(
     >>> trained.splats.save("garden.ply")  # doctest: +SKIP
     """
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
-    root = scene.root or Path(".")
-    options = TrainOptions(
-        scene=root,
-        out=root,  # nothing is written
+    training = Training(
         recipe=recipe,
-        protocol=protocol,
-        backend=backend,
-        schedule_scale=schedule_scale,
-        iterations=iterations,
         overrides=overrides,
-        seed=seed,
         robust=robust,
         exposure=exposure is True,
         no_exposure=exposure is False,
     )
     with progress_bar(on_event) if progress else nullcontext(on_event) as tell:
-        fitted, opened = resolve(options, open_capture(options, tell, scene), tell)
+        capture = capture_in_memory(scene, protocol, backend, tell)
+        fitted, opened = resolve(
+            training, capture, tell, seed=seed, schedule_scale=schedule_scale, iterations=iterations
+        )
         scene, rules, chosen = opened.scene, opened.protocol, opened.backend
         trainer = Trainer(scene, fitted, rules, backend=chosen, on_event=tell)
         trainer.run()
@@ -167,8 +161,7 @@ def _finished(
         return trained
     if scene is None:
         raise DataError("splats must come with the scene that they are of, got none; give it as the second argument")
-    root = scene.root or Path(".")
-    opened = open_capture(TrainOptions(scene=root, out=root, protocol=protocol, backend=backend), on_event, scene)
+    opened = capture_in_memory(scene, protocol, backend, on_event)
     settings = raster_settings(opened.protocol, scene.extent, trained.sh_degree)
     return Trained(trained.to(opened.backend.device), scene, opened.protocol, settings, opened.backend)
 

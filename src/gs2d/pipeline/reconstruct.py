@@ -20,7 +20,6 @@ from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import PLACED, TEXTURED_TOO, TRAINED, Notice, OnEvent, Plan, ignore
 from gs2d.pipeline.finish.run_texture import PACKAGES as TEXTURE_PACKAGES
 from gs2d.pipeline.finish.run_texture import texture_run
-from gs2d.pipeline.prepare.job import check_train_options, recipe_of
 from gs2d.pipeline.prepare.options import (
     Finding,
     HowItRuns,
@@ -32,7 +31,7 @@ from gs2d.pipeline.prepare.options import (
     values,
 )
 from gs2d.pipeline.prepare.pose_finding import asked_for, check_poses_options, find_poses, placed_line
-from gs2d.pipeline.prepare.quality import at_quality, quality_of
+from gs2d.pipeline.prepare.resolve import check_options
 from gs2d.pipeline.train.train_run import check_viewer, train
 from gs2d.sfm.colmap import check_installed
 from gs2d.sfm.images import find_photos
@@ -62,15 +61,15 @@ def poses_options(options: ReconstructOptions) -> PosesOptions:
 
 
 def train_options(options: ReconstructOptions) -> TrainOptions:
-    """Return those of ``gs2d train``, but for what ``quality`` decides."""
+    """Return those of ``gs2d train``."""
     capture = options.out / CAPTURE
     return TrainOptions(
         scene=capture,
         out=options.out,
         format="colmap",
-        title=_title(options.photos.resolve()),
-        allowed=(CAPTURE, hidden_workspace(capture).name, CLUSTER),
-        estimate=True,
+        quality=options.quality,
+        schedule_scale=options.schedule_scale,
+        downscale=options.downscale,
         **values(Training, options.training),
         **values(HowItRuns, options),
         **values(Resources, options),
@@ -107,13 +106,25 @@ def find_cameras(options: ReconstructOptions, on_event: OnEvent) -> None:
 def train_found(options: ReconstructOptions, on_event: OnEvent) -> RunFolder:
     """Train on the cameras that were found; texture the mesh, if it is asked for."""
     training = replace(train_options(options), overwrite=False)
-    run = train(_by_the_images(training, options, on_event), on_event)
+    if training.test_every is None and training.protocol == "auto" and _placed(options.out / CAPTURE) < FEW:
+        training = replace(training, test_every=0)
+    run = train(training, on_event, title=_title(options.photos.resolve()), allowed=_allowed(options))
     if options.texture and not run.file(TEXTURED).exists():
         with attempted(TEXTURED, again("mesh", run.path, "--texture"), on_event):
             if not run.file(MESH).exists():
                 raise ProtocolError(f"there is no {MESH} to be given a texture")
             texture_run(run.path, on_event=on_event, threads=options.threads)
     return run
+
+
+def _allowed(options: ReconstructOptions) -> tuple[str, ...]:
+    """Return the names that may be in the run folder before training begins."""
+    return (CAPTURE, hidden_workspace(options.out / CAPTURE).name, CLUSTER)
+
+
+def _placed(capture: Path) -> int:
+    """Return how many photographs have a camera."""
+    return len({view.path for view in load_scene(capture, format="colmap", test_every=0).views})
 
 
 def _title(photos: Path) -> str:
@@ -126,13 +137,8 @@ def _title(photos: Path) -> str:
 def check_reconstruct(options: ReconstructOptions) -> None:
     """Refuse what can be refused before anything is made."""
     training, out = train_options(options), options.out
-    quality = quality_of(options.quality, options.backend)
-    scale = options.schedule_scale
-    if scale is None:
-        scale = quality.schedule_scale(recipe_of(options.training.recipe))
-    downscale = 1 if options.downscale is None else options.downscale
-    check_train_options(replace(training, schedule_scale=scale, downscale=downscale))
-    check_claim(out, resume=options.resume, overwrite=options.overwrite, allowed=training.allowed)
+    check_options(training)
+    check_claim(out, resume=options.resume, overwrite=options.overwrite, allowed=_allowed(options))
     if options.texture:
         for package in TEXTURE_PACKAGES:
             required(package)
@@ -242,14 +248,3 @@ def _lines(poses: dict[str, Any], capture: Path) -> list[str]:
         *(f"no place: {row['source']}: {row['reason']}" for row in lost[:SHOWN_LOST]),
         *([f"... and {more} more without a place, in {capture / POSES_JSON}"] if more > 0 else []),
     ]
-
-
-def _by_the_images(training: TrainOptions, options: ReconstructOptions, on_event: OnEvent) -> TrainOptions:
-    """Set what depends on the photographs that were placed: image size, and whether some are held out."""
-    views = load_scene(training.scene, format="colmap", test_every=0).views
-    cameras, photographs = [view.camera for view in views], len({view.path for view in views})
-    sized = replace(training, downscale=options.downscale)
-    chosen = at_quality(sized, options.quality, cameras, on_event, options.schedule_scale)
-    if training.test_every is None and training.protocol == "auto" and photographs < FEW:
-        chosen = replace(chosen, test_every=0)
-    return chosen

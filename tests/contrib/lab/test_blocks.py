@@ -196,10 +196,10 @@ def test_a_block_that_fails_leaves_the_others_and_the_merge_waits(
 ) -> None:
     real = module.train
 
-    def failing(options: Any, on_event: Any) -> Any:
+    def failing(options: Any, on_event: Any, **more: Any) -> Any:
         if options.out.name == "0-1":
             raise DataError("the disk is full")
-        return real(options, on_event)
+        return real(options, on_event, **more)
 
     monkeypatch.setattr(module, "train", failing)
     job = tmp_path / "job"

@@ -14,7 +14,7 @@ from gs2d.contrib.lab.figures import rank_run, write_figures
 from gs2d.core.splats import Splats
 from gs2d.data.image_files import read_image
 from gs2d.io.run_dir import RunFolder, load_tensors
-from gs2d.pipeline.prepare.job import reload_job
+from gs2d.pipeline.prepare.loaded import reload_run
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.train.changes import mean_changes, take_snapshot
 from gs2d.pipeline.train.train_run import train
@@ -70,7 +70,7 @@ def test_figures_are_drawn_and_the_map_is_of_the_run_that_ranks(runs: dict[str, 
 
 def test_the_ranking_is_that_of_training(runs: dict[str, Path]) -> None:
     run = RunFolder(runs["2DGS-R (ours)"])
-    ranking = rank_run(run, reload_job(run, lambda _event: None))
+    ranking = rank_run(run, reload_run(run, lambda _event: None))
     assert ranking.when == "after surface"
     end = next(c.path for c in run.checkpoints() if c.stage == "appearance")
     assert torch.equal(ranking.worst, load_tensors(end)["state"]["groups"]["high_error"])

@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.config.partition import Partition, from_json, make_partition
+from gs2d.config.protocols import Protocol
+from gs2d.config.serialize import decode
 from gs2d.config.serialize import from_json as recipe_from_json
 from gs2d.contrib.lab.execute import execute
 from gs2d.contrib.lab.merged import MERGED, SEAM_VIEWS, finish_merged, read_seam_views, write_merged, write_result
@@ -36,22 +38,19 @@ from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import RecipeError, RunError
 from gs2d.io.run_dir import LOCK, REPORT, SPLATS, RunFolder, check_claim, is_run, make_folder, open_run
 from gs2d.pipeline.events import Notice, OnEvent, ignore
-from gs2d.pipeline.prepare.finished import finished_splats
-from gs2d.pipeline.prepare.job import check_train_options, protocol_from_json
+from gs2d.pipeline.prepare.loaded import finished_splats
 from gs2d.pipeline.prepare.memory_budget import use_memory
-from gs2d.pipeline.prepare.options import CommonTraining, Part, TrainOptions, values
+from gs2d.pipeline.prepare.options import CommonTraining, TrainOptions, values
+from gs2d.pipeline.prepare.part import Part
+from gs2d.pipeline.prepare.resolve import check_options
+from gs2d.pipeline.prepare.resolved import difference
 from gs2d.pipeline.prepare.run_exposures import read_exposures
 from gs2d.pipeline.prepare.threads import use_threads
-from gs2d.pipeline.train.same_run import difference
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.trainer import raster_settings
 
 BLOCKS_JSON = "blocks.json"  # in the job folder: what was settled
 COARSE, PARTITION, MERGE, FINISH = "coarse", "partition", "merge", "finish"
-SETTLED: dict[str, Any] = {  # what options have already decided: recipe and protocol are as they will be trained
-    **{"robust": "off", "exposure": False, "no_exposure": False, "test_every": None},
-    **{"depth_prior": None, "normal_prior": False, "overrides": (), "schedule_scale": 1.0},
-}
 RETRIES = 2  # of what is killed: another time it may have the memory
 
 
@@ -75,13 +74,22 @@ class BlocksTask(Task):
         """Return the task on so many CPU threads."""
         return replace(self, options=replace(self.options, threads=threads))
 
-    def training(self, **changes: Any) -> TrainOptions:
-        """Return the options of a training with the settled protocol."""
+    def protocol(self) -> Protocol:
+        """Return the settled protocol."""
+        protocol: Protocol = decode(settled_of(self.options.out)["protocol"], Protocol, "protocol")
+        return protocol
+
+    def train(self, part: Part, out: Path, on_event: OnEvent, *, downscale: int | None = None) -> RunFolder:
+        """Train a part of everything, or go on."""
+        self.limit()
+        downscale = self.options.downscale if downscale is None else downscale
+        options = replace(self.options, memory=self.memory, out=out, downscale=downscale)
+        return train(options, on_event, part=part)
+
+    def limit(self) -> None:
+        """Keep to the threads and the memory of the task."""
         use_threads(self.options.threads)
         use_memory(self.memory)
-        data = settled_of(self.options.out)
-        settled: dict[str, Any] = {"protocol": protocol_from_json(data["protocol"]), "memory": self.memory}
-        return replace(self.options, **{**settled, **SETTLED, "part": Part(), **changes})
 
     def partition(self) -> Partition:
         """Return the partition of the job."""
@@ -89,8 +97,10 @@ class BlocksTask(Task):
 
     def settled(self, on_event: OnEvent) -> Settled:
         """Return what is settled, with the scene."""
+        self.limit()
         data = settled_of(self.options.out)
-        found = open_settled(self.training(), recipe_from_json(data["recipe"]), on_event)
+        options = replace(self.options, memory=self.memory, protocol=self.protocol(), test_every=None)
+        found = open_settled(options, recipe_from_json(data["recipe"]), on_event)
         check_capture(self.options.out, data, found.capture)
         return found
 
@@ -104,7 +114,7 @@ class CoarseTask(BlocksTask):
         settled, partition = self.settled(on_event), self.partition()
         downscale = coarse_downscale(settled.scene, partition, self.options.downscale or 1)
         recipe, out = coarse_recipe(settled.recipe, partition), coarse_folder(self.options.out)
-        run = train(self.training(recipe=recipe, downscale=downscale, out=out), on_event)
+        run = self.train(Part(recipe=recipe, protocol=settled.protocol), out, on_event, downscale=downscale)
         return {"stages": run.metrics()["stages"]}
 
 
@@ -153,6 +163,8 @@ class BlockTask(BlocksTask):
             return {"skipped": block.skipped}
         whole = recipe_from_json(settled_of(out)["recipe"])
         part = Part(
+            recipe=block_recipe(whole, partition, block),
+            protocol=self.protocol(),
             views=block.views,
             splats=coarse_folder(out) / SPLATS,
             start=start_file(partition_folder(out), self.block),
@@ -160,8 +172,7 @@ class BlockTask(BlocksTask):
             extent=block.extent if partition.extent == "block" else None,
             prepared=out,
         )
-        recipe, folder = block_recipe(whole, partition, block), block_folder(out, self.block)
-        run = train(self.training(recipe=recipe, out=folder, part=part), on_event)
+        run = self.train(part, block_folder(out, self.block), on_event)
         return {"stages": run.metrics()["stages"]}
 
 
@@ -184,10 +195,17 @@ class SeamsTask(BlocksTask):
         views = read_seam_views(out)
         if views:
             start = start_file(partition_folder(out), SEAMS)
-            part = Part(views=views, splats=out / MERGED, start=start, prepared=out)
             trained = [len(block.views) for block in read_split(partition_folder(out)).blocks if not block.skipped]
             recipe = seam_recipe(settled.recipe, partition, len(views) * len(trained) / max(1, sum(trained)))
-            train(self.training(recipe=recipe, out=seam_folder(out), part=part), on_event)
+            part = Part(
+                recipe=recipe,
+                protocol=settled.protocol,
+                views=views,
+                splats=out / MERGED,
+                start=start,
+                prepared=out,
+            )
+            self.train(part, seam_folder(out), on_event)
         return {"splats": write_result(settled, self.options, partition, on_event)}
 
 
@@ -247,7 +265,7 @@ def blocks(options: BlocksOptions, on_event: OnEvent = ignore) -> RunFolder:
     if options.slots is not None and options.slots < 1:
         raise RecipeError(f"--slots must be a whole number >= 1, got {options.slots}")
     training = training_of(options)
-    check_train_options(training)
+    check_options(training)
     check_job_folder(options.out)
     use_threads(options.threads)
     share = _share(options.memory, None if options.cluster else options.slots)  # on a cluster: of each machine
@@ -270,7 +288,7 @@ def blocks(options: BlocksOptions, on_event: OnEvent = ignore) -> RunFolder:
     definition = settled.definition(training, partition)
     if begun:
         check_same_job(options.out, definition)
-    tasks = tasks_of(replace(training, recipe="", resume=True), partition, share)
+    tasks = tasks_of(replace(training, recipe="", overrides=(), resume=True), partition, share)
 
     def write() -> None:
         if not (options.out / BLOCKS_JSON).exists():

@@ -21,8 +21,7 @@ from gs2d.errors import Gs2dError
 from gs2d.io.run_dir import RunFolder, load_tensors, make_folder, open_run
 from gs2d.pipeline.events import Notice, OnEvent, counted, ignore
 from gs2d.pipeline.finish.run_images import choose_views, fraction_of_group, render_view, splatted
-from gs2d.pipeline.prepare.finished import finished_splats
-from gs2d.pipeline.prepare.job import Job, reload_job
+from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats, reload_run
 from gs2d.pipeline.prepare.run_exposures import numbers_of, photographed, read_exposures
 from gs2d.pipeline.train.resume import stage_end
 from gs2d.render.api import splat_errors
@@ -157,7 +156,7 @@ class Ranking:
     when: str
 
 
-def rank_run(run: RunFolder, job: Job, on_event: OnEvent = ignore) -> Ranking:
+def rank_run(run: RunFolder, job: LoadedRun, on_event: OnEvent = ignore) -> Ranking:
     """E_i (paper Eq. 8) of the splats that the recipe ranked, summed over all training views.
 
     Raises
@@ -194,7 +193,7 @@ def rank_run(run: RunFolder, job: Job, on_event: OnEvent = ignore) -> Ranking:
     return Ranking(splats, total, group.to(splats.device), when)
 
 
-def _ranked(run: RunFolder, job: Job, index: int, action: RankByError) -> tuple[Splats, Tensor | None, str]:
+def _ranked(run: RunFolder, job: LoadedRun, index: int, action: RankByError) -> tuple[Splats, Tensor | None, str]:
     """Return the splats nearest to those that stage ``index`` ranked, the group it found if known, and when."""
     stages = job.recipe.stages
     before = stage_end(run, job, index - 1) if index else None
@@ -231,7 +230,7 @@ def error_positions(errors: Tensor, limits: tuple[float, float]) -> Tensor:
     return ((errors.clamp(min=1e-300) / low).log() / np.log(high / low)).clamp(0, 1)
 
 
-def map_image(splats: Splats, positions: Tensor, view: View, job: Job, alpha: np.ndarray) -> np.ndarray:
+def map_image(splats: Splats, positions: Tensor, view: View, job: LoadedRun, alpha: np.ndarray) -> np.ndarray:
     """E_i splatted: each pixel has the colour of the mean position of its splats, over white; [H, W, 3]."""
     weighted = splatted(splats, positions, view, job.settings, job.backend)
     steps = error_scale(256)
@@ -244,7 +243,7 @@ def draw_error_maps(
     run: RunFolder, path: Path, on_event: OnEvent = ignore, *, title: str = "", views: int = 3, backend: str = "auto"
 ) -> None:
     """Write the E_i map of one run as a PNG: a row for each view."""
-    job = reload_job(run, on_event, backend=backend)
+    job = reload_run(run, on_event, backend=backend)
     ranking, transforms = rank_run(run, job, on_event), read_exposures(run, job.recipe)
     limits = map_limits(ranking.errors)
     positions = error_positions(ranking.errors, limits)

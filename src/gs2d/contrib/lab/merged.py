@@ -25,13 +25,13 @@ from gs2d.pipeline.finish.run_images import choose_views, draw_stage
 from gs2d.pipeline.finish.run_mesh import MeshFrames
 from gs2d.pipeline.finish.scoring import PeakMemory, score_views, split_metrics
 from gs2d.pipeline.finish.verdict import Collector
-from gs2d.pipeline.prepare.finished import finished_splats
-from gs2d.pipeline.prepare.job import Job
+from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats
 from gs2d.pipeline.prepare.memory_budget import release
-from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
+from gs2d.pipeline.prepare.options import TrainOptions, values
 from gs2d.pipeline.prepare.part import OWN, read_start
 from gs2d.pipeline.prepare.photographs import with_prepared
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
+from gs2d.pipeline.prepare.resolved import CaptureRecord, Execution, ResolvedRun
 from gs2d.pipeline.prepare.run_exposures import read_exposures, write_exposures
 from gs2d.pipeline.train.train_run import finish
 from gs2d.training.trainer import raster_settings
@@ -104,9 +104,8 @@ def write_result(settled: Settled, options: TrainOptions, partition: Partition, 
         rows, _ = read_start(start_file(partition_folder(options.out), SEAMS))
         rest = splats.rows(torch.from_numpy(rows != OWN))
         splats = rest.followed_by(finished_splats(open_run(seam_folder(options.out))))
-    job = merged_job(settled, options, settled.scene)
-    title = {"title": options.title or settled.scene.name, "schedule_scale": options.schedule_scale}
-    run.write_definition({**job.definition(), **title, "partition": partition_json(partition)})
+    definition = merged_run(settled, options, settled.scene).resolved.to_json()
+    run.write_definition({**definition, "partition": partition_json(partition)})
     if settled.recipe.exposure is not None:
         coarse = open_run(coarse_folder(options.out))
         write_exposures(run, read_exposures(coarse, settled.recipe), on_event)
@@ -115,19 +114,21 @@ def write_result(settled: Settled, options: TrainOptions, partition: Partition, 
     return len(splats)
 
 
-def merged_job(settled: Settled, options: TrainOptions, scene: Scene) -> Job:
+def merged_run(settled: Settled, options: TrainOptions, scene: Scene) -> LoadedRun:
     """Return the merged scene as other commands find it."""
-    settings = raster_settings(settled.protocol, scene.extent, settled.recipe.sh_degree)
-    return Job(
-        settled.recipe,
-        settled.protocol,
-        scene,
-        settled.backend,
-        settings,
-        options.downscale or 1,
-        settled.capture,
-        options.stage2_cache_mb << 20,
+    resolved = ResolvedRun(
+        recipe=settled.recipe,
+        protocol=settled.protocol,
+        scene=CaptureRecord.of(scene, settled.capture),
+        downscale=options.downscale or 1,
+        raster=raster_settings(settled.protocol, scene.extent, settled.recipe.sh_degree),
+        backend=settled.backend.facts(),
+        stage2_cache_bytes=options.stage2_cache_mb << 20,
+        schedule_scale=1.0 if options.schedule_scale is None else options.schedule_scale,
+        title=settled.scene.name,
+        execution=Execution(**values(Execution, options)),
     )
+    return LoadedRun(resolved, scene, settled.backend)
 
 
 def finish_merged(settled: Settled, options: TrainOptions, on_event: OnEvent) -> dict[str, Any]:
@@ -135,24 +136,22 @@ def finish_merged(settled: Settled, options: TrainOptions, on_event: OnEvent) ->
     run, memory = RunFolder(options.out), PeakMemory()
     if not run.file(SPLATS).exists():
         raise RunError(f"{options.out} must have {SPLATS} by now, got none; run the command again")
-    disk = None if options.disk is None else int(options.disk * 2**30)
-    scene = with_prepared(
-        settled.scene, options.out, options.prepare, on_event, disk=disk, threads=options.threads, shared=True
-    )
-    job = merged_job(settled, options, scene)
-    splats = read_splats(run.file(SPLATS)).to(job.backend.device)
-    brightness = metered(splats, job.settings, job.backend)
-    exposures = with_predicted(read_exposures(run, job.recipe), scene, brightness)
+    execution = Execution(**values(Execution, options))
+    scene = with_prepared(settled.scene, options.out, execution, on_event, shared=True)
+    loaded = merged_run(settled, options, scene)
+    splats = read_splats(run.file(SPLATS)).to(loaded.backend.device)
+    brightness = metered(splats, loaded.settings, loaded.backend)
+    exposures = with_predicted(read_exposures(run, loaded.recipe), scene, brightness)
     entry = {**_spent(options.out), "splats": len(splats), "bytes": splats.nbytes}
     collected = Collector(scene)
     hold()
-    with MeshFrames(job) as frames:
+    with MeshFrames(loaded) as frames:
         for split, views in (("train", scene.train), ("test", scene.test)):
             scores = score_views(
                 splats,
                 views,
-                job.settings,
-                job.backend,
+                loaded.settings,
+                loaded.backend,
                 name=f"scoring {split} views",
                 on_event=on_event,
                 exposures=exposures,
@@ -160,14 +159,13 @@ def finish_merged(settled: Settled, options: TrainOptions, on_event: OnEvent) ->
                 visitors=[frames.visit, collected.visit],
             )
             entry |= split_metrics(scores, split)
-        shown = choose_views(scene, options.shown_views)
+        shown = choose_views(scene)
         with attempted(f"pictures of {STAGE}", None, on_event):
-            draw_stage(run, job, shown, STAGE, splats, None, exposures)
+            draw_stage(run, loaded, shown, STAGE, splats, None, exposures)
         release(scene)
         entry["peak_memory_bytes"] = max(entry["peak_memory_bytes"], memory.read())
         run.write_metrics({"stages": [entry], "surface": None})
-        mesh = MeshOptions(subject_box=options.subject_box, whole_scene=options.whole_scene)
-        finish(run, job, splats, mesh, on_event, frames, collected, with_page=options.page)
+        finish(run, loaded, splats, on_event, frames, collected)
     return entry
 
 

@@ -28,9 +28,9 @@ from gs2d.data.archive import is_archive
 from gs2d.errors import DataError, RecipeError
 from gs2d.pipeline.events import Notice, OnEvent
 from gs2d.pipeline.prepare.estimate import Estimate, estimate, expected_splats, limit_of
-from gs2d.pipeline.prepare.job import check_train_options, resolve
-from gs2d.pipeline.prepare.opened import open_capture
+from gs2d.pipeline.prepare.open_capture import open_capture
 from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.prepare.resolve import check_options, resolve
 from gs2d.render.backends import Backend
 
 FORMAT = 1
@@ -76,12 +76,13 @@ class Settled:
 
 def settle(options: TrainOptions, on_event: OnEvent) -> Settled:
     """Read the headers of a capture and settle what all blocks have in common; nothing is written."""
-    check_train_options(options)
+    check_options(options)
     if is_archive(options.scene):
         remedy = instead(options.scene, "capture")
         raise DataError(f"blocks need the folder of a capture, got the file {options.scene}{remedy}")
     opened = open_capture(replace(options, downscale=options.downscale or 1), on_event)
-    recipe, resolved = resolve(options, opened, on_event)
+    scale = 1.0 if options.schedule_scale is None else options.schedule_scale
+    recipe, resolved = resolve(options, opened, on_event, seed=options.seed, schedule_scale=scale)
     if recipe.poses is not None:
         raise RecipeError(
             "blocks need cameras that stay where they are, got a recipe that refines poses; refine them in a run of "

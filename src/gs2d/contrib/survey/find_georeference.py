@@ -23,7 +23,7 @@ from gs2d.errors import DataError, RunError
 from gs2d.io.georeference import read_georeference, write_georeference
 from gs2d.io.run_dir import GEOREFERENCE, POSES, RunFolder, open_run
 from gs2d.pipeline.events import OnEvent, counted, ignore
-from gs2d.pipeline.prepare.job import reload_job
+from gs2d.pipeline.prepare.loaded import reload_run
 from gs2d.pipeline.prepare.options import GeoreferenceOptions
 
 SOURCES = ("gps", "positions", "control", "known_distance", "markers")
@@ -117,7 +117,7 @@ def _found(run: RunFolder, options: GeoreferenceOptions, source: str, on_event: 
 
 def _views(run: RunFolder, on_event: OnEvent) -> list[View]:
     """Return the photographs with their cameras; where cameras were refined, those only."""
-    scene = reload_job(run, on_event).scene
+    scene = reload_run(run, on_event).scene
     return list(scene.train if run.file(POSES).exists() else scene.views)
 
 

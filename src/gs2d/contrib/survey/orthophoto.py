@@ -24,8 +24,7 @@ from gs2d.meshing.texture import Texels, surface_colors
 from gs2d.pipeline.events import OnEvent, Phase, ignore
 from gs2d.pipeline.finish.placed import place_of
 from gs2d.pipeline.finish.run_texture import photographs
-from gs2d.pipeline.prepare.finished import open_job
-from gs2d.pipeline.prepare.job import Job
+from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.options import OrthophotoOptions
 from gs2d.pipeline.prepare.run_exposures import Transforms, read_exposures
 
@@ -81,7 +80,7 @@ def orthophoto_run(
     mesh = read_mesh(path / MESH)
     if not len(mesh.faces):
         raise RunError(f"{path / MESH} has no triangles to look at; extract it again with `gs2d mesh {path}`")
-    run, job, _ = open_job(path, threads, on_event)
+    run, job, _ = open_finished(path, threads, on_event)
     local = place.to_local(mesh.vertices)
     raster = _raster(local, options.resolution, _pixel(job, mesh) * place.scale)
     on_event(Phase("looking from above", 0))
@@ -100,7 +99,7 @@ def orthophoto_run(
     }
 
 
-def _pixel(job: Job, mesh: Mesh) -> float:
+def _pixel(job: LoadedRun, mesh: Mesh) -> float:
     """Size of a pixel on the surface, world units: the median over the surface of what its nearest view has."""
     some = mesh.vertices[:: max(1, len(mesh.vertices) // 2_000)].astype(np.float64)
     size = np.full(len(some), np.inf)
@@ -136,7 +135,7 @@ def _raster(local: np.ndarray, resolution: float | None, pixel: float) -> Raster
     return Raster(corner, resolution, (int(rows), int(columns)))
 
 
-def _colors(job: Job, mesh: Mesh, hits: Hits, exposures: Transforms, on_event: OnEvent) -> tuple[np.ndarray, int]:
+def _colors(job: LoadedRun, mesh: Mesh, hits: Hits, exposures: Transforms, on_event: OnEvent) -> tuple[np.ndarray, int]:
     """Return colours [H, W, 4] uint8 with alpha 0 where there is no surface, and how many cells no photograph sees."""
     height, width = hits.face.shape
     index = np.flatnonzero(hits.face.reshape(-1) >= 0)

@@ -12,7 +12,7 @@ from gs2d.data import Scene, View
 from gs2d.data.reach import Reach, reach_of
 from gs2d.meshing.bounds import backproject
 from gs2d.meshing.sky import sky_pixels
-from gs2d.pipeline.prepare.job import RenderedScene
+from gs2d.pipeline.prepare.loaded import RenderedScene
 
 BEYOND = 1.25  # times the reach of a scene (``data/reach.py``), past which no depth is believed
 MIN_POINTS = 20  # sparse points in a photograph, below which they do not say where it shows nothing

@@ -19,7 +19,7 @@ from gs2d.pipeline.events import Notice, OnEvent, Phase, ignore
 from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.scoring import score_views, split_metrics
 from gs2d.pipeline.finish.verdict import Collector, write_verdict
-from gs2d.pipeline.prepare.finished import open_job
+from gs2d.pipeline.prepare.loaded import open_finished
 from gs2d.pipeline.prepare.options import EvaluateOptions
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.run_exposures import read_exposures
@@ -42,7 +42,7 @@ def evaluate_run(
     path, given = Path(path), options.ground_truth
     truth = None if given is None or given.is_dir() else choose_truth(given, given.parent, tell)
     lpips = None if options.lpips_weights is None else load_lpips(options.lpips_weights)
-    run, job, splats = open_job(path, threads, on_event)
+    run, job, splats = open_finished(path, threads, on_event)
     lpips = None if lpips is None else lpips.to(job.backend.device)
     result: dict[str, Any] = {"run": str(run.path), "surface": run.metrics().get("surface")}
     if truth is None and job.scene.root is not None:

@@ -38,8 +38,7 @@ from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.finish.believed import believed_reach, within_reach
 from gs2d.pipeline.finish.camera_paths import flight_cameras, orbit_cameras
 from gs2d.pipeline.finish.scoring import evenly
-from gs2d.pipeline.prepare.finished import open_job
-from gs2d.pipeline.prepare.job import Job
+from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.run_exposures import NONE, Transforms, exposed, exposure_named, photographed, read_exposures
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
@@ -58,8 +57,10 @@ INDEX = "index.json"
 LONGEST_NAME = 180  # bytes; file systems take 255, and a picture's kind and a temporary suffix come after it
 IMAGES = ("color", "normal", "depth", "error", "high_error")
 
+SHOWN_VIEWS = 3  # views that are rendered after each stage for the report
 
-def choose_views(scene: Scene, count: int) -> list[tuple[str, View]]:
+
+def choose_views(scene: Scene, count: int = SHOWN_VIEWS) -> list[tuple[str, View]]:
     """(split, view) of the views to show: test views where there are any, spread evenly."""
     split, views = ("test", scene.test) if scene.test else ("train", scene.train)
     return [(split, view) for view in evenly(views, count)]
@@ -90,7 +91,7 @@ def _short_hash(text: str) -> str:
 
 def draw_stage(
     run: RunFolder,
-    job: Job,
+    job: LoadedRun,
     shown: Sequence[tuple[str, View]],
     stage: str,
     splats: Splats,
@@ -233,7 +234,7 @@ def render_run(
     asked, (moving, video) = video, check_frames(orbit, flight, video, fps)
     if video is not None and video != asked and video.suffix == ".webp":
         on_event(Notice(f"the video is an animated WebP, {video}: MP4 needs ffmpeg with libx264 ({FFMPEG})"))
-    run, job, splats = open_job(path, threads, on_event, splats_file=splats_file, out=out)
+    run, job, splats = open_finished(path, threads, on_event, splats_file=splats_file, out=out)
     transform = None if exposure_of is None else exposure_named(exposure_of, read_exposures(run, job.recipe))
     views: list[tuple[str, View]]
     if moving:
@@ -329,7 +330,7 @@ def check_frames(orbit: int, flight: int, video: Path | None, fps: float) -> tup
     return "orbit" if orbit else "flight" if flight else "", video
 
 
-def _spare_images(files: Sequence[Path], option: str, job: Job) -> None:
+def _spare_images(files: Sequence[Path], option: str, job: LoadedRun) -> None:
     """Raise rather than write a rendering over a photograph of the capture."""
     images = {view.path.resolve() for view in job.scene.views if view.path is not None}
     for file in files:

@@ -43,8 +43,7 @@ from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.run_subject import OPAQUE, meshed_subject
 from gs2d.pipeline.finish.scoring import SeenView
 from gs2d.pipeline.look.page import page_run
-from gs2d.pipeline.prepare.finished import checked_output, open_job
-from gs2d.pipeline.prepare.job import Job, RenderedScene
+from gs2d.pipeline.prepare.loaded import LoadedRun, RenderedScene, checked_output, open_finished
 from gs2d.pipeline.prepare.memory_budget import release, release_buffers
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.render.api import rasterize
@@ -68,7 +67,7 @@ class MeshFrames:
     Its :meth:`visit` is for :func:`~gs2d.pipeline.finish.scoring.score_views`.
     """
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: LoadedRun) -> None:
         self._job, self._reach, self._up = job, surface_reach(job), sky_direction(job)
         self.spool = Spool()
 
@@ -106,7 +105,7 @@ class MeshFrames:
 
 
 def extract_mesh(
-    job: Job,
+    job: LoadedRun,
     splats: Splats,
     options: MeshOptions,
     out: Path,
@@ -383,7 +382,7 @@ def mesh_run(
         mesh = read_mesh(path / MESH)
         write_mesh(out, placed_mesh(mesh, place))
         return {"file": str(out), "vertices": len(mesh.vertices), "faces": len(mesh.faces), **say_where(out, place)}
-    run, job, splats = open_job(path, threads, on_event, splats_file=splats_file, out=out)
+    run, job, splats = open_finished(path, threads, on_event, splats_file=splats_file, out=out)
     if splats_file is not None and out is not None and out.resolve() == run.file(MESH).resolve():
         raise RunError(f"--out {out} is the mesh of the run, which is that of its own splats; choose another name")
     if out is not None and out.resolve() != run.file(MESH).resolve():

@@ -30,7 +30,7 @@ from gs2d.io.run_dir import RENDERS, SUBJECT, RunFolder, make_folder
 from gs2d.meshing.bounds import backproject
 from gs2d.pipeline.events import Notice, OnEvent
 from gs2d.pipeline.finish.believed import surface_reach
-from gs2d.pipeline.prepare.job import Job, RenderedScene
+from gs2d.pipeline.prepare.loaded import LoadedRun, RenderedScene
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.render.api import rasterize
 from gs2d.report.sections.subject import IMAGE, write_subject_image
@@ -45,7 +45,7 @@ MAX_POINTS = 2000  # sparse points of a camera, evenly from the list
 
 
 def subject_of(
-    run: RunFolder, job: Job, splats: Splats, on_event: OnEvent, *, box: Sequence[float] | None = None
+    run: RunFolder, job: LoadedRun, splats: Splats, on_event: OnEvent, *, box: Sequence[float] | None = None
 ) -> Subject:
     """Return the subject of a run: the given box, else what ``subject.json`` says, else what is found; then kept there.
 
@@ -91,7 +91,7 @@ def subject_in(job: RenderedScene, splats: Splats, box: Sequence[float] | None =
         raise ProtocolError(str(error)) from error
 
 
-def _draw(run: RunFolder, job: Job, subject: Subject, on_event: OnEvent) -> None:
+def _draw(run: RunFolder, job: LoadedRun, subject: Subject, on_event: OnEvent) -> None:
     """Write the picture for the report; a full disk costs the picture, not the mesh."""
     points = np.zeros((0, 3)) if job.scene.points is None else np.asarray(job.scene.points.points, np.float64)
     try:
@@ -102,7 +102,9 @@ def _draw(run: RunFolder, job: Job, subject: Subject, on_event: OnEvent) -> None
         on_event(Notice(f"no picture of the subject: {error}"))
 
 
-def meshed_subject(run: RunFolder, job: Job, splats: Splats, options: MeshOptions, on_event: OnEvent) -> Subject | None:
+def meshed_subject(
+    run: RunFolder, job: LoadedRun, splats: Splats, options: MeshOptions, on_event: OnEvent
+) -> Subject | None:
     """Find the subject of a run; return it if the mesh is of it, None if it is of everything or of a box of its own."""
     wanted = wants_subject(job, options)
     subject = subject_of(run, job, splats, on_event, box=options.subject_box)

@@ -36,9 +36,8 @@ from gs2d.pipeline.finish.placed import placed_output, placed_textured, say_wher
 from gs2d.pipeline.finish.run_mesh import fused, mesh_run
 from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.run_subject import OPAQUE, meshed_subject
-from gs2d.pipeline.prepare.finished import open_job
-from gs2d.pipeline.prepare.job import Job
-from gs2d.pipeline.prepare.opened import read_scene
+from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
+from gs2d.pipeline.prepare.open_capture import read_scene
 from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions
 from gs2d.pipeline.prepare.run_exposures import NONE, Transforms, as_scene, read_exposures
 from gs2d.render.api import rasterize
@@ -77,7 +76,7 @@ def texture_run(
     if out is None and (mesh_options != MeshOptions() or not (path / MESH).exists()):
         mesh_run(path, mesh_options, on_event, threads=threads)
         mesh_options = MeshOptions()
-    run, job, splats = open_job(path, threads, on_event)
+    run, job, splats = open_finished(path, threads, on_event)
     for view in job.scene.views:
         if view.path is not None and view.path.resolve() in {file.resolve() for file in files}:
             raise RunError(f"--out {target} would write over the photograph {view.name}; choose another name")
@@ -107,7 +106,7 @@ def texture_run(
 
 
 def textured_mesh(
-    job: Job,
+    job: LoadedRun,
     splats: Splats,
     mesh: Mesh,
     options: TextureOptions,
@@ -140,7 +139,7 @@ def check_texture_options(options: TextureOptions) -> None:
         raise ProtocolError(f"--texture-size must be {MIN_SIZE} to {MAX_SIZE} texels, got {options.texture_size}")
 
 
-def _mesh(run: RunFolder, job: Job, splats: Splats, options: MeshOptions, on_event: OnEvent) -> Mesh:
+def _mesh(run: RunFolder, job: LoadedRun, splats: Splats, options: MeshOptions, on_event: OnEvent) -> Mesh:
     """Return the run's mesh as it is, or one of its own for other options."""
     if options == MeshOptions() and run.file(MESH).exists():
         return read_mesh(run.file(MESH))
@@ -150,7 +149,7 @@ def _mesh(run: RunFolder, job: Job, splats: Splats, options: MeshOptions, on_eve
     return mesh
 
 
-def _views(job: Job, options: TextureOptions, on_event: OnEvent) -> Sequence[View]:
+def _views(job: LoadedRun, options: TextureOptions, on_event: OnEvent) -> Sequence[View]:
     """Return the training views, in another size if one is asked for, from where those of the job are."""
     if options.texture_downscale in (None, job.downscale) or job.scene.root is None:
         return job.scene.train
@@ -162,7 +161,7 @@ def _views(job: Job, options: TextureOptions, on_event: OnEvent) -> Sequence[Vie
 
 
 def _images(
-    job: Job,
+    job: LoadedRun,
     views: Sequence[View],
     splats: Splats,
     options: TextureOptions,
@@ -183,14 +182,14 @@ def _images(
 
 
 def photographs(
-    job: Job, views: Sequence[View], exposures: Transforms, on_event: OnEvent, factor: int
+    job: LoadedRun, views: Sequence[View], exposures: Transforms, on_event: OnEvent, factor: int
 ) -> Iterator[ColorSource]:
     """Yield photographs in the mean exposure of a run, smaller by ``factor``."""
     for view in counted(views, PASSES[factor > 1], len(views), on_event):
         yield ColorSource(view.camera, as_scene(view, exposures), usable_pixels(view, job)).shrunk(factor)
 
 
-def usable_pixels(view: View, job: Job) -> np.ndarray | None:
+def usable_pixels(view: View, job: LoadedRun) -> np.ndarray | None:
     """Return the pixels that show the surface: not masked out, and on the object if fusion looked only there."""
     masks = [view.mask(), view.object_mask() if job.protocol.use_mask_in_fusion else None]
     given = [mask for mask in masks if mask is not None]

@@ -24,7 +24,7 @@ from gs2d.evaluation.images import ImageMetrics
 from gs2d.io.run_dir import VERDICT, RunFolder
 from gs2d.io.run_schema import VERDICT_SHAPE, check_shape
 from gs2d.pipeline.finish.scoring import SeenView
-from gs2d.pipeline.prepare.job import Job
+from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.sfm.workspace import POSES_JSON
 
 FORMAT = 3
@@ -235,7 +235,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 # -- verdict.json ------------------------------------------------------------------------------------------------------
-def write_verdict(run: RunFolder, job: Job, collected: Collector) -> dict[str, Any]:
+def write_verdict(run: RunFolder, job: LoadedRun, collected: Collector) -> dict[str, Any]:
     """Judge a run and write ``verdict.json``; without newly measured views, judge the earlier measures again.
 
     Raises

@@ -22,8 +22,7 @@ from gs2d.io.formats.registry import read_splats
 from gs2d.io.georeference import georeference_of_file, read_georeference
 from gs2d.io.run_dir import PAGE, RunFolder, is_run, open_run
 from gs2d.pipeline.events import Notice, OnEvent, Phase, ignore
-from gs2d.pipeline.prepare.finished import finished_splats
-from gs2d.pipeline.prepare.job import Job, reload_job
+from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats, reload_run
 from gs2d.render.types import RasterSettings
 from gs2d.viewer.web import PageScene, Seen, write_page
 
@@ -38,7 +37,7 @@ def page_run(
     *,
     sh_degree: int = 3,
     on_event: OnEvent = ignore,
-    job: Job | None = None,
+    job: LoadedRun | None = None,
 ) -> dict[str, Any]:
     """Write the page of a run or of a file of splats.
 
@@ -50,7 +49,7 @@ def page_run(
     sh_degree : int
         0 to 3: how much of the colours' dependence on the direction is stored.
     on_event : callable
-    job : Job or None
+    job : LoadedRun or None
         What defines the run, where it is at hand; None: it is read.
 
     Returns
@@ -95,7 +94,7 @@ class PageContent:
     run: RunFolder | None
 
 
-def page_content(path: Path, on_event: OnEvent = ignore, job: Job | None = None) -> PageContent:
+def page_content(path: Path, on_event: OnEvent = ignore, job: LoadedRun | None = None) -> PageContent:
     """Return what a page shows of a run (defined by ``job``, where it is at hand) or of a file of splats."""
     run = open_run(path) if path.is_dir() or is_run(path) else None
     if run is not None:
@@ -103,7 +102,7 @@ def page_content(path: Path, on_event: OnEvent = ignore, job: Job | None = None)
         definition = run.definition()
         title = definition.get("title") or definition["scene"]["name"]
         try:
-            job = job or reload_job(run, on_event)
+            job = job or reload_run(run, on_event)
         except (RunError, DataError) as error:
             on_event(Notice(f"without the cameras of the photographs: {error}"))
     else:

@@ -181,33 +181,6 @@ class Finding:
     """Hard links instead of copies of the photographs: no disk is used."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Part:
-    """That a training is a part of a larger one: recipe and protocol are settled, and only splats are written.
-
-    Attributes
-    ----------
-    views : tuple of str
-        Training views, by name, and no test views; () = the views of the capture as they are.
-    splats, start : Path or None
-        Splats that were trained before; and a file of which of them train, which stay frozen around them, and of the
-        exposures of the views (``pipeline.part``).
-    region : three tuples, or ()
-        Axes, lower and upper ends along them of where the part lies, world units: a dense start is made there.
-    extent : float or None
-        Of the part, world units, where it is not that of the capture.
-    prepared : Path or None
-        Where prepared photographs lie, so that parts share them; None: in the run.
-    """
-
-    views: tuple[str, ...] = ()
-    splats: Path | None = None
-    start: Path | None = None
-    region: tuple[tuple[Any, ...], ...] = ()
-    extent: float | None = None
-    prepared: Path | None = None
-
-
 # -- verbs that make a run ---------------------------------------------------------------------------------------------
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions(Training, Resources, HowItRuns):
@@ -227,23 +200,11 @@ class TrainOptions(Training, Resources, HowItRuns):
     """Shrink the photographs by this integer, area-filtered (default: not, or so much that they fit into memory)."""
     masks: Annotated[Path | None, Arg(metavar="DIR")] = None
     """Folder of masks of the photographs, white = keep (default: where COLMAP, nerfstudio and Metashape put them)."""
-    schedule_scale: float = 1.0
-    """Fraction of the full schedule: 0.1 trains a tenth of the iterations."""
-    iterations: Annotated[int | None, PYTHON_ONLY] = None
-    """Total iterations of the schedule, instead of ``schedule_scale``."""
+    schedule_scale: float | None = None
+    """Fraction of the full schedule: 0.1 trains a tenth of the iterations (default: all, or by --quality)."""
     init: Annotated[Path | None, Arg(metavar="FILE")] = None
     """Start from the splats of a file (PLY of 2DGS or 3DGS, .spz, .splat, .usd, .glb, .sog) in the frame of the
     capture, not from points. 3D Gaussians lose their smallest scale, along which the normal then points."""
-    title: Annotated[str | None, PYTHON_ONLY] = None
-    """Heading of the report; None: the name of the capture."""
-    shown_views: Annotated[int, PYTHON_ONLY] = 3
-    """Views that are rendered after each stage for the report."""
-    allowed: Annotated[tuple[str, ...], PYTHON_ONLY] = ()
-    """Names that may already be in ``out`` (the demo's capture)."""
-    estimate: Annotated[bool, PYTHON_ONLY] = False
-    """Print before training how long it will take."""
-    part: Annotated[Part | None, PYTHON_ONLY] = None
-    """What is trained of something larger."""
 
     def __post_init__(self) -> None:
         paths_of(self, "scene", "out", "masks", "init", "start_from", "cache")

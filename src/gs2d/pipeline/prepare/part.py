@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gs2d.config.protocols import Protocol
 from gs2d.config.recipe import Recipe
 from gs2d.core.files import atomic_write
 from gs2d.core.splats import Splats
@@ -21,10 +22,40 @@ from gs2d.data import Scene
 from gs2d.data.arrays import read_npz
 from gs2d.errors import DataError, RunError
 from gs2d.io.splat_ply import read_splats
-from gs2d.pipeline.prepare.options import Part
 from gs2d.training.initialize import splats_as_start
 
 ABSENT, FROZEN, OWN = 0, 1, 2  # of a row of the splats that were trained before
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """A part of a larger training, for which the whole has decided recipe and protocol; only splats are written.
+
+    Attributes
+    ----------
+    recipe, protocol
+        As the part is trained.
+    views : tuple of str
+        Training views, by name, and no test views; () = the views of the capture as they are.
+    splats, start : Path or None
+        Splats that were trained before; and a file of which of them train, which stay frozen around them, and of the
+        exposures of the views (:func:`write_start`).
+    region : three tuples, or ()
+        Axes, lower and upper ends along them of where the part lies, world units: a dense start is made there.
+    extent : float or None
+        Of the part, world units, where it is not that of the capture.
+    prepared : Path or None
+        Where prepared photographs lie, so that parts share them; None: in the run.
+    """
+
+    recipe: Recipe
+    protocol: Protocol
+    views: tuple[str, ...] = ()
+    splats: Path | None = None
+    start: Path | None = None
+    region: tuple[tuple[Any, ...], ...] = ()
+    extent: float | None = None
+    prepared: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ from gs2d.data.prepare import check_disk, packed_bytes, prepare
 from gs2d.data.prepared import decoded_bytes, forget_others, missing_views, prepared_scene
 from gs2d.errors import DataError
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
+from gs2d.pipeline.prepare.resolved import Execution
 
 PREPARED = "prepared"  # in the run folder
 HOW = ("auto", "always", "never")
@@ -25,30 +26,27 @@ def fits(scene: Scene) -> bool:
 def with_prepared(
     scene: Scene,
     run: Path,
-    how: str,
+    execution: Execution,
     on_event: OnEvent,
     *,
-    disk: int | None = None,
-    threads: int | None = None,
     shared: bool = False,
 ) -> Scene:
     """Return the scene as it is trained on, its photographs prepared in the run folder where that is wanted.
 
     Parameters
     ----------
-    how : str
-        "always", "never", or "auto": where the pictures would not stay in memory.
-    disk : int or None
-        Bytes that may be written.
+    execution : Execution
+        ``prepare`` is "always", "never", or "auto": where the images would not stay in memory.
     shared : bool
         Other runs keep photographs there too: what is not of this scene stays.
     """
+    how, threads = execution.prepare, execution.threads
     if how == "never" or (how == "auto" and fits(scene)):
         return scene
     folder = run / PREPARED
     chosen = prepared_scene(scene, folder)
     missing = missing_views(chosen)
-    check_disk(run, missing, disk)
+    check_disk(run, missing, execution.disk_bytes)
     size = decoded_bytes(scene) / 2**30
     where = f"prepared in {folder}, {packed_bytes(scene.views) / 2**30:.2g} GiB at most, and read ahead"
     on_event(Notice(f"photographs of {size:.2g} GiB do not stay in memory: {where} (--prepare never reads the files)"))

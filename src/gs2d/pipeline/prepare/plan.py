@@ -8,11 +8,11 @@ from gs2d.data.archive import is_archive, unpacked_for_a_moment
 from gs2d.errors import DataError
 from gs2d.pipeline.events import OnEvent, ignore
 from gs2d.pipeline.prepare.estimate import Estimate, estimate
-from gs2d.pipeline.prepare.job import check_train_options, read_init, resolve
+from gs2d.pipeline.prepare.loaded import read_init
 from gs2d.pipeline.prepare.memory_budget import use_memory
-from gs2d.pipeline.prepare.opened import open_capture
+from gs2d.pipeline.prepare.open_capture import open_capture
 from gs2d.pipeline.prepare.options import PlanOptions
-from gs2d.pipeline.prepare.quality import by_quality
+from gs2d.pipeline.prepare.resolve import by_quality, check_options, resolve
 from gs2d.pipeline.prepare.threads import use_threads
 
 
@@ -27,14 +27,16 @@ def plan(options: PlanOptions, on_event: OnEvent = ignore) -> Estimate:
     if is_archive(options.scene):
         with unpacked_for_a_moment(options.scene) as folder:
             return plan(replace(options, scene=folder), on_event)
-    check_train_options(options)
+    check_options(options)
     use_threads(options.threads)
     use_memory(options.memory)
     training = by_quality(options, on_event)
     start = None if options.init is None else len(read_init(options.init, on_event)[0])
-    recipe, opened = resolve(training, open_capture(training, on_event), on_event)
+    scale = 1.0 if training.schedule_scale is None else training.schedule_scale
+    opened = open_capture(training, on_event)
+    recipe, capture = resolve(training, opened, on_event, seed=training.seed, schedule_scale=scale)
     found = estimate(
-        opened.scene, recipe, opened.backend, downscale=opened.downscale, prepare=options.prepare, start=start
+        capture.scene, recipe, capture.backend, downscale=capture.downscale, prepare=options.prepare, start=start
     )
     if options.disk is not None and found.disk > options.disk * 2**30:
         raise DataError(

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import MappingProxyType
 
 from gs2d.config.recipe import Recipe
 from gs2d.core.camera import Camera
-from gs2d.data import load_scene
 from gs2d.errors import RecipeError
-from gs2d.pipeline.events import Notice, OnEvent
-from gs2d.pipeline.prepare.job import check_train_options, recipe_of
-from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.render.backends import get_backend
 
 
@@ -49,37 +45,3 @@ def quality_of(name: str, backend: str) -> Quality:
     if name not in QUALITIES:
         raise RecipeError(f"--quality must be one of {', '.join(QUALITIES)}, got {name}")
     return QUALITIES[name]["cpu" if get_backend(backend).on_host else "gpu"]
-
-
-def at_quality(
-    options: TrainOptions, name: str, cameras: Sequence[Camera], on_event: OnEvent, scale: float | None
-) -> TrainOptions:
-    """Return options with the schedule and the picture size of a quality, and say which they are.
-
-    ``scale``: the fraction of the schedule that was asked for, None: what the quality says. ``options.downscale``
-    stays where it is given.
-    """
-    quality = quality_of(name, options.backend)
-    scale = quality.schedule_scale(recipe_of(options.recipe)) if scale is None else scale
-    downscale = options.downscale or quality.downscale(cameras)
-    chosen = replace(options, schedule_scale=scale, downscale=downscale)
-    iterations = check_train_options(chosen).iterations
-    shown = max(cameras, key=lambda camera: max(camera.width, camera.height)).downscaled(downscale)
-    line = (
-        f"quality {name}: {iterations:,} iterations (--schedule-scale {scale:g}) "
-        f"on pictures of {shown.width}x{shown.height} (--downscale {downscale})"
-    )
-    on_event(Notice(line, detail=True))
-    return chosen
-
-
-def by_quality(options: TrainOptions, on_event: OnEvent) -> TrainOptions:
-    """Return the options of ``gs2d train`` with what their quality says; a schedule or a size that is given stays."""
-    if options.quality is None:
-        return options
-    check_train_options(options)
-    quality_of(options.quality, options.backend)  # before anything is read
-    views = load_scene(options.scene, format=options.format, test_every=0).views
-    scale = None if options.schedule_scale == 1.0 else options.schedule_scale
-    chosen = at_quality(options, options.quality, [view.camera for view in views], on_event, scale)
-    return replace(chosen, quality=None, estimate=True)

@@ -16,7 +16,7 @@ from gs2d.data import View
 from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import EXPOSURE, RunFolder
 from gs2d.pipeline.events import Notice, OnEvent
-from gs2d.pipeline.prepare.job import Job
+from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.render.exposure import expose, fit_exposure
 from gs2d.render.photometry import remove_photometry
 from gs2d.render.types import RenderOutput
@@ -113,7 +113,7 @@ def exposure_named(name: str, transforms: Transforms) -> Tensor:
     return transforms[name]
 
 
-def exposed(output: RenderOutput, transform: Tensor | None, job: Job) -> Tensor:
+def exposed(output: RenderOutput, transform: Tensor | None, job: LoadedRun) -> Tensor:
     """Return the picture of any view [H, W, 3], in an exposure if one is given.
 
     Where the photographs have an alpha channel, the background is none of them and stays as it is.

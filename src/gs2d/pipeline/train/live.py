@@ -19,8 +19,7 @@ from gs2d.errors import DataError
 from gs2d.pipeline.events import Event, Notice, OnEvent, Phase, Step
 from gs2d.pipeline.look.page import page_scene, some_views
 from gs2d.pipeline.look.view import images_route
-from gs2d.pipeline.prepare.job import Job
-from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.training import events as train_events
 from gs2d.training.state import TrainState
 from gs2d.viewer.server import Answer, PageServer
@@ -40,7 +39,7 @@ class Live:
         The port is taken.
     """
 
-    def __init__(self, job: Job, options: TrainOptions, tell: OnEvent) -> None:
+    def __init__(self, loaded: LoadedRun, tell: OnEvent) -> None:
         self._tell = tell
         self._lock = threading.Lock()  # of the copy and of what is packed
         self._copy: Splats | None = None
@@ -50,17 +49,17 @@ class Live:
         self._copy_at, self._copied = 0.0, 0.0
         self._phase, self._total, self._status, self._psnr = "", 0, "training begins", ""
         self._told = False
-        views = some_views(job.scene.train)
-        points = np.zeros((0, 3)) if job.scene.points is None else job.scene.points.points
-        self._scene = page_scene(options.title or job.scene.name, views, job.settings, points)
+        views = some_views(loaded.scene.train)
+        points = np.zeros((0, 3)) if loaded.scene.points is None else loaded.scene.points.points
+        self._scene = page_scene(loaded.resolved.title or loaded.scene.name, views, loaded.settings, points)
         page = served_page(self._scene, Served(has_images=True, is_live=True))
         routes = {
             "": lambda _: Answer("text/html; charset=utf-8", [page]),
             "state": self._answer_state,
             "splats": self._answer_splats,
-            "image": images_route(views, job.settings.background),
+            "image": images_route(views, loaded.settings.background),
         }
-        self._server = PageServer(options.viewer_port, routes, option="--viewer-port")
+        self._server = PageServer(loaded.resolved.execution.viewer_port, routes, option="--viewer-port")
         tell(Notice(f"watch it at {self._server.url}"))
 
     # -- the training thread -------------------------------------------------------------------------------------------

@@ -22,9 +22,8 @@ from gs2d.core.processes import Place, here
 from gs2d.errors import BackendError, Gs2dError, RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.events import Notice, OnEvent, ignore
-from gs2d.pipeline.prepare.job import Job, prepare_job
+from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
 from gs2d.pipeline.prepare.options import TrainOptions
-from gs2d.pipeline.prepare.quality import by_quality
 from gs2d.pipeline.train.interruption import HeldSignals
 from gs2d.pipeline.train.run_logger import progress_every
 from gs2d.training.parallel import ONE_PROCESS, LostContactError, ManyProcesses, OneProcess
@@ -102,16 +101,18 @@ def memory_of(place: Place, gib: float | None) -> float | None:
     return None if whole is None else whole / place.local_size
 
 
-def lead(job: Job, options: TrainOptions, together: OneProcess, on_event: OnEvent) -> Job:
+def lead(loaded: LoadedRun, together: OneProcess, on_event: OnEvent) -> LoadedRun:
     """Tell the others what this process trains, and the user that there are others."""
     if not isinstance(together, ManyProcesses):
-        return job
-    rate = job.recipe.stages[0].lr.for_views(together.size).sh0 / job.recipe.stages[0].lr.sh0
+        return loaded
+    rates = loaded.recipe.stages[0].lr
+    rate = rates.for_views(together.size).sh0 / rates.sh0
     text = f"{together.size} processes: as many photographs an iteration, each a view; rates times {rate:.3g}"
     on_event(Notice(text))
-    prepare = "always" if job.scene.ahead else "never"
-    together.tell({"scene": str(options.scene.resolve()), "prepare": prepare, "definition": _definition(job)})
-    return replace(job, processes=together.size)
+    prepare = "always" if loaded.scene.ahead else "never"
+    path = str(loaded.resolved.scene.path)
+    together.tell({"scene": path, "prepare": prepare, "facts": _shared_facts(loaded)})
+    return replace(loaded, processes=together.size)
 
 
 def follow(options: TrainOptions, together: ManyProcesses) -> RunFolder:
@@ -125,17 +126,16 @@ def follow(options: TrainOptions, together: ManyProcesses) -> RunFolder:
         Process 0 has ended.
     """
     told: dict[str, Any] = together.tell({})
-    prepared = by_quality(replace(options, scene=Path(told["scene"]), prepare=told["prepare"]), ignore)
-    job = prepare_job(prepared, ignore)
-    run = RunFolder(options.out)
-    _check_same(told["definition"], _definition(job))
+    same = replace(options, scene=Path(told["scene"]), prepare=told["prepare"])
+    loaded = prepare_run(same, ignore)
+    _check_same(told["facts"], _shared_facts(loaded))
     trainer = Trainer(
-        job.scene,
-        job.recipe,
-        job.protocol,
-        backend=job.backend,
-        progress_every=progress_every(job, options),
-        stage2_cache_bytes=job.stage2_cache_bytes,
+        loaded.scene,
+        loaded.recipe,
+        loaded.protocol,
+        backend=loaded.backend,
+        progress_every=progress_every(loaded),
+        stage2_cache_bytes=loaded.resolved.stage2_cache_bytes,
         processes=together,
     )
     signals = HeldSignals()
@@ -146,14 +146,12 @@ def follow(options: TrainOptions, together: ManyProcesses) -> RunFolder:
     finally:
         with contextlib.suppress(KeyboardInterrupt):
             signals.forget()
-    return run
+    return RunFolder(options.out)
 
 
-def _definition(job: Job) -> dict[str, Any]:
+def _shared_facts(loaded: LoadedRun) -> dict[str, Any]:
     """Return what must be the same in all processes."""
-    facts = job.definition()
-    scene = {name: value for name, value in facts["scene"].items() if name != "path"}
-    return {**facts, "scene": scene, "key": job.stage_key(len(job.recipe.stages) - 1)}
+    return {**loaded.resolved.decisive_facts(), "key": loaded.stage_key(len(loaded.recipe.stages) - 1)}
 
 
 def _check_same(first: dict[str, Any], own: dict[str, Any]) -> None:

@@ -23,8 +23,7 @@ from gs2d.io.run_dir import (
 )
 from gs2d.io.run_schema import METRICS_SHAPE, check_shape
 from gs2d.pipeline.events import Notice, OnEvent
-from gs2d.pipeline.prepare.job import Job
-from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.training.resumable import check_resumable
 from gs2d.training.state import TrainState
 
@@ -62,7 +61,7 @@ class FinishedStage:
     source: str
 
 
-def choose_start(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEvent) -> ResumePoint:
+def choose_start(run: RunFolder, loaded: LoadedRun, on_event: OnEvent) -> ResumePoint:
     """Return the furthest valid start; the log and the metrics are cut to it.
 
     Raises
@@ -70,49 +69,51 @@ def choose_start(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEv
     RunError
         ``start_from`` has no stage in common with this run, or no checkpoint is readable.
     """
+    execution = loaded.resolved.execution
     if run.checkpoints():
-        start = _resume(run, job, on_event)
-        if options.cache is not None:
-            _keep_scored(run, options.cache)
+        start = _resume(run, loaded, on_event)
+        if execution.cache is not None:
+            _keep_scored(run, execution.cache)
         return start
     run.events.cut(0)
     found = [
         stage
         for stage in (
-            _from_run(job, options.start_from) if options.start_from else None,
-            _from_cache(job, options.cache, on_event) if options.cache else None,
+            _from_run(loaded, execution.start_from) if execution.start_from else None,
+            _from_cache(loaded, execution.cache, on_event) if execution.cache else None,
         )
         if stage is not None
     ]
     if not found:
         run.write_metrics({"stages": [], "surface": None})
         return ResumePoint()
-    return _adopt(run, job, max(found, key=lambda stage: stage.index), on_event)
+    return _adopt(run, loaded, max(found, key=lambda stage: stage.index), on_event)
 
 
-def check_sources(job: Job, options: TrainOptions) -> None:
+def check_sources(out: Path, loaded: LoadedRun) -> None:
     """Raise what would be raised for ``start_from`` and ``cache``, before the run that is to be overwritten goes."""
-    if options.start_from is not None:
-        if options.start_from.resolve() == options.out.resolve():
-            raise RunError(f"--from and --out are the same run, {options.out}; take another --out")
-        _from_run(job, options.start_from)
-    if options.cache is not None:
-        remove_made(make_folder(options.cache))
+    execution = loaded.resolved.execution
+    if execution.start_from is not None:
+        if execution.start_from.resolve() == out.resolve():
+            raise RunError(f"--from and --out are the same run, {out}; take another --out")
+        _from_run(loaded, execution.start_from)
+    if execution.cache is not None:
+        remove_made(make_folder(execution.cache))
 
 
-def _resume(run: RunFolder, job: Job, on_event: OnEvent) -> ResumePoint:
+def _resume(run: RunFolder, loaded: LoadedRun, on_event: OnEvent) -> ResumePoint:
     checkpoints = run.checkpoints()
     for checkpoint in reversed(checkpoints):
         try:
             payload = _read(checkpoint.path)
-            state = _state_at(checkpoint, payload, job)
+            state = _state_at(checkpoint, payload, loaded)
         except RunError as error:
             on_event(Notice(f"{error}; going back to the checkpoint before it"))
             continue
         run.events.cut(payload["events_bytes"])
         finished = checkpoint.stage_index + (checkpoint.iteration is None)
         metrics = run.metrics()
-        unchanged = finished == len(job.recipe.stages)  # then what is said of the mesh still holds
+        unchanged = finished == len(loaded.recipe.stages)  # then what is said of the mesh still holds
         of_mesh: dict[str, Any] = {name: metrics[name] for name in ("surface", "mesh") if unchanged and name in metrics}
         run.write_metrics({"stages": metrics["stages"][:finished], "surface": None, **of_mesh})
         on_event(Notice(f"resuming after {checkpoint.path.stem}"))
@@ -148,12 +149,12 @@ def _state(path: Path, payload: dict[str, Any]) -> TrainState:
         raise _unreadable(path, str(error)) from error
 
 
-def _state_at(checkpoint: CheckpointFile, payload: dict[str, Any], job: Job) -> TrainState:
+def _state_at(checkpoint: CheckpointFile, payload: dict[str, Any], loaded: LoadedRun) -> TrainState:
     """Return the state in a checkpoint of this run, if it is where its name says and training can go on from it."""
     state, ended = _state(checkpoint.path, payload), checkpoint.iteration is None
     place = (checkpoint.stage_index + ended, 0 if ended else checkpoint.iteration)
     try:
-        check_resumable(state, job.recipe, job.scene)
+        check_resumable(state, loaded.recipe, loaded.scene)
     except (RunError, ShapeError) as error:
         raise _unreadable(checkpoint.path, str(error)) from error
     if (state.stage, state.step) != place:
@@ -161,9 +162,9 @@ def _state_at(checkpoint: CheckpointFile, payload: dict[str, Any], job: Job) -> 
     return state
 
 
-def _adopt(run: RunFolder, job: Job, stage: FinishedStage, on_event: OnEvent) -> ResumePoint:
+def _adopt(run: RunFolder, loaded: LoadedRun, stage: FinishedStage, on_event: OnEvent) -> ResumePoint:
     """Make another run's finished stages this run's own."""
-    name = job.recipe.stages[stage.index].name
+    name = loaded.recipe.stages[stage.index].name
     run.events.append_text(stage.log)
     run.write_metrics({"stages": [{**m, "reused_from": stage.source} for m in stage.metrics], "surface": None})
     payload = {k: v for k, v in stage.payload.items() if k != "events_bytes"}
@@ -172,18 +173,18 @@ def _adopt(run: RunFolder, job: Job, stage: FinishedStage, on_event: OnEvent) ->
     return ResumePoint(_state(Path(stage.source), stage.payload))
 
 
-def _from_run(job: Job, path: Path) -> FinishedStage:
+def _from_run(loaded: LoadedRun, path: Path) -> FinishedStage:
     """Return the furthest stage that another run has in common with this one."""
     other = open_run(path)
     ends = [c for c in other.checkpoints() if c.iteration is None]
     for checkpoint in reversed(ends):
         index = checkpoint.stage_index
-        if index >= len(job.recipe.stages):
+        if index >= len(loaded.recipe.stages):
             continue
         payload = _read(checkpoint.path)
         metrics = other.metrics()["stages"]
-        if payload["key"] == job.stage_key(index) and len(metrics) > index:
-            _state_at(checkpoint, payload, job)
+        if payload["key"] == loaded.stage_key(index) and len(metrics) > index:
+            _state_at(checkpoint, payload, loaded)
             log = other.events.read_bytes(payload["events_bytes"])
             return FinishedStage(index, payload, metrics[: index + 1], log, str(path))
     have = ", ".join(c.stage for c in ends) or "none"
@@ -198,15 +199,15 @@ def _cache_file(folder: Path, key: str) -> Path:
     return folder / f"{key[:32]}.pt"
 
 
-def _from_cache(job: Job, folder: Path, on_event: OnEvent) -> FinishedStage | None:
+def _from_cache(loaded: LoadedRun, folder: Path, on_event: OnEvent) -> FinishedStage | None:
     """Return the furthest stage that the cache has; what is damaged in it goes, and is trained and kept again."""
     sweep(folder)
-    for index in reversed(range(len(job.recipe.stages))):
-        key = job.stage_key(index)
+    for index in reversed(range(len(loaded.recipe.stages))):
+        key = loaded.stage_key(index)
         path = _cache_file(folder, key)
         if path.exists():
             try:
-                return _cached(job, index, path, key)
+                return _cached(loaded, index, path, key)
             except RunError as error:
                 on_event(Notice(f"{error}: done, that stage is trained again"))
                 with contextlib.suppress(OSError):
@@ -214,7 +215,7 @@ def _from_cache(job: Job, folder: Path, on_event: OnEvent) -> FinishedStage | No
     return None
 
 
-def _cached(job: Job, index: int, path: Path, key: str) -> FinishedStage:
+def _cached(loaded: LoadedRun, index: int, path: Path, key: str) -> FinishedStage:
     """Return what a file of the cache holds.
 
     Raises
@@ -223,8 +224,8 @@ def _cached(job: Job, index: int, path: Path, key: str) -> FinishedStage:
         It is damaged.
     """
     payload = _read(path)
-    end = CheckpointFile(path, index, job.recipe.stages[index].name, None)
-    _state_at(end, payload, job)
+    end = CheckpointFile(path, index, loaded.recipe.stages[index].name, None)
+    _state_at(end, payload, loaded)
     try:
         metrics, log = json.loads(payload.pop("metrics")), payload.pop("log").encode()
     except (LookupError, TypeError, AttributeError, ValueError, RecursionError) as error:
@@ -235,7 +236,7 @@ def _cached(job: Job, index: int, path: Path, key: str) -> FinishedStage:
     return FinishedStage(index, payload, metrics, log, str(path))
 
 
-def stage_end(run: RunFolder, job: Job, index: int) -> TrainState | None:
+def stage_end(run: RunFolder, loaded: LoadedRun, index: int) -> TrainState | None:
     """Return the state at the end of a stage: from the run's own checkpoint, or from where the stage was taken.
 
     None where neither is there any more.
@@ -247,10 +248,10 @@ def stage_end(run: RunFolder, job: Job, index: int) -> TrainState | None:
     """
     for checkpoint in run.checkpoints():
         if (checkpoint.stage_index, checkpoint.iteration) == (index, None):
-            return _state_at(checkpoint, _read(checkpoint.path), job)
+            return _state_at(checkpoint, _read(checkpoint.path), loaded)
     stages = run.metrics()["stages"]
     source = Path(stages[index].get("reused_from") or "") if len(stages) > index else Path()
-    key = job.stage_key(index)
+    key = loaded.stage_key(index)
     paths = [_cache_file(source.parent, key)] if source.suffix == ".pt" else []
     if is_run(source):
         ends = RunFolder(source).checkpoints()

@@ -35,9 +35,8 @@ from gs2d.pipeline.finish.scoring import (
     transparent_part,
 )
 from gs2d.pipeline.prepare.estimate import iteration_costs
-from gs2d.pipeline.prepare.job import Job
+from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.pipeline.prepare.memory_budget import release_buffers
-from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.run_exposures import Transforms, write_exposures
 from gs2d.pipeline.prepare.run_photometry import write_photometries
@@ -68,16 +67,16 @@ class RunLogger:
     def __init__(
         self,
         run: RunFolder,
-        job: Job,
-        options: TrainOptions,
+        job: LoadedRun,
         start: ResumePoint,
         on_event: OnEvent,
         visitors: Sequence[Visitor] = (),
     ) -> None:
-        self._run, self._job, self._options, self._start, self._on_event = run, job, options, start, on_event
+        self._run, self._job, self._on_event = run, job, on_event
+        self._execution = job.resolved.execution
         self._visitors = visitors
-        self.progress_every = progress_every(job, options)
-        self._shown = choose_views(job.scene, options.shown_views)
+        self.progress_every = progress_every(job)
+        self._shown = choose_views(job.scene)
         self._probes = (job.scene.test or job.scene.train)[
             :: max(1, len(job.scene.test or job.scene.train) // PROBE_VIEWS)
         ]
@@ -200,8 +199,8 @@ class RunLogger:
             f"{event.stage} {event.iteration:,}/{event.iterations:,}  {event.splats:,} splats  loss {event.loss:.4f}"
         )
         self._on_event(Step(self._iterations_before(event.index) + event.iteration, detail))
-        due = event.iteration - self._saved_iteration >= self._options.checkpoint_every
-        late = time.perf_counter() - self._saved_at >= self._options.checkpoint_seconds
+        due = event.iteration - self._saved_iteration >= self._execution.checkpoint_every
+        late = time.perf_counter() - self._saved_at >= self._execution.checkpoint_seconds
         if (due or late) and not last:
             self._stop_clock()
             self._save(event.index, event.iteration)
@@ -353,9 +352,9 @@ class RunLogger:
         self._draw(stage.name, outputs)
         stages = [*self._run.metrics()["stages"][:index], entry]
         self._run.write_metrics({"stages": stages, "surface": None})
-        if self._options.cache is not None:
+        if self._execution.cache is not None:
             saved = next(c for c in self._run.checkpoints() if c.stage_index == index and c.iteration is None)
-            put_in_cache(self._options.cache, self._run, index, load_tensors(saved.path))
+            put_in_cache(self._execution.cache, self._run, index, load_tensors(saved.path))
         self._on_event(StageDone(entry))
 
     def _scored(self, *, last: bool) -> list[tuple[str, Sequence[View]]]:
@@ -475,10 +474,10 @@ _ROWS_OR_JUMPS = (
 )
 
 
-def progress_every(job: Job, options: TrainOptions) -> int:
+def progress_every(job: LoadedRun) -> int:
     """Return the iterations between progress events."""
     every = REPORT_EVERY if job.backend.on_host else REPORT_EVERY_ON_GPU
-    return max(1, min(every, options.checkpoint_every))
+    return max(1, min(every, job.resolved.execution.checkpoint_every))
 
 
 def _storable(value: Any) -> bool:

@@ -35,17 +35,18 @@ from gs2d.pipeline.finish.scoring import Visitor
 from gs2d.pipeline.finish.verdict import Collector, write_verdict
 from gs2d.pipeline.look.page import page_run
 from gs2d.pipeline.prepare.estimate import estimate
-from gs2d.pipeline.prepare.job import Job, check_train_options, prepare_job, recipe_of
+from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
 from gs2d.pipeline.prepare.memory_budget import release, use_memory
 from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
+from gs2d.pipeline.prepare.part import Part
 from gs2d.pipeline.prepare.photographs import PREPARED
-from gs2d.pipeline.prepare.quality import by_quality
+from gs2d.pipeline.prepare.resolve import check_options
+from gs2d.pipeline.prepare.resolved import Execution, check_same_run
 from gs2d.pipeline.prepare.threads import use_threads
 from gs2d.pipeline.train.live import Live
 from gs2d.pipeline.train.process_group import connected, follow, lead, memory_of
 from gs2d.pipeline.train.resume import ResumePoint, check_sources, choose_start
 from gs2d.pipeline.train.run_logger import RunLogger
-from gs2d.pipeline.train.same_run import check_same_run
 from gs2d.training import events
 from gs2d.training.parallel import ONE_PROCESS, ManyProcesses, OneProcess
 from gs2d.viewer.server import free_port
@@ -54,7 +55,14 @@ MANY = 500  # photographs, from which time and memory are estimated before train
 UNPACKED = "unpacked"  # in the run folder: what came as a ZIP file
 
 
-def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
+def train(
+    options: TrainOptions,
+    on_event: OnEvent = ignore,
+    *,
+    title: str = "",
+    allowed: tuple[str, ...] = (),
+    part: Part | None = None,
+) -> RunFolder:
     """Train a run to its end: splats, mesh, metrics, report.
 
     A run that fails before its first checkpoint leaves nothing behind; one that fails or is killed later can be
@@ -65,6 +73,12 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
     options : TrainOptions
     on_event : callable
         Gets :mod:`gs2d.pipeline.events`.
+    title : str
+        Heading of the report; empty: the name of the capture.
+    allowed : tuple of str
+        Names that may already be in ``options.out``.
+    part : Part or None
+        The part of a larger training that this is; only its splats are written.
 
     Returns
     -------
@@ -81,99 +95,104 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
             use_threads(options.threads, together.place.local_size)
             use_memory(memory_of(together.place, options.memory))
             return follow(options, together)
-        return (_train_archive if is_archive(options.scene) else _train)(options, on_event, together)
+        if not is_archive(options.scene):
+            return _train(options, on_event, together, title, allowed, part)
+        check_options(options)
+        with _unpacked(options, allowed, on_event) as scene:
+            unpacked = replace(options, scene=scene)
+            return _train(unpacked, on_event, together, title or options.scene.stem, (*allowed, UNPACKED), part)
 
 
-def _train(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> RunFolder:
+def _train(
+    options: TrainOptions,
+    on_event: OnEvent,
+    together: OneProcess,
+    title: str,
+    allowed: tuple[str, ...],
+    part: Part | None,
+) -> RunFolder:
     """Train a run that is the only one, or that others follow."""
     check_viewer(options)
-    allowed = (*options.allowed, PREPARED)
-    claim = {"resume": options.resume, "overwrite": options.overwrite, "allowed": allowed}
-    check_claim(options.out, **claim)  # type: ignore[arg-type]
+    allowed = (*allowed, PREPARED)
+    check_claim(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
     use_threads(options.threads, together.place.local_size)
     use_memory(memory_of(together.place, options.memory))
     on_event(Plan(TRAINED))
     details: list[str] = []
     on_event = keeping_details(on_event, details)
-    options = by_quality(options, on_event)
-    job = prepare_job(options, on_event)
-    if unlike := _unlike_its_run(options, job):
+    loaded = prepare_run(options, on_event, title=title, part=part)
+    if unlike := _unlike_its_run(options.out, loaded):
         on_event(Notice(unlike))
     if options.overwrite:
-        check_sources(job, options)
-    run = claim_run(options.out, **claim)  # type: ignore[arg-type]
-    with run.locked(), discard_on_failure(run), watched(job, options, on_event) as live:
+        check_sources(options.out, loaded)
+    run = claim_run(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
+    with run.locked(), discard_on_failure(run), watched(loaded, on_event) as live:
         on_event = on_event if live is None else live.on_event
         if options.cache is not None:  # now, not when the first stage has been trained
             run.made += make_folder(options.cache)
         if is_run(run.path):
-            check_same_run(run, job)
+            check_same_run(run, loaded.resolved)
             if run.file(SPLATS).exists() and not run.checkpoints():
                 raise RunError(
                     f"{run.path} is finished and its checkpoints are gone: nothing to resume; "
                     "train it again with --overwrite, or choose another --out"
                 )
         else:
-            extra = {"title": options.title} if options.title else {}
-            scale = options.schedule_scale
-            if options.iterations is not None:
-                scale = options.iterations / recipe_of(options.recipe).iterations
-            run.write_definition({**job.definition(), "schedule_scale": scale, **extra})
-        job = lead(job, options, together, on_event)
-        start = choose_start(run, job, options, on_event)
+            run.write_definition(loaded.resolved.to_json())
+        loaded = lead(loaded, together, on_event)
+        start = choose_start(run, loaded, on_event)
         if start.state is None:
-            for event in pretraining_notices(job, options):
+            for event in pretraining_notices(loaded, is_part=part is not None):
                 on_event(event)
             for text in details:
                 run.events.append({"kind": "notice", "text": text})
         hold()
-        if options.part is not None:
-            train_stages(run, job, options, start, on_event, live=live)
-            release(job.scene)
+        if part is not None:
+            train_stages(run, loaded, start, on_event, live=live)
+            release(loaded.scene)
             return run
-        collected = Collector(job.scene)
-        with MeshFrames(job) as frames:
+        collected = Collector(loaded.scene)
+        with MeshFrames(loaded) as frames:
             visitors = [frames.visit, collected.visit]
-            splats, now = train_stages(run, job, options, start, on_event, visitors, together, live)
-            release(job.scene)  # before the volume of the mesh
-            job = replace(job, scene=now)
-            mesh = MeshOptions(subject_box=options.subject_box, whole_scene=options.whole_scene)
-            finish(run, job, splats, mesh, on_event, frames, collected, with_page=options.page)
+            splats, now = train_stages(run, loaded, start, on_event, visitors, together, live)
+            release(loaded.scene)  # before the volume of the mesh
+            finish(run, replace(loaded, scene=now), splats, on_event, frames, collected)
     return run
 
 
-def _unlike_its_run(options: TrainOptions, job: Job) -> str:
+def _unlike_its_run(out: Path, loaded: LoadedRun) -> str:
     """Return how this training differs from that of the run whose folder the capture lies in, as of `reconstruct`."""
-    home = Path(options.scene).absolute().parent
-    if not is_run(home) or home.resolve() == options.out.resolve():
+    resolved = loaded.resolved
+    home = resolved.scene.path.parent
+    if not is_run(home) or home == out.resolve():
         return ""
     run = RunFolder(home).definition()
     pairs = (
-        ("--schedule-scale", run.get("schedule_scale"), options.schedule_scale),
-        ("--downscale", run.get("downscale"), job.downscale),
-        ("--test-every", (run.get("protocol") or {}).get("test_every"), job.protocol.test_every),
+        ("--schedule-scale", run.get("schedule_scale"), resolved.schedule_scale),
+        ("--downscale", run.get("downscale"), resolved.downscale),
+        ("--test-every", (run.get("protocol") or {}).get("test_every"), resolved.protocol.test_every),
     )
     others = " ".join(f"{name} {theirs:g}" for name, theirs, ours in pairs if theirs not in (None, ours))
-    return f"{options.scene.parent} was trained with {others}; give the same for comparable results" if others else ""
+    return f"{home} was trained with {others}; give the same for comparable results" if others else ""
 
 
-def _is_planned(options: TrainOptions, views: int) -> bool:
+def _is_planned(execution: Execution, views: int) -> bool:
     """Whether time and memory are estimated before a training begins."""
-    return options.part is None and bool(options.estimate or options.memory or options.disk or views >= MANY)
+    return bool(execution.quality or execution.memory or execution.disk or views >= MANY)
 
 
-def _train_archive(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> RunFolder:
-    """Train on a capture in a ZIP file, which is unpacked into the run folder, where later commands find it."""
-    options = replace(options, allowed=(*options.allowed, UNPACKED), title=options.title or options.scene.stem)
-    check_train_options(options)
-    check_claim(options.out, resume=options.resume, overwrite=options.overwrite, allowed=options.allowed)
+@contextmanager
+def _unpacked(options: TrainOptions, allowed: tuple[str, ...], on_event: OnEvent) -> Iterator[Path]:
+    """Unpack the ZIP file of a capture into the run folder, where later commands find it."""
+    allowed = (*allowed, UNPACKED)
+    check_claim(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
     home = options.out / UNPACKED
     made = make_folder(home)
     try:
         on_event(Phase(f"unpacking {options.scene.name}", 0))
         scene = unpack(options.scene, home)
         with named_by(options.scene, scene):
-            return _train(replace(options, scene=scene), on_event, together)
+            yield scene
     finally:  # what the run is not of goes: all of it where there is no run, the older one where a run was replaced
         used = RunFolder(options.out).definition()["scene"]["path"] if is_run(options.out) else ""
         for folder in home.iterdir():
@@ -183,12 +202,12 @@ def _train_archive(options: TrainOptions, on_event: OnEvent, together: OneProces
 
 
 @contextmanager
-def watched(job: Job, options: TrainOptions, on_event: OnEvent) -> Iterator[Live | None]:
+def watched(loaded: LoadedRun, on_event: OnEvent) -> Iterator[Live | None]:
     """Serve the page of a training while it lasts, with ``--viewer``."""
-    if not options.viewer:
+    if not loaded.resolved.execution.viewer:
         yield None
         return
-    live = Live(job, options, on_event)
+    live = Live(loaded, on_event)
     try:
         yield live
     finally:
@@ -217,8 +236,7 @@ def discard_on_failure(run: RunFolder) -> Iterator[None]:
 
 def train_stages(
     run: RunFolder,
-    job: Job,
-    options: TrainOptions,
+    loaded: LoadedRun,
     start: ResumePoint,
     on_event: OnEvent,
     visitors: Sequence[Visitor] = (),
@@ -231,7 +249,8 @@ def train_stages(
     """
     from gs2d.training.trainer import Trainer
 
-    recorder = RunLogger(run, job, options, start, on_event, visitors)
+    part = loaded.part
+    recorder = RunLogger(run, loaded, start, on_event, visitors)
 
     def listen(event: events.Event) -> None:
         recorder.on_training_event(event)
@@ -241,19 +260,19 @@ def train_stages(
             recorder.stop_if_asked()
 
     trainer = Trainer(
-        job.scene,
-        job.recipe,
-        job.protocol,
-        backend=job.backend,
+        loaded.scene,
+        loaded.recipe,
+        loaded.protocol,
+        backend=loaded.backend,
         on_event=listen,
         between=recorder.stop_if_asked,
         state=start.state,
-        init=None if start.state is not None else job.init if job.part is None else job.part.own,
-        frozen=None if job.part is None else job.part.frozen,
-        within=None if job.part is None or job.recipe.dense_start is None else job.part.within,
-        exposures=None if job.part is None else job.part.exposures,
+        init=None if start.state is not None else loaded.init if part is None else part.own,
+        frozen=None if part is None else part.frozen,
+        within=None if part is None or loaded.recipe.dense_start is None else part.within,
+        exposures=None if part is None else part.exposures,
         progress_every=recorder.progress_every,
-        stage2_cache_bytes=job.stage2_cache_bytes,
+        stage2_cache_bytes=loaded.resolved.stage2_cache_bytes,
         processes=together,
     )
     recorder.begin(trainer)
@@ -273,14 +292,14 @@ def keeping_details(on_event: OnEvent, details: list[str]) -> OnEvent:
     return listen
 
 
-def pretraining_notices(job: Job, options: TrainOptions) -> list[Event]:
+def pretraining_notices(loaded: LoadedRun, *, is_part: bool = False) -> list[Event]:
     """Return what the user should know before training: photographs, image size, length and expected time."""
-    scene, shrunk, shortened = job.scene, "", ""
+    scene, resolved, shrunk, shortened = loaded.scene, loaded.resolved, "", ""
     camera = max((view.camera for view in scene.views), key=lambda camera: max(camera.width, camera.height))
-    if job.downscale > 1:
-        shrunk = f" (--downscale {job.downscale})"
-    if options.schedule_scale != 1:
-        shortened = f" (--schedule-scale {options.schedule_scale:g})"
+    if resolved.downscale > 1:
+        shrunk = f" (--downscale {resolved.downscale})"
+    if resolved.schedule_scale != 1:
+        shortened = f" (--schedule-scale {resolved.schedule_scale:g})"
     if scene.test:
         held_out = f"{len(scene.test)} do not train, they score the result"
         held_out += "" if scene.own_split else " (--test-every 0 trains on all)"
@@ -290,38 +309,45 @@ def pretraining_notices(job: Job, options: TrainOptions) -> list[Event]:
     told: list[Event] = [
         Notice(
             f"{len(scene.train)} of {len(scene.views)} photographs train at {camera.width}x{camera.height}{shrunk} for "
-            f"{job.recipe.iterations:,} iterations{shortened}; {held_out}"
+            f"{loaded.recipe.iterations:,} iterations{shortened}; {held_out}"
         )
     ]
-    if _is_planned(options, len(scene.views)):
-        start = None if job.init is None else len(job.init)
-        found = estimate(scene, job.recipe, job.backend, downscale=job.downscale, prepare=options.prepare, start=start)
+    execution = resolved.execution
+    if not is_part and _is_planned(execution, len(scene.views)):
+        start = None if loaded.init is None else len(loaded.init)
+        found = estimate(
+            scene,
+            loaded.recipe,
+            loaded.backend,
+            downscale=resolved.downscale,
+            prepare=execution.prepare,
+            start=start,
+        )
         told += [Notice(line, detail=True) for line in found.lines()]
-        told += [Notice(found.line())] if options.estimate else []
+        told += [Notice(found.line())] if execution.quality is not None else []
     return told
 
 
 def finish(
     run: RunFolder,
-    job: Job,
+    loaded: LoadedRun,
     splats: Splats,
-    mesh: MeshOptions,
     on_event: OnEvent,
     frames: MeshFrames,
     collected: Collector,
-    *,
-    with_page: bool,
 ) -> None:
     """Write each thing that is made of the splats of a run, whatever the others do."""
+    execution = loaded.resolved.execution
+    mesh = MeshOptions(subject_box=execution.subject_box, whole_scene=execution.whole_scene)
     with attempted(MESH, again("mesh", run.path), on_event):
-        subject = meshed_subject(run, job, splats, mesh, on_event)
+        subject = meshed_subject(run, loaded, splats, mesh, on_event)
         if not (run.file(MESH).exists() and "mesh" in run.metrics()):  # a kill may come between the two
-            keep_facts(run, extract_mesh(job, splats, mesh, run.file(MESH), on_event, subject=subject, seen=frames))
-    if with_page and not run.file(PAGE).exists():
+            keep_facts(run, extract_mesh(loaded, splats, mesh, run.file(MESH), on_event, subject=subject, seen=frames))
+    if execution.page and not run.file(PAGE).exists():
         with attempted(PAGE, again("page", run.path), on_event):
-            page_run(run.path, on_event=on_event, job=job)
+            page_run(run.path, on_event=on_event, job=loaded)
     with attempted(VERDICT, again("evaluate", run.path), on_event):
-        write_verdict(run, job, collected)
+        write_verdict(run, loaded, collected)
     on_event(Phase("writing the report", 0))  # last: it links to the others
     with attempted(REPORT, again("report", run.path), on_event):
         report_run(run.path, on_event)

@@ -1,21 +1,22 @@
-"""A capture as a training sees it: its protocol, its photographs at a size that fits into memory, the backend."""
+"""Open a capture for training: choose its protocol, the image size that fits into memory, and the backend."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from gs2d.config.protocols import Protocol, get_protocol, protocol_for
 from gs2d.data import Scene, detect_format, load_scene
 from gs2d.data.benchmarks import protocol_of
 from gs2d.data.load import reader_of
-from gs2d.data.masks import Masks
+from gs2d.data.masks import EMPTY, Masks
+from gs2d.data.scene import PointCloud, View
 from gs2d.errors import ProtocolError
 from gs2d.io.run_dir import RunFolder, is_run
 from gs2d.pipeline.events import Event, Notice, OnEvent
-from gs2d.pipeline.prepare.capture_masks import with_masks
 from gs2d.pipeline.prepare.memory_budget import check_memory, least_downscale
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.render.backends import Backend, backend_report, get_backend
@@ -24,7 +25,7 @@ SHOWN_SKIPS = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Opened:
+class OpenCapture:
     """A capture as a training sees it.
 
     Attributes
@@ -40,43 +41,38 @@ class Opened:
     downscale: int
 
 
-def open_capture(options: TrainOptions, on_event: OnEvent, scene: Scene | None = None) -> Opened:
-    """Choose backend and protocol and load the capture; its photographs are not decoded yet.
-
-    Parameters
-    ----------
-    options : TrainOptions
-    on_event : callable
-    scene : Scene, optional
-        The capture, if it is in memory already.
-    """
+def open_capture(options: TrainOptions, on_event: OnEvent) -> OpenCapture:
+    """Choose backend and protocol and load the capture; its photographs are not decoded yet."""
     backend = choose_backend(options.backend, on_event)
-    if scene is None:
-        scene_format = detect_format(options.scene) if options.format == "auto" else options.format
-        reader_of(scene_format)  # an unknown format is an error before anything is read
-        protocol = choose_protocol(options, scene_format, on_event)
-        downscale, scene = scene_that_fits(options, scene_format, protocol, backend, on_event)
-    else:
-        protocol, downscale = choose_protocol(options, scene.format, on_event), 1
+    scene_format = detect_format(options.scene) if options.format == "auto" else options.format
+    reader_of(scene_format)  # an unknown format is an error before anything is read
+    protocol = choose_protocol(options.protocol, options.scene, scene_format, on_event)
+    if options.test_every is not None:
+        protocol = replace(protocol, test_every=options.test_every)
+    downscale, scene = scene_that_fits(options, scene_format, protocol, backend, on_event)
     if options.test_every is not None and scene.own_split:
         raise ProtocolError(
             f"--test-every is for captures without a split of their own, got {options.scene}, which has one; "
             "leave it out"
         )
-    return Opened(scene, with_masks(protocol, scene, on_event), backend, downscale)
+    return OpenCapture(scene, with_masks(protocol, scene, on_event), backend, downscale)
 
 
-def choose_protocol(options: TrainOptions, scene_format: str, on_event: OnEvent) -> Protocol:
-    """Return the protocol of a name, or of the capture, with what the options change in it."""
-    named = options.protocol
-    if named == "auto":
-        protocol = protocol_of(options.scene, scene_format)
-        if protocol is not protocol_for(scene_format):
-            line = f"protocol {protocol.name}: {options.scene.name} is a scene of that data set"
-            on_event(Notice(line, detail=True))
-    else:
-        protocol = get_protocol(named) if isinstance(named, str) else named
-    return protocol if options.test_every is None else replace(protocol, test_every=options.test_every)
+def capture_in_memory(scene: Scene, protocol: str | Protocol, backend: str, on_event: OnEvent) -> OpenCapture:
+    """Choose backend and protocol for a capture that is loaded already."""
+    chosen = choose_backend(backend, on_event)
+    rules = choose_protocol(protocol, scene.root or Path("."), scene.format, on_event)
+    return OpenCapture(scene, with_masks(rules, scene, on_event), chosen, downscale=1)
+
+
+def choose_protocol(named: str | Protocol, path: Path, scene_format: str, on_event: OnEvent) -> Protocol:
+    """Return the protocol of a name; "auto": that of the capture."""
+    if named != "auto":
+        return get_protocol(named) if isinstance(named, str) else named
+    protocol = protocol_of(path, scene_format)
+    if protocol is not protocol_for(scene_format):
+        on_event(Notice(f"protocol {protocol.name}: {path.name} is a scene of that data set", detail=True))
+    return protocol
 
 
 def choose_backend(name: str, on_event: OnEvent) -> Backend:
@@ -162,3 +158,64 @@ def _about_skipped(scene: Scene) -> str:
     wholes = len({view.path or view.name for view in scene.views})
     count = f"{len(scene.skipped)} of {len(scene.skipped) + wholes} photographs are left out"
     return f"{count} (`gs2d info` lists them): {'; '.join(parts)}"
+
+
+def with_masks(protocol: Protocol, scene: Scene, on_event: OnEvent) -> Protocol:
+    """Return the protocol under which the scene's masks are what the user says; one that passes them over is told."""
+    masks = scene.masks
+    if not masks.found or masks.masked == EMPTY or protocol.use_mask_in_training:
+        return protocol
+    if masks.asked_for:
+        return replace(protocol, use_mask_in_training=True, use_mask_in_fusion=True)
+    on_event(Notice(f"the protocol {protocol.name} trains on masked pixels too (--masked ignore leaves them out)"))
+    return protocol
+
+
+def without_masked_points(scene: Scene, protocol: Protocol, on_event: OnEvent) -> Scene:
+    """Return the scene without the sparse points that training photographs show in masked pixels alone.
+
+    Nothing would ever move or prune splats there.
+    """
+    points, masks = scene.points, scene.masks
+    if not masks.found or points is None:
+        return scene
+    if masks.masked != EMPTY and not protocol.use_mask_in_training:
+        return scene
+    observed = scene.observed()
+    if observed is None or len(observed.points) != len(points):
+        return scene
+    masked, kept = np.zeros((2, len(points)), dtype=np.int64)
+    for view in scene.train:
+        rows = observed.seen.get(view.name)
+        if rows is None or not len(rows):
+            continue
+        shown = _kept_pixels(view)
+        pixels, depth = view.camera.project(observed.points[rows])
+        with np.errstate(invalid="ignore"):
+            column, row = (
+                np.floor(pixels[:, k]).clip(0, size - 1) for k, size in ((0, shown.shape[1]), (1, len(shown)))
+            )
+        there = (depth > 0) & np.isfinite(pixels).all(axis=1)
+        keeps = shown[row[there].astype(np.int64), column[there].astype(np.int64)]
+        np.add.at(kept, rows[there][keeps], 1)
+        np.add.at(masked, rows[there][~keeps], 1)
+    out = (masked > 0) & (kept == 0)
+    if not out.any() or out.all():
+        return scene
+    line = f"{int(out.sum()):,} of {len(points):,} sparse points lie in masked pixels alone: left out"
+    on_event(Notice(line, detail=True))
+    return replace(scene, points=_rows(points, ~out))
+
+
+def _kept_pixels(view: View) -> np.ndarray:
+    """Return where a mask keeps a photograph, [H, W] bool; the rim that undistortion leaves counts as kept."""
+    kept = np.ones((view.camera.height, view.camera.width), dtype=bool)
+    mask, valid, alpha = view.mask(), view.valid(), view.alpha()
+    if mask is not None:
+        kept &= mask if valid is None else mask | ~valid
+    return kept if alpha is None else kept & (alpha >= 0.5)
+
+
+def _rows(points: PointCloud, rows: np.ndarray) -> PointCloud:
+    colors, normals, sizes = (None if a is None else a[rows] for a in (points.colors, points.normals, points.sizes))
+    return PointCloud(points.points[rows], colors, normals, sizes)

@@ -1,0 +1,223 @@
+"""One training run as a value: what decides its result, and how it is executed. ``run.json`` holds it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+from gs2d.config.protocols import Protocol
+from gs2d.config.recipe import Recipe, validate
+from gs2d.config.registry import absent_guests
+from gs2d.config.serialize import decode, encode
+from gs2d.data import Scene
+from gs2d.data.masks import Masks
+from gs2d.errors import DataError, RecipeError, RunError, ShapeError
+from gs2d.io.run_dir import RUN_JSON, RunFolder
+from gs2d.pipeline.prepare.options import Box
+from gs2d.render.api import check_settings
+from gs2d.render.types import RasterSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureRecord:
+    """The capture of a run.
+
+    Attributes
+    ----------
+    name : str
+    path : Path
+        Absolute.
+    format : str
+    train, test : int
+        Number of views.
+    extent : float
+        World units.
+    skipped : tuple of str
+        Photographs that are left out, with the reason.
+    masks : Masks
+    digest : str
+        Hash of all decoded images, masks, cameras, points and priors.
+    """
+
+    name: str
+    path: Path
+    format: str
+    train: int
+    test: int
+    extent: float
+    skipped: tuple[str, ...] = ()
+    masks: Masks = field(default_factory=Masks)
+    digest: str = ""
+
+    @classmethod
+    def of(cls, scene: Scene, digest: str) -> CaptureRecord:
+        """Return the record of a loaded capture."""
+        folder = scene.masks.folder
+        return cls(
+            name=scene.name,
+            path=Path(scene.root or ".").resolve(),
+            format=scene.format,
+            train=len(scene.train),
+            test=len(scene.test),
+            extent=scene.extent,
+            skipped=tuple(scene.skipped),
+            masks=Masks(None if folder is None else folder.resolve(), scene.masks.masked),
+            digest=digest,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Execution:
+    """How a run is executed. No field changes the splats, and each may differ when the run is resumed.
+
+    The fields have the names and meanings of those of ``TrainOptions``.
+    """
+
+    quality: str | None = None
+    threads: int | None = None
+    memory: float | None = None
+    disk: float | None = None
+    prepare: str = "auto"
+    checkpoint_every: int = 10_000
+    checkpoint_seconds: float = 120.0
+    start_from: Path | None = None
+    cache: Path | None = None
+    page: bool = True
+    subject_box: Box | None = None
+    whole_scene: bool = False
+    viewer: bool = False
+    viewer_port: int | None = None
+
+    @property
+    def disk_bytes(self) -> int | None:
+        """Bytes of disk to keep to."""
+        return None if self.disk is None else int(self.disk * 2**30)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResolvedRun:
+    """Everything that defines a run; names and defaults are replaced by values.
+
+    Attributes
+    ----------
+    recipe : Recipe
+        As it is trained, with its seed.
+    protocol : Protocol
+    scene : CaptureRecord
+    downscale : int
+        Photographs are this factor smaller than their files.
+    raster : RasterSettings
+    backend : mapping
+        What decides its results (``Backend.facts``).
+    stage2_cache_bytes : int
+        Memory for cached views; see ``Trainer``.
+    schedule_scale : float
+        Trained fraction of the full schedule.
+    title : str
+        Heading of the report; empty: the name of the capture.
+    init : str or None
+        Hash of the file of splats that training starts from.
+    part : str or None
+        Hash of what a part of a larger training starts from.
+    execution : Execution
+    """
+
+    recipe: Recipe
+    protocol: Protocol
+    scene: CaptureRecord
+    downscale: int
+    raster: RasterSettings
+    backend: Mapping[str, Any]
+    stage2_cache_bytes: int
+    schedule_scale: float = 1.0
+    title: str = ""
+    init: str | None = None
+    part: str | None = None
+    execution: Execution = field(default_factory=Execution)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the run as plain JSON values."""
+        return {**encode(self), "raster": self.raster.facts(), "seed": self.recipe.seed}
+
+    def decisive_facts(self) -> dict[str, Any]:
+        """Return as JSON what decides the bytes of the splats: runs with equal facts train the same.
+
+        The background is in ``raster``; the mesh alone depends on the fused depth and the subject.
+        """
+        data = self.to_json()
+        fusion = {name: value for name, value in data["protocol"]["fusion"].items() if name not in ("depth", "subject")}
+        protocol = {name: value for name, value in data["protocol"].items() if name not in ("robust", "background")}
+        return {
+            "backend": data["backend"],  # first: another processor decodes cameras with other last digits
+            "recipe": data["recipe"],
+            "protocol": {**protocol, "fusion": fusion},
+            "downscale": self.downscale,
+            "scene": {"masks": data["scene"]["masks"], "digest": self.scene.digest},
+            "raster": data["raster"],
+            **{name: data[name] for name in ("stage2_cache_bytes", "init", "part")},
+        }
+
+
+def read_resolved(run: RunFolder) -> ResolvedRun:
+    """Return what ``run.json`` holds.
+
+    Raises
+    ------
+    RunError
+        If another version wrote it, or it was changed by hand.
+    """
+    data = run.definition()
+    known = {entry.name: data[entry.name] for entry in fields(ResolvedRun) if entry.name in data}
+    try:
+        with absent_guests():
+            resolved: ResolvedRun = decode(known, ResolvedRun, "run")
+        validate(resolved.recipe)
+        check_settings(resolved.raster)
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RecipeError, DataError, ShapeError) as e:
+        raise RunError(
+            f"{run.file(RUN_JSON)} must define a run as gs2d writes it, got another entry ({e}); restore it, or train "
+            "again with --overwrite"
+        ) from e
+    protocol = resolved.protocol
+    return replace(resolved, raster=resolved.raster.for_depths(protocol.depth, protocol.fused_depth))
+
+
+def check_same_run(run: RunFolder, resolved: ResolvedRun) -> None:
+    """Refuse to resume a run that is defined otherwise.
+
+    Raises
+    ------
+    RunError
+        Names the first difference.
+    """
+    before, after = read_resolved(run).decisive_facts(), resolved.decisive_facts()
+    name = next((name for name in after if before[name] != after[name]), None)
+    if name is None:
+        return
+    what = f"{name}{difference(before[name], after[name])}"
+    robust = ["off" if facts["recipe"]["removal"] is None else "on" for facts in (before, after)]
+    if name == "recipe" and robust[0] != robust[1]:
+        what = f"--robust, {robust[0]}, now {robust[1]}"
+    elif name == "scene" and before[name]["masks"] == after[name]["masks"]:
+        what = "scene: its photographs, cameras, points or maps changed, or this is another kind of processor"
+    elif name == "init":
+        what = "--init: another file, or none"
+    elif name == "part":
+        what = "start: the model that this part is cut of changed"
+    raise RunError(f"{run.path} was made with another {what}; resume with the same options, or choose another --out")
+
+
+def difference(old: Any, new: Any, where: str = "") -> str:
+    """Describe where two JSON values first differ."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in new:
+            if old.get(key) != new[key]:
+                return difference(old.get(key), new[key], f"{where}.{key}" if where else key)
+    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        for i, (a, b) in enumerate(zip(old, new, strict=True)):
+            if a != b:
+                name = b.get("name", i) if isinstance(b, dict) else i
+                return difference(a, b, f"{where}.{name}" if where else str(name))
+    return f" ({where + ': ' if where else ''}{str(old)[:60]}, now {str(new)[:60]})"
