@@ -58,7 +58,7 @@ def test_a_fault_of_ours_is_exit_code_1_with_a_traceback_only_for_debug(
 def test_ctrl_c_exits_with_130_and_says_how_to_go_on(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gs2d.pipeline.train.train_run import run_logger as recorder
+    from gs2d.pipeline.train import run_logger as recorder
 
     put = recorder.RunLogger._score_stage
 
