@@ -21,7 +21,7 @@ from PIL import Image
 
 CHROMIUM = next((found for name in ("chromium", "google-chrome", "chrome") if (found := shutil.which(name))), None)
 FLAGS = ("--headless=new", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-PATIENCE = 60.0  # s: machines of tests are busy, and draw without a GPU
+PATIENCE = 300.0  # s: machines of tests are busy, and draw without a GPU
 
 
 def require_browser() -> None:

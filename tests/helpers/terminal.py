@@ -44,7 +44,7 @@ def raw_screen_of(words: list[str], *, columns: int, env: dict[str, str] | None 
         os.close(theirs)
         reader.start()
         code = process.wait(timeout=600)
-        reader.join(timeout=20)
+        reader.join(timeout=600)
     finally:
         os.close(ours)
     text = b"".join(chunks).decode("utf-8", "replace").replace("\r\n", "\n")

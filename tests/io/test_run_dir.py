@@ -236,7 +236,7 @@ def test_a_checkpoint_that_does_not_fit_leaves_the_older_one_and_no_temporary(tm
 def _hold(path: str, ready: object, done: object) -> None:
     with RunFolder(Path(path)).locked():
         ready.set()  # type: ignore[attr-defined]
-        done.wait(30)  # type: ignore[attr-defined]
+        done.wait(900)  # type: ignore[attr-defined]
 
 
 def test_two_processes_cannot_train_in_one_folder_and_a_dead_one_frees_it(tmp_path: Path) -> None:
@@ -244,7 +244,7 @@ def test_two_processes_cannot_train_in_one_folder_and_a_dead_one_frees_it(tmp_pa
     ready, done = context.Event(), context.Event()
     process = context.Process(target=_hold, args=(str(tmp_path), ready, done))
     process.start()
-    assert ready.wait(60)
+    assert ready.wait(600)
     run = RunFolder(tmp_path)
     with pytest.raises(RunError, match="trained"), run.locked():
         pass

@@ -51,7 +51,7 @@ def test_a_killed_process_resumes_to_the_same_splats_byte_for_byte(
     capture: Path, undisturbed: RunFolder, tmp_path: Path, when: tuple[int, float]
 ) -> None:
     process = spawn(capture, tmp_path / "run")
-    deadline = time.monotonic() + 250
+    deadline = time.monotonic() + 900
     while not any(saved.progress >= when for saved in RunFolder(tmp_path / "run").checkpoints()):
         assert process.poll() is None, process.communicate()[1].decode()
         assert time.monotonic() < deadline

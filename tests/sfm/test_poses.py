@@ -213,7 +213,7 @@ def test_an_interrupted_command_leaves_no_process_and_what_the_next_one_goes_on_
     words = [sys.executable, "-m", "gs2d", "poses", str(room.photos), "--out", str(tmp_path / "capture")]
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     work = tmp_path / ".capture.poses"
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 600
     while not (work / "database.db").exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.02)
     process.send_signal(number)

@@ -123,6 +123,7 @@ def _run(words: list[str], images: Iterator[Image.Image], path: Path) -> None:
             pass
         except BaseException:
             job.kill()
+            job.wait()  # leaving the block waits a quarter of a second only after Ctrl-C
             raise
         if job.wait() != 0:
             said.seek(0)
