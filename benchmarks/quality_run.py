@@ -24,10 +24,10 @@ from gs2d.core.json_files import write_json
 from gs2d.core.splats import Splats
 from gs2d.errors import Gs2dError
 from gs2d.pipeline.events import ignore
+from gs2d.pipeline.prepare.limits import use_threads
 from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.prepare.run_exposures import NONE, Transforms
-from gs2d.pipeline.prepare.threads import use_threads
 from gs2d.training import events
 from gs2d.training.learned.learned_table import LearnedTable
 from gs2d.training.state import TrainState

@@ -33,7 +33,7 @@ from benchmarks.sampler import CostSampler, Rule
 
 PHASES = (
     *RUN_PHASES,
-    Rule("log of changes", (("pipeline/train/changes.py", ""),)),
+    Rule("log of changes", (("pipeline/train/attribute_changes.py", ""),)),
     Rule("imports", (("importlib._bootstrap>", ""),)),
 )
 _ADDING = ("add", "_add_chunk", "_blend_colors", "_change", "_view_arrays", "_volume_arrays")  # a view to a volume

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from gs2d.pipeline.finish.believed import BEYOND, believed_reach, within_reach
 from gs2d.pipeline.finish.run_images import shown_limits
+from gs2d.pipeline.finish.trusted_depth import BEYOND, believed_reach, within_reach
 from wall_scene import wall
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from gs2d.core.camera import look_at
 from gs2d.data import Scene, View
 from gs2d.data.cache import DecodedImage, ImageCache
-from gs2d.pipeline.prepare.memory_budget import release
+from gs2d.pipeline.prepare.limits import release
 
 
 def test_a_scene_that_forgets_its_pictures_decodes_them_again(tmp_path: Path) -> None:

@@ -13,9 +13,9 @@ from ball_runs import options
 from gs2d.core.memory_limit import MemoryLimit
 from gs2d.errors import DataError
 from gs2d.pipeline.events import Notice
-from gs2d.pipeline.prepare import memory_budget as module
+from gs2d.pipeline.prepare import limits as module
+from gs2d.pipeline.prepare.limits import check_memory
 from gs2d.pipeline.prepare.loaded import prepare_run
-from gs2d.pipeline.prepare.memory_budget import check_memory
 from gs2d.pipeline.train.train_run import train
 from tiny import write_capture
 

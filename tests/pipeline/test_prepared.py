@@ -21,8 +21,8 @@ from gs2d.pipeline.events import Event, Notice, Phase
 from gs2d.pipeline.finish.run_mesh import mesh_run
 from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.prepare import photographs
+from gs2d.pipeline.prepare.limits import use_memory
 from gs2d.pipeline.prepare.loaded import open_finished
-from gs2d.pipeline.prepare.memory_budget import use_memory
 from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare.photographs import PREPARED
 from gs2d.pipeline.prepare.resolved import Execution
@@ -147,6 +147,6 @@ def test_a_budget_bounds_caches_and_refuses_photographs_that_are_too_large(
     whole = memory_limit.memory_limit()
     assert whole is not None
     assert memory_limit.memory_budget() == whole.bytes // 2
-    monkeypatch.setattr("gs2d.pipeline.prepare.memory_budget.ITERATION_BYTES", 1 << 40)  # at no downscale
+    monkeypatch.setattr("gs2d.pipeline.prepare.limits.ITERATION_BYTES", 1 << 40)  # at no downscale
     with pytest.raises(DataError, match="--memory"):
         train(options(capture, tmp_path / "run", "auto", memory=1.0))

@@ -45,7 +45,7 @@ def execute(command: Common, console: Console) -> None:
     }
     try:
         if isinstance(command, c.Mesh | c.Render | c.Evaluate | c.Report):  # who trains does so itself
-            from gs2d.pipeline.prepare.memory_budget import use_memory
+            from gs2d.pipeline.prepare.limits import use_memory
 
             use_memory(command.memory)
         actions[type(command)](command, console)

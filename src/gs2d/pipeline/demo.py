@@ -9,9 +9,9 @@ from gs2d.io.run_dir import RunFolder, check_claim, is_run, open_run
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import DEMO, OnEvent, Phase, Plan, Step, ignore
 from gs2d.pipeline.finish.evaluate import evaluate_run
+from gs2d.pipeline.prepare.limits import use_threads
 from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, TrainOptions
 from gs2d.pipeline.prepare.resolve import check_options
-from gs2d.pipeline.prepare.threads import use_threads
 from gs2d.pipeline.train.train_run import check_viewer, train
 from gs2d.synthetic.capture import write_demo_capture
 from gs2d.synthetic.perturb_exposure import GAINS

@@ -16,7 +16,7 @@ from gs2d.data.image_files import read_image
 from gs2d.io.run_dir import RunFolder, load_tensors
 from gs2d.pipeline.prepare.loaded import reload_run
 from gs2d.pipeline.prepare.options import TrainOptions
-from gs2d.pipeline.train.changes import mean_changes, take_snapshot
+from gs2d.pipeline.train.attribute_changes import mean_changes, take_snapshot
 from gs2d.pipeline.train.train_run import train
 from tiny import write_capture
 

@@ -38,14 +38,13 @@ from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import RecipeError, RunError
 from gs2d.io.run_dir import LOCK, REPORT, SPLATS, RunFolder, check_claim, is_run, make_folder, open_run
 from gs2d.pipeline.events import Notice, OnEvent, ignore
+from gs2d.pipeline.prepare.limits import use_memory, use_threads
 from gs2d.pipeline.prepare.loaded import finished_splats
-from gs2d.pipeline.prepare.memory_budget import use_memory
 from gs2d.pipeline.prepare.options import CommonTraining, TrainOptions, values
 from gs2d.pipeline.prepare.part import Part
 from gs2d.pipeline.prepare.resolve import check_options
 from gs2d.pipeline.prepare.resolved import difference
 from gs2d.pipeline.prepare.run_exposures import read_exposures
-from gs2d.pipeline.prepare.threads import use_threads
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.trainer import raster_settings
 

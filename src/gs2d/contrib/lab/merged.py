@@ -25,8 +25,8 @@ from gs2d.pipeline.finish.run_images import choose_views, draw_stage
 from gs2d.pipeline.finish.run_mesh import MeshFrames
 from gs2d.pipeline.finish.scoring import PeakMemory, score_views, split_metrics
 from gs2d.pipeline.finish.verdict import Collector
+from gs2d.pipeline.prepare.limits import release
 from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats
-from gs2d.pipeline.prepare.memory_budget import release
 from gs2d.pipeline.prepare.options import TrainOptions, values
 from gs2d.pipeline.prepare.part import OWN, read_start
 from gs2d.pipeline.prepare.photographs import with_prepared

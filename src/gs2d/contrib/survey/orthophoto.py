@@ -22,8 +22,8 @@ from gs2d.io.run_dir import MESH, open_run
 from gs2d.meshing.raycast import Hits, cast_down
 from gs2d.meshing.texture import Texels, surface_colors
 from gs2d.pipeline.events import OnEvent, Phase, ignore
-from gs2d.pipeline.finish.placed import place_of
 from gs2d.pipeline.finish.run_texture import photographs
+from gs2d.pipeline.finish.world_frame import place_of
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.options import OrthophotoOptions
 from gs2d.pipeline.prepare.run_exposures import Transforms, read_exposures

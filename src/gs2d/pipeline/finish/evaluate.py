@@ -42,27 +42,27 @@ def evaluate_run(
     path, given = Path(path), options.ground_truth
     truth = None if given is None or given.is_dir() else choose_truth(given, given.parent, tell)
     lpips = None if options.lpips_weights is None else load_lpips(options.lpips_weights)
-    run, job, splats = open_finished(path, threads, on_event)
-    lpips = None if lpips is None else lpips.to(job.backend.device)
+    run, loaded, splats = open_finished(path, threads, on_event)
+    lpips = None if lpips is None else lpips.to(loaded.backend.device)
     result: dict[str, Any] = {"run": str(run.path), "surface": run.metrics().get("surface")}
-    if truth is None and job.scene.root is not None:
-        truth = choose_truth(given, job.scene.root, tell)
+    if truth is None and loaded.scene.root is not None:
+        truth = choose_truth(given, loaded.scene.root, tell)
     has_mesh = run.file(MESH).exists()
     if truth is not None and not has_mesh and given is not None:
         raise RunError(f"{path} has no {MESH}; make it with `gs2d mesh {path}`")
-    drawing = (job.settings, job.backend)
-    exposures = with_predicted(read_exposures(run, job.recipe), job.scene, metered(splats, *drawing))
+    drawing = (loaded.settings, loaded.backend)
+    exposures = with_predicted(read_exposures(run, loaded.recipe), loaded.scene, metered(splats, *drawing))
     if options.match_exposure:
         name = "scoring test views, colours matched"
-        scores = score_views(splats, job.scene.test, *drawing, name=name, on_event=on_event, lpips=lpips, match=True)
+        scores = score_views(splats, loaded.scene.test, *drawing, name=name, on_event=on_event, lpips=lpips, match=True)
         result |= split_metrics(scores, "test_matched", "test")
     if options.match_poses:
         name = "scoring test views, cameras aligned"
-        best = tuple(aligned(splats, job.scene.test, *drawing, job.scene.extent, on_event))
+        best = tuple(aligned(splats, loaded.scene.test, *drawing, loaded.scene.extent, on_event))
         scores = score_views(splats, best, *drawing, name=name, on_event=on_event, lpips=lpips)
         result |= split_metrics(scores, "test_aligned", "test")
-    collected = Collector(job.scene)
-    for split, views in (("train", job.scene.train), ("test", job.scene.test)):
+    collected = Collector(loaded.scene)
+    for split, views in (("train", loaded.scene.train), ("test", loaded.scene.test)):
         name = f"scoring {split} views"
         more: dict[str, Any] = {"exposures": exposures, "split": split, "visitors": [collected.visit]}
         scores = score_views(splats, views, *drawing, name=name, on_event=on_event, lpips=lpips, **more)
@@ -71,7 +71,7 @@ def evaluate_run(
     if truth is not None and has_mesh:
         mesh, folder, thresholds = read_mesh(run.file(MESH)), run.file(SURFACE), options.thresholds
         on_event(Phase("scoring the surface", 0))
-        result["surface"] = score_surface(mesh, truth, job.scene, folder=folder, tell=tell, thresholds=thresholds)
+        result["surface"] = score_surface(mesh, truth, loaded.scene, folder=folder, tell=tell, thresholds=thresholds)
     elif truth is not None:
         on_event(Notice(f"the surface is not scored: no {MESH}; make it with `gs2d mesh {path}`"))
     with run.locked():
@@ -80,6 +80,6 @@ def evaluate_run(
         stages = [*metrics["stages"][:-1], {**metrics["stages"][-1], **last}] if metrics["stages"] else []
         run.write_metrics({**metrics, "stages": stages, "surface": result["surface"]})
         with attempted(VERDICT, again("evaluate", path), on_event):
-            result["verdict"] = write_verdict(run, job, collected)["verdict"]
+            result["verdict"] = write_verdict(run, loaded, collected)["verdict"]
     report_again(run, on_event)
     return result

@@ -8,8 +8,8 @@ from typing import Any
 from gs2d.errors import RunError
 from gs2d.io.formats.registry import LAYOUTS, endings, layout_of, read_splats, write_layout, written_bytes
 from gs2d.io.run_dir import MESH, open_run
-from gs2d.pipeline.finish.placed import place_of, placed_splats, say_where
 from gs2d.pipeline.finish.run_subject import within
+from gs2d.pipeline.finish.world_frame import place_of, placed_splats, say_where
 from gs2d.pipeline.prepare.loaded import checked_output, finished_splats
 from gs2d.pipeline.prepare.options import Box
 

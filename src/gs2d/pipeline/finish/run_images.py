@@ -35,9 +35,9 @@ from gs2d.io.run_dir import (
 )
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
-from gs2d.pipeline.finish.believed import believed_reach, within_reach
 from gs2d.pipeline.finish.camera_paths import flight_cameras, orbit_cameras
 from gs2d.pipeline.finish.scoring import evenly
+from gs2d.pipeline.finish.trusted_depth import believed_reach, within_reach
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.run_exposures import NONE, Transforms, exposed, exposure_named, photographed, read_exposures
 from gs2d.render.api import rasterize
@@ -91,7 +91,7 @@ def _short_hash(text: str) -> str:
 
 def draw_stage(
     run: RunFolder,
-    job: LoadedRun,
+    loaded: LoadedRun,
     shown: Sequence[tuple[str, View]],
     stage: str,
     splats: Splats,
@@ -119,13 +119,13 @@ def draw_stage(
     views = []
     files = file_names([view for _, view in shown])
     for (split, view), file in zip(shown, files, strict=True):
-        output = outputs.get(view.name) or render_view(splats, view, job.settings, job.backend)
-        depth = output.depth(job.protocol.depth).cpu().numpy()
+        output = outputs.get(view.name) or render_view(splats, view, loaded.settings, loaded.backend)
+        depth = output.depth(loaded.protocol.depth).cpu().numpy()
         alpha = output.alpha.cpu().numpy()
         # Limits are of the first stage, so that stages compare.
-        near_far = limits.get(view.name) or shown_limits(job.scene, view, depth, alpha)
-        photo = view.target(job.settings.background)
-        color = photographed(view, output.color, exposures, job.settings.background).cpu().numpy()
+        near_far = limits.get(view.name) or shown_limits(loaded.scene, view, depth, alpha)
+        photo = view.target(loaded.settings.background)
+        color = photographed(view, output.color, exposures, loaded.settings.background).cpu().numpy()
         images = {
             "color": np.clip(color, 0, 1),
             "normal": normal_image(output.normal.cpu().numpy(), alpha),
@@ -133,7 +133,7 @@ def draw_stage(
             "error": error_image(color, photo, view.mask()),
         }
         if group is not None:
-            fraction = fraction_of_group(splats, group, view, job.settings, job.backend)
+            fraction = fraction_of_group(splats, group, view, loaded.settings, loaded.backend)
             images["high_error"] = highlight_image(color, fraction)
         for what, image in images.items():
             write_image(folder / stage / f"{file}.{what}.png", image)
@@ -234,31 +234,31 @@ def render_run(
     asked, (moving, video) = video, check_frames(orbit, flight, video, fps)
     if video is not None and video != asked and video.suffix == ".webp":
         on_event(Notice(f"the video is an animated WebP, {video}: MP4 needs ffmpeg with libx264 ({FFMPEG})"))
-    run, job, splats = open_finished(path, threads, on_event, splats_file=splats_file, out=out)
-    transform = None if exposure_of is None else exposure_named(exposure_of, read_exposures(run, job.recipe))
+    run, loaded, splats = open_finished(path, threads, on_event, splats_file=splats_file, out=out)
+    transform = None if exposure_of is None else exposure_named(exposure_of, read_exposures(run, loaded.recipe))
     views: list[tuple[str, View]]
     if moving:
         image = np.zeros((1, 1, 3), np.uint8)
-        seen = [view.camera for view in job.scene.train]
+        seen = [view.camera for view in loaded.scene.train]
         subject = read_subject(path)
         focus = None if subject is None or subject.kind != OBJECT else subject.center
         cameras = orbit_cameras(seen, orbit, focus) if orbit else flight_cameras(seen, flight)
         views = [(f"{i:04d}", View.from_arrays(f"{i:04d}", camera, image)) for i, camera in enumerate(cameras)]
     else:
-        if split is None and not job.scene.test:
+        if split is None and not loaded.scene.test:
             split = "train"
             on_event(Notice("rendering the training views, because the run has no test views"))
         split = split or "test"
-        chosen = job.scene.test if split == "test" else job.scene.train
+        chosen = loaded.scene.test if split == "test" else loaded.scene.train
         views = list(zip(file_names(chosen), chosen, strict=True))
     if not views:
         raise DataError(f"the capture of {path} has no {split} views; use --split train or --orbit 120")
     if width is not None:
         views = [(name, replace(view, camera=_at_width(view.camera, width))) for name, view in views]
     if out is not None:
-        _spare_images([out / f"{name}.png" for name, _ in views], "--out", job)
+        _spare_images([out / f"{name}.png" for name, _ in views], "--out", loaded)
     if video is not None:
-        _spare_images([video], "--video", job)
+        _spare_images([video], "--video", loaded)
     folder = out or run.file(RENDERS) / (moving or split or "test")
     made = make_folder(folder)
     with _alone_in(folder) if out is None else contextlib.nullcontext():
@@ -269,7 +269,9 @@ def render_run(
         written: list[Path] = []
         try:
             for name, view in counted(views, "rendering", len(views), on_event):
-                color = exposed(render_view(splats, view, job.settings, job.backend), transform, job).clamp(0, 1)
+                color = exposed(render_view(splats, view, loaded.settings, loaded.backend), transform, loaded).clamp(
+                    0, 1
+                )
                 is_new = not (folder / f"{name}.png").exists()
                 write_image(folder / f"{name}.png", color.cpu().numpy())
                 written += [folder / f"{name}.png"] if is_new else []
@@ -330,9 +332,9 @@ def check_frames(orbit: int, flight: int, video: Path | None, fps: float) -> tup
     return "orbit" if orbit else "flight" if flight else "", video
 
 
-def _spare_images(files: Sequence[Path], option: str, job: LoadedRun) -> None:
+def _spare_images(files: Sequence[Path], option: str, loaded: LoadedRun) -> None:
     """Raise rather than write a rendering over a photograph of the capture."""
-    images = {view.path.resolve() for view in job.scene.views if view.path is not None}
+    images = {view.path.resolve() for view in loaded.scene.views if view.path is not None}
     for file in files:
         if file.resolve() in images:
             raise RunError(f"{option} would write over the capture's photograph {file}; choose another name")

@@ -37,14 +37,14 @@ from gs2d.meshing.slabs import SLAB_BYTES
 from gs2d.meshing.tsdf import VolumeTooLargeError
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
-from gs2d.pipeline.finish.believed import sky_direction, sky_of, surface_reach, within_reach
-from gs2d.pipeline.finish.placed import placed_mesh, placed_output, say_where
 from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.run_subject import OPAQUE, meshed_subject
 from gs2d.pipeline.finish.scoring import SeenView
+from gs2d.pipeline.finish.trusted_depth import sky_direction, sky_of, surface_reach, within_reach
+from gs2d.pipeline.finish.world_frame import placed_mesh, placed_output, say_where
 from gs2d.pipeline.look.page import page_run
+from gs2d.pipeline.prepare.limits import release, release_buffers
 from gs2d.pipeline.prepare.loaded import LoadedRun, RenderedScene, checked_output, open_finished
-from gs2d.pipeline.prepare.memory_budget import release, release_buffers
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.render.api import rasterize
 from gs2d.render.types import RenderOutput
@@ -67,8 +67,8 @@ class MeshFrames:
     Its :meth:`visit` is for :func:`~gs2d.pipeline.finish.scoring.score_views`.
     """
 
-    def __init__(self, job: LoadedRun) -> None:
-        self._job, self._reach, self._up = job, surface_reach(job), sky_direction(job)
+    def __init__(self, loaded: LoadedRun) -> None:
+        self._loaded, self._reach, self._up = loaded, surface_reach(loaded), sky_direction(loaded)
         self.spool = Spool()
 
     def visit(self, seen: SeenView, scores: ImageMetrics) -> None:
@@ -83,7 +83,7 @@ class MeshFrames:
             return
         try:
             frame = fusion_frame(
-                self._job, seen.view, seen.output, self._job.protocol.fused_depth, self._reach, self._up
+                self._loaded, seen.view, seen.output, self._loaded.protocol.fused_depth, self._reach, self._up
             )
             self.spool.append(depth_map(frame))
         except Exception as error:  # must not cost the scores; the mesh meets and reports it
@@ -93,7 +93,7 @@ class MeshFrames:
     @property
     def complete(self) -> bool:
         """Whether every training view was seen."""
-        return len(self.spool) == len(self._job.scene.train)
+        return len(self.spool) == len(self._loaded.scene.train)
 
     def __enter__(self) -> MeshFrames:
         return self
@@ -105,7 +105,7 @@ class MeshFrames:
 
 
 def extract_mesh(
-    job: LoadedRun,
+    loaded: LoadedRun,
     splats: Splats,
     options: MeshOptions,
     out: Path,
@@ -131,7 +131,7 @@ def extract_mesh(
     """
     if not out.parent.is_dir():
         raise disk_error(out, FileNotFoundError(2, "No such file or directory"))
-    result = fused(job, splats, options, on_event, subject=subject, seen=seen)
+    result = fused(loaded, splats, options, on_event, subject=subject, seen=seen)
     release_buffers()
     write_mesh(out, result.mesh if place is None else placed_mesh(result.mesh, place))
     told = {} if place is None else say_where(out, place)
@@ -140,7 +140,7 @@ def extract_mesh(
         "file": str(out),
         "vertices": len(result.mesh.vertices),
         "faces": len(result.mesh.faces),
-        "depth": options.depth or job.protocol.fused_depth,
+        "depth": options.depth or loaded.protocol.fused_depth,
         "unbounded": options.unbounded,
         "levels": result.levels,
         "fused_by": result.backend,
@@ -155,7 +155,7 @@ def extract_mesh(
 
 
 def fused(
-    job: RenderedScene,
+    loaded: RenderedScene,
     splats: Splats,
     options: MeshOptions,
     on_event: OnEvent,
@@ -167,17 +167,17 @@ def fused(
     if not len(splats):
         raise ProtocolError("a scene with splats was expected, got none; train longer or check the cameras")
     check_mesh_options(options)
-    depth = options.depth or job.protocol.fused_depth
-    usable = seen is not None and seen.complete and depth == job.protocol.fused_depth and not options.whole_scene
+    depth = options.depth or loaded.protocol.fused_depth
+    usable = seen is not None and seen.complete and depth == loaded.protocol.fused_depth and not options.whole_scene
 
     def frames() -> Iterable[RenderedView] | Spool:
         return (
             seen.spool
             if seen is not None and usable
-            else _frames(job, splats, depth, on_event, whole=options.whole_scene)
+            else _frames(loaded, splats, depth, on_event, whole=options.whole_scene)
         )
 
-    result = _extract_that_fits(job, frames, options, on_event, subject)
+    result = _extract_that_fits(loaded, frames, options, on_event, subject)
     if seen is not None:
         seen.spool.close()  # its room on the disk
     if subject is None and result.limits.cut_fraction > MOSTLY_CUT:
@@ -229,31 +229,31 @@ def check_mesh_options(options: MeshOptions) -> None:
 
 
 def _extract_that_fits(
-    job: RenderedScene,
+    loaded: RenderedScene,
     frames: Callable[[], Iterable[RenderedView] | Spool],
     options: MeshOptions,
     on_event: OnEvent,
     subject: Subject | None,
 ) -> Extraction:
     """Extract a mesh; where nobody says how large its voxels are, they are as large as memory needs."""
-    free = options.voxel is None and options.max_gib is None and job.protocol.fusion.voxel is None
+    free = options.voxel is None and options.max_gib is None and loaded.protocol.fusion.voxel is None
     for _ in range(COARSER * free):
         try:
-            return _extract(job, frames(), options, on_event, subject)
+            return _extract(loaded, frames(), options, on_event, subject)
         except VolumeTooLargeError as error:
             on_event(Notice(f"{error}; the mesh has such voxels (--max-gib or --memory allow more)"))
             options = replace(options, voxel=error.voxel)
-    return _extract(job, frames(), options, on_event, subject)
+    return _extract(loaded, frames(), options, on_event, subject)
 
 
 def _extract(
-    job: RenderedScene,
+    loaded: RenderedScene,
     frames: Iterable[RenderedView] | Spool,
     options: MeshOptions,
     on_event: OnEvent,
     subject: Subject | None,
 ) -> Extraction:
-    fusion = job.protocol.fusion
+    fusion = loaded.protocol.fusion
     keep = fusion.clusters if options.keep_components is None else options.keep_components
     # A box or a voxel of the user's own makes the protocol's other limits meaningless.
     bbox = None if options.bbox is None else np.asarray(options.bbox, np.float64).reshape(2, 3)
@@ -273,7 +273,7 @@ def _extract(
         max_bytes=_volume_bytes(options),
         slab_bytes=_slab_bytes(),
         threads=torch.get_num_threads(),
-        backend=job.backend,
+        backend=loaded.backend,
     )
     if not len(result.mesh.faces):
         on_event(Notice("the mesh is empty: no surface was covered well enough"))
@@ -299,21 +299,21 @@ def _slab_bytes() -> int:
 
 
 def _frames(
-    job: RenderedScene, splats: Splats, depth: str, on_event: OnEvent, *, whole: bool
+    loaded: RenderedScene, splats: Splats, depth: str, on_event: OnEvent, *, whole: bool
 ) -> Iterator[RenderedView]:
     """Yield what is fused of each training view; of the ``whole`` scene the sky may be a ceiling, and stays."""
-    views, settings = job.scene.train, replace(job.settings, with_distortion=False).for_depths(depth)
-    reach, up = surface_reach(job), None if whole else sky_direction(job)
+    views, settings = loaded.scene.train, replace(loaded.settings, with_distortion=False).for_depths(depth)
+    reach, up = surface_reach(loaded), None if whole else sky_direction(loaded)
     for view in counted(views, "rendering depth", len(views), on_event):
         with torch.no_grad():
-            output = rasterize(splats, view.camera, settings, backend=job.backend)
-        yield fusion_frame(job, view, output, depth, reach, up)
-    release(job.scene)  # photographs were looked at for where they are known
+            output = rasterize(splats, view.camera, settings, backend=loaded.backend)
+        yield fusion_frame(loaded, view, output, depth, reach, up)
+    release(loaded.scene)  # photographs were looked at for where they are known
     on_event(Phase("fusing", 0))
 
 
 def fusion_frame(
-    job: RenderedScene,
+    loaded: RenderedScene,
     view: View,
     output: RenderOutput,
     depth: str,
@@ -325,19 +325,19 @@ def fusion_frame(
     Depth beyond ``reach``, and of the sky where its direction ``up`` is known, is infinite: the view sees past all
     surfaces there.
     """
-    sky = np.zeros(output.alpha.shape, bool) if up is None else sky_of(job, view, up)
+    sky = np.zeros(output.alpha.shape, bool) if up is None else sky_of(loaded, view, up)
     valid = (output.alpha >= OPAQUE).cpu().numpy() | sky
-    mask = view.object_mask() if job.protocol.use_mask_in_fusion else None
+    mask = view.object_mask() if loaded.protocol.use_mask_in_fusion else None
     # Beyond the photograph, and where it is ignored, nothing has said how far the surface is.
-    for pixels in (mask, view.usable(masks=job.protocol.use_mask_in_fusion)):
+    for pixels in (mask, view.usable(masks=loaded.protocol.use_mask_in_fusion)):
         if pixels is not None:
             valid = valid & pixels
     depths = output.depth(depth).cpu().numpy()
-    if job.protocol.fusion.subject:
+    if loaded.protocol.fusion.subject:
         valid = valid * np.maximum(confidence(output), sky)
     past = sky if reach is None else sky | ~within_reach(reach, view.camera, depths)
     depths = np.where(past, np.float32(np.inf), depths)
-    color = surface_color(output, job).cpu().numpy()
+    color = surface_color(output, loaded).cpu().numpy()
     return RenderedView(view.camera, depths, color, valid)
 
 
@@ -350,10 +350,10 @@ def confidence(output: RenderOutput) -> np.ndarray:
     return np.where(((mean - median).abs() <= ONE_SURFACE * median).cpu().numpy(), 1.0, SEVERAL)
 
 
-def surface_color(output: RenderOutput, job: RenderedScene) -> torch.Tensor:
+def surface_color(output: RenderOutput, loaded: RenderedScene) -> torch.Tensor:
     """Colour without the background that shows through, [H, W, 3] in [0, 1]."""
     alpha = output.alpha[..., None]
-    background = output.color.new_tensor(job.settings.background)
+    background = output.color.new_tensor(loaded.settings.background)
     return ((output.color - (1 - alpha) * background) / alpha.clamp(min=1e-3)).clamp(0, 1)
 
 
@@ -382,15 +382,15 @@ def mesh_run(
         mesh = read_mesh(path / MESH)
         write_mesh(out, placed_mesh(mesh, place))
         return {"file": str(out), "vertices": len(mesh.vertices), "faces": len(mesh.faces), **say_where(out, place)}
-    run, job, splats = open_finished(path, threads, on_event, splats_file=splats_file, out=out)
+    run, loaded, splats = open_finished(path, threads, on_event, splats_file=splats_file, out=out)
     if splats_file is not None and out is not None and out.resolve() == run.file(MESH).resolve():
         raise RunError(f"--out {out} is the mesh of the run, which is that of its own splats; choose another name")
     if out is not None and out.resolve() != run.file(MESH).resolve():
-        subject = meshed_subject(run, job, splats, options, on_event)
-        return extract_mesh(job, splats, options, out, on_event, subject=subject, place=place)
+        subject = meshed_subject(run, loaded, splats, options, on_event)
+        return extract_mesh(loaded, splats, options, out, on_event, subject=subject, place=place)
     with run.locked():
-        subject = meshed_subject(run, job, splats, options, on_event)
-        result = extract_mesh(job, splats, options, run.file(MESH), on_event, subject=subject)
+        subject = meshed_subject(run, loaded, splats, options, on_event)
+        result = extract_mesh(loaded, splats, options, run.file(MESH), on_event, subject=subject)
         if run.metrics().get("surface"):  # was of the mesh before
             run.write_metrics({**run.metrics(), "surface": None})
             shutil.rmtree(run.file(SURFACE), ignore_errors=True)
@@ -400,7 +400,7 @@ def mesh_run(
             on_event(Notice(f"{TEXTURED} was of the mesh before: removed"))
     if options.subject_box is not None and run.file(PAGE).exists():  # it opens at the subject
         with attempted(PAGE, again("page", run.path), on_event):
-            page_run(run.path, on_event=on_event, job=job)
+            page_run(run.path, on_event=on_event, loaded=loaded)
     report_again(run, on_event)
     return result
 

@@ -29,7 +29,7 @@ from gs2d.errors import DataError, DiskError, ProtocolError, RunError
 from gs2d.io.run_dir import RENDERS, SUBJECT, RunFolder, make_folder
 from gs2d.meshing.bounds import backproject
 from gs2d.pipeline.events import Notice, OnEvent
-from gs2d.pipeline.finish.believed import surface_reach
+from gs2d.pipeline.finish.trusted_depth import surface_reach
 from gs2d.pipeline.prepare.loaded import LoadedRun, RenderedScene
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.render.api import rasterize
@@ -45,7 +45,7 @@ MAX_POINTS = 2000  # sparse points of a camera, evenly from the list
 
 
 def subject_of(
-    run: RunFolder, job: LoadedRun, splats: Splats, on_event: OnEvent, *, box: Sequence[float] | None = None
+    run: RunFolder, loaded: LoadedRun, splats: Splats, on_event: OnEvent, *, box: Sequence[float] | None = None
 ) -> Subject:
     """Return the subject of a run: the given box, else what ``subject.json`` says, else what is found; then kept there.
 
@@ -67,14 +67,14 @@ def subject_of(
     known = read_subject(run.path) if box is None else None
     if known is not None:
         return known
-    subject = subject_in(job, splats, box)
-    on_event(Notice(subject_line(subject, meshed=box is not None or job.protocol.fusion.subject)))
-    _draw(run, job, subject, on_event)
+    subject = subject_in(loaded, splats, box)
+    on_event(Notice(subject_line(subject, meshed=box is not None or loaded.protocol.fusion.subject)))
+    _draw(run, loaded, subject, on_event)
     write_json(run.file(SUBJECT), subject.to_json())  # last: where it is, the picture is too, after a kill as well
     return subject
 
 
-def subject_in(job: RenderedScene, splats: Splats, box: Sequence[float] | None = None) -> Subject:
+def subject_in(loaded: RenderedScene, splats: Splats, box: Sequence[float] | None = None) -> Subject:
     """Return the subject of a scene: the given box, or what is found; nothing is read or written.
 
     Raises
@@ -85,33 +85,33 @@ def subject_in(job: RenderedScene, splats: Splats, box: Sequence[float] | None =
     if box is not None:
         within(splats, box, "--subject-box")
     try:
-        cameras = [view.camera for view in job.scene.train]
-        return find_subject(sights(job, splats)) if box is None else given_subject(box, cameras)
+        cameras = [view.camera for view in loaded.scene.train]
+        return find_subject(sights(loaded, splats)) if box is None else given_subject(box, cameras)
     except DataError as error:
         raise ProtocolError(str(error)) from error
 
 
-def _draw(run: RunFolder, job: LoadedRun, subject: Subject, on_event: OnEvent) -> None:
+def _draw(run: RunFolder, loaded: LoadedRun, subject: Subject, on_event: OnEvent) -> None:
     """Write the picture for the report; a full disk costs the picture, not the mesh."""
-    points = np.zeros((0, 3)) if job.scene.points is None else np.asarray(job.scene.points.points, np.float64)
+    points = np.zeros((0, 3)) if loaded.scene.points is None else np.asarray(loaded.scene.points.points, np.float64)
     try:
         make_folder(run.file(RENDERS))
-        cameras = [view.camera for view in job.scene.train]
+        cameras = [view.camera for view in loaded.scene.train]
         write_subject_image(run.file(RENDERS) / IMAGE, subject, cameras, points)
     except DiskError as error:
         on_event(Notice(f"no picture of the subject: {error}"))
 
 
 def meshed_subject(
-    run: RunFolder, job: LoadedRun, splats: Splats, options: MeshOptions, on_event: OnEvent
+    run: RunFolder, loaded: LoadedRun, splats: Splats, options: MeshOptions, on_event: OnEvent
 ) -> Subject | None:
     """Find the subject of a run; return it if the mesh is of it, None if it is of everything or of a box of its own."""
-    wanted = wants_subject(job, options)
-    subject = subject_of(run, job, splats, on_event, box=options.subject_box)
+    wanted = wants_subject(loaded, options)
+    subject = subject_of(run, loaded, splats, on_event, box=options.subject_box)
     return subject if wanted and subject.kind == OBJECT else None
 
 
-def wants_subject(job: RenderedScene, options: MeshOptions) -> bool:
+def wants_subject(loaded: RenderedScene, options: MeshOptions) -> bool:
     """Whether the mesh is to be of the subject, if there is one.
 
     Raises
@@ -122,7 +122,7 @@ def wants_subject(job: RenderedScene, options: MeshOptions) -> bool:
     given = options.subject_box
     others = {"--bbox": options.bbox is not None, "--scene": options.whole_scene, "--unbounded": options.unbounded}
     check_subject_box(given, others)
-    return given is not None or (job.protocol.fusion.subject and not any(others.values()))
+    return given is not None or (loaded.protocol.fusion.subject and not any(others.values()))
 
 
 def within(splats: Splats, box: Sequence[float], option: str = "--bbox") -> Splats:
@@ -157,22 +157,22 @@ def subject_line(subject: Subject, *, meshed: bool) -> str:
     return f"subject: {size} world units, box {_numbers(subject.box.ravel())} ({subject.why}); {end}"
 
 
-def sights(job: RenderedScene, splats: Splats) -> list[Sight]:
+def sights(loaded: RenderedScene, splats: Splats) -> list[Sight]:
     """Return what some of the training cameras see: rendered depth, and the sparse points that it does not hide."""
-    views = job.scene.train
+    views = loaded.scene.train
     count = min(len(views), MAX_VIEWS)
     chosen = [views[i] for i in np.linspace(0, len(views) - 1, count).round().astype(int)]
-    points = np.zeros((0, 3)) if job.scene.points is None else np.asarray(job.scene.points.points, np.float64)
-    reach = surface_reach(job)
+    points = np.zeros((0, 3)) if loaded.scene.points is None else np.asarray(loaded.scene.points.points, np.float64)
+    reach = surface_reach(loaded)
     return [
-        _sight(camera := _small(view.camera), _depth(job, splats, camera), points, _kept(job, view), reach)
+        _sight(camera := _small(view.camera), _depth(loaded, splats, camera), points, _kept(loaded, view), reach)
         for view in chosen
     ]
 
 
-def _kept(job: RenderedScene, view: View) -> np.ndarray | None:
+def _kept(loaded: RenderedScene, view: View) -> np.ndarray | None:
     """Return where a photograph may say what it looks at, [H, W] bool: where its mask keeps it. None: anywhere."""
-    used = job.scene.masks.found and job.protocol.use_mask_in_training
+    used = loaded.scene.masks.found and loaded.protocol.use_mask_in_training
     return view.mask() if used else None
 
 
@@ -181,10 +181,10 @@ def _small(camera: Camera) -> Camera:
     return camera.resized(max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
 
 
-def _depth(job: RenderedScene, splats: Splats, camera: Camera) -> np.ndarray:
+def _depth(loaded: RenderedScene, splats: Splats, camera: Camera) -> np.ndarray:
     """Return the median depth, 0 where little is covered: unlike the mean it lies on some surface."""
     with torch.no_grad():
-        output = rasterize(splats, camera, job.settings, backend=job.backend)
+        output = rasterize(splats, camera, loaded.settings, backend=loaded.backend)
     return np.asarray(torch.where(output.alpha >= OPAQUE, output.depth_median, 0).cpu().numpy(), np.float64)
 
 

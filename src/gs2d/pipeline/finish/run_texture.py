@@ -32,10 +32,10 @@ from gs2d.meshing.texture import (
     unwrap,
 )
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
-from gs2d.pipeline.finish.placed import placed_output, placed_textured, say_where
 from gs2d.pipeline.finish.run_mesh import fused, mesh_run
 from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.run_subject import OPAQUE, meshed_subject
+from gs2d.pipeline.finish.world_frame import placed_output, placed_textured, say_where
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.open_capture import read_scene
 from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions
@@ -76,13 +76,13 @@ def texture_run(
     if out is None and (mesh_options != MeshOptions() or not (path / MESH).exists()):
         mesh_run(path, mesh_options, on_event, threads=threads)
         mesh_options = MeshOptions()
-    run, job, splats = open_finished(path, threads, on_event)
-    for view in job.scene.views:
+    run, loaded, splats = open_finished(path, threads, on_event)
+    for view in loaded.scene.views:
         if view.path is not None and view.path.resolve() in {file.resolve() for file in files}:
             raise RunError(f"--out {target} would write over the photograph {view.name}; choose another name")
-    mesh = _mesh(run, job, splats, mesh_options, on_event)
-    baked = textured_mesh(job, splats, mesh, options, on_event, exposures=read_exposures(run, job.recipe))
-    up = up_direction([view.camera for view in job.scene.train])
+    mesh = _mesh(run, loaded, splats, mesh_options, on_event)
+    baked = textured_mesh(loaded, splats, mesh, options, on_event, exposures=read_exposures(run, loaded.recipe))
+    up = up_direction([view.camera for view in loaded.scene.train])
     if place is None:
         write_textured(target, baked.mesh, up=up)
     else:
@@ -106,7 +106,7 @@ def texture_run(
 
 
 def textured_mesh(
-    job: LoadedRun,
+    loaded: LoadedRun,
     splats: Splats,
     mesh: Mesh,
     options: TextureOptions,
@@ -119,13 +119,13 @@ def textured_mesh(
     Photographs whose exposure is known are taken back to the mean exposure first.
     """
     on_event(Phase("cutting the surface into charts", 0))
-    views, small = _views(job, options, on_event), simplified(mesh, options.faces)
+    views, small = _views(loaded, options, on_event), simplified(mesh, options.faces)
     if len(small.faces) > options.faces:
         on_event(
             Notice(f"simplified to {len(small.faces):,} triangles, as near as it comes to --faces {options.faces}")
         )
     size = options.texture_size or texture_size(small, [view.camera for view in views])
-    images = partial(_images, job, views, splats, options, exposures, on_event)
+    images = partial(_images, loaded, views, splats, options, exposures, on_event)
     return bake(unwrap(small, size), images, size, threads=torch.get_num_threads())
 
 
@@ -139,29 +139,34 @@ def check_texture_options(options: TextureOptions) -> None:
         raise ProtocolError(f"--texture-size must be {MIN_SIZE} to {MAX_SIZE} texels, got {options.texture_size}")
 
 
-def _mesh(run: RunFolder, job: LoadedRun, splats: Splats, options: MeshOptions, on_event: OnEvent) -> Mesh:
+def _mesh(run: RunFolder, loaded: LoadedRun, splats: Splats, options: MeshOptions, on_event: OnEvent) -> Mesh:
     """Return the run's mesh as it is, or one of its own for other options."""
     if options == MeshOptions() and run.file(MESH).exists():
         return read_mesh(run.file(MESH))
-    subject = meshed_subject(run, job, splats, options, on_event)
-    mesh = fused(job, splats, options, on_event, subject=subject).mesh
+    subject = meshed_subject(run, loaded, splats, options, on_event)
+    mesh = fused(loaded, splats, options, on_event, subject=subject).mesh
     trim()
     return mesh
 
 
-def _views(job: LoadedRun, options: TextureOptions, on_event: OnEvent) -> Sequence[View]:
-    """Return the training views, in another size if one is asked for, from where those of the job are."""
-    if options.texture_downscale in (None, job.downscale) or job.scene.root is None:
-        return job.scene.train
+def _views(loaded: LoadedRun, options: TextureOptions, on_event: OnEvent) -> Sequence[View]:
+    """Return the training views, in another size if one is asked for, from where those of the run are."""
+    if options.texture_downscale in (None, loaded.downscale) or loaded.scene.root is None:
+        return loaded.scene.train
     scene = read_scene(
-        job.scene.root, job.scene.format, options.texture_downscale or 1, job.protocol, on_event, job.scene.masks
+        loaded.scene.root,
+        loaded.scene.format,
+        options.texture_downscale or 1,
+        loaded.protocol,
+        on_event,
+        loaded.scene.masks,
     )
-    zooms = {view.name: view.zoom for view in job.scene.train if view.zoom is not None}
-    return scene.with_poses({view.name: view.camera.T_cam_world for view in job.scene.train}, zooms).train
+    zooms = {view.name: view.zoom for view in loaded.scene.train if view.zoom is not None}
+    return scene.with_poses({view.name: view.camera.T_cam_world for view in loaded.scene.train}, zooms).train
 
 
 def _images(
-    job: LoadedRun,
+    loaded: LoadedRun,
     views: Sequence[View],
     splats: Splats,
     options: TextureOptions,
@@ -171,26 +176,26 @@ def _images(
 ) -> Iterator[ColorSource]:
     """Yield the views, or renderings of the splats from them, smaller by ``factor``."""
     if options.texture_from == "photographs":
-        yield from photographs(job, views, exposures, on_event, factor)
+        yield from photographs(loaded, views, exposures, on_event, factor)
         return
     for view in counted(views, PASSES[factor > 1], len(views), on_event):
         camera = view.camera.downscaled(factor)
         with torch.no_grad():
-            output = rasterize(splats, camera, job.settings, backend=job.backend)
+            output = rasterize(splats, camera, loaded.settings, backend=loaded.backend)
         shown = (output.alpha >= OPAQUE).cpu().numpy()
         yield ColorSource(camera, to_uint8(output.color.clamp(0, 1).cpu().numpy()), shown)
 
 
 def photographs(
-    job: LoadedRun, views: Sequence[View], exposures: Transforms, on_event: OnEvent, factor: int
+    loaded: LoadedRun, views: Sequence[View], exposures: Transforms, on_event: OnEvent, factor: int
 ) -> Iterator[ColorSource]:
     """Yield photographs in the mean exposure of a run, smaller by ``factor``."""
     for view in counted(views, PASSES[factor > 1], len(views), on_event):
-        yield ColorSource(view.camera, as_scene(view, exposures), usable_pixels(view, job)).shrunk(factor)
+        yield ColorSource(view.camera, as_scene(view, exposures), usable_pixels(view, loaded)).shrunk(factor)
 
 
-def usable_pixels(view: View, job: LoadedRun) -> np.ndarray | None:
+def usable_pixels(view: View, loaded: LoadedRun) -> np.ndarray | None:
     """Return the pixels that show the surface: not masked out, and on the object if fusion looked only there."""
-    masks = [view.mask(), view.object_mask() if job.protocol.use_mask_in_fusion else None]
+    masks = [view.mask(), view.object_mask() if loaded.protocol.use_mask_in_fusion else None]
     given = [mask for mask in masks if mask is not None]
     return np.logical_and.reduce(given) if given else None

@@ -235,7 +235,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 # -- verdict.json ------------------------------------------------------------------------------------------------------
-def write_verdict(run: RunFolder, job: LoadedRun, collected: Collector) -> dict[str, Any]:
+def write_verdict(run: RunFolder, loaded: LoadedRun, collected: Collector) -> dict[str, Any]:
     """Judge a run and write ``verdict.json``; without newly measured views, judge the earlier measures again.
 
     Raises
@@ -246,7 +246,9 @@ def write_verdict(run: RunFolder, job: LoadedRun, collected: Collector) -> dict[
     """
     if collected.failure is not None:
         raise collected.failure
-    measures = Measures(collected.views, *placed_images(job.scene.root)) if collected.views else _measured_before(run)
+    measures = (
+        Measures(collected.views, *placed_images(loaded.scene.root)) if collected.views else _measured_before(run)
+    )
     data = {"format": FORMAT, "verdict": asdict(judge(measures)), "measured": asdict(measures)}
     write_json(run.file(VERDICT), data)
     return data

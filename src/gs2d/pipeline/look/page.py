@@ -37,7 +37,7 @@ def page_run(
     *,
     sh_degree: int = 3,
     on_event: OnEvent = ignore,
-    job: LoadedRun | None = None,
+    loaded: LoadedRun | None = None,
 ) -> dict[str, Any]:
     """Write the page of a run or of a file of splats.
 
@@ -49,7 +49,7 @@ def page_run(
     sh_degree : int
         0 to 3: how much of the colours' dependence on the direction is stored.
     on_event : callable
-    job : LoadedRun or None
+    loaded : LoadedRun or None
         What defines the run, where it is at hand; None: it is read.
 
     Returns
@@ -64,7 +64,7 @@ def page_run(
         raise RunError(f"--out must name an .html file, which is what is written, got {out}")
     if not 0 <= sh_degree <= 3:
         raise RunError(f"--sh-degree must be 0, 1, 2 or 3, got {sh_degree}")
-    content = page_content(path, on_event, job)
+    content = page_content(path, on_event, loaded)
     if content.run is not None:
         content.run.sweep()
     on_event(Phase("writing the page", 0))
@@ -94,26 +94,26 @@ class PageContent:
     run: RunFolder | None
 
 
-def page_content(path: Path, on_event: OnEvent = ignore, job: LoadedRun | None = None) -> PageContent:
-    """Return what a page shows of a run (defined by ``job``, where it is at hand) or of a file of splats."""
+def page_content(path: Path, on_event: OnEvent = ignore, loaded: LoadedRun | None = None) -> PageContent:
+    """Return what a page shows of a run (defined by ``loaded``, where it is at hand) or of a file of splats."""
     run = open_run(path) if path.is_dir() or is_run(path) else None
     if run is not None:
         splats = finished_splats(run)
         definition = run.definition()
         title = definition.get("title") or definition["scene"]["name"]
         try:
-            job = job or reload_run(run, on_event)
+            loaded = loaded or reload_run(run, on_event)
         except (RunError, DataError) as error:
             on_event(Notice(f"without the cameras of the photographs: {error}"))
     else:
         if not path.exists():
             raise DataError(f"expected a run folder or a file of splats at {path}, found nothing{where_it_ends(path)}")
         splats, title = read_splats(path, lambda text: on_event(Notice(text))), path.stem
-    photographs = [] if job is None else some_views(job.scene.train)
+    photographs = [] if loaded is None else some_views(loaded.scene.train)
     scene = page_scene(
         title,
         photographs,
-        settings_without_run(splats) if job is None else job.settings,
+        settings_without_run(splats) if loaded is None else loaded.settings,
         splats.means.cpu().numpy(),
         subject=_subject(path, on_event) if run is not None and photographs else None,
         world=_world_of(path, on_event),

@@ -1,1 +1,1 @@
-"""Before training: options, captures, priors and memory are checked and become one job; finished runs are opened."""
+"""Before training: options, captures, priors and memory become one resolved run; finished runs are opened."""

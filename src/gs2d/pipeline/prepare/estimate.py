@@ -30,7 +30,7 @@ from gs2d.data import Scene
 from gs2d.data.prepare import packed_bytes
 from gs2d.data.prepared import decoded_bytes
 from gs2d.errors import DataError
-from gs2d.pipeline.prepare.memory_budget import DECODING_BYTES, ITERATION_BYTES
+from gs2d.pipeline.prepare.limits import DECODING_BYTES, ITERATION_BYTES
 from gs2d.pipeline.prepare.photographs import fits
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend

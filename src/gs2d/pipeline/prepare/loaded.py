@@ -26,6 +26,7 @@ from gs2d.io.formats.registry import read_splats, read_surfels
 from gs2d.io.georeference import georeference_of_file
 from gs2d.io.run_dir import SPLATS, RunFolder, open_run, versions
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
+from gs2d.pipeline.prepare.limits import use_threads
 from gs2d.pipeline.prepare.open_capture import SHOWN_SKIPS, open_capture, read_scene, without_masked_points
 from gs2d.pipeline.prepare.options import TrainOptions, values
 from gs2d.pipeline.prepare.part import LoadedPart, Part, load_part, part_scene
@@ -34,7 +35,6 @@ from gs2d.pipeline.prepare.resolve import by_quality, check_execution, check_opt
 from gs2d.pipeline.prepare.resolved import CaptureRecord, Execution, ResolvedRun, read_resolved
 from gs2d.pipeline.prepare.run_photometry import with_found_photometries
 from gs2d.pipeline.prepare.run_poses import with_found_poses
-from gs2d.pipeline.prepare.threads import use_threads
 from gs2d.pipeline.prepare.view_priors import with_priors
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings

@@ -113,15 +113,15 @@ def exposure_named(name: str, transforms: Transforms) -> Tensor:
     return transforms[name]
 
 
-def exposed(output: RenderOutput, transform: Tensor | None, job: LoadedRun) -> Tensor:
+def exposed(output: RenderOutput, transform: Tensor | None, loaded: LoadedRun) -> Tensor:
     """Return the picture of any view [H, W, 3], in an exposure if one is given.
 
     Where the photographs have an alpha channel, the background is none of them and stays as it is.
     """
     if transform is None:
         return output.color
-    cut_out = job.scene.train[0].alpha() is not None
-    background = torch.tensor(job.settings.background, dtype=output.color.dtype, device=output.color.device)
+    cut_out = loaded.scene.train[0].alpha() is not None
+    background = torch.tensor(loaded.settings.background, dtype=output.color.dtype, device=output.color.device)
     cover = (output.alpha, background) if cut_out else ()
     return expose(output.color, transform.to(output.color), *cover)
 

@@ -35,13 +35,13 @@ from gs2d.pipeline.finish.scoring import (
     transparent_part,
 )
 from gs2d.pipeline.prepare.estimate import iteration_costs
+from gs2d.pipeline.prepare.limits import release_buffers
 from gs2d.pipeline.prepare.loaded import LoadedRun
-from gs2d.pipeline.prepare.memory_budget import release_buffers
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.run_exposures import Transforms, write_exposures
 from gs2d.pipeline.prepare.run_photometry import write_photometries
 from gs2d.pipeline.prepare.run_poses import NONE, found_poses, write_poses
-from gs2d.pipeline.train.changes import Snapshot, mean_changes, take_snapshot
+from gs2d.pipeline.train.attribute_changes import Snapshot, mean_changes, take_snapshot
 from gs2d.pipeline.train.interruption import HeldSignals
 from gs2d.pipeline.train.loss_reports import report_losses
 from gs2d.pipeline.train.resume import ResumePoint, put_in_cache
@@ -67,21 +67,21 @@ class RunLogger:
     def __init__(
         self,
         run: RunFolder,
-        job: LoadedRun,
+        loaded: LoadedRun,
         start: ResumePoint,
         on_event: OnEvent,
         visitors: Sequence[Visitor] = (),
     ) -> None:
-        self._run, self._job, self._on_event = run, job, on_event
-        self._execution = job.resolved.execution
+        self._run, self._loaded, self._on_event = run, loaded, on_event
+        self._execution = loaded.resolved.execution
         self._visitors = visitors
-        self.progress_every = progress_every(job)
-        self._shown = choose_views(job.scene)
-        self._probes = (job.scene.test or job.scene.train)[
-            :: max(1, len(job.scene.test or job.scene.train) // PROBE_VIEWS)
+        self.progress_every = progress_every(loaded)
+        self._shown = choose_views(loaded.scene)
+        self._probes = (loaded.scene.test or loaded.scene.train)[
+            :: max(1, len(loaded.scene.test or loaded.scene.train) // PROBE_VIEWS)
         ]
         self._probes = self._probes[:PROBE_VIEWS]
-        self._memory, self._gpu_memory = PeakMemory(), PeakGpuMemory(job.backend)
+        self._memory, self._gpu_memory = PeakMemory(), PeakGpuMemory(loaded.backend)
         self._stage_clock = 0.0  # perf_counter() at which the stage would have begun without breaks
         self._seconds, self._peak = start.seconds, start.peak_memory
         self._at_entry = dict(start.at_entry)
@@ -104,7 +104,7 @@ class RunLogger:
             self._before = take_snapshot(state.splats, state.step)  # as the run that was broken off had it
         self._saved_iteration = state.step
         if state.processes and state.processes[-1][:2] == (state.stage, state.step):
-            stage, count = min(state.stage, len(self._job.recipe.stages) - 1), trainer.processes.size
+            stage, count = min(state.stage, len(self._loaded.recipe.stages) - 1), trainer.processes.size
             fact = {"stage": self._stage(stage).name, "iteration": state.step, "count": count}
             self._run.events.append({"kind": "processes", **fact})
         self._phase()
@@ -222,7 +222,7 @@ class RunLogger:
             return
         self._stop_clock()
         over = event.iteration - before.iteration
-        changes = mean_changes(before, self._state.splats, iterations=over, extent=self._job.scene.extent)
+        changes = mean_changes(before, self._state.splats, iterations=over, extent=self._loaded.scene.extent)
         fact = {"stage": event.stage, "iteration": event.iteration, "over": over}
         self._run.events.append({"kind": "changes", **fact, **changes})
         self._start_clock()
@@ -230,9 +230,11 @@ class RunLogger:
     def _probe_psnr(self, splats: Splats) -> float | None:
         """Mean PSNR over a few fixed views (test views where there are any)."""
         self._stop_clock()
-        scene = self._job.scene  # by neighbours alone: what the camera would see costs a rendering of every photograph
+        scene = (
+            self._loaded.scene
+        )  # by neighbours alone: what the camera would see costs a rendering of every photograph
         exposures = with_predicted(self._found_exposures, scene)
-        psnr = mean_psnr(splats, self._now(self._probes), self._settings, self._job.backend, exposures)
+        psnr = mean_psnr(splats, self._now(self._probes), self._settings, self._loaded.backend, exposures)
         self._start_clock()
         return psnr
 
@@ -240,7 +242,7 @@ class RunLogger:
     def _payload(self, index: int) -> dict[str, Any]:
         extra = {"seconds": self._seconds, "peak_memory": self._peak, "at_entry": self._at_entry}
         state = self._state
-        key = self._job.stage_key(index, state.processes)
+        key = self._loaded.stage_key(index, state.processes)
         return {"state": state.state_dict(), "extra": json.dumps(extra), "key": key}
 
     def _save(self, index: int, iteration: int | None) -> None:
@@ -270,7 +272,7 @@ class RunLogger:
         release_buffers()  # scoring has its own
         with self._attempted_at_end(index):
             self._score_stage(index)
-        if index + 1 < len(self._job.recipe.stages):
+        if index + 1 < len(self._loaded.recipe.stages):
             self._phase()
 
     def _finish_reused(self, state: TrainState) -> None:
@@ -290,12 +292,12 @@ class RunLogger:
 
     def _write_results(self) -> None:
         """Write the splats and what belongs to them, before anything that is made of them can fail."""
-        run, job, state = self._run, self._job, self._state
+        run, loaded, state = self._run, self._loaded, self._state
         with attempted("learned cameras and exposures", None, self._on_event):
             now = self._scene_now
-            poses = NONE if job.recipe.poses is None else found_poses(job.scene, now)
+            poses = NONE if loaded.recipe.poses is None else found_poses(loaded.scene, now)
             write_exposures(run, self._found_exposures, self._on_event)
-            write_poses(run, job.scene, poses, self._on_event)
+            write_poses(run, loaded.scene, poses, self._on_event)
             write_photometries(run, now, self._on_event)
         write_splats(run.file(SPLATS), state.splats)
 
@@ -348,7 +350,7 @@ class RunLogger:
         entry |= transparent_entry(transparent)
         with attempted(f"what the losses say of stage {stage.name}", None, self._on_event):
             assert self._trainer is not None
-            entry |= report_losses(self._run, self._trainer, self._job.scene.train)
+            entry |= report_losses(self._run, self._trainer, self._loaded.scene.train)
         self._draw(stage.name, outputs)
         stages = [*self._run.metrics()["stages"][:index], entry]
         self._run.write_metrics({"stages": stages, "surface": None})
@@ -362,8 +364,8 @@ class RunLogger:
 
         Where training views are what stages are compared by (DTU, captures without test views) all of them do.
         """
-        scene = self._job.scene
-        compared = self._job.protocol.test_on == "train" or not scene.test
+        scene = self._loaded.scene
+        compared = self._loaded.protocol.test_on == "train" or not scene.test
         train = scene.train if last or compared else evenly(scene.train, EARLY_VIEWS)
         return [("train", train), ("test", scene.test)]
 
@@ -372,7 +374,7 @@ class RunLogger:
             self._drawn,
             self._now(views),
             self._settings,
-            self._job.backend,
+            self._loaded.backend,
             name=name,
             on_event=self._on_event,
             exposures=self._exposures,
@@ -385,12 +387,12 @@ class RunLogger:
         shown = zip((split for split, _ in self._shown), self._now([view for _, view in self._shown]), strict=True)
         with attempted(f"pictures of stage {stage}", None, self._on_event):
             group = _group(state) if len(self._drawn) == len(state.splats) else None  # none of what is frozen
-            draw_stage(self._run, self._job, list(shown), stage, self._drawn, group, self._exposures, outputs)
+            draw_stage(self._run, self._loaded, list(shown), stage, self._drawn, group, self._exposures, outputs)
 
     # -- small things --------------------------------------------------------------------------------------------------
     @property
     def _settings(self) -> Any:
-        return self._job.settings
+        return self._loaded.settings
 
     @property
     def _scene_now(self) -> Scene:
@@ -406,14 +408,14 @@ class RunLogger:
     def _exposures(self) -> Transforms:
         at = (self._state.stage, self._state.step)
         if self._predicted is None or self._predicted[0] != at:
-            scene, brightness = self._job.scene, metered(self._drawn, self._settings, self._job.backend)
+            scene, brightness = self._loaded.scene, metered(self._drawn, self._settings, self._loaded.backend)
             found = with_predicted(self._found_exposures, scene, brightness)
             self._predicted = (at, found)
         return self._predicted[1]
 
     def _now(self, views: Sequence[View]) -> list[View]:
         """Return views of the capture from where their cameras are now."""
-        scene = self._job.scene
+        scene = self._loaded.scene
         now = dict(zip(map(id, scene.views), self._scene_now.views, strict=True))
         return [now.get(id(view), view) for view in views]
 
@@ -434,21 +436,21 @@ class RunLogger:
         return bool(self._visitors) and not self._run.file(VERDICT).exists()
 
     def _views(self, split: str) -> Sequence[View]:
-        return self._job.scene.train if split == "train" else self._job.scene.test
+        return self._loaded.scene.train if split == "train" else self._loaded.scene.test
 
     def _is_last(self, index: int) -> bool:
-        return index == len(self._job.recipe.stages) - 1
+        return index == len(self._loaded.recipe.stages) - 1
 
     def _stage(self, index: int) -> Stage:
-        return self._job.recipe.stages[index]
+        return self._loaded.recipe.stages[index]
 
     def _iterations_before(self, index: int) -> int:
-        return sum(stage.iterations for stage in self._job.recipe.stages[:index])
+        return sum(stage.iterations for stage in self._loaded.recipe.stages[:index])
 
     def _phase(self) -> None:
         state = self._state
         done = self._iterations_before(state.stage) + state.step
-        recipe = self._job.recipe
+        recipe = self._loaded.recipe
         costs = iteration_costs(recipe)
         self._on_event(Phase(f"training {recipe.name}", recipe.iterations, done, growth=GROWTH, costs=costs))
 
@@ -474,10 +476,10 @@ _ROWS_OR_JUMPS = (
 )
 
 
-def progress_every(job: LoadedRun) -> int:
+def progress_every(loaded: LoadedRun) -> int:
     """Return the iterations between progress events."""
-    every = REPORT_EVERY if job.backend.on_host else REPORT_EVERY_ON_GPU
-    return max(1, min(every, job.resolved.execution.checkpoint_every))
+    every = REPORT_EVERY if loaded.backend.on_host else REPORT_EVERY_ON_GPU
+    return max(1, min(every, loaded.resolved.execution.checkpoint_every))
 
 
 def _storable(value: Any) -> bool:

@@ -35,14 +35,13 @@ from gs2d.pipeline.finish.scoring import Visitor
 from gs2d.pipeline.finish.verdict import Collector, write_verdict
 from gs2d.pipeline.look.page import page_run
 from gs2d.pipeline.prepare.estimate import estimate
+from gs2d.pipeline.prepare.limits import release, use_memory, use_threads
 from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
-from gs2d.pipeline.prepare.memory_budget import release, use_memory
 from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare.part import Part
 from gs2d.pipeline.prepare.photographs import PREPARED
 from gs2d.pipeline.prepare.resolve import check_options
 from gs2d.pipeline.prepare.resolved import Execution, check_same_run
-from gs2d.pipeline.prepare.threads import use_threads
 from gs2d.pipeline.train.live import Live
 from gs2d.pipeline.train.process_group import connected, follow, lead, memory_of
 from gs2d.pipeline.train.resume import ResumePoint, check_sources, choose_start
@@ -345,7 +344,7 @@ def finish(
             keep_facts(run, extract_mesh(loaded, splats, mesh, run.file(MESH), on_event, subject=subject, seen=frames))
     if execution.page and not run.file(PAGE).exists():
         with attempted(PAGE, again("page", run.path), on_event):
-            page_run(run.path, on_event=on_event, job=loaded)
+            page_run(run.path, on_event=on_event, loaded=loaded)
     with attempted(VERDICT, again("evaluate", run.path), on_event):
         write_verdict(run, loaded, collected)
     on_event(Phase("writing the report", 0))  # last: it links to the others

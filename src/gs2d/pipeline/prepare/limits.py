@@ -1,8 +1,11 @@
-"""Memory between the phases of a run: what the next phase has no use for goes first."""
+"""What a command takes of the machine: CPU threads, memory, and memory given back between the phases of a run."""
 
 from __future__ import annotations
 
 import gc
+import os
+
+import torch
 
 from gs2d.core.memory import trim
 from gs2d.core.memory_limit import CACHE_FRACTION, memory_limit, set_memory_budget
@@ -14,9 +17,25 @@ ITERATION_BYTES = 216  # of a pixel: images, gradients, losses, what the heap ke
 CACHES = 2 * CACHE_FRACTION  # of the room, that those of photographs and of targets take beside it
 DECODING_BYTES = 12  # of a pixel of the file: what a JPEG is decoded through
 MAX_DOWNSCALE = 64
-
-
+MAX_THREADS = 1024  # each has a stack: far more of them end in errors that name anything but the cause
 LEAST_GIB = 0.5  # torch and the kernels by themselves take 0.4
+
+
+def use_threads(threads: int | None, processes: int = 1) -> None:
+    """Set the CPU threads of torch and of the native kernels; several processes of a machine share its cores.
+
+    Raises
+    ------
+    RecipeError
+        Not a number from 1 to ``MAX_THREADS``.
+    """
+    if threads is not None:
+        if not 1 <= threads <= MAX_THREADS:
+            raise RecipeError(f"--threads must be a whole number from 1 to {MAX_THREADS}, got {threads}")
+        torch.set_num_threads(threads)
+    elif processes > 1:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        torch.set_num_threads(max(1, cores // processes))
 
 
 def use_memory(gib: float | None) -> None:

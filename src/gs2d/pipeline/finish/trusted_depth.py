@@ -29,9 +29,9 @@ def believed_reach(scene: Scene) -> Reach | None:
     return None if reach is None else replace(reach, radius=BEYOND * reach.radius)
 
 
-def surface_reach(job: RenderedScene) -> Reach | None:
+def surface_reach(loaded: RenderedScene) -> Reach | None:
     """Return how far surfaces are taken; None, as far as they go, by the protocols of data sets: they have limits."""
-    return believed_reach(job.scene) if job.protocol.fusion.subject else None
+    return believed_reach(loaded.scene) if loaded.protocol.fusion.subject else None
 
 
 def within_reach(reach: Reach, camera: Camera, depths: np.ndarray) -> np.ndarray:
@@ -41,25 +41,25 @@ def within_reach(reach: Reach, camera: Camera, depths: np.ndarray) -> np.ndarray
     return reach.holds(places).reshape(depths.shape)
 
 
-def sky_direction(job: RenderedScene) -> np.ndarray | None:
+def sky_direction(loaded: RenderedScene) -> np.ndarray | None:
     """Return the direction [3] of the sky: up. None where the photographs are not searched for sky.
 
     The fusions of data sets have limits of their own, and an alpha channel says itself what is empty.
     """
-    scene = job.scene
-    if not job.protocol.fusion.subject or scene.observed() is None or scene.train[0].alpha() is not None:
+    scene = loaded.scene
+    if not loaded.protocol.fusion.subject or scene.observed() is None or scene.train[0].alpha() is not None:
         return None
     return up_direction([view.camera for view in scene.train])
 
 
-def sky_of(job: RenderedScene, view: View, up: np.ndarray) -> np.ndarray:
+def sky_of(loaded: RenderedScene, view: View, up: np.ndarray) -> np.ndarray:
     """Return the pixels [H, W] bool in which a photograph shows the sky, which is in the direction ``up`` [3]."""
     camera = view.camera
-    observed = job.scene.observed()
+    observed = loaded.scene.observed()
     points = np.zeros((0, 2)) if observed is None else observed.inside(camera, min_track=2).pixels
     if len(points) < MIN_POINTS:
         return np.zeros((camera.height, camera.width), bool)
     rows, columns = np.indices((camera.height, camera.width)).reshape(2, -1)
     rays = backproject(camera, np.ones(len(rows)), rows, columns) - camera.center
     above = (rays @ up > 0).reshape(camera.height, camera.width)
-    return sky_pixels(view.target(job.settings.background), points, above, view.valid())
+    return sky_pixels(view.target(loaded.settings.background), points, above, view.valid())
