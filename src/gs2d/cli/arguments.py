@@ -74,10 +74,12 @@ class Option:
         value += " ..." if self.count is None and "..." not in value else ""
         return " ".join(word for word in (self.name if self.flags else "", "" if self.kind is bool else value) if word)
 
-    def add_to(self, parser: argparse.ArgumentParser) -> None:
-        """Add the option to a parser. Missing ones are reported by the caller, so that misspelt ones come first."""
+    def add_to(self, parser: argparse._ActionsContainer, text: str = "") -> None:
+        """Add the option to a parser with its help text. The caller reports missing options after misspelt ones."""
+        text = text.replace("%", "%%")
         if self.kind is bool:
-            parser.add_argument(*self.flags, dest=self.field, action="store_false" if self.default else "store_true")
+            action = "store_false" if self.default else "store_true"
+            parser.add_argument(*self.flags, dest=self.field, action=action, help=text)
             return
         nargs: int | str | None = "+" if self.count is None else self.count if self.count > 1 else None
         if not self.flags:
@@ -89,6 +91,7 @@ class Option:
             nargs=nargs,
             type=self.kind,
             choices=self.choices or None,
+            help=text,
             metavar=tuple(self.metavar.split()) if isinstance(nargs, int) else self.metavar,
         )
 

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 
 import gs2d
 from gs2d.cli.arguments import NAMES, Option, about, options_of
 from gs2d.cli.commands import Common
-from gs2d.cli.layout import entries, terminal_width, wrapped
+from gs2d.cli.layout import terminal_width
 from gs2d.pipeline.prepare.options import CommonTraining, Finding, HowItRuns, Training
 
-_SLOGAN = "Photographs in; a surface mesh and a scene of 2D Gaussian splats out."
-_FIRST_DAY = (
-    ("gs2d doctor", "what this machine can run, and how to get the rest"),
-    ("gs2d demo", "try everything on a small synthetic scene: minutes"),
-    ("gs2d reconstruct PHOTOS --out RUN", "photographs or a video to cameras, splats, mesh, report and page"),
-    ("gs2d view RUN", "look at a run in the browser, while it is served"),
-    ("gs2d mesh RUN --texture", "the mesh once more, with a texture or other settings"),
-)
+_SLOGAN = "Turns photographs into a surface mesh and a 3D scene that you can view from any angle."
+_FIRST_DAY = """usage: gs2d COMMAND [OPTIONS]
+
+  gs2d doctor                          check what this machine can run
+  gs2d demo                            try everything on a small synthetic scene
+  gs2d reconstruct PHOTOS --out RUN    photographs or a video to splats and mesh
+  gs2d view RUN                        look at the result in the browser
+  gs2d mesh RUN --texture              extract the mesh again, with a texture
+
+All commands: gs2d --help. Options of one: gs2d COMMAND --help."""
 GROUPS: dict[str, tuple[str, ...]] = {
     "To begin with": ("doctor", "demo", "reconstruct", "view", "completion"),
     "Step by step": ("poses", "plan", "train", "blocks", "mesh"),
@@ -25,114 +28,89 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "Real-world coordinates": ("georeference", "orthophoto"),
     "Measure and compare": ("evaluate", "recipes", "sweep", "paper"),
 }
-_PROGRAM_OPTIONS = (
-    ("--version", "Print the version."),
-    ("--help", "This list; `gs2d COMMAND --help`: what one needs first of a command."),
-    ("--help-all", "Every option of every command; `gs2d COMMAND --help-all`: of one."),
-)
-_FIRST: dict[str, tuple[str, ...]] = {  # options that `--help` explains; of other commands all but those of every one
+_FIRST: dict[str, tuple[str, ...]] = {  # options that `--help` shows, by use; of other commands all but the common ones
     "demo": ("out", "schedule_scale", "viewer", "resume", "overwrite"),
     "reconstruct": ("photos", "out", "quality", "texture", "viewer", "resume", "overwrite"),
     "poses": ("photos", "out", "frames", "camera_model", "max_size", "overwrite"),
     "plan": ("scene", "quality", "recipe", "schedule_scale", "downscale", "memory", "disk"),
-    "train": (
-        "scene", "out", "quality", "recipe", "schedule_scale", "downscale", "exposure", "viewer", "resume", "overwrite"
-    ),
+    "train": ("scene", "out", "quality", "recipe", "schedule_scale", "downscale", "viewer", "resume", "overwrite"),
     "blocks": ("scene", "out", "blocks", "recipe", "schedule_scale", "downscale", "memory", "slots"),
     "mesh": ("run", "out", "texture", "voxel", "bbox", "unbounded"),
     "render": ("run", "split", "orbit", "flight", "width", "video", "out"),
     "evaluate": ("run", "ground_truth", "thresholds", "lpips_weights"),
+    "georeference": ("run", "gps", "positions", "control", "known_distance", "markers", "remove"),
     "paper": ("table", "data", "out", "scenes", "schedule_scale", "train"),
     "sweep": ("recipes", "data", "out", "seeds", "schedule_scale", "train"),
-}  # fmt: skip
+}
 _OWN = "Of this command"
-TITLES = {  # in the order in which they are shown
+TITLES = {  # headings of shared options, in order
     Finding: "Cameras of photographs",
     CommonTraining: "Training",
     Training: "Training",
     HowItRuns: "How it runs",
-    Common: "What is printed",
+    Common: "Output",
 }
 
 
 def first_day() -> list[str]:
-    """Return what ``gs2d`` alone shows: the five commands of a first day."""
-    width = terminal_width()
-    return [
-        *wrapped(f"gs2d {gs2d.__version__}. {_SLOGAN}", width),
-        "",
-        "usage: gs2d COMMAND [OPTIONS]",
-        "",
-        *entries(_FIRST_DAY, width),
-        "",
-        *wrapped(
-            "`gs2d --help` lists all commands, `gs2d COMMAND --help` what one needs of a command, "
-            "`gs2d --version` the version.",
-            width,
-        ),
-    ]
+    """Return the help of ``gs2d`` alone: five commands for the first day."""
+    return [f"gs2d {gs2d.__version__}", "", *_FIRST_DAY.splitlines()]
 
 
 def program_help(*, everything: bool = False) -> list[str]:
-    """Return the help of ``gs2d``: all commands in groups; with ``everything`` all options of each, too."""
-    width = terminal_width()
-    lines = ["usage: gs2d COMMAND [OPTIONS]", "", *wrapped(_SLOGAN, width)]
+    """Return all commands in groups; with ``everything`` also all options of each."""
+    parser = _parser("gs2d", "gs2d COMMAND [OPTIONS]", _SLOGAN, "Options: gs2d COMMAND --help; the version: --version")
     for title, names in GROUPS.items():
-        lines += ["", f"{title}:", *entries([(name, about(NAMES[name])) for name in names], width)]
-    lines += ["", "Options:", *entries(_PROGRAM_OPTIONS, width)]
-    if everything:
-        for names in GROUPS.values():
-            for name in names:
-                lines += ["", "-" * min(width, 40), *command_help(name, everything=True)]
+        group = parser.add_argument_group(title)
+        for name in names:
+            group.add_argument(name, help=about(NAMES[name]))
+    lines = parser.format_help().splitlines()
+    for name in [name for names in GROUPS.values() for name in names] if everything else ():
+        lines += ["", *command_help(name, everything=True)]
     return lines
 
 
 def command_help(name: str, *, everything: bool = False) -> list[str]:
-    """Return the help of a command: the options needed first and the number of the others, or all of them in groups."""
-    width, options = terminal_width(), options_of(NAMES[name])
-    needed = [option for option in options if option.required or not option.flags]
-    words = sorted(needed, key=lambda option: bool(option.flags))
-    usage = " ".join(option.usage if option.required else f"[{option.usage}]" for option in words)
-    lines = wrapped(f"gs2d {name} {usage} [OPTIONS]".replace("  ", " "), width, first="usage: ", rest="  ")
-    lines += ["", *wrapped(about(NAMES[name]), width)]
+    """Return the help of a command: its most used options and the number of the others, or all options in groups."""
+    options = options_of(NAMES[name])
+    needed = sorted((o for o in options if o.required or not o.flags), key=lambda o: bool(o.flags))
+    words = [o.usage if o.required else f"[{o.usage}]" for o in needed]
     groups = _groups(name, options)
-    if everything:
-        return [*lines, *(line for title in groups for line in ("", f"{title}:", *_explained(groups[title], width)))]
-    if first := groups.pop("First", []):
-        lines += ["", *_explained(first, width)]
-    if more := len(options) - len(first):
-        lines += ["", f"{more} more options: gs2d {name} --help-all"]
-    return lines
+    more = sum(len(group) for title, group in groups.items() if title)
+    rest = "" if everything else f"{more} more options: --help-all"
+    parser = _parser(f"gs2d {name}", " ".join([f"gs2d {name}", *words, "[OPTIONS]"]), about(NAMES[name]), rest)
+    for title, group in groups.items():
+        if everything or not title:
+            shown = parser.add_argument_group(title or None)
+            for option in group:
+                option.add_to(shown, option_text(option))
+    return parser.format_help().splitlines()
 
 
-def _first(name: str, options: Sequence[Option]) -> list[Option]:
-    """Return the options that are explained at once, in the order in which they are needed."""
-    if name not in _FIRST:
-        return _needed_first([option for option in options if option.owner is not Common])
-    by_field = {option.field: option for option in options}
-    return [by_field[field] for field in _FIRST[name]]
+def _parser(prog: str, usage: str, description: str, epilog: str) -> argparse.ArgumentParser:
+    def formatter(prog: str) -> argparse.HelpFormatter:
+        return argparse.HelpFormatter(prog, max_help_position=28, width=terminal_width())
 
-
-def _needed_first(options: Sequence[Option]) -> list[Option]:
-    return sorted(options, key=lambda option: (bool(option.flags), not option.required))
+    return argparse.ArgumentParser(
+        prog, usage, description, epilog, formatter_class=formatter, add_help=False, allow_abbrev=False
+    )
 
 
 def _groups(name: str, options: Sequence[Option]) -> dict[str, list[Option]]:
-    """All options by heading: those of the first help, the others of the command itself, then what it shares."""
-    groups: dict[str, list[Option]] = {title: [] for title in ("First", _OWN, *TITLES.values())}
-    groups["First"] = first = _first(name, options)
+    """Return all options by heading: the most used ones under "", then those of the command, then shared ones."""
+    by_field = {option.field: option for option in options}
+    own = sorted((o for o in options if o.owner is not Common), key=lambda o: (bool(o.flags), not o.required))
+    first = [by_field[field] for field in _FIRST[name]] if name in _FIRST else own
+    groups: dict[str, list[Option]] = {title: [] for title in ("", _OWN, *TITLES.values())}
+    groups[""] = first
     for option in options:
         if option not in first:
             groups[TITLES.get(option.owner, _OWN)].append(option)
     return {title: group for title, group in groups.items() if group}
 
 
-def _explained(options: Sequence[Option], width: int) -> list[str]:
-    return entries([(option.usage, option_text(option)) for option in options], width)
-
-
 def option_text(option: Option) -> str:
-    """Return the help of an option: its docstring, the values where no room was before, and the default."""
+    """Return the help of an option: its docstring, choices that its metavar does not list, and the default."""
     values = "" if all(choice in option.usage for choice in option.choices) else f" {', '.join(option.choices)}."
     said = "default:" in option.about or option.kind is bool or option.default in (None, (), "")
     return option.about + values + ("" if said else f" (default: {_shown(option.default)})")

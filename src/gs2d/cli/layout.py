@@ -9,7 +9,6 @@ from collections.abc import Sequence
 
 WIDEST = 100  # columns of running text; longer lines are hard to read
 _COMMAND, _HELD = re.compile(r"`[^`]*`"), "\0"  # what stays whole; a space in it
-_LEFT, _NARROW = 30, 70  # columns: most of the left column; below the second less of it
 
 
 def terminal_width() -> int:
@@ -36,22 +35,6 @@ def message(text: str, width: int, *, rest: str = "  ") -> list[str]:
     """Return the lines of a message, broken between words; a command in backticks stays whole, to be copied."""
     held = _COMMAND.sub(lambda found: found[0].replace(" ", _HELD), text)
     return [line.replace(_HELD, " ") for line in wrapped(held, width, rest=rest)]
-
-
-def entries(pairs: Sequence[tuple[str, str]], width: int) -> list[str]:
-    """Return names and what is said of each, in two columns; a name that is too long has a line of its own."""
-    most = _LEFT if width >= _NARROW else _LEFT - 12
-    column = max((len(left) for left, _ in pairs if len(left) <= most), default=0)
-    lines = []
-    for left, right in pairs:
-        gap = " " * (column + 4)
-        if not right:
-            lines.append(f"  {left}")
-        elif len(left) <= column:
-            lines += wrapped(right, width, first=f"  {left:<{column}}  ", rest=gap)
-        else:
-            lines += [f"  {left}", *wrapped(right, width, first=gap, rest=gap)]
-    return lines
 
 
 def records(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
