@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import subprocess
 import sys
 
@@ -31,7 +32,7 @@ from gs2d.cli.parser import parse
         ("train . --out there --backend gpu", "reference"),
         ("train . --out there --format=colmp", "colmap"),
         ("recipes shwo 2dgs", "ACTION"),
-        ("train", "SCENE"),
+        ("train", "CAPTURE"),
         ("train a b --out there", "'b'"),
         ("train here --out there --downscale two", "--downscale"),
         ("mesh here --bbox 1 2 3", "--bbox"),
@@ -65,6 +66,22 @@ def test_help_is_instant_because_it_does_not_import_torch() -> None:
 def test_help_exits_with_0(words: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(words.split()) == 0
     assert "usage: gs2d" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["", *NAMES])
+def test_help_fits_a_small_terminal_and_counts_the_other_options(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert run([*name.split(), "--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 40
+    assert max(map(len, lines)) <= 80
+    if name:
+        assert re.fullmatch(r"\d+ more options: --help-all", lines[-1])
+        assert run([name, "--help-all"]) == 0
+        whole = capsys.readouterr().out
+        assert all(option.name in whole for option in options_of(NAMES[name]))
 
 
 def test_every_option_is_parsed_and_fills_its_field() -> None:

@@ -31,154 +31,150 @@ class Common:
     """Options of every command."""
 
     quiet: bool = False
-    """No progress and no tables; errors only."""
+    """Print errors only."""
     verbose: bool = False
-    """Print every decision; without it those that need no action are in events.jsonl only."""
+    """Print every decision. Without it, most are only in events.jsonl."""
     json: bool = False
-    """Results as JSON on stdout, and nothing else there."""
+    """Print the result as JSON on stdout."""
     debug: bool = False
-    """Show the traceback of an error."""
+    """Print the traceback of an error."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(DemoOptions, Common):
-    """Make a small synthetic capture, train on it, extract and score the mesh, write the report."""
+    """Render a small synthetic capture, train on it and score the result."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reconstruct(ReconstructAnywhereOptions, Common):
-    """A folder of photographs to cameras, splats, a mesh and a report: `gs2d poses` and `gs2d train` in one."""
+    """Turn photographs or a video into splats, mesh and report."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Poses(PosesOptions, Common):
-    """Photographs without cameras to a capture that `gs2d train` reads: structure from motion, by COLMAP."""
+    """Find the cameras of photographs, with COLMAP."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plan(PlanOptions, Common):
-    """Estimate what training on a capture takes: splats, memory, disk and hours on this machine. Nothing is trained."""
+    """Estimate splats, memory, disk and time of a training."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Train(TrainOptions, Common):
-    """Posed photographs to splats, mesh and report."""
+    """Train on photographs whose cameras are known."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Blocks(BlocksOptions, Common):
-    """Train a capture in blocks where it is too large for one training; the merged scene is a run as any other."""
+    """Train a large capture in blocks and merge them."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mesh(TextureOptions, MeshOptions, Common):
-    """Extract the mesh of a trained run again, with other settings."""
+    """Extract the mesh of a run again, with other settings."""
 
     run: RunPath
     """Run folder."""
     out: Path | None = None
-    """Mesh file (default: mesh.ply in the run; with --texture mesh.glb)."""
+    """Mesh file (default: mesh.ply in the run, or mesh.glb with --texture)."""
     splats: Annotated[Path | None, Arg(metavar="FILE")] = None
-    """Take the splats of this file, of any format that is read, in the frame of the run; needs --out."""
+    """Use the splats of this file, in the frame of the run. Needs --out."""
     texture: bool = False
-    """Write it with a texture from the photographs: mesh.glb, or what --out names, .glb or .obj. Without options that
-    change the mesh it is the run's mesh.ply."""
+    """Write a textured mesh, as .glb or .obj, from the photographs. Without options that change the mesh, uses
+    mesh.ply."""
     georeferenced: bool = False
-    """In metres of the world (`gs2d georeference`), less an offset that is said in the file and beside it."""
+    """Write world coordinates in metres (`gs2d georeference`), relative to an offset that the file names."""
     memory: MemoryOption = None
-    """GiB of memory to keep to (default: half of what this machine or container has)."""
+    """Memory limit in GiB (default: half of the memory of this machine or container)."""
     threads: int | None = None
     """CPU threads."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Render(Common):
-    """Render a trained run to PNG files, or to a video."""
+    """Render images or a video of a run."""
 
     run: RunPath
     """Run folder."""
     split: Literal["test", "train"] | None = None
-    """Which views (default: the test views, or the training views if the run has no test views)."""
+    """Views to render (default: test views, or training views where there are none)."""
     orbit: int = 0
-    """Instead of the views, so many frames of a circle around the subject, or to and fro where only a part of the
-    circle was photographed."""
+    """Render N frames of a circle around the subject, or of an arc if only one side was photographed."""
     flight: int = 0
-    """Instead of the views, so many frames of a smooth flight along the photographs."""
+    """Render N frames of a smooth flight along the cameras."""
     width: Annotated[int | None, Arg(metavar="PIXELS")] = None
-    """Width of the images; the height follows from the aspect ratio (default: as in training)."""
+    """Image width; the height follows (default: as in training)."""
     out: Path | None = None
-    """Folder for the pictures (default: renders/SPLIT, renders/orbit or renders/flight in the run)."""
+    """Folder of the images (default: renders/SPLIT, renders/orbit or renders/flight in the run)."""
     video: Annotated[Path | None, Arg(metavar="FILE")] = None
-    """With --orbit or --flight: also a video of the frames, .mp4 (H.264, by ffmpeg) or .webp; no ending: what works."""
+    """With --orbit or --flight: also write a video, .mp4 (H.264, needs ffmpeg) or .webp."""
     fps: float = 30.0
-    """Frames a second of the video."""
+    """Frames per second of the video."""
     exposure_of: Annotated[str | None, Arg(metavar="PHOTOGRAPH")] = None
-    """Of a run with --exposure: in the exposure of this training photograph (default: in the mean of all)."""
+    """Render in the learned exposure of this training photograph (default: the mean exposure)."""
     splats: Annotated[Path | None, Arg(metavar="FILE")] = None
-    """Take the splats of this file, of any format that is read, in the frame of the run; needs --out."""
+    """Use the splats of this file, in the frame of the run. Needs --out."""
     memory: MemoryOption = None
-    """GiB of memory to keep to (default: half of what this machine or container has)."""
+    """Memory limit in GiB (default: half of the memory of this machine or container)."""
     threads: int | None = None
     """CPU threads."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class View(Common):
-    """Look at a trained run in the browser: splats, mesh and cameras, served from this machine only."""
+    """Show splats, mesh and cameras of a run in the browser."""
 
     path: Annotated[Path, Arg(metavar="RUN", positional=True)]
-    """Run folder, or a file of flat splats: PLY (compressed too), .spz, .splat, .usd, .glb or .sog."""
+    """Run folder, or a file of splats: PLY, .spz, .splat, .usd, .glb or .sog."""
     port: int | None = None
-    """Port of the page (default: the first free one from 8080 on)."""
+    """Port of the page (default: the first free port from 8080)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Page(Common):
-    """Write the splats as one HTML file that any browser draws exactly: no server, no network, to mail or to host."""
+    """Write the splats as one HTML file that works offline in any browser."""
 
     path: Annotated[Path, Arg(metavar="RUN", positional=True)]
-    """Run folder, or a file of flat splats: PLY (compressed too), .spz, .splat, .usd, .glb or .sog."""
+    """Run folder, or a file of splats: PLY, .spz, .splat, .usd, .glb or .sog."""
     out: Annotated[Path | None, Arg(metavar="FILE")] = None
-    """HTML file (default: scene.html in the run, or beside the file)."""
+    """HTML file (default: scene.html in the run, or next to the file)."""
     sh_degree: int = 3
-    """How far colours may depend on the direction; less is a smaller file: 80, 64, 48 or 32 bytes a splat."""
+    """Degree of the view-dependent colours, 0 to 3. Lower is smaller: 32 to 80 bytes per splat."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(EvaluateOptions, Common):
-    """Score a trained run: PSNR, SSIM, LPIPS; with a ground truth also Chamfer distance and F-score of the mesh."""
+    """Score images (PSNR, SSIM, LPIPS) and the mesh of a run."""
 
     run: RunPath
     """Run folder."""
     memory: MemoryOption = None
-    """GiB of memory to keep to (default: half of what this machine or container has)."""
+    """Memory limit in GiB (default: half of the memory of this machine or container)."""
     threads: int | None = None
     """CPU threads."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Export(Common):
-    """Write the splats of a run in another layout."""
+    """Write the splats of a run in another format."""
 
     run: RunPath
-    """Run folder, or a file of flat splats: PLY (compressed too), .spz, .splat, .usd, .glb or .sog."""
+    """Run folder, or a file of splats: PLY, .spz, .splat, .usd, .glb or .sog."""
     out: Annotated[Path, Arg(metavar="FILE")]
-    """File to write; by its ending .ply is 3dgs, .compressed.ply compressed, .spz spz, .splat splat, .usd usd, .glb
-    gltf, .sog sog, lod-meta.json streamed (in a folder of its own)."""
+    """File to write. Its ending selects the format."""
     layout: str | None = None
-    """2dgs: two scales, the official 2DGS layout; 3dgs: a third, tiny scale, which common viewers open; compressed:
-    PlayCanvas's and SuperSplat's PLY; spz: Niantic's, the smallest; splat: antimatter15's, one colour a splat;
-    usd: OpenUSD, to the bit; gltf: Khronos' KHR_gaussian_splatting, as flat 3D Gaussians;
-    sog: PlayCanvas's pictures, for the web; streamed: the same in levels of detail, for large scenes."""
+    """Format: 2dgs (of the 2DGS paper), 3dgs (opens in common viewers), compressed, spz, spz4, splat, usd, gltf, sog,
+    streamed, or one of a package (default: by the ending of --out; .ply is 3dgs)."""
     bbox: BoxOption = None
-    """Only the splats with their centres in this box (`gs2d view` and subject.json have numbers)."""
+    """Export only splats whose centre is in this box. `gs2d view` shows its numbers."""
     georeferenced: bool = False
-    """In metres of the world (`gs2d georeference`), less an offset that is said in the file and beside it."""
+    """Write world coordinates in metres (`gs2d georeference`), relative to an offset that the file names."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Georeference(GeoreferenceOptions, Common):
-    """Find where a run is in the world: scale, up and place, from GPS, control points, a distance or markers."""
+    """Find scale, up and world position of a run."""
 
     run: RunPath
     """Run folder."""
@@ -186,12 +182,12 @@ class Georeference(GeoreferenceOptions, Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Orthophoto(OrthophotoOptions, Common):
-    """Write a georeferenced run from straight above: orthophoto and elevation model, as GeoTIFF."""
+    """Write orthophoto and elevation model of a georeferenced run."""
 
     run: RunPath
     """Run folder, with mesh.ply and `gs2d georeference`."""
     out: Annotated[Path | None, Arg(metavar="FILE.tif")] = None
-    """The orthophoto (default: orthophoto.tif in the run); heights go to NAME_elevation.tif beside it."""
+    """Orthophoto (default: orthophoto.tif in the run). Heights go to NAME_elevation.tif."""
     threads: int | None = None
     """CPU threads."""
 
@@ -203,49 +199,51 @@ class Report(Common):
     run: RunPath
     """Run folder."""
     memory: MemoryOption = None
-    """GiB of memory to keep to (default: half of what this machine or container has)."""
+    """Memory limit in GiB (default: half of the memory of this machine or container)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recipes(Common):
-    """List the recipes, or show one: `gs2d recipes show NAME`."""
+    """List recipes, or show one: `gs2d recipes show NAME`."""
 
     action: Annotated[Literal["list", "show"], Arg(positional=True)] = "list"
-    """What to do."""
+    """Action."""
     name: Annotated[str, Arg(positional=True)] = ""
     """Name of the recipe to show."""
+    all: bool = False
+    """List all recipes, not only the three for everyday use."""
     schedule_scale: float = 1.0
-    """As in `gs2d train`."""
+    """Fraction of the iterations of the recipe."""
     overrides: Overrides = ()
-    """As in `gs2d train`."""
+    """Change the recipe, as in `gs2d train`; may be repeated."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Paper(PaperOptions, Common):
-    """Train what one of the paper's tables needs, score it, and write the table beside the paper's figures."""
+    """Reproduce a table of the paper."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep(SweepOptions, Common):
-    """Train and score recipes on every scene and seed, and write a table with a row for each recipe."""
+    """Compare recipes on scenes and seeds, as a table."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Doctor(Common):
-    """Say what this machine can run, and why not the rest."""
+    """Check what this machine can run, and what is missing."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Completion(Common):
-    """Print what completes commands, options and values in a shell: source <(gs2d completion bash)."""
+    """Print the completion script of a shell."""
 
     shell: Annotated[Literal["bash", "zsh", "fish"], Arg(positional=True)]
-    """The shell; the first line of what is printed says where it goes."""
+    """Shell. The first line of the output says where it goes."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Info(Common):
-    """Show what a run folder, a capture or a file of splats, mesh or points holds."""
+    """Describe a run, a capture, or a file of splats, mesh or points."""
 
     path: Annotated[Path, Arg(metavar="PATH", positional=True)]
     """Run folder, capture (folder or .zip), or file: PLY, .spz, .splat, .usd, .glb or .sog."""

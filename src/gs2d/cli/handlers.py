@@ -17,6 +17,8 @@ from gs2d.core.processes import here
 from gs2d.errors import ProtocolError, RecipeError
 from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions, values
 
+EVERYDAY = ("best", "best-surface", "2dgs")  # recipes that `gs2d recipes` shows without --all
+
 
 def execute(command: Common, console: Console) -> None:
     """Run a parsed command."""
@@ -310,9 +312,12 @@ def recipes(command: c.Recipes, console: Console) -> None:
         if command.name:
             raise RecipeError(f"`gs2d recipes list` takes no name, got {command.name!r}; use `gs2d recipes show NAME`")
         names = {name: about_recipe(name) for name, _ in RECIPES.working()}
-        width = max(map(len, names))
-        for name, about in names.items():
+        shown = {name: about for name, about in names.items() if command.all or name in (*EVERYDAY, *RECIPES.guests())}
+        width = max(map(len, shown))
+        for name, about in shown.items():
             console.say(f"{name:<{width}}  {about}")
+        if len(shown) < len(names):
+            console.say(f"{len(names) - len(shown)} more recipes: --all")
         console.result(names)
         return
     if not command.name:

@@ -34,7 +34,6 @@ _ELSEWHERE: dict[str, tuple[str, str]] = {  # option of other programs -> our op
 _OUTPUTS = ("out", "video", "cache")  # paths that need not exist
 _EXPECTED = {
     "RUN": "a run folder",
-    "SCENE": "the folder of a capture",
     "CAPTURE": "the folder of a capture",
     "PHOTOS": "a folder of photographs or a video",
     "DIR": "a folder",

@@ -393,9 +393,9 @@ def _registry() -> dict[str, NamedRecipe]:
     def add(name: str, about: str, build: Callable[..., Recipe]) -> None:
         entries[name] = NamedRecipe(about, partial(build, name=name))
 
-    add("best", "The default: the best pictures and surface per minute; 2DGS from a fitted dense start", best)
+    add("best", "The default: 2DGS from a fitted dense start; best images and surface for the time", best)
     add("best-fast", "best in a third of its iterations", partial(best, FAST_ITERATIONS))
-    add("best-surface", "best with neighbouring photographs compared at the end: Chamfer before dB", best_surface)
+    add("best-surface", "best, then compares neighbouring photographs: more accurate surface, lower PSNR", best_surface)
     add("2dgs", "2DGS with normal consistency 0.05: the paper's baseline and its stage 1", two_dgs)
     add("2dgs-no-nc", "2DGS without normal consistency", partial(two_dgs, nc=0.0))
     add("2dgs-60k", "2DGS for as many iterations as 2DGS-R: the fair control", two_dgs_60k)

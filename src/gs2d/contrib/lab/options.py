@@ -1,4 +1,4 @@
-"""What `gs2d paper` and `gs2d sweep` are asked to do, as `pipeline/prepare/options.py` has it of the other verbs."""
+"""Options of `gs2d paper`, `gs2d sweep` and `gs2d blocks`."""
 
 from __future__ import annotations
 
@@ -16,41 +16,40 @@ SWEEP = "sweep"  # the name of a table of chosen recipes
 
 @dataclass(frozen=True, kw_only=True)
 class TableOptions:
-    """Options of the commands that train and score many runs, and write a table of them."""
+    """Options of the commands that train and score many runs."""
 
     data: Annotated[Path, Arg(metavar="DIR")]
-    """A capture, or a folder of captures."""
+    """Capture, or folder of captures."""
     out: Annotated[Path, Arg(metavar="DIR")]
-    """Folder for runs, table and page. The command can be stopped and started again."""
+    """Folder for runs, table and page. The same command continues an interrupted one."""
     scenes: tuple[str, ...] = ()
-    """Only these captures, by the names of their folders."""
+    """Names of the captures to use (default: all)."""
     protocol: str = "auto"
     """Protocol of all captures (default: by the format of each)."""
     downscale: int | None = None
-    """Shrink the photographs by this integer (default: what the protocol says)."""
+    """Shrink the photographs by this integer factor (default: by protocol)."""
     schedule_scale: float = 1.0
-    """Fraction of the full schedule."""
+    """Fraction of the iterations of the recipe."""
     seeds: Annotated[tuple[int, ...], Arg(kind=str)] = (0,)
-    """Seeds, as 0,1,2; or a count: 3 is 0,1,2."""
+    """Seeds, such as 0,1,2, or a count: 3 means 0,1,2."""
     backend: str = "auto"
     """Rasterizer."""
     slots: Annotated[int | None, Arg(alias="--jobs")] = None
-    """Runs at the same time (default: one a GPU, else one)."""
+    """Number of parallel runs (default: one per GPU, else one)."""
     cluster: Annotated[str | None, Arg(metavar="ADDRESS")] = None
-    """Let the machines of a Ray cluster work, which share the disk of --out: HOST:PORT, or auto, the one that this
-    machine is of."""
+    """Run on a Ray cluster that shares the disk of --out: HOST:PORT, or auto for the cluster of this machine."""
     threads: int | None = None
-    """CPU threads of each of several runs (default: the cores divided among them)."""
+    """CPU threads per run (default: the cores divided by the number of parallel runs)."""
     cache: Annotated[Path | None, Arg(metavar="DIR")] = None
-    """Stage cache (default: in --out). Tables that share it train their common stages once."""
+    """Folder that keeps finished stages (default: in --out). Tables that share it train common stages once."""
     truth: Annotated[Path | None, Arg(metavar="DIR")] = None
-    """True surfaces, NAME.ply, for captures that have no mesh_gt.ply beside them."""
+    """Folder of true surfaces, NAME.ply, for captures without mesh_gt.ply."""
     lpips_weights: Path | None = None
-    """VGG-16 and LPIPS weights for the LPIPS metric."""
+    """VGG-16 and LPIPS weights; without them LPIPS is not computed."""
     overrides: Overrides = ()
-    """Change the recipes, as in `gs2d train`; reaches those that have the stage."""
+    """Change the recipes that have this stage; may be repeated."""
     train: bool = True
-    """Only write the table of what is there."""
+    """Only write the table of finished runs."""
 
     def __post_init__(self) -> None:
         paths_of(self, "data", "out", "cache", "truth", "lpips_weights")
@@ -60,22 +59,21 @@ class TableOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class PaperOptions(TableOptions):
-    """Which table of the paper, of which scenes, how."""
+    """Options of `gs2d paper`."""
 
     table: Annotated[
         Literal["regularisation", "benchmark", "k", "freeze", "modules", "absgs"],
         Arg(metavar="TABLE", positional=True),
     ]
-    """Which table: regularisation, benchmark, k, freeze, modules or absgs."""
+    """Table of the paper."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepOptions(TableOptions):
-    """Which recipes, on which scenes, how."""
+    """Options of `gs2d sweep`."""
 
     recipes: Annotated[tuple[str, ...], Arg(metavar="RECIPE [RECIPE ...]", positional=True)]
-    """Names that `gs2d recipes` lists, or files: mine.json, mine.py:name. Recipes that --out has already keep their
-    rows."""
+    """Recipes: names that `gs2d recipes` lists, or files (mine.json, mine.py:name)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -83,7 +81,7 @@ class SweepOptions(TableOptions):
 
     @property
     def table(self) -> str:
-        """The name of the table."""
+        """Return the name of the table."""
         return SWEEP
 
 
@@ -109,34 +107,32 @@ def parse_seeds(words: Iterable[str | int]) -> tuple[int, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class BlocksOptions(CommonTraining, Resources):
-    """What is trained in blocks, how it is cut, and where."""
+    """Options of `gs2d blocks`."""
 
     scene: Annotated[Path, Arg(metavar="CAPTURE", positional=True)]
-    """Folder of the capture, as in `gs2d train`."""
+    """Folder or .zip of a capture, as in `gs2d train`."""
     out: Annotated[Path, Arg(metavar="JOB")]
-    """Job folder, which becomes the run of the merged scene. The command can be stopped and given again."""
+    """Run folder of the merged scene. The same command continues an interrupted one."""
     blocks: str = "auto"
-    """Blocks along the ground, as 3x3, or in space, as 2x2x2; auto: none where one training of everything fits into
-    --memory, else as many as it needs."""
+    """Blocks on the ground, such as 3x3, or in space, such as 2x2x2 (auto: as many as --memory requires)."""
     partition: Annotated[tuple[str, ...], Arg(metavar="FIELD=VALUE", repeated=True)] = ()
-    """Change how it is cut, e.g. --partition margin=0.3, --partition coarse.side=800; may be repeated."""
+    """Change the partition, e.g. --partition margin=0.3; may be repeated."""
     slots: Annotated[int | None, Arg(alias="--jobs")] = None
-    """Runs at the same time (default: one a GPU, else one)."""
+    """Number of parallel runs (default: one per GPU, else one)."""
     cluster: Annotated[str | None, Arg(metavar="ADDRESS")] = None
-    """Let the machines of a Ray cluster work, which share the disk of --out: HOST:PORT, or auto, the one that this
-    machine is of."""
+    """Run on a Ray cluster that shares the disk of --out: HOST:PORT, or auto for the cluster of this machine."""
     format: str = "auto"
-    """Format of the capture: blender, nerfstudio, dtu, colmap, opensfm, metashape, alicevision, or a package's."""
+    """Format of the capture: blender, nerfstudio, dtu, colmap, opensfm, metashape, alicevision, or one of a package."""
     downscale: int = 1
-    """Shrink the photographs by this integer, area-filtered; the coarse model has smaller ones."""
+    """Shrink the photographs by this integer factor."""
     schedule_scale: float = 1.0
-    """Fraction of the full schedule, of each block."""
+    """Fraction of the iterations of the recipe, for each block."""
     backend: str = "auto"
-    """Rasterizer, as in `gs2d train`."""
+    """Rasterizer: auto (the fastest here), cpu, cuda or reference. `gs2d doctor` lists them."""
     seed: int = 0
-    """Seed of every random choice; the same seed gives the same bytes."""
+    """Random seed. The same seed gives the same bytes."""
     threads: int | None = None
-    """CPU threads, of each of several blocks (default: the cores divided among them)."""
+    """CPU threads per block (default: the cores divided by the number of parallel runs)."""
     masks: Annotated[Path | None, Arg(metavar="DIR")] = None
     """Folder of masks of the photographs, white = keep (default: where COLMAP, nerfstudio and Metashape put them)."""
 
@@ -149,5 +145,4 @@ class ReconstructAnywhereOptions(ReconstructOptions):
     """From photographs to a mesh, here or on a cluster."""
 
     cluster: Annotated[str | None, Arg(metavar="ADDRESS")] = None
-    """Let the machines of a Ray cluster work, which share the disk of --out: HOST:PORT, or auto, the one that this
-    machine is of."""
+    """Run on a Ray cluster that shares the disk of --out: HOST:PORT, or auto for the cluster of this machine."""
