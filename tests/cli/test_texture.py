@@ -33,7 +33,7 @@ def test_the_runs_mesh_gets_a_texture_of_what_the_photographs_show(
     assert run(["mesh", str(ball), "--texture", "--threads", "1"]) == 0
     out, _ = capsys.readouterr()
     assert "mesh.glb: 2,304 triangles" in out
-    assert "seen by no photograph" in out
+    assert "not visible in any photograph" in out
     assert (ball / "mesh.ply").read_bytes() == before
     assert 'href="mesh.glb"' in (ball / "report.html").read_text()
     scene = trimesh.load(ball / "mesh.glb")

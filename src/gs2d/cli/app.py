@@ -1,7 +1,7 @@
-"""From arguments to an exit code: 0 done, 2 the user can mend it (one line), 1 a fault of ours, 130 interrupted.
+"""Runs a command line and returns its exit code: 0 done, 1 internal error, 2 user error (one line), 130 interrupted.
 
-3 where the work is done and something that belongs to it could not be made, such as the report or a picture; 141 (as of
-a process that SIGPIPE ended) where the reader of a pipe went away: ``gs2d recipes | head -1``.
+3: the result is complete, but a part such as the report could not be written. 141: the reader of a pipe closed it, as in
+``gs2d recipes | head -1``.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ def _report(error: Exception, debug: bool) -> int:
         if (limit := address_space()) is not None:
             return _fail(f"out of memory: the address space is limited to {limit / 2**30:.2f} GiB; raise ulimit -v")
         if no_thread:
-            return _fail("no more threads or processes may be begun here; raise ulimit -u, or use fewer --threads")
+            return _fail("cannot start more threads or processes; raise ulimit -u, or use fewer --threads")
         return _fail("out of memory; use a larger --downscale, or fewer splats (--set STAGE.densify.max_splats=N)")
     text = " ".join(str(error).split()) or "no message"
     hint = "" if debug else "; run again with --debug and report it with the traceback"

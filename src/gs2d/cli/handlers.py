@@ -65,7 +65,7 @@ def plan(command: c.Plan, console: Console) -> None:
     again = shlex.join(["gs2d", "train", *_words_of(command, c.Train), *set_words(found.budget)])
     for line in found.lines():
         console.say(line)
-    console.say(f"train so: {again}")
+    console.say(f"train with: {again}")
     console.result({**asdict(found), "command": again})
 
 
@@ -162,7 +162,9 @@ def _textured_mesh(command: c.Mesh, mesh_options: Any, console: Console) -> None
     console.close()
     size, unseen = result["texture_size"], result["texels_unseen"] / max(result["texels"], 1)
     console.say(f"{result['files'][0]}: {result['faces']:,} triangles, {result['bytes'] / 1e6:.1f} MB")
-    console.say(f"texture {size}x{size} in {result['charts']:,} charts, {unseen:.2%} of it seen by no photograph")
+    console.say(
+        f"texture {size}x{size} in {result['charts']:,} charts, {unseen:.2%} of it not visible in any photograph"
+    )
     say_where_it_is(result, console)
     console.result(result)
 
@@ -171,7 +173,7 @@ def _refuse_texture_options(command: c.Mesh) -> None:
     """Refuse an option that would do nothing."""
     for name, default in values(TextureOptions, TextureOptions()).items():
         if getattr(command, name) != default:
-            raise ProtocolError(f"--{name.replace('_', '-')} belongs to --texture, which was not given; give both")
+            raise ProtocolError(f"--{name.replace('_', '-')} needs --texture; give both")
 
 
 def render(command: c.Render, console: Console) -> None:
@@ -235,7 +237,7 @@ def evaluate(command: c.Evaluate, console: Console) -> None:
         rows += score_rows("test, matched", result["test_matched"])
     if command.match_poses:
         rows += score_rows("test, aligned", result["test_aligned"])
-    console.table("", ["views", "pictures", "PSNR dB", "SSIM", "LPIPS 0..1", "LPIPS -1..1"], rows)
+    console.table("", ["views", "images", "PSNR dB", "SSIM", "LPIPS 0..1", "LPIPS -1..1"], rows)
     for split in ("train", "test"):
         reason = (result.get(split) or {}).get("lpips_reason") or result.get(f"{split}_reason")
         if reason:
@@ -270,7 +272,7 @@ def georeference(command: c.Georeference, console: Console) -> None:
         console.say(line)
     if found is not None:
         run = shlex.quote(str(command.run))
-        console.say(f"shown in report and page after: gs2d report {run}; gs2d page {run}")
+        console.say(f"to show it in report and page: gs2d report {run}; gs2d page {run}")
     if found is None:
         console.say("no georeference: --gps, --positions, --control, --known-distance or --markers finds one")
     console.result({"run": str(command.run), "georeference": None if found is None else found.to_json()})
@@ -287,7 +289,7 @@ def orthophoto(command: c.Orthophoto, console: Console) -> None:
     unseen = result["cells_unseen"] / result["cells"]
     console.say(
         f"{result['rows']:,} x {result['columns']:,} cells of {result['resolution']:g} m, {result['frame']}; "
-        f"{unseen:.0%} of the surface in colours of the mesh, as no photograph sees it"
+        f"{unseen:.0%} of the surface is not visible in any photograph and has the colours of the mesh"
     )
     console.result(result)
 

@@ -1,11 +1,11 @@
-"""What ``gs2d poses`` shows: how many photographs have a camera, which do not and why, and what to do next."""
+"""The output of ``gs2d poses``: photographs with and without a camera, and the next command."""
 
 from __future__ import annotations
 
 import shlex
 from typing import Any
 
-_MAX_LINES = 12  # of photographs without a place; poses.json has them all
+_MAX_LINES = 12  # of photographs without a camera; poses.json lists all
 
 
 def poses_lines(result: dict[str, Any]) -> list[str]:
@@ -19,9 +19,9 @@ def poses_lines(result: dict[str, Any]) -> list[str]:
     if len(result["cameras"]) > 4:
         lines.append(f"and {len(result['cameras']) - 4} more cameras, in poses.json")
     left_out = [row for row in result["photographs"] if not row["placed"]]
-    lines += [f"no place: {row['source']}: {row['reason']}" for row in left_out[:_MAX_LINES]]
+    lines += [f"no camera: {row['source']}: {row['reason']}" for row in left_out[:_MAX_LINES]]
     if len(left_out) > _MAX_LINES:
-        lines.append(f"no place: {len(left_out) - _MAX_LINES} more, in poses.json")
+        lines.append(f"no camera: {len(left_out) - _MAX_LINES} more, in poses.json")
     for other in result["other_models"]:
         lines.append(
             f"{other['folder']} holds a separate piece: {len(other['photos'])} photographs, {other['points']:,} points"

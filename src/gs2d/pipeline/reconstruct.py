@@ -245,6 +245,6 @@ def _lines(poses: dict[str, Any], capture: Path) -> list[str]:
     more = len(lost) - SHOWN_LOST
     return [
         f"{placed_line(poses)}; {capture / POSES_PNG} shows them",
-        *(f"no place: {row['source']}: {row['reason']}" for row in lost[:SHOWN_LOST]),
+        *(f"no camera: {row['source']}: {row['reason']}" for row in lost[:SHOWN_LOST]),
         *([f"... and {more} more without a place, in {capture / POSES_JSON}"] if more > 0 else []),
     ]
