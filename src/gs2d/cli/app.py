@@ -1,7 +1,7 @@
 """Runs a command line and returns its exit code: 0 done, 1 internal error, 2 user error (one line), 130 interrupted.
 
-3: the result is complete, but a part such as the report could not be written. 141: the reader of a pipe closed it, as in
-``gs2d recipes | head -1``.
+3: the result is complete, but a part such as the report could not be written. 141: the reader of a pipe closed it
+(``gs2d recipes | head -1``).
 """
 
 from __future__ import annotations
