@@ -36,7 +36,7 @@ from gs2d.evaluation.images import image_metrics, psnr_float
 from gs2d.pipeline.prepare.options import Training
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.resolve import build_recipe, robust_and_exposure, with_backdrop
-from gs2d.pipeline.prepare.run_exposures import Transforms, photographed
+from gs2d.pipeline.prepare.run_appearance import photographed
 from gs2d.render.api import rasterize
 from gs2d.render.exposure import fit_exposure
 from gs2d.render.types import RasterSettings
@@ -84,11 +84,11 @@ def measure(scene: Scene, trainer: Trainer) -> dict[str, Any]:
     """The figures of a trained scene."""
     settings, splats = trainer.settings, trainer.splats
     brightness = metered(splats, settings, trainer.backend)
-    transforms = with_predicted(trainer.learned.by_name(trainer.state.learned, "exposure"), scene, brightness)
-    tests = [_score(scene, view, splats, settings, transforms) for view in scene.test]
+    seen = with_predicted(trainer.scene_now(), brightness)
+    tests = [_score(scene, view, splats, settings) for view in seen.test]
     by_view = [score["psnr"] for score in tests]
-    chosen = scene.train[:: max(1, len(scene.train) // TRAINING_VIEWS)]
-    trains = [_score(scene, view, splats, settings, transforms) for view in chosen]
+    chosen = seen.train[:: max(1, len(scene.train) // TRAINING_VIEWS)]
+    trains = [_score(scene, view, splats, settings) for view in chosen]
     hidden = [score.pop("points") for score in tests]
     return {
         "test": {key: float(np.mean([score[key] for score in tests])) for key in ("psnr", "ssim", "fitted")},
@@ -103,11 +103,9 @@ def measure(scene: Scene, trainer: Trainer) -> dict[str, Any]:
     }
 
 
-def _score(
-    scene: Scene, view: View, splats: Splats, settings: RasterSettings, transforms: Transforms
-) -> dict[str, Any]:
+def _score(scene: Scene, view: View, splats: Splats, settings: RasterSettings) -> dict[str, Any]:
     output = rasterize(splats, view.camera, settings, backend="cpu")
-    color = photographed(view, output.color, transforms, settings.background)
+    color = photographed(view, output.color, settings.background)
     target, pixels = torch.from_numpy(view.target(settings.background)), view.mask()
     mask = None if pixels is None else torch.from_numpy(pixels)
     everywhere = torch.ones(target.shape[:2], dtype=torch.bool) if mask is None else mask

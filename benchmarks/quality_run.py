@@ -22,12 +22,12 @@ import torch
 
 from gs2d.core.json_files import write_json
 from gs2d.core.splats import Splats
+from gs2d.data import Scene
 from gs2d.errors import Gs2dError
 from gs2d.pipeline.events import ignore
 from gs2d.pipeline.prepare.limits import use_threads
 from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
 from gs2d.pipeline.prepare.options import TrainOptions
-from gs2d.pipeline.prepare.run_exposures import NONE, Transforms
 from gs2d.training import events
 from gs2d.training.learned.learned_table import LearnedTable
 from gs2d.training.state import TrainState
@@ -161,23 +161,20 @@ def _save(file: Path, state: TrainState, spent: Spent, course: list[dict[str, An
 
 def score(job: LoadedRun, state: TrainState) -> dict[str, Any]:
     """Return the scores of the test views (of the training views where there are none), and the size of the scene."""
-    learned = LearnedTable(job.recipe, job.scene).by_name(state.learned, "exposure")
-    return score_splats(job, state.splats, learned)
+    return score_splats(job, state.splats, LearnedTable(job.recipe, job.scene).scene_now(state.learned))
 
 
-def score_splats(job: LoadedRun, splats: Splats, learned: Transforms = NONE) -> dict[str, Any]:
-    """Return what :func:`score` does, of splats with the exposures that were learned with them."""
+def score_splats(job: LoadedRun, splats: Splats, learned: Scene | None = None) -> dict[str, Any]:
+    """Return what :func:`score` does, of splats with the scene as it was learned with them."""
     # Here, while the clocks stand still: a training does not need them.
     from benchmarks.street_runs import summary_of
     from gs2d.pipeline.finish.scoring import score_views
     from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 
-    views = job.scene.test or job.scene.train
     brightness = metered(splats, job.settings, job.backend)
-    exposures = with_predicted(learned, job.scene, brightness)
-    scores = score_views(
-        splats, views, job.settings, job.backend, name="", on_event=ignore, exposures=exposures, split="test"
-    )
+    scene = with_predicted(learned or job.scene, brightness)
+    views = scene.test or scene.train
+    scores = score_views(splats, views, job.settings, job.backend, name="", on_event=ignore, split="test")
     summary = dict(summary_of(scores) or {})
     summary.pop("psnr_by_view", None)
     size = float(splats.scales.max()) / job.scene.extent

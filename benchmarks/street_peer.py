@@ -42,7 +42,7 @@ from gs2d.errors import DataError
 from gs2d.evaluation.images import ImageMetrics, image_metrics
 from gs2d.pipeline.events import ignore
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
-from gs2d.pipeline.prepare.run_exposures import matched_by_halves
+from gs2d.pipeline.prepare.run_appearance import matched_by_halves
 
 OWN_ITERATIONS = 30_000
 OWN = {"refine-every": 500, "densify-from": 500, "sh-degree-interval": 1000}  # of 30,000 iterations

@@ -40,7 +40,6 @@ from gs2d.pipeline.finish.run_subject import sights, surface_reach
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
-from gs2d.pipeline.prepare.run_exposures import read_exposures
 from gs2d.pipeline.reconstruct import CAPTURE, FEW
 from gs2d.render.api import rasterize
 from gs2d.sfm.images import find_photos
@@ -221,18 +220,18 @@ def score_run(path: Path) -> dict[str, Any]:
     Test views have the exposure that the training photographs around them predict, as in the run's own scores, and none
     in "test_plain".
     """
-    run, job, splats = open_finished(path, None, ignore)
+    _, job, splats = open_finished(path, None, ignore)
     drawing = (job.settings, job.backend)
-    exposures = with_predicted(read_exposures(run, job.recipe), job.scene, metered(splats, *drawing))
+    scene = with_predicted(job.scene, metered(splats, *drawing))
 
     def scores(views: Sequence[View], **how: Any) -> dict[str, Any] | None:
         return summary_of(score_views(splats, views, *drawing, name="", on_event=ignore, **how))
 
     return {
-        "test": scores(job.scene.test, exposures=exposures),
+        "test": scores(scene.test),
         "test_plain": scores(job.scene.test),
         "test_matched": scores(job.scene.test, match=True),
-        "train": scores(job.scene.train, exposures=exposures),
+        "train": scores(scene.train),
         "hidden": hidden_fraction(job, splats),
         "splats": len(splats),
         "downscale": job.downscale,

@@ -40,7 +40,7 @@ from gs2d.pipeline.finish.run_texture import textured_mesh
 from gs2d.pipeline.prepare.loaded import finished_splats, reload_run
 from gs2d.pipeline.prepare.open_capture import read_scene
 from gs2d.pipeline.prepare.options import TextureOptions
-from gs2d.pipeline.prepare.run_exposures import NONE, Transforms, as_scene, read_exposures
+from gs2d.pipeline.prepare.run_appearance import as_scene
 
 SAMPLES = 2  # rays a pixel along each axis
 
@@ -90,13 +90,12 @@ def compare(
     views: Sequence[View],
     background: Sequence[float],
     pictures: Path | None,
-    exposures: Transforms = NONE,
 ) -> None:
     """Print the figures of each mesh, and write the pictures."""
     for name, mesh in meshes.items():
         figures = []
         for i, view in enumerate(views):
-            target = composite(as_scene(view, exposures), background)
+            target = composite(as_scene(view), background)
             drawn, covered = image(mesh, view.camera, background)
             alpha = view.alpha()
             both = (covered == 1) & (alpha == 1 if alpha is not None else True)
@@ -130,7 +129,7 @@ def main() -> None:
     arguments = parser.parse_args()
     run = open_run(arguments.run)
     job, splats, mesh = reload_run(run, lambda _event: None), finished_splats(run), read_mesh(run.file(MESH))
-    shrink, exposures = arguments.downscale or job.downscale, read_exposures(run, job.recipe)
+    shrink = arguments.downscale or job.downscale
     if shrink != job.downscale and job.scene.root is not None:
         scene = read_scene(job.scene.root, job.scene.format, shrink, job.protocol, lambda _event: None)
         job = replace(job, scene=scene, resolved=replace(job.resolved, downscale=shrink))
@@ -143,12 +142,12 @@ def main() -> None:
     for source in ("photographs", "renders"):
         options = TextureOptions(faces=arguments.faces, texture_size=arguments.size, texture_from=source)
         start, cpu = time.perf_counter(), time.process_time()
-        baked = textured_mesh(job, splats, mesh, options, exposures=exposures)
+        baked = textured_mesh(job, splats, mesh, options)
         took = f"{time.perf_counter() - start:.1f} s ({time.process_time() - cpu:.1f} s of CPU)"
         size, unseen = len(baked.mesh.texture), baked.unseen / baked.texels
         print(f"from {source}: {size}x{size}, {len(baked.mesh.faces):,} faces, {unseen:.2%} unseen, {took}", flush=True)
         meshes[f"from {source}"] = baked.mesh
-    compare(meshes, views[:: arguments.every], job.settings.background, arguments.pictures, exposures)
+    compare(meshes, views[:: arguments.every], job.settings.background, arguments.pictures)
 
 
 if __name__ == "__main__":

@@ -71,6 +71,9 @@ def test_a_run_uses_all_of_them_and_says_so(trained: Path) -> None:
     assert losses["example-tint"] > 0
     state = torch.load(sorted((trained / "checkpoints").glob("*.pt"))[-1], weights_only=True)["state"]
     assert state["learned"]["example-tint"]["values"].abs().max() > 0.005
+    views = json.loads((trained / "learned.json").read_text())["views"]
+    assert len(views) == 6
+    assert all(len(view["example-tint"]) == 3 for view in views.values())
     pruned = [event for event in events if event["kind"] == "densify"]
     assert [(event["iteration"], event["splats"]) for event in pruned] == [(3, 58)]
 

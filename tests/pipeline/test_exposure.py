@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from ball_runs import SMALL, options
 from gs2d.data import View
 from gs2d.data.image_files import read_image, write_image
 from gs2d.data.subject import OBJECT, read_subject
 from gs2d.errors import RunError
-from gs2d.io.run_dir import EXPOSURE, RunFolder
+from gs2d.io.run_dir import EXPOSURE, LEARNED, RunFolder
 from gs2d.pipeline.demo import demo
 from gs2d.pipeline.events import Event, Notice, ignore
 from gs2d.pipeline.finish.camera_paths import orbit_cameras
@@ -24,7 +26,6 @@ from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.loaded import open_finished
 from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, TrainOptions
-from gs2d.pipeline.prepare.run_exposures import read_exposures
 from gs2d.pipeline.train.train_run import train
 from gs2d.synthetic import capture as toy
 from gs2d.synthetic.perturb_exposure import GAINS, random_gains, with_gains
@@ -93,13 +94,12 @@ def test_the_transforms_lie_beside_the_run_and_their_mean_is_the_identity(run: R
 
 def test_training_views_are_scored_in_their_exposures_and_test_views_as_they_are(run: RunFolder) -> None:
     _, job, splats = open_finished(run.path, 1, ignore)
-    transforms = read_exposures(run, job.recipe)
     drawing = {"settings": job.settings, "backend": job.backend, "name": "", "on_event": ignore}
     last = run.metrics()["stages"][-1]
     for split, views in (("train", job.scene.train), ("test", job.scene.test)):
         plain, own = (
-            np.mean([m.psnr.value for m in score_views(splats, views, exposures=e, **drawing).values()])  # type: ignore[arg-type]
-            for e in ({}, transforms)
+            np.mean([m.psnr.value for m in score_views(splats, seen, **drawing).values()])  # type: ignore[arg-type]
+            for seen in ([replace(view, appearance={}) for view in views], views)
         )
         assert last[split]["psnr"] == pytest.approx(own)
         assert (plain == own) == (split == "test")
@@ -125,7 +125,7 @@ def test_any_view_can_be_rendered_in_the_exposure_of_a_photograph(run: RunFolder
     output = render_view(
         splats, View.from_arrays("0", camera, np.zeros((1, 1, 3), np.uint8)), job.settings, job.backend
     )
-    A, b = read_exposures(run, job.recipe)["train/r_1.png"].split([3, 1], dim=1)
+    A, b = torch.from_numpy(job.scene.train[1].appearance["exposure"]).float().split([3, 1], dim=1)
     alpha = output.alpha[..., None]
     light = (output.color - (1 - alpha)) @ A.T + alpha * b[:, 0]  # the white behind the ball is no photograph
     expected = 255 * (light + 1 - alpha).clamp(0, 1).numpy()
@@ -138,13 +138,15 @@ def test_any_view_can_be_rendered_in_the_exposure_of_a_photograph(run: RunFolder
 def test_a_lost_or_damaged_file_of_exposures_is_named_with_its_remedy(run: RunFolder, tmp_path: Path) -> None:
     copy = RunFolder(tmp_path / "copy")
     shutil.copytree(run.path, copy.path)
-    for damage in ('{"photographs": [{"name": "a"}]}', '{"photographs": [{"name": "a", "transform": [[1]]}]}', "{"):
-        copy.file(EXPOSURE).write_text(damage)
-        with pytest.raises(RunError, match="--resume"):
+    whole = copy.file(LEARNED).read_text()
+    for damage in ('{"views": {"a": [1]}}', '{"views": {"a": {"exposure": [[1]]}}}', "{", whole.replace("r_0", "r_99")):
+        copy.file(LEARNED).write_text(damage)
+        with pytest.raises(RunError, match=r"learned\.json must hold .*--resume"):
             evaluate_run(copy.path)
-    copy.file(EXPOSURE).unlink()
+    copy.file(LEARNED).unlink()
     with pytest.raises(RunError, match="--resume"):
         evaluate_run(copy.path)
+    copy.file(EXPOSURE).unlink()
     report_run(copy.path)
     assert "exposure.json is missing" in copy.file("report.html").read_text()
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +10,11 @@ import pytest
 import torch
 
 from ball_runs import SMALL, options
-from gs2d.core.photometry import CameraPhotometry
-from gs2d.errors import RunError
+from gs2d.core.photometry import reach_of
 from gs2d.io.run_dir import PHOTOMETRY, REPORT, RunFolder
 from gs2d.pipeline.events import Event, Notice, ignore
 from gs2d.pipeline.prepare.loaded import reload_run
-from gs2d.pipeline.prepare.run_exposures import as_scene, photographed
+from gs2d.pipeline.prepare.run_appearance import as_scene, photographed
 from gs2d.pipeline.train.train_run import train
 
 EARLY = (*SMALL, "photometry.start=5", "photometry.rate=0.02")
@@ -42,7 +39,9 @@ def test_every_view_has_the_light_of_its_camera_and_the_report_says_it(run: RunF
     job = reload_run(run, ignore)
     assert camera["photographs"] == [view.name for view in job.scene.views]
     for view in job.scene.views:
-        assert view.photometry == CameraPhotometry(tuple(camera["falloff"]), camera["reach"], 0.0)
+        falloff = view.appearance["vignetting"] * camera["reach"] ** np.array([2, 4, 6])
+        assert falloff == pytest.approx(np.array(camera["falloff"]))
+        assert view.appearance["response"] == 0
     assert max(map(abs, camera["falloff"])) > 0.005
     assert "Vignetting and response of the cameras" in run.file(REPORT).read_text()
     assert run.definition()["recipe"]["name"] == "2dgs-r-photometry"
@@ -50,32 +49,16 @@ def test_every_view_has_the_light_of_its_camera_and_the_report_says_it(run: RunF
 
 def test_what_is_rendered_and_taken_back_are_each_other_s_inverse(run: RunFolder) -> None:
     view = reload_run(run, ignore).scene.train[0]
-    view = view.through(CameraPhotometry((0.4, 0.0, 0.0), view.photometry.reach))  # type: ignore[union-attr]
+    reach = reach_of([view.camera])
+    view = view.with_appearance({"vignetting": np.array([0.4 / reach**2, 0.0, 0.0])})
     color = torch.full((view.camera.height, view.camera.width, 3), 0.5)
-    seen = photographed(replace(view), color, {}, (0.0, 0.0, 0.0))
+    seen = photographed(view, color, (0.0, 0.0, 0.0))
     alpha = torch.from_numpy(view.alpha())
     corner, middle = seen[0, 0, 0], seen[view.camera.height // 2, view.camera.width // 2, 0]
     assert float(corner) < 0.36  # 0.5 exp(-0.4) and a little
     assert float(middle) == pytest.approx(0.5, abs=0.01)
     assert alpha.shape == seen.shape[:2]
-    back, given = as_scene(view, {}), view.image()
+    back, given = as_scene(view), view.image()
     assert np.array_equal(back[..., 3], given[..., 3])
     assert (back[..., :3] >= given[..., :3]).all()
     assert back[0, :, :3].sum() >= given[0, :, :3].sum()
-
-
-def test_a_damaged_file_is_one_line_that_says_what_to_do(run: RunFolder, tmp_path: Path) -> None:
-    copy = RunFolder(Path(shutil.copytree(run.path, tmp_path / "run")))
-    whole = copy.file(PHOTOMETRY).read_text()
-    damages = {
-        whole.replace('"reach": ', '"reach": -'): "reach -",
-        whole.replace('"falloff"', '"fall"'): "must hold vignetting and response",
-        whole.replace("r_0.png", "r_99.png"): "must name each training photograph, got none of",
-        "{": "must hold vignetting and response",
-    }
-    for text, words in damages.items():
-        copy.file(PHOTOMETRY).write_text(text)
-        with pytest.raises(RunError, match=words) as caught:
-            reload_run(copy, ignore)
-        assert "--resume" in str(caught.value)
-        assert "\n" not in str(caught.value)

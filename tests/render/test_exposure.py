@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -13,7 +12,6 @@ from gs2d.render.exposure import (
     expose,
     fit_exposure,
     identity,
-    remove_exposure,
 )
 
 
@@ -83,13 +81,3 @@ def test_a_grey_picture_fits_without_wild_colours() -> None:
     found = fit_exposure(grey, 0.8 * grey, torch.ones(8, 8, dtype=torch.bool))
     assert expose(grey, found).flatten().tolist() == pytest.approx([0.4] * 192, abs=1e-3)
     assert (found - identity(found)).abs().max() < 0.1
-
-
-def test_a_photograph_goes_back_to_the_exposure_of_the_scene() -> None:
-    scene = np.array([[[40, 80, 120, 7], [100, 60, 20, 255]]], np.uint8)
-    transform = gains(1.5, 1.2, 0.8, 0.04).numpy()
-    image = scene.copy()
-    image[..., :3] = np.rint(scene[..., :3] * [1.5, 1.2, 0.8] + 255 * 0.04)
-    back = remove_exposure(image, transform)
-    assert np.abs(back.astype(int) - scene).max() <= 1  # rounded twice
-    assert np.array_equal(back[..., 3], scene[..., 3])

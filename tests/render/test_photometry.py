@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from gs2d.core.camera import Camera
-from gs2d.core.photometry import CameraPhotometry, reach_of, squared_radii
+from gs2d.core.photometry import reach_of, squared_radii
 from gs2d.render.exposure import expose, identity
-from gs2d.render.photometry import bend, remove_photometry, show, squares_of, vignetting
+from gs2d.render.photometry import bend, show, squares_of, vignetting
 
 CAMERA = Camera(8, 6, 10.0, 10.0, 4.0, 3.0, np.eye(4))
 
@@ -44,7 +44,6 @@ def test_light_is_whole_at_the_principal_point_and_falls_off_to_the_reach() -> N
     assert squares[0, 0] == pytest.approx((0.35**2 + 0.25**2) / 0.25)  # the middle of the corner's pixel
     a = torch.tensor([0.3, 0.1, 0.2])
     assert vignetting(torch.tensor([0.0, 1.0]), a).tolist() == pytest.approx([1.0, math.exp(-0.6)])
-    assert CameraPhotometry((0.3, 0.1, 0.2)).corner() == pytest.approx(math.exp(-0.6))
 
 
 def test_a_picture_of_half_the_size_has_the_same_light() -> None:
@@ -83,17 +82,3 @@ def test_the_background_stays() -> None:
     over_white, numbers = color * coverage[..., None] + (1 - coverage[..., None]), random(4)
     seen = photograph(over_white, 3 * identity(color), numbers, squares_of(CAMERA, 0.5, color), coverage, background)
     assert torch.allclose(seen[:, 4:], torch.ones(6, 4, 3, dtype=torch.float64))
-
-
-def test_a_photograph_is_taken_back_to_the_colours_of_the_scene() -> None:
-    scene = 0.2 + 0.5 * random(6, 8, 3, seed=4)
-    transform = identity(scene) + torch.tensor([[0.1, 0.02, 0.0, 0.03]] * 3, dtype=torch.float64)
-    photometry = CameraPhotometry((0.3, 0.1, 0.0), 0.5, 0.5)
-    numbers = torch.tensor([0.3, 0.1, 0.0, 0.5], dtype=torch.float64)
-    taken = photograph(scene, transform, numbers, squares_of(CAMERA, 0.5, scene))
-    image = np.rint(255 * taken.numpy()).astype(np.uint8)
-    back = remove_photometry(image, transform.numpy(), photometry, CAMERA)
-    assert np.abs(back / 255.0 - scene.numpy()).max() < 4 / 255  # one step of the photograph, through steep curves
-    with_alpha = np.concatenate([image, np.full((6, 8, 1), 7, np.uint8)], axis=2)
-    assert (remove_photometry(with_alpha, None, photometry, CAMERA)[..., 3] == 7).all()
-    assert remove_photometry(image, None, None, CAMERA) is image

@@ -13,16 +13,16 @@ from gs2d.config.presets import surface
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Exposure, LearningRates, Photometry, Recipe
 from gs2d.core.camera import look_at
-from gs2d.core.photometry import CameraPhotometry
+from gs2d.core.photometry import reach_of
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import camera_extent
-from gs2d.data.scene import PointCloud, Scene, View
+from gs2d.data.scene import Appearance, PointCloud, Scene, View
 from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.exposure import identity
 from gs2d.render.types import RasterSettings
 from gs2d.synthetic.perturb_exposure import random_gains
-from gs2d.training.learned.appearance import shown, shown_splats
+from gs2d.training.learned.appearance import numbers_of, shown, shown_splats, unshown
 from gs2d.training.learned.quantity import ImagePoints
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
@@ -51,14 +51,13 @@ def test_photographs_of_one_camera_share_its_light(scene: Scene) -> None:
     assert made.table.quantities["vignetting"].row_of == [0, 1, 0, 1, 0, 1]
     made.step("vignetting", 2, [5.0, -5.0, 1.0], 0.01)
     made.step("response", 2, [-1.0], 0.01)
-    seen = [view.photometry for view in made.table.scene_now(made.rows).train]
-    assert seen[0] == seen[2] == seen[4]
-    assert seen[0] is not None
-    assert seen[1] is not None
-    assert seen[0].falloff == pytest.approx((-0.01, 0.01, -0.01))
-    assert seen[0].shift == pytest.approx(0.005)  # half of the photographs are its own, and the mean is taken off
-    assert seen[1].falloff == (0, 0, 0)
-    assert seen[1].shift == pytest.approx(-0.005)
+    seen = [view.appearance for view in made.table.scene_now(made.rows).train]
+    powers = reach_of([scene.train[0].camera]) ** np.array([2.0, 4.0, 6.0])
+    for index in (0, 2, 4):
+        assert seen[index]["vignetting"] * powers == pytest.approx([-0.01, 0.01, -0.01])
+        assert seen[index]["response"] == pytest.approx(0.005)  # half of the photographs are its own
+    assert not seen[1]["vignetting"].any()
+    assert seen[1]["response"] == pytest.approx(-0.005)
     only = replace(short(), photometry=Photometry(response=False))
     assert [*Learner(only, views).rows] == ["vignetting"]
 
@@ -121,12 +120,20 @@ def test_errors_are_ranked_as_the_camera_shows_the_splats(scene: Scene) -> None:
     assert (darker.sh0 < even.sh0 - 0.01).any()
 
 
+def test_a_photograph_is_taken_back_to_the_colours_of_the_scene(scene: Scene) -> None:
+    color, at = 0.2 + 0.5 * torch.rand(SIZE, SIZE, 3, dtype=torch.float64), ImagePoints(scene.train[0].camera)
+    transform = identity(color) + torch.tensor([[0.1, 0.02, 0.0, 0.03]] * 3, dtype=torch.float64)
+    known = {"response": torch.tensor([0.5]), "exposure": transform, "vignetting": torch.tensor([0.3, 0.1, 0.0])}
+    known = {name: numbers.double() for name, numbers in known.items()}
+    assert torch.allclose(unshown(shown(color, known, at), known, at), color)
+
+
 # -- what it is worth ---------------------------------------------------------------------------------------------
 TRAIN, TEST = 24, 4
 FALLOFF = (0.35, 0.15, 0.0)
 
 
-def taken(lights: tuple[CameraPhotometry, ...], gains: np.ndarray) -> tuple[Scene, Splats]:
+def taken(lights: tuple[dict[str, torch.Tensor], ...], gains: np.ndarray) -> tuple[Scene, Splats]:
     """Matt splats in photographs of these gains, by cameras of these lights by turns, whose intrinsics differ."""
     truth = random_splats(120, seed=3)
     truth.shN.zero_()
@@ -141,7 +148,7 @@ def taken(lights: tuple[CameraPhotometry, ...], gains: np.ndarray) -> tuple[Scen
         with torch.no_grad():
             color = rasterize(truth, camera, RasterSettings(), backend="reference").color
             exposure = {"exposure": identity(color) * torch.from_numpy(gains[i]).float()[:, None]}
-            color = shown(color, exposure | light_of(lights[number]), ImagePoints(camera))
+            color = shown(color, exposure | lights[number], ImagePoints(camera))
         view = View.from_arrays(f"{i:03d}.png", camera, np.rint(255 * color.clamp(0, 1).numpy()).astype(np.uint8))
         views.append(replace(view, intrinsics=Intrinsics(SIZE, SIZE, 30.0 + number, 30.0, SIZE / 2, SIZE / 2)))
     scene = Scene(
@@ -156,19 +163,13 @@ def taken(lights: tuple[CameraPhotometry, ...], gains: np.ndarray) -> tuple[Scen
     return scene, truth
 
 
-def light_of(camera: CameraPhotometry) -> dict[str, torch.Tensor]:
-    """Numbers of a camera's light."""
-    falloff = torch.tensor(camera.falloff) / camera.reach ** torch.tensor([2.0, 4.0, 6.0])
-    return {"vignetting": falloff, "response": torch.tensor([camera.shift])}
-
-
-def learned(scene: Scene, truth: Splats, recipe: Recipe) -> tuple[float, list[CameraPhotometry | None]]:
+def learned(scene: Scene, truth: Splats, recipe: Recipe) -> tuple[float, list[Appearance]]:
     """PSNR of the test photographs after a training from the true splats, and what was found of the cameras."""
     state = begun(TrainState(truth.clone(), torch.Generator().manual_seed(0)), recipe, scene)
     trainer = Trainer(scene, recipe, GENERIC, backend="cpu", state=state)
     trainer.run()
     now = trainer.scene_now()
-    return held_out_psnr(now, trainer), [view.photometry for view in now.test]
+    return held_out_psnr(now, trainer), [view.appearance for view in now.test]
 
 
 def short_stage(iterations: int) -> Recipe:
@@ -180,29 +181,26 @@ def short_stage(iterations: int) -> Recipe:
 @needs_cpu
 def test_the_falloff_is_found_beside_exposures_and_new_views_gain_by_it() -> None:
     gains = np.concatenate([random_gains(TRAIN, 0), np.ones((TEST, 3))])
-    light = CameraPhotometry(FALLOFF, math.hypot(SIZE, SIZE) / 2 / 30)
-    scene, truth = taken((light,), gains)
+    powers = (math.hypot(SIZE, SIZE) / 2 / 30) ** torch.tensor([2.0, 4.0, 6.0])
+    scene, truth = taken(({"vignetting": torch.tensor(FALLOFF) / powers},), gains)
     plain = replace(short_stage(600), exposure=Exposure(decay_steps=600, start=0))
     light = Photometry(response=False, rate=0.01, rate_final=1e-3, decay_steps=600, start=0)
     without, _ = learned(scene, truth, plain)
     score, (found, *_) = learned(scene, truth, replace(plain, photometry=light))
-    assert found is not None
     assert score > without + 8  # measured: 35.4 and 51.7 dB
-    assert found.corner() == pytest.approx(math.exp(-0.5), rel=0.08)  # measured: 0.583 for 0.607
+    corner = math.exp(-(found["vignetting"] * powers.numpy()).sum())
+    assert corner == pytest.approx(math.exp(-0.5), rel=0.08)  # measured: 0.583 for 0.607
 
 
 @needs_cpu
 def test_the_curves_of_two_cameras_are_found_and_new_views_gain_by_it() -> None:
-    reach = math.hypot(SIZE, SIZE) / 2 / 30
-    lights = CameraPhotometry(reach=reach, shift=0.5), CameraPhotometry(reach=reach, shift=-0.5)
+    lights = {"response": torch.tensor([0.5])}, {"response": torch.tensor([-0.5])}
     scene, truth = taken(lights, np.ones((TRAIN + TEST, 3)))
     light = Photometry(vignetting=False, rate=0.01, rate_final=1e-3, decay_steps=600, start=0)
     without, _ = learned(scene, truth, short_stage(600))
     score, (first, second, *_) = learned(scene, truth, replace(short_stage(600), photometry=light))
-    assert first is not None
-    assert second is not None
     assert score > without + 20  # measured: 21.2 and 55.6 dB
-    assert (first.shift, second.shift) == pytest.approx((0.5, -0.5), abs=0.03)  # measured: within 0.002
+    assert (*first["response"], *second["response"]) == pytest.approx((0.5, -0.5), abs=0.03)  # measured: within 0.002
 
 
 def held_out_psnr(scene: Scene, trainer: Trainer) -> float:
@@ -211,8 +209,7 @@ def held_out_psnr(scene: Scene, trainer: Trainer) -> float:
     for view in scene.test:
         with torch.no_grad():
             color = rasterize(trainer.splats, view.camera, trainer.settings, backend="cpu").color
-            known = {} if view.photometry is None else light_of(view.photometry)
-            color = shown(color, known, ImagePoints(view.camera))
+            color = shown(color, numbers_of(view, color), ImagePoints(view.camera))
         target = torch.from_numpy(view.target(GENERIC.background))
         errors.append(float((color.clamp(0, 1) - target).square().mean()))
     return float(-10 * np.log10(np.mean(errors)))

@@ -15,13 +15,15 @@ from gs2d.core.camera import Camera, Zoom
 from gs2d.core.checks import check_shapes
 from gs2d.core.images import composite
 from gs2d.core.memory import trim
-from gs2d.core.photometry import CameraPhotometry
 from gs2d.data.cache import DecodedImage, ImageCache
 from gs2d.data.masks import Masks
 from gs2d.data.priors import UNOBSERVED, ObservedPoints, PriorMaps
 from gs2d.data.straighten import straightened_picture
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
+
+Appearance = Mapping[str, np.ndarray]
+"""Numbers of a view by the name of the quantity."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -46,8 +48,9 @@ class View:
         Of the photograph's file, before its lens was taken out and before it was shrunk; None: as ``camera``.
     zoom : Zoom or None
         What training has made of the intrinsics of ``camera`` since they were read; None: nothing.
-    photometry : CameraPhotometry or None
-        What training has found of the vignetting and the response of its camera; None: nothing.
+    appearance : mapping of name to ndarray
+        What training has learned of how the photograph shows the colours of the scene: numbers of each quantity
+        (``gs2d.training.learned``).
     is_face : bool
         Whether it was cut out of a panorama or a wide fisheye (``data/faces.py``): its axis is not that of a lens.
     """
@@ -60,7 +63,7 @@ class View:
     maps: PriorMaps | None = None
     intrinsics: Intrinsics | None = None
     zoom: Zoom | None = None
-    photometry: CameraPhotometry | None = None
+    appearance: Appearance = field(default_factory=dict)
     is_face: bool = False
 
     @classmethod
@@ -94,9 +97,9 @@ class View:
             return seen
         return replace(seen, decode=lambda: straightened_picture(self._image(), now, lens))
 
-    def through(self, photometry: CameraPhotometry) -> View:
-        """Return the same photograph, with what is known of its camera's light."""
-        return self._sharing(photometry=photometry)
+    def with_appearance(self, found: Appearance) -> View:
+        """Return the same photograph, with more that is known of how it shows colours."""
+        return self._sharing(appearance={**self.appearance, **found})
 
     def _sharing(self, **changes: Any) -> View:
         """Return a view with other facts whose picture stays in the cache of this one."""
@@ -300,13 +303,13 @@ class Scene:
         train = tuple(moved(view, poses.get(view.name)) for view in self.train)
         return replace(self, train=train, test=tuple(moved(view, None) for view in self.test))
 
-    def with_photometries(self, found: Mapping[str, CameraPhotometry]) -> Scene:
-        """Return the scene with what is known of the light of cameras, by the names of their views."""
+    def with_appearance(self, found: Mapping[str, Appearance]) -> Scene:
+        """Return the scene with what is known of how its photographs show colours, by the name of the view."""
 
-        def lit(views: tuple[View, ...]) -> tuple[View, ...]:
-            return tuple(view.through(found[view.name]) if view.name in found else view for view in views)
+        def seen(views: tuple[View, ...]) -> tuple[View, ...]:
+            return tuple(view.with_appearance(found[view.name]) if view.name in found else view for view in views)
 
-        return replace(self, train=lit(self.train), test=lit(self.test))
+        return replace(self, train=seen(self.train), test=seen(self.test))
 
     def downscaled(self, factor: int) -> Scene:
         """Return the scene with training photographs of 1 / ``factor`` of their size; test views stay as they are."""

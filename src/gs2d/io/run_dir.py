@@ -8,7 +8,7 @@
       checkpoints/   <stage number>-<stage>-<iteration>.pt (the last two), <stage number>-<stage>-end.pt (all)
       metrics.json  splats.ply  mesh.ply  mesh.glb (textured, if asked for)  renders/  report.html
       scene.html     the splats as a page for any browser, if asked for
-      exposure.json  poses.json  photometry.json  what was learned of photographs and cameras, where the recipe does
+      poses.json  learned.json  exposure.json  photometry.json  what was learned of photographs and cameras
       subject.json   what the cameras look at (data.subject.read_subject)
       georeference.json  where the run is in the world, if that was found (io.georeference)
       .lock          held by the process that trains; the kernel frees it when that process dies
@@ -51,7 +51,7 @@ CHECKPOINTS, RENDERS, SURFACE = "checkpoints", "renders", "surface"
 LOSSES = "losses"  # in RENDERS
 SPLATS, MESH, TEXTURED, REPORT, PAGE = "splats.ply", "mesh.ply", "mesh.glb", "report.html", "scene.html"
 EXPOSURE, POSES, SUBJECT, VERDICT = "exposure.json", "poses.json", "subject.json", "verdict.json"
-PHOTOMETRY = "photometry.json"
+PHOTOMETRY, LEARNED = "photometry.json", "learned.json"
 GEOREFERENCE = "georeference.json"
 FORMAT = 2
 KEPT_CHECKPOINTS = 2
@@ -201,8 +201,8 @@ class RunFolder:
         """Delete what a run writes, and nothing else; ``run.json`` last, so that a killed clear can be repeated."""
         for name in (CHECKPOINTS, RENDERS, SURFACE):
             shutil.rmtree(self.file(name), ignore_errors=True)
-        results = (SPLATS, EXPOSURE, POSES, PHOTOMETRY, SUBJECT, VERDICT, GEOREFERENCE, MESH, TEXTURED, REPORT, PAGE)
-        for name in (EVENTS, METRICS, *results, RUN_JSON):
+        results = (SPLATS, SUBJECT, VERDICT, GEOREFERENCE, MESH, TEXTURED, REPORT, PAGE)
+        for name in (EVENTS, METRICS, EXPOSURE, POSES, PHOTOMETRY, LEARNED, *results, RUN_JSON):
             self.file(name).unlink(missing_ok=True)
 
     def discard(self) -> None:

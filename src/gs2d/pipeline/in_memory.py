@@ -6,12 +6,10 @@ The same pieces as behind the commands, in the same order and with the same defa
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
-
-from torch import Tensor
 
 from gs2d.config.presets import DEFAULT_RECIPE
 from gs2d.config.protocols import Protocol
@@ -49,15 +47,13 @@ class Trained:
     ----------
     splats : Splats
     scene : Scene
-        With the poses that were learned, where the recipe learns them.
+        With what was learned of images and cameras: poses, ``View.appearance``.
     protocol : Protocol
     settings : RasterSettings
         The rasterizer's constants in training: near, far, background.
     backend : Backend
     recipe : Recipe or None
         As it was trained; None for splats from elsewhere.
-    exposures : mapping of name to Tensor [3, 4]
-        Of the training images, where the recipe learns them.
     """
 
     splats: Splats
@@ -66,7 +62,6 @@ class Trained:
     settings: RasterSettings
     backend: Backend
     recipe: Recipe | None = None
-    exposures: Mapping[str, Tensor] = field(default_factory=dict)
 
 
 def train(
@@ -147,8 +142,7 @@ def train(
         scene, rules, chosen = opened.scene, opened.protocol, opened.backend
         trainer = Trainer(scene, fitted, rules, backend=chosen, on_event=tell)
         trainer.run()
-    exposures = trainer.learned.by_name(trainer.state.learned, "exposure")
-    return Trained(trainer.splats, trainer.scene_now(), rules, trainer.settings, chosen, trainer.recipe, exposures)
+    return Trained(trainer.splats, trainer.scene_now(), rules, trainer.settings, chosen, trainer.recipe)
 
 
 def _finished(
@@ -207,7 +201,8 @@ def evaluate(
     finished = _finished(trained, scene, protocol, backend, on_event)
     if split not in ("test", "train"):
         raise DataError(f"split must be 'test' or 'train', got {split!r}")
-    views = finished.scene.test if split == "test" else finished.scene.train
+    scene = with_predicted(finished.scene, metered(finished.splats, finished.settings, finished.backend))
+    views = scene.test if split == "test" else scene.train
     if not views:
         raise DataError(
             f"scene {finished.scene.name} has no {split} views to score; load it with test_every=8, or take "
@@ -221,11 +216,6 @@ def evaluate(
         name=f"scoring {split} views",
         on_event=on_event,
         lpips=lpips,
-        exposures=with_predicted(
-            finished.exposures,
-            finished.scene,
-            metered(finished.splats, finished.settings, finished.backend),
-        ),
         split=split,
     )
     return mean_metrics(list(scores.values()))

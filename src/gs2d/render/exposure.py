@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -145,12 +144,3 @@ def fit_exposure(
     missing = (wanted - light)[pixels]  # [P, 3]
     normal = rows.T @ rows + RIDGE * max(len(rows), 1) * torch.eye(4, dtype=rows.dtype, device=rows.device)
     return (identity(rows) + torch.linalg.solve(normal, rows.T @ missing).T).to(color.dtype)
-
-
-def remove_exposure(image: np.ndarray, transform: np.ndarray) -> np.ndarray:
-    """Return a photograph uint8 [H, W, 3 or 4] in the exposure of the scene: A^-1 (P - b), rounded; alpha stays."""
-    back = np.linalg.inv(transform[:, :3].astype(np.float64))
-    color = (image[..., :3] / 255.0 - transform[:, 3]) @ back.T
-    result = image.copy()
-    result[..., :3] = np.rint(255 * np.clip(color, 0, 1))
-    return result

@@ -15,10 +15,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gs2d.core.camera import Camera
-from gs2d.core.photometry import CameraPhotometry, squared_radii
+from gs2d.core.photometry import squared_radii
 from gs2d.kernels.library import library_for
 from gs2d.render import photometry_native as native
-from gs2d.render.exposure import remove_exposure
 
 
 def squares_of(camera: Camera, reach: float, like: Tensor) -> Tensor:
@@ -109,28 +108,3 @@ def bend(values: Tensor, shift: Tensor) -> Tensor:
 def vignetting(squares: Tensor, falloff: Tensor) -> Tensor:
     """Return what is left of the light at squared radii."""
     return (-squares * (falloff[0] + squares * (falloff[1] + squares * falloff[2]))).exp()
-
-
-def remove_photometry(
-    image: np.ndarray, transform: np.ndarray | None, photometry: CameraPhotometry | None, camera: Camera
-) -> np.ndarray:
-    """Return a photograph uint8 [H, W, 3 or 4] in the colours of the scene, rounded; alpha stays.
-
-    Parameters
-    ----------
-    transform : ndarray [3, 4], optional
-        Of its exposure; without it the mean one.
-    photometry : CameraPhotometry, optional
-    camera : Camera
-        At the size of the picture.
-    """
-    if photometry is None:
-        return image if transform is None else remove_exposure(image, transform)
-    transform = np.eye(3, 4) if transform is None else transform.astype(np.float64)
-    seen, result = torch.from_numpy(image[..., :3] / 255.0), image.copy()
-    light = bend(seen, torch.tensor(-photometry.shift, dtype=torch.float64)).numpy()
-    light = (light - transform[:, 3]) @ np.linalg.inv(transform[:, :3]).T
-    squares = squares_of(camera, photometry.reach, seen)
-    left = vignetting(squares, torch.tensor(photometry.falloff, dtype=torch.float64)).numpy()[..., None]
-    result[..., :3] = np.rint(255 * np.clip(light / left, 0, 1))
-    return result

@@ -44,7 +44,7 @@ from gs2d.pipeline.prepare.options import CommonTraining, TrainOptions, values
 from gs2d.pipeline.prepare.part import Part
 from gs2d.pipeline.prepare.resolve import check_options
 from gs2d.pipeline.prepare.resolved import difference
-from gs2d.pipeline.prepare.run_exposures import read_exposures
+from gs2d.pipeline.prepare.run_appearance import with_learned_appearance
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.trainer import raster_settings
 
@@ -129,13 +129,12 @@ class PartitionTask(BlocksTask):
         splats = finished_splats(coarse).to(settled.backend.device)
         found = split_model(
             splats,
-            settled.scene,
+            with_learned_appearance(coarse, settled.recipe, settled.scene),
             self.partition(),
             raster_settings(settled.protocol, settled.scene.extent, settled.recipe.sh_degree),
             settled.backend,
             partition_folder(out),
             on_event,
-            read_exposures(coarse, settled.recipe),
         )
         return {"blocks": {block.name: len(block.views) for block in found.blocks}}
 

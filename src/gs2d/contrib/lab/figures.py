@@ -22,12 +22,12 @@ from gs2d.io.run_dir import RunFolder, load_tensors, make_folder, open_run
 from gs2d.pipeline.events import Notice, OnEvent, counted, ignore
 from gs2d.pipeline.finish.run_images import choose_views, fraction_of_group, render_view, splatted
 from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats, reload_run
-from gs2d.pipeline.prepare.run_exposures import numbers_of, photographed, read_exposures
+from gs2d.pipeline.prepare.run_appearance import photographed
 from gs2d.pipeline.train.resume import stage_end
 from gs2d.render.api import splat_errors
 from gs2d.report.images import ERROR_TOP, error_image, error_scale, highlight_image, valid_image
 from gs2d.report.plots import Panel, compared, read_history
-from gs2d.training.learned.appearance import shown_splats
+from gs2d.training.learned.appearance import numbers_of, shown_splats
 from gs2d.training.rank_clone import worst
 from gs2d.training.state import TrainState
 
@@ -168,11 +168,11 @@ def rank_run(run: RunFolder, job: LoadedRun, on_event: OnEvent = ignore) -> Rank
     splats, group, when = _ranked(run, job, index, action)
     splats = splats.to(job.backend.device)
     total = torch.zeros(len(splats), dtype=torch.float64, device=splats.device)
-    views, transforms = job.scene.train, read_exposures(run, job.recipe)
+    views = job.scene.train
     for view in counted(views, "errors of each splat", len(views), on_event):
         seen, settings = splats, job.settings
-        if view.name in transforms or view.photometry is not None:  # those of the end: after stage 1 they hardly move
-            numbers = numbers_of(view, transforms, splats.means)
+        if view.appearance:  # that of the end: after stage 1 it hardly changes
+            numbers = numbers_of(view, splats.means)
             seen = shown_splats(splats, view.camera, numbers, settings.sh_degree)
             settings = replace(settings, sh_degree=0)
         image = torch.from_numpy(view.target(job.settings.background)).to(splats.means)
@@ -244,7 +244,7 @@ def draw_error_maps(
 ) -> None:
     """Write the E_i map of one run as a PNG: a row for each view."""
     job = reload_run(run, on_event, backend=backend)
-    ranking, transforms = rank_run(run, job, on_event), read_exposures(run, job.recipe)
+    ranking = rank_run(run, job, on_event)
     limits = map_limits(ranking.errors)
     positions = error_positions(ranking.errors, limits)
     shown = choose_views(job.scene, views)
@@ -255,7 +255,7 @@ def draw_error_maps(
     rows: list[tuple[str, list[np.ndarray]]] = []
     for (split, view), fraction in zip(shown, fractions, strict=True):
         output = render_view(ranking.splats, view, job.settings, job.backend)
-        own = photographed(view, output.color, transforms, job.settings.background)
+        own = photographed(view, output.color, job.settings.background)
         color, alpha = np.clip(own.cpu().numpy(), 0, 1), output.alpha.cpu().numpy()
         photo = view.target(job.settings.background)
         images = [

@@ -32,7 +32,7 @@ from gs2d.pipeline.prepare.part import OWN, read_start
 from gs2d.pipeline.prepare.photographs import with_prepared
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.resolved import CaptureRecord, Execution, ResolvedRun
-from gs2d.pipeline.prepare.run_exposures import read_exposures, write_exposures
+from gs2d.pipeline.prepare.run_appearance import with_learned_appearance, write_appearance
 from gs2d.pipeline.train.train_run import finish
 from gs2d.training.trainer import raster_settings
 
@@ -69,13 +69,12 @@ def write_merged(settled: Settled, options: TrainOptions, partition: Partition, 
         views = split_seams(
             splats.to(settled.backend.device),
             read_split(partition_folder(out)),
-            settled.scene,
+            with_learned_appearance(open_run(coarse_folder(out)), settled.recipe, settled.scene),
             partition,
             raster_settings(settled.protocol, settled.scene.extent, settled.recipe.sh_degree),
             settled.backend,
             partition_folder(out),
             on_event,
-            read_exposures(open_run(coarse_folder(out)), settled.recipe),
         )
     write_splats(out / MERGED, splats)
     write_json(out / SEAM_VIEWS, {"views": list(views)})
@@ -106,9 +105,8 @@ def write_result(settled: Settled, options: TrainOptions, partition: Partition, 
         splats = rest.followed_by(finished_splats(open_run(seam_folder(options.out))))
     definition = merged_run(settled, options, settled.scene).resolved.to_json()
     run.write_definition({**definition, "partition": partition_json(partition)})
-    if settled.recipe.exposure is not None:
-        coarse = open_run(coarse_folder(options.out))
-        write_exposures(run, read_exposures(coarse, settled.recipe), on_event)
+    coarse = open_run(coarse_folder(options.out))
+    write_appearance(run, with_learned_appearance(coarse, settled.recipe, settled.scene), on_event)
     run.events.cut(0)
     write_splats(run.file(SPLATS), splats)
     return len(splats)
@@ -140,13 +138,13 @@ def finish_merged(settled: Settled, options: TrainOptions, on_event: OnEvent) ->
     scene = with_prepared(settled.scene, options.out, execution, on_event, shared=True)
     loaded = merged_run(settled, options, scene)
     splats = read_splats(run.file(SPLATS)).to(loaded.backend.device)
-    brightness = metered(splats, loaded.settings, loaded.backend)
-    exposures = with_predicted(read_exposures(run, loaded.recipe), scene, brightness)
+    known = with_learned_appearance(run, loaded.recipe, scene)
+    seen = with_predicted(known, metered(splats, loaded.settings, loaded.backend))
     entry = {**_spent(options.out), "splats": len(splats), "bytes": splats.nbytes}
     collected = Collector(scene)
     hold()
     with MeshFrames(loaded) as frames:
-        for split, views in (("train", scene.train), ("test", scene.test)):
+        for split, views in (("train", seen.train), ("test", seen.test)):
             scores = score_views(
                 splats,
                 views,
@@ -154,14 +152,13 @@ def finish_merged(settled: Settled, options: TrainOptions, on_event: OnEvent) ->
                 loaded.backend,
                 name=f"scoring {split} views",
                 on_event=on_event,
-                exposures=exposures,
                 split=split,
                 visitors=[frames.visit, collected.visit],
             )
             entry |= split_metrics(scores, split)
-        shown = choose_views(scene)
+        shown = choose_views(seen)
         with attempted(f"pictures of {STAGE}", None, on_event):
-            draw_stage(run, loaded, shown, STAGE, splats, None, exposures)
+            draw_stage(run, loaded, shown, STAGE, splats, None)
         release(scene)
         entry["peak_memory_bytes"] = max(entry["peak_memory_bytes"], memory.read())
         run.write_metrics({"stages": [entry], "surface": None})

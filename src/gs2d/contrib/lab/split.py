@@ -19,7 +19,6 @@ from gs2d.data import Scene, View
 from gs2d.errors import DataError, RunError
 from gs2d.pipeline.events import Notice, OnEvent, counted
 from gs2d.pipeline.prepare.part import FROZEN, OWN, write_start
-from gs2d.pipeline.prepare.run_exposures import Transforms
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 from gs2d.training.seen_area import shown_weights, shrunk
@@ -105,7 +104,6 @@ def split_model(
     backend: Backend,
     folder: Path,
     on_event: OnEvent,
-    exposures: Transforms,
 ) -> Split:
     """Cut a coarse model and write what each block trains: ``BLOCK.npz``, and at last ``cells.json``.
 
@@ -119,8 +117,6 @@ def split_model(
         Of training.
     backend : Backend
     folder : Path
-    exposures : mapping of view name to Tensor [3, 4]
-        What the coarse model found; empty where it looked for none.
 
     Raises
     ------
@@ -152,7 +148,7 @@ def split_model(
         if why:
             on_event(Notice(f"block {name} is not trained: {why}; it stays as the coarse model has it ({core} splats)"))
         rows = FROZEN * frozen.astype(np.uint8) + OWN * own.astype(np.uint8)
-        known = np.stack([exposures[view].cpu().numpy() for view in views]) if exposures and views else None
+        known = _exposures(scene, views)
         write_start(start_file(folder, name), rows, known)
         extent = camera_extent([scene.train[i].camera for i in chosen]) if len(chosen) > 1 else scene.extent
         counts = {"floor": len(floor), "own": int(own.sum()), "frozen": int(frozen.sum()), "core": core}
@@ -172,7 +168,6 @@ def split_seams(
     backend: Backend,
     folder: Path,
     on_event: OnEvent,
-    exposures: Transforms,
 ) -> tuple[str, ...]:
     """Write which splats of a merged scene learn once more, those at seams that are seen; arguments as of a model.
 
@@ -191,9 +186,15 @@ def split_seams(
     chosen = [view.name for view, share in zip(scene.train, shares, strict=True) if share >= partition.min_share / 2]
     own = strip & seen
     rows = np.where(own, OWN, FROZEN).astype(np.uint8)
-    known = np.stack([exposures[view].cpu().numpy() for view in chosen]) if exposures and chosen else None
+    known = _exposures(scene, chosen)
     write_start(start_file(folder, SEAMS), rows, known)
     return tuple(chosen) if own.any() else ()
+
+
+def _exposures(scene: Scene, names: Sequence[str]) -> np.ndarray | None:
+    """Return the transforms [V, 3, 4] of some training views; None if none were learned."""
+    known = {view.name: view.appearance["exposure"] for view in scene.train if "exposure" in view.appearance}
+    return np.stack([known[name] for name in names]) if known and names else None
 
 
 class Looks:

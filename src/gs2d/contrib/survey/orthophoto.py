@@ -26,7 +26,6 @@ from gs2d.pipeline.finish.run_texture import photographs
 from gs2d.pipeline.finish.world_frame import place_of
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.options import OrthophotoOptions
-from gs2d.pipeline.prepare.run_exposures import Transforms, read_exposures
 
 ELEVATION = "_elevation"  # after the name of the orthophoto
 MAX_CELLS = 36_000_000  # a colour's choice takes about 70 bytes a cell: 2.5 GB
@@ -80,12 +79,12 @@ def orthophoto_run(
     mesh = read_mesh(path / MESH)
     if not len(mesh.faces):
         raise RunError(f"{path / MESH} has no triangles to look at; extract it again with `gs2d mesh {path}`")
-    run, job, _ = open_finished(path, threads, on_event)
+    _, job, _ = open_finished(path, threads, on_event)
     local = place.to_local(mesh.vertices)
     raster = _raster(local, options.resolution, _pixel(job, mesh) * place.scale)
     on_event(Phase("looking from above", 0))
     hits = cast_down(local, mesh.faces, raster.corner, raster.step, raster.size)
-    colors, unseen = _colors(job, mesh, hits, read_exposures(run, job.recipe), on_event)
+    colors, unseen = _colors(job, mesh, hits, on_event)
     _write(files, colors, _elevations(local, mesh, hits, place), raster, place)
     return {
         "files": [str(file) for file in files],
@@ -135,7 +134,7 @@ def _raster(local: np.ndarray, resolution: float | None, pixel: float) -> Raster
     return Raster(corner, resolution, (int(rows), int(columns)))
 
 
-def _colors(job: LoadedRun, mesh: Mesh, hits: Hits, exposures: Transforms, on_event: OnEvent) -> tuple[np.ndarray, int]:
+def _colors(job: LoadedRun, mesh: Mesh, hits: Hits, on_event: OnEvent) -> tuple[np.ndarray, int]:
     """Return colours [H, W, 4] uint8 with alpha 0 where there is no surface, and how many cells no photograph sees."""
     height, width = hits.face.shape
     index = np.flatnonzero(hits.face.reshape(-1) >= 0)
@@ -145,7 +144,7 @@ def _colors(job: LoadedRun, mesh: Mesh, hits: Hits, exposures: Transforms, on_ev
         hits.face.reshape(-1)[index],
         np.ascontiguousarray(hits.weights.reshape(-1, 3)[index, :2]),
     )
-    images = partial(photographs, job, job.scene.train, exposures, on_event)
+    images = partial(photographs, job, job.scene.train, on_event)
     found, seen = surface_colors(mesh, texels, images, threads=torch.get_num_threads())
     if mesh.colors is not None and not seen.all():
         found[~seen] = np.rint(texels.interpolated(mesh.colors, mesh.faces))[~seen].astype(np.uint8)

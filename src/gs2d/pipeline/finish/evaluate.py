@@ -22,7 +22,6 @@ from gs2d.pipeline.finish.verdict import Collector, write_verdict
 from gs2d.pipeline.prepare.loaded import open_finished
 from gs2d.pipeline.prepare.options import EvaluateOptions
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
-from gs2d.pipeline.prepare.run_exposures import read_exposures
 from gs2d.pipeline.prepare.run_poses import aligned
 
 
@@ -51,7 +50,7 @@ def evaluate_run(
     if truth is not None and not has_mesh and given is not None:
         raise RunError(f"{path} has no {MESH}; make it with `gs2d mesh {path}`")
     drawing = (loaded.settings, loaded.backend)
-    exposures = with_predicted(read_exposures(run, loaded.recipe), loaded.scene, metered(splats, *drawing))
+    scene = with_predicted(loaded.scene, metered(splats, *drawing))
     if options.match_exposure:
         name = "scoring test views, colours matched"
         scores = score_views(splats, loaded.scene.test, *drawing, name=name, on_event=on_event, lpips=lpips, match=True)
@@ -62,9 +61,9 @@ def evaluate_run(
         scores = score_views(splats, best, *drawing, name=name, on_event=on_event, lpips=lpips)
         result |= split_metrics(scores, "test_aligned", "test")
     collected = Collector(loaded.scene)
-    for split, views in (("train", loaded.scene.train), ("test", loaded.scene.test)):
+    for split, views in (("train", scene.train), ("test", scene.test)):
         name = f"scoring {split} views"
-        more: dict[str, Any] = {"exposures": exposures, "split": split, "visitors": [collected.visit]}
+        more: dict[str, Any] = {"split": split, "visitors": [collected.visit]}
         scores = score_views(splats, views, *drawing, name=name, on_event=on_event, lpips=lpips, **more)
         result |= split_metrics(scores, split)
         result[f"{split}_views"] = {view: metrics.to_json() for view, metrics in scores.items()}

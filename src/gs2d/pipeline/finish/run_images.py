@@ -39,7 +39,7 @@ from gs2d.pipeline.finish.camera_paths import flight_cameras, orbit_cameras
 from gs2d.pipeline.finish.scoring import evenly
 from gs2d.pipeline.finish.trusted_depth import believed_reach, within_reach
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
-from gs2d.pipeline.prepare.run_exposures import NONE, Transforms, exposed, exposure_named, photographed, read_exposures
+from gs2d.pipeline.prepare.run_appearance import exposed, exposure_named, photographed
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
@@ -96,12 +96,11 @@ def draw_stage(
     stage: str,
     splats: Splats,
     group: Tensor | None,
-    exposures: Transforms = NONE,
     outputs: Mapping[str, RenderOutput] = MappingProxyType({}),
 ) -> None:
     """Write the pictures of one stage, the photographs, and the index of both.
 
-    Training views are drawn in the exposures of their photographs, where those are known.
+    Views are drawn as their photographs show the scene, as far as that is known.
 
     Parameters
     ----------
@@ -125,7 +124,7 @@ def draw_stage(
         # Limits are of the first stage, so that stages compare.
         near_far = limits.get(view.name) or shown_limits(loaded.scene, view, depth, alpha)
         photo = view.target(loaded.settings.background)
-        color = photographed(view, output.color, exposures, loaded.settings.background).cpu().numpy()
+        color = photographed(view, output.color, loaded.settings.background).cpu().numpy()
         images = {
             "color": np.clip(color, 0, 1),
             "normal": normal_image(output.normal.cpu().numpy(), alpha),
@@ -235,7 +234,7 @@ def render_run(
     if video is not None and video != asked and video.suffix == ".webp":
         on_event(Notice(f"the video is an animated WebP, {video}: MP4 needs ffmpeg with libx264 ({FFMPEG})"))
     run, loaded, splats = open_finished(path, threads, on_event, splats_file=splats_file, out=out)
-    transform = None if exposure_of is None else exposure_named(exposure_of, read_exposures(run, loaded.recipe))
+    transform = None if exposure_of is None else exposure_named(exposure_of, loaded.scene.train)
     views: list[tuple[str, View]]
     if moving:
         image = np.zeros((1, 1, 3), np.uint8)
@@ -269,11 +268,12 @@ def render_run(
         written: list[Path] = []
         try:
             for name, view in counted(views, "rendering", len(views), on_event):
-                color = exposed(render_view(splats, view, loaded.settings, loaded.backend), transform, loaded).clamp(
-                    0, 1
-                )
+                output = render_view(splats, view, loaded.settings, loaded.backend)
+                color = output.color
+                if transform is not None:
+                    color = exposed(output, transform, loaded.scene.train[0], loaded.settings.background)
                 is_new = not (folder / f"{name}.png").exists()
-                write_image(folder / f"{name}.png", color.cpu().numpy())
+                write_image(folder / f"{name}.png", color.clamp(0, 1).cpu().numpy())
                 written += [folder / f"{name}.png"] if is_new else []
         except BaseException:  # a full disk, Ctrl-C: half of the pictures would look like all of them
             for picture in written:

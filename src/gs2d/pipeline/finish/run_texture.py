@@ -39,7 +39,7 @@ from gs2d.pipeline.finish.world_frame import placed_output, placed_textured, say
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.open_capture import read_scene
 from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions
-from gs2d.pipeline.prepare.run_exposures import NONE, Transforms, as_scene, read_exposures
+from gs2d.pipeline.prepare.run_appearance import as_scene
 from gs2d.render.api import rasterize
 
 PACKAGES = ("xatlas",)  # of the extra `texture`
@@ -81,7 +81,7 @@ def texture_run(
         if view.path is not None and view.path.resolve() in {file.resolve() for file in files}:
             raise RunError(f"--out {target} would write over the photograph {view.name}; choose another name")
     mesh = _mesh(run, loaded, splats, mesh_options, on_event)
-    baked = textured_mesh(loaded, splats, mesh, options, on_event, exposures=read_exposures(run, loaded.recipe))
+    baked = textured_mesh(loaded, splats, mesh, options, on_event)
     up = up_direction([view.camera for view in loaded.scene.train])
     if place is None:
         write_textured(target, baked.mesh, up=up)
@@ -111,12 +111,10 @@ def textured_mesh(
     mesh: Mesh,
     options: TextureOptions,
     on_event: OnEvent = ignore,
-    *,
-    exposures: Transforms = NONE,
 ) -> Baked:
     """Simplify a mesh of a run, cut it into charts and colour them.
 
-    Photographs whose exposure is known are taken back to the mean exposure first.
+    Photographs are taken back to the colours of the scene first, as far as it is known how they show them.
     """
     on_event(Phase("cutting the surface into charts", 0))
     views, small = _views(loaded, options, on_event), simplified(mesh, options.faces)
@@ -125,7 +123,7 @@ def textured_mesh(
             Notice(f"simplified to {len(small.faces):,} triangles, as near as it comes to --faces {options.faces}")
         )
     size = options.texture_size or texture_size(small, [view.camera for view in views])
-    images = partial(_images, loaded, views, splats, options, exposures, on_event)
+    images = partial(_images, loaded, views, splats, options, on_event)
     return bake(unwrap(small, size), images, size, threads=torch.get_num_threads())
 
 
@@ -162,7 +160,8 @@ def _views(loaded: LoadedRun, options: TextureOptions, on_event: OnEvent) -> Seq
         loaded.scene.masks,
     )
     zooms = {view.name: view.zoom for view in loaded.scene.train if view.zoom is not None}
-    return scene.with_poses({view.name: view.camera.T_cam_world for view in loaded.scene.train}, zooms).train
+    scene = scene.with_poses({view.name: view.camera.T_cam_world for view in loaded.scene.train}, zooms)
+    return scene.with_appearance({view.name: view.appearance for view in loaded.scene.train}).train
 
 
 def _images(
@@ -170,13 +169,12 @@ def _images(
     views: Sequence[View],
     splats: Splats,
     options: TextureOptions,
-    exposures: Transforms,
     on_event: OnEvent,
     factor: int,
 ) -> Iterator[ColorSource]:
     """Yield the views, or renderings of the splats from them, smaller by ``factor``."""
     if options.texture_from == "photographs":
-        yield from photographs(loaded, views, exposures, on_event, factor)
+        yield from photographs(loaded, views, on_event, factor)
         return
     for view in counted(views, PASSES[factor > 1], len(views), on_event):
         camera = view.camera.downscaled(factor)
@@ -186,12 +184,10 @@ def _images(
         yield ColorSource(camera, to_uint8(output.color.clamp(0, 1).cpu().numpy()), shown)
 
 
-def photographs(
-    loaded: LoadedRun, views: Sequence[View], exposures: Transforms, on_event: OnEvent, factor: int
-) -> Iterator[ColorSource]:
-    """Yield photographs in the mean exposure of a run, smaller by ``factor``."""
+def photographs(loaded: LoadedRun, views: Sequence[View], on_event: OnEvent, factor: int) -> Iterator[ColorSource]:
+    """Yield photographs in the colours of the scene, smaller by ``factor``."""
     for view in counted(views, PASSES[factor > 1], len(views), on_event):
-        yield ColorSource(view.camera, as_scene(view, exposures), usable_pixels(view, loaded)).shrunk(factor)
+        yield ColorSource(view.camera, as_scene(view), usable_pixels(view, loaded)).shrunk(factor)
 
 
 def usable_pixels(view: View, loaded: LoadedRun) -> np.ndarray | None:

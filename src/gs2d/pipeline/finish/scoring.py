@@ -17,7 +17,7 @@ from gs2d.data import View
 from gs2d.evaluation.images import ImageMetrics, image_metrics, mean_metrics, psnr_float
 from gs2d.evaluation.lpips import Lpips
 from gs2d.pipeline.events import OnEvent, Phase, Step
-from gs2d.pipeline.prepare.run_exposures import NONE, Transforms, matched_by_halves, photographed
+from gs2d.pipeline.prepare.run_appearance import matched_by_halves, photographed
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
@@ -82,20 +82,19 @@ def score_views(
     name: str,
     on_event: OnEvent,
     lpips: Lpips | None = None,
-    exposures: Transforms = NONE,
     match: bool = False,
     split: str = "",
     visitors: Sequence[Visitor] = (),
 ) -> dict[str, ImageMetrics]:
     """Image metrics of each view by its name; pixels that the view's mask leaves out count nowhere.
 
-    A view with a transform in ``exposures`` is rendered in the exposure of its photograph, any other as the scene is;
-    with ``match`` by :func:`~gs2d.pipeline.prepare.run_exposures.matched_by_halves`.
+    A view is rendered as its photograph shows the scene, as far as its ``appearance`` is known; with ``match`` by
+    :func:`~gs2d.pipeline.prepare.run_appearance.matched_by_halves`.
     ``visitors`` see each view, named ``split``.
     """
     on_event(Phase(name, len(views)))
     scores: dict[str, ImageMetrics] = {}
-    for done, seen in enumerate(_seen(splats, views, settings, backend, exposures, match, split), start=1):
+    for done, seen in enumerate(_seen(splats, views, settings, backend, match, split), start=1):
         metrics = image_metrics(seen.image, seen.target, seen.mask, backend=backend, lpips=lpips)
         scores[seen.view.name] = metrics
         for visit in visitors:
@@ -109,10 +108,9 @@ def mean_psnr(
     views: Sequence[View],
     settings: RasterSettings,
     backend: Backend,
-    exposures: Transforms = NONE,
 ) -> float | None:
     """Mean ``psnr_float`` of the views that have one, as by :func:`score_views`, without the other metrics."""
-    values = [psnr_float(s.image, s.target, s.mask) for s in _seen(splats, views, settings, backend, exposures)]
+    values = [psnr_float(s.image, s.target, s.mask) for s in _seen(splats, views, settings, backend)]
     finite = [value for value in values if math.isfinite(value)]
     return sum(finite) / len(finite) if finite else None
 
@@ -122,7 +120,6 @@ def _seen(
     views: Sequence[View],
     settings: RasterSettings,
     backend: Backend,
-    exposures: Transforms,
     match: bool = False,
     split: str = "",
 ) -> Iterator[SeenView]:
@@ -136,7 +133,7 @@ def _seen(
         if match:
             image = matched_by_halves(view, output.color, target, mask, settings.background)
         else:
-            image = photographed(view, output.color, exposures, settings.background)
+            image = photographed(view, output.color, settings.background)
         yield SeenView(view, split, output, image, target, mask)
 
 

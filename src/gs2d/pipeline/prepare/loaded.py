@@ -33,7 +33,7 @@ from gs2d.pipeline.prepare.part import LoadedPart, Part, load_part, part_scene
 from gs2d.pipeline.prepare.photographs import already_prepared, with_prepared
 from gs2d.pipeline.prepare.resolve import by_quality, check_execution, check_options, resolve
 from gs2d.pipeline.prepare.resolved import CaptureRecord, Execution, ResolvedRun, read_resolved
-from gs2d.pipeline.prepare.run_photometry import with_found_photometries
+from gs2d.pipeline.prepare.run_appearance import with_learned_appearance
 from gs2d.pipeline.prepare.run_poses import with_found_poses
 from gs2d.pipeline.prepare.view_priors import with_priors
 from gs2d.render.backends import Backend, get_backend
@@ -306,7 +306,7 @@ def reload_run(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> L
             f"{record.train} + {record.test}; restore it or train again"
         )
     scene = with_found_poses(run, resolved.recipe, already_prepared(scene, run.path))
-    scene = with_found_photometries(run, resolved.recipe, scene)
+    scene = with_learned_appearance(run, resolved.recipe, scene)
     chosen = get_backend(resolved.backend["name"] if backend == "auto" else backend)
     return LoadedRun(resolved, scene, chosen)
 

@@ -18,7 +18,6 @@ import torch
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.data import Scene, View
-from gs2d.pipeline.prepare.run_exposures import Transforms
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.exposure import identity
@@ -52,21 +51,20 @@ def metered(splats: Splats, settings: RasterSettings, backend: Backend) -> Brigh
     return brightness
 
 
-def with_predicted(transforms: Transforms, scene: Scene, brightness: Brightness | None = None) -> Transforms:
-    """Return the transforms of training photographs with predicted ones of the test views, by name.
+def with_predicted(scene: Scene, brightness: Brightness | None = None) -> Scene:
+    """Return a scene whose test views have predicted exposures; as it is where training views have none.
 
     Parameters
     ----------
-    transforms : mapping of name to Tensor [3, 4]
-        Of the training photographs; empty where a run learns none, and then nothing is added.
     scene : Scene
+        With what was learned of its training views.
     brightness : callable, optional
         How bright the scene is in a view (:func:`metered`); without it neighbours alone decide.
     """
-    if not transforms or not scene.test:
-        return transforms
+    if not scene.test or any("exposure" not in view.appearance for view in scene.train):
+        return scene
     cameras = [view.camera for view in scene.train]
-    offsets = torch.stack([transforms[view.name] for view in scene.train]).double()
+    offsets = torch.from_numpy(np.stack([view.appearance["exposure"] for view in scene.train]))
     offsets = offsets - identity(offsets)
     greys = (GREY * offsets[:, :, :3].sum(dim=2) + offsets[:, :, 3]).mean(dim=1).numpy()  # [V] what grey gains
     around = np.stack([_weights(camera, cameras, scene.extent, without=i) for i, camera in enumerate(cameras)])
@@ -75,7 +73,7 @@ def with_predicted(transforms: Transforms, scene: Scene, brightness: Brightness 
     if brightness is not None and len(cameras) >= ENOUGH:
         seen = np.array([brightness(view) for view in scene.train])
         meter = _Meter.fitted(seen, 1 + greys / GREY, around, trust)
-    predicted = dict(transforms)
+    predicted = {}
     for view in scene.test:
         weights = _weights(view.camera, cameras, scene.extent)
         mean = (torch.from_numpy(weights)[:, None, None] * offsets).sum(dim=0)
@@ -83,8 +81,8 @@ def with_predicted(transforms: Transforms, scene: Scene, brightness: Brightness 
         if meter is not None and brightness is not None:
             own = 1 + float((GREY * transform[:, :3].sum(dim=1) + transform[:, 3] - GREY).mean()) / GREY
             transform = transform * (meter.gain(brightness(view), weights) / max(own, LEAST_GAIN))
-        predicted[view.name] = transform.to(transforms[scene.train[0].name])
-    return predicted
+        predicted[view.name] = {"exposure": transform.numpy()}
+    return scene.with_appearance(predicted)
 
 
 @dataclass(frozen=True)

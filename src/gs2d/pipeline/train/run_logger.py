@@ -38,8 +38,7 @@ from gs2d.pipeline.prepare.estimate import iteration_costs
 from gs2d.pipeline.prepare.limits import release_buffers
 from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
-from gs2d.pipeline.prepare.run_exposures import Transforms, write_exposures
-from gs2d.pipeline.prepare.run_photometry import write_photometries
+from gs2d.pipeline.prepare.run_appearance import write_appearance
 from gs2d.pipeline.prepare.run_poses import NONE, found_poses, write_poses
 from gs2d.pipeline.train.attribute_changes import Snapshot, mean_changes, take_snapshot
 from gs2d.pipeline.train.interruption import HeldSignals
@@ -87,7 +86,7 @@ class RunLogger:
         self._at_entry = dict(start.at_entry)
         self._saved_at, self._saved_iteration = time.perf_counter(), 0
         self._trainer: Trainer | None = None
-        self._predicted: tuple[tuple[int, int], Transforms] | None = None  # of stage and step
+        self._predicted: tuple[tuple[int, int], Scene] | None = None  # of stage and step
         self.psnr: float | None = None  # of the probe views, the last time that they were scored
         self._before: Snapshot | None = None  # of the last step line, until it is compared with the next progress
         self._signals = HeldSignals()
@@ -230,11 +229,9 @@ class RunLogger:
     def _probe_psnr(self, splats: Splats) -> float | None:
         """Mean PSNR over a few fixed views (test views where there are any)."""
         self._stop_clock()
-        scene = (
-            self._loaded.scene
-        )  # by neighbours alone: what the camera would see costs a rendering of every photograph
-        exposures = with_predicted(self._found_exposures, scene)
-        psnr = mean_psnr(splats, self._now(self._probes), self._settings, self._loaded.backend, exposures)
+        # By neighbours alone: what the camera would see costs a rendering of every photograph.
+        views = self._now(self._probes, with_predicted(self._scene_now))
+        psnr = mean_psnr(splats, views, self._settings, self._loaded.backend)
         self._start_clock()
         return psnr
 
@@ -296,9 +293,8 @@ class RunLogger:
         with attempted("learned cameras and exposures", None, self._on_event):
             now = self._scene_now
             poses = NONE if loaded.recipe.poses is None else found_poses(loaded.scene, now)
-            write_exposures(run, self._found_exposures, self._on_event)
             write_poses(run, loaded.scene, poses, self._on_event)
-            write_photometries(run, now, self._on_event)
+            write_appearance(run, now, self._on_event)
         write_splats(run.file(SPLATS), state.splats)
 
     @contextmanager
@@ -372,22 +368,22 @@ class RunLogger:
     def _score(self, split: str, views: Sequence[View], name: str, visitors: Sequence[Visitor] = ()) -> Any:
         return score_views(
             self._drawn,
-            self._now(views),
+            self._now(views, self._scene_shown),
             self._settings,
             self._loaded.backend,
             name=name,
             on_event=self._on_event,
-            exposures=self._exposures,
             split=split,
             visitors=visitors,
         )
 
     def _draw(self, stage: str, outputs: Mapping[str, RenderOutput] = MappingProxyType({})) -> None:
         state = self._state
-        shown = zip((split for split, _ in self._shown), self._now([view for _, view in self._shown]), strict=True)
+        views = self._now([view for _, view in self._shown], self._scene_shown)
+        shown = zip((split for split, _ in self._shown), views, strict=True)
         with attempted(f"pictures of stage {stage}", None, self._on_event):
             group = _group(state) if len(self._drawn) == len(state.splats) else None  # none of what is frozen
-            draw_stage(self._run, self._loaded, list(shown), stage, self._drawn, group, self._exposures, outputs)
+            draw_stage(self._run, self._loaded, list(shown), stage, self._drawn, group, outputs)
 
     # -- small things --------------------------------------------------------------------------------------------------
     @property
@@ -400,23 +396,17 @@ class RunLogger:
         return self._trainer.scene_now()
 
     @property
-    def _found_exposures(self) -> Transforms:
-        assert self._trainer is not None
-        return self._trainer.learned.by_name(self._state.learned, "exposure")
-
-    @property
-    def _exposures(self) -> Transforms:
+    def _scene_shown(self) -> Scene:
+        """The scene with what was learned of it, and predicted exposures of its test views."""
         at = (self._state.stage, self._state.step)
         if self._predicted is None or self._predicted[0] != at:
-            scene, brightness = self._loaded.scene, metered(self._drawn, self._settings, self._loaded.backend)
-            found = with_predicted(self._found_exposures, scene, brightness)
-            self._predicted = (at, found)
+            brightness = metered(self._drawn, self._settings, self._loaded.backend)
+            self._predicted = (at, with_predicted(self._scene_now, brightness))
         return self._predicted[1]
 
-    def _now(self, views: Sequence[View]) -> list[View]:
-        """Return views of the capture from where their cameras are now."""
-        scene = self._loaded.scene
-        now = dict(zip(map(id, scene.views), self._scene_now.views, strict=True))
+    def _now(self, views: Sequence[View], scene: Scene) -> list[View]:
+        """Return views of the capture as a scene with what was learned has them."""
+        now = dict(zip(map(id, self._loaded.scene.views), scene.views, strict=True))
         return [now.get(id(view), view) for view in views]
 
     @property

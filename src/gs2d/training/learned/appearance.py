@@ -11,10 +11,11 @@ from gs2d.config.quantities import QUANTITIES
 from gs2d.core.camera import Camera
 from gs2d.core.sh import rgb_to_sh0, sh_to_rgb
 from gs2d.core.splats import Splats
-from gs2d.training.learned.quantity import ImagePoints
+from gs2d.data.scene import View
+from gs2d.training.learned.quantity import ImagePoints, LearnedQuantity
 
 Numbers = Mapping[str, Tensor]
-"""Numbers of a view by the name of the quantity, in the order of application."""
+"""Numbers of a view by the name of the quantity."""
 
 
 def shown(color: Tensor, numbers: Numbers, at: ImagePoints, clipped: Tensor | None = None) -> Tensor:
@@ -28,7 +29,7 @@ def shown(color: Tensor, numbers: Numbers, at: ImagePoints, clipped: Tensor | No
     clipped : Tensor [H, W, 3] bool, optional
         Where the photograph is at its ceiling, so that it says "this bright or brighter": there at most 1.
     """
-    quantities = [(QUANTITIES.get(name), found) for name, found in numbers.items()]
+    quantities = _ordered(numbers)
     for quantity, found in quantities:
         color = quantity.apply(color, found, at)
     if clipped is None or not any(quantity.changes_color for quantity, _ in quantities):
@@ -44,3 +45,20 @@ def shown_splats(splats: Splats, camera: Camera, numbers: Numbers, sh_degree: in
     rgb = sh_to_rgb(splats.sh0, splats.shN, directions, min(sh_degree, splats.sh_degree))  # [N, 3]
     seen = shown(rgb[None], numbers, ImagePoints(camera, points=splats.means))[0]
     return Splats(**(dict(splats.items()) | {"sh0": rgb_to_sh0(seen)}))
+
+
+def unshown(color: Tensor, numbers: Numbers, at: ImagePoints) -> Tensor:
+    """Return colours [H, W, 3] of a photograph as the scene has them: the inverse of :func:`shown`."""
+    for quantity, found in reversed(_ordered(numbers)):
+        color = quantity.undo(color, found, at)
+    return color
+
+
+def numbers_of(view: View, like: Tensor) -> dict[str, Tensor]:
+    """Return what is known of how the photograph of a view shows colours, of the type of ``like`` where that is."""
+    return {name: torch.as_tensor(found).to(like) for name, found in view.appearance.items()}
+
+
+def _ordered(numbers: Numbers) -> list[tuple[type[LearnedQuantity], Tensor]]:
+    """Return quantities and numbers in the order in which they are applied: that of the registry."""
+    return [(QUANTITIES.get(name), numbers[name]) for name in QUANTITIES if name in numbers]

@@ -7,42 +7,14 @@ from torch import Tensor
 
 from gs2d.config.quantities import QUANTITIES, Photometry
 from gs2d.core.camera import Camera
-from gs2d.core.photometry import CameraPhotometry, reach_of
-from gs2d.data.scene import Scene, View
-from gs2d.render.photometry import show
+from gs2d.core.photometry import reach_of
+from gs2d.data.scene import Scene
+from gs2d.render.photometry import bend, show, vignetting
 from gs2d.training.learned.quantity import ImagePoints, LearnedQuantity
 
 
-class _CameraLight(LearnedQuantity):
-    """What both have in common: a light of each camera, found in its training views and known of its test views."""
-
-    per_camera = True
-
-    def __init__(self, settings: Photometry, scene: Scene) -> None:
-        super().__init__(settings, scene)
-        cameras: list[list[Camera]] = [[] for _ in range(self.rows)]
-        for row, view in zip(self.row_of, scene.train, strict=True):
-            cameras[row].append(view.camera)
-        self.reach = list(map(reach_of, cameras))
-
-    def light(self, values: Tensor, index: int, known: CameraPhotometry) -> CameraPhotometry:
-        """Return what is known of a camera and what was learned of it."""
-        raise NotImplementedError
-
-    def place(self, values: Tensor, scene: Scene) -> Scene:
-        """Return the scene with the light of its cameras."""
-        first = {view.file_intrinsics(): k for k, view in reversed(list(enumerate(scene.train)))}
-
-        def found(view: View) -> CameraPhotometry:
-            index = first[view.file_intrinsics()]
-            known = view.photometry or CameraPhotometry(reach=self.reach[self.row_of[index]])
-            return self.light(values, index, known)
-
-        return scene.with_photometries({v.name: found(v) for v in scene.views if v.file_intrinsics() in first})
-
-
 @QUANTITIES.register("vignetting")
-class Vignetting(_CameraLight):
+class Vignetting(LearnedQuantity):
     """Falloff of the light towards the corners of each camera; 1 at the principal point.
 
     Rows are a, b and c at radii whose 1 is the farthest corner. The numbers of a view are the same at radii in focal
@@ -50,7 +22,15 @@ class Vignetting(_CameraLight):
     """
 
     shape = (3,)
+    per_camera = True
     limit = 1.0  # beyond, a corner has a twentieth of the light, or twenty times too much
+
+    def __init__(self, settings: Photometry, scene: Scene) -> None:
+        super().__init__(settings, scene)
+        cameras: list[list[Camera]] = [[] for _ in range(self.rows)]
+        for row, view in zip(self.row_of, scene.train, strict=True):
+            cameras[row].append(view.camera)
+        self.reach = list(map(reach_of, cameras))
 
     def _powers(self, index: int) -> Tensor:
         """Return the powers of the reach [3] by which numbers are smaller than rows."""
@@ -66,6 +46,11 @@ class Vignetting(_CameraLight):
         curve = torch.cat([numbers, numbers.new_zeros(1)])
         return show(color, curve, at.squared_radii(color), at.coverage, at.background)
 
+    @staticmethod
+    def undo(color: Tensor, numbers: Tensor, at: ImagePoints) -> Tensor:
+        """Return colours without the falloff."""
+        return color / vignetting(at.squared_radii(color), numbers)[..., None]
+
     def penalty(self, numbers: Tensor, index: int) -> Tensor | None:
         """Return the weighted squares of the row."""
         return super().penalty(numbers * self._powers(index).to(numbers), index)
@@ -75,20 +60,16 @@ class Vignetting(_CameraLight):
         found = super().gradient(leaf, index, camera)
         return None if found is None else found.double().cpu() / self._powers(index) * (not self.views[index].is_face)
 
-    def light(self, values: Tensor, index: int, known: CameraPhotometry) -> CameraPhotometry:
-        """Return a camera with its falloff."""
-        a, b, c = values[self.row_of[index]].tolist()
-        return known._replace(falloff=(a, b, c))
-
 
 @QUANTITIES.register("response")
-class Response(_CameraLight):
+class Response(LearnedQuantity):
     """Curve of each camera by which light becomes a value: one number s.
 
     The mean of s over all images is taken off: a scene in another curve would have the same images. So a single camera
     has none, and those of several are what they differ by.
     """
 
+    per_camera = True
     limit = 2.0
 
     def numbers(self, values: Tensor, index: int) -> Tensor:
@@ -100,12 +81,13 @@ class Response(_CameraLight):
         """Return the values into which a camera turns light."""
         return show(color, torch.cat([numbers.new_zeros(3), numbers]), None, at.coverage, at.background)
 
+    @staticmethod
+    def undo(color: Tensor, numbers: Tensor, at: ImagePoints) -> Tensor:
+        """Return the light of values."""
+        return bend(color, -numbers[0])
+
     def gradient(self, leaf: Tensor | None, index: int, camera: Camera) -> Tensor | None:
         """Return that of s, less its share of the mean."""
         found = super().gradient(leaf, index, camera)
         share = self.row_of.count(self.row_of[index]) / len(self.row_of)
         return None if found is None else found.double().cpu() * (1 - share)
-
-    def light(self, values: Tensor, index: int, known: CameraPhotometry) -> CameraPhotometry:
-        """Return a camera with its response."""
-        return known._replace(shift=float(self.numbers(values, index)))

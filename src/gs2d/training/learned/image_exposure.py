@@ -56,6 +56,11 @@ class ImageExposure(LearnedQuantity):
         """Return colours in the exposure of the photograph."""
         return expose(color, numbers, at.coverage, at.background)
 
+    @staticmethod
+    def undo(color: Tensor, numbers: Tensor, at: ImagePoints) -> Tensor:
+        """Return A^-1 (P - b)."""
+        return (color - numbers[:, 3]) @ torch.linalg.inv(numbers[:, :3]).T
+
     def penalty(self, numbers: Tensor, index: int) -> Tensor:
         """Return the weighted squares of what the transform differs from the identity by."""
         return self.settings.prior * (numbers - identity(numbers)).square().sum()

@@ -10,7 +10,7 @@ from torch import Tensor
 from gs2d.config.quantities import QUANTITIES, Learning, Quantity
 from gs2d.config.recipe import Recipe
 from gs2d.core.camera import Camera
-from gs2d.data.scene import Scene
+from gs2d.data.scene import Appearance, Scene
 from gs2d.errors import RecipeError, RunError
 from gs2d.kernels.reference import finite
 from gs2d.render.backends import Backend
@@ -158,19 +158,14 @@ class LearnedTable:
         found = {name: quantity.gradient(leaves.get(name), index, camera) for name, quantity in self.quantities.items()}
         return {name: gradient for name, gradient in found.items() if gradient is not None}
 
-    def by_name(self, rows: Rows, name: str) -> dict[str, Tensor]:
-        """Return the numbers of a quantity by the name of the training view; empty where it is not learned."""
-        if name not in self.quantities:
-            return {}
-        views, quantity = self._scene.train, self.quantities[name]
-        return {view.name: quantity.numbers(rows[name].values, index) for index, view in enumerate(views)}
-
     # -- afterwards ----------------------------------------------------------------------------------------------------
     def scene_now(self, rows: Rows) -> Scene:
         """Return the scene with what was learned of its views."""
         scene = self._scene
         for name, quantity in self.quantities.items():
             scene = quantity.place(rows[name].values, scene)
+            if quantity.changes_color:
+                scene = scene.with_appearance(_appearances(name, quantity, rows[name].values.cpu(), scene))
         return scene
 
 
@@ -181,6 +176,17 @@ def first_not_finite_quantity(tensors: Mapping[str, Tensor], *, waits: bool) -> 
     """
     seen = ((name, tensor) for name, tensor in tensors.items() if waits or tensor.device.type == "cpu")
     return next((name for name, tensor in seen if not finite(tensor)), None)
+
+
+def _appearances(name: str, quantity: LearnedQuantity, values: Tensor, scene: Scene) -> dict[str, Appearance]:
+    """Return the numbers of training views by their names, and of test views that share a camera with them."""
+    index_of = {view.name: index for index, view in enumerate(scene.train)}
+    if quantity.per_camera:
+        first = {view.file_intrinsics(): index for index, view in reversed(list(enumerate(scene.train)))}
+        known = ((view.name, first.get(view.file_intrinsics())) for view in scene.views)
+        index_of = {view: index for view, index in known if index is not None}
+    numbers = {view: quantity.numbers(values, index) for view, index in index_of.items()}
+    return {view: {name: found.detach().double().numpy()} for view, found in numbers.items()}
 
 
 def _quantity(name: str, settings: Learning, scene: Scene) -> LearnedQuantity:

@@ -138,6 +138,14 @@ class LearnedQuantity:
         """Return colours [H, W, 3] of the scene as the photograph shows them, differentiable in both tensors."""
         return color
 
+    @staticmethod
+    def undo(color: Tensor, numbers: Tensor, at: ImagePoints) -> Tensor:
+        """Return colours [H, W, 3] of a photograph as the scene has them: the inverse of :meth:`apply`, for textures.
+
+        By default colours stay.
+        """
+        return color
+
     def penalty(self, numbers: Tensor, index: int) -> Tensor | None:
         """Return a term of the loss on the numbers of a view, or None."""
         prior = getattr(self.settings, "prior", 0.0)

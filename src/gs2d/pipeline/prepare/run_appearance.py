@@ -1,0 +1,208 @@
+"""How photographs show a scene, as a run has learned it: its files, and images as photographs show them.
+
+``learned.json`` has the numbers of every view, which later commands read. ``exposure.json`` and ``photometry.json`` say
+the same for people.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from difflib import get_close_matches
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gs2d.config.quantities import QUANTITIES
+from gs2d.config.recipe import Recipe
+from gs2d.core.json_files import read_json, write_json
+from gs2d.core.photometry import reach_of
+from gs2d.data import Scene, View
+from gs2d.data.scene import Appearance
+from gs2d.errors import DataError, RunError
+from gs2d.io.run_dir import EXPOSURE, LEARNED, PHOTOMETRY, SPLATS, RunFolder
+from gs2d.pipeline.events import Notice, OnEvent
+from gs2d.render.exposure import expose, fit_exposure
+from gs2d.render.types import RenderOutput
+from gs2d.training.learned.appearance import numbers_of, shown, unshown
+from gs2d.training.learned.quantity import ImagePoints
+
+ABOUT = "numbers by which each view shows the colours of the scene, by the name of the quantity (docs/math.md)"
+ABOUT_EXPOSURE = (
+    "color as photographed = A c + b for the scene's color c (sRGB values in [0, 1]), transform = [A | b]; "
+    "the mean over the photographs is the identity; grey: what the scene's (0.5, 0.5, 0.5) becomes"
+)
+ABOUT_PHOTOMETRY = (
+    "at a pixel whose distance from the principal point is r times reach, counted in focal lengths, a camera has "
+    "exp(-(a r^2 + b r^4 + c r^6)) of the light, falloff = [a, b, c]; corner: what is left at r = 1. f(x) = k x / (1 + "
+    "(k - 1) x), k = e^s, turns light into values, s = shift; the scene is in that of s = 0, the photographs' mean"
+)
+GREY = 0.5
+
+
+def write_appearance(run: RunFolder, scene: Scene, on_event: OnEvent) -> None:
+    """Write what was learned of the colours of photographs beside the splats, and report it in a line each."""
+    known = {view.name: view.appearance for view in scene.views if view.appearance}
+    if not known:
+        return
+    views = {view: {name: numbers.tolist() for name, numbers in found.items()} for view, found in known.items()}
+    write_json(run.file(LEARNED), {"format": 1, "about": ABOUT, "views": views})
+    exposures = {view.name: view.appearance["exposure"] for view in scene.train if "exposure" in view.appearance}
+    if exposures:
+        _write_exposures(run, exposures, on_event)
+    if any(found.keys() & {"vignetting", "response"} for found in known.values()):
+        _write_photometry(run, scene, on_event)
+
+
+def _write_exposures(run: RunFolder, transforms: Appearance, on_event: OnEvent) -> None:
+    images = []
+    for name, transform in transforms.items():
+        grey = GREY * transform[:, :3].sum(axis=1) + transform[:, 3]
+        images.append({"name": name, "transform": transform.tolist(), "grey": grey.tolist()})
+    write_json(run.file(EXPOSURE), {"format": 1, "about": ABOUT_EXPOSURE, "photographs": images})
+    gains = {entry["name"]: sum(entry["grey"]) / (3 * GREY) for entry in images}
+    low, high = min(gains, key=gains.__getitem__), max(gains, key=gains.__getitem__)
+    on_event(Notice(f"exposures: {gains[low]:.2f} ({low}) to {gains[high]:.2f} ({high}) times the mean: {EXPOSURE}"))
+
+
+def _write_photometry(run: RunFolder, scene: Scene, on_event: OnEvent) -> None:
+    of_camera: dict[tuple[float, ...], list[View]] = {}
+    for view in scene.views:
+        falloff, response = (view.appearance.get(name, np.zeros(3)) for name in ("vignetting", "response"))
+        if view.appearance:
+            of_camera.setdefault((*falloff.tolist(), float(response[0])), []).append(view)
+    cameras: list[dict[str, Any]] = []
+    for (a, b, c, shift), views in of_camera.items():
+        reach = reach_of([view.camera for view in views])
+        numbers = [a * reach**2, b * reach**4, c * reach**6]
+        found = {"falloff": numbers, "reach": reach, "shift": shift, "corner": math.exp(-sum(numbers))}
+        cameras.append({**found, "photographs": [view.name for view in views]})
+    write_json(run.file(PHOTOMETRY), {"format": 1, "about": ABOUT_PHOTOMETRY, "cameras": cameras})
+    corners, shifts = (sorted(camera[name] for camera in cameras) for name in ("corner", "shift"))
+    many = f" ({len(cameras)} cameras)" if len(cameras) > 1 else ""
+    line = f"corners have {_range(corners, '.3f')} of the light, responses are bent by {_range(shifts, '+.3f')}"
+    on_event(Notice(f"{line}{many}: {PHOTOMETRY}"))
+
+
+def _range(values: list[float], form: str) -> str:
+    low, high = format(values[0], form), format(values[-1], form)
+    return low if low == high else f"{low} to {high}"
+
+
+def with_learned_appearance(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
+    """Return a scene with what :func:`write_appearance` wrote; as it is if the run has learned none, or is unfinished.
+
+    Raises
+    ------
+    RunError
+        If the file is missing, damaged or of other photographs.
+    """
+    names = recipe.quantities.keys() - {"poses", "intrinsics"}
+    if not names or not (run.file(LEARNED).exists() or run.file(SPLATS).exists()):
+        return scene
+    remedy = f"continue with `gs2d train ... --out {run.path} --resume`, which writes it again"
+    try:
+        views = read_json(run.file(LEARNED))["views"]
+        found = {view: {name: _numbers(name, values) for name, values in views[view].items()} for view in views}
+    except (DataError, LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise RunError(f"{run.file(LEARNED)} must hold the numbers of this run, got: {error}; {remedy}") from error
+    for view in scene.train:
+        missing = (names & set(QUANTITIES.builtin)) - found.get(view.name, {}).keys()
+        if missing:
+            raise RunError(f"{run.file(LEARNED)} must hold the {min(missing)} of {view.name}, got none; {remedy}")
+    return scene.with_appearance(found)
+
+
+def _numbers(name: str, values: list[float]) -> np.ndarray:
+    """Return the numbers of a quantity (ValueError: they cannot be)."""
+    numbers = np.array(values, dtype=np.float64)
+    if not np.isfinite(numbers).all() or np.abs(numbers).max(initial=0) > 1e6:
+        raise ValueError(f"{name} that is not finite")
+    if name in QUANTITIES.builtin and numbers.shape != QUANTITIES.get(name).shape:
+        raise ValueError(f"{name} of shape {list(numbers.shape)}")
+    return numbers
+
+
+def photographed(view: View, color: Tensor, background: tuple[float, float, float]) -> Tensor:
+    """Return an image [H, W, 3] rendered from a view as its photograph shows it, as far as that is known."""
+    if not view.appearance:
+        return color
+    return shown(color, numbers_of(view, color), ImagePoints(view.camera, *over(view, color, background)))
+
+
+def as_scene(view: View) -> np.ndarray:
+    """Return the photograph of a view, uint8 [H, W, 3 or 4], in the colours of the scene, as far as that is known."""
+    image = view.image()
+    if not view.appearance:
+        return image
+    color = torch.from_numpy(image[..., :3] / 255.0)
+    back, result = unshown(color, numbers_of(view, color), ImagePoints(view.camera)), image.copy()
+    result[..., :3] = np.rint(255 * np.clip(back.numpy(), 0, 1))
+    return result
+
+
+def exposure_named(name: str, views: Sequence[View]) -> Tensor:
+    """Return the transform [3, 4] of a training photograph.
+
+    Raises
+    ------
+    RunError
+        If no exposure was learned, or none of a photograph of this name.
+    """
+    known = {view.name: view.appearance["exposure"] for view in views if "exposure" in view.appearance}
+    if not known:
+        raise RunError(f"the exposure of {name} was asked for, and this run learned none; train with --exposure")
+    if name not in known:
+        near = get_close_matches(name, known, n=3) or list(known)[:3]
+        raise RunError(f"no training photograph {name!r}; there is {', '.join(near)}, ...: {EXPOSURE} lists all")
+    return torch.from_numpy(known[name])
+
+
+def exposed(output: RenderOutput, transform: Tensor, like: View, background: tuple[float, float, float]) -> Tensor:
+    """Return the image of any view [H, W, 3] in an exposure.
+
+    If photographs have an alpha channel, as that of the view ``like``, the background is no part of them and stays.
+    """
+    behind = torch.tensor(background, dtype=output.color.dtype, device=output.color.device)
+    cover = () if like.alpha() is None else (output.alpha, behind)
+    return expose(output.color, transform.to(output.color), *cover)
+
+
+def matched_by_halves(
+    view: View, color: Tensor, target: Tensor, mask: Tensor | None, background: tuple[float, float, float]
+) -> Tensor:
+    """Return a rendered picture whose colours are matched to the photograph, no pixel by itself.
+
+    The left half gets the transform that fits the right half best (least squares), the right half that of the left. So
+    the photograph is looked at, but nothing is scored that was fitted to: not a score of the scene alone.
+
+    Parameters
+    ----------
+    view : View
+    color, target : Tensor [H, W, 3]
+        Rendering and photograph, over the background.
+    mask : Tensor [H, W] bool or None
+        False = ignore this pixel.
+    background : three floats
+    """
+    camera = replace(view, appearance={k: found for k, found in view.appearance.items() if k != "exposure"})
+    color, cover = photographed(camera, color, background), over(view, color, background)
+    usable = torch.ones_like(color[..., 0], dtype=torch.bool) if mask is None else mask.clone()
+    if cover:
+        usable &= cover[0] > 0
+    left = torch.zeros_like(usable)
+    left[:, : color.shape[1] // 2] = True
+    to_right = expose(color, fit_exposure(color, target, usable & left, *cover), *cover)
+    to_left = expose(color, fit_exposure(color, target, usable & ~left, *cover), *cover)
+    return torch.where(left[..., None], to_left, to_right)
+
+
+def over(view: View, color: Tensor, background: tuple[float, float, float]) -> tuple[Tensor, ...]:
+    """Coverage and background for ``expose``, where the view's photograph has an alpha channel."""
+    alpha = view.alpha()
+    if alpha is None:
+        return ()
+    return torch.from_numpy(alpha).to(color), torch.tensor(background, dtype=color.dtype, device=color.device)
