@@ -19,9 +19,8 @@ from gs2d.pipeline.events import Event, MissingFile
 from gs2d.pipeline.train.train_run import train
 
 LATER = {  # of a training, with what is missing then
-    "train.run_logger.write_exposures": "learned cameras and exposures",
     "train.run_logger.write_poses": "learned cameras and exposures",
-    "train.run_logger.write_photometries": "learned cameras and exposures",
+    "train.run_logger.write_appearance": "learned cameras and exposures",
     "train.run_logger.score_views": "scores of train views, stage refine",
     "train.run_logger.split_metrics": "scores of train views, stage refine",
     "train.run_logger.report_losses": "what the losses say of stage refine",

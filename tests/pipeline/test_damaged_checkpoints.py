@@ -89,7 +89,7 @@ def half(tensor: torch.Tensor) -> torch.Tensor:
         (("events_bytes",), lambda _: -5),
         (("extra",), lambda _: '{"seconds": NaN, "peak_memory": 0, "at_entry": {}}'),
         (("extra",), lambda _: "[" * 100_000),
-        (("state", "exposures"), lambda _: {"offsets": torch.zeros(6, 3, 4)}),
+        (("state", "learned"), lambda _: {"exposure": {"values": torch.zeros(6, 3, 4)}}),
     ],
 )
 def test_a_checkpoint_whose_entries_do_not_fit_together_is_passed_over(
@@ -102,7 +102,7 @@ def test_a_checkpoint_whose_entries_do_not_fit_together_is_passed_over(
 ) -> None:
     run = RunFolder(Path(shutil.copytree(stopped.path, tmp_path / "run")))
     payload = load_tensors(run.checkpoints()[-1].path)
-    if path[-1] in ("other", "high_error", "exposures"):
+    if path[-1] in ("other", "high_error"):
         payload = with_change(payload, path[:-1], lambda inner: inner | {path[-1]: None})
     start, said = resumed(run, job, capture, with_change(payload, path, change))
     assert start.state is not None

@@ -26,7 +26,7 @@ CPU = get_backend(backends()[-1])
 
 def splits(splats: Splats, folder: Path, partition: Partition, told: list[Event] | None = None) -> Split:
     on_event = ignore if told is None else told.append
-    return split_model(splats, SCENE, partition, RasterSettings(), CPU, folder, on_event, {})
+    return split_model(splats, SCENE, partition, RasterSettings(), CPU, folder, on_event)
 
 
 def test_photographs_that_show_enough_of_a_block_are_its_and_the_best_others_up_to_the_floor() -> None:
