@@ -80,7 +80,7 @@ INSIDE = {
         "cpu_cached pose_gradient exposure": 4,
         "cpu cuda cuda_step reference_errors": 3,
         "cuda_passes photometry_native reference": 2,
-        "pair_budget whole_step reference_projection reference_transmittance": 1,
+        "pair_budget whole_step cuda_works reference_projection reference_transmittance": 1,
         "pose_gradient_native exposure_native": 1,
         "types": 0,
     },

@@ -12,7 +12,7 @@ from gs2d.errors import ProtocolError
 from gs2d.meshing.bounds import DepthSample, FusionBounds, backproject, derive_limits, sample_depths, widen_truncation
 from gs2d.meshing.consistency import depth_noise
 from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
-from gs2d.meshing.extract import extract
+from gs2d.meshing.extract import ExtractOptions, extract
 from surface_shapes import box_depth, orbit, sphere_depth
 
 UP = np.array([0, 0, 1.0])
@@ -156,8 +156,8 @@ def test_the_truncation_is_twenty_times_the_noise_within_five_and_twenty_voxels_
 
 def test_noisy_maps_are_fused_better_with_the_widened_truncation() -> None:
     frames = [RenderedView(m.camera, m.depth) for m in orbit_maps(0.02)]
-    wide = extract(frames, voxel=0.007, threads=1)
-    narrow = extract(frames, voxel=0.007, truncation=0.035, threads=1)
+    wide = extract(frames, ExtractOptions(voxel=0.007), threads=1)
+    narrow = extract(frames, ExtractOptions(voxel=0.007, truncation=0.035), threads=1)
     assert wide.limits.truncation == pytest.approx(0.025 * wide.limits.side)  # 0.049
 
     def error(mesh_vertices: np.ndarray) -> float:

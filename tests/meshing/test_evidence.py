@@ -10,7 +10,7 @@ from gs2d.core.mesh import Mesh
 from gs2d.meshing.bounds import backproject
 from gs2d.meshing.depth_maps import RenderedView, depth_map
 from gs2d.meshing.evidence import FACES_A_PIXEL, areas, gather
-from gs2d.meshing.extract import extract
+from gs2d.meshing.extract import ExtractOptions, extract
 from surface_shapes import orbit, sphere_depth
 
 BOX = np.array([[-2.0, -2, -2], [2, 2, 2]])
@@ -37,7 +37,9 @@ def off_the_ball(mesh: Mesh) -> float:
 
 def test_a_sheet_that_one_view_saw_goes_and_the_ball_stays_whole() -> None:
     seen = frames(14, sheets=1)
-    before, after = (extract(seen, bbox=BOX, voxel=0.1, threads=1, by_evidence=cleans) for cleans in (False, True))
+    before, after = (
+        extract(seen, ExtractOptions(bbox=BOX, voxel=0.1, by_evidence=cleans), threads=1) for cleans in (False, True)
+    )
     assert off_the_ball(before.mesh) > 0.01  # there was a sheet
     assert off_the_ball(after.mesh) == 0.0
     assert areas(after.mesh).sum() == pytest.approx(4 * np.pi, rel=0.1)
@@ -48,14 +50,14 @@ def test_a_sheet_that_one_view_saw_goes_and_the_ball_stays_whole() -> None:
 
 def test_no_face_reaches_beyond_the_box_though_voxels_do() -> None:
     box = np.array([[-0.73, -2, -2], [0.77, 2, 2]])
-    mesh = extract(frames(14), bbox=box, voxel=0.1, threads=1).mesh
+    mesh = extract(frames(14), ExtractOptions(bbox=box, voxel=0.1), threads=1).mesh
     assert mesh.vertices[:, 0].min() == pytest.approx(-0.73, abs=0.1)
     assert mesh.vertices[:, 0].max() == pytest.approx(0.77, abs=0.1)
     assert (np.abs(mesh.vertices[:, 0] - 0.02) <= 0.75).all()
 
 
 def test_faces_are_no_more_than_the_pixels_that_saw_them_carry_and_keep_colour_and_shape() -> None:
-    found = extract(frames(14), bbox=BOX, voxel=0.06, threads=1, by_evidence=True)
+    found = extract(frames(14), ExtractOptions(bbox=BOX, voxel=0.06, by_evidence=True), threads=1)
     assert found.cleaned is not None
     # a pixel at distance 3 is 3 / 40 wide, and the best view of each part looks nearly straight at it
     assert found.cleaned.pixels == pytest.approx(4 * np.pi * (40 / 3) ** 2, rel=0.3)
@@ -67,7 +69,7 @@ def test_faces_are_no_more_than_the_pixels_that_saw_them_carry_and_keep_colour_a
 
 def test_what_views_say_is_said_vertex_by_vertex_whatever_the_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     made = [depth_map(frame) for frame in frames(5, sheets=2)]
-    mesh = extract(frames(5), bbox=BOX, voxel=0.1, threads=1).mesh
+    mesh = extract(frames(5), ExtractOptions(bbox=BOX, voxel=0.1), threads=1).mesh
     whole = gather(mesh, made, 0.1)
     monkeypatch.setattr("gs2d.meshing.evidence.VERTICES_AT_ONCE", 37)
     parts = gather(mesh, made, 0.1)
@@ -105,7 +107,9 @@ def views_of_a_floor(count: int = 12) -> list[RenderedView]:
 
 def part_of_floor(frames: list[RenderedView]) -> float:
     """The part of the square |x|, |y| < 0.7 that is covered by a mesh of the frames, and what lies above it."""
-    mesh = extract(frames, bbox=BOX, voxel=0.06, truncation=0.3, min_weight=0.25, threads=1, by_evidence=True).mesh
+    mesh = extract(
+        frames, ExtractOptions(bbox=BOX, voxel=0.06, truncation=0.3, min_weight=0.25, by_evidence=True), threads=1
+    ).mesh
     inside = (np.abs(mesh.vertices[mesh.faces].mean(axis=1)[:, :2]) < 0.7).all(axis=1)
     return float(areas(mesh)[inside].sum()) / 1.4**2
 

@@ -11,7 +11,7 @@ import pytest
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.mesh import Mesh
 from gs2d.meshing.depth_maps import RenderedView
-from gs2d.meshing.extract import extract, extract_unbounded
+from gs2d.meshing.extract import ExtractOptions, extract, extract_unbounded
 from surface_shapes import rays
 
 ROOM = np.array([3.0, 2.0, 1.3])  # half its sides; the cameras stand in it
@@ -79,9 +79,9 @@ def cells_without(mesh: Mesh, cell: float = 0.1) -> int:
 
 
 def test_a_highlight_that_some_views_see_through_leaves_no_hole() -> None:
-    assert cells_without(extract(shining_wall(4), resolution=96, threads=1).mesh) == 0
+    assert cells_without(extract(shining_wall(4), ExtractOptions(resolution=96), threads=1).mesh) == 0
 
 
 def test_what_all_views_see_through_is_a_hole() -> None:
     """A mirror is not mended by fusion: what every photograph explains behind it is meshed behind it."""
-    assert cells_without(extract(shining_wall(12), resolution=96, threads=1).mesh) > 10
+    assert cells_without(extract(shining_wall(12), ExtractOptions(resolution=96), threads=1).mesh) > 10

@@ -11,7 +11,7 @@ from gs2d.core.camera import Camera, look_at
 from gs2d.errors import ProtocolError
 from gs2d.meshing.bounds import derive_limits, sample_depths
 from gs2d.meshing.depth_maps import DepthMap, RenderedView, Spool, depth_map
-from gs2d.meshing.extract import extract
+from gs2d.meshing.extract import ExtractOptions, extract
 from gs2d.meshing.marching_cubes import components, marching_cubes
 from gs2d.meshing.tsdf import FULL_WEIGHT_BEHIND, block_bytes, fuse
 from surface_shapes import (
@@ -207,7 +207,7 @@ def test_an_orbit_at_uneven_distances_keeps_the_whole_scene() -> None:
     frames = [RenderedView(c, box_depth(c, *wall)) for c in cameras]
     derived = derive_limits([sample_depths(depth_map(f)) for f in frames], cameras, resolution=100)
     assert derived.depth_limit > 5
-    mesh = extract(frames, resolution=100, threads=1).mesh
+    mesh = extract(frames, ExtractOptions(resolution=100), threads=1).mesh
     front = np.abs(mesh.vertices[:, 1]) < 0.05
     assert mesh.vertices[front].min(0)[0] < -1.9
     assert mesh.vertices[front].max(0)[0] > 1.9

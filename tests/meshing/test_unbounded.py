@@ -11,7 +11,7 @@ from cascade_scenes import BALL, GROUND, cascade_of, outdoor_frames, volumes_of
 from gs2d.core.camera import look_at
 from gs2d.errors import ProtocolError
 from gs2d.meshing.depth_maps import RenderedView, depth_map
-from gs2d.meshing.extract import Extraction, extract_unbounded
+from gs2d.meshing.extract import Extraction, ExtractOptions, extract_unbounded
 from gs2d.meshing.marching_cubes import components
 from gs2d.meshing.tsdf import block_bytes
 from gs2d.meshing.unbounded import (
@@ -109,7 +109,7 @@ def test_a_plane_through_all_levels_has_one_layer_and_no_hole_at_the_joins() -> 
 
 # -- the sky -----------------------------------------------------------------------------------------------------------
 def outdoors(sky: str, seed: int = 0) -> Extraction:
-    return extract_unbounded(outdoor_frames(sky, seed=seed), resolution=64, threads=1)
+    return extract_unbounded(outdoor_frames(sky, seed=seed), ExtractOptions(resolution=64), threads=1)
 
 
 @pytest.mark.parametrize("sky", ["unseen", "thin", "scattered", "cards"])
@@ -129,13 +129,13 @@ def test_a_sky_makes_no_shell_and_the_ground_reaches_far_out(sky: str) -> None:
 
 def test_memory_of_all_levels_together_is_bounded_and_the_error_names_a_voxel_that_fits() -> None:
     frames = outdoor_frames("unseen", views=8, size=48)
-    result = extract_unbounded(frames, voxel=0.03, threads=1)
+    result = extract_unbounded(frames, ExtractOptions(voxel=0.03), threads=1)
     assert result.volume_bytes == result.blocks * block_bytes(colored=True)
     bound = result.volume_bytes // 2
     with pytest.raises(ProtocolError, match="use a voxel of about") as caught:
-        extract_unbounded(frames, voxel=0.03, threads=1, max_bytes=bound)
+        extract_unbounded(frames, ExtractOptions(voxel=0.03, max_bytes=bound), threads=1)
     named = float(str(caught.value).split("use a voxel of about ")[1].split(" ")[0])
-    assert extract_unbounded(frames, voxel=named, threads=1, max_bytes=bound).volume_bytes <= bound
+    assert extract_unbounded(frames, ExtractOptions(voxel=named, max_bytes=bound), threads=1).volume_bytes <= bound
 
 
 @pytest.mark.parametrize("colored", [True, False])

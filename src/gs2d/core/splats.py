@@ -12,6 +12,15 @@ from torch import Tensor
 from gs2d.core.checks import check_shapes
 
 ATTRIBUTES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
+IMAGES = (
+    "color",
+    "alpha",
+    "normal",
+    "depth_mean",
+    "depth_median",
+    "distortion",
+)
+"""Images of a rendering, in the order of the kernels."""
 
 
 @dataclass(eq=False)

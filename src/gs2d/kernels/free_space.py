@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from gs2d.kernels.library import library_for
 
-__all__ = ["look_at_free_space"]
+__all__ = ["SeenSpace", "look_at_free_space"]
 
 
 class _Arguments(ctypes.Structure):
@@ -25,19 +26,32 @@ class _Arguments(ctypes.Structure):
     )
 
 
-def look_at_free_space(
-    ends: Tensor,
-    reach: Tensor,
-    project: Tensor,
-    center: Tensor,
-    *,
-    radius: float,
-    limit: Tensor,
-    known: Tensor,
-    fraction: float,
-    against: Tensor,
-    support: Tensor,
-) -> bool:
+class SeenSpace(NamedTuple):
+    """What an image says about the space before it.
+
+    Attributes
+    ----------
+    project : Tensor [3, 4] float32
+        A place p is at pixel (x, y) and depth z: (x z, y z, z) = project (p, 1).
+    center : Tensor [3] float32
+        Camera centre, world units.
+    limit, known : Tensor [H, W] float32, world units
+        What is nearer than ``limit`` is free; ``known`` is the depth of the surface in the image, or infinite.
+    radius : float
+        Radius of the free ball around the camera, world units.
+    fraction : float
+        Of the depth, within which a centre lies on the surface.
+    """
+
+    project: Tensor
+    center: Tensor
+    limit: Tensor
+    known: Tensor
+    radius: float
+    fraction: float
+
+
+def look_at_free_space(ends: Tensor, reach: Tensor, seen: SeenSpace, against: Tensor, support: Tensor) -> bool:
     """Count, for each splat, a photograph that sees through it and one that shows a surface there.
 
     Parameters
@@ -46,16 +60,7 @@ def look_at_free_space(
         Places at which a splat is looked at, its centre first.
     reach : Tensor [N] float32, world units
         No place of a splat is farther from its centre.
-    project : Tensor [3, 4] float32
-        A place p is at pixel (x, y) and depth z: (x z, y z, z) = project (p, 1).
-    center : Tensor [3] float32
-        Of the camera, world units.
-    radius : float
-        Of a ball around it that is free, world units.
-    limit, known : Tensor [H, W] float32, world units
-        What is nearer than the one is free; the other is the depth of what the photograph shows, or infinite.
-    fraction : float
-        Of the depth, within which a centre lies on the surface.
+    seen : SeenSpace
     against, support : Tensor [N] int32
         One is added where any place is free, and where the centre lies on the surface.
 
@@ -67,16 +72,17 @@ def look_at_free_space(
     library = library_for(ends)
     if library is None or library.dtype != torch.float32:
         return False
-    inputs = {"ends": ends, "reach": reach, "project": project, "center": center, "limit": limit, "known": known}
+    inputs = {"ends": ends, "reach": reach}
+    inputs |= {name: getattr(seen, name) for name in ("project", "center", "limit", "known")}
     given = {name: tensor.contiguous() for name, tensor in inputs.items()}
-    height, width = limit.shape
+    height, width = seen.limit.shape
     arguments = _Arguments(
         count=ends.shape[1],
         places=len(ends),
         height=height,
         width=width,
-        radius=radius,
-        fraction=fraction,
+        radius=seen.radius,
+        fraction=seen.fraction,
         against=against.data_ptr(),
         support=support.data_ptr(),
         **{name: tensor.data_ptr() for name, tensor in given.items()},

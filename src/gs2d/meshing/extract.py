@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -40,25 +40,58 @@ class Extraction:
     cleaned: Cleaned | None = None  # where it was made to hold what the views saw, and no more
 
 
+@dataclass(frozen=True, eq=False)
+class ExtractOptions:
+    """How depth maps become a mesh; limits that are None are derived from the maps.
+
+    Attributes
+    ----------
+    resolution : int
+        Voxels along the longest side, see ``bounds.derive_limits`` and ``unbounded.derive_cascade``.
+    bbox : array [2, 3] world units or None
+        Box that is fused; no face reaches beyond it. Of an unbounded scene the innermost level.
+    voxel, truncation, depth_limit : float world units or None
+        A truncation that is None grows with the disagreement of the depth maps (``consistency.depth_noise``).
+    min_weight : float
+        See ``marching_cubes``.
+    far_views : float
+        The same outside the innermost level of an unbounded scene, at most half as many as there are views.
+    min_faces, keep : int
+        See ``keep_components``.
+    by_evidence : bool
+        Leave only what more views see than see through, in no more faces than their pixels carry
+        (``evidence.clean``). Not for unbounded scenes.
+    max_bytes : int
+        Bound on the volume.
+    slab_bytes : int
+        Bytes of the volume that are in memory at a time; the mesh does not depend on it.
+    """
+
+    resolution: int = 512
+    bbox: np.ndarray | None = None
+    voxel: float | None = None
+    truncation: float | None = None
+    depth_limit: float | None = None
+    min_weight: float = 1.0
+    far_views: float = FAR_VIEWS
+    min_faces: int = 50
+    keep: int | None = None
+    by_evidence: bool = False
+    max_bytes: int = 4 << 30
+    slab_bytes: int = SLAB_BYTES
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """Limits as ``derive_limits`` and ``derive_cascade`` take them."""
+        return {name: getattr(self, name) for name in ("resolution", "bbox", "voxel", "truncation", "depth_limit")}
+
+
 def extract(
     frames: Iterable[RenderedView] | Spool,
+    options: ExtractOptions = ExtractOptions(),
     *,
-    limits: FusionBounds | None = None,
-    resolution: int = 512,
-    bbox: np.ndarray | None = None,
-    voxel: float | None = None,
-    truncation: float | None = None,
-    depth_limit: float | None = None,
-    points: np.ndarray | None = None,
-    min_weight: float = 1.0,
-    min_faces: int = 50,
-    keep: int | None = None,
-    max_bytes: int = 4 << 30,
     threads: int | None = None,
     backend: str | Backend = "auto",
-    folder: str | os.PathLike[str] | None = None,
-    by_evidence: bool = False,
-    slab_bytes: int = SLAB_BYTES,
 ) -> Extraction:
     """Fuse frames into a mesh.
 
@@ -66,27 +99,10 @@ def extract(
     ----------
     frames : iterable of RenderedView, or Spool
         Read once (a generator is fine) and kept in a temporary file; a spool is one, and stays open.
-    limits : FusionBounds, optional
-        Default: ``derive_limits`` from the frames, with ``resolution``, ``bbox``, ``voxel``, ``truncation``,
-        ``depth_limit`` and ``points`` as it takes them (they may not be given together with ``limits``); a truncation
-        that is not given grows with the disagreement of the depth maps (``consistency.depth_noise``). With ``bbox`` no
-        face reaches beyond it.
-    min_weight : float
-        See ``marching_cubes``.
-    min_faces, keep : int
-        See ``keep_components``.
-    max_bytes : int
-        Bound on the volume.
+    options : ExtractOptions
     threads : int, optional
     backend : str or Backend
         What fuses, see ``fuse``.
-    folder : path, optional
-        Where the temporary file goes.
-    by_evidence : bool
-        Leave only what more views see than see through, in no more faces than their pixels carry
-        (``evidence.clean``).
-    slab_bytes : int
-        Of the volume that are in memory at a time; the mesh does not depend on it.
 
     Raises
     ------
@@ -99,41 +115,29 @@ def extract(
     BackendError
         If the backend is unknown or cannot run here.
     """
-    if limits is not None and any(v is not None for v in (bbox, voxel, truncation, depth_limit, points)):
-        raise TypeError("give limits, or the numbers to derive them from, not both")
     backend = fusion_backend(backend)
-    with Spool.of(frames, folder) as spool:
-        if limits is None:
-            samples = sampled(spool)
-            limits = derive_limits(
-                samples,
-                spool.cameras,
-                resolution=resolution,
-                bbox=bbox,
-                voxel=voxel,
-                truncation=truncation,
-                depth_limit=depth_limit,
-                points=points,
-            )
-            if truncation is None:
-                limits = widen_truncation(limits, depth_noise(spool, samples, limits))
-            del samples
-            trim()  # 20 to 60 MB, before the volume
-        blocks = find_blocks(spool, limits, max_bytes=max_bytes, threads=threads, backend=backend)
-        fused = _Fused(blocks.frames, len(blocks.keys), blocks.nbytes, 1)
+    with Spool.of(frames) as spool:
+        samples = sampled(spool)
+        limits = derive_limits(samples, spool.cameras, **options.given)
+        if options.truncation is None:
+            limits = widen_truncation(limits, depth_noise(spool, samples, limits))
+        del samples
+        trim()  # 20 to 60 MB, before the volume
+        blocks = find_blocks(spool, limits, max_bytes=options.max_bytes, threads=threads, backend=backend)
+        fused = _Fused.of([blocks])
         whole = fused_surface(
             spool,
             limits,
             blocks,
-            min_weight=min_weight,
-            slab_bytes=slab_bytes,
+            min_weight=options.min_weight,
+            slab_bytes=options.slab_bytes,
             threads=threads,
             backend=backend,
         )
-        whole = whole if bbox is None else inside_box(whole, bbox)
+        whole = whole if options.bbox is None else inside_box(whole, options.bbox)
         trim()  # the volume of the last slab
-        found = _extraction(whole, limits, fused, min_faces=min_faces, keep=keep, backend=backend)
-        if not by_evidence:
+        found = _extraction(whole, limits, fused, options, backend)
+        if not options.by_evidence:
             return found
         del whole
         cleaned = clean(found.mesh, spool, limits.truncation)
@@ -144,36 +148,16 @@ def extract(
 
 def extract_unbounded(
     frames: Iterable[RenderedView] | Spool,
+    options: ExtractOptions = ExtractOptions(),
     *,
-    resolution: int = 512,
-    bbox: np.ndarray | None = None,
-    voxel: float | None = None,
-    truncation: float | None = None,
-    depth_limit: float | None = None,
-    min_weight: float = 1.0,
-    far_views: float = FAR_VIEWS,
-    min_faces: int = 50,
-    keep: int | None = None,
-    max_bytes: int = 4 << 30,
     threads: int | None = None,
     backend: str | Backend = "auto",
-    folder: str | os.PathLike[str] | None = None,
-    slab_bytes: int = SLAB_BYTES,
 ) -> Extraction:
     """Fuse frames of a scene without bounds into a mesh, in voxels that grow with the distance from its centre.
 
     Parameters
     ----------
-    frames : iterable of RenderedView, or Spool
-        As for ``extract``.
-    resolution, bbox, voxel, truncation, depth_limit
-        See ``unbounded.derive_cascade``; ``bbox``, ``voxel`` and ``truncation`` are those of the innermost level. A
-        truncation that is not given grows with the disagreement of the depth maps, as in ``extract``.
-    min_weight : float
-        See ``marching_cubes``.
-    far_views : float
-        The same outside the innermost level, at most half as many as there are views.
-    min_faces, keep, max_bytes, threads, backend, folder, slab_bytes
+    frames, options, threads, backend
         As for ``extract``.
 
     Returns
@@ -187,38 +171,29 @@ def extract_unbounded(
         As ``extract``.
     """
     backend = fusion_backend(backend)
-    with Spool.of(frames, folder) as spool:
+    with Spool.of(frames) as spool:
         samples = sampled(spool)
-        cascade = derive_cascade(
-            samples,
-            spool.cameras,
-            resolution=resolution,
-            bbox=bbox,
-            voxel=voxel,
-            truncation=truncation,
-            depth_limit=depth_limit,
-        )
-        if truncation is None:
+        cascade = derive_cascade(samples, spool.cameras, **options.given)
+        if options.truncation is None:
             inner = cascade.levels[0]
             # far depths contradict each other more, but their levels have wider bands
             noise = depth_noise(spool, samples, replace(inner, depth_limit=min(inner.depth_median, inner.depth_limit)))
             cascade = cascade.with_truncation(widen_truncation(inner, noise).truncation, noise)
         del samples
         trim()
-        blocks = find_cascade_blocks(spool, cascade, max_bytes=max_bytes, threads=threads, backend=backend)
+        blocks = find_cascade_blocks(spool, cascade, max_bytes=options.max_bytes, threads=threads, backend=backend)
         whole = fused_cascade_surface(
             spool,
             cascade,
             blocks,
-            min_weight=min_weight,
-            far_weight=min(far_views, blocks[0].frames / 2),
-            slab_bytes=slab_bytes,
+            min_weight=options.min_weight,
+            far_weight=min(options.far_views, blocks[0].frames / 2),
+            slab_bytes=options.slab_bytes,
             threads=threads,
             backend=backend,
         )
-    fused = _Fused.of(blocks)
     limits = replace(cascade.levels[0], lower=cascade.levels[-1].lower, upper=cascade.levels[-1].upper)
-    return _extraction(whole, limits, fused, min_faces=min_faces, keep=keep, backend=backend)
+    return _extraction(whole, limits, _Fused.of(blocks), options, backend)
 
 
 def sampled(spool: Spool) -> list[DepthSample]:
@@ -243,10 +218,10 @@ class _Fused:
 
 
 def _extraction(
-    whole: Mesh, limits: FusionBounds, fused: _Fused, *, min_faces: int, keep: int | None, backend: Backend
+    whole: Mesh, limits: FusionBounds, fused: _Fused, options: ExtractOptions, backend: Backend
 ) -> Extraction:
-    """Without small pieces, with the figures."""
-    mesh = keep_components(whole, min_faces=min_faces, keep=keep)
+    """Return the mesh without small components, with the figures."""
+    mesh = keep_components(whole, min_faces=options.min_faces, keep=options.keep)
     return Extraction(
         mesh=mesh,
         limits=limits,

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gs2d.core.camera import Camera
-from gs2d.core.splats import ATTRIBUTES, Splats
+from gs2d.core.splats import ATTRIBUTES, IMAGES, Splats
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.library import Library, ready_library
 from gs2d.render.types import NEAR_PLANE_POLICIES, PLAIN_COLORS, Features, RasterSettings, RenderOutput
@@ -25,7 +25,6 @@ from gs2d.render.types import NEAR_PLANE_POLICIES, PLAIN_COLORS, Features, Raste
 __all__ = ["rasterize", "rasterize_with", "splat_errors", "splat_errors_with"]
 
 CONSTANTS = ("near", "far", "alpha_min", "alpha_max", "transmittance_min", "error_cutoff", "lowpass_px")
-IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
 
 
 class _View(ctypes.Structure):

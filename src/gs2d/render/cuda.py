@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 
 from gs2d.core.camera import Camera
-from gs2d.core.splats import Splats
+from gs2d.core.splats import ATTRIBUTES, IMAGES, Splats
 from gs2d.errors import ShapeError
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.arguments import View
@@ -23,8 +23,6 @@ from gs2d.kernels.cuda.launch import Launcher
 from gs2d.render.cuda_passes import (
     CHANNELS,
     DEPTH,
-    IMAGES,
-    PARAMETERS,
     ForwardState,
     Wanted,
     backward,
@@ -124,8 +122,8 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
         options: _Options = ctx.options
         values, features, *saved = ctx.saved_tensors
-        tensors = saved[-len(PARAMETERS) :]
-        images = dict(zip((*IMAGES, "final_T", "moments", *DEPTH), saved[len(SAVED) : -len(PARAMETERS)], strict=True))
+        tensors = saved[-len(ATTRIBUTES) :]
+        images = dict(zip((*IMAGES, "final_T", "moments", *DEPTH), saved[len(SAVED) : -len(ATTRIBUTES)], strict=True))
         hidden = dict(zip(SAVED, saved[: len(SAVED)], strict=True))
         frame = ForwardState(view=options.view, images=images, **hidden)
         given = [None if g is None else g.detach().to(torch.float32).contiguous() for g in upstream[1:]]
@@ -138,7 +136,7 @@ class _Rasterize(torch.autograd.Function):
             given[0] = given[0][..., :3].contiguous()
         want_probe, want_intrinsics, want_values, *want = ctx.needs_input_grad[1:]
         gradients = {
-            name: torch.empty_like(t) if w else None for name, t, w in zip(PARAMETERS, tensors, want, strict=True)
+            name: torch.empty_like(t) if w else None for name, t, w in zip(ATTRIBUTES, tensors, want, strict=True)
         }
         device = tensors[0].device
         probe = torch.empty(ctx.probe_shape, dtype=torch.float32, device=device) if want_probe else None

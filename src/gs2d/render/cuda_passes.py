@@ -6,36 +6,41 @@ without a GPU. Memory is torch's; nothing waits for the device but for the numbe
 
 from __future__ import annotations
 
-import ctypes
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gs2d.core.camera import Camera
+from gs2d.core.splats import ATTRIBUTES, IMAGES
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda.arguments import (
-    BlendArguments,
-    BlendColorsArguments,
-    BlendVjpArguments,
     DepthArguments,
-    EmitArguments,
     ErrorArguments,
     FeatureArguments,
     Features,
     OccludedArguments,
-    OrderArguments,
-    ProjectArguments,
-    ProjectColorsArguments,
-    ProjectVjpArguments,
-    RangeArguments,
     SlotArguments,
     View,
+    fill,
 )
-from gs2d.kernels.cuda.launch import Launcher
+from gs2d.kernels.cuda.launch import Launcher, Work
+from gs2d.render.cuda_works import (
+    blend,
+    blend_gradients,
+    blocks_of,
+    emit,
+    find_ranges,
+    order_tiles,
+    project,
+    see,
+    splat_gradients,
+    takes_view,
+    work_of,
+)
 from gs2d.render.pair_budget import MAX_PAIRS, PairBudget, Rendering, room_for
 from gs2d.render.types import NEAR_PLANE_POLICIES, RasterSettings
 
@@ -43,7 +48,6 @@ __all__ = [
     "CHANNELS",
     "DEPTH",
     "IMAGES",
-    "PARAMETERS",
     "ForwardState",
     "Wanted",
     "backward",
@@ -54,16 +58,22 @@ __all__ = [
 ]
 
 TILE = 16
-THREADS = 128
-ORDER_THREADS = 512  # order.cu
 CHANNELS = 8  # pixels.h: further channels come in groups of these
-PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 MAX_SPLATS = 1 << 24  # an entry holds the splat in 24 bits
 MAX_SLOTTED = 1 << 30  # four slots each, counted in 32 bits
 ERROR_UNIT = 2.0**-24  # occluded.cu
 CAMERA_BYTES = View.near.offset  # pose and intrinsics: what tells views of a training apart
-IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
 DEPTH = ("depth_transmittance", "slope")  # without pixels where that depth was not asked for
+LISTS = ("records", "entries", "ranges", "tiles", "seen")
+PROJECTED = {
+    "records": (16, torch.float32),
+    "cull": (8, torch.float32),
+    "rects": (4, torch.int16),
+    "depth_keys": (1, torch.int32),
+    "tile_counts": (1, torch.int32),
+    "radii": (1, torch.float32),
+}
+"""Columns and types of what project.cu writes of each splat."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,17 +119,10 @@ class ForwardState:
     ends: Tensor
     permutation: Tensor
 
-
-@dataclass(frozen=True, eq=False)
-class _Lists:
-    """The splats of each tile, front to back; fields as in Frame."""
-
-    entries: Tensor
-    ranges: Tensor
-    tiles: Tensor
-    order: Tensor
-    ends: Tensor
-    permutation: Tensor
+    @property
+    def lists(self) -> dict[str, Tensor]:
+        """What all kernels that blend take."""
+        return {name: getattr(self, name) for name in LISTS}
 
 
 def view_of(camera: Camera, settings: RasterSettings) -> View:
@@ -155,51 +158,31 @@ def view_of(camera: Camera, settings: RasterSettings) -> View:
     return view
 
 
-def _fill(arguments: ctypes.Structure, tensors: dict[str, Tensor | None]) -> None:
-    """Set the structure's pointers; None is a null pointer."""
-    for name, tensor in tensors.items():
-        setattr(arguments, name, None if tensor is None else tensor.data_ptr())
+def _run(launcher: Launcher, view: View, work: Work) -> None:
+    """Run a launch for a view."""
+    if takes_view(work):
+        see([work], view)
+    launcher.launch(work.name, work.blocks, work.threads, work.arguments)
 
 
-def _blocks(count: int) -> int:
-    return -(-count // THREADS)
-
-
-@dataclass(frozen=True, eq=False)
-class _Projected:
-    """What project.cu writes; records, cull and rects of splats without tiles are garbage."""
-
-    records: Tensor  # [N, 16] float32
-    cull: Tensor  # [N, 8] float32
-    rects: Tensor  # [N, 4] int16
-    depth_keys: Tensor  # [N] int32
-    tile_counts: Tensor  # [N] int32
-    radii: Tensor  # [N] float32
-
-
-PROJECTED = tuple(field.name for field in fields(_Projected))
+def _named(parameters: Sequence[Tensor]) -> dict[str, Tensor]:
+    return dict(zip(ATTRIBUTES, parameters, strict=True))
 
 
 def _project(
     launcher: Launcher, view: View, parameters: Sequence[Tensor], *, errors: bool, exact: bool = True
-) -> _Projected:
-    """Return records and footprints: those of blending, or with ``errors`` those of rho <= error_cutoff^2."""
+) -> dict[str, Tensor]:
+    """Return what project.cu writes; records, cull and rects of splats without tiles are garbage."""
     count, device = parameters[0].shape[0], parameters[0].device
     if count >= MAX_SPLATS:
         raise BackendError(f"the cuda backend takes fewer than {MAX_SPLATS} splats, got {count}")
-    shapes = {"records": (count, 16), "cull": (count, 8), "rects": (count, 4)}
-    types = {"rects": torch.int16, "depth_keys": torch.int32, "tile_counts": torch.int32}
-    arrays = {
-        name: torch.empty(shapes.get(name, (count,)), dtype=types.get(name, torch.float32), device=device)
-        for name in PROJECTED
+    projected = {
+        name: torch.empty(count * columns, dtype=dtype, device=device).view(-1, *((columns,) if columns > 1 else ()))
+        for name, (columns, dtype) in PROJECTED.items()
     }
     if count > 0:
-        project = ProjectArguments(view=view, count=count, sh_rest=parameters[5].shape[1])
-        project.errors, project.exact = int(errors), int(exact)
-        _fill(project, dict(zip(PARAMETERS, parameters, strict=True)))
-        _fill(project, dict(arrays))
-        launcher.launch("project_splats", _blocks(count), THREADS, project)
-    return _Projected(**arrays)
+        _run(launcher, view, project(_named(parameters), projected, errors=errors, exact=exact))
+    return projected
 
 
 def forward(
@@ -224,41 +207,23 @@ def forward(
         return torch.empty(shape, dtype=torch.float32, device=device)
 
     projected = _project(launcher, view, parameters, errors=False, exact=exact)
-    lists = _bin(launcher, view, projected, exact, budget)
-    words = (len(lists.entries) >> 5) + len(lists.tiles) + 1
-    seen = torch.empty(words, 8, dtype=torch.int32, device=device)
-    H, W = int(view.height), int(view.width)
+    found = _bin(launcher, view, projected, exact, budget)
+    words = (len(found["entries"]) >> 5) + len(found["tiles"]) + 1
+    found |= {"records": projected["records"], "seen": torch.empty(words, 8, dtype=torch.int32, device=device)}
+    H, W, tiles = int(view.height), int(view.width), len(found["tiles"])
     images = {name: floats(H, W, 3) if name in ("color", "normal") else floats(H, W) for name in IMAGES}
     images |= {"final_T": floats(H, W), "moments": floats(H, W, 3) if distortion else floats(0)}
     if not distortion:
         images["distortion"].fill_(math.nan)
-    blend = BlendArguments(view=view)
-    _fill(blend, {"records": projected.records, "seen": seen, **images})
-    _fill(blend, {name: getattr(lists, name) for name in ("entries", "ranges", "tiles")})
-    launcher.launch(f"blend_forward{'_distortion' if distortion else ''}", len(lists.tiles), THREADS, blend)
+    lists = {name: found[name] for name in LISTS}
+    _run(launcher, view, blend(tiles, lists, images, distortion=distortion))
     images |= {name: floats(H, W) if transmittance else floats(0) for name in DEPTH}
     if transmittance:
-        find = DepthArguments(view=view)
-        _fill(find, {"records": projected.records, "seen": seen, "alpha": images["alpha"]})
-        _fill(find, {"median": images["depth_median"], "depth": images["depth_transmittance"]})
-        _fill(
-            find, {"slope": images["slope"], **{name: getattr(lists, name) for name in ("entries", "ranges", "tiles")}}
-        )
-        launcher.launch("transmittance_depth", len(lists.tiles), THREADS, find)
-    return ForwardState(
-        view=view,
-        records=projected.records,
-        tile_counts=projected.tile_counts,
-        entries=lists.entries,
-        ranges=lists.ranges,
-        tiles=lists.tiles,
-        seen=seen,
-        images=images,
-        radii=projected.radii,
-        order=lists.order,
-        ends=lists.ends,
-        permutation=lists.permutation,
-    )
+        more = {"alpha": images["alpha"], "median": images["depth_median"], "slope": images["slope"]}
+        more |= {"depth": images["depth_transmittance"]}
+        _run(launcher, view, work_of("transmittance_depth", tiles, DepthArguments(), lists, more))
+    kept = {name: projected[name] for name in ("tile_counts", "radii")}
+    return ForwardState(view=view, images=images, **found, **kept)
 
 
 def _features(
@@ -266,8 +231,7 @@ def _features(
 ) -> Features:
     """Return the structure of further channels, a multiple of ``CHANNELS``; all tensors are contiguous."""
     features = Features(count=values.shape[1])
-    _fill(features, {"values": values, "background": background, "images": images})
-    _fill(features, {"upstream": upstream, "gradients": gradients})
+    fill(features, values=values, background=background, images=images, upstream=upstream, gradients=gradients)
     return features
 
 
@@ -275,21 +239,20 @@ def blend_features(launcher: Launcher, frame: ForwardState, values: Tensor, back
     """Return images [F, H, W] of further channels [N, F] over a background [F]: those of the view of ``frame``."""
     final_T = frame.images["final_T"]
     images = final_T.new_empty(values.shape[1], *final_T.shape)
-    blend = FeatureArguments(view=frame.view, features=_features(values, background, images))
-    _fill(blend, {name: getattr(frame, name) for name in ("records", "entries", "ranges", "tiles", "seen")})
-    _fill(blend, {"final_T": final_T})
-    launcher.launch("features_forward", len(frame.tiles), THREADS, blend)
+    arguments = FeatureArguments(features=_features(values, background, images))
+    work = work_of("features_forward", len(frame.tiles), arguments, frame.lists, {"final_T": final_T})
+    _run(launcher, frame.view, work)
     return images
 
 
 def _bin(
-    launcher: Launcher, view: View, projected: _Projected, exact: bool, budget: PairBudget | None = None
-) -> _Lists:
-    """Return a stable sort by depth, emission of candidates, a stable sort by tile."""
-    device = projected.records.device
+    launcher: Launcher, view: View, projected: dict[str, Tensor], exact: bool, budget: PairBudget | None = None
+) -> dict[str, Tensor]:
+    """Return the splats of each tile: a stable sort by depth, emission of candidates, a stable sort by tile."""
+    device = projected["records"].device
     tiles = int(view.tiles_x) * int(view.tiles_y)
-    order = torch.sort(projected.depth_keys, stable=True).indices
-    ends = torch.cumsum(projected.tile_counts[order], 0, dtype=torch.int64)
+    order = torch.sort(projected["depth_keys"], stable=True).indices
+    ends = torch.cumsum(projected["tile_counts"][order], 0, dtype=torch.int64)
     camera = bytes(view)[:CAMERA_BYTES]
     candidates = room_for(ends[-1], Rendering(tiles, len(order), camera), budget) if len(ends) else 0
     if candidates > MAX_PAIRS:
@@ -303,23 +266,16 @@ def _bin(
         bits = 16 if tiles < 1 << 15 else 32  # the sentinel is `tiles`
         keys = torch.empty(candidates, dtype=torch.int16 if bits == 16 else torch.int32, device=device)
         payloads = torch.empty(candidates, dtype=torch.int32, device=device)
-        emit = EmitArguments(candidates=candidates, visible=len(order), exact=int(exact))
-        for name in ("width", "height", "tiles_x", "tiles_y", "near"):
-            setattr(emit, name, getattr(view, name))
-        _fill(emit, {"order": order, "ends": ends})
-        _fill(emit, {name: getattr(projected, name) for name in ("cull", "records", "rects")})
-        _fill(emit, {"keys": keys, "payloads": payloads})
-        launcher.launch(f"emit_entries_{bits}", _blocks(candidates), THREADS, emit)
+        given = {name: projected[name] for name in ("cull", "records", "rects")}
+        given |= {"order": order, "ends": ends, "keys": keys, "payloads": payloads}
+        _run(launcher, view, emit(f"emit_entries_{bits}", candidates, len(order), given, exact=exact))
         sorted_keys, permutation = torch.sort(keys, stable=True)
-        find = RangeArguments(candidates=candidates)
-        _fill(find, {"keys": sorted_keys, "permutation": permutation, "payloads": payloads})
-        _fill(find, {"entries": entries, "ranges": ranges})
-        launcher.launch(f"find_ranges_{bits}", _blocks(candidates), THREADS, find)
+        given = {"keys": sorted_keys, "permutation": permutation, "payloads": payloads}
+        _run(launcher, view, find_ranges(bits, candidates, given | {"entries": entries, "ranges": ranges}))
     heavy_first = torch.empty(tiles, dtype=torch.int32, device=device)
-    arrange = OrderArguments(tiles=tiles)
-    _fill(arrange, {"ranges": ranges, "order": heavy_first})
-    launcher.launch("order_tiles", 1, ORDER_THREADS, arrange)
-    return _Lists(entries, ranges, heavy_first, order, ends, permutation)
+    _run(launcher, view, order_tiles(tiles, {"ranges": ranges, "order": heavy_first}))
+    lists = {"entries": entries, "ranges": ranges, "tiles": heavy_first}
+    return lists | {"order": order, "ends": ends, "permutation": permutation}
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,60 +318,27 @@ def backward(
     """
     if len(parameters[0]) == 0:
         return
-    if wanted.only_colors and features is None:
-        return _backward_colors(launcher, frame, parameters, upstream["color"], wanted)
-    probe = wanted.parameters["probe"]
-    absolute = probe is not None and probe.shape[1] == 4
-    kind = "color"
-    if any(upstream[name] is not None for name in ("normal", "depth_mean", "depth_median")):
-        kind = "geometry"
-    if upstream["distortion"] is not None:
-        kind = "distortion"
-    if upstream["depth_transmittance"] is not None:
-        kind = "distortion_transmittance" if kind == "distortion" else "transmittance"
-    sums = _Sums(frame, wanted.deterministic, columns=16)
-    blend = BlendVjpArguments(view=frame.view)
-    _fill(blend, {name: getattr(frame, name) for name in ("records", "entries", "ranges", "tiles", "seen")})
-    _fill(blend, {name: image for name, image in frame.images.items() if name != "depth_median"})
-    _fill(blend, {f"g_{name}": upstream[name] for name in (*IMAGES, "depth_transmittance")})
-    _fill(blend, {"gradients": sums.gradients, "extras": sums.extras, "slots": sums.slots, "learns": wanted.learns})
-    kernel = f"blend_vjp_{kind}"
-    if features is not None:
-        blend.features = _features(*features)
-        kernel = f"features_vjp{'_distortion' if kind == 'distortion' else ''}"
-    launcher.launch(f"{kernel}{'_abs' if absolute else ''}", len(frame.tiles), THREADS, blend)
-    gradients, extras = sums.of_splats(launcher)
-
-    project = ProjectVjpArguments(view=frame.view, count=len(parameters[0]), sh_rest=parameters[5].shape[1])
-    _fill(project, dict(zip(PARAMETERS, parameters, strict=True)))
-    _fill(project, {"tile_counts": frame.tile_counts, "learns": wanted.learns})
-    _fill(project, {"gradients": gradients, "extras": extras})
-    _fill(project, {f"g_{name}": tensor for name, tensor in wanted.parameters.items()})
-    project.probe_columns = 0 if probe is None else int(probe.shape[1])
-    launcher.launch("project_splats_vjp", _blocks(len(parameters[0])), THREADS, project)
-
-
-def _backward_colors(
-    launcher: Launcher, frame: ForwardState, parameters: Sequence[Tensor], g_color: Tensor | None, wanted: Wanted
-) -> None:
-    """Of sh0 and shN alone: no geometry, and no work behind the last splat that learns."""
-    means, *_, sh0, shN = parameters
-    g_sh0, g_shN = wanted.parameters["sh0"], wanted.parameters["shN"]
-    if g_color is None:
-        for tensor in (g_sh0, g_shN):
+    only_colors = wanted.only_colors and features is None
+    if only_colors and upstream["color"] is None:
+        for tensor in wanted.parameters.values():
             if tensor is not None:
                 tensor.zero_()
         return
-    sums = _Sums(frame, wanted.deterministic, columns=0)
-    blend = BlendColorsArguments(view=frame.view)
-    _fill(blend, {name: getattr(frame, name) for name in ("records", "entries", "ranges", "tiles", "seen")})
-    _fill(blend, {"learns": wanted.learns, "g_color": g_color, "slots": sums.slots, "gradients": sums.extras})
-    launcher.launch("blend_vjp_learning", len(frame.tiles), THREADS, blend)
-    _, gradients = sums.of_splats(launcher)
-    project = ProjectColorsArguments(view=frame.view, count=len(means), sh_rest=shN.shape[1])
-    _fill(project, {"means": means, "sh0": sh0, "shN": shN, "tile_counts": frame.tile_counts})
-    _fill(project, {"learns": wanted.learns, "gradients": gradients, "g_sh0": g_sh0, "g_shN": g_shN})
-    launcher.launch("project_colors_vjp", _blocks(len(means)), THREADS, project)
+    probe = wanted.parameters["probe"]
+    sums = _Sums(frame, wanted.deterministic, columns=0 if only_colors else 16)
+    blended = blend_gradients(
+        len(frame.tiles),
+        frame.lists,
+        frame.images,
+        upstream,
+        {"gradients": sums.gradients, "extras": sums.extras, "slots": sums.slots, "learns": wanted.learns},
+        absolute=probe is not None and probe.shape[1] == 4,
+        features=None if features is None else _features(*features),
+    )
+    _run(launcher, frame.view, blended)
+    gradients, extras = sums.of_splats(launcher)
+    given = {"tile_counts": frame.tile_counts, "learns": wanted.learns, "gradients": gradients, "extras": extras}
+    _run(launcher, frame.view, splat_gradients(_named(parameters), given, wanted.parameters))
 
 
 class _Sums:
@@ -442,10 +365,10 @@ class _Sums:
         count = len(self.frame.records)
         extras = self.extras.new_empty(count, 4)
         gradients = None if self.gradients is None else self.gradients.new_empty(count, self.gradients.shape[1])
-        slots = SlotArguments(count=count, candidates=len(self.slots))
-        _fill(slots, {"order": self.frame.order, "ends": self.frame.ends})
-        _fill(slots, {"slots": self.gradients, "extra_slots": self.extras, "gradients": gradients, "extras": extras})
-        launcher.launch("sum_slots", _blocks(32 * count), THREADS, slots)
+        given = {"order": self.frame.order, "ends": self.frame.ends, "gradients": gradients, "extras": extras}
+        arguments = SlotArguments(count=count, candidates=len(self.slots))
+        slots = {"slots": self.gradients, "extra_slots": self.extras}
+        _run(launcher, self.frame.view, work_of("sum_slots", blocks_of(32 * count), arguments, given, slots))
         return gradients, extras
 
 
@@ -462,17 +385,15 @@ def errors(
     projected = _project(launcher, view, parameters, errors=True)
     if count == 0:
         return torch.empty(0, dtype=torch.float32, device=image.device)
+    given: dict[str, Tensor | None] = {"image": image, "mask": mask}
     if occlusion:
         lists = _bin(launcher, view, projected, True)
         units = torch.zeros(count, dtype=torch.int64, device=image.device)
-        occluded = OccludedArguments(view=view)
-        _fill(occluded, {name: getattr(lists, name) for name in ("entries", "ranges", "tiles")})
-        _fill(occluded, {"records": projected.records, "image": image, "mask": mask, "errors": units})
-        launcher.launch("splat_errors_occluded", len(lists.tiles), THREADS, occluded)
+        given |= {name: lists[name] for name in ("entries", "ranges", "tiles")}
+        given |= {"records": projected["records"], "errors": units}
+        _run(launcher, view, work_of("splat_errors_occluded", len(lists["tiles"]), OccludedArguments(), given))
         return (units.to(torch.float64) * ERROR_UNIT).to(torch.float32)
     total = torch.empty(count, dtype=torch.float32, device=image.device)
-    arguments = ErrorArguments(view=view, count=count)
-    _fill(arguments, {name: getattr(projected, name) for name in ("records", "cull", "rects", "tile_counts")})
-    _fill(arguments, {"image": image, "mask": mask, "errors": total})
-    launcher.launch("splat_errors", _blocks(32 * count), THREADS, arguments)
+    given |= {name: projected[name] for name in ("records", "cull", "rects", "tile_counts")} | {"errors": total}
+    _run(launcher, view, work_of("splat_errors", blocks_of(32 * count), ErrorArguments(count=count), given))
     return total

@@ -9,15 +9,13 @@ launcher may start as a graph. The arithmetic is that of :mod:`gs2d.render.cuda_
 
 from __future__ import annotations
 
-import ctypes
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gs2d.core.splats import ATTRIBUTES
 from gs2d.kernels.adam import bias_corrections_of
 from gs2d.kernels.cuda import arguments as structures
 from gs2d.kernels.cuda.launch import Launcher, Work
@@ -32,7 +30,20 @@ from gs2d.kernels.cuda.sort import (
     passes_of,
     pieces_of,
 )
-from gs2d.render.cuda_passes import CAMERA_BYTES, MAX_SPLATS, ORDER_THREADS, THREADS, view_of
+from gs2d.render.cuda_passes import CAMERA_BYTES, MAX_SPLATS, PROJECTED, view_of
+from gs2d.render.cuda_works import (
+    THREADS,
+    blend,
+    blend_gradients,
+    blocks_of,
+    emit,
+    find_ranges,
+    order_tiles,
+    project,
+    see,
+    splat_gradients,
+    takes_view,
+)
 from gs2d.render.pair_budget import PairBudget, Rendering
 from gs2d.render.whole_step import WholeStep
 
@@ -179,73 +190,49 @@ def _key(step: WholeStep) -> tuple[object, ...]:
     )
 
 
-def _address(tensor: Tensor | None) -> int | None:
-    return None if tensor is None else tensor.data_ptr()
+class _Sorting:
+    """The launches that sort splats by depth and pairs by tile, and the memory that is cleared for them.
 
+    Parameters
+    ----------
+    arena : Arena
+    count : int
+        Splats.
+    tiles : int
+    room : int
+        Pairs of splat and tile; with some to spare, because the next view has more.
 
-class _Plan:
-    """The launches of an iteration in their order, in two parts: until the number of pairs is known, and afterwards."""
+    Attributes
+    ----------
+    most_room : int
+        Pairs that there is memory for.
+    bits : int
+        Of the keys of tiles.
+    order, ends, keys, payloads, tile_keys, entries : Tensor
+        Splats by depth, the running sum of their pairs, what emission writes, and the same sorted.
+    """
 
-    def __init__(self, arena: Arena, step: WholeStep, view: structures.View, room: int) -> None:
-        self._arena, self._step = arena, step
-        self._height, self._width, self._count = int(view.height), int(view.width), len(step.splats)
-        self._tiles = int(view.tiles_x) * int(view.tiles_y)
-        self._wide = 16 if self._tiles < 1 << 15 else 32
-        self._passes = passes_of(self._tiles.bit_length())  # of tiles 0 .. tiles, the last of which is none
-        self._with_view: list[ctypes.Structure] = []  # those that hold a View
-        self._of_room: list[Callable[[int], None]] = []
-        self.overflow = arena.get("overflow", 1, torch.int32)[:1].view(())
-        self._only_colors = not set(step.learned) - {"sh0", "shN"}
-        self._pairs(room)
-        self._images()
-        self._sums()
-        self._scratch()
-        self.until_known = [self._clear(), self._project(), *self._by_depth(), self._running()]
-        self.afterwards = [self._emit(), *self._by_tile(), self._ranges(), self._order(), self._blend()]
-        self.afterwards += [*self._losses(), *self._gradients(), self._adam()]
-
-    # -- memory ------------------------------------------------------------------------------------------------------
-    def _pairs(self, room: int) -> None:
-        """Of splats and tiles: with some to spare, because the next view has more."""
-        arena, key = self._arena, torch.int16 if self._wide == 16 else torch.int32
+    def __init__(self, arena: Arena, count: int, tiles: int, room: int) -> None:
+        self._arena, self._count, self._tiles = arena, count, tiles
+        self.bits = 16 if tiles < 1 << 15 else 32
+        self._passes = passes_of(tiles.bit_length())  # of tiles 0 .. tiles, the last of which is none
+        key = torch.int16 if self.bits == 16 else torch.int32
         entries = arena.get("entries", room, torch.int32)
         self.most_room = len(entries)
-        self._buffers = {
-            "keys": arena.get(f"keys_{self._wide}", self.most_room, key, spare=1),
-            "more_keys": arena.get(f"more_keys_{self._wide}", self.most_room, key, spare=1),
-            "payloads": arena.get("payloads", self.most_room, torch.int32, spare=1),
-            "entries": entries,
-            "seen": arena.get("seen", 8 * ((self.most_room >> 5) + self._tiles + 1), torch.int32),
-        }
-
-    def _images(self) -> None:
-        pixels = self._height * self._width
-        planes = {"color": 3, "alpha": 1, "normal": 3, "depth_mean": 1, "depth_median": 1, "final_T": 1}
-        planes |= {"maps": 9, "g_color": 3}
-        if self._has_normals:
-            planes |= {"g_normal": 3, "g_depth": 1}
-        if self._has_silhouette:
-            planes |= {"g_alpha": 1}
-        self._pixels = {name: self._arena.get(name, n * pixels) for name, n in planes.items()}
-
-    @property
-    def _has_normals(self) -> bool:
-        return self._step.losses.normals is not None and not self._only_colors
-
-    @property
-    def _has_silhouette(self) -> bool:
-        return self._step.losses.silhouette is not None and not self._only_colors
-
-    def _sums(self) -> None:
-        """Of gradients: rows of the splats, which the last reader clears."""
-        self._gradient_rows = self._arena.get("gradient_rows", 16 * self._count, zeros=True)
-        self._extras = self._arena.get("extras", 4 * self._count, zeros=True)
+        keys = [arena.get(f"{name}_{self.bits}", self.most_room, key, spare=1) for name in ("keys", "more_keys")]
+        payloads = [arena.get("payloads", self.most_room, torch.int32, spare=1), entries]
+        self._keys, self._payloads = keys, payloads
+        self.keys, self.payloads = keys[0], payloads[0]
+        last = len(self._passes) % 2
+        self.tile_keys, self.entries = keys[last], payloads[last]
+        self.ends = arena.get("ends", count, torch.int32)
+        self._scratch()
 
     def _scratch(self) -> None:
         """Lay out what is cleared when an iteration begins: one piece of memory, and where its parts begin."""
-        tiles, pieces = self._tiles, pieces_of(self._count)
+        pieces = pieces_of(self._count)
         ends = {"tickets": TICKETS, "depth_digits": MOST_PASSES * DIGITS, "tile_digits": MOST_PASSES * DIGITS}
-        ends |= {"ranges": 4 * (tiles + 1), "running": -(-pieces // 4) * 4}
+        ends |= {"ranges": 4 * (self._tiles + 1), "running": -(-pieces // 4) * 4}
         ends |= {"depth_words": len(passes_of(DEPTH_BITS)) * pieces * DIGITS}
         at, self._parts = 0, {}
         for name, words in ends.items():
@@ -253,286 +240,129 @@ class _Plan:
             at += words
         self._parts["tile_words"] = at  # last: how many follows the room
         most = at + len(self._passes) * pieces_of(self.most_room) * DIGITS
-        self._scratch_words = self._arena.get("scratch", most, torch.int32)
+        self._words = self._arena.get("scratch", most, torch.int32)
 
-    def _part(self, name: str, words: int = 0) -> int:
+    def part(self, name: str, words: int = 0) -> int:
         """Return the address of a part of the scratch memory, so many times 4 bytes on."""
-        return self._scratch_words.data_ptr() + 4 * (self._parts[name] + words)
+        return self._words.data_ptr() + 4 * (self._parts[name] + words)
 
-    # -- launches ----------------------------------------------------------------------------------------------------
-    def _splat_blocks(self) -> int:
-        return -(-self._count // THREADS)
+    def clear(self) -> Work:
+        """Fill the scratch memory with zeros."""
+        self._clearing = Work("clear_words", 1, SORT_THREADS, structures.ClearArguments(words=self.part("tickets")))
+        return self._clearing
 
-    def _clear(self) -> Work:
-        arguments = structures.ClearArguments(words=self._scratch_words.data_ptr())
-        work = Work("clear_words", 1, SORT_THREADS, arguments)
-
-        def of_room(room: int) -> None:
-            words = self._parts["tile_words"] + len(self._passes) * pieces_of(room) * DIGITS
-            arguments.count, work.blocks = words // 4, clear_blocks(words // 4)
-
-        self._of_room.append(of_room)
-        return work
-
-    def _project(self) -> Work:
+    def by_depth(self, depth_keys: Tensor) -> list[Work]:
+        """Sort splats by depth; keys go back and forth between two places, and the last pass leaves them out."""
         n, arena = self._count, self._arena
-        splats = self._step.splats
-        arguments = structures.ProjectArguments(count=n, sh_rest=splats.shN.shape[1], errors=0, exact=1)
-        structures.fill(arguments, **dict(splats.items()))
-        self._projected = {
-            "records": arena.get("records", 16 * n),
-            "cull": arena.get("cull", 8 * n),
-            "rects": arena.get("rects", 4 * n, torch.int16),
-            "depth_keys": arena.get("depth_keys", n, torch.int32),
-            "tile_counts": arena.get("tile_counts", n, torch.int32),
-            "radii": arena.get("radii", n),
-        }
-        structures.fill(arguments, **self._projected)
-        self._with_view.append(arguments)
-        return Work("project_splats", self._splat_blocks(), THREADS, arguments)
-
-    def _by_depth(self) -> list[Work]:
-        """Splats by depth; keys go back and forth between two places, and the last pass leaves them out."""
-        n, arena = self._count, self._arena
-        keys = [arena.get("depth_keys", n, torch.int32), arena.get("more_depth_keys", n, torch.int32)]
+        keys = [depth_keys, arena.get("more_depth_keys", n, torch.int32)]
         orders = [arena.get("order", n, torch.int32), arena.get("more_order", n, torch.int32)]
-        counting = structures.DigitArguments(
-            keys=keys[0].data_ptr(), count=n, passes=MOST_PASSES, digits=self._part("depth_digits")
-        )
+        counting = structures.DigitArguments(count=n, passes=MOST_PASSES, digits=self.part("depth_digits"))
+        structures.fill(counting, keys=keys[0])
         works, plan = [Work("count_digits_32", digit_blocks(n), SORT_THREADS, counting)], passes_of(DEPTH_BITS)
         for number, (shift, bits) in enumerate(plan):
             source, target = number % 2, (number + 1) % 2
-            arguments = structures.SortArguments(
-                keys=keys[source].data_ptr(),
-                payloads=None if number == 0 else orders[source].data_ptr(),
-                sorted_keys=None if number == len(plan) - 1 else keys[target].data_ptr(),
-                sorted_payloads=orders[target].data_ptr(),
-                count=n,
-                shift=shift,
-                bits=bits,
-                digits=self._part("depth_digits", number * DIGITS),
-                ticket=self._part("tickets", number),
-                words=self._part("depth_words", number * pieces_of(n) * DIGITS),
+            arguments = structures.SortArguments(count=n, shift=shift, bits=bits)
+            structures.fill(
+                arguments,
+                keys=keys[source],
+                payloads=None if number == 0 else orders[source],
+                sorted_keys=None if number == len(plan) - 1 else keys[target],
+                sorted_payloads=orders[target],
+                digits=self.part("depth_digits", number * DIGITS),
+                ticket=self.part("tickets", number),
+                words=self.part("depth_words", number * pieces_of(n) * DIGITS),
             )
             works.append(Work("sort_pass_32", pieces_of(n), SORT_THREADS, arguments))
-        self._sorted = orders[len(plan) % 2]
+        self.order = orders[len(plan) % 2]
         return works
 
-    def _running(self) -> Work:
-        n = self._count
-        self._ends = self._arena.get("ends", n, torch.int32)
-        self._counting = structures.RunningArguments(
-            order=self._sorted.data_ptr(),
-            tile_counts=self._projected["tile_counts"].data_ptr(),
-            count=n,
-            ends=self._ends.data_ptr(),
-            ticket=self._part("tickets", 2 * MOST_PASSES),
-            words=self._part("running"),
-            overflow=self.overflow.data_ptr(),
-        )
-        return Work("running_counts", pieces_of(n), SORT_THREADS, self._counting)
+    def running(self, tile_counts: Tensor, overflow: Tensor) -> Work:
+        """Add up pairs by depth: running sums, their number, and whether there is room for them."""
+        self._counting = structures.RunningArguments(count=self._count)
+        structures.fill(self._counting, order=self.order, tile_counts=tile_counts, ends=self.ends, overflow=overflow)
+        structures.fill(self._counting, ticket=self.part("tickets", 2 * MOST_PASSES), words=self.part("running"))
+        return Work("running_counts", pieces_of(self._count), SORT_THREADS, self._counting)
 
-    def _emit(self) -> Work:
-        arguments = structures.EmitArguments(visible=self._count, exact=1)
-        structures.fill(arguments, order=self._sorted, ends=self._ends)
-        structures.fill(arguments, **{name: self._projected[name] for name in ("cull", "records", "rects")})
-        structures.fill(arguments, keys=self._buffers["keys"], payloads=self._buffers["payloads"])
-        arguments.width, arguments.height = self._width, self._height
-        arguments.tiles_x, arguments.tiles_y = -(-self._width // 16), -(-self._height // 16)
-        self._emitting = arguments
-        work = Work(f"emit_sorted_{self._wide}", 1, THREADS, arguments)
-
-        def of_room(room: int) -> None:
-            arguments.candidates, work.blocks = room, -(-room // THREADS)
-
-        self._of_room.append(of_room)
-        return work
-
-    def _by_tile(self) -> list[Work]:
-        buffers = self._buffers
-        keys, payloads = [buffers["keys"], buffers["more_keys"]], [buffers["payloads"], buffers["entries"]]
-        counting = structures.DigitArguments(passes=len(self._passes), digits=self._part("tile_digits"))
+    def by_tile(self) -> list[Work]:
+        """Sort pairs by tile."""
+        keys, payloads = self._keys, self._payloads
+        counting = structures.DigitArguments(passes=len(self._passes), digits=self.part("tile_digits"))
         structures.fill(counting, keys=keys[0])
-        works = [Work(f"count_digits_{self._wide}", 1, SORT_THREADS, counting)]
-        passes = []
+        self._by_tile = [Work(f"count_digits_{self.bits}", 1, SORT_THREADS, counting)]
         for number, (shift, bits) in enumerate(self._passes):
+            source, target = number % 2, (number + 1) % 2
             arguments = structures.SortArguments(shift=shift, bits=bits)
-            structures.fill(arguments, keys=keys[number % 2], payloads=payloads[number % 2])
-            structures.fill(arguments, sorted_keys=keys[(number + 1) % 2], sorted_payloads=payloads[(number + 1) % 2])
-            arguments.digits = self._part("tile_digits", number * DIGITS)
-            arguments.ticket = self._part("tickets", MOST_PASSES + number)
-            passes.append(arguments)
-            works.append(Work(f"sort_pass_{self._wide}", 1, SORT_THREADS, arguments))
-        self._tile_keys, self._entries = keys[len(passes) % 2], payloads[len(passes) % 2]
+            structures.fill(arguments, keys=keys[source], payloads=payloads[source])
+            structures.fill(arguments, sorted_keys=keys[target], sorted_payloads=payloads[target])
+            arguments.digits = self.part("tile_digits", number * DIGITS)
+            arguments.ticket = self.part("tickets", MOST_PASSES + number)
+            self._by_tile.append(Work(f"sort_pass_{self.bits}", 1, SORT_THREADS, arguments))
+        return self._by_tile
 
-        def of_room(room: int) -> None:
-            counting.count, works[0].blocks = room, digit_blocks(room)
-            for number, arguments in enumerate(passes):
-                arguments.count, works[1 + number].blocks = room, pieces_of(room)
-                arguments.words = self._part("tile_words", number * pieces_of(room) * DIGITS)
+    def set(self, room: int, pairs: Tensor) -> None:
+        """Write the room for pairs, and where their number goes."""
+        pieces = pieces_of(room)
+        words = self._parts["tile_words"] + len(self._passes) * pieces * DIGITS
+        self._clearing.arguments.count, self._clearing.blocks = words // 4, clear_blocks(words // 4)
+        self._counting.room, self._counting.pairs = room, pairs.data_ptr()
+        first, *passes = self._by_tile
+        first.arguments.count, first.blocks = room, digit_blocks(room)
+        for number, work in enumerate(passes):
+            work.arguments.count, work.blocks = room, pieces
+            work.arguments.words = self.part("tile_words", number * pieces * DIGITS)
 
-        self._of_room.append(of_room)
-        return works
 
-    def _ranges(self) -> Work:
-        arguments = structures.RangeArguments(ranges=self._part("ranges"))
-        structures.fill(arguments, keys=self._tile_keys)
-        work = Work(f"find_ranges_{self._wide}", 1, THREADS, arguments)
+class _Losses:
+    """The launches of the losses: gradients of images; L1, SSIM and L2 without their values.
 
-        def of_room(room: int) -> None:
-            arguments.candidates, work.blocks = room, -(-room // THREADS)
+    Parameters
+    ----------
+    step : WholeStep
+    images : mapping of str to Tensor
+        What blending writes, "maps" for the SSIM, and places for gradients: "g_color" and those of ``upstream``.
+    upstream : mapping of str to Tensor
+        Gradients of the images besides colour, by name of the image: "alpha", "normal" and a depth.
+    """
 
-        self._of_room.append(of_room)
-        return work
-
-    def _order(self) -> Work:
-        self._order_of_tiles = self._arena.get("tiles", self._tiles, torch.int32)
-        arguments = structures.OrderArguments(tiles=self._tiles, ranges=self._part("ranges"))
-        structures.fill(arguments, order=self._order_of_tiles)
-        return Work("order_tiles", 1, ORDER_THREADS, arguments)
-
-    def _fill_lists(self, arguments: ctypes.Structure) -> None:
-        structures.fill(arguments, records=self._projected["records"], entries=self._entries)
-        structures.fill(arguments, tiles=self._order_of_tiles, seen=self._buffers["seen"])
-        arguments.ranges = self._part("ranges")
-
-    def _blend(self) -> Work:
-        arguments = structures.BlendArguments()
-        self._fill_lists(arguments)
-        outputs = ("color", "alpha", "normal", "depth_mean", "depth_median", "final_T")
-        structures.fill(arguments, **{name: self._pixels[name] for name in outputs})
-        self._with_view.append(arguments)
-        return Work("blend_forward", self._tiles, THREADS, arguments)
-
-    def _losses(self) -> list[Work]:
-        """L1, SSIM and L2, whose values nobody asks for, and the gradients of all losses."""
-        channels, blocks = self._step.photograph.shape[2], strips(self._height, self._width)
-        kind = "rgb" if channels == 3 else "rgba"
-        first = structures.PhotometricArguments(self._height, self._width)
-        structures.fill(first, rendered=self._pixels["color"], maps=self._pixels["maps"])
-        second = structures.PhotometricVjpArguments(self._height, self._width)
-        structures.fill(second, rendered=self._pixels["color"], maps=self._pixels["maps"])
-        structures.fill(second, gradient=self._pixels["g_color"])
+    def __init__(self, step: WholeStep, images: Mapping[str, Tensor], upstream: Mapping[str, Tensor]) -> None:
+        height, width, channels = step.photograph.shape
+        kind, blocks = "rgb" if channels == 3 else "rgba", strips(height, width)
+        first = structures.PhotometricArguments(height, width)
+        second = structures.PhotometricVjpArguments(height, width)
+        for one in (first, second):
+            structures.fill(one, rendered=images["color"], maps=images["maps"])
+            one.photograph.background[:] = step.background
+        structures.fill(second, gradient=images["g_color"])
         self._comparing = first, second
-        for one in self._comparing:
-            one.photograph.background[:] = self._step.background
-        works = [
+        self.works = [
             Work(f"photometric_forward_{kind}", blocks, THREADS, first),
             Work(f"photometric_vjp_{kind}", blocks, THREADS, second),
         ]
         self._normals: structures.NormalArguments | None = None
-        wanted = self._step.losses.normals
-        if wanted is not None and not self._only_colors:
-            normals = structures.NormalArguments(
-                height=self._height, width=self._width, per_splat=0, at_camera=int(wanted.at_camera)
-            )
-            depth = self._pixels[f"depth_{wanted.depth}"]
-            structures.fill(normals, normal=self._pixels["normal"], depth=depth, alpha=self._pixels["alpha"])
-            structures.fill(normals, g_normal=self._pixels["g_normal"], g_depth=self._pixels["g_depth"])
+        wanted = step.losses.normals
+        if wanted is not None and "normal" in upstream:
+            depth = f"depth_{wanted.depth}"
+            normals = structures.NormalArguments(height=height, width=width, at_camera=int(wanted.at_camera))
+            structures.fill(normals, normal=images["normal"], depth=images[depth], alpha=images["alpha"])
+            structures.fill(normals, g_normal=upstream["normal"], g_depth=upstream[depth])
             if wanted.of_object and channels == 3:
-                structures.fill(normals, weights=self._pixels["alpha"])
-            tiles = -(-self._width // NORMAL_W) * -(-self._height // NORMAL_H)
-            works.append(Work("normal_consistency_vjp", tiles, THREADS, normals))
+                structures.fill(normals, weights=images["alpha"])
+            tiles = -(-width // NORMAL_W) * -(-height // NORMAL_H)
+            self.works.append(Work("normal_consistency_vjp", tiles, THREADS, normals))
             self._normals = normals
         self._silhouette: structures.SilhouetteArguments | None = None
-        if self._has_silhouette:
-            silhouette = structures.SilhouetteArguments(pixels=self._height * self._width)
-            structures.fill(silhouette, alpha=self._pixels["alpha"], g_alpha=self._pixels["g_alpha"])
-            works.append(Work("silhouette_vjp", -(-silhouette.pixels // THREADS), THREADS, silhouette))
+        if "alpha" in upstream:
+            silhouette = structures.SilhouetteArguments(pixels=height * width)
+            structures.fill(silhouette, alpha=images["alpha"], g_alpha=upstream["alpha"])
+            self.works.append(Work("silhouette_vjp", blocks_of(height * width), THREADS, silhouette))
             self._silhouette = silhouette
-        return works
 
-    def _gradients(self) -> list[Work]:
-        """Of the blending, by atomics, and of the parameters; with the densification signal."""
-        step, n = self._step, self._count
-        self._of_parameters = {
-            name: self._arena.get(f"g_{name}", getattr(step.splats, name).numel()) for name in step.learned
-        }
-        if self._only_colors:
-            return self._color_gradients()
-        blend = structures.BlendVjpArguments()
-        self._fill_lists(blend)
-        images = ("color", "alpha", "normal", "depth_mean", "final_T")
-        structures.fill(blend, **{name: self._pixels[name] for name in images}, g_color=self._pixels["g_color"])
-        if step.losses.normals is not None:
-            structures.fill(blend, g_normal=self._pixels["g_normal"])
-            structures.fill(blend, **{f"g_depth_{step.losses.normals.depth}": self._pixels["g_depth"]})
-        if self._has_silhouette:
-            structures.fill(blend, g_alpha=self._pixels["g_alpha"])
-        structures.fill(blend, gradients=self._gradient_rows, extras=self._extras, learns=step.rows)
-        project = structures.ProjectVjpArguments(count=n, sh_rest=step.splats.shN.shape[1], clears=1)
-        structures.fill(project, **dict(step.splats.items()))
-        structures.fill(project, tile_counts=self._projected["tile_counts"], learns=step.rows)
-        structures.fill(project, gradients=self._gradient_rows, extras=self._extras)
-        structures.fill(project, **{f"g_{name}": tensor for name, tensor in self._of_parameters.items()})
-        if step.gathered:
-            names = {"signed_norms": "signed", "absolute_norms": "absolute", "counts": "count"}
-            structures.fill(project.gathered, **{field: step.gathered.get(name) for field, name in names.items()})
-            structures.fill(project.gathered, radii=self._projected["radii"], skip=self.overflow)
-        self._with_view += [blend, project]
-        kind = f"{'geometry' if self._has_normals else 'color'}{'_abs' if 'absolute' in step.gathered else ''}"
-        return [
-            Work(f"blend_vjp_{kind}", self._tiles, THREADS, blend),
-            Work("project_splats_vjp", self._splat_blocks(), THREADS, project),
-        ]
-
-    def _color_gradients(self) -> list[Work]:
-        step = self._step
-        blend = structures.BlendColorsArguments()
-        self._fill_lists(blend)
-        structures.fill(blend, learns=step.rows, g_color=self._pixels["g_color"], gradients=self._extras)
-        project = structures.ProjectColorsArguments(count=self._count, sh_rest=step.splats.shN.shape[1], clears=1)
-        structures.fill(project, means=step.splats.means, sh0=step.splats.sh0, shN=step.splats.shN)
-        structures.fill(project, tile_counts=self._projected["tile_counts"], learns=step.rows, gradients=self._extras)
-        structures.fill(project, **{f"g_{name}": tensor for name, tensor in self._of_parameters.items()})
-        self._with_view += [blend, project]
-        return [
-            Work("blend_vjp_learning", self._tiles, THREADS, blend),
-            Work("project_colors_vjp", self._splat_blocks(), THREADS, project),
-        ]
-
-    def _adam(self) -> Work:
-        beta1, beta2, eps = self._step.betas
-        arguments = structures.AdamArguments(weight_1=1 - beta1, beta2=beta2, weight_2=1 - beta2, eps=eps)
-        structures.fill(arguments, skip=self.overflow)
-        blocks = 0
-        self._adam_slots: dict[str, structures.AdamAttribute] = {}
-        for name in ATTRIBUTES:
-            one = self._step.learned.get(name)
-            parameter = getattr(self._step.splats, name)
-            if one is None or parameter.numel() == 0:
-                continue
-            slot = arguments.attributes[arguments.count]
-            structures.fill(slot, parameter=parameter, mean=one.mean, square=one.square)
-            structures.fill(slot, gradient=self._of_parameters[name], trained=one.trained)
-            slot.elements, slot.first_block, slot.columns = parameter.numel(), blocks, math.prod(parameter.shape[1:])
-            self._adam_slots[name] = slot
-            arguments.count += 1
-            blocks += -(-parameter.numel() // ADAM_ELEMENTS)
-        return Work("adam_step", blocks, THREADS, arguments)
-
-    # -- from one iteration to the next --------------------------------------------------------------------------------
-    def set(self, step: WholeStep, view: structures.View, room: int, pairs: Tensor) -> None:
-        """Write what differs: the camera, the photograph, the room, where the number of pairs goes, and the rates."""
-        for arguments in self._with_view:
-            arguments.view = view
-        self._emitting.near = view.near
-        self._counting.room, self._counting.pairs = room, pairs.data_ptr()
-        for of_room in self._of_room:
-            of_room(room)
-        self._set_losses(step, view)
-        beta1, beta2, _ = step.betas
-        for name, slot in self._adam_slots.items():
-            one = step.learned[name]
-            slot.step_size, slot.root_2 = bias_corrections_of(one.rate, one.step, beta1, beta2)
-
-    def _set_losses(self, step: WholeStep, view: structures.View) -> None:
-        """Scales are products of float32 numbers, as where autograd multiplies them."""
-        mask, photograph = _address(step.mask), step.photograph.data_ptr()
+    def set(self, step: WholeStep, view: structures.View) -> None:
+        """Write photograph, mask and weights. Scales are products of float32 numbers, as of autograd."""
+        mask, photograph = None if step.mask is None else step.mask.data_ptr(), step.photograph.data_ptr()
         for arguments in self._comparing:
             arguments.mask, arguments.photograph.bytes = mask, photograph
-        one = np.float32(1 / max(3 * step.valid, 1))
-        second = self._comparing[1]
+        one, second = np.float32(1 / max(3 * step.valid, 1)), self._comparing[1]
         second.l1_scale = np.float32(step.losses.l1) * one
         second.ssim_scale = -np.float32(step.losses.ssim) * one
         second.l2_scale = np.float32(step.losses.l2) * one
@@ -547,3 +377,124 @@ class _Plan:
         if self._silhouette is not None:
             self._silhouette.mask, self._silhouette.object = mask, photograph
             self._silhouette.scale = np.float32(step.losses.silhouette or 0.0) / np.float32(max(step.valid, 1))
+
+
+class _Adam:
+    """The launch of Adam."""
+
+    def __init__(self, step: WholeStep, gradients: Mapping[str, Tensor], overflow: Tensor) -> None:
+        beta1, beta2, eps = step.betas
+        arguments = structures.AdamArguments(weight_1=1 - beta1, beta2=beta2, weight_2=1 - beta2, eps=eps)
+        structures.fill(arguments, skip=overflow)
+        blocks = 0
+        self._slots: dict[str, structures.AdamAttribute] = {}
+        for name, parameter in step.splats.items():
+            one = step.learned.get(name)
+            if one is None or parameter.numel() == 0:
+                continue
+            slot = arguments.attributes[arguments.count]
+            structures.fill(slot, parameter=parameter, mean=one.mean, square=one.square)
+            structures.fill(slot, gradient=gradients[name], trained=one.trained)
+            slot.elements, slot.first_block, slot.columns = parameter.numel(), blocks, math.prod(parameter.shape[1:])
+            self._slots[name] = slot
+            arguments.count += 1
+            blocks += -(-parameter.numel() // ADAM_ELEMENTS)
+        self.work = Work("adam_step", blocks, THREADS, arguments)
+
+    def set(self, step: WholeStep) -> None:
+        """Write the rates."""
+        beta1, beta2, _ = step.betas
+        for name, slot in self._slots.items():
+            one = step.learned[name]
+            slot.step_size, slot.root_2 = bias_corrections_of(one.rate, one.step, beta1, beta2)
+
+
+class _Plan:
+    """The launches of an iteration in their order, in two parts: until the number of pairs is known, and afterwards."""
+
+    def __init__(self, arena: Arena, step: WholeStep, view: structures.View, room: int) -> None:
+        splats, count, tiles = dict(step.splats.items()), len(step.splats), int(view.tiles_x) * int(view.tiles_y)
+        self.overflow = arena.get("overflow", 1, torch.int32)[:1].view(())
+        self._sorting = sorting = _Sorting(arena, count, tiles, room)
+        projected = {name: arena.get(name, n * count, dtype) for name, (n, dtype) in PROJECTED.items()}
+        by_depth = sorting.by_depth(projected["depth_keys"])
+        running = sorting.running(projected["tile_counts"], self.overflow)
+        self.until_known = [sorting.clear(), project(splats, projected), *by_depth, running]
+
+        pointers = {name: projected[name] for name in ("cull", "records", "rects")}
+        pointers |= {name: getattr(sorting, name) for name in ("order", "ends", "keys", "payloads")}
+        ranges, heavy_first = sorting.part("ranges"), arena.get("tiles", tiles, torch.int32)
+        self._of_room = [
+            emit(f"emit_sorted_{sorting.bits}", room, count, pointers),
+            find_ranges(sorting.bits, room, {"keys": sorting.tile_keys, "ranges": ranges}),
+        ]
+        seen = arena.get("seen", 8 * ((sorting.most_room >> 5) + tiles + 1), torch.int32)
+        lists: dict[str, Tensor | int | None] = {
+            "records": projected["records"],
+            "entries": sorting.entries,
+            "ranges": ranges,
+        }
+        lists |= {"tiles": heavy_first, "seen": seen}
+        images, upstream = _images(arena, step)
+        kept = {name: images[name] for name in ("color", "alpha", "normal", "depth_mean", "depth_median", "final_T")}
+        self._losses = _Losses(step, images, upstream)
+        self.afterwards = [
+            self._of_room[0],
+            *sorting.by_tile(),
+            self._of_room[1],
+            order_tiles(tiles, {"ranges": ranges, "order": heavy_first}),
+            blend(tiles, lists, kept, distortion=False),
+            *self._losses.works,
+        ]
+
+        sums: dict[str, Tensor | int | None] = {"learns": step.rows}
+        sums["extras"] = arena.get("extras", 4 * count, zeros=True)
+        if not _only_colors(step):
+            sums["gradients"] = arena.get("gradient_rows", 16 * count, zeros=True)
+        found = {"color": images["g_color"], **upstream}
+        gradients = {name: arena.get(f"g_{name}", splats[name].numel()) for name in step.learned}
+        blended = blend_gradients(tiles, lists, kept, found, sums, absolute="absolute" in step.gathered)
+        last = splat_gradients(splats, sums | {"tile_counts": projected["tile_counts"]}, gradients, clears=True)
+        if step.gathered and not _only_colors(step):
+            names = {"signed_norms": "signed", "absolute_norms": "absolute", "counts": "count"}
+            gathered = last.arguments.gathered
+            structures.fill(gathered, **{field: step.gathered.get(name) for field, name in names.items()})
+            structures.fill(gathered, radii=projected["radii"], skip=self.overflow)
+        self._adam = _Adam(step, gradients, self.overflow)
+        self.afterwards += [blended, last, self._adam.work]
+        self._seeing = [work for work in (*self.until_known, *self.afterwards) if takes_view(work)]
+
+    @property
+    def most_room(self) -> int:
+        """Pairs that there is memory for."""
+        return self._sorting.most_room
+
+    def set(self, step: WholeStep, view: structures.View, room: int, pairs: Tensor) -> None:
+        """Write what differs: the camera, the photograph, the room, where the number of pairs goes, and the rates."""
+        see(self._seeing, view)
+        for work in self._of_room:
+            work.arguments.candidates, work.blocks = room, blocks_of(room)
+        self._sorting.set(room, pairs)
+        self._losses.set(step, view)
+        self._adam.set(step)
+
+
+def _only_colors(step: WholeStep) -> bool:
+    """Whether nothing but colours learns."""
+    return not set(step.learned) - {"sh0", "shN"}
+
+
+def _images(arena: Arena, step: WholeStep) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Return images and what else lies by pixel, and the gradients of the images besides colour, by their names."""
+    pixels = step.camera.height * step.camera.width
+    planes = {"color": 3, "alpha": 1, "normal": 3, "depth_mean": 1, "depth_median": 1, "final_T": 1}
+    planes |= {"maps": 9, "g_color": 3}
+    images = {name: arena.get(name, n * pixels) for name, n in planes.items()}
+    upstream = {}
+    normals = step.losses.normals
+    if normals is not None and not _only_colors(step):
+        upstream = {"normal": arena.get("g_normal", 3 * pixels)}
+        upstream[f"depth_{normals.depth}"] = arena.get("g_depth", pixels)
+    if step.losses.silhouette is not None and not _only_colors(step):
+        upstream["alpha"] = arena.get("g_alpha", pixels)
+    return images, upstream

@@ -19,7 +19,7 @@ from gs2d.core.memory_limit import cache_bytes
 from gs2d.core.spill import Spilled
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
-from gs2d.kernels.free_space import look_at_free_space
+from gs2d.kernels.free_space import SeenSpace, look_at_free_space
 from gs2d.training.plane_sweep import SWEEP_BYTES, Sweep
 
 NEARER = 0.9  # free is what is nearer than this fraction of the depth: depths are good to a few percent
@@ -132,19 +132,8 @@ def _look(
     support: Tensor,
 ) -> None:
     """Count one image for each splat [N], natively if possible, else in torch."""
-    done = look_at_free_space(
-        ends,
-        reach,
-        _projection(view),
-        _center(view),
-        radius=radius,
-        limit=limit,
-        known=view.known,
-        fraction=1 - NEARER,
-        against=against,
-        support=support,
-    )
-    if not done:
+    seen = SeenSpace(_projection(view), _center(view), limit, view.known, radius, 1 - NEARER)
+    if not look_at_free_space(ends, reach, seen, against, support):
         look_at_free_space_reference(view, ends, limit, radius, against, support)
 
 

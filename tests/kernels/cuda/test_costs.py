@@ -16,7 +16,7 @@ from benchmarks.gpu.host import host_cost
 from emulate import Emulator
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.arguments import OrderArguments, fill
-from gs2d.render import cuda_passes
+from gs2d.render import cuda_works
 
 # Own launches, device launches, torch operations, allocations. A tile more than 256 in the image is a launch more. The
 # operation is the order of the views, on the host, once in an epoch.
@@ -63,7 +63,7 @@ def test_tiles_are_taken_longest_first_each_once(emulator: Emulator, lengths: li
     order = torch.full((len(lengths),), -1, dtype=torch.int32)
     arguments = OrderArguments(tiles=len(lengths))
     fill(arguments, ranges=ranges, order=order)
-    emulator.launch("order_tiles", 1, cuda_passes.ORDER_THREADS, arguments)
+    emulator.launch("order_tiles", 1, cuda_works.ORDER_THREADS, arguments)
     assert sorted(order.tolist()) == list(range(len(lengths)))
     chunks = [min(-(-lengths[tile] // 32), 511) for tile in order.tolist()]
     assert chunks == sorted(chunks, reverse=True)

@@ -26,7 +26,7 @@ ctypes.CDLL(sys.argv[1])
 sys.path.insert(0, sys.argv[2])
 
 from gs2d.kernels.cuda import adam, arguments, launch, losses as ops
-from gs2d.render import cuda, pair_budget as cuda_budget, cuda_passes
+from gs2d.render import cuda, pair_budget as cuda_budget, cuda_passes, cuda_works
 from fake_backends import altered
 from gs2d.render.backends import CudaBackend
 
@@ -34,14 +34,13 @@ launched, pointers = set(), [0]
 
 def fill(structure, **tensors):
     for name, tensor in tensors.items():
-        if tensor is not None:
+        if isinstance(tensor, torch.Tensor):
             assert tensor.device == torch.device("cuda:0"), (name, tensor.device)
             assert tensor.is_contiguous(), name
             pointers[0] += 1
 
-for module in (adam, arguments, ops):
+for module in (adam, arguments, ops, cuda_passes, cuda_works):
     module.fill = fill
-cuda_passes._fill = lambda structure, tensors: fill(structure, **tensors)
 launcher = SimpleNamespace(launch=lambda name, *rest: launched.add(name))
 
 def launcher_for(device):
@@ -93,6 +92,7 @@ print(sorted(devices), sorted(launched), pointers[0])
 
 GRADIENTS = """
 import numpy as np
+from gs2d.kernels.losses import NormalOptions
 from render_scenes import front_camera
 from gs2d.render.types import RasterSettings
 
@@ -129,8 +129,8 @@ with FakeTensorMode():
     mean = ops.blur(image, launcher=launcher)
     there_and_back(ops._Photometric, (True,), image, rand(24, 40, 3), mask, mean, True, launcher)
     for form, weights in ((False, None), (True, plane)):
-        given = (image, plane, plane, mask, weights, camera, form, form, launcher)
-        there_and_back(ops._NormalConsistency, (True, True, True), *given)
+        how = NormalOptions(camera, mask, weights, form, form)
+        there_and_back(ops._NormalConsistency, (True, True, True), image, plane, plane, how, launcher)
     there_and_back(ops._MaskedMean, (True,), plane, mask, launcher)
     cuda_passes.errors(launcher, view, splats, image, mask)
     print(sorted(launched), pointers[0])

@@ -6,6 +6,8 @@ import ctypes
 
 from torch import Tensor
 
+from gs2d.core.splats import ATTRIBUTES, IMAGES
+
 __all__ = [
     "AdamArguments",
     "AdamAttribute",
@@ -41,14 +43,12 @@ __all__ = [
 ]
 
 _Field = tuple[str, type]
-PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
-IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
 
 
-def fill(arguments: ctypes.Structure, **tensors: Tensor | None) -> None:
-    """Set the structure's pointers; None is a null pointer."""
-    for name, tensor in tensors.items():
-        setattr(arguments, name, None if tensor is None else tensor.data_ptr())
+def fill(arguments: ctypes.Structure, **pointers: Tensor | int | None) -> None:
+    """Set the structure's pointers: to tensors, to addresses, or null."""
+    for name, pointer in pointers.items():
+        setattr(arguments, name, pointer.data_ptr() if isinstance(pointer, Tensor) else pointer)
 
 
 def _all(kind: type, *names: str) -> tuple[_Field, ...]:
@@ -80,7 +80,7 @@ class ProjectArguments(ctypes.Structure):
     _fields_ = (
         ("view", View),
         *_all(ctypes.c_int64, "count", "sh_rest"),
-        *_pointers(*PARAMETERS, "records", "cull", "depth_keys", "rects", "tile_counts", "radii"),
+        *_pointers(*ATTRIBUTES, "records", "cull", "depth_keys", "rects", "tile_counts", "radii"),
         *_all(ctypes.c_int32, "errors", "exact"),
     )
 
@@ -206,8 +206,8 @@ class ProjectVjpArguments(ctypes.Structure):
     _fields_ = (
         ("view", View),
         *_all(ctypes.c_int64, "count", "sh_rest"),
-        *_pointers(*PARAMETERS, "tile_counts", "learns", "gradients", "extras"),
-        *_pointers(*(f"g_{name}" for name in PARAMETERS), "g_probe"),
+        *_pointers(*ATTRIBUTES, "tile_counts", "learns", "gradients", "extras"),
+        *_pointers(*(f"g_{name}" for name in ATTRIBUTES), "g_probe"),
         ("probe_columns", ctypes.c_int64),
         *_pointers("g_intrinsics"),
         ("gathered", Gathered),

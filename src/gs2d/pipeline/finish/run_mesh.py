@@ -6,7 +6,6 @@ import math
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -32,7 +31,7 @@ from gs2d.io.run_dir import (
     RunFolder,
 )
 from gs2d.meshing.depth_maps import RenderedView, Spool, depth_map
-from gs2d.meshing.extract import Extraction, extract, extract_unbounded
+from gs2d.meshing.extract import Extraction, ExtractOptions, extract, extract_unbounded
 from gs2d.meshing.slabs import SLAB_BYTES
 from gs2d.meshing.tsdf import VolumeTooLargeError
 from gs2d.pipeline.attempts import again, attempted
@@ -259,22 +258,21 @@ def _extract(
     bbox = None if options.bbox is None else np.asarray(options.bbox, np.float64).reshape(2, 3)
     bbox = bbox if subject is None else subject.box
     own = bbox is not None or options.unbounded
-    fuse_frames = extract_unbounded if options.unbounded else partial(extract, by_evidence=fusion.subject)
     if isinstance(frames, Spool):
         on_event(Phase("fusing", 0))
-    result = fuse_frames(
-        frames,
+    chosen = ExtractOptions(
         bbox=bbox,
         voxel=options.voxel if own else options.voxel or fusion.voxel,
         truncation=options.truncation or (None if own or options.voxel else fusion.truncation),
         depth_limit=options.depth_limit if own else options.depth_limit or fusion.depth_limit,
         min_weight=SEVERAL if fusion.subject else 1.0,  # of one pixel
         keep=keep or None,
+        by_evidence=fusion.subject,
         max_bytes=_volume_bytes(options),
         slab_bytes=_slab_bytes(),
-        threads=torch.get_num_threads(),
-        backend=loaded.backend,
     )
+    fuse_frames = extract_unbounded if options.unbounded else extract
+    result = fuse_frames(frames, chosen, threads=torch.get_num_threads(), backend=loaded.backend)
     if not len(result.mesh.faces):
         on_event(Notice("the mesh is empty: no surface was covered well enough"))
     return result

@@ -1,0 +1,186 @@
+"""The launches of a rendering and of its gradients: which kernel, how many blocks, which arguments.
+
+``cuda_passes`` makes them for tensors of torch and runs them at once; ``cuda_step`` makes them for memory that stays
+and runs them in each iteration, one by one or as a graph. The view and the room for pairs may be written afterwards.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterable, Mapping
+from typing import TypeAlias
+
+from torch import Tensor
+
+from gs2d.kernels.cuda.arguments import (
+    BlendArguments,
+    BlendColorsArguments,
+    BlendVjpArguments,
+    EmitArguments,
+    Features,
+    OrderArguments,
+    ProjectArguments,
+    ProjectColorsArguments,
+    ProjectVjpArguments,
+    RangeArguments,
+    View,
+    fill,
+)
+from gs2d.kernels.cuda.launch import Work
+
+__all__ = [
+    "THREADS",
+    "blend",
+    "blend_gradients",
+    "blocks_of",
+    "emit",
+    "find_ranges",
+    "order_tiles",
+    "project",
+    "see",
+    "splat_gradients",
+    "takes_view",
+    "work_of",
+]
+
+THREADS = 128
+ORDER_THREADS = 512  # order.cu
+OF_EMISSION = ("width", "height", "tiles_x", "tiles_y", "near")
+
+Pointers: TypeAlias = Mapping[str, Tensor | int | None]
+
+
+def blocks_of(count: int) -> int:
+    """Return the blocks of a kernel with a thread for each of ``count``."""
+    return -(-count // THREADS)
+
+
+def work_of(kernel: str, blocks: int, arguments: ctypes.Structure, *pointers: Pointers) -> Work:
+    """Return a launch whose structure has these pointers: tensors, addresses or None."""
+    for named in pointers:
+        fill(arguments, **named)
+    return Work(kernel, blocks, THREADS, arguments)
+
+
+def takes_view(work: Work) -> bool:
+    """Whether a launch takes a view, or parts of one."""
+    return isinstance(work.arguments, EmitArguments) or hasattr(work.arguments, "view")
+
+
+def see(works: Iterable[Work], view: View) -> None:
+    """Write a view into launches that take one."""
+    for work in works:
+        if isinstance(work.arguments, EmitArguments):
+            for name in OF_EMISSION:
+                setattr(work.arguments, name, getattr(view, name))
+        else:
+            work.arguments.view = view
+
+
+def project(
+    splats: Mapping[str, Tensor], projected: Mapping[str, Tensor], *, errors: bool = False, exact: bool = True
+) -> Work:
+    """Make records and footprints: those of blending, or with ``errors`` those of rho <= error_cutoff^2."""
+    count = len(splats["means"])
+    arguments = ProjectArguments(count=count, sh_rest=splats["shN"].shape[1], errors=int(errors), exact=int(exact))
+    return work_of("project_splats", blocks_of(count), arguments, splats, projected)
+
+
+def emit(kernel: str, room: int, visible: int, pointers: Pointers, *, exact: bool = True) -> Work:
+    """Pairs of splat and tile."""
+    arguments = EmitArguments(candidates=room, visible=visible, exact=int(exact))
+    return work_of(kernel, blocks_of(room), arguments, pointers)
+
+
+def find_ranges(bits: int, room: int, pointers: Pointers) -> Work:
+    """Each tile's part of the sorted pairs, whose keys have ``bits``."""
+    return work_of(f"find_ranges_{bits}", blocks_of(room), RangeArguments(candidates=room), pointers)
+
+
+def order_tiles(tiles: int, pointers: Pointers) -> Work:
+    """Tiles, those with the most pairs first."""
+    work = work_of("order_tiles", 1, OrderArguments(tiles=tiles), pointers)
+    work.threads = ORDER_THREADS
+    return work
+
+
+def blend(tiles: int, lists: Pointers, images: Pointers, *, distortion: bool) -> Work:
+    """Images of the lists of all tiles."""
+    name = f"blend_forward{'_distortion' if distortion else ''}"
+    return work_of(name, tiles, BlendArguments(), lists, images)
+
+
+def blend_gradients(
+    tiles: int,
+    lists: Pointers,
+    images: Pointers,
+    upstream: Pointers,
+    sums: Pointers,
+    *,
+    absolute: bool = False,
+    features: Features | None = None,
+) -> Work:
+    """Gradients of the blending, added up for each splat.
+
+    Parameters
+    ----------
+    tiles : int
+    lists, images : mapping
+        Of the forward pass.
+    upstream : mapping
+        Gradients of the images by name; absent or None: no gradient.
+    sums : mapping
+        "gradients", "extras", "slots" and "learns"; without "gradients" those of colours alone.
+    absolute : bool
+        Whether the absolute densification signal is gathered too.
+    features : Features, optional
+        Further channels.
+    """
+    if sums.get("gradients") is None:
+        colors = {"g_color": upstream["color"], "gradients": sums["extras"]}
+        colors |= {name: sums.get(name) for name in ("learns", "slots")}
+        return work_of("blend_vjp_learning", tiles, BlendColorsArguments(), lists, colors)
+    given = {name: tensor for name, tensor in upstream.items() if tensor is not None}
+    distortion, further = "distortion" in given, "depth_transmittance" in given
+    if features is not None:
+        kind = "features_vjp" + "_distortion" * distortion
+    elif further:
+        kind = "blend_vjp_" + "distortion_" * distortion + "transmittance"
+    elif distortion:
+        kind = "blend_vjp_distortion"
+    else:
+        geometry = not given.keys().isdisjoint(("normal", "depth_mean", "depth_median"))
+        kind = f"blend_vjp_{'geometry' if geometry else 'color'}"
+    arguments = BlendVjpArguments()
+    if features is not None:
+        arguments.features = features
+    kept = {name: image for name, image in images.items() if name != "depth_median"}
+    gradients = {f"g_{name}": tensor for name, tensor in given.items()}
+    return work_of(f"{kind}{'_abs' if absolute else ''}", tiles, arguments, lists, kept, gradients, sums)
+
+
+def splat_gradients(
+    splats: Mapping[str, Tensor], sums: Pointers, gradients: Mapping[str, Tensor | None], *, clears: bool = False
+) -> Work:
+    """Gradients of the parameters, of the sums of :func:`blend_gradients`.
+
+    Parameters
+    ----------
+    splats : mapping of attribute to Tensor
+    sums : mapping
+        "tile_counts", "learns", "gradients" and "extras"; without "gradients" those of colours alone.
+    gradients : mapping of name to Tensor or None
+        To be filled, by attribute, "probe" and "intrinsics"; absent or None: not computed.
+    clears : bool
+        Whether the sums are zeros afterwards.
+    """
+    count = len(splats["means"])
+    scalars = {"count": count, "sh_rest": splats["shN"].shape[1], "clears": int(clears)}
+    wanted = {f"g_{name}": tensor for name, tensor in gradients.items() if tensor is not None}
+    if sums.get("gradients") is None:
+        colors = {name: splats[name] for name in ("means", "sh0", "shN")} | wanted
+        shared = {"tile_counts": sums["tile_counts"], "learns": sums.get("learns"), "gradients": sums["extras"]}
+        return work_of("project_colors_vjp", blocks_of(count), ProjectColorsArguments(**scalars), colors, shared)
+    probe = gradients.get("probe")
+    arguments = ProjectVjpArguments(**scalars, probe_columns=0 if probe is None else int(probe.shape[1]))
+    return work_of("project_splats_vjp", blocks_of(count), arguments, splats, sums, wanted)
