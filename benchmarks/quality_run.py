@@ -31,7 +31,7 @@ from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.training import events
 from gs2d.training.learned.learned_table import LearnedTable
 from gs2d.training.state import TrainState
-from gs2d.training.trainer import Trainer
+from gs2d.training.trainer import Trainer, TrainerOptions
 
 SPEC, RESULT, STATE = "spec.json", "result.json", "state.pt"
 PROGRESS_EVERY = 10  # iterations: how finely a point of the course can be placed
@@ -129,7 +129,13 @@ def train(spec: dict[str, Any], folder: Path, clocks: Clocks) -> dict[str, Any]:
 
     every = PROGRESS_EVERY
     trainer = Trainer(
-        job.scene, job.recipe, job.protocol, backend=job.backend, on_event=listen, state=state, progress_every=every
+        job.scene,
+        job.recipe,
+        job.protocol,
+        backend=job.backend,
+        on_event=listen,
+        state=state,
+        options=TrainerOptions(progress_every=every),
     )
     trainer.run()
     spent = clocks.spent()

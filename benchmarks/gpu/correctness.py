@@ -145,7 +145,8 @@ def _render_all_ways(bench: Bench) -> None:
     for (settings, names), columns, deterministic in itertools.product(kinds, (2, 4), (False, True)):
         leaves = Splats(**{name: tensor.detach().requires_grad_() for name, tensor in splats.items()})
         probe = torch.zeros(len(splats), columns, device=bench.device, requires_grad=True)
-        output = cuda.rasterize_with(launcher, leaves, camera, settings, probe, deterministic=deterministic)
+        choices = cuda.CudaChoices(deterministic=deterministic)
+        output = cuda.rasterize_with(launcher, leaves, camera, settings, probe, choices=choices)
         sum(getattr(output, name).sum() for name in names).backward()  # type: ignore[union-attr]
     values = torch.rand(len(splats), 9, device=bench.device, requires_grad=True)
     further, plain = Features(values, values.detach()[0]), replace(SETTINGS, sh_degree=PLAIN_COLORS)

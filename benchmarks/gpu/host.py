@@ -34,7 +34,7 @@ from gs2d.kernels.cuda.compile import compile_source
 from gs2d.render import pair_budget
 from gs2d.training import objective, trainer
 from gs2d.training.state import TrainState
-from gs2d.training.trainer import Trainer
+from gs2d.training.trainer import Trainer, TrainerOptions
 
 WAYS = ("autograd", "launches", "graph")
 SOURCES = tuple(
@@ -164,7 +164,12 @@ def null_trainer() -> Trainer:
     state = TrainState(splats, torch.Generator().manual_seed(0))
     state.groups["high_error"] = torch.arange(SPLATS) < SPLATS // 100 + 1
     return Trainer(
-        scene, recipe, replace(GENERIC, near=0.2), backend=EmulatedBackend(), state=state, progress_every=10**9
+        scene,
+        recipe,
+        replace(GENERIC, near=0.2),
+        backend=EmulatedBackend(),
+        state=state,
+        options=TrainerOptions(progress_every=10**9),
     )
 
 

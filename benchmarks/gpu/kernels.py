@@ -25,7 +25,7 @@ from gs2d.errors import BackendError
 from gs2d.render import cuda, cuda_passes
 from gs2d.render.types import RasterSettings
 from gs2d.training.state import TrainState
-from gs2d.training.trainer import Trainer
+from gs2d.training.trainer import Trainer, TrainerOptions
 
 SETTINGS = RasterSettings()
 Parts = Iterator[tuple[str, Callable[[], dict[str, Any]]]]  # to be done in turn
@@ -239,7 +239,9 @@ def bench_trainer(bench: Bench, scene: GpuScene, targets: list[Tensor] | None = 
     recipe = Recipe("bench", tuple(steady(stage) for stage in recipe.stages[:stages]))
     protocol = replace(GENERIC, near=0.2)
     state = TrainState(disturbed(scene.splats), torch.Generator().manual_seed(2))
-    return Trainer(capture, recipe, protocol, backend=bench.backend, state=state, progress_every=10**9)
+    return Trainer(
+        capture, recipe, protocol, backend=bench.backend, state=state, options=TrainerOptions(progress_every=10**9)
+    )
 
 
 def _in_iterations(bench: Bench, trainer: Trainer) -> dict[str, float]:

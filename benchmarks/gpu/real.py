@@ -21,7 +21,7 @@ from gs2d.config.protocols import protocol_for
 from gs2d.config.schedule import scale_schedule
 from gs2d.data import load_scene
 from gs2d.render import cuda_passes
-from gs2d.training.trainer import Trainer
+from gs2d.training.trainer import Trainer, TrainerOptions
 
 PARTS = (0.1, 0.5, 0.9)  # of the schedule
 MEASURED = 100  # iterations
@@ -47,7 +47,9 @@ def of_capture(
     scene = load_scene(capture, downscale=downscale)
     steps = scale_schedule(get_recipe(recipe), scale)
     steps = replace(steps, init_points=60, dense_start=None) if bench.dry else steps
-    trainer = Trainer(scene, steps, protocol_for(scene.format), backend=bench.backend, progress_every=50)
+    trainer = Trainer(
+        scene, steps, protocol_for(scene.format), backend=bench.backend, options=TrainerOptions(progress_every=50)
+    )
     trainer.enter(0)
     bench.wait()
     rows["seconds_until_training"] = round(time.perf_counter() - begun, 2)

@@ -98,7 +98,11 @@ def differences(bench: Bench) -> dict[str, Any]:
     for chosen in WAYS:
         with _way(chosen, bench.dry):
             made = trainer.Trainer(
-                scene, replace(recipe, stages=(quiet,)), GENERIC, backend=bench.backend, progress_every=1000
+                scene,
+                replace(recipe, stages=(quiet,)),
+                GENERIC,
+                backend=bench.backend,
+                options=trainer.TrainerOptions(progress_every=1000),
             )
             start = made.splats.clone()
             made.run()

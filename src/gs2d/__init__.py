@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from gs2d.render.types import RasterSettings, RenderOutput
     from gs2d.report.sections.registry import register_section
     from gs2d.training.learned.quantity import LearnedQuantity
-    from gs2d.training.trainer import Trainer
+    from gs2d.training.trainer import Trainer, TrainerOptions
 
 __version__ = "0.2.0"  # the one place: pyproject.toml reads it from here
 
@@ -61,6 +61,7 @@ __all__ = [
     "TrainOptions",
     "Trained",
     "Trainer",
+    "TrainerOptions",
     "__version__",
     "backend_report",
     "compute_losses",
@@ -113,6 +114,7 @@ _HOME = {
     "TrainOptions": "gs2d.pipeline.prepare.options",
     "Trained": "gs2d.pipeline.in_memory",
     "Trainer": "gs2d.training.trainer",
+    "TrainerOptions": "gs2d.training.trainer",
     "backend_report": "gs2d.render.backends",
     "compute_losses": "gs2d.losses.api",
     "evaluate": "gs2d.pipeline.in_memory",

@@ -195,11 +195,17 @@ def test_an_iteration_waits_for_nothing_once_it_knows_how_many_pairs_to_expect(g
     from dataclasses import replace
 
     from gs2d.config.protocols import GENERIC
-    from gs2d.training.trainer import Trainer
+    from gs2d.training.trainer import Trainer, TrainerOptions
 
     recipe = train_toys.short()
     quiet = tuple(replace(s, densify=None, iterations=100) for s in recipe.stages)
-    trainer = Trainer(train_toys.make_scene(), replace(recipe, stages=quiet), GENERIC, backend=gpu, progress_every=999)
+    trainer = Trainer(
+        train_toys.make_scene(),
+        replace(recipe, stages=quiet),
+        GENERIC,
+        backend=gpu,
+        options=TrainerOptions(progress_every=999),
+    )
     for index in range(stage + 1):
         trainer.enter(index)
     for _ in range(8):  # every photograph is taken in
@@ -225,12 +231,12 @@ def test_three_stages_train_on_the_gpu_like_on_the_cpu(gpu: Backend) -> None:
 def test_what_was_trained_on_the_gpu_goes_on_on_the_cpu_and_back(gpu: Backend) -> None:
     from gs2d.config.protocols import GENERIC
     from gs2d.training.state import TrainState
-    from gs2d.training.trainer import Trainer
+    from gs2d.training.trainer import Trainer, TrainerOptions
 
     toy, recipe = train_toys.make_scene(), train_toys.short()
     state, devices = None, []
     for backend in (gpu, get_backend("reference"), gpu):
-        trainer = Trainer(toy, recipe, GENERIC, backend=backend, state=state, progress_every=1)
+        trainer = Trainer(toy, recipe, GENERIC, backend=backend, state=state, options=TrainerOptions(progress_every=1))
         if state is None:
             trainer.enter(0)
         trainer.step()

@@ -52,8 +52,9 @@ def rendering(emulator: Emulator, case: Case) -> dict[str, Tensor]:
     every = tuple(name for name, _ in case.splats.items())
     rows = torch.arange(len(case.splats)) % 3 == 0
     for sure in (False, True):
-        render(f"all {sure}", every, deterministic=sure)
-        render(f"colours {sure}", ("sh0", "shN"), deterministic=sure, gradient_rows=rows)
+        choices = cuda.CudaChoices(deterministic=sure)
+        render(f"all {sure}", every, choices=choices)
+        render(f"colours {sure}", ("sh0", "shN"), choices=choices, gradient_rows=rows)
     numbers = torch.randn(len(case.splats), 9, generator=_numbers())
     for columns in (2, 4):
         for distortion in (False, True):

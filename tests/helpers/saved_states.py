@@ -11,7 +11,7 @@ from gs2d.config.recipe import Recipe
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
 from gs2d.training.state import TrainState
-from gs2d.training.trainer import Trainer
+from gs2d.training.trainer import Trainer, TrainerOptions
 from train_toys import same
 
 
@@ -29,7 +29,12 @@ def resumed_everywhere(scene: Scene, recipe: Recipe, backend: str, every: int = 
     """Train, resume from the state at each ``every``-th event, and return what all of them end with."""
     saves: list[bytes] = []
     trainer = Trainer(
-        scene, recipe, GENERIC, backend=backend, progress_every=1, on_event=lambda _: saves.append(saved(trainer))
+        scene,
+        recipe,
+        GENERIC,
+        backend=backend,
+        on_event=lambda _: saves.append(saved(trainer)),
+        options=TrainerOptions(progress_every=1),
     )
     end = trainer.run()
     for data in saves[::every]:

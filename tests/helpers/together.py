@@ -33,7 +33,7 @@ from gs2d.training.objective import StepResult
 from gs2d.training.parallel import OneProcess, Turn
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
-from train_toys import backends, compared, make_scene, short
+from train_toys import backends, compared, grouped, make_scene, short
 from wall_scene import wall
 
 
@@ -151,8 +151,9 @@ def trained(
     begun = None if state is None else TrainState.from_state_dict(state)
     room = ROOM * together.place.local_size
     given = {"backend": backends()[-1], "progress_every": 1, "stage2_cache_bytes": room} | options
+    given["processes"] = together
     scene = wall() if recipe.removal else make_scene()
-    trainer = Trainer(scene, recipe, GENERIC, on_event=on_event, processes=together, state=begun, **given)
+    trainer = Trainer(scene, recipe, GENERIC, on_event=on_event, state=begun, **grouped(given))
     trainer.run()
     return trainer.state, heard
 

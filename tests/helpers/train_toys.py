@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +22,7 @@ from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events
 from gs2d.training.state import Moments, TrainState
-from gs2d.training.trainer import Trainer
+from gs2d.training.trainer import Trainer, TrainerOptions
 
 VIEWS, SIZE, POINTS = 6, 24, 60
 
@@ -154,16 +155,18 @@ class RunLogger:
         raise AssertionError(f"no {kind.__name__} in {stage}")
 
 
+def grouped(given: dict[str, Any]) -> dict[str, Any]:
+    """Return arguments of a trainer with those of its options in their place."""
+    names = {entry.name for entry in fields(TrainerOptions)} & given.keys()
+    rest = {name: value for name, value in given.items() if name not in names}
+    return rest | {"options": TrainerOptions(**{name: given[name] for name in names})}
+
+
 def train(scene: Scene, recipe: Recipe, **options: object) -> tuple[Trainer, RunLogger]:
     recorder = RunLogger()
-    trainer = Trainer(
-        scene,
-        recipe,
-        options.pop("protocol", GENERIC),
-        on_event=recorder,
-        progress_every=1,
-        **({"backend": "reference"} | options),  # type: ignore[arg-type]
-    )
+    given = {"backend": "reference", "progress_every": 1} | options
+    protocol = given.pop("protocol", GENERIC)
+    trainer = Trainer(scene, recipe, protocol, on_event=recorder, **grouped(given))
     recorder.trainer = trainer
     trainer.run()
     return trainer, recorder

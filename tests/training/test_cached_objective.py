@@ -20,7 +20,7 @@ from gs2d.training import events
 from gs2d.training.cached_objective import CachedViews, is_cacheable
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
-from train_toys import SIZE, VIEWS, backends, random_splats, same
+from train_toys import SIZE, VIEWS, backends, grouped, random_splats, same
 
 needs_cpu = pytest.mark.skipif("cpu" not in backends(), reason="the native library is not built")
 ROOM = 1 << 30
@@ -54,7 +54,8 @@ def trainer(
 ) -> Trainer:
     if state is None:
         state = TrainState(random_splats(90, seed=5), torch.Generator().manual_seed(0))
-    return Trainer(scene, recipe(iterations), GENERIC, backend="cpu", state=state, stage2_cache_bytes=room, **options)  # type: ignore[arg-type]
+    given = {"backend": "cpu", "state": state, "stage2_cache_bytes": room} | options
+    return Trainer(scene, recipe(iterations), GENERIC, **grouped(given))
 
 
 def entered(scene: Scene, room: int = ROOM, **options: object) -> Trainer:

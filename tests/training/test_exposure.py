@@ -29,7 +29,7 @@ from gs2d.training.learned.quantity import ImagePoints
 from gs2d.training.objective import clipped_pixels
 from gs2d.training.state import TrainState
 from gs2d.training.targets import Target
-from gs2d.training.trainer import Trainer
+from gs2d.training.trainer import Trainer, TrainerOptions
 from learned_rows import Learner, begun
 from train_toys import SIZE, VIEWS, backends, random_splats, same, short
 
@@ -77,7 +77,7 @@ def test_on_a_device_neither_the_transform_nor_its_update_waits(scene: Scene) ->
 # -- the loss -----------------------------------------------------------------------------------------------------
 def test_the_gradient_of_a_transform_is_that_of_the_whole_loss(scene: Scene) -> None:
     recipe = with_exposure(Recipe("one", (replace(surface(), iterations=5),)))
-    trainer = Trainer(scene, recipe, GENERIC, backend="reference", dtype=torch.float64)
+    trainer = Trainer(scene, recipe, GENERIC, backend="reference", options=TrainerOptions(dtype=torch.float64))
     trainer.enter(0)
     state, stage = trainer.state, recipe.stages[0]
     rows = state.learned["exposure"]
@@ -256,6 +256,8 @@ def test_the_events_name_the_prior_among_the_losses(scene: Scene) -> None:
             seen.append(event)
 
     recipe = Recipe("one", (replace(refine(), iterations=2, on_enter=()),), exposure=Exposure(start=0))
-    Trainer(scene, recipe, GENERIC, backend="reference", on_event=listen, progress_every=1).run()
+    Trainer(
+        scene, recipe, GENERIC, backend="reference", on_event=listen, options=TrainerOptions(progress_every=1)
+    ).run()
     assert [event.losses["exposure"] > 0 for event in seen] == [False, True]  # identities first
     assert seen[1].loss == pytest.approx(sum(seen[1].losses.values()))

@@ -14,7 +14,7 @@ from gs2d.core.splats import Splats
 from gs2d.training.blended_sums import blended_sums
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
-from train_toys import backends, compared, make_scene, random_splats, short
+from train_toys import backends, compared, grouped, make_scene, random_splats, short
 
 SCENE = make_scene()
 
@@ -23,7 +23,8 @@ def trainer_of(
     recipe: Recipe, own: Splats, frozen: Splats | None, backend: str, state: TrainState | None = None, **more: object
 ) -> Trainer:
     init = own if state is None else None
-    return Trainer(SCENE, recipe, GENERIC, backend=backend, init=init, frozen=frozen, state=state, **more)  # type: ignore[arg-type]
+    given = {"backend": backend, "init": init, "state": state, "frozen": frozen} | more
+    return Trainer(SCENE, recipe, GENERIC, **grouped(given))
 
 
 def same(one: Splats, other: Splats) -> bool:

@@ -19,7 +19,7 @@ from gs2d.errors import DivergedError, RecipeError, RunError
 from gs2d.training.learned.camera_pose import CameraPose
 from gs2d.training.learned.learned_table import LearnedTable
 from gs2d.training.state import TrainState
-from gs2d.training.trainer import Trainer
+from gs2d.training.trainer import Trainer, TrainerOptions
 from learned_rows import Learner, begun
 from train_toys import backends, random_splats, same, short
 
@@ -98,8 +98,8 @@ def test_resuming_from_any_event_gives_the_same_splats_and_rows(scene: Scene) ->
         recipe,
         GENERIC,
         backend=backend,
-        progress_every=1,
         on_event=lambda _: kept.append(trainer.state.state_dict()),
+        options=TrainerOptions(progress_every=1),
     )
     end = trainer.run()
     found = trainer.state.learned

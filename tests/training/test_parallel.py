@@ -20,7 +20,7 @@ from gs2d.training.adam import adam_step
 from gs2d.training.densify.densifier import Densifier
 from gs2d.training.parallel import ONE_PROCESS
 from gs2d.training.state import Moments, TrainState
-from gs2d.training.trainer import Trainer
+from gs2d.training.trainer import Trainer, TrainerOptions
 from together import RECIPES, Batch, flat, together_in, trained
 from train_toys import random_splats, short
 
@@ -159,5 +159,5 @@ def test_densifiers_that_cannot_share_an_iteration_are_refused(
     monkeypatch.setattr("gs2d.training.trainer.densifier_of", lambda densify, around: densify and guest(around))
     recipe = Recipe("guest", (replace(short().stages[0], densify=Densify("relocation")),))
     with pytest.raises(RecipeError, match=says):
-        Trainer(scene, recipe, GENERIC, backend="reference", processes=Batch(2))
+        Trainer(scene, recipe, GENERIC, backend="reference", options=TrainerOptions(processes=Batch(2)))
     Trainer(scene, recipe, GENERIC, backend="reference")

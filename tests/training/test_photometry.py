@@ -25,7 +25,7 @@ from gs2d.synthetic.perturb_exposure import random_gains
 from gs2d.training.learned.appearance import numbers_of, shown, shown_splats, unshown
 from gs2d.training.learned.quantity import ImagePoints
 from gs2d.training.state import TrainState
-from gs2d.training.trainer import Trainer
+from gs2d.training.trainer import Trainer, TrainerOptions
 from learned_rows import Learner, begun
 from train_toys import SIZE, VIEWS, backends, random_splats, short
 
@@ -77,7 +77,7 @@ def test_of_faces_of_a_panorama_the_response_alone_is_learned(scene: Scene) -> N
 def test_the_gradient_of_a_camera_s_numbers_is_that_of_the_whole_loss(scene: Scene) -> None:
     recipe = Recipe("one", (replace(surface(), iterations=5),), photometry=Photometry(), exposure=Exposure())
     views = replace(scene, train=tuple(seen_through(scene.train, 2)))
-    trainer = Trainer(views, recipe, GENERIC, backend="reference", dtype=torch.float64)
+    trainer = Trainer(views, recipe, GENERIC, backend="reference", options=TrainerOptions(dtype=torch.float64))
     trainer.enter(0)
     state, stage = trainer.state, recipe.stages[0]
     state.learned["exposure"].values += 0.1 * torch.randn(VIEWS, 3, 4, generator=state.generator, dtype=torch.float64)

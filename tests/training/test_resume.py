@@ -14,7 +14,7 @@ from gs2d.data.scene import Scene
 from gs2d.errors import RunError
 from gs2d.training import events
 from gs2d.training.state import TrainState
-from gs2d.training.trainer import Trainer
+from gs2d.training.trainer import Trainer, TrainerOptions
 from saved_states import reload, saved
 from train_toys import backends, random_splats, same, short, train
 
@@ -28,8 +28,8 @@ def test_resuming_from_any_event_gives_the_same_bytes(scene: Scene, absgs: bool)
         short(absgs),
         GENERIC,
         backend=backend,
-        progress_every=1,
         on_event=lambda event: kept.append((event, saved(trainer))),
+        options=TrainerOptions(progress_every=1),
     )
     end = trainer.run()
     robust = {events.FloatersRemoved}  # of robust recipes alone: test_robust
@@ -47,7 +47,7 @@ class Killed(Exception):
 def test_a_run_that_is_killed_in_an_event_resumes_from_its_last_save_to_the_same_bytes(
     scene: Scene, backend: str, when: int
 ) -> None:
-    end = Trainer(scene, short(), GENERIC, backend=backend, progress_every=1).run()
+    end = Trainer(scene, short(), GENERIC, backend=backend, options=TrainerOptions(progress_every=1)).run()
     saves: list[bytes] = []
 
     def on_event(event: events.Event) -> None:
@@ -58,7 +58,9 @@ def test_a_run_that_is_killed_in_an_event_resumes_from_its_last_save_to_the_same
             raise Killed
 
     seen: list[events.Event] = []
-    trainer = Trainer(scene, short(), GENERIC, backend=backend, on_event=on_event, progress_every=1)
+    trainer = Trainer(
+        scene, short(), GENERIC, backend=backend, on_event=on_event, options=TrainerOptions(progress_every=1)
+    )
     with pytest.raises(Killed):
         trainer.run()
     state = reload(saves[-1]) if saves else None

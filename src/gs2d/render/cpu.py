@@ -9,7 +9,7 @@ import ctypes
 import struct
 from collections.abc import Sequence
 from operator import attrgetter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -180,8 +180,18 @@ def _with_features(library: Library, frame: _Frame, color: Tensor, values: Tenso
     return wide
 
 
+class _Options(NamedTuple):
+    """What _Rasterize takes besides the tensors that have gradients."""
+
+    library: Library
+    view: _View
+    depth_width: float | None  # None: no depth by transmittance
+    rows: Tensor | None  # those whose gradients are wanted; None: all
+    background: Tensor | None  # of further channels
+
+
 class _Rasterize(torch.autograd.Function):
-    """Radii and images from the six parameter tensors; ``rows`` are those whose gradients are wanted, None for all.
+    """Radii and images from the six parameter tensors.
 
     With further channels ``values`` [N, F] the colours are [H, W, 3 + F].
     """
@@ -189,17 +199,14 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        library: Library,
-        view: _View,
-        depth_width: float | None,
-        rows: Tensor | None,
-        background: Tensor | None,
+        options: _Options,
         probe: Tensor | None,
         intrinsics: Tensor | None,
         values: Tensor | None,
         *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
         tensors = [p.detach().contiguous() for p in parameters]
+        library, view, depth_width, rows, background = options
         images, radii, frame = _forward(library, view, tensors, depth_width)
         wide = None
         if values is not None and background is not None:
@@ -225,7 +232,7 @@ class _Rasterize(torch.autograd.Function):
         of_wide = None if values is None else given[0]
         if of_wide is not None:
             given[0] = of_wide[..., :3].contiguous()
-        want_probe, want_intrinsics, want_values, *want = ctx.needs_input_grad[5:]
+        want_probe, want_intrinsics, want_values, *want = ctx.needs_input_grad[1:]
         empty, dtype = library.pool.empty, library.dtype
         grads = [empty(t.shape, dtype) if wanted else None for t, wanted in zip(tensors, want, strict=True)]
         probe = empty(ctx.probe_shape, dtype) if want_probe else None
@@ -245,7 +252,7 @@ class _Rasterize(torch.autograd.Function):
         total = None
         if to_intrinsics is not None:  # numpy adds one row after the other: the same bits for any number of threads
             total = torch.from_numpy(to_intrinsics.numpy().sum(axis=0, dtype=np.float64)).to(ctx.of_intrinsics)
-        return None, None, None, None, None, probe, total, to_values, *grads
+        return None, probe, total, to_values, *grads
 
 
 def rasterize_with(
@@ -272,10 +279,10 @@ def rasterize_with(
         gradient_rows = gradient_rows.to("cpu", copy=True).contiguous()  # it may change before the backward pass
     depth_width = settings.depth_width(camera) if settings.with_transmittance_depth else None
     view = _view(camera, settings, exact_masks)
-    given = (library, view, depth_width, gradient_rows)
     background, values = (None, None) if features is None else (features.background, features.values)
+    options = _Options(library, view, depth_width, gradient_rows, background)
     learning = (screen_probe, camera.intrinsics, values)
-    radii, *images = _Rasterize.apply(*given, background, *learning, *(t for _, t in splats.items()))
+    radii, *images = _Rasterize.apply(options, *learning, *(t for _, t in splats.items()))
     names = (*IMAGES, "depth_transmittance")[: len(images)]
     return RenderOutput(**dict(zip(names, images, strict=True)), radii=radii)
 

@@ -34,7 +34,7 @@ from gs2d.render.cuda_passes import view_of as _view
 from gs2d.render.pair_budget import PairBudget
 from gs2d.render.types import PLAIN_COLORS, Features, RasterSettings, RenderOutput
 
-__all__ = ["rasterize", "rasterize_with", "splat_errors", "splat_errors_with"]
+__all__ = ["CudaChoices", "rasterize", "rasterize_with", "splat_errors", "splat_errors_with"]
 
 
 def _check_tensors(splats: Splats, settings: RasterSettings) -> None:
@@ -49,6 +49,26 @@ def _check_tensors(splats: Splats, settings: RasterSettings) -> None:
             f"sh_degree must be -1 to 3 and within the stored coefficients ({1 + splats.shN.shape[1]}), "
             f"got {settings.sh_degree}"
         )
+
+
+@dataclass(frozen=True, eq=False)
+class CudaChoices:
+    """How the CUDA kernels render.
+
+    Attributes
+    ----------
+    exact_masks : bool
+        False turns off culling inside tiles; the image must not change by a bit (tests).
+    deterministic : bool or None
+        The same gradients bit for bit from run to run, for 320 bytes a pair of splat and tile and one more pass.
+        None: as torch.use_deterministic_algorithms says.
+    budget : PairBudget or None
+        Instead of waiting for the number of pairs of splat and tile; the caller looks whether it was enough.
+    """
+
+    exact_masks: bool = True
+    deterministic: bool | None = None
+    budget: PairBudget | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,11 +179,8 @@ def rasterize_with(
     screen_probe: Tensor | None = None,
     gradient_rows: Tensor | None = None,
     *,
-    distortion: bool = True,
-    exact_masks: bool = True,
-    deterministic: bool | None = None,
-    budget: PairBudget | None = None,
     features: Features | None = None,
+    choices: CudaChoices = CudaChoices(),
 ) -> RenderOutput:
     """Render one view with the CUDA kernels; the contract is in :mod:`gs2d.render.api`.
 
@@ -182,17 +199,9 @@ def rasterize_with(
         Zeros; its gradient is the densification signal.
     gradient_rows : Tensor [N] bool, optional
         Gradients are wanted of these splats only; all others get zeros.
-    distortion : bool
-        False leaves that image out, which is then NaN: blending is a tenth shorter.
-    exact_masks : bool
-        False turns off culling inside tiles; the image must not change by a bit (tests).
-    deterministic : bool, optional
-        The same gradients bit for bit from run to run, for 320 bytes a pair of splat and tile and one more pass.
-        None: as torch.use_deterministic_algorithms says.
-    budget : PairBudget, optional
-        Instead of waiting for the number of pairs of splat and tile; the caller looks whether it was enough.
     features : Features, optional
-        Further channels; without ``gradient_rows``, ``deterministic`` and depth by transmittance.
+        Further channels; without ``gradient_rows``, deterministic gradients and depth by transmittance.
+    choices : CudaChoices
 
     Raises
     ------
@@ -207,15 +216,16 @@ def rasterize_with(
         if found != ((len(splats),), torch.bool, splats.device):
             raise ShapeError(f"gradient_rows must be bool [{len(splats)}] on {splats.device}, got {found}")
         gradient_rows = gradient_rows.clone()  # whatever happens to it before the backward pass
+    deterministic = choices.deterministic
     if deterministic is None:
         deterministic = torch.are_deterministic_algorithms_enabled()
     transmittance = settings.with_transmittance_depth
-    choices = (exact_masks, distortion, transmittance, deterministic)
+    chosen = (choices.exact_masks, settings.with_distortion, transmittance, deterministic)
     values = background = None
     if features is not None:
         values, background = features.values, features.background.detach()
         background = pad(background, (0, -len(background) % CHANNELS))
-    options = _Options(launcher, _view(camera, settings), *choices, gradient_rows, budget, background)
+    options = _Options(launcher, _view(camera, settings), *chosen, gradient_rows, choices.budget, background)
     learning = (screen_probe, camera.intrinsics, values)
     radii, *images = _Rasterize.apply(options, *learning, *(t for _, t in splats.items()))
     return RenderOutput(**dict(zip(_image_names(transmittance), images, strict=True)), radii=radii)
@@ -234,7 +244,7 @@ def rasterize(
     """:func:`rasterize_with` on the device on which the splats lie, on torch's current stream there."""
     launcher = launch.launcher_for(splats.device)
     given = (splats, camera, settings, screen_probe, gradient_rows)
-    return rasterize_with(launcher, *given, distortion=settings.with_distortion, budget=budget, features=features)
+    return rasterize_with(launcher, *given, features=features, choices=CudaChoices(budget=budget))
 
 
 def splat_errors_with(

@@ -151,9 +151,9 @@ def rasterize_2dgs(
             "rasterize_2dgs has no depth by transmittance, got settings with it: render with gs2d.rasterize, or leave "
             "with_transmittance_depth False"
         )
-    tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, screen_probe)
+    tensors = _Tensors(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, screen_probe)
     if not torch.compiler.is_compiling():
-        for name, tensor in zip(_TENSOR_NAMES, tensors, strict=True):
+        for name, tensor in tensors._asdict().items():
             if tensor is not None or name not in ("backgrounds", "screen_probe"):
                 check_dense(name, tensor)
     if torch.compiler.is_compiling() or not _is_plain(means):
@@ -163,10 +163,46 @@ def rasterize_2dgs(
         choices = (settings.lowpass_depth, settings.near_plane_policy, settings.with_distortion, backend)
         degree = PLAIN_COLORS if sh_degree is None else sh_degree
         return Rasterization(*_operator(*tensors, width, height, degree, constants, *choices))
-    return _render(*tensors, width, height, sh_degree, settings, backend)
+    return _render(tensors, (width, height), sh_degree, settings, backend)
 
 
-_TENSOR_NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds", "screen_probe")
+class _Tensors(NamedTuple):
+    """The tensors of :func:`rasterize_2dgs`."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+    viewmats: Tensor
+    Ks: Tensor
+    backgrounds: Tensor | None
+    screen_probe: Tensor | None
+
+
+class _Numbers(NamedTuple):
+    """What the operator takes besides tensors: its schema has no other types."""
+
+    width: int
+    height: int
+    sh_degree: int  # PLAIN_COLORS: none
+    constants: Sequence[float]  # those of CONSTANTS
+    lowpass_depth: str
+    near_plane_policy: str
+    with_distortion: bool
+    backend: str
+
+    @property
+    def settings(self) -> RasterSettings:
+        """The constants as settings."""
+        given: dict[str, Any] = dict(zip(CONSTANTS, self.constants, strict=True))
+        names = ("lowpass_depth", "near_plane_policy", "with_distortion")
+        return RasterSettings(**given, **{name: getattr(self, name) for name in names})
+
+    def render(self, tensors: _Tensors) -> Rasterization:
+        """Render the tensors."""
+        degree = None if self.sh_degree == PLAIN_COLORS else self.sh_degree
+        return _render(tensors, (self.width, self.height), degree, self.settings, self.backend)
 
 
 def _is_plain(tensor: object) -> bool:
@@ -175,24 +211,16 @@ def _is_plain(tensor: object) -> bool:
 
 
 def _render(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    backgrounds: Tensor | None,
-    screen_probe: Tensor | None,
-    width: int,
-    height: int,
+    tensors: _Tensors,
+    size: tuple[int, int],
     sh_degree: int | None,
     settings: RasterSettings,
     backend: str | Backend,
 ) -> Rasterization:
     """Render by :func:`gs2d.render.api.rasterize`, whose autograd functions are all there is."""
-    cameras = _cameras(viewmats, Ks, width, height)
-    count, channels = len(cameras), _check(means, quats, scales, opacities, colors, viewmats, sh_degree)
+    means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, screen_probe = tensors
+    cameras = _cameras(viewmats, Ks, *size)
+    count, channels = len(cameras), _check(tensors, sh_degree)
     if screen_probe is not None and screen_probe.shape[:-1] != (count, len(means)):
         raise ShapeError(
             f"screen_probe must be [{count}, {len(means)}, 2] or [{count}, {len(means)}, 4], "
@@ -258,16 +286,9 @@ def _cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> list[Came
     return cameras
 
 
-def _check(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    sh_degree: int | None,
-) -> int:
+def _check(tensors: _Tensors, sh_degree: int | None) -> int:
     """Check the splats and return the number of channels; what :func:`rasterize` checks is left to it."""
+    means, quats, scales, opacities, colors, viewmats, *_ = tensors
     third = 3 if scales.dim() == 2 and scales.shape[1] == 3 else 2
     layout = "N D" if sh_degree is None else "N K 3"
     if colors.dim() == len(layout.split()) + 1:
@@ -360,7 +381,7 @@ class _OverBackground(torch.autograd.Function):
 
 # The operator -----------------------------------------------------------------------------------------------------
 
-_TENSORS = 9  # means to screen_probe
+_TENSORS = len(_Tensors._fields)
 _ARGUMENTS = (  # written out: what torch reads from annotations differs between its versions
     "Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor colors, Tensor viewmats, Tensor Ks, "
     "Tensor? backgrounds, Tensor? screen_probe, SymInt width, SymInt height, int sh_degree, float[] constants, "
@@ -371,51 +392,10 @@ _BACKWARD = f"(Tensor?[] upstream, bool[] wanted, {_ARGUMENTS}) -> Tensor[]"
 
 
 @torch.library.custom_op("gs2d::rasterize_2dgs", mutates_args=(), schema=_FORWARD)
-def _operator(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    backgrounds: Tensor | None,
-    screen_probe: Tensor | None,
-    width: int,
-    height: int,
-    sh_degree: int,
-    constants: Sequence[float],
-    lowpass_depth: str,
-    near_plane_policy: str,
-    with_distortion: bool,
-    backend: str,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Render without gradients; ``sh_degree`` -1 is None, ``constants`` are those of ``CONSTANTS``."""
-    tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, screen_probe)
-    numbers = (width, height, sh_degree, constants, lowpass_depth, near_plane_policy, with_distortion, backend)
+def _operator(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Render without gradients."""
     with torch.no_grad():
-        return tuple(_render(*tensors, *_python_options(*numbers)))  # type: ignore[return-value]
-
-
-def _python_options(
-    width: int,
-    height: int,
-    sh_degree: int,
-    constants: Sequence[float],
-    lowpass_depth: str,
-    near_plane_policy: str,
-    with_distortion: bool,
-    backend: str,
-) -> tuple[int, int, int | None, RasterSettings, str]:
-    """Return the operator's numbers as :func:`_render` takes them."""
-    given: dict[str, Any] = dict(zip(CONSTANTS, constants, strict=True))
-    settings = RasterSettings(
-        **given,
-        lowpass_depth=lowpass_depth,
-        near_plane_policy=near_plane_policy,
-        with_distortion=with_distortion,
-    )
-    return width, height, None if sh_degree == PLAIN_COLORS else sh_degree, settings, backend
+        return tuple(_Numbers(*arguments[_TENSORS:]).render(_Tensors(*arguments[:_TENSORS])))  # type: ignore[return-value]
 
 
 @_operator.register_fake
@@ -428,35 +408,15 @@ def _(*arguments: Any) -> tuple[Tensor, ...]:
 
 
 @torch.library.custom_op("gs2d::rasterize_2dgs_backward", mutates_args=(), schema=_BACKWARD)
-def _backward_operator(
-    upstream: Sequence[Tensor | None],
-    wanted: Sequence[bool],
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    backgrounds: Tensor | None,
-    screen_probe: Tensor | None,
-    width: int,
-    height: int,
-    sh_degree: int,
-    constants: Sequence[float],
-    lowpass_depth: str,
-    near_plane_policy: str,
-    with_distortion: bool,
-    backend: str,
-) -> list[Tensor]:
+def _backward_operator(upstream: Sequence[Tensor | None], wanted: Sequence[bool], *arguments: Any) -> list[Tensor]:
     """Render again and return the gradients of the tensors that are wanted."""
-    tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, screen_probe)
-    numbers = (width, height, sh_degree, constants, lowpass_depth, near_plane_policy, with_distortion, backend)
+    tensors, numbers = arguments[:_TENSORS], _Numbers(*arguments[_TENSORS:])
+    means = tensors[0]
     stream = torch.cuda.current_stream(means.device) if means.is_cuda else None
 
     def again() -> list[Tensor]:
         with torch.cuda.stream(stream):  # of a GPU; None changes nothing
-            return _gradients(upstream, wanted, tensors, _python_options(*numbers))
+            return _gradients(upstream, wanted, tensors, numbers)
 
     # Within an operator the dispatcher records nothing, in this thread; another has a dispatcher as it always is.
     with ThreadPoolExecutor(1) as thread:
@@ -467,7 +427,7 @@ def _gradients(
     upstream: Sequence[Tensor | None],
     wanted: Sequence[bool],
     tensors: Sequence[Tensor | None],
-    options: tuple[Any, ...],
+    numbers: _Numbers,
 ) -> list[Tensor]:
     """Gradients of the tensors that are wanted; those of the images are ``upstream``."""
     leaves: list[Any] = [
@@ -475,7 +435,7 @@ def _gradients(
         for tensor, want in zip(tensors, wanted, strict=True)
     ]
     learning = [leaf for leaf, want in zip(leaves, wanted, strict=True) if want]
-    images = _render(*leaves, *options)
+    images = numbers.render(_Tensors(*leaves))
     pairs = [(image, g) for image, g in zip(images, upstream, strict=True) if g is not None and image.requires_grad]
     if not pairs:
         return [torch.zeros_like(leaf) for leaf in learning]

@@ -7,7 +7,7 @@ loss, backward, statistics, densify and prune, opacity reset, Adam. So on an ite
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -54,11 +54,54 @@ from gs2d.training.state import TrainState
 from gs2d.training.targets import PINNED_BYTES, TARGET_BYTES, DeviceTargets, Targets, TargetSource
 from gs2d.training.whole_steps import WholeSteps
 
-__all__ = ["OnEvent", "Trainer", "raster_settings"]
+__all__ = ["OnEvent", "Trainer", "TrainerOptions", "raster_settings"]
 
 OnEvent = Callable[[events.Event], None]
 MIN_START = 10  # splats that a dense start must find where there are others to start from
 MIN_SIDE = 11  # px of a photograph in training: the window of SSIM
+
+
+@dataclass(frozen=True, eq=False)
+class TrainerOptions:
+    """What else a training needs: its surroundings and its memory.
+
+    Attributes
+    ----------
+    between : callable
+        Called after each iteration on a device that nobody waits for (the CPU), when no event is due: a moment for
+        something else that uses the rasterizer. It must leave the state alone.
+    frozen : Splats or None
+        Of the recipe's SH degree: rendered with those in training, and never changed, counted, densified or returned.
+        They are what lies around a part of a scene that is trained by itself.
+    within : callable or None
+        Which places [M, 3] are to be trained, [M] bool. With ``init``, and where the recipe has a dense start: training
+        starts from what that finds there, and from ``init`` only where photographs agree on nothing.
+    exposures : Tensor [V, 3, 4] or None
+        Transforms of the training views, for a recipe whose exposures are given.
+    progress_every : int
+        Iterations between Progress events (the last of a stage always sends one).
+    target_bytes : int or None
+        Memory for photographs: float tensors on the CPU (default 256 MiB), bytes on a GPU (default 2 GiB).
+    stage2_cache_bytes : int
+        Memory for cached views (cpu backend, stages that train only the colours of a row group); 0 = none. The first
+        views that fit are cached. The result depends on it, by rounding.
+    dtype : torch.dtype
+        Of a new start.
+    processes : OneProcess
+        Those that train together (``training.parallel.ManyProcesses``), each with an own Trainer of the same scene and
+        recipe. An iteration of W processes takes W views and counts as W of the schedule: ``state.step`` counts views.
+        Process 0 has the ``state`` or ``init``, or makes the start, for all.
+    """
+
+    between: Callable[[], None] = lambda: None
+    frozen: Splats | None = None
+    within: Callable[[Tensor], Tensor] | None = None
+    exposures: Tensor | None = None
+    progress_every: int = 10
+    target_bytes: int | None = None
+    stage2_cache_bytes: int = 1 << 30
+    dtype: torch.dtype = torch.float32
+    processes: OneProcess = ONE_PROCESS
 
 
 class Trainer:
@@ -73,34 +116,11 @@ class Trainer:
         Rasterizer: "auto", "cuda", "cpu" or "reference". Its device is where everything is kept.
     on_event : callable
         Gets every event; the state is whole then, so ``state.state_dict()`` may be saved. What it raises stops the run.
-    between : callable
-        Called after each iteration on a device that nobody waits for (the CPU), when no event is due: a moment for
-        something else that uses the rasterizer. It must leave the state alone.
     state : TrainState, optional
         To go on from; without it training starts anew from ``recipe.seed``.
     init : Splats, optional
         To start anew from, instead of points: copied, with the recipe's SH degree.
-    frozen : Splats, optional
-        Of the recipe's SH degree: rendered with those in training, and never changed, counted, densified or returned.
-        They are what lies around a part of a scene that is trained by itself.
-    within : callable, optional
-        Which places [M, 3] are to be trained, [M] bool. With ``init``, and where the recipe has a dense start: training
-        starts from what that finds there, and from ``init`` only where photographs agree on nothing.
-    exposures : Tensor [V, 3, 4], optional
-        Transforms of the training views, for a recipe whose exposures are given.
-    progress_every : int
-        Iterations between Progress events (the last of a stage always sends one).
-    target_bytes : int, optional
-        Memory for photographs: float tensors on the CPU (default 256 MiB), bytes on a GPU (default 2 GiB).
-    stage2_cache_bytes : int
-        Memory for cached views (cpu backend, stages that train only the colours of a row group); 0 = none. The first
-        views that fit are cached. The result depends on it, by rounding.
-    dtype : torch.dtype
-        Of a new start.
-    processes : OneProcess
-        Those that train together (``training.parallel.ManyProcesses``), each with an own Trainer of the same scene and
-        recipe. An iteration of W processes takes W views and counts as W of the schedule: ``state.step`` counts views.
-        Process 0 has the ``state`` or ``init``, or makes the start, for all.
+    options : TrainerOptions
 
     Raises
     ------
@@ -116,17 +136,9 @@ class Trainer:
         *,
         backend: str | Backend = "auto",
         on_event: OnEvent = lambda event: None,
-        between: Callable[[], None] = lambda: None,
         state: TrainState | None = None,
         init: Splats | None = None,
-        frozen: Splats | None = None,
-        within: Callable[[Tensor], Tensor] | None = None,
-        exposures: Tensor | None = None,
-        progress_every: int = 10,
-        target_bytes: int | None = None,
-        stage2_cache_bytes: int = 1 << 30,
-        dtype: torch.dtype = torch.float32,
-        processes: OneProcess = ONE_PROCESS,
+        options: TrainerOptions = TrainerOptions(),
     ) -> None:
         if not scene.train:
             raise DataError(f"scene {scene.name} has no training views")
@@ -135,16 +147,16 @@ class Trainer:
         for stage in self.recipe.stages:
             protocol.resolve(stage.losses)  # each loss has a weight
         self.backend = backend if isinstance(backend, Backend) else get_backend(backend)
-        self._on_event, self._between, self._progress_every = on_event, between, progress_every
-        self.processes = processes
+        self._on_event, self._options = on_event, options
+        self.processes = processes = options.processes
         self.views = processes.size  # of the last iteration
         self._pending: list[events.Event] = []
         if state is not None and init is not None:
             raise RunError("training goes on from a state or starts from init, got both; leave one out")
         # What goes on has begun; free space is found by the settings of the dense start, so that sweep is made again.
-        self._within = within
-        goes_on = (init is not None and within is None) or (state is not None and self.recipe.removal is None)
+        goes_on = (init is not None and options.within is None) or (state is not None and self.recipe.removal is None)
         begins = replace(self.recipe, dense_start=None) if goes_on else self.recipe
+        frozen = options.frozen
         self._frozen = None if frozen is None or len(frozen) == 0 else frozen.detach().to(self.backend.device)
         if self._frozen is not None and self._frozen.sh_degree != self.recipe.sh_degree:
             degrees = f"{self._frozen.sh_degree}, the recipe trains {self.recipe.sh_degree}"
@@ -153,7 +165,7 @@ class Trainer:
         self._robust = Robustness(scene, begins, self.settings, self.backend, processes, self._frozen)
         if state is not None:
             check_resumable(state, self.recipe, scene)
-        self.state = processes.share(lambda: self._new_state(dtype, init, exposures) if state is None else state)
+        self.state = processes.share(lambda: self._new_state(init) if state is None else state)
         self.state.trained_by(processes.size)
         self.state.move_to(self.backend.device)
         self.learned.move_to(self.state.learned, self.backend.device)
@@ -161,7 +173,6 @@ class Trainer:
         self._learner = self.backend.for_training()
         self._densifiers = [densifier_of(stage.densify, self._surroundings(stage)) for stage in self.recipe.stages]
         self._check_shared()
-        self._target_bytes, self._stage2_cache_bytes = target_bytes, stage2_cache_bytes
         self._objective: Objective | None = None  # of the stage under way, from its first iteration here
         self._whole_steps: WholeSteps | None = None  # likewise
         self._ahead = ReadAhead(lambda index: scene.train[index].image()) if scene.ahead else None
@@ -212,7 +223,7 @@ class Trainer:
             while self.state.step < stage.iterations:
                 self.step()
                 if not is_async(self.state.splats.device):
-                    self._between()
+                    self._options.between()
             self._finish(stage)
         return self.state.splats
 
@@ -260,9 +271,9 @@ class Trainer:
         if self._ahead is not None:
             self._ahead.expect(together.part(state.queue[-self.scene.ahead * together.size :][::-1]))
         if self._objective is None:
-            limit = self._stage2_cache_bytes // together.place.local_size
+            limit = self._options.stage2_cache_bytes // together.place.local_size
             self._objective = choose_objective(self._whole, state, stage, limit, together.size)
-        reports = any(i % self._progress_every == 0 for i in iterations) or iteration == stage.iterations
+        reports = any(i % self._options.progress_every == 0 for i in iterations) or iteration == stage.iterations
         changes_rows = any(self._changes(i) or self._robust.removes(stage, i) for i in iterations)
         sharpens = stage.downscale_at(iteration + 1) != stage.downscale_at(iteration)  # then nothing may be done again
         result, happened = self._learner.iterate(
@@ -402,7 +413,7 @@ class Trainer:
             return
         self._downscale, self._objective, self._whole_steps = downscale, None, None
         scene = self.scene.downscaled(downscale)
-        self._targets: TargetSource = self._make_targets(scene, self._target_bytes)
+        self._targets: TargetSource = self._make_targets(scene, self._options.target_bytes)
         self._whole = FullRender(
             scene, self.recipe, self.protocol, self._learner, self._targets, self._frozen, self.learned
         )
@@ -438,7 +449,8 @@ class Trainer:
             limit_bytes=limit_bytes if limit_bytes is not None else 0 if scene.ahead else TARGET_BYTES,
         )
 
-    def _new_state(self, dtype: torch.dtype, init: Splats | None, exposures: Tensor | None) -> TrainState:
+    def _new_state(self, init: Splats | None) -> TrainState:
+        dtype, exposures = self._options.dtype, self._options.exposures
         generator = torch.Generator().manual_seed(self.recipe.seed)
         found = None if init is not None and not self._robust.starts_densely else self._started(dtype, generator)
         if init is not None and (found is None or len(found) < MIN_START):
@@ -463,7 +475,8 @@ class Trainer:
         source = initial.source if start is self._robust.scene else "depths"
         source = "sweep" if source == "points" and self._robust.starts_densely else source
         splats = self._robust.fitted(initial)
-        splats = splats if self._within is None else splats.rows(self._within(splats.means))
+        within = self._options.within
+        splats = splats if within is None else splats.rows(within(splats.means))
         self._pending.append(events.Initialised(len(splats), source, initial.dropped, self._robust.lacks))
         return splats
 

@@ -90,7 +90,8 @@ def test_rows_that_begin_in_the_middle_of_sixteen_bytes_have_the_same_gradients(
             room = torch.zeros(len(tensor) + 1, *tensor.shape[1:])
             room[shift : shift + len(tensor)] = tensor.detach()
             setattr(scene, name, room[shift : shift + len(tensor)].requires_grad_())
-        output = cuda.rasterize_with(emulator, scene, camera, RasterSettings(), deterministic=True)
+        choices = cuda.CudaChoices(deterministic=True)
+        output = cuda.rasterize_with(emulator, scene, camera, RasterSettings(), choices=choices)
         contraction(output, cotangents).backward()
         found.append([tensor.grad for _, tensor in scene.items()])
     assert scene.means.data_ptr() % 16 != 0

@@ -36,7 +36,7 @@ from gs2d.training import events
 from gs2d.training import objective as views
 from gs2d.training import trainer as loop
 from gs2d.training.targets import DeviceTargets, Targets
-from gs2d.training.trainer import Trainer
+from gs2d.training.trainer import Trainer, TrainerOptions
 from render_scenes import front_camera, splat, stack
 
 
@@ -172,7 +172,9 @@ def test_an_iteration_waits_for_nothing_once_it_knows_how_many_pairs_to_expect(
     recipe = quiet(VARIANTS[variant]) if stage == 0 else VARIANTS[variant]
     monkeypatch.setattr(loop, "is_async", lambda device: True)
     monkeypatch.setattr(views, "is_async", lambda device: True)
-    trainer = Trainer(scene, recipe, GENERIC, backend=emulated, progress_every=1000, target_bytes=1 << 20)
+    trainer = Trainer(
+        scene, recipe, GENERIC, backend=emulated, options=TrainerOptions(progress_every=1000, target_bytes=1 << 20)
+    )
     in_stage(trainer, stage)
     trainer.step()
     for index in range(len(scene.train)):
@@ -195,7 +197,7 @@ def test_a_loss_that_is_not_finite_stops_training_at_the_next_report(
 
     monkeypatch.setattr(loop, "is_async", lambda device: True)
     monkeypatch.setattr(views, "is_async", lambda device: True)
-    trainer = Trainer(scene, train_toys.short(), GENERIC, backend=emulated, progress_every=2)
+    trainer = Trainer(scene, train_toys.short(), GENERIC, backend=emulated, options=TrainerOptions(progress_every=2))
     trainer.enter(0)
     trainer.step()
     trainer.state.splats.sh0[3] = float("nan")
@@ -218,7 +220,7 @@ def test_without_waiting_for_the_number_of_pairs_training_gives_the_same_bits(
     monkeypatch.setattr(
         cuda_budget.PairBudget, "overflowed", lambda self: outcomes.append(settle(self)) or outcomes[-1]
     )
-    trainer = Trainer(scene, recipe, GENERIC, backend=emulated, progress_every=5)
+    trainer = Trainer(scene, recipe, GENERIC, backend=emulated, options=TrainerOptions(progress_every=5))
     trainer.run()
     assert any(outcomes) == (slack < 1)
     assert train_toys.same(kept.splats, trainer.splats)

@@ -77,7 +77,8 @@ def quiet(stage):
 recipe = replace(recipe, stages=tuple(quiet(stage) for stage in recipe.stages))
 with FakeTensorMode(allow_non_fake_inputs=True):
     state = TrainState(start.splats, generator, queue=[0, 1] * 10)
-    trainer = loop.Trainer(scene, recipe, GENERIC, backend=backend, state=state, progress_every=10**9)
+    options = loop.TrainerOptions(progress_every=10**9)
+    trainer = loop.Trainer(scene, recipe, GENERIC, backend=backend, state=state, options=options)
     trainer._learner._budget.room = lambda tiles: 1000
     ones = torch.ones(len(start.splats), dtype=torch.bool, device="cuda:0")
     trainer.state.groups = {g: ones for stage in recipe.stages for g in stage.train.values() if g != "all"}

@@ -55,11 +55,12 @@ from fake_backends import cuda_on_host
 from gs2d.render.backends import get_backend
 from gs2d.config.protocols import GENERIC
 from gs2d.kernels.cuda import launch
-from gs2d.training.trainer import Trainer
+from gs2d.training.trainer import Trainer, TrainerOptions
 
 def trained(backend):
     given = train_toys.make_scene(), train_toys.short(), GENERIC
-    made = Trainer(*given, backend=backend, progress_every=100)  # iterations that nobody looks at are by kernels alone
+    options = TrainerOptions(progress_every=100)  # iterations that nobody looks at are by kernels alone
+    made = Trainer(*given, backend=backend, options=options)
     made.run()
     return made
 

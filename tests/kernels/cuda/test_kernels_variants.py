@@ -42,11 +42,13 @@ def gradients(
     columns: int = 0,
     **options: Any,
 ) -> dict[str, Tensor]:
-    """Of the trained attributes, and with ``columns`` of the probe; ``options`` go to rasterize_with."""
+    """Of the trained attributes, and with ``columns`` of the probe; ``options`` are CudaChoices and the like."""
     scene = Splats(**{name: t.clone().requires_grad_(name in trained) for name, t in case.splats.items()})
     probe = torch.zeros(len(scene), columns, requires_grad=True) if columns else None
-    settings = replace(SETTINGS, sh_degree=3 if scene.shN.shape[1] else 0)
-    output = cuda.rasterize_with(launcher, scene, case.camera, settings, probe, **options)
+    rows, distortion = options.pop("gradient_rows", None), options.pop("distortion", True)
+    settings = replace(SETTINGS, sh_degree=3 if scene.shN.shape[1] else 0, with_distortion=distortion)
+    choices = cuda.CudaChoices(**options)
+    output = cuda.rasterize_with(launcher, scene, case.camera, settings, probe, rows, choices=choices)
     contraction(output, dict(cotangents)).backward()
     found = {name: tensor.grad for name, tensor in scene.items() if name in trained}
     if probe is not None:
@@ -167,7 +169,7 @@ def test_culling_splats_without_an_ellipse_changes_no_bit(emulator: Emulator, se
 def test_without_distortion_the_other_images_and_gradients_keep_every_bit(emulator: Emulator) -> None:
     case = many_tiles()
     full = cuda.rasterize_with(emulator, case.splats, case.camera, SETTINGS)
-    part = cuda.rasterize_with(emulator, case.splats, case.camera, SETTINGS, distortion=False)
+    part = cuda.rasterize_with(emulator, case.splats, case.camera, replace(SETTINGS, with_distortion=False))
     assert bool(part.distortion.isnan().all())  # whoever uses it by mistake will notice
     for name in ("color", "alpha", "normal", "depth_mean", "depth_median", "radii"):
         assert torch.equal(getattr(full, name), getattr(part, name)), name

@@ -53,7 +53,8 @@ def test_no_pass_of_the_rasterizer_reads_what_is_not_written(emulator: Emulator,
     def work() -> list[Tensor]:
         scene = requiring_grad(case.splats)
         probe = torch.zeros(len(scene), 4, requires_grad=True)
-        output = cuda.rasterize_with(emulator, scene, case.camera, SETTINGS, probe, deterministic=deterministic)
+        choices = cuda.CudaChoices(deterministic=deterministic)
+        output = cuda.rasterize_with(emulator, scene, case.camera, SETTINGS, probe, choices=choices)
         contraction(output, cotangents).backward()
         given = (emulator, case.splats, case.camera, image, SETTINGS)
         errors = [cuda.splat_errors_with(*given, occlusion=occlusion) for occlusion in (False, True)]

@@ -29,7 +29,7 @@ from gs2d.render import cuda_step, pair_budget
 from gs2d.training import objective as views
 from gs2d.training import trainer as loop
 from gs2d.training.densify.gradient import GradientDensifier
-from gs2d.training.trainer import Trainer
+from gs2d.training.trainer import Trainer, TrainerOptions
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,9 @@ def trained(
 ) -> tuple[Trainer, int]:
     """The trainer at the end, and its iterations in one piece."""
     with mode(chosen, launcher) as done:
-        trainer = Trainer(scene, recipe, protocol, backend=cuda_on_host(), **{"progress_every": 100, **options})
+        trainer = Trainer(
+            scene, recipe, protocol, **train_toys.grouped({"backend": cuda_on_host(), "progress_every": 100, **options})
+        )
         trainer.run()
     return trainer, sum(done)
 
@@ -292,7 +294,13 @@ def test_an_iteration_asks_torch_for_nothing(emulator: Emulator, scene: Scene) -
     recipe = of_object(brief())
     first = replace(recipe.stages[0], iterations=200)
     with mode("launches", emulator) as done:
-        trainer = Trainer(scene, replace(recipe, stages=(first,)), GENERIC, backend=cuda_on_host(), progress_every=1000)
+        trainer = Trainer(
+            scene,
+            replace(recipe, stages=(first,)),
+            GENERIC,
+            backend=cuda_on_host(),
+            options=TrainerOptions(progress_every=1000),
+        )
         trainer.enter(0)
         for _ in range(7):
             trainer.step()

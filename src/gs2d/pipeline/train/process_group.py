@@ -27,7 +27,7 @@ from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.train.interruption import HeldSignals
 from gs2d.pipeline.train.run_logger import progress_every
 from gs2d.training.parallel import ONE_PROCESS, LostContactError, ManyProcesses, OneProcess
-from gs2d.training.trainer import Trainer
+from gs2d.training.trainer import Trainer, TrainerOptions
 
 PATIENCE = timedelta(days=7)  # the others wait while process 0 scores; who is gone is noticed by its connection
 GIB = 2**30
@@ -134,9 +134,11 @@ def follow(options: TrainOptions, together: ManyProcesses) -> RunFolder:
         loaded.recipe,
         loaded.protocol,
         backend=loaded.backend,
-        progress_every=progress_every(loaded),
-        stage2_cache_bytes=loaded.resolved.stage2_cache_bytes,
-        processes=together,
+        options=TrainerOptions(
+            progress_every=progress_every(loaded),
+            stage2_cache_bytes=loaded.resolved.stage2_cache_bytes,
+            processes=together,
+        ),
     )
     signals = HeldSignals()
     together.hears = lambda: signals.asked

@@ -246,7 +246,7 @@ def train_stages(
 
     The splats are written before they are scored. ``visitors`` see every view of the finished splats.
     """
-    from gs2d.training.trainer import Trainer
+    from gs2d.training.trainer import Trainer, TrainerOptions
 
     part = loaded.part
     recorder = RunLogger(run, loaded, start, on_event, visitors)
@@ -264,15 +264,16 @@ def train_stages(
         loaded.protocol,
         backend=loaded.backend,
         on_event=listen,
-        between=recorder.stop_if_asked,
         state=start.state,
         init=None if start.state is not None else loaded.init if part is None else part.own,
-        frozen=None if part is None else part.frozen,
-        within=None if part is None or loaded.recipe.dense_start is None else part.within,
-        exposures=None if part is None else part.exposures,
-        progress_every=recorder.progress_every,
-        stage2_cache_bytes=loaded.resolved.stage2_cache_bytes,
-        processes=together,
+        options=TrainerOptions(
+            frozen=None if part is None else part.frozen,
+            within=None if part is None or loaded.recipe.dense_start is None else part.within,
+            exposures=None if part is None else part.exposures,
+            progress_every=recorder.progress_every,
+            stage2_cache_bytes=loaded.resolved.stage2_cache_bytes,
+            processes=together,
+        ),
     )
     recorder.begin(trainer)
     with recorder.ending_well():
