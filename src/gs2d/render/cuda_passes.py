@@ -177,7 +177,7 @@ def _project(
     if count >= MAX_SPLATS:
         raise BackendError(f"the cuda backend takes fewer than {MAX_SPLATS} splats, got {count}")
     projected = {
-        name: torch.empty(count * columns, dtype=dtype, device=device).view(-1, *((columns,) if columns > 1 else ()))
+        name: torch.empty((count, columns) if columns > 1 else (count,), dtype=dtype, device=device)
         for name, (columns, dtype) in PROJECTED.items()
     }
     if count > 0:
