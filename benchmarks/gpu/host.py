@@ -32,11 +32,12 @@ from gs2d.errors import BackendError
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.compile import compile_source
 from gs2d.render import pair_budget
+from gs2d.render.backends import CudaBackend
 from gs2d.training import objective, trainer
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer, TrainerOptions
 
-WAYS = ("autograd", "launches", "graph")
+WAYS = ("torch", "launches", "graph")
 SOURCES = tuple(
     f"cuda/{name}.cu"
     for name in "sort project emit order blend photometric losses blend_vjp blend_colors project_vjp adam".split()
@@ -173,17 +174,34 @@ def null_trainer() -> Trainer:
     )
 
 
+@contextmanager
+def iterations_by(way: str) -> Iterator[None]:
+    """Iterations of a training through torch ("torch"), by "launches", by "graph", or as it is set ("")."""
+    before, takes = os.environ.get(launch.STEP_VARIABLE), CudaBackend.takes_whole_steps
+    if way == "torch":
+        CudaBackend.takes_whole_steps = lambda self: False  # type: ignore[method-assign]
+    elif way:
+        os.environ[launch.STEP_VARIABLE] = way
+    try:
+        yield
+    finally:
+        CudaBackend.takes_whole_steps = takes  # type: ignore[method-assign]
+        if before is not None:
+            os.environ[launch.STEP_VARIABLE] = before
+        else:
+            os.environ.pop(launch.STEP_VARIABLE, None)
+
+
 def host_cost(repeats: int = 300, stages: int = 4, way: str = "") -> dict[str, Any]:
     """By stage: microseconds of the host an iteration, its launches, torch operations and allocations.
 
-    ``way`` is that of ``GS2D_CUDA_STEP``; "": as it is set.
+    ``way`` is that of :func:`iterations_by`.
     """
-    threads, before = torch.get_num_threads(), os.environ.get(launch.STEP_VARIABLE, "")
+    threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    os.environ[launch.STEP_VARIABLE] = way or before
     found: dict[str, Any] = {}
     try:
-        with nothing_runs() as driver:
+        with iterations_by(way), nothing_runs() as driver:
             made = null_trainer()
             for index, stage in enumerate(made.recipe.stages[:stages]):
                 made.enter(index)
@@ -192,7 +210,6 @@ def host_cost(repeats: int = 300, stages: int = 4, way: str = "") -> dict[str, A
                 found[stage.name] = {**_time(made, repeats), **_count(made, driver)}
     finally:
         torch.set_num_threads(threads)
-        os.environ[launch.STEP_VARIABLE] = before
     return found
 
 

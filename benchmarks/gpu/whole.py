@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -11,6 +10,7 @@ from typing import Any
 import torch
 
 from benchmarks.gpu.bench import Bench, rounded
+from benchmarks.gpu.host import WAYS, iterations_by
 from gs2d.config.protocols import GENERIC
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
@@ -21,7 +21,6 @@ from gs2d.render.types import RasterSettings
 from gs2d.render.whole_step import Learned, StepLosses, StepNormals, WholeStep
 from gs2d.training import objective, trainer
 
-WAYS = ("autograd", "launches", "graph")
 ROOM = 1 << 20  # pairs
 
 
@@ -70,19 +69,16 @@ def _step(bench: Bench, splats: Splats, camera: Camera, channels: int) -> None:
 @contextmanager
 def _way(chosen: str, dry: bool) -> Iterator[None]:
     """Iterations done in one way; with ``dry`` as on a device that nobody waits for."""
-    before, asked = os.environ.get(launch.STEP_VARIABLE), objective.is_async
-    os.environ[launch.STEP_VARIABLE] = chosen
+    asked = objective.is_async
     places: tuple[Any, ...] = (trainer, objective)
     for place in places if dry else ():
         place.is_async = lambda device: True
     try:
-        yield
+        with iterations_by(chosen):
+            yield
     finally:
         for place in places:
             place.is_async = asked
-        del os.environ[launch.STEP_VARIABLE]
-        if before is not None:
-            os.environ[launch.STEP_VARIABLE] = before
 
 
 def differences(bench: Bench) -> dict[str, Any]:
@@ -107,11 +103,11 @@ def differences(bench: Bench) -> dict[str, Any]:
             start = made.splats.clone()
             made.run()
             ends[chosen] = made.splats
-    moved = {name: float((tensor - getattr(start, name)).norm()) for name, tensor in ends["autograd"].items()}
+    moved = {name: float((tensor - getattr(start, name)).norm()) for name, tensor in ends["torch"].items()}
     return {
         chosen: rounded(
             {
-                name: float((tensor - getattr(ends["autograd"], name)).norm()) / max(moved[name], 1e-30)
+                name: float((tensor - getattr(ends["torch"], name)).norm()) / max(moved[name], 1e-30)
                 for name, tensor in ends[chosen].items()
             }
         )

@@ -532,16 +532,16 @@ class CudaBackend(Backend):
         budget = self._budget
         if budget is None:
             return False
-        takes = not budget.exact and launch.steps() != launch.AUTOGRAD
-        if not takes and self._stepper is not None:
+        if budget.exact and self._stepper is not None:
             self._stepper.release()
-        return takes and not torch.are_deterministic_algorithms_enabled()
+        return not budget.exact and not torch.are_deterministic_algorithms_enabled()
 
     def step(self, step: WholeStep) -> bool:
         """Do an iteration by kernels alone (:mod:`gs2d.render.cuda_step`)."""
         if self._budget is None or not self.takes_whole_steps():
             return False
         if self._stepper is None:
+            launch.steps()  # an unknown value is refused before anything is done
             device = step.splats.device
             self._stepper = Stepper(launch.launcher_for(device), device)
         return self._stepper.run(step, self._budget)

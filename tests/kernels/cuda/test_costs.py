@@ -14,7 +14,6 @@ import torch
 from benchmarks.gpu.host import host_cost
 
 from emulate import Emulator
-from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.arguments import OrderArguments, fill
 from gs2d.render import cuda_works
 
@@ -33,7 +32,7 @@ LIMITS = {
         "refine": (20, 20, 1, 0),
         "best": (20, 20, 1, 0),
     },
-    "autograd": {
+    "torch": {
         "surface": (14, 68, 128, 38),
         "appearance": (11, 52, 84, 29),
         "refine": (14, 55, 110, 36),
@@ -44,9 +43,8 @@ CHANGED = 11  # nodes of a graph: those that hold a camera, a photograph or rate
 
 
 @pytest.mark.parametrize("way", list(LIMITS))
-def test_an_iteration_gives_the_device_no_more_to_do_than_before(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(launch.STEP_VARIABLE, way)
-    for stage, row in host_cost(repeats=2).items():
+def test_an_iteration_gives_the_device_no_more_to_do_than_before(way: str) -> None:
+    for stage, row in host_cost(repeats=2, way=way).items():
         names = ("own_launches", "device_launches", "torch_operations", "allocations")
         for name, most in zip(names, LIMITS[way][stage], strict=True):
             assert 0 <= row[name] <= most, f"{stage}: {name}"

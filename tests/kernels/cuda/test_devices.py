@@ -61,7 +61,8 @@ from gs2d.training.state import TrainState
 
 backend = CudaBackend()
 backend.device = "cuda:0"
-launch.steps = lambda: launch.AUTOGRAD  # an iteration by kernels alone makes no tensors that could lie elsewhere
+# An iteration by kernels alone makes no tensors that could lie elsewhere.
+CudaBackend.takes_whole_steps = lambda self: False
 CudaBackend.for_training = lambda self: altered(self, _budget=cuda_budget.PairBudget())
 recipe, scene, generator = train_toys.compared(), train_toys.make_scene(), torch.Generator()
 start = initial_splats(scene, sh_degree=recipe.sh_degree, random_points=50, near=0.2, generator=generator)

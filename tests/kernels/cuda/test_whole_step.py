@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from benchmarks.gpu.host import OperationCount
+from benchmarks.gpu.host import OperationCount, iterations_by
 
 import fake_driver
 import train_toys
@@ -47,8 +47,7 @@ def mode(chosen: str, launcher: Launcher) -> Iterator[list[bool]]:
         done.append(run(self, *given))
         return done[-1]
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(launch.STEP_VARIABLE, chosen)
+    with pytest.MonkeyPatch.context() as patch, iterations_by(chosen):
         patch.setattr(launch, "launcher_for", lambda device: launcher)
         patch.setattr(loop, "is_async", lambda device: True)
         patch.setattr(views, "is_async", lambda device: True)
@@ -157,7 +156,7 @@ def test_three_stages_have_the_bits_of_those_that_go_through_torch(
     """Densified, reset, ranked and cloned in between; what counts then has been gathered by a kernel."""
     change, recipe, protocol = VARIANTS[variant]
     given = emulator, change(scene), recipe
-    parts, none = trained(*given, "autograd", protocol)
+    parts, none = trained(*given, "torch", protocol)
     whole, some = trained(*given, "launches", protocol)
     assert none == 0
     assert some >= 10  # of 19: those that densify or end a stage, and the first one of a size, are looked at
@@ -187,7 +186,7 @@ def test_memory_of_before_and_the_order_of_threads_change_nothing(
 
     monkeypatch.setattr(cuda_step.Stepper, "run", poisoned)
     shuffled = Emulator(seed=seed)
-    parts, _ = trained(shuffled, scene, train_toys.short(), "autograd")
+    parts, _ = trained(shuffled, scene, train_toys.short(), "torch")
     whole, some = trained(shuffled, scene, train_toys.short(), "launches")
     assert some == checked["extras"] >= 11
     for (name, a), (_, b) in zip(parts.splats.items(), whole.splats.items(), strict=True):
@@ -239,7 +238,7 @@ def test_a_driver_without_graphs_launches_one_by_one(emulator: Emulator, scene: 
 
 
 def test_a_way_that_does_not_exist_is_one_line(scene: Scene, emulator: Emulator) -> None:
-    with pytest.raises(BackendError, match="GS2D_CUDA_STEP must be graph, launches or autograd, got 'fast'; unset it"):
+    with pytest.raises(BackendError, match="GS2D_CUDA_STEP must be graph or launches, got 'fast'; unset it"):
         trained(emulator, scene, brief(), "fast")
 
 
@@ -283,7 +282,7 @@ def test_an_iteration_by_kernels_has_the_bits_of_one_through_torch(emulator: Emu
         recipe, count = brief(train_toys.compared()), 5  # from the seventh on
     else:
         options = {"target_bytes": 0}
-    parts, _ = trained(emulator, given, recipe, "autograd", **options)
+    parts, _ = trained(emulator, given, recipe, "torch", **options)
     whole, some = trained(emulator, given, recipe, "launches", **options)
     assert some == count
     assert same(parts, whole)

@@ -25,7 +25,7 @@ from gs2d.kernels.cuda.graph import Graph, Work, can_replay
 __all__ = ["GpuLauncher", "Launcher", "OneByOne", "Work", "grow_in_place", "launcher_for", "steps"]
 
 ALLOCATOR_VARIABLES = ("PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_ALLOC_CONF")
-STEP_VARIABLE, GRAPH, LAUNCHES, AUTOGRAD = "GS2D_CUDA_STEP", "graph", "launches", "autograd"
+STEP_VARIABLE, GRAPH, LAUNCHES = "GS2D_CUDA_STEP", "graph", "launches"
 STATIC_SHARED_BYTES = 48 << 10  # what a block may have without asking
 GRAPHS_FROM = 3  # times that the same launches come, from which they are worth a graph
 MAX_GRAPHS = 64
@@ -248,18 +248,18 @@ class GpuLauncher:
 
 
 def steps() -> str:
-    """Return how iterations of a training are done: ``GS2D_CUDA_STEP``, "graph" where it is not set.
+    """Return how the launches of an iteration are started: ``GS2D_CUDA_STEP``, "graph" where it is not set.
 
-    "launches" starts each kernel of an iteration by itself, "autograd" goes through torch for every part.
+    "launches" starts each kernel by itself.
 
     Raises
     ------
     BackendError
-        It is none of these.
+        It is neither.
     """
     chosen = os.environ.get(STEP_VARIABLE) or GRAPH
-    if chosen not in (GRAPH, LAUNCHES, AUTOGRAD):
-        raise BackendError(f"{STEP_VARIABLE} must be {GRAPH}, {LAUNCHES} or {AUTOGRAD}, got {chosen!r}; unset it")
+    if chosen not in (GRAPH, LAUNCHES):
+        raise BackendError(f"{STEP_VARIABLE} must be {GRAPH} or {LAUNCHES}, got {chosen!r}; unset it")
     return chosen
 
 
