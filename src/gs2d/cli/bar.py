@@ -1,4 +1,4 @@
-"""The lines that are drawn while a phase runs, for a terminal of any width."""
+"""Progress bar of a phase, for a terminal of any width."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _FULL, _EMPTY = "\u2501", "\u2500"
 
 
 class Bar:
-    """A phase: its name, a bar, counts, the time left; below what it is about, and the whole run."""
+    """Progress of a phase: name, bar, counts and time left; below it details and the whole run."""
 
     def __init__(self, phase: Phase, whole: WholeRun, clock: Callable[[], float] = time.monotonic) -> None:
         self.phase, self._whole, self._clock = phase, whole, clock
@@ -29,13 +29,13 @@ class Bar:
         self.done, self.detail = done, detail
 
     def left(self) -> str:
-        """Return "3 min left", or how long the phase has taken where it is too early to tell."""
+        """Return the time left ("3 min left"), or the elapsed time where it is too early to estimate."""
         elapsed = self._clock() - self._began
         seconds = self.phase.seconds_left(self.done, elapsed)
         return duration(elapsed) if seconds is None else f"{duration(self._shown.show(seconds))} left"
 
     def lines(self, width: int, *, ascii_only: bool = False) -> Iterator[Text]:
-        """Draw it: never wider than ``width``."""
+        """Yield the lines, at most ``width`` columns wide."""
         counts = f"{self.done:,}/{self.phase.total:,}" if self.phase.total else ""
         tail = "  ".join(word for word in (counts, self.left()) if word)
         name = _cut(self.phase.name, max(width - len(tail) - 2, 8))

@@ -1,4 +1,4 @@
-"""Everything a person sees: progress on stderr, tables or JSON on stdout."""
+"""Console output: progress on stderr, tables or JSON on stdout."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ _NO_SCREENS = ("dumb", "unknown")  # values of TERM: no cursor that goes back
 
 class _Screen(RichConsole):
     def print(self, *objects: Any, **how: Any) -> None:
-        """Print; names of files in a text do nothing to the terminal."""
+        """Print, with control characters in file names escaped."""
         super().print(*(printable(it, lines=True) if isinstance(it, str) else it for it in objects), **how)
 
     def on_broken_pipe(self) -> None:
-        """Say that nobody reads, where rich would end the process itself."""
+        """Raise where rich would end the process."""
         raise BrokenPipeError
 
 
 def show_help(lines: Sequence[str]) -> None:
-    """Print help on stdout, headings in bold where that is wanted."""
+    """Print help on stdout, with headings in bold on a terminal."""
     screen = _screen(sys.stdout)
     for line in lines:
         heading = line.endswith(":") and not line.startswith(" ")
@@ -46,20 +46,20 @@ def show_help(lines: Sequence[str]) -> None:
 
 
 def _screen(file: IO[str], **settings: Any) -> _Screen:
-    """One of the two streams; without a single escape of style where ``NO_COLOR`` says that none is wanted."""
+    """Return a console for a stream; ``NO_COLOR`` disables styles."""
     color = None if os.environ.get("NO_COLOR") else "auto"
     return _Screen(file=file, highlight=False, color_system=color, **settings)  # type: ignore[arg-type]
 
 
 def _has_cursor(file: IO[str] | None) -> bool:
-    """Whether lines can be drawn over: not in a file or a pipe, whatever the colours, nor on a dumb terminal."""
+    """Whether lines can be overwritten: on a terminal that is not dumb."""
     return file is not None and file.isatty() and os.environ.get("TERM", "") not in _NO_SCREENS
 
 
 class Console:
-    """The screen. With ``quiet`` nothing but results asked for as JSON; with ``as_json`` stdout carries only JSON.
+    """Prints events and results. ``quiet``: only JSON results; ``as_json``: only JSON on stdout.
 
-    Notices that are details are printed with ``verbose`` only.
+    Detail notices are printed with ``verbose`` only.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Console:
         self._logs = 0  # lines of a log file about how far the phase is
 
     def on_event(self, event: Event) -> None:
-        """Draw an event of the pipeline."""
+        """Print an event of the pipeline."""
         self._before_each()
         if isinstance(event, MissingFile):
             self.missing.append(event)
@@ -156,12 +156,12 @@ class Console:
         self._bar = None
 
     def flush(self) -> None:
-        """Write what stdout still holds: a full disk or a closed pipe is heard of here, not when Python shuts down."""
+        """Flush stdout, so that a full disk or a closed pipe raises here and not at exit."""
         if sys.stdout is not None:
             sys.stdout.flush()
 
     def say(self, text: str, *, indent: str = "") -> None:
-        """Print a line for people on stdout; on a terminal it breaks between words, and goes on after ``indent``."""
+        """Print a line on stdout; on a terminal it is wrapped, with later lines indented by ``indent``."""
         if self.quiet or self.as_json:
             return
         lines = wrapped(text, self._out.width, rest=indent, keep_spaces=True) if self._out.is_terminal else [text]
@@ -169,13 +169,13 @@ class Console:
             self._out.print(line, markup=False)
 
     def heading(self, text: str) -> None:
-        """Print an empty line and a heading for people, on stdout."""
+        """Print an empty line and a heading on stdout."""
         if not (self.quiet or self.as_json):
             self._out.print()
             self._out.print(text, markup=False, style="bold")
 
     def table(self, title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        """Print a table for people on stdout; the first column is text, the others are figures."""
+        """Print a table on stdout; the first column is text, the others are numbers."""
         if self.quiet or self.as_json:
             return
         table, needed = self._table(title, columns, rows, frame=box.SIMPLE)
@@ -203,7 +203,7 @@ class Console:
         return table, self._out.measure(table, options=self._out.options.update(max_width=_ANY_WIDTH)).maximum
 
     def result(self, value: Any) -> None:
-        """Print the result of the command for programs: JSON on stdout, if it was asked for."""
+        """Print the result as JSON on stdout, with ``as_json``."""
         if self.as_json:
             if self.missing and isinstance(value, dict):
                 value = {**value, "missing": [{"what": m.what, "reason": m.reason} for m in self.missing]}
@@ -211,5 +211,5 @@ class Console:
 
 
 def figure(value: float | None, digits: int, unit: str = "") -> str:
-    """Return a number for a table; a dash where there is none."""
+    """Return a number for a table, or a dash for None."""
     return "-" if value is None else f"{value:,.{digits}f}{unit}"

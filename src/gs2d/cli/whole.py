@@ -1,4 +1,4 @@
-"""How far the whole run is, and how long it still takes: from the progress of training."""
+"""Progress and time left of a whole run, from the progress of training."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ _TRAINING = "training"
 
 
 class Countdown:
-    """The seconds left as they are shown: they do not rise, unless the work grew."""
+    """Time left as it is shown: it rises only if the work grew."""
 
     def __init__(self) -> None:
         self._shown = math.inf
 
     def show(self, left: float) -> float:
-        """Take up a new estimate, and return what to show."""
+        """Take a new estimate and return the seconds to show."""
         self._shown = min(left, self._shown) if left <= GREW[0] * self._shown + GREW[1] else left
         return self._shown
 
 
 class WholeRun:
-    """Follows the events of a run that said of what it consists."""
+    """Follows the events of a run from its plan on."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -34,7 +34,7 @@ class WholeRun:
         self.on_plan(Plan(()))
 
     def on_plan(self, plan: Plan) -> None:
-        """Take up a plan; one that is a part of the plan before says nothing new, the same one is another run."""
+        """Take a plan. A subset of the current plan is ignored; the same plan starts another run."""
         if set(plan.parts) < set(self._parts):
             return
         self._parts = plan.parts
@@ -47,7 +47,7 @@ class WholeRun:
         self._shown = Countdown()
 
     def on_phase(self, phase: Phase) -> None:
-        """Go to the part that a phase begins; most phases are in the part that runs already."""
+        """Go to the part that a phase begins, if it begins one."""
         for index in range(max(self._now, 0), len(self._parts)):
             if phase.name.startswith(self._parts[index].begins):
                 if index != self._now:

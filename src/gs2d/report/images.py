@@ -1,4 +1,4 @@
-"""How renderings become pictures: the colours of normals, depths, errors and of the high-error splats."""
+"""Colour images of normals, depths, errors and high-error splats."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import numpy as np
 
 from gs2d.core.checks import check_shapes
 
-ERROR_TOP = 0.2  # mean absolute error over channels, on colours in [0, 1], that gets the last colour of its scale
-HIGHLIGHT = (0.93, 0.11, 0.62)  # of the high-error splats
-HATCH, HATCHED = 6, (0.9, 0.9, 0.92)  # px, and the lighter stripes of what is unknown; the darker ones are IGNORED
-IGNORED = (0.82, 0.82, 0.84)  # of pixels that the view's mask leaves out
+ERROR_TOP = 0.2  # mean absolute error at the end of the scale, for colours in [0, 1]
+HIGHLIGHT = (0.93, 0.11, 0.62)  # colour of high-error splats
+HATCH, HATCHED = 6, (0.9, 0.9, 0.92)  # width of the stripes of unknown pixels in px, and the lighter colour
+IGNORED = (0.82, 0.82, 0.84)  # colour of masked pixels
 
 _ERROR_SCALE = np.array(
     [[0.03, 0.03, 0.09], [0.33, 0.08, 0.42], [0.75, 0.20, 0.38], [0.97, 0.53, 0.22], [1.00, 0.96, 0.72]]
@@ -37,12 +37,12 @@ def depth_scale(steps: int) -> np.ndarray:
 
 
 def normal_image(normal: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """World normals as colours, (n + 1) / 2, over white.
+    """Return world normals as colours, (n + 1) / 2, over white.
 
     Parameters
     ----------
     normal : ndarray [H, W, 3]
-        Of any length, as ``RenderOutput.normal``; a zero vector shows as white.
+        Normals of any length, as in ``RenderOutput.normal``; zero vectors are white.
     alpha : ndarray [H, W]
 
     Returns
@@ -57,9 +57,9 @@ def normal_image(normal: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 
 def depth_limits(depth: np.ndarray, alpha: np.ndarray) -> tuple[float, float]:
-    """Nearest and farthest depth worth a colour, world units: the 1st and 99th percentile where alpha is at least 0.5.
+    """Return the 1st and 99th percentile of the depth where alpha is at least 0.5, world units.
 
-    Use the limits of one stage for the pictures of all, so that they compare. (0, 1) where nothing was hit.
+    Use the limits of one stage for all stages, so that their images compare. (0, 1) where nothing was hit.
     """
     check_shapes({"depth": (depth, "H W"), "alpha": (alpha, "H W")})
     covered = depth[(alpha >= 0.5) & (depth > 0) & np.isfinite(depth)]
@@ -70,7 +70,7 @@ def depth_limits(depth: np.ndarray, alpha: np.ndarray) -> tuple[float, float]:
 
 
 def depth_image(depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, float] | None = None) -> np.ndarray:
-    """Depth from near (light) to far (dark) over white.
+    """Return depth as colours from near (light) to far (dark), over white.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def depth_image(depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, float
         0 where nothing was hit.
     alpha : ndarray [H, W]
     limits : (near, far) world units, optional
-        Default: :func:`depth_limits` of this picture.
+        Default: :func:`depth_limits` of this image.
 
     Returns
     -------
@@ -91,7 +91,7 @@ def depth_image(depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, float
 
 
 def error_image(color: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
-    """Mean absolute error over channels, from black at 0 to pale yellow at :data:`ERROR_TOP` and above.
+    """Return the mean absolute error over channels, from black at 0 to pale yellow at :data:`ERROR_TOP` and above.
 
     Parameters
     ----------
@@ -114,14 +114,14 @@ def error_image(color: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = 
 
 
 def valid_image(photo: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
-    """Return a photograph hatched where it says nothing (``valid`` is False), which undistortion left black.
+    """Return a photograph with hatching where ``valid`` is False, which undistortion left black.
 
     Parameters
     ----------
     photo : ndarray [H, W, 3 or 4]
-        uint8, or floats in [0, 1]; as it is returned.
+        uint8, or floats in [0, 1]; the result has the same type.
     valid : ndarray bool [H, W] or None
-        None: all of it.
+        None: all pixels are valid.
     """
     if valid is None:
         return photo
@@ -134,14 +134,14 @@ def valid_image(photo: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
 
 
 def highlight_image(color: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return the high-error splats in magenta over the faded grey picture.
+    """Return the high-error splats in magenta over a pale grey image.
 
     Parameters
     ----------
     color : ndarray [H, W, 3] in [0, 1]
         The rendering.
     weight : ndarray [H, W] in [0, 1]
-        Their share in each pixel: the blending weights of these splats, summed.
+        Sum of their blending weights in each pixel.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Pictures of the mesh for the report, with the demo's ray caster and one lamp beside the camera."""
+"""Images of a mesh, by ray casting, lit from beside the camera."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _ROWS_AT_ONCE = 64 * _SAMPLES
 
 @dataclass(frozen=True, eq=False)
 class MeshImage:
-    """A mesh from one camera, over white.
+    """Images of a mesh from one camera, over white.
 
     Attributes
     ----------
     shape : ndarray [H, W, 3] float32
-        Clay, shaded by the normals of the faces.
+        Clay, shaded by face normals.
     color : ndarray [H, W, 3] float32 or None
-        The texture or the vertex colours, unshaded; None where the mesh has neither.
+        Texture or vertex colours, unshaded; None where the mesh has neither.
     """
 
     shape: np.ndarray
@@ -36,7 +36,7 @@ class MeshImage:
 
 
 def orbit_cameras(mesh: Mesh, *, count: int = 2, size: int = 420) -> tuple[Camera, ...]:
-    """Cameras around a mesh whose third axis is up, from 25 degrees above."""
+    """Return cameras around a mesh whose third axis is up, 25 degrees above it."""
     low, high = np.percentile(mesh.vertices, [1, 99], axis=0)
     center, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-9)
     cameras = []
@@ -53,7 +53,7 @@ def orbit_cameras(mesh: Mesh, *, count: int = 2, size: int = 420) -> tuple[Camer
 def mesh_images(
     mesh: Mesh, cameras: Sequence[Camera], textured: TexturedMesh | None = None, *, width: int = 420
 ) -> list[MeshImage]:
-    """Render a mesh from each camera, resized to ``width`` px, in colours of its textured copy if there is one."""
+    """Render a mesh from each camera at a width of ``width`` px, with the texture of ``textured`` if given."""
     images = []
     for camera in cameras:
         resized = camera.resized(width, max(round(width * camera.height / camera.width), 1))
@@ -70,7 +70,7 @@ def mesh_images(
 
 
 def _clay(mesh: Mesh, camera: Camera, hits: Hits, top: int) -> np.ndarray:
-    """Clay [hits, 3] of rows of rays from ``top``: a lamp that travels with the camera, faces seen from both sides."""
+    """Return clay colours [hits, 3] of the rows of rays from ``top``; faces are two-sided."""
     hit = hits.face >= 0
     a, b, c = (mesh.vertices[mesh.faces[hits.face[hit], k]].astype(np.float64) for k in range(3))
     normal = np.cross(b - a, c - a) @ camera.rotation.T
@@ -89,7 +89,7 @@ def _clay(mesh: Mesh, camera: Camera, hits: Hits, top: int) -> np.ndarray:
 
 
 def _vertex_colors(mesh: Mesh, hits: Hits, _top: int) -> np.ndarray:
-    """Interpolated vertex colours [hits, 3] in [0, 1]."""
+    """Return interpolated vertex colours [hits, 3] in [0, 1]."""
     assert mesh.colors is not None
     hit = hits.face >= 0
     corners = mesh.colors[mesh.faces[hits.face[hit]]].astype(np.float64) / 255  # [hits, 3, 3]
@@ -97,17 +97,16 @@ def _vertex_colors(mesh: Mesh, hits: Hits, _top: int) -> np.ndarray:
 
 
 def _texture_colors(mesh: TexturedMesh, hits: Hits, _top: int) -> np.ndarray:
-    """Colours [hits, 3] of the texture in [0, 1]."""
+    """Return texture colours [hits, 3] in [0, 1]."""
     hit = hits.face >= 0
     uv = np.einsum("hk,hkc->hc", hits.weights[hit], mesh.uv[mesh.faces[hits.face[hit]]]) * len(mesh.texture)
     return bilinear(mesh.texture, uv[:, 0], uv[:, 1]) / 255
 
 
 def _average(hits: Hits, paint: Callable[[Hits, int], np.ndarray]) -> np.ndarray:
-    """Pixels [H, W, 3]: the mean over the rays of each, white where they hit nothing.
+    """Return pixels [H, W, 3]: the mean over the rays of each, white where they hit nothing.
 
-    ``paint`` gives the colours of the hits of some rows of rays, and is told the first row: those of all rays, in
-    doubles, were most of what a report took.
+    ``paint`` returns the colours of hits from a given row on. Rows are painted in batches to save memory.
     """
     height, width = hits.face.shape
     pixels = np.empty((height // _SAMPLES, width // _SAMPLES, 3), np.float32)

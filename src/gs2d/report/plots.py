@@ -11,10 +11,8 @@ import numpy as np
 
 INK = "#858b94"  # readable on white and on black
 _COLORS = ("#3f86d6", "#e0893a", "#46a56b", "#c6509f", "#8a74d8", "#b9a02d", "#50a9b8")
-_STEP_KINDS = ("step", "progress")
 _CHANGES = ("mean", "covariance", "opacity", "sh")
-_AREA_NAMES = ("mean_area", "mean_k_a", "mean_Ka")
-MOST = 1e30  # that is drawn: axes are worked out in numbers that end at 1e308
+MOST = 1e30  # largest value that is drawn; the limits of axes overflow at 1e308
 
 
 @dataclass(frozen=True)
@@ -28,7 +26,7 @@ class StageSpan:
 
 @dataclass(frozen=True)
 class History:
-    """What the log says, against iterations counted over all stages.
+    """The series of a log over iterations, which count over all stages.
 
     Attributes
     ----------
@@ -43,7 +41,7 @@ class History:
 
 
 def read_history(events: Sequence[Mapping[str, Any]]) -> History:
-    """Sort the log's steps into series. Kinds and figures that are not known are passed over."""
+    """Sort the steps of a log into series. Unknown kinds and figures are ignored."""
     order: list[str] = []
     lengths: dict[str, int] = {}
     for event in events:
@@ -53,7 +51,7 @@ def read_history(events: Sequence[Mapping[str, Any]]) -> History:
         if stage not in lengths:
             order.append(stage)
             lengths[stage] = 0
-        declared = event.get("iterations") if _kind(event) in ("stage_start", "stage_started") else None
+        declared = event.get("iterations") if event.get("kind") == "stage_start" else None
         lengths[stage] = max(lengths[stage], _whole(declared), _whole(event.get("iteration")))
     starts, total = {}, 0
     for stage in order:
@@ -63,7 +61,7 @@ def read_history(events: Sequence[Mapping[str, Any]]) -> History:
     for event in events:
         stage = event.get("stage")
         known = isinstance(stage, str) and stage in starts
-        if _kind(event) in (*_STEP_KINDS, "changes") and known and "iteration" in event:
+        if event.get("kind") in ("step", "changes") and known and "iteration" in event:
             iteration = starts[event["stage"]] + _whole(event["iteration"])
             for name, value in _figures(event).items():
                 points.setdefault(name, []).append((iteration, value))
@@ -72,26 +70,21 @@ def read_history(events: Sequence[Mapping[str, Any]]) -> History:
     return History(spans, series)
 
 
-def _kind(event: Mapping[str, Any]) -> str:
-    return str(event.get("kind", event.get("event", "")))
-
-
 def _whole(value: Any) -> int:
     return int(value) if _is_number(value) else 0
 
 
 def _is_number(value: Any) -> TypeGuard[float]:
-    """Whether this can be drawn: the log may have been changed by hand."""
+    """Whether a value can be drawn."""
     return isinstance(value, int | float) and abs(value) < MOST  # not NaN
 
 
 def _figures(event: Mapping[str, Any]) -> dict[str, float]:
-    """Return the numbers of one step, or of what changed after it, that are finite."""
-    if _kind(event) == "changes":
+    """Return the finite numbers of a step, or of the changes after it."""
+    if event.get("kind") == "changes":
         changes = {f"change/{name}": event.get(name) for name in _CHANGES}
         return {name: float(v) for name, v in changes.items() if _is_number(v)}
-    named: dict[str, Any] = {name: event.get(name) for name in ("psnr", "splats", "mean_opacity")}
-    named["mean_area"] = next((event[name] for name in _AREA_NAMES if name in event), None)
+    named: dict[str, Any] = {name: event.get(name) for name in ("psnr", "splats", "mean_opacity", "mean_area")}
     losses = event.get("losses")
     for term, value in losses.items() if isinstance(losses, Mapping) else ():
         named[f"loss/{term}"] = value
@@ -105,13 +98,13 @@ def smoothed(values: np.ndarray, count: int = 9) -> np.ndarray:
 
 
 def curves(history: History, stage_psnr: Mapping[str, float], split: str) -> dict[str, str]:
-    """One SVG per figure, keyed by its title; figures without data are left out.
+    """Return SVG by title; figures without data are left out.
 
     Parameters
     ----------
     history : History
     stage_psnr : mapping of stage name to PSNR at its end, dB
-        Of the ``split`` views; drawn as points.
+        Scores of the ``split`` views; drawn as points.
     """
     drawn: dict[str, str] = {}
     terms = sorted(name for name in history.series if name.startswith("loss/"))
@@ -135,7 +128,7 @@ def curves(history: History, stage_psnr: Mapping[str, float], split: str) -> dic
 
 @dataclass(frozen=True)
 class Panel:
-    """One diagram of a comparison: the series that every run contributes a line to."""
+    """One diagram of a comparison, and the series that it shows."""
 
     series: str
     title: str
@@ -144,18 +137,18 @@ class Panel:
 
 
 def compared(histories: Mapping[str, History], panels: Sequence[Panel]) -> str | None:
-    """Return runs side by side: a diagram for each panel, a line for each run, one key for all.
+    """Compare runs: one diagram per panel, one line per run, a common legend.
 
     Parameters
     ----------
     histories : mapping of label to History
     panels : sequence of Panel
-        At most four, in one row; those for which no run has figures are left out.
+        At most four; those without data are left out.
 
     Returns
     -------
     str or None
-        SVG; None if nothing is left to draw.
+        SVG; None without data.
     """
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
@@ -187,7 +180,7 @@ def compared(histories: Mapping[str, History], panels: Sequence[Panel]) -> str |
 
 
 def line_style(k: int) -> dict[str, Any]:
-    """Return colour and dashes of line ``k``: no two of 28 lines are alike, and the first is on top where they meet."""
+    """Return colour, dashes and drawing order of line ``k``; 28 lines differ."""
     dashes = ("-", "--", ":", "-.")[k // len(_COLORS) % 4]
     return {"color": _COLORS[k % len(_COLORS)], "linestyle": dashes, "order": 3 - 0.01 * k}
 
@@ -195,7 +188,7 @@ def line_style(k: int) -> dict[str, Any]:
 def _draw_stages(
     axes: Any, history: History, name: str, *, label: str, smooth: bool, color: str, linestyle: str, order: float
 ) -> None:
-    """One line a stage: nothing is drawn or averaged across a boundary."""
+    """Draw one line per stage, without connecting stages."""
     for span in history.stages if name in history.series else ():
         x, y = _within(history, name, span)
         if not len(x):
@@ -241,7 +234,7 @@ def _figure(
 
 
 def plot_by_image(height: float) -> tuple[Any, Any]:
-    """Figure and plain axes for something of each training photograph, in their order."""
+    """Return a figure and axes for values of the training photographs, in order."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
@@ -258,7 +251,7 @@ def plot_by_image(height: float) -> tuple[Any, Any]:
 
 
 def svg_text(figure: Any) -> str:
-    """Return a figure as SVG: the same bytes for the same figure."""
+    """Return a figure as SVG with reproducible bytes."""
     import matplotlib
 
     text = io.StringIO()
@@ -274,7 +267,7 @@ def _within(history: History, name: str, span: StageSpan) -> tuple[np.ndarray, n
 
 
 def _dress(axes: Any, history: History, *, log: bool, legend: bool) -> None:
-    """Axes in grey, stage boundaries and names."""
+    """Style the axes, and mark the stages."""
     from matplotlib.ticker import EngFormatter
 
     values = [y for line in axes.get_lines() for y in np.atleast_1d(line.get_ydata()) if y > 0]
