@@ -127,10 +127,25 @@ def test_imports_only_go_down() -> None:
             continue  # gs2d/__init__.py exports lazily from every layer
         for imported in imports_of(module):
             other = unit(imported)
-            if other not in ("", own, "__version__", "contrib") and not FLOORS.get(other, 99) < FLOORS[own]:
+            if other not in ("", own, "__version__") and not FLOORS.get(other, 99) < FLOORS[own]:
                 wrong.append(f"{module} imports {imported}")
             if imported.startswith("."):
                 wrong.append(f"{module} imports {imported}: write the full name")
+    assert not wrong
+
+
+def test_contrib_uses_public_names_and_its_parts_are_independent() -> None:
+    """That the core never imports contrib follows from the layers: contrib is the highest."""
+    wrong = []
+    for module in MODULES:
+        if unit(module) != "contrib":
+            continue
+        part = ".".join(module.split(".")[:3])
+        for imported in imports_of(module):
+            in_contrib = imported.startswith("gs2d.contrib")
+            private = any(name.startswith("_") for name in imported.split("."))
+            if private or (in_contrib and not imported.startswith(part)):
+                wrong.append(f"{module} imports {imported}")
     assert not wrong
 
 

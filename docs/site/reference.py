@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 
 import gs2d
 from gs2d.cli.arguments import NAMES, Option, about, options_of
-from gs2d.cli.help import GROUPS, TITLES, option_text
+from gs2d.cli.help import TITLES, groups, option_text
 
 _SPOKEN = re.compile(r"(`[^`]*`)")  # what is code already
 
@@ -22,7 +22,7 @@ def commands() -> str:
             owners[group].append(name)
     shared = {group for group, names in owners.items() if len(names) > 1}
     lines = []
-    for title, names in GROUPS.items():
+    for title, names in groups().items():
         lines += [f"## {title}", ""]
         for name in names:
             lines += _command(name, shared)
@@ -36,7 +36,7 @@ def commands() -> str:
 
 
 def _names() -> Iterator[str]:
-    for names in GROUPS.values():
+    for names in groups().values():
         yield from names
 
 

@@ -9,6 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gs2d.cli.registry import register_command
     from gs2d.config.densify import register_densifier
     from gs2d.config.losses import register_loss
     from gs2d.config.presets import get_recipe, list_recipes, register_recipe
@@ -78,6 +79,7 @@ __all__ = [
     "rasterize_2dgs",
     "read_splats",
     "register_backend",
+    "register_command",
     "register_densifier",
     "register_evaluator",
     "register_format",
@@ -130,6 +132,7 @@ _HOME = {
     "rasterize_2dgs": "gs2d.render.tensor_api",
     "read_splats": "gs2d.io.formats.registry",
     "register_backend": "gs2d.render.backends",
+    "register_command": "gs2d.cli.registry",
     "register_densifier": "gs2d.config.densify",
     "register_evaluator": "gs2d.evaluation.evaluators",
     "register_format": "gs2d.io.formats.registry",

@@ -118,7 +118,7 @@ def test_an_export_whose_layout_and_ending_contradict_each_other_is_refused(
     assert run(["export", str(trained), "--out", str(tmp_path / "a.spz"), "--layout", "3dgs"]) == 2
     assert "--out" in capsys.readouterr().err
     assert run(["export", str(trained), "--out", str(tmp_path / "a.fbx")]) == 2
-    endings = ".compressed.ply, .ply, .spz, .splat, .usd, .glb, .sog, lod-meta.json"
+    endings = ".ply, .spz, .compressed.ply, .splat, .usd, .glb, .sog, lod-meta.json"
     told = capsys.readouterr().err
     assert f"splats are written as {endings} files, got --out" in told
     assert "meshes are written by `gs2d mesh RUN`" in told

@@ -112,6 +112,15 @@ def test_its_evaluator_scores_the_surface(gs2d: Run, trained: Path) -> None:
     assert surface["evaluator"] == "example-vertices"
 
 
+def test_its_command_is_listed_parsed_and_run(gs2d: Run, trained: Path) -> None:
+    listed = gs2d("--help").stdout
+    assert "Examples:" in listed
+    assert "Count the splats of a file." in listed
+    assert "Count each splat twice." in gs2d("example-count", "--help").stdout
+    assert json.loads(gs2d("example-count", trained / "splats.ply", "--double", "--json").stdout) == {"splats": 116}
+    assert "no option --triple" in gs2d("example-count", trained / "splats.ply", "--triple", code=2).stderr
+
+
 def test_a_run_goes_on_with_the_recipe_from_a_file(gs2d: Run, trained: Path) -> None:
     """What `gs2d recipes show --json` prints, and what trained the run, are one recipe."""
     file = trained.parent / "mine.json"

@@ -91,8 +91,8 @@ def read_run(root: Path) -> None:
 
 def execute(words: list[str]) -> None:
     """As the command line, without its net for exceptions."""
+    from gs2d.cli.app import execute as act
     from gs2d.cli.console import Console
-    from gs2d.cli.handlers import execute as act
 
     act(_parsed(tuple(words)), Console(quiet=True, as_json=False))
 

@@ -1,11 +1,15 @@
 """One example of each extension point of gs2d, in a package of its own; docs/extending.md shows it piece by piece."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
 
 import gs2d
+from gs2d.cli.commands import Common
+from gs2d.config.arguments import Arg
 from gs2d.config.densify import Densify
 from gs2d.errors import DivergedError
 from gs2d.io.gaussians import Gaussians
@@ -156,3 +160,22 @@ class VertexCount:
     def score(self, mesh, truth, scene, *, folder, thresholds):
         difference = float(abs(len(mesh.vertices) - truth))
         return {"unit": "vertices", "chamfer": difference, "thresholds": [], "self_check": {"ok": True, "messages": []}}
+
+
+@gs2d.register_command("example-count", action="gs2d_example:count", group="Examples")
+@dataclass(frozen=True, kw_only=True)
+class Count(Common):
+    """Count the splats of a file."""
+
+    path: Annotated[Path, Arg(metavar="FILE", positional=True)]
+    """File of splats."""
+    double: bool = False
+    """Count each splat twice."""
+
+
+def count(options, console):
+    """Print the number of splats."""
+    splats = gs2d.read_splats(options.path)
+    number = len(splats) * (1 + options.double)
+    console.say(f"{number} splats")
+    console.result({"splats": number})

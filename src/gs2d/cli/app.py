@@ -22,7 +22,6 @@ import gs2d
 from gs2d.cli import layout
 from gs2d.cli.arguments import NAMES
 from gs2d.cli.commands import (
-    COMMANDS,
     Common,
     Completion,
     Demo,
@@ -35,7 +34,7 @@ from gs2d.cli.commands import (
 from gs2d.cli.console import Console, show_help
 from gs2d.cli.interrupts import INTERRUPTED, Interruptible
 from gs2d.cli.parser import HELP_WORDS, UsageError, check_inputs, parse
-from gs2d.contrib.lab.options import TableOptions
+from gs2d.cli.registry import COMMANDS
 from gs2d.core.memory_limit import address_space, check_address_space
 from gs2d.core.processes import here
 from gs2d.core.text import printable
@@ -57,8 +56,8 @@ _MENDABLE = {
     errno.EISDIR,
     errno.EIO,
 }
-_HEAVY = tuple(command for command in COMMANDS if command not in (Recipes, Doctor, Info, Completion))
 _LIGHT = (Recipes, Completion)  # which load no numbers
+_NO_TRAINING = (*_LIGHT, Doctor, Info)  # which load torch themselves, if at all
 # How torch says it on the CPU and on a GPU, how C++ does, and the loader of shared libraries.
 _NO_MEMORY = re.compile(
     "can't allocate memory|out of memory|std::bad_alloc|failed to map segment|cannot allocate memory", re.IGNORECASE
@@ -86,11 +85,10 @@ def run(argv: Sequence[str]) -> int:
     try:
         if not isinstance(command, _LIGHT):
             check_address_space()
-        actions = importlib.import_module("gs2d.cli.handlers")
-        if isinstance(command, _HEAVY):
+        if not isinstance(command, _NO_TRAINING):
             importlib.import_module("gs2d.pipeline.train.train_run")  # torch and all: see `interrupts`
         with interruptible:
-            actions.execute(command, console)
+            execute(command, console)
             console.flush()
         return _what_is_missing(console, argv, command)
     except KeyboardInterrupt:
@@ -104,6 +102,18 @@ def run(argv: Sequence[str]) -> int:
         if getattr(error, "told", False):  # contact was lost to another process, and another one says why
             return EXIT_USAGE
         return _report(error, command.debug)
+
+
+def execute(command: Common, console: Console) -> None:
+    """Run a parsed command."""
+    try:
+        COMMANDS[_name_of(command)].run(command, console)
+    finally:
+        console.close()
+
+
+def _name_of(command: Common) -> str:
+    return next(name for name, options in NAMES.items() if options is type(command))
 
 
 def leave(code: int) -> NoReturn:
@@ -157,8 +167,7 @@ def _of_this_process(command: Common) -> Common:
     """
     place = here()
     if place.size > 1 and not isinstance(command, Train):
-        name = type(command).__name__.lower()
-        raise UsageError(f"gs2d {name} runs in one process, got {place.size}; gs2d train is for torchrun")
+        raise UsageError(f"gs2d {_name_of(command)} runs in one process, got {place.size}; gs2d train is for torchrun")
     return command if place.leads else replace(command, quiet=True, json=False)
 
 
@@ -233,9 +242,7 @@ def _interrupted(argv: Sequence[str], command: Common) -> int:
             line += f"; {'' if trained else kept}resume with: {_resumed(argv)}"
         else:
             line += "; nothing was kept, because training had not begun"
-    if isinstance(command, TableOptions) and command.train:
-        line += f"; go on with: gs2d {shlex.join(argv)}"
-    print(printable(line), file=sys.stderr)
+    print(printable(line + command.after_interrupt(argv)), file=sys.stderr)
     return INTERRUPTED
 
 

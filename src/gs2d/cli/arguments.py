@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from gs2d.cli.commands import COMMANDS
+from gs2d.cli.registry import COMMANDS
 from gs2d.config.arguments import Arg
 
-NAMES: dict[str, type] = {command.__name__.lower(): command for command in COMMANDS}
+NAMES: dict[str, type] = {name: command.options for name, command in COMMANDS.working()}
 _METAVARS = {int: "N", float: "NUMBER", Path: "PATH", str: "NAME"}
 _MANY = 24  # columns; longer lists of choices are in the text of the option
 

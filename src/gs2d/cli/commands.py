@@ -1,23 +1,23 @@
-"""The commands: the pipeline's classes of options, and what is printed. No torch: `--help` is instant."""
+"""The commands of the core: classes of options with those of printing. No torch: `--help` is instant."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+from gs2d.cli.registry import BEGIN, LOOK, MEASURE, STEPS, register_command
 from gs2d.config.arguments import Arg
-from gs2d.contrib.lab.options import BlocksOptions, PaperOptions, ReconstructAnywhereOptions, SweepOptions
 from gs2d.pipeline.prepare.options import (
     BoxOption,
     DemoOptions,
     EvaluateOptions,
-    GeoreferenceOptions,
     MeshOptions,
-    OrthophotoOptions,
     Overrides,
     PlanOptions,
     PosesOptions,
+    ReconstructOptions,
     TextureOptions,
     TrainOptions,
 )
@@ -39,37 +39,69 @@ class Common:
     debug: bool = False
     """Print the traceback of an error."""
 
+    def after_interrupt(self, words: Sequence[str]) -> str:
+        """Return what to say after Ctrl-C, beyond "interrupted"; ``words`` is the command line."""
+        return ""
 
+
+@register_command(
+    "demo",
+    action="gs2d.cli.handlers:demo",
+    group=BEGIN,
+    first=("out", "schedule_scale", "viewer", "resume", "overwrite"),
+)
 @dataclass(frozen=True, kw_only=True)
 class Demo(DemoOptions, Common):
     """Render a small synthetic capture, train on it and score the result."""
 
 
+@register_command(
+    "reconstruct",
+    action="gs2d.cli.handlers:reconstruct",
+    group=BEGIN,
+    first=("photos", "out", "quality", "texture", "viewer", "resume", "overwrite"),
+)
 @dataclass(frozen=True, kw_only=True)
-class Reconstruct(ReconstructAnywhereOptions, Common):
+class Reconstruct(ReconstructOptions, Common):
     """Turn photographs or a video into splats, mesh and report."""
 
 
+@register_command(
+    "poses",
+    action="gs2d.cli.handlers:poses",
+    group=STEPS,
+    first=("photos", "out", "frames", "camera_model", "max_size", "overwrite"),
+)
 @dataclass(frozen=True, kw_only=True)
 class Poses(PosesOptions, Common):
     """Find the cameras of photographs, with COLMAP."""
 
 
+@register_command(
+    "plan",
+    action="gs2d.cli.handlers:plan",
+    group=STEPS,
+    first=("scene", "quality", "recipe", "schedule_scale", "downscale", "memory", "disk"),
+)
 @dataclass(frozen=True, kw_only=True)
 class Plan(PlanOptions, Common):
     """Estimate splats, memory, disk and time of a training."""
 
 
+@register_command(
+    "train",
+    action="gs2d.cli.handlers:train",
+    group=STEPS,
+    first=("scene", "out", "quality", "recipe", "schedule_scale", "downscale", "viewer", "resume", "overwrite"),
+)
 @dataclass(frozen=True, kw_only=True)
 class Train(TrainOptions, Common):
     """Train on photographs whose cameras are known."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Blocks(BlocksOptions, Common):
-    """Train a large capture in blocks and merge them."""
-
-
+@register_command(
+    "mesh", action="gs2d.cli.handlers:mesh", group=STEPS, first=("run", "out", "texture", "voxel", "bbox", "unbounded")
+)
 @dataclass(frozen=True, kw_only=True)
 class Mesh(TextureOptions, MeshOptions, Common):
     """Extract the mesh of a run again, with other settings."""
@@ -91,6 +123,12 @@ class Mesh(TextureOptions, MeshOptions, Common):
     """CPU threads."""
 
 
+@register_command(
+    "render",
+    action="gs2d.cli.handlers:render",
+    group=LOOK,
+    first=("run", "split", "orbit", "flight", "width", "video", "out"),
+)
 @dataclass(frozen=True, kw_only=True)
 class Render(Common):
     """Render images or a video of a run."""
@@ -121,6 +159,7 @@ class Render(Common):
     """CPU threads."""
 
 
+@register_command("view", action="gs2d.cli.handlers:view", group=BEGIN)
 @dataclass(frozen=True, kw_only=True)
 class View(Common):
     """Show splats, mesh and cameras of a run in the browser."""
@@ -131,6 +170,7 @@ class View(Common):
     """Port of the page (default: the first free port from 8080)."""
 
 
+@register_command("page", action="gs2d.cli.handlers:page", group=LOOK)
 @dataclass(frozen=True, kw_only=True)
 class Page(Common):
     """Write the splats as one HTML file that works offline in any browser."""
@@ -143,6 +183,12 @@ class Page(Common):
     """Degree of the view-dependent colours, 0 to 3. Lower is smaller: 32 to 80 bytes per splat."""
 
 
+@register_command(
+    "evaluate",
+    action="gs2d.cli.handlers:evaluate",
+    group=MEASURE,
+    first=("run", "ground_truth", "thresholds", "lpips_weights"),
+)
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(EvaluateOptions, Common):
     """Score images (PSNR, SSIM, LPIPS) and the mesh of a run."""
@@ -155,6 +201,7 @@ class Evaluate(EvaluateOptions, Common):
     """CPU threads."""
 
 
+@register_command("export", action="gs2d.cli.handlers:export", group=LOOK)
 @dataclass(frozen=True, kw_only=True)
 class Export(Common):
     """Write the splats of a run in another format."""
@@ -172,26 +219,7 @@ class Export(Common):
     """Write world coordinates in metres (`gs2d georeference`), relative to an offset that the file names."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Georeference(GeoreferenceOptions, Common):
-    """Find scale, up and world position of a run."""
-
-    run: RunPath
-    """Run folder."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Orthophoto(OrthophotoOptions, Common):
-    """Write orthophoto and elevation model of a georeferenced run."""
-
-    run: RunPath
-    """Run folder, with mesh.ply and `gs2d georeference`."""
-    out: Annotated[Path | None, Arg(metavar="FILE.tif")] = None
-    """Orthophoto (default: orthophoto.tif in the run). Heights go to NAME_elevation.tif."""
-    threads: int | None = None
-    """CPU threads."""
-
-
+@register_command("report", action="gs2d.cli.handlers:report", group=LOOK)
 @dataclass(frozen=True, kw_only=True)
 class Report(Common):
     """Write report.html of a run again."""
@@ -202,6 +230,7 @@ class Report(Common):
     """Memory limit in GiB (default: half of the memory of this machine or container)."""
 
 
+@register_command("recipes", action="gs2d.cli.handlers:recipes", group=MEASURE)
 @dataclass(frozen=True, kw_only=True)
 class Recipes(Common):
     """List recipes, or show one: `gs2d recipes show NAME`."""
@@ -218,21 +247,13 @@ class Recipes(Common):
     """Change the recipe, as in `gs2d train`; may be repeated."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Paper(PaperOptions, Common):
-    """Reproduce a table of the paper."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sweep(SweepOptions, Common):
-    """Compare recipes on scenes and seeds, as a table."""
-
-
+@register_command("doctor", action="gs2d.cli.handlers:doctor", group=BEGIN)
 @dataclass(frozen=True, kw_only=True)
 class Doctor(Common):
     """Check what this machine can run, and what is missing."""
 
 
+@register_command("completion", action="gs2d.cli.handlers:completion", group=BEGIN)
 @dataclass(frozen=True, kw_only=True)
 class Completion(Common):
     """Print the completion script of a shell."""
@@ -241,15 +262,10 @@ class Completion(Common):
     """Shell. The first line of the output says where it goes."""
 
 
+@register_command("info", action="gs2d.cli.handlers:info", group=LOOK)
 @dataclass(frozen=True, kw_only=True)
 class Info(Common):
     """Describe a run, a capture, or a file of splats, mesh or points."""
 
     path: Annotated[Path, Arg(metavar="PATH", positional=True)]
     """Run folder, capture (folder or .zip), or file: PLY, .spz, .splat, .usd, .glb or .sog."""
-
-
-COMMANDS: tuple[type[Common], ...] = (
-    Demo, Reconstruct, Poses, Plan, Train, Blocks, Mesh, Render, View, Page, Evaluate, Export, Georeference, Orthophoto,
-    Report, Recipes, Paper, Sweep, Doctor, Info, Completion
-)  # fmt: skip

@@ -79,9 +79,7 @@ OPTIONAL = (
     Wanted("texture", "textured meshes (--texture)", _packages("texture", "xatlas")),
     Wanted("spz4", "SPZ of version 4 (gs2d export --layout spz4)", _packages("spz4", "zstandard")),
     Wanted("usd", "OpenUSD files (gs2d export --out x.usd)", _packages("usd", "usd-core")),
-    Wanted(
-        "cluster", "several machines (gs2d sweep, paper, blocks, reconstruct --cluster)", _packages("cluster", "ray")
-    ),
+    Wanted("cluster", "several machines (gs2d sweep, paper, blocks --cluster)", _packages("cluster", "ray")),
 )
 
 

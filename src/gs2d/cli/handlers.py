@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,41 +19,6 @@ from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions, values
 EVERYDAY = ("best", "best-surface", "2dgs")  # recipes that `gs2d recipes` shows without --all
 
 
-def execute(command: Common, console: Console) -> None:
-    """Run a parsed command."""
-    actions: dict[type, Callable[[Any, Console], None]] = {
-        c.Demo: demo,
-        c.Reconstruct: reconstruct,
-        c.Poses: poses,
-        c.Plan: plan,
-        c.Train: train,
-        c.Blocks: blocks,
-        c.Mesh: mesh,
-        c.Render: render,
-        c.View: view,
-        c.Page: page,
-        c.Evaluate: evaluate,
-        c.Export: export,
-        c.Georeference: georeference,
-        c.Orthophoto: orthophoto,
-        c.Report: report,
-        c.Recipes: recipes,
-        c.Paper: table,
-        c.Sweep: table,
-        c.Doctor: doctor,
-        c.Info: info,
-        c.Completion: completion,
-    }
-    try:
-        if isinstance(command, c.Mesh | c.Render | c.Evaluate | c.Report):  # who trains does so itself
-            from gs2d.pipeline.prepare.limits import use_memory
-
-            use_memory(command.memory)
-        actions[type(command)](command, console)
-    finally:
-        console.close()
-
-
 def plan(command: c.Plan, console: Console) -> None:
     """``gs2d plan``."""
     from gs2d.pipeline.prepare.estimate import set_words
@@ -67,6 +31,13 @@ def plan(command: c.Plan, console: Console) -> None:
         console.say(line)
     console.say(f"train with: {again}")
     console.result({**asdict(found), "command": again})
+
+
+def _keep_to(gib: float | None) -> None:
+    """Limit the memory of a command; training does so itself."""
+    from gs2d.pipeline.prepare.limits import use_memory
+
+    use_memory(gib)
 
 
 def _words_of(command: Common, kind: type) -> list[str]:
@@ -101,15 +72,6 @@ def train(command: c.Train, console: Console) -> None:
         show_run(run.path, run.metrics(), console)
 
 
-def blocks(command: c.Blocks, console: Console) -> None:
-    """``gs2d blocks``."""
-    from gs2d.contrib.lab.blocks import blocks as run_blocks
-
-    run = run_blocks(command, console.on_event)
-    console.close()
-    show_run(run.path, run.metrics(), console)
-
-
 def demo(command: c.Demo, console: Console) -> None:
     """``gs2d demo``."""
     from gs2d.pipeline.demo import demo as run_demo
@@ -123,6 +85,7 @@ def mesh(command: c.Mesh, console: Console) -> None:
     """``gs2d mesh``."""
     from gs2d.pipeline.finish.run_mesh import mesh_run
 
+    _keep_to(command.memory)
     options = MeshOptions(**values(MeshOptions, command))
     if command.texture:
         _textured_mesh(command, options, console)
@@ -180,6 +143,7 @@ def render(command: c.Render, console: Console) -> None:
     """``gs2d render``."""
     from gs2d.pipeline.finish.run_images import render_run
 
+    _keep_to(command.memory)
     result = render_run(
         command.run,
         console.on_event,
@@ -230,6 +194,7 @@ def evaluate(command: c.Evaluate, console: Console) -> None:
     """``gs2d evaluate``."""
     from gs2d.pipeline.finish.evaluate import evaluate_run
 
+    _keep_to(command.memory)
     result = evaluate_run(command.run, command, console.on_event, threads=command.threads)
     console.close()
     rows = [row for split in ("train", "test") for row in score_rows(split, result.get(split))]
@@ -262,42 +227,11 @@ def export(command: c.Export, console: Console) -> None:
     console.result(result)
 
 
-def georeference(command: c.Georeference, console: Console) -> None:
-    """``gs2d georeference``."""
-    from gs2d.contrib.survey.find_georeference import georeference_run
-
-    found = georeference_run(command.run, command, console.on_event)
-    console.close()
-    for line in [] if found is None else found.lines():
-        console.say(line)
-    if found is not None:
-        run = shlex.quote(str(command.run))
-        console.say(f"to show it in report and page: gs2d report {run}; gs2d page {run}")
-    if found is None:
-        console.say("no georeference: --gps, --positions, --control, --known-distance or --markers finds one")
-    console.result({"run": str(command.run), "georeference": None if found is None else found.to_json()})
-
-
-def orthophoto(command: c.Orthophoto, console: Console) -> None:
-    """``gs2d orthophoto``."""
-    from gs2d.contrib.survey.orthophoto import orthophoto_run
-
-    result = orthophoto_run(command.run, command.out, command, console.on_event, threads=command.threads)
-    console.close()
-    for file in result["files"]:
-        console.say(file)
-    unseen = result["cells_unseen"] / result["cells"]
-    console.say(
-        f"{result['rows']:,} x {result['columns']:,} cells of {result['resolution']:g} m, {result['frame']}; "
-        f"{unseen:.0%} of the surface is not visible in any photograph and has the colours of the mesh"
-    )
-    console.result(result)
-
-
 def report(command: c.Report, console: Console) -> None:
     """``gs2d report``."""
     from gs2d.pipeline.finish.run_report import report_run
 
+    _keep_to(command.memory)
     path = report_run(command.run, console.on_event)
     console.say(str(path))
     console.result({"file": str(path)})
@@ -330,19 +264,12 @@ def recipes(command: c.Recipes, console: Console) -> None:
     console.result(to_json(recipe))
 
 
-def table(command: c.Paper | c.Sweep, console: Console) -> None:
-    """``gs2d paper`` and ``gs2d sweep``."""
-    from gs2d.contrib.lab.show_table import show_table
-
-    show_table(command, console)
-
-
 def reconstruct(command: c.Reconstruct, console: Console) -> None:
     """``gs2d reconstruct``: then the figures, the files and the next command."""
-    from gs2d.contrib.lab.reconstruct import reconstruct as run_all
     from gs2d.core.json_files import read_json
     from gs2d.io.run_dir import PAGE
     from gs2d.pipeline.reconstruct import CAPTURE
+    from gs2d.pipeline.reconstruct import reconstruct as run_all
     from gs2d.sfm.workspace import POSES_JSON
 
     run = run_all(command, console.on_event)

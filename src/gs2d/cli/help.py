@@ -9,6 +9,7 @@ import gs2d
 from gs2d.cli.arguments import NAMES, Option, about, options_of
 from gs2d.cli.commands import Common
 from gs2d.cli.layout import terminal_width
+from gs2d.cli.registry import COMMANDS, GROUPS
 from gs2d.pipeline.prepare.options import CommonTraining, Finding, HowItRuns, Training
 
 _SLOGAN = "Turns photographs into a surface mesh and a 3D scene that you can view from any angle."
@@ -21,27 +22,6 @@ _FIRST_DAY = """usage: gs2d COMMAND [OPTIONS]
   gs2d mesh RUN --texture              extract the mesh again, with a texture
 
 All commands: gs2d --help. Options of one: gs2d COMMAND --help."""
-GROUPS: dict[str, tuple[str, ...]] = {
-    "To begin with": ("doctor", "demo", "reconstruct", "view", "completion"),
-    "Step by step": ("poses", "plan", "train", "blocks", "mesh"),
-    "Look, keep and share": ("info", "render", "page", "export", "report"),
-    "Real-world coordinates": ("georeference", "orthophoto"),
-    "Measure and compare": ("evaluate", "recipes", "sweep", "paper"),
-}
-_FIRST: dict[str, tuple[str, ...]] = {  # options that `--help` shows, by use; of other commands all but the common ones
-    "demo": ("out", "schedule_scale", "viewer", "resume", "overwrite"),
-    "reconstruct": ("photos", "out", "quality", "texture", "viewer", "resume", "overwrite"),
-    "poses": ("photos", "out", "frames", "camera_model", "max_size", "overwrite"),
-    "plan": ("scene", "quality", "recipe", "schedule_scale", "downscale", "memory", "disk"),
-    "train": ("scene", "out", "quality", "recipe", "schedule_scale", "downscale", "viewer", "resume", "overwrite"),
-    "blocks": ("scene", "out", "blocks", "recipe", "schedule_scale", "downscale", "memory", "slots"),
-    "mesh": ("run", "out", "texture", "voxel", "bbox", "unbounded"),
-    "render": ("run", "split", "orbit", "flight", "width", "video", "out"),
-    "evaluate": ("run", "ground_truth", "thresholds", "lpips_weights"),
-    "georeference": ("run", "gps", "positions", "control", "known_distance", "markers", "remove"),
-    "paper": ("table", "data", "out", "scenes", "schedule_scale", "train"),
-    "sweep": ("recipes", "data", "out", "seeds", "schedule_scale", "train"),
-}
 _OWN = "Of this command"
 TITLES = {  # headings of shared options, in order
     Finding: "Cameras of photographs",
@@ -52,6 +32,14 @@ TITLES = {  # headings of shared options, in order
 }
 
 
+def groups() -> dict[str, list[str]]:
+    """Return the names of all commands by the heading of their group."""
+    found: dict[str, list[str]] = {title: [] for title in GROUPS}
+    for name in NAMES:
+        found.setdefault(COMMANDS[name].group, []).append(name)
+    return {title: names for title, names in found.items() if names}
+
+
 def first_day() -> list[str]:
     """Return the help of ``gs2d`` alone: five commands for the first day."""
     return [f"gs2d {gs2d.__version__}", "", *_FIRST_DAY.splitlines()]
@@ -60,12 +48,12 @@ def first_day() -> list[str]:
 def program_help(*, everything: bool = False) -> list[str]:
     """Return all commands in groups; with ``everything`` also all options of each."""
     parser = _parser("gs2d", "gs2d COMMAND [OPTIONS]", _SLOGAN, "Options: gs2d COMMAND --help; the version: --version")
-    for title, names in GROUPS.items():
+    for title, names in groups().items():
         group = parser.add_argument_group(title)
         for name in names:
             group.add_argument(name, help=about(NAMES[name]))
     lines = parser.format_help().splitlines()
-    for name in [name for names in GROUPS.values() for name in names] if everything else ():
+    for name in [name for names in groups().values() for name in names] if everything else ():
         lines += ["", *command_help(name, everything=True)]
     return lines
 
@@ -75,11 +63,11 @@ def command_help(name: str, *, everything: bool = False) -> list[str]:
     options = options_of(NAMES[name])
     needed = sorted((o for o in options if o.required or not o.flags), key=lambda o: bool(o.flags))
     words = [o.usage if o.required else f"[{o.usage}]" for o in needed]
-    groups = _groups(name, options)
-    more = sum(len(group) for title, group in groups.items() if title)
+    titled = _groups(name, options)
+    more = sum(len(group) for title, group in titled.items() if title)
     rest = "" if everything else f"{more} more options: --help-all"
     parser = _parser(f"gs2d {name}", " ".join([f"gs2d {name}", *words, "[OPTIONS]"]), about(NAMES[name]), rest)
-    for title, group in groups.items():
+    for title, group in titled.items():
         if everything or not title:
             shown = parser.add_argument_group(title or None)
             for option in group:
@@ -100,7 +88,7 @@ def _groups(name: str, options: Sequence[Option]) -> dict[str, list[Option]]:
     """Return all options by heading: the most used ones under "", then those of the command, then shared ones."""
     by_field = {option.field: option for option in options}
     own = sorted((o for o in options if o.owner is not Common), key=lambda o: (bool(o.flags), not o.required))
-    first = [by_field[field] for field in _FIRST[name]] if name in _FIRST else own
+    first = [by_field[field] for field in COMMANDS[name].first] or own
     groups: dict[str, list[Option]] = {title: [] for title in ("", _OWN, *TITLES.values())}
     groups[""] = first
     for option in options:

@@ -39,7 +39,6 @@ from gs2d.sfm.video_frames import is_video, look_into
 from gs2d.sfm.workspace import POSES_JSON, POSES_PNG, hidden_workspace, sweep_workspace
 
 CAPTURE = "capture"
-CLUSTER = "cluster"  # in the run folder: what became of its tasks on the machines of a cluster
 FEW = 24  # photographs, below which each is needed for the surface and none is held out
 NO_NAMES = ("images", "photos", "photographs", "pictures")  # of folders; the one above has a better one
 SHOWN_LOST = 3  # photographs without a place that are named; poses.json has all
@@ -119,7 +118,7 @@ def train_found(options: ReconstructOptions, on_event: OnEvent) -> RunFolder:
 
 def _allowed(options: ReconstructOptions) -> tuple[str, ...]:
     """Return the names that may be in the run folder before training begins."""
-    return (CAPTURE, hidden_workspace(options.out / CAPTURE).name, CLUSTER)
+    return (CAPTURE, hidden_workspace(options.out / CAPTURE).name)
 
 
 def _placed(capture: Path) -> int:

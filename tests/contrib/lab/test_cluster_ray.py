@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import shutil
 import signal
 import subprocess
 from collections.abc import Iterator
@@ -14,7 +13,6 @@ import pytest
 from flown import digest, tiny_blocks, write_tiny_flight
 from gs2d.contrib.lab.blocks import blocks
 from ray_commands import begin, blocks_words, cluster_of, lose, read_until
-from room_photos import Room
 
 pytestmark = [
     pytest.mark.slow,
@@ -75,25 +73,3 @@ def test_an_interrupted_command_goes_on_to_the_same_bytes(
     assert process.returncode == 0, said
     assert "coarse begins" not in said  # that was done
     assert digest(tmp_path / "job" / "splats.ply") == digest(straight / "splats.ply")
-
-
-def test_photographs_become_a_run_though_the_machine_of_the_training_is_lost(
-    nodes: tuple[subprocess.Popen[str], str], room: Room, tmp_path: Path
-) -> None:
-    cluster, address = nodes
-    words = ["reconstruct", str(room.photos), "--threads", "1", "--downscale", "4", "--recipe", "2dgs", "--robust"]
-    words += ["off", "--schedule-scale", "0.005", "--checkpoint-every", "20", "--no-page"]
-    words += ["--set", "init_points=100", "--set", "surface.densify.max_splats=150"]
-    with begin([*words, "--verbose", "--out", str(tmp_path / "run"), "--cluster", address]) as process:
-        said = read_until(process, "training begins on")
-        said += read_until(process, "training: starting from")
-        lose(cluster)
-        said += process.communicate()[1]
-    assert process.returncode == 0, said
-    assert "cameras: 12 of 12 photographs have a place" in said
-    assert "training: its process or its machine" in said
-    shutil.copytree(tmp_path / "run/capture", tmp_path / "here/capture")
-    with begin([*words, "--out", str(tmp_path / "here"), "--resume"]) as process:
-        said = process.communicate()[1]
-    assert process.returncode == 0, said
-    assert digest(tmp_path / "here/splats.ply") == digest(tmp_path / "run/splats.ply")

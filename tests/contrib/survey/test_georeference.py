@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ball_runs import options as training
 from gs2d.cli import run as gs2d
+from gs2d.contrib.survey.commands import GeoreferenceOptions
 from gs2d.contrib.survey.find_georeference import georeference_run
 from gs2d.core.georeference import Georeference
 from gs2d.core.projection import Projection, to_enu
@@ -21,7 +22,6 @@ from gs2d.io.formats.registry import read_splat_file
 from gs2d.io.georeference import georeference_of_file, read_georeference, write_georeference
 from gs2d.io.meshes import read_mesh
 from gs2d.io.splat_ply import read_splats
-from gs2d.pipeline.prepare.options import GeoreferenceOptions
 from gs2d.pipeline.train.train_run import train
 from tiny import ball_cameras, write_ball_mesh, write_capture
 

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from gs2d.config.arguments import Arg
 from gs2d.errors import RecipeError
-from gs2d.pipeline.prepare.options import CommonTraining, Overrides, ReconstructOptions, Resources, paths_of
+from gs2d.pipeline.prepare.options import CommonTraining, Overrides, Resources, paths_of
 
 SWEEP = "sweep"  # the name of a table of chosen recipes
 
@@ -138,11 +138,3 @@ class BlocksOptions(CommonTraining, Resources):
 
     def __post_init__(self) -> None:
         paths_of(self, "scene", "out", "masks")
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReconstructAnywhereOptions(ReconstructOptions):
-    """From photographs to a mesh, here or on a cluster."""
-
-    cluster: Annotated[str | None, Arg(metavar="ADDRESS")] = None
-    """Run on a Ray cluster that shares the disk of --out: HOST:PORT, or auto for the cluster of this machine."""

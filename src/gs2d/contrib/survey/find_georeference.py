@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from gs2d.contrib.survey.commands import GeoreferenceOptions
 from gs2d.contrib.survey.control import Located, locate, read_control
 from gs2d.contrib.survey.fit import Fit, cameras_up, fit_places
 from gs2d.contrib.survey.markers import Marker, detected, detector, in_run
@@ -24,7 +25,6 @@ from gs2d.io.georeference import read_georeference, write_georeference
 from gs2d.io.run_dir import GEOREFERENCE, POSES, RunFolder, open_run
 from gs2d.pipeline.events import OnEvent, counted, ignore
 from gs2d.pipeline.prepare.loaded import reload_run
-from gs2d.pipeline.prepare.options import GeoreferenceOptions
 
 SOURCES = ("gps", "positions", "control", "known_distance", "markers")
 _FEWEST = 3  # places of photographs

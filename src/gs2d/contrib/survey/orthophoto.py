@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gs2d.contrib.survey.commands import OrthophotoOptions
 from gs2d.contrib.survey.geotiff import NO_DATA, write_geotiff
 from gs2d.core.extras import required
 from gs2d.core.files import check_writable
@@ -25,7 +26,6 @@ from gs2d.pipeline.events import OnEvent, Phase, ignore
 from gs2d.pipeline.finish.run_texture import photographs
 from gs2d.pipeline.finish.world_frame import place_of
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
-from gs2d.pipeline.prepare.options import OrthophotoOptions
 
 ELEVATION = "_elevation"  # after the name of the orthophoto
 MAX_CELLS = 36_000_000  # a colour's choice takes about 70 bytes a cell: 2.5 GB

@@ -22,7 +22,6 @@ LensModel = Literal[
     "auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "EQUIRECTANGULAR"
 ]
 Box = tuple[float, float, float, float, float, float]  # x0 y0 z0 x1 y1 z1, world units
-KnownDistance = tuple[float, float, float, float, float, float, float]  # two points of the run, metres
 BoxOption = Annotated[Box | None, Arg(metavar="X0 Y0 Z0 X1 Y1 Z1")]
 Overrides = Annotated[tuple[str, ...], Arg(name="set", metavar="STAGE.FIELD=VALUE", repeated=True)]
 Photos = Annotated[Path, Arg(metavar="PHOTOS", positional=True)]
@@ -353,42 +352,3 @@ class EvaluateOptions:
 
     def __post_init__(self) -> None:
         paths_of(self, "ground_truth", "lpips_weights")
-
-
-@dataclass(frozen=True, kw_only=True)
-class GeoreferenceOptions:
-    """Where a run is in the world; one source at a time, none: what the run says is shown."""
-
-    gps: bool = False
-    """Use the GPS positions in the EXIF of the photographs."""
-    positions: Annotated[Path | None, Arg(metavar="FILE")] = None
-    """Use positions of photographs: CSV (name,lat,lon,height or name,x,y,z) or OpenDroneMap's geo.txt."""
-    control: Annotated[Path | None, Arg(metavar="FILE")] = None
-    """Use control points: CSV (name,x,y,z,photo,u,v in pixels, or name,x,y,z,run_x,run_y,run_z) or gcp_list.txt."""
-    check_points: tuple[str, ...] = ()
-    """With --control: points that are only measured (also marked by a column `check`)."""
-    known_distance: Annotated[KnownDistance | None, Arg(metavar="X0 Y0 Z0 X1 Y1 Z1 METRES")] = None
-    """Use the distance between two points, in coordinates of mesh.ply."""
-    markers: Annotated[float | None, Arg(metavar="METRES")] = None
-    """Use printed ArUco markers with this side length."""
-    marker_dictionary: str = "4x4_50"
-    """With --markers: dictionary: 4x4_50 to 7x7_1000, aruco_original, apriltag_36h11."""
-    epsg: int | None = None
-    """Projected coordinate system in metres (default: that of the file, or the UTM zone)."""
-    enu: bool = False
-    """With --gps or --positions: use metres east, north and up of their centre instead of a map projection."""
-    up: Annotated[tuple[float, float, float] | None, Arg(metavar="X Y Z")] = None
-    """Up direction in the run (default: from the positions, else from the cameras)."""
-    remove: bool = False
-    """Delete the georeference of the run."""
-
-    def __post_init__(self) -> None:
-        paths_of(self, "positions", "control")
-
-
-@dataclass(frozen=True, kw_only=True)
-class OrthophotoOptions:
-    """How the view from above is made."""
-
-    resolution: Annotated[float | None, Arg(metavar="METRES")] = None
-    """Cell size (default: pixel size on the surface, rounded up to 1, 2, 2.5 or 5)."""

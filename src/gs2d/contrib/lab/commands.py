@@ -1,0 +1,58 @@
+"""The commands of the lab: blocks, paper and sweep. No torch: `--help` is instant."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from gs2d.cli.commands import Common
+from gs2d.cli.registry import MEASURE, STEPS, register_command
+from gs2d.contrib.lab.options import BlocksOptions, PaperOptions, SweepOptions, TableOptions
+
+_ACTIONS = "gs2d.contrib.lab.show_table"
+
+
+def _going_on(options: TableOptions, words: Sequence[str]) -> str:
+    return f"; go on with: gs2d {shlex.join(words)}" if options.train else ""
+
+
+@register_command(
+    "blocks",
+    action=f"{_ACTIONS}:show_blocks",
+    group=STEPS,
+    first=("scene", "out", "blocks", "recipe", "schedule_scale", "downscale", "memory", "slots"),
+)
+@dataclass(frozen=True, kw_only=True)
+class Blocks(BlocksOptions, Common):
+    """Train a large capture in blocks and merge them."""
+
+
+@register_command(
+    "sweep",
+    action=f"{_ACTIONS}:show_table",
+    group=MEASURE,
+    first=("recipes", "data", "out", "seeds", "schedule_scale", "train"),
+)
+@dataclass(frozen=True, kw_only=True)
+class Sweep(SweepOptions, Common):
+    """Compare recipes on scenes and seeds, as a table."""
+
+    def after_interrupt(self, words: Sequence[str]) -> str:
+        """Return the command that goes on."""
+        return _going_on(self, words)
+
+
+@register_command(
+    "paper",
+    action=f"{_ACTIONS}:show_table",
+    group=MEASURE,
+    first=("table", "data", "out", "scenes", "schedule_scale", "train"),
+)
+@dataclass(frozen=True, kw_only=True)
+class Paper(PaperOptions, Common):
+    """Reproduce a table of the paper."""
+
+    def after_interrupt(self, words: Sequence[str]) -> str:
+        """Return the command that goes on."""
+        return _going_on(self, words)

@@ -1,0 +1,80 @@
+"""The commands of the survey, georeference and orthophoto, and their options. No torch: `--help` is instant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from gs2d.cli.commands import Common, RunPath
+from gs2d.cli.registry import WORLD, register_command
+from gs2d.config.arguments import Arg
+from gs2d.pipeline.prepare.options import paths_of
+
+KnownDistance = tuple[float, float, float, float, float, float, float]  # two points of the run, metres
+
+
+@dataclass(frozen=True, kw_only=True)
+class GeoreferenceOptions:
+    """Where a run is in the world; one source at a time, none: what the run says is shown."""
+
+    gps: bool = False
+    """Use the GPS positions in the EXIF of the photographs."""
+    positions: Annotated[Path | None, Arg(metavar="FILE")] = None
+    """Use positions of photographs: CSV (name,lat,lon,height or name,x,y,z) or OpenDroneMap's geo.txt."""
+    control: Annotated[Path | None, Arg(metavar="FILE")] = None
+    """Use control points: CSV (name,x,y,z,photo,u,v in pixels, or name,x,y,z,run_x,run_y,run_z) or gcp_list.txt."""
+    check_points: tuple[str, ...] = ()
+    """With --control: points that are only measured (also marked by a column `check`)."""
+    known_distance: Annotated[KnownDistance | None, Arg(metavar="X0 Y0 Z0 X1 Y1 Z1 METRES")] = None
+    """Use the distance between two points, in coordinates of mesh.ply."""
+    markers: Annotated[float | None, Arg(metavar="METRES")] = None
+    """Use printed ArUco markers with this side length."""
+    marker_dictionary: str = "4x4_50"
+    """With --markers: dictionary: 4x4_50 to 7x7_1000, aruco_original, apriltag_36h11."""
+    epsg: int | None = None
+    """Projected coordinate system in metres (default: that of the file, or the UTM zone)."""
+    enu: bool = False
+    """With --gps or --positions: use metres east, north and up of their centre instead of a map projection."""
+    up: Annotated[tuple[float, float, float] | None, Arg(metavar="X Y Z")] = None
+    """Up direction in the run (default: from the positions, else from the cameras)."""
+    remove: bool = False
+    """Delete the georeference of the run."""
+
+    def __post_init__(self) -> None:
+        paths_of(self, "positions", "control")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OrthophotoOptions:
+    """How the view from above is made."""
+
+    resolution: Annotated[float | None, Arg(metavar="METRES")] = None
+    """Cell size (default: pixel size on the surface, rounded up to 1, 2, 2.5 or 5)."""
+
+
+@register_command(
+    "georeference",
+    action="gs2d.contrib.survey.show:georeference",
+    group=WORLD,
+    first=("run", "gps", "positions", "control", "known_distance", "markers", "remove"),
+)
+@dataclass(frozen=True, kw_only=True)
+class Georeference(GeoreferenceOptions, Common):
+    """Find scale, up and world position of a run."""
+
+    run: RunPath
+    """Run folder."""
+
+
+@register_command("orthophoto", action="gs2d.contrib.survey.show:orthophoto", group=WORLD)
+@dataclass(frozen=True, kw_only=True)
+class Orthophoto(OrthophotoOptions, Common):
+    """Write orthophoto and elevation model of a georeferenced run."""
+
+    run: RunPath
+    """Run folder, with mesh.ply and `gs2d georeference`."""
+    out: Annotated[Path | None, Arg(metavar="FILE.tif")] = None
+    """Orthophoto (default: orthophoto.tif in the run). Heights go to NAME_elevation.tif."""
+    threads: int | None = None
+    """CPU threads."""

@@ -1,0 +1,38 @@
+"""What the commands georeference and orthophoto print."""
+
+from __future__ import annotations
+
+import shlex
+
+from gs2d.cli.console import Console
+from gs2d.contrib.survey.commands import Georeference, Orthophoto
+from gs2d.contrib.survey.find_georeference import georeference_run
+from gs2d.contrib.survey.orthophoto import orthophoto_run
+
+
+def georeference(command: Georeference, console: Console) -> None:
+    """``gs2d georeference``."""
+    found = georeference_run(command.run, command, console.on_event)
+    console.close()
+    for line in [] if found is None else found.lines():
+        console.say(line)
+    if found is not None:
+        run = shlex.quote(str(command.run))
+        console.say(f"to show it in report and page: gs2d report {run}; gs2d page {run}")
+    if found is None:
+        console.say("no georeference: --gps, --positions, --control, --known-distance or --markers finds one")
+    console.result({"run": str(command.run), "georeference": None if found is None else found.to_json()})
+
+
+def orthophoto(command: Orthophoto, console: Console) -> None:
+    """``gs2d orthophoto``."""
+    result = orthophoto_run(command.run, command.out, command, console.on_event, threads=command.threads)
+    console.close()
+    for file in result["files"]:
+        console.say(file)
+    unseen = result["cells_unseen"] / result["cells"]
+    console.say(
+        f"{result['rows']:,} x {result['columns']:,} cells of {result['resolution']:g} m, {result['frame']}; "
+        f"{unseen:.0%} of the surface is not visible in any photograph and has the colours of the mesh"
+    )
+    console.result(result)

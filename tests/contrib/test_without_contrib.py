@@ -1,0 +1,56 @@
+"""The core works when the folder of contrib is deleted; the entry points of contrib name what is there."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import gs2d
+from gs2d.cli.registry import COMMANDS
+from gs2d.config.registry import Registry, contrib_entries
+from gs2d.data.readers.registry import READERS
+from gs2d.evaluation.evaluators import EVALUATORS
+from gs2d.io.formats.registry import LAYOUTS, SPLAT_READERS
+from tiny import write_capture
+
+SOURCE = Path(gs2d.__file__).parent
+REGISTRIES: tuple[Registry, ...] = (COMMANDS, READERS, EVALUATORS, LAYOUTS, SPLAT_READERS)
+
+
+def test_every_entry_point_registers_its_name() -> None:
+    """Names registered in contrib are exactly those of its entry points."""
+    entries = {(entry.group, entry.name): entry.module for entry in contrib_entries()}
+    assert len(entries) > 15
+    by_group = {registry.group: registry for registry in REGISTRIES}
+    for (group, name), module in entries.items():
+        importlib.import_module(module)
+        assert name in dict(by_group[group].working(by_group[group].builtin)), f"{group}: {name}"
+        assert name not in by_group[group].guests()
+
+
+def test_the_core_trains_and_exports_without_contrib(tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    shutil.copytree(SOURCE, site / "gs2d", ignore=shutil.ignore_patterns("contrib", "__pycache__"))
+    environment = os.environ | {"PYTHONPATH": str(site), "OMP_NUM_THREADS": "1"}
+
+    def run(*words: object, code: int = 0) -> str:
+        command = [sys.executable, "-m", "gs2d", *map(str, words)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, cwd=tmp_path)
+        assert done.returncode == code, done.stdout + done.stderr
+        return done.stdout + done.stderr
+
+    listed = run("--help")
+    assert "reconstruct" in listed
+    assert "orthophoto" not in listed
+    capture = write_capture(tmp_path / "ball")
+    few = ("--set", "init_points=60", "--schedule-scale", "0.0003", "--no-page", "--recipe", "2dgs")
+    run("train", capture, "--out", tmp_path / "run", *few)
+    run("export", tmp_path / "run", "--out", tmp_path / "a.ply")
+    assert (tmp_path / "a.ply").stat().st_size > 1000
+    assert "splats are written as .ply, .spz files" in run(
+        "export", tmp_path / "run", "--out", tmp_path / "a.sog", code=2
+    )
