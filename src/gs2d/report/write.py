@@ -7,6 +7,7 @@ run folder.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from markupsafe import Markup
@@ -18,7 +19,7 @@ from gs2d.report.first_screen import first_screen
 from gs2d.report.guard import Guard, OnFailure
 from gs2d.report.html import macro, missing, page
 from gs2d.report.record import RunRecord, read_record
-from gs2d.report.sections.registry import SECTIONS
+from gs2d.report.sections.registry import SECTIONS, Section
 
 
 def write_report(run: Path, *, cameras: Sequence[Camera] = (), on_failure: OnFailure | None = None) -> Path:
@@ -58,10 +59,15 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = (), on_failure: OnFai
 
 def _sections(record: RunRecord, guard: Guard) -> list[str]:
     """Return the sections that have something to show, folded."""
-    made = []
+    made: list[str] = []
     for name, section in SECTIONS.working():
-        html = guard(f"section {name}", lambda section=section: Markup(section(record) or ""))
+        html = guard(f"section {name}", partial(_html, section, record))
         if html:
             shown = html if isinstance(html, Markup) else missing(html)
             made.append(macro("macros.html", "folded", name, getattr(section, "title", name), shown))
     return made
+
+
+def _html(section: Section, record: RunRecord) -> Markup:
+    """Return the HTML of a section; empty where it has nothing to show."""
+    return Markup(section(record) or "")

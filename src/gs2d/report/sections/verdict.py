@@ -30,9 +30,11 @@ def read_verdict(run: Path) -> Mapping[str, Any] | None:
     data = read_json(path)
     verdict = data.get("verdict") if isinstance(data, Mapping) else None
     findings = verdict.get("findings") if isinstance(verdict, Mapping) else None
-    if not isinstance(findings, list) or not all(isinstance(finding, Mapping) for finding in findings):
+    if not isinstance(verdict, Mapping) or not isinstance(findings, list):
         raise DataError(f"{path} must hold a verdict as gs2d writes it, got something else")
-    return dict(verdict)
+    if not all(isinstance(finding, Mapping) for finding in findings):
+        raise DataError(f"{path} must hold findings as gs2d writes them, got something else")
+    return verdict
 
 
 @register_section("verdict", title="Verdict")
