@@ -147,8 +147,8 @@ def test_another_removal_makes_another_stage_and_another_run(undisturbed: RunFol
     run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
     job = reload_run(run, lambda _: None)
     recipe = with_robustness(job.recipe)
-    none, more = replace(recipe, removal=None), replace(recipe, removal=Removal(dropout=0.3))
-    robust, none, more = (replace(job, resolved=replace(job.resolved, recipe=each)) for each in (recipe, none, more))
+    recipes = (recipe, replace(recipe, removal=None), replace(recipe, removal=Removal(dropout=0.3)))
+    robust, none, more = (replace(job, resolved=replace(job.resolved, recipe=each)) for each in recipes)
     assert len({one.stage_key(0) for one in (robust, none, more)}) == 3
     data = json.loads(run.file("run.json").read_text())
     data["recipe"] = to_json(robust.recipe)
