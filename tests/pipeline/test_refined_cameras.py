@@ -74,7 +74,7 @@ def test_photographs_of_another_size_have_it_too(run: RunFolder) -> None:
 def test_a_file_without_focal_lengths_is_refused(run: RunFolder, tmp_path: Path) -> None:
     copy = RunFolder(Path(shutil.copytree(run.path, tmp_path / "run")))
     data = json.loads(copy.file(POSES).read_text())
-    for broken, words in (([1.0, np.nan, 0.0], "finite numbers"), ([-1.0, 0.0, 0.0], "finite numbers"), (None, "zoom")):
+    for broken, words in (([1.0, np.nan, 0.0], "finite numbers"), ([-1.0, 0.0, 0.0], "positive"), (None, "zoom")):
         for entry in data["frames"]:
             entry["zoom"] = broken
             if broken is None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,31 +23,6 @@ from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 
-
-@dataclass(frozen=True, eq=False)
-class FoundPoses:
-    """The cameras that a run found.
-
-    Attributes
-    ----------
-    poses : mapping
-        T_cam_world [4, 4] by the name of the training view; empty where a run learns none.
-    zooms : mapping
-        What became of the intrinsics of a view, training or test, by its name; empty where a run learns none.
-    """
-
-    poses: Mapping[str, np.ndarray] = field(default_factory=dict)
-    zooms: Mapping[str, Zoom] = field(default_factory=dict)
-
-    def __bool__(self) -> bool:
-        return bool(self.poses)
-
-    def of(self, scene: Scene) -> Scene:
-        """Return a scene with these cameras."""
-        return scene.with_poses(self.poses, self.zooms)
-
-
-NONE = FoundPoses()
 ABOUT = (
     "cameras of the training photographs as refined, then those of the test photographs as given, in the layout of "
     "nerfstudio's transforms.json (OpenGL camera to world), for pictures of size w x h without distortion; "
@@ -64,19 +38,10 @@ RATE, RATE_FINAL = 2e-3, 2e-5  # rad and extents
 PHOTOMETRIC = (LossTerm("l1", 0.8), LossTerm("ssim", 0.2))
 
 
-def found_poses(given: Scene, now: Scene) -> FoundPoses:
-    """Return the poses of the training views of a scene whose cameras have moved; none if it is the same."""
-    if now is given:
-        return NONE
-    zooms = {view.name: view.zoom for view in now.views if view.zoom is not None}
-    return FoundPoses({view.name: view.camera.T_cam_world for view in now.train}, zooms)
-
-
-def write_poses(run: RunFolder, scene: Scene, poses: FoundPoses, on_event: OnEvent) -> None:
-    """Write ``poses.json`` beside the splats, where cameras were refined, and say how far they moved."""
-    if not poses:
+def write_poses(run: RunFolder, scene: Scene, refined: Scene, on_event: OnEvent) -> None:
+    """Write ``poses.json`` beside the splats if cameras of a scene were refined, and report how far they moved."""
+    if all(now.camera is given.camera for now, given in zip(refined.train, scene.train, strict=True)):
         return
-    refined = poses.of(scene)
     middle = focus_point([view.camera for view in scene.train])
     frames, far = [], []
     for given, view in zip(scene.train, refined.train, strict=True):
@@ -91,8 +56,9 @@ def write_poses(run: RunFolder, scene: Scene, poses: FoundPoses, on_event: OnEve
             f"{100 * mean['shift']:.3f} % of the extent): {POSES}"
         )
     )
-    if poses.zooms:
-        on_event(Notice(zoom_line([poses.zooms[name] for name in poses.poses])))
+    zooms = [view.zoom for view in refined.train if view.zoom is not None]
+    if zooms:
+        on_event(Notice(zoom_line(zooms)))
 
 
 def zoom_line(zooms: Sequence[Zoom]) -> str:
@@ -152,59 +118,31 @@ def how_far(given: Camera, now: Camera, middle: np.ndarray, extent: float) -> di
     }
 
 
-def read_poses(run: RunFolder, recipe: Recipe) -> FoundPoses:
-    """Return what :func:`write_poses` wrote; none where the recipe refines none, or the run is not finished.
+def with_found_poses(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
+    """Return a scene with the cameras of ``poses.json``; as it is if the run has refined none, or is unfinished.
 
     Raises
     ------
     RunError
-        The file is gone or damaged.
+        If the file is missing, damaged or of other photographs.
     """
     if recipe.poses is None or not (run.file(POSES).exists() or run.file(SPLATS).exists()):
-        return NONE
+        return scene
     remedy = f"continue with `gs2d train ... --out {run.path} --resume`, which writes it again"
     try:
         every = read_json(run.file(POSES))["frames"]
         frames = [entry for entry in every if entry["split"] == "train"]
         poses = {entry["name"]: np.array(entry["T_cam_world"], dtype=np.float64) for entry in frames}
         zooms = {entry["name"]: Zoom(*map(float, entry["zoom"])) for entry in every if "zoom" in entry}
-    except (DataError, KeyError, TypeError, ValueError, OverflowError) as error:
-        raise RunError(f"{run.file(POSES)} must hold the poses that this run found, got: {error}; {remedy}") from error
-    for name, pose in poses.items():
-        if pose.shape != (4, 4) or not np.isfinite(pose).all():
-            raise RunError(f"{run.file(POSES)} must hold 4x4 numbers for {name}, got others; {remedy}")
-    if recipe.intrinsics is not None and not zooms.keys() >= poses.keys():
-        raise RunError(f"{run.file(POSES)} must hold the zoom of each training photograph, got none of some; {remedy}")
-    for name, zoom in zooms.items():
-        if not (np.isfinite(zoom).all() and zoom.scale > 0):
-            raise RunError(f"{run.file(POSES)} must hold a zoom of finite numbers for {name}, got others; {remedy}")
-    return FoundPoses(poses, zooms)
-
-
-def with_found_poses(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
-    """Return the capture of a run with the training cameras that it found: for all that is done with its splats.
-
-    Raises
-    ------
-    RunError
-        The file is gone, damaged, or of other photographs.
-    """
-    poses = read_poses(run, recipe)
-    if not poses:
-        return scene
-    missing = [view.name for view in scene.train if view.name not in poses.poses]
-    if missing:
-        raise RunError(
-            f"{run.file(POSES)} must hold a pose for each training photograph, got none for {missing[0]}; continue "
-            f"with `gs2d train ... --out {run.path} --resume`, which writes it again"
-        )
-    try:
-        return poses.of(scene)
-    except ShapeError as error:
-        raise RunError(
-            f"{run.file(POSES)} must hold rigid motions, got another: {error}; continue with `gs2d train ... --out "
-            f"{run.path} --resume`, which writes it again"
-        ) from error
+        if not all(np.isfinite(zoom).all() for zoom in zooms.values()):
+            raise ValueError("a zoom that is not of finite numbers")
+        refined = scene.with_poses(poses, zooms)
+    except (DataError, ShapeError, KeyError, TypeError, ValueError, OverflowError) as error:
+        raise RunError(f"{run.file(POSES)} must hold the cameras of this run, got: {error}; {remedy}") from error
+    for view in scene.train:
+        if view.name not in poses or (recipe.intrinsics is not None and view.name not in zooms):
+            raise RunError(f"{run.file(POSES)} must hold pose and zoom of {view.name}, got none; {remedy}")
+    return refined
 
 
 def aligned(

@@ -39,7 +39,7 @@ from gs2d.pipeline.prepare.limits import release_buffers
 from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.run_appearance import write_appearance
-from gs2d.pipeline.prepare.run_poses import NONE, found_poses, write_poses
+from gs2d.pipeline.prepare.run_poses import write_poses
 from gs2d.pipeline.train.attribute_changes import Snapshot, mean_changes, take_snapshot
 from gs2d.pipeline.train.interruption import HeldSignals
 from gs2d.pipeline.train.loss_reports import report_losses
@@ -292,8 +292,7 @@ class RunLogger:
         run, loaded, state = self._run, self._loaded, self._state
         with attempted("learned cameras and exposures", None, self._on_event):
             now = self._scene_now
-            poses = NONE if loaded.recipe.poses is None else found_poses(loaded.scene, now)
-            write_poses(run, loaded.scene, poses, self._on_event)
+            write_poses(run, loaded.scene, now, self._on_event)
             write_appearance(run, now, self._on_event)
         write_splats(run.file(SPLATS), state.splats)
 

@@ -2,7 +2,19 @@
 
 from __future__ import annotations
 
-from gs2d.io.run_dir import EVENTS, EXPOSURE, MESH, METRICS, PAGE, PHOTOMETRY, POSES, RUN_JSON, SPLATS, TEXTURED
+from gs2d.io.run_dir import (
+    EVENTS,
+    EXPOSURE,
+    LEARNED,
+    MESH,
+    METRICS,
+    PAGE,
+    PHOTOMETRY,
+    POSES,
+    RUN_JSON,
+    SPLATS,
+    TEXTURED,
+)
 from gs2d.report.html import macro
 from gs2d.report.record import RunRecord
 from gs2d.report.sections.registry import register_section
@@ -15,6 +27,7 @@ FILES = {  # the most useful first
     METRICS: "all scores",
     RUN_JSON: "settings, machine and versions",
     EVENTS: "training log",
+    LEARNED: "learned colours of each photograph, as numbers",
     EXPOSURE: "exposure of each photograph",
     POSES: "refined cameras",
     PHOTOMETRY: "vignetting and response of each camera",
