@@ -97,7 +97,6 @@ def derive_limits(
     voxel: float | None = None,
     truncation: float | None = None,
     depth_limit: float | None = None,
-    points: np.ndarray | None = None,
 ) -> FusionBounds:
     """Limits from samples of all views; every named limit overrides the derived one.
 
@@ -112,8 +111,6 @@ def derive_limits(
     bbox : array [2, 3] world units, optional
         Fuse this box, whole: it also sets the voxel and lifts the depth limit to its farthest corner.
     voxel, truncation, depth_limit : float world units, optional
-    points : array [P, 3] world units, optional
-        Splat centres or points of structure from motion: the derived box is cut to their extent (with the margin).
 
     Raises
     ------
@@ -143,7 +140,7 @@ def derive_limits(
             )
         lower, upper = np.percentile(near, BOX_PERCENTILES, axis=0)
         side = float((upper - lower).max())
-        lower, upper = _widened(lower, upper, side, points)
+        lower, upper = lower - BOX_MARGIN * side, upper + BOX_MARGIN * side
     limit = limit if depth_limit is None else depth_limit
     near_footprints = footprints[depths <= limit]
     footprint = float(np.median(near_footprints if len(near_footprints) else footprints))
@@ -170,19 +167,6 @@ def widen_truncation(limits: FusionBounds, noise: float | None) -> FusionBounds:
     most = min(MAX_VOXELS_PER_TRUNCATION * limits.voxel, MAX_TRUNCATION_OF_SIDE * limits.side)
     wide = min(NOISE_PER_TRUNCATION * noise, most)
     return replace(limits, truncation=max(limits.truncation, wide), depth_noise=noise)
-
-
-def _widened(
-    lower: np.ndarray, upper: np.ndarray, side: float, points: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the robust box with its margin, cut to the extent of the points (with the same margin)."""
-    margin = BOX_MARGIN * side
-    if points is not None and len(points):
-        lower = np.maximum(lower, np.min(points, axis=0))
-        upper = np.minimum(upper, np.max(points, axis=0))
-        if not (upper > lower).all():
-            raise ProtocolError("points around the surface were expected, got points beside it; are they its own?")
-    return lower - margin, upper + margin
 
 
 def checked_box(bbox: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

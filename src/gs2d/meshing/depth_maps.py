@@ -100,12 +100,7 @@ class _Slot:
 
 
 class Spool:
-    """Depth maps in a temporary file, to be iterated over any number of times.
-
-    Parameters
-    ----------
-    folder : path or None
-        Where the file lies (default: the system's temporary folder). It has no name and vanishes when closed.
+    """Depth maps in a temporary file without a name, to be iterated over any number of times.
 
     Raises
     ------
@@ -113,11 +108,11 @@ class Spool:
         If the file cannot be written.
     """
 
-    def __init__(self, folder: str | os.PathLike[str] | None = None) -> None:
+    def __init__(self) -> None:
         try:
-            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - closed by close()
+            self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed by close()
         except OSError as error:
-            raise DiskError(f"a temporary file for depth maps cannot be made in {folder}: {error.strerror}") from error
+            raise DiskError(f"Cannot create a temporary file for depth maps: {error.strerror}. Set TMPDIR.") from error
         self._slots: list[_Slot] = []
 
     def append(self, item: DepthMap) -> None:
@@ -133,16 +128,14 @@ class Spool:
         except OSError as error:
             raise DiskError(
                 f"depth maps need a temporary file, writing number {len(self._slots) + 1} failed "
-                f"({error.strerror}); free some space or name another folder"
+                f"({error.strerror}); free some space or set TMPDIR to another folder"
             ) from error
         has = (part is not None for part in (item.color, item.weight))
         self._slots.append(_Slot(item.camera, offset, *has))
 
     @classmethod
     @contextmanager
-    def of(
-        cls, frames: Iterable[RenderedView] | Spool, folder: str | os.PathLike[str] | None = None
-    ) -> Iterator[Spool]:
+    def of(cls, frames: Iterable[RenderedView] | Spool) -> Iterator[Spool]:
         """Give the frames in a file of their own, cleaned one by one, that is closed at the end; a spool as it is.
 
         A spool stays open: whoever made it may read it again, in larger voxels.
@@ -150,7 +143,7 @@ class Spool:
         if isinstance(frames, Spool):
             yield frames
             return
-        with cls(folder) as spool:
+        with cls() as spool:
             spool.extend(frames)
             yield spool
 
