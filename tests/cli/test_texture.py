@@ -49,7 +49,7 @@ def test_the_runs_mesh_gets_a_texture_of_what_the_photographs_show(
     ("words", "named"),
     [
         (["--faces", "100"], "--texture"),
-        (["--texture-size", "64"], "belongs"),
+        (["--texture-size", "64"], "needs --texture"),
         (["--texture", "--faces", "2"], "number"),
         (["--texture", "--texture-size", "10"], "texels"),
         (["--texture", "--texture-downscale", "0"], "number"),
