@@ -270,7 +270,7 @@ def test_a_lens_is_found_with_the_scene_and_new_views_gain(seed: int) -> None:
             error = (color - torch.from_numpy(view.target((0.0, 0.0, 0.0)))).square().mean(dim=2)
             errors.append(float(error.mean() if valid is None else error[torch.from_numpy(valid)].mean()))
         psnr.append(-10 * math.log10(np.mean(errors)))
-    assert psnr[1] > psnr[0] + 2.0, psnr
+    assert psnr[1] > psnr[0] + 1.0, psnr
 
 
 def test_photographs_of_a_lens_that_was_found_are_straightened_wherever_they_are_asked_for() -> None:
