@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from benchmarks.sampler import Rule
 
-RUN_LOGGER, LOOP = "pipeline/train/run_logger.py", "training/trainer.py"
+RESULTS, LOOP = "pipeline/train/stage_results.py", "training/trainer.py"
 RUN_PHASES = (  # names that a version of the code does not have are found nowhere in it
     Rule(
         "read the capture",
         (("pipeline/prepare/loaded.py", "prepare_run"), ("pipeline/prepare/loaded.py", "reload_run")),
     ),
-    Rule("PSNR curve", ((RUN_LOGGER, "_probe_psnr"),)),
+    Rule("PSNR curve", ((RESULTS, "probe_psnr"),)),
     Rule("pictures", (("pipeline/finish/run_images.py", "draw_stage"),)),
-    Rule("score a stage", ((RUN_LOGGER, "_score_stage"), (RUN_LOGGER, "_score_entry"))),
-    Rule("checkpoints", ((RUN_LOGGER, "_save"),)),
+    Rule("score a stage", ((RESULTS, "_score_stage"), (RESULTS, "score_entry"))),
+    Rule("checkpoints", (("pipeline/train/run_logger.py", "_save"),)),
     Rule("initial splats", ((LOOP, "_new_state"),)),
     Rule("rank by E_i", (("training/rank_clone.py", "rank_by_error"),)),
     Rule("fill the stage 2 cache", (("training/cached_objective.py", "choose_objective"),)),

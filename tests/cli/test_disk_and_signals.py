@@ -58,15 +58,15 @@ def test_a_fault_of_ours_is_exit_code_1_with_a_traceback_only_for_debug(
 def test_ctrl_c_exits_with_130_and_says_how_to_go_on(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gs2d.pipeline.train import run_logger as recorder
+    from gs2d.pipeline.train.stage_results import StageResults
 
-    put = recorder.RunLogger._score_stage
+    score = StageResults.score
 
-    def interrupted(self: recorder.RunLogger, index: int) -> None:
-        put(self, index)
+    def interrupted(self: StageResults, index: int, facts: dict[str, object]) -> None:
+        score(self, index, facts)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(recorder.RunLogger, "_score_stage", interrupted)
+    monkeypatch.setattr(StageResults, "score", interrupted)
     words = ["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", "--threads", "1", *TINY]
     assert run(words) == 130
     line = capsys.readouterr().err.strip()

@@ -19,13 +19,13 @@ from gs2d.pipeline.events import Event, MissingFile
 from gs2d.pipeline.train.train_run import train
 
 LATER = {  # of a training, with what is missing then
-    "train.run_logger.write_poses": "learned cameras and exposures",
-    "train.run_logger.write_appearance": "learned cameras and exposures",
-    "train.run_logger.score_views": "scores of train views, stage refine",
-    "train.run_logger.split_metrics": "scores of train views, stage refine",
-    "train.run_logger.report_losses": "what the losses say of stage refine",
-    "train.run_logger.draw_stage": "pictures of stage refine",
-    "train.run_logger.StageDone": "scores of stage refine",
+    "train.stage_results.write_poses": "learned cameras and exposures",
+    "train.stage_results.write_appearance": "learned cameras and exposures",
+    "train.stage_results.score_views": "scores of train views, stage refine",
+    "train.stage_results.split_metrics": "scores of train views, stage refine",
+    "train.stage_results.report_losses": "what the losses say of stage refine",
+    "train.stage_results.draw_stage": "pictures of stage refine",
+    "train.stage_results.StageDone": "scores of stage refine",
     "finish.run_mesh.fusion_frame": "mesh.ply",
     "finish.verdict.Collector._measure": "verdict.json",
     "train.train_run.meshed_subject": "mesh.ply",
@@ -79,7 +79,7 @@ def test_a_step_that_fails_after_training_is_named_and_costs_no_splats(
 def test_a_training_whose_views_cannot_be_scored_has_its_splats(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gs2d.pipeline.train.run_logger.score_views", failing(DataError("no points")))
+    monkeypatch.setattr("gs2d.pipeline.train.stage_results.score_views", failing(DataError("no points")))
     heard: list[Event] = []
     run = train(options(capture, tmp_path / "run", page=False), heard.append)
     assert len(read_splats(run.file("splats.ply"))) > 0

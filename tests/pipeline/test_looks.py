@@ -11,7 +11,7 @@ from ball_runs import options
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.finish import run_mesh as surface
 from gs2d.pipeline.finish.run_mesh import mesh_run
-from gs2d.pipeline.train import run_logger as recorder
+from gs2d.pipeline.train import stage_results as recorder
 from gs2d.pipeline.train.train_run import train
 
 

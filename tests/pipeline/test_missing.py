@@ -57,7 +57,7 @@ def finished(undisturbed: RunFolder, tmp_path: Path) -> Path:
             "gs2d page {run}",
         ),
         (
-            "train.run_logger.draw_stage",
+            "train.stage_results.draw_stage",
             ValueError("x"),
             "pictures of stage refine",
             "fault in gs2d: ValueError: x",

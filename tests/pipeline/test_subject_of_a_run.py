@@ -54,7 +54,8 @@ def test_a_box_of_the_user_becomes_the_subject_and_limits_the_mesh(undisturbed: 
         )
     ]
     out = tmp_path / "part.ply"
-    generic = replace(job, protocol=replace(job.protocol, fusion=PROTOCOLS["generic"].fusion))
+    protocol = replace(job.protocol, fusion=PROTOCOLS["generic"].fusion)
+    generic = replace(job, resolved=replace(job.resolved, protocol=protocol))
     result = extract_mesh(generic, splats, MeshOptions(voxel=0.05), out, lambda _: None, subject=subject)
     vertices = read_mesh(out).vertices
     assert (np.abs(vertices) <= np.array(BOX[3:]) + 0.05 * 8).all()

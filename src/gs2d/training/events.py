@@ -1,9 +1,13 @@
-"""What training tells the outside, as small frozen values. Whenever one is sent the state is whole and can be saved."""
+"""Events of a training, as small frozen values. Whenever one is sent the state is whole and can be saved.
+
+``kind`` is the name of an event in ``events.jsonl``.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 
 @dataclass(frozen=True)
@@ -15,6 +19,7 @@ class Initialised:
     have one.
     """
 
+    kind: ClassVar[str] = "initialised"
     splats: int
     source: str
     dropped: int
@@ -25,6 +30,7 @@ class Initialised:
 class StageEntering:
     """A stage is about to run its entry actions; the splats are still those of the stage before."""
 
+    kind: ClassVar[str] = "stage_entering"
     stage: str
     index: int
     splats: int
@@ -34,6 +40,7 @@ class StageEntering:
 class Ranked:
     """Splats were ranked by colour error: the group's smallest E_i, and its share of the sum of all."""
 
+    kind: ClassVar[str] = "ranked"
     stage: str
     group: str
     count: int
@@ -45,6 +52,7 @@ class Ranked:
 class Cloned:
     """Splats were cloned in place."""
 
+    kind: ClassVar[str] = "cloned"
     stage: str
     group: str
     count: int
@@ -56,6 +64,7 @@ class Cloned:
 class StageStarted:
     """The entry actions of a stage are done; its first iteration comes next."""
 
+    kind: ClassVar[str] = "stage_start"
     stage: str
     index: int
     iterations: int
@@ -76,6 +85,7 @@ class Progress:
     sh_degree : degree in training
     """
 
+    kind: ClassVar[str] = "step"
     stage: str
     index: int
     iteration: int
@@ -93,6 +103,7 @@ class Progress:
 class Densified:
     """Splats were cloned, split and pruned."""
 
+    kind: ClassVar[str] = "densify"
     stage: str
     iteration: int
     cloned: int
@@ -106,6 +117,7 @@ class Densified:
 class OpacityLimited:
     """Opacity was limited from above: a reset, or AbsGS's cap."""
 
+    kind: ClassVar[str] = "opacity_limited"
     stage: str
     iteration: int
     ceiling: float
@@ -116,6 +128,7 @@ class OpacityLimited:
 class FloatersRemoved:
     """Splats that something spoke against, and that the training images did not miss, were removed."""
 
+    kind: ClassVar[str] = "floaters_removed"
     stage: str
     iteration: int
     removed: int
@@ -126,6 +139,7 @@ class FloatersRemoved:
 class StageFinished:
     """A stage is done; the state already points at the next one. ``unseen`` splats, in no training view, are gone."""
 
+    kind: ClassVar[str] = "stage_end"
     stage: str
     index: int
     iterations: int

@@ -45,7 +45,7 @@ from gs2d.pipeline.prepare.resolved import Execution, check_same_run
 from gs2d.pipeline.train.live import Live
 from gs2d.pipeline.train.process_group import connected, follow, lead, memory_of
 from gs2d.pipeline.train.resume import ResumePoint, check_sources, choose_start
-from gs2d.pipeline.train.run_logger import RunLogger
+from gs2d.pipeline.train.run_logger import RunLogger, progress_every
 from gs2d.training import events
 from gs2d.training.parallel import ONE_PROCESS, ManyProcesses, OneProcess
 from gs2d.viewer.server import free_port
@@ -249,7 +249,6 @@ def train_stages(
     from gs2d.training.trainer import Trainer, TrainerOptions
 
     part = loaded.part
-    recorder = RunLogger(run, loaded, start, on_event, visitors)
 
     def listen(event: events.Event) -> None:
         recorder.on_training_event(event)
@@ -267,15 +266,17 @@ def train_stages(
         state=start.state,
         init=None if start.state is not None else loaded.init if part is None else part.own,
         options=TrainerOptions(
+            between=lambda: recorder.stop_if_asked(),
             frozen=None if part is None else part.frozen,
             within=None if part is None or loaded.recipe.dense_start is None else part.within,
             exposures=None if part is None else part.exposures,
-            progress_every=recorder.progress_every,
+            progress_every=progress_every(loaded),
             stage2_cache_bytes=loaded.resolved.stage2_cache_bytes,
             processes=together,
         ),
     )
-    recorder.begin(trainer)
+    recorder = RunLogger(run, loaded, trainer, start, on_event, visitors)
+    recorder.begin()
     with recorder.ending_well():
         trainer.run()
     return trainer.splats, trainer.scene_now()

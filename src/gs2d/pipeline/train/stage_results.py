@@ -1,0 +1,210 @@
+"""Results of the stages of a training: scores, images, entries of ``metrics.json``, and the finished splats."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from types import MappingProxyType
+from typing import Any
+
+from gs2d.config.recipe import Stage
+from gs2d.data import Scene, View
+from gs2d.evaluation.images import ImageMetrics
+from gs2d.io.run_dir import SPLATS, VERDICT, RunFolder, load_tensors
+from gs2d.io.splat_ply import write_splats
+from gs2d.pipeline.attempts import again, attempted
+from gs2d.pipeline.events import OnEvent, StageDone
+from gs2d.pipeline.finish.run_images import choose_views, draw_stage
+from gs2d.pipeline.finish.scoring import (
+    SeenView,
+    Visitor,
+    evenly,
+    is_partial,
+    mean_psnr,
+    score_views,
+    split_metrics,
+    transparent_entry,
+    transparent_part,
+)
+from gs2d.pipeline.prepare.loaded import LoadedRun
+from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
+from gs2d.pipeline.prepare.run_appearance import write_appearance
+from gs2d.pipeline.prepare.run_poses import write_poses
+from gs2d.pipeline.train.loss_reports import report_losses
+from gs2d.pipeline.train.resume import put_in_cache
+from gs2d.render.types import RenderOutput
+from gs2d.training.trainer import Trainer
+
+PROBE_VIEWS = 4
+EARLY_VIEWS = 16  # training views that score a stage before the last, where stages are compared by test views
+
+
+class StageResults:
+    """Scores and draws the stages of a training, and writes what comes of them.
+
+    Parameters
+    ----------
+    run : RunFolder
+    loaded : LoadedRun
+    trainer : Trainer
+    on_event : callable
+    visitors : sequence of Visitor
+        See every view of the finished splats, while they are scored.
+    """
+
+    def __init__(
+        self, run: RunFolder, loaded: LoadedRun, trainer: Trainer, on_event: OnEvent, visitors: Sequence[Visitor] = ()
+    ) -> None:
+        self._run, self._loaded, self._trainer, self._on_event = run, loaded, trainer, on_event
+        self._visitors = visitors
+        self._shown = choose_views(loaded.scene)
+        probes = loaded.scene.test or loaded.scene.train
+        self._probes = probes[:: max(1, len(probes) // PROBE_VIEWS)][:PROBE_VIEWS]
+        self._predicted: tuple[tuple[int, int], Scene] | None = None  # of stage and step
+
+    def probe_psnr(self) -> float | None:
+        """Return the mean PSNR of a few fixed views (test views where there are any)."""
+        # By neighbours alone: what the camera would see costs a rendering of every photograph.
+        views, loaded = self._now(self._probes, with_predicted(self._trainer.scene_now())), self._loaded
+        return mean_psnr(self._trainer.drawn, views, loaded.settings, loaded.backend)
+
+    def score_entry(self) -> dict[str, Any]:
+        """Score just after the entry actions, to compare with the stage before: the price of the clone."""
+        entry: dict[str, Any] = {}
+        for split, views in self._scored(last=False):
+            with attempted(f"scores of {split} views after the clone", "", self._on_event):
+                scores = self._score(split, views, f"scoring after the clone ({split})")
+                entry |= split_metrics(scores, split, of=len(self._views(split)))
+        return entry
+
+    def score(self, index: int, facts: Mapping[str, Any]) -> None:
+        """Score and draw a finished stage; ``facts`` go into its entry. After the last stage an error ends nothing."""
+        with self._attempted_at_end(index):
+            self._score_stage(index, facts)
+
+    def take_over(self, index: int, facts: Mapping[str, Any]) -> None:
+        """Draw a stage of another run or process, and score it if it was not, or if every view has to be seen."""
+        stages = self._run.metrics()["stages"]
+        if self._is_last(index):
+            self.write_splats()
+        unseen = bool(self._visitors) and not self._run.file(VERDICT).exists()
+        with self._attempted_at_end(index):
+            if len(stages) <= index:
+                self._score_stage(index, facts)
+            elif self._is_last(index) and (unseen or is_partial(stages[-1])):
+                self._score_stage(index, {**facts, **stages[-1]})
+            else:
+                self._draw(self._stage(index).name)
+
+    def write_splats(self) -> None:
+        """Write the splats and what belongs to them, before anything that is made of them can fail."""
+        run, loaded = self._run, self._loaded
+        with attempted("learned cameras and exposures", None, self._on_event):
+            now = self._trainer.scene_now()
+            write_poses(run, loaded.scene, now, self._on_event)
+            write_appearance(run, now, self._on_event)
+        write_splats(run.file(SPLATS), self._trainer.splats)
+
+    @contextmanager
+    def _attempted_at_end(self, index: int) -> Iterator[None]:
+        """After the last stage, report an error and go on; before it, raise it."""
+        if not self._is_last(index):
+            yield
+            return
+        with attempted(f"scores of stage {self._stage(index).name}", again("evaluate", self._run.path), self._on_event):
+            yield
+
+    def _score_stage(self, index: int, facts: Mapping[str, Any]) -> None:
+        """Score a finished stage, draw it, write its entry of ``metrics.json``, put it in the cache."""
+        stage, last, splats = self._stage(index), self._is_last(index), self._trainer.splats
+        entry: dict[str, Any] = {
+            "name": stage.name,
+            "iterations": stage.iterations,
+            "splats": len(splats),
+            "bytes": splats.nbytes,
+            **facts,
+        }
+        shown = {view.name for _, view in self._shown}
+        outputs: dict[str, RenderOutput] = {}
+        transparent: dict[str, float] = {}
+
+        def keep(seen: SeenView, scores: ImageMetrics) -> None:
+            if seen.view.name in shown:
+                outputs[seen.view.name] = seen.output
+            part = transparent_part(seen) if seen.split == "train" else None
+            if part is not None and math.isfinite(part):  # a mask may leave no pixel
+                transparent[seen.view.name] = part
+
+        for split, views in self._scored(last=last):
+            entry |= {split: None, f"{split}_reason": "its views could not be scored"}
+            with attempted(f"scores of {split} views, stage {stage.name}", None, self._on_event):
+                visitors = [keep, *(self._visitors if last else ())]
+                scores = self._score(split, views, f"scoring {split} views", visitors)
+                del entry[f"{split}_reason"]
+                entry |= split_metrics(scores, split, of=len(self._views(split)))
+        entry |= transparent_entry(transparent)
+        with attempted(f"what the losses say of stage {stage.name}", None, self._on_event):
+            entry |= report_losses(self._run, self._trainer, self._loaded.scene.train)
+        self._draw(stage.name, outputs)
+        stages = [*self._run.metrics()["stages"][:index], entry]
+        self._run.write_metrics({"stages": stages, "surface": None})
+        cache = self._loaded.resolved.execution.cache
+        if cache is not None:
+            saved = next(c for c in self._run.checkpoints() if c.stage_index == index and c.iteration is None)
+            put_in_cache(cache, self._run, index, load_tensors(saved.path))
+        self._on_event(StageDone(entry))
+
+    def _scored(self, *, last: bool) -> list[tuple[str, Sequence[View]]]:
+        """Return the views that score a stage: all, but before the last stage some of the training views.
+
+        Where training views are what stages are compared by (DTU, captures without test views) all of them do.
+        """
+        scene = self._loaded.scene
+        compared = self._loaded.protocol.test_on == "train" or not scene.test
+        train = scene.train if last or compared else evenly(scene.train, EARLY_VIEWS)
+        return [("train", train), ("test", scene.test)]
+
+    def _score(
+        self, split: str, views: Sequence[View], name: str, visitors: Sequence[Visitor] = ()
+    ) -> dict[str, ImageMetrics]:
+        return score_views(
+            self._trainer.drawn,
+            self._now(views, self._shown_scene()),
+            self._loaded.settings,
+            self._loaded.backend,
+            name=name,
+            on_event=self._on_event,
+            split=split,
+            visitors=visitors,
+        )
+
+    def _draw(self, stage: str, outputs: Mapping[str, RenderOutput] = MappingProxyType({})) -> None:
+        drawn, state = self._trainer.drawn, self._trainer.state
+        views = self._now([view for _, view in self._shown], self._shown_scene())
+        shown = zip((split for split, _ in self._shown), views, strict=True)
+        with attempted(f"pictures of stage {stage}", None, self._on_event):
+            group = state.groups.get("high_error") if len(drawn) == len(state.splats) else None  # none of the frozen
+            draw_stage(self._run, self._loaded, list(shown), stage, drawn, group, outputs)
+
+    def _shown_scene(self) -> Scene:
+        """Return the scene with what was learned of it, and predicted exposures of its test views."""
+        at = (self._trainer.state.stage, self._trainer.state.step)
+        if self._predicted is None or self._predicted[0] != at:
+            brightness = metered(self._trainer.drawn, self._loaded.settings, self._loaded.backend)
+            self._predicted = (at, with_predicted(self._trainer.scene_now(), brightness))
+        return self._predicted[1]
+
+    def _now(self, views: Sequence[View], scene: Scene) -> list[View]:
+        """Return views of the capture as they are in ``scene``, which is the capture as it is now."""
+        now = dict(zip(map(id, self._loaded.scene.views), scene.views, strict=True))
+        return [now.get(id(view), view) for view in views]
+
+    def _views(self, split: str) -> Sequence[View]:
+        return self._loaded.scene.train if split == "train" else self._loaded.scene.test
+
+    def _is_last(self, index: int) -> bool:
+        return index == len(self._loaded.recipe.stages) - 1
+
+    def _stage(self, index: int) -> Stage:
+        return self._loaded.recipe.stages[index]
