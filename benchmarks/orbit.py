@@ -23,6 +23,7 @@ from gs2d.pipeline.events import ignore
 from gs2d.pipeline.finish.camera_paths import orbit_cameras
 from gs2d.pipeline.finish.run_images import render_run
 from gs2d.pipeline.prepare.loaded import reload_run
+from gs2d.pipeline.prepare.options import RenderOptions
 from gs2d.report.mesh_images import mesh_images
 
 
@@ -54,7 +55,7 @@ def main(words: Sequence[str] | None = None) -> None:
     width = round(height * cameras[0].width / cameras[0].height)
     images = []
     with tempfile.TemporaryDirectory() as folder:
-        render_run(args.run, orbit=args.frames, width=width, out=Path(folder))
+        render_run(args.run, RenderOptions(orbit=args.frames, width=width), out=Path(folder))
         for frame, camera in zip(sorted(Path(folder).glob("*.png")), cameras, strict=True):
             clay = (mesh_images(mesh, [camera], width=width)[0].shape * 255).round().astype(np.uint8)
             both = Image.new("RGB", (2 * across, height))

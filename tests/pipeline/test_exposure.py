@@ -25,7 +25,7 @@ from gs2d.pipeline.finish.run_images import render_run, render_view
 from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.loaded import open_finished
-from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, TrainOptions
+from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, RenderOptions, TrainOptions
 from gs2d.pipeline.train.train_run import train
 from gs2d.synthetic import capture as toy
 from gs2d.synthetic.perturb_exposure import GAINS, random_gains, with_gains
@@ -116,7 +116,7 @@ def test_matched_scores_are_beside_the_plain_ones_where_they_are_asked_for(run: 
 
 
 def test_any_view_can_be_rendered_in_the_exposure_of_a_photograph(run: RunFolder, tmp_path: Path) -> None:
-    render_run(run.path, orbit=2, out=tmp_path, exposure_of="train/r_1.png")
+    render_run(run.path, RenderOptions(orbit=2, exposure_of="train/r_1.png"), out=tmp_path)
     _, job, splats = open_finished(run.path, 1, ignore)
     subject = read_subject(run.path)
     assert subject is not None
@@ -132,7 +132,7 @@ def test_any_view_can_be_rendered_in_the_exposure_of_a_photograph(run: RunFolder
     assert np.abs(read_image(tmp_path / "0000.png") - expected).max() <= 0.51
     assert np.abs(255 * output.color.clamp(0, 1).numpy() - expected).max() > 2
     with pytest.raises(RunError, match="r_9"):
-        render_run(run.path, exposure_of="train/r_9.png")
+        render_run(run.path, RenderOptions(exposure_of="train/r_9.png"))
 
 
 def test_a_lost_or_damaged_file_of_exposures_is_named_with_its_remedy(run: RunFolder, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from gs2d.pipeline.finish.run_images import file_names, render_run
 from gs2d.pipeline.finish.run_mesh import mesh_run
 from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.look.page import page_run
-from gs2d.pipeline.prepare.options import EvaluateOptions, MeshOptions
+from gs2d.pipeline.prepare.options import EvaluateOptions, MeshOptions, RenderOptions
 from gs2d.pipeline.train.train_run import train
 from tiny import ball_cameras, write_ball_mesh
 
@@ -56,14 +56,14 @@ def test_a_ground_truth_of_another_kind_is_refused_before_the_run_is_read(
 def test_two_commands_do_not_render_into_the_same_folder_of_a_run(undisturbed: RunFolder, tmp_path: Path) -> None:
     """The second would delete the frames of the first, which it then could not make a film of."""
     copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
-    render_run(copy, orbit=3, threads=1)
+    render_run(copy, RenderOptions(orbit=3), threads=1)
     with (
         RunFolder(copy / "renders" / "orbit").locked(),
         pytest.raises(RunError, match="--out"),
     ):
-        render_run(copy, orbit=2, threads=1)
+        render_run(copy, RenderOptions(orbit=2), threads=1)
     assert len(list((copy / "renders" / "orbit").glob("*.png"))) == 3
-    render_run(copy, orbit=2, threads=1)
+    render_run(copy, RenderOptions(orbit=2), threads=1)
     assert len(list((copy / "renders" / "orbit").glob("*.png"))) == 2
 
 
@@ -172,7 +172,7 @@ def test_a_rendering_that_fails_leaves_none_of_its_pictures_and_no_folder(
     (tmp_path / "mine" / "0001.png").write_text("an older picture")
     for folder in (tmp_path / "new" / "deep", tmp_path / "mine"):
         with pytest.raises(DiskError):
-            render_run(undisturbed.path, orbit=5, out=folder, threads=1)
+            render_run(undisturbed.path, RenderOptions(orbit=5), out=folder, threads=1)
     assert not (tmp_path / "new").exists()
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["0001.png"]
 

@@ -24,7 +24,7 @@ from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.finish.run_texture import _views
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.loaded import open_finished, reload_run
-from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, TextureOptions, TrainOptions
+from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, RenderOptions, TextureOptions, TrainOptions
 from gs2d.pipeline.prepare.run_poses import aligned, how_far
 from gs2d.pipeline.train.train_run import train
 from gs2d.synthetic import capture as toy
@@ -102,7 +102,7 @@ def test_everybody_takes_the_cameras_that_were_found(run: RunFolder, capture: Pa
     as_given = mean_metrics(list(score_views(splats, given.train, **drawing).values()))  # type: ignore[arg-type]
     assert as_given.to_json()["psnr"] != psnr
     assert evaluate_run(run.path)["train"]["psnr"] == psnr
-    render_run(run.path, split="train", out=tmp_path)
+    render_run(run.path, RenderOptions(split="train"), out=tmp_path)
     assert len(list(tmp_path.glob("*.png"))) == 6
     texture = _views(job, TextureOptions(texture_downscale=2), ignore)
     assert np.array_equal(texture[0].camera.T_cam_world, job.scene.train[0].camera.T_cam_world)

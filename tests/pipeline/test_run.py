@@ -24,7 +24,7 @@ from gs2d.pipeline.demo import demo
 from gs2d.pipeline.events import Event, Notice, Phase, Step, ignore
 from gs2d.pipeline.finish.run_images import render_run
 from gs2d.pipeline.prepare.loaded import prepare_run
-from gs2d.pipeline.prepare.options import DemoOptions
+from gs2d.pipeline.prepare.options import DemoOptions, RenderOptions
 from gs2d.pipeline.train.train_run import pretraining_notices, train
 from tiny import write_capture
 
@@ -253,15 +253,15 @@ def test_a_run_without_test_views_renders_its_training_views_and_another_trainin
     short = options(tmp_path / "run" / "capture", tmp_path / "run", protocol="generic", schedule_scale=0.0005)
     train(replace(short, test_every=0, downscale=2), allowed=("capture",))
     heard: list[Event] = []
-    result = render_run(tmp_path / "run", heard.append, width=31, threads=1)
+    result = render_run(tmp_path / "run", RenderOptions(width=31), heard.append, threads=1)
     assert (result["images"], Path(result["folder"]).name) == (9, "train")
     assert any("because the run has no test views" in e.text for e in heard if isinstance(e, Notice))
     sizes = {read_image(path).shape for path in Path(result["folder"]).glob("*.png")}
     assert sizes == {(23, 31, 3)}  # of 20x15
     with pytest.raises(DataError, match="no test views; use --split train or --orbit 120"):
-        render_run(tmp_path / "run", split="test", threads=1)
+        render_run(tmp_path / "run", RenderOptions(split="test"), threads=1)
     with pytest.raises(RunError, match="--width must be a number of pixels from 1 to 16384, got 0"):
-        render_run(tmp_path / "run", width=0)
+        render_run(tmp_path / "run", RenderOptions(width=0))
 
     def listen(event: Event) -> None:
         heard.append(event)

@@ -18,6 +18,7 @@ from gs2d.pipeline.prepare.options import (
     PlanOptions,
     PosesOptions,
     ReconstructOptions,
+    RenderOptions,
     TextureOptions,
     TrainOptions,
 )
@@ -130,27 +131,13 @@ class Mesh(TextureOptions, MeshOptions, Common):
     first=("run", "split", "orbit", "flight", "width", "video", "out"),
 )
 @dataclass(frozen=True, kw_only=True)
-class Render(Common):
+class Render(RenderOptions, Common):
     """Render images or a video of a run."""
 
     run: RunPath
     """Run folder."""
-    split: Literal["test", "train"] | None = None
-    """Views to render (default: test views, or training views where there are none)."""
-    orbit: int = 0
-    """Render N frames of a circle around the subject, or of an arc if only one side was photographed."""
-    flight: int = 0
-    """Render N frames of a smooth flight along the cameras."""
-    width: Annotated[int | None, Arg(metavar="PIXELS")] = None
-    """Image width; the height follows (default: as in training)."""
     out: Path | None = None
     """Folder of the images (default: renders/SPLIT, renders/orbit or renders/flight in the run)."""
-    video: Annotated[Path | None, Arg(metavar="FILE")] = None
-    """With --orbit or --flight: also write a video, .mp4 (H.264, needs ffmpeg) or .webp."""
-    fps: float = 30.0
-    """Frames per second of the video."""
-    exposure_of: Annotated[str | None, Arg(metavar="PHOTOGRAPH")] = None
-    """Render in the learned exposure of this training photograph (default: the mean exposure)."""
     splats: Annotated[Path | None, Arg(metavar="FILE")] = None
     """Use the splats of this file, in the frame of the run. Needs --out."""
     memory: MemoryOption = None

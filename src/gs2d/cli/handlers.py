@@ -146,15 +146,9 @@ def render(command: c.Render, console: Console) -> None:
     _keep_to(command.memory)
     result = render_run(
         command.run,
+        command,
         console.on_event,
-        split=command.split,
-        orbit=command.orbit,
-        flight=command.flight,
-        width=command.width,
         out=command.out,
-        video=command.video,
-        fps=command.fps,
-        exposure_of=command.exposure_of,
         splats_file=command.splats,
         threads=command.threads,
     )

@@ -84,7 +84,7 @@ from gs2d.evaluation import evaluators
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.finish.run_mesh import mesh_run
 from gs2d.pipeline.finish.run_images import render_run
-from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.prepare.options import RenderOptions, TrainOptions
 from gs2d.pipeline.train.train_run import train
 import tiny
 
@@ -99,7 +99,7 @@ print(last["test"]["psnr"] > 5, last["peak_gpu_memory_bytes"] > 0)
 launched.clear()
 print(mesh_run(folder / "run")["fused_by"], launched["fuse_voxels"] > 0)
 print(evaluate_run(folder / "run")["surface"]["chamfer"] > 0)
-print(render_run(folder / "run", orbit=1)["images"])
+print(render_run(folder / "run", RenderOptions(orbit=1))["images"])
 """
 
 

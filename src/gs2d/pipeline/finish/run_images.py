@@ -39,6 +39,7 @@ from gs2d.pipeline.finish.camera_paths import flight_cameras, orbit_cameras
 from gs2d.pipeline.finish.scoring import evenly
 from gs2d.pipeline.finish.trusted_depth import believed_reach, within_reach
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
+from gs2d.pipeline.prepare.options import RenderOptions
 from gs2d.pipeline.prepare.run_appearance import exposed, exposure_named, photographed
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
@@ -200,41 +201,33 @@ def splatted(splats: Splats, values: Tensor, view: View, settings: RasterSetting
 
 MAX_FRAMES = 100_000  # of an orbit or a flight
 MAX_WIDTH = 1 << 14  # px
-FPS = 30.0
 
 
 def render_run(
     path: Path,
+    options: RenderOptions = RenderOptions(),  # noqa: B008 (frozen)
     on_event: OnEvent = ignore,
     *,
-    split: str | None = None,
-    orbit: int = 0,
-    flight: int = 0,
-    width: int | None = None,
     out: Path | None = None,
-    video: Path | None = None,
-    fps: float = FPS,
-    exposure_of: str | None = None,
     splats_file: Path | None = None,
     threads: int | None = None,
 ) -> dict[str, Any]:
     """Render the views of a split, ``orbit`` frames of a circle or ``flight`` frames past the photographs, as PNGs.
 
-    ``split`` None takes the test views, or the training views of a run that has none. ``width`` (px) resizes the
-    cameras; heights follow. Frames of a circle or a flight can be made a video too: ``video`` names it, ``fps`` frames
-    a second. All are in the mean exposure of the photographs, or in that of the training photograph ``exposure_of``.
-    ``splats_file`` is drawn instead of the run's splats, into ``out``.
+    ``splats_file`` is drawn instead of the splats of the run, into ``out``.
     """
     from gs2d.io.video import write_video
 
-    path, out, video = Path(path), None if out is None else Path(out), None if video is None else Path(video)
+    path, out, video = Path(path), None if out is None else Path(out), options.video
+    split, orbit, flight, width, fps = options.split, options.orbit, options.flight, options.width, options.fps
     if width is not None and not (isinstance(width, int) and 1 <= width <= MAX_WIDTH):
         raise RunError(f"--width must be a number of pixels from 1 to {MAX_WIDTH}, got {width}")
     asked, (moving, video) = video, check_frames(orbit, flight, video, fps)
     if video is not None and video != asked and video.suffix == ".webp":
         on_event(Notice(f"the video is an animated WebP, {video}: MP4 needs ffmpeg with libx264 ({FFMPEG})"))
     run, loaded, splats = open_finished(path, threads, on_event, splats_file=splats_file, out=out)
-    transform = None if exposure_of is None else exposure_named(exposure_of, loaded.scene.train)
+    named = options.exposure_of
+    transform = None if named is None else exposure_named(named, loaded.scene.train)
     views: list[tuple[str, View]]
     if moving:
         image = np.zeros((1, 1, 3), np.uint8)
@@ -322,7 +315,7 @@ def check_frames(orbit: int, flight: int, video: Path | None, fps: float) -> tup
             raise RunError(f"{name} must be a number of frames from 1 to {MAX_FRAMES}, got {frames}")
     if orbit and flight:
         raise RunError(f"--orbit {orbit} and --flight {flight} exclude each other; give one")
-    if video is None and fps != FPS:
+    if video is None and fps != RenderOptions.fps:
         raise RunError(f"--fps {fps:g} is of a video, and no --video was given; give both")
     if video is not None:
         if not (orbit or flight):

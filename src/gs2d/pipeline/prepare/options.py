@@ -336,6 +336,29 @@ class TextureOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RenderOptions:
+    """Which images of a run are rendered."""
+
+    split: Literal["test", "train"] | None = None
+    """Views to render (default: test views, or training views where there are none)."""
+    orbit: int = 0
+    """Render N frames of a circle around the subject, or of an arc if only one side was photographed."""
+    flight: int = 0
+    """Render N frames of a smooth flight along the cameras."""
+    width: Annotated[int | None, Arg(metavar="PIXELS")] = None
+    """Image width; the height follows (default: as in training)."""
+    video: Annotated[Path | None, Arg(metavar="FILE")] = None
+    """With --orbit or --flight: also write a video, .mp4 (H.264, needs ffmpeg) or .webp."""
+    fps: float = 30.0
+    """Frames per second of the video."""
+    exposure_of: Annotated[str | None, Arg(metavar="PHOTOGRAPH")] = None
+    """Render in the learned exposure of this training photograph (default: the mean exposure)."""
+
+    def __post_init__(self) -> None:
+        paths_of(self, "video")
+
+
+@dataclass(frozen=True, kw_only=True)
 class EvaluateOptions:
     """What is measured."""
 
