@@ -27,7 +27,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does,
 
 import torch
 
-from benchmarks.run_phases import LOOP, RESULTS, RUN_PHASES
+from benchmarks.run_phases import LOOP, RUN_PHASES
 from benchmarks.sampler import Rule, Sampler, Seconds
 from benchmarks.timing import machine, peak_probe
 from gs2d.kernels.library import load
@@ -61,7 +61,8 @@ PARTS = (
     Rule("neighbours", (("gs2d/core/transforms.py", "nearest_distances"),)),
     Rule("imports", (("importlib._bootstrap>", ""),)),
     Rule(
-        "log and progress", ((RESULTS, ""), ("io/run_dir.py", ""), ("core/json_files.py", ""), (LOOP, "_progress"))
+        "log and progress",
+        (("pipeline/train/run_logger.py", ""), ("io/run_dir.py", ""), ("core/json_files.py", ""), (LOOP, "_progress")),
     ),
 )
 
