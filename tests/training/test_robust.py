@@ -121,6 +121,13 @@ def test_the_images_that_see_through_a_splat_are_counted(monkeypatch: pytest.Mon
     assert 0 < some < all_of_them
 
 
+def test_images_that_show_a_surface_on_a_splat_are_counted_for_its_ends_too(maps: FreeSpaceMaps) -> None:
+    splats = splat_at((0.5, 0, WALL), (0.5, 0, 2.0), (0.5, 60.0, WALL), (0.5, 60.0, WALL))
+    splats.log_scales[3, 1] = np.log(60.0)  # from outside of all images down to the middle of the wall
+    images = len(wall().train)
+    assert maps.showing(splats).tolist() == [images, 0, 0, images]
+
+
 # -- the trial ------------------------------------------------------------------------------------------------------
 def wall_of_splats() -> tuple[Splats, list[Witness]]:
     """A grid of grey splats on a wall of their colour, which five cameras see, and the images that show it."""
@@ -208,6 +215,23 @@ def test_frozen_splats_stand_behind_what_is_tried(behind: bool) -> None:
     robust = Robustness(wall(), short(), RASTER, BACKEND, frozen=frozen)
     robust.remove(state, short().stages[0], 10)
     assert len(state.splats) == (15 if behind else 20)
+
+
+def test_large_splats_shrink_where_images_show_a_surface_and_nowhere_else() -> None:
+    state, stage = full_state(20), short().stages[0]
+    splats = state.splats
+    splats.means[:10], splats.means[10:] = torch.tensor([0.5, 0.0, WALL]), torch.tensor([0.5, 0.0, 3 * WALL])
+    splats.quats[:] = torch.tensor([1.0, 0, 0, 0])
+    splats.log_scales[:] = torch.tensor([0.1, WALL]).log()
+    robust = Robustness(wall(), short(), RASTER, BACKEND)
+    kept = splats.log_scales.clone()
+    robust.remove(state, replace(stage, iterations=10), 10)  # the last iteration: nothing learns what shrinking leaves
+    assert torch.equal(state.splats.log_scales, kept[: len(state.splats)])
+    robust.remove(state, replace(stage, iterations=100), 10)
+    short_axis, long_axis = state.splats.scales[:10].T
+    torch.testing.assert_close(short_axis, torch.full((10,), 0.1))
+    assert (long_axis < 0.3 * WALL).all()
+    assert torch.equal(state.splats.log_scales[10:], kept[10:])
 
 
 def test_a_resumed_run_starts_from_the_same_places_and_ends_with_the_same_bits() -> None:

@@ -25,6 +25,7 @@ from gs2d.training.plane_sweep import SWEEP_BYTES, Sweep
 NEARER = 0.9  # free is what is nearer than this fraction of the depth: depths are good to a few percent
 WINDOW = 5  # px of the small images, the nearest depth of which counts: splats have a size, and edges are not sharp
 SPREAD = 1.0  # standard deviations from its centre, along both axes, at which a splat is looked at too
+SAMPLES = (0.15, 0.4, 1.0)  # standard deviations from its centre at which a large splat may lie on a known surface
 FLOOR = 0.8  # where a depth is unknown, the fraction of the nearest sparse point's in the image that is free
 BALL = 0.5  # of that distance: the radius of a free ball around a camera, where the photographer stood
 AGREE = 0.03  # depths of the plane sweep count where a neighbour's differs by at most this fraction
@@ -96,6 +97,24 @@ class FreeSpaceMaps:
             _look(view, ends, reach, view.nearest, view.radius, silent, unused)
         return torch.where(against > support, against, (silent > support).to(against.dtype))
 
+    @torch.no_grad()
+    def showing(self, splats: Splats) -> Tensor:
+        """Return how many images show a surface of known depth on each splat, [N] int32.
+
+        A splat is sampled at its centre and at ``SAMPLES`` standard deviations along both axes. The centre of a large
+        splat may lie outside of all images.
+        """
+        axes = quats_to_matrices(splats.quats)[:, :, :2] * splats.scales[:, None, :]
+        offsets = [axes[:, :, axis] * (sign * step) for step in SAMPLES for axis in (0, 1) for sign in (-1, 1)]
+        count = torch.zeros(len(splats), dtype=torch.int32, device=splats.device)
+        for kept in self._views:
+            view = kept.to(self._device)
+            on_surface = _is_on_surface(view, splats.means)
+            for offset in offsets:
+                on_surface |= _is_on_surface(view, splats.means + offset)
+            count += on_surface
+        return count
+
     def _ends(self, splats: Splats) -> Tensor:
         """Places [P, N, 3] at which a splat is looked at: its centre, and its ends along both axes."""
         reach = SPREAD * splats.scales
@@ -150,9 +169,14 @@ def look_at_free_space_reference(
         z, inside, row, column = _seen(view, places)
         free |= inside & (z < limit[row, column])
     against += free
-    z, inside, row, column = _seen(view, ends[0])
+    support += _is_on_surface(view, ends[0])
+
+
+def _is_on_surface(view: FreeView, points: Tensor) -> Tensor:
+    """Return whether points [N, 3] lie on the surface that an image shows; False where no depth is known. Bool [N]."""
+    z, inside, row, column = _seen(view, points)
     known = view.known[row, column]
-    support += inside & torch.isfinite(known) & ((z - known).abs() <= (1 - NEARER) * known)
+    return inside & torch.isfinite(known) & ((z - known).abs() <= (1 - NEARER) * known)
 
 
 def _center(view: FreeView) -> Tensor:

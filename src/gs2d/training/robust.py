@@ -31,13 +31,14 @@ from gs2d.training.opaque import is_opaque
 from gs2d.training.parallel import ONE_PROCESS, OneProcess
 from gs2d.training.plane_sweep import SmallView, Sweep, start_points, sweep_views
 from gs2d.training.rows import keep_rows
-from gs2d.training.seen_area import mostly_unseen
+from gs2d.training.seen_area import largest_log_scales, mostly_unseen
 from gs2d.training.start_fit import fit_start
 from gs2d.training.state import TrainState
 from gs2d.training.trial import Witness, missed
 
 PARTS = 5  # of a stage: at the end of each, all splats are proposed and tried anew, also those that were missed before
 FEW_NEW = 0.002  # of the splats: fewer new proposals wait, because a trial costs as much as some 50 iterations
+SHOWN = 0.25  # of the images, and 3 at least, that show a surface where splats are kept small
 MAX_WITNESSES = 24  # images that a trial asks; of more images each trial asks others
 DECAY_EVERY, LEAST_OPACITY = 10, 0.005  # iterations; splats never decay below what is pruned or not drawn
 NEEDED, REMOVED = 1, 2  # verdicts; 0: not tried
@@ -144,6 +145,8 @@ class Robustness:
         """Remove the proposed splats that the training images do not miss, where that is due."""
         if not self.removes(stage, iteration):
             return []
+        if iteration < stage.iterations:  # what is left out is learned by others, which takes iterations
+            self._limit_scales(state)
         nobody = torch.zeros(state.splats.means.shape[0], dtype=torch.bool, device=state.splats.device)
         known = nobody if ends_part(self._recipe, stage, iteration) else state.groups.get(MISSED, nobody)
         verdict = self._processes.decide(
@@ -156,6 +159,27 @@ class Robustness:
             return []
         keep_rows(state, ~guilty)
         return [events.FloatersRemoved(stage.name, iteration, removed, len(state.splats))]
+
+    @torch.no_grad()
+    def _limit_scales(self, state: TrainState) -> None:
+        """Shrink large splats on surfaces of known depth, which are sheets and needles before the detail of a wall.
+
+        Elsewhere large splats stay: they are all that new views show where few images look.
+        """
+        cameras = [view.camera for view in self._learned.scene_now(state.learned).train]
+        most = largest_log_scales(state.splats, cameras)
+        large = (state.splats.log_scales > most).any(dim=1)
+        shrinks = self._processes.decide(self._are_shown, state.splats, large).bool()
+        scales = state.splats.log_scales
+        self._backend.assign(scales, torch.where(shrinks[:, None], torch.minimum(scales, most), scales))
+
+    def _are_shown(self, splats: Splats, large: Tensor) -> Tensor:
+        """Return which of the large splats lie on a surface that many images show, uint8 [N]."""
+        assert self._free is not None
+        result = torch.zeros(len(splats), dtype=torch.uint8, device=splats.device)
+        rows = large.nonzero().squeeze(1)
+        result[rows] = (self._free.showing(splats.rows(rows)) >= max(3, SHOWN * len(self._images))).byte()
+        return result
 
     def _tried(self, state: TrainState, stage: Stage, iteration: int, splats: Splats, spared: Tensor) -> Tensor:
         """Propose splats, but those that are spared, and try them: NEEDED, REMOVED or neither, uint8 [N]."""

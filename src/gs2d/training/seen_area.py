@@ -24,6 +24,7 @@ PLACES = 7
 LEAST = 0.05  # a splat stays where some image shows this fraction of its weight
 INSIDE = 0.6  # it stays as well where this fraction of it lies within the images, all together
 LARGE = 0.001  # of an image: smaller splats cannot hide much
+LARGEST = 0.12  # of an image: standard deviation of a splat on a surface that many images show; 0.25 hides half the relief
 SIDE = 200  # px, longer side of the images that are rendered
 
 
@@ -71,6 +72,17 @@ def inside_fraction(splats: Splats, cameras: Sequence[Camera]) -> Tensor:
         column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         inside |= (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     return inside.to(splats.dtype).mean(dim=1)
+
+
+@torch.no_grad()
+def largest_log_scales(splats: Splats, cameras: Sequence[Camera]) -> Tensor:
+    """Return the logarithm of the standard deviation [N, 1] above which a splat is too large for detail.
+
+    ``LARGEST`` of the narrower side of an image, at the distance of the nearest camera.
+    """
+    centers = torch.stack([torch.as_tensor(camera.center).to(splats.means) for camera in cameras])
+    angle = min(min(camera.width / camera.fx, camera.height / camera.fy) for camera in cameras)
+    return (LARGEST * angle * torch.cdist(splats.means, centers).amin(dim=1, keepdim=True)).log()
 
 
 def shrunk(camera: Camera, side: int) -> Camera:
