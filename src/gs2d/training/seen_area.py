@@ -24,7 +24,7 @@ PLACES = 7
 LEAST = 0.05  # a splat stays where some image shows this fraction of its weight
 INSIDE = 0.6  # it stays as well where this fraction of it lies within the images, all together
 LARGE = 0.001  # of an image: smaller splats cannot hide much
-LARGEST = 0.12  # of an image: standard deviation of a splat on a surface that many images show; 0.25 hides half the relief
+LARGEST = 0.12  # of an image: standard deviation of a splat on a known surface; 0.25 hides half of the relief
 SIDE = 200  # px, longer side of the images that are rendered
 
 
