@@ -103,7 +103,7 @@ def test_separate_pieces_and_photographs_without_a_place_are_named(
     out = tmp_path / "capture"
     assert poses(pieces, out) == 0
     text = capsys.readouterr()
-    assert "5 of 10 photographs have a place" in text.out
+    assert "5 of 10 photographs placed" in text.out
     assert "no camera: 010.jpg: in a separate piece (sparse/1)" in text.out
     assert "no camera: blank.jpg: 0 features: blurred, or nothing in it has texture" in text.out
     assert "sparse/1 holds a separate piece: 4 photographs" in text.out

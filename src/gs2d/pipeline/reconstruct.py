@@ -245,5 +245,5 @@ def _lines(poses: dict[str, Any], capture: Path) -> list[str]:
     return [
         f"{placed_line(poses)}; {capture / POSES_PNG} shows them",
         *(f"no camera: {row['source']}: {row['reason']}" for row in lost[:SHOWN_LOST]),
-        *([f"... and {more} more without a place, in {capture / POSES_JSON}"] if more > 0 else []),
+        *([f"... and {more} more without a camera, in {capture / POSES_JSON}"] if more > 0 else []),
     ]

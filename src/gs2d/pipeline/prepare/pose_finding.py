@@ -457,10 +457,11 @@ def _circle_of(model: SfmModel, number: int, request: Request) -> Circle | None:
 
 
 def placed_line(result: dict[str, Any]) -> str:
-    """How well it went, for people."""
+    """Summarize the reconstruction in one line."""
     return (
-        f"{result['placed']} of {result['count']} photographs have a place; {result['points']:,} points, each seen by "
-        f"{result['photos_per_point']:.1f} of them, {result['mean_error_px']:.2f} px off in the mean"
+        f"{result['placed']} of {result['count']} photographs placed; {result['points']:,} points, "
+        f"{result['photos_per_point']:.1f} photographs per point, "
+        f"mean reprojection error {result['mean_error_px']:.2f} px"
     )
 
 
@@ -478,8 +479,8 @@ def _pieces_line(result: dict[str, Any]) -> str:
         return ""
     rest = ", ".join(str(count) for count in others[:_PIECES]) + (" ..." if len(others) > _PIECES else "")
     return (
-        f"the photographs make {len(others) + 1} pieces that nothing joins, of {result['placed']}, {rest}: the largest "
-        f"is the capture ({SPARSE}/0); photographs between them would join them"
+        f"the photographs form {len(others) + 1} unconnected models of {result['placed']}, {rest} photographs: the "
+        f"largest is the capture ({SPARSE}/0); take photographs between them to connect them"
     )
 
 
@@ -488,21 +489,22 @@ def _doubts(result: dict[str, Any]) -> list[str]:
     doubts = []
     if result["placed"] < _DOUBTFUL_FRACTION * result["count"]:
         doubts.append(
-            f"only {result['placed']} of {result['count']} photographs have a place: look at {POSES_PNG}, and take "
-            "more between those that are missing and the others"
+            f"only {result['placed']} of {result['count']} photographs placed: look at {POSES_PNG}, and take "
+            "more between the missing photographs and the others"
         )
     if result["median_angle_degrees"] < _DOUBTFUL_ANGLE:
         doubts.append(
-            f"the photographs were taken from nearly one place ({result['median_angle_degrees']:.1f} degrees between "
-            "the rays to a point, 10 or more are good): depth is guesswork; step sideways between photographs"
+            f"the photographs were taken from nearly the same position ({result['median_angle_degrees']:.1f} degrees "
+            "between the rays to a point, 10 or more are good), so depths are unreliable: move sideways between "
+            "photographs"
         )
     if result["mean_error_px"] > _DOUBTFUL_ERROR:
         doubts.append(
-            f"points are {result['mean_error_px']:.2f} px from where they should be in the mean (expected below "
+            f"the mean reprojection error is {result['mean_error_px']:.2f} px (expected below "
             f"{_DOUBTFUL_ERROR}): try --cameras each, or --camera-model OPENCV_FISHEYE for a very wide lens"
         )
     if result["up"] is None:
-        doubts.append("the photographs do not agree on what is up: the axes are COLMAP's own")
+        doubts.append("the photographs do not agree on which way is up: the axes are COLMAP's")
     return doubts
 
 
