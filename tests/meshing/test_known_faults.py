@@ -51,7 +51,7 @@ def covered(mesh: Mesh, axis: int, side: float, cell: float = 0.2) -> float:
 @pytest.mark.parametrize("bounded", [True, False])
 def test_a_room_seen_from_inside_has_all_its_walls(bounded: bool) -> None:
     views = room_views()
-    mesh = (extract if bounded else extract_unbounded)(views, resolution=96, threads=1).mesh
+    mesh = (extract if bounded else extract_unbounded)(views, ExtractOptions(resolution=96), threads=1).mesh
     parts = {(axis, side): covered(mesh, axis, side) for axis in range(3) for side in (-1.0, 1.0)}
     assert min(parts.values()) > 0.8, parts
 

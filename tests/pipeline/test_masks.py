@@ -155,7 +155,7 @@ def test_a_run_remembers_its_masks(tmp_path: Path, capsys: pytest.CaptureFixture
     words += ["--set", "init_points=60", "--quiet", "--no-page", "--masks", str(tmp_path / "mine")]
     assert run([*words, "--masked", "empty"]) in (0, 3)  # 3: there is no surface yet
     data = json.loads((tmp_path / "run" / "run.json").read_text())
-    assert data["scene"]["masks"] == {"folder": str(tmp_path / "mine"), "masked": "empty"}
+    assert data["scene"]["masks"] == {"folder": str(tmp_path / "mine"), "masked": "empty", "found": 8}
     scene = reload_run(RunFolder(tmp_path / "run"), lambda _: None).scene
     assert scene.masks.found == 8
     assert scene.train[0].alpha() is not None

@@ -39,7 +39,9 @@ def test_the_background_changes_at_the_end_of_stages_that_train_opacity() -> Non
 
 def opacity_gradient(iterations: range, *, channels: int) -> float:
     """Of all opacities together, over iterations of which photograph, splats and background have one colour."""
-    scene, recipe, state = make_scene(), robust(dropout=0.0), full_state(20)
+    scene, state = make_scene(), full_state(20)
+    stage = replace(robust().stages[0], losses=(LossTerm("l2", 1.0),))
+    recipe = replace(robust(dropout=0.0), stages=(stage,))
     camera = scene.train[0].camera
     pixels = np.full((camera.height, camera.width, channels), 128, np.uint8)
     pixels[..., 3:] = 255
@@ -48,7 +50,6 @@ def opacity_gradient(iterations: range, *, channels: int) -> float:
     targets = Targets(scene.train, GREY, use_masks=False, with_silhouettes=True)
     backend = get_backend("reference")
     whole = FullRender(scene, recipe, replace(GENERIC, background=GREY), backend, targets)
-    stage = replace(recipe.stages[0], losses=(LossTerm("l2", 1.0),))
     found = [whole.evaluate(state, stage, iteration, 0).gradients["opacity_logits"] for iteration in iterations]
     return float(torch.stack(found).sum())
 

@@ -299,7 +299,8 @@ class FullRender:
             If one of them is not finite. On a GPU nothing is looked at here, because a look waits for the device; the
             trainer looks at losses and parameters together, before anything is reported or saved.
         """
-        target, at = self.targets[index], self._points(camera, self.targets[index])
+        target = self.targets[index]
+        at = self._points(camera, target)
         numbers = self.learned.leaves(state.learned, index, camera, output.color)
         if numbers:
             color = shown(output.color, numbers, at, clipped_pixels(target))

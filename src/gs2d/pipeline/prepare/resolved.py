@@ -63,7 +63,7 @@ class CaptureRecord:
             test=len(scene.test),
             extent=scene.extent,
             skipped=tuple(scene.skipped),
-            masks=Masks(None if folder is None else folder.resolve(), scene.masks.masked),
+            masks=replace(scene.masks, folder=None if folder is None else folder.resolve()),
             digest=digest,
         )
 
