@@ -111,7 +111,7 @@ class LearnedQuantity:
         return max(self.row_of) + 1
 
     def begin(self, given: Tensor | None = None) -> Tensor:
-        """Return the rows [G, *shape] that training starts from; ``given``: what another training has found."""
+        """Return the initial rows, a Tensor [G, ...] of this shape; ``given`` are rows of another training."""
         return torch.zeros(self.rows, *self.shape, dtype=torch.float64)
 
     def numbers(self, values: Tensor, index: int) -> Tensor:
