@@ -120,7 +120,8 @@ class DenseStart:
 class Removal:
     """Remove floaters: splats that something speaks against and that the training images do not miss.
 
-    Depth maps, sizes and colours only propose splats; the training images decide (``training/trial.py``).
+    Depth maps, sizes and colours only propose splats; the training images decide (``training/trial.py``). In the same
+    iterations, large splats on surfaces of known depth shrink (docs/notebook/floaters.md).
 
     Attributes
     ----------

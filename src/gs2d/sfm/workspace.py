@@ -1,7 +1,7 @@
 """Where a capture is made before it has its name: it appears as a whole or not at all.
 
 All work is done in the hidden folder ``.NAME.poses`` beside the capture: copies, COLMAP's database, models. What an
-interrupted or killed command leaves there is gone on with by the next one with the same ``--out`` (``search``), or
+interrupted or killed command leaves there is resumed by the next one with the same ``--out`` (``search``), or
 removed where nothing says of what it was made.
 """
 

@@ -142,7 +142,7 @@ class Robustness:
         return looks_at_free_space(self._recipe, stage, iteration) or ends_part(self._recipe, stage, iteration)
 
     def remove(self, state: TrainState, stage: Stage, iteration: int) -> list[events.Event]:
-        """Remove the proposed splats that the training images do not miss, where that is due."""
+        """Shrink splats that are too large for a known surface and remove floaters, where that is due."""
         if not self.removes(stage, iteration):
             return []
         if iteration < stage.iterations:  # what is left out is learned by others, which takes iterations

@@ -41,7 +41,7 @@ class Task(ABC):
     alone : bool
         Nothing runs beside it: it has all CPU threads.
     retries : int
-        Times that it is begun again by itself when its process dies; what it had saved is gone on with.
+        How often it restarts from its last checkpoint when its process dies.
     memory : float or None, GiB
         That it keeps to.
     gpu : bool

@@ -137,7 +137,7 @@ def scene_that_fits(
 
 
 def _begun_with(options: TrainOptions) -> int | None:
-    """Return the downscale of the run that is gone on with; None: there is none, or it was not written down."""
+    """Return the downscale of the run that is resumed; None if there is none or it was not recorded."""
     if not (options.resume and is_run(options.out)):
         return None
     begun = RunFolder(options.out).definition().get("downscale")
