@@ -30,7 +30,7 @@ from gs2d.training.initialize import initial_splats
 from gs2d.training.plane_sweep import start_points, sweep_views
 from gs2d.training.point_gains import point_gains
 from gs2d.training.robust import Robustness
-from gs2d.training.seen_area import mostly_unseen
+from gs2d.training.seen_area import LARGEST, largest_log_scales, mostly_unseen
 from gs2d.training.trainer import Trainer
 from gs2d.training.trial import Witness, missed
 from train_toys import full_state, make_scene, random_splats
@@ -215,6 +215,20 @@ def test_frozen_splats_stand_behind_what_is_tried(behind: bool) -> None:
     robust = Robustness(wall(), short(), RASTER, BACKEND, frozen=frozen)
     robust.remove(state, short().stages[0], 10)
     assert len(state.splats) == (15 if behind else 20)
+
+
+def test_the_largest_scale_is_a_fraction_of_the_image_at_the_nearest_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    cameras = cameras_of_the_wall()
+    splats = splat_at((0.5, 0, WALL), (0.2, 0.1, 2.0), (0.0, 0.0, 50.0))
+    distance = torch.stack([(splats.means - torch.as_tensor(c.center).float()).norm(dim=1) for c in cameras]).amin(
+        dim=0
+    )
+    angle = min(min(camera.width / camera.fx, camera.height / camera.fy) for camera in cameras)
+    expected = LARGEST * angle * distance
+    whole = largest_log_scales(splats, cameras)
+    torch.testing.assert_close(whole.exp().squeeze(1), expected)
+    monkeypatch.setattr("gs2d.training.seen_area.PAIRS", len(cameras))  # one splat at a time
+    assert torch.equal(largest_log_scales(splats, cameras), whole)
 
 
 def test_large_splats_shrink_where_images_show_a_surface_and_nowhere_else() -> None:

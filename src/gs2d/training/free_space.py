@@ -106,13 +106,13 @@ class FreeSpaceMaps:
         """
         axes = quats_to_matrices(splats.quats)[:, :, :2] * splats.scales[:, None, :]
         offsets = [axes[:, :, axis] * (sign * step) for step in SAMPLES for axis in (0, 1) for sign in (-1, 1)]
+        samples = torch.cat([splats.means, *(splats.means + offset for offset in offsets)])  # [P N, 3]
         count = torch.zeros(len(splats), dtype=torch.int32, device=splats.device)
         for kept in self._views:
             view = kept.to(self._device)
-            on_surface = _is_on_surface(view, splats.means)
-            for offset in offsets:
-                on_surface |= _is_on_surface(view, splats.means + offset)
-            count += on_surface
+            unused, support = torch.zeros((2, len(samples)), dtype=torch.int32, device=splats.device)
+            _look(view, samples[None], samples.new_zeros(len(samples)), view.limit, 0.0, unused, support)
+            count += (support.view(-1, len(splats)) > 0).any(dim=0)
         return count
 
     def _ends(self, splats: Splats) -> Tensor:
@@ -169,14 +169,9 @@ def look_at_free_space_reference(
         z, inside, row, column = _seen(view, places)
         free |= inside & (z < limit[row, column])
     against += free
-    support += _is_on_surface(view, ends[0])
-
-
-def _is_on_surface(view: FreeView, points: Tensor) -> Tensor:
-    """Return whether points [N, 3] lie on the surface that an image shows; False where no depth is known. Bool [N]."""
-    z, inside, row, column = _seen(view, points)
+    z, inside, row, column = _seen(view, ends[0])
     known = view.known[row, column]
-    return inside & torch.isfinite(known) & ((z - known).abs() <= (1 - NEARER) * known)
+    support += inside & torch.isfinite(known) & ((z - known).abs() <= (1 - NEARER) * known)
 
 
 def _center(view: FreeView) -> Tensor:

@@ -25,6 +25,7 @@ LEAST = 0.05  # a splat stays where some image shows this fraction of its weight
 INSIDE = 0.6  # it stays as well where this fraction of it lies within the images, all together
 LARGE = 0.001  # of an image: smaller splats cannot hide much
 LARGEST = 0.12  # of an image: standard deviation of a splat on a known surface; 0.25 hides half of the relief
+PAIRS = 1 << 24  # distances between splats and cameras that are in memory at a time, 64 MB
 SIDE = 200  # px, longer side of the images that are rendered
 
 
@@ -82,7 +83,12 @@ def largest_log_scales(splats: Splats, cameras: Sequence[Camera]) -> Tensor:
     """
     centers = torch.stack([torch.as_tensor(camera.center).to(splats.means) for camera in cameras])
     angle = min(min(camera.width / camera.fx, camera.height / camera.fy) for camera in cameras)
-    return (LARGEST * angle * torch.cdist(splats.means, centers).amin(dim=1, keepdim=True)).log()
+    # Differences, not matrix products: exact far from the origin, and the same bytes with any number of threads.
+    near = [
+        torch.cdist(part, centers, compute_mode="donot_use_mm_for_euclid_dist").amin(dim=1, keepdim=True)
+        for part in splats.means.split(max(1, PAIRS // len(cameras)))
+    ]
+    return (LARGEST * angle * torch.cat(near)).log()
 
 
 def shrunk(camera: Camera, side: int) -> Camera:
