@@ -126,6 +126,7 @@ def test_images_that_show_a_surface_on_a_splat_are_counted_for_its_ends_too(maps
     splats.log_scales[3, 1] = np.log(60.0)  # from outside of all images down to the middle of the wall
     images = len(wall().train)
     assert maps.showing(splats).tolist() == [images, 0, 0, images]
+    assert maps.showing(splats.rows(torch.tensor([], dtype=torch.int64))).tolist() == []
 
 
 # -- the trial ------------------------------------------------------------------------------------------------------

@@ -112,7 +112,7 @@ class FreeSpaceMaps:
             view = kept.to(self._device)
             unused, support = torch.zeros((2, len(samples)), dtype=torch.int32, device=splats.device)
             _look(view, samples[None], samples.new_zeros(len(samples)), view.limit, 0.0, unused, support)
-            count += (support.view(-1, len(splats)) > 0).any(dim=0)
+            count += (support.view(1 + len(offsets), len(splats)) > 0).any(dim=0)
         return count
 
     def _ends(self, splats: Splats) -> Tensor:
