@@ -28,11 +28,11 @@ import numpy as np
 import torch
 from PIL import Image
 
-from gs2d.config.partition import make_partition
 from gs2d.contrib.lab.blocks import blocks
 from gs2d.contrib.lab.cells import Cells
 from gs2d.contrib.lab.merged import MERGED
 from gs2d.contrib.lab.options import BlocksOptions
+from gs2d.contrib.lab.partition import make_partition
 from gs2d.contrib.lab.split import read_split
 from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh

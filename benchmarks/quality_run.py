@@ -189,8 +189,8 @@ def score_splats(job: LoadedRun, splats: Splats, learned: Scene | None = None) -
 
 def surface(job: LoadedRun, state: TrainState, spec: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Return how good the mesh is and the seconds that making it took, where there is a true surface."""
-    from gs2d.config.surface_protocols import VISIBLE_SURFACE
     from gs2d.evaluation.evaluators import VISIBLE, choose_truth, score_surface
+    from gs2d.evaluation.visible_surface import VISIBLE_SURFACE
     from gs2d.pipeline.in_memory import Trained, extract_mesh
 
     given = None if spec["ground_truth"] is None else Path(spec["ground_truth"])

@@ -53,7 +53,7 @@ INSIDE = {
     "data": {
         "archive": 12,
         "load subject": 11,
-        "benchmarks prepare prepare_worker": 10,
+        "known_captures prepare prepare_worker": 10,
         "prepared": 9,
         "readers": 8,
         "build": 7,

@@ -11,14 +11,16 @@ from pathlib import Path
 
 import gs2d
 from gs2d.cli.registry import COMMANDS
+from gs2d.config.protocols import PROTOCOLS
 from gs2d.config.registry import Registry, contrib_entries
+from gs2d.data.known_captures import DATA_SETS
 from gs2d.data.readers.registry import READERS
 from gs2d.evaluation.evaluators import EVALUATORS
 from gs2d.io.formats.registry import LAYOUTS, SPLAT_READERS
 from tiny import write_capture
 
 SOURCE = Path(gs2d.__file__).parent
-REGISTRIES: tuple[Registry, ...] = (COMMANDS, READERS, EVALUATORS, LAYOUTS, SPLAT_READERS)
+REGISTRIES: tuple[Registry, ...] = (COMMANDS, PROTOCOLS, DATA_SETS, READERS, EVALUATORS, LAYOUTS, SPLAT_READERS)
 
 
 def test_every_entry_point_registers_its_name() -> None:

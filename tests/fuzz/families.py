@@ -82,8 +82,8 @@ def written(*writers: Callable[[Path], object]) -> Callable[[], list[Files]]:
 # -- captures ----------------------------------------------------------------------------------------------------------
 def read_capture(root: Path) -> None:
     """As `gs2d train` does before it trains: the scene, one view with all that belongs to it, the points it shows."""
+    from gs2d.contrib.lab.dataset_folders import missing_lines
     from gs2d.data import load_scene
-    from gs2d.data.benchmarks import missing_lines
 
     missing_lines(root)
     scene = load_scene(root)

@@ -37,7 +37,7 @@ def test_training_writes_the_subject_and_only_the_generic_protocol_meshes_it(und
     job, splats = reload_run(undisturbed, lambda _: None), finished_splats(undisturbed)
     assert job.protocol.name == "nerf-synthetic"
     assert meshed_subject(undisturbed, job, splats, MeshOptions(), lambda _: None) is None
-    assert [name for name, protocol in PROTOCOLS.items() if protocol.fusion.subject] == ["generic"]
+    assert [name for name, protocol in PROTOCOLS.working() if protocol.fusion.subject] == ["generic"]
 
 
 def test_a_box_of_the_user_becomes_the_subject_and_limits_the_mesh(undisturbed: RunFolder, tmp_path: Path) -> None:

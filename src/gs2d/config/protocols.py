@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from gs2d.config.recipe import LossTerm
+from gs2d.config.registry import Registry
 from gs2d.errors import ProtocolError, RecipeError
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
@@ -155,23 +156,6 @@ DTU = Protocol(
     fusion=FusionLimits(voxel=0.004, truncation=0.016, depth_limit=3.0, clusters=1),  # [s]
     metrics=MetricConventions(surface="chamfer"),  # [r]
 )
-TNT = Protocol(
-    "tnt",  # Barn, Caterpillar, Ignatius, Truck
-    depth="median",  # [s] depth_ratio 1
-    loss_weights={"distortion": 100.0},  # [s] printed (not executed); [r] Table 1 "100"
-    near=0.2,  # [c]
-    near_plane_policy="box",  # [c] forward.cu, compute_aabb
-    downscale=2,  # [s] -r 2, [r]
-    test_every=8,  # [c] --eval; [r] its PSNR is of novel views
-    use_mask_in_training=False,  # [c]
-    fusion=FusionLimits(voxel=0.004, truncation=0.016, depth_limit=3.0, clusters=1),  # [s]
-)
-TNT_LARGE = replace(
-    TNT,
-    name="tnt-large",  # Meetingroom, Courthouse
-    loss_weights={"distortion": 10.0},  # [s] printed (not executed); [r] Table 1 "10"
-    fusion=FusionLimits(voxel=0.006, truncation=0.024, depth_limit=4.5, clusters=1),  # [s]
-)
 NERF_SYNTHETIC = Protocol(
     "nerf-synthetic",
     depth="mean",  # [s] depth_ratio stays 0
@@ -184,16 +168,6 @@ NERF_SYNTHETIC = Protocol(
     # [d] no script meshes this set: limits from the scene; some objects come in pieces; median is nearer the truth
     fusion=FusionLimits(depth="median"),
 )
-MIP_NERF_360 = Protocol(
-    "mip-nerf-360",
-    depth="mean",  # [s] depth_ratio stays 0
-    loss_weights={"distortion": 100.0},  # [2dgs] unbounded scenes; the script uses none
-    near=0.2,  # [c]
-    near_plane_policy="box",  # [c]
-    downscale=4,  # [s] images_4 outdoors (images_2 indoors)
-    test_every=8,  # [c] --eval
-    use_mask_in_training=False,  # [c]
-)
 GENERIC = Protocol(
     "generic",
     depth="mean",  # [d] as 2DGS advises for scenes that are not object-centred
@@ -204,13 +178,15 @@ GENERIC = Protocol(
     robust=True,  # [d] photographs of the street: few, unevenly spread, on automatic
 )
 
-PROTOCOLS: Mapping[str, Protocol] = MappingProxyType(
-    {p.name: p for p in (DTU, TNT, TNT_LARGE, NERF_SYNTHETIC, MIP_NERF_360, GENERIC)}
+PROTOCOLS: Registry[Protocol] = Registry(
+    "protocol",
+    "gs2d.protocols",
+    builtin=dict.fromkeys((DTU.name, NERF_SYNTHETIC.name, GENERIC.name), __name__),
+    error=ProtocolError,
 )
-_BY_FORMAT = MappingProxyType(
-    {"blender": NERF_SYNTHETIC, "dtu": DTU}
-    | dict.fromkeys(("colmap", "nerfstudio", "opensfm", "metashape", "alicevision"), GENERIC)
-)
+for _protocol in (DTU, NERF_SYNTHETIC, GENERIC):
+    PROTOCOLS.register(_protocol.name, module=__name__)(_protocol)
+_BY_FORMAT = MappingProxyType({"blender": NERF_SYNTHETIC, "dtu": DTU})
 
 
 def get_protocol(name: str) -> Protocol:
@@ -219,13 +195,13 @@ def get_protocol(name: str) -> Protocol:
     Raises
     ------
     ProtocolError
-        Unknown name; says which exist.
+        If there is no protocol of this name; lists the names.
     """
     if name not in PROTOCOLS:
-        raise ProtocolError(f"no protocol {name!r}; there is auto, {', '.join(PROTOCOLS)}")
+        raise ProtocolError(PROTOCOLS.unknown(name, also=("auto",)))
     return PROTOCOLS[name]
 
 
 def protocol_for(scene_format: str) -> Protocol:
-    """Return the protocol of ``--protocol auto`` for ``Scene.format``: the generic one for a reader from elsewhere."""
+    """Return the default protocol of a capture format (``Scene.format``)."""
     return _BY_FORMAT.get(scene_format, GENERIC)

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from gs2d.core.memory_limit import cache_bytes as room_for_cache
 from gs2d.core.missing import instead, where_it_ends
-from gs2d.data.benchmarks import missing_lines
 from gs2d.data.build import Capture, build_scene
 from gs2d.data.file_names import IMAGES, in_any_case
+from gs2d.data.known_captures import missing_lines
 from gs2d.data.masks import Masks, without_masks
 from gs2d.data.readers.colmap import MODEL_FOLDERS, model_folder, read_colmap
 from gs2d.data.readers.dtu import CAMERA_FILES, camera_archives, read_dtu

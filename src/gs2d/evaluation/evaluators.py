@@ -11,13 +11,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from gs2d.config.registry import Register, Registry
-from gs2d.config.surface_protocols import VISIBLE_SURFACE
 from gs2d.core.mesh import Mesh
 from gs2d.data.arrays import read_npy
-from gs2d.data.benchmarks import MESH_TRUTHS
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
 from gs2d.evaluation.surface import SurfaceScore, evaluate_surface, write_clouds
+from gs2d.evaluation.visible_surface import VISIBLE_SURFACE
 from gs2d.io.meshes import FOREIGN, read_mesh, read_points
 from gs2d.io.run_dir import make_folder
 from gs2d.io.splat_ply import ply_kind
@@ -25,6 +24,7 @@ from gs2d.io.splat_ply import ply_kind
 Tell = Callable[[str], None]
 
 APART = 0.05  # of the truth's diagonal: farther, and it is hardly the same surface in the same frame
+MESH_TRUTHS = ("mesh_gt.ply", "mesh_gt.obj", "points_gt.ply")  # beside a capture's photographs
 VISIBLE = "visible-surface"  # the evaluator of captures that no other one knows
 SEEN_SUFFIX = "_seen.npy"  # beside FILE.ply: FILE_seen.npy, how many views see each face
 

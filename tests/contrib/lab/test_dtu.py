@@ -10,7 +10,7 @@ import pytest
 from scipy.io import savemat
 from scipy.spatial import cKDTree
 
-from gs2d.config.surface_protocols import DTU_SURFACE
+from gs2d.contrib.lab.dataset_folders import dtu_truth_files
 from gs2d.contrib.lab.evaluate_dtu import (
     DtuTruth,
     Silhouette,
@@ -19,9 +19,9 @@ from gs2d.contrib.lab.evaluate_dtu import (
     read_dtu_truth,
     thin,
 )
+from gs2d.contrib.lab.surface_protocols import DTU_SURFACE
 from gs2d.core.camera import look_at
 from gs2d.core.mesh import Mesh
-from gs2d.data.benchmarks import dtu_truth_files
 from gs2d.errors import DataError
 from gs2d.io.ply_format import write_ply
 from oracle_scenes import grid_mesh, similarity

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from gs2d.config.partition import Partition
 from gs2d.config.presets import get_recipe
 from gs2d.config.protocols import GENERIC
 from gs2d.contrib.lab import settle as module
+from gs2d.contrib.lab.partition import Partition
 from gs2d.contrib.lab.settle import Settled, capture_digest, fitting_partition
 from gs2d.errors import DataError
 from gs2d.pipeline.events import Event

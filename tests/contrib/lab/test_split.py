@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gs2d.config.partition import Partition
 from gs2d.config.presets import get_recipe
 from gs2d.config.recipe import Exposure
+from gs2d.contrib.lab.partition import Partition
 from gs2d.contrib.lab.settle import block_recipe, budget_of, with_budget
 from gs2d.contrib.lab.split import Block, Split, choose_views, merge, read_split, split_model, start_file
 from gs2d.core.splats import Splats

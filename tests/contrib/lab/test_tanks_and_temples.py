@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gs2d.config.surface_protocols import TNT_SURFACE
 from gs2d.contrib.lab.evaluate_tnt import CropVolume, TntScore, TntTruth, box, evaluate_tnt, f_score
+from gs2d.contrib.lab.surface_protocols import TNT_SURFACE
 from gs2d.core.mesh import Mesh
 from oracle_scenes import TAU, TntScene, grid_mesh, moved, similarity, tnt_scene
 

@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gs2d.config.partition import Partition, from_json, make_partition
 from gs2d.config.protocols import Protocol
 from gs2d.config.serialize import decode
 from gs2d.config.serialize import from_json as recipe_from_json
 from gs2d.contrib.lab.execute import execute
 from gs2d.contrib.lab.merged import MERGED, SEAM_VIEWS, finish_merged, read_seam_views, write_merged, write_result
 from gs2d.contrib.lab.options import BlocksOptions
+from gs2d.contrib.lab.partition import Partition, from_json, make_partition
 from gs2d.contrib.lab.settle import (
     Settled,
     block_folder,

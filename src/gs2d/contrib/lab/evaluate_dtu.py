@@ -21,7 +21,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from gs2d.config.surface_protocols import DTU_SURFACE, DtuSurface
+from gs2d.contrib.lab.surface_protocols import DTU_SURFACE, DtuSurface
 from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
 from gs2d.core.similarity import apply, similarity_scale
@@ -71,7 +71,7 @@ class DtuTruth:
 
 
 def read_dtu_truth(scan: int, files: Mapping[str, Path]) -> DtuTruth:
-    """Read the ground truth of a scan from its three ``files`` (keys as ``data.benchmarks.dtu_truth_files``).
+    """Read the ground truth of a scan from its three ``files`` (keys as ``dtu_truth_files``).
 
     Raises
     ------

@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gs2d.config.surface_protocols import TNT_SURFACE, IcpStage, TntSurface
 from gs2d.contrib.lab.alignment import IcpResult, icp, uniform_downsample, voxel_downsample
+from gs2d.contrib.lab.surface_protocols import TNT_SURFACE, IcpStage, TntSurface
 from gs2d.core.checks import check_shapes
 from gs2d.core.images import natural_key
 from gs2d.core.json_files import read_json
@@ -132,7 +132,7 @@ class TntTruth:
 
 
 def read_tnt_truth(scene: str, files: Mapping[str, Path]) -> TntTruth:
-    """Read the ground truth of a scene from its four ``files`` (keys as ``data.benchmarks.tnt_truth_files``).
+    """Read the ground truth of a scene from its four ``files`` (keys as ``tnt_truth_files``).
 
     Raises
     ------

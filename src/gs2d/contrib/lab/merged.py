@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 
-from gs2d.config.partition import Partition
-from gs2d.config.partition import to_json as partition_json
+from gs2d.contrib.lab.partition import Partition
+from gs2d.contrib.lab.partition import to_json as partition_json
 from gs2d.contrib.lab.settle import Settled, block_folder, coarse_folder, partition_folder, seam_folder
 from gs2d.contrib.lab.split import SEAMS, merge, read_split, split_seams, start_file
 from gs2d.core.json_files import read_json, write_json

@@ -6,11 +6,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gs2d.config.datasets import DATASETS, DataSet, SceneFacts
 from gs2d.config.protocols import Protocol, get_protocol
+from gs2d.contrib.lab.dataset_folders import (
+    DEPTH,
+    MESH_TRUTHS,
+    find_truth,
+    missing_lines,
+    protocol_of,
+    recognise,
+    subfolders,
+)
+from gs2d.contrib.lab.datasets import DATASETS, DataSet, SceneFacts
 from gs2d.contrib.lab.tables import DTU, NERF_SYNTHETIC, TNT
 from gs2d.data import detect_format
-from gs2d.data.benchmarks import DEPTH, MESH_TRUTHS, find_truth, missing_lines, protocol_of, recognise, subfolders
 from gs2d.errors import DataError
 
 PAPER_NAMES = {"dtu": DTU, "tnt": TNT, "nerf-synthetic": NERF_SYNTHETIC, "mip-nerf-360": "Mip-NeRF 360"}

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from gs2d.config.densify import Densify
-from gs2d.config.partition import Partition, grid_for
-from gs2d.config.partition import to_json as partition_json
 from gs2d.config.protocols import Protocol
 from gs2d.config.recipe import ALL, GradDensify, Recipe, validate
 from gs2d.config.schedule import longer_steps, scale_schedule
 from gs2d.config.serialize import to_json
 from gs2d.contrib.lab.cells import spread_of
+from gs2d.contrib.lab.partition import Partition, grid_for
+from gs2d.contrib.lab.partition import to_json as partition_json
 from gs2d.contrib.lab.split import Block
 from gs2d.core.memory_limit import memory_budget
 from gs2d.core.missing import instead

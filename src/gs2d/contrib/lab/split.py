@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from gs2d.config.partition import Partition
 from gs2d.contrib.lab.cells import Cells, cut, spread_of
+from gs2d.contrib.lab.partition import Partition
 from gs2d.core.json_files import read_json, write_json
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import camera_extent

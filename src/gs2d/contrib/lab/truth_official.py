@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.config.datasets import SceneFacts
-from gs2d.config.surface_protocols import DTU_SURFACE, TNT_SURFACE
+from gs2d.contrib.lab.dataset_folders import find_truth, published_log, recognise
+from gs2d.contrib.lab.datasets import SceneFacts
 from gs2d.contrib.lab.evaluate_dtu import Silhouette, evaluate_dtu, read_dtu_truth
 from gs2d.contrib.lab.evaluate_tnt import Alignment, evaluate_tnt, read_tnt_truth, read_trajectory
+from gs2d.contrib.lab.surface_protocols import DTU_SURFACE, TNT_SURFACE
 from gs2d.core.mesh import Mesh
-from gs2d.data.benchmarks import find_truth, published_log, recognise
 from gs2d.data.image_files import read_mask
 from gs2d.data.readers.dtu import dtu_silhouettes
 from gs2d.data.scene import Scene
@@ -32,7 +32,7 @@ class OfficialTruth:
     ----------
     facts : SceneFacts
     files : mapping of str to Path
-        Keys as ``gs2d.data.benchmarks`` names them.
+        Keys as ``gs2d.contrib.lab.dataset_folders`` names them.
     """
 
     facts: SceneFacts

@@ -18,7 +18,7 @@ from gs2d.config.recipe import Recipe, validate
 from gs2d.core.splats import Splats
 from gs2d.core.text import name_bytes
 from gs2d.data import Scene, View
-from gs2d.data.benchmarks import missing_lines
+from gs2d.data.known_captures import missing_lines
 from gs2d.data.masks import EMPTY
 from gs2d.errors import DataError, RunError
 from gs2d.io import splat_ply

@@ -10,7 +10,7 @@ import torch
 
 from gs2d.config.protocols import Protocol, get_protocol, protocol_for
 from gs2d.data import Scene, detect_format, load_scene
-from gs2d.data.benchmarks import protocol_of
+from gs2d.data.known_captures import protocol_of
 from gs2d.data.load import reader_of
 from gs2d.data.masks import EMPTY, Masks
 from gs2d.data.scene import PointCloud, View

@@ -12,9 +12,9 @@ import pytest
 from scipy.io import savemat
 
 from capture_writers import ColmapModel, small_blender, small_colmap, small_dtu, write_image_of
-from gs2d.config.datasets import get_dataset
+from gs2d.contrib.lab.dataset_folders import describe, find_scenes, missing_lines, protocol_of, recognise
+from gs2d.contrib.lab.datasets import get_dataset
 from gs2d.data import detect_format, load_scene
-from gs2d.data.benchmarks import describe, find_scenes, missing_lines, protocol_of, recognise
 
 
 def write_dtu_2dgs(data: Path) -> Path:

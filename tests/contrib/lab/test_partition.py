@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gs2d.config.partition import (
+from gs2d.contrib.lab.partition import (
     CoarseModel,
     Partition,
     from_json,

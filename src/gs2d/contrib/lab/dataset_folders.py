@@ -13,7 +13,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from gs2d.config.datasets import (
+from gs2d.config.protocols import Protocol, get_protocol, protocol_for
+from gs2d.contrib.lab.datasets import (
     DATASETS,
     DTU_SCENES,
     MIP_NERF_360_SCENES,
@@ -23,12 +24,13 @@ from gs2d.config.datasets import (
     SceneFacts,
     get_dataset,
 )
-from gs2d.config.protocols import Protocol, get_protocol, protocol_for
 from gs2d.core.images import is_number
 from gs2d.core.json_files import read_json
+from gs2d.data.known_captures import DATA_SETS
 from gs2d.data.readers.colmap import read_images
 from gs2d.data.readers.dtu import CAMERA_FILES
 from gs2d.errors import DataError
+from gs2d.evaluation.evaluators import MESH_TRUTHS
 
 # -- what may be missing -----------------------------------------------------------------------------------------------
 TRAINING, TESTING, NOTHING = "for training", "for testing", "distributed, but not read by gs2d"
@@ -162,7 +164,6 @@ def blender_pieces(root: Path, source: str) -> list[MissingFile]:
 
 # -- the data sets -----------------------------------------------------------------------------------------------------
 DEPTH = 3  # folders below the data folder in which scenes are looked for (TNT_GOF/TrainingSet/Barn)
-MESH_TRUTHS = ("mesh_gt.ply", "mesh_gt.obj", "points_gt.ply")  # beside a capture's photographs
 SCORING = "to score the surface"
 _BY_NAME = ("tnt", "mip-nerf-360")  # COLMAP models as anyone's: only the names tell them
 
@@ -358,17 +359,25 @@ def find_truth(
 
 
 def protocol_of(root: Path, scene_format: str, truth: Path | None = None) -> Protocol:
-    """Return what ``--protocol auto`` takes: the scene's of a known data set, else that of the format of the capture.
+    """Return the protocol of a capture: that of its scene in a known data set, else that of its format."""
+    name = known_protocol(root, scene_format, truth)
+    return protocol_for(scene_format) if name is None else get_protocol(name)
 
-    Raises
-    ------
-    ProtocolError
-        Unknown format.
-    """
-    valid = recognise(root, truth)
-    if valid is None or (valid[0].name in _BY_NAME) != (scene_format == "colmap"):
-        return protocol_for(scene_format)
-    return get_protocol(valid[1].protocol)
+
+def known_protocol(root: Path, scene_format: str, truth: Path | None = None) -> str | None:
+    """Return the name of the protocol of a scene of a known data set; None for other captures."""
+    known = recognise(root, truth)
+    if known is None or (known[0].name in _BY_NAME) != (scene_format == "colmap"):
+        return None
+    return known[1].protocol
+
+
+@DATA_SETS.register("paper")
+class PaperCaptures:
+    """The four data sets of the paper, for ``gs2d train`` and ``gs2d info``."""
+
+    protocol = staticmethod(known_protocol)
+    missing = staticmethod(missing_lines)
 
 
 def dtu_truth_files(scan: int) -> dict[str, str]:
