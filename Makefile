@@ -58,7 +58,6 @@ lint: $(VENV)/installed
 
 types: $(VENV)/installed
 	$(PY) -m mypy
-	$(PY) -m mypy --config-file tests/mypy.ini tests benchmarks
 
 install: $(VENV)/installed
 

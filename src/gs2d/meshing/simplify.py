@@ -44,7 +44,7 @@ def collapse(points: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.ndar
     ModuleNotFoundError
         The package fast_simplification is missing.
     """
-    import fast_simplification  # type: ignore[import-untyped]  # here: it is slow to import
+    import fast_simplification  # here: it is slow to import
 
     points, faces = np.ascontiguousarray(points, np.float32), np.ascontiguousarray(faces, np.int32)
     if len(faces) >= OWN_PROCESS_FACES and (found := _elsewhere(points, faces, count)) is not None:
