@@ -2,11 +2,10 @@
 
 ::
 
-    python -m benchmarks.channels [--splats 20000] [--size 400] [--repeats 10]
+    python -m benchmarks.channels [--splats 20000] [--size 400] [--repeats 10] [--backend cpu]
 
-Forward and backward of one view of the synthetic room on one thread of the cpu backend. Each way is timed beside
-``gs2d.rasterize`` of three plain channels in the same round, and the median of the rounds' ratios is printed, with
-their quartiles.
+Forward and backward passes of one view of the synthetic room on one thread. Each variant is timed next to
+``gs2d.rasterize`` with three plain channels in the same round. Prints the median ratio of all rounds and its quartiles.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ Row = tuple[str, float, float, float]
 """What was timed; median, first and third quartile of its time over that of three channels of one view."""
 
 
-def ways(splats: Splats, size: int) -> dict[str, Callable[[], object]]:
+def ways(splats: Splats, size: int, backend: str) -> dict[str, Callable[[], object]]:
     """Forward and backward passes by name; the first is what the others are compared with."""
     view = camera(size)
     generator = torch.Generator().manual_seed(0)
@@ -43,14 +42,14 @@ def ways(splats: Splats, size: int) -> dict[str, Callable[[], object]]:
     def one_view() -> None:
         parts = {name: tensor.detach().requires_grad_() for name, tensor in splats.items()}
         parts |= {"sh0": colors[:, None, :3].clone().requires_grad_(), "shN": splats.shN[:, :0].detach()}
-        rasterize(Splats(**parts), view, RasterSettings(sh_degree=PLAIN_COLORS), backend="cpu").color.sum().backward()
+        rasterize(Splats(**parts), view, RasterSettings(sh_degree=PLAIN_COLORS), backend=backend).color.sum().backward()
 
     def leaves(channels: int, cameras: bool) -> list[Tensor]:
         tensors = [tensor.detach().requires_grad_() for tensor in (*given, colors[:, :channels].clone())]
         return [*tensors, *(tensor.detach().requires_grad_(cameras) for tensor in (pose, K))]
 
     def loss(*tensors: Tensor) -> Tensor:
-        return rasterize_2dgs(*tensors, width=size, height=size, backend="cpu").colors.sum()  # type: ignore[misc]
+        return rasterize_2dgs(*tensors, width=size, height=size, backend=backend).colors.sum()  # type: ignore[misc]
 
     def plain(channels: int, cameras: bool) -> None:
         loss(*leaves(channels, cameras)).backward()
@@ -64,11 +63,11 @@ def ways(splats: Splats, size: int) -> dict[str, Callable[[], object]]:
     }
 
 
-def measure(splats: int, size: int, repeats: int) -> list[Row]:
+def measure(splats: int, size: int, repeats: int, backend: str = "cpu") -> list[Row]:
     """Ratios of CPU time, a row for each way."""
     torch.set_num_threads(1)
     torch._dynamo.reset()
-    found = ways(room(splats), size)
+    found = ways(room(splats), size, backend)
     for work in found.values():
         work()
     seconds: dict[str, list[float]] = {name: [] for name in found}
@@ -87,8 +86,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--splats", type=int, default=20_000)
     parser.add_argument("--size", type=int, default=400, help="px, of both sides")
     parser.add_argument("--repeats", type=int, default=10)
+    parser.add_argument("--backend", default="cpu", help="cpu or reference")
     options = parser.parse_args(arguments)
-    for name, median, low, high in measure(options.splats, options.size, options.repeats):
+    for name, median, low, high in measure(options.splats, options.size, options.repeats, options.backend):
         print(f"{name:34} {median:6.2f}  ({low:.2f} to {high:.2f})")
 
 

@@ -57,15 +57,18 @@ def rendering(emulator: Emulator, case: Case) -> dict[str, Tensor]:
         render(f"colours {sure}", ("sh0", "shN"), choices=choices, gradient_rows=rows)
     numbers = torch.randn(len(case.splats), 9, generator=_numbers())
     for columns in (2, 4):
-        for distortion in (False, True):
+        for distortion, sure in ((False, False), (True, False), (True, True)):
             values, probe = numbers.clone().requires_grad_(), torch.zeros(len(numbers), columns, requires_grad=True)
             settings = replace(SETTINGS, sh_degree=PLAIN_COLORS)
             further = Features(values, numbers[0])
-            output = cuda.rasterize_with(emulator, case.splats, case.camera, settings, probe, features=further)
+            choices = cuda.CudaChoices(deterministic=sure)
+            output = cuda.rasterize_with(
+                emulator, case.splats, case.camera, settings, probe, features=further, choices=choices
+            )
             (output.color.square().sum() + (output.distortion.sum() if distortion else 0.0)).backward()
             assert values.grad is not None
             assert probe.grad is not None
-            name = f"channels {columns} {distortion}"
+            name = f"channels {columns} {distortion} {sure}"
             found |= {f"{name}.values": values.grad, f"{name}.probe": probe.grad}
     render("by transmittance", every, SETTINGS.for_depths("transmittance"))
     image, mask = torch.rand(45, 70, 3, generator=_numbers()), torch.rand(45, 70, generator=_numbers()) > 0.3

@@ -476,9 +476,7 @@ class CudaBackend(Backend):
         features: Features,
         screen_probe: Tensor | None = None,
     ) -> RenderOutput:
-        """Render one view with further channels; deterministic gradients only three at a time."""
-        if torch.are_deterministic_algorithms_enabled():
-            return super().rasterize_features(splats, camera, settings, features, screen_probe)
+        """Render one view with further channels."""
         return cuda.rasterize(splats, camera, settings, screen_probe, budget=self._budget, features=features)
 
     def splat_errors(

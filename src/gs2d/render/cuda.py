@@ -60,8 +60,8 @@ class CudaChoices:
     exact_masks : bool
         False turns off culling inside tiles; the image must not change by a bit (tests).
     deterministic : bool or None
-        The same gradients bit for bit from run to run, for 320 bytes a pair of splat and tile and one more pass.
-        None: as torch.use_deterministic_algorithms says.
+        The same gradients bit for bit from run to run. Costs one more pass and 320 bytes for each pair of splat and
+        tile, and 16 more bytes for each further channel. None: as torch.use_deterministic_algorithms says.
     budget : PairBudget or None
         Instead of waiting for the number of pairs of splat and tile; the caller looks whether it was enough.
     """
@@ -200,7 +200,7 @@ def rasterize_with(
     gradient_rows : Tensor [N] bool, optional
         Gradients are wanted of these splats only; all others get zeros.
     features : Features, optional
-        Further channels; without ``gradient_rows``, deterministic gradients and depth by transmittance.
+        Further channels; without ``gradient_rows`` and depth by transmittance.
     choices : CudaChoices
 
     Raises

@@ -313,8 +313,8 @@ def backward(
     """Fill the gradient tensors in ``wanted``.
 
     ``features`` are the values [N, F], background [F] and images [F, H, W] of further channels, the gradients of these
-    images, and zeros [N, F] for those of the values; then ``wanted`` is not deterministic, for all splats and without
-    depth by transmittance.
+    images, and zeros [N, F] for the gradients of the values. They exclude ``wanted.learns`` and a gradient of the depth
+    by transmittance.
     """
     if len(parameters[0]) == 0:
         return
@@ -326,6 +326,10 @@ def backward(
         return
     probe = wanted.parameters["probe"]
     sums = _Sums(frame, wanted.deterministic, columns=0 if only_colors else 16)
+    further = None
+    if features is not None:
+        *given, to_values = features
+        further = _features(*given, sums.of_features(to_values))
     blended = blend_gradients(
         len(frame.tiles),
         frame.lists,
@@ -333,7 +337,7 @@ def backward(
         upstream,
         {"gradients": sums.gradients, "extras": sums.extras, "slots": sums.slots, "learns": wanted.learns},
         absolute=probe is not None and probe.shape[1] == 4,
-        features=None if features is None else _features(*features),
+        features=further,
     )
     _run(launcher, frame.view, blended)
     gradients, extras = sums.of_splats(launcher)
@@ -357,6 +361,15 @@ class _Sums:
         both = torch.zeros(rows * (columns + 4), dtype=torch.float32, device=frame.records.device)
         self.extras = both[rows * columns :].view(rows, 4)
         self.gradients = both[: rows * columns].view(rows, columns) if columns else None
+        self._features: tuple[Tensor, Tensor] | None = None  # slots [4 M, F] and the sums [N, F]
+
+    def of_features(self, gradients: Tensor) -> Tensor:
+        """Return the tensor to which the blending adds the gradients of features, whose sums are ``gradients``."""
+        if self.slots is None:
+            return gradients
+        slots = gradients.new_zeros(4 * len(self.slots), gradients.shape[1])
+        self._features = slots, gradients
+        return slots
 
     def of_splats(self, launcher: Launcher) -> tuple[Tensor | None, Tensor]:
         """[N, columns] and [N, 4]."""
@@ -368,6 +381,9 @@ class _Sums:
         given = {"order": self.frame.order, "ends": self.frame.ends, "gradients": gradients, "extras": extras}
         arguments = SlotArguments(count=count, candidates=len(self.slots))
         slots = {"slots": self.gradients, "extra_slots": self.extras}
+        if self._features is not None:
+            slots["feature_slots"], given["features"] = self._features
+            arguments.channels = self._features[1].shape[1]
         _run(launcher, self.frame.view, work_of("sum_slots", blocks_of(32 * count), arguments, given, slots))
         return gradients, extras
 

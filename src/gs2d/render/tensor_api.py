@@ -85,9 +85,9 @@ def rasterize_2dgs(
     exist); the distortion is the squared one; ``Ks`` has gradients; the densification signal is the gradient of
     ``screen_probe`` instead of an entry of a dictionary. docs/migration.md has the whole table.
 
-    Each camera is one call of :func:`gs2d.rasterize`, with the same bits. Further channels are blended in the same
-    pass: 64 take 4 to 7 times what 3 take (docs/notebook/performance.md). Under ``torch.compile`` and
-    ``torch.export`` it is the operator ``torch.ops.gs2d.rasterize_2dgs``, whose backward pass renders a second time.
+    Each camera is one call of :func:`gs2d.rasterize`, with the same bits. Further channels share one more pass: 64
+    channels take up to 7 times as long as 3 (docs/notebook/performance.md). Under ``torch.compile`` and
+    ``torch.export`` this is the operator ``torch.ops.gs2d.rasterize_2dgs``, whose backward pass renders a second time.
 
     Parameters
     ----------

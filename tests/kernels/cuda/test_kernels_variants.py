@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from emulate import Emulator
 from gs2d.core.camera import Camera
 from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.render import cuda, cuda_passes, reference
+from gs2d.render.types import PLAIN_COLORS, Features
 from kernel_cases import SETTINGS, Case, crossing_tiles, double, many_tiles
 from render_scenes import IMAGES, contraction, front_camera, random_cotangents, requiring_grad, splat, stack
 
@@ -85,6 +87,36 @@ def test_gradients_of_colours_alone_agree_with_the_reference(emulator: Emulator,
     assert len(errors) >= 10
     assert np.median(errors) < 1e-5
     assert max(errors) < 2e-3
+
+
+def test_deterministic_gradients_of_features_do_not_depend_on_order_or_culling(
+    emulator: Emulator,
+) -> None:
+    case = many_tiles()
+    settings = replace(SETTINGS, sh_degree=PLAIN_COLORS)
+    numbers = torch.randn(len(case.splats), 37, generator=torch.Generator().manual_seed(1))
+
+    def gradients_of(rasterize: Any, dtype: torch.dtype = torch.float32, **options: Any) -> dict[str, Tensor]:
+        scene = requiring_grad(case.splats.to(dtype=dtype))
+        values = numbers.to(dtype, copy=True).requires_grad_()
+        probe = torch.zeros(len(scene), 4, dtype=dtype, requires_grad=True)
+        features = Features(values, numbers[0].to(dtype))
+        rasterize(scene, case.camera, settings, probe, features=features, **options).color.square().sum().backward()
+        tensors = {**dict(scene.items()), "values": values, "probe": probe}
+        return {name: tensor.grad for name, tensor in tensors.items() if tensor.grad is not None}
+
+    first, second = (
+        gradients_of(
+            partial(cuda.rasterize_with, launcher),
+            choices=cuda.CudaChoices(deterministic=True, exact_masks=exact),
+        )
+        for launcher, exact in ((emulator, True), (replace(emulator, seed=1), False))
+    )
+    expected = gradients_of(reference.rasterize, torch.float64)
+    assert {"values", "probe", "means", "sh0"} <= first.keys()
+    for name, gradient in first.items():
+        assert torch.equal(gradient, second[name]), name
+        assert relative_error(gradient, expected.get(name, torch.zeros(()))) < 1e-3, name
 
 
 @pytest.mark.parametrize("trained", [COLORS, ("sh0",), ("shN",), ATTRIBUTES])

@@ -164,7 +164,8 @@ class SlotArguments(ctypes.Structure):
 
     _fields_ = (
         *_all(ctypes.c_int64, "count", "candidates"),
-        *_pointers("order", "ends", "slots", "extra_slots", "gradients", "extras"),
+        *_pointers("order", "ends", "slots", "extra_slots", "gradients", "extras", "feature_slots", "features"),
+        ("channels", ctypes.c_int64),
     )
 
 

@@ -22,7 +22,7 @@ struct BlendVjpArguments {
     float* gradients;     // [N, 16], zeros on entry; with slots [4 * candidates, 16]
     float* extras;        // the same rows of 4: low-pass centre, absolute densification signal
     const float *depth_transmittance, *slope, *g_depth_transmittance;  // of transmittance.cu; TRANS only
-    Features features;                                                 // FEAT only: learns and slots are null
+    Features features;  // FEAT only: learns is null; with slots features.gradients is [4 * candidates, F]
 };
 
 // One value of a plane that may be absent.
@@ -164,9 +164,17 @@ __device__ __forceinline__ void weigh_features(const BlendVjpArguments& a, const
     });
 }
 
-// The gradients of the features of each of those splats, from its weights.
+// The row of `gradients` and `extras` of splat j of a chunk: with slots, the one of this entry and warp.
+template <bool FEAT>
+__device__ __forceinline__ int64 gradient_row(const BlendVjpArguments& a, const Place& at, const Staged& staged,
+                                              int64 chunk, int j) {
+    if (FEAT && a.slots) return 4 * a.slots[chunk + j] + at.warp;
+    return staged.rows[j];
+}
+
+// Adds the feature gradients of those splats, from their weights. `chunk` is the first entry of the chunk.
 __device__ __forceinline__ void add_features(const BlendVjpArguments& a, const Place& at, const Staged& staged,
-                                             uint wanted, PairValues weights) {
+                                             int64 chunk, uint wanted, PairValues weights) {
     for_each_channels(a, at, [&](int64 c, const float (&g)[HALVES][CHANNELS]) {
         for (uint left = wanted; left; left &= left - 1) {  // the same for all lanes
             const int j = __ffs(int(left)) - 1;
@@ -175,7 +183,7 @@ __device__ __forceinline__ void add_features(const BlendVjpArguments& a, const P
 #pragma unroll
             for (int k = 0; k < CHANNELS; ++k) v[k] = fma(first, g[0][k], second * g[1][k]);
             const float mine = transpose_reduce<CHANNELS>(v, at.lane);
-            float* row = a.features.gradients + int64(staged.rows[j]) * a.features.count + c;
+            float* row = a.features.gradients + gradient_row<true>(a, at, staged, chunk, j) * a.features.count + c;
             if (at.lane % (32 / CHANNELS) == 0) atomicAdd(row + at.lane / (32 / CHANNELS), mine);
         }
     });
@@ -212,7 +220,8 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
             const uint splat = a.entries[i + at.lane] >> 8;
             if (a.learns) learns = a.learns[splat];
             fetch_record(a.records, splat, staged.records, at.lane);
-            staged.rows[at.lane] = a.slots ? uint(a.slots[i + at.lane]) * 4u + uint(at.warp) : splat;
+            // Feature values are read by splat, so their kernels look the slot up where they write.
+            staged.rows[at.lane] = !FEAT && a.slots ? uint(a.slots[i + at.lane]) * 4u + uint(at.warp) : splat;
             mine_is_plain = plain_for_warp(a.view, at, staged.records);
         }
         const uint plain = __ballot_sync(FULL_MASK, mine_is_plain);
@@ -240,7 +249,8 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
             }
             if (!(learning & bit)) return;  // the same for all lanes
             finish_column(dx, sums);
-            add_gradient<ABS, PLAIN>(a, staged.rows[j], finish(s, ABS ? reciprocal(s.iz) : 0.f, sums, limits), at.lane);
+            const int64 row = gradient_row<FEAT>(a, at, staged, i, j);
+            add_gradient<ABS, PLAIN>(a, row, finish(s, ABS ? reciprocal(s.iz) : 0.f, sums, limits), at.lane);
         };
         if constexpr (!FEAT) {
             for_each_splat(wanted, plain, step);
@@ -250,7 +260,7 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
                 if (part == 0u) continue;  // the same for all lanes
                 weigh_features(a, at, staged, part, pairs);
                 for_each_splat(part, plain, step);
-                add_features(a, at, staged, part, pairs);
+                add_features(a, at, staged, i, part, pairs);
             }
         }
         __syncwarp();  // before the records are overwritten

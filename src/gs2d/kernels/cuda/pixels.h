@@ -12,7 +12,7 @@ struct Features {
     const float* background;  // [F]
     float* images;            // [F, H, W]
     const float* upstream;    // [F, H, W]; the backward pass only, as what follows
-    float* gradients;         // [N, F], zeros on entry
+    float* gradients;         // [N, F], or a row per slot (blend_vjp.cu); zeros on entry
 };
 constexpr int CHANNELS = 8;  // worked on together
 

@@ -12,6 +12,9 @@ struct SlotArguments {
     const int64* ends;
     const float *slots, *extra_slots;  // [4 * candidates, 16] or null, [4 * candidates, 4]
     float *gradients, *extras;         // [N, 16] or null, [N, 4]
+    const float* feature_slots;        // [4 * candidates, channels] or null
+    float* features;                   // [N, channels]
+    int64 channels;
 };
 
 // One warp per splat. A lane adds up slots of the same warps of every tile: tiles that do not see the splat change no bit, in the list or not.
@@ -30,6 +33,11 @@ extern "C" __global__ void __launch_bounds__(128) sum_slots(SlotArguments a) {
     for (int step = 8; step >= 4; step >>= 1) extra = extra + __shfl_xor_sync(FULL_MASK, extra, step);
     if (lane < 16 && a.gradients) a.gradients[16 * splat + lane] = sum;
     if (lane < 4) a.extras[4 * splat + lane] = extra;
+    for (int64 c = lane; a.feature_slots && c < a.channels; c += 32) {
+        float feature = 0.f;
+        for (int64 row = first; row < last; ++row) feature = feature + a.feature_slots[a.channels * row + c];
+        a.features[a.channels * splat + c] = feature;
+    }
 }
 
 }  // namespace gs2d
