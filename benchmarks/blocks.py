@@ -39,7 +39,7 @@ from gs2d.core.mesh import Mesh
 from gs2d.core.splats import Splats
 from gs2d.data.scene import View
 from gs2d.errors import Gs2dError
-from gs2d.evaluation.surface import evaluate_surface
+from gs2d.evaluation.surface_score import evaluate_surface
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import SPLATS
 from gs2d.io.splat_ply import read_splats

@@ -32,7 +32,7 @@ from gs2d.core.sh import C0
 from gs2d.core.splats import Splats
 from gs2d.data import Scene, View, load_scene
 from gs2d.evaluation.hidden_points import HiddenPoints, hidden_points, total
-from gs2d.evaluation.images import image_metrics, psnr_float
+from gs2d.evaluation.image_metrics import image_metrics, psnr_float
 from gs2d.pipeline.prepare.options import Training
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.resolve import build_recipe, robust_and_exposure, with_backdrop

@@ -25,12 +25,12 @@ import numpy as np
 
 from benchmarks.timing import machine
 from gs2d.core.camera import Camera, look_at
-from gs2d.meshing.bounds import derive_limits, sample_depths, widen_truncation
 from gs2d.meshing.consistency import depth_noise
 from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
 from gs2d.meshing.evidence import gather
+from gs2d.meshing.fusion_bounds import derive_limits, sample_depths, widen_truncation
 from gs2d.meshing.marching_cubes import keep_components, marching_cubes
-from gs2d.meshing.tsdf import Volume, fuse, fusion_backend
+from gs2d.meshing.tsdf_volume import Volume, fuse, fusion_backend
 from gs2d.meshing.unbounded import cascade_marching_cubes, derive_cascade, fuse_cascade
 
 RADIUS = 0.9

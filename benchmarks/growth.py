@@ -34,11 +34,11 @@ from benchmarks.workload import Workload, camera, places, room
 from gs2d.config.recipe import CloneInPlace, RankByError
 from gs2d.core.splats import Splats
 from gs2d.data.scene import PointCloud, Scene, View
-from gs2d.evaluation.images import image_metrics
+from gs2d.evaluation.image_metrics import image_metrics
 from gs2d.kernels.library import load
-from gs2d.meshing.bounds import derive_limits, sample_depths
+from gs2d.meshing.fusion_bounds import derive_limits, sample_depths
 from gs2d.meshing.marching_cubes import keep_components, marching_cubes
-from gs2d.meshing.tsdf import fuse
+from gs2d.meshing.tsdf_volume import fuse
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.training.initialize import initial_splats
 from gs2d.training.rank_clone import clone_in_place, rank_by_error

@@ -42,7 +42,10 @@ PHASES = (
 )
 PARTS = (
     Rule("rasterizer", (("render/cpu.py", ""), ("render/cpu_cached.py", ""))),
-    Rule("losses and metrics", (("gs2d/losses/api.py", ""), ("kernels/losses.py", ""), ("evaluation/images.py", ""))),
+    Rule(
+        "losses and metrics",
+        (("gs2d/losses/api.py", ""), ("kernels/losses.py", ""), ("evaluation/image_metrics.py", "")),
+    ),
     Rule("Adam", (("training/adam.py", ""),)),
     Rule("densification", (("training/densify/gradient.py", "densify_and_prune"),)),
     Rule("densification statistics", (("training/densify/gradient.py", "accumulate"),)),
@@ -51,12 +54,12 @@ PARTS = (
         "photographs",
         (("gs2d/core/images.py", ""), ("data/image_files.py", ""), ("data/scene.py", ""), ("training/targets.py", "")),
     ),
-    Rule("fusion", (("meshing/tsdf.py", ""), ("meshing/sampling.py", ""))),
-    Rule("depth maps", (("meshing/depth_maps.py", ""), ("meshing/bounds.py", ""), ("meshing/consistency.py", ""))),
+    Rule("fusion", (("meshing/tsdf_volume.py", ""), ("meshing/sampling.py", ""))),
+    Rule("depth maps", tuple((f"meshing/{name}.py", "") for name in ("depth_maps", "fusion_bounds", "consistency"))),
     Rule("marching cubes", (("meshing/marching_cubes.py", ""),)),
     Rule(
         "surface score",
-        (("evaluation/surface.py", ""), ("evaluation/visibility.py", "")),
+        (("evaluation/surface_score.py", ""), ("evaluation/visibility.py", "")),
     ),
     Rule("neighbours", (("gs2d/core/transforms.py", "nearest_distances"),)),
     Rule("imports", (("importlib._bootstrap>", ""),)),

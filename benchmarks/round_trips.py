@@ -29,7 +29,7 @@ from gs2d.contrib.formats.sog import read_level
 from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.errors import BackendError
-from gs2d.io.formats.registry import LAYOUTS, read_splats, write_layout, written_bytes
+from gs2d.io.formats.splat_formats import LAYOUTS, read_splats, write_layout, written_bytes
 from gs2d.io.run_dir import open_run
 from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats, reload_run
 from gs2d.render.api import rasterize

@@ -49,12 +49,12 @@ PARTS = (
             ("data/undistort.py", ""),
         ),
     ),
-    Rule("metrics", (("evaluation/images.py", ""), ("gs2d/losses/api.py", ""), ("kernels/losses.py", ""))),
+    Rule("metrics", (("evaluation/image_metrics.py", ""), ("gs2d/losses/api.py", ""), ("kernels/losses.py", ""))),
     Rule("evidence", tuple(("meshing/evidence.py", name) for name in ("gather", "_count", "_look", "_normals"))),
     Rule("clean by evidence", (("meshing/evidence.py", ""),)),
-    Rule("integrate", (*(("meshing/tsdf.py", name) for name in _ADDING), ("meshing/sampling.py", ""))),
-    Rule("blocks", (("meshing/tsdf.py", ""),)),
-    Rule("depth maps", (("meshing/depth_maps.py", ""), ("meshing/bounds.py", ""), ("meshing/consistency.py", ""))),
+    Rule("integrate", (*(("meshing/tsdf_volume.py", name) for name in _ADDING), ("meshing/sampling.py", ""))),
+    Rule("blocks", (("meshing/tsdf_volume.py", ""),)),
+    Rule("depth maps", tuple((f"meshing/{name}.py", "") for name in ("depth_maps", "fusion_bounds", "consistency"))),
     Rule("marching cubes", (("meshing/marching_cubes.py", ""),)),
 )
 

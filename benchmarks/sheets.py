@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from gs2d.core.splats import Splats
-from gs2d.evaluation.images import psnr_8bit
+from gs2d.evaluation.image_metrics import psnr_8bit
 from gs2d.io.run_dir import open_run
 from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.prepare.loaded import LoadedRun, reload_run

@@ -39,7 +39,7 @@ from gs2d.core.camera import Camera
 from gs2d.data import Scene, View
 from gs2d.data.image_files import read_image, write_image
 from gs2d.errors import DataError
-from gs2d.evaluation.images import ImageMetrics, image_metrics
+from gs2d.evaluation.image_metrics import ImageMetrics, image_metrics
 from gs2d.pipeline.events import ignore
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.run_appearance import matched_by_halves

@@ -28,7 +28,7 @@ from gs2d.data import View
 from gs2d.data.subject import find_subject
 from gs2d.errors import DataError
 from gs2d.evaluation.hidden_points import hidden_points, total
-from gs2d.evaluation.images import ImageMetrics
+from gs2d.evaluation.image_metrics import ImageMetrics
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, METRICS, PAGE, REPORT, SPLATS
 from gs2d.meshing.depth_maps import depth_map
@@ -42,7 +42,7 @@ from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.reconstruct import CAPTURE, FEW
 from gs2d.render.api import rasterize
-from gs2d.sfm.images import find_photos
+from gs2d.sfm.photos import find_photos
 from gs2d.sfm.workspace import POSES_JSON
 
 POLL_SECONDS = 0.2

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from gs2d.data.scene import Scene
     from gs2d.errors import Gs2dError
     from gs2d.evaluation.evaluators import register_evaluator
-    from gs2d.io.formats.registry import read_splats, register_format, register_splat_reader, write_splats
+    from gs2d.io.formats.splat_formats import read_splats, register_format, register_splat_reader, write_splats
     from gs2d.io.meshes import write_mesh
     from gs2d.losses.api import Loss, LossView, compute_losses
     from gs2d.losses.reference import normals_from_depth
@@ -130,23 +130,23 @@ _HOME = {
     "perturb_pose": "gs2d.core.transforms",
     "rasterize": "gs2d.render.api",
     "rasterize_2dgs": "gs2d.render.tensor_api",
-    "read_splats": "gs2d.io.formats.registry",
+    "read_splats": "gs2d.io.formats.splat_formats",
     "register_backend": "gs2d.render.backends",
     "register_command": "gs2d.cli.registry",
     "register_densifier": "gs2d.config.densify",
     "register_evaluator": "gs2d.evaluation.evaluators",
-    "register_format": "gs2d.io.formats.registry",
+    "register_format": "gs2d.io.formats.splat_formats",
     "register_loss": "gs2d.config.losses",
     "register_quantity": "gs2d.config.quantities",
     "register_reader": "gs2d.data.readers.registry",
     "register_recipe": "gs2d.config.presets",
     "register_section": "gs2d.report.sections.registry",
-    "register_splat_reader": "gs2d.io.formats.registry",
+    "register_splat_reader": "gs2d.io.formats.splat_formats",
     "rgb_to_sh0": "gs2d.core.sh",
     "splat_errors": "gs2d.render.api",
     "train": "gs2d.pipeline.in_memory",
     "write_mesh": "gs2d.io.meshes",
-    "write_splats": "gs2d.io.formats.registry",
+    "write_splats": "gs2d.io.formats.splat_formats",
 }
 
 

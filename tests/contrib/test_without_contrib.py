@@ -16,7 +16,7 @@ from gs2d.config.registry import Registry, contrib_entries
 from gs2d.data.known_captures import DATA_SETS
 from gs2d.data.readers.registry import READERS
 from gs2d.evaluation.evaluators import EVALUATORS
-from gs2d.io.formats.registry import LAYOUTS, SPLAT_READERS
+from gs2d.io.formats.splat_formats import LAYOUTS, SPLAT_READERS
 from tiny import write_capture
 
 SOURCE = Path(gs2d.__file__).parent

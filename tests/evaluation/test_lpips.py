@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from gs2d.errors import DataError
-from gs2d.evaluation.images import image_metrics
+from gs2d.evaluation.image_metrics import image_metrics
 from gs2d.evaluation.lpips import load_lpips
 from lpips_states import head_state, vgg_state
 

@@ -123,7 +123,7 @@ def some_splats(count: int = 20, degree: int = 1) -> Splats:
 
 def _splats(layout: str, name: str) -> Callable[[Path], object]:
     def write(root: Path) -> None:
-        from gs2d.io.formats.registry import write_layout
+        from gs2d.io.formats.splat_formats import write_layout
 
         write_layout(root / name, some_splats(), layout)
 
@@ -148,7 +148,7 @@ def as_ascii(name: str) -> Callable[[Path], object]:
 
 def read_splats_everywhere(root: Path) -> None:
     """As `gs2d info`, `gs2d export` and `--init` do."""
-    from gs2d.io.formats.registry import LAYOUTS, read_splat_file, read_splats, read_surfels, write_layout
+    from gs2d.io.formats.splat_formats import LAYOUTS, read_splat_file, read_splats, read_surfels, write_layout
     from gs2d.pipeline.look.info import describe_file
 
     (path,) = (p for p in root.iterdir() if p.is_file())
@@ -195,7 +195,7 @@ def Xform "World"
 
 def read_usd(root: Path) -> None:
     """As `--init` does: each reading is a process."""
-    from gs2d.io.formats.registry import read_surfels
+    from gs2d.io.formats.splat_formats import read_surfels
 
     (path,) = (p for p in root.iterdir() if p.is_file())
     read_surfels(path, lambda _: None)
@@ -217,7 +217,7 @@ def _gltf_text(root: Path) -> None:
 def _stream(root: Path) -> None:
     """A tree of a few leaves in some levels."""
     from gs2d.contrib.formats import sog_streamed
-    from gs2d.io.formats.registry import write_layout
+    from gs2d.io.formats.splat_formats import write_layout
 
     with mock.patch.object(sog_streamed, "_LEAF", 20), mock.patch.object(sog_streamed, "_FILE", 30):
         write_layout(root / "lod-meta.json", some_splats(60), "streamed")
@@ -225,7 +225,7 @@ def _stream(root: Path) -> None:
 
 def read_stream(root: Path) -> None:
     """As `gs2d info` and `--init` do."""
-    from gs2d.io.formats.registry import read_splat_file
+    from gs2d.io.formats.splat_formats import read_splat_file
     from gs2d.pipeline.look.info import describe_file
 
     describe_file(root / "lod-meta.json")
@@ -325,7 +325,7 @@ def read_picture(root: Path) -> None:
     from gs2d.data.image_files import image_size, read_image, read_mask
     from gs2d.data.priors import read_depth, read_normals
     from gs2d.errors import DataError
-    from gs2d.sfm.images import _read as looked_at
+    from gs2d.sfm.photos import _read as looked_at
 
     (path,) = (p for p in root.iterdir() if p.is_file())
     refused: Exception | None = None

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from depth_waves import waves
-from gs2d.meshing.bounds import derive_limits, sample_depths
-from gs2d.meshing.tsdf import fuse
+from gs2d.meshing.fusion_bounds import derive_limits, sample_depths
+from gs2d.meshing.tsdf_volume import fuse
 from gs2d.render.backends import Backend
 
 pytestmark = pytest.mark.gpu

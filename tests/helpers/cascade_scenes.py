@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 
 from gs2d.core.camera import look_at
-from gs2d.meshing.bounds import FusionBounds
 from gs2d.meshing.depth_maps import RenderedView
-from gs2d.meshing.tsdf import BLOCK, VOXELS, Volume
+from gs2d.meshing.fusion_bounds import FusionBounds
+from gs2d.meshing.tsdf_volume import BLOCK, VOXELS, Volume
 from gs2d.meshing.unbounded import TsdfCascade
 from surface_shapes import rays, sphere_depth
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.mesh import Mesh
-from gs2d.meshing.bounds import FusionBounds
 from gs2d.meshing.depth_maps import RenderedView
-from gs2d.meshing.tsdf import BLOCK, VOXELS, Volume
+from gs2d.meshing.fusion_bounds import FusionBounds
+from gs2d.meshing.tsdf_volume import BLOCK, VOXELS, Volume
 
 
 def limits(half: float, voxel: float, truncation: float | None = None, depth_limit: float = 100.0) -> FusionBounds:

@@ -10,7 +10,7 @@ import torch
 
 import gs2d
 from gs2d.errors import DataError, DiskError
-from gs2d.io.formats.registry import write_layout
+from gs2d.io.formats.splat_formats import write_layout
 from gs2d.io.meshes import read_mesh
 
 

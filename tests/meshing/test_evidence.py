@@ -7,10 +7,10 @@ import pytest
 
 from gs2d.core.camera import look_at
 from gs2d.core.mesh import Mesh
-from gs2d.meshing.bounds import backproject
 from gs2d.meshing.depth_maps import RenderedView, depth_map
 from gs2d.meshing.evidence import FACES_A_PIXEL, areas, gather
 from gs2d.meshing.extract import ExtractOptions, extract
+from gs2d.meshing.fusion_bounds import backproject
 from surface_shapes import orbit, sphere_depth
 
 BOX = np.array([[-2.0, -2, -2], [2, 2, 2]])

@@ -11,10 +11,10 @@ import pytest
 from gs2d.core.camera import Camera
 from gs2d.errors import BackendError
 from gs2d.kernels.library import available_variants
-from gs2d.meshing.bounds import sample_depths
 from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
+from gs2d.meshing.fusion_bounds import sample_depths
 from gs2d.meshing.sampling import make_sampler
-from gs2d.meshing.tsdf import (
+from gs2d.meshing.tsdf_volume import (
     Volume,
     block_grid,
     fuse,

@@ -11,7 +11,7 @@ from gs2d.meshing.marching_cubes import (
     keep_components,
     marching_cubes,
 )
-from gs2d.meshing.tsdf import BLOCK, Volume
+from gs2d.meshing.tsdf_volume import BLOCK, Volume
 from surface_shapes import area, dense, edge_uses, is_closed_manifold, limits, signed_volume, volume_of
 
 

@@ -16,7 +16,7 @@ from gs2d.errors import ProtocolError, RunError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RunFolder
 from gs2d.kernels.library import available_variants
-from gs2d.meshing.tsdf import Add, Volume, integrator
+from gs2d.meshing.tsdf_volume import Add, Volume, integrator
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.finish.run_mesh import extract_mesh, mesh_run
 from gs2d.pipeline.prepare.loaded import finished_splats, reload_run
@@ -116,7 +116,7 @@ def test_a_run_is_fused_by_its_own_backend_and_says_so(
         return integrator(volumes, backend, threads)
 
     job, splats = reload_run(RunFolder(run), lambda _event: None), finished_splats(RunFolder(run))
-    monkeypatch.setattr("gs2d.meshing.tsdf.integrator", recorded)
+    monkeypatch.setattr("gs2d.meshing.tsdf_volume.integrator", recorded)
     for backend in ("reference", *(["cpu"] if available_variants() else [])):
         options = MeshOptions(unbounded=unbounded, voxel=0.05)
         result = extract_mesh(

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gs2d.meshing.bounds import derive_limits, sample_depths
 from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
+from gs2d.meshing.fusion_bounds import derive_limits, sample_depths
 from gs2d.meshing.marching_cubes import marching_cubes
 from gs2d.meshing.slabs import fused_surface, slabs
-from gs2d.meshing.tsdf import block_bytes, find_blocks, fuse, fuse_blocks
+from gs2d.meshing.tsdf_volume import block_bytes, find_blocks, fuse, fuse_blocks
 from surface_shapes import orbit, sphere_depth
 
 

@@ -13,7 +13,7 @@ from gs2d.errors import ProtocolError
 from gs2d.meshing.depth_maps import RenderedView, depth_map
 from gs2d.meshing.extract import Extraction, ExtractOptions, extract_unbounded
 from gs2d.meshing.marching_cubes import components
-from gs2d.meshing.tsdf import block_bytes
+from gs2d.meshing.tsdf_volume import block_bytes
 from gs2d.meshing.unbounded import (
     cascade_marching_cubes,
     find_cascade_blocks,

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from gs2d.errors import DataError, RecipeError, RunError
-from gs2d.io.formats.registry import write_layout
+from gs2d.io.formats.splat_formats import write_layout
 from gs2d.pipeline.prepare.loaded import prepare_run
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.prepare.resolved import check_same_run

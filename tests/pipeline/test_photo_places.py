@@ -12,7 +12,7 @@ from gs2d.errors import DataError
 from gs2d.pipeline.prepare.options import PosesOptions
 from gs2d.pipeline.prepare.photo_places import places_of
 from gs2d.pipeline.prepare.pose_finding import _matching
-from gs2d.sfm.images import Photo
+from gs2d.sfm.photos import Photo
 
 DEGREE = 111_195.0  # m of latitude, about
 

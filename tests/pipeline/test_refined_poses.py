@@ -14,7 +14,7 @@ from ball_runs import SMALL, Stop, comparable, options
 from gs2d.core.transforms import perturb_pose
 from gs2d.data import load_scene
 from gs2d.errors import RunError
-from gs2d.evaluation.images import mean_metrics
+from gs2d.evaluation.image_metrics import mean_metrics
 from gs2d.io.run_dir import POSES, RunFolder
 from gs2d.pipeline.demo import demo
 from gs2d.pipeline.events import Event, Notice, Step, ignore

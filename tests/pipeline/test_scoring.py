@@ -9,7 +9,7 @@ import torch
 from gs2d.core.camera import look_at
 from gs2d.core.splats import Splats
 from gs2d.data.scene import View
-from gs2d.evaluation.images import ImageMetrics
+from gs2d.evaluation.image_metrics import ImageMetrics
 from gs2d.pipeline.finish.scoring import (
     CLEAR,
     SeenView,

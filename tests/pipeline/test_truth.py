@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gs2d.evaluation.surface import evaluate_surface
+from gs2d.evaluation.surface_score import evaluate_surface
 from gs2d.io.run_dir import RunFolder, open_run
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.finish.evaluate import evaluate_run

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gs2d.errors import DataError
-from gs2d.sfm.colmap import read_facts
+from gs2d.sfm.colmap_process import read_facts
 
 
 @pytest.mark.parametrize("data", [None, b"no database", b""])

@@ -21,9 +21,9 @@ from gs2d.pipeline.prepare.options import PosesOptions
 from gs2d.pipeline.prepare.pose_finding import find_poses
 from gs2d.sfm import as_fisheye
 from gs2d.sfm.fisheye import Circle, circle_of, small_if_dark
-from gs2d.sfm.images import Photo, find_photos, read_photos
 from gs2d.sfm.lens_probe import probe
-from gs2d.sfm.masks import copy_masks
+from gs2d.sfm.photo_masks import copy_masks
+from gs2d.sfm.photos import Photo, find_photos, read_photos
 
 SIZE = (400, 300)
 F = 150.0

@@ -15,7 +15,7 @@ from gs2d.cli import run
 from gs2d.data.readers.colmap import ColmapImage, ColmapPoints
 from gs2d.errors import BackendError, DataError, RunError
 from gs2d.io.run_dir import RunFolder
-from gs2d.sfm.colmap import Facts, Group, Request, Solved, check_installed, solve
+from gs2d.sfm.colmap_process import Group, MatchFacts, Request, Solved, check_installed, solve
 from gs2d.sfm.model import SfmModel, why_not_placed
 from gs2d.sfm.workspace import check_out, put_in_place, workspace
 
@@ -27,7 +27,7 @@ def piece(*names: str) -> SfmModel:
 
 
 FEATURES = {**dict.fromkeys("abcdefg", 900), "blurred": 7}
-FACTS = Facts(
+FACTS = MatchFacts(
     FEATURES,
     {("a", "b"): 300, ("a", "c"): 250, ("d", "a"): 17, ("d", "b"): 21, ("e", "f"): 400, ("g", "blurred"): 16},
 )
@@ -46,7 +46,7 @@ PIECES = [piece("a", "b", "c"), piece("x", "y", "z")]
     ],
 )
 def test_the_reason_for_a_photograph_without_a_place(name: str, expected: str) -> None:
-    facts = Facts({**FEATURES, "lonely": 500, "y": 900}, FACTS.matches)
+    facts = MatchFacts({**FEATURES, "lonely": 500, "y": 900}, FACTS.matches)
     assert why_not_placed(name, PIECES, facts) == expected
     refused = why_not_placed(name, PIECES, facts, {name: "it was taken out"})
     assert refused == (expected if name == "y" else "it was taken out")  # a piece of its own says more

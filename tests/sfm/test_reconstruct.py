@@ -169,7 +169,7 @@ def test_an_extra_that_is_missing_is_one_line_before_anything_is_made(
     write_room(tmp_path / "photos", 3)
     monkeypatch.setitem(sys.modules, package, None)
     if package == "pycolmap":
-        monkeypatch.setattr("gs2d.sfm.colmap.importlib.util.find_spec", lambda _name: None)
+        monkeypatch.setattr("gs2d.sfm.colmap_process.importlib.util.find_spec", lambda _name: None)
     assert run(words_for(tmp_path / "photos", tmp_path / "run", "--quiet", *words)) == 2
     assert message in one_line(capsys.readouterr().err)
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]

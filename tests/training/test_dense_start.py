@@ -18,7 +18,7 @@ from gs2d.core.camera import look_at
 from gs2d.core.sh import sh_to_rgb
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError
-from gs2d.evaluation.images import psnr_float
+from gs2d.evaluation.image_metrics import psnr_float
 from gs2d.pipeline.train.run_logger import start_text
 from gs2d.render.api import rasterize
 from gs2d.training.events import Initialised

@@ -14,7 +14,7 @@ from gs2d.config.protocols import GENERIC
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.errors import DataError, RunError
-from gs2d.io.formats.registry import LAYOUTS, read_surfels, write_layout
+from gs2d.io.formats.splat_formats import LAYOUTS, read_surfels, write_layout
 from gs2d.io.gaussians import Gaussians
 from gs2d.training import events
 from gs2d.training.trainer import Trainer

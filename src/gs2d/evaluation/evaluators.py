@@ -15,7 +15,7 @@ from gs2d.core.mesh import Mesh
 from gs2d.data.arrays import read_npy
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
-from gs2d.evaluation.surface import SurfaceScore, evaluate_surface, write_clouds
+from gs2d.evaluation.surface_score import SurfaceScore, evaluate_surface, write_clouds
 from gs2d.evaluation.visible_surface import VISIBLE_SURFACE
 from gs2d.io.meshes import FOREIGN, read_mesh, read_points
 from gs2d.io.run_dir import make_folder
@@ -170,7 +170,7 @@ def score_surface(
 
 
 @EVALUATORS.register(VISIBLE)
-class VisibleSurface:
+class VisibleSurfaceEvaluator:
     """Chamfer distance, precision, recall and F-score of a mesh, over what the training views see."""
 
     has_thresholds = True

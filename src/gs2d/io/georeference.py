@@ -21,7 +21,7 @@ from gs2d.core.files import atomic_write
 from gs2d.core.georeference import Georeference
 from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import DataError
-from gs2d.io.formats.registry import LAYOUTS, layout_of, reader_of
+from gs2d.io.formats.splat_formats import LAYOUTS, layout_of, reader_of
 from gs2d.io.ply_format import read_ply_comments
 from gs2d.io.run_dir import GEOREFERENCE
 

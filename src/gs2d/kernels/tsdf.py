@@ -1,6 +1,6 @@
 """Adding one depth map to a volume, natively and on a GPU: the formulas are in ``kernels/core/fuse.h``.
 
-Shapes and types are those of ``meshing/tsdf.py``; ``meshing/tsdf.py``, the only caller, has the same in numpy.
+Shapes and types are those of ``meshing/tsdf_volume.py``, the only caller, which has the same in numpy.
 """
 
 from __future__ import annotations

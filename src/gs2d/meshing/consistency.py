@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from gs2d.meshing.bounds import MAX_VOXELS_PER_TRUNCATION, DepthSample, FusionBounds
 from gs2d.meshing.depth_maps import DepthMap
+from gs2d.meshing.fusion_bounds import MAX_VOXELS_PER_TRUNCATION, DepthSample, FusionBounds
 from gs2d.meshing.sampling import make_sampler
 
 NEIGHBOURS = 8  # views compared with each

@@ -10,13 +10,13 @@ import numpy as np
 
 from gs2d.core.memory import trim
 from gs2d.core.mesh import Mesh
-from gs2d.meshing.bounds import DepthSample, FusionBounds, derive_limits, sample_depths, widen_truncation
 from gs2d.meshing.consistency import depth_noise
 from gs2d.meshing.depth_maps import RenderedView, Spool
 from gs2d.meshing.evidence import Cleaned, clean, simplified
+from gs2d.meshing.fusion_bounds import DepthSample, FusionBounds, derive_limits, sample_depths, widen_truncation
 from gs2d.meshing.marching_cubes import components, inside_box, keep_components
 from gs2d.meshing.slabs import SLAB_BYTES, fused_surface
-from gs2d.meshing.tsdf import Blocks, find_blocks, fusion_backend
+from gs2d.meshing.tsdf_volume import VolumeBlocks, find_blocks, fusion_backend
 from gs2d.meshing.unbounded import FAR_VIEWS, derive_cascade, find_cascade_blocks, fused_cascade_surface
 from gs2d.render.backends import Backend
 
@@ -212,7 +212,7 @@ class _Fused:
     levels: int
 
     @classmethod
-    def of(cls, levels: Sequence[Blocks]) -> _Fused:
+    def of(cls, levels: Sequence[VolumeBlocks]) -> _Fused:
         blocks, nbytes = sum(len(level.keys) for level in levels), sum(level.nbytes for level in levels)
         return cls(levels[0].frames, blocks, nbytes, len(levels))
 

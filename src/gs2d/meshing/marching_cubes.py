@@ -14,7 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from gs2d.core.mesh import Mesh
-from gs2d.meshing.tsdf import BLOCK, VOXELS, Volume
+from gs2d.meshing.tsdf_volume import BLOCK, VOXELS, Volume
 
 # -- the cases of a cube -----------------------------------------------------------------------------------------------
 # A cell has corners c = 0..7 at (c & 1, c >> 1 & 1, c >> 2 & 1), inside where the field is negative. The surface cuts

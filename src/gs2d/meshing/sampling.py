@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gs2d.core.camera import Camera
-from gs2d.meshing.bounds import FusionBounds
 from gs2d.meshing.depth_maps import DepthMap
+from gs2d.meshing.fusion_bounds import FusionBounds
 
 UNSEEN = np.float32(-1e30)  # a depth so near that nothing lies before it: the weight comes out as 0, without NaN
 

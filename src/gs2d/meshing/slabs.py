@@ -12,10 +12,10 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from gs2d.core.mesh import Mesh
-from gs2d.meshing.bounds import FusionBounds
 from gs2d.meshing.depth_maps import DepthMap
+from gs2d.meshing.fusion_bounds import FusionBounds
 from gs2d.meshing.marching_cubes import EDGES_OF_BLOCK, cell_surface, edge_vertices
-from gs2d.meshing.tsdf import Blocks, block_bytes, fuse_blocks
+from gs2d.meshing.tsdf_volume import VolumeBlocks, block_bytes, fuse_blocks
 from gs2d.render.backends import Backend
 
 SLAB_BYTES = 192 << 20  # of the volume: much less and its views are prepared too often, much more and it is the peak
@@ -24,7 +24,7 @@ SLAB_BYTES = 192 << 20  # of the volume: much less and its views are prepared to
 def fused_surface(
     frames: Iterable[DepthMap],
     limits: FusionBounds,
-    blocks: Blocks,
+    blocks: VolumeBlocks,
     *,
     min_weight: float = 1.0,
     slab_bytes: int = SLAB_BYTES,
@@ -38,7 +38,7 @@ def fused_surface(
     frames : iterable of DepthMap
         Read once for each slab: a sequence or a ``Spool``.
     limits : FusionBounds
-    blocks : Blocks
+    blocks : VolumeBlocks
         Those that the frames touch, as ``find_blocks`` finds them.
     min_weight : float
         See ``marching_cubes``.
@@ -69,7 +69,7 @@ def fused_surface(
     return Mesh(np.concatenate(vertices)[first], number.astype(np.int32)[np.concatenate(faces)], tinted)
 
 
-def slabs(blocks: Blocks, slab_bytes: int) -> Iterator[tuple[int, int, int]]:
+def slabs(blocks: VolumeBlocks, slab_bytes: int) -> Iterator[tuple[int, int, int]]:
     """Yield rows (start, own, stop) of slabs: those from ``start`` to ``own`` make surface, the rest is read alone."""
     layer = blocks.keys // (blocks.dims[1] * blocks.dims[2])
     starts = np.searchsorted(layer, np.arange(blocks.dims[0] + 2))  # first row of each layer; none is beyond the last

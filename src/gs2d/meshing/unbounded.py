@@ -18,7 +18,8 @@ import numpy as np
 from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
 from gs2d.errors import ProtocolError
-from gs2d.meshing.bounds import (
+from gs2d.meshing.depth_maps import DepthMap
+from gs2d.meshing.fusion_bounds import (
     BOX_PERCENTILES,
     DEPTH_PERCENTILE,
     FAR_FACTOR,
@@ -29,16 +30,15 @@ from gs2d.meshing.bounds import (
     check_positive,
     checked_box,
 )
-from gs2d.meshing.depth_maps import DepthMap
 from gs2d.meshing.marching_cubes import CORNERS, EDGES, case_table, cell_surface, mixed_colors, near_plane_policy
 from gs2d.meshing.sampling import DepthSampler, make_sampler
 from gs2d.meshing.slabs import SLAB_BYTES, slabs
-from gs2d.meshing.tsdf import (
+from gs2d.meshing.tsdf_volume import (
     BLOCK,
     VOXELS,
-    Blocks,
     Budget,
     Volume,
+    VolumeBlocks,
     add_all,
     block_finder,
     check_truncation,
@@ -247,7 +247,7 @@ def find_cascade_blocks(
     max_bytes: int = 4 << 30,
     threads: int | None = None,
     backend: str | Backend = "auto",
-) -> tuple[Blocks, ...]:
+) -> tuple[VolumeBlocks, ...]:
     """Find the blocks that are fused, of each level; parameters and errors as of ``fuse_cascade``."""
     if iter(frames) is frames:
         raise TypeError("frames are read twice: pass a list or a Spool, not an iterator")
@@ -264,10 +264,10 @@ def find_cascade_blocks(
     budget.check(sum(map(len, keys)), colored, partial=False)
     if not any(map(len, keys)):
         raise ProtocolError("depth inside the fusion limits was expected, got none; widen bbox or depth_limit")
-    return tuple(Blocks(cascade.dims, found, colored, count) for found in keys)
+    return tuple(VolumeBlocks(cascade.dims, found, colored, count) for found in keys)
 
 
-def _empty(blocks: Blocks, limits: FusionBounds) -> Volume:
+def _empty(blocks: VolumeBlocks, limits: FusionBounds) -> Volume:
     return invalid_volume(limits, blocks.dims, blocks.keys, colored=blocks.colored, frames=blocks.frames)
 
 
@@ -404,7 +404,7 @@ def cascade_marching_cubes(
 def fused_cascade_surface(
     frames: Iterable[DepthMap],
     cascade: TsdfCascade,
-    blocks: Sequence[Blocks],
+    blocks: Sequence[VolumeBlocks],
     *,
     min_weight: float = 1.0,
     far_weight: float,
@@ -422,7 +422,7 @@ def fused_cascade_surface(
     frames : iterable of DepthMap
         Read once for each slab: a sequence or a ``Spool``.
     cascade : TsdfCascade
-    blocks : sequence of Blocks
+    blocks : sequence of VolumeBlocks
         Of each level, as ``find_cascade_blocks`` finds them.
     min_weight, far_weight : float
         See ``cascade_marching_cubes``.
@@ -445,7 +445,7 @@ def fused_cascade_surface(
     return surface.mesh()
 
 
-def _batches(blocks: Sequence[Blocks], slab_bytes: int) -> Iterator[list[tuple[int, int, int, int]]]:
+def _batches(blocks: Sequence[VolumeBlocks], slab_bytes: int) -> Iterator[list[tuple[int, int, int, int]]]:
     """Yield slabs (level, start, own, stop; as of ``slabs``) in order, as many at a time as fit."""
     batch: list[tuple[int, int, int, int]] = []
     held = 0
@@ -493,7 +493,7 @@ class _CascadeSurface:
         self._count += len(pairs)
 
     def _at_joins(self, blocks: np.ndarray) -> np.ndarray:
-        """Blocks [M] at the outer border of a level, or around the hole in it."""
+        """VolumeBlocks [M] at the outer border of a level, or around the hole in it."""
         first, last = self._cascade.hole
         outermost = ((blocks == 0) | (blocks == np.asarray(self._cascade.dims) - 1)).any(axis=1)
         return np.asarray(outermost | ((blocks >= first - 1) & (blocks <= last)).all(axis=1))

@@ -19,7 +19,7 @@ from gs2d.core.splats import Splats
 from gs2d.data import Scene, load_scene
 from gs2d.data.subject import OBJECT
 from gs2d.errors import DataError, ProtocolError
-from gs2d.evaluation.images import ImageMetrics, mean_metrics
+from gs2d.evaluation.image_metrics import ImageMetrics, mean_metrics
 from gs2d.evaluation.lpips import Lpips
 from gs2d.pipeline.events import ignore
 from gs2d.pipeline.finish.run_mesh import fused
@@ -172,7 +172,7 @@ def evaluate(
 ) -> ImageMetrics:
     """Return the mean PSNR, SSIM and LPIPS of views, as ``gs2d evaluate`` measures them.
 
-    Surfaces are scored by :func:`gs2d.evaluation.surface.evaluate_surface`.
+    Surfaces are scored by :func:`gs2d.evaluation.surface_score.evaluate_surface`.
 
     Parameters
     ----------

@@ -33,8 +33,8 @@ from gs2d.pipeline.prepare.options import (
 from gs2d.pipeline.prepare.pose_finding import asked_for, check_poses_options, find_poses, placed_line
 from gs2d.pipeline.prepare.resolve import check_options
 from gs2d.pipeline.train.train_run import check_viewer, train
-from gs2d.sfm.colmap import check_installed
-from gs2d.sfm.images import find_photos
+from gs2d.sfm.colmap_process import check_installed
+from gs2d.sfm.photos import find_photos
 from gs2d.sfm.video_frames import is_video, look_into
 from gs2d.sfm.workspace import POSES_JSON, POSES_PNG, hidden_workspace, sweep_workspace
 

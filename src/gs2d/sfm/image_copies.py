@@ -15,7 +15,7 @@ from gs2d.core.files import atomic_write, disk_error
 from gs2d.data.exif import DAMAGED_EXIF
 from gs2d.data.image_files import is_float, open_image, read_image
 from gs2d.errors import DataError
-from gs2d.sfm.images import JPEG, Photo, turn
+from gs2d.sfm.photos import JPEG, Photo, turn
 
 QUALITY = 95  # of JPEG files that had to be written again, without chroma subsampling
 

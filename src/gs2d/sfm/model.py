@@ -22,7 +22,7 @@ from gs2d.data.readers.colmap import (
 )
 from gs2d.data.undistort import colmap_intrinsics
 from gs2d.errors import DataError
-from gs2d.sfm.colmap import Facts
+from gs2d.sfm.colmap_process import MatchFacts
 from gs2d.sfm.fisheye import Circle
 from gs2d.sfm.panoramas import PANORAMA
 
@@ -96,7 +96,7 @@ def _median_angle(images: Sequence[ColmapImage], points: ColmapPoints) -> float:
     return float(np.degrees(np.arccos(np.clip(np.median(cosines), -1, 1)))) if cosines else 0.0
 
 
-def check_any(pieces: Sequence[SfmModel], facts: Facts, root: Path) -> None:
+def check_any(pieces: Sequence[SfmModel], facts: MatchFacts, root: Path) -> None:
     """Raise DataError where there is no model at all; says at which step it ended, and what to do."""
     if pieces:
         return
@@ -125,7 +125,7 @@ def check_any(pieces: Sequence[SfmModel], facts: Facts, root: Path) -> None:
     )
 
 
-def _largest_group(facts: Facts) -> int:
+def _largest_group(facts: MatchFacts) -> int:
     """How many photographs the largest group holds that pairs with the same points connect."""
     groups: list[set[str]] = []
     for pair in facts.matches:
@@ -134,7 +134,7 @@ def _largest_group(facts: Facts) -> int:
     return max(map(len, groups), default=1)
 
 
-def why_not_placed(name: str, pieces: Sequence[SfmModel], facts: Facts, refused: Mapping[str, str] = _NONE) -> str:
+def why_not_placed(name: str, pieces: Sequence[SfmModel], facts: MatchFacts, refused: Mapping[str, str] = _NONE) -> str:
     """Return the reason, as far as it is known, why a photograph has no camera in the first piece.
 
     ``refused`` are those that found a place in the second round and lost it again, with what is known of them.

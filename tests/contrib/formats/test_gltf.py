@@ -18,7 +18,7 @@ from gs2d.core.georeference import Georeference
 from gs2d.core.sh import sh_basis
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.errors import DataError
-from gs2d.io.formats.registry import read_splat_file, read_surfels, write_layout
+from gs2d.io.formats.splat_formats import read_splat_file, read_surfels, write_layout
 from gs2d.io.gaussians import Gaussians
 from gs2d.io.georeference import stamp
 from splat_scenes import a_scene, turned_by

@@ -11,7 +11,7 @@ import pytest
 
 from gs2d.contrib.formats.gltf import EXTENSION
 from gs2d.core.splats import Splats
-from gs2d.io.formats.registry import read_splat_file, write_layout
+from gs2d.io.formats.splat_formats import read_splat_file, write_layout
 from gs2d.io.gaussians import Gaussians, unit_quats
 from npm import forget, node, package, splat_transform
 from splat_scenes import a_scene, turned_by

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from gs2d.contrib.formats.sog import read_sog, write_sog
 from gs2d.errors import DataError
-from gs2d.io.formats.registry import is_splat_file, read_splat_file
+from gs2d.io.formats.splat_formats import is_splat_file, read_splat_file
 from gs2d.io.gaussians import FLAT_LOG_SCALE, Gaussians, sigmoid
 from gs2d.pipeline.look.info import describe_file
 from splat_scenes import a_scene, turned_by

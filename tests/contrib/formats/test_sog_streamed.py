@@ -13,7 +13,7 @@ import pytest
 from gs2d.contrib.formats import sog_streamed
 from gs2d.contrib.formats.sog import read_sog
 from gs2d.errors import DiskError
-from gs2d.io.formats.registry import read_splat_file, write_layout, written_bytes
+from gs2d.io.formats.splat_formats import read_splat_file, write_layout, written_bytes
 from gs2d.io.gaussians import Gaussians
 from splat_scenes import a_scene
 

@@ -15,7 +15,7 @@ from gs2d.contrib.formats import usd
 from gs2d.contrib.formats.usd import read_usd, write_usd
 from gs2d.core.georeference import Georeference
 from gs2d.errors import BackendError, DataError
-from gs2d.io.formats.registry import read_splat_file, read_surfels
+from gs2d.io.formats.splat_formats import read_splat_file, read_surfels
 from gs2d.io.gaussians import Gaussians
 from splat_scenes import a_scene
 

@@ -17,7 +17,7 @@ from gs2d.core.mesh import Mesh
 from gs2d.data import load_scene
 from gs2d.errors import DataError
 from gs2d.evaluation.evaluators import VISIBLE, choose_truth, score_surface
-from gs2d.evaluation.surface import evaluate_surface
+from gs2d.evaluation.surface_score import evaluate_surface
 from gs2d.io.meshes import read_points, write_mesh
 from official_captures import T_MM, write_dtu_capture, write_points, write_tnt_capture
 from oracle_scenes import grid_mesh, moved

@@ -18,7 +18,7 @@ from gs2d.contrib.survey.commands import GeoreferenceOptions
 from gs2d.contrib.survey.find_georeference import georeference_run
 from gs2d.core.georeference import Georeference
 from gs2d.core.projection import Projection, to_enu
-from gs2d.io.formats.registry import read_splat_file
+from gs2d.io.formats.splat_formats import read_splat_file
 from gs2d.io.georeference import georeference_of_file, read_georeference, write_georeference
 from gs2d.io.meshes import read_mesh
 from gs2d.io.splat_ply import read_splats

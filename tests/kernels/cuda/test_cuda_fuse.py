@@ -10,9 +10,9 @@ import torch
 
 import emulate
 from depth_waves import waves
-from gs2d.meshing.bounds import derive_limits, sample_depths
+from gs2d.meshing.fusion_bounds import derive_limits, sample_depths
 from gs2d.meshing.sampling import make_sampler
-from gs2d.meshing.tsdf import Volume, add_in_numpy, add_on_gpu, block_grid, invalid_volume, touched_blocks
+from gs2d.meshing.tsdf_volume import Volume, add_in_numpy, add_on_gpu, block_grid, invalid_volume, touched_blocks
 
 
 @pytest.mark.parametrize("colored", [True, False])

@@ -79,7 +79,7 @@ assert {"adam_step", "splat_errors", "blend_vjp_learning", "running_counts"} <= 
 
 WHOLE_PATH = """
 from functools import partial
-from gs2d.evaluation.surface import evaluate_surface
+from gs2d.evaluation.surface_score import evaluate_surface
 from gs2d.evaluation import evaluators
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.finish.run_mesh import mesh_run

@@ -18,7 +18,7 @@ import numpy as np
 from gs2d.core.sh import C0
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
-from gs2d.io.formats.registry import register_format, register_splat_reader
+from gs2d.io.formats.splat_formats import register_format, register_splat_reader
 from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, logit_of_byte, sigmoid, to_byte, unit_quats
 from gs2d.io.ply_format import PlyElement, PlyFile, read_ply, write_ply
 

@@ -25,7 +25,7 @@ from gs2d.core.growth import check_growth
 from gs2d.core.sh import C0
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
-from gs2d.io.formats.registry import register_format, register_splat_reader
+from gs2d.io.formats.splat_formats import register_format, register_splat_reader
 from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, log_scales_of, logit, sigmoid, to_byte, unit_quats
 from gs2d.io.georeference import stamp_glb
 from gs2d.io.meshes import LINEAR_U16

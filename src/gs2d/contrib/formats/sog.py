@@ -29,7 +29,7 @@ from gs2d.core.files import atomic_write
 from gs2d.core.growth import check_entries, check_growth
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
-from gs2d.io.formats.registry import register_format, register_splat_reader
+from gs2d.io.formats.splat_formats import register_format, register_splat_reader
 from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, logit_of_byte, sigmoid, to_byte, unit_quats
 
 _ROW = 64  # rows of the palette side by side in its picture

@@ -23,7 +23,7 @@ from gs2d.contrib.formats.levels import halved
 from gs2d.contrib.formats.sog import packed_sog
 from gs2d.core.files import atomic_write, disk_error
 from gs2d.core.splats import Splats
-from gs2d.io.formats.registry import register_format
+from gs2d.io.formats.splat_formats import register_format
 from gs2d.io.gaussians import Gaussians, unit_quats
 
 INDEX = "lod-meta.json"

@@ -27,7 +27,7 @@ from gs2d.core.files import atomic_write, disk_error
 from gs2d.core.georeference import Georeference
 from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, DataError
-from gs2d.io.formats.registry import register_format, register_splat_reader
+from gs2d.io.formats.splat_formats import register_format, register_splat_reader
 from gs2d.io.gaussians import (
     Gaussians,
     Tell,

@@ -27,7 +27,7 @@ from gs2d.core.mesh import Mesh
 from gs2d.core.similarity import apply, similarity_scale
 from gs2d.errors import DataError
 from gs2d.evaluation.nearest import Cloud
-from gs2d.evaluation.surface import ScoredClouds
+from gs2d.evaluation.surface_score import ScoredClouds
 from gs2d.io.meshes import read_points
 
 

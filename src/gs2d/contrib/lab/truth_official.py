@@ -20,7 +20,7 @@ from gs2d.data.readers.dtu import dtu_silhouettes
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
 from gs2d.evaluation.evaluators import register_evaluator
-from gs2d.evaluation.surface import write_clouds
+from gs2d.evaluation.surface_score import write_clouds
 from gs2d.io.run_dir import make_folder
 
 

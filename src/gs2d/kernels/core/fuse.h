@@ -1,4 +1,4 @@
-// What one depth map changes in one voxel of a truncated signed distance field (docs/math.md; meshing/tsdf.py
+// What one depth map changes in one voxel of a truncated signed distance field (docs/math.md; meshing/tsdf_volume.py
 // and meshing/sampling.py have the same in numpy, operation for operation: single precision gives the same bits, so
 // nothing here is a fused multiply-add).
 #pragma once
@@ -8,7 +8,7 @@
 namespace gs2d {
 
 constexpr int FUSE_VOXELS = 512;           // of a block of 8^3, z fastest
-constexpr double FUSE_WEIGHT_SLOPE = 4.0;  // 1 / (1 - FULL_WEIGHT_BEHIND) of meshing/tsdf.py
+constexpr double FUSE_WEIGHT_SLOPE = 4.0;  // 1 / (1 - FULL_WEIGHT_BEHIND) of meshing/tsdf_volume.py
 constexpr double FUSE_NO_WEIGHT = 1e-20;   // a sum of weights below this is taken as this
 
 // One view over some blocks of a volume, for kernels/tsdf.py. R is the type of the arrays.

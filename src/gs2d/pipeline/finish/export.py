@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.errors import RunError
-from gs2d.io.formats.registry import LAYOUTS, endings, layout_of, read_splats, write_layout, written_bytes
+from gs2d.io.formats.splat_formats import LAYOUTS, endings, layout_of, read_splats, write_layout, written_bytes
 from gs2d.io.run_dir import MESH, open_run
 from gs2d.pipeline.finish.run_subject import within
 from gs2d.pipeline.finish.world_frame import place_of, placed_splats, say_where

@@ -21,7 +21,7 @@ from gs2d.data import View
 from gs2d.data.reach import Reach
 from gs2d.data.subject import LARGEST, Subject, checked_box
 from gs2d.errors import ProtocolError, RunError
-from gs2d.evaluation.images import ImageMetrics
+from gs2d.evaluation.image_metrics import ImageMetrics
 from gs2d.io.meshes import read_mesh, write_mesh
 from gs2d.io.run_dir import (
     MESH,
@@ -33,7 +33,7 @@ from gs2d.io.run_dir import (
 from gs2d.meshing.depth_maps import RenderedView, Spool, depth_map
 from gs2d.meshing.extract import Extraction, ExtractOptions, extract, extract_unbounded
 from gs2d.meshing.slabs import SLAB_BYTES
-from gs2d.meshing.tsdf import VolumeTooLargeError
+from gs2d.meshing.tsdf_volume import VolumeTooLargeError
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
 from gs2d.pipeline.finish.run_report import report_again

@@ -27,7 +27,7 @@ from gs2d.data.subject import (
 )
 from gs2d.errors import DataError, DiskError, ProtocolError, RunError
 from gs2d.io.run_dir import RENDERS, SUBJECT, RunFolder, make_folder
-from gs2d.meshing.bounds import backproject
+from gs2d.meshing.fusion_bounds import backproject
 from gs2d.pipeline.events import Notice, OnEvent
 from gs2d.pipeline.finish.trusted_depth import surface_reach
 from gs2d.pipeline.prepare.loaded import LoadedRun, RenderedScene

@@ -10,7 +10,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.transforms import up_direction
 from gs2d.data import Scene, View
 from gs2d.data.reach import Reach, reach_of
-from gs2d.meshing.bounds import backproject
+from gs2d.meshing.fusion_bounds import backproject
 from gs2d.meshing.sky import sky_pixels
 from gs2d.pipeline.prepare.loaded import RenderedScene
 

@@ -20,7 +20,7 @@ from gs2d.core.json_files import read_json, write_json
 from gs2d.data import Scene
 from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.evaluation.hidden_points import hidden_points
-from gs2d.evaluation.images import ImageMetrics
+from gs2d.evaluation.image_metrics import ImageMetrics
 from gs2d.io.run_dir import VERDICT, RunFolder
 from gs2d.io.run_schema import VERDICT_SHAPE, check_shape
 from gs2d.pipeline.finish.scoring import SeenView

@@ -10,7 +10,7 @@ from gs2d.data import detect_format, load_scene
 from gs2d.data.archive import is_archive, unpacked_for_a_moment
 from gs2d.data.known_captures import missing_lines
 from gs2d.errors import DataError
-from gs2d.io.formats.registry import is_splat_file, read_splat_file, reader_of
+from gs2d.io.formats.splat_formats import is_splat_file, read_splat_file, reader_of
 from gs2d.io.georeference import georeference_of_file
 from gs2d.io.meshes import FOREIGN, read_mesh, read_points
 from gs2d.io.splat_ply import ply_kind

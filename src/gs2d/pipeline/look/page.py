@@ -18,7 +18,7 @@ from gs2d.core.transforms import focus_point, up_direction
 from gs2d.data import View
 from gs2d.data.subject import Subject, read_subject
 from gs2d.errors import DataError, RunError
-from gs2d.io.formats.registry import read_splats
+from gs2d.io.formats.splat_formats import read_splats
 from gs2d.io.georeference import georeference_of_file, read_georeference
 from gs2d.io.run_dir import PAGE, RunFolder, is_run, open_run
 from gs2d.pipeline.events import Notice, OnEvent, Phase, ignore

@@ -22,7 +22,7 @@ from gs2d.data.known_captures import missing_lines
 from gs2d.data.masks import EMPTY
 from gs2d.errors import DataError, RunError
 from gs2d.io import splat_ply
-from gs2d.io.formats.registry import read_splats, read_surfels
+from gs2d.io.formats.splat_formats import read_splats, read_surfels
 from gs2d.io.georeference import georeference_of_file
 from gs2d.io.run_dir import SPLATS, RunFolder, open_run, versions
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step

@@ -10,7 +10,7 @@ import numpy as np
 
 from gs2d.data.positions import Positions, in_frame, matched, read_positions
 from gs2d.errors import DataError
-from gs2d.sfm.images import Photo
+from gs2d.sfm.photos import Photo
 
 Place = tuple[float, float, float]
 _LEAST_SPREAD = 15.0  # m; root mean square from their middle: receivers in phones are off by 5 m and more

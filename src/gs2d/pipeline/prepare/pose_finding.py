@@ -26,10 +26,14 @@ from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.events import PLACED, Notice, OnEvent, Phase, Plan, Step, counted, ignore
 from gs2d.pipeline.prepare.options import PosesOptions
 from gs2d.pipeline.prepare.photo_places import Places, places_of
-from gs2d.sfm.colmap import Facts, Group, Request, Solved, check_installed, layers, read_facts, solve
+from gs2d.sfm.colmap_process import Group, MatchFacts, Request, Solved, check_installed, layers, read_facts, solve
 from gs2d.sfm.fisheye import Circle
 from gs2d.sfm.image_copies import copy_images
-from gs2d.sfm.images import (
+from gs2d.sfm.lens import START, lens_line
+from gs2d.sfm.model import SfmModel, camera_line, check_any, focal_length, read_model, why_not_placed
+from gs2d.sfm.panoramas import PANORAMA
+from gs2d.sfm.photo_masks import copy_masks, masks_of
+from gs2d.sfm.photos import (
     FEWEST,
     FISHEYE,
     Photo,
@@ -41,10 +45,6 @@ from gs2d.sfm.images import (
     read_photos,
     rig_folders,
 )
-from gs2d.sfm.lens import START, lens_line
-from gs2d.sfm.masks import copy_masks, masks_of
-from gs2d.sfm.model import SfmModel, camera_line, check_any, focal_length, read_model, why_not_placed
-from gs2d.sfm.panoramas import PANORAMA
 from gs2d.sfm.plot import write_image_of
 from gs2d.sfm.search import DATABASE, SEARCH, forget, go_on, is_of
 from gs2d.sfm.video_frames import MAX_FRAMES, Video, choose, is_video, look_into, sharpness_of, take
@@ -396,7 +396,7 @@ def _result(
     photos: Sequence[Photo],
     staged: Sequence[str],
     pieces: Sequence[SfmModel],
-    facts: Facts,
+    facts: MatchFacts,
     solved: Solved,
 ) -> dict[str, Any]:
     """All that is known about the capture, for ``poses.json``."""

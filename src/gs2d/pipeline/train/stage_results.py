@@ -10,7 +10,7 @@ from typing import Any
 
 from gs2d.config.recipe import Stage
 from gs2d.data import Scene, View
-from gs2d.evaluation.images import ImageMetrics
+from gs2d.evaluation.image_metrics import ImageMetrics
 from gs2d.io.run_dir import SPLATS, VERDICT, RunFolder, load_tensors
 from gs2d.io.splat_ply import write_splats
 from gs2d.pipeline.attempts import again, attempted

@@ -9,10 +9,17 @@ import pytest
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.errors import ProtocolError
-from gs2d.meshing.bounds import DepthSample, FusionBounds, backproject, derive_limits, sample_depths, widen_truncation
 from gs2d.meshing.consistency import depth_noise
 from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
 from gs2d.meshing.extract import ExtractOptions, extract
+from gs2d.meshing.fusion_bounds import (
+    DepthSample,
+    FusionBounds,
+    backproject,
+    derive_limits,
+    sample_depths,
+    widen_truncation,
+)
 from surface_shapes import box_depth, orbit, sphere_depth
 
 UP = np.array([0, 0, 1.0])

@@ -19,7 +19,7 @@ from gs2d.data.image_files import image_size, read_mask, write_image
 from gs2d.data.masks import FOLDER, Masks, find_masks, find_masks_in
 from gs2d.errors import DataError
 from gs2d.sfm.fisheye import Circle
-from gs2d.sfm.images import Photo, turn
+from gs2d.sfm.photos import Photo, turn
 
 _NONE: Mapping[str, Circle] = MappingProxyType({})
 _ASPECT = 0.01  # by which a mask of another size may differ from its photograph

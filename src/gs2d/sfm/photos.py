@@ -305,7 +305,7 @@ def fisheye_hints(
     Returns
     -------
     list of (str, Circle or None)
-        The first is a hint as of :class:`gs2d.sfm.colmap.Group`.
+        The first is a hint as of :class:`gs2d.sfm.colmap_process.Group`.
     list of str
     """
     if camera_model not in ("auto", FISHEYE):

@@ -20,8 +20,8 @@ import numpy as np
 
 from gs2d.errors import ProtocolError
 from gs2d.kernels.tsdf import FusionOnHost
-from gs2d.meshing.bounds import FusionBounds, backproject
 from gs2d.meshing.depth_maps import DepthMap
+from gs2d.meshing.fusion_bounds import FusionBounds, backproject
 from gs2d.meshing.sampling import DepthSampler, block_visibility, make_sampler, may_see
 from gs2d.render.backends import Backend, get_backend
 
@@ -430,7 +430,7 @@ def fuse(
 
 
 @dataclass(frozen=True, eq=False)
-class Blocks:
+class VolumeBlocks:
     """The blocks near what depth maps saw.
 
     Attributes
@@ -453,7 +453,7 @@ class Blocks:
         """Bytes of a volume of them."""
         return len(self.keys) * block_bytes(self.colored)
 
-    def part(self, start: int, stop: int) -> Blocks:
+    def part(self, start: int, stop: int) -> VolumeBlocks:
         """Return the blocks of these rows."""
         return replace(self, keys=self.keys[start:stop])
 
@@ -465,7 +465,7 @@ def find_blocks(
     max_bytes: int = 4 << 30,
     threads: int | None = None,
     backend: str | Backend = "auto",
-) -> Blocks:
+) -> VolumeBlocks:
     """Find the blocks that are fused; parameters and errors as of ``fuse``."""
     if iter(frames) is frames:
         raise TypeError("frames are read twice: pass a list or a Spool, not an iterator")
@@ -482,13 +482,13 @@ def find_blocks(
     budget.check(len(keys), colored, partial=False)
     if not len(keys):
         raise ProtocolError("depth inside the fusion limits was expected, got none; widen bbox or depth_limit")
-    return Blocks(dims, keys, colored, count)
+    return VolumeBlocks(dims, keys, colored, count)
 
 
 def fuse_blocks(
     frames: Iterable[DepthMap],
     limits: FusionBounds,
-    blocks: Blocks,
+    blocks: VolumeBlocks,
     *,
     threads: int | None = None,
     backend: str | Backend = "auto",

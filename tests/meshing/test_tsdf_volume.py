@@ -9,11 +9,11 @@ import pytest
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.errors import ProtocolError
-from gs2d.meshing.bounds import derive_limits, sample_depths
 from gs2d.meshing.depth_maps import DepthMap, RenderedView, Spool, depth_map
 from gs2d.meshing.extract import ExtractOptions, extract
+from gs2d.meshing.fusion_bounds import derive_limits, sample_depths
 from gs2d.meshing.marching_cubes import components, marching_cubes
-from gs2d.meshing.tsdf import FULL_WEIGHT_BEHIND, block_bytes, fuse
+from gs2d.meshing.tsdf_volume import FULL_WEIGHT_BEHIND, block_bytes, fuse
 from surface_shapes import (
     box_depth,
     edge_uses,

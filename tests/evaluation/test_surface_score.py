@@ -13,7 +13,7 @@ import trimesh
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
-from gs2d.evaluation.surface import (
+from gs2d.evaluation.surface_score import (
     distances_to_mesh,
     evaluate_surface,
     face_areas,

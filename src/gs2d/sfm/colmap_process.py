@@ -261,14 +261,14 @@ def _last_words(phase: str, code: int, log: Path) -> str:
 
 
 @dataclass(frozen=True)
-class Facts:
+class MatchFacts:
     """What the database knows: features of each photograph, and verified matches of each pair that has some."""
 
     features: dict[str, int]
     matches: dict[tuple[str, str], int]
 
 
-def read_facts(database: Path) -> Facts:
+def read_facts(database: Path) -> MatchFacts:
     """Read the database of a finished worker.
 
     A pair's number is 2147483647 * (smaller image id) + (larger one) (COLMAP's documentation, Database Format).
@@ -290,4 +290,4 @@ def read_facts(database: Path) -> Facts:
             f"{database} must be the database that COLMAP wrote, it cannot be read: {error}; free some space, or "
             f"remove {database.parent} and begin anew"
         ) from error
-    return Facts(features, matches)
+    return MatchFacts(features, matches)

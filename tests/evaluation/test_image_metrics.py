@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gs2d.errors import DataError
-from gs2d.evaluation.images import (
+from gs2d.evaluation.image_metrics import (
     Metric,
     image_metrics,
     mean_metrics,
