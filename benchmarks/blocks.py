@@ -28,6 +28,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from benchmarks.flight import Flight, write_flight
 from gs2d.contrib.lab.blocks import blocks
 from gs2d.contrib.lab.cells import Cells
 from gs2d.contrib.lab.merged import MERGED
@@ -49,7 +50,6 @@ from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.train.train_run import train
 from gs2d.render.api import rasterize
-from gs2d.synthetic.flight import Flight, write_flight
 
 ALL_OF = {"2dgs": 30_000, "best": 20_000}  # iterations of the recipes
 ZOOM = 6  # of the pictures of seams

@@ -15,8 +15,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from benchmarks.flight import Flight, write_flight
 from gs2d.errors import Gs2dError
-from gs2d.synthetic.flight import Flight, write_flight
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.flight import Flight, write_flight
 from gs2d.contrib.survey.commands import GeoreferenceOptions
 from gs2d.contrib.survey.find_georeference import georeference_run
 from gs2d.contrib.survey.fit import fit_places
@@ -37,7 +38,6 @@ from gs2d.data import View, load_scene
 from gs2d.errors import Gs2dError
 from gs2d.io.run_dir import open_run
 from gs2d.pipeline.prepare.loaded import reload_run
-from gs2d.synthetic.flight import Flight, write_flight
 
 NOISES = (0.0, 0.02, 0.5, 2.0, 5.0)  # m, along each axis
 OUTLIERS, FAR = 0.05, 50.0  # share of the positions, and how far off they are, m

@@ -29,13 +29,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks.flight import Flight, write_flight
 from gs2d.core.splats import Splats
 from gs2d.data import load_scene
 from gs2d.data.scene import PointCloud
 from gs2d.errors import Gs2dError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.splat_ply import write_splats
-from gs2d.synthetic.flight import Flight, write_flight
 from gs2d.training.initialize import initial_splats
 
 EVERY = 0.02  # s, between looks at memory

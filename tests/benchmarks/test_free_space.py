@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from benchmarks.flight import Flight, write_flight
 from benchmarks.free_space import main
 
-from gs2d.synthetic.flight import Flight, write_flight
 from gs2d.training import free_space
 
 

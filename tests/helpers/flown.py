@@ -7,8 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from benchmarks.flight import Flight, write_flight
+
 from gs2d.contrib.lab.options import BlocksOptions
-from gs2d.synthetic.flight import Flight, write_flight
 
 WORDS = (
     "surface.densify.start=3",

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from benchmarks.flight import Flight, write_flight
 
 from gs2d.cli.app import run as main
 from gs2d.cli.parser import parse
@@ -25,7 +26,6 @@ from gs2d.pipeline.prepare.options import PlanOptions, TrainOptions
 from gs2d.pipeline.prepare.plan import plan
 from gs2d.pipeline.train import train_run as train_module
 from gs2d.pipeline.train.train_run import train
-from gs2d.synthetic.flight import Flight, write_flight
 
 
 @pytest.fixture(autouse=True)

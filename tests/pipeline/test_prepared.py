@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from benchmarks.flight import Flight, write_flight
 
 from gs2d.config.presets import get_recipe
 from gs2d.config.protocols import GENERIC
@@ -27,7 +28,6 @@ from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare.photographs import PREPARED
 from gs2d.pipeline.prepare.resolved import Execution
 from gs2d.pipeline.train.train_run import train
-from gs2d.synthetic.flight import Flight, write_flight
 from gs2d.training.trainer import Trainer
 
 FLIGHT = Flight(12, width=64, height=48, points=6000, seed=1)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks.flight import Flight, write_flight
 
 from flown import digest, tiny_blocks, write_tiny_flight
 from gs2d.contrib.lab import blocks as module
@@ -21,7 +22,6 @@ from gs2d.io.run_dir import open_run
 from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.events import Event
 from gs2d.pipeline.prepare.part import FROZEN, OWN, read_start
-from gs2d.synthetic.flight import Flight, write_flight
 
 
 @pytest.fixture(scope="module")

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks.flight import PIXEL_NOISE, Flight, flown_cameras, write_flight
 
 from gs2d.data import load_scene
 from gs2d.data.image_files import read_image
 from gs2d.data.readers.colmap import read_images, read_points
 from gs2d.io.meshes import read_mesh
 from gs2d.meshing.raycast import cast_camera
-from gs2d.synthetic.flight import PIXEL_NOISE, Flight, flown_cameras, write_flight
 
 FLIGHT = Flight(10, width=64, height=48, points=8000, seed=3, gps_noise=0.0)
 
