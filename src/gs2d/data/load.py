@@ -15,7 +15,6 @@ from gs2d.data.file_names import IMAGES, in_any_case
 from gs2d.data.known_captures import missing_lines
 from gs2d.data.masks import Masks, without_masks
 from gs2d.data.readers.colmap import MODEL_FOLDERS, model_folder, read_colmap
-from gs2d.data.readers.dtu import CAMERA_FILES, camera_archives, read_dtu
 from gs2d.data.readers.registry import READERS, Reader, register_reader
 from gs2d.data.readers.transforms import CAMERAS, TRAIN, read_blender, read_nerfstudio
 from gs2d.data.scene import Scene
@@ -59,7 +58,6 @@ def _register(name: str, holds: Callable[[Path], object], make: Callable[[Path],
 
 _register("blender", lambda root: in_any_case(root, TRAIN).is_file(), read_blender, f"{TRAIN} (Blender)")
 _register("nerfstudio", lambda root: in_any_case(root, CAMERAS).is_file(), read_nerfstudio, f"{CAMERAS} (nerfstudio)")
-_register("dtu", camera_archives, read_dtu, f"{' or '.join(CAMERA_FILES)} (DTU)")
 register_reader("colmap")(_Colmap)
 
 _PROJECTS = {  # files of other tools that do not hold cameras in the open
@@ -82,8 +80,8 @@ def detect_format(path: str | os.PathLike[str]) -> str:
     """
     root = _folder(path)
     looked_for = []
-    for name, make in READERS.working():
-        reader = make()
+    readers = [(name, make()) for name, make in READERS.working()]
+    for name, reader in sorted(readers, key=lambda pair: not getattr(pair[1], "before_colmap", False)):
         if reader.detect(root):
             return name
         looked_for.append(getattr(reader, "looks_for", ""))

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from capture_writers import SCALE_MAT, ColmapModel, ring, small_dtu, write_image_of
+from gs2d.contrib.lab.dtu_reader import decompose_projection, dtu_silhouettes
 from gs2d.data import load_scene
-from gs2d.data.readers.dtu import decompose_projection, dtu_silhouettes
 from gs2d.errors import DataError
 
 

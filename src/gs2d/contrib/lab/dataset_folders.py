@@ -28,7 +28,6 @@ from gs2d.core.images import is_number
 from gs2d.core.json_files import read_json
 from gs2d.data.known_captures import DATA_SETS
 from gs2d.data.readers.colmap import read_images
-from gs2d.data.readers.dtu import CAMERA_FILES
 from gs2d.errors import DataError
 from gs2d.evaluation.evaluators import MESH_TRUTHS
 
@@ -38,6 +37,7 @@ FULL_SIZE = "for its folder, full size"  # photographs that are trained from a f
 _DTU_2DGS = "get it from the preprocessed DTU of 2DGS (linked from github.com/hbb1/2d-gaussian-splatting)"
 _DTU_NEUS = "get it from the DTU scans of NeuS (data_DTU, linked from github.com/Totoro97/NeuS)"
 _IMAGES = {".png", ".jpg", ".jpeg"}
+CAMERA_FILES = ("cameras_sphere.npz", "cameras.npz")  # DTU
 
 
 @dataclass(frozen=True)

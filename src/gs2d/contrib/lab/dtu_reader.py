@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import rq
 
+from gs2d.contrib.lab.dataset_folders import CAMERA_FILES
 from gs2d.core.camera import Camera
 from gs2d.core.images import is_number, natural_key
 from gs2d.data.arrays import read_npz
@@ -26,11 +27,11 @@ from gs2d.data.readers.colmap import (
     read_cameras,
     read_images,
 )
+from gs2d.data.readers.registry import register_reader
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, colmap_intrinsics
 from gs2d.errors import DataError
 
-CAMERA_FILES = ("cameras_sphere.npz", "cameras.npz")
 _IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg"}
 
 
@@ -92,6 +93,22 @@ def read_dtu(root: Path) -> Capture:
         notes=notes,
         observe=None if model is None or points is None else partial(_observed, model, frames),
     )
+
+
+@register_reader("dtu")
+class DtuReader:
+    """DTU scans; those of 2DGS also contain a COLMAP model."""
+
+    looks_for = f"{' or '.join(CAMERA_FILES)} (DTU)"
+    before_colmap = True
+
+    def detect(self, path: Path) -> bool:
+        """Whether the folder has projection matrices."""
+        return bool(camera_archives(path))
+
+    def read(self, path: Path, *, downscale: int) -> Capture:
+        """Read a scan."""
+        return read_dtu(path)
 
 
 def _observed(model: _Model, frames: Sequence[PosedImage]) -> ObservedPoints:

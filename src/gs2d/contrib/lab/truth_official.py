@@ -11,12 +11,12 @@ import numpy as np
 
 from gs2d.contrib.lab.dataset_folders import find_truth, published_log, recognise
 from gs2d.contrib.lab.datasets import SceneFacts
+from gs2d.contrib.lab.dtu_reader import dtu_silhouettes
 from gs2d.contrib.lab.evaluate_dtu import Silhouette, evaluate_dtu, read_dtu_truth
 from gs2d.contrib.lab.evaluate_tnt import Alignment, evaluate_tnt, read_tnt_truth, read_trajectory
 from gs2d.contrib.lab.surface_protocols import DTU_SURFACE, TNT_SURFACE
 from gs2d.core.mesh import Mesh
 from gs2d.data.image_files import read_mask
-from gs2d.data.readers.dtu import dtu_silhouettes
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
 from gs2d.evaluation.evaluators import register_evaluator

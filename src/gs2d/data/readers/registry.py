@@ -13,13 +13,14 @@ from gs2d.errors import DataError
 
 __all__ = ["READERS", "Reader", "register_reader"]
 
-_CORE = ("blender", "nerfstudio", "dtu", "colmap")
+_CORE = ("blender", "nerfstudio", "colmap")
 
 
 class Reader(Protocol):
-    """How a format of captures is recognised and read. A class is registered; it is made without arguments.
+    """How a capture format is detected and read. Register a class whose constructor needs no arguments.
 
-    An attribute ``looks_for`` names the files for a message: "cameras.xml (Metashape)".
+    Optional attributes: ``looks_for`` names the expected files in messages, such as "cameras.xml (Metashape)";
+    ``before_colmap = True`` tests a format first whose captures also contain a COLMAP model.
     """
 
     def detect(self, path: Path) -> bool:
