@@ -34,7 +34,7 @@ from gs2d.core.files import atomic_write
 from gs2d.core.json_files import write_json
 from gs2d.errors import Gs2dError
 from gs2d.io.run_dir import machine, versions
-from gs2d.pipeline.events import Event, Notice
+from gs2d.training.events import Event, Notice
 
 RECIPE = "2dgs-r-absgs-d"
 FACTORS = (1, 2, 4)  # what the thresholds of D are divided by

@@ -45,11 +45,11 @@ from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import SPLATS
 from gs2d.io.splat_ply import read_splats
 from gs2d.meshing.raycast import cast_camera
-from gs2d.pipeline.events import Notice
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.train.train_run import train
 from gs2d.render.api import rasterize
+from gs2d.training.events import Notice
 
 ALL_OF = {"2dgs": 30_000, "best": 20_000}  # iterations of the recipes
 ZOOM = 6  # of the pictures of seams

@@ -27,8 +27,8 @@ from gs2d.core.json_files import write_json
 from gs2d.io.run_dir import SPLATS, RunFolder
 from gs2d.io.splat_ply import read_splats
 from gs2d.kernels.library import describe_library
-from gs2d.pipeline.events import ignore
 from gs2d.pipeline.prepare.loaded import reload_run
+from gs2d.training.events import ignore
 
 CASES = {
     "lego": Case("lego", "nerf_synthetic_lego", downscale=2),

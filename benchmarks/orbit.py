@@ -19,12 +19,12 @@ from gs2d.core.camera import Camera
 from gs2d.data.subject import OBJECT, read_subject
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, RunFolder
-from gs2d.pipeline.events import ignore
 from gs2d.pipeline.finish.camera_paths import orbit_cameras
 from gs2d.pipeline.finish.run_images import render_run
 from gs2d.pipeline.prepare.loaded import reload_run
 from gs2d.pipeline.prepare.options import RenderOptions
 from gs2d.report.mesh_images import mesh_images
+from gs2d.training.events import ignore
 
 
 def cropped(image: Image.Image, width: int, height: int) -> Image.Image:

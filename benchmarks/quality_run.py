@@ -24,11 +24,11 @@ from gs2d.core.json_files import write_json
 from gs2d.core.splats import Splats
 from gs2d.data import Scene
 from gs2d.errors import Gs2dError
-from gs2d.pipeline.events import ignore
 from gs2d.pipeline.prepare.limits import use_threads
 from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.training import events
+from gs2d.training.events import ignore
 from gs2d.training.learned.learned_table import LearnedTable
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer, TrainerOptions

@@ -40,9 +40,9 @@ from gs2d.data import Scene, View
 from gs2d.data.image_files import read_image, write_image
 from gs2d.errors import DataError
 from gs2d.evaluation.image_metrics import ImageMetrics, image_metrics
-from gs2d.pipeline.events import ignore
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.run_appearance import matched_by_halves
+from gs2d.training.events import ignore
 
 OWN_ITERATIONS = 30_000
 OWN = {"refine-every": 500, "densify-from": 500, "sh-degree-interval": 1000}  # of 30,000 iterations

@@ -33,7 +33,6 @@ from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, METRICS, PAGE, REPORT, SPLATS
 from gs2d.meshing.depth_maps import depth_map
 from gs2d.meshing.evidence import gather, pixels
-from gs2d.pipeline.events import ignore
 from gs2d.pipeline.finish.run_images import render_view
 from gs2d.pipeline.finish.run_mesh import fusion_frame
 from gs2d.pipeline.finish.run_subject import sights, surface_reach
@@ -44,6 +43,7 @@ from gs2d.pipeline.reconstruct import CAPTURE, FEW
 from gs2d.render.api import rasterize
 from gs2d.sfm.photos import find_photos
 from gs2d.sfm.workspace import POSES_JSON
+from gs2d.training.events import ignore
 
 POLL_SECONDS = 0.2
 PROCESS, CONSOLE, PHOTOS, PEER = "process.json", "console.txt", "photographs", "peer"

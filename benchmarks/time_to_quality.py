@@ -64,9 +64,9 @@ from gs2d.data import Scene
 from gs2d.data.scene import PointCloud
 from gs2d.errors import DataError, Gs2dError
 from gs2d.evaluation.evaluators import choose_truth
-from gs2d.pipeline.events import ignore
 from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
 from gs2d.synthetic.capture import write_demo_capture
+from gs2d.training.events import ignore
 
 DEMO, PEER = "demo", "opensplat"
 CONSOLE, RECIPES, SCALES = "console.txt", ("2dgs", "2dgs-60k", "2dgs-r"), (0.02, 0.05, 0.1)

@@ -31,9 +31,9 @@ from gs2d.core.json_files import write_json
 from gs2d.core.similarity import apply, similarity_scale, umeyama
 from gs2d.data.readers.colmap import read_images
 from gs2d.errors import Gs2dError
-from gs2d.pipeline.events import Notice
 from gs2d.pipeline.prepare.options import PosesOptions
 from gs2d.pipeline.prepare.pose_finding import CAMERA_MODELS, find_poses
+from gs2d.training.events import Notice
 
 LOW, HIGH = np.array([-2.0, -1.6, 0.0]), np.array([2.0, 1.6, 2.4])  # m, of the room
 CELLS, METRES = 256, 4.0  # of a wall's pattern, and what it covers

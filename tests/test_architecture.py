@@ -70,8 +70,7 @@ INSIDE = {
         "finish": 4,
         "look": 3,
         "prepare": 2,
-        "attempts": 1,
-        "events": 0,
+        "attempts run_parts": 1,
     },
     "render": {
         "tensor_api": 7,

@@ -11,9 +11,9 @@ import torch
 
 from benchmarks.gpu.bench import ROOT, Bench
 from benchmarks.gpu.capture import SYNTHETIC, write_capture
-from gs2d.pipeline.events import Phase, StageDone
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.train.train_run import train
+from gs2d.training.events import Phase, StageScored
 
 RECIPE = "2dgs-r"  # the paper's, three stages; goals of seconds are its
 STAGE = ("name", "iterations", "seconds", "splats", "bytes", "train", "test", "after_clone")
@@ -89,7 +89,7 @@ def whole_run(
     ended: list[dict[str, Any]] = []
 
     def on_event(event: Any) -> None:
-        if isinstance(event, StageDone):
+        if isinstance(event, StageScored):
             ended.append({k: event.metrics.get(k) for k in STAGE})
             report({"schedule_scale": scale, "unfinished": True, "stages_so_far": ended})
         if isinstance(event, Phase):

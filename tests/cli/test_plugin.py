@@ -74,7 +74,7 @@ def test_a_run_uses_all_of_them_and_says_so(trained: Path) -> None:
     views = json.loads((trained / "learned.json").read_text())["views"]
     assert len(views) == 6
     assert all(len(view["example-tint"]) == 3 for view in views.values())
-    pruned = [event for event in events if event["kind"] == "densify"]
+    pruned = [event for event in events if event["kind"] == "densified"]
     assert [(event["iteration"], event["splats"]) for event in pruned] == [(3, 58)]
 
 

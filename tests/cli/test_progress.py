@@ -12,16 +12,18 @@ import pytest
 from gs2d.cli.bar import Bar
 from gs2d.cli.console import Console
 from gs2d.cli.whole import WholeRun
-from gs2d.pipeline.events import TRAINED, Notice, Phase, Plan, Step
+from gs2d.pipeline.run_parts import TRAINED
+from gs2d.training.events import Notice, Phase, RunPlan, Step
 from terminal import ESCAPES, raw_screen_of
 
 DRAWN = textwrap.dedent(
     """
     import time
     from gs2d.cli.console import Console
-    from gs2d.pipeline.events import TRAINED, Notice, Phase, Plan, Step
+    from gs2d.pipeline.run_parts import TRAINED
+    from gs2d.training.events import Notice, Phase, RunPlan, Step
     console = Console(quiet=False, as_json=False)
-    console.on_event(Plan(TRAINED))
+    console.on_event(RunPlan(TRAINED))
     console.on_event(Phase("training 2dgs-r", 6000))
     for done in (1000, 2000, 3000):
         time.sleep(0.3)
@@ -92,7 +94,7 @@ def test_a_log_file_gets_a_line_a_phase_and_now_and_then_how_far_it_is(
 def test_quiet_and_json_draw_nothing_on_stdout(capsys: pytest.CaptureFixture[str]) -> None:
     quiet, as_json = Console(quiet=True, as_json=True), Console(quiet=False, as_json=True)
     for console in (quiet, as_json):
-        for event in (Plan(TRAINED), Phase("training", 3), Step(1), Notice("n")):
+        for event in (RunPlan(TRAINED), Phase("training", 3), Step(1), Notice("n")):
             console.on_event(event)
         console.table("", ["a"], [["b"]])
         console.say("text")
@@ -123,7 +125,7 @@ def follow(seconds: list[float]) -> Iterator[tuple[float, str, float | None]]:
     """Play a training, and yield seconds, the time left of its bar, and that of the whole run."""
     clock = Clock()
     whole = WholeRun(clock)
-    whole.on_plan(Plan(TRAINED))
+    whole.on_plan(RunPlan(TRAINED))
     phase = Phase("training best", 10 * len(seconds), growth=1.1)
     whole.on_phase(phase)
     bar = Bar(phase, whole, clock)

@@ -15,10 +15,10 @@ from capture_writers import ring, small_colmap
 from gs2d.core.splats import Splats
 from gs2d.data import View, load_scene
 from gs2d.data.undistort import colmap_intrinsics, source_positions
-from gs2d.pipeline.events import ignore
 from gs2d.pipeline.finish import run_mesh as surface
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
+from gs2d.training.events import ignore
 from gs2d.training.targets import DeviceTargets, Targets
 
 WIDTH, HEIGHT = 160, 120

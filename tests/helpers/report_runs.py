@@ -67,14 +67,14 @@ def events() -> list[dict[str, Any]]:
             lines.append({"kind": "ranked", "stage": name, "group": "high_error", "count": 200, "fraction": 0.123})
         if name == "refine":
             lines.append({"kind": "cloned", "stage": name, "count": 200, "opacity": "copy", "splats": 20200})
-        lines.append({"kind": "stage_start", "stage": name, "iterations": iterations, "splats": 5000})
+        lines.append({"kind": "stage_started", "stage": name, "iterations": iterations, "splats": 5000})
         for iteration in range(20, iterations + 1, 20):
             t = (offset + iteration) / 6000
             losses = {"l1": 0.05 * np.exp(-2 * t) * rng.uniform(0.7, 1.3), "ssim": 0.02 * np.exp(-t)}
             if name != "appearance":
                 losses["normal_consistency"] = 0.004 * rng.uniform(0.9, 1.1)
             line = {
-                "kind": "step",
+                "kind": "progress",
                 "stage": name,
                 "iteration": iteration,
                 "losses": losses,
@@ -88,7 +88,7 @@ def events() -> list[dict[str, Any]]:
             if name == "surface" and iteration % 1000 == 0:
                 pruned = {"pruned_by_opacity": 4, "pruned_large": 1}
                 lines.append(
-                    {"kind": "densify", "stage": name, "iteration": iteration, "cloned": 10, "split": 20, **pruned}
+                    {"kind": "densified", "stage": name, "iteration": iteration, "cloned": 10, "split": 20, **pruned}
                 )
                 lines.append({"kind": "opacity_limited", "stage": name, "iteration": iteration, "reset": True})
         offset += iterations

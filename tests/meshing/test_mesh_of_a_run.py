@@ -17,7 +17,6 @@ from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RunFolder
 from gs2d.kernels.library import available_variants
 from gs2d.meshing.tsdf_volume import Add, Volume, integrator
-from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.finish.run_mesh import extract_mesh, mesh_run
 from gs2d.pipeline.prepare.loaded import finished_splats, reload_run
 from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
@@ -25,6 +24,7 @@ from gs2d.pipeline.prepare.resolve import with_fused_depth
 from gs2d.pipeline.prepare.resolved import check_same_run
 from gs2d.pipeline.train.train_run import train
 from gs2d.render.backends import Backend, get_backend
+from gs2d.training.events import Event, Notice
 from tiny import RADIUS, write_capture
 
 

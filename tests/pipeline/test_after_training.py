@@ -15,8 +15,8 @@ from gs2d.cli import run as gs2d
 from gs2d.errors import DataError
 from gs2d.io.run_dir import RunFolder
 from gs2d.io.splat_ply import read_splats
-from gs2d.pipeline.events import Event, MissingFile
 from gs2d.pipeline.train.train_run import train
+from gs2d.training.events import Event, NotMade
 
 LATER = {  # of a training, with what is missing then
     "train.stage_results.write_poses": "learned cameras and exposures",
@@ -25,7 +25,7 @@ LATER = {  # of a training, with what is missing then
     "train.stage_results.split_metrics": "scores of train views, stage refine",
     "train.stage_results.report_losses": "what the losses say of stage refine",
     "train.stage_results.draw_stage": "pictures of stage refine",
-    "train.stage_results.StageDone": "scores of stage refine",
+    "train.stage_results.StageScored": "scores of stage refine",
     "finish.run_mesh.fusion_frame": "mesh.ply",
     "finish.verdict.Collector._measure": "verdict.json",
     "train.train_run.meshed_subject": "mesh.ply",
@@ -83,7 +83,7 @@ def test_a_training_whose_views_cannot_be_scored_has_its_splats(
     heard: list[Event] = []
     run = train(options(capture, tmp_path / "run", page=False), heard.append)
     assert len(read_splats(run.file("splats.ply"))) > 0
-    missing = [event.what for event in heard if isinstance(event, MissingFile)]
+    missing = [event.what for event in heard if isinstance(event, NotMade)]
     assert [what for what in missing if what.endswith("refine")] == [
         "scores of train views, stage refine",
         "scores of test views, stage refine",

@@ -13,10 +13,10 @@ import torch
 
 from ball_runs import Stop, comparable, options
 from gs2d.io.run_dir import CheckpointFile, RunFolder, load_tensors, save_tensors
-from gs2d.pipeline.events import Event, Notice, Step, ignore
 from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
 from gs2d.pipeline.train.resume import ResumePoint, choose_start
 from gs2d.pipeline.train.train_run import train
+from gs2d.training.events import Event, Notice, Step, ignore
 
 
 @pytest.fixture(scope="module")

@@ -11,10 +11,10 @@ import gs2d.pipeline.prepare.quality as module
 from ball_runs import options
 from gs2d.config.presets import get_recipe
 from gs2d.errors import RecipeError
-from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.prepare.quality import Quality
 from gs2d.pipeline.prepare.resolve import by_quality
 from gs2d.pipeline.train.train_run import train
+from gs2d.training.events import Event, Notice
 
 
 @pytest.fixture(autouse=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gs2d.pipeline.events import Phase
+from gs2d.training.events import Phase
 
 
 def test_the_time_left_of_a_phase_follows_how_its_steps_grow() -> None:

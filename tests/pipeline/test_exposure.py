@@ -18,7 +18,6 @@ from gs2d.data.subject import OBJECT, read_subject
 from gs2d.errors import RunError
 from gs2d.io.run_dir import EXPOSURE, LEARNED, RunFolder
 from gs2d.pipeline.demo import demo
-from gs2d.pipeline.events import Event, Notice, ignore
 from gs2d.pipeline.finish.camera_paths import orbit_cameras
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.finish.run_images import render_run, render_view
@@ -29,6 +28,7 @@ from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, RenderOp
 from gs2d.pipeline.train.train_run import train
 from gs2d.synthetic import capture as toy
 from gs2d.synthetic.perturb_exposure import GAINS, random_gains, with_gains
+from gs2d.training.events import Event, Notice, ignore
 
 EARLY = (*SMALL, "exposure.start=5", "exposure.rate=0.2")  # so that 60 iterations show something
 

@@ -17,7 +17,6 @@ from gs2d.errors import DataError, DiskError, RunError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RunFolder, open_run
 from gs2d.io.splat_ply import read_splats, write_splats
-from gs2d.pipeline.events import Event, StageDone
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.finish.export import export_run
 from gs2d.pipeline.finish.run_images import file_names, render_run
@@ -26,6 +25,7 @@ from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.look.page import page_run
 from gs2d.pipeline.prepare.options import EvaluateOptions, MeshOptions, RenderOptions
 from gs2d.pipeline.train.train_run import train
+from gs2d.training.events import Event, StageScored
 from tiny import ball_cameras, write_ball_mesh
 
 
@@ -90,7 +90,7 @@ def test_a_command_removes_what_a_killed_one_left_in_the_run(
 
 def test_an_unfinished_run_cannot_be_exported(capture: Path, tmp_path: Path) -> None:
     def listen(event: Event) -> None:
-        if isinstance(event, StageDone):
+        if isinstance(event, StageScored):
             raise Stop
 
     with pytest.raises(Stop):

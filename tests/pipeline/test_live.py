@@ -22,12 +22,11 @@ from cli_runs import TINY
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.events import Event, Notice, Phase, Step, ignore
 from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
 from gs2d.pipeline.train import live as module
 from gs2d.pipeline.train.live import Live
 from gs2d.pipeline.train.train_run import train
-from gs2d.training.events import Progress, StageEntering
+from gs2d.training.events import Event, Notice, Phase, Progress, StageEntering, Step, ignore
 from gs2d.training.state import TrainState
 
 

@@ -20,13 +20,13 @@ from gs2d.core.splats import Splats
 from gs2d.data import load_scene
 from gs2d.errors import DataError
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.events import Notice
 from gs2d.pipeline.finish.run_subject import sights
 from gs2d.pipeline.in_memory import Trained, evaluate, extract_mesh, train
 from gs2d.pipeline.prepare.loaded import reload_run, scene_digest
 from gs2d.pipeline.prepare.open_capture import without_masked_points
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.render.backends import get_backend
+from gs2d.training.events import Notice
 from gs2d.training.trainer import raster_settings
 from tiny import ball_cameras, ball_image
 

@@ -12,11 +12,11 @@ import pytest
 from ball_runs import options
 from gs2d.core.memory_limit import MemoryLimit
 from gs2d.errors import DataError
-from gs2d.pipeline.events import Notice
 from gs2d.pipeline.prepare import limits as module
 from gs2d.pipeline.prepare.limits import check_memory
 from gs2d.pipeline.prepare.loaded import prepare_run
 from gs2d.pipeline.train.train_run import train
+from gs2d.training.events import Notice
 from tiny import write_capture
 
 GB = 10**9

@@ -14,9 +14,9 @@ from gs2d.core.files import disk_error
 from gs2d.errors import DiskError, ProtocolError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.attempts import attempted
-from gs2d.pipeline.events import Event, MissingFile
 from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.train.train_run import train
+from gs2d.training.events import Event, NotMade
 
 MADE = ("mesh.ply", "report.html", "scene.html")
 
@@ -78,7 +78,7 @@ def test_what_cannot_be_made_is_said_and_leaves_the_others(
     monkeypatch.setattr(f"gs2d.pipeline.{place}", failing(error))
     heard: list[Event] = []
     train(options(capture, finished, resume=True), heard.append)
-    missing = [event for event in heard if isinstance(event, MissingFile)]
+    missing = [event for event in heard if isinstance(event, NotMade)]
     assert [(event.what, event.reason) for event in missing] == [(what, reason)]
     assert missing[0].command == (command and command.format(run=finished))
     assert missing[0].error is error
@@ -118,14 +118,14 @@ def test_a_section_that_fails_loses_no_other_section(
     (copy / "renders" / "index.json").write_text("{")
     heard: list[Event] = []
     report_run(copy, heard.append)
-    whats = [event.what for event in heard if isinstance(event, MissingFile)]
+    whats = [event.what for event in heard if isinstance(event, NotMade)]
     assert whats == [
         "cameras of the pictures in report.html",
         "comparison with a photograph in report.html",
         "section views in report.html",
         "section training in report.html",
     ]
-    assert {event.command for event in heard if isinstance(event, MissingFile)} == {f"gs2d report {copy}"}
+    assert {event.command for event in heard if isinstance(event, NotMade)} == {f"gs2d report {copy}"}
     text = (copy / "report.html").read_text()
     assert "The section training could not be made: no curve today" in text
     assert "Settings" in text

@@ -10,9 +10,9 @@ import pytest
 
 from ball_runs import SMALL, Stop, comparable, options
 from gs2d.errors import DataError
-from gs2d.pipeline.events import Event, Step
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.train.train_run import train
+from gs2d.training.events import Event, Step
 
 WIDE = (  # for few cameras, far apart, and pictures of a few pixels
     *("multiview.max_angle=80", "multiview.max_baseline=2", "multiview.radius=1", "multiview.occluded=50"),
@@ -27,7 +27,7 @@ def comparing(capture: Path, out: Path, **changes: Any) -> TrainOptions:
 
 def test_a_run_that_compares_views_resumes_to_the_same_bytes_and_logs_its_loss(capture: Path, tmp_path: Path) -> None:
     whole = train(comparing(capture, tmp_path / "whole"))
-    logged = [line["losses"] for line in whole.events.read() if line["kind"] == "step"]
+    logged = [line["losses"] for line in whole.events.read() if line["kind"] == "progress"]
     assert any(losses.get("multiview_photometric", 0) > 0 for losses in logged)
 
     def listen(event: Event) -> None:

@@ -12,10 +12,10 @@ import torch
 from ball_runs import SMALL, options
 from gs2d.core.photometry import reach_of
 from gs2d.io.run_dir import PHOTOMETRY, REPORT, RunFolder
-from gs2d.pipeline.events import Event, Notice, ignore
 from gs2d.pipeline.prepare.loaded import reload_run
 from gs2d.pipeline.prepare.run_appearance import as_scene, photographed
 from gs2d.pipeline.train.train_run import train
+from gs2d.training.events import Event, Notice, ignore
 
 EARLY = (*SMALL, "photometry.start=5", "photometry.rate=0.02")
 

@@ -18,7 +18,6 @@ from gs2d.core import memory_limit
 from gs2d.data import load_scene
 from gs2d.data.prepared import SUFFIX, Stored
 from gs2d.errors import DataError
-from gs2d.pipeline.events import Event, Notice, Phase
 from gs2d.pipeline.finish.run_mesh import mesh_run
 from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.prepare import photographs
@@ -28,6 +27,7 @@ from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare.photographs import PREPARED
 from gs2d.pipeline.prepare.resolved import Execution
 from gs2d.pipeline.train.train_run import train
+from gs2d.training.events import Event, Notice, Phase
 from gs2d.training.trainer import Trainer
 
 FLIGHT = Flight(12, width=64, height=48, points=6000, seed=1)

@@ -17,9 +17,9 @@ from PIL import Image
 from ball_runs import SMALL, Stop, options
 from gs2d.errors import DataError
 from gs2d.io.run_dir import REPORT, RunFolder
-from gs2d.pipeline.events import Event, MissingFile, Notice, Step
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.train.train_run import train
+from gs2d.training.events import Event, Notice, NotMade, Step
 from tiny import RADIUS, SIZE, ball_cameras
 
 EAGER = (*SMALL, "depth_prior.opacity=0.05")
@@ -57,7 +57,7 @@ def run(valid: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 
 def test_a_run_logs_measures_and_shows_what_was_known(run: RunFolder) -> None:
-    logged = [line["losses"] for line in run.events.read() if line["kind"] == "step"]
+    logged = [line["losses"] for line in run.events.read() if line["kind"] == "progress"]
     assert any(losses.get("depth_prior", 0) > 0 for losses in logged)
     assert any(losses.get("normal_prior", 0) > 0 for losses in logged)
     for stage in run.metrics()["stages"]:
@@ -127,4 +127,4 @@ def test_names_that_are_no_utf_8_and_hold_escape_sequences_have_known_depths_too
     stages = train(knowing(named, tmp_path / "run"), heard.append).metrics()["stages"]
     assert len(stages[-1]["losses"]["depth_prior"]["by_view"]) == 6
     assert (tmp_path / "run" / REPORT).exists()
-    assert not any(isinstance(event, MissingFile) for event in heard)
+    assert not any(isinstance(event, NotMade) for event in heard)

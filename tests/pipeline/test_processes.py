@@ -37,8 +37,8 @@ def whole(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_of_two_processes_is_written_by_one(whole: Path) -> None:
     run = RunFolder(whole)
     kinds = [entry["kind"] for entry in run.events.read()]
-    assert kinds.count("initialised") == kinds.count("processes") == kinds.count("stage_end") == 1
-    assert "densify" in kinds
+    assert kinds.count("initialised") == kinds.count("processes") == kinds.count("stage_finished") == 1
+    assert "densified" in kinds
     end = load_tensors(run.checkpoints()[-1].path)
     assert end["state"]["processes"] == [[0, 0, 2]]
     assert run.metrics()["stages"][0]["iterations"] == ITERATIONS

@@ -13,11 +13,11 @@ from ball_runs import SMALL, options
 from gs2d.data import load_scene
 from gs2d.errors import RunError
 from gs2d.io.run_dir import POSES, RunFolder
-from gs2d.pipeline.events import Event, Notice, ignore
 from gs2d.pipeline.finish.run_texture import _views
 from gs2d.pipeline.prepare.loaded import reload_run
 from gs2d.pipeline.prepare.options import TextureOptions
 from gs2d.pipeline.train.train_run import train
+from gs2d.training.events import Event, Notice, ignore
 
 EARLY = (*SMALL, "poses.start=5", "intrinsics.start=5", "intrinsics.rate=0.01")
 

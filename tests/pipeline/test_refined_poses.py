@@ -17,7 +17,6 @@ from gs2d.errors import RunError
 from gs2d.evaluation.image_metrics import mean_metrics
 from gs2d.io.run_dir import POSES, RunFolder
 from gs2d.pipeline.demo import demo
-from gs2d.pipeline.events import Event, Notice, Step, ignore
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.finish.run_images import render_run, render_view
 from gs2d.pipeline.finish.run_report import report_run
@@ -29,6 +28,7 @@ from gs2d.pipeline.prepare.run_poses import aligned, how_far
 from gs2d.pipeline.train.train_run import train
 from gs2d.synthetic import capture as toy
 from gs2d.synthetic.perturb_poses import TRUTH
+from gs2d.training.events import Event, Notice, Step, ignore
 
 EARLY = (*SMALL, "poses.start=5", "poses.rate=0.01")  # so that 60 iterations show something
 

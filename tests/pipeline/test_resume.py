@@ -14,8 +14,8 @@ import pytest
 from ball_runs import SMALL, Stop, comparable, options, spawn
 from gs2d.errors import DiskError, RunError
 from gs2d.io.run_dir import RunFolder, open_run
-from gs2d.pipeline.events import Event, Notice, StageDone, Step
 from gs2d.pipeline.train.train_run import train
+from gs2d.training.events import Event, Notice, StageScored, Step
 
 
 @pytest.mark.parametrize("stop_after", [3, 13, 30, 37, 41, 59])
@@ -36,7 +36,7 @@ def test_a_run_stopped_between_the_end_of_a_stage_and_its_scores_is_scored_on_re
     capture: Path, undisturbed: RunFolder, tmp_path: Path
 ) -> None:
     def listen(event: Event) -> None:
-        if isinstance(event, StageDone):
+        if isinstance(event, StageScored):
             raise Stop
 
     with pytest.raises(Stop):

@@ -21,11 +21,11 @@ from gs2d.errors import DataError, DiskError, DivergedError, ProtocolError, Reci
 from gs2d.io.run_dir import RunFolder
 from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.demo import demo
-from gs2d.pipeline.events import Event, Notice, Phase, Step, ignore
 from gs2d.pipeline.finish.run_images import render_run
 from gs2d.pipeline.prepare.loaded import prepare_run
 from gs2d.pipeline.prepare.options import DemoOptions, RenderOptions
 from gs2d.pipeline.train.train_run import pretraining_notices, train
+from gs2d.training.events import Event, Notice, Phase, Step, ignore
 from tiny import write_capture
 
 
@@ -69,14 +69,14 @@ def test_metrics_have_an_entry_for_each_stage_with_a_reason_for_each_null(undist
 
 
 def test_the_log_has_the_figures_of_every_curve(undisturbed: RunFolder) -> None:
-    steps = [event for event in undisturbed.events.read() if event["kind"] == "step"]
+    steps = [event for event in undisturbed.events.read() if event["kind"] == "progress"]
     assert steps[-1]["total_iteration"] == 60
     assert {event["stage"] for event in steps} == {"surface", "appearance", "refine"}
     for event in steps:
         assert {"loss", "losses", "splats", "mean_opacity", "mean_area", "iteration"} <= set(event)
     assert any("psnr" in event for event in steps)
     kinds = {event["kind"] for event in undisturbed.events.read()}
-    assert {"initialised", "stage_start", "stage_end", "ranked", "cloned", "after_clone"} <= kinds
+    assert {"initialised", "stage_started", "stage_finished", "ranked", "cloned", "after_clone"} <= kinds
 
 
 def test_pictures_of_every_stage_lie_beside_the_photographs(undisturbed: RunFolder) -> None:

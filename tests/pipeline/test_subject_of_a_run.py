@@ -15,13 +15,13 @@ from gs2d.data.subject import OBJECT, read_subject
 from gs2d.errors import ProtocolError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.events import Notice
 from gs2d.pipeline.finish.run_mesh import extract_mesh
 from gs2d.pipeline.finish.run_subject import meshed_subject, subject_line
 from gs2d.pipeline.prepare.loaded import finished_splats, reload_run
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.report.record import read_record
 from gs2d.report.sections.subject import subject_section
+from gs2d.training.events import Notice
 
 BOX = (-0.5, -0.6, -0.7, 0.5, 0.6, 0.7)
 

@@ -11,10 +11,10 @@ import pytest
 
 from gs2d.evaluation.surface_score import evaluate_surface
 from gs2d.io.run_dir import RunFolder, open_run
-from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.finish.run_mesh import mesh_run
 from gs2d.pipeline.prepare.options import EvaluateOptions, MeshOptions
+from gs2d.training.events import Event, Notice
 from tiny import write_ball_mesh
 
 

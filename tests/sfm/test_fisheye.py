@@ -16,7 +16,6 @@ from gs2d.core.json_files import read_json
 from gs2d.data import load_scene
 from gs2d.data.image_files import read_mask
 from gs2d.data.readers.colmap import read_cameras, read_images
-from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.prepare.options import PosesOptions
 from gs2d.pipeline.prepare.pose_finding import find_poses
 from gs2d.sfm import as_fisheye
@@ -24,6 +23,7 @@ from gs2d.sfm.fisheye import Circle, circle_of, small_if_dark
 from gs2d.sfm.lens_probe import probe
 from gs2d.sfm.photo_masks import copy_masks
 from gs2d.sfm.photos import Photo, find_photos, read_photos
+from gs2d.training.events import Event, Notice
 
 SIZE = (400, 300)
 F = 150.0

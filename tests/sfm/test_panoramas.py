@@ -28,11 +28,11 @@ from gs2d.core.similarity import apply, umeyama
 from gs2d.data import load_scene
 from gs2d.data.readers.colmap import read_cameras
 from gs2d.errors import DataError
-from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.prepare.options import PosesOptions
 from gs2d.pipeline.prepare.pose_finding import find_poses
 from gs2d.sfm.panoramas import meets_itself
 from gs2d.sfm.photos import Photo, camera_groups, find_photos, panorama_groups, read_photos
+from gs2d.training.events import Event, Notice
 from gs2d.training.plane_sweep import start_points, sweep_views
 from room_photos import room_cameras, room_image, textures
 

@@ -22,9 +22,9 @@ from gs2d.core.camera import look_at
 from gs2d.data import load_scene
 from gs2d.data.image_files import read_image
 from gs2d.data.readers.colmap import read_images
-from gs2d.pipeline.events import Event, Notice, Phase
 from gs2d.pipeline.prepare.options import PosesOptions
 from gs2d.pipeline.prepare.pose_finding import find_poses
+from gs2d.training.events import Event, Notice, Phase
 from room_photos import FOCAL, SIZE, UP, Room, room_image, textures, write_room
 
 

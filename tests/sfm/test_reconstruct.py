@@ -19,9 +19,9 @@ from gs2d.cli import commands, run
 from gs2d.cli.parser import parse
 from gs2d.io.run_dir import open_run
 from gs2d.pipeline import reconstruct as module
-from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.prepare.options import ReconstructOptions, Training, values
 from gs2d.pipeline.reconstruct import poses_options, reconstruct, train_options
+from gs2d.training.events import Event, Notice
 from room_photos import Room, write_room
 from tiny import write_capture
 

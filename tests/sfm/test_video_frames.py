@@ -14,10 +14,10 @@ from cli_runs import one_line
 from gs2d.cli import run
 from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
-from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.prepare.options import PosesOptions
 from gs2d.pipeline.prepare.pose_finding import find_poses
 from gs2d.sfm.video_frames import choose, look_into, sharpness_of, take
+from gs2d.training.events import Event, Notice
 from room_photos import write_room
 
 real = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="there is no ffmpeg on this machine")

@@ -36,7 +36,7 @@ class Twins(Densifier):
     def changes(self, iteration: int) -> bool:
         return iteration == self.at
 
-    def after_backward(self, state: TrainState, output: StepResult, iteration: int) -> Sequence[events.Event]:
+    def after_backward(self, state: TrainState, output: StepResult, iteration: int) -> Sequence[events.TrainingEvent]:
         assert state.statistics is not None
         assert output.radii is not None
         seen = state.statistics["seen"]
@@ -99,7 +99,7 @@ def test_large_splats_are_pruned_after_densification_and_in_a_stage_that_does_no
     train = dict.fromkeys(("means", "quats", "log_scales", "sh0"), "all")
     stages = (replace(recipe.stages[0], densify=cull, train=train),)
     trainer = Trainer(train_toys.make_scene(), replace(recipe, stages=stages), train_toys.GENERIC, backend="reference")
-    happened: list[events.Event] = []
+    happened: list[events.TrainingEvent] = []
     trainer._on_event = happened.append
     trainer.enter(0)
     assert trainer.state.statistics == {}

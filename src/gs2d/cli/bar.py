@@ -10,7 +10,7 @@ from rich.text import Text
 
 from gs2d.cli.whole import Countdown, WholeRun
 from gs2d.core.text import duration, printable
-from gs2d.pipeline.events import Phase
+from gs2d.training.events import Phase
 
 _WIDEST, _LEAST = 32, 6  # columns of a bar; with fewer there is none
 _FULL, _EMPTY = "\u2501", "\u2500"

@@ -19,7 +19,7 @@ from gs2d.cli.bar import Bar
 from gs2d.cli.layout import records, wrapped
 from gs2d.cli.whole import WholeRun
 from gs2d.core.text import printable
-from gs2d.pipeline.events import Event, MissingFile, Notice, Phase, Plan, StageDone, Step
+from gs2d.training.events import Event, Notice, NotMade, Phase, RunPlan, StageScored, Step
 
 LOG_SECONDS, LOG_FRACTION = 60.0, 0.1  # in a log file: a line after so long, if at least so much of the phase was done
 LOG_SILENCE = 300.0  # s, after which there is a line whatever was done; the first one comes after LOG_SECONDS
@@ -76,18 +76,18 @@ class Console:
         self._live: Live | None = None
         self._bar: Bar | None = None
         self._named: set[str] = set()  # phases that a log file has heard of
-        self.missing: list[MissingFile] = []  # what could not be made, for the end of the command
+        self.missing: list[NotMade] = []  # what could not be made, for the end of the command
         self._logged = (0.0, 0)  # s, steps done: at the last line of a log file
         self._logs = 0  # lines of a log file about how far the phase is
 
     def on_event(self, event: Event) -> None:
         """Print an event of the pipeline."""
         self._before_each()
-        if isinstance(event, MissingFile):
+        if isinstance(event, NotMade):
             self.missing.append(event)
         if self.quiet:
             return
-        if isinstance(event, Plan):
+        if isinstance(event, RunPlan):
             self._whole.on_plan(event)
         elif isinstance(event, Phase):
             self._whole.on_phase(event)
@@ -98,12 +98,12 @@ class Console:
         elif isinstance(event, Notice):
             if self._verbose or not event.detail:
                 self._note(event)
-        elif isinstance(event, MissingFile):
+        elif isinstance(event, NotMade):
             self._err.print(
                 f"[red]not made[/red] {escape(printable(event.what))}: {escape(printable(event.reason))}",
                 soft_wrap=True,
             )
-        elif isinstance(event, StageDone):
+        elif isinstance(event, StageScored):
             self._lines(wrapped(event.line(), self._err.width, rest="  "))
 
     def _note(self, notice: Notice) -> None:

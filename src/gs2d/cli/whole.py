@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 
 from gs2d.core.text import duration
-from gs2d.pipeline.events import Part, Phase, Plan
+from gs2d.training.events import Phase, RunPart, RunPlan
 
 GREW = (2.0, 60.0)  # an estimate of more than so many times what is shown, and so many seconds: the work grew
 _TRAINING = "training"
@@ -30,10 +30,10 @@ class WholeRun:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._parts: tuple[Part, ...] = ()
-        self.on_plan(Plan(()))
+        self._parts: tuple[RunPart, ...] = ()
+        self.on_plan(RunPlan(()))
 
-    def on_plan(self, plan: Plan) -> None:
+    def on_plan(self, plan: RunPlan) -> None:
         """Take a plan. A subset of the current plan is ignored; the same plan starts another run."""
         if set(plan.parts) < set(self._parts):
             return

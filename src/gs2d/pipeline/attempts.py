@@ -9,7 +9,7 @@ from pathlib import Path
 
 from gs2d.core.files import is_full
 from gs2d.errors import Gs2dError
-from gs2d.pipeline.events import MissingFile, OnEvent
+from gs2d.training.events import NotMade, OnEvent
 
 LONGEST = 500  # characters of a message that is not ours
 
@@ -28,14 +28,14 @@ def attempted(what: str, command: str | None, on_event: OnEvent) -> Iterator[Non
     command : str or None
         What makes it again (:func:`again`); None: the same command with ``--resume``; "": nothing does.
     on_event : callable
-        Is told :class:`~gs2d.pipeline.events.MissingFile`.
+        Is told :class:`~gs2d.training.events.NotMade`.
     """
     try:
         yield
     except Exception as error:
         if is_full(error) or isinstance(error, BrokenPipeError):
             raise
-        on_event(MissingFile(what, reason_of(error), command, error))
+        on_event(NotMade(what, reason_of(error), command, error))
 
 
 def again(verb: str, path: Path, *more: object) -> str:

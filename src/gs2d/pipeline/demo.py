@@ -7,15 +7,16 @@ from pathlib import Path
 from gs2d.errors import RunError
 from gs2d.io.run_dir import RunFolder, check_claim, is_run, open_run
 from gs2d.pipeline.attempts import again, attempted
-from gs2d.pipeline.events import DEMO, OnEvent, Phase, Plan, Step, ignore
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.prepare.limits import use_threads
 from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, TrainOptions
 from gs2d.pipeline.prepare.resolve import check_options
+from gs2d.pipeline.run_parts import DEMO
 from gs2d.pipeline.train.train_run import check_viewer, train
 from gs2d.synthetic.capture import write_demo_capture
 from gs2d.synthetic.perturb_exposure import GAINS
 from gs2d.synthetic.perturb_poses import TRUTH as TRUE_POSES
+from gs2d.training.events import OnEvent, Phase, RunPlan, Step, ignore
 
 CAPTURE, TRUTH = "capture", "mesh_gt.ply"
 CAPTURE_FILES = ("train", "test", "transforms_train.json", "transforms_test.json", GAINS, TRUE_POSES)  # and mesh_gt*
@@ -42,7 +43,7 @@ def demo(
     check_claim(options.out, resume=options.resume, overwrite=overwrite, allowed=(CAPTURE,))
     check_viewer(training)
     use_threads(options.threads)
-    on_event(Plan(DEMO))
+    on_event(RunPlan(DEMO))
     if not (options.resume and (capture / "transforms_train.json").exists()):
         _check_capture(capture)
         total = options.train_views + options.test_views

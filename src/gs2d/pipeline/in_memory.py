@@ -21,7 +21,6 @@ from gs2d.data.subject import OBJECT
 from gs2d.errors import DataError, ProtocolError
 from gs2d.evaluation.image_metrics import ImageMetrics, mean_metrics
 from gs2d.evaluation.lpips import Lpips
-from gs2d.pipeline.events import ignore
 from gs2d.pipeline.finish.run_mesh import fused
 from gs2d.pipeline.finish.run_subject import subject_in, wants_subject
 from gs2d.pipeline.finish.scoring import score_views
@@ -32,6 +31,7 @@ from gs2d.pipeline.prepare.resolve import resolve
 from gs2d.pipeline.train.progress_bar import progress_bar
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
+from gs2d.training.events import ignore
 from gs2d.training.trainer import Trainer, raster_settings
 
 __all__ = ["Trained", "evaluate", "extract_mesh", "train"]

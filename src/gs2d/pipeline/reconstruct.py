@@ -17,7 +17,6 @@ from gs2d.errors import DataError, ProtocolError, RunError
 from gs2d.io.run_dir import LOCK, MESH, TEXTURED, RunFolder, check_claim, is_run, make_folder, open_run, remove_made
 from gs2d.meshing.texture import required
 from gs2d.pipeline.attempts import again, attempted
-from gs2d.pipeline.events import PLACED, TEXTURED_TOO, TRAINED, Notice, OnEvent, Plan, ignore
 from gs2d.pipeline.finish.run_texture import PACKAGES as TEXTURE_PACKAGES
 from gs2d.pipeline.finish.run_texture import texture_run
 from gs2d.pipeline.prepare.options import (
@@ -32,11 +31,13 @@ from gs2d.pipeline.prepare.options import (
 )
 from gs2d.pipeline.prepare.pose_finding import asked_for, check_poses_options, find_poses, placed_line
 from gs2d.pipeline.prepare.resolve import check_options
+from gs2d.pipeline.run_parts import PLACED, TEXTURED_TOO, TRAINED
 from gs2d.pipeline.train.train_run import check_viewer, train
 from gs2d.sfm.colmap_process import check_installed
 from gs2d.sfm.photos import find_photos
 from gs2d.sfm.video_frames import is_video, look_into
 from gs2d.sfm.workspace import POSES_JSON, POSES_PNG, hidden_workspace, sweep_workspace
+from gs2d.training.events import Notice, OnEvent, RunPlan, ignore
 
 CAPTURE = "capture"
 FEW = 24  # photographs, below which each is needed for the surface and none is held out
@@ -82,7 +83,7 @@ def reconstruct(options: ReconstructOptions, on_event: OnEvent = ignore) -> RunF
     whole, also where training fails later: ``resume`` then does not find the cameras again.
     """
     check_reconstruct(options)
-    on_event(Plan((*PLACED, *(TEXTURED_TOO if options.texture else TRAINED))))
+    on_event(RunPlan((*PLACED, *(TEXTURED_TOO if options.texture else TRAINED))))
     find_cameras(options, on_event)
     return train_found(options, on_event)
 

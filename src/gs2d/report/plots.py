@@ -51,7 +51,7 @@ def read_history(events: Sequence[Mapping[str, Any]]) -> History:
         if stage not in lengths:
             order.append(stage)
             lengths[stage] = 0
-        declared = event.get("iterations") if event.get("kind") == "stage_start" else None
+        declared = event.get("iterations") if event.get("kind") == "stage_started" else None
         lengths[stage] = max(lengths[stage], _whole(declared), _whole(event.get("iteration")))
     starts, total = {}, 0
     for stage in order:
@@ -61,7 +61,7 @@ def read_history(events: Sequence[Mapping[str, Any]]) -> History:
     for event in events:
         stage = event.get("stage")
         known = isinstance(stage, str) and stage in starts
-        if event.get("kind") in ("step", "changes") and known and "iteration" in event:
+        if event.get("kind") in ("progress", "changes") and known and "iteration" in event:
             iteration = starts[event["stage"]] + _whole(event["iteration"])
             for name, value in _figures(event).items():
                 points.setdefault(name, []).append((iteration, value))

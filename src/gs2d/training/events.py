@@ -1,22 +1,35 @@
-"""Events of a training, as small frozen values. Whenever one is sent the state is whole and can be saved.
+"""Events of a run, as small frozen values: the trainer, the pipeline, the log and the console all use these.
 
-``kind`` is the name of an event in ``events.jsonl``.
+Events of the trainer are sent while its state is complete and can be saved. ``kind`` is the name of an event in
+``events.jsonl``. The log has four more kinds: ``notice`` (a detail), ``changes`` (mean change of each attribute per
+iteration), ``after_clone`` (scores just after the entry actions of a stage) and ``processes`` (their number).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import ClassVar
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, TypeVar
+
+T = TypeVar("T")
+MIN_SHARE, MIN_SECONDS = 0.05, 60.0  # of a phase; time left is unknown until one of them has passed
 
 
+# -- events of the trainer, which the log keeps ------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Initialised:
-    """The start.
+    """The initial splats.
 
-    ``source`` is "points" (the scene's), "sweep" (those of photographs that agree), "depths" (known ones too),
-    "random", or "splats" (given); ``dropped``: unusable. ``lacks``: why there is no dense start, where the recipe would
-    have one.
+    Attributes
+    ----------
+    splats : int
+    source : str
+        "points" (of the scene), "sweep" (dense start), "depths" (points and known depths), "random", or "splats"
+        (passed by the caller).
+    dropped : int
+        Unusable points.
+    lacks : str
+        Reason why a recipe with a dense start has none here.
     """
 
     kind: ClassVar[str] = "initialised"
@@ -28,7 +41,7 @@ class Initialised:
 
 @dataclass(frozen=True)
 class StageEntering:
-    """A stage is about to run its entry actions; the splats are still those of the stage before."""
+    """The entry actions of a stage are about to run; the splats are those of the previous stage."""
 
     kind: ClassVar[str] = "stage_entering"
     stage: str
@@ -38,7 +51,7 @@ class StageEntering:
 
 @dataclass(frozen=True)
 class Ranked:
-    """Splats were ranked by colour error: the group's smallest E_i, and its share of the sum of all."""
+    """Splats were ranked by colour error. ``threshold`` is the smallest E_i of the group, ``fraction`` its share."""
 
     kind: ClassVar[str] = "ranked"
     stage: str
@@ -62,9 +75,9 @@ class Cloned:
 
 @dataclass(frozen=True)
 class StageStarted:
-    """The entry actions of a stage are done; its first iteration comes next."""
+    """The entry actions of a stage are done; its first iteration is next."""
 
-    kind: ClassVar[str] = "stage_start"
+    kind: ClassVar[str] = "stage_started"
     stage: str
     index: int
     iterations: int
@@ -77,15 +90,19 @@ class Progress:
 
     Attributes
     ----------
-    losses : weighted value of each active term
-    loss : their sum
-    mean_opacity : mean of o
-    mean_k_a : mean of K_a = s_u s_v (the paper's Eq. 7), world units^2
-    lr : learning rate of each trained attribute (means: world units)
-    sh_degree : degree in training
+    losses : mapping
+        Weighted value of each active term; ``loss`` is their sum.
+    mean_opacity : float
+        Mean of o.
+    mean_k_a : float
+        Mean of K_a = s_u s_v (the paper's Eq. 7), world units^2.
+    lr : mapping
+        Learning rate of each trained attribute (means: world units).
+    sh_degree : int
+        Degree in training.
     """
 
-    kind: ClassVar[str] = "step"
+    kind: ClassVar[str] = "progress"
     stage: str
     index: int
     iteration: int
@@ -103,7 +120,7 @@ class Progress:
 class Densified:
     """Splats were cloned, split and pruned."""
 
-    kind: ClassVar[str] = "densify"
+    kind: ClassVar[str] = "densified"
     stage: str
     iteration: int
     cloned: int
@@ -115,7 +132,7 @@ class Densified:
 
 @dataclass(frozen=True)
 class OpacityLimited:
-    """Opacity was limited from above: a reset, or AbsGS's cap."""
+    """Opacities were reset, or capped as in AbsGS."""
 
     kind: ClassVar[str] = "opacity_limited"
     stage: str
@@ -126,7 +143,7 @@ class OpacityLimited:
 
 @dataclass(frozen=True)
 class FloatersRemoved:
-    """Splats that something spoke against, and that the training images did not miss, were removed."""
+    """Splats that were proposed for removal, and that the training images do not need, were removed."""
 
     kind: ClassVar[str] = "floaters_removed"
     stage: str
@@ -137,9 +154,9 @@ class FloatersRemoved:
 
 @dataclass(frozen=True)
 class StageFinished:
-    """A stage is done; the state already points at the next one. ``unseen`` splats, in no training view, are gone."""
+    """A stage is trained; the state points at the next one. ``unseen`` splats, in no training view, were removed."""
 
-    kind: ClassVar[str] = "stage_end"
+    kind: ClassVar[str] = "stage_finished"
     stage: str
     index: int
     iterations: int
@@ -147,7 +164,145 @@ class StageFinished:
     unseen: int = 0
 
 
-Event = (
+# -- events of the pipeline, which the console shows -------------------------------------------------------------------
+@dataclass(frozen=True)
+class Phase:
+    """A phase of ``total`` steps begins (0: unknown); the previous phase is over.
+
+    Attributes
+    ----------
+    name : str
+    total : int
+    done : int
+        Steps that an interrupted run had done.
+    growth : float
+        For steps of increasing cost: the first fraction s of the steps takes the fraction s ** growth of the time.
+    costs : tuple of (int, float)
+        Numbers of steps with the relative cost of each, where costs differ.
+    """
+
+    name: str
+    total: int
+    done: int = 0
+    growth: float = 1.0
+    costs: tuple[tuple[int, float], ...] = ()
+
+    def seconds_left(self, done: int, elapsed: float) -> float | None:
+        """Return the seconds until the phase ends, after ``elapsed`` seconds; None: too early to estimate."""
+        total = self.seconds_in_all(done, elapsed)
+        return None if total is None else total * (1.0 - self._time_share(min(done, self.total)))
+
+    def seconds_in_all(self, done: int, elapsed: float) -> float | None:
+        """Return the seconds of the whole phase, including steps before a resume; None: too early to estimate."""
+        if not self.total or done <= self.done:
+            return None
+        begun, now = (self._time_share(steps) for steps in (self.done, min(done, self.total)))
+        if now - begun < MIN_SHARE * (1.0 - begun) and elapsed < MIN_SECONDS:
+            return None
+        return elapsed / (now - begun)
+
+    def _time_share(self, steps: int) -> float:
+        """Return the fraction of the time of the phase that its first ``steps`` take."""
+        costs = self.costs or ((self.total, 1.0),)
+        spent, left = 0.0, steps
+        for count, cost in costs:
+            spent += min(count, left) * cost
+            left -= min(count, left)
+        return float((spent / sum(count * cost for count, cost in costs)) ** self.growth)
+
+
+@dataclass(frozen=True)
+class Step:
+    """The number of steps of the phase that are done."""
+
+    done: int
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class Notice:
+    """A line for the user.
+
+    Attributes
+    ----------
+    text : str
+    detail : bool
+        A decision that needs no action: printed with ``--verbose``, and logged in ``events.jsonl`` before training.
+    is_warning : bool
+        A part of the input is left out.
+    """
+
+    kind: ClassVar[str] = "notice"
+    text: str
+    detail: bool = False
+    is_warning: bool = False
+
+
+@dataclass(frozen=True)
+class StageScored:
+    """A finished stage was scored; ``metrics`` is its entry of ``metrics.json``."""
+
+    metrics: dict[str, Any] = field(default_factory=dict)
+
+    def line(self) -> str:
+        """Return time, number of splats and scores in one line."""
+        metrics = self.metrics
+        words = [f"{metrics['name']}: {metrics['iterations']} iterations in {metrics['seconds']:.0f} s"]
+        words.append(f"{metrics['splats']:,} splats")
+        for split in ("train", "test"):
+            scores = metrics.get(split)
+            if scores and scores.get("psnr") is not None:
+                words.append(f"{split} PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f}")
+        return "; ".join(words) + (" (from a cache)" if metrics.get("reused_from") else "")
+
+
+@dataclass(frozen=True)
+class NotMade:
+    """A file or a section of the result could not be made; the run continues.
+
+    Attributes
+    ----------
+    what : str
+        File or section.
+    reason : str
+        One line.
+    command : str or None
+        Makes it; None: the same command with ``--resume``; "": nothing does.
+    error : Exception or None
+    """
+
+    what: str
+    reason: str
+    command: str | None = None
+    error: Exception | None = None
+
+
+@dataclass(frozen=True)
+class RunPart:
+    """A part of a run, of one or more phases.
+
+    Attributes
+    ----------
+    name : str
+    begins : tuple of str
+        Prefixes of the names of its phases. Any other phase belongs to the part in which it occurs.
+    of_training : float or None
+        Expected time as a fraction of the training time; None: unknown.
+    """
+
+    name: str
+    begins: tuple[str, ...]
+    of_training: float | None = None
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """The parts of a run, in order. A plan that is a subset of the previous plan is ignored."""
+
+    parts: tuple[RunPart, ...]
+
+
+TrainingEvent = (
     Initialised
     | StageEntering
     | Ranked
@@ -159,3 +314,17 @@ Event = (
     | FloatersRemoved
     | StageFinished
 )
+Event = TrainingEvent | Phase | Step | Notice | StageScored | NotMade | RunPlan
+OnEvent = Callable[[Event], None]
+
+
+def ignore(_event: Any) -> None:
+    """Ignore an event."""
+
+
+def counted(items: Iterable[T], name: str, total: int, on_event: OnEvent) -> Iterator[T]:
+    """Iterate as a phase of ``total`` steps."""
+    on_event(Phase(name, total))
+    for done, item in enumerate(items, start=1):
+        yield item
+        on_event(Step(done))

@@ -141,7 +141,7 @@ class Robustness:
         """Whether splats may be removed at the end of an iteration (1-based) of a stage."""
         return looks_at_free_space(self._recipe, stage, iteration) or ends_part(self._recipe, stage, iteration)
 
-    def remove(self, state: TrainState, stage: Stage, iteration: int) -> list[events.Event]:
+    def remove(self, state: TrainState, stage: Stage, iteration: int) -> list[events.TrainingEvent]:
         """Shrink splats that are too large for a known surface and remove floaters, where that is due."""
         if not self.removes(stage, iteration):
             return []

@@ -56,7 +56,7 @@ from gs2d.training.whole_steps import WholeSteps
 
 __all__ = ["OnEvent", "Trainer", "TrainerOptions", "raster_settings"]
 
-OnEvent = Callable[[events.Event], None]
+OnEvent = Callable[[events.TrainingEvent], None]
 MIN_START = 10  # splats that a dense start must find where there are others to start from
 MIN_SIDE = 11  # px of a photograph in training: the window of SSIM
 
@@ -150,7 +150,7 @@ class Trainer:
         self._on_event, self._options = on_event, options
         self.processes = processes = options.processes
         self.views = processes.size  # of the last iteration
-        self._pending: list[events.Event] = []
+        self._pending: list[events.TrainingEvent] = []
         if state is not None and init is not None:
             raise RunError("training goes on from a state or starts from init, got both; leave one out")
         # What goes on has begun; free space is found by the settings of the dense start, so that sweep is made again.
@@ -314,7 +314,7 @@ class Trainer:
             changed |= changes
         return range(first, stop)
 
-    def _learn(self, stage: Stage, turns: Sequence[Turn]) -> tuple[StepResult | None, list[events.Event]]:
+    def _learn(self, stage: Stage, turns: Sequence[Turn]) -> tuple[StepResult | None, list[events.TrainingEvent]]:
         """Gradients of a view, statistics and densification, Adam."""
         state, objective, densifier = self.state, self._objective, self._densifiers[self.state.stage]
         assert objective is not None
@@ -480,7 +480,7 @@ class Trainer:
         self._pending.append(events.Initialised(len(splats), source, initial.dropped, self._robust.lacks))
         return splats
 
-    def _act(self, stage: Stage, action: RankByError | CloneInPlace) -> events.Event:
+    def _act(self, stage: Stage, action: RankByError | CloneInPlace) -> events.TrainingEvent:
         """Run an entry action."""
         if isinstance(action, CloneInPlace):
             count = clone_in_place(self.state, action)

@@ -20,8 +20,8 @@ from gs2d.contrib.lab.split import read_split
 from gs2d.errors import DataError, Gs2dError, RecipeError, RunError
 from gs2d.io.run_dir import open_run
 from gs2d.io.splat_ply import read_splats
-from gs2d.pipeline.events import Event
 from gs2d.pipeline.prepare.part import FROZEN, OWN, read_start
+from gs2d.training.events import Event
 
 
 @pytest.fixture(scope="module")

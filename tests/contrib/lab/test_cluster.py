@@ -22,7 +22,7 @@ from gs2d.contrib.lab.execute import execute
 from gs2d.contrib.lab.jobs import Job
 from gs2d.contrib.lab.tasks import failures
 from gs2d.errors import DataError
-from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
+from gs2d.training.events import Notice, OnEvent, Phase, Step
 from sweep_jobs import make_jobs
 from tiny import write_capture
 

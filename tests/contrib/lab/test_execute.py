@@ -20,7 +20,7 @@ from gs2d.contrib.lab.execute import execute
 from gs2d.contrib.lab.jobs import Job
 from gs2d.contrib.lab.tasks import failures
 from gs2d.errors import DataError, RunError
-from gs2d.pipeline.events import Notice, OnEvent
+from gs2d.training.events import Notice, OnEvent
 from sweep_jobs import fail_or_die, make_jobs
 
 HELPERS = str(Path(__file__).resolve().parents[2] / "helpers")

@@ -13,10 +13,10 @@ from gs2d.contrib.lab import settle as module
 from gs2d.contrib.lab.partition import Partition
 from gs2d.contrib.lab.settle import Settled, capture_digest, fitting_partition
 from gs2d.errors import DataError
-from gs2d.pipeline.events import Event
 from gs2d.pipeline.prepare.estimate import Estimate, Range
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.render.backends import get_backend
+from gs2d.training.events import Event
 from train_toys import backends, make_scene
 
 SCENE = make_scene()

@@ -29,7 +29,7 @@ from gs2d.contrib.lab.schedule import Executor
 from gs2d.contrib.lab.tasks import AnyTask, Task
 from gs2d.core.extras import install
 from gs2d.errors import BackendError
-from gs2d.pipeline.events import Event, MissingFile, Notice, OnEvent, Phase, StageDone, Step
+from gs2d.training.events import Event, Notice, NotMade, OnEvent, Phase, StageScored, Step
 
 RETRIES = 2  # of a task whose machine or process is lost, at least
 CONNECT_SECONDS, TCP_SECONDS = 60.0, 5.0
@@ -322,9 +322,9 @@ class OnCluster(Executor[AnyTask]):
             at.done = event.done
         elif isinstance(event, Notice) and not event.text.startswith(f"{name} failed: "):  # said when it has ended
             on_event(Notice(f"{name}: {event.text}", event.detail))
-        elif isinstance(event, StageDone):
+        elif isinstance(event, StageScored):
             on_event(Notice(f"{name}: {event.line()}"))
-        elif isinstance(event, MissingFile):
+        elif isinstance(event, NotMade):
             on_event(event)
 
     def detail(self) -> str:

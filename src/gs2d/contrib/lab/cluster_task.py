@@ -12,7 +12,7 @@ from typing import Any
 
 from gs2d.contrib.lab.tasks import Task, do
 from gs2d.core.locks import try_lock
-from gs2d.pipeline.events import Event, MissingFile, Notice, Phase, StageDone, Step
+from gs2d.training.events import Event, Notice, NotMade, Phase, StageScored, Step
 
 WAIT_SECONDS = 90.0  # a shared disk may show a new file, and give the lock of a dead machine back, a minute late
 STEP_SECONDS = 1.0  # between two steps that are told
@@ -77,9 +77,9 @@ class Told:
             if time.monotonic() - self._last < STEP_SECONDS:
                 return
             self._last = time.monotonic()
-        if isinstance(event, Phase | Step | Notice | StageDone):
+        if isinstance(event, Phase | Step | Notice | StageScored):
             self.send(event)
-        elif isinstance(event, MissingFile):
+        elif isinstance(event, NotMade):
             self.send(replace(event, error=None))  # which need not survive the way
 
     def send(self, event: Event | Begun) -> None:

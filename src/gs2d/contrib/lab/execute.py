@@ -19,7 +19,7 @@ from gs2d.contrib.lab.schedule import Executor, given_up, several_at_once
 from gs2d.contrib.lab.tasks import AnyTask, Task, do
 from gs2d.errors import BackendError
 from gs2d.io.run_dir import RunFolder, make_folder
-from gs2d.pipeline.events import Notice, OnEvent, ignore
+from gs2d.training.events import Notice, OnEvent, ignore
 
 POLL_SECONDS = 0.5
 

@@ -19,7 +19,6 @@ from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.errors import Gs2dError
 from gs2d.io.run_dir import RunFolder, load_tensors, make_folder, open_run
-from gs2d.pipeline.events import Notice, OnEvent, counted, ignore
 from gs2d.pipeline.finish.run_images import choose_views, fraction_of_group, render_view, splatted
 from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats, reload_run
 from gs2d.pipeline.prepare.run_appearance import photographed
@@ -27,6 +26,7 @@ from gs2d.pipeline.train.resume import stage_end
 from gs2d.render.api import splat_errors
 from gs2d.report.images import ERROR_TOP, error_image, error_scale, highlight_image, valid_image
 from gs2d.report.plots import Panel, compared, read_history
+from gs2d.training.events import Notice, OnEvent, counted, ignore
 from gs2d.training.learned.appearance import numbers_of, shown_splats
 from gs2d.training.rank_clone import worst
 from gs2d.training.state import TrainState

@@ -12,8 +12,8 @@ from typing import Any
 
 from gs2d.contrib.lab.tasks import Task
 from gs2d.io.run_dir import MESH, SPLATS, RunFolder
-from gs2d.pipeline.events import Event, MissingFile, OnEvent
 from gs2d.pipeline.prepare.options import EvaluateOptions, TrainOptions
+from gs2d.training.events import Event, NotMade, OnEvent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,10 +92,10 @@ def train_and_evaluate(job: Job, on_event: OnEvent) -> dict[str, str]:
     from gs2d.pipeline.finish.evaluate import evaluate_run
     from gs2d.pipeline.train.train_run import train
 
-    missing: list[MissingFile] = []
+    missing: list[NotMade] = []
 
     def listen(event: Event) -> None:
-        missing.extend([event] if isinstance(event, MissingFile) else [])
+        missing.extend([event] if isinstance(event, NotMade) else [])
         on_event(event)
 
     train(job.train, listen)

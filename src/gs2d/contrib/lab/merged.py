@@ -20,7 +20,6 @@ from gs2d.errors import RunError
 from gs2d.io.run_dir import SPLATS, RunFolder, is_run, open_run
 from gs2d.io.splat_ply import read_splats, write_splats
 from gs2d.pipeline.attempts import attempted
-from gs2d.pipeline.events import OnEvent
 from gs2d.pipeline.finish.run_images import choose_views, draw_stage
 from gs2d.pipeline.finish.run_mesh import MeshFrames
 from gs2d.pipeline.finish.scoring import PeakMemory, score_views, split_metrics
@@ -34,6 +33,7 @@ from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.resolved import CaptureRecord, Execution, ResolvedRun
 from gs2d.pipeline.prepare.run_appearance import with_learned_appearance, write_appearance
 from gs2d.pipeline.train.train_run import finish
+from gs2d.training.events import OnEvent
 from gs2d.training.trainer import raster_settings
 
 MERGED, SEAM_VIEWS = "merged.ply", "seams.json"  # in the job folder: all blocks, and the photographs of their seams

@@ -24,7 +24,7 @@ from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import RunError
 from gs2d.evaluation.visible_surface import VISIBLE_SURFACE
 from gs2d.io.run_dir import machine, make_folder, versions
-from gs2d.pipeline.events import Notice, OnEvent, ignore
+from gs2d.training.events import Notice, OnEvent, ignore
 
 ABOUT = "about.json"
 FIXED = ("table", "protocol", "schedule_scale", "downscale", "backend", "overrides")  # of all runs in a folder

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Sequence
 from typing import Generic
 
 from gs2d.contrib.lab.tasks import AnyTask, Task
-from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
+from gs2d.training.events import Notice, OnEvent, Phase, Step
 
 
 class Executor(ABC, Generic[AnyTask]):

@@ -26,12 +26,12 @@ from gs2d.core.text import name_bytes
 from gs2d.data import Scene
 from gs2d.data.archive import is_archive
 from gs2d.errors import DataError, RecipeError
-from gs2d.pipeline.events import Notice, OnEvent
 from gs2d.pipeline.prepare.estimate import Estimate, estimate, expected_splats, limit_of
 from gs2d.pipeline.prepare.open_capture import open_capture
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.prepare.resolve import check_options, resolve
 from gs2d.render.backends import Backend
+from gs2d.training.events import Notice, OnEvent
 
 FORMAT = 1
 SEAM_RATES = 0.3  # of a block's iterations, its last: by their rates seams learn. Full ones undo more than they mend

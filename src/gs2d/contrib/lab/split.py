@@ -17,10 +17,10 @@ from gs2d.core.splats import Splats
 from gs2d.core.transforms import camera_extent
 from gs2d.data import Scene, View
 from gs2d.errors import DataError, RunError
-from gs2d.pipeline.events import Notice, OnEvent, counted
 from gs2d.pipeline.prepare.part import FROZEN, OWN, write_start
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
+from gs2d.training.events import Notice, OnEvent, counted
 from gs2d.training.seen_area import shown_weights, shrunk
 
 SIDE = 200  # px, of the pictures in which is looked at what shows what: fractions do not need more

@@ -18,7 +18,7 @@ from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import Gs2dError
 from gs2d.io.run_dir import now
 from gs2d.io.run_schema import check_shape
-from gs2d.pipeline.events import Notice, OnEvent, ignore
+from gs2d.training.events import Notice, OnEvent, ignore
 
 _OUTCOME = {"state": str, "reason?": str, "notes?": (dict, None), "wanted?": [str], "trained?": bool}
 

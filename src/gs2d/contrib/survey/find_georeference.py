@@ -23,8 +23,8 @@ from gs2d.data.positions import Positions, WorldFrame, in_frame, matched, read_p
 from gs2d.errors import DataError, RunError
 from gs2d.io.georeference import read_georeference, write_georeference
 from gs2d.io.run_dir import GEOREFERENCE, POSES, RunFolder, open_run
-from gs2d.pipeline.events import OnEvent, counted, ignore
 from gs2d.pipeline.prepare.loaded import reload_run
+from gs2d.training.events import OnEvent, counted, ignore
 
 SOURCES = ("gps", "positions", "control", "known_distance", "markers")
 _FEWEST = 3  # places of photographs

@@ -22,10 +22,10 @@ from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, open_run
 from gs2d.meshing.raycast import Hits, cast_down
 from gs2d.meshing.texture import Texels, surface_colors
-from gs2d.pipeline.events import OnEvent, Phase, ignore
 from gs2d.pipeline.finish.run_texture import photographs
 from gs2d.pipeline.finish.world_frame import place_of
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
+from gs2d.training.events import OnEvent, Phase, ignore
 
 ELEVATION = "_elevation"  # after the name of the orthophoto
 MAX_CELLS = 36_000_000  # a colour's choice takes about 70 bytes a cell: 2.5 GB

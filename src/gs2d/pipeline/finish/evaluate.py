@@ -15,7 +15,6 @@ from gs2d.io.run_dir import (
     VERDICT,
 )
 from gs2d.pipeline.attempts import again, attempted
-from gs2d.pipeline.events import Notice, OnEvent, Phase, ignore
 from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.scoring import score_views, split_metrics
 from gs2d.pipeline.finish.verdict import Collector, write_verdict
@@ -23,6 +22,7 @@ from gs2d.pipeline.prepare.loaded import open_finished
 from gs2d.pipeline.prepare.options import EvaluateOptions
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.run_poses import aligned
+from gs2d.training.events import Notice, OnEvent, Phase, ignore
 
 
 def evaluate_run(

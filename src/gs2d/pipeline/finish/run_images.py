@@ -34,7 +34,6 @@ from gs2d.io.run_dir import (
     remove_made,
 )
 from gs2d.pipeline.attempts import again, attempted
-from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.finish.camera_paths import flight_cameras, orbit_cameras
 from gs2d.pipeline.finish.scoring import evenly
 from gs2d.pipeline.finish.trusted_depth import believed_reach, within_reach
@@ -53,6 +52,7 @@ from gs2d.report.images import (
     normal_image,
     valid_image,
 )
+from gs2d.training.events import Notice, OnEvent, Phase, Step, counted, ignore
 
 INDEX = "index.json"
 LONGEST_NAME = 180  # bytes; file systems take 255, and a picture's kind and a temporary suffix come after it

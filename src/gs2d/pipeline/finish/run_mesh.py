@@ -35,7 +35,6 @@ from gs2d.meshing.extract import Extraction, ExtractOptions, extract, extract_un
 from gs2d.meshing.slabs import SLAB_BYTES
 from gs2d.meshing.tsdf_volume import VolumeTooLargeError
 from gs2d.pipeline.attempts import again, attempted
-from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
 from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.run_subject import OPAQUE, meshed_subject
 from gs2d.pipeline.finish.scoring import SeenView
@@ -47,6 +46,7 @@ from gs2d.pipeline.prepare.loaded import LoadedRun, RenderedScene, checked_outpu
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.render.api import rasterize
 from gs2d.render.types import RenderOutput
+from gs2d.training.events import Notice, OnEvent, Phase, counted, ignore
 
 ONE_SURFACE = 0.02  # of the depth: where mean and median differ by more, a pixel sees several surfaces
 SEVERAL = 0.25  # weight of such a pixel

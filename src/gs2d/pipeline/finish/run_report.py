@@ -11,12 +11,12 @@ from gs2d.io.run_dir import (
     open_run,
 )
 from gs2d.pipeline.attempts import again, attempted, reason_of
-from gs2d.pipeline.events import MissingFile, OnEvent, ignore
 from gs2d.pipeline.finish.run_images import shown_cameras
+from gs2d.training.events import NotMade, OnEvent, ignore
 
 
 def report_run(path: Path, on_event: OnEvent = ignore) -> Path:
-    """Write the report of a run; a section that fails says so, and a ``MissingFile`` event is sent."""
+    """Write the report of a run; a section that fails says so, and a ``NotMade`` event is sent."""
     from gs2d.report.write import write_report
 
     run = open_run(Path(path))
@@ -24,7 +24,7 @@ def report_run(path: Path, on_event: OnEvent = ignore) -> Path:
     command = again("report", run.path)
 
     def failed(section: str, error: Exception) -> None:
-        on_event(MissingFile(f"{section} in {REPORT}", reason_of(error), command, error))
+        on_event(NotMade(f"{section} in {REPORT}", reason_of(error), command, error))
 
     cameras: list[Camera] = []
     with attempted(f"cameras of the pictures in {REPORT}", command, on_event):

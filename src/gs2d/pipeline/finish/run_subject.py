@@ -28,12 +28,12 @@ from gs2d.data.subject import (
 from gs2d.errors import DataError, DiskError, ProtocolError, RunError
 from gs2d.io.run_dir import RENDERS, SUBJECT, RunFolder, make_folder
 from gs2d.meshing.fusion_bounds import backproject
-from gs2d.pipeline.events import Notice, OnEvent
 from gs2d.pipeline.finish.trusted_depth import surface_reach
 from gs2d.pipeline.prepare.loaded import LoadedRun, RenderedScene
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.render.api import rasterize
 from gs2d.report.sections.subject import IMAGE, write_subject_image
+from gs2d.training.events import Notice, OnEvent
 
 MAX_VIEWS = 64  # cameras, evenly chosen, that vote
 SIDE = 56  # px, the shorter side of the depth maps that are looked at

@@ -31,7 +31,6 @@ from gs2d.meshing.texture import (
     texture_size,
     unwrap,
 )
-from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
 from gs2d.pipeline.finish.run_mesh import fused, mesh_run
 from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.run_subject import OPAQUE, meshed_subject
@@ -41,6 +40,7 @@ from gs2d.pipeline.prepare.open_capture import read_scene
 from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions
 from gs2d.pipeline.prepare.run_appearance import as_scene
 from gs2d.render.api import rasterize
+from gs2d.training.events import Notice, OnEvent, Phase, counted, ignore
 
 PACKAGES = ("xatlas",)  # of the extra `texture`
 PASSES = ("colouring the texture", "comparing the colours")

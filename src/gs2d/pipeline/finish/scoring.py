@@ -16,11 +16,11 @@ from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.evaluation.image_metrics import ImageMetrics, image_metrics, mean_metrics, psnr_float
 from gs2d.evaluation.lpips import Lpips
-from gs2d.pipeline.events import OnEvent, Phase, Step
 from gs2d.pipeline.prepare.run_appearance import matched_by_halves, photographed
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.training.events import OnEvent, Phase, Step
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,9 +21,9 @@ from gs2d.errors import DataError, RunError
 from gs2d.io.formats.splat_formats import read_splats
 from gs2d.io.georeference import georeference_of_file, read_georeference
 from gs2d.io.run_dir import PAGE, RunFolder, is_run, open_run
-from gs2d.pipeline.events import Notice, OnEvent, Phase, ignore
 from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats, reload_run
 from gs2d.render.types import RasterSettings
+from gs2d.training.events import Notice, OnEvent, Phase, ignore
 from gs2d.viewer.web import PageScene, Seen, write_page
 
 MAX_VIEWS = 100  # photographs that one can step through

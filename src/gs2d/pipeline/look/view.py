@@ -16,9 +16,9 @@ from gs2d.data import View
 from gs2d.errors import DataError
 from gs2d.io.meshes import glb_bytes, read_mesh
 from gs2d.io.run_dir import MESH, TEXTURED, RunFolder, load_tensors
-from gs2d.pipeline.events import OnEvent, Step, ignore
 from gs2d.pipeline.look.page import page_content
 from gs2d.report.images import valid_image
+from gs2d.training.events import OnEvent, Step, ignore
 from gs2d.training.state import TrainState
 from gs2d.viewer.server import Answer, PageServer, Route, number_in
 from gs2d.viewer.web import Packed, PageScene, Served, pack, served_page, splats_answer

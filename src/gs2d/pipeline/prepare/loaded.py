@@ -25,7 +25,6 @@ from gs2d.io import splat_ply
 from gs2d.io.formats.splat_formats import read_splats, read_surfels
 from gs2d.io.georeference import georeference_of_file
 from gs2d.io.run_dir import SPLATS, RunFolder, open_run, versions
-from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
 from gs2d.pipeline.prepare.limits import use_threads
 from gs2d.pipeline.prepare.open_capture import SHOWN_SKIPS, open_capture, read_scene, without_masked_points
 from gs2d.pipeline.prepare.options import TrainOptions, values
@@ -39,6 +38,7 @@ from gs2d.pipeline.prepare.view_priors import with_priors
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training.cached_objective import is_cacheable
+from gs2d.training.events import Notice, OnEvent, Phase, Step
 from gs2d.training.initialize import usable_points
 from gs2d.training.trainer import raster_settings
 

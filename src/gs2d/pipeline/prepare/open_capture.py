@@ -16,10 +16,10 @@ from gs2d.data.masks import EMPTY, Masks
 from gs2d.data.scene import PointCloud, View
 from gs2d.errors import ProtocolError
 from gs2d.io.run_dir import RunFolder, is_run
-from gs2d.pipeline.events import Event, Notice, OnEvent
 from gs2d.pipeline.prepare.limits import check_memory, least_downscale
 from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.render.backends import Backend, backend_report, get_backend
+from gs2d.training.events import Event, Notice, OnEvent
 
 SHOWN_SKIPS = 3
 

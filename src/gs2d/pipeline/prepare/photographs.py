@@ -11,8 +11,8 @@ from gs2d.data import Scene
 from gs2d.data.prepare import check_disk, packed_bytes, prepare
 from gs2d.data.prepared import decoded_bytes, forget_others, missing_views, prepared_scene
 from gs2d.errors import DataError
-from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
 from gs2d.pipeline.prepare.resolved import Execution
+from gs2d.training.events import Notice, OnEvent, Phase, Step
 
 PREPARED = "prepared"  # in the run folder
 HOW = ("auto", "always", "never")

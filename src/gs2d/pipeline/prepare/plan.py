@@ -6,13 +6,13 @@ from dataclasses import replace
 
 from gs2d.data.archive import is_archive, unpacked_for_a_moment
 from gs2d.errors import DataError
-from gs2d.pipeline.events import OnEvent, ignore
 from gs2d.pipeline.prepare.estimate import Estimate, estimate
 from gs2d.pipeline.prepare.limits import use_memory, use_threads
 from gs2d.pipeline.prepare.loaded import read_init
 from gs2d.pipeline.prepare.open_capture import open_capture
 from gs2d.pipeline.prepare.options import PlanOptions
 from gs2d.pipeline.prepare.resolve import by_quality, check_options, resolve
+from gs2d.training.events import OnEvent, ignore
 
 
 def plan(options: PlanOptions, on_event: OnEvent = ignore) -> Estimate:

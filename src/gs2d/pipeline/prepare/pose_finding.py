@@ -23,9 +23,9 @@ from gs2d.data.masks import FOLDER
 from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import make_folder, now, remove_made, versions
 from gs2d.pipeline.attempts import attempted
-from gs2d.pipeline.events import PLACED, Notice, OnEvent, Phase, Plan, Step, counted, ignore
 from gs2d.pipeline.prepare.options import PosesOptions
 from gs2d.pipeline.prepare.photo_places import Places, places_of
+from gs2d.pipeline.run_parts import PLACED
 from gs2d.sfm.colmap_process import Group, MatchFacts, Request, Solved, check_installed, layers, read_facts, solve
 from gs2d.sfm.fisheye import Circle
 from gs2d.sfm.image_copies import copy_images
@@ -59,6 +59,7 @@ from gs2d.sfm.workspace import (
     sweep_workspace,
     workspace,
 )
+from gs2d.training.events import Notice, OnEvent, Phase, RunPlan, Step, counted, ignore
 
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", PANORAMA)
 MATCHINGS = ("auto", "exhaustive", "sequential", "similar", "spatial")
@@ -88,7 +89,7 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
     DataError, RunError, DiskError
     """
     started = time.monotonic()
-    on_event(Plan(PLACED))
+    on_event(RunPlan(PLACED))
     check_installed()
     check_poses_options(options)
     video = look_into(options.photos) if is_video(options.photos) else None

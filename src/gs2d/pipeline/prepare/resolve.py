@@ -24,12 +24,12 @@ from gs2d.data import Scene, load_scene
 from gs2d.data.subject import check_subject_box
 from gs2d.errors import ProtocolError, RecipeError
 from gs2d.losses.api import losses_of
-from gs2d.pipeline.events import Notice, OnEvent
 from gs2d.pipeline.prepare.open_capture import OpenCapture, without_masked_points
 from gs2d.pipeline.prepare.options import Training, TrainOptions
 from gs2d.pipeline.prepare.photographs import HOW
 from gs2d.pipeline.prepare.quality import quality_of
 from gs2d.training.backdrop import find_backdrop
+from gs2d.training.events import Notice, OnEvent
 from gs2d.training.point_gains import point_gains
 from gs2d.training.robust import check_free_space
 

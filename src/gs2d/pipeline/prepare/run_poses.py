@@ -18,10 +18,10 @@ from gs2d.data import Scene, View
 from gs2d.errors import DataError, RunError, ShapeError
 from gs2d.io.run_dir import POSES, SPLATS, RunFolder
 from gs2d.losses.api import LossView, compute_losses
-from gs2d.pipeline.events import Notice, OnEvent, counted
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
+from gs2d.training.events import Notice, OnEvent, counted
 
 ABOUT = (
     "cameras of the training photographs as refined, then those of the test photographs as given, in the layout of "

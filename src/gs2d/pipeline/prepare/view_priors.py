@@ -13,7 +13,7 @@ from gs2d.core.text import name_bytes
 from gs2d.data import Scene, View
 from gs2d.errors import DataError
 from gs2d.losses.priors import Depths, MetricDepth, NormalTarget, PointDepths
-from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
+from gs2d.training.events import Notice, OnEvent, Phase, Step
 from gs2d.training.priors import DepthPlan, Priors, has_priors
 
 

@@ -16,11 +16,11 @@ import numpy as np
 
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
-from gs2d.pipeline.events import Event, Notice, OnEvent, Phase, Step
 from gs2d.pipeline.look.page import page_scene, some_views
 from gs2d.pipeline.look.view import images_route
 from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.training import events as train_events
+from gs2d.training.events import Event, Notice, OnEvent, Phase, Step
 from gs2d.training.state import TrainState
 from gs2d.viewer.server import Answer, PageServer
 from gs2d.viewer.web import Packed, Served, pack, served_page, splats_answer
@@ -75,7 +75,7 @@ class Live:
             self._told = True
             self._tell(Notice(f"the viewer failed, training goes on: {type(failure).__name__}: {failure}"))
 
-    def on_training_event(self, event: train_events.Event, state: TrainState, psnr: float | None) -> None:
+    def on_training_event(self, event: train_events.TrainingEvent, state: TrainState, psnr: float | None) -> None:
         """Copy the splats if it is time to; the state is whole at every event. ``psnr`` is that of the probe views."""
         self._psnr = "" if psnr is None else f"  PSNR {psnr:.2f} dB"
         now = time.monotonic()

@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gs2d.core.text import printable
-from gs2d.pipeline.events import Notice
 from gs2d.training import events
+from gs2d.training.events import Notice
 
 __all__ = ["progress_bar"]
 

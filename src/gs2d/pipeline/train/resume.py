@@ -22,8 +22,8 @@ from gs2d.io.run_dir import (
     save_tensors,
 )
 from gs2d.io.run_schema import METRICS_SHAPE, check_shape
-from gs2d.pipeline.events import Notice, OnEvent
 from gs2d.pipeline.prepare.loaded import LoadedRun
+from gs2d.training.events import Notice, OnEvent
 from gs2d.training.resumable import check_resumable
 from gs2d.training.state import TrainState
 

@@ -13,7 +13,6 @@ from typing import Any
 from gs2d.config.recipe import CloneInPlace, Stage
 from gs2d.errors import DivergedError, Gs2dError
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
 from gs2d.pipeline.finish.scoring import PeakGpuMemory, PeakMemory, Visitor
 from gs2d.pipeline.prepare.estimate import iteration_costs
 from gs2d.pipeline.prepare.limits import release_buffers
@@ -23,6 +22,7 @@ from gs2d.pipeline.train.interruption import HeldSignals
 from gs2d.pipeline.train.resume import ResumePoint
 from gs2d.pipeline.train.stage_results import StageResults
 from gs2d.training import events as train_events
+from gs2d.training.events import Notice, OnEvent, Phase, Step
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
 
@@ -143,7 +143,7 @@ class RunLogger:
         finally:
             self._signals.forget()
 
-    def on_training_event(self, event: train_events.Event) -> None:
+    def on_training_event(self, event: train_events.TrainingEvent) -> None:
         """Log an event, and do what is due."""
         if isinstance(event, train_events.Progress):
             self._on_progress(event)
@@ -167,7 +167,7 @@ class RunLogger:
             self._finish_stage(event.index)
 
     # -- the log -------------------------------------------------------------------------------------------------------
-    def _log(self, event: train_events.Event, **extra: Any) -> None:
+    def _log(self, event: train_events.TrainingEvent, **extra: Any) -> None:
         facts = {name: value for name, value in asdict(event).items() if _storable(value)}
         self._run.events.append({"kind": event.kind, **facts, **extra})
 

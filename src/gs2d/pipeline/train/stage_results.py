@@ -14,7 +14,6 @@ from gs2d.evaluation.image_metrics import ImageMetrics
 from gs2d.io.run_dir import SPLATS, VERDICT, RunFolder, load_tensors
 from gs2d.io.splat_ply import write_splats
 from gs2d.pipeline.attempts import again, attempted
-from gs2d.pipeline.events import OnEvent, StageDone
 from gs2d.pipeline.finish.run_images import choose_views, draw_stage
 from gs2d.pipeline.finish.scoring import (
     SeenView,
@@ -34,6 +33,7 @@ from gs2d.pipeline.prepare.run_poses import write_poses
 from gs2d.pipeline.train.loss_reports import report_losses
 from gs2d.pipeline.train.resume import put_in_cache
 from gs2d.render.types import RenderOutput
+from gs2d.training.events import OnEvent, StageScored
 from gs2d.training.trainer import Trainer
 
 PROBE_VIEWS = 4
@@ -153,7 +153,7 @@ class StageResults:
         if cache is not None:
             saved = next(c for c in self._run.checkpoints() if c.stage_index == index and c.iteration is None)
             put_in_cache(cache, self._run, index, load_tensors(saved.path))
-        self._on_event(StageDone(entry))
+        self._on_event(StageScored(entry))
 
     def _scored(self, *, last: bool) -> list[tuple[str, Sequence[View]]]:
         """Return the views that score a stage: all, but before the last stage some of the training views.

@@ -27,7 +27,6 @@ from gs2d.io.run_dir import (
     remove_made,
 )
 from gs2d.pipeline.attempts import again, attempted
-from gs2d.pipeline.events import TRAINED, Event, Notice, OnEvent, Phase, Plan, ignore
 from gs2d.pipeline.finish.run_mesh import MeshFrames, extract_mesh, keep_facts
 from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.finish.run_subject import meshed_subject
@@ -42,11 +41,13 @@ from gs2d.pipeline.prepare.part import Part
 from gs2d.pipeline.prepare.photographs import PREPARED
 from gs2d.pipeline.prepare.resolve import check_options
 from gs2d.pipeline.prepare.resolved import Execution, check_same_run
+from gs2d.pipeline.run_parts import TRAINED
 from gs2d.pipeline.train.live import Live
 from gs2d.pipeline.train.process_group import connected, follow, lead, memory_of
 from gs2d.pipeline.train.resume import ResumePoint, check_sources, choose_start
 from gs2d.pipeline.train.run_logger import RunLogger, progress_every
 from gs2d.training import events
+from gs2d.training.events import Event, Notice, OnEvent, Phase, RunPlan, ignore
 from gs2d.training.parallel import ONE_PROCESS, ManyProcesses, OneProcess
 from gs2d.viewer.server import free_port
 
@@ -71,7 +72,7 @@ def train(
     ----------
     options : TrainOptions
     on_event : callable
-        Gets :mod:`gs2d.pipeline.events`.
+        Gets :mod:`gs2d.training.events`.
     title : str
         Heading of the report; empty: the name of the capture.
     allowed : tuple of str
@@ -116,7 +117,7 @@ def _train(
     check_claim(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
     use_threads(options.threads, together.place.local_size)
     use_memory(memory_of(together.place, options.memory))
-    on_event(Plan(TRAINED))
+    on_event(RunPlan(TRAINED))
     details: list[str] = []
     on_event = keeping_details(on_event, details)
     loaded = prepare_run(options, on_event, title=title, part=part)
@@ -250,7 +251,7 @@ def train_stages(
 
     part = loaded.part
 
-    def listen(event: events.Event) -> None:
+    def listen(event: events.TrainingEvent) -> None:
         recorder.on_training_event(event)
         if live is not None:
             live.on_training_event(event, trainer.state, recorder.psnr)

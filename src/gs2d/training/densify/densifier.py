@@ -107,7 +107,7 @@ class Densifier:
         """
         return None
 
-    def after_backward(self, state: TrainState, output: StepResult, iteration: int) -> Sequence[events.Event]:
+    def after_backward(self, state: TrainState, output: StepResult, iteration: int) -> Sequence[events.TrainingEvent]:
         """Gather, and change splats where that is due; return what happened.
 
         Adam follows, but for an iteration with an event ``Densified`` (its rows are new), and but for opacity in one

@@ -82,10 +82,10 @@ class GradientDensifier(Densifier):
         columns = 4 if self._options.absolute else 2
         return state.splats.means.new_zeros(len(state.splats), columns, requires_grad=True)
 
-    def after_backward(self, state: TrainState, output: StepResult, iteration: int) -> Sequence[events.Event]:
+    def after_backward(self, state: TrainState, output: StepResult, iteration: int) -> Sequence[events.TrainingEvent]:
         """Statistics, densification and opacity resets of one iteration."""
         options, around = self._options, self.surroundings
-        happened: list[events.Event] = []
+        happened: list[events.TrainingEvent] = []
         if iteration >= options.stop:
             return self._prune_large(state, iteration)
         assert state.statistics is not None
@@ -118,7 +118,7 @@ class GradientDensifier(Densifier):
         """Return by how much the gradients of splats count more [N], at a densification; None: all as they are."""
         return None
 
-    def _prune_large(self, state: TrainState, iteration: int) -> Sequence[events.Event]:
+    def _prune_large(self, state: TrainState, iteration: int) -> Sequence[events.TrainingEvent]:
         """Prune splats that have grown too large after densification, where that is due."""
         options, around = self._options, self.surroundings
         if not options.only_prunes(iteration):

@@ -122,7 +122,7 @@ class RelocationDensifier(Densifier):
         """Whether splats are relocated or wander at the end of an iteration."""
         return self._options.round_at(iteration) > 0 or self._options.wanders(iteration)
 
-    def after_backward(self, state: TrainState, output: StepResult, iteration: int) -> Sequence[events.Event]:
+    def after_backward(self, state: TrainState, output: StepResult, iteration: int) -> Sequence[events.TrainingEvent]:
         """Add the gradients of what lets go; relocate and add splats, or let them wander, where that is due."""
         self._let_go(state, output)
         number_of_round = self._options.round_at(iteration)
@@ -153,7 +153,7 @@ class RelocationDensifier(Densifier):
         self.surroundings.backend.assign(splats.means, moved)
 
     @torch.no_grad()
-    def _relocate(self, state: TrainState, number_of_round: int, iteration: int) -> Sequence[events.Event]:
+    def _relocate(self, state: TrainState, number_of_round: int, iteration: int) -> Sequence[events.TrainingEvent]:
         options, splats, around = self._options, state.splats, self.surroundings
         opacities = splats.opacities
         faint = opacities < options.dead_opacity
