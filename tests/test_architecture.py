@@ -61,7 +61,7 @@ INSIDE = {
         "scene": 5,
         "priors faces straighten masks": 4,
         "cache exif file_names undistort": 3,
-        "image_files photo_formats positions": 2,
+        "camera_models image_files photo_formats positions": 2,
         "arrays csv_tables exr float_tiff": 1,
     },
     "pipeline": {

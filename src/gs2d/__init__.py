@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from gs2d.core.sh import rgb_to_sh0
     from gs2d.core.splats import Splats
     from gs2d.core.transforms import perturb_pose
+    from gs2d.data.camera_models import register_camera_model
     from gs2d.data.load import load_scene
     from gs2d.data.readers.registry import register_reader
     from gs2d.data.scene import Scene
@@ -79,6 +80,7 @@ __all__ = [
     "rasterize_2dgs",
     "read_splats",
     "register_backend",
+    "register_camera_model",
     "register_command",
     "register_densifier",
     "register_evaluator",
@@ -132,6 +134,7 @@ _HOME = {
     "rasterize_2dgs": "gs2d.render.tensor_api",
     "read_splats": "gs2d.io.formats.splat_formats",
     "register_backend": "gs2d.render.backends",
+    "register_camera_model": "gs2d.data.camera_models",
     "register_command": "gs2d.cli.registry",
     "register_densifier": "gs2d.config.densify",
     "register_evaluator": "gs2d.evaluation.evaluators",

@@ -9,8 +9,10 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from gs2d import errors
 from gs2d.kernels.library import available_variants
@@ -110,6 +112,18 @@ def test_its_evaluator_scores_the_surface(gs2d: Run, trained: Path) -> None:
     (trained.parent / "link" / "vertices.txt").write_text("7")
     surface = json.loads(gs2d("evaluate", trained, "--json").stdout)["surface"]
     assert surface["evaluator"] == "example-vertices"
+
+
+def test_its_camera_model_is_read_and_cut_into_faces(gs2d: Run, tmp_path: Path) -> None:
+    frames = []
+    for index in range(3):
+        pose = np.eye(4)
+        pose[0, 3] = index
+        frames.append({"file_path": f"{index}.png", "transform_matrix": pose.tolist()})
+        Image.fromarray(np.full((40, 40, 3), 90, np.uint8)).save(tmp_path / f"{index}.png")
+    meta = {"camera_model": "example-equisolid", "k1": 1.0, "fl_x": 15.0, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(meta))
+    assert "3 example-equisolid photographs are cut into" in gs2d("info", tmp_path).stdout
 
 
 def test_its_command_is_listed_parsed_and_run(gs2d: Run, trained: Path) -> None:

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import gs2d
 from capture_writers import ColmapModel, opengl_camera_to_world, ring
 from gs2d.core.camera import Camera
 from gs2d.data import Scene, load_scene
+from gs2d.data.camera_models import CAMERA_MODELS, CameraModel, Lens
 from gs2d.data.faces import FACES, field_of_view
-from gs2d.data.undistort import Intrinsics, Lens
+from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
 
 WIDTH = 256
@@ -176,6 +178,38 @@ def test_a_wide_fisheye_is_cut_and_its_rim_is_kept_and_a_narrow_one_undistorted(
     assert field_of_view(narrow) < 120
     write_fisheyes(tmp_path / "narrow", narrow, FISHEYE)
     assert len(load_scene(tmp_path / "narrow").views) == 9
+
+
+def test_a_registered_camera_model_is_cut_into_faces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stereographic fisheyes, 170 degrees across, from transforms.json."""
+    monkeypatch.setattr(CAMERA_MODELS, "_things", dict(CAMERA_MODELS._things))
+
+    @gs2d.register_camera_model("stereographic")
+    class Stereographic(CameraModel):
+        is_wide = True
+        parameters = ("k",)
+
+        def project(self, lens: Lens, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            ahead = np.linalg.norm(rays, axis=-1) + rays[..., 2]
+            return 2 * lens.radial[0] * rays[..., :2] / ahead[..., None], ahead > 1e-9
+
+    size, focal, frames = 200, 54.5, []
+    for index, camera in enumerate(ring(9)):
+        rows, columns = np.mgrid[:size, :size] + 0.5
+        x, y = (columns - size / 2) / focal, (rows - size / 2) / focal
+        rays = np.stack([x, y, 1 - (x * x + y * y) / 4], axis=-1)  # of a unit sphere, scaled
+        (tmp_path / "images").mkdir(exist_ok=True)
+        Image.fromarray(np.rint(sky(rays @ camera.rotation)).astype(np.uint8)).save(tmp_path / f"images/{index}.png")
+        frames.append({"file_path": f"images/{index}.png", "transform_matrix": opengl_camera_to_world(camera)})
+    meta = {"camera_model": "stereographic", "k": 1.0, "fl_x": focal, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(meta))
+    scene = load_scene(tmp_path)
+    assert len(scene.views) > 9
+    assert any("9 stereographic photographs are cut into" in note for note in scene.notes)
+    assert_faces_agree(scene, 3.0)
+    (tmp_path / "transforms.json").write_text(json.dumps(meta | {"camera_model": "unheard-of"}))
+    with pytest.raises(DataError, match="register_camera_model"):
+        load_scene(tmp_path)
 
 
 def test_faces_that_the_mask_of_a_round_fisheye_hides_are_left_out(tmp_path: Path) -> None:

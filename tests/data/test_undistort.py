@@ -11,7 +11,8 @@ from PIL import Image
 
 from capture_writers import small_colmap
 from gs2d.data import load_scene
-from gs2d.data.undistort import Intrinsics, Lens, colmap_intrinsics, source_positions, undistort_image
+from gs2d.data.camera_models import Lens
+from gs2d.data.undistort import Intrinsics, colmap_intrinsics, source_positions, undistort_image
 
 WIDTH, HEIGHT, F, CX, CY = 160, 120, 110.0, 77.0, 63.5
 MODELS = {
@@ -121,9 +122,11 @@ def test_pixels_that_the_photograph_did_not_see_are_masked_out_and_empty(tmp_pat
 def test_a_polynomial_that_folds_back_is_cut_where_it_turns() -> None:
     """r (1 - 0.2 r^2) grows until 1 - 0.6 r^2 = 0, r = 1.29099; beyond it the picture would repeat."""
     lens = Lens("perspective", (-0.2,))
-    assert lens.largest_radius() == pytest.approx(1 / math.sqrt(0.6), rel=1e-5)
-    assert Lens("perspective", (0.2,)).largest_radius() == math.inf
-    assert Lens("fisheye", (0.0,) * 4).largest_radius() == math.inf
+    turn = 1 / math.sqrt(0.6)
+    rays = np.array([[turn * (1 - 1e-5), 0, 1], [turn * (1 + 1e-5), 0, 1], [0, 0, -1]])
+    assert lens.project(rays)[1].tolist() == [True, False, False]
+    assert Lens("perspective", (0.2,)).project(np.array([1e6, 0, 1]))[1]
+    assert Lens("fisheye", (0.0,) * 4).project(np.array([1e6, 0, -1]))[1]
     k = Intrinsics(400, 20, 100.0, 100.0, 200.0, 10.0, lens)
     _, valid = source_positions(k)
     np.testing.assert_array_equal(np.flatnonzero(valid[10])[[0, -1]], [200 - 129, 199 + 129])

@@ -11,6 +11,7 @@ import gs2d
 from gs2d.cli.commands import Common
 from gs2d.config.arguments import Arg
 from gs2d.config.densify import Densify
+from gs2d.data.camera_models import CameraModel
 from gs2d.errors import DivergedError
 from gs2d.io.gaussians import Gaussians
 from gs2d.losses.api import LossReport
@@ -62,6 +63,19 @@ class LinkReader:
 
     def read(self, path, *, downscale):
         return gs2d.load_scene((path / "capture.txt").read_text().strip(), downscale=downscale)
+
+
+@gs2d.register_camera_model("example-equisolid")
+class Equisolid(CameraModel):
+    """A fisheye that shows the angle t from its axis at radius 2 k sin(t / 2)."""
+
+    parameters = ("k1",)
+    is_wide = True
+
+    def project(self, lens, rays):
+        across = np.maximum(np.hypot(rays[..., 0], rays[..., 1]), 1e-12)
+        radius = 2 * lens.radial[0] * np.sin(np.arctan2(across, rays[..., 2]) / 2)
+        return rays[..., :2] * (radius / across)[..., None], np.ones(across.shape, bool)
 
 
 @gs2d.register_densifier("example-prune")

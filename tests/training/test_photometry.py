@@ -16,8 +16,9 @@ from gs2d.core.camera import look_at
 from gs2d.core.photometry import reach_of
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import camera_extent
+from gs2d.data.camera_models import Lens
 from gs2d.data.scene import Appearance, PointCloud, Scene, View
-from gs2d.data.undistort import Intrinsics, Lens
+from gs2d.data.undistort import Intrinsics
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.exposure import identity
 from gs2d.render.types import RasterSettings

@@ -16,8 +16,9 @@ from gs2d.config.recipe import IntrinsicsRefinement, LearningRates, LossTerm, Po
 from gs2d.core.camera import Zoom, look_at
 from gs2d.core.residual_lens import through_lens
 from gs2d.core.splats import Splats
+from gs2d.data.camera_models import Lens
 from gs2d.data.scene import Scene, View
-from gs2d.data.undistort import Intrinsics, Lens
+from gs2d.data.undistort import Intrinsics
 from gs2d.errors import RecipeError
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings

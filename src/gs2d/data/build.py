@@ -19,6 +19,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.transforms import camera_extent, camera_outliers
 from gs2d.data.bounds import scene_bounds
 from gs2d.data.cache import DecodedImage, ImageCache
+from gs2d.data.camera_models import model_of
 from gs2d.data.faces import GLANCE, LEAST_SHOWN, Face, face_name, face_positions, faces_of, wrapped
 from gs2d.data.file_names import in_any_case
 from gs2d.data.image_files import image_size, read_image, read_mask
@@ -417,7 +418,7 @@ def _mask_leaves(frame: PosedImage, face: Face, known: dict[Any, bool]) -> bool:
     ``known`` is filled with what was found: most photographs of a camera have one mask.
     """
     k = frame.intrinsics
-    if frame.mask is None or frame.mask_is_alpha or k.lens is None or k.lens.kind != "fisheye":
+    if frame.mask is None or frame.mask_is_alpha or k.lens is None or model_of(k.lens).wraps:
         return True
     key = (k, face.name, hashlib.sha256(frame.mask.read_bytes()).digest())
     if key not in known:

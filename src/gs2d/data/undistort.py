@@ -1,16 +1,6 @@
-"""Lens distortion and its removal.
+"""Pinhole images of photographs whose lens distorts: where each pixel comes from, and the resampling.
 
-Points are on the plane z = 1 of the camera: (x, y) = (X/Z, Y/Z), r^2 = x^2 + y^2. A lens maps the ideal point (x, y)
-to the point that the sensor saw; fx, fy, cx, cy then map both to pixels. With n, d the radial coefficients and p the
-tangential ones (OpenCV and COLMAP write them the same way):
-
-perspective  s = (1 + n1 r^2 + n2 r^4 + ...) / (1 + d1 r^2 + d2 r^4 + ...)
-             x' = x s + 2 p1 x y + p2 (r^2 + 2 x^2),   y' = y s + 2 p2 x y + p1 (r^2 + 2 y^2)
-fisheye      t = atan(r);  (x', y') = (x, y) t (1 + n1 t^2 + n2 t^4 + ...) / r, plus the tangential terms above of
-             (x, y) t / r (Metashape, OpenSfM's fisheye62), and those of a thin prism: s1 t^2, s2 t^2
-fov          (x', y') = (x, y) atan(2 r tan(w/2)) / (w r)
-
-A sensor whose axes are not at right angles (Metashape's b2) shears what the lens made: x' + skew y'.
+The formulas of the lenses are in :mod:`gs2d.data.camera_models`.
 """
 
 from __future__ import annotations
@@ -20,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.optimize import brentq
 
+from gs2d.data.camera_models import Lens
 from gs2d.errors import DataError, UnusableViewError
 
 _NEWTON = 20  # steps at the most, from the bent point to the ideal one
@@ -44,114 +34,8 @@ _COLMAP_LENSES = {
 
 
 @dataclass(frozen=True)
-class Lens:
-    """A lens that bends: see the module's formulas.
-
-    Attributes
-    ----------
-    kind : str
-        "perspective", "fisheye" or "fov".
-    radial : tuple of float
-        n1, n2, ... (for "fov": the angle w).
-    divisor : tuple of float
-        d1, d2, ...
-    tangential : tuple of 2 floats
-        p1, p2 ("perspective" and "fisheye").
-    skew : float
-        Shear of the sensor, in units of fx.
-    prism : tuple of 2 floats
-        s1, s2 ("fisheye").
-    """
-
-    kind: str
-    radial: tuple[float, ...] = ()
-    divisor: tuple[float, ...] = ()
-    tangential: tuple[float, float] = (0.0, 0.0)
-    skew: float = 0.0
-    prism: tuple[float, float] = (0.0, 0.0)
-
-    @property
-    def is_identity(self) -> bool:
-        """True if nothing bends, so that images need no undistortion."""
-        if self.skew:
-            return False
-        if self.kind == "perspective":
-            return not (any(self.radial) or any(self.divisor) or any(self.tangential))
-        return self.kind == "fov" and abs(self.radial[0]) < 1e-9
-
-    def distort(self, points: np.ndarray) -> np.ndarray:
-        """Ideal points [..., 2] to the points that the sensor saw [..., 2] (plane z = 1)."""
-        x, y = points[..., 0], points[..., 1]
-        r2 = x * x + y * y
-        if self.kind == "fisheye":
-            return self.bend(points, np.arctan(np.maximum(np.sqrt(r2), 1e-12)))
-        scale = self._radial_scale(np.sqrt(r2))
-        p1, p2 = self.tangential
-        u, v = x * scale, y * scale
-        u, v = u + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), v + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
-        return np.stack([u + self.skew * v if self.skew else u, v], axis=-1)
-
-    def bend(self, directions: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """Return where a fisheye shows rays at angles ``t`` [...], rad, from its axis: points as of :meth:`distort`.
-
-        ``directions`` [..., 2] point from the axis to the rays; their length does not matter. Unlike a point on the
-        plane z = 1 an angle may be 90 degrees and more.
-        """
-        x, y = directions[..., 0], directions[..., 1]
-        r = np.maximum(np.sqrt(x * x + y * y), 1e-12)
-        scale = np.asarray(t * _polynomial(self.radial, t * t) / r)
-        u, v = x * scale, y * scale
-        p1, p2 = self.tangential
-        if p1 or p2 or any(self.prism):  # of the bent point
-            x, y, r2 = x * t / r, y * t / r, t**2
-            u = u + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + self.prism[0] * r2
-            v = v + 2 * p2 * x * y + p1 * (r2 + 2 * y * y) + self.prism[1] * r2
-        return np.stack([u + self.skew * v if self.skew else u, v], axis=-1)
-
-    def _radial_scale(self, r: np.ndarray) -> np.ndarray:
-        if self.kind == "perspective":
-            r2 = r * r
-            return np.asarray(_polynomial(self.radial, r2) / _polynomial(self.divisor, r2))
-        safe = np.maximum(r, 1e-12)
-        if self.kind == "fisheye":
-            t = np.arctan(safe)
-            return np.asarray(t * _polynomial(self.radial, t * t) / safe)
-        w = self.radial[0]
-        return np.asarray(np.arctan(2 * safe * math.tan(w / 2)) / (w * safe))
-
-    def largest_radius(self) -> float:
-        """Return the ideal radius up to which the radial mapping grows; beyond it a polynomial folds back."""
-
-        def radius(r: float) -> float:
-            return float(r * self._radial_scale(np.array(r)))
-
-        # A field of view of 175 degrees is more than any pinhole image holds.
-        grid = np.tan(np.linspace(0.0, math.radians(87.5), 2000))
-        with np.errstate(all="ignore"):
-            values = grid * self._radial_scale(grid)
-        falls = np.flatnonzero(~(np.diff(values) > 0))
-        if not len(falls):
-            return math.inf
-        low, high = float(grid[max(falls[0] - 1, 0)]), float(grid[falls[0] + 1])
-
-        def slope(r: float) -> float:
-            h = 1e-6 * max(r, 1e-3)
-            return (radius(r + h) - radius(max(r - h, 0.0))) / h
-
-        return brentq(slope, low, high) if slope(low) > 0 > slope(high) else low
-
-
-def _polynomial(coefficients: tuple[float, ...], x: np.ndarray) -> np.ndarray:
-    """1 + c1 x + c2 x^2 + ..."""
-    value = np.zeros_like(x)
-    for coefficient in reversed(coefficients):
-        value = (value + coefficient) * x
-    return np.asarray(value + 1.0)
-
-
-@dataclass(frozen=True)
 class Intrinsics:
-    """What a data set says about a lens: pixels of an image of width x height, and the lens if it bends."""
+    """Intrinsics of a photograph in pixels, and its lens unless it is a pinhole image."""
 
     width: int
     height: int
@@ -162,17 +46,23 @@ class Intrinsics:
     lens: Lens | None = None
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Return the pixels [..., 2] of the file where ideal points [..., 2] on the plane z = 1 are seen."""
+        """Return the pixels [..., 2] of the photograph that show ideal points [..., 2] of the plane z = 1."""
         bent = points if self.lens is None else self.lens.distort(points)
         return np.asarray(bent * (self.fx, self.fy) + (self.cx, self.cy))
 
+    def project_rays(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the pixels [..., 2] that show rays [..., 3] of a camera with a lens, and which it shows [...] bool."""
+        assert self.lens is not None
+        points, shown = self.lens.project(rays)
+        return points * (self.fx, self.fy) + (self.cx, self.cy), shown
+
     def ideal(self, pixels: np.ndarray) -> np.ndarray:
-        """Return the points [P, 2] on the plane z = 1 that are seen at pixels [P, 2] of the file: Newton's method.
+        """Return the points [P, 2] of the plane z = 1 that pixels [P, 2] of the photograph show, by Newton's method.
 
         Raises
         ------
         DataError
-            A pixel that nothing is seen at through this lens.
+            If the lens maps no ray to one of the pixels.
         """
         bent = (np.asarray(pixels, np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
         if self.lens is None:
@@ -186,10 +76,10 @@ class Intrinsics:
                 left = lens.distort(x) - bent
                 x = x - np.linalg.solve(np.stack([across, along], axis=-1), left[..., None])[..., 0]
             off = np.linalg.norm(lens.distort(x) - bent, axis=-1) * max(self.fx, self.fy)
-            known = (off < 1e-3) & (np.linalg.norm(x, axis=-1) < lens.largest_radius())
-        if not known.all():
-            u, v = np.asarray(pixels)[np.flatnonzero(~known)[0]]
-            raise DataError(f"a pixel that the lens maps to was expected, got {u:g}, {v:g} beyond its reach")
+            shown = (off < 1e-3) & lens.project(np.append(x, np.ones((len(x), 1)), axis=1))[1]
+        if not shown.all():
+            u, v = np.asarray(pixels)[np.flatnonzero(~shown)[0]]
+            raise DataError(f"expected a pixel that the lens maps a ray to, got {u:g}, {v:g}")
         return x
 
     def scaled(self, width: int, height: int) -> Intrinsics:
@@ -261,21 +151,15 @@ def source_positions(intrinsics: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
     valid : ndarray bool [H, W]
         True where the position lies between pixel centres of the distorted image and the lens is one to one.
     """
-    k, lens = intrinsics, intrinsics.lens
+    k = intrinsics
     x = (np.arange(k.width) + 0.5 - k.cx) / k.fx
     y = (np.arange(k.height) + 0.5 - k.cy) / k.fy
-    ideal = np.stack(np.meshgrid(x, y), axis=-1)  # [H, W, 2]
-    if lens is None:
-        bent, valid = ideal, np.ones(ideal.shape[:2], dtype=bool)
-    else:
-        with np.errstate(all="ignore"):
-            bent = lens.distort(ideal)
-        valid = np.hypot(ideal[..., 0], ideal[..., 1]) < lens.largest_radius()
-    positions = bent * (k.fx, k.fy) + (k.cx, k.cy)
+    rays = np.stack([*np.meshgrid(x, y), np.ones((k.height, k.width))], axis=-1)  # [H, W, 3]
+    positions, valid = k.project_rays(rays)
     # Between the outer pixel centres every sample is an interpolation; a thousandth of a pixel is rounding.
     low, high = 0.499, np.array((k.width, k.height)) - 0.499
     inside = ((positions >= low) & (positions <= high)).all(axis=-1)
-    valid &= inside  # comparisons with NaN are False
+    valid = valid & inside  # comparisons with NaN are False
     return np.where(valid[..., None], positions, 0.0).astype(np.float32), valid
 
 

@@ -328,8 +328,8 @@ def backward(
     sums = _Sums(frame, wanted.deterministic, columns=0 if only_colors else 16)
     further = None
     if features is not None:
-        *given, to_values = features
-        further = _features(*given, sums.of_features(to_values))
+        *inputs, to_values = features
+        further = _features(*inputs, sums.of_features(to_values))
     blended = blend_gradients(
         len(frame.tiles),
         frame.lists,

@@ -33,7 +33,7 @@ from foreign_writers import (
     write_points,
 )
 from gs2d.data import Scene, detect_format, load_scene
-from gs2d.data.undistort import Lens as OurLens
+from gs2d.data.camera_models import Lens as OurLens
 from gs2d.errors import DataError
 
 Writer = Callable[[Path, Lens], None]

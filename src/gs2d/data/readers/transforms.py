@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 
 from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world, skipping
+from gs2d.data.camera_models import CAMERA_MODELS, Lens
 from gs2d.data.faces import panorama
 from gs2d.data.file_names import Files, in_any_case
 from gs2d.data.image_files import image_size
@@ -20,7 +21,7 @@ from gs2d.data.masks import FOLDER
 from gs2d.data.priors import DEPTHS, NORMALS, MapFiles
 from gs2d.data.readers.common import Photograph, find_photographs
 from gs2d.data.scene import PointCloud
-from gs2d.data.undistort import Intrinsics, Lens
+from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError, UnusableViewError
 from gs2d.io.meshes import read_points
 
@@ -220,7 +221,7 @@ def frame_intrinsics(entry: Mapping[str, Any], image: Path, where: str) -> Intri
         fy,
         width / 2 if cx is None else cx,
         height / 2 if cy is None else cy,
-        _lens(entry, {key: number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2")}, where),
+        _lens(entry, number, where),
     )
 
 
@@ -237,13 +238,18 @@ def _model(entry: Mapping[str, Any]) -> str:
     return str(entry.get("camera_model", "OPENCV_FISHEYE" if entry.get("is_fisheye") else "OPENCV")).upper()
 
 
-def _lens(entry: Mapping[str, Any], value: Mapping[str, float], where: str) -> Lens | None:
-    model = _model(entry)
+def _lens(entry: Mapping[str, Any], number: Callable[[str], float | None], where: str) -> Lens | None:
+    model, name = _model(entry), str(entry.get("camera_model"))
+    if name in CAMERA_MODELS and model not in _PERSPECTIVE | _FISHEYE:
+        keys = CAMERA_MODELS.get(name)().parameters
+        return Lens(name, tuple(number(key) or 0.0 for key in keys))
     if model not in _PERSPECTIVE | _FISHEYE:
         raise DataError(
             f"{where}: camera_model {model} cannot be undistorted here "
-            f"(known: {', '.join(sorted(_PERSPECTIVE | _FISHEYE | {_PANORAMA}))}); undistort the images first"
+            f"(known: {', '.join(sorted(_PERSPECTIVE | _FISHEYE | {_PANORAMA}))}); undistort the images first, or "
+            "register it with gs2d.register_camera_model"
         )
+    value = {key: number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
     if "PINHOLE" in model and any(value.values()):
         bent = {key: number for key, number in value.items() if number}
         raise DataError(f"{where}: camera_model {model} must have no distortion, got {bent}; is it OPENCV?")
