@@ -57,7 +57,7 @@ lint: $(VENV)/installed
 	$(MAKE) --no-print-directory types
 
 types: $(VENV)/installed
-	$(PY) -m mypy
+	$(PY) -m mypy -n $(WORKERS)
 
 install: $(VENV)/installed
 

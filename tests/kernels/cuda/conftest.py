@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,15 @@ import torch
 
 import fake_gpu
 import kernel_cases
+from gs2d.render import pair_budget
+
+
+@pytest.fixture(scope="session", autouse=True)
+def little_room_for_pairs() -> Iterator[None]:
+    """Round the room for pairs up to 512, not 65,536: the emulator sorts all of it, which takes most of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pair_budget, "STEP", 512)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -110,28 +110,7 @@ def test_a_scene_through_launcher_and_driver_is_what_the_kernels_make_of_it(emul
 
 
 SCRIPT = """
-import ctypes, sys
-import torch
-from gs2d.errors import BackendError
-from gs2d.kernels.cuda.launch import GpuLauncher
-
-class Numbers(ctypes.Structure):
-    _fields_ = (("a", ctypes.c_int64), ("b", ctypes.c_float))
-
-try:
-    launcher = GpuLauncher(
-        torch.device("cuda", 1), stream_of=lambda d: 0x1234, architecture_of=lambda d: "sm_90",
-        code_of=lambda name, arch: b"\\x7fELF" + bytes(100),
-    )
-    launcher.launch("project_splats", 5, 128, Numbers(77, 0.5))
-    launcher.launch("project_splats", 6, 128, Numbers(78, 0.5), 60000)
-except BackendError as error:
-    print(error)
-"""
-
-
-REPLAY = """
-import ctypes
+import ctypes, os, sys
 import torch
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda.launch import GpuLauncher, Work
@@ -139,58 +118,72 @@ from gs2d.kernels.cuda.launch import GpuLauncher, Work
 class Numbers(ctypes.Structure):
     _fields_ = (("a", ctypes.c_int64), ("b", ctypes.c_float))
 
-launcher = GpuLauncher(
-    torch.device("cuda", 1), stream_of=lambda d: 0x1234, architecture_of=lambda d: "sm_90",
-    code_of=lambda name, arch: b"\\x7fELF" + bytes(100),
-)
-first, second = Numbers(77, 0.5), Numbers(78, 0.5)
-works = [Work("project_splats", 5, 128, first), Work("project_splats_vjp", 6, 256, second)]
-try:
+def make_launcher():
+    return GpuLauncher(
+        torch.device("cuda", 1), stream_of=lambda d: 0x1234, architecture_of=lambda d: "sm_90",
+        code_of=lambda name, arch: b"\\x7fELF" + bytes(100),
+    )
+
+def single():
+    launcher = make_launcher()
+    launcher.launch("project_splats", 5, 128, Numbers(77, 0.5))
+    launcher.launch("project_splats", 6, 128, Numbers(78, 0.5), 60000)
+
+def repeated():
+    launcher = make_launcher()
+    first, second = Numbers(77, 0.5), Numbers(78, 0.5)
+    works = [Work("project_splats", 5, 128, first), Work("project_splats_vjp", 6, 256, second)]
     for number in range(5):
         second.a = 100 + number
         launcher.run(works)
-except BackendError as error:
-    print(error)
+
+for name in sys.argv[2:]:
+    os.environ["FAKE_CUDA_LOG"] = f"{sys.argv[1]}/{name}"
+    os.environ["FAKE_CUDA_FAIL"] = "" if name in ("single", "repeated") else f"{name}:801"
+    try:
+        single() if name == "single" else repeated()
+    except BackendError as error:
+        print(error)
 """
+WITHOUT_GRAPHS = ("cuGraphCreate", "cuGraphAddKernelNode", "cuGraphInstantiate")  # each fails in a case of its own
+Calls = dict[str, list[dict[str, object]]]
 
 
-def with_fake_libcuda(folder: Path, script: str = SCRIPT, **environment: str) -> tuple[str, list[dict[str, object]]]:
-    """What the script prints, and what the fake library saw."""
+@pytest.fixture(scope="module")
+def calls(tmp_path_factory: pytest.TempPathFactory) -> Calls:
+    """Calls that a fake libcuda receives through the real bindings, by case; one process runs all cases."""
     pytest.importorskip("cuda.bindings", reason="cuda-bindings is not here")
     if shutil.which("g++") is None or sys.platform != "linux":
         pytest.skip("no g++ on Linux here to build a fake libcuda")
+    folder = tmp_path_factory.mktemp("libcuda")
     source = Path(__file__).resolve().parents[2] / "helpers" / "fake_libcuda.cpp"
-    library, log = folder / "libcuda.so.1", folder / "log"
+    library = folder / "libcuda.so.1"
     command = ["g++", "-std=c++17", "-O1", "-fPIC", "-shared", "-Wall", f"-Wl,-soname,{library.name}"]
     subprocess.run([*command, "-o", str(library), str(source)], check=True)
-    settings = {**os.environ, "LD_LIBRARY_PATH": str(folder), "FAKE_CUDA_LOG": str(log), **environment}
-    done = subprocess.run([sys.executable, "-c", script], env=settings, check=True, capture_output=True, text=True)
-    lines = log.read_text().splitlines() if log.exists() else []
-    return done.stdout, [json.loads(line) for line in lines]
+    settings = {**os.environ, "LD_LIBRARY_PATH": str(folder), "FAKE_CUDA_LOG": str(folder / "loading")}
+    cases = ("single", "repeated", *WITHOUT_GRAPHS)
+    command = [sys.executable, "-c", SCRIPT, str(folder), *cases]
+    done = subprocess.run(command, env=settings, check=True, capture_output=True, text=True)
+    assert done.stdout == ""
+    return {name: [json.loads(line) for line in (folder / name).read_text().splitlines()] for name in cases}
 
 
-def test_the_real_bindings_hand_a_launch_on_as_it_was_meant(tmp_path: Path) -> None:
-    """Only libcuda is fake here: the library says what arrived, and refuses a launch without a current context."""
-    said, seen = with_fake_libcuda(tmp_path)
-    assert said == ""
+def test_the_real_bindings_pass_on_every_launch(calls: Calls) -> None:
+    """Only libcuda is fake here: it records the calls, and refuses a launch without a current context."""
     launched = {"call": "launch", "kernel": "project_splats", "block": [128, 1, 1], "stream": 0x1234, "device": 1}
-    assert seen == [
-        {"call": "load"},
+    assert [call for call in calls["single"] if call["call"] != "load"] == [
         {**launched, "grid": [5, 1, 1], "shared": 0, "first": 77},
         {"call": "attribute", "attribute": 8, "value": 60000, "kernel": "project_splats", "device": 1},
         {**launched, "grid": [6, 1, 1], "shared": 60000, "first": 78},
     ]
 
 
-def test_the_real_bindings_make_launches_that_come_again_a_graph_and_change_what_differs(tmp_path: Path) -> None:
-    said, seen = with_fake_libcuda(tmp_path, REPLAY)
-    assert said == ""
+def test_the_real_bindings_make_repeated_launches_a_graph_and_change_what_differs(calls: Calls) -> None:
     first = {"kernel": "project_splats", "grid": [5, 1, 1], "block": [128, 1, 1], "first": 77}
     second = {"kernel": "project_splats_vjp", "grid": [6, 1, 1], "block": [256, 1, 1]}
     of_launch = {"call": "launch", "shared": 0, "stream": 0x1234, "device": 1}
-    launched = [line for line in seen if line["call"] != "load"]
     replay = {"call": "replay", "stream": 0x1234}
-    assert launched == [
+    assert [call for call in calls["repeated"] if call["call"] != "load"] == [
         {**of_launch, **first},
         {**of_launch, **second, "first": 100},
         {**of_launch, **first},
@@ -205,12 +198,11 @@ def test_the_real_bindings_make_launches_that_come_again_a_graph_and_change_what
     ]
 
 
-@pytest.mark.parametrize("function", ["cuGraphCreate", "cuGraphAddKernelNode", "cuGraphInstantiate"])
-def test_a_driver_that_makes_no_graph_launches_one_by_one(tmp_path: Path, function: str) -> None:
-    said, seen = with_fake_libcuda(tmp_path, REPLAY, FAKE_CUDA_FAIL=f"{function}:801")
-    assert said == ""
-    assert [line["first"] for line in seen if line["call"] == "launch"][1::2] == [100, 101, 102, 103, 104]
-    assert "replay" not in {line["call"] for line in seen}
+@pytest.mark.parametrize("function", WITHOUT_GRAPHS)
+def test_a_driver_that_makes_no_graph_launches_one_by_one(calls: Calls, function: str) -> None:
+    made = calls[function]
+    assert [call["first"] for call in made if call["call"] == "launch"][1::2] == [100, 101, 102, 103, 104]
+    assert "replay" not in {call["call"] for call in made}
 
 
 NEWER = "_accelerator_setAllocatorSettings"  # of later versions of torch
