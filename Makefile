@@ -21,7 +21,8 @@ SECONDS ?= 3600
 
 SOURCES := $(shell find src CMakeLists.txt pyproject.toml README.md LICENSE -type f \
 	-not -path '*/__pycache__/*' -not -path 'src/gs2d/kernels/lib/*' 2>/dev/null)
-# One thread per test worker: two workers share two cores. The kernels' own tests set their thread counts.
+# One thread per test worker: two workers share two cores. The kernels' own tests set their thread counts. Work stealing
+# keeps neighbouring tests in one worker, so that what they share is made once.
 TEST_ENV := OMP_NUM_THREADS=1 MPLBACKEND=Agg
 
 .PHONY: demo test test-all test-gpu docs fuzz audit lint types kernels install clean
@@ -30,10 +31,10 @@ demo: $(VENV)/installed
 	$(VENV)/bin/gs2d demo
 
 test: lint
-	$(TEST_ENV) $(PY) -m pytest -m "not slow" -n $(WORKERS) -q $(TEST_ARGS)
+	$(TEST_ENV) $(PY) -m pytest -m "not slow" -n $(WORKERS) --dist worksteal -q $(TEST_ARGS)
 
 test-all: lint $(VENV)/docs
-	$(TEST_ENV) $(PY) -m pytest -n $(WORKERS) -q $(TEST_ARGS)
+	$(TEST_ENV) $(PY) -m pytest -n $(WORKERS) --dist worksteal -q $(TEST_ARGS)
 
 # One process: the tests share the device.
 test-gpu: $(VENV)/installed

@@ -6,7 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,18 +14,18 @@ import pytest
 import torch
 from PIL import Image
 
+from cli_process import CliProcess
 from gs2d import errors
 from gs2d.kernels.library import available_variants
 from tiny import write_capture
 
 PLUGIN = Path(__file__).parents[1] / "plugin"
 SOURCE = Path(errors.__file__).parents[1]  # the source tree, or where the wheel was installed
-Run = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
 @pytest.fixture(scope="module")
-def gs2d(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """The command line in a process that sees the package."""
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which pip installed the package."""
     pytest.importorskip("setuptools", minversion="70")
     if not available_variants():
         pytest.skip("its backend needs the native library, which is not built")
@@ -37,19 +37,19 @@ def gs2d(tmp_path_factory: pytest.TempPathFactory) -> Run:
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
     done = subprocess.run([*pip, "--target", str(folder), str(copy)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-
-    def run(*words: object, code: int = 0, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-        environment = os.environ | {"PYTHONPATH": f"{folder}{os.pathsep}{SOURCE}", "OMP_NUM_THREADS": "1"}
-        command = [sys.executable, "-m", "gs2d", *map(str, words)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, cwd=cwd)
-        assert done.returncode == code, done.stdout + done.stderr
-        return done
-
-    return run
+    return folder
 
 
 @pytest.fixture(scope="module")
-def trained(gs2d: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def gs2d(site: Path) -> Iterator[CliProcess]:
+    """Commands in a process that imports the package."""
+    process = CliProcess(site, SOURCE)
+    yield process
+    process.close()
+
+
+@pytest.fixture(scope="module")
+def trained(gs2d: CliProcess, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run on a capture that the package reads, by its recipe, loss and densifier, on its backend."""
     folder = tmp_path_factory.mktemp("work")
     capture = write_capture(folder / "ball")
@@ -92,29 +92,33 @@ def test_its_loss_and_its_section_are_in_the_report(trained: Path) -> None:
     assert "<p>Seed 0, " in report
 
 
-def test_the_lists_name_what_the_package_adds(gs2d: Run) -> None:
+def test_the_lists_name_what_the_package_adds(gs2d: CliProcess) -> None:
     listed = gs2d("recipes").stdout
     assert "example-2dgs" in listed
     assert "Like 2dgs, with losses and a densifier of this package." in listed
     assert "example-checked: " in gs2d("doctor").stdout
 
 
-def test_later_commands_find_the_package_and_export_writes_its_format(gs2d: Run, trained: Path, tmp_path: Path) -> None:
-    said = gs2d("export", trained, "--out", tmp_path / "a.xyz")
+def test_another_process_finds_the_package_and_exports_its_format(
+    site: Path, gs2d: CliProcess, trained: Path, tmp_path: Path
+) -> None:
+    command = [sys.executable, "-m", "gs2d", "export", str(trained), "--out", str(tmp_path / "a.xyz")]
+    environment = os.environ | {"PYTHONPATH": f"{site}{os.pathsep}{SOURCE}"}
+    said = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     assert "centres" in said.stdout + said.stderr
     assert len((tmp_path / "a.xyz").read_text().splitlines()) == 58
     gs2d("export", tmp_path / "a.xyz", "--out", tmp_path / "a.ply")
     assert "splats: 58" in gs2d("info", tmp_path / "a.ply").stdout
 
 
-def test_its_evaluator_scores_the_surface(gs2d: Run, trained: Path) -> None:
+def test_its_evaluator_scores_the_surface(gs2d: CliProcess, trained: Path) -> None:
     (trained.parent / "ball" / "vertices.txt").write_text("7")
     (trained.parent / "link" / "vertices.txt").write_text("7")
     surface = json.loads(gs2d("evaluate", trained, "--json").stdout)["surface"]
     assert surface["evaluator"] == "example-vertices"
 
 
-def test_its_camera_model_is_read_and_cut_into_faces(gs2d: Run, tmp_path: Path) -> None:
+def test_its_camera_model_is_read_and_cut_into_faces(gs2d: CliProcess, tmp_path: Path) -> None:
     frames = []
     for index in range(3):
         pose = np.eye(4)
@@ -126,7 +130,7 @@ def test_its_camera_model_is_read_and_cut_into_faces(gs2d: Run, tmp_path: Path) 
     assert "3 example-equisolid photographs are cut into" in gs2d("info", tmp_path).stdout
 
 
-def test_its_command_is_listed_parsed_and_run(gs2d: Run, trained: Path) -> None:
+def test_its_command_is_listed_parsed_and_run(gs2d: CliProcess, trained: Path) -> None:
     listed = gs2d("--help").stdout
     assert "Examples:" in listed
     assert "Count the splats of a file." in listed
@@ -135,7 +139,7 @@ def test_its_command_is_listed_parsed_and_run(gs2d: Run, trained: Path) -> None:
     assert "no option --triple" in gs2d("example-count", trained / "splats.ply", "--triple", code=2).stderr
 
 
-def test_a_run_goes_on_with_the_recipe_from_a_file(gs2d: Run, trained: Path) -> None:
+def test_a_run_goes_on_with_the_recipe_from_a_file(gs2d: CliProcess, trained: Path) -> None:
     """What `gs2d recipes show --json` prints, and what trained the run, are one recipe."""
     file = trained.parent / "mine.json"
     file.write_text(gs2d("recipes", "show", "example-2dgs", "--json").stdout)
@@ -149,7 +153,7 @@ def test_a_run_goes_on_with_the_recipe_from_a_file(gs2d: Run, trained: Path) -> 
     ("field", "guest"),
     [("surface.densify", "densifier 'example-prune'"), ("learned.example-tint", "quantity 'example-tint'")],
 )
-def test_a_wrong_option_of_a_guest_is_one_line(gs2d: Run, trained: Path, field: str, guest: str) -> None:
+def test_a_wrong_option_of_a_guest_is_one_line(gs2d: CliProcess, trained: Path, field: str, guest: str) -> None:
     wrong = ("--recipe", "example-2dgs", "--set", f'{field}.options={{"when": 3}}')
     out = trained.parent / "none"
     said = gs2d("train", trained.parent / "ball", "--out", out, *wrong, "--quiet", code=2).stderr

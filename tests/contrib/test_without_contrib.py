@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import importlib
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import gs2d
+from cli_process import CliProcess
 from gs2d.cli.registry import COMMANDS
 from gs2d.config.protocols import PROTOCOLS
 from gs2d.config.registry import Registry, contrib_entries
@@ -37,15 +35,9 @@ def test_every_entry_point_registers_its_name() -> None:
 def test_the_core_trains_and_exports_without_contrib(tmp_path: Path) -> None:
     site = tmp_path / "site"
     shutil.copytree(SOURCE, site / "gs2d", ignore=shutil.ignore_patterns("contrib", "__pycache__"))
-    environment = os.environ | {"PYTHONPATH": str(site), "OMP_NUM_THREADS": "1"}
+    run = CliProcess(site)
 
-    def run(*words: object, code: int = 0) -> str:
-        command = [sys.executable, "-m", "gs2d", *map(str, words)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, cwd=tmp_path)
-        assert done.returncode == code, done.stdout + done.stderr
-        return done.stdout + done.stderr
-
-    listed = run("--help")
+    listed = run("--help").stdout
     assert "reconstruct" in listed
     assert "orthophoto" not in listed
     capture = write_capture(tmp_path / "ball")
@@ -53,6 +45,8 @@ def test_the_core_trains_and_exports_without_contrib(tmp_path: Path) -> None:
     run("train", capture, "--out", tmp_path / "run", *few)
     run("export", tmp_path / "run", "--out", tmp_path / "a.ply")
     assert (tmp_path / "a.ply").stat().st_size > 1000
-    assert "splats are written as .ply, .spz files" in run(
-        "export", tmp_path / "run", "--out", tmp_path / "a.sog", code=2
+    assert (
+        "splats are written as .ply, .spz files"
+        in run("export", tmp_path / "run", "--out", tmp_path / "a.sog", code=2).stderr
     )
+    run.close()
