@@ -38,7 +38,7 @@ from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.resolve import build_recipe, robust_and_exposure, with_backdrop
 from gs2d.pipeline.prepare.run_appearance import photographed
 from gs2d.render.api import rasterize
-from gs2d.render.exposure import fit_exposure
+from gs2d.render.exposure_transform import fit_exposure
 from gs2d.render.types import RasterSettings
 from gs2d.training.trainer import Trainer
 

@@ -41,10 +41,10 @@ PHASES = (
     Rule("evaluate", (("pipeline/finish/evaluate.py", "evaluate_run"),)),
 )
 PARTS = (
-    Rule("rasterizer", (("render/cpu.py", ""), ("render/cpu_cached.py", ""))),
+    Rule("rasterizer", (("render/cpu_backend.py", ""), ("render/cpu_cached.py", ""))),
     Rule(
         "losses and metrics",
-        (("gs2d/losses/api.py", ""), ("kernels/losses.py", ""), ("evaluation/image_metrics.py", "")),
+        (("gs2d/losses/api.py", ""), ("kernels/native_losses.py", ""), ("evaluation/image_metrics.py", "")),
     ),
     Rule("Adam", (("training/adam.py", ""),)),
     Rule("densification", (("training/densify/gradient.py", "densify_and_prune"),)),

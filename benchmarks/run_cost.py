@@ -38,7 +38,7 @@ PHASES = (
 )
 _ADDING = ("add", "_add_chunk", "_blend_colors", "_change", "_view_arrays", "_volume_arrays")  # a view to a volume
 PARTS = (
-    Rule("render", (("render/cpu.py", ""), ("render/cpu_cached.py", ""))),
+    Rule("render", (("render/cpu_backend.py", ""), ("render/cpu_cached.py", ""))),
     Rule(
         "photographs",
         (
@@ -49,7 +49,9 @@ PARTS = (
             ("data/undistort.py", ""),
         ),
     ),
-    Rule("metrics", (("evaluation/image_metrics.py", ""), ("gs2d/losses/api.py", ""), ("kernels/losses.py", ""))),
+    Rule(
+        "metrics", (("evaluation/image_metrics.py", ""), ("gs2d/losses/api.py", ""), ("kernels/native_losses.py", ""))
+    ),
     Rule("evidence", tuple(("meshing/evidence.py", name) for name in ("gather", "_count", "_look", "_normals"))),
     Rule("clean by evidence", (("meshing/evidence.py", ""),)),
     Rule("integrate", (*(("meshing/tsdf_volume.py", name) for name in _ADDING), ("meshing/sampling.py", ""))),

@@ -18,10 +18,10 @@ from benchmarks.workload import Workload
 from gs2d.config.presets import two_dgs_r
 from gs2d.config.recipe import GradDensify
 from gs2d.core.splats import Splats
-from gs2d.kernels import losses as ops
+from gs2d.kernels import native_losses as ops
 from gs2d.kernels.library import Library
 from gs2d.render.backends import get_backend
-from gs2d.render.cpu import IMAGES, rasterize_with
+from gs2d.render.cpu_backend import IMAGES, rasterize_with
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.training.adam import adam_step, begin_stage
 from gs2d.training.densify.gradient import densify_and_prune

@@ -22,11 +22,12 @@ from benchmarks.gpu.bench import ROOT, Bench, run_program
 from benchmarks.gpu.probes import ceilings
 from gs2d.config.recipe import Stage
 from gs2d.core.splats import Splats
+from gs2d.kernels.cuda import cuda_losses as ops
 from gs2d.kernels.cuda import launch
-from gs2d.kernels.cuda import losses as ops
 from gs2d.kernels.cuda.compile import ARCHITECTURES, compile_source, kernel_sources, source_names
 from gs2d.kernels.tsdf import arguments_of, fuse_on_gpu
-from gs2d.render import cuda, reference
+from gs2d.render import cuda_backend as cuda
+from gs2d.render import reference_rasterizer as reference
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.types import PLAIN_COLORS, TRANSMITTANCE, Features, RasterSettings
 

@@ -16,7 +16,7 @@ from benchmarks.stages import Passes, count_work, frame_bytes, trim
 from benchmarks.workload import Workload, room_workload
 
 from gs2d.kernels.library import available_variants, load
-from gs2d.render.reference import rasterize as rasterize_reference
+from gs2d.render.reference_rasterizer import rasterize as rasterize_reference
 from gs2d.render.types import RasterSettings
 
 needs_native = pytest.mark.skipif(not available_variants(), reason="the native library was not built")

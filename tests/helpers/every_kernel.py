@@ -16,11 +16,11 @@ import two_views
 from emulate import Emulator
 from gs2d.config.multiview import MultiView
 from gs2d.core.splats import Splats
-from gs2d.kernels.cuda import losses as ops
-from gs2d.kernels.cuda.adam import AdamUpdate, adam_step
-from gs2d.kernels.cuda.multiview import compare_views
-from gs2d.kernels.losses import NormalOptions
-from gs2d.render import cuda
+from gs2d.kernels.cuda import cuda_losses as ops
+from gs2d.kernels.cuda.cuda_adam import AdamUpdate, adam_step
+from gs2d.kernels.cuda.cuda_multiview import compare_views
+from gs2d.kernels.native_losses import NormalOptions
+from gs2d.render import cuda_backend as cuda
 from gs2d.render.cuda_step import Stepper
 from gs2d.render.pair_budget import PairBudget, Rendering
 from gs2d.render.types import PLAIN_COLORS, Features, RasterSettings

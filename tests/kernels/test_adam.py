@@ -13,9 +13,9 @@ from torch.optim.adam import adam
 
 from emulate import Emulator
 from gs2d.errors import ShapeError
-from gs2d.kernels.adam import AdamUpdate, adam_step, first_not_finite
-from gs2d.kernels.cuda import adam as cuda
+from gs2d.kernels.cuda import cuda_adam as cuda
 from gs2d.kernels.library import Library, load
+from gs2d.kernels.native_adam import AdamUpdate, adam_step, first_not_finite
 
 WRITTEN = ("parameter", "mean", "square")
 BETAS = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-15}

@@ -10,7 +10,7 @@ from torch import Tensor
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.splats import Splats
 from gs2d.kernels.library import Library
-from gs2d.render.cpu import rasterize_with
+from gs2d.render.cpu_backend import rasterize_with
 from gs2d.render.cpu_cached import CachedView, cache_view
 from gs2d.render.types import RasterSettings
 

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from gs2d.kernels.library import Library
-from gs2d.render.exposure import _exposed, _gradients
 from gs2d.render.exposure_native import exposed, gradients
+from gs2d.render.exposure_transform import _exposed, _gradients
 
 
 @pytest.mark.parametrize("cut_out", [False, True])

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.errors import BackendError
-from gs2d.kernels import losses as ops
+from gs2d.kernels import native_losses as ops
 from gs2d.kernels.library import Library, available_variants, load
-from gs2d.kernels.losses import NormalOptions
+from gs2d.kernels.native_losses import NormalOptions
 from gs2d.losses import reference
 
 SIZES = [(1, 1), (2, 9), (5, 3), (11, 16), (37, 53), (70, 21)]

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from emulate import Emulator
 from gs2d.config.multiview import MultiView
-from gs2d.kernels.cuda import multiview as cuda
+from gs2d.kernels.cuda import cuda_multiview as cuda
 from gs2d.kernels.library import Library
-from gs2d.kernels.multiview import compare_views
+from gs2d.kernels.native_multiview import compare_views
 from two_views import Scenario, in_torch, scenario
 
 DOUBLE = torch.float64

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from gs2d.kernels.library import Library
-from gs2d.render.photometry import _shown
+from gs2d.render.camera_response import _shown
 from gs2d.render.photometry_native import gradients, shown
 
 

@@ -24,7 +24,7 @@ from gs2d.errors import ShapeError
 from gs2d.losses.api import LossView, compute_losses
 from gs2d.losses.reference import normal_consistency, normal_consistency_per_splat
 from gs2d.render import pose_gradient as camera_gradient
-from gs2d.render import reference
+from gs2d.render import reference_rasterizer as reference
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings, RenderOutput

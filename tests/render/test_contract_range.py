@@ -13,7 +13,8 @@ import torch
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.splats import ATTRIBUTES, Splats
-from gs2d.render import reference, reference_errors
+from gs2d.render import reference_errors
+from gs2d.render import reference_rasterizer as reference
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backends import Backend
 from gs2d.render.types import MAX_COLOR, MAX_SIZE, MIN_QUATERNION, RasterSettings

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gs2d.render.exposure import (
+from gs2d.render.exposure_transform import (
     expose,
     fit_exposure,
     identity,

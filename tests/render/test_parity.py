@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from gs2d.core.splats import ATTRIBUTES
-from gs2d.render import reference, reference_errors
+from gs2d.render import reference_errors
+from gs2d.render import reference_rasterizer as reference
 from gs2d.render.backends import Backend
 from kernel_cases import SETTINGS, Case, cases, cases_with_margins, double, gradients, quantile
 from render_scenes import IMAGES, random_camera, random_cotangents, random_splats

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from gs2d.core.camera import Camera
 from gs2d.core.photometry import reach_of, squared_radii
-from gs2d.render.exposure import expose, identity
-from gs2d.render.photometry import bend, show, squares_of, vignetting
+from gs2d.render.camera_response import bend, show, squares_of, vignetting
+from gs2d.render.exposure_transform import expose, identity
 
 CAMERA = Camera(8, 6, 10.0, 10.0, 4.0, 3.0, np.eye(4))
 

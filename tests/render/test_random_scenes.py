@@ -18,7 +18,7 @@ from torch import Tensor
 import render_oracle
 from gs2d.core.camera import Camera
 from gs2d.core.splats import ATTRIBUTES, Splats
-from gs2d.render import reference
+from gs2d.render import reference_rasterizer as reference
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 from render_scenes import IMAGES, contraction, random_camera, random_cotangents, random_splats, requiring_grad

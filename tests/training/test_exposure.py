@@ -19,7 +19,7 @@ from gs2d.core.splats import Splats
 from gs2d.core.transforms import camera_extent
 from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.render.api import rasterize, splat_errors
-from gs2d.render.exposure import _gradients
+from gs2d.render.exposure_transform import _gradients
 from gs2d.render.types import RasterSettings
 from gs2d.synthetic.perturb_exposure import random_gains
 from gs2d.training import events

@@ -20,7 +20,7 @@ from gs2d.data.camera_models import Lens
 from gs2d.data.scene import Appearance, PointCloud, Scene, View
 from gs2d.data.undistort import Intrinsics
 from gs2d.render.api import rasterize, splat_errors
-from gs2d.render.exposure import identity
+from gs2d.render.exposure_transform import identity
 from gs2d.render.types import RasterSettings
 from gs2d.synthetic.perturb_exposure import random_gains
 from gs2d.training.learned.appearance import numbers_of, shown, shown_splats, unshown

@@ -1,4 +1,4 @@
-"""Adds the densification signal of a view: the native form of ``kernels.reference.accumulate``."""
+"""Adds the densification signal of a view: the native form of ``torch_kernels.accumulate``."""
 
 from __future__ import annotations
 

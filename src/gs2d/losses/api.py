@@ -24,7 +24,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
 from gs2d.data.scene import Scene
 from gs2d.errors import RecipeError, ShapeError
-from gs2d.kernels.losses import LossOperations
+from gs2d.kernels.native_losses import LossOperations
 from gs2d.losses import reference
 from gs2d.losses.multiview import Neighbour
 from gs2d.losses.reference import normals_from_depth

@@ -24,14 +24,14 @@ from torch.autograd.function import once_differentiable
 
 from gs2d.config.multiview import MultiView
 from gs2d.core.camera import Camera
-from gs2d.kernels.multiview import Compared
+from gs2d.kernels.native_multiview import Compared
 
 MIN_COSINE = 0.1  # between normal and ray: a plane seen more edge-on than this is no plane to warp by
 MIN_SCALE = 0.1  # depth in the neighbour in that here: below, the patch comes too close to the neighbour's camera
 MIN_NORMAL = 1e-4  # length of a rendered normal that has a direction
 
 CompareViews = Callable[[Tensor, Tensor, Tensor, Compared], tuple[Tensor, Tensor]]
-"""``kernels.multiview.compare_views``, or that of another backend."""
+"""``kernels.native_multiview.compare_views``, or that of another backend."""
 
 
 @dataclass(frozen=True, eq=False)

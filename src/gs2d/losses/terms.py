@@ -15,7 +15,7 @@ from gs2d.config.losses import register_loss
 from gs2d.config.recipe import LossTerm
 from gs2d.config.validate import number, one_of, require
 from gs2d.errors import RecipeError
-from gs2d.kernels.losses import LossOperations, NormalOptions
+from gs2d.kernels.native_losses import LossOperations, NormalOptions
 from gs2d.losses import multiview, reference
 from gs2d.losses.api import Loss, LossView
 from gs2d.losses.multiview import ViewPair

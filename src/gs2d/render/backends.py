@@ -18,15 +18,17 @@ from gs2d.config.registry import Register, Registry
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, ShapeError
-from gs2d.kernels import adam, densify_stats, library, losses, multiview, reference
-from gs2d.kernels.cuda import adam as cuda_adam
-from gs2d.kernels.cuda import diagnose, launch
-from gs2d.kernels.cuda import losses as cuda_losses
-from gs2d.kernels.cuda import multiview as cuda_multiview
-from gs2d.kernels.losses import LossOperations
+from gs2d.kernels import densify_stats, library
+from gs2d.kernels import native_adam as adam
+from gs2d.kernels import native_losses as losses
+from gs2d.kernels import native_multiview as multiview
+from gs2d.kernels import torch_kernels as reference
+from gs2d.kernels.cuda import cuda_adam, cuda_losses, cuda_multiview, diagnose, launch
+from gs2d.kernels.native_losses import LossOperations
 from gs2d.kernels.tsdf import FusionOnDevice, FusionOnHost
-from gs2d.render import cpu, cpu_cached, cuda, reference_errors
-from gs2d.render import reference as reference_rasterizer
+from gs2d.render import cpu_backend as cpu
+from gs2d.render import cpu_cached, reference_errors, reference_rasterizer
+from gs2d.render import cuda_backend as cuda
 from gs2d.render.cpu_cached import CachedView
 from gs2d.render.cuda_step import Stepper
 from gs2d.render.pair_budget import PairBudget

@@ -20,7 +20,7 @@ from gs2d.core.checks import check_shapes
 from gs2d.core.splats import Splats
 from gs2d.errors import ShapeError
 from gs2d.kernels.library import Library, ready_library
-from gs2d.render.cpu import _address, _check_tensors, _forward, _ParameterGradients, _parameters, _view
+from gs2d.render.cpu_backend import _address, _check_tensors, _forward, _ParameterGradients, _parameters, _view
 from gs2d.render.types import RasterSettings
 
 __all__ = ["CachedView", "cache_view"]
@@ -164,7 +164,7 @@ def cache_view(
     Raises
     ------
     ShapeError, BackendError
-        As for :func:`gs2d.render.cpu.rasterize`.
+        As for :func:`gs2d.render.cpu_backend.rasterize`.
     """
     library = library or ready_library()
     _check_tensors(splats, settings, library.dtype)

@@ -17,7 +17,7 @@ from torch import Tensor
 from gs2d.core.camera import Camera
 from gs2d.core.splats import ATTRIBUTES, IMAGES
 from gs2d.errors import BackendError
-from gs2d.kernels.cuda.arguments import (
+from gs2d.kernels.cuda.kernel_arguments import (
     DepthArguments,
     ErrorArguments,
     FeatureArguments,

@@ -4,7 +4,7 @@ No autograd, no operation of torch, no memory asked for once it runs: what a ren
 :class:`Arena`, the arguments of every kernel stay filled, and from one iteration to the next only the camera, the
 photograph, the room for pairs and the learning rates are written. So the launches are always the same ones, which a
 launcher may start as a graph. The arithmetic is that of :mod:`gs2d.render.cuda_passes` and the losses of
-:mod:`gs2d.kernels.cuda.losses`, kernel by kernel; without gradients that are added up by atomics the bits are too.
+:mod:`gs2d.kernels.cuda.cuda_losses`, kernel by kernel; without gradients that are added up by atomics the bits are too.
 """
 
 from __future__ import annotations
@@ -16,10 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gs2d.kernels.adam import bias_corrections_of
-from gs2d.kernels.cuda import arguments as structures
+from gs2d.kernels.cuda import kernel_arguments as structures
+from gs2d.kernels.cuda.cuda_losses import NORMAL_H, NORMAL_W, strips
 from gs2d.kernels.cuda.launch import Launcher, Work
-from gs2d.kernels.cuda.losses import NORMAL_H, NORMAL_W, strips
 from gs2d.kernels.cuda.sort import (
     DIGITS,
     MOST_PASSES,
@@ -30,6 +29,7 @@ from gs2d.kernels.cuda.sort import (
     passes_of,
     pieces_of,
 )
+from gs2d.kernels.native_adam import bias_corrections_of
 from gs2d.render.cuda_passes import CAMERA_BYTES, MAX_SPLATS, PROJECTED, view_of
 from gs2d.render.cuda_works import (
     THREADS,

@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 from torch import Tensor
 
-from gs2d.kernels.cuda.arguments import (
+from gs2d.kernels.cuda.kernel_arguments import (
     BlendArguments,
     BlendColorsArguments,
     BlendVjpArguments,

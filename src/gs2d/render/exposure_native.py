@@ -1,4 +1,4 @@
-"""The native colour transform of a photograph and its gradients; ``gs2d.render.exposure`` has the same in torch."""
+"""The native colour transform of a photograph; ``gs2d.render.exposure_transform`` has the same in torch."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _image(color: Tensor, transform: Tensor, coverage: Tensor | None, background
 def exposed(
     library: Library, color: Tensor, transform: Tensor, coverage: Tensor | None, background: Tensor | None
 ) -> Tensor:
-    """Return the image; arguments as of ``gs2d.render.exposure.expose``.
+    """Return the image; arguments as of ``gs2d.render.exposure_transform.expose``.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The native vignetting and response of a camera; ``gs2d.render.photometry`` has the same in torch."""
+"""The native vignetting and response of a camera; ``gs2d.render.camera_response`` has the same in torch."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def shown(
     coverage: Tensor | None,
     background: Tensor | None,
 ) -> Tensor:
-    """Return the picture; arguments as of ``gs2d.render.photometry.show``.
+    """Return the picture; arguments as of ``gs2d.render.camera_response.show``.
 
     Raises
     ------

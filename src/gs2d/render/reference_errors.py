@@ -7,8 +7,8 @@ from torch import Tensor
 
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
-from gs2d.render.reference import evaluate_pairs, pair_alpha
 from gs2d.render.reference_projection import blocks, cutoff_squared, project, screen_boxes, visible_rows
+from gs2d.render.reference_rasterizer import evaluate_pairs, pair_alpha
 from gs2d.render.types import RasterSettings
 
 __all__ = ["splat_errors"]

@@ -1,6 +1,6 @@
 """First half of the reference rasterizer: from splats to screen (docs/math.md, "Projection" and "Footprint").
 
-Everything here is per splat; :mod:`gs2d.render.reference` is per pair of splat and pixel.
+Everything here is per splat; :mod:`gs2d.render.reference_rasterizer` is per pair of splat and pixel.
 """
 
 from __future__ import annotations

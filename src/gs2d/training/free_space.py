@@ -19,7 +19,7 @@ from gs2d.core.memory_limit import cache_bytes
 from gs2d.core.spill import Spilled
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
-from gs2d.kernels.free_space import SeenSpace, look_at_free_space
+from gs2d.kernels.native_free_space import SeenSpace, look_at_free_space
 from gs2d.training.plane_sweep import SWEEP_BYTES, Sweep
 
 NEARER = 0.9  # free is what is nearer than this fraction of the depth: depths are good to a few percent

@@ -14,7 +14,7 @@ import torch
 from benchmarks.gpu.host import host_cost
 
 from emulate import Emulator
-from gs2d.kernels.cuda.arguments import OrderArguments, fill
+from gs2d.kernels.cuda.kernel_arguments import OrderArguments, fill
 from gs2d.render import cuda_works
 
 # Own launches, device launches, torch operations, allocations. A tile more than 256 in the image is a launch more. The
@@ -74,7 +74,7 @@ def test_rows_that_begin_in_the_middle_of_sixteen_bytes_have_the_same_gradients(
     """A view of another tensor's rows is contiguous, and begins anywhere."""
     import numpy as np
 
-    from gs2d.render import cuda
+    from gs2d.render import cuda_backend as cuda
     from gs2d.render.types import RasterSettings
     from render_scenes import contraction, random_camera, random_cotangents, random_splats, requiring_grad
 

@@ -25,8 +25,8 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 ctypes.CDLL(sys.argv[1])
 sys.path.insert(0, sys.argv[2])
 
-from gs2d.kernels.cuda import adam, arguments, launch, losses as ops
-from gs2d.render import cuda, pair_budget as cuda_budget, cuda_passes, cuda_works
+from gs2d.kernels.cuda import cuda_adam as adam, kernel_arguments as arguments, launch, cuda_losses as ops
+from gs2d.render import cuda_backend as cuda, pair_budget as cuda_budget, cuda_passes, cuda_works
 from fake_backends import altered
 from gs2d.render.backends import CudaBackend
 
@@ -94,7 +94,7 @@ print(sorted(devices), sorted(launched), pointers[0])
 
 GRADIENTS = """
 import numpy as np
-from gs2d.kernels.losses import NormalOptions
+from gs2d.kernels.native_losses import NormalOptions
 from render_scenes import front_camera
 from gs2d.render.types import RasterSettings
 

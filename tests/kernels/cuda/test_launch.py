@@ -19,7 +19,7 @@ from emulate import Emulator
 from fake_driver import FakeDriver, Result
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.cuda import launch
-from gs2d.render import cuda
+from gs2d.render import cuda_backend as cuda
 from gs2d.render.backends import CudaBackend
 from gs2d.render.types import RasterSettings
 from render_scenes import IMAGES, contraction, random_camera, random_cotangents, random_splats, requiring_grad

@@ -1,4 +1,4 @@
-"""The structures of ``kernels/cuda/arguments.py`` lie in memory as NVRTC lays out those of the kernels, field by field.
+"""The structures of ``kernel_arguments.py`` have the memory layout that NVRTC gives those of the kernels.
 
 The emulator's compiler is another: what it agrees with Python about, NVRTC might not, and then a kernel would read a
 pointer from the middle of two.
@@ -12,9 +12,10 @@ import re
 import pytest
 
 from gs2d.errors import BackendError
-from gs2d.kernels import multiview
+from gs2d.kernels import native_multiview as multiview
 from gs2d.kernels import tsdf as fusion
-from gs2d.kernels.cuda import arguments, compile
+from gs2d.kernels.cuda import compile
+from gs2d.kernels.cuda import kernel_arguments as arguments
 
 KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )?(\w+)\((\w+)(<float>)? ')
 CAMERA = {name: f"camera.{name}" for name in ("R", "t", "center", "fx", "fy", "cx", "cy")}  # of View

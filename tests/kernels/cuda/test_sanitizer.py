@@ -28,7 +28,7 @@ emulator = Emulator(**{sys.argv[2]: True})
 """
 
 BEYOND = """
-from gs2d.kernels.cuda.arguments import BlurArguments, fill
+from gs2d.kernels.cuda.kernel_arguments import BlurArguments, fill
 
 arguments = BlurArguments(20, 20)
 image, out = torch.rand(20 * 20 * 3 - 1), torch.rand(20 * 20 * 3)  # one number too few
@@ -44,7 +44,7 @@ print("all done")
 """
 
 MISPLACED = """
-from gs2d.kernels.cuda.arguments import ClearArguments
+from gs2d.kernels.cuda.kernel_arguments import ClearArguments
 
 words = torch.zeros(64)
 emulator.launch("clear_words", 1, 256, ClearArguments(words=words.data_ptr() + 4, count=3))  # of 16 bytes each

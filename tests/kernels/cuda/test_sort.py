@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from emulate import Emulator
-from gs2d.kernels.cuda.arguments import DigitArguments, RunningArguments, SortArguments, fill
+from gs2d.kernels.cuda.kernel_arguments import DigitArguments, RunningArguments, SortArguments, fill
 from gs2d.kernels.cuda.sort import (
     DIGITS,
     MOST_PASSES,

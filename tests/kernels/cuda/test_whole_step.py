@@ -313,8 +313,8 @@ def test_an_iteration_asks_torch_for_nothing(emulator: Emulator, scene: Scene) -
 
 def test_a_byte_is_the_same_number_as_by_a_division(emulator: Emulator) -> None:
     """All 256: a row of them, against a target of floats, is an L1 of exactly 0."""
-    from gs2d.kernels.cuda.arguments import PhotometricArguments, fill
-    from gs2d.kernels.cuda.losses import THREADS, strips
+    from gs2d.kernels.cuda.cuda_losses import THREADS, strips
+    from gs2d.kernels.cuda.kernel_arguments import PhotometricArguments, fill
 
     width = 86  # 258 reals
     values = torch.arange(3 * width) % 256

@@ -10,7 +10,7 @@ namespace {
 
 constexpr int64_t PIECE = 8192;  // elements a thread takes at a time: 160 KB are read and written
 
-// kernels/adam.py has the same.
+// kernels/native_adam.py has the same.
 struct AdamAttribute {
     real *parameter, *mean, *square;          // [N, columns]
     const real* gradient;                     // [N, columns], or [M, columns] with `compact`

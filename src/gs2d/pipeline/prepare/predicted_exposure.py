@@ -20,7 +20,7 @@ from gs2d.core.splats import Splats
 from gs2d.data import Scene, View
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
-from gs2d.render.exposure import identity
+from gs2d.render.exposure_transform import identity
 from gs2d.render.types import RasterSettings
 
 NEIGHBOURS = 5  # training photographs that a prediction is made of

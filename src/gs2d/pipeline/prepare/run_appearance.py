@@ -24,7 +24,7 @@ from gs2d.data import Scene, View
 from gs2d.data.scene import Appearance
 from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import EXPOSURE, LEARNED, PHOTOMETRY, SPLATS, RunFolder
-from gs2d.render.exposure import expose, fit_exposure
+from gs2d.render.exposure_transform import expose, fit_exposure
 from gs2d.render.types import RenderOutput
 from gs2d.training.events import Notice, OnEvent
 from gs2d.training.learned.appearance import numbers_of, shown, unshown

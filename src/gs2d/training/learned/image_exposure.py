@@ -8,7 +8,7 @@ from torch import Tensor
 from gs2d.config.quantities import QUANTITIES, Exposure
 from gs2d.data.scene import Scene
 from gs2d.errors import RecipeError
-from gs2d.render.exposure import expose, identity
+from gs2d.render.exposure_transform import expose, identity
 from gs2d.training.learned.quantity import ImagePoints, LearnedQuantity
 from gs2d.training.point_gains import point_gains
 

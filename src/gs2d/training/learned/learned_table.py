@@ -12,7 +12,7 @@ from gs2d.config.recipe import Recipe
 from gs2d.core.camera import Camera
 from gs2d.data.scene import Appearance, Scene
 from gs2d.errors import RecipeError, RunError
-from gs2d.kernels.reference import finite
+from gs2d.kernels.torch_kernels import finite
 from gs2d.render.backends import Backend
 from gs2d.training.learned.learned_rows import LearnedRows
 from gs2d.training.learned.quantity import LearnedQuantity

@@ -15,7 +15,7 @@ from gs2d.config.quantities import Learning
 from gs2d.core.camera import Camera
 from gs2d.core.photometry import reach_of
 from gs2d.data.scene import Scene, View
-from gs2d.render.photometry import squares_of
+from gs2d.render.camera_response import squares_of
 from gs2d.training.targets import Target
 
 

@@ -1,4 +1,4 @@
-"""The comparison of two views on a GPU: ``kernels/multiview.py`` over a launcher; nothing waits for the host."""
+"""The comparison of two views on a GPU: ``kernels/native_multiview.py`` over a launcher; nothing waits for the host."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from gs2d.kernels.cuda.arguments import fill
-from gs2d.kernels.cuda.losses import ready
-from gs2d.kernels.multiview import CompareArguments, Compared, compare_on
+from gs2d.kernels.cuda.cuda_losses import ready
+from gs2d.kernels.cuda.kernel_arguments import fill
+from gs2d.kernels.native_multiview import CompareArguments, Compared, compare_on
 
 if TYPE_CHECKING:
     from gs2d.kernels.cuda.launch import Launcher
@@ -23,7 +23,7 @@ PATCHES = 4  # multiview.cu: of a block
 def compare_views(
     depth: Tensor, normal: Tensor, motion: Tensor, given: Compared, *, launcher: Launcher
 ) -> tuple[Tensor, Tensor]:
-    """Compare pixels of a view with a neighbour: the form on a GPU of the function of ``kernels.multiview``.
+    """Compare pixels of a view with a neighbour: the form on a GPU of the function of ``kernels.native_multiview``.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The image losses on a GPU: the functions of ``kernels/losses.py`` over a launcher; nothing waits for the host.
+"""The image losses on a GPU: the functions of ``kernels/native_losses.py`` over a launcher; nothing waits for the host.
 
 Values are reduced in a fixed order, so they are the same from run to run. Unlike the native ones, gradients wait for
 the backward pass: their cotangents are read on the device, and nothing has to be guessed (``expected`` is accepted and
@@ -18,7 +18,7 @@ from torch.autograd.function import once_differentiable
 
 from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
-from gs2d.kernels.cuda.arguments import (
+from gs2d.kernels.cuda.kernel_arguments import (
     BlurArguments,
     FinishArguments,
     MeanArguments,
@@ -27,7 +27,7 @@ from gs2d.kernels.cuda.arguments import (
     PhotometricVjpArguments,
     fill,
 )
-from gs2d.kernels.losses import NormalOptions
+from gs2d.kernels.native_losses import NormalOptions
 
 if TYPE_CHECKING:
     from gs2d.kernels.cuda.launch import Launcher

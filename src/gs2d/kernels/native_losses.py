@@ -40,7 +40,7 @@ class LossOperations:
     blur : callable or None
         Where ``photometric`` takes the local mean of the target, which is then worth keeping.
     compare_views : callable or None
-        ``kernels.multiview.compare_views``; None: the losses of two views are worked out in torch.
+        ``kernels.native_multiview.compare_views``; None: the losses of two views are worked out in torch.
     """
 
     photometric: Callable[..., tuple[Tensor, Tensor, Tensor]]

@@ -18,7 +18,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import ATTRIBUTES, IMAGES, Splats
 from gs2d.errors import ShapeError
 from gs2d.kernels.cuda import launch
-from gs2d.kernels.cuda.arguments import View
+from gs2d.kernels.cuda.kernel_arguments import View
 from gs2d.kernels.cuda.launch import Launcher
 from gs2d.render.cuda_passes import (
     CHANNELS,

@@ -51,7 +51,7 @@ def show(
     squares : Tensor [H, W], optional
         Squared radii; without them there is no vignetting.
     coverage, background
-        As for :func:`gs2d.render.exposure.expose`.
+        As for :func:`gs2d.render.exposure_transform.expose`.
 
     Returns
     -------

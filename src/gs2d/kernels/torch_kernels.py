@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
-from gs2d.kernels.adam import AdamUpdate
+from gs2d.kernels.native_adam import AdamUpdate
 
 __all__ = ["accumulate", "adam_step", "finite", "first_not_finite"]
 
