@@ -18,7 +18,7 @@ from PIL import Image
 
 from gs2d.core.mesh import TexturedMesh
 from gs2d.errors import DataError
-from gs2d.io.meshes import glb_bytes, read_mesh, write_textured
+from gs2d.io.meshes import glb_bytes, read_mesh, write_mesh
 from gs2d.pipeline.look.view import open_viewer, serve
 from gs2d.viewer.server import PageServer
 from tiny import write_ball_mesh
@@ -58,7 +58,7 @@ def test_a_run_is_served_with_its_stages_its_mesh_and_its_cameras(trained: Path,
             with pytest.raises(urllib.error.HTTPError, match="400"):
                 fetch(server, path, **values)
         assert server.failure is None
-        write_textured(copy / "mesh.glb", TexturedMesh(np.eye(3), np.eye(3), np.array([[0, 1, 2]]),
+        write_mesh(copy / "mesh.glb", TexturedMesh(np.eye(3), np.eye(3), np.array([[0, 1, 2]]),
                                                        np.zeros((3, 2)), np.zeros((4, 4, 3), np.uint8)))  # fmt: skip
     finally:
         server.close()
@@ -71,7 +71,7 @@ def test_nothing_or_a_mesh_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="folder"):
         open_viewer(tmp_path / "nothing.ply")
     mesh = TexturedMesh(np.eye(3), np.eye(3), np.array([[0, 1, 2]]), np.zeros((3, 2)), np.zeros((4, 4, 3), np.uint8))
-    write_textured(tmp_path / "mesh.glb", mesh)
+    write_mesh(tmp_path / "mesh.glb", mesh)
     with pytest.raises(DataError):
         open_viewer(tmp_path / "mesh.glb")
 

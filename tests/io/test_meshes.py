@@ -1,4 +1,4 @@
-"""Meshes in files: they come back as they were, and other programs open them."""
+"""Mesh files: round trips, and files that other programs read."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from surface_shapes import tetrahedron
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("colors", [True, False])
-def test_a_mesh_comes_back(tmp_path: Path, dtype: type, colors: bool) -> None:
+def test_a_mesh_survives_a_round_trip(tmp_path: Path, dtype: type, colors: bool) -> None:
     mesh = tetrahedron(colors, dtype)
     write_mesh(tmp_path / "a.ply", mesh)
     back = read_mesh(tmp_path / "a.ply")
@@ -29,27 +29,27 @@ def test_a_mesh_comes_back(tmp_path: Path, dtype: type, colors: bool) -> None:
     assert (back.colors is None) if mesh.colors is None else np.array_equal(back.colors, mesh.colors)
 
 
-def test_trimesh_reads_our_mesh(tmp_path: Path) -> None:
+def test_trimesh_reads_a_written_mesh(tmp_path: Path) -> None:
     write_mesh(tmp_path / "a.ply", tetrahedron())
     back = trimesh.load(tmp_path / "a.ply", process=False)
-    assert back.volume == pytest.approx(1 / 6)  # positive: the faces look outward
+    assert back.volume == pytest.approx(1 / 6)  # positive: the faces point outwards
     assert back.visual.vertex_colors[1].tolist() == [255, 4, 5, 255]
 
 
-def test_a_face_that_names_no_vertex_is_a_data_error(tmp_path: Path) -> None:
+def test_a_face_with_an_invalid_index_is_a_data_error(tmp_path: Path) -> None:
     mesh = tetrahedron()
     write_mesh(tmp_path / "a.ply", Mesh(mesh.vertices[:3], mesh.faces))
-    with pytest.raises(DataError, match="below"):
+    with pytest.raises(DataError, match="expected vertex indices"):
         read_mesh(tmp_path / "a.ply")
 
 
-def test_points_are_no_mesh(tmp_path: Path) -> None:
+def test_points_are_not_read_as_a_mesh(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", {"vertex": np.zeros(3, [(name, "f4") for name in "xyz"])})
     with pytest.raises(DataError, match="without faces"):
         read_mesh(tmp_path / "a.ply")
 
 
-def test_polygons_become_fans() -> None:
+def test_polygons_become_triangle_fans() -> None:
     faces = triangulate(np.array([2, 5, 3]), np.array([0, 1, 10, 11, 12, 13, 14, 20, 21, 22]))
     assert faces.tolist() == [[10, 11, 12], [10, 12, 13], [10, 13, 14], [20, 21, 22]]
 
@@ -66,7 +66,7 @@ def test_obj_faces_with_texture_indices_negative_indices_and_polygons_are_read(t
 
 
 @pytest.mark.parametrize("name", ["a.stl", "a.off", "a.obj", "A.OBJ"])
-def test_other_formats_come_back_as_trimesh_writes_them(tmp_path: Path, name: str) -> None:
+def test_other_formats_are_read_as_trimesh_writes_them(tmp_path: Path, name: str) -> None:
     mesh = tetrahedron(colors=False)
     trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(tmp_path / name.lower())
     (tmp_path / name.lower()).rename(tmp_path / name)
@@ -84,7 +84,7 @@ def test_a_broken_obj_is_a_data_error(tmp_path: Path, text: str) -> None:
         read_mesh(tmp_path / "a.obj")
 
 
-def test_a_coloured_mesh_becomes_a_glb_with_its_colours(tmp_path: Path) -> None:
+def test_a_glb_has_the_vertex_colours(tmp_path: Path) -> None:
     colors = np.array([[255, 0, 0], [0, 188, 0], [12, 0, 255]], np.uint8)
     data = glb_bytes(Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), colors))
     (tmp_path / "a.glb").write_bytes(data)

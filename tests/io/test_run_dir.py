@@ -1,4 +1,4 @@
-"""Run folders: who may write where, what survives a kill, what a resume sees."""
+"""Run folders: ownership, files after a kill, and what a resume reads."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_a_new_run_has_a_definition_with_versions_and_machine(tmp_path: Path) ->
     assert names(run.path) == ["run.json"]
 
 
-def test_a_folder_that_holds_a_run_is_refused_unless_resumed_or_overwritten(tmp_path: Path) -> None:
+def test_an_existing_run_is_an_error_unless_resumed_or_overwritten(tmp_path: Path) -> None:
     new_run(tmp_path / "run")
     with pytest.raises(RunError, match="--resume"):
         claim_run(tmp_path / "run", resume=False, overwrite=False)
@@ -65,7 +65,7 @@ def test_a_folder_with_other_files_is_never_taken(tmp_path: Path, overwrite: boo
     assert names(tmp_path) == ["thesis.tex"]
 
 
-def test_a_run_whose_process_was_killed_while_it_wrote_run_json_is_started_again(tmp_path: Path) -> None:
+def test_a_run_without_a_complete_definition_is_started_again(tmp_path: Path) -> None:
     kill = "import os; from gs2d.core.files import atomic_write\nwith atomic_write('run.json'): os.kill(os.getpid(), 9)"
     subprocess.run([sys.executable, "-c", kill], cwd=tmp_path, check=False)
     (left,) = names(tmp_path)
@@ -73,7 +73,7 @@ def test_a_run_whose_process_was_killed_while_it_wrote_run_json_is_started_again
     assert claim_run(tmp_path, resume=True, overwrite=False).checkpoints() == []
 
 
-def test_whoever_locks_a_run_removes_what_a_killed_process_left_in_it(tmp_path: Path) -> None:
+def test_a_lock_removes_temporary_files_of_killed_processes(tmp_path: Path) -> None:
     run = new_run(tmp_path)
     kill = "import os, sys\nfrom gs2d.core.files import atomic_write\n"
     kill += "with atomic_write(sys.argv[1]): os.kill(os.getpid(), 9)"
@@ -87,15 +87,15 @@ def test_whoever_locks_a_run_removes_what_a_killed_process_left_in_it(tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("make", "found"), [(None, "nothing"), ("folder", "a folder without run.json"), ("file", "a file")]
+    ("make", "got"), [(None, "nothing"), ("folder", "a folder without run.json"), ("file", "a file")]
 )
-def test_opening_what_is_no_run_says_what_was_found(tmp_path: Path, make: str | None, found: str) -> None:
+def test_opening_something_else_names_what_it_is(tmp_path: Path, make: str | None, got: str) -> None:
     path = tmp_path / "x"
     if make == "folder":
         path.mkdir()
     elif make == "file":
         path.write_text("")
-    with pytest.raises(RunError, match=f"expected a run folder at .*x, found {found}"):
+    with pytest.raises(RunError, match=f"expected a run folder at .*x, got {got}"):
         open_run(path)
 
 
@@ -105,7 +105,7 @@ def test_opening_what_is_no_run_says_what_was_found(tmp_path: Path, make: str | 
 def test_a_run_of_another_format_names_the_version_that_wrote_it(tmp_path: Path, versions: object, words: str) -> None:
     run = new_run(tmp_path)
     (tmp_path / "run.json").write_text(json.dumps({"format": 99, "versions": versions}))
-    with pytest.raises(RunError, match=f"format 99, expected 2; it was written by {words}: use that one"):
+    with pytest.raises(RunError, match=f"format 99, expected 2; use {words}, which wrote it"):
         run.definition()
 
 
@@ -125,7 +125,7 @@ def test_damaged_metrics_are_one_line(tmp_path: Path, text: str) -> None:
         run.metrics()
 
 
-def test_the_log_is_cut_to_the_checkpoint_and_loses_a_half_written_line(tmp_path: Path) -> None:
+def test_the_log_is_truncated_to_the_checkpoint_without_incomplete_lines(tmp_path: Path) -> None:
     log = EventLog(tmp_path / "events.jsonl")
     log.append({"iteration": 1})
     size = log.size
@@ -139,7 +139,7 @@ def test_the_log_is_cut_to_the_checkpoint_and_loses_a_half_written_line(tmp_path
     assert log.path.read_text() == '{"iteration": 1}\n{"iteration": 2}\n'
 
 
-def test_a_log_line_that_does_not_fit_is_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_log_line_is_removed_if_the_disk_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import resource
 
     log = EventLog(tmp_path / "events.jsonl")
@@ -158,7 +158,7 @@ def test_a_log_line_that_does_not_fit_is_taken_back(tmp_path: Path, monkeypatch:
     assert log.path.read_bytes() == b'{"a": 1}\n'
 
 
-def test_the_last_two_checkpoints_of_a_stage_are_kept_and_its_end_for_ever(tmp_path: Path) -> None:
+def test_the_last_two_checkpoints_and_the_end_of_a_stage_are_kept(tmp_path: Path) -> None:
     run = new_run(tmp_path)
     for iteration in (10, 20, 30):
         run.save_checkpoint(0, "surface", iteration, {"i": iteration})
@@ -170,7 +170,7 @@ def test_the_last_two_checkpoints_of_a_stage_are_kept_and_its_end_for_ever(tmp_p
     assert load_tensors(found[-1].path)["i"] == 45
 
 
-def test_a_checkpoint_remembers_the_length_of_the_log(tmp_path: Path) -> None:
+def test_a_checkpoint_stores_the_length_of_the_log(tmp_path: Path) -> None:
     run = new_run(tmp_path)
     run.events.append({"iteration": 1})
     path = run.save_checkpoint(0, "surface", 1, {"tensor": torch.arange(3)})
@@ -179,7 +179,7 @@ def test_a_checkpoint_remembers_the_length_of_the_log(tmp_path: Path) -> None:
     assert torch.equal(payload["tensor"], torch.arange(3))
 
 
-def test_one_changed_byte_of_a_checkpoint_is_noticed(tmp_path: Path) -> None:
+def test_one_changed_byte_of_a_checkpoint_is_detected(tmp_path: Path) -> None:
     path = tmp_path / "x.pt"
     save_tensors(path, {"a": torch.full((1000,), 0.5)})  # 00 00 00 3f
     data = bytearray(path.read_bytes())
@@ -203,7 +203,7 @@ def test_a_broken_checkpoint_is_named(tmp_path: Path, damage: str) -> None:
         load_tensors(path)
 
 
-def test_a_checkpoint_that_would_execute_code_is_refused(tmp_path: Path) -> None:
+def test_a_checkpoint_with_code_is_an_error(tmp_path: Path) -> None:
     class Evil:
         def __reduce__(self) -> tuple[object, tuple[str]]:
             return os.mkdir, (str(tmp_path / "executed"),)
@@ -214,7 +214,7 @@ def test_a_checkpoint_that_would_execute_code_is_refused(tmp_path: Path) -> None
     assert not (tmp_path / "executed").exists()
 
 
-def test_a_checkpoint_that_does_not_fit_leaves_the_older_one_and_no_temporary(tmp_path: Path) -> None:
+def test_a_full_disk_keeps_the_older_checkpoint(tmp_path: Path) -> None:
     import resource
     import signal
 
@@ -239,7 +239,7 @@ def _hold(path: str, ready: object, done: object) -> None:
         done.wait(900)  # type: ignore[attr-defined]
 
 
-def test_two_processes_cannot_train_in_one_folder_and_a_dead_one_frees_it(tmp_path: Path) -> None:
+def test_a_lock_excludes_other_processes_and_ends_with_its_own(tmp_path: Path) -> None:
     context = multiprocessing.get_context("spawn")
     ready, done = context.Event(), context.Event()
     process = context.Process(target=_hold, args=(str(tmp_path), ready, done))
@@ -254,7 +254,7 @@ def test_two_processes_cannot_train_in_one_folder_and_a_dead_one_frees_it(tmp_pa
         pass
 
 
-def test_discarding_removes_the_run_and_the_folders_made_for_it(tmp_path: Path) -> None:
+def test_discarding_removes_the_run_and_its_created_folders(tmp_path: Path) -> None:
     run = new_run(tmp_path / "a" / "b")
     with run.locked():
         run.save_checkpoint(0, "s", 1, {})
@@ -262,7 +262,7 @@ def test_discarding_removes_the_run_and_the_folders_made_for_it(tmp_path: Path) 
     assert names(tmp_path) == []
 
 
-def test_a_checkpoint_that_a_killed_process_had_no_time_to_drop_goes_with_the_lock(tmp_path: Path) -> None:
+def test_a_lock_removes_superseded_checkpoints(tmp_path: Path) -> None:
     """Killed between the checkpoint at the end of a stage and the end of the one within it."""
     run = new_run(tmp_path / "run")
     for index, iteration in ((0, None), (1, None), (2, 4)):

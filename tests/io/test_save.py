@@ -1,4 +1,4 @@
-"""``Splats.save`` and ``Mesh.save`` write what the exporters write, by the ending of the name."""
+"""``Splats.save`` and ``Mesh.save`` choose the format by the suffix."""
 
 from __future__ import annotations
 
@@ -36,9 +36,7 @@ def mesh() -> gs2d.Mesh:
 @pytest.mark.parametrize(
     ("name", "layout"), [("a.ply", "3dgs"), ("a.compressed.ply", "compressed"), ("A.SPZ", "spz"), ("a.splat", "splat")]
 )
-def test_the_ending_chooses_the_format_and_read_splats_reads_it(
-    splats: gs2d.Splats, tmp_path: Path, name: str, layout: str
-) -> None:
+def test_the_suffix_selects_the_format(splats: gs2d.Splats, tmp_path: Path, name: str, layout: str) -> None:
     splats.save(tmp_path / name)
     write_layout(tmp_path / "exported", splats, layout)
     assert (tmp_path / name).read_bytes() == (tmp_path / "exported").read_bytes()
@@ -53,7 +51,7 @@ def test_the_ending_chooses_the_format_and_read_splats_reads_it(
         ("a.ply", "3dg", "layout"),
     ],
 )
-def test_a_name_that_no_format_has_is_refused_and_nothing_is_written(
+def test_an_unknown_suffix_or_layout_is_an_error(
     splats: gs2d.Splats, tmp_path: Path, name: str, layout: str | None, message: str
 ) -> None:
     with pytest.raises(DataError, match=message):
@@ -61,7 +59,7 @@ def test_a_name_that_no_format_has_is_refused_and_nothing_is_written(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_mesh_is_saved_by_its_ending(mesh: gs2d.Mesh, tmp_path: Path) -> None:
+def test_a_mesh_is_saved_by_its_suffix(mesh: gs2d.Mesh, tmp_path: Path) -> None:
     mesh.save(tmp_path / "a.ply")
     again = read_mesh(tmp_path / "a.ply")
     assert np.array_equal(again.vertices, mesh.vertices)

@@ -27,7 +27,7 @@ def random_splats(n: int, degree: int, seed: int = 0) -> Splats:
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 @pytest.mark.parametrize("n", [0, 7])
-def test_splats_come_back_bit_for_bit(tmp_path: Path, degree: int, n: int) -> None:
+def test_splats_survive_a_round_trip_exactly(tmp_path: Path, degree: int, n: int) -> None:
     splats = random_splats(n, degree)
     if n:
         splats.means[0, 0] = -0.0  # the sign of zero and subnormals survive too
@@ -39,7 +39,7 @@ def test_splats_come_back_bit_for_bit(tmp_path: Path, degree: int, n: int) -> No
         assert np.array_equal(before.numpy().view(np.int32), after.numpy().view(np.int32)), name
 
 
-def test_the_2dgs_layout_is_the_official_one(tmp_path: Path) -> None:
+def test_the_2dgs_layout_equals_the_official_one(tmp_path: Path) -> None:
     splats = random_splats(2, 1)
     write_splats(tmp_path / "a.ply", splats)
     vertex = read_ply(tmp_path / "a.ply").elements["vertex"]
@@ -63,7 +63,7 @@ def test_the_viewer_layout_has_a_flat_third_scale_after_the_second(tmp_path: Pat
     np.testing.assert_array_equal(vertex.properties["scale_1"], splats.log_scales[:, 1])
 
 
-def test_a_3dgs_file_a_mesh_and_points_are_told_apart(tmp_path: Path) -> None:
+def test_kinds_of_ply_files_are_distinguished(tmp_path: Path) -> None:
     write_splats(tmp_path / "3dgs.ply", random_splats(3, 0), layout="3dgs")
     write_mesh(tmp_path / "mesh.ply", tetrahedron())
     points = np.zeros(3, dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
@@ -166,7 +166,7 @@ def test_a_truncated_file_is_a_data_error(tmp_path: Path, order: str, lost: int)
         (b"ply\nformat ascii 1.0\nelement vertex -1\nend_header\n", "negative count"),
         (b"ply\nformat ascii 1.0\nelement v 1\nproperty float x\nproperty float x\nend_header\n1 1\n", "twice"),
         (b"ply\nformat binary_little_endian 1.0\nelement v 999999999999\nproperty float x\nend_header\n", "ends early"),
-        (b"ply\nformat ascii 1.0\nelement v 1\nproperty float x\nend_header\nfive\n", "no number"),
+        (b"ply\nformat ascii 1.0\nelement v 1\nproperty float x\nend_header\nfive\n", "invalid number"),
     ],
 )
 def test_a_malformed_file_is_a_data_error_in_one_line(tmp_path: Path, text: bytes, words: str) -> None:
@@ -181,11 +181,11 @@ def test_a_malformed_file_is_a_data_error_in_one_line(tmp_path: Path, text: byte
     [
         ("ascii", b"0 0 0\nnan 0 0\n", "a list of length nan"),
         ("ascii", b"0 0 0\n2.5 0 0\n", "a list of length 2.5"),
-        ("ascii", b"0 0 0\n1 3e9\n", "a number that is no int"),
+        ("ascii", b"0 0 0\n1 3e9\n", "a number out of the range of int"),
         ("binary_little_endian", bytes(12) + b"\xff\xff\xff\x7f" + bytes(8), "it ends early"),
     ],
 )
-def test_a_count_or_number_that_cannot_be_is_a_data_error(tmp_path: Path, kind: str, body: bytes, words: str) -> None:
+def test_an_invalid_count_or_number_is_a_data_error(tmp_path: Path, kind: str, body: bytes, words: str) -> None:
     file = tmp_path / "x.ply"
     header = f"ply\nformat {kind} 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
     header += "element face 1\nproperty list int int vertex_indices\nend_header\n"

@@ -12,7 +12,7 @@ from benchmarks.texture import image, psnr
 
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.errors import DiskError, ProtocolError
-from gs2d.io.meshes import write_textured
+from gs2d.io.meshes import write_mesh
 from gs2d.meshing import texture as atlas_module
 from gs2d.meshing.texture import (
     FEATHER,
@@ -182,7 +182,7 @@ def textured() -> TexturedMesh:
 @pytest.mark.parametrize("name", ["mesh.glb", "mesh.obj"])
 def test_other_programs_open_the_files_with_their_texture(tmp_path: Path, name: str) -> None:
     mesh = textured()
-    write_textured(tmp_path / name, mesh)
+    mesh.save(tmp_path / name)
     loaded = trimesh.load(tmp_path / name, force="mesh", process=False)
     assert len(loaded.faces) == len(mesh.faces)
     np.testing.assert_allclose(
@@ -206,10 +206,10 @@ def test_an_obj_file_its_material_and_its_texture_are_replaced_all_three_or_not_
 
     monkeypatch.setattr("gs2d.io.meshes._lines", full)
     with pytest.raises(DiskError, match="No space left"):
-        write_textured(tmp_path / "a.obj", textured())
+        write_mesh(tmp_path / "a.obj", textured())
     assert list(tmp_path.iterdir()) == []
     for name in ("a.obj", "a.mtl", "a.png"):
         (tmp_path / name).write_text("mine")
     with pytest.raises(DiskError, match="No space left"):
-        write_textured(tmp_path / "a.obj", textured())
+        write_mesh(tmp_path / "a.obj", textured())
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"] * 3

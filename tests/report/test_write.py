@@ -21,7 +21,7 @@ from gs2d.core.camera import Camera, look_at
 from gs2d.core.json_files import write_json
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.errors import DataError, RunError
-from gs2d.io.meshes import write_textured
+from gs2d.io.meshes import write_mesh
 from gs2d.report import mesh_images as report_mesh
 from gs2d.report import mesh_view as report_view
 from gs2d.report.mesh_view import MeshView, mesh_view
@@ -267,10 +267,10 @@ def test_the_mesh_is_shown_with_its_texture() -> None:
 
 def test_a_broken_texture_loses_only_the_view_of_the_mesh(tmp_path: Path) -> None:
     run = fabricate(tmp_path / "run", size=16)
-    write_textured(run / "mesh.glb", square_with_texture())
+    write_mesh(run / "mesh.glb", square_with_texture())
     assert "triangles" in text_of(write_report(run).read_text())
     (run / "mesh.glb").write_bytes(b"not a mesh, of some length")
-    assert "a .glb file as <code>gs2d mesh --texture</code> writes it was expected" in write_report(run).read_text()
+    assert "expected a .glb file of <code>gs2d mesh --texture</code>" in write_report(run).read_text()
 
 
 def unpacked(view: MeshView) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray]:

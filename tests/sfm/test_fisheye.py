@@ -221,7 +221,7 @@ def test_round_photographs_of_185_degrees_are_placed_masked_and_cut_into_faces(c
     assert made["lens"]["chosen"].endswith("_FISHEYE")
     assert made["lens"]["fisheyes"][0]["why"] == "circle"
     assert read_json(tmp_path / "capture/poses.json")["lens"] == made["lens"]
-    assert any("(they are round)" in line for line in said)
+    assert any("(round images)" in line for line in said)
     assert made["masks"] == 8  # which this command may replace
     assert searched(tmp_path, overwrite=True)[0]["lens"] == made["lens"]
     (camera,) = read_cameras(tmp_path / "capture/sparse/0", "bin").values()

@@ -89,8 +89,8 @@ def test_panoramas_are_known_by_their_pictures_or_by_their_xmp(tmp_path: Path) -
     )
     found, lines = groups_of(photos)
     assert found == [True, True, False, False]
-    assert lines[0] == "2 photographs are 360-degree panoramas: each has one place, and is trained in faces"
-    assert lines[1].startswith("1 photographs are twice as wide as high, but their edges do not meet")
+    assert lines[0] == "2 photographs are 360-degree panoramas: each has one pose, and is trained as several faces"
+    assert lines[1].startswith("1 photographs have an aspect ratio of 2:1, but their edges do not fit together")
     assert groups_of(photos, "OPENCV") == ([False] * 4, [])
     assert groups_of(photos[:3], "EQUIRECTANGULAR")[0] == [True, True, True]
     with pytest.raises(DataError, match="panorama"):
@@ -121,7 +121,7 @@ def test_the_places_of_panoramas_are_found_from_photographs_alone(
 ) -> None:
     """Measured: 0.3 mm of a room of 4 m, 0.02 degrees."""
     root, truth, said = panoramas
-    assert "7 photographs are 360-degree panoramas: each has one place, and is trained in faces" in said
+    assert "7 photographs are 360-degree panoramas: each has one pose, and is trained as several faces" in said
     found = errors(root / "capture", truth)
     assert found["placed"] == 7
     assert found["centres_worst_m"] < 0.003

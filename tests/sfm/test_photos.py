@@ -84,13 +84,13 @@ def test_files_that_are_no_photographs_are_named_with_what_to_do(tmp_path: Path)
     found, notes, warning = find_photos(tmp_path)
     assert len(found) == 3
     assert warning == (
-        "3 of 6 photographs cannot be read and are left out: 2 HEIC (x.HEIC ...): pip install pi-heif (its wheel holds "
+        "3 of 6 photographs cannot be read and are ignored: 2 HEIC (x.HEIC ...): pip install pi-heif (its wheel holds "
         "LGPL code), or convert them to JPEG (magick mogrify -format jpg *.heic); 1 CR2 (z.CR2): raw files are not "
         "developed here; export JPEG or PNG from your photo program"
     )
     video, other = notes
-    assert video == "clip.MOV was not read: a video; give it alone, or put frames of it here"
-    assert other == "notes.txt was not read: no photographs"
+    assert video == "clip.MOV was ignored: a video; use it as the input, or copy frames of it here"
+    assert other == "notes.txt was ignored: no photographs"
 
 
 @pytest.mark.parametrize(

@@ -104,8 +104,8 @@ def test_separate_pieces_and_photographs_without_a_place_are_named(
     assert poses(pieces, out) == 0
     text = capsys.readouterr()
     assert "5 of 10 photographs placed" in text.out
-    assert "no camera: 010.jpg: in a separate piece (sparse/1)" in text.out
-    assert "no camera: blank.jpg: 0 features: blurred, or nothing in it has texture" in text.out
+    assert "no camera: 010.jpg: in a separate model (sparse/1)" in text.out
+    assert "no camera: blank.jpg: 0 features: blurred, or without texture" in text.out
     assert "sparse/1 holds a separate piece: 4 photographs" in text.out
     assert "photographs" in text.err
     assert load_scene(out).notes[0].startswith("the model sparse/0 is read, which has 5 images; 1 has 4. Read another")
@@ -121,8 +121,8 @@ def test_the_same_seed_gives_the_same_bytes(colmap: None, pieces: Path, tmp_path
     assert {path: path.read_bytes() for path in sorted(out.rglob("*.bin"))} == models
 
 
-class Kept:
-    """What a search says: the names of its phases, and its lines."""
+class Events:
+    """Records phases and notices of a search, and interrupts it at the phase ``interrupt_at``."""
 
     def __init__(self, interrupt_at: str = "") -> None:
         self.phases: list[str] = []
@@ -152,7 +152,7 @@ def strangers(root: Path) -> None:
     ("write", "expected"),
     [
         (blank, "must hold photographs with texture, got 0 features in the median photograph"),
-        (strangers, "must hold photographs that overlap, got no two that show the same points"),
+        (strangers, "must hold photographs that overlap, got 3 without a single matching pair"),
     ],
 )
 def test_photographs_that_give_no_cameras_say_why_and_leave_nothing(
@@ -178,25 +178,25 @@ def test_a_camera_that_only_turned_is_doubted(colmap: None, tmp_path: Path, caps
 
 
 @pytest.mark.parametrize(
-    ("phase", "said"),
+    ("phase", "kept"),
     [
-        ("matching pairs", "features of 12 photographs, 0 pairs"),
+        ("matching pairs", "features of 12 photographs, [0-9]+ pairs"),  # the worker matches on until it is stopped
         ("placing cameras", "features of 12 photographs, 66 pairs"),
-        ("comparing lenses", "features of 12 photographs, 66 pairs, cameras that were placed"),
+        ("comparing lenses", "features of 12 photographs, 66 pairs, placed cameras"),
     ],
 )
-def test_a_search_that_was_interrupted_goes_on_and_ends_in_the_same_bytes(
-    room: Room, tmp_path: Path, phase: str, said: str
+def test_an_interrupted_search_continues_and_gives_the_same_bytes(
+    room: Room, tmp_path: Path, phase: str, kept: str
 ) -> None:
     out = tmp_path / "new" / "capture"
     options = PosesOptions(photos=room.photos, out=out, threads=2)
     with pytest.raises(KeyboardInterrupt):
-        find_poses(options, first := Kept(interrupt_at=phase))
+        find_poses(options, first := Events(interrupt_at=phase))
     work = tmp_path / "new" / ".capture.poses"
-    assert first.lines[-1] == f"what was found is kept in {work}: the same command goes on; remove it to begin anew"
+    assert first.lines[-1].startswith(f"what was found is kept in {work}")
     assert [path.name for path in out.parent.iterdir()] == [".capture.poses"]
-    find_poses(options, second := Kept())
-    assert f"going on with the search that was interrupted: {said}" in second.lines
+    find_poses(options, second := Events())
+    assert any(re.fullmatch(f"continuing the interrupted search: {kept}", line) for line in second.lines)
     assert [path.name for path in out.parent.iterdir()] == ["capture"]
     for name in ("cameras", "images", "points3D", "frames", "rigs"):
         same = f"sparse/0/{name}.bin"

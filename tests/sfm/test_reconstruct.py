@@ -224,7 +224,7 @@ def test_ctrl_c_among_the_cameras_keeps_what_was_found_and_names_the_command(roo
     options = ReconstructOptions(photos=room.photos, out=out, resume=True, training=TRAINING, **SMALL)  # type: ignore[arg-type]
     reconstruct(options, heard.append)
     lines = [event.text for event in heard if isinstance(event, Notice)]
-    assert any(line.startswith("going on with the search that was interrupted: features of ") for line in lines)
+    assert any(line.startswith("continuing the interrupted search: features of ") for line in lines)
     assert not (out / ".capture.poses").exists()
 
 

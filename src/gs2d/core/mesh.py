@@ -32,7 +32,7 @@ class Mesh:
             check_shapes({"vertices": (self.vertices, "P 3"), "colors": (self.colors, "P 3")})
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the mesh to a file, in the format of its ending: .ply or .glb.
+        """Write the mesh to a file: .ply or .glb.
 
         Parameters
         ----------
@@ -41,7 +41,7 @@ class Mesh:
         Raises
         ------
         DataError
-            If the name has another ending.
+            If the name has another suffix.
         DiskError
             If the file could not be written.
 
@@ -49,14 +49,14 @@ class Mesh:
         --------
         >>> gs2d.extract_mesh(trained).save("garden.ply")  # doctest: +SKIP
         """
-        import gs2d  # the writers lie above this layer; the package imports them when they are used
+        import gs2d  # the writers are in a higher layer
 
         gs2d.write_mesh(path, self)
 
 
 @dataclass(frozen=True, eq=False)
 class TexturedMesh:
-    """Triangles with a picture on them. A vertex on a seam of the texture stands there once for each side.
+    """Triangles with a texture. A vertex on a seam of the texture exists once for each side.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class TexturedMesh:
     faces : ndarray [F, 3] int32
         Vertex indices, counter-clockwise seen from outside.
     uv : ndarray [P, 2] float32
-        Places in the texture, (0, 0) its upper left and (1, 1) its lower right corner (glTF's convention).
+        Texture coordinates, (0, 0) at the upper left and (1, 1) at the lower right corner, as in glTF.
     texture : ndarray [S, S, 3] uint8, sRGB
     """
 
@@ -85,3 +85,21 @@ class TexturedMesh:
                 "texture": (self.texture, "S S 3"),
             }
         )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the mesh with its texture to a file: .glb, or .obj with .mtl and .png beside it.
+
+        Parameters
+        ----------
+        path : path
+
+        Raises
+        ------
+        DataError
+            If the name has another suffix.
+        DiskError
+            If a file could not be written.
+        """
+        import gs2d  # the writers are in a higher layer
+
+        gs2d.write_mesh(path, self)

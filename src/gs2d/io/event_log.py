@@ -1,4 +1,4 @@
-"""The log of a run, ``events.jsonl``: it only grows; a resume cuts it back to the checkpoint it goes on from."""
+"""The log of a run, ``events.jsonl``. A resume truncates it to its length at the checkpoint."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gs2d.errors import DiskError, RunError
 
 
 class EventLog:
-    """``events.jsonl``: append-only, one JSON object a line, flushed at each line."""
+    """Append-only file with one JSON object per line, flushed after each line."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -24,13 +24,13 @@ class EventLog:
         Raises
         ------
         DiskError
-            The line did not fit; the log is cut back to its last whole line.
+            If it could not be written; the log then ends with its last complete line.
         """
         line = (json.dumps(event, allow_nan=False, sort_keys=True) + "\n").encode()
         self.append_text(line)
 
     def append_text(self, lines: bytes) -> None:
-        """Write whole lines at once (the log of a cached stage)."""
+        """Write several lines (the log of a cached stage)."""
         start = self.size
         try:
             with open(self.path, "ab") as file:
@@ -42,11 +42,11 @@ class EventLog:
 
     @property
     def size(self) -> int:
-        """Bytes of the log."""
+        """Size of the log in bytes."""
         return self.path.stat().st_size if self.path.exists() else 0
 
     def cut(self, size: int) -> None:
-        """Forget everything after ``size`` bytes (and an unfinished last line)."""
+        """Truncate the log to ``size`` bytes, and remove an incomplete last line."""
         if not self.path.exists():
             return
         try:
@@ -57,14 +57,14 @@ class EventLog:
             raise disk_error(self.path, error) from error
 
     def read_bytes(self, size: int) -> bytes:
-        """Return the first ``size`` bytes, as far as there are so many."""
+        """Return the first ``size`` bytes, or all if there are fewer."""
         if not self.path.exists():
             return b""
         with open(self.path, "rb") as file:
             return file.read(size)
 
     def sync(self) -> None:
-        """Bring the log to the disk, before a checkpoint that refers to it."""
+        """Flush the log to disk, before a checkpoint refers to its length."""
         if not self.path.exists():
             return
         try:
@@ -74,12 +74,12 @@ class EventLog:
             raise disk_error(self.path, error) from error
 
     def read(self) -> list[dict[str, Any]]:
-        """All whole events.
+        """Return all complete events.
 
         Raises
         ------
         RunError
-            A line is no JSON object.
+            If a line is no JSON object.
         """
         if not self.path.exists():
             return []

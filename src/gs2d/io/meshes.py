@@ -1,4 +1,4 @@
-"""Meshes on disk: PLY read and written; OBJ, STL and OFF read by trimesh; with a texture written as glTF or OBJ."""
+"""Read and write meshes: PLY; OBJ, STL and OFF (read by trimesh); glTF and OBJ with a texture."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from gs2d.io.ply_format import PlyElement, PlyList, read_ply, write_ply
 
 COLORS = ("red", "green", "blue")
 FOREIGN = (".obj", ".stl", ".off")  # read by trimesh
-SUFFIXES = (".glb", ".obj")  # of a mesh with a texture
+SUFFIXES = (".glb", ".obj")  # of textured meshes
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942  # "glTF", "JSON", "BIN\0"
 _FLOAT, _UINT, _USHORT = 5126, 5125, 5123  # component types
 _VERTICES, _INDICES = 34962, 34963  # targets of a buffer view: ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
@@ -37,26 +37,30 @@ _CLAMP, _LINEAR, _MIPMAPS = 33071, 9729, 9987  # CLAMP_TO_EDGE, LINEAR, LINEAR_M
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """A point cloud as a file holds it: ``points`` [P, 3] float64 world units, ``colors`` and ``normals`` or None."""
+    """A point cloud: ``points`` [P, 3] float64 world units, with optional ``colors`` and ``normals``."""
 
     points: np.ndarray
     colors: np.ndarray | None = None  # [P, 3] uint8
     normals: np.ndarray | None = None  # [P, 3] float64
 
 
-def write_mesh(path: str | os.PathLike[str], mesh: Mesh) -> None:
-    """Write a triangle mesh with its vertex colours: the whole file, or nothing.
+def write_mesh(path: str | os.PathLike[str], mesh: Mesh | TexturedMesh, *, up: np.ndarray | None = None) -> None:
+    """Write a triangle mesh with vertex colours or a texture. The file is written completely or not at all.
 
     Parameters
     ----------
     path : path
-        Ends in .ply (vertices [P, 3] as they are, float32 or float64) or .glb (glTF, vertices in float32).
-    mesh : Mesh
+        For a Mesh, ends in .ply (vertices float32 or float64) or .glb (glTF 2.0, vertices float32). For a
+        TexturedMesh, ends in .glb or .obj, which gets an .mtl and a .png file of the same name.
+    mesh : Mesh or TexturedMesh
+    up : ndarray [3], optional
+        Up direction of the mesh. The node of a .glb is rotated so that viewers, which expect y up, show it upright; the
+        vertices do not change.
 
     Raises
     ------
     DataError
-        If the name has another ending.
+        If the name has another suffix.
     DiskError
         If the file could not be written.
 
@@ -64,12 +68,19 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh) -> None:
     --------
     >>> gs2d.write_mesh("garden.ply", gs2d.extract_mesh(trained))  # doctest: +SKIP
     """
-    suffix = Path(path).suffix.lower()
-    if suffix == ".glb":
-        write_glb(Path(path), mesh)
-        return
-    if suffix != ".ply":
-        raise DataError(f"a mesh is written as .ply or .glb, got {os.fspath(path)}; choose such a name")
+    path = Path(path)
+    if isinstance(mesh, TexturedMesh) and len(written_files(path)) > 1:
+        _write_obj(path, mesh)
+    elif path.suffix.lower() == ".glb":
+        with atomic_write(path) as file:
+            file.write(glb_bytes(mesh, up=up))
+    elif path.suffix.lower() == ".ply" and isinstance(mesh, Mesh):
+        _write_ply(path, mesh)
+    else:
+        raise DataError(f"a mesh is written as .ply or .glb, got {path}; choose such a name")
+
+
+def _write_ply(path: Path, mesh: Mesh) -> None:
     real = "<f8" if mesh.vertices.dtype == np.float64 else "<f4"
     fields = [(name, real) for name in "xyz"]
     if mesh.colors is not None:
@@ -81,22 +92,22 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh) -> None:
         for i, name in enumerate(COLORS):
             vertices[name] = mesh.colors[:, i]
     faces = np.empty(len(mesh.faces), dtype=[("vertex_indices", "<i4", (3,))])
-    faces["vertex_indices"] = mesh.faces  # the only property: all that common readers understand
+    faces["vertex_indices"] = mesh.faces  # the only property, because common readers understand no others
     write_ply(path, {"vertex": vertices, "face": faces})
 
 
 def read_mesh(path: str | os.PathLike[str]) -> Mesh:
-    """Read a mesh from PLY, OBJ, STL or OFF; polygons become triangles, other properties are passed over.
+    """Read a mesh from PLY, OBJ, STL or OFF. Polygons become triangles; other properties are ignored.
 
     Returns
     -------
     Mesh
-        Vertices float32, or float64 where the file has doubles (or is no PLY).
+        Vertices are float32, or float64 if the file has doubles or is no PLY.
 
     Raises
     ------
     DataError
-        If the file is broken, has vertices but no faces, or a face names a vertex that does not exist.
+        If the file is broken, has vertices but no faces, or a face refers to a missing vertex.
     """
     if Path(path).suffix.lower() in FOREIGN:
         return _read_foreign(Path(path))
@@ -104,27 +115,31 @@ def read_mesh(path: str | os.PathLike[str]) -> Mesh:
     vertex, face = file.elements.get("vertex"), file.elements.get("face")
     positions = vertex.scalars("x", "y", "z") if vertex else None
     if vertex is None or positions is None:
-        raise DataError(f"{path}: a mesh was expected, got a PLY without vertex positions; give a triangle mesh")
-    if face is None or (face.count == 0 and vertex.count > 0):  # nothing at all is an empty mesh
-        raise DataError(f"{path}: a mesh was expected, got a PLY without faces (points or splats); give a mesh")
+        raise DataError(f"{path}: expected a mesh, got a PLY without vertex positions; use a triangle mesh")
+    if face is None or (face.count == 0 and vertex.count > 0):  # without vertices, it is an empty mesh
+        raise DataError(f"{path}: expected a mesh, got a PLY without faces (points or splats); use a mesh")
     lists = face.properties.get("vertex_indices", face.properties.get("vertex_index"))
     if not isinstance(lists, PlyList):
-        raise DataError(f"{path}: faces with a list vertex_indices were expected, got {sorted(face.properties)}")
+        raise DataError(f"{path}: expected faces with a list vertex_indices, got {sorted(face.properties)}")
     if lists.values.dtype.kind == "f":
-        raise DataError(f"{path}: whole numbers as vertex indices were expected, got {lists.values.dtype}")
+        raise DataError(f"{path}: expected integers as vertex indices, got {lists.values.dtype}")
     faces = triangulate(lists.counts, lists.values)
-    if len(faces) and (faces.min() < 0 or faces.max() >= vertex.count):
-        raise DataError(f"{path}: vertex indices below {vertex.count} were expected, got {faces.max()}")
+    _check_indices(path, faces, vertex.count)
     dtype = np.float64 if vertex.scalar("x").dtype == np.float64 else np.float32
     return Mesh(positions.astype(dtype), faces.astype(np.int32), _colors(vertex))
 
 
+def _check_indices(path: str | os.PathLike[str], faces: np.ndarray, count: int) -> None:
+    if len(faces) and (faces.min() < 0 or faces.max() >= count):
+        raise DataError(f"{path}: expected vertex indices from 0 to {count - 1}, got {faces.min()} to {faces.max()}")
+
+
 @contextlib.contextmanager
 def _quiet_trimesh() -> Iterator[None]:
-    """Without numpy's warnings, and without the tracebacks that trimesh logs and goes on from."""
+    """Suppress numpy's warnings, and tracebacks that trimesh logs before it continues."""
     log = logging.getLogger("trimesh")
     before = log.level
-    log.setLevel(logging.CRITICAL + 1)  # of those below it too
+    log.setLevel(logging.CRITICAL + 1)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -134,40 +149,39 @@ def _quiet_trimesh() -> Iterator[None]:
 
 
 def _read_foreign(path: Path) -> Mesh:
-    """Read a mesh by trimesh, corners in the order of the file."""
-    import trimesh  # 0.6 s: for those who have such a file
+    """Read a mesh with trimesh, keeping the order of the vertices."""
+    import trimesh  # slow to import (0.6 s)
 
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise DataError(f"{path}: a mesh was expected, it cannot be read: {error.strerror}") from error
+        raise DataError(f"cannot read {path}: {error.strerror}") from error
     kind = path.suffix.lower().lstrip(".")
-    if kind == "obj":  # trimesh takes a comment behind a face for one of its corners
+    if kind == "obj":  # trimesh reads a comment behind a face as one of its corners
         data = re.sub(rb"#[^\n]*", b"", data)
     try:
-        with _quiet_trimesh():  # what comes of numbers that it cannot read is checked below
+        with _quiet_trimesh():
             loaded = trimesh.load_mesh(
                 io.BytesIO(data), file_type=kind, process=False, maintain_order=True, skip_materials=True
             )
         vertices, faces = np.array(loaded.vertices, np.float64), np.array(loaded.faces, np.int64)
         visual: Any = loaded.visual
         colors = np.array(visual.vertex_colors, np.uint8)[:, :3] if visual.kind == "vertex" else None
-    except Exception as error:  # whatever its parsers run into
+    except Exception as error:  # its parsers raise many kinds
         reason = first_line(error)
-        raise DataError(f"{path}: a mesh was expected, trimesh cannot read it ({reason}); export it again") from error
+        raise DataError(f"{path}: expected a mesh, but trimesh cannot read it ({reason}); export it again") from error
     if not len(faces):
-        raise DataError(f"{path}: a mesh was expected, the file has no faces; give a triangle mesh")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise DataError(f"{path}: vertex indices below {len(vertices)} were expected, got {faces.max()}")
+        raise DataError(f"{path}: expected a mesh, got a file without faces; use a triangle mesh")
+    _check_indices(path, faces, len(vertices))
     return Mesh(vertices, faces.astype(np.int32), colors)
 
 
 def triangulate(counts: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Triangle fans [F, 3] of polygons given as ``counts`` [n] and flat ``indices``; shorter than 3 give nothing."""
+    """Split polygons, stored as ``counts`` [n] and flat ``indices``, into triangle fans [F, 3]."""
     counts = np.asarray(counts, dtype=np.int64)
-    fans = np.maximum(counts - 2, 0)  # triangles of each polygon
+    fans = np.maximum(counts - 2, 0)  # number of triangles of each polygon
     first = np.repeat(np.cumsum(counts) - counts, fans)  # flat position of the polygon's first index
-    k = np.arange(len(first)) - np.repeat(np.cumsum(fans) - fans, fans)  # 0, 1, ... within the polygon
+    k = np.arange(len(first)) - np.repeat(np.cumsum(fans) - fans, fans)  # index of the triangle in its polygon
     return np.stack([indices[first], indices[first + k + 1], indices[first + k + 2]], axis=1).astype(np.int64)
 
 
@@ -188,17 +202,17 @@ def read_points(path: str | os.PathLike[str]) -> Points:
     vertex = read_ply(path).elements.get("vertex")
     positions = vertex.scalars("x", "y", "z") if vertex else None
     if vertex is None or positions is None:
-        raise DataError(f"{path}: points were expected, got a PLY without vertex positions; give a point cloud")
+        raise DataError(f"{path}: expected points, got a PLY without vertex positions; use a point cloud")
     return Points(positions, _colors(vertex), vertex.scalars("nx", "ny", "nz"))
 
 
 def written_files(path: Path) -> tuple[Path, ...]:
-    """Return the files that ``write_textured`` makes for a name.
+    """Return the files that ``write_mesh`` creates for a textured mesh.
 
     Raises
     ------
     DataError
-        The name ends in something else than .glb or .obj, or is one that an OBJ file cannot refer to.
+        If the suffix is neither .glb nor .obj, or an OBJ file cannot refer to the name.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -206,42 +220,15 @@ def written_files(path: Path) -> tuple[Path, ...]:
     if suffix == ".glb":
         return (path,)
     if any(letter.isspace() for letter in path.name):
-        raise DataError(f"an OBJ file names its texture without spaces, got {path.name!r}; choose such a name, or .glb")
+        raise DataError(f"the name of an OBJ file must not contain spaces, got {path.name!r}; rename it, or use .glb")
     return path, path.with_suffix(".mtl"), path.with_suffix(".png")
 
 
-def write_textured(path: str | Path, mesh: TexturedMesh, *, up: np.ndarray | None = None) -> None:
-    """Write a textured mesh as its name says.
-
-    Parameters
-    ----------
-    path : path
-        Ends in ``.glb`` or ``.obj``; its folder must exist.
-    mesh : TexturedMesh
-    up : ndarray [3], optional
-        What is up in the mesh's frame: the node of a .glb is turned so that viewers, which take y for up (glTF 2.0,
-        3.4), show it upright. The vertices stay as they are. An OBJ file says nothing about that.
-    """
-    files = written_files(Path(path))
-    if len(files) == 1:
-        write_glb(files[0], mesh, up=up)
-    else:
-        write_obj(files[0], mesh)
-
-
-def write_glb(path: Path, mesh: Mesh | TexturedMesh, *, up: np.ndarray | None = None) -> None:
-    """Write glTF 2.0 in one file."""
-    data = glb_bytes(mesh, up=up)
-    with atomic_write(path) as file:
-        file.write(data)
-
-
 def glb_bytes(mesh: Mesh | TexturedMesh, *, up: np.ndarray | None = None) -> bytes:
-    """Return a mesh with its texture (PNG) or its vertex colours as the bytes of a glTF 2.0 binary file.
+    """Return a mesh with its texture (PNG) or vertex colours as the bytes of a binary glTF 2.0 file.
 
-    The material is unlit (KHR_materials_unlit), because the light of the photographs is in their colours; viewers that
-    do not know the extension shade a rough, non-metallic surface instead. Vertex colours are linear in glTF (3.7.2.1),
-    of 16 bits here.
+    The material is unlit (KHR_materials_unlit), because the colours contain the light of the photographs. Viewers
+    without the extension show a rough, non-metallic surface. Vertex colours are linear in glTF (3.7.2.1), 16 bits here.
     """
     vertices = np.ascontiguousarray(mesh.vertices, "<f4")
     count = len(vertices)
@@ -261,9 +248,9 @@ def glb_bytes(mesh: Mesh | TexturedMesh, *, up: np.ndarray | None = None) -> byt
         document["textures"] = [{"source": 0, "sampler": 0}]
         document["images"] = [{"bufferView": len(parts) + 1, "mimeType": "image/png"}]
         document["samplers"] = [{"magFilter": _LINEAR, "minFilter": _MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}]
-        png = png_bytes(mesh.texture)
+        png = _png_bytes(mesh.texture)
     elif mesh.colors is not None:
-        linear = np.ones((count, 4), "<u2")  # with the fourth, vertices are aligned to 4 bytes
+        linear = np.ones((count, 4), "<u2")  # four channels: glTF requires alignment to 4 bytes
         linear[:, :3], linear[:, 3] = LINEAR_U16[mesh.colors], 65535
         parts.append(("COLOR_0", linear.tobytes(), {"componentType": _USHORT, "type": "VEC4", "normalized": True}))
     indices = np.ascontiguousarray(mesh.faces, "<u4").tobytes()
@@ -281,7 +268,7 @@ def glb_bytes(mesh: Mesh | TexturedMesh, *, up: np.ndarray | None = None) -> byt
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0} if up is None else {"mesh": 0, "rotation": turn_to_y(up)}],
+        "nodes": [{"mesh": 0} if up is None else {"mesh": 0, "rotation": _rotation_to_y(up)}],
         "meshes": [{"primitives": [{"attributes": attributes, "indices": len(parts), "material": 0}]}],
         "accessors": accessors,
         "bufferViews": views,
@@ -295,17 +282,21 @@ def glb_bytes(mesh: Mesh | TexturedMesh, *, up: np.ndarray | None = None) -> byt
 
 
 def read_textured(path: str | Path) -> TexturedMesh:
-    """Read a .glb file that ``write_glb`` wrote.
+    """Read a textured mesh from a .glb file of ``write_mesh``.
 
     Raises
     ------
     DataError
-        The file is something else, or damaged.
+        If the file is damaged or was written by another program.
     """
-    with _own_glb(f"{path}: "):
-        document, binary = _glb_parts(Path(path).read_bytes())
-        parts = [binary[v["byteOffset"] : v["byteOffset"] + v["byteLength"]] for v in document["bufferViews"]]
-        vertices, normals, uv, faces, png = parts
+    try:
+        data = Path(path).read_bytes()
+        magic, _, _, length, kind = struct.unpack("<IIIII", data[:20])
+        if (magic, kind) != (_MAGIC, _JSON):
+            raise ValueError("no binary glTF")
+        document, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
+        views = [binary[v["byteOffset"] : v["byteOffset"] + v["byteLength"]] for v in document["bufferViews"]]
+        vertices, normals, uv, faces, png = views
         return TexturedMesh(
             np.frombuffer(vertices, "<f4").reshape(-1, 3),
             np.frombuffer(normals, "<f4").reshape(-1, 3),
@@ -313,54 +304,37 @@ def read_textured(path: str | Path) -> TexturedMesh:
             np.frombuffer(uv, "<f4").reshape(-1, 2),
             np.asarray(Image.open(io.BytesIO(png)).convert("RGB")),
         )
-
-
-def _glb_parts(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """Return the JSON document and the buffer of a .glb file."""
-    magic, _, _, length, kind = struct.unpack("<IIIII", data[:20])
-    if (magic, kind) != (_MAGIC, _JSON):
-        raise ValueError("another kind of file")
-    return json.loads(data[20 : 20 + length]), data[28 + length :]
-
-
-@contextlib.contextmanager
-def _own_glb(name: str) -> Iterator[None]:
-    """Turn errors of a .glb file that was not written here into one line."""
-    try:
-        yield
     except (ValueError, KeyError, IndexError, TypeError, OSError, struct.error) as error:
-        raise DataError(
-            f"{name}a .glb file as `gs2d mesh --texture` writes it was expected, got another ({error})"
-        ) from error
+        raise DataError(f"{path}: expected a .glb file of `gs2d mesh --texture`, got another ({error})") from error
 
 
-def turn_to_y(up: np.ndarray) -> list[float]:
+def _rotation_to_y(up: np.ndarray) -> list[float]:
     """Return the smallest rotation that takes ``up`` [3] to +y, as a quaternion x, y, z, w (glTF's order)."""
     x, y, z = np.asarray(up, np.float64) / np.linalg.norm(up)
     if y < -1 + 1e-9:
-        return [1.0, 0.0, 0.0, 0.0]  # upside down: half a turn about x
+        return [1.0, 0.0, 0.0, 0.0]  # upside down: rotate by 180 degrees about x
     quaternion = np.array([-z, 0.0, x, 1 + y])  # up x (0, 1, 0), 1 + up . (0, 1, 0)
     return [float(q) for q in quaternion / np.linalg.norm(quaternion)]
 
 
-def write_obj(path: Path, mesh: TexturedMesh) -> None:
-    """Write ``path``, and beside it the material and the texture under the same name; positions are not split at seams.
+def _write_obj(path: Path, mesh: TexturedMesh) -> None:
+    """Write an OBJ file with its material and texture; vertices are not duplicated at seams.
 
-    All three or none; the texture and the material get their names first: an OBJ file that is there is complete.
+    Either all three files are written or none. The OBJ file is renamed last, so an existing OBJ file is complete.
     """
     obj, mtl, png = written_files(path)
-    positions, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    place = place.reshape(-1)[mesh.faces] + 1  # [F, 3]; the format counts from 1
+    positions, vertex = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    vertex = vertex.reshape(-1)[mesh.faces] + 1  # [F, 3]; OBJ counts from 1
     corner = mesh.faces + 1
     with atomic_write(obj, "w") as file, atomic_write(mtl, "w") as material, atomic_write(png) as texture:
-        texture.write(png_bytes(mesh.texture))
+        texture.write(_png_bytes(mesh.texture))
         material.write(f"newmtl texture\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {png.name}\n")
         file.write(f"mtllib {mtl.name}\nusemtl texture\n")
         _lines(file, "v %.9g %.9g %.9g\n", positions)
-        _lines(file, "vt %.7g %.7g\n", np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], axis=1))  # from the lower left
+        _lines(file, "vt %.7g %.7g\n", np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], axis=1))  # origin at lower left
         _lines(file, "vn %.5g %.5g %.5g\n", mesh.normals)
-        _lines(file, "f %d/%d/%d %d/%d/%d %d/%d/%d\n", np.stack([place, corner, corner], axis=2).reshape(-1, 9))
-        file.flush()  # a full disk is heard of while all three still have their temporary names
+        _lines(file, "f %d/%d/%d %d/%d/%d %d/%d/%d\n", np.stack([vertex, corner, corner], axis=2).reshape(-1, 9))
+        file.flush()  # a full disk must raise before any of the three files is renamed
 
 
 def _lines(file: Any, template: str, rows: np.ndarray, chunk: int = 10_000) -> None:
@@ -369,7 +343,7 @@ def _lines(file: Any, template: str, rows: np.ndarray, chunk: int = 10_000) -> N
         file.write((template * len(part)) % tuple(part.reshape(-1).tolist()))
 
 
-def png_bytes(image: np.ndarray) -> bytes:
+def _png_bytes(image: np.ndarray) -> bytes:
     """Return an image [H, W, 3] uint8 as the bytes of a PNG file."""
     buffer = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(image)).save(buffer, format="PNG")

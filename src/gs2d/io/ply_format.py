@@ -1,7 +1,6 @@
-"""The PLY container: a header of named elements, then their rows, in ASCII or binary of either byte order.
+"""Read and write the PLY container: a header with named elements, then their rows, in ASCII or binary.
 
-Elements of scalars only become structured numpy arrays in one read. A list property (the vertex indices of a face)
-becomes a ``PlyList``: the counts and the flat values.
+A list property (the vertex indices of a face) becomes a ``PlyList``: counts and flat values.
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ _TYPES = {
 _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}  # fmt: skip # noqa: E501
 _COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-_MAX_WORD = 64  # letters of a number
-_HEADER_LIMIT = 1 << 20  # bytes: a header longer than this is no PLY header
+_MAX_WORD = 64  # characters of a number
+_HEADER_LIMIT = 1 << 20  # bytes
 
 
 @dataclass(frozen=True, eq=False)
 class PlyList:
-    """A list property: ``counts`` [n] and the rows' values one after the other, ``values`` [sum(counts)]."""
+    """A list property: ``counts`` [n] and the concatenated ``values`` [sum(counts)] of all rows."""
 
     counts: np.ndarray
     values: np.ndarray
@@ -39,48 +38,48 @@ class PlyList:
 
 @dataclass(frozen=True)
 class PlyElement:
-    """One element: its number of rows, and its properties by name, in the order of the file."""
+    """One element: number of rows, and properties by name in file order."""
 
     count: int
     properties: Mapping[str, np.ndarray | PlyList]
 
     def scalar(self, name: str) -> np.ndarray:
-        """Return a property [count] of scalars that is known to be there."""
+        """Return an existing scalar property [count]."""
         column = self.properties[name]
         assert isinstance(column, np.ndarray), name
         return column
 
     def scalars(self, *names: str) -> np.ndarray | None:
-        """Return the named scalar properties as float64 columns [count, len(names)], or None where one is missing."""
+        """Return scalar properties as float64 columns [count, len(names)], or None if one is missing."""
         columns = [self.properties.get(name) for name in names]
         arrays = [column for column in columns if isinstance(column, np.ndarray)]
-        with np.errstate(invalid="ignore"):  # of a NaN that signals
+        with np.errstate(invalid="ignore"):  # signalling NaN
             return np.stack(arrays, axis=1).astype(np.float64) if len(arrays) == len(names) else None
 
     def reals(self, path: object, name: str) -> np.ndarray:
-        """Return a property [count] of real numbers, float64; the bits of a 2-byte integer are those of a half float.
+        """Return a property [count] of real numbers as float64; 2-byte integers are read as half floats.
 
         PLY has no type for half floats, so programs that write them declare ``ushort``.
 
         Raises
         ------
         DataError
-            It is of another integer type.
+            If it has another integer type.
         """
         values = self.scalar(name)
         if values.dtype.kind in "iu" and values.dtype.itemsize != 2:
             raise DataError(
-                f"{path}: expected the property {name} as float, or as ushort that holds half floats, got "
+                f"{path}: expected the property {name} as float, or as ushort with half floats, got "
                 f"{_NAMES[values.dtype.str[1:]]}; export the splats with float properties"
             )
-        with np.errstate(invalid="ignore"):  # of a NaN that signals
+        with np.errstate(invalid="ignore"):  # signalling NaN
             return (values if values.dtype.kind == "f" else values.view(np.float16)).astype(np.float64)
 
     def colors(self) -> np.ndarray | None:
-        """Return colours [count, 3] as float64, 0 to 1, or None without any.
+        """Return colours [count, 3] as float64 in [0, 1], or None if there are none.
 
-        They are called ``red green blue``, ``diffuse_red ...`` or ``r g b``. Integers, and floats of which one is above
-        2, count to 255; where one is above 255 they count to 65535.
+        Their names are ``red green blue``, ``diffuse_red ...`` or ``r g b``. The range is 65535 if a value exceeds 255,
+        else 255 for integers or if a value exceeds 2, else 1.
         """
         for names in _COLORS:
             colors = self.scalars(*names)
@@ -96,7 +95,7 @@ class PlyElement:
 
 @dataclass(frozen=True)
 class PlyFile:
-    """Elements by name, in the order of the file, and the comment lines."""
+    """Elements by name in file order, and the comment lines."""
 
     elements: Mapping[str, PlyElement]
     comments: tuple[str, ...] = ()
@@ -106,7 +105,7 @@ class PlyFile:
 class _Property:
     name: str
     dtype: str
-    count_dtype: str | None = None  # a list property's count type
+    count_dtype: str | None = None  # for a list property
 
 
 @dataclass
@@ -121,40 +120,32 @@ class _Header:
     order: str  # "" for ASCII, else numpy's byte-order mark
     elements: list[_Element]
     comments: tuple[str, ...]
-    size: int  # bytes, with the end_header line
+    size: int  # bytes, including the end_header line
 
 
 def read_ply(path: str | os.PathLike[str]) -> PlyFile:
-    """Read every element of a PLY file.
+    """Read all elements of a PLY file.
 
     Raises
     ------
     DataError
         If the file is missing, is no PLY, has a malformed header, or ends early.
     """
-    try:
-        with open(path, "rb") as file:
-            data = file.read()
-    except OSError as error:
-        raise DataError(f"{path}: a PLY file was expected, it cannot be read: {error.strerror}") from error
+    data = _read(path)
     header = _parse_header(path, data)
     reader = _AsciiReader(path, data, header) if not header.order else _BinaryReader(path, data, header)
     return PlyFile({e.name: reader.element(e) for e in header.elements}, header.comments)
 
 
 def read_ply_comments(path: str | os.PathLike[str]) -> tuple[str, ...]:
-    """Return the comment lines of a PLY file; its rows are not read. Nothing of what is no PLY.
+    """Read the comment lines of a PLY file without its rows; empty for other files.
 
     Raises
     ------
     DataError
-        The file cannot be read.
+        If the file cannot be read.
     """
-    try:
-        with open(path, "rb") as file:
-            head = file.read(_HEADER_LIMIT)
-    except OSError as error:
-        raise DataError(f"{path}: a PLY file was expected, it cannot be read: {error.strerror}") from error
+    head = _read(path, _HEADER_LIMIT)
     end = head.find(b"end_header")
     if not head.startswith((b"ply\n", b"ply\r")) or end < 0:
         return ()
@@ -162,13 +153,21 @@ def read_ply_comments(path: str | os.PathLike[str]) -> tuple[str, ...]:
     return tuple(line.removeprefix("comment").strip() for line in lines if line.startswith("comment "))
 
 
+def _read(path: str | os.PathLike[str], size: int = -1) -> bytes:
+    try:
+        with open(path, "rb") as file:
+            return file.read(size)
+    except OSError as error:
+        raise DataError(f"{path}: expected a PLY file, but it cannot be read: {error.strerror}") from error
+
+
 def _broken(path: object, what: str) -> DataError:
-    return DataError(f"{path}: a well-formed PLY file was expected, {what}; export or copy the file again")
+    return DataError(f"{path}: expected a valid PLY file, but {what}; export or copy the file again")
 
 
 def _parse_header(path: object, data: bytes) -> _Header:
     if not data.startswith((b"ply\n", b"ply\r")):
-        raise DataError(f"{path}: a PLY file was expected, it does not start with 'ply'; give a .ply file")
+        raise DataError(f"{path}: expected a PLY file, but it does not start with 'ply'; use a .ply file")
     end = data.find(b"end_header", 0, _HEADER_LIMIT)
     newline = data.find(b"\n", end)
     if end < 0 or newline < 0:
@@ -188,7 +187,7 @@ def _parse_header(path: object, data: bytes) -> _Header:
             elif words[0] == "element":
                 elements.append(_Element(words[1], int(words[2])))
             elif words[0] == "property" and words[1] == "list":
-                if _TYPES[words[2]][0] == "f":  # a length of 2.5, or of NaN
+                if _TYPES[words[2]][0] == "f":  # a list length must be an integer
                     raise ValueError
                 elements[-1].properties.append(_Property(words[4], _TYPES[words[3]], _TYPES[words[2]]))
             elif words[0] == "property":
@@ -196,21 +195,21 @@ def _parse_header(path: object, data: bytes) -> _Header:
             else:
                 raise KeyError(words[0])
         except (KeyError, IndexError, ValueError) as error:
-            raise _broken(path, f"its header line {line.strip()!r} is not understood") from error
+            raise _broken(path, f"its header line {line.strip()!r} is invalid") from error
     if order is None:
         raise _broken(path, "its header has no format line")
     if any(e.count < 0 for e in elements):
         raise _broken(path, "its header has a negative count")
     most = max((e.count for e in elements), default=0)
-    if most > len(data):  # a row takes a byte at least
-        raise _broken(path, f"it ends early ({str(most)[:20]} rows were announced in a file of {len(data)} bytes)")
+    if most > len(data):  # a row has at least one byte
+        raise _broken(path, f"it ends early ({str(most)[:20]} rows in a file of {len(data)} bytes)")
     if any(len({p.name for p in e.properties}) < len(e.properties) for e in elements):
         raise _broken(path, "its header names a property twice")
     return _Header(order, elements, tuple(comments), newline + 1)
 
 
 class _BinaryReader:
-    """Reads elements one after the other from the bytes behind the header."""
+    """Reads consecutive elements from the bytes after the header."""
 
     def __init__(self, path: object, data: bytes, header: _Header) -> None:
         self.path, self.data, self.order, self.offset = path, data, header.order, header.size
@@ -236,14 +235,14 @@ class _BinaryReader:
         return rows
 
     def _equal_lists(self, element: _Element) -> PlyElement | None:
-        """One read for the usual case: every row has lists as long as the first row's (all triangles)."""
+        """Read an element whose lists have equal lengths (all triangles) at once; None if the lengths differ."""
         if element.count == 0:
             empty = {p.name: _empty(p) for p in element.properties}
             return PlyElement(0, empty)
         start = self.offset
         lengths = self._first_row_lengths(element)
         fields: list[Any] = []
-        row = 0  # bytes; added up here, because numpy refuses a type of 2 GiB, which a broken count may ask for
+        row = 0  # bytes; summed here, because a broken count may exceed numpy's limit of 2 GiB per item
         for p in element.properties:
             row += np.dtype(p.dtype).itemsize * lengths.get(p.name, 1)
             if row > len(self.data):
@@ -285,7 +284,7 @@ class _BinaryReader:
         return value
 
     def _ragged_lists(self, element: _Element) -> PlyElement:
-        """Rows of different length: walk them one by one."""
+        """Read rows of different lengths one by one."""
         starts: dict[str, list[int]] = {p.name: [] for p in element.properties}
         counts: dict[str, list[int]] = {p.name: [] for p in element.properties}
         offset = self.offset
@@ -311,7 +310,7 @@ class _BinaryReader:
 
 
 class _AsciiReader:
-    """Reads elements one after the other from the words behind the header."""
+    """Reads consecutive elements from the words after the header."""
 
     def __init__(self, path: object, data: bytes, header: _Header) -> None:
         self.path, self.words, self.at = path, data[header.size :].split(), 0
@@ -319,14 +318,14 @@ class _AsciiReader:
     def _take(self, count: int) -> np.ndarray:
         words = self.words[self.at : self.at + count]
         if len(words) < count:
-            raise _broken(self.path, f"it ends early ({count} more numbers were announced, {len(words)} are left)")
-        if max(map(len, words), default=0) > _MAX_WORD:  # all words of an array of numpy take as much as the longest
-            raise _broken(self.path, f"it has a number of more than {_MAX_WORD} letters")
+            raise _broken(self.path, f"it ends early (expected {count} more numbers, got {len(words)})")
+        if max(map(len, words), default=0) > _MAX_WORD:  # numpy allocates the longest length for every word
+            raise _broken(self.path, f"it has a number of more than {_MAX_WORD} characters")
         self.at += count
         try:
             return np.array(words, dtype="S").astype(np.float64) if count else np.zeros(0)
         except ValueError as error:
-            raise _broken(self.path, f"it has a word that is no number ({error})") from error
+            raise _broken(self.path, f"it has an invalid number ({error})") from error
 
     def _length(self) -> int:
         length = float(self._take(1)[0])
@@ -335,12 +334,12 @@ class _AsciiReader:
         return int(length)
 
     def _cast(self, values: np.ndarray, dtype: str) -> np.ndarray:
-        """Numbers as the type that the header says."""
+        """Convert numbers to the type in the header."""
         if dtype[0] in "iu":
             limits = np.iinfo(dtype)
             if not ((values >= limits.min) & (values <= limits.max)).all():
-                raise _broken(self.path, f"it has a number that is no {_NAMES[dtype]}")
-        with np.errstate(over="ignore"):  # a double beyond float32 is infinite
+                raise _broken(self.path, f"it has a number out of the range of {_NAMES[dtype]}")
+        with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite
             return values.astype(dtype)
 
     def element(self, element: _Element) -> PlyElement:
@@ -365,7 +364,7 @@ class _AsciiReader:
 
 
 def _native(values: np.ndarray) -> np.ndarray:
-    """Return a contiguous, writable copy in the machine's byte order."""
+    """Return a contiguous, writable copy in native byte order."""
     return np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("=")).copy()
 
 
@@ -377,7 +376,7 @@ def _empty(p: _Property) -> np.ndarray | PlyList:
 def write_ply(
     path: str | os.PathLike[str], elements: Mapping[str, np.ndarray], *, comments: tuple[str, ...] = ()
 ) -> None:
-    """Write a binary little-endian PLY, atomically.
+    """Write a binary little-endian PLY file atomically.
 
     Parameters
     ----------
@@ -385,12 +384,12 @@ def write_ply(
     elements : mapping of element name to structured array [n]
         A field of shape (k,) becomes a list property of k items with a uchar count (k < 256).
     comments : tuple of str
-        One comment line each.
+        Comment lines.
 
     Raises
     ------
     DiskError
-        If the file could not be written; nothing is left behind.
+        If the file could not be written.
     """
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments)]
     bodies = []

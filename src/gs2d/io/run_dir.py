@@ -1,20 +1,20 @@
-"""The run folder: everything that defines a run, what it logged, its checkpoints and results.
+"""The run folder: definition, log, checkpoints and results of a run.
 
 ::
 
     RUN/
-      run.json       what defines the run (recipe, protocol, scene, backend, seed ...), versions, machine
-      events.jsonl   one JSON object a line; after a resume it reads as if the run had never stopped
+      run.json       definition of the run (recipe, protocol, scene, backend, seed ...), versions, machine
+      events.jsonl   one JSON object per line; after a resume it is the same as without an interruption
       checkpoints/   <stage number>-<stage>-<iteration>.pt (the last two), <stage number>-<stage>-end.pt (all)
-      metrics.json  splats.ply  mesh.ply  mesh.glb (textured, if asked for)  renders/  report.html
-      scene.html     the splats as a page for any browser, if asked for
-      poses.json  learned.json  exposure.json  photometry.json  what was learned of photographs and cameras
-      subject.json   what the cameras look at (data.subject.read_subject)
-      georeference.json  where the run is in the world, if that was found (io.georeference)
-      .lock          held by the process that trains; the kernel frees it when that process dies
+      metrics.json  splats.ply  mesh.ply  mesh.glb (with --texture)  renders/  report.html
+      scene.html     the splats as a web page (`gs2d export`)
+      poses.json  learned.json  exposure.json  photometry.json  learned properties of images and cameras
+      subject.json   the subject that the cameras look at (data.subject.read_subject)
+      georeference.json  position of the run in the world, if known
+      .lock          held by the process that trains; the operating system releases it when that process ends
 
-Every file is written to a temporary name and renamed, except the log, which only grows: each checkpoint holds the
-length of the log at its iteration, and a resume cuts the log there.
+Every file is written to a temporary name and renamed, except the log, which is appended to: each checkpoint stores the
+length of the log, and a resume truncates the log to it.
 """
 
 from __future__ import annotations
@@ -64,25 +64,25 @@ _CHECKPOINT_NAME = re.compile(r"(\d+)-(.+)-(\d+|end)\.pt")
 
 @dataclass(frozen=True)
 class CheckpointFile:
-    """A checkpoint on disk; they sort by how far training had come."""
+    """A checkpoint on disk."""
 
     path: Path
     stage_index: int
     stage: str
-    iteration: int | None  # of the stage; None = its end
+    iteration: int | None  # within the stage; None at its end
 
     @property
     def progress(self) -> tuple[int, float]:
-        """Sort key."""
+        """Sort key: stage and iteration."""
         return self.stage_index, float("inf") if self.iteration is None else float(self.iteration)
 
 
 class RunFolder:
-    """One run on disk. Use :func:`claim_run` to make or continue one, :func:`open_run` to read a finished one."""
+    """One run on disk. :func:`claim_run` creates or continues one, :func:`open_run` opens an existing one."""
 
     def __init__(self, path: Path, made: tuple[Path, ...] = ()) -> None:
         self.path = path
-        self.made = made  # folders that did not exist before
+        self.made = made  # folders that were created for it
         self.events = EventLog(path / EVENTS)
 
     def file(self, name: str) -> Path:
@@ -91,12 +91,12 @@ class RunFolder:
 
     # -- definition and results ----------------------------------------------------------------------------------------
     def write_definition(self, definition: dict[str, Any]) -> None:
-        """Write ``run.json``: the definition, with versions, machine and time beside it."""
+        """Write ``run.json``: the definition, with versions, machine and time."""
         extra = {"format": FORMAT, "versions": versions(), "machine": machine(), "created": now()}
         write_json(self.file(RUN_JSON), {**extra, **definition})
 
     def definition(self) -> dict[str, Any]:
-        """Return what ``run.json`` holds.
+        """Read ``run.json``.
 
         Raises
         ------
@@ -106,30 +106,30 @@ class RunFolder:
         try:
             data = _object(self.file(RUN_JSON))
         except RecursionError as error:
-            raise RunError(f"{self.file(RUN_JSON)} is nested too deeply to read; it was damaged: restore it") from error
+            raise RunError(f"{self.file(RUN_JSON)} is nested too deeply and must be damaged; restore it") from error
         if data.get("format") != FORMAT:
             made = data.get("versions")
             writer = f"gs2d {made['2dgs-r']}" if isinstance(made, dict) and "2dgs-r" in made else "another version"
             raise RunError(
-                f"{self.file(RUN_JSON)} has format {str(data.get('format'))[:40]}, expected {FORMAT}; it was written "
-                f"by {writer[:40]}: use that one, or train again with --overwrite"
+                f"{self.file(RUN_JSON)} has format {str(data.get('format'))[:40]}, expected {FORMAT}; use "
+                f"{writer[:40]}, which wrote it, or train again with --overwrite"
             )
         check_shape(self.file(RUN_JSON), data, DEFINITION_SHAPE, "restore it, or train again with --overwrite")
         return data
 
     def metrics(self) -> dict[str, Any]:
-        """Return what ``metrics.json`` holds; ``{"stages": []}`` before the first stage is finished.
+        """Read ``metrics.json``; ``{"stages": []}`` before the first stage is finished.
 
         Raises
         ------
         RunError
-            Damaged.
+            If it is damaged.
         """
         path = self.file(METRICS)
         if not path.exists():
             return {"stages": []}
         data = _object(path)
-        check_shape(path, data, METRICS_SHAPE, "delete it and go on with --resume")
+        check_shape(path, data, METRICS_SHAPE, "delete it and continue with --resume")
         return data
 
     def write_metrics(self, metrics: dict[str, Any]) -> None:
@@ -138,7 +138,7 @@ class RunFolder:
 
     # -- checkpoints ---------------------------------------------------------------------------------------------------
     def checkpoints(self) -> list[CheckpointFile]:
-        """All checkpoints, oldest first."""
+        """Return all checkpoints, oldest first."""
         found = []
         for path in self.file(CHECKPOINTS).glob("*.pt"):
             match = _CHECKPOINT_NAME.fullmatch(path.name)
@@ -148,9 +148,9 @@ class RunFolder:
         return sorted(found, key=lambda checkpoint: checkpoint.progress)
 
     def save_checkpoint(self, stage_index: int, stage: str, iteration: int | None, payload: dict[str, Any]) -> Path:
-        """Write a checkpoint (``iteration=None``: the stage's end) and drop those it makes needless.
+        """Write a checkpoint (``iteration=None``: the end of the stage) and remove older ones.
 
-        Mid-stage checkpoints go when their stage ends, and all but the last two before that.
+        The last two checkpoints within a stage are kept until it ends.
         """
         folder = self.file(CHECKPOINTS)
         make_folder(folder)
@@ -158,21 +158,20 @@ class RunFolder:
         path = folder / f"{stage_index}-{stage}-{number}.pt"
         self.events.sync()
         save_tensors(path, {**payload, "events_bytes": self.events.size})
-        middle = [c for c in self.checkpoints() if c.iteration is not None]
-        needless = middle if iteration is None else middle[:-KEPT_CHECKPOINTS]
-        for checkpoint in needless:
+        within = [c for c in self.checkpoints() if c.iteration is not None]
+        for checkpoint in within if iteration is None else within[:-KEPT_CHECKPOINTS]:
             checkpoint.path.unlink(missing_ok=True)
         return path
 
     # -- ownership -----------------------------------------------------------------------------------------------------
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold the run against other processes; what killed ones left half written goes.
+        """Lock the run, and remove incomplete files of killed processes.
 
         Raises
         ------
         RunError
-            Another process trains in this folder.
+            If another process trains in this folder.
         """
         try:
             file = open(self.file(LOCK), "a+b")  # noqa: SIM115 - closed below; the lock lives as long as the file
@@ -187,9 +186,9 @@ class RunFolder:
             file.close()
 
     def sweep(self) -> None:
-        """Remove what killed processes left in the run's own folders: temporary files, checkpoints of ended stages."""
-        drawn = (Path(folder) for folder, _, _ in os.walk(self.file(RENDERS)))
-        for folder in (self.path, self.file(CHECKPOINTS), self.file(SURFACE), *drawn):
+        """Remove what killed processes left: temporary files, and checkpoints within stages that have ended."""
+        renders = (Path(folder) for folder, _, _ in os.walk(self.file(RENDERS)))
+        for folder in (self.path, self.file(CHECKPOINTS), self.file(SURFACE), *renders):
             sweep(folder)
         ended = max((c.stage_index for c in self.checkpoints() if c.iteration is None), default=-1)
         for checkpoint in self.checkpoints():
@@ -198,7 +197,7 @@ class RunFolder:
                     checkpoint.path.unlink()
 
     def clear(self) -> None:
-        """Delete what a run writes, and nothing else; ``run.json`` last, so that a killed clear can be repeated."""
+        """Delete the files of the run only; ``run.json`` last, so that an interrupted call can be repeated."""
         for name in (CHECKPOINTS, RENDERS, SURFACE):
             shutil.rmtree(self.file(name), ignore_errors=True)
         results = (SPLATS, SUBJECT, VERDICT, GEOREFERENCE, MESH, TEXTURED, REPORT, PAGE)
@@ -206,22 +205,22 @@ class RunFolder:
             self.file(name).unlink(missing_ok=True)
 
     def discard(self) -> None:
-        """Undo a run that failed before it had anything worth keeping: its files and the folders made for it."""
+        """Remove a run that failed early: its files, and the folders that were created for it."""
         self.clear()
         self.file(LOCK).unlink(missing_ok=True)
         remove_made(self.made)
 
 
 def _object(path: Path) -> dict[str, Any]:
-    """Return a JSON file that holds an object."""
+    """Read a JSON file that holds an object."""
     data = read_json(path)
     if not isinstance(data, dict):
-        raise RunError(f"{path} must hold a JSON object, got {type(data).__name__}; it was damaged: restore it")
+        raise RunError(f"{path} must hold a JSON object, got {type(data).__name__}; restore it")
     return data
 
 
 def _is_unfinished(name: str) -> bool:
-    """Whether a file was left by a process that was killed while it made a run."""
+    """Whether a file is an incomplete ``run.json`` of a killed process."""
     return name.startswith(f".{RUN_JSON}.") and is_temporary(name)
 
 
@@ -231,37 +230,37 @@ def is_run(path: Path) -> bool:
 
 
 def open_run(path: str | Path) -> RunFolder:
-    """Return an existing run, for reading.
+    """Open an existing run.
 
     Raises
     ------
     RunError
-        The folder does not exist or holds no run.
+        If the folder does not exist or holds no run.
     """
     path = Path(path)
     if not is_run(path):
         got = "a folder without run.json" if path.is_dir() else "a file" if path.exists() else "nothing"
         remedy = instead(path, "run") if path.exists() else where_it_ends(path)
-        raise RunError(f"expected a run folder at {path}, found {got}{remedy}")
+        raise RunError(f"expected a run folder at {path}, got {got}{remedy}")
     return RunFolder(path)
 
 
 def check_claim(path: str | Path, *, resume: bool, overwrite: bool, allowed: tuple[str, ...] = ()) -> None:
-    """Raise the error that :func:`claim_run` would raise, before anything slow happens; writes nothing.
+    """Check early that :func:`claim_run` will succeed; writes nothing.
 
     Raises
     ------
     RunError
-        A file, a folder that holds a run (without ``resume`` or ``overwrite``), or one that holds something else.
+        If ``path`` is a file, holds a run (without ``resume`` or ``overwrite``), or holds other files.
     """
     path = Path(path)
     if resume and overwrite:
-        raise RunError("--resume and --overwrite exclude each other; give one")
+        raise RunError("--resume and --overwrite exclude each other; use one of them")
     try:
         path.stat()
     except FileNotFoundError:
         return
-    except OSError as error:  # a name that is too long, a file in the middle of the path
+    except OSError as error:  # for example a name that is too long
         raise disk_error(path, error) from error
     if not path.is_dir():
         raise RunError(f"--out must be a folder, {path} is a file")
@@ -278,15 +277,15 @@ def check_claim(path: str | Path, *, resume: bool, overwrite: bool, allowed: tup
 
 
 def claim_run(path: str | Path, *, resume: bool, overwrite: bool, allowed: tuple[str, ...] = ()) -> RunFolder:
-    """Make a run folder, or take over an existing run.
+    """Create a run folder, or take over an existing run.
 
     Parameters
     ----------
     path : path
     resume, overwrite : bool
-        What to do with a run that is already there; ``overwrite`` deletes the run's own files only.
+        Continue or replace an existing run; ``overwrite`` deletes the files of the run only.
     allowed : tuple of str
-        Names that may already be in a folder that holds no run.
+        Names of files that may exist in a folder without a run.
     """
     check_claim(path, resume=resume, overwrite=overwrite, allowed=allowed)
     path = Path(path)
@@ -299,7 +298,7 @@ def claim_run(path: str | Path, *, resume: bool, overwrite: bool, allowed: tuple
 
 
 def make_folder(path: Path) -> tuple[Path, ...]:
-    """Make a folder and its parents; returns those that were made, innermost first."""
+    """Create a folder and its parents; returns the created folders, innermost first."""
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -309,14 +308,14 @@ def make_folder(path: Path) -> tuple[Path, ...]:
 
 
 def remove_made(folders: tuple[Path, ...]) -> None:
-    """Undo ``make_folder``, as far as the folders are empty."""
+    """Remove the folders that ``make_folder`` created, if they are empty."""
     for folder in folders:
-        with contextlib.suppress(OSError):  # not empty: somebody else's files
+        with contextlib.suppress(OSError):  # not empty
             folder.rmdir()
 
 
 def save_tensors(path: Path, payload: dict[str, Any]) -> None:
-    """``torch.save`` to a temporary name, then rename."""
+    """Write with ``torch.save`` to a temporary name, then rename."""
     import torch
 
     with atomic_write(path) as file:
@@ -324,15 +323,14 @@ def save_tensors(path: Path, payload: dict[str, Any]) -> None:
 
 
 def load_tensors(path: Path) -> dict[str, Any]:
-    """Read what :func:`save_tensors` wrote; tensors and plain values only, nothing is executed.
+    """Read a file of :func:`save_tensors`: tensors and plain values only, no code is executed.
 
-    torch does not look at the checksums in its files, so that a damaged one would give other numbers: they are
-    compared first.
+    torch does not verify the checksums in its files, so they are verified here.
 
     Raises
     ------
     RunError
-        Missing, cut short, damaged, or not such a file.
+        If the file is missing or damaged.
     """
     import pickle
 
@@ -341,12 +339,12 @@ def load_tensors(path: Path) -> dict[str, Any]:
     try:
         with zipfile.ZipFile(path) as archive:
             packed = [e.filename for e in check_entries(path, archive.infolist()) if e.compress_size < e.file_size]
-            if packed:  # torch packs nothing
-                raise ValueError(f"{packed[0]} would grow when it is unpacked")
+            if packed:  # torch does not compress
+                raise ValueError(f"{packed[0]} is compressed")
             damaged = archive.testzip()
         if damaged is not None:
             raise ValueError(f"the checksum of {damaged} is wrong")
-        with warnings.catch_warnings():  # torch's, of a damaged head
+        with warnings.catch_warnings():  # of torch, about a damaged header
             warnings.simplefilter("ignore")
             return dict(torch.load(path, map_location="cpu", weights_only=True))
     except (*_UNREADABLE, DataError, pickle.UnpicklingError) as error:
@@ -355,7 +353,7 @@ def load_tensors(path: Path) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Versions that decide the result."""
+    """Return the versions that the result depends on."""
     found = {"python": platform.python_version(), "2dgs-r": __version__}
     for name in ("torch", "numpy", "scipy", "pillow"):
         try:
@@ -366,7 +364,7 @@ def versions() -> dict[str, str]:
 
 
 def machine() -> dict[str, Any]:
-    """Return the machine, as far as times depend on it."""
+    """Describe the machine: system, processor and cores."""
     model = platform.processor() or platform.machine()
     with contextlib.suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text().splitlines():
@@ -378,5 +376,5 @@ def machine() -> dict[str, Any]:
 
 
 def now() -> str:
-    """UTC time, to the second."""
+    """Return the UTC time, to the second."""
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")

@@ -1,4 +1,4 @@
-"""Shapes of the JSON files of a run, checked when they are read again: people edit them, and disks damage them."""
+"""Expected structure of the JSON files of a run, checked when they are read, because files can be damaged."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 from gs2d.errors import RunError
 
 Shape = Any
-"""A type (``int``: a count; ``float``: any finite number); ``[shape]``: a list of them; ``(shape, None)``: it, or null;
-``{name: shape}``: an object. Names that end in ``?`` may be missing; names that a shape lacks are not checked.
+"""A type (``int``: a count; ``float``: any finite number); ``[shape]``: a list; ``(shape, None)``: nullable;
+``{name: shape}``: an object. Names that end in ``?`` are optional; other names in the file are not checked.
 """
 
 _NUMBER = (float, None)
@@ -54,18 +54,18 @@ VERDICT_SHAPE: Shape = {
     },
 }
 _KINDS: dict[type, str] = {
-    **{str: "text", bool: "true or false", int: "a whole number >= 0", float: "a finite number"},
+    **{str: "text", bool: "true or false", int: "an integer >= 0", float: "a finite number"},
     **{list: "a list", dict: "an object"},
 }
 
 
 def check_shape(path: Path, value: Any, shape: Shape, remedy: str) -> None:
-    """Raise for the first value that does not have its ``shape``.
+    """Check a value against a shape.
 
     Raises
     ------
     RunError
-        Names the file, the place in it and what it must be.
+        For the first mismatch; with the file, the path of the value in it, and what was expected.
     """
     try:
         _check(value, shape, "")
@@ -73,24 +73,24 @@ def check_shape(path: Path, value: Any, shape: Shape, remedy: str) -> None:
         raise RunError(f"{path} was damaged or changed: {error}; {remedy}") from None
 
 
-def _check(value: Any, shape: Shape, place: str) -> None:
+def _check(value: Any, shape: Shape, name: str) -> None:
     if isinstance(shape, tuple):
         if value is not None:
-            _check(value, shape[0], place)
+            _check(value, shape[0], name)
         return
     kind = type(shape) if isinstance(shape, list | dict) else shape
     if not _is(value, kind):
-        raise ValueError(f"{place or 'it'} must be {_KINDS[kind]}, got {value!r:.40}")
+        raise ValueError(f"{name or 'the file'} must be {_KINDS[kind]}, got {value!r:.40}")
     if isinstance(shape, list):
         for index, entry in enumerate(value):
-            _check(entry, shape[0], f"{place}[{index}]")
+            _check(entry, shape[0], f"{name}[{index}]")
     if isinstance(shape, dict):
-        for name, entry in shape.items():
-            key = name.removesuffix("?")
+        for field, entry in shape.items():
+            key = field.removesuffix("?")
             if key in value:
-                _check(value[key], entry, f"{place}.{key}".lstrip("."))
-            elif key == name:
-                raise ValueError(f"{place or 'it'} must hold {key!r}")
+                _check(value[key], entry, f"{name}.{key}".lstrip("."))
+            elif key == field:
+                raise ValueError(f"{name or 'the file'} must hold {key!r}")
 
 
 def _is(value: Any, kind: type) -> bool:

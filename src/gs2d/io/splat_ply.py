@@ -1,7 +1,7 @@
-"""Splats as PLY files.
+"""Splats as PLY files, before activation.
 
-They are raw (before activation). The official 2DGS layout has two scales; common viewers know only the 3DGS layout,
-whose third scale is a thickness that does not show, with the disk's normal along the third axis in both.
+The official 2DGS layout has two scales. Common viewers only read the 3DGS layout, whose third scale is a negligible
+thickness. The normal of the disk is the third axis in both.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _FIXED = ("x", "y", "z", *_DC, "opacity", "scale_0", "scale_1", *_ROT)
 
 
 def splat_fields(n_rest: int, *, layout: str) -> list[str]:
-    """Property names of a splat file in order, with ``n_rest`` = 3 (K - 1) higher SH coefficients."""
+    """Return the property names of a splat file, with ``n_rest`` = 3 (K - 1) higher SH coefficients."""
     if layout not in ("2dgs", "3dgs"):
         raise ValueError(f"layout must be '2dgs' or '3dgs', got {layout!r}")
     scales = ["scale_0", "scale_1"] + (["scale_2"] if layout == "3dgs" else [])
@@ -41,9 +41,9 @@ def write_splats(path: str | os.PathLike[str], splats: Splats, *, layout: str = 
     ----------
     path : path
     splats : Splats
-        On any device; float32 comes back bit for bit (``layout="2dgs"``).
+        On any device; float32 values are stored exactly (``layout="2dgs"``).
     layout : "2dgs" or "3dgs"
-        The official 2DGS layout, or the one common viewers open (``scale_2``, the thickness, after ``scale_1``).
+        The official 2DGS layout, or the one for common viewers (with ``scale_2``, the thickness, after ``scale_1``).
 
     Raises
     ------
@@ -70,66 +70,66 @@ def _fill(rows: np.ndarray, names: list[str] | tuple[str, ...], columns: np.ndar
 
 
 def read_splats(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> Splats:
-    """Read splats in the official 2DGS layout (extra properties are passed over), float32 on the CPU.
+    """Read splats in the official 2DGS layout, float32 on the CPU; extra properties are ignored.
 
-    Half floats stored as ``ushort`` are decoded. Colours ``red green blue`` in place of ``f_dc_*`` are of SH degree 0.
+    Half floats stored as ``ushort`` are decoded. Colours ``red green blue`` may replace ``f_dc_*``.
 
     Parameters
     ----------
     path : path
     tell : callable
-        Receives a sentence on SH bands above degree 3, which are left out.
+        Receives a message if SH bands above degree 3 are dropped.
 
     Raises
     ------
     DataError
-        If the file is no PLY, is broken, or is of another kind: 3DGS (three scales), compressed, a mesh, points.
+        If the file is broken, no PLY, or of another kind: 3DGS (three scales), compressed, a mesh, points.
     """
     vertex = _splat_element(path, read_ply(path))
     return Splats(**_attributes(path, vertex, ("scale_0", "scale_1"), tell))
 
 
 def read_gaussians(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> Gaussians:
-    """Read 3DGS splats, which have three scales, as ``read_splats`` reads those of two.
+    """Read 3DGS splats, with three scales; otherwise as ``read_splats``.
 
     Raises
     ------
     DataError
-        If the file is no PLY, is broken, or has no three scales.
+        If the file is broken, no PLY, or has fewer scales.
     """
     vertex = read_ply(path).elements.get("vertex")
     if vertex is None:
-        raise DataError(f"{path}: 3DGS splats were expected, got a PLY without vertices; give a file of splats")
-    _check_complete(f"{path}: 3DGS splats were expected", vertex, (*_FIXED, "scale_2"))
+        raise DataError(f"{path}: expected 3DGS splats, got a PLY without vertices; use a splat file")
+    _check_complete(f"{path}: expected 3DGS splats", vertex, (*_FIXED, "scale_2"))
     a = {name: t.numpy() for name, t in _attributes(path, vertex, ("scale_0", "scale_1", "scale_2"), tell).items()}
     return Gaussians(**{**a, "sh0": a["sh0"][:, 0]})
 
 
-def _check_complete(expected: str, vertex: PlyElement, wanted: tuple[str, ...]) -> None:
-    """Raise where properties are missing; any colours will do in place of ``f_dc_*``."""
-    missing = [name for name in wanted if not isinstance(vertex.properties.get(name), np.ndarray)]
+def _check_complete(expected: str, vertex: PlyElement, required: tuple[str, ...]) -> None:
+    """Raise DataError if properties are missing; colours may replace ``f_dc_*``."""
+    missing = [name for name in required if not isinstance(vertex.properties.get(name), np.ndarray)]
     if not set(missing) <= set(_DC) or (missing and vertex.colors() is None):
         raise DataError(
-            f"{expected}, the properties {', '.join(missing)} are missing; export the splats with SH coefficients"
+            f"{expected}, but the properties {', '.join(missing)} are missing; export the splats with SH coefficients"
         )
 
 
 def _attributes(path: object, vertex: PlyElement, scales: tuple[str, ...], tell: Tell) -> dict[str, torch.Tensor]:
-    """Return the fields of Splats of the rows of an element."""
+    """Return the fields of ``Splats`` from the rows of an element."""
     names = {name for name, values in vertex.properties.items() if isinstance(values, np.ndarray)}
     n_rest = sum(name.startswith("f_rest_") for name in names)
     rest = [f"f_rest_{i}" for i in range(n_rest)]
-    places = n_rest // 3
-    if n_rest % 3 or math.isqrt(1 + places) ** 2 != 1 + places or not names.issuperset(rest):
+    per_channel = n_rest // 3
+    if n_rest % 3 or math.isqrt(1 + per_channel) ** 2 != 1 + per_channel or not names.issuperset(rest):
         raise DataError(
-            f"{path}: 0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3) were expected, got {n_rest}; export the "
-            "splats again"
+            f"{path}: expected 0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), got {n_rest}; export the splats "
+            "again"
         )
 
-    def columns(*wanted: str) -> np.ndarray:
-        table = np.empty((vertex.count, len(wanted)), np.float32)
-        with np.errstate(over="ignore"):  # a double beyond float32 is infinite
-            for i, name in enumerate(wanted):
+    def columns(*keys: str) -> np.ndarray:
+        table = np.empty((vertex.count, len(keys)), np.float32)
+        with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite
+            for i, name in enumerate(keys):
                 table[:, i] = vertex.reals(path, name)
         return table
 
@@ -140,13 +140,13 @@ def _attributes(path: object, vertex: PlyElement, scales: tuple[str, ...], tell:
         "log_scales": columns(*scales),
         "opacity_logits": columns("opacity")[:, 0],
         "sh0": (columns(*_DC) if colors is None else ((colors - 0.5) / C0).astype(np.float32))[:, None],
-        "shN": drawn_bands(str(path), columns(*rest).reshape(vertex.count, 3, places).transpose(0, 2, 1), tell),
+        "shN": drawn_bands(str(path), columns(*rest).reshape(vertex.count, 3, per_channel).transpose(0, 2, 1), tell),
     }
     return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()}
 
 
 def ply_kind(path: str | os.PathLike[str]) -> str:
-    """Return what a PLY file holds: "2dgs", "3dgs" or "compressed" splats, a "mesh" (any face), or "points".
+    """Return the content of a PLY file: "2dgs", "3dgs" or "compressed" splats, a "mesh" (with faces), or "points".
 
     Raises
     ------
@@ -166,18 +166,18 @@ def ply_kind(path: str | os.PathLike[str]) -> str:
 
 
 def _splat_element(path: object, file: PlyFile) -> PlyElement:
-    """Return the vertex element of a 2DGS file, or an error that says what the file is instead."""
+    """Return the vertex element of a 2DGS file; DataError for other kinds of files."""
     vertex = file.elements.get("vertex")
     names = set(vertex.properties) if vertex else set()
-    expected = f"{path}: 2DGS splats (scale_0 and scale_1 only) were expected"
+    expected = f"{path}: expected 2DGS splats (scale_0 and scale_1 only)"
     if "chunk" in file.elements or "packed_position" in names:
-        raise DataError(f"{expected}, got a compressed PLY; give the uncompressed splats.ply of a gs2d or 2DGS run")
+        raise DataError(f"{expected}, got a compressed PLY; use the uncompressed splats.ply of a gs2d or 2DGS run")
     if "scale_2" in names:
-        raise DataError(f"{expected}, got 3DGS splats with three scales; give the splats.ply of a gs2d or 2DGS run")
+        raise DataError(f"{expected}, got 3DGS splats with three scales; use the splats.ply of a gs2d or 2DGS run")
     if vertex is None or "scale_0" not in names:
         has_faces = "face" in file.elements and file.elements["face"].count > 0
         kind = "a mesh" if has_faces else "a point cloud" if {"x", "y", "z"} <= names else "a PLY without vertices"
         beside = Path(str(path)).with_name("splats.ply")
-        raise DataError(f"{expected}, got {kind}; give {beside if beside.exists() else 'that of a gs2d or 2DGS run'}")
+        raise DataError(f"{expected}, got {kind}; use {beside if beside.exists() else 'that of a gs2d or 2DGS run'}")
     _check_complete(expected, vertex, _FIXED)
     return vertex

@@ -1,9 +1,9 @@
-"""Cameras that are taken for fisheyes: those that their pictures or names tell of, and those that are nothing else.
+"""Detect fisheye cameras.
 
-A camera with a hint (a round picture, the name of an action camera, ``--camera-model OPENCV_FISHEYE``) is looked at
-before any photograph has a place; one without a hint only where its places leave a doubt, so that ordinary captures
-lose no time. What its photographs have in common decides (``lens_probe``). Its matches are then verified anew, as rays
-of a fisheye of the focal length that was found, and COLMAP places it so. It runs in the worker.
+A camera with a hint (round images, the name of an action camera, ``--camera-model OPENCV_FISHEYE``) is tested before
+images are placed. A camera without a hint is tested only if its placed images leave doubts, so that ordinary captures
+take no extra time. The matches decide (``lens_probe``): they are verified again as rays of a fisheye with the estimated
+focal length, and COLMAP places the images with it. Runs in the worker.
 """
 
 from __future__ import annotations
@@ -20,34 +20,34 @@ from gs2d.sfm.steps import Steps
 
 Say = Callable[..., None]
 SUSPECTED, VERIFIED = "suspected", "suspected verified"  # steps
-USUAL, ROUND = 75.0, 90.0  # degrees from the axis to the corner, or to the rim, where no photograph tells
-NEARLY = 0.98  # of the matches that a pinhole explains must agree with the fisheye of a round picture
-BEND = 0.1  # how far the corner is moved inwards, of its distance, from where on a fisheye is looked for
-ERROR = 1.0  # px; mean of the model's observations, likewise
-PLACED = 0.5  # of a camera's photographs: fewer with a place, likewise
-AS_MANY = 0.9  # of the photographs that have a place otherwise must have one as fisheyes
+USUAL, ROUND = 75.0, 90.0  # degrees from the axis to the corner, or to the rim, if matches do not tell
+NEARLY = 0.98  # fraction of the pinhole inliers that must fit the fisheye of round images
+BEND = 0.1  # test for a fisheye if distortion moves the corner inwards by more than this fraction,
+ERROR = 1.0  # px; or if the mean reprojection error is larger,
+PLACED = 0.5  # or if fewer of the images are placed
+AS_MANY = 0.9  # a fisheye model must place at least this fraction of the images that the other lens placed
 
-# Of a camera: its number, "photographs" (how many), "why", shares of matches "plain" and "bent", the focal length that
-# these tell ("probed", px) and the one to begin with ("focal"), "model" and "params" (None: it is no fisheye).
+# Result for one camera: "camera" (id), "photographs" (count), "why", inlier ratios "plain" and "bent", the estimated
+# ("probed") and the initial ("focal") focal length in px, "model" and "params" (None: not a fisheye).
 Found = dict[str, Any]
 
 
 def settle_hinted(pycolmap: Any, request: Mapping[str, Any], steps: Steps, say: Say) -> None:
-    """Step "hinted": what was found of each camera with a hint; those that are fisheyes are some in the database."""
+    """Step "hinted": test each camera with a hint, and store the fisheyes in the database."""
     hinted = {i: group for i, group in enumerate(request["groups"], start=1) if group.get("hint")}
-    found = [_looked_at(pycolmap, request, i, group["hint"]) for i, group in hinted.items()]
+    found = [_test(pycolmap, request, i, group["hint"]) for i, group in hinted.items()]
     if taken := [row for row in found if row["params"]]:
         verify_anew(pycolmap, request, steps, fisheyes(pycolmap, request, taken), say)
     steps.finish(HINTED, found)
 
 
 def suspects(pycolmap: Any, request: Mapping[str, Any], piece: Any | None) -> list[Found]:
-    """Return what was found of the cameras without a hint that are fisheyes, though they were placed as other lenses.
+    """Return the cameras without a hint that are fisheyes, although they were placed with another lens.
 
     Parameters
     ----------
     piece : pycolmap.Reconstruction or None
-        The largest model; None: nothing was placed.
+        The largest model; None if nothing was placed.
     """
     if request["asked_lens"] is not None:
         return []
@@ -55,7 +55,7 @@ def suspects(pycolmap: Any, request: Mapping[str, Any], piece: Any | None) -> li
     for i, group in enumerate(request["groups"], start=1):
         if group["camera_model"] == START and not group.get("hint") and _is_doubted(piece, i, len(group["names"])):
             doubted.append(i)
-    found = [_looked_at(pycolmap, request, i, DOUBT) for i in doubted]
+    found = [_test(pycolmap, request, i, DOUBT) for i in doubted]
     return [row for row in found if row["params"]]
 
 
@@ -69,8 +69,8 @@ def _is_doubted(piece: Any | None, number: int, photographs: int) -> bool:
     return bool(corner_bend(camera) < -BEND or piece.compute_mean_reprojection_error() > ERROR)
 
 
-def _looked_at(pycolmap: Any, request: Mapping[str, Any], number: int, why: str) -> Found:
-    """Return what a camera's photographs say of its lens; ``params`` is None where it is no fisheye."""
+def _test(pycolmap: Any, request: Mapping[str, Any], number: int, why: str) -> Found:
+    """Test whether a camera is a fisheye; ``params`` is None if it is not."""
     group = request["groups"][number - 1]
     width, height = group["size"]
     centre, reach = (width / 2, height / 2), math.hypot(width, height) / 2
@@ -82,10 +82,10 @@ def _looked_at(pycolmap: Any, request: Mapping[str, Any], number: int, why: str)
         camera = pycolmap.Camera(
             model="SIMPLE_FISHEYE", width=width, height=height, params=[reach, *centre], camera_id=number
         )
-        told = probe(pycolmap, database, camera, reach=reach, seed=request["seed"])
+        probed = probe(pycolmap, database, camera, reach=reach, seed=request["seed"])
     finally:
         database.close()
-    focal = _focal(told, why, reach, known)
+    focal = _focal(probed, why, reach, known)
     model = "OPENCV_FISHEYE" if why == ASKED else BENT[START]
     blank = pycolmap.Camera.create_from_model_name(number, model, focal or reach, width, height)
     params = [focal] * len(blank.focal_length_idxs()) + [*centre] + [0.0] * len(blank.extra_params_idxs())
@@ -93,26 +93,26 @@ def _looked_at(pycolmap: Any, request: Mapping[str, Any], number: int, why: str)
         "camera": number,
         "photographs": len(group["names"]),
         "why": why,
-        "plain": told.plain if told else None,
-        "bent": told.bent if told else None,
-        "probed": told.focal if told else None,
+        "plain": probed.plain if probed else None,
+        "bent": probed.bent if probed else None,
+        "probed": probed.focal if probed else None,
         "focal": focal,
         "model": model,
         "params": params if focal else None,
     }
 
 
-def _focal(told: Probe | None, why: str, reach: float, known: Any) -> float | None:
-    """Return the focal length, px, to begin with; None: it is no fisheye."""
-    if told is not None and (told.is_fisheye or (why == CIRCLE and told.bent >= NEARLY * told.plain)):
-        return told.focal
+def _focal(probed: Probe | None, why: str, reach: float, known: Any) -> float | None:
+    """Return the initial focal length in px; None if the camera is not a fisheye."""
+    if probed is not None and (probed.is_fisheye or (why == CIRCLE and probed.bent >= NEARLY * probed.plain)):
+        return probed.focal
     if why == ASKED:
         return known.mean_focal_length() if known.has_prior_focal_length else reach / math.radians(USUAL)
-    return reach / math.radians(ROUND) if why == CIRCLE and told is None else None
+    return reach / math.radians(ROUND) if why == CIRCLE and probed is None else None
 
 
 def fisheyes(pycolmap: Any, request: Mapping[str, Any], found: Sequence[Found]) -> list[Any]:
-    """Return the cameras (pycolmap.Camera) of what was found, of known focal length: matches are verified as rays."""
+    """Return fisheye cameras (pycolmap.Camera) with a known focal length, so that matches are verified as rays."""
     made = []
     for row in found:
         width, height = request["groups"][row["camera"] - 1]["size"]
@@ -132,16 +132,16 @@ def put_back(
     before: Sequence[tuple[str, list[float], bool]],
     say: Say,
 ) -> None:
-    """Give cameras that are no fisheyes the lens that they had: model, parameters, and whether EXIF told it."""
+    """Restore the earlier lens of cameras: model, parameters, and whether the focal length is from EXIF."""
     cameras = cameras_of(pycolmap, request, [row["camera"] for row in found])
-    for camera, (model, params, is_told) in zip(cameras, before, strict=True):
+    for camera, (model, params, has_prior) in zip(cameras, before, strict=True):
         camera.model = getattr(pycolmap.CameraModelId, model)
-        camera.params, camera.has_prior_focal_length = list(params), is_told
+        camera.params, camera.has_prior_focal_length = list(params), has_prior
     verify_anew(pycolmap, request, steps, cameras, say)
 
 
 def cameras_of(pycolmap: Any, request: Mapping[str, Any], numbers: Sequence[int]) -> list[Any]:
-    """Return cameras as the database has them."""
+    """Read cameras from the database."""
     database = pycolmap.Database.open(request["database"])
     try:
         return [database.read_camera(number) for number in numbers]
@@ -150,8 +150,8 @@ def cameras_of(pycolmap: Any, request: Mapping[str, Any], numbers: Sequence[int]
 
 
 def verify_anew(pycolmap: Any, request: Mapping[str, Any], steps: Steps, cameras: Sequence[Any], say: Say) -> None:
-    """Give the database these cameras, and verify the matches of their photographs once more."""
-    steps.finish(CALIBRATED_ANEW, [camera.camera_id for camera in cameras])  # the pairs are not those of `match` now
+    """Store cameras in the database, and verify the matches of their images again."""
+    steps.finish(CALIBRATED_ANEW, [camera.camera_id for camera in cameras])  # the pairs differ from those of `match`
     numbers = {camera.camera_id for camera in cameras}
     database = pycolmap.Database.open(request["database"])
     try:
@@ -175,7 +175,7 @@ def verify_anew(pycolmap: Any, request: Mapping[str, Any], steps: Steps, cameras
 
 
 def is_better(fisheye: Any, before: Any | None) -> bool:
-    """Whether a model of fisheyes is to be believed rather than the one with other lenses, if there is one."""
+    """Whether a model with fisheyes is better than the one with other lenses, if there is one."""
     bent = [camera for camera in fisheye.cameras.values() if is_bent(camera)]
     if any(map(doubts, bent)):
         return False

@@ -1,4 +1,4 @@
-"""Run COLMAP in a process of its own and follow what it does."""
+"""Run COLMAP in a separate process and report its progress."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from gs2d.core.extras import install
 from gs2d.core.files import atomic_write
 from gs2d.errors import BackendError, DataError
 
-OnProgress = Callable[[str, int, int], None]  # name of the phase, steps done, steps in all
-OnNote = Callable[[str], None]  # a line for people
+OnProgress = Callable[[str, int, int], None]  # name of the phase, finished steps, total steps
+OnNote = Callable[[str], None]  # a message to show
 MISSING = f"structure from motion needs pycolmap, which is not installed: {install('sfm')}"
 POLL_SECONDS = 0.5
-_LITTLE_SPACE = 64 << 20  # bytes; what SQLite could not write is given back when it gives up
-# Modules are looked for where this process does: `-m` would first take a random.py of the folder one is in.
+_LITTLE_SPACE = 64 << 20  # bytes; SQLite frees what it could not finish writing when it gives up
+# The worker gets the module search path of this process: `-m` would find a random.py in the current folder first.
 _WORKER = "import sys; sys.path[:] = sys.argv[2:]; from gs2d.sfm.colmap_worker import main; main(sys.argv[1])"
 _PAIRS = "two_view_geometries"
-_COUNTED = {"features": "keypoints", "matching": _PAIRS, "verifying": _PAIRS, "again": _PAIRS}  # a row a step
+_COUNTED = {"features": "keypoints", "matching": _PAIRS, "verifying": _PAIRS}  # tables with one row per step
 _PHASES = {
     "features": "finding features",
     "comparing": "finding similar photographs",
@@ -37,28 +37,28 @@ _PHASES = {
     "verifying": "matching as fisheyes",
     "cameras": "placing cameras",
     "lenses": "comparing lenses",
-    "again": "matching pairs once more",
-    "cameras again": "placing cameras once more",
+    "extending": "placing more cameras",
 }
 
 
 @dataclass(frozen=True)
 class Group:
-    """Photographs of one camera.
+    """Images of one camera.
 
     Attributes
     ----------
     names : tuple of str
     camera_model : str
-        COLMAP's.
+        COLMAP camera model.
     size : (int, int)
-        Of its pictures, px.
+        Width and height, px.
     original : str
-        A photograph with EXIF.
+        An image file with EXIF.
     hint : "circle", "name", "asked" or ""
-        What tells of a fisheye (``as_fisheye``).
+        Why the camera may be a fisheye (``as_fisheye``).
     circle : (float, float, float) or None
-        Of a round picture (``fisheye.Circle``): its middle of width and height, its radius of the longer side.
+        Image circle (``fisheye.Circle``): centre as fractions of width and height, radius as fraction of the longer
+        side.
     """
 
     names: tuple[str, ...]
@@ -71,33 +71,31 @@ class Group:
 
 @dataclass(frozen=True)
 class Request:
-    """What the worker is asked to do; every path is absolute.
+    """Input of the worker. Every path is absolute.
 
     Attributes
     ----------
     images : str
-        Folder of the photographs.
+        Folder of the images.
     database, output : str
-        COLMAP's database, and the folder for the models ``0``, ``1`` ...; neither exists.
+        COLMAP database, and the folder for the models ``0``, ``1`` ...
     groups : tuple of Group
     in_order : tuple of str
-        All names, in the order in which they were taken.
+        All image names, in the order in which they were taken.
     ordered_by : "time" or "name"
-        What tells the order.
+        Source of that order.
     places : tuple of (x, y, z) or None
-        Metres, of each name in ``in_order``; None for those without a position.
+        Position of each name in ``in_order``, metres; None if unknown.
     matching : "exhaustive", "sequential", "similar" or "spatial"
     overlap, neighbours : int
-        Next photographs, and similar ones, that each is matched with where not all pairs are; fewer near ones do.
+        Number of consecutive and of similar images that each image is matched with, unless all pairs are matched.
     mapper : "incremental" or "global"
-    rig : tuple of str
-        Folders of cameras that are mounted together, the reference first; none: there is no rig.
     feature_size : int
-        Longer side on which features are found, px.
+        Longer side for feature detection, px.
     asked_lens : str or None
-        The model that the user wants; None: lenses are compared.
+        Requested camera model; None: models are compared.
     masks : str or None
-        Folder of masks (``NAME.png``): no features are looked for in their black pixels.
+        Folder of masks (``NAME.png``): black pixels give no features.
     """
 
     images: str
@@ -111,7 +109,6 @@ class Request:
     overlap: int
     neighbours: int
     mapper: str
-    rig: tuple[str, ...]
     feature_size: int
     threads: int
     seed: int
@@ -120,14 +117,14 @@ class Request:
 
 
 def layers(request: Request) -> dict[str, Any]:
-    """Return what features, pairs and mapping are made of, for :func:`gs2d.sfm.search.go_on`."""
-    told = asdict(request)
+    """Return the inputs of features, pairs and mapping, for :func:`gs2d.sfm.search.go_on`."""
+    inputs = asdict(request)
     pairs = ("in_order", "ordered_by", "places", "matching", "overlap", "neighbours")
     features = ("groups", "feature_size", "seed", *(("masks",) if request.masks is not None else ()))
     return {
-        "features": {name: told[name] for name in features},
-        "pairs": {name: told[name] for name in pairs},
-        "mapping": {name: told[name] for name in ("asked_lens", "mapper", "rig")},
+        "features": {name: inputs[name] for name in features},
+        "pairs": {name: inputs[name] for name in pairs},
+        "mapping": {name: inputs[name] for name in ("asked_lens", "mapper")},
     }
 
 
@@ -139,43 +136,40 @@ def check_installed() -> None:
 
 @dataclass(frozen=True)
 class Solved:
-    """What the worker did.
+    """Result of the worker.
 
     Attributes
     ----------
     models : list of dict
-        What was done to each model that was written, the largest first; none: there is no model.
+        Facts of each model that was written, largest first; empty if nothing could be placed.
     lens : dict
-        What was decided about the lens (``lens.lens_line``); empty without a model.
-    refused : dict of str to str
-        Photographs that found a place and were taken out again, with the reason.
+        The chosen lens (``lens.lens_line``); empty without a model.
     """
 
     models: list[dict[str, Any]]
     lens: dict[str, Any]
-    refused: dict[str, str]
 
 
 def solve(
     request: Request, on_progress: OnProgress, on_note: OnNote = lambda _line: None, *, command: Sequence[str] = ()
 ) -> Solved:
-    """Find the cameras.
+    """Estimate the cameras.
 
     Parameters
     ----------
     command : sequence of str
-        The worker's command line, without the request; empty: our own.
+        Command line of the worker, without the request (default: ``colmap_worker``).
 
     Raises
     ------
     DataError
-        COLMAP gave up or died; says when, and its last words.
+        If the worker failed or crashed; with the phase and its last line.
     """
     work = Path(request.database).parent
     with atomic_write(work / "request.json", "w") as file:
         json.dump(asdict(request), file)
     words = [*(command or (sys.executable, "-c", _WORKER)), str(work / "request.json"), *sys.path]
-    # Passive waiting: cores are often shared, and spinning threads of one library then stop those of another.
+    # Cores are often shared: with active waiting, idle threads of one library block those of another.
     environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ}
     with open(work / "worker.log", "wb") as log:
         process = subprocess.Popen(
@@ -197,7 +191,7 @@ def solve(
 def _follow(
     process: subprocess.Popen[str], database: Path, on_progress: OnProgress, on_note: OnNote
 ) -> tuple[Solved | None, str]:
-    """Pass progress on until the worker has finished or died."""
+    """Report progress until the worker ends; returns its result, if any, and its last phase."""
     lines: queue.Queue[str | None] = queue.Queue()
     assert process.stdout is not None
     reader = threading.Thread(target=_read_lines, args=(process.stdout, lines), daemon=True)
@@ -218,28 +212,28 @@ def _follow(
             return solved, phase
         message = json.loads(line)
         if "models" in message:
-            solved = Solved(message["models"], message.get("lens", {}), message.get("refused", {}))
+            solved = Solved(message["models"], message.get("lens", {}))
         if "note" in message:
             on_note(message["note"])
         if "phase" in message:
             phase, total = message["phase"], message["total"]
             before = 0
-            if phase in ("again", "verifying"):  # those of the first time do not count
-                before = _rows(database, _COUNTED[phase]) - message.get("done", 0)
+            if phase == "verifying":  # do not count pairs that are already in the table
+                before = _rows(database, _COUNTED[phase])
             on_progress(_PHASES[phase], message.get("done", 0), total)
         elif "done" in message:
             on_progress(_PHASES[phase], message["done"], total)
 
 
 def _read_lines(pipe: IO[str], lines: queue.Queue[str | None]) -> None:
-    with contextlib.suppress(ValueError):  # closed under our hands: the command was interrupted
+    with contextlib.suppress(ValueError):  # the pipe was closed because the command was interrupted
         for line in pipe:
             lines.put(line)
     lines.put(None)
 
 
 def _rows(database: Path, table: str) -> int:
-    """Rows of a table that COLMAP is writing (in WAL mode, in which readers stop nobody); 0 where it cannot be read."""
+    """Count the rows of a table while COLMAP writes it (in WAL mode, readers do not block it); 0 if unreadable."""
     with contextlib.suppress(sqlite3.Error), contextlib.closing(_open(database)) as connection:
         return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
     return 0
@@ -250,19 +244,19 @@ def _open(database: Path) -> sqlite3.Connection:
 
 
 def _last_words(phase: str, code: int, log: Path) -> str:
-    """Return the one line about a worker that died."""
+    """Describe the failure of a worker in one line."""
     lines = [line.strip() for line in log.read_text("utf-8", "replace").splitlines() if line.strip()]
     how = f"was ended by signal {-code}" if code < 0 else f"ended with code {code}"
-    said = lines[-1][:300] if lines else "it said nothing"
-    remedy = "give it less: --threads 2, --feature-size 1000" if code < 0 else "if the disk is not full, report it"
-    if (free := shutil.disk_usage(log.parent).free) < _LITTLE_SPACE:  # its last words may not have fitted either
+    output = lines[-1][:300] if lines else "no output"
+    remedy = "use less memory: --threads 2, --feature-size 1000" if code < 0 else "if the disk is not full, report it"
+    if (free := shutil.disk_usage(log.parent).free) < _LITTLE_SPACE:  # the log may be cut short too
         remedy = f"{free / 1e6:.0f} MB are free on the disk of --out: free some space or choose another folder"
-    return f"COLMAP {how} while {_PHASES.get(phase, 'it started')}: {said}; {remedy}"
+    return f"COLMAP {how} while {_PHASES.get(phase, 'starting')}: {output}; {remedy}"
 
 
 @dataclass(frozen=True)
 class MatchFacts:
-    """What the database knows: features of each photograph, and verified matches of each pair that has some."""
+    """Number of features of each image, and of verified matches of each pair that has any."""
 
     features: dict[str, int]
     matches: dict[tuple[str, str], int]
@@ -276,7 +270,7 @@ def read_facts(database: Path) -> MatchFacts:
     Raises
     ------
     DataError
-        It cannot be read: SQLite needs room on the disk to read what another process wrote.
+        If it cannot be read. SQLite needs free disk space to read a database that another process wrote.
     """
     try:
         with contextlib.closing(_open(database)) as connection:
@@ -287,7 +281,7 @@ def read_facts(database: Path) -> MatchFacts:
             matches = {(names[pair // 2147483647], names[pair % 2147483647]): rows for pair, rows in found}
     except (sqlite3.Error, KeyError) as error:
         raise DataError(
-            f"{database} must be the database that COLMAP wrote, it cannot be read: {error}; free some space, or "
-            f"remove {database.parent} and begin anew"
+            f"cannot read the COLMAP database {database}: {error}; free some disk space, or remove {database.parent} "
+            "and start again"
         ) from error
     return MatchFacts(features, matches)

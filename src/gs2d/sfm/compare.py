@@ -1,6 +1,6 @@
-"""Features of photographs, and what they match: the steps before cameras, each of which goes on where it was ended.
+"""Find features and match image pairs with COLMAP. Both continue where an interrupted search ended.
 
-COLMAP writes each photograph and each pair in a transaction of its own, and leaves out what is there.
+COLMAP writes each image and each pair in a separate transaction, and skips those that are in the database.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from gs2d.sfm.pairs import Chosen, chosen, near_pairs, neighbour_pairs, similar_
 from gs2d.sfm.panoramas import FINER, PANORAMA
 
 Say = Callable[..., None]
-ALIKE = "alike.json"  # beside the database: which photographs look alike
-LESS_NEXT, LESS_ALIKE = 3, 4  # times fewer next and similar ones where near ones are known (docs/notebook/sfm.md)
+ALIKE = "alike.json"  # beside the database: pairs of similar images
+LESS_NEXT, LESS_ALIKE = 3, 4  # divisors for consecutive and similar images if positions are known (notebook/sfm.md)
 
 
 def find_features(pycolmap: Any, request: dict[str, Any], say: Say) -> None:
-    """SIFT features of all photographs into the database; each group of photographs shares a camera.
+    """Write SIFT features of all images to the database. Each group of images shares a camera.
 
-    The photographs are listed before, so that their numbers do not depend on which thread is first.
+    The images are registered first, so that their ids do not depend on the order of threads.
     """
     say(phase="features", total=len(request["in_order"]))
     database, images = request["database"], request["images"]
-    if _listed(database) != len(request["in_order"]):  # ended before all of them were: their cameras would be several
-        _list(pycolmap, request)
+    if _count_images(database) != len(request["in_order"]):  # new, or interrupted while images were registered
+        _register(pycolmap, request)
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = request["threads"]
     mode, reader = pycolmap.CameraMode.AUTO, pycolmap.ImageReaderOptions()
@@ -45,15 +45,15 @@ def find_features(pycolmap: Any, request: dict[str, Any], say: Say) -> None:
             pycolmap.extract_features(database, images, names, mode, reader, options, pycolmap.Device.cpu)
 
 
-def _listed(database: str) -> int:
-    """How many photographs the database has."""
+def _count_images(database: str) -> int:
+    """Count the images in the database; 0 if it does not exist."""
     with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(database, timeout=60.0)) as connection:
         return int(connection.execute("SELECT COUNT(*) FROM images").fetchone()[0])
     return 0
 
 
-def _list(pycolmap: Any, request: dict[str, Any]) -> None:
-    """Write photographs and cameras into a new database."""
+def _register(pycolmap: Any, request: dict[str, Any]) -> None:
+    """Write images and cameras to a new database."""
     for path in Path(request["database"]).parent.glob(f"{Path(request['database']).name}*"):
         path.unlink()
     pycolmap.Database.open(request["database"]).close()
@@ -66,17 +66,16 @@ def _list(pycolmap: Any, request: dict[str, Any]) -> None:
 
 
 def _prior(pycolmap: Any, group: dict[str, Any]) -> str:
-    """Camera parameters from the EXIF block of the group's first original; empty without a focal length in it.
+    """Return camera parameters from the EXIF of the group's first original; empty without a focal length.
 
-    A panorama has no others than its size.
-
-    Of the original, because COLMAP takes some of the tags as pixels, which a smaller copy has fewer of.
+    The original is read because COLMAP interprets some tags in pixels, and a copy may be smaller. The parameters of a
+    panorama are its size.
     """
     if group["camera_model"] == PANORAMA:
         return ", ".join(map(str, group["size"]))
     try:
         original = pycolmap.infer_camera_from_image(group["original"])
-    except (RuntimeError, ValueError):  # a format that COLMAP does not read; the copy is one that it does
+    except (RuntimeError, ValueError):  # a format that COLMAP cannot read; the copy has been converted
         return ""
     if not original.has_prior_focal_length:
         return ""
@@ -87,7 +86,7 @@ def _prior(pycolmap: Any, group: dict[str, Any]) -> str:
 
 
 def match(pycolmap: Any, request: dict[str, Any], say: Say) -> None:
-    """Compare photographs and verify what matches by a fundamental or essential matrix."""
+    """Match image pairs and verify the matches with a fundamental or essential matrix."""
     matching = pycolmap.FeatureMatchingOptions()
     matching.num_threads = request["threads"]
     verification = pycolmap.TwoViewGeometryOptions()
@@ -109,7 +108,7 @@ def match(pycolmap: Any, request: dict[str, Any], say: Say) -> None:
 
 
 def _pairs(pycolmap: Any, request: dict[str, Any], say: Say) -> Chosen:
-    """Which pairs to compare, where not all are: next ones, those near in space, and those that look alike."""
+    """Choose the pairs to match if not all are matched: consecutive, spatially near, and similar images."""
     matching, count = request["matching"], len(request["in_order"])
     next_to = f"next to each other by {request['ordered_by']}"
     following = neighbour_pairs(count, request["overlap"])
@@ -121,12 +120,12 @@ def _pairs(pycolmap: Any, request: dict[str, Any], say: Say) -> Chosen:
         reasons[next_to] = {(i, j) for i, j in following if j - i <= few or lost & {i, j}}
     if matching != "sequential":
         say(phase="comparing", total=2 * count)
-        reasons["that look alike"] = _similar(pycolmap, request, say)
+        reasons["similar"] = _similar(pycolmap, request, say)
     return chosen(reasons)
 
 
 def _alike(request: dict[str, Any]) -> list[int]:
-    """How many that look alike each photograph is compared with: fewer where near ones are known."""
+    """Return the number of similar images to match each image with: fewer if its position is known."""
     many = int(request["neighbours"])
     if request["matching"] != "spatial":
         return [many] * len(request["in_order"])
@@ -134,7 +133,7 @@ def _alike(request: dict[str, Any]) -> list[int]:
 
 
 def _similar(pycolmap: Any, request: dict[str, Any], say: Say) -> set[tuple[int, int]]:
-    """Pairs that look alike; kept, because a second round asks again."""
+    """Return pairs of similar images; kept in a file for an interrupted search."""
     kept = Path(request["database"]).with_name(ALIKE)
     if kept.exists():
         return {(i, j) for i, j in json.loads(kept.read_text(encoding="utf-8"))}
@@ -153,23 +152,3 @@ def _similar(pycolmap: Any, request: dict[str, Any], say: Say) -> set[tuple[int,
     with atomic_write(kept, "w") as file:
         json.dump(sorted(pairs), file)
     return pairs
-
-
-def likeness(pycolmap: Any, request: dict[str, Any]) -> Callable[[str, str], float]:
-    """How much two photographs share: verified matches, and where they were not compared, how alike they look."""
-    names = request["in_order"]
-    near: set[frozenset[str]] = set()
-    if request["matching"] != "exhaustive":
-        alike = _similar(pycolmap, request, lambda **_: None)
-        near = {frozenset((names[i], names[j])) for i, j in alike}
-    database = pycolmap.Database.open(request["database"])
-    try:
-        name = {image.image_id: image.name for image in database.read_all_images()}
-        pairs, counts = database.read_two_view_geometry_num_inliers()
-        shared = {
-            frozenset(name[i] for i in pycolmap.pair_id_to_image_pair(pair)): float(count)
-            for pair, count in zip(pairs, counts, strict=True)
-        }
-    finally:
-        database.close()
-    return lambda a, b: shared.get(frozenset((a, b)), 0.0) + 0.5 * (frozenset((a, b)) in near)

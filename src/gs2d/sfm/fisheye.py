@@ -1,8 +1,7 @@
-"""Which photographs may be those of a fisheye: by the circle that such a lens draws, or by the name of its camera.
+"""Hints at a fisheye: an image circle that all images of a camera share, or the name of the camera.
 
-The circle is where all photographs of one camera are dark beyond it: one that is still among pictures that are not.
-Neither is proof (a statue that turns before black velvet, an action camera that stretches its pictures itself): what
-the photographs show in common decides (``gs2d.sfm.lens_probe``).
+Neither is a proof: an object may turn in front of black velvet, and action cameras may correct distortion. The matches
+decide (``gs2d.sfm.lens_probe``).
 """
 
 from __future__ import annotations
@@ -14,20 +13,20 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
-SMALL = 256  # px, the longer side on which a circle is looked for
-DARK = 24  # levels of 255: as bright as noise and stray light leave what no light reaches
-_CORNER = 0.03  # of the sides: a patch in each corner, all of which are dark, or no circle is looked for
-_ANGLES = 360  # directions, in which the edge of the circle is looked for
-_QUARTERS = 4  # each must show some of the edge
-_OF_QUARTER = 0.1  # of its directions
-_ROUND = 0.012  # of the radius, root mean square: how far the edge may be from a circle
-_STEPS = 5  # of fitting, each without what the one before was far from
-_MIDDLE = 0.1  # of the longer side, that the middle of the circle may be off that of the picture
-_LEAST = 0.35  # of the shorter side: the radius of a circle that somebody photographs with
-_FULL, _DARK = 0.9, 0.97  # of the pixels: so many are bright in some photograph well within the circle, dark beyond
-_WITHIN, _BEYOND = 0.97, 1.02  # times the radius
-INSIDE = 0.98  # times the radius: the rim is blurred and has the colours of the glass
-# Makers' names, and words of lenses. Action cameras can store pictures that are stretched already ("linear").
+SMALL = 256  # px, longer side of the images in which a circle is searched
+DARK = 24  # of 255: noise and stray light outside the circle stay below
+_CORNER = 0.03  # of the sides: size of the four corner patches that must be dark
+_ANGLES = 360  # directions in which the edge is searched
+_QUARTERS = 4  # quadrants that must show some of the edge,
+_OF_QUARTER = 0.1  # in this fraction of their directions
+_ROUND = 0.012  # of the radius: largest RMS distance of the edge from a circle
+_STEPS = 5  # of the fit; each leaves out outliers of the step before
+_MIDDLE = 0.1  # of the longer side: largest offset of the circle from the image centre
+_LEAST = 0.35  # of the shorter side: smallest radius
+_FULL, _DARK = 0.9, 0.97  # smallest fractions of bright pixels inside and of dark pixels outside
+_WITHIN, _BEYOND = 0.97, 1.02  # times the radius: limits of inside and outside for that test
+INSIDE = 0.98  # times the radius: the rim is blurred and coloured by the glass
+# Names of makers and lenses. Action cameras can also store corrected images ("linear").
 _NAMES = re.compile(
     r"fish-?\s?eye|gopro|\bhero\s?\d|insta\s?360|osmo ?action|\baction\s?\d|\bsjcam|\bakaso|\byi (4k|lite)|xiaoyi|"
     r"\bfdr-x|\bhdr-as|drift (ghost|x)|garmin virb|\btg-tracker|entaniya|madv|laowa 4mm",
@@ -37,12 +36,14 @@ _NAMES = re.compile(
 
 @dataclass(frozen=True)
 class Circle:
-    """The circle of a fisheye, as fractions of the picture: its middle of width and height, its radius of the longer.
+    """Image circle of a fisheye.
 
     Attributes
     ----------
     x, y : float
+        Centre, as fractions of width and height.
     radius : float
+        As a fraction of the longer side.
     """
 
     x: float
@@ -50,22 +51,22 @@ class Circle:
     radius: float
 
     def inside(self, width: int, height: int) -> np.ndarray:
-        """Return which pixels [H, W] of a picture are within the circle, its blurred rim left out."""
+        """Return a mask [H, W] of the pixels inside the circle, without its blurred rim."""
         v, u = np.mgrid[:height, :width] + 0.5
         return np.asarray(np.hypot(u - self.x * width, v - self.y * height) < self.reach(width, height))
 
     def reach(self, width: int, height: int) -> float:
-        """Return the radius of what is used, px."""
+        """Return the radius of the used part, px."""
         return INSIDE * self.radius * max(width, height)
 
 
 def named_fisheye(made_by: Sequence[str]) -> bool:
-    """Whether the names of camera and lens (EXIF) are those of action cameras or fisheyes."""
+    """Whether the EXIF names of camera and lens belong to an action camera or a fisheye."""
     return any(_NAMES.search(name) for name in made_by)
 
 
 def small_if_dark(image: np.ndarray) -> np.ndarray | None:
-    """Return the brightest channel of a picture, small, float32 [h, w]; None where a corner is not dark: no circle.
+    """Return the brightest channel of a downscaled image, float32 [h, w]; None unless all corners are dark.
 
     Parameters
     ----------
@@ -82,16 +83,16 @@ def small_if_dark(image: np.ndarray) -> np.ndarray | None:
     return np.asarray(small.max(axis=-1), np.float32)
 
 
-def circle_of(pictures: Sequence[np.ndarray | None]) -> Circle | None:
-    """Return the circle that the photographs of one camera share, or None.
+def circle_of(images: Sequence[np.ndarray | None]) -> Circle | None:
+    """Return the image circle that the images of one camera share, or None.
 
     Parameters
     ----------
-    pictures : sequence of ndarray [h, w] or None
-        As of :func:`small_if_dark`; of one size.
+    images : sequence of ndarray [h, w] or None
+        From :func:`small_if_dark`.
     """
-    dark = [picture for picture in pictures if picture is not None]
-    if not dark or 10 * len(dark) < 9 * len(pictures) or len({picture.shape for picture in dark}) > 1:
+    dark = [image for image in images if image is not None]
+    if not dark or 10 * len(dark) < 9 * len(images) or len({image.shape for image in dark}) > 1:
         return None
     brightest = np.max(np.stack(dark), axis=0)
     edge = _edge(brightest)
@@ -109,7 +110,7 @@ def circle_of(pictures: Sequence[np.ndarray | None]) -> Circle | None:
 
 
 def _edge(brightest: np.ndarray) -> np.ndarray:
-    """Return directions (numbers) and places [P, 3] of the outermost bright pixels, where it is dark beyond them."""
+    """Return direction index and pixel (x, y) [P, 3] of the outermost bright pixels that have dark ones outside."""
     height, width = brightest.shape
     middle, found = np.array([width / 2, height / 2]), []
     for number in range(_ANGLES):
@@ -119,20 +120,20 @@ def _edge(brightest: np.ndarray) -> np.ndarray:
         along = np.arange(0.0, reach, 0.25)
         u, v = (middle[:, None] + ray[:, None] * along).astype(int)
         bright = np.flatnonzero(brightest[v, u] >= DARK)
-        if len(bright) and along[bright[-1]] < reach - 2:  # else the circle ends beyond the picture
+        if len(bright) and along[bright[-1]] < reach - 2:  # otherwise the circle is cut off by the border
             found.append((number, *(middle + ray * along[bright[-1]])))
     return np.array(found).reshape(-1, 3)
 
 
 def _circle_through(points: np.ndarray) -> np.ndarray:
-    """Return the circle (x, y, radius) [3] of least squares through points [P, 2]: x^2 + y^2 = 2 a x + 2 b y + c."""
+    """Return the least-squares circle (x, y, radius) of points [P, 2]: x^2 + y^2 = 2 a x + 2 b y + c."""
     system = np.hstack([2 * points, np.ones((len(points), 1))])
     a, b, c = np.linalg.lstsq(system, (points**2).sum(axis=1), rcond=None)[0]
     return np.array([a, b, np.sqrt(max(c + a * a + b * b, 0.0))])
 
 
 def _believed(brightest: np.ndarray, fit: np.ndarray, off: float) -> Circle | None:
-    """Return the circle if pictures look like it: round, near the middle, bright within, dark beyond."""
+    """Return the circle if it is plausible: a round edge, near the centre, bright inside, dark outside."""
     height, width = brightest.shape
     longer = max(height, width)
     if off > _ROUND * fit[2] or fit[2] < _LEAST * min(height, width):

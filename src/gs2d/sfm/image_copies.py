@@ -1,4 +1,4 @@
-"""Photographs into the capture's own folder: the same bytes, or upright and smaller copies. Theirs are only read."""
+"""Copy photographs into the capture: unchanged, or rotated upright and downscaled. The originals are only read."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from gs2d.data.image_files import is_float, open_image, read_image
 from gs2d.errors import DataError
 from gs2d.sfm.photos import JPEG, Photo, turn
 
-QUALITY = 95  # of JPEG files that had to be written again, without chroma subsampling
+QUALITY = 95  # of re-encoded JPEG files, without chroma subsampling
 
 
 def copy_images(
     photos: Sequence[Photo], folder: Path, *, max_size: int | None, link: bool, threads: int
 ) -> Generator[str, None, None]:
-    """Put the photographs into ``folder``; yields for each what was done: "copied", "linked", "turned", "resized".
+    """Copy images into ``folder``; yields "copied", "linked", "turned", "resized" or "converted" for each.
 
-    What is there already, of a search that was interrupted, is not written again.
+    Files that exist, from an interrupted search, are kept.
 
     Parameters
     ----------
     max_size : int or None
-        The longer side may have so many px.
+        Largest longer side, px.
     link : bool
-        Hard links where the bytes stay the same: no disk is used. Copied all the same where the disk is another one.
+        Use hard links for unchanged images; they are copied if the folder is on another disk.
     """
     for parent in sorted({(folder / photo.name).parent for photo in photos}):
         try:
@@ -64,7 +64,7 @@ def _stage(photo: Photo, target: Path, max_size: int | None, link: bool) -> str:
 
 def _copy(source: Path, target: Path) -> None:
     try:
-        file = open(source, "rb")  # noqa: SIM115 - closed below; its errors are not the target's
+        file = open(source, "rb")  # noqa: SIM115 - closed below; its errors must not be reported for the target
     except OSError as error:
         raise DataError(f"cannot read {source}: {error.strerror or error}") from error
     with file, atomic_write(target) as copy:
@@ -72,7 +72,7 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def _rewrite(photo: Photo, target: Path, size: tuple[int, int]) -> None:
-    """Write a picture again: upright, of ``size``, in its own format or as PNG; EXIF stays, but for the orientation."""
+    """Re-encode an image: upright, with ``size``, as JPEG or PNG. EXIF is kept except for the orientation."""
     image = turn(Image.fromarray(read_image(photo.source)), photo.orientation)
     if image.size != size:
         premultiplied = image.convert("RGBa") if image.mode == "RGBA" else image
@@ -86,9 +86,9 @@ def _rewrite(photo: Photo, target: Path, size: tuple[int, int]) -> None:
 
 
 def _kept(source: Path) -> dict[str, bytes]:
-    """Return an image's colour profile (of RGB only: pixels are RGB now) and EXIF block for Pillow's ``save``.
+    """Return the colour profile (of RGB images only) and EXIF block of an image, for Pillow's ``save``.
 
-    Of floats nothing is kept: they are sRGB values now, and Pillow does not open all of them.
+    Nothing is kept of float images: they have been converted to sRGB, and Pillow cannot open all of them.
     """
     if is_float(source):
         return {}

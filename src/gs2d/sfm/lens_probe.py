@@ -1,10 +1,9 @@
-"""Whether a camera's lens is a fisheye, and of which focal length: by what its photographs have in common.
+"""Test from matches alone whether a camera is a fisheye, and estimate its focal length.
 
-No place is known yet. Of two photographs through a pinhole, or nearly one, all matches agree with one fundamental
-matrix, whatever the focal length; through a fisheye only those do that lie in one part of the pictures. As rays of an
-equidistant fisheye of the right focal length they all agree with one essential matrix. So the share of matches that
-agree has a peak at the focal length of a fisheye, and none for other lenses: there a fisheye of any focal length is as
-good as a pinhole. It runs in the worker, on COLMAP's own database.
+For two pinhole images, all matches agree with one fundamental matrix. For two fisheye images, only matches in one part
+of the images do, but as rays of an equidistant fisheye with the right focal length all agree with one essential matrix.
+The inlier ratio over the focal length therefore has a peak for fisheyes, and none for other lenses. Runs in the worker,
+on the COLMAP database.
 """
 
 from __future__ import annotations
@@ -16,26 +15,26 @@ from typing import Any
 
 import numpy as np
 
-PAIRS, MATCHES = 16, 300  # that are looked at; of each pair so many matches
-FEWEST = 30  # matches that agree with one motion, or a pair tells nothing
-OVERLAP = 0.7  # of the pairs, those with most matches first: others have more false ones
-CLEARLY = 1.02  # times as many matches must agree through a fisheye; ordinary lenses have 1.00
+PAIRS, MATCHES = 16, 300  # number of pairs, and of matches of each
+FEWEST = 30  # verified matches of a pair
+OVERLAP = 0.7  # fraction of the pairs, those with most matches: the others have more false matches
+CLEARLY = 1.02  # smallest ratio of fisheye inliers to pinhole inliers; ordinary lenses have 1.00
 ANGLES = (45.0, 60.0, 75.0, 90.0, 105.0)  # degrees from the axis to the corner, or to the rim of the circle
-FINER = (-7.5, 7.5)  # degrees beside the best of them
-WITHIN = 0.0025  # of the longer side: how far, px, matches that agree may be off
-_TRIALS = 1000  # of drawing a motion at random
+FINER = (-7.5, 7.5)  # degrees; tried around the best angle
+WITHIN = 0.0025  # of the longer side: inlier threshold
+_TRIALS = 1000  # of RANSAC
 
 
 @dataclass(frozen=True)
 class Probe:
-    """What a camera's photographs say of its lens.
+    """Inlier ratios of a camera's matches.
 
     Attributes
     ----------
     plain, bent : float
-        Share of the matches that agree with one motion: through a pinhole, and through the best fisheye.
-    focal : float
-        px; of the best fisheye, r = focal * angle.
+        Inlier ratio with a pinhole, and with the best fisheye.
+    focal : float, px
+        Focal length of the best fisheye, r = focal * angle.
     """
 
     plain: float
@@ -44,21 +43,21 @@ class Probe:
 
     @property
     def is_fisheye(self) -> bool:
-        """Whether a fisheye explains clearly more."""
+        """Whether a fisheye fits clearly better."""
         return self.bent >= CLEARLY * self.plain
 
 
 def probe(pycolmap: Any, database: Any, camera: Any, *, reach: float, seed: int) -> Probe | None:
-    """Return what the photographs of a camera say of its lens; None where too few pairs show the same points.
+    """Compare a pinhole with fisheyes of several focal lengths; None if too few pairs match.
 
     Parameters
     ----------
     database : pycolmap.Database
-        With matches of pairs, verified by any lens.
+        With matches of pairs, verified with any lens.
     camera : pycolmap.Camera
-        Its size and principal point are taken.
-    reach : float
-        px from the principal point to the farthest corner, or to the rim of the circle.
+        Its id, size and principal point are used.
+    reach : float, px
+        Distance from the principal point to the farthest corner, or to the rim of the circle.
     """
     matches = _matches(pycolmap, database, camera.camera_id, seed)
     if not matches:
@@ -74,7 +73,7 @@ def probe(pycolmap: Any, database: Any, camera: Any, *, reach: float, seed: int)
 
 
 def _best(share: Callable[[float], float]) -> tuple[float, float]:
-    """Return the largest share, and its angle."""
+    """Return the largest inlier ratio, and its angle."""
     found = {angle: share(angle) for angle in ANGLES}
     coarse = max(found, key=lambda angle: found[angle])
     found |= {coarse + more: share(coarse + more) for more in FINER}
@@ -82,7 +81,7 @@ def _best(share: Callable[[float], float]) -> tuple[float, float]:
 
 
 def _matches(pycolmap: Any, database: Any, camera: int, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return places px [M, 2] in both photographs of pairs of one camera, from pairs with many matches to few."""
+    """Return matched pixels [M, 2] in both images of some pairs of one camera, by decreasing number of matches."""
     images = {image.image_id for image in database.read_all_images() if image.camera_id == camera}
     numbers, counts = database.read_two_view_geometry_num_inliers()
     pairs = [(count, *pycolmap.pair_id_to_image_pair(pair)) for pair, count in zip(numbers, counts, strict=True)]
@@ -106,11 +105,11 @@ def _share(
     matches: Sequence[tuple[np.ndarray, np.ndarray]],
     seed: int,
 ) -> float:
-    """Return which share of the matches agrees with one motion of a camera of this model."""
+    """Return the fraction of the matches that agree with one relative pose, for a camera of this model."""
     camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(params))
     camera.has_prior_focal_length = True
     options = pycolmap.TwoViewGeometryOptions()
-    options.min_E_F_inlier_ratio, options.max_H_inlier_ratio = 0.0, 1.0  # the essential matrix, whatever else fits
+    options.min_E_F_inlier_ratio, options.max_H_inlier_ratio = 0.0, 1.0  # always the essential matrix
     options.detect_watermark = False
     options.ransac.max_error = max(1.0, WITHIN * max(size))
     options.ransac.random_seed, options.ransac.max_num_trials = seed, _TRIALS

@@ -1,4 +1,4 @@
-"""What came out of structure from motion, and why some photographs have no place in it."""
+"""Results of structure from motion, and reasons why images could not be placed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -27,28 +26,27 @@ from gs2d.sfm.fisheye import Circle
 from gs2d.sfm.panoramas import PANORAMA
 
 _MAX_ANGLES = 2000
-FEW_FEATURES = 50  # of a photograph: fewer verify nothing
-_NONE: Mapping[str, str] = MappingProxyType({})
-_SHOOTING = "take photographs a step apart, each showing two thirds of what the one before shows"
+FEW_FEATURES = 50  # of an image: too few for a match
+_SHOOTING = "take photographs a step apart, with two thirds of overlap"
 
 
 @dataclass(frozen=True, eq=False)
 class SfmModel:
-    """One model: photographs that are connected with each other.
+    """One model: a connected set of images.
 
     Attributes
     ----------
     images : tuple of ColmapImage
     cameras : dict of int to ColmapCamera
     points : ColmapPoints
-    mean_error : float
-        px; of all observations.
+    mean_error : float, px
+        Mean reprojection error.
     mean_track : float
-        Photographs that see a point.
-    median_angle : float
-        Degrees; of the widest angle between the rays that see a point. Near 0 for a camera that only turned.
+        Mean number of images per point.
+    median_angle : float, degrees
+        Median over points of the widest angle between two rays. Near 0 for a camera that only rotated.
     upright : bool
-        Turned so that +z is up.
+        Whether +z is up.
     """
 
     images: tuple[ColmapImage, ...]
@@ -61,12 +59,12 @@ class SfmModel:
 
     @property
     def names(self) -> set[str]:
-        """Of the photographs that are placed in it."""
+        """Names of the placed images."""
         return {image.name for image in self.images}
 
 
 def read_model(folder: Path, done: Mapping[str, Any]) -> SfmModel:
-    """Read a model that the worker wrote, by our own reader."""
+    """Read a model that the worker wrote; ``done`` are its facts."""
     points = read_points(folder, "bin")
     images = sorted(read_images(folder, "bin", observations=True), key=lambda image: image.name)
     assert points is not None  # the worker writes no model without points
@@ -82,51 +80,51 @@ def read_model(folder: Path, done: Mapping[str, Any]) -> SfmModel:
 
 
 def _median_angle(images: Sequence[ColmapImage], points: ColmapPoints) -> float:
-    """See ``SfmModel``; over at most ``_MAX_ANGLES`` points."""
+    """Return the median angle (see ``SfmModel``) over at most ``_MAX_ANGLES`` points."""
     step = -(-len(points.ids) // _MAX_ANGLES)
     rays: dict[int, list[np.ndarray]] = {int(number): [] for number in points.ids[::step]}
-    places = dict(zip(rays, points.xyz[::step], strict=True))
+    positions = dict(zip(rays, points.xyz[::step], strict=True))
     for image in images:
         assert image.point_ids is not None
         center = -image.T_cam_world[:3, :3].T @ image.T_cam_world[:3, 3]
         for number in rays.keys() & set(image.point_ids.tolist()):
-            ray = places[number] - center
+            ray = positions[number] - center
             rays[number].append(ray / np.linalg.norm(ray))
-    cosines = [np.min(np.array(seen) @ np.array(seen).T) for seen in rays.values() if len(seen) > 1]
+    cosines = [np.min(np.array(some) @ np.array(some).T) for some in rays.values() if len(some) > 1]
     return float(np.degrees(np.arccos(np.clip(np.median(cosines), -1, 1)))) if cosines else 0.0
 
 
 def check_any(pieces: Sequence[SfmModel], facts: MatchFacts, root: Path) -> None:
-    """Raise DataError where there is no model at all; says at which step it ended, and what to do."""
+    """Raise DataError if there is no model; the message names the step that failed and a remedy."""
     if pieces:
         return
     features = sorted(facts.features.values())
     if features[len(features) // 2] < FEW_FEATURES:
         raise DataError(
             f"{root} must hold photographs with texture, got {features[len(features) // 2]} features in the median "
-            f"photograph (expected {FEW_FEATURES} or more): blurred, dark, or of plain surfaces; photograph it in "
-            "better light, on a patterned base"
+            f"photograph (expected {FEW_FEATURES} or more): they are blurred or dark, or show plain surfaces; use more "
+            "light and a patterned base"
         )
     if not facts.matches:
         raise DataError(
-            f"{root} must hold photographs that overlap, got no two that show the same points (of "
-            f"{len(facts.features)} photographs); {_SHOOTING}"
+            f"{root} must hold photographs that overlap, got {len(facts.features)} without a single matching pair; "
+            f"{_SHOOTING}"
         )
     best = max(facts.matches.values())
     together = _largest_group(facts)
     if 2 * together < len(facts.features):
         raise DataError(
-            f"{root} must hold photographs that overlap, got at most {together} of {len(facts.features)} that show the "
-            f"same points as one another: the steps between them are too large; {_SHOOTING}"
+            f"{root} must hold photographs that overlap, but at most {together} of {len(facts.features)} are connected "
+            f"by matches: the steps between them are too large; {_SHOOTING}"
         )
     raise DataError(
-        f"{root} must hold photographs taken from different places: {len(facts.matches)} pairs show the same points "
-        f"(up to {best}), but none of them from two places far enough apart; do not turn on the spot: {_SHOOTING}"
+        f"{root} must hold photographs from different positions: {len(facts.matches)} pairs match (up to {best} "
+        f"points), but none from two positions far enough apart; do not just rotate the camera: {_SHOOTING}"
     )
 
 
 def _largest_group(facts: MatchFacts) -> int:
-    """How many photographs the largest group holds that pairs with the same points connect."""
+    """Return the size of the largest set of images that is connected by matches."""
     groups: list[set[str]] = []
     for pair in facts.matches:
         touched = [group for group in groups if not group.isdisjoint(pair)]
@@ -134,27 +132,22 @@ def _largest_group(facts: MatchFacts) -> int:
     return max(map(len, groups), default=1)
 
 
-def why_not_placed(name: str, pieces: Sequence[SfmModel], facts: MatchFacts, refused: Mapping[str, str] = _NONE) -> str:
-    """Return the reason, as far as it is known, why a photograph has no camera in the first piece.
-
-    ``refused`` are those that found a place in the second round and lost it again, with what is known of them.
-    """
+def why_not_placed(name: str, pieces: Sequence[SfmModel], facts: MatchFacts) -> str:
+    """Return the most likely reason why an image has no camera in the first model."""
     for number, piece in enumerate(pieces[1:], start=1):
         if name in piece.names:
-            return f"in a separate piece (sparse/{number}): too little in it is seen from the photographs of sparse/0"
-    if name in refused:
-        return refused[name]
+            return f"in a separate model (sparse/{number}): too few matches with the photographs of sparse/0"
     features = facts.features.get(name, 0)
     if features < FEW_FEATURES:
-        return f"{features} features: blurred, or nothing in it has texture"
+        return f"{features} features: blurred, or without texture"
     partners = {a if b == name else b: rows for (a, b), rows in facts.matches.items() if name in (a, b)}
     if not partners:
-        return "nothing in it was found in another photograph"
+        return "no matches with any other photograph"
     placed = {other: rows for other, rows in partners.items() if other in pieces[0].names}
     if not placed:
         return f"matches only photographs that are not placed either ({_first(partners)})"
     best = max(placed, key=lambda other: placed[other])
-    return f"{placed[best]} matches with {best} at best: too few points of known place in it"
+    return f"too few matches with placed photographs (at most {placed[best]}, with {best})"
 
 
 def _first(names: Mapping[str, int]) -> str:
@@ -163,14 +156,14 @@ def _first(names: Mapping[str, int]) -> str:
 
 
 def camera_line(camera: ColmapCamera, images: int, circle: Circle | None = None) -> str:
-    """One line about an estimated camera: model, focal length, field of view (of a round picture, its circle)."""
+    """Describe an estimated camera: model, focal length, field of view (of the image circle, if there is one)."""
     if camera.model == PANORAMA:
         return f"{camera.model} of {images} photographs, {camera.width}x{camera.height} (360 degrees wide)"
     focal = focal_length(camera)
     k = colmap_intrinsics(camera.model, camera.model, camera.width, camera.height, camera.params)
     if circle is not None and k.lens is not None and k.lens.kind == "fisheye":
         across = round(2 * circle.radius * max(k.width, k.height))
-        if across < k.width:  # the picture goes on where the lens shows nothing
+        if across < k.width:  # the image is wider than its circle
             k = replace(k, width=across, cx=across / 2)
     angle = field_of_view(k)
     return (
@@ -180,7 +173,7 @@ def camera_line(camera: ColmapCamera, images: int, circle: Circle | None = None)
 
 
 def focal_length(camera: ColmapCamera) -> float:
-    """px; the first parameter of every model of COLMAP, but for panoramas: px a radian."""
+    """Return the focal length in px: the first parameter of every COLMAP model; for panoramas px per radian."""
     if camera.model == PANORAMA:
         return camera.width / (2 * math.pi)
     return float(camera.params[0])

@@ -1,4 +1,4 @@
-"""Which photographs to compare with which, where all pairs would be too many. Numpy and scipy only."""
+"""Choose image pairs to match if all pairs would be too many. Uses numpy and scipy only."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from scipy.spatial import cKDTree
 
 WORDS = 64
 _ROUNDS = 10  # of k-means
-_SAMPLES = 30_000  # descriptors that the words are learnt from
+_SAMPLES = 30_000  # descriptors for k-means
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """Pairs to compare, and why.
+    """Pairs to match, with the reasons.
 
     Attributes
     ----------
     pairs : tuple of (int, int)
         i < j, ascending.
     reasons : mapping of str to int
-        How many there are for each reason; a pair may have several.
+        Number of pairs for each reason; a pair may have several.
     """
 
     pairs: tuple[tuple[int, int], ...]
@@ -32,45 +32,45 @@ class Chosen:
         return len(self.pairs)
 
     def line(self, count: int) -> str:
-        """Return how many of all pairs of ``count`` photographs are compared, and why, for people."""
+        """Summarize how many of all pairs of ``count`` images are matched, and why."""
         why = ", ".join(f"{number:,} {reason}" for reason, number in self.reasons.items())
         both = " (some for two reasons)" if sum(self.reasons.values()) > len(self.pairs) else ""
-        return f"{len(self.pairs):,} of {count * (count - 1) // 2:,} pairs of photographs are compared: {why}{both}"
+        return f"{len(self.pairs):,} of {count * (count - 1) // 2:,} pairs of photographs are matched: {why}{both}"
 
 
 def chosen(reasons: Mapping[str, set[tuple[int, int]]]) -> Chosen:
-    """Return all pairs of these sets."""
+    """Return the union of sets of pairs, by reason."""
     pairs = sorted(set().union(*reasons.values()))
     return Chosen(tuple(pairs), {reason: len(some) for reason, some in reasons.items() if some})
 
 
 def neighbour_pairs(count: int, overlap: int) -> set[tuple[int, int]]:
-    """Pairs (i < j) of each photograph with the next ``overlap`` ones, and with those 2^k places on.
+    """Return pairs (i < j) of each image with the next ``overlap`` ones, and with those 2^k images later.
 
-    The far ones (k < overlap) bridge what a stretch of blurred frames would cut, as COLMAP's quadratic overlap does.
+    The distant ones (k < overlap) bridge blurred frames, as COLMAP's quadratic overlap does.
     """
     steps = {*range(1, overlap + 1), *(1 << k for k in range(overlap))}
     return {(i, i + step) for i in range(count) for step in steps if i + step < count}
 
 
-def near_pairs(places: Sequence[Sequence[float] | None], neighbours: int) -> set[tuple[int, int]]:
-    """Pairs (i < j) of each photograph with those that were taken nearest to it.
+def near_pairs(positions: Sequence[Sequence[float] | None], neighbours: int) -> set[tuple[int, int]]:
+    """Return pairs (i < j) of each image with the spatially nearest ones.
 
     Parameters
     ----------
-    places : sequence of [3] or None
-        Metres; None: nobody knows.
+    positions : sequence of [3] or None
+        Metres; None if unknown.
     neighbours : int
-        Nearest photographs that each is paired with.
+        Number of nearest images to pair each image with.
     """
-    known = [i for i, place in enumerate(places) if place is not None]
+    known = [i for i, position in enumerate(positions) if position is not None]
     if len(known) < 2:
         return set()
-    at = np.array([places[i] for i in known], dtype=float)
+    at = np.array([positions[i] for i in known], dtype=float)
     count = min(neighbours, len(known) - 1)
     _, found = cKDTree(at).query(at, k=count + 1)
     pairs = set()
-    for row, others in enumerate(np.atleast_2d(found)):  # of those at the same place any may be the first
+    for row, others in enumerate(np.atleast_2d(found)):  # with equal positions, the image itself need not be first
         for other in [j for j in others if j != row][:count]:
             pairs.add((known[min(row, other)], known[max(row, other)]))
     return pairs
@@ -79,18 +79,18 @@ def near_pairs(places: Sequence[Sequence[float] | None], neighbours: int) -> set
 def similar_pairs(
     read: Callable[[int], np.ndarray], count: int, *, neighbours: int | Sequence[int], seed: int = 0
 ) -> set[tuple[int, int]]:
-    """Pairs (i < j) of each photograph with those that look most like it.
+    """Return pairs (i < j) of each image with the most similar ones.
 
-    Each photograph becomes one vector: sums of the residuals of its SIFT descriptors to ``WORDS`` cluster centres,
+    Each image becomes one vector: sums of the residuals of its SIFT descriptors to ``WORDS`` cluster centres,
     normalised per centre and as a whole (VLAD with intra-normalisation: Jegou et al. 2010, Arandjelovic and
-    Zisserman 2013). The words are learnt from the photographs themselves: nothing is downloaded.
+    Zisserman 2013). The cluster centres are computed from the images, so nothing is downloaded.
 
     Parameters
     ----------
-    read : function of a number
-        The descriptors [M, 128] of a photograph; called twice for each.
-    neighbours : int, or a sequence of int
-        Most similar photographs that each is paired with, or that of each.
+    read : callable
+        Returns the descriptors [M, 128] of an image; called twice for each.
+    neighbours : int or sequence of int
+        Number of similar images to pair each image with, for all or for each.
     """
     each_of = [neighbours] * count if isinstance(neighbours, int) else neighbours
     rng = np.random.default_rng(seed)
@@ -110,7 +110,7 @@ def _sample(descriptors: np.ndarray, most: int, rng: np.random.Generator) -> np.
 
 
 def _cluster(samples: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Centres [WORDS, 128] by Lloyd's algorithm from random samples; one that loses all its samples stays."""
+    """Return centres [WORDS, 128] by Lloyd's algorithm from random samples; an empty cluster keeps its centre."""
     words = samples[rng.choice(len(samples), WORDS, replace=False)]
     for _ in range(_ROUNDS):
         nearest = _nearest_word(samples, words)
@@ -126,7 +126,7 @@ def _nearest_word(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
 
 
 def _vlad(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
-    """[WORDS * 128], unit length (or 0 without descriptors)."""
+    """Return the VLAD vector [WORDS * 128], of unit length (zero without descriptors)."""
     vector = np.zeros_like(words, dtype=np.float32)
     if len(descriptors):
         nearest = _nearest_word(descriptors, words)

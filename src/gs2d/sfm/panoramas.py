@@ -1,6 +1,6 @@
-"""Which photographs are 360-degree panoramas: by what their files say, or because a picture meets itself.
+"""Detect 360-degree panoramas by their metadata or content.
 
-COLMAP places them by its own spherical camera, one pose a panorama; training cuts them into faces (``data.faces``).
+COLMAP places them with its spherical camera, one pose per panorama; training cuts them into faces (``data.faces``).
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from PIL import Image
 from gs2d.core.images import is_twice_as_wide
 
 PANORAMA = "EQUIRECTANGULAR"
-FINER = 2  # times --feature-size: a panorama shows four times what a photograph does across
-_SMALL = (512, 256)  # px, in which edges are compared: noise and compression are averaged out
-_STEP, _LEVELS = 3.0, 2.0  # the step over the seam: so many times that of neighbouring columns, and levels
-_ONE_COLOUR = 0.5  # of the spread of a row in the middle, that the uppermost row may have: it is one direction
-_DARK, _DARK_MOST = 8, 0.5  # levels; of the seam: two round fisheye pictures side by side meet in black
+FINER = 2  # times --feature-size: a panorama covers four times the field of view of a photograph
+_SMALL = (512, 256)  # px; size at which edges are compared, to average out noise and compression
+_STEP, _LEVELS = 3.0, 2.0  # largest difference across the seam: factor of that between columns, plus grey levels
+_ONE_COLOUR = 0.5  # of the spread of middle rows: largest spread of the top row, which is a single direction
+_DARK, _DARK_MOST = 8, 0.5  # grey level, fraction of the seam: two fisheye circles side by side meet in black
 
 
 def meets_itself(image: np.ndarray) -> bool:
-    """Whether a picture is that of a whole sphere: its left edge goes on at its right one, its top row is one place.
+    """Whether an image shows a whole sphere: its left and right edges fit together, and its top row has one colour.
 
     Parameters
     ----------

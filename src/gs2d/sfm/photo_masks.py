@@ -1,7 +1,6 @@
-"""Masks of photographs without cameras: found where tools put them, and copied into the capture as COLMAP names them.
+"""Find masks of photographs where common tools put them, and copy them into the capture with COLMAP's names.
 
-They are turned and shrunk with their photographs. COLMAP then looks for no features in their black pixels, and training
-finds them in the capture as those of any other.
+Masks are rotated and downscaled with their photographs. COLMAP ignores features in black pixels.
 """
 
 from __future__ import annotations
@@ -22,28 +21,28 @@ from gs2d.sfm.fisheye import Circle
 from gs2d.sfm.photos import Photo, turn
 
 _NONE: Mapping[str, Circle] = MappingProxyType({})
-_ASPECT = 0.01  # by which a mask of another size may differ from its photograph
+_ASPECT = 0.01  # largest relative difference of the aspect ratios of a mask and its photograph
 
 
 def masks_of(photos: Sequence[Photo], root: Path, folder: Path | None) -> tuple[list[Path | None], str]:
-    """Return the mask of each photograph, and a line about them ("" without any).
+    """Return the mask of each photograph or None, and a message about them ("" if there are none).
 
     Parameters
     ----------
     photos : sequence of Photo
     root : Path
-        Folder of the photographs: masks are in ``masks`` in it, beside it or in its sub-folders, or are called
+        Folder of the photographs. Masks are searched in ``masks`` inside or beside it or in its sub-folders, and as
         ``STEM_mask.png`` or ``NAME.mask.png``.
     folder : Path or None
-        Where they are instead, as the user says.
+        Folder of the masks (``--masks``), instead of the search.
 
     Raises
     ------
     DataError
-        The user's folder is none, or holds no mask of these photographs.
+        If ``folder`` does not exist or holds no mask of these photographs.
     """
     if folder is not None and not folder.is_dir():
-        raise DataError(f"--masks must be a folder of masks, got {folder}, which is none")
+        raise DataError(f"--masks must be a folder of masks, got {folder}, which does not exist")
     names, images = [photo.label for photo in photos], [photo.source for photo in photos]
     own: dict[Path, Path | None] = {}
     for parent in dict.fromkeys(image.parent for image in images) if folder is None else ():
@@ -61,18 +60,17 @@ def copy_masks(
     max_size: int | None,
     circles: Mapping[str, Circle] = _NONE,
 ) -> int:
-    """Write the masks of photographs as ``folder/NAME.png``, in the size of their copies; how many there are.
+    """Write masks as ``folder/NAME.png`` with the size of the copied images; returns their number.
 
     Parameters
     ----------
     circles : dict of str to Circle
-        Of round photographs, by name: what is beyond is masked too.
+        Image circles by name; pixels outside are masked, too.
 
     Raises
     ------
     DataError
-        A mask of another shape than its photograph, or without a white pixel in all of them.
-    DiskError
+        If a mask and its photograph differ in shape, or all masks are completely black.
     """
     count, kept = 0, False
     for photo, path in zip(photos, masks, strict=True):
@@ -80,7 +78,7 @@ def copy_masks(
         if path is None and circle is None:
             continue
         target = folder / f"{photo.name}.png"
-        if target.exists():  # of a search that was interrupted
+        if target.exists():  # from an interrupted search
             count, kept = count + 1, True
             continue
         try:
@@ -94,14 +92,12 @@ def copy_masks(
         write_image(target, mask)
         count, kept = count + 1, kept or bool(mask.any())
     if count == len(photos) and not kept:
-        raise DataError(
-            f"masks must keep a pixel of some photograph, got {count} black ones; white = keep: invert them"
-        )
+        raise DataError(f"masks must have white pixels (white = keep), got {count} completely black ones; invert them")
     return count
 
 
 def _resized(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Return a mask bool [H, W] in another size (width, height): True where all of a pixel is."""
+    """Resize a mask, bool [H, W], to (width, height); a pixel is True if all of its area is."""
     if (mask.shape[1], mask.shape[0]) == size:
         return mask
     grey = Image.fromarray(mask.astype(np.uint8) * np.uint8(255)).resize(size, Image.Resampling.BOX)
@@ -109,24 +105,24 @@ def _resized(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def _upright(photo: Photo, path: Path) -> np.ndarray:
-    """Return a mask as its photograph is seen, bool [H, W]; one of the stored pixels' shape is turned with them.
+    """Read a mask, bool [H, W], rotated like its upright photograph.
 
     Raises
     ------
     DataError
-        It has another shape.
+        If its shape differs from that of the photograph.
     """
     width, height = photo.size
     stored = (height, width) if photo.orientation >= 5 else (width, height)
     size = image_size(path)
-    if _alike(size, stored):  # a half turn cannot be told from none: masks are of the file's pixels
+    if _alike(size, stored):  # masks are assumed to match the stored pixels: a rotation by 180 degrees is ambiguous
         mask = Image.fromarray(read_mask(path).astype(np.uint8))
         return np.asarray(turn(mask, photo.orientation)) > 0
-    if _alike(size, photo.size):  # made by a program that had turned the photograph
+    if _alike(size, photo.size):  # made by a program that rotates photographs upright
         return read_mask(path)
     raise DataError(
-        f"mask {path} must have the size (or aspect) of {photo.label}, {stored[0]}x{stored[1]}, got "
-        f"{size[0]}x{size[1]}; make it of the same file"
+        f"mask {path} must have the size or aspect ratio of {photo.label}, {stored[0]}x{stored[1]}, got "
+        f"{size[0]}x{size[1]}; create it from the same file"
     )
 
 

@@ -1,9 +1,8 @@
-"""The photographs of a folder: which files they are, how they must be turned, and which camera took them."""
+"""Photographs of a folder: files, orientation, and which of them share a camera."""
 
 from __future__ import annotations
 
 import os
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -30,10 +29,10 @@ _KINDS = {
     for kind, suffixes in (("unread", UNREAD), ("video", VIDEOS), ("photo", JPEG + PNG + CONVERTED))
     for suffix in suffixes
 }
-FISHEYE = "OPENCV_FISHEYE"  # the model of --camera-model
-FEWEST = 3  # two photographs give no point that a third confirms
+FISHEYE = "OPENCV_FISHEYE"  # value of --camera-model
+FEWEST = 3  # a point that two images show must be confirmed by a third
 _HIDDEN = (".", "__MACOSX")
-_ORIENTATIONS = {  # EXIF 2.32, tag 0x0112: what makes the stored pixels upright
+_ORIENTATIONS = {  # EXIF 2.32, tag 0x0112: operation that makes the stored pixels upright
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
     4: Image.Transpose.FLIP_TOP_BOTTOM,
@@ -42,7 +41,7 @@ _ORIENTATIONS = {  # EXIF 2.32, tag 0x0112: what makes the stored pixels upright
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
-_SHOOTING = "take 30 or more, each showing most of what the one before shows, from places a step apart"
+_SHOOTING = "take 30 or more, a step apart, with much overlap"
 
 
 @dataclass(frozen=True)
@@ -53,17 +52,18 @@ class Photo:
     ----------
     source : Path
     label : str
-        Its path below the user's folder, with ``/``: what messages call it.
+        Path relative to the user's folder, with ``/``; used in messages.
     name : str
-        Its path below ``images/`` of the capture: UTF-8 without white space, as COLMAP's lists; ``.png`` if converted.
+        Path relative to ``images/`` of the capture: UTF-8 without white space, which COLMAP's lists need; ``.png`` if
+        converted.
     size : (int, int)
-        Width and height as it is seen, px: after its EXIF orientation.
+        Width and height of the upright image, px.
     taken : Taken
-        What the file says of how it was taken; its orientation is what is left to be turned.
+        Metadata of the file; ``orientation`` is the rotation that remains to be applied.
     is_sphere : bool
-        Its picture looks like that of a whole sphere (``panoramas.meets_itself``).
+        Whether the image looks like a whole sphere (``panoramas.meets_itself``).
     dark : ndarray float32 [h, w] or None
-        Its picture, small and upright, where its corners are dark (``fisheye.small_if_dark``).
+        Downscaled upright image, if its corners are dark (``fisheye.small_if_dark``).
     """
 
     source: Path
@@ -76,16 +76,16 @@ class Photo:
 
     @property
     def orientation(self) -> int:
-        """EXIF, 1 (upright) to 8."""
+        """EXIF orientation, 1 (upright) to 8."""
         return self.taken.orientation
 
     @property
     def is_converted(self) -> bool:
-        """Whether it is stored as PNG, because not everybody reads its own format."""
+        """Whether the copy is a PNG, because the original format is not widely supported."""
         return self.source.suffix.lower() in CONVERTED
 
     def size_within(self, max_size: int | None) -> tuple[int, int]:
-        """Its size when its longer side may have ``max_size`` px."""
+        """Return the size after downscaling the longer side to at most ``max_size`` px."""
         width, height = self.size
         if max_size is None or max(width, height) <= max_size:
             return self.size
@@ -94,21 +94,21 @@ class Photo:
 
 
 def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...], str]:
-    """Return the photographs in a folder and its sub-folders, and what is not used.
+    """Find the photographs in a folder and its sub-folders.
 
     Returns
     -------
     list of Path
-        The photographs, in the order of people.
+        The photographs, in natural order.
     tuple of str
-        A line about each kind of files that are no photographs.
+        A message about each kind of other files.
     str
-        A line about the photographs that cannot be read: how many, why, and what to do; "" without any.
+        A message about the photographs that cannot be read: how many, why, and the remedy; "" if there are none.
 
     Raises
     ------
     DataError
-        No folder, a video, formats that are not read, or too few photographs.
+        If ``root`` is no folder, or holds too few photographs.
     """
     if root.is_file():
         other = instead(root, "photographs")
@@ -120,7 +120,7 @@ def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...], str]:
     sorted_out: dict[str, list[Path]] = {"photo": [], "video": [], "unread": [], "mask": [], "other": []}
     for path in _files(root):
         kind = _KINDS.get(path.suffix.lower(), "other")
-        if path.exists() and not path.is_file():  # a pipe, which would be waited for
+        if path.exists() and not path.is_file():  # reading a pipe would block
             kind = "other"
         if FOLDER in path.relative_to(root).parent.as_posix().lower().split("/"):
             kind = "mask"
@@ -129,9 +129,9 @@ def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...], str]:
     photos = without_masks(photos)
     notes = []
     if videos:
-        notes.append(f"{_some(videos, root)} not read: a video; give it alone, or put frames of it here")
+        notes.append(f"{_some(videos, root)} ignored: a video; use it as the input, or copy frames of it here")
     if others:
-        notes.append(f"{_some(others, root)} not read: no photographs")
+        notes.append(f"{_some(others, root)} ignored: no photographs")
     warning = _about_unread(unread, len(photos), root)
     if len(photos) < FEWEST:
         got = f"{len(photos)} photographs" if photos else "none"
@@ -141,7 +141,7 @@ def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...], str]:
 
 
 def _about_unread(unread: Sequence[Path], read: int, root: Path) -> str:
-    """Return one line about the photographs that cannot be read, or ""."""
+    """Describe the photographs that cannot be read; "" if there are none."""
     kinds: dict[str, list[Path]] = {}
     for path in unread:
         kinds.setdefault(path.suffix.lower(), []).append(path)
@@ -149,12 +149,12 @@ def _about_unread(unread: Sequence[Path], read: int, root: Path) -> str:
     for suffix, paths in kinds.items():
         first = paths[0].relative_to(root).as_posix() + (" ..." if len(paths) > 1 else "")
         parts.append(f"{len(paths)} {suffix[1:].upper()} ({first}): {remedy(suffix)}")
-    count = f"{len(unread)} of {read + len(unread)} photographs cannot be read and are left out"
+    count = f"{len(unread)} of {read + len(unread)} photographs cannot be read and are ignored"
     return f"{count}: {'; '.join(parts)}" if unread else ""
 
 
 def _files(root: Path) -> Iterator[Path]:
-    """Files below a folder that are not hidden, in natural order of their paths."""
+    """Yield the files below a folder that are not hidden, in natural order of their paths."""
 
     def refuse(error: OSError) -> None:
         raise DataError(f"cannot read the folder {error.filename}: {error.strerror}") from error
@@ -164,25 +164,25 @@ def _files(root: Path) -> Iterator[Path]:
         visible = {
             name: os.path.realpath(os.path.join(folder, name)) for name in folders if not name.startswith(_HIDDEN)
         }
-        folders[:] = [name for name, place in visible.items() if place not in entered]  # a link to above would not end
+        folders[:] = [name for name, path in visible.items() if path not in entered]  # avoid cycles of links
         entered.update(visible.values())
         found += [Path(folder, name) for name in names if not name.startswith(".")]
     yield from sorted(found, key=lambda path: natural_key(path.relative_to(root).as_posix()))
 
 
 def _some(paths: Sequence[Path], root: Path) -> str:
-    """``a.heic`` or ``a.heic and 3 more``."""
+    """Return ``a.heic was`` or ``a.heic and 3 more were``."""
     first = paths[0].relative_to(root).as_posix()
     return f"{first} was" if len(paths) == 1 else f"{first} and {len(paths) - 1} more were"
 
 
 def read_photos(paths: Sequence[Path], root: Path, *, threads: int) -> Iterator[Photo]:
-    """Yield what each file says about itself; every one is decoded, so that a broken one is found before the slow part.
+    """Read and decode each file, so that a broken one is reported before the slow steps.
 
     Raises
     ------
     DataError
-        One that does not decode; names it.
+        If a file cannot be decoded.
     """
     names = _names([path.relative_to(root).as_posix() for path in paths])
     with ThreadPoolExecutor(threads) as pool:
@@ -193,7 +193,7 @@ def _read(path: Path, root: Path, name: str) -> Photo:
     image = read_image(path)
     height, width = image.shape[:2]
     taken = read_taken(path)
-    orientation = 1 if path.suffix.lower() in (".tif", ".tiff") else taken.orientation  # which Pillow has turned
+    orientation = 1 if path.suffix.lower() in (".tif", ".tiff") else taken.orientation  # Pillow rotates TIFF itself
     size = (height, width) if orientation >= 5 else (width, height)
     taken = replace(taken, orientation=orientation)
     dark = small_if_dark(image)
@@ -203,14 +203,14 @@ def _read(path: Path, root: Path, name: str) -> Photo:
 
 
 def _names(labels: Sequence[str]) -> list[str]:
-    """Names in the capture: white space becomes ``_``, what is not UTF-8 ``?``; names stay different."""
+    """Return unique names for the capture: white space becomes ``_``, invalid UTF-8 ``?``."""
     names: list[str] = []
     taken = set()
     for label in labels:
         name = "_".join(label.split()).encode("utf-8", "replace").decode("utf-8")
         if Path(name).suffix.lower() in CONVERTED:
             name += ".png"
-        while name.lower() in taken:  # file systems that do not tell cases apart
+        while name.lower() in taken:  # some file systems ignore case
             name = str(Path(name).with_name(f"_{Path(name).name}").as_posix())
         taken.add(name.lower())
         names.append(name)
@@ -218,19 +218,19 @@ def _names(labels: Sequence[str]) -> list[str]:
 
 
 def turn(image: Image.Image, orientation: int) -> Image.Image:
-    """Return the picture as it is meant to be seen."""
+    """Rotate an image upright, by its EXIF orientation."""
     return image if orientation == 1 else image.transpose(_ORIENTATIONS[orientation])
 
 
 def camera_groups(photos: Sequence[Photo], sizes: Sequence[tuple[int, int]], cameras: str) -> list[list[int]]:
-    """Which photographs share a camera: lists of their numbers.
+    """Group photographs (by index) that share a camera.
 
-    "auto": same folder, size, camera, lens and focal length; "one": all; "each": none.
+    "auto": equal folder, size, camera, lens and focal length; "one": all; "each": none.
 
     Raises
     ------
     DataError
-        "one", but the sizes differ.
+        For "one", if the sizes differ.
     """
     if cameras == "each":
         return [[i] for i in range(len(photos))]
@@ -251,19 +251,19 @@ def camera_groups(photos: Sequence[Photo], sizes: Sequence[tuple[int, int]], cam
 def panorama_groups(
     photos: Sequence[Photo], groups: Sequence[Sequence[int]], camera_model: str
 ) -> tuple[list[bool], list[str]]:
-    """Return which groups of photographs of one camera are panoramas, and lines for people.
+    """Return whether each group of photographs consists of panoramas, and messages.
 
     Parameters
     ----------
     groups : sequence of sequences of int
-        Numbers of photographs of one camera each, of one size.
+        Indices of photographs, one group per camera.
     camera_model : str
-        As the user asks: "auto" looks, ``PANORAMA`` says that all are, another one that none is.
+        "auto" tests the images, ``PANORAMA`` means that all are panoramas, other values that none is.
 
     Raises
     ------
     DataError
-        A panorama that is not whole.
+        If a panorama does not cover the whole sphere.
     """
     if camera_model not in ("auto", PANORAMA):
         return [False] * len(groups), []
@@ -280,12 +280,12 @@ def panorama_groups(
         found.append(is_one)
         doubted += 0 if is_one or not is_twice_as_wide(*first.size) else len(group)
     count = sum(len(group) for group, is_one in zip(groups, found, strict=True) if is_one)
-    about = f"{count} photographs are 360-degree panoramas: each has one place, and is trained in faces"
+    about = f"{count} photographs are 360-degree panoramas: each has one pose, and is trained as several faces"
     lines = [about] if count else []
     if doubted:
         lines.append(
-            f"{doubted} photographs are twice as wide as high, but their edges do not meet: taken as ordinary ones "
-            f"(--camera-model {PANORAMA} if they are panoramas)"
+            f"{doubted} photographs have an aspect ratio of 2:1, but their edges do not fit together: not treated as "
+            f"panoramas (use --camera-model {PANORAMA} if they are)"
         )
     return found, lines
 
@@ -293,20 +293,21 @@ def panorama_groups(
 def fisheye_hints(
     photos: Sequence[Photo], groups: Sequence[Sequence[int]], panoramas: Sequence[bool], camera_model: str
 ) -> tuple[list[tuple[str, Circle | None]], list[str]]:
-    """Return what tells that each group of photographs of one camera is a fisheye's, with its circle; lines for people.
+    """Return hints that groups of photographs are fisheye images, and messages.
 
     Parameters
     ----------
     panoramas : sequence of bool
-        Which groups are panoramas.
+        Whether each group consists of panoramas.
     camera_model : str
-        As the user asks: "auto" looks, "OPENCV_FISHEYE" says that all are, another one that none is.
+        "auto" tests the images, "OPENCV_FISHEYE" means that all are fisheye images, other values that none is.
 
     Returns
     -------
     list of (str, Circle or None)
-        The first is a hint as of :class:`gs2d.sfm.colmap_process.Group`.
+        For each group the hint (see :class:`gs2d.sfm.colmap_process.Group`) and the image circle.
     list of str
+        Messages.
     """
     if camera_model not in ("auto", FISHEYE):
         return [("", None)] * len(groups), []
@@ -318,54 +319,22 @@ def fisheye_hints(
         hint = "asked" if camera_model == FISHEYE else "circle" if circle else "name" if named else ""
         hints.append((hint, circle))
         round_ones += len(group) if circle else 0
-    line = f"{round_ones} photographs are round: what is beyond their circle is masked, and teaches nothing"
+    line = f"{round_ones} photographs have an image circle: pixels outside are masked and not trained"
     return hints, [line] if round_ones else []
 
 
 def _not_whole(photo: Photo, why: str) -> DataError:
     width, height = photo.size
     return DataError(
-        f"{photo.label} must be a whole panorama, 360 by 180 degrees in 2:1, got a part of one, {width}x{height}, "
-        f"{why}; export it whole (what is missing in black, with a mask), or say what lens it is (--camera-model)"
+        f"{photo.label} must be a full panorama, 360 by 180 degrees in 2:1, got a part of one, {width}x{height}, "
+        f"{why}; export the full sphere (with a mask for missing parts), or set the lens (--camera-model)"
     )
 
 
-def rig_folders(photos: Sequence[Photo], groups: Sequence[Sequence[int]]) -> tuple[str, ...]:
-    """Return the folders whose photographs of one name were taken at one moment by cameras that are mounted together.
-
-    Parameters
-    ----------
-    groups : sequence of sequences of int
-        Which photographs share a camera.
-
-    Raises
-    ------
-    DataError
-        Fewer than two folders, names that most photographs have alone, or a folder of several cameras.
-    """
-    names: dict[str, set[str]] = {}
-    for photo in photos:
-        names.setdefault(os.path.dirname(photo.name), set()).add(os.path.basename(photo.name))
-    expected = "--rig needs a sub-folder for each camera, with the same names for the same moments"
-    if len(names) < 2 or "" in names:
-        raise DataError(f"{expected}; got photographs in {', '.join(sorted(names)) or 'one folder'}")
-    often = Counter(name for those in names.values() for name in those)
-    alone = sorted((name for name, number in often.items() if number == 1), key=natural_key)
-    if 2 * len(alone) > len(often):
-        raise DataError(f"{expected}; got {len(alone)} of {len(often)} names in one folder alone, such as {alone[0]}")
-    folders = {frozenset(os.path.dirname(photos[i].name) for i in group) for group in groups}
-    if len(groups) != len(names) or len(folders) != len(names) or any(len(those) != 1 for those in folders):
-        raise DataError(
-            f"--rig needs one camera a folder, got {len(groups)} cameras for {len(names)} folders: photographs of one "
-            "size and lens in each, and --cameras auto"
-        )
-    return tuple(sorted(names, key=lambda folder: (-len(names[folder]), natural_key(folder))))
-
-
 def in_order_taken(photos: Sequence[Photo]) -> tuple[list[int], str]:
-    """Return the numbers of the photographs in the order in which they were taken, and by what: "time" or "name".
+    """Return the indices of the photographs in the order in which they were taken, and its source: "time" or "name".
 
-    By their clocks where each has one that runs: where most of the times differ.
+    Times are used if every photograph has one and most of them differ.
     """
     times = [photo.taken.seconds for photo in photos]
     known = [seconds for seconds in times if seconds is not None]

@@ -1,4 +1,4 @@
-"""``poses.png``: cameras and points from above and from the side, to see at one glance whether they are right."""
+"""Draw ``poses.png``: cameras and points from above and from the side, for a quick check."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from gs2d.sfm.model import SfmModel, focal_length
 
 MAX_POINTS = 20_000
 _VIEWS = (("from above", 0, 1), ("from the side", 0, 2))
-_WIDEST = 1.0  # half the width of what a wedge shows, at the distance 1: panoramas and fisheyes show more
-_WEDGE = 0.06  # length of a camera's wedge, of the picture's width
+_WIDEST = 1.0  # largest half width of a wedge at distance 1; panoramas and fisheyes exceed it
+_WEDGE = 0.06  # length of a camera's wedge, as a fraction of the plot width
 _CAMERA = "#d62728"
 
 
 def write_image_of(path: Path, piece: SfmModel, title: str) -> None:
-    """Draw a model in the plane of its first two axes, and of the first and third."""
+    """Draw a model projected on its x-y plane and its x-z plane."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
@@ -28,8 +28,8 @@ def write_image_of(path: Path, piece: SfmModel, title: str) -> None:
     figure = Figure(figsize=(12, 6.4), dpi=110, layout="compressed")
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=11)
-    for place, (name, across, upwards) in enumerate(_VIEWS, start=1):
-        axes = figure.add_subplot(1, 2, place)
+    for number, (name, across, upwards) in enumerate(_VIEWS, start=1):
+        axes = figure.add_subplot(1, 2, number)
         plane = [across, upwards]
         axes.scatter(points[:, across], points[:, upwards], s=1.5, c=colors, linewidths=0)
         wedges = [_wedge(image.T_cam_world, center, piece, image.camera_id, high - low, plane)
@@ -48,13 +48,13 @@ def write_image_of(path: Path, piece: SfmModel, title: str) -> None:
 
 
 def _thinned(piece: SfmModel) -> tuple[np.ndarray, np.ndarray]:
-    """At most ``MAX_POINTS`` points [P, 3] and their colours [P, 3] in [0, 1], evenly from the list."""
+    """Return at most ``MAX_POINTS`` points [P, 3], evenly from the list, and their colours [P, 3] in [0, 1]."""
     step = max(1, -(-len(piece.points.xyz) // MAX_POINTS))
     return piece.points.xyz[::step], piece.points.rgb[::step] / 255
 
 
 def _limits(points: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the box [3] and [3] of all cameras and all points but the farthest 2 % on each side, with a margin."""
+    """Return the corners [3] of a box around all cameras and the middle 96 % of the points, with a margin."""
     low = np.minimum(np.quantile(points, 0.02, axis=0), centers.min(axis=0))
     high = np.maximum(np.quantile(points, 0.98, axis=0), centers.max(axis=0))
     margin = 0.06 * float((high - low).max())
@@ -64,7 +64,7 @@ def _limits(points: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, np.nda
 def _wedge(
     T_cam_world: np.ndarray, center: np.ndarray, piece: SfmModel, camera_id: int, box: np.ndarray, plane: list[int]
 ) -> np.ndarray:
-    """Return what a camera sees, from its centre to the two ends of its picture's middle row: [4, 2], closed."""
+    """Return a closed path [4, 2] from the camera centre to both ends of the middle image row."""
     camera = piece.cameras[camera_id]
     half = min(_WIDEST, camera.width / (2 * focal_length(camera)))
     ends = np.array([[-half, 0.0, 1.0], [half, 0.0, 1.0]]) @ T_cam_world[:3, :3]

@@ -1,7 +1,7 @@
-"""What an interrupted search for cameras leaves, and how much of it the next one goes on with.
+"""Continue an interrupted search for cameras.
 
-A search is made of layers: photographs, features, pairs, mapping. ``search.json`` in its folder says what each was made
-of. What the next search would make alike is kept; from the first layer on that would differ all is made anew.
+A search consists of four layers: photographs, features, pairs, mapping. ``search.json`` in its folder stores the inputs
+of each. The next search keeps the layers whose inputs are equal, and repeats everything from the first difference on.
 """
 
 from __future__ import annotations
@@ -20,27 +20,26 @@ from gs2d.errors import DataError
 SEARCH = "search.json"
 LAYERS = ("photographs", "features", "pairs", "mapping")
 DATABASE, MAPPING = "database.db", "mapping"
-_PAIRS = ("pairs.txt", "pairs_again.txt", "pairs_anew.txt", "alike.json")
-DAMAGED = (sqlite3.Error, UnicodeDecodeError)  # of a database, whose words need not be text
-HINTED = "hinted"  # step of the mapping, before a camera is placed: which of them could be fisheyes
-CALIBRATED_ANEW = "calibrated anew"  # step of the mapping: from here on pairs are verified with other cameras
-_AGAIN = ("pairs again.json", f"{CALIBRATED_ANEW}.json")  # likewise, or compared by looser rules
+_PAIRS = ("pairs.txt", "pairs_anew.txt", "alike.json")
+DAMAGED = (sqlite3.Error, UnicodeDecodeError)  # errors of a damaged database
+HINTED = "hinted"  # step of the mapping, before images are placed: cameras that may be fisheyes
+CALIBRATED_ANEW = "calibrated anew"  # step of the mapping: pairs are verified again with other cameras
 
 
 def is_of(work: Path, layer: str, wanted: Any) -> bool:
-    """Whether a layer of the search that was left here was made of ``wanted``."""
+    """Whether a layer of the interrupted search has the inputs ``wanted``."""
     return bool(_read(work).get(layer) == _plain(wanted))
 
 
 def go_on(work: Path, wanted: Mapping[str, Any], *, ours: Sequence[str]) -> str:
-    """Keep of an earlier search what ``wanted`` would make alike, and remember what is made now.
+    """Keep the layers of an earlier search whose inputs are equal, remove the others, and store the new inputs.
 
     Parameters
     ----------
     wanted : mapping
-        What each of ``LAYERS`` is made of.
+        Inputs of each of ``LAYERS``.
     ours : sequence of str
-        Names in the folder that are the caller's, made of the photographs.
+        Folders of the caller that belong to the layer "photographs".
 
     Returns
     -------
@@ -49,22 +48,22 @@ def go_on(work: Path, wanted: Mapping[str, Any], *, ours: Sequence[str]) -> str:
     """
     before, wanted = _read(work), _plain(wanted)
     first = next((i for i, layer in enumerate(LAYERS) if before.get(layer) != wanted[layer]), len(LAYERS))
-    if first < len(LAYERS) and any((work / MAPPING / name).exists() for name in _AGAIN):
+    if first < len(LAYERS) and (work / MAPPING / f"{CALIBRATED_ANEW}.json").exists():
         first = min(first, LAYERS.index("pairs"))
     kept = _kept(work, first) if before and first else ""
-    for layer in reversed(LAYERS[first:]):  # the last first: what is left is always whole
+    for layer in reversed(LAYERS[first:]):  # the last layer first, so that an interruption leaves complete layers
         _remove(work, layer, ours)
     write_json(work / SEARCH, {layer: wanted[layer] for layer in LAYERS})
     return kept
 
 
 def forget(work: Path) -> None:
-    """Say that nothing of a search is worth keeping."""
+    """End a search: nothing of it is kept."""
     (work / SEARCH).unlink(missing_ok=True)
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as JSON gives it back."""
+    """Return a value as it is after a round trip through JSON."""
     return json.loads(json.dumps(value))
 
 
@@ -73,7 +72,7 @@ def _read(work: Path) -> dict[str, Any]:
         return {}
     try:
         return dict(read_json(work / SEARCH))
-    except (DataError, TypeError, ValueError):  # a disk that lost its power
+    except (DataError, TypeError, ValueError):  # damaged, for example by a power failure
         return {}
 
 
@@ -93,7 +92,7 @@ def _remove(work: Path, layer: str, ours: Sequence[str]) -> None:
 
 
 def _clear(database: Path) -> None:
-    """Remove all matches from a database; a database that cannot be opened is removed with the features."""
+    """Remove all matches from a database; an unreadable database is removed, with its features."""
     if not database.exists():
         return
     try:
@@ -106,17 +105,17 @@ def _clear(database: Path) -> None:
 
 
 def _kept(work: Path, layers: int) -> str:
-    """Return what of the first ``layers`` layers is there, for people."""
-    said = []
+    """Describe what exists of the first ``layers`` layers."""
+    parts = []
     with contextlib.suppress(*DAMAGED), contextlib.closing(_open(work / DATABASE)) as connection:
         if layers > LAYERS.index("features"):
-            said.append(f"features of {_count(connection, 'keypoints'):,} photographs")
+            parts.append(f"features of {_count(connection, 'keypoints'):,} photographs")
         if layers > LAYERS.index("pairs"):
-            said.append(f"{_count(connection, 'two_view_geometries'):,} pairs")
+            parts.append(f"{_count(connection, 'two_view_geometries'):,} pairs")
     if layers > LAYERS.index("mapping") and (work / MAPPING).is_dir():
         steps = {path.stem for path in (work / MAPPING).iterdir()} - {HINTED, CALIBRATED_ANEW}
-        said += ["cameras that were placed"] if steps else []
-    return f"going on with the search that was interrupted: {', '.join(said) or 'copies of photographs'}"
+        parts += ["placed cameras"] if steps else []
+    return f"continuing the interrupted search: {', '.join(parts) or 'copies of photographs'}"
 
 
 def _open(database: Path) -> sqlite3.Connection:

@@ -1,18 +1,18 @@
-"""Which way is up, from how people hold cameras. Numpy only: the process that runs COLMAP does not load torch."""
+"""Estimate the up direction from camera rotations. Uses numpy only, because the worker does not load torch."""
 
 from __future__ import annotations
 
 import numpy as np
 
-MIN_AGREEMENT = 0.3  # length of the mean of the cameras' up vectors
-_TOWARDS_MEAN = 0.01  # decides where all right-hand vectors are parallel, negligible where they are not
+MIN_AGREEMENT = 0.3  # smallest length of the mean of the cameras' up vectors
+_TOWARDS_MEAN = 0.01  # decides if all right vectors are parallel, negligible otherwise
 
 
 def up_direction(rotations: np.ndarray) -> np.ndarray | None:
-    """Return the direction that is up, as a unit vector [3] of the world; None where the cameras do not agree on one.
+    """Return the up direction as a unit vector [3] in the world; None if the cameras do not agree.
 
-    Photographers hold the camera level but tilt it up and down: up is what the cameras' x axes r_i are perpendicular
-    to, the unit vector u that minimises mean((r_i . u)^2) - 0.01 (m . u)^2 with m the mean of the cameras' up vectors.
+    Photographers hold the camera level but tilt it up and down, so up is perpendicular to the cameras' x axes r_i: the
+    unit vector u that minimises mean((r_i . u)^2) - 0.01 (m . u)^2, where m is the mean of the cameras' up vectors.
 
     Parameters
     ----------

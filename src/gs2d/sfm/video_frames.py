@@ -1,7 +1,7 @@
-"""The frames of a video as photographs: of each stretch of it the sharpest one, taken by the ffmpeg of the machine.
+"""Extract frames of a video: the sharpest one of each interval, by the installed ffmpeg.
 
-ffmpeg is a program of the user's, not a dependency: its wheels hold code under the GPL. The video is decoded twice,
-once small and grey to see how sharp each frame is, once to write those that were chosen.
+ffmpeg is not a dependency, because its wheels contain GPL code. The video is decoded twice: once at low resolution to
+measure sharpness, and once to write the chosen frames.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from gs2d.errors import DataError
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp", ".wmv")
 MAX_FRAMES = 2000
-SIDE = 640  # px at which frames are judged, whatever their shape: smear of a pixel or two at full size still shows
-QUALITY = 2  # of ffmpeg's JPEG, 1 to 31: its best but one
+SIDE = 640  # px; width and height at which sharpness is measured: blur of two pixels at full size still counts
+QUALITY = 2  # of ffmpeg's JPEG encoder, 1 (best) to 31
 HDR = {"smpte2084": "PQ", "arib-std-b67": "HLG"}
-_RATE = 25  # a made-up one: every frame that is let through is written once, whatever times it had
+_RATE = 25  # arbitrary: with new time stamps, every selected frame is written exactly once
 
 
 @dataclass(frozen=True)
 class Video:
-    """A video that can be read: how many frames it says it has (0: it does not say), and its light curve if HDR."""
+    """A readable video: its number of frames (0 if unknown), and its transfer function if it is HDR."""
 
     path: Path
     frames: int
@@ -42,25 +42,25 @@ class Video:
 
 
 def is_video(path: Path) -> bool:
-    """Whether a path is called as videos are, and is no folder."""
+    """Whether a path has the suffix of a video and is no folder."""
     return path.suffix.lower() in VIDEOS and not path.is_dir()
 
 
 def look_into(path: Path) -> Video:
-    """Return what a video is.
+    """Inspect a video.
 
     Raises
     ------
     DataError
-        No such file, no video in it, or no ffmpeg on this machine.
+        If there is no such file, no video in it, or no ffmpeg on the PATH.
     """
     if not path.is_file():
         raise DataError(f"{path} must be a video or a folder of photographs, got no such file")
     for program in ("ffmpeg", "ffprobe"):
         if shutil.which(program) is None:
             raise DataError(
-                f"{path} is a video, whose frames are taken by ffmpeg, and there is no {program} on the PATH; install "
-                f"it ({FFMPEG}), or give a folder of photographs"
+                f"{path} is a video, which needs ffmpeg, but there is no {program} on the PATH; install it ({FFMPEG}), "
+                "or use a folder of photographs"
             )
     entries = "stream=nb_read_packets,color_transfer"
     words = ["ffprobe", "-v", "error", "-select_streams", "V:0", "-count_packets", "-show_entries", entries]
@@ -80,12 +80,12 @@ def _streams(text: str) -> list[dict[str, Any]]:
 
 
 def sharpness_of(video: Video) -> Generator[float, None, None]:
-    """How sharp each frame is: the variance of the Laplacian of its grey values, from the first frame to the last.
+    """Yield the sharpness of each frame: the variance of the Laplacian of its grey values.
 
     Raises
     ------
     DataError
-        ffmpeg gave up.
+        If ffmpeg fails.
     """
     size = SIDE * SIDE
     scaled = f"scale={SIDE}:{SIDE}:flags=area,format=gray,setpts=N/({_RATE}*TB)"
@@ -97,9 +97,9 @@ def sharpness_of(video: Video) -> Generator[float, None, None]:
 
 
 def choose(sharpness: Sequence[float], count: int) -> list[int]:
-    """Choose frames by number, from 0, ascending: the sharpest of each of ``count`` stretches of one length.
+    """Return the frame numbers, from 0, of the sharpest frame in each of ``count`` equal intervals.
 
-    All of them where there are no more than ``count``.
+    Returns all frames if there are at most ``count``.
     """
     total = len(sharpness)
     if total <= count:
@@ -109,12 +109,12 @@ def choose(sharpness: Sequence[float], count: int) -> list[int]:
 
 
 def take(video: Video, numbers: Sequence[int], folder: Path) -> list[Path]:
-    """Write the frames of these numbers as ``frame_NUMBER.jpg`` into a new folder, upright, of the video's own size.
+    """Write frames as ``frame_NUMBER.jpg`` to a new folder, upright and at full size.
 
     Raises
     ------
     DataError
-        ffmpeg gave up, or wrote fewer.
+        If ffmpeg fails or writes fewer frames.
     """
     folder.mkdir(parents=True)
     wanted = "+".join(f"eq(n,{number})" for number in numbers)
@@ -128,21 +128,21 @@ def take(video: Video, numbers: Sequence[int], folder: Path) -> list[Path]:
         try:
             os.rename(folder / f"{i:06d}.jpg", frames[-1])
         except FileNotFoundError as error:
-            raise DataError(f"ffmpeg took {i} of {len(numbers)} frames of {video.path}; is the file whole?") from error
+            raise DataError(f"ffmpeg wrote {i} of {len(numbers)} frames of {video.path}; is the file cut?") from error
     return frames
 
 
 @contextmanager
 def _decoding(video: Video, options: Sequence[str], into: Path | None = None) -> Iterator[IO[bytes]]:
-    """Run ffmpeg and give what it writes to its standard output; it works in ``into`` and ends with the block.
+    """Run ffmpeg in the folder ``into`` and yield its standard output; it is stopped at the end of the block.
 
     Raises
     ------
     DataError
-        It failed; with what it said last.
+        If it fails; with the last line of its output.
     """
     words = ["ffmpeg", "-nostdin", "-v", "error", "-i", _url(video.path), "-map", "0:V:0", *options]
-    with tempfile.TemporaryFile() as said, subprocess.Popen(words, stdout=PIPE, stderr=said, cwd=into) as job:
+    with tempfile.TemporaryFile() as errors, subprocess.Popen(words, stdout=PIPE, stderr=errors, cwd=into) as job:
         try:
             assert job.stdout is not None
             yield job.stdout
@@ -150,12 +150,12 @@ def _decoding(video: Video, options: Sequence[str], into: Path | None = None) ->
         finally:
             job.kill()
         if failed:
-            said.seek(0)
-            raise DataError(f"ffmpeg cannot decode {video.path}: {_last_line(said.read().decode(errors='replace'))}")
+            errors.seek(0)
+            raise DataError(f"ffmpeg cannot decode {video.path}: {_last_line(errors.read().decode(errors='replace'))}")
 
 
 def _url(path: Path) -> str:
-    """Return a path as ffmpeg takes none for an option or a protocol."""
+    """Return a path in a form that ffmpeg cannot mistake for an option or a protocol."""
     return f"file:{path.resolve()}"
 
 

@@ -1,8 +1,7 @@
-"""Where a capture is made before it has its name: it appears as a whole or not at all.
+"""Hidden folder in which a capture is created, so that it appears completely or not at all.
 
-All work is done in the hidden folder ``.NAME.poses`` beside the capture: copies, COLMAP's database, models. What an
-interrupted or killed command leaves there is resumed by the next one with the same ``--out`` (``search``), or
-removed where nothing says of what it was made.
+All work is done in ``.NAME.poses`` beside the capture: copies, the COLMAP database, models. The next command with the
+same ``--out`` continues an interrupted search there (``search``), or removes the folder if its inputs are unknown.
 """
 
 from __future__ import annotations
@@ -21,18 +20,18 @@ from gs2d.io.run_dir import LOCK, RunFolder, make_folder, remove_made
 from gs2d.sfm.search import SEARCH
 
 IMAGES, SPARSE, POSES_JSON, POSES_PNG = "images", "sparse", "poses.json", "poses.png"
-STAGED = "capture"  # the new one, in the workplace
-OLD = "old"  # an earlier capture, until the new one has its name
-EXIT_BUG = (IMAGES, SPARSE, POSES_JSON, POSES_PNG)
+STAGED = "capture"  # the new capture, in the workspace
+OLD = "old"  # an earlier capture, until it is replaced
+_FILES = (IMAGES, SPARSE, POSES_JSON, POSES_PNG)
 
 
 def check_out(given: Path, images: Path, *, overwrite: bool) -> None:
-    """Raise before anything slow begins, where the capture cannot or must not be put."""
+    """Raise RunError or DiskError if the capture cannot or must not be written to ``given``."""
     out, photos = given.resolve(), images.resolve()
     if out == photos or photos in out.parents or out in photos.parents:
         raise RunError(
-            f"--out {given} must lie beside the photographs, not in their folder or above it ({images}): "
-            "that folder is only read"
+            f"--out {given} must not be inside or above the folder of the photographs ({images}), which is only read; "
+            "choose a folder beside it"
         )
     try:
         entries = {entry.name for entry in out.iterdir()}
@@ -43,8 +42,8 @@ def check_out(given: Path, images: Path, *, overwrite: bool) -> None:
     except OSError as error:
         raise disk_error(out, error) from error
     if out.is_mount():
-        raise RunError(f"--out {given} is where a disk is mounted, and cannot be renamed; choose a folder in it")
-    others = sorted(entries - set(EXIT_BUG) - ({MASKS} if _has_masks_of_ours(out) else set()))
+        raise RunError(f"--out {given} is a mount point, which cannot be renamed; choose a folder in it")
+    others = sorted(entries - set(_FILES) - ({MASKS} if _has_own_masks(out) else set()))
     if POSES_JSON in entries and not others:
         if not overwrite:
             raise RunError(f"{given} already holds a capture; replace it with --overwrite")
@@ -54,11 +53,11 @@ def check_out(given: Path, images: Path, *, overwrite: bool) -> None:
             f"({(others or sorted(entries))[0]}); choose another folder"
         )
     if out == Path.cwd() or out in Path.cwd().parents:
-        raise RunError(f"--out {given} is the folder that you are in, and is replaced as a whole; go elsewhere")
+        raise RunError(f"--out {given} is the current folder and would be replaced; run the command from elsewhere")
 
 
-def _has_masks_of_ours(out: Path) -> bool:
-    """Whether the masks of a capture were put there by this command: nobody else's are replaced."""
+def _has_own_masks(out: Path) -> bool:
+    """Whether this command wrote the masks of a capture; other masks are not replaced."""
     try:
         return bool(read_json(out / POSES_JSON).get("masks"))
     except (DataError, AttributeError):
@@ -66,20 +65,20 @@ def _has_masks_of_ours(out: Path) -> bool:
 
 
 def hidden_workspace(out: Path) -> Path:
-    """Where the capture ``out`` is made."""
+    """Return the folder in which the capture ``out`` is created."""
     return out.with_name(f".{out.name[:200]}.poses")
 
 
 @contextlib.contextmanager
 def workspace(out: Path) -> Iterator[Path]:
-    """Hold a hidden folder beside the capture against other processes; remove it at the end, but for a search.
+    """Lock the hidden folder of a capture; it is removed at the end, unless it holds an unfinished search.
 
-    It is empty, or has what a search that was interrupted left; ``search.forget`` ends one.
+    It is empty or holds an interrupted search, which ``search.forget`` ends.
 
     Raises
     ------
     RunError
-        Another process makes the same capture.
+        If another process creates the same capture.
     """
     work = hidden_workspace(out)
     made = make_folder(work)
@@ -87,7 +86,7 @@ def workspace(out: Path) -> Iterator[Path]:
         try:
             held.enter_context(RunFolder(work).locked())
         except RunError as error:
-            raise RunError(f"{out} is being made by another process; wait for it or choose another --out") from error
+            raise RunError(f"{out} is being created by another process; wait for it or choose another --out") from error
         try:
             if (work / OLD).exists() and not out.exists():  # killed between two renames
                 os.rename(work / OLD, out)
@@ -97,13 +96,13 @@ def workspace(out: Path) -> Iterator[Path]:
         finally:
             if not (work / SEARCH).exists():
                 shutil.rmtree(work, ignore_errors=True)
-    remove_made(made)  # where an open lock cannot be deleted
+    remove_made(made)  # on systems where an open lock file cannot be deleted
 
 
 def sweep_workspace(out: Path) -> None:
-    """Remove the workplace of a capture that is in place: a command was killed while it removed it.
+    """Remove the workspace of a finished capture, left by a command that was killed while removing it.
 
-    One that another process holds stays, and so does one in which another capture is being made.
+    A locked workspace is kept, and so is one with an unfinished search.
     """
     work = hidden_workspace(out)
     done = (out / POSES_JSON).exists() and not ((work / SEARCH).exists() and (work / STAGED).exists())
@@ -119,7 +118,7 @@ def _empty(work: Path) -> None:
 
 
 def put_in_place(capture: Path, out: Path, work: Path) -> None:
-    """Rename the finished capture to its name; an older one goes with the workplace."""
+    """Move the finished capture to ``out``; an older one is removed with the workspace."""
     try:
         if out.exists():
             os.rename(out, work / OLD)

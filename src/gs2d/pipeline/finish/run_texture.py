@@ -18,7 +18,7 @@ from gs2d.core.splats import Splats
 from gs2d.core.transforms import up_direction
 from gs2d.data import View
 from gs2d.errors import ProtocolError, RunError
-from gs2d.io.meshes import read_mesh, write_textured, written_files
+from gs2d.io.meshes import read_mesh, write_mesh, written_files
 from gs2d.io.run_dir import MESH, TEXTURED, RunFolder
 from gs2d.meshing.texture import (
     MAX_SIZE,
@@ -84,9 +84,9 @@ def texture_run(
     baked = textured_mesh(loaded, splats, mesh, options, on_event)
     up = up_direction([view.camera for view in loaded.scene.train])
     if place is None:
-        write_textured(target, baked.mesh, up=up)
+        write_mesh(target, baked.mesh, up=up)
     else:
-        write_textured(target, placed_textured(baked.mesh, place), up=np.array([0.0, 0.0, 1.0]))
+        write_mesh(target, placed_textured(baked.mesh, place), up=np.array([0.0, 0.0, 1.0]))
     if target.resolve() == run.file(TEXTURED).resolve():
         report_again(run, on_event)
     told = {} if place is None else say_where(target, place)

@@ -164,8 +164,6 @@ class Finding:
     (default: GPS in EXIF or XMP)."""
     mapper: Literal["auto", "incremental", "global"] = "auto"
     """Estimate cameras one by one (incremental) or all at once (global). auto: global from 500 photographs."""
-    rig: bool = False
-    """Cameras are mounted together: one sub-folder per camera; equal file names mean the same moment."""
     max_size: int | None = None
     """Shrink the copies to this longer side, px (default: full size)."""
     feature_size: int = 1600

@@ -43,7 +43,6 @@ from gs2d.sfm.photos import (
     in_order_taken,
     panorama_groups,
     read_photos,
-    rig_folders,
 )
 from gs2d.sfm.plot import write_image_of
 from gs2d.sfm.search import DATABASE, SEARCH, forget, go_on, is_of
@@ -68,7 +67,7 @@ MANY = 500  # photographs, from which on "auto" places all at once (docs/noteboo
 ALL_PAIRS = 150  # photographs, up to which "auto" matches every pair
 ASKED_FOR = (  # what poses.json remembers of the options: with another of these the capture is another one
     *("cameras", "camera_model", "matching", "overlap", "neighbours", "positions"),
-    *("mapper", "rig", "max_size", "feature_size", "frames", "seed"),
+    *("mapper", "max_size", "feature_size", "frames", "seed"),
     *("masks", "match_masked"),
 )
 _MOST = 0.5  # of the photographs: so many have a place where "auto" goes by places
@@ -131,7 +130,7 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
         raise
     lens = result["lens"]
     if lens["about"]:
-        on_event(Notice(lens["about"], detail=not (lens.get("asked") or lens.get("fisheyes"))))
+        on_event(Notice(lens["about"], detail=not lens.get("fisheyes")))
     for line in filter(None, (_pieces_line(result), *_doubts(result))):
         on_event(Notice(line))
     return {"capture": str(options.out), **result}
@@ -244,7 +243,7 @@ def _frames_of(video: Video, work: Path, count: int, made_of: dict[str, Any], on
     with contextlib.closing(looking):
         sharpness = list(counted(looking, "looking for sharp frames", video.frames, on_event))
     if len(sharpness) < FEWEST:
-        raise DataError(f"{video.path} must have {FEWEST} frames or more, got {len(sharpness)}; is the file whole?")
+        raise DataError(f"{video.path} must have {FEWEST} frames or more, got {len(sharpness)}; is the file cut?")
     numbers = choose(sharpness, count)
     on_event(Phase("taking frames", 0))
     frames = take(video, numbers, folder)
@@ -332,7 +331,6 @@ def _request(options: PosesOptions, work: Path, photos: Sequence[Photo], threads
         places=tuple(places.metres[i] for i in order),
         matching=_matching(options, len(photos), places),
         mapper=_mapper(options, len(photos)),
-        rig=rig_folders(photos, groups) if options.rig else (),
         overlap=options.overlap,
         neighbours=options.neighbours,
         feature_size=options.feature_size,
@@ -407,7 +405,7 @@ def _result(
     for photo, how in zip(photos, staged, strict=True):
         row = {"name": photo.name, "source": photo.label, "file": how, "features": facts.features.get(photo.name, 0)}
         placed = photo.name in best.names
-        reason = {} if placed else {"reason": why_not_placed(photo.name, pieces, facts, solved.refused)}
+        reason = {} if placed else {"reason": why_not_placed(photo.name, pieces, facts)}
         rows.append({**row, "placed": placed, **reason})
     return {
         "photos": str(options.photos.resolve()),

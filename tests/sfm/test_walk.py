@@ -1,4 +1,4 @@
-"""How cameras are placed first: by COLMAP's own demands, by easier ones, or all at once."""
+"""Initial pairs of a walk straight ahead, which need looser thresholds."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from gs2d.data.readers.colmap import read_images
 from room_photos import write_walk
 
 
-def test_a_walk_straight_ahead_has_cameras(colmap: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """COLMAP's own demands refuse every pair of it. Focal length and depth are one scale then, which nothing tells."""
+def test_a_walk_straight_ahead_is_placed(colmap: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """COLMAP's default thresholds reject every pair. Focal length and depth share one unknown scale."""
     write_walk(tmp_path / "photos")
     out = tmp_path / "capture"
     assert run(["poses", str(tmp_path / "photos"), "--out", str(out), "--threads", "1"]) == 0
