@@ -18,9 +18,10 @@ from PIL import Image
 
 from gs2d.core.mesh import TexturedMesh
 from gs2d.errors import DataError
-from gs2d.io.meshes import glb_bytes, read_mesh, write_mesh
+from gs2d.io.meshes import read_mesh, read_textured, write_mesh
+from gs2d.meshing.web_mesh import web_mesh
 from gs2d.pipeline.look.view import open_viewer, serve
-from gs2d.viewer.server import PageServer
+from gs2d.viewer.page_server import PageServer
 from tiny import write_ball_mesh
 
 
@@ -43,18 +44,24 @@ def test_a_run_is_served_with_its_stages_its_mesh_and_its_cameras(trained: Path,
     try:
         assert shown == ["cameras", "mesh", "splats"]
         facts = facts_of(fetch(server, "")[1])
-        stages = facts["served"]["stages"]
-        assert facts["served"] == {"stages": stages, "has_mesh": True, "has_images": True, "is_live": False}
+        stages = facts["offer"]["stages"]
+        assert facts["offer"] == {
+            "meshes": ["mesh"],
+            "photographs": True,
+            "served": True,
+            "stages": stages,
+            "live": False,
+        }
         assert stages == ["surface", "appearance", "final"]
         for stage in stages:
             headers, data = fetch(server, "splats", stage=stage)
             told = json.loads(headers["X-Splats"])
-            assert len(data) == (32 + 16 * told["stored"]) * told["splats"] > 0
-        assert fetch(server, "mesh")[1] == glb_bytes(read_mesh(copy / "mesh.ply"))
+            assert len(data) == (32 + 16 * told["texels"]) * told["splats"] > 0
+        assert fetch(server, "mesh")[1] == web_mesh(read_mesh(copy / "mesh.ply"))
         assert len(facts["cameras"]) == 3
-        with Image.open(io.BytesIO(fetch(server, "image", view="2")[1])) as image:
+        with Image.open(io.BytesIO(fetch(server, "photograph", view="2")[1])) as image:
             assert image.size == (20, 20)
-        for path, values in (("splats", {"stage": "other"}), ("image", {"view": "3"})):
+        for path, values in (("splats", {"stage": "other"}), ("photograph", {"view": "3"})):
             with pytest.raises(urllib.error.HTTPError, match="400"):
                 fetch(server, path, **values)
         assert server.failure is None
@@ -63,7 +70,7 @@ def test_a_run_is_served_with_its_stages_its_mesh_and_its_cameras(trained: Path,
     finally:
         server.close()
     server, _ = open_viewer(copy)
-    assert fetch(server, "mesh")[1] == (copy / "mesh.glb").read_bytes()
+    assert fetch(server, "textured")[1] == web_mesh(read_textured(copy / "mesh.glb"))
     server.close()
 
 

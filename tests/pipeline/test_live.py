@@ -55,7 +55,7 @@ def test_a_watched_training_has_the_bytes_of_an_unwatched_one(
                     version = state["version"]
                     headers, data = fetch(url, "splats")
                     seen.append({**json.loads(headers["X-Splats"]), "bytes": len(data)})
-                    assert fetch(url + "&view=1", "image")[1][:2] == b"\xff\xd8"
+                    assert fetch(url + "&view=1", "photograph")[1][:2] == b"\xff\xd8"
         except BaseException as error:
             wrong.append(error)
         finally:
@@ -71,7 +71,7 @@ def test_a_watched_training_has_the_bytes_of_an_unwatched_one(
     assert done.wait(600)
     assert wrong == []
     assert comparable(watched) == comparable(undisturbed)
-    assert all(told["bytes"] == (32 + 16 * told["stored"]) * told["splats"] > 0 for told in seen)
+    assert all(told["bytes"] == (32 + 16 * told["texels"]) * told["splats"] > 0 for told in seen)
 
 
 @pytest.fixture(scope="module")

@@ -396,7 +396,7 @@ def mesh_run(
         if run.file(TEXTURED).exists():
             run.file(TEXTURED).unlink()
             on_event(Notice(f"{TEXTURED} was of the mesh before: removed"))
-    if options.subject_box is not None and run.file(PAGE).exists():  # it opens at the subject
+    if run.file(PAGE).exists():  # it shows the mesh
         with attempted(PAGE, again("page", run.path), on_event):
             page_run(run.path, on_event=on_event, loaded=loaded)
     report_again(run, on_event)

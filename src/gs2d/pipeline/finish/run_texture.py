@@ -19,7 +19,7 @@ from gs2d.core.transforms import up_direction
 from gs2d.data import View
 from gs2d.errors import ProtocolError, RunError
 from gs2d.io.meshes import read_mesh, write_mesh, written_files
-from gs2d.io.run_dir import MESH, TEXTURED, RunFolder
+from gs2d.io.run_dir import MESH, PAGE, TEXTURED, RunFolder
 from gs2d.meshing.texture import (
     MAX_SIZE,
     MIN_SIZE,
@@ -31,10 +31,12 @@ from gs2d.meshing.texture import (
     texture_size,
     unwrap,
 )
+from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.run_mesh import fused, mesh_run
 from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.run_subject import OPAQUE, meshed_subject
 from gs2d.pipeline.finish.world_frame import placed_output, placed_textured, say_where
+from gs2d.pipeline.look.page import page_run
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.open_capture import read_scene
 from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions
@@ -88,6 +90,9 @@ def texture_run(
     else:
         write_mesh(target, placed_textured(baked.mesh, place), up=np.array([0.0, 0.0, 1.0]))
     if target.resolve() == run.file(TEXTURED).resolve():
+        if run.file(PAGE).exists():  # it shows the textured mesh
+            with attempted(PAGE, again("page", run.path), on_event):
+                page_run(run.path, on_event=on_event, loaded=loaded)
         report_again(run, on_event)
     told = {} if place is None else say_where(target, place)
     return {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.georeference import Georeference
@@ -20,14 +22,21 @@ from gs2d.data.subject import Subject, read_subject
 from gs2d.errors import DataError, RunError
 from gs2d.io.formats.splat_formats import read_splats
 from gs2d.io.georeference import georeference_of_file, read_georeference
-from gs2d.io.run_dir import PAGE, RunFolder, is_run, open_run
+from gs2d.io.meshes import read_mesh, read_textured
+from gs2d.io.run_dir import MESH, PAGE, TEXTURED, RunFolder, is_run, open_run
+from gs2d.meshing.evidence import simplified_to
+from gs2d.meshing.web_mesh import web_mesh
 from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats, reload_run
 from gs2d.render.types import RasterSettings
+from gs2d.report.images import valid_image
 from gs2d.training.events import Notice, OnEvent, Phase, ignore
-from gs2d.viewer.web import PageScene, Seen, write_page
+from gs2d.viewer.scene_page import PageScene, PageView, write_page
 
 MAX_VIEWS = 100  # photographs that one can step through
 SUFFIXES = (".html", ".htm")
+EMBEDDED_SIDE = 320  # px, longer side of the photographs in a page
+EMBEDDED_FACES = 200_000  # of the mesh in a page
+EMBEDDED_TEXTURE = 2048  # px, side of its texture
 LARGE = 50_000_000  # bytes, from which phones take long, and mail refuses
 
 
@@ -68,10 +77,43 @@ def page_run(
     if content.run is not None:
         content.run.sweep()
     on_event(Phase("writing the page", 0))
-    written = write_page(out, content.splats, content.scene, sh_degree=sh_degree)
+    background = content.scene.settings.background
+    photographs = [photograph_jpeg(view, background, EMBEDDED_SIDE) for view in content.photographs]
+    written = write_page(
+        out,
+        content.splats,
+        content.scene,
+        sh_degree=sh_degree,
+        meshes={} if content.run is None else _embedded_meshes(content.run),
+        photographs=photographs,
+    )
     if written["bytes"] > LARGE:
         on_event(Notice(f"{written['bytes'] / 1e6:.0f} MB are much for a page: --sh-degree 1 or 0 makes it smaller"))
     return {"file": str(out), "views": len(content.scene.views), **written}
+
+
+def photograph_jpeg(view: View, background: Sequence[float], side: int) -> bytes:
+    """Return the photograph of a view as a JPEG file of at most ``side`` px; transparent pixels show the background."""
+    image = Image.fromarray(valid_image(view.image(), view.valid()))
+    image.thumbnail((side, side), Image.Resampling.BOX)
+    if image.mode == "RGBA":
+        behind = Image.new("RGBA", image.size, tuple(round(255 * channel) for channel in background))
+        image = Image.alpha_composite(behind, image)
+    file = io.BytesIO()
+    image.convert("RGB").save(file, "JPEG", quality=90)
+    return file.getvalue()
+
+
+def _embedded_meshes(run: RunFolder) -> dict[str, bytes]:
+    """Return the meshes of a run, small enough for a page. A textured mesh with more faces is left out."""
+    meshes = {}
+    if run.file(MESH).exists():
+        meshes["mesh"] = web_mesh(simplified_to(read_mesh(run.file(MESH)), EMBEDDED_FACES))
+    if run.file(TEXTURED).exists():
+        textured = read_textured(run.file(TEXTURED))
+        if len(textured.faces) <= EMBEDDED_FACES:
+            meshes["textured"] = web_mesh(textured, max_texture=EMBEDDED_TEXTURE)
+    return meshes
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,10 +176,10 @@ def page_scene(
     cameras = [view.camera for view in photographs]
     focus, unit = _focus(cameras, centers)
     up = up_direction(cameras) if cameras else np.array([0.0, 0.0, 1.0])
-    seen = [Seen(view.name, view.camera) for view in photographs]
+    seen = [PageView(view.name, view.camera) for view in photographs]
     if not seen:
         eye = focus + np.array([2.0, -2.5, 1.5]) * unit
-        seen = [Seen("from aside", look_at(eye, focus, up, width=4, height=3, fx=4.0))]
+        seen = [PageView("Opening view", look_at(eye, focus, up, width=4, height=3, fx=4.0))]
     return PageScene(title, seen, settings, focus, unit, up, subject, world)
 
 

@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
-import io
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 
-from PIL import Image
-
 from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.errors import DataError
-from gs2d.io.meshes import glb_bytes, read_mesh
+from gs2d.io.meshes import read_mesh, read_textured
 from gs2d.io.run_dir import MESH, TEXTURED, RunFolder, load_tensors
-from gs2d.pipeline.look.page import page_content
-from gs2d.report.images import valid_image
+from gs2d.meshing.web_mesh import web_mesh
+from gs2d.pipeline.look.page import page_content, photograph_jpeg
 from gs2d.training.events import OnEvent, Step, ignore
 from gs2d.training.state import TrainState
-from gs2d.viewer.server import Answer, PageServer, Route, number_in
-from gs2d.viewer.web import Packed, PageScene, Served, pack, served_page, splats_answer
+from gs2d.viewer.packed_splats import PackedSplats
+from gs2d.viewer.page_server import Answer, PageServer, Route, number_in
+from gs2d.viewer.scene_page import PageOffer, PageScene, pack_for, served_page, splats_answer
 
 FINAL = "final"
-IMAGE_SIDE = 640  # px, longer side of the image of a view
+PHOTOGRAPH_SIDE = 640  # px, longer side
 _TICK = 0.2  # s between looks at Ctrl-C
 
 
@@ -39,21 +37,20 @@ def open_viewer(path: Path, port: int | None = None, on_event: OnEvent = ignore)
     """
     content = page_content(path, on_event)
     stages: dict[str, Callable[[], Splats]] = {FINAL: lambda: content.splats}
-    mesh: Callable[[], bytes] | None = None
+    meshes: dict[str, Callable[[], bytes]] = {}
     if content.run is not None:
         ends = [checkpoint for checkpoint in content.run.checkpoints() if checkpoint.iteration is None]
         earlier = {end.stage: partial(_splats_of, end.path) for end in ends[:-1]}  # the last one is splats.ply
-        stages, mesh = {**earlier, **stages}, _mesh_of(content.run)
-    has_images = bool(content.photographs)
-    page = served_page(content.scene, Served(list(stages), mesh is not None, has_images))
+        stages, meshes = {**earlier, **stages}, _meshes_of(content.run)
+    has_photographs = bool(content.photographs)
+    page = served_page(content.scene, PageOffer(tuple(meshes), has_photographs, stages=tuple(stages)))
     routes: dict[str, Route] = {
         "": lambda _: Answer("text/html; charset=utf-8", [page]),
         "splats": _stages_route(stages, content.scene),
-        "image": images_route(content.photographs, content.scene.settings.background),
+        "photograph": photographs_route(content.photographs, content.scene.settings.background),
+        **{name: partial(_mesh_answer, block) for name, block in meshes.items()},
     }
-    if mesh is not None:
-        routes["mesh"] = lambda _: Answer("model/gltf-binary", [mesh()])
-    shown = [*(["cameras"] if has_images else []), *(["mesh"] if mesh else []), "splats"]
+    shown = [*(["cameras"] if has_photographs else []), *(["mesh"] if meshes else []), "splats"]
     return PageServer(port, routes), shown
 
 
@@ -71,19 +68,12 @@ def serve(server: PageServer, on_event: OnEvent = ignore) -> None:
     raise server.failure
 
 
-def images_route(views: Sequence[View], background: Sequence[float]) -> Route:
-    """Return the route of the views' images, as small JPEG files; transparent ones lie over the background (RGB)."""
+def photographs_route(views: Sequence[View], background: Sequence[float]) -> Route:
+    """Return the route of the photographs of the views, as small JPEG files."""
 
     def answer(arguments: Mapping[str, str]) -> Answer:
         view = views[number_in(arguments, "view", len(views))]
-        image = Image.fromarray(valid_image(view.image(), view.valid()))
-        image.thumbnail((IMAGE_SIDE, IMAGE_SIDE), Image.Resampling.BOX)
-        if image.mode == "RGBA":
-            behind = Image.new("RGBA", image.size, tuple(round(255 * channel) for channel in background))
-            image = Image.alpha_composite(behind, image)
-        file = io.BytesIO()
-        image.convert("RGB").save(file, "JPEG", quality=90)
-        return Answer("image/jpeg", [file.getvalue()])
+        return Answer("image/jpeg", [photograph_jpeg(view, background, PHOTOGRAPH_SIDE)])
 
     return answer
 
@@ -92,8 +82,8 @@ def _stages_route(stages: Mapping[str, Callable[[], Splats]], scene: PageScene) 
     lock = threading.Lock()
 
     @lru_cache(maxsize=1)  # one stage in memory
-    def packed(stage: str) -> Packed:
-        return pack(stages[stage](), scene.focus, scene.settings.sh_degree, scene.settings.alpha_min)
+    def packed(stage: str) -> PackedSplats:
+        return pack_for(scene, stages[stage]())
 
     def answer(arguments: Mapping[str, str]) -> Answer:
         stage = arguments.get("stage", "")
@@ -109,8 +99,15 @@ def _splats_of(checkpoint: Path) -> Splats:
     return TrainState.from_state_dict(load_tensors(checkpoint)["state"]).splats
 
 
-def _mesh_of(run: RunFolder) -> Callable[[], bytes] | None:
-    """Return what reads the textured mesh, else the coloured one, as a .glb file; None where there is no mesh."""
-    if run.file(TEXTURED).exists():
-        return run.file(TEXTURED).read_bytes
-    return (lambda: glb_bytes(read_mesh(run.file(MESH)))) if run.file(MESH).exists() else None
+def _meshes_of(run: RunFolder) -> dict[str, Callable[[], bytes]]:
+    """Return functions that read the meshes of a run for the page."""
+    readers: dict[str, Callable[[], bytes]] = {
+        "mesh": lambda: web_mesh(read_mesh(run.file(MESH))),
+        "textured": lambda: web_mesh(read_textured(run.file(TEXTURED))),
+    }
+    files = {"mesh": MESH, "textured": TEXTURED}
+    return {name: read for name, read in readers.items() if run.file(files[name]).exists()}
+
+
+def _mesh_answer(block: Callable[[], bytes], _: Mapping[str, str]) -> Answer:
+    return Answer("application/octet-stream", [block()])

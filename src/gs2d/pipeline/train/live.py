@@ -17,13 +17,14 @@ import numpy as np
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.pipeline.look.page import page_scene, some_views
-from gs2d.pipeline.look.view import images_route
+from gs2d.pipeline.look.view import photographs_route
 from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.training import events as train_events
 from gs2d.training.events import Event, Notice, OnEvent, Phase, Step
 from gs2d.training.state import TrainState
-from gs2d.viewer.server import Answer, PageServer
-from gs2d.viewer.web import Packed, Served, pack, served_page, splats_answer
+from gs2d.viewer.packed_splats import PackedSplats
+from gs2d.viewer.page_server import Answer, PageServer
+from gs2d.viewer.scene_page import PageOffer, pack_for, served_page, splats_answer
 
 WATCHED = 5.0  # s after a question of a page, which asks every second, during which it counts as open
 MIN_SECONDS = 2.0  # between two copies
@@ -43,7 +44,7 @@ class Live:
         self._tell = tell
         self._lock = threading.Lock()  # of the copy and of what is packed
         self._copy: Splats | None = None
-        self._packed: Packed | None = None
+        self._packed: PackedSplats | None = None
         self._version = 0
         self._asked = -math.inf  # when a page asked last
         self._copy_at, self._copied = 0.0, 0.0
@@ -52,12 +53,12 @@ class Live:
         views = some_views(loaded.scene.train)
         points = np.zeros((0, 3)) if loaded.scene.points is None else loaded.scene.points.points
         self._scene = page_scene(loaded.resolved.title or loaded.scene.name, views, loaded.settings, points)
-        page = served_page(self._scene, Served(has_images=True, is_live=True))
+        page = served_page(self._scene, PageOffer(photographs=True, live=True))
         routes = {
             "": lambda _: Answer("text/html; charset=utf-8", [page]),
             "state": self._answer_state,
             "splats": self._answer_splats,
-            "image": images_route(views, loaded.settings.background),
+            "photograph": photographs_route(views, loaded.settings.background),
         }
         self._server = PageServer(loaded.resolved.execution.viewer_port, routes, option="--viewer-port")
         tell(Notice(f"watch it at {self._server.url}"))
@@ -107,8 +108,7 @@ class Live:
         with self._lock:
             if self._copy is not None:
                 began = time.thread_time()  # of this thread: it waits where the cores are busy
-                settings = self._scene.settings
-                self._packed = pack(self._copy, self._scene.focus, settings.sh_degree, settings.alpha_min)
+                self._packed = pack_for(self._scene, self._copy)
                 self._copy = None
                 taken = self._copied + time.thread_time() - began
                 self._copy_at = time.monotonic() + max(MIN_SECONDS, taken / MAX_FRACTION)

@@ -49,7 +49,7 @@ from gs2d.pipeline.train.run_logger import RunLogger, progress_every
 from gs2d.training import events
 from gs2d.training.events import Event, Notice, OnEvent, Phase, RunPlan, ignore
 from gs2d.training.parallel import ONE_PROCESS, ManyProcesses, OneProcess
-from gs2d.viewer.server import free_port
+from gs2d.viewer.page_server import free_port
 
 MANY = 500  # photographs, from which time and memory are estimated before training
 UNPACKED = "unpacked"  # in the run folder: what came as a ZIP file

@@ -1,5 +1,5 @@
 #version 300 es
-// The background behind what was blended; normals and depths as colours, over white.
+// Blended splats over the background; normals and depths as colours over white.
 precision highp float;
 precision highp int;
 uniform sampler2D blended;
@@ -8,7 +8,7 @@ uniform vec2 canvas;  // px
 uniform int kind;
 out vec4 color;
 
-vec3 ofDepth(float t) {  // report/images.py, from near to far
+vec3 depthColor(float t) {  // from near to far, as in report/images.py
     vec3 s[5] = vec3[](vec3(0.99, 0.91, 0.60), vec3(0.60, 0.81, 0.47), vec3(0.16, 0.60, 0.56), vec3(0.17, 0.36, 0.56),
                        vec3(0.19, 0.11, 0.36));
     float at = 4.0 * clamp(t, 0.0, 1.0);
@@ -18,14 +18,14 @@ vec3 ofDepth(float t) {  // report/images.py, from near to far
 
 void main() {
     vec4 c = texture(blended, gl_FragCoord.xy / canvas);
-    vec3 seen = c.rgb, behind = background;
+    vec3 front = c.rgb, behind = background;
     if (kind == 1) {
         vec3 n = 2.0 * c.rgb - c.a;
-        seen = c.a * (0.5 + 0.5 * n / max(length(n), 1e-6));
+        front = c.a * (0.5 + 0.5 * n / max(length(n), 1e-6));
         behind = vec3(1.0);
     } else if (kind == 2) {
-        seen = c.a * ofDepth(c.r / max(c.a, 1e-6));
+        front = c.a * depthColor(c.r / max(c.a, 1e-6));
         behind = vec3(1.0);
     }
-    color = vec4(clamp(seen + (1.0 - c.a) * behind, 0.0, 1.0), 1.0);
+    color = vec4(clamp(front + (1.0 - c.a) * behind, 0.0, 1.0), 1.0);
 }

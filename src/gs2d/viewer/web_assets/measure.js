@@ -1,14 +1,14 @@
-// Measuring: two places on the surface, the distance between them, and the command that gives a run its true size.
+// Measures the distance between two points of the surface, and writes the command that scales a run by it.
 const ruler = { on: false, ends: [] }; // ends relative to facts.origin
-const SURE = 0.5; // of a pixel's light that must be stopped: the median depth of the rasterizer's contract
-const TAP = 5; // CSS px that a finger may move in a tap
-let records, reaches; // 8 words a splat (viewer/web.py); how far each can be seen from its centre, world units
+const OPAQUE = 0.5; // transmittance at the surface: the median depth of the rasterizer's contract
+const TAP = 5; // CSS px that a pointer may move in a tap
+let records, reaches; // 8 words per splat (viewer/packed_splats.py); visible radius of each splat, world units
 
-const half = (h) => {
-  const power = (h >> 10) & 31, part = h & 1023, sign = h & 0x8000 ? -1 : 1;
-  return sign * (power ? (1 + part / 1024) * 2 ** (power - 15) : part * 2 ** -24);
+const float16 = (h) => {
+  const exponent = (h >> 10) & 31, fraction = h & 1023, sign = h & 0x8000 ? -1 : 1;
+  return sign * (exponent ? (1 + fraction / 1024) * 2 ** (exponent - 15) : fraction * 2 ** -24);
 };
-const short = (word) => Math.max(((word << 16) >> 16) / 32767, -1);
+const int16 = (word) => Math.max(((word << 16) >> 16) / 32767, -1);
 
 function keepRecords(buffer) {
   records = new Uint32Array(buffer.slice(0, 32 * facts.splats));
@@ -17,11 +17,11 @@ function keepRecords(buffer) {
 
 function splatAt(i) {
   const words = records.subarray(8 * i, 8 * i + 8), mean = [...new Float32Array(records.buffer, 32 * i, 3)];
-  const scales = [words[3] & 0xffff, words[3] >>> 16].map((h) => Math.exp(half(h)));
-  const q = [words[4], words[4] >>> 16, words[5], words[5] >>> 16].map(short), length = Math.hypot(...q);
+  const scales = [words[3] & 0xffff, words[3] >>> 16].map((h) => Math.exp(float16(h)));
+  const q = [words[4], words[4] >>> 16, words[5], words[5] >>> 16].map(int16), length = Math.hypot(...q);
   const [w, x, y, z] = q.map((part) => part / length);
   return {
-    mean, scales, opacity: half(words[7] >>> 16),
+    mean, scales, opacity: Math.abs(float16(words[7] >>> 16)),
     tu: [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
     tv: [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
   };
@@ -36,107 +36,110 @@ function findReaches() {
 }
 
 function surfaceAt(x, y) {
-  // The place (relative to facts.origin) where half of the light of a point of the window is stopped, or null.
+  // The surface point (relative to facts.origin) at a point of the window, or null.
   if (!reaches) findReaches();
-  const s = fit(), [px, py] = [x - canvas.clientWidth / 2 + s * here.w / 2, y - canvas.clientHeight / 2 + s * here.h / 2];
-  const across = [(px - s * here.cx) / (s * here.fx), (py - s * here.cy) / (s * here.fy)];
-  const ray = plus(plus(times(here.right, across[0]), here.down, across[1]), here.ahead); // of depth 1
-  const square = dot(ray, ray), means = new Float32Array(records.buffer), met = [];
-  const blur = (4 * facts.lowpass) / (s * Math.min(here.fx, here.fy)); // of the depth: no pixel is seen farther off
+  const s = fit(), [px, py] = [x - canvas.clientWidth / 2 + s * camera.w / 2, y - canvas.clientHeight / 2 + s * camera.h / 2];
+  const across = [(px - s * camera.cx) / (s * camera.fx), (py - s * camera.cy) / (s * camera.fy)];
+  const ray = plus(plus(times(camera.right, across[0]), camera.down, across[1]), camera.ahead); // depth 1
+  const square = dot(ray, ray), means = new Float32Array(records.buffer), hits = [];
+  const blur = (4 * facts.lowpass) / (s * Math.min(camera.fx, camera.fy)); // relative to the depth: a splat is at least this wide
   for (let i = 0; i < facts.splats; ++i) {
-    const rel = [means[8 * i] - here.eye[0], means[8 * i + 1] - here.eye[1], means[8 * i + 2] - here.eye[2]];
-    const z = dot(rel, here.ahead), along = dot(rel, ray);
+    const rel = [means[8 * i] - camera.eye[0], means[8 * i + 1] - camera.eye[1], means[8 * i + 2] - camera.eye[2]];
+    const z = dot(rel, camera.ahead), along = dot(rel, ray);
     if (z <= facts.near || dot(rel, rel) - (along * along) / square > (reaches[i] + blur * z) ** 2) continue;
-    if (inBox([means[8 * i], means[8 * i + 1], means[8 * i + 2]])) met.push({ i, z, rel });
+    if (isInCrop([means[8 * i], means[8 * i + 1], means[8 * i + 2]])) hits.push({ i, z, rel });
   }
-  met.sort((a, b) => a.z - b.z);
-  let light = 1;
-  for (const { i, z, rel } of met) {
-    const [depth, alpha] = meeting(splatAt(i), rel, z, ray, across, s);
-    light *= 1 - alpha;
-    if (light < SURE) return plus(here.eye, ray, depth);
+  hits.sort((a, b) => a.z - b.z);
+  let transmittance = 1;
+  for (const { i, z, rel } of hits) {
+    const [depth, alpha] = intersection(splatAt(i), rel, z, ray, across, s);
+    transmittance *= 1 - alpha;
+    if (transmittance < OPAQUE) return plus(camera.eye, ray, depth);
   }
   return null;
 }
 
-function meeting({ scales, opacity, tu, tv }, rel, z, ray, across, s) {
-  // Depth and alpha of a splat on a ray, as splat.frag has them. One that crosses the camera's plane is no surface.
-  const tilt = (scales[0] * dot(tu, here.ahead)) ** 2 + (scales[1] * dot(tv, here.ahead)) ** 2;
+function intersection({ scales, opacity, tu, tv }, rel, z, ray, across, s) {
+  // Depth and alpha of a splat on a ray, as in splat.frag. Splats that cross the camera's plane do not count.
+  const tilt = (scales[0] * dot(tu, camera.ahead)) ** 2 + (scales[1] * dot(tv, camera.ahead)) ** 2;
   if (facts.crossingCutoff ** 2 * tilt >= z * z) return [z, 0];
-  const n = cross(tu, tv), onPlane = dot(n, rel) / dot(n, ray), hit = plus(times(ray, onPlane), rel, -1);
-  const flat = onPlane > 0 ? (dot(hit, tu) / scales[0]) ** 2 + (dot(hit, tv) / scales[1]) ** 2 : Infinity;
-  const dx = s * here.fx * (across[0] - dot(rel, here.right) / z), dy = s * here.fy * (across[1] - dot(rel, here.down) / z);
+  const n = cross(tu, tv), onPlane = dot(n, rel) / dot(n, ray), offset = plus(times(ray, onPlane), rel, -1);
+  const flat = onPlane > 0 ? (dot(offset, tu) / scales[0]) ** 2 + (dot(offset, tv) / scales[1]) ** 2 : Infinity;
+  const dx = s * camera.fx * (across[0] - dot(rel, camera.right) / z), dy = s * camera.fy * (across[1] - dot(rel, camera.down) / z);
   const round = (dx * dx + dy * dy) / facts.lowpass ** 2, depth = flat <= round ? onPlane : z;
   const alpha = opacity * Math.exp(-0.5 * Math.min(flat, round));
   return [depth, depth < facts.near || alpha < facts.alphaMin ? 0 : Math.min(alpha, facts.alphaMax)];
 }
 
-// ---- what it is in the world ----
-function inWorld(way) {
-  // A way between two places in metres east, north and up, where the run knows its place.
+// ---- distances ----
+function inWorld(vector) {
+  // A vector of the scene in metres east, north and up; for georeferenced runs.
   const { metres, rotation } = facts.world;
-  return [0, 3, 6].map((row) => metres * dot(rotation.slice(row, row + 3), way));
+  return [0, 3, 6].map((row) => metres * dot(rotation.slice(row, row + 3), vector));
 }
 
-const plain = (x) => Number(x.toPrecision(4)).toString();
+const rounded = (x) => Number(x.toPrecision(4)).toString();
 
-function distanceTold(a, b) {
-  const way = plus(b, a, -1);
-  if (!facts.world) return { short: `${plain(Math.hypot(...way))} units`, long: "of the capture, whose size is not known" };
-  const [east, north, up] = inWorld(way), level = Math.hypot(east, north);
-  return { short: `${plain(Math.hypot(east, north, up))} m`, long: `level ${plain(level)} m, height ${up < 0 ? "−" : "+"}${plain(Math.abs(up))} m` };
+function distanceText(a, b) {
+  const vector = plus(b, a, -1);
+  if (!facts.world) return { short: `${rounded(norm(vector))} units`, long: "Units of the capture; the scale is unknown." };
+  const world = inWorld(vector), horizontal = Math.hypot(world[0], world[1]), sign = world[2] < 0 ? "−" : "+";
+  return { short: `${rounded(norm(world))} m`, long: `Horizontal ${rounded(horizontal)} m, height ${sign}${rounded(Math.abs(world[2]))} m` };
 }
 
-const placeTold = (p) => plus(p, facts.origin).map((x) => x.toFixed(digits + 1)).join(" ");
+const pointText = (p) => plus(p, facts.origin).map((x) => x.toFixed(digits + 1)).join(" ");
 
-function measuring(on = ruler.on) {
+function setMeasuring(on = ruler.on) {
   ruler.on = on;
   if (!on) ruler.ends = [];
-  $("measure").setAttribute("aria-pressed", on);
+  press("measure", on);
   $("measurepanel").hidden = !on;
   canvas.style.cursor = on ? "crosshair" : "";
-  const [a, b] = ruler.ends, whole = a && b;
-  $("distance").textContent = whole ? distanceTold(a, b).short : a ? "and now the other end" : "click one end";
-  $("aside").textContent = whole ? distanceTold(a, b).long : "";
-  $("known").hidden = !whole;
-  const metres = $("truly").valueAsNumber;
-  $("knowncommand").value = whole && metres > 0 ? `gs2d georeference RUN --known-distance ${placeTold(a)} ${placeTold(b)} ${metres}` : "";
+  const [a, b] = ruler.ends, isComplete = a && b;
+  $("distance").textContent = isComplete ? distanceText(a, b).short : a ? "Click the other end." : "Click one end of a distance.";
+  $("aside").textContent = isComplete ? distanceText(a, b).long : "";
+  $("scalepanel").hidden = !isComplete;
+  const metres = $("metres").valueAsNumber;
+  $("scalecommand").value = isComplete && metres > 0 ? `gs2d georeference RUN --known-distance ${pointText(a)} ${pointText(b)} ${metres}` : "";
   drawRuler();
 }
 
 function measureAt(x, y) {
-  const place = surfaceAt(x, y);
+  const point = surfaceAt(x, y);
   if (ruler.ends.length === 2) ruler.ends = [];
-  if (place) ruler.ends.push(place);
-  measuring();
-  if (!place) $("aside").textContent = "nothing solid there";
+  if (point) ruler.ends.push(point);
+  setMeasuring();
+  if (!point) $("aside").textContent = "There is no surface at this point.";
 }
 
 function drawRuler() {
-  const line = $("ruler"), marks = line.querySelectorAll("circle"), cut = ruler.ends.length === 2 && cutAtNear(...ruler.ends);
-  line.style.display = ruler.on ? "" : "none";
-  if (!ruler.on || !here) return;
-  marks.forEach((mark, i) => {
+  $("ruler").style.display = ruler.on ? "" : "none";
+  if (!ruler.on) return;
+  $("ruler").querySelectorAll("circle").forEach((marker, i) => {
     const p = ruler.ends[i] && onScreen(ruler.ends[i]);
-    mark.style.display = p && p.z > facts.near ? "" : "none";
-    if (p) { mark.setAttribute("cx", p.x.toFixed(1)); mark.setAttribute("cy", p.y.toFixed(1)); }
+    marker.style.display = p && p.z > facts.near ? "" : "none";
+    if (!p) return;
+    marker.setAttribute("cx", p.x.toFixed(1));
+    marker.setAttribute("cy", p.y.toFixed(1));
   });
-  const ends = cut ? cut.map(onScreen) : [];
-  line.querySelector("path").setAttribute("d", cut ? "M" + ends.map((p) => `${p.x.toFixed(1)} ${p.y.toFixed(1)}`).join("L") : "");
-  const label = line.querySelector("text");
-  label.textContent = cut ? distanceTold(...ruler.ends).short : "";
-  if (cut) { label.setAttribute("x", ((ends[0].x + ends[1].x) / 2).toFixed(1)); label.setAttribute("y", ((ends[0].y + ends[1].y) / 2 - 8).toFixed(1)); }
+  const line = ruler.ends.length === 2 && clipped(...ruler.ends), ends = line ? line.map(onScreen) : [];
+  $("ruler").querySelector("path").setAttribute("d", line ? `M${ends.map(pathPoint).join("L")}` : "");
+  const label = $("ruler").querySelector("text");
+  label.textContent = line ? distanceText(...ruler.ends).short : "";
+  if (!line) return;
+  label.setAttribute("x", ((ends[0].x + ends[1].x) / 2).toFixed(1));
+  label.setAttribute("y", ((ends[0].y + ends[1].y) / 2 - 8).toFixed(1));
 }
 
-function listenForTaps() {
-  let from = null;
-  canvas.addEventListener("pointerdown", (e) => { from = e.isPrimary ? [e.clientX, e.clientY] : null; });
+function listenToTaps() {
+  let start = null;
+  canvas.addEventListener("pointerdown", (e) => { start = e.isPrimary ? [e.clientX, e.clientY] : null; });
   canvas.addEventListener("pointerup", (e) => {
-    const near = from && Math.hypot(e.clientX - from[0], e.clientY - from[1]) < TAP;
-    if (ruler.on && near && e.button === 0) measureAt(e.clientX, e.clientY);
+    const isTap = start && Math.hypot(e.clientX - start[0], e.clientY - start[1]) < TAP;
+    if (ruler.on && isTap && e.button === 0) measureAt(e.clientX, e.clientY);
   });
-  $("measure").onclick = () => measuring(!ruler.on);
-  $("truly").oninput = () => measuring();
-  $("copyknown").onclick = () => copied("knowncommand", "copiedknown");
-  measuring(false);
+  $("measure").onclick = () => setMeasuring(!ruler.on);
+  $("metres").oninput = () => setMeasuring();
+  $("copyscale").onclick = () => copy("scalecommand", "copiedscale");
+  setMeasuring(false);
 }

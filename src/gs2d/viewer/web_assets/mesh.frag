@@ -1,16 +1,19 @@
 #version 300 es
-// Unlit: the light of the images is in the colours.
+// Colours of the mesh without shading, or grey with the shape only.
 precision highp float;
+precision highp int;
 
-in vec3 at, painted;
-uniform vec3 boxLow, boxHigh;
-uniform sampler2D atlas;
-uniform bool textured;
+in vec3 position, positionCam, painted;
+uniform vec3 cropLow, cropHigh;
+uniform float cropped;
+uniform int paint;  // 0 none, 1 vertex colours, 2 texture
+uniform int kind;   // 0 colours, otherwise shape only
+uniform sampler2D image;
 out vec4 color;
 
 void main() {
-    if (any(lessThan(at, boxLow)) || any(greaterThan(at, boxHigh))) discard;
-    vec3 curved = 1.055 * pow(painted, vec3(1.0 / 2.4)) - 0.055;  // sRGB
-    vec3 srgb = mix(curved, 12.92 * painted, lessThan(painted, vec3(0.0031308)));
-    color = vec4(textured ? texture(atlas, painted.xy).rgb : srgb, 1.0);
+    if (cropped > 0.5 && (any(lessThan(position, cropLow)) || any(greaterThan(position, cropHigh)))) discard;
+    float facing = abs(dot(normalize(cross(dFdx(positionCam), dFdy(positionCam))), normalize(positionCam)));
+    vec3 shape = vec3(0.84, 0.84, 0.87) * (0.25 + 0.75 * facing);
+    color = vec4(paint == 0 || kind != 0 ? shape : paint == 1 ? painted : texture(image, painted.xy).rgb, 1.0);
 }

@@ -1,5 +1,5 @@
 #version 300 es
-// One pair of splat and pixel: rules 3 to 6 of the rasterizer's contract, premultiplied.
+// One splat in one pixel: rules 3 to 6 of the rasterizer's contract, premultiplied.
 precision highp float;
 precision highp int;
 
@@ -7,8 +7,8 @@ flat in vec2 center;
 flat in vec4 planes;
 flat in vec3 inverseDepth;
 flat in vec4 paint;
-uniform vec2 range;                // depths whose colours are the ends of the scale
-uniform int kind;                  // 2: the depth, not a colour
+uniform vec2 range;                // depths at the ends of the colour scale
+uniform int kind;                  // 2: depth instead of colour
 uniform float height, near, alphaMin, alphaMax, lowpass;
 out vec4 blended;
 
@@ -24,6 +24,6 @@ void main() {
     float alpha = paint.a * exp(-0.5 * rho);
     if (depth < near || alpha < alphaMin) discard;
     alpha = min(alpha, alphaMax);
-    vec3 shown = kind == 2 ? vec3((depth - range.x) / (range.y - range.x)) : paint.rgb;
-    blended = vec4(alpha * shown, alpha);
+    vec3 value = kind == 2 ? vec3((depth - range.x) / (range.y - range.x)) : paint.rgb;
+    blended = vec4(alpha * value, alpha);
 }

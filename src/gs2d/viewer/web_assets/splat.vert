@@ -6,14 +6,17 @@ precision highp usampler2D;
 
 layout(location = 0) in uint row;  // of the splat; instanced
 uniform usampler2D splats, harmonics;
-uniform mat3 turn;                 // world to camera
-uniform vec3 shift, eye;           // x_cam = turn x + shift; the camera's centre
-uniform vec4 lens;                 // fx, fy, cx, cy, px
-uniform vec2 size;                 // of the picture, px
+uniform mat3 R;                    // world to camera
+uniform vec3 t, eye;               // x_cam = R x + t; the camera centre
+uniform vec4 intrinsics;           // fx, fy, cx, cy, px
+uniform vec2 size;                 // of the image, px
 uniform float near, alphaMin, lowpass, crossingCutoff;
-uniform int degree, stored, near_plane_policy, kind;  // near_plane_policy: 0 draw, 1 cull, 2 box; kind: 0 colour, 1 normals, 2 depth
-uniform vec3 boxLow, boxHigh;      // only splats whose means lie between are drawn
-uniform float scales[15];          // of the 8-bit coefficients, by place
+uniform int degree, texels;        // SH degree; texels of SH coefficients per splat
+uniform int nearPlanePolicy;       // 0 draw, 1 cull, 2 box
+uniform int kind;                  // 0 colours, 1 normals, 2 depth
+uniform vec3 cropLow, cropHigh;
+uniform float cropped;             // 0 draws everything; 1 hides splats outside the crop box and spikes
+uniform float scales[15];          // of the 8-bit SH coefficients
 
 flat out vec2 center;
 flat out vec4 planes;              // au, bu, av, bv
@@ -22,6 +25,7 @@ flat out vec4 paint;               // colour or normal, opacity
 
 const int WIDTH = 2048;
 const vec4 NOWHERE = vec4(2.0, 2.0, 2.0, 1.0);
+const vec2 LARGE = vec2(0.7, 1.2);  // half widths, relative to the shorter side of the image, at which splats fade
 
 uvec4 texel(usampler2D from, int i) { return texelFetch(from, ivec2(i % WIDTH, i / WIDTH), 0); }
 
@@ -29,7 +33,7 @@ vec3 coefficient(int k) {  // SH coefficient k >= 1
     vec3 c;
     for (int channel = 0; channel < 3; ++channel) {
         int at = 3 * (k - 1) + channel;
-        uvec4 words = texel(harmonics, int(row) * stored + at / 16);
+        uvec4 words = texel(harmonics, int(row) * texels + at / 16);
         int byte = int(words[(at / 4) % 4] << uint(24 - 8 * (at % 4))) >> 24;
         c[channel] = float(byte) / 127.0;
     }
@@ -54,7 +58,7 @@ vec3 colorAlong(vec3 d, vec3 sh0) {  // kernels/core/sh.h
     return max(c, 0.0);
 }
 
-// Middle and half side of what a disc of k standard deviations covers along one axis of the screen, from its centre.
+// Centre (relative to the projected mean) and half width of a disc of k standard deviations along one image axis.
 vec2 extent(float f, float c0, float c, vec2 across, vec2 depths, float kk, float ww) {
     vec2 A = f * across + (c0 - c) * depths;
     float middle = kk * dot(A, depths) / ww;
@@ -65,31 +69,35 @@ void main() {
     gl_Position = NOWHERE;
     uvec4 first = texel(splats, 2 * int(row)), second = texel(splats, 2 * int(row) + 1);
     vec3 mean = uintBitsToFloat(first.xyz);
-    if (any(lessThan(mean, boxLow)) || any(greaterThan(mean, boxHigh))) return;
+    vec2 redGreen = unpackHalf2x16(second.z), blueOpacity = unpackHalf2x16(second.w);
+    bool isSpike = blueOpacity.y < 0.0;  // the mark of viewer/packed_splats.py
+    bool isOutside = isSpike || any(lessThan(mean, cropLow)) || any(greaterThan(mean, cropHigh));
+    if (isOutside && cropped == 1.0) return;
     vec2 s = exp(unpackHalf2x16(first.w));
     vec4 q = normalize(vec4(unpackSnorm2x16(second.x), unpackSnorm2x16(second.y)));  // w, x, y, z
-    vec2 redGreen = unpackHalf2x16(second.z), blueOpacity = unpackHalf2x16(second.w);
-    float opacity = blueOpacity.y;
-    vec3 p = turn * mean + shift;
+    float opacity = abs(blueOpacity.y);
+    vec3 p = R * mean + t;
     if (!(p.z > near) || !(opacity >= alphaMin)) return;
 
     float w = q.x, x = q.y, y = q.z, z = q.w;
-    vec3 tu = turn * vec3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y));
-    vec3 tv = turn * vec3(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x));
+    vec3 tu = R * vec3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y));
+    vec3 tv = R * vec3(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x));
     vec3 n = cross(tu, tv), a = s.x * tu, b = s.y * tv;
-    center = lens.xy * p.xy / p.z + lens.zw;
+    center = intrinsics.xy * p.xy / p.z + intrinsics.zw;
 
     float kk = 2.0 * log(opacity / alphaMin), k = sqrt(kk);
     vec2 depths = vec2(a.z, b.z);
     float steep = dot(depths, depths);
     bool crosses = crossingCutoff * crossingCutoff * steep >= p.z * p.z;
+    float hidden = isOutside || crosses || kk * steep >= p.z * p.z ? 1.0 : 0.0;
     vec2 low = vec2(0.0), high = size;
-    if (crosses && near_plane_policy == 1) return;
-    if (crosses && near_plane_policy == 2) kk = crossingCutoff * crossingCutoff;
-    if (kk * steep < p.z * p.z || (crosses && near_plane_policy == 2)) {
+    if (crosses && nearPlanePolicy == 1) return;
+    if (crosses && nearPlanePolicy == 2) kk = crossingCutoff * crossingCutoff;
+    if (kk * steep < p.z * p.z || (crosses && nearPlanePolicy == 2)) {
         float ww = kk * steep - p.z * p.z;
-        vec2 h = extent(lens.x, lens.z, center.x, vec2(a.x, b.x), depths, kk, ww);
-        vec2 v = extent(lens.y, lens.w, center.y, vec2(a.y, b.y), depths, kk, ww);
+        vec2 h = extent(intrinsics.x, intrinsics.z, center.x, vec2(a.x, b.x), depths, kk, ww);
+        vec2 v = extent(intrinsics.y, intrinsics.w, center.y, vec2(a.y, b.y), depths, kk, ww);
+        hidden = max(hidden, smoothstep(LARGE.x, LARGE.y, max(h.y, v.y) / min(size.x, size.y)));
         if (crosses) {  // the official rasterizer's square, in whole tiles
             vec2 middle = center + vec2(h.x, v.x);
             float side = ceil(max(max(h.y, v.y), lowpass * crossingCutoff));
@@ -100,18 +108,19 @@ void main() {
             high = min(high, center + max(vec2(h.x + h.y, v.x + v.y), lowpass * k));
         }
     }
-    if (any(greaterThanEqual(low, high))) return;
+    opacity *= 1.0 - cropped * hidden;
+    if (any(greaterThanEqual(low, high)) || opacity < alphaMin) return;
 
     float facing = dot(n, p), least = 1e-7 * length(p);
     float inverse = 1.0 / (abs(facing) >= least ? facing : facing < 0.0 ? -least : least);
-    vec2 f = 1.0 / lens.xy;
+    vec2 f = 1.0 / intrinsics.xy;
     planes = inverse * vec4(f * cross(tv, p).xy / s.x, f * cross(p, tu).xy / s.y);
     inverseDepth = vec3(f * inverse * n.xy, 1.0 / p.z);
 
     vec3 toSplat = mean - eye;
     if (kind == 1) {
-        vec3 seen = (facing > 0.0 ? -n : n) * turn;  // n turn = turn^T n: back to the world
-        paint = vec4(0.5 + 0.5 * seen, opacity);
+        vec3 normal = (facing > 0.0 ? -n : n) * R;  // n R = R^T n: back to the world
+        paint = vec4(0.5 + 0.5 * normal, opacity);
     } else if (kind == 0) {
         paint = vec4(colorAlong(normalize(toSplat), vec3(redGreen, blueOpacity.x)), opacity);
     } else {

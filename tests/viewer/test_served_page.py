@@ -1,4 +1,4 @@
-"""The served page in a browser: splats that change, stages, mesh, cameras and images; other sites get nothing."""
+"""The served page in a browser: stages, mesh, photographs, live training; other sites get nothing."""
 
 from __future__ import annotations
 
@@ -17,24 +17,25 @@ from PIL import Image
 
 from browser import Page, browser, require_browser
 from gs2d.core.camera import look_at
-from gs2d.core.mesh import Mesh, TexturedMesh
+from gs2d.core.mesh import Mesh
 from gs2d.core.sh import rgb_to_sh0
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
-from gs2d.io.meshes import glb_bytes
+from gs2d.meshing.web_mesh import web_mesh
 from gs2d.render.types import RasterSettings
-from gs2d.viewer.server import Answer, PageServer
-from gs2d.viewer.web import PageScene, Seen, Served, pack, served_page, splats_answer
+from gs2d.viewer.packed_splats import pack_splats
+from gs2d.viewer.page_server import Answer, PageServer
+from gs2d.viewer.scene_page import PageOffer, PageScene, PageView, served_page, splats_answer
 
 ORIGIN, UP = np.array([10.0, -20.0, 5.0]), np.array([0.0, 0.0, 1.0])
 SETTINGS = RasterSettings(near=0.05, background=(1.0, 1.0, 1.0), sh_degree=0)
 COLORS = {"red": (0.9, 0.1, 0.1), "green": (0.1, 0.9, 0.1), "blue": (0.1, 0.1, 0.9)}
 
 
-def seen_from(degrees: float) -> Seen:
+def seen_from(degrees: float) -> PageView:
     angle = np.radians(degrees)
     eye = ORIGIN + np.array([4 * np.cos(angle), 4 * np.sin(angle), 0.5])
-    return Seen(f"{degrees:g}.jpg", look_at(eye, ORIGIN, UP, width=240, height=160, fx=200.0))
+    return PageView(f"{degrees:g}.jpg", look_at(eye, ORIGIN, UP, width=240, height=160, fx=200.0))
 
 
 SCENE = PageScene("a disc", [seen_from(0), seen_from(10)], SETTINGS, ORIGIN, 4.0, UP)
@@ -44,36 +45,32 @@ def disc(color: str) -> Splats:
     """A large opaque disc across x in the middle of the scene."""
     sh0 = rgb_to_sh0(torch.tensor([COLORS[color]]))
     turn = torch.tensor([[np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]])
-    return Splats(torch.tensor(ORIGIN)[None], turn, torch.zeros(1, 2), torch.full((1,), 6.0), sh0,
+    return Splats(torch.tensor(ORIGIN)[None], turn, torch.full((1, 2), -1.0), torch.full((1,), 6.0), sh0,
                   torch.zeros(1, 0, 3))  # fmt: skip
 
 
-def square(*, textured: bool) -> bytes:
-    """A green square across x, with a texture or with colours."""
+def square() -> bytes:
+    """Return a green square across x."""
     corners = ORIGIN + np.array([[0.0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1]])
-    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     green = np.tile(np.array([26, 230, 26], np.uint8), (4, 1))
-    if not textured:
-        return glb_bytes(Mesh(corners.astype(np.float32), faces, green))
-    uv = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
-    return glb_bytes(TexturedMesh(corners, corners * 0 + [1, 0, 0], faces, uv, np.tile(green[0], (8, 8, 1))))
+    return web_mesh(Mesh(corners.astype(np.float32), np.array([[0, 1, 2], [0, 2, 3]], np.int32), green))
 
 
 class Training:
-    """What the server tells, as a training changes it."""
+    """A server whose answers change as a training goes on."""
 
-    def __init__(self, *, is_live: bool = False, textured: bool = False) -> None:
+    def __init__(self, *, is_live: bool = False) -> None:
         self.version, self.status = 0, "training begins"
         stages = () if is_live else ("red", "broken", "blue")
-        page = served_page(SCENE, Served(stages, has_mesh=not is_live, has_images=True, is_live=is_live))
+        page = served_page(SCENE, PageOffer(() if is_live else ("mesh",), True, stages=stages, live=is_live))
         self.server = PageServer(
             None,
             {
                 "": lambda _: Answer("text/html; charset=utf-8", [page]),
                 "state": lambda _: Answer("application/json", [json.dumps(self.state).encode()]),
                 "splats": self.splats,
-                "mesh": lambda _: Answer("model/gltf-binary", [square(textured=textured)]),
-                "image": self.image,
+                "mesh": lambda _: Answer("application/octet-stream", [square()]),
+                "photograph": self.photograph,
             },
         )
 
@@ -85,9 +82,9 @@ class Training:
         stage = arguments.get("stage") or ["", "red", "blue"][self.version]
         if stage not in COLORS:
             raise DataError(f"{stage} cannot be read")
-        return splats_answer(pack(disc(stage), ORIGIN, 0, SETTINGS.alpha_min))
+        return splats_answer(pack_splats(disc(stage), ORIGIN, 0, SETTINGS.alpha_min))
 
-    def image(self, arguments: Mapping[str, str]) -> Answer:
+    def photograph(self, arguments: Mapping[str, str]) -> Answer:
         file = io.BytesIO()
         Image.new("RGB", (8 * (1 + int(arguments["view"])), 8)).save(file, "JPEG")
         return Answer("image/jpeg", [file.getvalue()])
@@ -117,9 +114,8 @@ def _browser() -> None:
     require_browser()
 
 
-@pytest.mark.parametrize("textured", [False, True])
-def test_stages_and_the_mesh_are_fetched_when_they_are_chosen(textured: bool) -> None:
-    with opened(Training(textured=textured)) as tab:
+def test_stages_the_mesh_and_photographs_are_requested_when_they_are_chosen() -> None:
+    with opened(Training()) as tab:
         tab.until("facts.splats === 1")
         assert middle(tab) == "blue"  # the last stage
         choose = "(name) => { $('stage').value = name; $('stage').onchange(); }"
@@ -130,30 +126,11 @@ def test_stages_and_the_mesh_are_fetched_when_they_are_chosen(textured: bool) ->
         tab.ask(f"({choose})('red')")
         tab.until("$('status').hidden")
         assert middle(tab) == "red"
-        tab.click("[data-kind='3']")
-        tab.until("mesh")
+        tab.click("[data-show=mesh]")
+        tab.until("meshes.mesh")
         assert middle(tab) == "green"
-        tab.key("b")
-        tab.ask("setFace('high', 0, -0.1)")  # the square is in front of the box
-        assert middle(tab) == "white"
-        tab.key("c")
-        tab.key("b")
-        assert middle(tab) == "red"
-        assert tab.errors == []
-
-
-def test_cameras_and_images_are_shown_and_a_click_goes_to_a_camera() -> None:
-    with opened(Training()) as tab:
-        tab.until("facts.splats === 1")
-        tab.click("#showcameras")
-        tab.click("#photo")
-        tab.until("$('photograph').naturalWidth === 8 * (1 + shown)")
-        tab.ask("goTo(0); zoom(1.5)")
-        tab.until("document.body.dataset.drawn === 'still'")
-        assert tab.ask("$('cameras').querySelector('path').getAttribute('d').length") > 50
-        tab.click("#cameras circle:last-child")
-        assert tab.ask("shown") == 1
-        tab.until("$('photograph').naturalWidth === 16")
+        tab.ask("goTo(1)")
+        tab.until("$('photograph').querySelector('img').naturalWidth === 16")
         assert tab.errors == []
 
 
@@ -175,7 +152,7 @@ def test_a_page_of_a_training_shows_new_splats_until_it_is_held_and_says_when_no
         assert middle(tab) == "blue"
         assert tab.errors == []
         training.server.close()
-        tab.until("$('status').textContent.startsWith('gs2d no longer answers')")
+        tab.until("$('status').textContent.startsWith('gs2d does not answer')")
 
 
 def test_without_the_token_there_is_nothing() -> None:

@@ -1,4 +1,4 @@
-"""The page that draws splats in a browser: what it stores, what it is made of, its pictures where there is Chromium."""
+"""The data and the parts of the page that shows splats."""
 
 from __future__ import annotations
 
@@ -21,17 +21,8 @@ from gs2d.core.camera import Camera, look_at
 from gs2d.core.splats import Splats
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
-from gs2d.viewer.web import (
-    Packed,
-    PageScene,
-    Seen,
-    Served,
-    pack,
-    served_page,
-    splats_answer,
-    texels_of,
-    write_page,
-)
+from gs2d.viewer.packed_splats import PackedSplats, pack_splats, sh_texels
+from gs2d.viewer.scene_page import SHADERS, PageOffer, PageScene, PageView, served_page, splats_answer, write_page
 
 ORIGIN = np.array([1000.0, -2000.0, 500.0])  # far away: float32 keeps a tenth of a millimetre there
 CAMERA = look_at(ORIGIN + np.array([0.3, -4.0, 0.8]), ORIGIN, np.array([0.0, 0.0, 1.0]), width=120, height=80, fx=100.0)
@@ -79,7 +70,7 @@ def unpacked(data: bytes, count: int, degree: int, scales: list[float]) -> Splat
     )
 
 
-def data_of(packed: Packed) -> bytes:
+def data_of(packed: PackedSplats) -> bytes:
     """What the page is given, in one piece."""
     return b"".join(packed.data)
 
@@ -97,8 +88,8 @@ def at_origin(camera: Camera) -> Camera:
 @pytest.mark.parametrize(("degree", "least"), [(3, 50.0), (1, 50.0), (0, 50.0)])
 def test_what_is_stored_renders_as_the_splats_do(degree: int, least: float) -> None:
     splats, settings = some_splats(), replace(SETTINGS, sh_degree=degree)
-    packed = pack(splats, ORIGIN, degree, settings.alpha_min)
-    assert (packed.degree, packed.stored) == (degree, texels_of(degree))
+    packed = pack_splats(splats, ORIGIN, degree, settings.alpha_min)
+    assert (packed.degree, packed.facts["texels"]) == (degree, sh_texels(degree))
     stored = unpacked(data_of(packed), packed.count, degree, packed.scales)
     with torch.no_grad():
         before = rasterize(splats, CAMERA, settings, backend="reference")
@@ -135,7 +126,7 @@ class Scripts(HTMLParser):
 
 SCENE = PageScene(
     title="a <b> & {{facts}} {{splats}}",
-    views=[Seen("</script>.png", CAMERA), Seen("2.png", CAMERA)],
+    views=[PageView("</script>.png", CAMERA), PageView("2.png", CAMERA)],
     settings=SETTINGS,
     focus=ORIGIN,
     unit=4.0,
@@ -143,14 +134,17 @@ SCENE = PageScene(
 )
 
 
-def page_of(path: Path, settings: RasterSettings = SETTINGS) -> Scripts:
-    write_page(path, some_splats(), replace(SCENE, settings=settings))
+MESH, PHOTOGRAPHS = b"a mesh", [b"a photograph", b"another one"]
+
+
+def page_of(path: Path) -> Scripts:
+    write_page(path, some_splats(), SCENE, meshes={"mesh": MESH}, photographs=PHOTOGRAPHS)
     page = Scripts()
     page.feed(path.read_text())
     return page
 
 
-def test_the_page_is_one_file_that_loads_nothing_and_holds_what_it_is_told(tmp_path: Path) -> None:
+def test_the_page_is_one_file_with_all_data_and_loads_nothing(tmp_path: Path) -> None:
     path = tmp_path / "scene.html"
     page = page_of(path)
     text = path.read_text()
@@ -158,76 +152,75 @@ def test_the_page_is_one_file_that_loads_nothing_and_holds_what_it_is_told(tmp_p
     assert page.title == SCENE.title
     assert not re.search(r"https?://", text)
     assert "default-src 'none'" in text
-    assert set(page.texts) == {
-        "facts",
-        "splat-vert",
-        "splat-frag",
-        "final-vert",
-        "final-frag",
-        "sorter",
-        "splats",
-        "main",
-    }
+    assert "connect-src" not in text
+    assert set(page.texts) == {"facts", *SHADERS, "sorter", "mesh", "photographs", "splats", "main"}
     facts = json.loads(page.texts["facts"])
     assert facts["origin"] == ORIGIN.tolist()
     assert [camera["name"] for camera in facts["cameras"]] == ["</script>.png", "2.png"]
     assert np.allclose(facts["cameras"][0]["t"], at_origin(CAMERA).T_cam_world[:3, 3])
-    packed = pack(some_splats(), ORIGIN, 3, SETTINGS.alpha_min)
+    packed = pack_splats(some_splats(), ORIGIN, 3, SETTINGS.alpha_min)
     assert gzip.decompress(base64.b64decode(page.texts["splats"])) == data_of(packed)
-    assert (facts["splats"], facts["stored"], facts["background"]) == (packed.count, 3, [0.2, 0.5, 0.9])
-    names = set(re.findall(r"uniform \w+ ([\w, ]+);", page.texts["splat-vert"].replace("[15]", "")))
-    told = {name.strip() for line in names for name in line.split(",")}
-    for name in told - {"splats"}:
-        assert name in page.texts["main"], f"nobody sets the shader's {name}"
+    assert (facts["splats"], facts["texels"], facts["background"]) == (packed.count, 3, [0.2, 0.5, 0.9])
+    assert facts["offer"] == {"meshes": ["mesh"], "photographs": True, "served": False, "stages": [], "live": False}
+    assert gzip.decompress(base64.b64decode(page.texts["mesh"])) == MESH
+    assert [base64.b64decode(line) for line in page.texts["photographs"].split()] == PHOTOGRAPHS
+    for shader in SHADERS:
+        for line in re.findall(r"uniform \w+ ([\w, ]+)", page.texts[shader]):
+            for name in line.replace(" ", "").split(","):
+                assert name in page.texts["main"], f"{shader}: the uniform {name} is not set"
     again = tmp_path / "again.html"
     page_of(again)
     assert again.read_bytes() == path.read_bytes()
 
 
+def test_the_most_important_splats_come_first() -> None:
+    splats = some_splats()
+    packed = pack_splats(splats, ORIGIN, 0, SETTINGS.alpha_min)
+    stored = unpacked(data_of(packed), packed.count, 0, packed.scales)
+    importance = stored.opacity_logits.sigmoid().log() + stored.log_scales.sum(dim=1)
+    assert (importance.diff() < 0.02).all()
+
+
 def served() -> Scripts:
     """A page as a server offers it."""
     page = Scripts()
-    page.feed(served_page(SCENE, Served(["surface", "final"], has_mesh=True, has_images=True)).decode())
+    page.feed(served_page(SCENE, PageOffer(("mesh", "textured"), True, stages=("surface", "final"))).decode())
     return page
 
 
-def test_a_served_page_has_no_splats_and_asks_its_own_server_only(tmp_path: Path) -> None:
+def test_a_served_page_has_no_data_and_connects_to_its_own_server_only(tmp_path: Path) -> None:
     page, alone = served(), page_of(tmp_path / "scene.html")
     assert page.loads == ["data:,"]
-    assert page.texts["splats"].strip() == ""
-    assert set(page.texts) == {*alone.texts, "mesh-vert", "mesh-frag"}
-    facts, of_file = json.loads(page.texts["facts"]), json.loads(alone.texts["facts"])
-    assert facts["served"] == {"stages": ["surface", "final"], "has_mesh": True, "has_images": True, "is_live": False}
-    assert of_file["served"] is None
-    packed = pack(some_splats(), ORIGIN, 3, SETTINGS.alpha_min)
+    assert set(page.texts) == set(alone.texts) - {"mesh", "photographs", "splats"}
+    packed = pack_splats(some_splats(), ORIGIN, 3, SETTINGS.alpha_min)
     answer = splats_answer(packed)
     assert b"".join(answer.parts) == data_of(packed)
-    assert {**facts, **json.loads(answer.headers["X-Splats"]), "served": None} == of_file
-    text = served_page(SCENE, Served()).decode()
+    facts = {**json.loads(page.texts["facts"]), **json.loads(answer.headers["X-Splats"]), "offer": None}
+    assert facts == {**json.loads(alone.texts["facts"]), "offer": None}
+    text = served_page(SCENE, PageOffer()).decode()
     assert "default-src 'none'" in text
     assert "connect-src 'self'; img-src 'self' data:" in text
     assert not re.search(r"https?://", text)
-    assert "connect-src" not in (tmp_path / "scene.html").read_text()
 
 
 @node
 def test_the_scripts_are_javascript_and_the_sorter_sorts_exactly(tmp_path: Path) -> None:
     page = page_of(tmp_path / "scene.html")
-    for name, text in (("alone.js", page.texts["main"]), ("served.js", served().texts["main"])):
-        (tmp_path / name).write_text(text)
-        subprocess.run(["node", "--check", str(tmp_path / name)], check=True)
+    (tmp_path / "page.js").write_text(page.texts["main"])
+    subprocess.run(["node", "--check", str(tmp_path / "page.js")], check=True)
     rng = np.random.default_rng(0)
     means = rng.normal(size=(500, 3)).astype(np.float32)
     means[100:200] = means[:100]  # equal depths: later rows are drawn first, because rule 2 has them behind
-    ahead = np.array([0.6, 0.0, 0.8, 1.5], np.float32)
-    given = json.dumps({"means": means.flatten().tolist(), "ahead": ahead.astype(float).tolist()})
+    plane = np.array([0.6, 0.0, 0.8, 1.5], np.float32)
+    values = json.dumps({"means": means.flatten().tolist(), "plane": plane.astype(float).tolist()})
     (tmp_path / "sorter.js").write_text(
         page.texts["sorter"].replace('"use strict";', "")
-        + f";const given = {given}; globalThis.postMessage = (m) => console.log(JSON.stringify([...m.order]));"
-        "onmessage({data: {means: Float32Array.from(given.means)}});"
-        "onmessage({data: {ahead: given.ahead, near: 0.2}});"
+        + f";const values = {values}; globalThis.postMessage = (m) => console.log(JSON.stringify([...m.order]));"
+        "onmessage({data: {means: Float32Array.from(values.means)}});"
+        "for (const limit of [500, 150]) onmessage({data: {plane: values.plane, near: 0.2, limit}});"
     )
     done = subprocess.run(["node", str(tmp_path / "sorter.js")], capture_output=True, text=True, check=True)
-    depth = (means.astype(float) @ ahead[:3].astype(float) + float(ahead[3])).astype(np.float32)
-    front = np.flatnonzero(depth > 0.2)
-    assert json.loads(done.stdout) == front[np.argsort(depth[front], kind="stable")][::-1].tolist()
+    depth = (means.astype(float) @ plane[:3].astype(float) + float(plane[3])).astype(np.float32)
+    for limit, line in zip((500, 150), done.stdout.splitlines(), strict=True):
+        front = np.flatnonzero(depth[:limit] > 0.2)
+        assert json.loads(line) == front[np.argsort(depth[front], kind="stable")][::-1].tolist()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gs2d.errors import BackendError, DataError
-from gs2d.viewer.server import HOST, Answer, PageServer, free_port
+from gs2d.viewer.page_server import HOST, Answer, PageServer, free_port
 
 
 def page(_: Mapping[str, str]) -> Answer:
@@ -103,8 +103,8 @@ def test_broken_requests_leave_the_server_alive_and_the_terminal_clean(
 def test_idle_connections_are_limited_and_end_in_time(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("gs2d.viewer.server._MAX_CONNECTIONS", 2)
-    monkeypatch.setattr("gs2d.viewer.server._Handler.timeout", 0.5)
+    monkeypatch.setattr("gs2d.viewer.page_server._MAX_CONNECTIONS", 2)
+    monkeypatch.setattr("gs2d.viewer.page_server._Handler.timeout", 0.5)
     server = PageServer(None, {"": page})
     idle = [socket.create_connection((HOST, server.port)) for _ in range(2)]
     time.sleep(0.2)

@@ -1,7 +1,8 @@
-"""The page of splats in a browser: where it opens, how it is turned, how far it goes, its clip box, its help."""
+"""The page in a browser: opening view, limits of the camera, crop, meshes, photographs, touch and keys."""
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,14 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from browser import Page, browser, require_browser
 from gs2d.core.camera import look_at
+from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.core.splats import Splats
 from gs2d.data.subject import Subject
+from gs2d.meshing.web_mesh import web_mesh
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
-from gs2d.viewer.web import PageScene, Seen, write_page
+from gs2d.viewer.scene_page import PageScene, PageView, write_page
 
 ORIGIN = np.array([100.0, -200.0, 50.0])
 UP = np.array([0.0, 0.0, 1.0])
@@ -25,11 +29,11 @@ SETTINGS = RasterSettings(near=0.05, background=(0.2, 0.5, 0.9), sh_degree=0)
 WIDTH, HEIGHT = 240, 160
 
 
-def seen_from(degrees: float, *, height: float = 1.0, away: float = 4.0) -> Seen:
+def seen_from(degrees: float, *, height: float = 1.0, away: float = 4.0) -> PageView:
     angle = np.radians(degrees)
     eye = ORIGIN + np.array([away * np.cos(angle), away * np.sin(angle), height])
     camera = look_at(eye, ORIGIN, UP, width=WIDTH, height=HEIGHT, fx=200.0)
-    return Seen(f"{degrees:g}.jpg", camera)
+    return PageView(f"{degrees:g}.jpg", camera)
 
 
 ONE_SIDE = [seen_from(degrees) for degrees in (-40, -20, 0, 20, 40)]
@@ -45,8 +49,26 @@ def two_balls() -> Splats:
                   torch.zeros(2, 0, 3).double())  # fmt: skip
 
 
-def write(path: Path, views: list[Seen] = ONE_SIDE) -> Path:
-    write_page(path, two_balls(), PageScene("two balls", views, SETTINGS, ORIGIN, 4.0, UP, SUBJECT))
+def square(*, textured: bool) -> Mesh | TexturedMesh:
+    """Return a square across x, red with vertex colours or green with a texture."""
+    corners = (ORIGIN + 0.5 * np.array([[0.0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1]])).astype(np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    if not textured:
+        return Mesh(corners, faces, np.tile(np.array([230, 26, 26], np.uint8), (4, 1)))
+    uv = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+    texture = np.tile(np.array([26, 230, 26], np.uint8), (8, 8, 1))
+    return TexturedMesh(corners, np.tile(np.float32([1, 0, 0]), (4, 1)), faces, uv, texture)
+
+
+def write(path: Path, views: list[PageView] = ONE_SIDE) -> Path:
+    scene = PageScene("two balls", views, SETTINGS, ORIGIN, 4.0, UP, SUBJECT)
+    meshes = {"mesh": web_mesh(square(textured=False)), "textured": web_mesh(square(textured=True))}
+    photographs = []
+    for k in range(len(views)):
+        file = io.BytesIO()
+        Image.new("RGB", (8 * (1 + k), 8)).save(file, "JPEG")
+        photographs.append(file.getvalue())
+    write_page(path, two_balls(), scene, meshes=meshes, photographs=photographs)
     return path
 
 
@@ -69,12 +91,13 @@ def as_at_first(request: pytest.FixtureRequest) -> None:
         tab = request.getfixturevalue("page")
         tab.size(640, 420)
         tab.ask("$('help').close(); limited = true; $('free').checked = false; document.body.classList.remove('bare');"
-                "boxed(false); measuring(false); show(0); home(); document.activeElement.blur()")  # fmt: skip
+                "resetCrop(); editCrop(false); setCrop(true); setMeasuring(false); setKind(0); show('splats');"
+                "press('showcameras', false); goHome(); document.activeElement.blur()")  # fmt: skip
         still(tab)
 
 
 def still(page: Page) -> None:
-    """Wait until what is seen is drawn in full."""
+    """Wait until the full image is drawn."""
     page.until("document.body.dataset.drawn === 'still'")
 
 
@@ -83,9 +106,9 @@ def values(page: Page, *names: str) -> list[Any]:
 
 
 # -- in a browser ------------------------------------------------------------------------------------------------------
-def test_it_opens_where_a_photograph_was_taken_with_the_subject_in_the_middle(page: Page) -> None:
+def test_it_opens_at_a_photograph_with_the_subject_in_the_middle_and_crop_on(page: Page) -> None:
     page.key("h")
-    eye, target, ahead = (np.array(value) for value in values(page, "here.eye", "target", "here.ahead"))
+    eye, target, ahead = (np.array(value) for value in values(page, "camera.eye", "target", "camera.ahead"))
     np.testing.assert_allclose(eye, ONE_SIDE[2].camera.center - ORIGIN, atol=1e-6)
     np.testing.assert_allclose(target, 0, atol=1e-9)
     np.testing.assert_allclose(ahead, -eye / np.linalg.norm(eye), atol=1e-6)
@@ -94,78 +117,129 @@ def test_it_opens_where_a_photograph_was_taken_with_the_subject_in_the_middle(pa
     assert np.abs(image[210, 320 - 4 : 320 + 4] - [0.2, 0.5, 0.9]).max() > 0.02  # the balls, not the background alone
     # all of the subject's ball fits into the window: 2 asin(radius / away) of the view, 10 % to spare
     needed = 2.2 * 200 * np.tan(np.arcsin(SUBJECT.radius / np.linalg.norm(eye)))
-    assert values(page, "here.h")[0] == pytest.approx(min(needed, HEIGHT))
+    assert values(page, "crop.on", "isCropped()", "shows", "isPressed('showcameras')") == [True, True, "splats", False]
+    assert values(page, "camera.h")[0] == pytest.approx(min(needed, HEIGHT))
 
 
 def test_dragging_turns_about_the_subject_and_stops_at_the_end_of_the_arc(page: Page) -> None:
     page.key("h")
     page.drag((320, 160), (360, 160))
-    eye, target = (np.array(value) for value in values(page, "here.eye", "target"))
+    eye, target = (np.array(value) for value in values(page, "camera.eye", "target"))
     np.testing.assert_allclose(target, 0, atol=1e-9)
     assert np.linalg.norm(eye) == pytest.approx(np.hypot(4, 1))
     assert np.degrees(np.arctan2(eye[1], eye[0])) == pytest.approx(-np.degrees(40 * 0.006), abs=1)
     for _ in range(6):
         page.drag((100, 160), (400, 160), steps=3)
-    eye = np.array(values(page, "here.eye")[0])
+    eye = np.array(values(page, "camera.eye")[0])
     assert -53 < np.degrees(np.arctan2(eye[1], eye[0])) < -10  # 40 degrees and 12 of margin
     for start, end in ((40, 300), (300, 40)):  # towards the zenith, and towards the floor
         for _ in range(4):
             page.drag((320, start), (320, end), steps=8)
-        rise = np.degrees(np.arcsin(values(page, "here.eye")[0][2] / np.hypot(4, 1)))
+        rise = np.degrees(np.arcsin(values(page, "camera.eye")[0][2] / np.hypot(4, 1)))
         assert 14 - 12 - 0.1 < rise < 14 + 20 + 0.1
-        assert abs(rise - 14) > 5  # it did turn
+        assert abs(rise - 14) > 5  # it turned
     assert values(page, "$('note').hidden") == [True]
     page.ask("$('free').click()")
     page.drag((100, 160), (400, 160), steps=4)  # 103 degrees on
     still(page)
-    assert values(page, "$('note').hidden") == [False]  # now it is a guess, and said
+    assert values(page, "$('note').hidden") == [False]
     page.ask("$('free').click()")
     page.key("h")
     still(page)
     assert values(page, "$('note').hidden") == [True]
 
 
-def test_the_clip_box_cuts_what_is_drawn_and_its_numbers_are_an_option(page: Page) -> None:
-    page.key("h")
-    page.click("#box")
+def coloured(image: np.ndarray, channel: int) -> int:
+    """Return the number of red (0) or green (1) pixels."""
+    return int(((image[..., channel] > 0.6) & (image[..., 1 - channel] < 0.4) & (image[..., 2] < 0.4)).sum())
+
+
+def drawn(page: Page) -> np.ndarray:
+    still(page)
+    page.ask("document.body.classList.add('bare')")
+    image = page.image()
+    page.ask("document.body.classList.remove('bare')")
+    return image
+
+
+def test_the_crop_box_hides_splats_and_its_numbers_are_an_option(page: Page) -> None:
+    page.click("#editcrop")
     assert page.ask("$('bbox').value") == "--bbox 99.400 -200.600 49.400 100.600 -199.400 50.600"
-    page.ask("$('boxpanel').querySelector('[data-side=high][data-axis=\"1\"]').focus()")
+    page.ask("$('croppanel').querySelector('[data-side=high][data-axis=\"1\"]').focus()")
     page.ask("document.activeElement.select()")
     page.send("Input.insertText", text="-200")
     assert page.ask("$('bbox').value") == "--bbox 99.400 -200.600 49.400 100.600 -200.000 50.600"
-    still(page)
     page.ask("document.activeElement.blur()")
-    page.ask("document.body.classList.add('bare'); $('boxpanel').hidden = true; $('lines').style.display = 'none'")
-    page.until("document.body.dataset.drawn === 'still'")
-    cut = page.image()
-    red, green = ((cut[..., k] > 0.6) & (cut[..., 2] < 0.4) for k in (0, 1))
-    assert green.sum() > 50
-    assert red.sum() == 0
-    page.ask("document.body.classList.remove('bare')")
-    page.ask("boxed(true)")
+    page.key("b")  # the box remains, its panel and lines are closed
+    image = drawn(page)
+    assert coloured(image, 0) == 0
+    assert coloured(image, 1) > 50
+    page.key("x")
+    assert coloured(drawn(page), 0) > 50
+    page.key("b")
     handle = page.middle("circle[data-side=high][data-axis='2']")
     page.drag(handle, (handle[0], handle[1] + 30))
     high = float(page.ask("$('bbox').value").split()[-1])
-    assert 50.0 < high < 50.55  # the top came down
-    page.ask("$('subjectbox').click(); boxed(false)")
-    assert page.ask("numbers()") == "99.400 -200.600 49.400 100.600 -199.400 50.600"
+    assert 50.0 < high < 50.55  # the top is lower
+    page.click("#resetcrop")
+    assert page.ask("cropText()") == "99.400 -200.600 49.400 100.600 -199.400 50.600"
+
+
+def test_the_view_of_a_photograph_shows_everything_and_other_views_no_spikes(page: Page) -> None:
+    page.ask("setFace('high', 1, 0)")  # without the red ball
+    page.ask("goTo(2)")
+    assert coloured(drawn(page), 0) > 50
+    page.ask("orbit(0.01, 0)")
+    assert coloured(drawn(page), 0) == 0
+    page.ask("resetCrop()")
+    assert coloured(drawn(page), 0) > 50
+    page.ask("limited = false; zoom(0.1)")  # the balls are larger than the window
+    assert coloured(drawn(page), 0) + coloured(drawn(page), 1) == 0
+    page.key("x")
+    assert coloured(drawn(page), 0) + coloured(drawn(page), 1) > 50
+
+
+def test_mesh_and_textured_mesh_are_shown_in_place_of_the_splats(page: Page) -> None:
+    assert page.ask("[...$('shows').children].map((b) => b.textContent).join()") == "Splats,Mesh,Textured mesh"
+    for name, channel in (("mesh", 0), ("textured", 1)):
+        page.click(f"[data-show={name}]")
+        page.until(f"meshes.{name}")
+        image = drawn(page)
+        assert coloured(image, channel) > 5000
+        assert coloured(image, 1 - channel) == 0
+    page.ask("setFace('high', 0, -0.1)")  # the square is in front of the box
+    assert coloured(drawn(page), 1) == 0
+    page.click("[data-show=splats]")
+
+
+def test_a_click_on_a_camera_goes_there_and_shows_its_photograph_until_the_view_moves(page: Page) -> None:
+    page.ask("goTo(0); zoom(1.5)")
+    page.click("#showcameras")
+    still(page)
+    assert page.ask("[...$('cameras').children].every((path) => path.getAttribute('d').length > 50)")
+    page.click("#cameras path:nth-child(5)")
+    assert page.ask("shown") == 4
+    page.until("$('photograph').querySelector('img').naturalWidth === 8 * 5 && !$('photograph').hidden")
+    page.key("d")
+    page.until("$('photograph').hidden")
 
 
 def test_a_phone_has_every_button_in_sight_turns_and_pinches(page: Page) -> None:
     page.size(375, 667, phone=True)
     try:
-        page.key("h")
+        page.click("#tools")
         shown = page.ask(
-            "[...document.querySelectorAll('#bar button:not([hidden])')].map((b) => b.getBoundingClientRect())"
+            "[...document.querySelectorAll('#bar button')].filter((b) => b.checkVisibility())"
+            ".map((b) => b.getBoundingClientRect())"
             ".every((r) => r.left >= 0 && r.right <= innerWidth && r.bottom <= innerHeight && r.height >= 40)"
         )
         assert shown
         assert page.ask("[...document.querySelectorAll('button')].every((b) => b.textContent.trim() || b.ariaLabel)")
         page.fingers(((180, 300), (220, 300)))
-        assert abs(values(page, "here.eye")[0][1]) > 0.3
-        away = np.linalg.norm(values(page, "here.eye")[0])
+        assert abs(values(page, "camera.eye")[0][1]) > 0.3
+        away = np.linalg.norm(values(page, "camera.eye")[0])
         page.fingers(((170, 300), (120, 300)), ((200, 300), (250, 300)))
-        assert np.linalg.norm(np.subtract(*values(page, "here.eye", "target"))) < 0.7 * away
+        assert np.linalg.norm(np.subtract(*values(page, "camera.eye", "target"))) < 0.7 * away
     finally:
         page.size(640, 420)
         page.key("h")
@@ -178,13 +252,13 @@ def test_keys_open_help_show_normals_and_depth_and_step_through_photographs(page
     page.key("Escape")
     assert values(page, "$('help').open", "kind") == [False, 0]
     page.key("z")
-    assert values(page, "kind", "document.querySelector('[data-kind=\"2\"]').ariaPressed") == [2, "true"]
+    assert values(page, "kind", "$('kind').value") == [2, "2"]
     page.key("c")
     page.key("ArrowRight")
     assert page.ask("$('view').textContent") == "20.jpg"
     page.key("h")
     page.key("t")
-    page.until("Math.abs(here.eye[1]) > 0.05")  # it turns by itself
+    page.until("Math.abs(camera.eye[1]) > 0.05")  # it turns by itself
     page.key("t")
     still(page)
 
@@ -195,7 +269,7 @@ def test_a_photographed_view_is_drawn_as_the_rasterizer_draws_it_after_turning_a
     try:
         page.ask("document.body.classList.add('bare'); goTo(3)")
         still(page)
-        page.until("drawn === asked")
+        page.until("drawn === wanted")
         with torch.no_grad():
             ours = rasterize(two_balls(), ONE_SIDE[3].camera, SETTINGS, backend="reference").color.numpy()
         error = ((page.image() - np.clip(ours, 0, 1)) ** 2).mean()
@@ -209,16 +283,16 @@ def test_two_clicks_measure_a_distance_on_the_surface(page: Page) -> None:
     page.key("m")
     place = "JSON.stringify([[0, 0.3, 0], [0, -0.3, 0]].map(onScreen).map((p) => [p.x, p.y]))"
     red, green = json.loads(page.ask(place))
-    eye = values(page, "here.eye")[0]
+    eye = values(page, "camera.eye")[0]
     for x, y in (red, green):
         page.mouse("mousePressed", x, y)
         page.mouse("mouseReleased", x, y)
-    assert values(page, "here.eye")[0] == eye
+    assert values(page, "camera.eye")[0] == eye
     np.testing.assert_allclose(values(page, "ruler.ends")[0], [[0, 0.3, 0], [0, -0.3, 0]], atol=2e-3)
     assert page.ask("$('distance').textContent") == "0.6 units"
     assert page.ask("$('ruler').querySelector('text').textContent") == "0.6 units"
-    page.ask("$('truly').value = 1.25; $('truly').oninput()")
-    words = page.ask("$('knowncommand').value").split()
+    page.ask("$('metres').value = 1.25; $('metres').oninput()")
+    words = page.ask("$('scalecommand').value").split()
     assert words[:4] == ["gs2d", "georeference", "RUN", "--known-distance"]
     np.testing.assert_allclose([float(word) for word in words[4:]], [100, -199.7, 50, 100, -200.3, 50, 1.25], atol=3e-3)
     page.key("Escape")
