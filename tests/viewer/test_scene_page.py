@@ -22,7 +22,16 @@ from gs2d.core.splats import Splats
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
 from gs2d.viewer.packed_splats import PackedSplats, pack_splats, sh_texels
-from gs2d.viewer.scene_page import SHADERS, PageOffer, PageScene, PageView, served_page, splats_answer, write_page
+from gs2d.viewer.scene_page import (
+    SHADERS,
+    PageOffer,
+    PageScene,
+    PageView,
+    pack_for,
+    served_page,
+    splats_answer,
+    write_page,
+)
 
 ORIGIN = np.array([1000.0, -2000.0, 500.0])  # far away: float32 keeps a tenth of a millimetre there
 CAMERA = look_at(ORIGIN + np.array([0.3, -4.0, 0.8]), ORIGIN, np.array([0.0, 0.0, 1.0]), width=120, height=80, fx=100.0)
@@ -158,7 +167,7 @@ def test_the_page_is_one_file_with_all_data_and_loads_nothing(tmp_path: Path) ->
     assert facts["origin"] == ORIGIN.tolist()
     assert [camera["name"] for camera in facts["cameras"]] == ["</script>.png", "2.png"]
     assert np.allclose(facts["cameras"][0]["t"], at_origin(CAMERA).T_cam_world[:3, 3])
-    packed = pack_splats(some_splats(), ORIGIN, 3, SETTINGS.alpha_min)
+    packed = pack_for(SCENE, some_splats())
     assert gzip.decompress(base64.b64decode(page.texts["splats"])) == data_of(packed)
     assert (facts["splats"], facts["texels"], facts["background"]) == (packed.count, 3, [0.2, 0.5, 0.9])
     assert facts["offer"] == {"meshes": ["mesh"], "photographs": True, "served": False, "stages": [], "live": False}
@@ -192,7 +201,7 @@ def test_a_served_page_has_no_data_and_connects_to_its_own_server_only(tmp_path:
     page, alone = served(), page_of(tmp_path / "scene.html")
     assert page.loads == ["data:,"]
     assert set(page.texts) == set(alone.texts) - {"mesh", "photographs", "splats"}
-    packed = pack_splats(some_splats(), ORIGIN, 3, SETTINGS.alpha_min)
+    packed = pack_for(SCENE, some_splats())
     answer = splats_answer(packed)
     assert b"".join(answer.parts) == data_of(packed)
     facts = {**json.loads(page.texts["facts"]), **json.loads(answer.headers["X-Splats"]), "offer": None}

@@ -39,7 +39,7 @@ class PackedSplats:
         Value of the 8-bit SH coefficient 127, for each coefficient of degree 1 to 3.
     words : ndarray [N, 8] uint32
         Per splat: mean relative to the page's origin (3 x float32), log scales (2 x float16), unit quaternion w x y z
-        (4 x int16, 32767 = 1), SH of degree 0 (3 x float16), opacity (float16; negative for spikes, see :func:`pack_splats`).
+        (4 x int16, 32767 = 1), SH of degree 0 (3 x float16), opacity (float16; negative for spikes).
     harmonics : ndarray [N, 16 * texels] int8
         Other SH coefficients of each splat, as red, green, blue of each coefficient, padded to a multiple of 16 bytes.
     """

@@ -18,10 +18,11 @@ function drawFrustums() {
     const c = cameraOf(i);
     const corner = (x, y) =>
       plus(plus(plus(c.eye, c.right, (depth * (x - c.cx)) / c.fx), c.down, (depth * (y - c.cy)) / c.fy), c.ahead, depth);
-    const corners = [corner(0, 0), corner(c.w, 0), corner(c.w, c.h), corner(0, c.h)];
-    const edges = corners.flatMap((p, k) => [[c.eye, p, corners[(k + 1) % 4]]]);
-    const isVisible = !(atPhotograph && i === shown) && [c.eye, ...corners].every((p) => onScreen(p).z > facts.near);
-    path.setAttribute("d", isVisible ? edges.map((points) => `M${points.map(onScreen).map(pathPoint).join("L")}Z`).join("") : "");
+    const [tip, ...corners] = [c.eye, corner(0, 0), corner(c.w, 0), corner(c.w, c.h), corner(0, c.h)].map(onScreen);
+    const width = Math.max(...corners.map((p) => Math.hypot(p.x - tip.x, p.y - tip.y)));
+    const isVisible = [tip, ...corners].every((p) => p.z > facts.near) && width < 0.3 * canvas.clientWidth;
+    const sides = corners.map((p, k) => `M${[tip, p, corners[(k + 1) % 4]].map(pathPoint).join("L")}Z`);
+    path.setAttribute("d", isVisible ? sides.join("") : "");
   });
 }
 
