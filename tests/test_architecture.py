@@ -45,15 +45,15 @@ TOP = {"__init__.py", "__main__.py", "errors.py"}  # nothing else lies loose
 # Floors inside a room: a module imports from lower ones of its room only. A folder of a room is one entry.
 INSIDE = {
     "core": {
-        "checks growth light locks extras memory memory_limit missing processes spill text": 0,
-        "files georeference images projection similarity": 1,
+        "checks growth locks extras memory memory_limit missing processes spill text": 0,
+        "files images similarity": 1,
         "json_files camera mesh sh splats": 2,
         "photometry residual_lens transforms": 3,
     },
     "data": {
         "archive": 12,
         "load subject": 11,
-        "known_captures prepare prepare_worker": 10,
+        "known_captures": 10,
         "prepared": 9,
         "readers": 8,
         "build": 7,
@@ -62,7 +62,7 @@ INSIDE = {
         "priors faces straighten masks": 4,
         "cache exif file_names undistort": 3,
         "camera_models image_files photo_formats positions": 2,
-        "arrays csv_tables exr float_tiff": 1,
+        "arrays csv_tables float_images": 1,
     },
     "pipeline": {
         "demo in_memory reconstruct": 6,

@@ -15,17 +15,21 @@ from gs2d.data.known_captures import DATA_SETS
 from gs2d.data.readers.registry import READERS
 from gs2d.evaluation.evaluators import EVALUATORS
 from gs2d.io.formats.splat_formats import LAYOUTS, SPLAT_READERS
+from gs2d.report.sections.registry import SECTIONS
 from tiny import write_capture
 
 SOURCE = Path(gs2d.__file__).parent
-REGISTRIES: tuple[Registry, ...] = (COMMANDS, PROTOCOLS, DATA_SETS, READERS, EVALUATORS, LAYOUTS, SPLAT_READERS)
+CONTRIB_USES: tuple[Registry, ...] = (
+    *(COMMANDS, PROTOCOLS, DATA_SETS, READERS, EVALUATORS),
+    *(LAYOUTS, SPLAT_READERS, SECTIONS),
+)
 
 
 def test_every_entry_point_registers_its_name() -> None:
     """Names registered in contrib are exactly those of its entry points."""
     entries = {(entry.group, entry.name): entry.module for entry in contrib_entries()}
     assert len(entries) > 15
-    by_group = {registry.group: registry for registry in REGISTRIES}
+    by_group = {registry.group: registry for registry in CONTRIB_USES}
     for (group, name), module in entries.items():
         importlib.import_module(module)
         assert name in dict(by_group[group].working(by_group[group].builtin)), f"{group}: {name}"

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gs2d.data import exr, load_scene
+from gs2d.data import load_scene
+from gs2d.data.float_images import read_exr
 from gs2d.data.image_files import image_size, read_grey, read_image
 from gs2d.data.priors import read_depth
 from gs2d.errors import DataError
@@ -70,7 +71,7 @@ def test_a_capture_may_have_photographs_of_floats(tmp_path: Path) -> None:
     (tmp_path / "sparse/points3D.txt").write_text("1 0 0 0 9 9 9 0.5 1 0\n")
     scene = load_scene(tmp_path)
     assert [view.name for view in scene.views] == ["1.exr", "2.exr", "0.exr"]
-    assert np.array_equal(scene.views[2].image(), exr.display_image(tmp_path / "images/0.exr"))
+    assert np.array_equal(scene.views[2].image(), read_exr(tmp_path / "images/0.exr"))
 
 
 def test_a_header_that_announces_more_than_its_file_can_hold_is_refused_before_decoding(tmp_path: Path) -> None:

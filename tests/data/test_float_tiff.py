@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gs2d.data import float_tiff
+from gs2d.data.float_images import FloatTiff, read_float_tiff
 from gs2d.data.image_files import image_size, read_grey, read_image
 from gs2d.data.priors import read_depth
 from gs2d.errors import DataError
@@ -87,6 +87,6 @@ def test_damage_anywhere_gives_a_picture_or_a_plain_error(tmp_path: Path) -> Non
 
 def test_a_header_that_announces_more_than_its_file_can_hold_is_refused_before_decoding(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "a.tif", colors(), photometric="rgb")
-    huge = float_tiff.Header(100_000, 100_000, 3)
+    huge = FloatTiff(100_000, 100_000, 3)
     with pytest.raises(DataError, match=r"a\.tif"):
-        float_tiff.display_image(tmp_path / "a.tif", huge)
+        read_float_tiff(tmp_path / "a.tif", huge)

@@ -65,11 +65,11 @@ def test_what_masked_cannot_change_is_said(tmp_path: Path, masked: str) -> None:
     small_colmap(tmp_path / "bare")
     scene, plain = load_scene(tmp_path / "scan", masked=masked), load_scene(tmp_path / "scan")
     line = (
-        f"masks: --masked {masked} changes nothing: format dtu has silhouettes, which limit the surface alone "
-        "(--masks DIR names masks)"
+        f"masks: --masked {masked} has no effect: format dtu has silhouettes, which only limit the surface "
+        "(--masks DIR sets masks)"
     )
     assert set(scene.notes) - set(plain.notes) == {line}
-    assert not any("changes nothing" in note for note in plain.notes)
+    assert not any("has no effect" in note for note in plain.notes)
     for view, same in zip(scene.views, plain.views, strict=True):
         assert view.alpha() is None
         assert view.mask() is None
@@ -78,7 +78,7 @@ def test_what_masked_cannot_change_is_said(tmp_path: Path, masked: str) -> None:
         assert before is not None
         assert np.array_equal(silhouette, before)
     said = [note for note in load_scene(tmp_path / "bare", masked=masked).notes if note.startswith("masks:")]
-    none = f"masks: none of 9 views has one in masks (a/b.jpg.png for a/b.jpg): --masked {masked} changes nothing"
+    none = f"masks: none of 9 views has one in masks (a/b.jpg.png for a/b.jpg): --masked {masked} has no effect"
     assert said == ([] if masked == "off" else [none])  # without masks none is used: what was asked for
 
 

@@ -1,4 +1,4 @@
-"""Prepared photographs: the same pictures, from files that are checked, resumed and made by several processes."""
+"""Prepared images equal decoded ones; files are checked, and an interrupted preparation continues."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from PIL import Image
 
 from capture_writers import small_colmap
 from gs2d.data import Scene, View, load_scene
-from gs2d.data import prepare as preparing
-from gs2d.data.prepare import prepare
 from gs2d.data.prepared import (
     AHEAD,
     Stored,
     forget_others,
     missing_views,
+    prepare,
     prepared_scene,
     read_prepared,
     write_prepared,
@@ -27,7 +26,7 @@ from gs2d.errors import DataError
 
 @pytest.fixture
 def capture(tmp_path: Path) -> Path:
-    """Bent lenses, masks, one picture with alpha."""
+    """Distorted lenses and some masks."""
     root = tmp_path / "capture"
     model = small_colmap(root, count=6)
     camera = next(iter(model.cameras))
@@ -71,9 +70,7 @@ def assert_same_pictures(one: Scene, other: Scene) -> None:
 
 
 @pytest.mark.parametrize("downscale", [1, 2])
-def test_prepared_pictures_and_masks_are_those_of_the_photographs_bit_for_bit(
-    capture: Path, tmp_path: Path, downscale: int
-) -> None:
+def test_prepared_images_and_masks_equal_decoded_ones(capture: Path, tmp_path: Path, downscale: int) -> None:
     scene = ready(capture, tmp_path / "prepared", downscale)
     assert scene.ahead == AHEAD
     assert missing_views(scene) == []
@@ -89,7 +86,7 @@ def test_prepared_pictures_and_masks_are_those_of_the_photographs_bit_for_bit(
     assert any(view.valid() is not None for view in scene.views)  # the lens leaves corners unknown
 
 
-def test_what_was_broken_off_is_gone_on_with_and_a_changed_photograph_is_prepared_again(
+def test_an_interrupted_preparation_continues_and_a_changed_photograph_is_prepared_again(
     capture: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / "prepared"
@@ -114,31 +111,20 @@ def test_what_was_broken_off_is_gone_on_with_and_a_changed_photograph_is_prepare
     assert_same_pictures(again, loaded(capture))
 
 
-def test_a_damaged_file_is_as_none_and_the_photograph_is_read_instead(capture: Path, tmp_path: Path) -> None:
+def test_a_damaged_file_is_ignored_and_the_photograph_is_decoded(capture: Path, tmp_path: Path) -> None:
     scene = ready(capture, tmp_path / "prepared")
     expected = [view.image().copy() for view in loaded(capture).views]
     for at, view in enumerate(scene.views):
         file = stored(view).file
         data = bytearray(file.read_bytes())
-        data[len(data) * (at + 1) // 8] ^= 4  # the first ones in the header, the last in the pixels
-        file.write_bytes(data if at % 2 else data[: -at - 1])
-        assert read_prepared(file, stored(view).key) is None
+        data[len(data) * (at + 2) // 10] ^= 4
+        file.write_bytes(data if at % 2 else data[: len(data) * (at + 1) // 8])
+        assert read_prepared(file) is None
     for view, picture in zip(scene.views, expected, strict=True):
         np.testing.assert_array_equal(view.image(), picture)
 
 
-def test_several_processes_write_the_same_files(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    here = ready(capture, tmp_path / "here")
-    monkeypatch.setattr(preparing, "MANY_PIXELS", 0)
-    there = ready(capture, tmp_path / "there")
-    files = [[stored(view).file.read_bytes() for view in scene.views] for scene in (here, there)]
-    assert files[0] == files[1]
-
-
-def test_a_photograph_that_does_not_decode_in_a_process_is_one_line_and_the_others_stay(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(preparing, "MANY_PIXELS", 0)
+def test_a_photograph_that_does_not_decode_is_an_error_of_one_line(capture: Path, tmp_path: Path) -> None:
     folder = tmp_path / "prepared"
     folder.mkdir()
     scene = prepared_scene(loaded(capture), folder)
@@ -150,10 +136,11 @@ def test_a_photograph_that_does_not_decode_in_a_process_is_one_line_and_the_othe
     assert not any(path.name.endswith(".gs2d.tmp") for path in folder.iterdir())
 
 
-def test_a_reader_from_elsewhere_keeps_its_views_as_they_are(capture: Path, tmp_path: Path) -> None:
+def test_views_of_third_party_readers_are_unchanged(capture: Path, tmp_path: Path) -> None:
     scene = loaded(capture)
     view = scene.train[0]
     picture = view._image()
     own = replace(scene, train=(replace(view, decode=lambda: picture), *scene.train[1:]))
     assert prepared_scene(own, tmp_path).train[0] is own.train[0]
-    assert write_prepared(tmp_path / "x.prepared", "k", picture) > 0
+    write_prepared(tmp_path / "x.prepared", picture)
+    assert read_prepared(tmp_path / "x.prepared") is not None

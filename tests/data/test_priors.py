@@ -74,7 +74,7 @@ def broken_files(folder: Path) -> dict[str, Path]:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("colour.png", "coloured"),
+        ("colour.png", "colour-coded"),
         ("zero.png", "depths"),
         ("nan.npy", "must hold depths above 0"),
         ("words.npy", "numbers"),
@@ -94,7 +94,7 @@ def test_files_that_hold_no_depths_are_named(tmp_path: Path, name: str, message:
 def test_a_map_of_another_shape_than_its_photograph_is_refused(tmp_path: Path) -> None:
     small_colmap(tmp_path)
     write_depth(tmp_path / "depths" / "0.png", slope(40, 30))
-    with pytest.raises(DataError, match="photograph"):
+    with pytest.raises(DataError, match="aspect ratio of its image"):
         view_of(tmp_path).maps.depth()
 
 

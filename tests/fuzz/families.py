@@ -167,11 +167,6 @@ _FIELD = """#usda 1.0
     defaultPrim = "World"
     metersPerUnit = 1
     upAxis = "Y"
-    customLayerData = {
-        dictionary gs2d = {
-            string georeference = "{}"
-        }
-    }
 )
 
 def Xform "World"
@@ -366,10 +361,6 @@ def _exr(name: str, channels: str, compression: str, dtype: type = np.float32) -
 
 
 # -- places in the world -----------------------------------------------------------------------------------------------
-_PLACE = {
-    "format": 1, "method": "positions", "scale": 2.5, "rotation": [[0, -1, 0], [1, 0, 0], [0, 0, 1]], "epsg": 32632,
-    "translation": [1, 2, 3], "origin": [600000, 5200000, 400], "geodetic": [47.5, 9.25, 400], "grid_scale": 0.9996,
-}  # fmt: skip
 _TABLES = {
     "control.csv": "# EPSG:32632\nname,x,y,z,photo,u,v,check\nA,600000.5,5200000,400,f_0.png,12.5,7,\n"
     "A,600000.5,5200000,400,f_1.png,3,9,\nB,600010,5200000,401.5,f_0.png,20,11,yes\n",
@@ -381,25 +372,11 @@ _TABLES = {
 }
 
 
-def _georeferenced(root: Path) -> None:
-    from gs2d.io.georeference import Georeference, stamp, write_sidecars
-
-    place = Georeference.from_json(_PLACE)
-    for name, write in (("a.ply", lambda p: ply_mesh(p, "ascii")), ("a.obj", _obj)):
-        write(root / name)
-        stamp(root / name, place)
-    _splats("gltf", "a.glb")(root)
-    stamp(root / "a.glb", place)
-    write_sidecars(root / "b.ply", place, None)
-    ply_mesh(root / "b.ply", "ascii")
-
-
 def read_places(root: Path) -> None:
-    """As `gs2d georeference` reads its tables, and whatever reads a file in local metres what that says of itself."""
+    """As `gs2d georeference` reads its tables."""
     from gs2d.contrib.survey.control import read_control
     from gs2d.data.positions import matched, read_positions
     from gs2d.errors import DataError
-    from gs2d.io.georeference import georeference_of_file
 
     refused: Exception | None = None
     for path in sorted(root.iterdir()):
@@ -408,8 +385,6 @@ def read_places(root: Path) -> None:
                 read_control(path)
             elif path.stem.startswith("positions"):
                 matched(read_positions(path), ["f_0.png", "f_1.png"])
-            elif path.suffix in (".ply", ".obj", ".glb"):
-                georeference_of_file(path)
         except DataError as error:
             refused = error
     if refused is not None:
@@ -538,10 +513,8 @@ _ALL = (
         _exr("a.exr", "Z", "RLE_COMPRESSION"), _exr("a.exr", "RGB", "NO_COMPRESSION"),
         _exr("a.exr", "RGB", "DWAA_COMPRESSION", np.float16), _exr("a.exr", "Y", "B44_COMPRESSION", np.float16)),
         {".exr": m.of_bytes}, read_picture),
-    Family("places", written(lambda root: [(root / name).write_text(text) for name, text in _TABLES.items()],
-                             _georeferenced),
-           {".csv": _TEXT, ".txt": _TEXT, ".json": _JSON, ".ply": m.of_ply, ".obj": _TEXT, ".glb": m.of_glb},
-           read_places),
+    Family("places", written(lambda root: [(root / name).write_text(text) for name, text in _TABLES.items()]),
+           {".csv": _TEXT, ".txt": _TEXT}, read_places),
     Family("official", written(_official), {".json": _JSON, ".txt": _TEXT, ".log": _TEXT}, read_official),
     Family("zip", written(_packed(zipfile.ZIP_DEFLATED), _packed(zipfile.ZIP_STORED)),
            {".zip": m.either(m.of_zip(_JSON), m.of_bytes)}, read_archive),

@@ -86,7 +86,7 @@ def test_files_that_are_no_photographs_are_named_with_what_to_do(tmp_path: Path)
     assert warning == (
         "3 of 6 photographs cannot be read and are ignored: 2 HEIC (x.HEIC ...): pip install pi-heif (its wheel holds "
         "LGPL code), or convert them to JPEG (magick mogrify -format jpg *.heic); 1 CR2 (z.CR2): raw files are not "
-        "developed here; export JPEG or PNG from your photo program"
+        "supported; export JPEG or PNG from your photo program"
     )
     video, other = notes
     assert video == "clip.MOV was ignored: a video; use it as the input, or copy frames of it here"

@@ -108,7 +108,7 @@ def test_separate_pieces_and_photographs_without_a_place_are_named(
     assert "no camera: blank.jpg: 0 features: blurred, or without texture" in text.out
     assert "sparse/1 holds a separate piece: 4 photographs" in text.out
     assert "photographs" in text.err
-    assert load_scene(out).notes[0].startswith("the model sparse/0 is read, which has 5 images; 1 has 4. Read another")
+    assert load_scene(out).notes[0].startswith("using the model sparse/0 with 5 images; 1 has 4. To use another")
 
 
 @pytest.mark.slow

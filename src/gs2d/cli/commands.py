@@ -116,8 +116,6 @@ class Mesh(TextureOptions, MeshOptions, Common):
     texture: bool = False
     """Write a textured mesh, as .glb or .obj, from the photographs. Without options that change the mesh, uses
     mesh.ply."""
-    georeferenced: bool = False
-    """Write world coordinates in metres (`gs2d georeference`), relative to an offset that the file names."""
     memory: MemoryOption = None
     """Memory limit in GiB (default: half of the memory of this machine or container)."""
     threads: int | None = None
@@ -202,8 +200,6 @@ class Export(Common):
     streamed, or one of a package (default: by the ending of --out; .ply is 3dgs)."""
     bbox: BoxOption = None
     """Export only splats whose centre is in this box. `gs2d view` shows its numbers."""
-    georeferenced: bool = False
-    """Write world coordinates in metres (`gs2d georeference`), relative to an offset that the file names."""
 
 
 @register_command("report", action="gs2d.cli.handlers:report", group=LOOK)

@@ -11,7 +11,7 @@ from gs2d.cli import commands as c
 from gs2d.cli.arguments import options_of
 from gs2d.cli.commands import Common
 from gs2d.cli.console import Console
-from gs2d.cli.tables import say_where_it_is, score_rows, show_run, show_surface
+from gs2d.cli.tables import score_rows, show_run, show_surface
 from gs2d.core.processes import here
 from gs2d.errors import ProtocolError, RecipeError
 from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions, values
@@ -98,13 +98,11 @@ def mesh(command: c.Mesh, console: Console) -> None:
         out=command.out,
         splats_file=command.splats,
         threads=command.threads,
-        georeferenced=command.georeferenced,
     )
     console.close()
     console.say(f"{result['file']}: {result['vertices']:,} vertices, {result['faces']:,} triangles")
     if "voxel" in result:
         console.say(f"voxel {result['voxel']:.4g}, truncation {result['truncation']:.4g}, depth {result['depth']}")
-    say_where_it_is(result, console)
     console.result(result)
 
 
@@ -120,7 +118,6 @@ def _textured_mesh(command: c.Mesh, mesh_options: Any, console: Console) -> None
         console.on_event,
         out=command.out,
         threads=command.threads,
-        georeferenced=command.georeferenced,
     )
     console.close()
     size, unseen = result["texture_size"], result["texels_unseen"] / max(result["texels"], 1)
@@ -128,7 +125,6 @@ def _textured_mesh(command: c.Mesh, mesh_options: Any, console: Console) -> None
     console.say(
         f"texture {size}x{size} in {result['charts']:,} charts, {unseen:.2%} of it not visible in any photograph"
     )
-    say_where_it_is(result, console)
     console.result(result)
 
 
@@ -209,15 +205,12 @@ def export(command: c.Export, console: Console) -> None:
     """``gs2d export``."""
     from gs2d.pipeline.finish.export import export_run
 
-    result = export_run(
-        command.run, command.out, command.layout, bbox=command.bbox, georeferenced=command.georeferenced
-    )
+    result = export_run(command.run, command.out, command.layout, bbox=command.bbox)
     console.say(
         f"{result['file']}: {result['splats']:,} splats, {result['bytes'] / 1e6:.1f} MB, layout {result['layout']}"
     )
     for note in result["notes"]:
         console.say(note)
-    say_where_it_is(result, console)
     console.result(result)
 
 

@@ -41,13 +41,7 @@ def show_run(
     for name in ("report.html", "scene.html", "mesh.ply", "mesh.glb", "splats.ply"):
         if (path / name).exists():
             console.say(f"{path / name}")
-    from gs2d.io.georeference import read_georeference  # numpy: `gs2d recipes` is instant
-
-    place = read_georeference(path)
-    for line in [] if place is None else place.lines():
-        console.say(line)
-    extra = (extra or {}) | ({} if place is None else {"georeference": place.to_json()})
-    extra = extra | ({} if definition is None else {"definition": definition}) | say_verdict(path, console)
+    extra = (extra or {}) | ({} if definition is None else {"definition": definition}) | say_verdict(path, console)
     console.result({"run": str(path), **metrics, **extra})
 
 
@@ -72,10 +66,3 @@ def show_surface(surface: dict[str, Any] | None, console: Console) -> None:
         console.table("", ["surface within", "precision", "recall", "F-score"], rows)
     if surface.get("chamfer") is not None:
         console.say(f"Chamfer distance {surface['chamfer']:.5g} {surface.get('unit', 'world units')}")
-
-
-def say_where_it_is(result: dict[str, Any], console: Console) -> None:
-    """Say what a written file is in, where it is georeferenced."""
-    if "frame" in result:
-        offset = " ".join(f"{value:.10g}" for value in result["offset"])
-        console.say(f"metres of {result['frame']}, less the offset {offset}: {', '.join(result['beside'])}")

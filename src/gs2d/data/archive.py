@@ -1,4 +1,4 @@
-"""A capture packed as one ZIP file."""
+"""Captures in a ZIP file."""
 
 from __future__ import annotations
 
@@ -20,34 +20,35 @@ from gs2d.data.file_names import IMAGES
 from gs2d.data.load import detect_format
 from gs2d.errors import DataError
 
-_JUNK = "__MACOSX"  # what macOS adds: a shadow of every file
-_BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, LookupError, struct.error, RuntimeError)  # a password
-_ZIP = "cp437"  # of names, where an entry does not state UTF-8
+_JUNK = "__MACOSX"  # added by macOS
+_BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, LookupError, struct.error, RuntimeError)
+_ZIP = "cp437"  # encoding of names without the UTF-8 flag
 _STATES_UTF8 = 0x800  # flag of an entry
-#: encodings of names that are not UTF-8 and do not say what they are, in the order in which they are tried: Chinese,
-#: Japanese, Korean, traditional Chinese, Cyrillic (Windows, DOS), Central and Western European (Windows, DOS)
+#: Candidate encodings of other names, in order: Chinese, Japanese, Korean, traditional Chinese, Cyrillic (Windows,
+#: DOS), Central and Western European (Windows, DOS)
 _ENCODINGS = ("gb18030", "cp932", "cp949", "big5", "cp1251", "cp866", "cp1250", "cp1252", "cp852", "cp850", _ZIP)
 _CAMERA_FILES = ("images.txt", "images.bin", ".json", ".xml", ".sfm")
-_LOOKED_AT = 64 << 20  # bytes of a camera file
-_DEPTH = 3  # folders with nothing but a folder in them, above the capture
+_LOOKED_AT = 64 << 20  # bytes read from a camera file
+_DEPTH = 3  # largest number of nested single folders above the capture
 
 
 def is_archive(path: Path) -> bool:
-    """Whether a path is a ZIP file, by its ending."""
+    """Whether a path is a ZIP file, by its suffix."""
     return path.suffix.lower() == ".zip" and path.is_file()
 
 
 def unpack(path: Path, home: Path) -> Path:
-    """Unpack a ZIP file into the folder ``home`` and return the capture's folder in it.
+    """Unpack a ZIP file into the folder ``home`` and return the folder of the capture.
 
-    What is unpacked has the name of its contents: an archive that is there already, under whatever name it came, is
-    not unpacked again. It appears when all is there, or not at all.
+    The target is named by a hash of the archive, so that the same archive is unpacked only once. It appears only when
+    it is complete.
 
     Raises
     ------
     DataError
-        No ZIP file, damaged, encrypted, without a capture, or with entries that grow beyond reason.
+        If the file is not a valid ZIP file, is encrypted or implausibly large, or contains no capture.
     DiskError
+        If it cannot be unpacked.
     """
     try:
         with _opened(path) as file:
@@ -62,10 +63,10 @@ def unpack(path: Path, home: Path) -> Path:
                 with tempfile.TemporaryDirectory(dir=home, prefix=".unpacking-") as hidden:
                     inside = Path(hidden, digest, path.stem.strip(". ") or "capture")
                     inside.mkdir(parents=True)
-                    file.extractall(inside, infos)  # names with .. or / stay inside; links become files
+                    file.extractall(inside, infos)  # sanitises names; links become files
                     _move(Path(hidden, digest), target)
     except _BROKEN as error:
-        raise DataError(f"{path} must be a whole ZIP file without a password, got: {error}; pack it again") from error
+        raise DataError(f"{path} must be a complete ZIP file without password: {error}; pack it again") from error
     except OSError as error:
         raise disk_error(home, error) from error
     try:
@@ -75,17 +76,17 @@ def unpack(path: Path, home: Path) -> Path:
         if not holds_photographs(path):
             raise
         remedy = instead(path, "capture")
-        raise DataError(f"{path} must hold cameras, got photographs without any{remedy}") from error
+        raise DataError(f"{path} must contain cameras, got images without cameras{remedy}") from error
 
 
 @contextlib.contextmanager
 def unpacked_for_a_moment(path: Path) -> Iterator[Path]:
-    """Unpack a ZIP file into a temporary folder; errors about what is in it name the archive.
+    """Unpack a ZIP file into a temporary folder; errors about its content name the archive.
 
     Raises
     ------
     DataError, DiskError
-        As :func:`unpack`.
+        As for :func:`unpack`.
     """
     with tempfile.TemporaryDirectory(prefix="gs2d-") as home:
         folder = unpack(path, Path(home))
@@ -95,7 +96,7 @@ def unpacked_for_a_moment(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def named_by(path: Path, folder: Path) -> Iterator[None]:
-    """Let errors about the folder that an archive was unpacked into name the archive: the folder may be gone."""
+    """Replace the unpacked folder by the archive in error messages."""
     try:
         yield
     except DataError as error:
@@ -103,7 +104,7 @@ def named_by(path: Path, folder: Path) -> Iterator[None]:
 
 
 def _move(made: Path, target: Path) -> None:
-    """Put a folder in its place; another process that put the same there in the meantime was as good."""
+    """Rename a folder; ignore that another process has created the same target."""
     try:
         os.replace(made, target)
     except OSError:
@@ -112,9 +113,9 @@ def _move(made: Path, target: Path) -> None:
 
 
 def _opened(path: Path) -> zipfile.ZipFile:
-    """Open an archive with its names in UTF-8, else in the encoding that ``_encoding`` finds."""
+    """Open an archive with names in UTF-8, else in the encoding from ``_encoding``."""
     try:
-        return zipfile.ZipFile(path, metadata_encoding="utf-8")  # which macOS writes without saying so
+        return zipfile.ZipFile(path, metadata_encoding="utf-8")  # macOS does not set the flag
     except UnicodeDecodeError:
         with zipfile.ZipFile(path) as file:
             encoding = _encoding(path, file)
@@ -122,9 +123,9 @@ def _opened(path: Path) -> zipfile.ZipFile:
 
 
 def _encoding(path: Path, file: zipfile.ZipFile) -> str:
-    """Return the first encoding in which a photograph has a name that occurs in a camera file, else ``_ZIP``.
+    """Return the first encoding in which an image name occurs in a camera file, else ``_ZIP``.
 
-    The ZIP format knows UTF-8 and code page 437 only, but Windows writes names in the code page of its language.
+    The ZIP format knows only UTF-8 and code page 437, but Windows uses the code page of its language.
     """
     infos = check_entries(path, file.infolist())
     names = [info.filename.encode(_ZIP) for info in infos if not info.flag_bits & _STATES_UTF8]
@@ -146,7 +147,7 @@ def _encoding(path: Path, file: zipfile.ZipFile) -> str:
 
 
 def _capture_in(folder: Path) -> Path:
-    """Find the capture's folder in an unpacked archive: the only folder in it, or the only one in that."""
+    """Return the folder of the capture in an unpacked archive, below single folders."""
     for _ in range(_DEPTH):
         try:
             detect_format(folder)

@@ -1,4 +1,4 @@
-"""NumPy arrays on disk, ``.npy`` and ``.npz``: numbers only, and no larger than their file says."""
+"""NumPy files, ``.npy`` and ``.npz``: numbers only, with a guard against decompression bombs."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def read_npy(path: str | os.PathLike[str], what: str) -> np.ndarray:
     ----------
     path : path
     what : str
-        What the file is, for messages.
+        Description of the file, for messages.
 
     Raises
     ------
     DataError
-        If the file is missing, damaged, cut short, or holds anything but numbers.
+        If the file is missing, damaged, or holds anything but numbers.
     """
     name = f"{what} {os.fspath(path)}"
     with _one_line(name, "npy"), open(path, "rb") as file:
@@ -36,12 +36,12 @@ def read_npy(path: str | os.PathLike[str], what: str) -> np.ndarray:
 
 
 def read_npz(path: str | os.PathLike[str], what: str, wanted: Callable[[str], bool]) -> dict[str, np.ndarray]:
-    """Read the arrays of a ``.npz`` archive whose names are ``wanted``, of numbers as :func:`read_npy`.
+    """Read the arrays of a ``.npz`` archive whose names satisfy ``wanted``.
 
     Raises
     ------
     DataError
-        If the file is missing, damaged, no such archive, or one that would grow beyond reason.
+        If the file is missing, damaged, or implausibly large when unpacked.
     """
     name = f"{what} {os.fspath(path)}"
     with _one_line(name, "npz"), zipfile.ZipFile(path) as archive:
@@ -55,7 +55,7 @@ def read_npz(path: str | os.PathLike[str], what: str, wanted: Callable[[str], bo
 
 
 def _array(file: IO[bytes], name: str) -> np.ndarray:
-    """Read an array of numbers, in the machine's byte order."""
+    """Read an array of numbers, in native byte order."""
     array: np.ndarray = np.lib.format.read_array(file, allow_pickle=False)
     if array.dtype.kind not in "biuf":
         raise DataError(f"{name} must be an array of numbers, got {array.dtype}; save it again as floats")
@@ -64,7 +64,7 @@ def _array(file: IO[bytes], name: str) -> np.ndarray:
 
 @contextlib.contextmanager
 def _one_line(name: str, kind: str) -> Iterator[None]:
-    """Turn whatever numpy and zipfile make of a file that is missing or damaged into one line."""
+    """Convert errors of NumPy and zipfile to DataError."""
     try:
         yield
     except DataError:

@@ -1,4 +1,4 @@
-"""Where the cameras look: the box that a scene without points starts in."""
+"""The box that the cameras look at, in which training without points starts."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from gs2d.core.transforms import camera_extent, focus_point
 from gs2d.data.scene import PointCloud
 
 _GRID = 40  # samples along each side of the search box
-_CAMERAS = 48  # at most so many, evenly chosen, vote: loading stays fast with thousands of views
-_BLENDER_HALF = 1.3  # the initial box of NeRF-Synthetic in the 3DGS and 2DGS recipes
+_CAMERAS = 48  # largest number of cameras that vote, evenly chosen
+_BLENDER_HALF = 1.3  # half side of the initial box of NeRF-Synthetic in 3DGS and 2DGS
 
 
 def scene_bounds(
@@ -20,9 +20,8 @@ def scene_bounds(
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return the box that the cameras look at.
 
-    With sparse points, their 1st to 99th percentile on each axis, widened by a tenth. Without, the box around the
-    places that most cameras see. For a synthetic data set the customary [-1.3, 1.3]^3, if the cameras
-    agree with it.
+    With sparse points: their 1st to 99th percentile on each axis, enlarged by a tenth. Without: the region that most
+    cameras see. For synthetic captures: [-1.3, 1.3]^3 if the cameras agree with it.
 
     Parameters
     ----------
@@ -36,7 +35,7 @@ def scene_bounds(
     -------
     bounds : ndarray [2, 3] float64, world units
     notes : tuple of str
-        What a user should know about a box that is a guess.
+        Warning about a guessed box.
     """
     if points is not None and len(points) >= 10:
         low, high = np.percentile(points.points, (1, 99), axis=0)
@@ -49,26 +48,26 @@ def scene_bounds(
     if box is not None:
         return box, ()
     return _box_ahead(cameras), (
-        "the optical axes do not meet, so the depth of the scene is a guess; give sparse points for a good start",
+        "the optical axes do not meet, so the depth of the scene is a guess; add sparse points for a better start",
     )
 
 
 def _fits_blender_box(cameras: Sequence[Camera]) -> bool:
-    """All cameras stand outside the customary box and look at its middle."""
+    """Whether all cameras are outside the box of NeRF-Synthetic and look at its centre."""
     focus = focus_point(cameras)
     if not _axes_meet(cameras) or np.abs(focus).max() > 0.5 * _BLENDER_HALF:
         return False
     distances = [np.abs(camera.center).max() for camera in cameras]
     if min(distances) <= _BLENDER_HALF:
         return False
-    # The box must fill a fair part of the pictures: in other units (centimetres) it would be a dot or the whole world.
+    # The box must fill a fair part of the images, else the capture has other units.
     radius = np.median([np.linalg.norm(camera.center) for camera in cameras])
     half_view = np.median([min(c.width / c.fx, c.height / c.fy) / 2 for c in cameras]) * radius
     return bool(0.5 < half_view / _BLENDER_HALF < 3.0)
 
 
 def _axes_meet(cameras: Sequence[Camera]) -> bool:
-    """Return the axes fix a point (they are not nearly parallel) and it lies ahead of most cameras."""
+    """Whether the optical axes are not nearly parallel and meet in front of most cameras."""
     axes = np.stack([camera.forward for camera in cameras])
     spread = np.linalg.eigvalsh(np.eye(3) - axes.T @ axes / len(axes))[0]  # mean sin^2 to the best common axis
     ahead = np.mean([(focus_point(cameras) - c.center) @ c.forward > 0 for c in cameras])
@@ -76,7 +75,7 @@ def _axes_meet(cameras: Sequence[Camera]) -> bool:
 
 
 def _box_seen_by_most(cameras: Sequence[Camera]) -> np.ndarray | None:
-    """Return the box around grid points that are seen by nearly as many cameras as the best seen one is."""
+    """Return the box of the grid points that at least 80 % of the maximum number of cameras see."""
     if len(cameras) < 2 or not _axes_meet(cameras):
         return None
     focus = focus_point(cameras)
@@ -98,7 +97,7 @@ def _box_seen_by_most(cameras: Sequence[Camera]) -> np.ndarray | None:
 
 
 def _box_ahead(cameras: Sequence[Camera]) -> np.ndarray:
-    """Around the pictures at the depths between one and four camera extents: all that parallel axes tell."""
+    """Return the box of the view frusta between one and four camera extents."""
     extent = max(camera_extent(cameras), 1e-6)
     corners = []
     for camera in cameras:

@@ -1,4 +1,4 @@
-"""What every reader produces, and the one way from there to a Scene."""
+"""Captures as readers return them, and their conversion to a Scene."""
 
 from __future__ import annotations
 
@@ -39,22 +39,22 @@ from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.data.undistort import Intrinsics, source_positions, undistort_image, undistort_mask
 from gs2d.errors import DataError, ShapeError, UnusableViewError
 
-# An image may differ from its camera's size by a factor; each axis may then be off by rounding.
+# The image size may differ from the camera's by a factor; each axis may then be off by rounding.
 _ASPECT_TOLERANCE = 0.01
 _LARGEST_SIDE = 1 << 31  # px, of a camera
 
 _LENSES = (0.01, 1e5)  # focal length / side: fields of view from 178.9 degrees down to 2 arc seconds
 
-# Positions are float32: how far apart they may be in units of the extent. The smallest steps of training are 1e-6.
+# Largest float32 spacing of positions, relative to the extent: warning, error. Training moves splats by 1e-6.
 _COARSE, _TOO_COARSE = 1e-5, 1e-3
-_FARTHEST = 1e12  # world units from the origin: cubes of it are float32 numbers still
+_FARTHEST = 1e12  # world units from the origin; its cube is still a float32 number
 
 LensMaps = Callable[[Intrinsics], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PosedImage:
-    """What a data set says about one photograph that exists.
+    """An image file with its camera.
 
     Attributes
     ----------
@@ -62,21 +62,22 @@ class PosedImage:
         Unique, with ``/``.
     path : Path
     intrinsics : Intrinsics
-        For the size that the data set states.
+        For the image size that the capture states.
     T_cam_world : ndarray [4, 4]
     split : "train", "test" or None
-        None: the data set has no split of its own.
+        None: the capture has no split.
     mask, object_mask : Path or None
-        Image files; white = counts, white = object.
+        Image files; white = used, white = object.
     alpha_is_silhouette : bool
-        The alpha channel says where the object is and the colour behind it is real (DTU as 2DGS ships it): alpha
-        becomes the object mask and the picture stays opaque.
+        Use the alpha channel as the object mask and keep the image opaque, because the background is real (DTU as
+        2DGS ships it).
     maps : MapFiles or None
         Depth and normal maps.
     mask_is_alpha : bool
-        What the mask leaves out is empty: it becomes the alpha channel, which is 1 where there is no mask.
+        Use the mask as the alpha channel: masked pixels are empty.
     face : Face or None
-        The part of the photograph that this is; name and pose are the part's, path and intrinsics the whole's.
+        Pinhole face of a wide image. ``name`` and ``T_cam_world`` are those of the face, ``path`` and ``intrinsics``
+        those of the image.
     """
 
     name: str
@@ -94,12 +95,22 @@ class PosedImage:
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """A data set as its reader understood it (fields as in Scene).
+    """A capture as its reader returns it; further attributes are as in Scene.
 
-    ``downscaled_by`` is the factor by which the image files that were chosen are already smaller (``images_N``);
-    ``home`` the folder that may hold the folders of maps and masks, where it is not the root, and ``mask_homes`` others
-    that may hold masks. ``finds_masks`` is False where files of these names are something else. ``is_synthetic`` says
-    that the object may fill the box [-1.3, 1.3]^3 of NeRF-Synthetic; it is used if the cameras agree with it.
+    Attributes
+    ----------
+    downscaled_by : int
+        Factor by which the image files are already downscaled (``images_N``).
+    home : Path or None
+        Folder that may hold folders of maps and masks, if it is not the root.
+    observe : callable or None
+        Reads which sparse points each image observes.
+    mask_homes : tuple of Path
+        Further folders that may hold masks.
+    finds_masks : bool
+        False if files with the usual names of masks are something else.
+    is_synthetic : bool
+        Try the box [-1.3, 1.3]^3 of NeRF-Synthetic; it is used if the cameras agree with it.
     """
 
     format: str
@@ -119,14 +130,14 @@ class Capture:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Decoder:
-    """Reads one photograph: decode, undistort, downscale; with its masks."""
+    """Decodes, undistorts and downscales one image and its masks."""
 
     frame: PosedImage
     downscale: int
     lens_maps: LensMaps
 
     def __call__(self) -> DecodedImage:
-        """Decode, undistort and shrink the photograph and its masks."""
+        """Return the decoded image."""
         frame, k = self.frame, self.frame.intrinsics
         image = read_image(frame.path)
         if image.shape[:2] != (k.height, k.width):
@@ -159,21 +170,21 @@ class Decoder:
         return DecodedImage(image, valid if mask is None else mask, small.object_mask, valid)
 
     def _read_mask(self, path: Path | None, need: float) -> np.ndarray | None:
-        """Return a mask at the image's size: True where at least ``need`` of the pixel's area is white."""
+        """Return a mask at image size: True where at least ``need`` of the pixel area is white."""
         if path is None:
             return None
         mask = read_mask(path)
         k = self.frame.intrinsics
         if mask.shape == (k.height, k.width):
             return mask
-        # A mask of another resolution (full-size masks beside images_4): its aspect was checked at load.
+        # A mask of another size (full-size masks beside images_4); its aspect ratio was checked at load.
         grey = Image.fromarray(mask.astype(np.uint8) * np.uint8(255))
         return np.asarray(grey.resize((k.width, k.height), Image.Resampling.BOX)) >= 255 * need
 
 
 @contextmanager
 def skipping(name: str, skipped: list[str]) -> Iterator[None]:
-    """Add the image ``name`` to ``skipped``, with the reason, where its pose or camera is not finite."""
+    """Catch UnusableViewError and add image and reason to ``skipped``."""
     try:
         yield
     except UnusableViewError as error:
@@ -181,29 +192,29 @@ def skipping(name: str, skipped: list[str]) -> Iterator[None]:
 
 
 def pose_from_camera_to_world(matrix: object, where: str, *, opengl: bool) -> np.ndarray:
-    """T_cam_world of a camera-to-world matrix [3 or 4, 4], as nested lists; rotations are cleaned of rounding.
+    """Return T_cam_world of a camera-to-world matrix [3 or 4, 4]; the rotation is orthonormalised.
 
-    OpenGL cameras look along -z with y up; ours look along z with y down: axes y and z change sign.
+    With ``opengl`` the axes y and z change sign: OpenGL cameras look along -z with y up.
 
     Raises
     ------
     UnusableViewError
-        NaN or infinity.
+        If a number is not finite.
     DataError
-        Not a matrix, or not a rigid motion.
+        If it is not a matrix or not a rigid motion.
     """
     try:
         M = np.asarray(matrix, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise DataError(f"{where} must be a 4x4 matrix of numbers, got {str(matrix)[:60]}") from error
     except OverflowError as error:
-        raise UnusableViewError(f"{where} must be finite, got a number beyond all floats") from error
+        raise UnusableViewError(f"{where} must be finite, got a number out of range") from error
     if M.shape not in ((4, 4), (3, 4)):
         raise DataError(f"{where} must be a 4x4 matrix, got shape {list(M.shape)}")
     if not np.isfinite(M).all():
         raise UnusableViewError(f"{where} must be finite, got NaN or infinity")
     R = M[:3, :3]
-    with np.errstate(all="ignore"):  # numbers so large that they overflow are no rotation either
+    with np.errstate(all="ignore"):  # numbers that overflow fail the check
         is_rotation = np.abs(R.T @ R - np.eye(3)).max() <= 1e-2 and np.linalg.det(R) > 0
         length, volume = np.linalg.norm(R, axis=0).round(4).tolist(), float(np.linalg.det(R))
     if not is_rotation:
@@ -222,20 +233,20 @@ def pose_from_camera_to_world(matrix: object, where: str, *, opengl: bool) -> np
 
 
 def fit_to_file(frame: PosedImage) -> PosedImage:
-    """Return the frame with intrinsics for the size that its file really has.
+    """Return the frame with intrinsics for the actual size of its file.
 
     Raises
     ------
     DataError
-        The file is no image, or its aspect is another one; or a mask's.
+        If the file is not an image, or its aspect ratio or that of a mask differs.
     """
     k = frame.intrinsics
     width, height = image_size(frame.path)
     if (width, height) != (k.width, k.height):
-        if max(k.width, k.height) > _LARGEST_SIDE:  # more than a double tells from its neighbours
+        if max(k.width, k.height) > _LARGEST_SIDE:  # double precision is exhausted
             raise DataError(
-                f"image {frame.path} must have a camera of its size, {width}x{height}, got one of more than "
-                f"{_LARGEST_SIDE:,} pixels a side; is the line of its camera whole?"
+                f"image {frame.path} must have a camera of its size, {width}x{height}, got one with more than "
+                f"{_LARGEST_SIDE:,} pixels per side; is the camera file complete?"
             )
         _check_aspect(f"image {frame.path}", (width, height), (k.width, k.height), "camera")
         k = k.scaled(width, height)
@@ -247,16 +258,16 @@ def fit_to_file(frame: PosedImage) -> PosedImage:
 
 def _check_aspect(what: str, got: tuple[int, int], expected: tuple[int, int], owner: str) -> None:
     sx, sy = got[0] / expected[0], got[1] / expected[1]
-    # A pixel of rounding on either axis is no other aspect.
+    # Allow one pixel of rounding on either axis.
     if abs(sx / sy - 1) > max(_ASPECT_TOLERANCE, 1 / min(got), 1 / min(expected)):
         raise DataError(
-            f"{what} must have the size (or aspect) of its {owner}, {expected[0]}x{expected[1]}, "
+            f"{what} must have the size or aspect ratio of its {owner}, {expected[0]}x{expected[1]}, "
             f"got {got[0]}x{got[1]}; was it rotated or cropped after calibration?"
         )
 
 
 def cut_out(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-    """Return a photograph [H, W, 3 or 4] with an alpha channel, 0 where a mask [H, W] bool is False."""
+    """Return an image [H, W, 3 or 4] with an alpha channel that is 0 where a mask [H, W] bool is False."""
     alpha = np.full(image.shape[:2], 255, np.uint8) if image.shape[2] == 3 else image[:, :, 3].copy()
     if mask is not None:
         alpha[~mask] = 0
@@ -272,27 +283,27 @@ def build_scene(
     cache_bytes: int,
     masks: Masks = Masks(),  # noqa: B008 (frozen)
 ) -> Scene:
-    """Return a Scene of a Capture: sizes checked, cameras downscaled, views split, extent and bounds measured.
+    """Convert a Capture to a Scene: check sizes, downscale cameras, split views, measure extent and bounds.
 
     Raises
     ------
     DataError
-        No view, no training view, twice the same name, or cameras that all stand at one point.
+        If there is no training view, a name occurs twice, or all cameras have the same centre.
     """
     if not capture.frames:
-        raise DataError(f"{root} must have at least one view, got none{_explained(capture)}")
+        raise DataError(f"{root} must contain at least one image with a camera, got none{_explained(capture)}")
     if downscale < 1 or (test_every is not None and test_every < 0):
         raise DataError(f"downscale must be >= 1 and test_every >= 0, got {downscale} and {test_every}")
     factor = max(1, downscale // capture.downscaled_by)
     cache = ImageCache(cache_bytes)
-    lens_maps = functools.lru_cache(maxsize=4)(source_positions)  # 12 bytes a pixel; cameras are mostly shared
+    lens_maps = functools.lru_cache(maxsize=4)(source_positions)  # 12 bytes per pixel; cameras are mostly shared
     frames, mask_notes, masks = _with_masks(capture, root, masks)
     frames = sorted((fit_to_file(frame) for frame in frames), key=lambda frame: frame.name)
     frames, cut = _cut(frames)
     names = [frame.name for frame in frames]
     if len(set(names)) != len(names):
         twice = next(a for a, b in itertools.pairwise(names) if a == b)
-        raise DataError(f"{root} must name each view once, got {twice} more than once")
+        raise DataError(f"{root} has several views named {twice}; names must be unique")
     frames, map_notes = (frames, ()) if cut else _with_maps(frames, capture.home or root)
     views = [_view(frame, factor, cache, lens_maps) for frame in frames]
     outliers = camera_outliers([view.camera for view in views])
@@ -314,7 +325,7 @@ def build_scene(
         bounds=bounds,
         T_metric_scene=capture.T_metric_scene,
         skipped=tuple(
-            f"{names[i]} is left out: its camera is {ratio:,.4g} times as far from the centre of the cameras "
+            f"{names[i]} is left out: its camera is {ratio:,.4g} times as far from the median camera centre "
             "as the median camera, so its pose is wrong"
             for i, ratio in outliers.items()
         )
@@ -329,19 +340,19 @@ def build_scene(
 
 
 def _explained(capture: Capture) -> str:
-    """Return what the reader reported of a capture with too few views, to end an error with; "" for nothing."""
+    """Return the notes of the reader, for the end of an error message; "" without any."""
     skipped = f"{len(capture.skipped)} skipped, first: {capture.skipped[0]}" if capture.skipped else ""
-    told = [*capture.notes, *([skipped] if skipped else [])]
-    return f" ({'; '.join(told)})" if told else ""
+    notes = [*capture.notes, *([skipped] if skipped else [])]
+    return f" ({'; '.join(notes)})" if notes else ""
 
 
 def _measured_extent(cameras: Sequence[Camera], root: Path) -> tuple[float, tuple[str, ...]]:
-    """Return the extent, world units, and a note where 32-bit positions are coarse so far from the origin.
+    """Return the extent, world units, and a warning if float32 positions are coarse this far from the origin.
 
     Raises
     ------
     DataError
-        Cameras in one place, or so far from the origin that positions in 32 bits cannot hold the scene.
+        If all cameras have the same centre, or float32 positions are too coarse for the scene.
     """
     farthest = max(float(np.abs(camera.center).max()) for camera in cameras)
     if not farthest <= _FARTHEST:
@@ -352,17 +363,17 @@ def _measured_extent(cameras: Sequence[Camera], root: Path) -> tuple[float, tupl
     extent = camera_extent(cameras)
     if not extent > 1e-9 * (1 + farthest):
         raise DataError(
-            f"{root} must have training cameras at two or more places, got {len(cameras)} at one place: "
-            "nothing can be reconstructed without a baseline"
+            f"{root} must have training cameras with different centres, got {len(cameras)} with the same centre: "
+            "reconstruction needs a baseline"
         )
-    step = farthest * float(np.finfo(np.float32).eps)  # between neighbouring 32-bit numbers so far out
+    step = farthest * float(np.finfo(np.float32).eps)  # float32 spacing
     if step <= _COARSE * extent:
         return extent, ()
-    what = f"positions are 32-bit numbers, {step:.2g} apart where the cameras stand ({farthest:.4g} from the origin)"
+    what = f"32-bit positions have a spacing of {step:.2g} near the cameras, {farthest:.4g} units from the origin"
     if step > _TOO_COARSE * extent:
         raise DataError(
-            f"{root} must lie nearer to its origin: {what}, for a scene of extent {extent:.4g}; subtract an offset "
-            "from the poses and points (map coordinates have large ones)"
+            f"{root} is too far from the origin: {what}, for a scene of extent {extent:.4g}; subtract an offset "
+            "from the poses and points (map coordinates have a large one)"
         )
     return extent, (f"{what}: fine detail is lost; subtract an offset from the poses and points",)
 
@@ -371,7 +382,7 @@ def _view(frame: PosedImage, factor: int, cache: ImageCache, lens_maps: LensMaps
     k = frame.intrinsics
     if not all(_LENSES[0] <= f / side <= _LENSES[1] for f, side in ((k.fx, k.width), (k.fy, k.height))):
         raise DataError(
-            f"view {frame.name}: a focal length of {_LENSES[0]:g} to {_LENSES[1]:g} times the image's side expected, "
+            f"view {frame.name}: expected a focal length of {_LENSES[0]:g} to {_LENSES[1]:g} times the image side, "
             f"got {k.fx:.4g}, {k.fy:.4g} px for {k.width}x{k.height} px; is it in pixels?"
         )
     seen = k if frame.face is None else frame.face.intrinsics
@@ -386,7 +397,7 @@ def _view(frame: PosedImage, factor: int, cache: ImageCache, lens_maps: LensMaps
 
 
 def _cut(frames: Sequence[PosedImage]) -> tuple[list[PosedImage], tuple[str, ...]]:
-    """Return the frames with panoramas and wide fisheyes in faces, and a note about them."""
+    """Split panoramas and wide fisheyes into pinhole faces; returns the frames and a note."""
     faces = {k: faces_of(k) for k in dict.fromkeys(frame.intrinsics for frame in frames)}
     found: list[PosedImage] = []
     kinds: dict[str, int] = {}
@@ -413,9 +424,9 @@ def _cut(frames: Sequence[PosedImage]) -> tuple[list[PosedImage], tuple[str, ...
 
 
 def _mask_leaves(frame: PosedImage, face: Face, known: dict[Any, bool]) -> bool:
-    """Whether the mask of a fisheye leaves enough of a face: a round picture shows nothing beyond its circle.
+    """Whether the mask of a fisheye leaves enough of a face.
 
-    ``known`` is filled with what was found: most photographs of a camera have one mask.
+    ``known`` caches results: the images of a camera mostly share one mask.
     """
     k = frame.intrinsics
     if frame.mask is None or frame.mask_is_alpha or k.lens is None or model_of(k.lens).wraps:
@@ -433,9 +444,9 @@ def _mask_leaves(frame: PosedImage, face: Face, known: dict[Any, bool]) -> bool:
 def _observed(
     capture: Capture, frames: Sequence[PosedImage], points: PointCloud | None, cameras: Mapping[str, Camera]
 ) -> Callable[[], ObservedPoints] | None:
-    """Return what reads which points the views show: a face those of its photograph that lie in it.
+    """Return a function that reads which points the views observe; faces get the points of their image.
 
-    Where the capture does not say it, or its observations are broken, the points are projected.
+    Without valid observations, the points are projected into the views.
     """
     if capture.observe is None and points is None:
         return None
@@ -458,18 +469,18 @@ def _observed(
                 seen[part.name] = rows[np.maximum(abs(x), abs(y)) < z]
         return replace(found, seen=seen)
 
-    return functools.cache(read)  # asked for by view after view
+    return functools.cache(read)  # called for every view
 
 
 def _with_masks(capture: Capture, root: Path, masks: Masks) -> tuple[list[PosedImage], tuple[str, ...], Masks]:
-    """Return the frames with their masks, a note about them, and how many there are."""
+    """Return the frames with their masks, a note, and the masks with their count."""
     frames = list(capture.frames)
     if not capture.finds_masks and masks.folder is None:
-        said = (
-            f"masks: --masked {masks.masked} changes nothing: format {capture.format} has silhouettes, which limit the "
-            "surface alone (--masks DIR names masks)"
+        note = (
+            f"masks: --masked {masks.masked} has no effect: format {capture.format} has silhouettes, which only limit "
+            "the surface (--masks DIR sets masks)"
         )
-        return frames, (said,) if masks.masked is not None else (), masks
+        return frames, (note,) if masks.masked is not None else (), masks
     homes = [home for home in (capture.home, *capture.mask_homes, root) if home is not None]
     named, names, images = ([getattr(frame, what) for frame in frames] for what in ("mask", "name", "path"))
     found, note = find_masks(names, images, named, homes, masks)
@@ -480,7 +491,7 @@ def _with_masks(capture: Capture, root: Path, masks: Masks) -> tuple[list[PosedI
 
 
 def _with_maps(frames: list[PosedImage], home: Path) -> tuple[list[PosedImage], tuple[str, ...]]:
-    """Return the frames with the maps that lie in ``depths`` and ``normals``, and a note for each such folder."""
+    """Return the frames with their maps in ``depths`` and ``normals``, and a note per folder."""
     found: dict[str, list[Path | None]] = {}
     for what, folder, suffixes in (("depth", DEPTHS, DEPTH_SUFFIXES), ("normal", NORMALS, NORMAL_SUFFIXES)):
         if (at := in_any_case(home, folder)).is_dir():
@@ -514,12 +525,12 @@ def _split(
         wholes = [frame.name if frame.face is None else str(frame.path) for frame in frames]
         numbers = {whole: number for number, whole in enumerate(dict.fromkeys(wholes))}  # faces stay together
         is_test = [bool(every) and numbers[whole] % every == 0 for whole in wholes]
-    train, test = (  # by the position among all views: an outlier does not change which others are test views
+    train, test = (  # outliers do not change the other test views
         tuple(view for i, view in enumerate(views) if is_test[i] == wanted and i not in outliers)
         for wanted in (False, True)
     )
     if not train:
-        raise DataError(f"{root} must have a training view, got {len(test)} test views only; use test_every=0")
+        raise DataError(f"{root} must have a training view, got only {len(test)} test views; use test_every=0")
     return train, test
 
 
@@ -544,6 +555,6 @@ def _lens_notes(frames: list[PosedImage]) -> tuple[str, ...]:
     bent = sum(frame.intrinsics.lens is not None for frame in frames)
     wide = max(math.degrees(2 * math.atan(max(k.width / k.fx, k.height / k.fy) / 2)) for k in lenses)
     return (
-        f"{bent} of {len(frames)} views are undistorted on load ({' and '.join(kinds)} lenses; a pinhole image of "
-        f"{wide:.0f} degrees is kept)",
+        f"{bent} of {len(frames)} views are undistorted on load ({' and '.join(kinds)} lenses, to pinhole images of "
+        f"{wide:.0f} degrees)",
     )

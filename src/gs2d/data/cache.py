@@ -1,4 +1,4 @@
-"""A thread-safe cache of decoded pictures, bounded in bytes."""
+"""A thread-safe, bounded cache of decoded images."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ import numpy as np
 from gs2d.core.images import area_downscale, mask_downscale
 from gs2d.core.memory import trim
 
-TRIM_EVERY = 16  # pictures that are decoded between giving back what decoding left: a few ms each time
+TRIM_EVERY = 16  # decoded images between two calls of trim(), which take a few ms
 
 
 @dataclass(frozen=True, eq=False)
 class DecodedImage:
-    """One decoded photograph with its masks; the arrays are read-only because they are shared.
+    """A decoded image with its masks; the arrays are shared and therefore read-only.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class DecodedImage:
     object_mask : ndarray bool [H, W] or None
         True = the object.
     valid : ndarray bool [H, W] or None
-        False = the photograph does not reach so far: undistortion left the pixel black. None: all are known.
+        False = outside the photograph after undistortion (black). None: all valid.
     """
 
     image: np.ndarray
@@ -47,9 +47,9 @@ class DecodedImage:
                 object.__setattr__(self, field, frozen)
 
     def downscaled(self, factor: int) -> DecodedImage:
-        """Return it at 1 / ``factor`` of its size, area-filtered; leftover rows and columns are cut.
+        """Return the image at 1 / ``factor`` of its size, area-filtered; leftover rows and columns are cut.
 
-        A pixel counts where all of its block does, and is the object's where half of its block is.
+        A pixel is used if its whole block is, and belongs to the object if half of its block does.
         """
         if factor == 1:
             return self
@@ -61,17 +61,16 @@ class DecodedImage:
 
     @property
     def nbytes(self) -> int:
-        """Bytes held."""
+        """Memory of the arrays, bytes."""
         arrays = [array for array in (self.image, self.mask, self.object_mask, self.valid) if array is not None]
-        return sum({array.ctypes.data: array.nbytes for array in arrays}.values())  # often mask is known
+        return sum({array.ctypes.data: array.nbytes for array in arrays}.values())  # mask may be valid
 
 
 class ImageCache:
-    """Least-recently-used pictures, at most ``max_bytes`` of them.
+    """A least-recently-used cache of at most ``max_bytes``.
 
-    A picture larger than the bound is handed out and not kept. What decoding frees is given back to the system now and
-    then. Decoding happens outside the lock: threads decode
-    different pictures at the same time; two threads that ask for the same one may both decode it.
+    Larger images are returned without being stored. Decoding happens outside the lock: threads decode different images
+    in parallel; two threads that request the same image may both decode it.
     """
 
     def __init__(self, max_bytes: int) -> None:
@@ -82,20 +81,20 @@ class ImageCache:
 
     @property
     def nbytes(self) -> int:
-        """Bytes held now."""
+        """Current memory use, bytes."""
         return self._nbytes
 
     def __len__(self) -> int:
         return len(self._images)
 
     def clear(self) -> None:
-        """Drop all pictures; they are decoded again when somebody asks."""
+        """Drop all images."""
         with self._lock:
             self._images.clear()
             self._nbytes = 0
 
     def get(self, key: Hashable, decode: Callable[[], DecodedImage]) -> DecodedImage:
-        """Return the picture of ``key``, decoded if it is not held."""
+        """Return the image of ``key``, decoded if it is not in the cache."""
         with self._lock:
             held = self._images.get(key)
             if held is not None:
@@ -117,14 +116,14 @@ class ImageCache:
 
 
 class ReadAhead:
-    """Fills caches with the pictures that will be asked for next, on threads of its own.
+    """Decodes images in advance, on its own threads, to fill a cache.
 
-    What goes wrong there is not told: whoever asks for the picture meets the same error.
+    Errors are ignored here; they are raised again when the image is requested.
 
     Parameters
     ----------
     load : callable
-        Asks for the picture of an index.
+        Requests the image of an index.
     threads : int
     """
 
@@ -134,7 +133,7 @@ class ReadAhead:
         self._asked: set[int] = set()
 
     def expect(self, indices: Sequence[int]) -> None:
-        """Ask for those of the indices that were not among the expected ones of the last time."""
+        """Request the images of indices that were not in the previous call."""
         for index in indices:
             if index not in self._asked:
                 self._pool.submit(self._quietly, index)

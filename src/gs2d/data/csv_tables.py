@@ -1,16 +1,17 @@
-"""Tables of names and numbers as people write them: CSV with a header, and OpenDroneMap's text files."""
+"""Tables of names and numbers: CSV with a header, and OpenDroneMap's text files."""
 
 from __future__ import annotations
 
 import csv
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gs2d.core.projection import named_crs
 from gs2d.errors import DataError
 
+WGS84 = 4326  # EPSG code of latitude and longitude
 _LARGEST = 64 << 20  # bytes
 
 
@@ -22,8 +23,8 @@ class Table:
     ----------
     path : Path
     epsg : int or None
-        What a line of the file says of its coordinates.
-    rows : tuple of (line number, words by column)
+        Coordinate system that the file names.
+    rows : tuple of (line number, text by column)
     columns : tuple of str
     """
 
@@ -33,7 +34,7 @@ class Table:
     columns: tuple[str, ...]
 
     def number(self, line: int, row: Mapping[str, str], column: str) -> float:
-        """Return a number of a row."""
+        """Return the number in a column of a row."""
         text = row.get(column, "").strip()
         try:
             value = float(text)
@@ -44,17 +45,17 @@ class Table:
         return value
 
     def has(self, row: Mapping[str, str], *columns: str) -> bool:
-        """Whether a row has something in each of these columns."""
+        """Whether none of these columns is empty in a row."""
         return all(row.get(column, "").strip() for column in columns)
 
 
 def read_table(path: Path, plain: Sequence[str], required: Sequence[str]) -> Table:
-    """Read a table: CSV with a header, or OpenDroneMap's lines of words below the name of a coordinate system.
+    """Read a CSV file with a header, or OpenDroneMap's rows below the name of a coordinate system.
 
     Parameters
     ----------
     plain : sequence of str
-        The columns of OpenDroneMap's layout, in order; what follows them in a line is passed over.
+        Columns of OpenDroneMap's layout, in order; further columns are ignored.
     required : sequence of str
         Columns that a CSV file must have.
     """
@@ -62,14 +63,36 @@ def read_table(path: Path, plain: Sequence[str], required: Sequence[str]) -> Tab
     first = next((line for line in lines if line[1] and not line[1].startswith("#")), None)
     if first is None:
         raise DataError(f"{path} must hold a table, got an empty file")
-    if (epsg := named_crs(first[1])) is not None:
+    if (epsg := _named_crs(first[1])) is not None:
         words = [(number, text.split()) for number, text in lines if number > first[0] and text and text[0] != "#"]
         rows = tuple((number, dict(zip(plain, row, strict=False))) for number, row in words)
         if not rows:
-            raise DataError(f"{path} must hold a line for each place below its coordinate system, got none")
+            raise DataError(f"{path} must hold one row per item below its coordinate system, got none")
         return Table(path, epsg, rows, tuple(plain))
-    told = (named_crs(text.lstrip("# ")) for _, text in lines if text.startswith("#"))
-    return _read_csv(path, lines, next((code for code in told if code is not None), None), required)
+    codes = (_named_crs(text.lstrip("# ")) for _, text in lines if text.startswith("#"))
+    return _read_csv(path, lines, next((code for code in codes if code is not None), None), required)
+
+
+def _named_crs(text: str) -> int | None:
+    """Return the EPSG code in a line such as ``EPSG:32632``, ``WGS84 UTM 32N`` or ``+proj=utm +zone=32``, or None.
+
+    Raises
+    ------
+    DataError
+        For any other PROJ string.
+    """
+    text = text.strip()
+    if match := re.fullmatch(r"EPSG:\s*(\d{4,6})", text, re.IGNORECASE):
+        return int(match[1])
+    if match := re.fullmatch(r"WGS ?84 UTM (\d{1,2}) ?([NS])", text, re.IGNORECASE):
+        return (32600 if match[2].upper() == "N" else 32700) + int(match[1])
+    if not text.startswith("+proj="):
+        return None
+    if re.search(r"\+proj=(latlong|longlat)\b", text):
+        return WGS84
+    if (match := re.search(r"\+proj=utm\b.*\+zone=(\d{1,2})\b", text)) and "+ellps=GRS80" not in text:
+        return (32700 if "+south" in text else 32600) + int(match[1])
+    raise DataError(f"a coordinate system with an EPSG code was expected, got {text[:60]}; write EPSG:CODE")
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
@@ -78,7 +101,7 @@ def _lines(path: Path) -> list[tuple[int, str]]:
             raise DataError(f"{path} must be a table of names and numbers, got a file of {path.stat().st_size:,} bytes")
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise DataError(f"{path} must be text in UTF-8, got a byte that is not at offset {error.start}") from error
+        raise DataError(f"{path} must be UTF-8 text, got an invalid byte at offset {error.start}") from error
     except OSError as error:
         raise DataError(f"cannot read {path}: {error.strerror or error}") from error
     return [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
@@ -95,7 +118,7 @@ def _read_csv(path: Path, lines: Sequence[tuple[int, str]], epsg: int | None, re
             f"layout, which begins with EPSG:CODE), {', '.join(missing)} is missing in {head[:60]!r}"
         )
     rows = []
-    for number, text in kept[1:]:  # by itself: a quote that is not closed ends with its line
+    for number, text in kept[1:]:  # line by line, so that an unclosed quote ends with its line
         words = _split(path, number, text, delimiter)
         if len(words) > len(columns):
             raise DataError(f"{path}, line {number}: {len(columns)} values were expected, got {len(words)}")
@@ -108,5 +131,5 @@ def _read_csv(path: Path, lines: Sequence[tuple[int, str]], epsg: int | None, re
 def _split(path: Path, number: int, text: str, delimiter: str) -> list[str]:
     try:
         return next(csv.reader([text], delimiter=delimiter))
-    except csv.Error as error:  # a field of more than 128 KiB
-        raise DataError(f"{path}, line {number}: words between {delimiter!r} were expected, got: {error}") from error
+    except csv.Error as error:  # a field larger than 128 KiB
+        raise DataError(f"{path}, line {number}: values separated by {delimiter!r} were expected: {error}") from error

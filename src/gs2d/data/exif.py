@@ -1,6 +1,6 @@
-"""What a photograph's file says of how it was taken: place, time, orientation and camera, by EXIF and by XMP of drones.
+"""EXIF and XMP metadata of an image: position, time, orientation and camera.
 
-A damaged block is none: nothing here raises for what a file says of itself, but for a file that is no image.
+Damaged metadata is ignored.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from PIL import ExifTags, Image
 
 from gs2d.data.image_files import open_image
 
-#: What Pillow raises for a damaged EXIF block.
+#: Exceptions of Pillow for a damaged EXIF block.
 DAMAGED_EXIF = (
     *(OSError, SyntaxError, ValueError, KeyError, TypeError, ZeroDivisionError, AttributeError, OverflowError),
     struct.error,
 )
 _UPRIGHT = 1
 _ORIENTATIONS = range(1, 9)
-# Names in XMP, without their prefix: DJI (also in its own spelling), senseFly and others; the first that is there.
+# Names in XMP, without prefix: DJI (including its misspelling), senseFly and others; the first one is used.
 _LATITUDES = ("GpsLatitude", "GPSLatitude", "Latitude")
 _LONGITUDES = ("GpsLongitude", "GpsLongtitude", "GPSLongitude", "Longitude")
 _HEIGHTS = ("AbsoluteAltitude", "AltitudeWGS84", "GPSAltitude", "AltitudeAMSL")
@@ -34,20 +34,20 @@ _HEIGHTS = ("AbsoluteAltitude", "AltitudeWGS84", "GPSAltitude", "AltitudeAMSL")
 
 @dataclass(frozen=True)
 class Taken:
-    """How a photograph was taken, as far as its file tells.
+    """How a photograph was taken.
 
     Attributes
     ----------
     orientation : int
         EXIF, 1 (upright) to 8.
     made_by : tuple of str
-        Camera, lens and focal length as EXIF has them; empty strings where it has none.
+        Make, model, lens and focal lengths as in EXIF; empty strings if missing.
     place : (float, float, float) or None
-        Latitude and longitude (degrees, WGS 84) and height (m); a height that is missing is NaN.
+        Latitude and longitude (degrees, WGS 84) and height (m); a missing height is NaN.
     seconds : float or None
-        When, on the clock of the camera, which knows no time zone; comparable among photographs only.
+        Time of the camera clock, without time zone.
     panorama : str
-        "whole" or "part" of an equirectangular 360-degree panorama, as XMP says (GPano); empty where it does not.
+        "whole" or "part" of an equirectangular 360-degree panorama (XMP GPano), or empty.
     """
 
     orientation: int = _UPRIGHT
@@ -58,7 +58,7 @@ class Taken:
 
 
 def read_taken(path: Path) -> Taken:
-    """Return what a photograph's file says of how it was taken."""
+    """Read the metadata of an image; defaults if it is damaged."""
     base = ExifTags.Base
     try:
         with open_image(path) as file:
@@ -75,19 +75,19 @@ def read_taken(path: Path) -> Taken:
 
 
 def read_place(path: Path) -> np.ndarray | None:
-    """Return latitude, longitude and height that a photograph's file has [3], or None; see :class:`Taken`."""
+    """Return latitude, longitude and height [3] of an image, or None; see :class:`Taken`."""
     place = read_taken(path).place
     return None if place is None else np.array(place)
 
 
 def _xmp(file: Image.Image) -> str:
-    """Return the XMP block as text: attributes and elements are looked for by name, so that no XML is parsed."""
+    """Return the XMP block as text; values are searched by name, without an XML parser."""
     block = file.info.get("xmp") or file.info.get("XML:com.adobe.xmp") or b""
     return block.decode("utf-8", "replace") if isinstance(block, bytes) else str(block)
 
 
 def _panorama(xmp: str) -> str:
-    """Return "whole", "part" or nothing: Google's Photo Sphere XMP, which 360-degree cameras and stitchers write."""
+    """Return "whole", "part" or "" by Google's Photo Sphere XMP, as 360-degree cameras and stitchers write it."""
     if _found(xmp, "ProjectionType").lower() != "equirectangular":
         return ""
     sides = [
@@ -97,24 +97,24 @@ def _panorama(xmp: str) -> str:
     return "part" if any(shown != whole for shown, whole in sides if shown and whole) else "whole"
 
 
-# -- where -------------------------------------------------------------------------------------------------------------
+# -- position ----------------------------------------------------------------------------------------------------------
 def _place(exif: Image.Exif, xmp: str) -> tuple[float, float, float] | None:
-    """EXIF's place, else XMP's; a height that one lacks is the other's."""
-    told = _exif_place(exif)
-    more = _xmp_place(xmp) if told is None or math.isnan(told[2]) else None
-    if told is None or more is None:
-        return told or more
-    return told[0], told[1], more[2]
+    """Return the position of EXIF, else that of XMP; a missing height is taken from XMP."""
+    place = _exif_place(exif)
+    other = _xmp_place(xmp) if place is None or math.isnan(place[2]) else None
+    if place is None or other is None:
+        return place or other
+    return place[0], place[1], other[2]
 
 
 def _exif_place(exif: Image.Exif) -> tuple[float, float, float] | None:
     gps = ExifTags.GPS
     try:
-        told: Mapping[int, Any] = exif.get_ifd(ExifTags.IFD.GPSInfo)
-        latitude = _degrees(told[gps.GPSLatitude], told.get(gps.GPSLatitudeRef, "N"), "S")
-        longitude = _degrees(told[gps.GPSLongitude], told.get(gps.GPSLongitudeRef, "E"), "W")
-        height = float(told[gps.GPSAltitude]) if gps.GPSAltitude in told else math.nan
-        if told.get(gps.GPSAltitudeRef, b"\0") in (b"\1", 1):
+        tags: Mapping[int, Any] = exif.get_ifd(ExifTags.IFD.GPSInfo)
+        latitude = _degrees(tags[gps.GPSLatitude], tags.get(gps.GPSLatitudeRef, "N"), "S")
+        longitude = _degrees(tags[gps.GPSLongitude], tags.get(gps.GPSLongitudeRef, "E"), "W")
+        height = float(tags[gps.GPSAltitude]) if gps.GPSAltitude in tags else math.nan
+        if tags.get(gps.GPSAltitudeRef, b"\0") in (b"\1", 1):
             height = -height
     except DAMAGED_EXIF:
         return None
@@ -144,18 +144,18 @@ def _xmp_place(xmp: str) -> tuple[float, float, float] | None:
 
 
 def _named(xmp: str, names: Sequence[str]) -> str:
-    """Return what XMP has under the first of these names that it has; empty without any."""
+    """Return the value of the first of these names in XMP; "" without any."""
     return next(filter(None, (_found(xmp, name) for name in names)), "")
 
 
 def _found(xmp: str, name: str) -> str:
-    """Return what XMP has under a name of any prefix, as attribute or element; empty without it."""
+    """Return the value of a name with any prefix in XMP, as attribute or element; "" without it."""
     found = re.search(rf"[\w-]+:{name}\s*(?:=\s*[\"']([^\"'<>]*)[\"']|>([^<]*)<)", xmp)
     return (found[1] or found[2] or "").strip() if found else ""
 
 
 def _xmp_degrees(text: str) -> float:
-    """Return degrees of ``+46.84``, or of EXIF's form in XMP: ``46,50.55N`` or ``46,50,33N``."""
+    """Parse degrees: ``+46.84``, or EXIF's form in XMP, ``46,50.55N`` or ``46,50,33N``."""
     letter = text[-1:].upper()
     if letter not in ("N", "S", "E", "W"):
         return float(text)
@@ -165,20 +165,20 @@ def _xmp_degrees(text: str) -> float:
 
 
 def _believable(latitude: float, longitude: float, height: float) -> tuple[float, float, float] | None:
-    """Return the place, or None for one that cannot be: receivers without a fix write zeros."""
+    """Return the position, or None if it is invalid: receivers without a fix write zeros."""
     if not (abs(latitude) <= 90 and abs(longitude) <= 180) or (latitude == 0 and longitude == 0):
         return None
     return latitude, longitude, height if math.isfinite(height) else math.nan
 
 
-# -- when --------------------------------------------------------------------------------------------------------------
+# -- time --------------------------------------------------------------------------------------------------------------
 def _seconds(exif: Image.Exif, details: Mapping[int, Any]) -> float | None:
     base = ExifTags.Base
     text = details.get(base.DateTimeOriginal) or details.get(base.DateTimeDigitized) or exif.get(base.DateTime)
     part = details.get(base.SubsecTimeOriginal) or details.get(base.SubsecTime) or ""
     try:
-        told = datetime.datetime.strptime(str(text).strip("\0 "), "%Y:%m:%d %H:%M:%S")
-        whole = told.replace(tzinfo=datetime.UTC).timestamp()
+        time = datetime.datetime.strptime(str(text).strip("\0 "), "%Y:%m:%d %H:%M:%S")
+        whole = time.replace(tzinfo=datetime.UTC).timestamp()
     except DAMAGED_EXIF:
         return None
     digits = str(part).strip("\0 ")

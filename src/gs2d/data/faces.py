@@ -1,8 +1,7 @@
-"""Photographs that see more than one pinhole image holds, panoramas and wide fisheyes, cut into pinhole faces.
+"""Pinhole faces of panoramas and wide fisheyes.
 
 The faces are those of a cube around the camera: front, right, back, left, up, down, 90 degrees each, at the resolution
-that the photograph has in the middle of the face. All faces have the camera centre of the photograph. Their pixels are
-sampled where the camera model (:mod:`gs2d.data.camera_models`) shows their rays.
+of the image in the middle of the face.
 """
 
 from __future__ import annotations
@@ -17,9 +16,9 @@ from gs2d.data.camera_models import PANORAMA, Lens, model_of
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
 
-WIDEST = 120.0  # degrees: a wider fisheye is cut; in a pinhole image of it the rim would be stretched fourfold
-LEAST_SHOWN = 0.02  # of a face's pixels that the photograph must show; a sliver teaches nothing
-GLANCE = 64  # px of a face, to see how much of it is shown
+WIDEST = 120.0  # degrees; wider fisheyes are split, because a pinhole image would stretch the rim fourfold
+LEAST_SHOWN = 0.02  # smallest visible fraction of a face
+GLANCE = 64  # px, face size for measuring the visible fraction
 _TURNS = {  # degrees to the right, then up
     "front": (0, 0),
     "right": (90, 0),
@@ -33,7 +32,7 @@ FACES = tuple(_TURNS)
 
 @dataclass(frozen=True)
 class Face:
-    """One face of a photograph: its name, and the side of its square picture, px."""
+    """A face of an image: its name and the side of its square image, px."""
 
     name: str
     side: int
@@ -42,14 +41,14 @@ class Face:
     def rotation(self) -> np.ndarray:
         """R_face_camera [3, 3]: x_face = R x_camera."""
         right, up = np.radians(_TURNS[self.name])
-        # A ray ahead of the face is turned right about y (down) and up about x.
+        # The axis of the face is rotated right about y (down) and up about x.
         turn = np.array([[math.cos(right), 0, math.sin(right)], [0, 1, 0], [-math.sin(right), 0, math.cos(right)]])
         rise = np.array([[1, 0, 0], [0, math.cos(up), -math.sin(up)], [0, math.sin(up), math.cos(up)]])
         return np.asarray(np.rint((turn @ rise).T))
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """Of its picture: 90 degrees across."""
+        """Intrinsics of the face: 90 degrees wide."""
         half = self.side / 2
         return Intrinsics(self.side, self.side, half, half, half, half)
 
@@ -60,7 +59,7 @@ def panorama(width: int, height: int, where: str) -> Intrinsics:
     Raises
     ------
     DataError
-        It is not twice as wide as high.
+        If it is not twice as wide as high.
     """
     if not is_twice_as_wide(width, height):
         raise DataError(
@@ -71,7 +70,7 @@ def panorama(width: int, height: int, where: str) -> Intrinsics:
 
 
 def field_of_view(k: Intrinsics) -> float:
-    """Return the horizontal field of view of a photograph in degrees; of a wide camera model along its axis."""
+    """Return the horizontal field of view of an image, degrees; for wide camera models along the axis."""
     lens = k.lens
     if lens is None or not model_of(lens).is_wide:
         return math.degrees(2 * math.atan(k.width / 2 / k.fx))
@@ -83,7 +82,7 @@ def field_of_view(k: Intrinsics) -> float:
 
 
 def faces_of(k: Intrinsics) -> tuple[Face, ...]:
-    """Return the faces that a photograph is cut into: none where one pinhole image will do."""
+    """Return the faces of an image; none if one pinhole image suffices."""
     if k.lens is None or not model_of(k.lens).is_wide or field_of_view(k) <= WIDEST:
         return ()
     every = [Face(name, 2 * max(1, round(k.fx))) for name in FACES]  # 90 degrees at this focal length
@@ -91,9 +90,9 @@ def faces_of(k: Intrinsics) -> tuple[Face, ...]:
 
 
 def face_positions(k: Intrinsics, face: Face) -> tuple[np.ndarray, np.ndarray]:
-    """Where each pixel of a face comes from: as ``undistort.source_positions``.
+    """Return the source position of each pixel of a face, as ``undistort.source_positions``.
 
-    Of a panorama in pixels of ``wrapped`` pictures, one column wider on each side.
+    For panoramas, positions refer to ``wrapped`` images, which have one more column on each side.
     """
     centres = (np.arange(face.side) + 0.5 - face.side / 2) / (face.side / 2)
     x, y = np.meshgrid(centres, centres)
@@ -108,13 +107,13 @@ def face_positions(k: Intrinsics, face: Face) -> tuple[np.ndarray, np.ndarray]:
 
 
 def wrapped(image: np.ndarray, k: Intrinsics) -> np.ndarray:
-    """Return a panorama [H, W, ...] with its last column before the first, its first after the last; others as is."""
+    """Pad a panorama [H, W, ...] with its last column on the left and its first on the right; else unchanged."""
     if k.lens is None or not model_of(k.lens).wraps:
         return image
     return np.concatenate([image[:, -1:], image, image[:, :1]], axis=1)
 
 
 def face_name(name: str, face: Face) -> str:
-    """Return what a face is called: ``a/b_front.jpg`` of ``a/b.jpg``."""
+    """Return the name of a face: ``a/b_front.jpg`` of ``a/b.jpg``."""
     stem, dot, ending = name.rpartition(".")
     return f"{stem}_{face.name}{dot}{ending}" if dot and "/" not in ending else f"{name}_{face.name}"

@@ -1,4 +1,4 @@
-"""Find files by the names that camera files use: paths of another machine, another case, another Unicode form."""
+"""Find files by the names in camera files, which may have other folders, letter case or Unicode form."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from dataclasses import dataclass
 from pathlib import Path
 
 IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif", ".exr")
-#: folders below a capture that hold images of the photographs' names, but no photographs
+#: Folders of a capture whose images have the names of photographs but are something else.
 NO_PHOTOGRAPHS = frozenset({"mask", "masks", "depths", "normals", "depthmaps", "undistorted", "thumbnails"})
-_SMALLER = re.compile(r"images_\d+")  # of smaller copies of the photographs
+_SMALLER = re.compile(r"images_\d+")  # downscaled copies
 
 
 @dataclass(frozen=True)
 class Match:
-    """The file that a name stands for.
+    """The file that matches a name.
 
     Attributes
     ----------
     path : Path or None
-        None if no file fits, or if several fit equally well.
+        None if no file or several files match.
     rank : tuple of int
-        How well the path agrees with the name; a longer common end is larger.
+        Quality of the match; larger for a longer common end.
     elsewhere : bool
-        The folders of the file and of the name differ.
+        Whether the folders of file and name differ.
     several : tuple of Path
-        The files that fit equally well, if there is more than one.
+        Files that match equally well, if more than one.
     """
 
     path: Path | None = None
@@ -38,19 +38,19 @@ class Match:
 
 
 class Files:
-    r"""Find files below some folders by the names that a camera file uses; list each folder at most once.
+    r"""Find files below some folders by the names in a camera file; each folder is listed at most once.
 
-    A name stands for the file at that path: absolute, or relative to ``base`` or one of the folders. If there is no
-    such file, the longest end of the path that names one file below a folder counts. ``\\`` and ``/`` are both
-    separators, and case and Unicode form (NFC, NFD) matter only if several files differ in nothing else.
+    A name matches the file at that path: absolute, or relative to ``base`` or one of the folders. Otherwise the file
+    below a folder with the longest common end of the path is used. ``\\`` and ``/`` are both separators. Letter case
+    and Unicode form (NFC, NFD) matter only if several files differ in nothing else.
 
     Parameters
     ----------
     folders : sequence of Path
-        Where files may be, most likely first; sub-folders count too, except hidden and linked ones. Folders that do
-        not exist are passed over.
+        Folders to search, most likely first, with sub-folders except hidden and linked ones. Missing folders are
+        ignored.
     base : Path, optional
-        Folder that relative paths are relative to; tried before ``folders``.
+        Base folder of relative paths; tried before ``folders``.
     """
 
     def __init__(self, folders: Sequence[Path], base: Path | None = None) -> None:
@@ -69,20 +69,20 @@ class Files:
     ) -> list[Match]:
         """Return the file of each name.
 
-        Names are matched together: no two names get the same file by an end of their paths, because at least one
-        would be wrong. For the same reason, a file in a folder that contradicts the name (``left/1.png`` for
-        ``right/1.png``) is used only if no name has a file in its own folder.
+        Names are matched together: two names never share a file by a common end, because at least one would be wrong.
+        For the same reason, a file in a contradicting folder (``left/1.png`` for ``right/1.png``) is used only if no
+        name has a file in its own folder.
 
         Parameters
         ----------
         names : sequence of sequences of str
-            The spellings of each name, most likely first.
+            Spellings of each name, most likely first.
         not_in : collection of str
-            Names of folders, in lower case, whose files do not count unless a name is their path.
+            Folder names, in lower case, whose files match only by their exact path.
         taken : collection of Path
-            Files that do not count unless a name is their path.
+            Files that match only by their exact path.
         moved : bool, optional
-            Whether files in folders that contradict their names may count at all.
+            Whether files in contradicting folders may match at all.
         """
         found = [self._exact(spellings) for spellings in names]
         owned = {match.path for match in found if match.path is not None} | set(taken)
@@ -102,13 +102,13 @@ class Files:
         ]
 
     def of_stem(self, name: str, suffixes: Collection[str], not_in: Collection[str] = ()) -> Path | None:
-        """Return a file that differs from a name in its extension alone, which is one of ``suffixes``."""
+        """Return a file that differs from a name only in its suffix, one of ``suffixes``."""
         stem = os.path.splitext(name)[0]
         match = self._best([stem + suffix for suffix in suffixes], not_in, ())
         return None if match.elsewhere else match.path
 
     def _exact(self, spellings: Sequence[str]) -> Match:
-        """Return the file whose path is the name."""
+        """Return the file whose path equals the name."""
         for base in self._bases:
             for name in spellings:
                 path = base / name.replace("\\", "/")
@@ -117,17 +117,17 @@ class Files:
         return Match()
 
     def _is_file(self, path: Path) -> bool:
-        """Whether a path is a file; it is asked of the file system only if its folder lists the name."""
+        """Whether a path is a file; uses cached folder listings."""
         folder, name = os.path.split(path)
         if folder not in self._entries:
             try:
                 self._entries[folder] = frozenset(os.listdir(folder))
-            except (OSError, ValueError):  # no such folder, or a name that none can have
+            except (OSError, ValueError):  # missing folder or invalid name
                 self._entries[folder] = frozenset()
         return name in self._entries[folder] and os.path.isfile(path)
 
     def _best(self, spellings: Sequence[str], not_in: Collection[str], taken: Collection[Path | None]) -> Match:
-        """Return the file whose path has the longest end in common with the name."""
+        """Return the file with the longest common end of its path."""
         for folder in self._folders:
             for name in spellings:
                 parts = _parts(name)
@@ -146,7 +146,7 @@ class Files:
         return Match()
 
     def _below(self, folder: Path) -> Mapping[str, Sequence[tuple[str, ...]]]:
-        """Return the files below a folder, as parts of their paths, by their folded names."""
+        """Return the files below a folder, as path parts, by folded name."""
         if folder not in self._listed:
             names: dict[str, list[tuple[str, ...]]] = {}
             for parts in sorted(_walk(folder)):
@@ -156,14 +156,14 @@ class Files:
 
 
 def folded(name: str) -> str:
-    """Return a file name without differences of case and of Unicode form."""
+    """Return a file name without letter case and Unicode form."""
     return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
 
 
 def in_any_case(home: Path, name: str) -> Path:
-    """Return the file or folder ``name`` below ``home``; its parts may be in other letters (``Masks``) on the disk.
+    """Return the path of ``name`` below ``home``, whose parts may have another letter case on disk (``Masks``).
 
-    An exact match is preferred. If there is none, and not just one that differs in case, this is ``home / name``.
+    Prefers an exact match. Without a unique match, returns ``home / name``.
     """
     for part in Path(name).parts:
         if not (home / part).exists() and home.is_dir():
@@ -174,12 +174,12 @@ def in_any_case(home: Path, name: str) -> Path:
 
 
 def files_ending(folder: Path, ending: str) -> list[Path]:
-    """Return the entries of a folder whose names end in ``ending``, in any case, sorted by name."""
+    """Return the entries of a folder with a suffix, in any letter case, sorted by name."""
     return sorted(path for path in folder.iterdir() if path.suffix.lower() == ending)
 
 
 def name_below(path: Path, folders: Sequence[Path]) -> str:
-    """Return the path of a file below the first of the folders that holds it, else its whole path, with ``/``."""
+    """Return the path relative to the first folder that contains it, else the whole path, with ``/``."""
     inside = next((path.relative_to(folder) for folder in folders if path.is_relative_to(folder)), None)
     return (inside or Path(*path.parts[1:])).as_posix()
 
@@ -196,7 +196,7 @@ def _walk(folder: Path) -> Iterator[tuple[str, ...]]:
 
 
 def _compare(folder: Path, own: Sequence[str], parts: Sequence[str]) -> Match:
-    """Compare the end of a file's path below ``folder`` with that of a name; the last parts are alike."""
+    """Compare the end of a path below ``folder`` with a name of equal last part."""
     pairs = list(zip(reversed(own), reversed(parts), strict=False))
     agreed = next((i for i, (a, b) in enumerate(pairs) if folded(a) != folded(b)), len(pairs))
     form = sum(unicodedata.normalize("NFC", a) == unicodedata.normalize("NFC", b) for a, b in pairs[:agreed])
@@ -205,5 +205,5 @@ def _compare(folder: Path, own: Sequence[str], parts: Sequence[str]) -> Match:
 
 
 def _owns(name: str, owners: Mapping[str, tuple[int, ...]]) -> bool:
-    """Whether a name agrees better with a file than all others that fit it."""
+    """Whether a name matches a file better than all other names."""
     return all(owners[name] > rank for other, rank in owners.items() if other != name)

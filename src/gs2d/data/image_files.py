@@ -18,27 +18,26 @@ from gs2d.core.files import atomic_write
 from gs2d.core.growth import check_growth
 from gs2d.core.images import to_uint8
 from gs2d.core.text import first_line
-from gs2d.data import exr, float_tiff
+from gs2d.data.float_images import exr_size, float_tiff, is_exr, read_exr, read_exr_map, read_float_tiff
 from gs2d.errors import DataError, ShapeError
 
-#: What Pillow is let near: formats of photographs, masks and depths. The forty others, some of which start programs
-#: (EPS: Ghostscript) or which nobody has looked at for years, are never tried, whatever a file is called.
+#: Formats that Pillow may open. Others are rarely tested or start external programs (EPS: Ghostscript).
 FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "WEBP", "AVIF", "HEIF", "BMP", "PPM", "JPEG2000")
 
 
 def open_image(path: str | os.PathLike[str] | IO[bytes]) -> Image.Image:
-    """Open an image of one of ``FORMATS`` by Pillow, which has then read its header; errors are Pillow's."""
+    """Open an image of one of ``FORMATS`` and read its header; errors are those of Pillow."""
     _silence_decoders()
-    Image.init()  # asked for a format that it has not loaded, Pillow raises KeyError
+    Image.init()  # else Pillow raises KeyError for formats that are not loaded
     return Image.open(path, formats=[name for name in FORMATS if name in Image.OPEN])
 
 
 @cache
 def _silence_decoders() -> None:
-    """Keep Pillow, and libtiff below it, from writing lines of their own about a damaged file to the terminal.
+    """Keep Pillow and libtiff from printing warnings about damaged files.
 
-    Pillow's go to whoever listens to its log. The handlers of libtiff are found through Pillow's module, whose
-    dependency it is; where it is part of that (Windows), it says what it always said.
+    The handlers of libtiff are reached through Pillow's module. On Windows, where libtiff is linked statically, it
+    still prints.
     """
     logging.getLogger("PIL").addHandler(logging.NullHandler())
     with contextlib.suppress(AttributeError, OSError):
@@ -51,7 +50,7 @@ def _silence_decoders() -> None:
 
 @contextlib.contextmanager
 def _opened(path: str | os.PathLike[str], expected: str) -> Iterator[Image.Image]:
-    """Open an image, and turn whatever Pillow's parsers run into, here or in the body, into one line."""
+    """Open an image; convert any error of Pillow, here or in the body, to DataError."""
     try:
         with open_image(path) as file:
             yield file
@@ -59,40 +58,39 @@ def _opened(path: str | os.PathLike[str], expected: str) -> Iterator[Image.Image
         raise DataError(f"image {os.fspath(path)} does not exist") from error
     except DataError:
         raise
-    except MemoryError as error:  # JPEG 2000's decoder also says so of a damaged file
+    except MemoryError as error:  # the JPEG 2000 decoder also raises it for damaged files
         raise DataError(
-            f"image {os.fspath(path)} must decode in the memory there is, got a decoder that asked for more; "
-            "it is damaged, or too large for this machine"
+            f"image {os.fspath(path)} does not fit in memory; it is damaged, or too large for this machine"
         ) from error
     except Exception as error:
         raise DataError(expected.format(path=os.fspath(path), error=_first_line(error))) from error
 
 
 def _check_pixels(path: str | os.PathLike[str], file: Image.Image, bytes_per_pixel: int) -> None:
-    """Raise for an image of many more pixels than its file can hold of a photograph, before any is decoded."""
+    """Raise before decoding an image with implausibly many pixels for its file size."""
     packed = os.stat(path).st_size
     check_growth(path, packed, file.width * file.height * bytes_per_pixel, f"an image ({file.width}x{file.height})")
 
 
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """(width, height) of an image file, px, from its header only. EXIF orientation is not applied.
+    """Return (width, height) of an image file, px, from its header. EXIF orientation is not applied.
 
     Raises
     ------
     DataError
-        Missing, or not an image.
+        If the file is missing or not an image.
     """
-    if exr.is_exr(path):
-        return exr.read_size(path)
-    if (floats := float_tiff.float_header(path)) is not None:
+    if is_exr(path):
+        return exr_size(path)
+    if (floats := float_tiff(path)) is not None:
         return floats.width, floats.height
     with _opened(path, "{path} must be an image, got: {error}") as file:
         return file.size
 
 
 def is_float(path: str | os.PathLike[str]) -> bool:
-    """Whether a photograph is of floats: linear light, of which display values are made."""
-    return exr.is_exr(path) or float_tiff.float_header(path) is not None
+    """Whether an image file holds linear floats."""
+    return is_exr(path) or float_tiff(path) is not None
 
 
 _UNDECODED = "image {path} does not decode: {error}; replace or remove the file"
@@ -101,9 +99,8 @@ _UNDECODED = "image {path} does not decode: {error}; replace or remove the file"
 def read_image(path: str | os.PathLike[str]) -> np.ndarray:
     """Decode an image.
 
-    EXIF orientation is **not** applied: COLMAP does not apply it either, so poses belong to the stored pixels.
-    Grey images become RGB, palettes are resolved, 16-bit grey becomes 8-bit. OpenEXR's linear floats become sRGB values
-    (:func:`gs2d.data.exr.display_image`). Other images of floats are refused: what is white in them is not known.
+    EXIF orientation is **not** applied, as in COLMAP: poses refer to the stored pixels. Grey and palette images become
+    RGB, 16-bit grey becomes 8-bit, linear floats (OpenEXR, TIFF) become sRGB.
 
     Returns
     -------
@@ -112,12 +109,12 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
     Raises
     ------
     DataError
-        Missing, not an image of ``FORMATS``, cut short, or of far more pixels than its bytes can hold; names the file.
+        If the file is missing, truncated, not an image of ``FORMATS``, or has implausibly many pixels.
     """
-    if exr.is_exr(path):
-        return exr.display_image(path)
-    if (floats := float_tiff.float_header(path)) is not None:
-        return float_tiff.display_image(path, floats)
+    if is_exr(path):
+        return read_exr(path)
+    if (floats := float_tiff(path)) is not None:
+        return read_float_tiff(path, floats)
     with _opened(path, _UNDECODED) as file:
         _check_pixels(path, file, 4)
         if file.mode.startswith("I;16") or file.mode == "I":
@@ -125,19 +122,19 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
             return np.repeat(np.round(grey).astype(np.uint8)[:, :, None], 3, axis=2)
         has_alpha = file.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in file.info
         mode = "RGBA" if has_alpha else "RGB"
-        return np.array(file if file.mode == mode else file.convert(mode))  # which copies where nothing changes
+        return np.array(file if file.mode == mode else file.convert(mode))  # convert() copies
 
 
 def read_grey(path: str | os.PathLike[str]) -> tuple[np.ndarray, str]:
-    """Decode the numbers of an image as they are, and its mode: [h, w] where that is a grey one.
+    """Decode an image without conversion: its array, [h, w] if grey, and its Pillow mode.
 
     Raises
     ------
     DataError
-        As :func:`read_image`.
+        As for :func:`read_image`.
     """
-    if exr.is_exr(path):
-        return exr.grey_values(path), "F"
+    if is_exr(path):
+        return read_exr_map(path), "F"
     with _opened(path, _UNDECODED) as file:
         _check_pixels(path, file, 4)
         return np.asarray(file), file.mode
@@ -146,8 +143,8 @@ def read_grey(path: str | os.PathLike[str]) -> tuple[np.ndarray, str]:
 def read_mask(path: str | os.PathLike[str]) -> np.ndarray:
     """Decode a mask: bool [H, W], True where the image is at least half white and half opaque.
 
-    In a file of zeros and ones, which would be all black, one is white. A mask of one colour is small at any size: of
-    8 bits it may have more pixels for its bytes than a photograph.
+    In a file of zeros and ones, one is white. 8-bit masks compress well, so that more pixels per byte are allowed than
+    for photographs.
     """
     with _opened(path, _UNDECODED) as file:
         plain = file.mode in ("1", "L") and "transparency" not in file.info
@@ -183,9 +180,9 @@ def write_image(path: str | os.PathLike[str], image: np.ndarray) -> None:
     Raises
     ------
     ShapeError
-        Another shape, or NaN in a float image.
+        If the shape is wrong or a float image has NaN.
     DiskError
-        The file could not be written.
+        If the file could not be written.
     """
     pixels = to_uint8(image)
     if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] not in (3, 4)):

@@ -1,4 +1,4 @@
-"""`load_scene`: find out what a folder holds and read it."""
+"""`load_scene`: detect the format of a capture and read it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FORMATS = READERS.builtin
 
 @dataclass(frozen=True)
 class _Reader:
-    """One of gs2d's own."""
+    """A built-in reader."""
 
     holds: Callable[[Path], object]
     make: Callable[[Path], Capture]
@@ -39,7 +39,7 @@ class _Reader:
 
 
 class _Colmap:
-    """COLMAP keeps smaller photographs beside the large ones."""
+    """COLMAP models; ``images_N`` has downscaled images."""
 
     looks_for = f"cameras.bin and images.bin (or .txt) in {', '.join(MODEL_FOLDERS)} (COLMAP)"
 
@@ -60,23 +60,23 @@ _register("blender", lambda root: in_any_case(root, TRAIN).is_file(), read_blend
 _register("nerfstudio", lambda root: in_any_case(root, CAMERAS).is_file(), read_nerfstudio, f"{CAMERAS} (nerfstudio)")
 register_reader("colmap")(_Colmap)
 
-_PROJECTS = {  # files of other tools that do not hold cameras in the open
-    ".psx": "in Metashape, File > Export > Export Cameras as Agisoft XML (cameras.xml)",
-    ".mg": "take cameras.sfm of Meshroom's node StructureFromMotion, in its MeshroomCache",
-    ".abc": "take cameras.sfm of Meshroom's node StructureFromMotion, which lies beside it",
+_PROJECTS = {  # project files of other tools, which must be exported first
+    ".psx": "in Metashape, use File > Export > Export Cameras as Agisoft XML (cameras.xml)",
+    ".mg": "use cameras.sfm of Meshroom's node StructureFromMotion, in its MeshroomCache",
+    ".abc": "use cameras.sfm of Meshroom's node StructureFromMotion, in the same folder",
     ".rcproj": "in RealityCapture, export the registration as COLMAP",
     ".rsproj": "in RealityScan, export the registration as COLMAP",
 }
-DEFAULT_CACHE_BYTES = 4 << 30  # 4 GiB of decoded pictures, where memory is not limited
+DEFAULT_CACHE_BYTES = 4 << 30  # of decoded images, if memory is not limited
 
 
 def detect_format(path: str | os.PathLike[str]) -> str:
-    """Return the format of a folder: one of FORMATS, or of a reader from elsewhere.
+    """Return the format of a folder: one of FORMATS, or that of a third-party reader.
 
     Raises
     ------
     DataError
-        Missing or empty folder, or no known layout; lists what was looked for.
+        If the folder is missing, empty or of unknown format; lists the expected files.
     """
     root = _folder(path)
     looked_for = []
@@ -93,13 +93,13 @@ def detect_format(path: str | os.PathLike[str]) -> str:
     project = next((name for name in held if os.path.splitext(name)[1].lower() in _PROJECTS), None)
     if project is not None:
         remedy = _PROJECTS[os.path.splitext(project)[1].lower()]
-        raise DataError(f"{root} must hold cameras that are written in the open, got {project}: {remedy}")
+        raise DataError(f"{root} must contain exported cameras, got the project file {project}: {remedy}")
     lacking = missing_lines(root)
-    hint = f"; as a scene of a known data set: {lacking[0]}" if lacking else ""
+    hint = f"; {lacking[0]}" if lacking else ""
     images = next((folder for folder in (root, in_any_case(root, "images")) if _images(folder)), None)
     if images is not None and not lacking:
         raise DataError(
-            f"{root} must hold cameras, got {_images(images)} photographs without any{instead(root, 'capture')}"
+            f"{root} must contain cameras, got {_images(images)} images without cameras{instead(root, 'capture')}"
         )
     *others, last = filter(None, looked_for)
     raise DataError(
@@ -109,7 +109,7 @@ def detect_format(path: str | os.PathLike[str]) -> str:
 
 
 def _images(folder: Path) -> int:
-    """Files of a folder that are photographs by their names."""
+    """Return the number of images in a folder, by name."""
     paths = [path for path in folder.iterdir() if path.suffix.lower() in IMAGES] if folder.is_dir() else []
     return len(without_masks(paths))
 
@@ -132,7 +132,7 @@ def reader_of(format: str) -> Reader:
     Raises
     ------
     DataError
-        There is none of this name, or its package cannot be imported.
+        If there is no such reader, or its package cannot be imported.
     """
     if format not in READERS:
         raise DataError(READERS.unknown(format, also=("auto",)))
@@ -149,37 +149,37 @@ def load_scene(
     masks: str | os.PathLike[str] | None = None,
     masked: str | None = None,
 ) -> Scene:
-    """Read a capture; nothing is decoded but image headers, and nothing is ever written.
+    """Read a capture. Only image headers are decoded, and nothing is written.
 
     Parameters
     ----------
     path : path
-        The capture's folder.
+        Folder of the capture.
     format : str
-        One of FORMATS, that of a reader from elsewhere, or "auto": by the files that are there.
+        One of FORMATS, the name of a registered reader, or "auto": detected from the files.
     downscale : int
-        Area-filter the photographs by this whole factor (COLMAP: ``images_N`` is used where it exists).
+        Downscale the images by this integer factor (COLMAP: ``images_N`` is used if it exists).
     test_every : int or None
-        Every n-th view (sorted by name, from the first) is a test view where the data set has no split of its own;
-        0 = all views train. None: 8, and 0 for DTU (whose protocol trains on all views).
+        Hold out every n-th view (sorted by name, starting with the first) if the capture has no split of its own;
+        0 = train on all views. None: 8; 0 for DTU.
     cache_bytes : int
-        Bound on decoded pictures held in memory. None: ``DEFAULT_CACHE_BYTES``, or a fifth of what the limits in force
-        (control group, address space, the machine) leave this process.
+        Limit on decoded images in memory. None: ``DEFAULT_CACHE_BYTES``, or a fifth of the available memory if that is
+        less.
     masks : path, optional
-        Folder of masks (white = keep) of another place than tools put them; those are found without it.
+        Folder of masks (white = keep). Masks in the usual folders are found without it.
     masked : str, optional
-        What a black pixel of a mask is: "ignore", it takes part in nothing; "empty", nothing is there, as an alpha
-        channel says; "off", masks are not used. None: ignored, where the protocol uses masks.
+        Meaning of a black pixel: "ignore", never used; "empty", transparent; "off", masks are not used. None: ignored
+        if the protocol uses masks.
 
     Returns
     -------
     Scene
-        Views with their cameras and splits, and the sparse points; images are decoded when they are used.
+        Views with cameras and split, and sparse points. Images are decoded on demand.
 
     Raises
     ------
     DataError
-        If a file is missing or wrong; the message says what to do.
+        If a file is missing or invalid; the message says what to do.
 
     Examples
     --------
@@ -199,8 +199,8 @@ def load_scene(
     capture = reader.read(root, downscale=downscale)
     if isinstance(capture, Scene):
         if masks is not None or masked is not None:
-            raise DataError(f"format {format} has masks of its own, got masks or masked; leave them out")
+            raise DataError(f"format {format} has its own masks; leave out masks and masked")
         if downscale > 1:
-            raise DataError(f"format {format} cannot be shrunk when it is read, got downscale {downscale}; use 1")
+            raise DataError(f"format {format} does not support downscaling, got downscale {downscale}; use 1")
         return replace(capture, own_split=True)
     return build_scene(capture, root, downscale=downscale, test_every=test_every, cache_bytes=cache_bytes, masks=chosen)

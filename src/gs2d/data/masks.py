@@ -1,7 +1,6 @@
-"""Masks of photographs: where tools put them, and what a black pixel means.
+"""Masks of images: where they are found, and what a black pixel means.
 
-White = keep. A black pixel is *ignored* (it takes part in nothing), or *empty* (there is nothing, as an alpha channel
-of 0 says).
+White = keep. A black pixel is *ignored* (never used), or *empty* (transparent, as alpha 0).
 """
 
 from __future__ import annotations
@@ -19,24 +18,24 @@ from gs2d.errors import DataError
 IGNORE, EMPTY, OFF = "ignore", "empty", "off"
 MASKED = (IGNORE, EMPTY, OFF)
 FOLDER = "masks"
-ENDING = "_mask"  # a_mask.png for a.jpg: Metashape's own template, and others
-LAYER = ".mask.png"  # a.jpg.mask.png for a.jpg: layers of RealityCapture
+ENDING = "_mask"  # a_mask.png for a.jpg: Metashape and others
+LAYER = ".mask.png"  # a.jpg.mask.png for a.jpg: RealityCapture
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
-_NAMED, _BESIDE = "the file of cameras", "the photographs' folder"
+_NAMED, _BESIDE = "the camera file", "the image folder"
 
 
 @dataclass(frozen=True)
 class Masks:
-    """Which masks a capture's photographs have.
+    """Masks of a capture.
 
     Attributes
     ----------
     folder : Path or None
-        Where they are, as the user says; None: where tools put them.
+        Folder set by the user; None: the usual folders.
     masked : "ignore", "empty", "off" or None
-        What a black pixel is; None: ignored, where the protocol looks at masks.
+        Meaning of a black pixel; None: ignored if the protocol uses masks.
     found : int
-        Views that have one.
+        Number of views with a mask.
     """
 
     folder: Path | None = None
@@ -48,18 +47,18 @@ class Masks:
             raise DataError(f"masked must be one of {', '.join(MASKED)}, got {self.masked}")
 
     def options(self) -> dict[str, Any]:
-        """Return what ``load_scene`` takes; nothing where the user has said nothing."""
-        said = {"masks": self.folder, "masked": self.masked}
-        return {name: value for name, value in said.items() if value is not None}
+        """Return the options set by the user, as keyword arguments of ``load_scene``."""
+        options = {"masks": self.folder, "masked": self.masked}
+        return {name: value for name, value in options.items() if value is not None}
 
     @property
     def asked_for(self) -> bool:
-        """Whether masks count under any protocol, because the user says so."""
+        """Whether the user requests masks, whatever the protocol."""
         return self.masked == IGNORE or (self.masked is None and self.folder is not None)
 
 
 def _spellings(name: str) -> list[str]:
-    """Return the names that the mask of ``a/b.jpg`` may have in a folder of masks, most likely first.
+    """Return the possible names of the mask of ``a/b.jpg`` in a folder of masks, most likely first.
 
     ``a/b.jpg.png`` (COLMAP), ``a/b.png``, those of ``_beside``, and ``a/b.jpg``.
     """
@@ -68,7 +67,7 @@ def _spellings(name: str) -> list[str]:
 
 
 def _beside(name: str) -> list[str]:
-    """Return the names that the mask of ``b.jpg`` may have in the same folder: ``b_mask.png``, ``b.jpg.mask.png``."""
+    """Return the possible names of the mask of ``b.jpg`` in its own folder: ``b_mask.png``, ``b.jpg.mask.png``."""
     return [*(f"{os.path.splitext(name)[0]}{ENDING}{suffix}" for suffix in _SUFFIXES), f"{name}{LAYER}"]
 
 
@@ -84,7 +83,7 @@ def find_masks_in(folders: Sequence[Path], names: Sequence[str]) -> list[Path | 
 
 
 def _masks_beside(images: Sequence[Path]) -> list[Path | None]:
-    """Return the mask of each photograph in its folder, or None."""
+    """Return the mask of each image in its own folder, or None."""
     parents: dict[Path, dict[str, Path]] = {image.parent: {} for image in images}
     for parent, files in parents.items():
         files.update((folded(entry.name), Path(entry.path)) for entry in os.scandir(parent) if entry.is_file())
@@ -95,16 +94,16 @@ def _masks_beside(images: Sequence[Path]) -> list[Path | None]:
 def find_masks(
     names: Sequence[str], images: Sequence[Path], named: Sequence[Path | None], homes: Sequence[Path], masks: Masks
 ) -> tuple[list[Path | None], str]:
-    """Return the mask of each photograph, and a line about them ("" where there are none).
+    """Return the mask of each image, and a note ("" without masks).
 
     Parameters
     ----------
     names : sequence of str
-        Of the photographs, with ``/``.
+        Names of the images, with ``/``.
     images : sequence of Path
-        Their files.
+        Image files.
     named : sequence of Path or None
-        Masks that the capture itself names, which are taken before those that are found.
+        Masks named by the capture, which take precedence.
     homes : sequence of Path
         Folders that may hold a folder ``masks``.
     masks : Masks
@@ -112,7 +111,7 @@ def find_masks(
     Raises
     ------
     DataError
-        The folder that the user names holds no mask of any of the photographs.
+        If the folder set by the user has no mask of any image.
     """
     if masks.masked == OFF:
         return [None] * len(names), "masks are not used (--masked off)" if any(named) else ""
@@ -132,11 +131,11 @@ def find_masks(
     count = counts.total()
     if masks.folder is not None and not count:
         raise DataError(
-            f"{masks.folder} must hold masks of the photographs, got none of {len(names)}: {names[0]}.png, "
-            f"{Path(names[0]).with_suffix('.png')} or {Path(names[0]).stem}{ENDING}.png was looked for"
+            f"{masks.folder} must hold masks of the images, got none for {len(names)} images; expected for example "
+            f"{names[0]}.png, {Path(names[0]).with_suffix('.png')} or {Path(names[0]).stem}{ENDING}.png"
         )
     if not count:
-        vain = "" if masks.masked is None else f": --masked {masks.masked} changes nothing"
+        vain = "" if masks.masked is None else f": --masked {masks.masked} has no effect"
         line = f"masks: none of {len(names)} views has one in {FOLDER} (a/b.jpg.png for a/b.jpg){vain}"
         return found, line if folders or vain else ""
     in_what = " and ".join(counts)

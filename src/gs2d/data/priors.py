@@ -1,8 +1,7 @@
-"""Depth and normal maps of photographs from files, brought to the photographs' pixels; sparse points by photograph.
+"""Depth and normal maps from files, resampled to the pixels of their image, and sparse points per image.
 
-A pixel of a map is one reading of a sensor or a network: readings are never averaged across an edge, nor with pixels
-of which nothing is known. Where a map is larger than the photograph in training, a block of it becomes the middle one
-of its known readings; where it is smaller, neighbours are interpolated only if they agree.
+Values are never averaged across an edge or with unknown pixels. A map larger than the training image is reduced to the
+median of the known values of each block; a smaller map is interpolated only where neighbours agree.
 """
 
 from __future__ import annotations
@@ -25,27 +24,27 @@ from gs2d.errors import DataError
 DEPTHS, NORMALS = "depths", "normals"
 DEPTH_SUFFIXES = (".npy", ".png", ".tif", ".tiff", ".exr")
 NORMAL_SUFFIXES = (".npy", ".png", ".jpg", ".jpeg", ".webp")
-AGREE = 0.05  # neighbours that differ by more, as a share of the largest, are an edge
-UNIT_LENGTH = (0.8, 1.2)  # a normal of another length is none
+AGREE = 0.05  # largest relative difference of neighbours; more is an edge
+UNIT_LENGTH = (0.8, 1.2)  # accepted lengths of normals
 UNOBSERVED = "the capture does not say which points its images show"
-MAX_PROJECTED = 100_000  # points: more would not tell more of depths
-HIDING_CELLS = 48  # along the longer side of an image, in which points hide those behind them
-HIDDEN = 1.25  # times the depth of a point in the same or a neighbouring cell, behind which others are hidden
-_ASPECT = 0.02  # maps of networks have sides that are multiples of 14 or 32
+MAX_PROJECTED = 100_000  # points; enough to align depths
+HIDING_CELLS = 48  # cells along the longer image side for the occlusion test
+HIDDEN = 1.25  # points beyond this multiple of the nearest depth in the same or a neighbouring cell are occluded
+_ASPECT = 0.02  # relative tolerance: networks write sides that are multiples of 14 or 32
 
 LensMaps = Callable[[Intrinsics], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True, eq=False)
 class PriorDepth:
-    """Depths along the optical axis at the pixels of a photograph, as they were stored.
+    """Depths along the optical axis at the pixels of a view.
 
     Attributes
     ----------
     values : ndarray [H, W] float32
-        In the file's unit; 0 where unknown.
+        In the unit of the file; 0 = unknown.
     whole : bool
-        The file holds whole numbers (millimetres, mostly).
+        Whether the file holds integers (mostly millimetres).
     """
 
     values: np.ndarray
@@ -54,7 +53,7 @@ class PriorDepth:
 
 @dataclass(frozen=True, eq=False)
 class PointsInView:
-    """Sparse points in a picture: ``pixels`` [M, 2] px and ``depth`` [M] world units along the optical axis."""
+    """Sparse points in a view: ``pixels`` [M, 2] px and ``depth`` [M] world units along the optical axis."""
 
     pixels: np.ndarray
     depth: np.ndarray
@@ -62,7 +61,7 @@ class PointsInView:
 
 @dataclass(frozen=True, eq=False)
 class ObservedPoints:
-    """The sparse points of a reconstruction, and which photographs they were found in.
+    """Sparse points of a reconstruction and the views that observe them.
 
     Attributes
     ----------
@@ -70,12 +69,11 @@ class ObservedPoints:
     error : ndarray [P] float64 px
         Mean reprojection error.
     track : ndarray [P] int64
-        Photographs in which it was found.
+        Number of views that observe the point.
     seen : mapping of view name to ndarray [M] int32 or int64
-        Rows of the points found in a view.
+        Indices of the observed points.
     guessed : str
-        Why the capture does not say in which photographs its points were found; ``seen`` is then a guess, made by
-        projecting them. Empty where it does.
+        Why the capture has no observations; ``seen`` then comes from projecting the points. Empty otherwise.
     """
 
     points: np.ndarray
@@ -86,12 +84,12 @@ class ObservedPoints:
 
     @classmethod
     def projected(cls, points: np.ndarray | None, cameras: Mapping[str, Camera], why: str) -> ObservedPoints:
-        """Return points with the views in whose images they lie, as far as no other point hides them there.
+        """Guess the observations of points by projection and an occlusion test.
 
         Parameters
         ----------
         points : ndarray [P, 3] world units, or None
-            Of many, some are taken, evenly; the others are in no view.
+            At most ``MAX_PROJECTED``, evenly chosen, are assigned to views.
         cameras : mapping of view name to Camera
         why : str
             Reason for ``guessed``.
@@ -103,24 +101,24 @@ class ObservedPoints:
         return cls(points, np.zeros(len(points)), track, seen, why)
 
     def in_view(self, name: str, camera: Camera, *, min_track: int = 3, max_error: float = 2.0) -> PointsInView:
-        """Return the points found in one view, inside its outer pixel centres and in front of it.
+        """Return the points that a view observes, in front of it and inside its outer pixel centres.
 
         Parameters
         ----------
         name : str
-            Of the view.
+            Name of the view.
         camera : Camera
-            Of the view, at the size that its pictures have.
+            Camera of the view, at training size.
         min_track : int
-            Points found in fewer photographs are left out.
+            Smallest number of views per point.
         max_error : float, px
-            Points with a larger mean reprojection error are left out.
+            Largest mean reprojection error.
         """
         rows = self.seen.get(name, np.zeros(0, dtype=np.int64))
         return self._project(rows, camera, min_track, max_error)
 
     def inside(self, camera: Camera, *, min_track: int = 3, max_error: float = 2.0) -> PointsInView:
-        """Return all points that lie in a camera's picture, as :meth:`in_view`, also those that something hides."""
+        """Return all points inside the image of a camera, as :meth:`in_view`, including occluded ones."""
         return self._project(np.arange(len(self.points)), camera, min_track, max_error)
 
     def _project(self, rows: np.ndarray, camera: Camera, min_track: int, max_error: float) -> PointsInView:
@@ -132,7 +130,7 @@ class ObservedPoints:
 
 
 def _unhidden(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return which points [P] bool lie in an image and not far behind another point in the same part of it."""
+    """Return which points [P] bool lie in an image and not far behind another point of the same cell."""
     pixels, depth = camera.project(points)
     size = np.array((camera.width, camera.height))
     inside = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(axis=1)
@@ -145,15 +143,15 @@ def _unhidden(points: np.ndarray, camera: Camera) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MapFiles:
-    """The maps that a photograph has.
+    """Map files of an image.
 
     Attributes
     ----------
     depth, normal : Path or None
     unit : float or None
-        world units of a depth of 1 in the file, where the capture says so.
+        World units per unit of depth, if the capture states it.
     metric : bool
-        The capture says that its depths are a sensor's.
+        Whether the depths come from a sensor.
     """
 
     depth: Path | None = None
@@ -164,17 +162,17 @@ class MapFiles:
 
 @dataclass(frozen=True, eq=False)
 class PriorMaps:
-    """The maps of one view, decoded when asked for.
+    """Maps of a view, decoded on demand.
 
     Attributes
     ----------
     files : MapFiles
     intrinsics : Intrinsics
-        Of the photograph's file, with its lens.
+        Intrinsics of the image file, with its lens.
     camera : Camera
-        Of the view: pinhole, at the size in training.
+        Pinhole camera of the view, at training size.
     lens_maps : callable
-        ``undistort.source_positions``, with a cache.
+        Cached ``undistort.source_positions``.
     """
 
     files: MapFiles
@@ -183,12 +181,12 @@ class PriorMaps:
     lens_maps: LensMaps
 
     def depth(self) -> PriorDepth:
-        """Return the depth map at the view's pixels.
+        """Return the depth map at the pixels of the view.
 
         Raises
         ------
         DataError
-            The file is no depth map, or of another shape than its photograph.
+            If the file is not a depth map, or its aspect ratio differs from the image.
         """
         assert self.files.depth is not None
         values = read_depth(self.files.depth)
@@ -200,25 +198,25 @@ class PriorMaps:
         return PriorDepth(sample(shrink(valid, factor), *positions), whole)
 
     def normal(self) -> np.ndarray:
-        """Return normals [H, W, 3] float32 in the axes of the file, unit length; 0 where unknown.
+        """Return unit normals [H, W, 3] float32 in the axes of the file; 0 = unknown.
 
         Raises
         ------
         DataError
-            The file is no normal map, or of another shape than its photograph.
+            If the file is not a normal map, or its aspect ratio differs from the image.
         """
         assert self.files.normal is not None
         normals = read_normals(self.files.normal)
         _check_shape("normal map", self.files.normal, normals.shape[:2], self.intrinsics)
         factor = max(1, normals.shape[1] // self.camera.width)
-        middle = factor // 2  # one reading of a block: the mean of normals on both sides of an edge is neither
+        middle = factor // 2  # one value per block: averaging normals across an edge is wrong
         positions, valid = self._positions(normals.shape[1] / factor, normals.shape[0] / factor)
         normals = normals[middle::factor, middle::factor]
         rows, columns = _nearest(positions, normals.shape[:2])
         return np.asarray(np.where(valid[..., None], normals[rows, columns], 0), dtype=np.float32)
 
     def _positions(self, width: float, height: float) -> tuple[np.ndarray, np.ndarray]:
-        """Where the view's pixels are in a map of this size: positions [H, W, 2] px, corner origin, and validity."""
+        """Return the pixels of the view in a map of this size: positions [H, W, 2] px, corner origin, and validity."""
         camera, k = self.camera, self.intrinsics
         smaller = Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, k.lens)
         if k.lens is None:
@@ -227,26 +225,26 @@ class PriorMaps:
             valid = np.ones(positions.shape[:2], dtype=bool)
         else:
             positions, valid = self.lens_maps(smaller)
-        # The photograph at the view's scale has k.width fx / k.fx pixels: a fraction where rows were cut.
+        # Image size at the scale of the view; fractional if downscaling cut rows.
         sides = np.array((k.width * camera.fx / k.fx, k.height * camera.fy / k.fy))
         return positions * (np.array((width, height)) / sides), valid
 
 
 def find_maps(folder: Path, names: Sequence[str], suffixes: Sequence[str]) -> list[Path | None]:
-    """Return the map of each photograph: its name with one of the suffixes for its own, or after it; None without."""
+    """Return the map of each image, or None: its name with the suffix replaced or appended."""
     spellings = [[word + s for s in suffixes for word in (os.path.splitext(name)[0], name)] for name in names]
     return [match.path for match in Files([folder]).match(spellings, moved=False)]
 
 
 def read_depth(path: str | os.PathLike[str]) -> np.ndarray:
-    """Return the numbers of a depth map [h, w]: a grey image of 8, 16 or 32 bits, or an array of numpy.
+    """Read a depth map [h, w]: a grey image of 8, 16 or 32 bits, or a NumPy array.
 
-    An image of three channels that are alike is grey, too: networks write such.
+    An image with three equal channels counts as grey.
 
     Raises
     ------
     DataError
-        Missing, no such file, or no number above 0 in it.
+        If the file is missing, not a depth map, or has no value above 0.
     """
     path = Path(path)
     if path.suffix == ".npy":
@@ -256,14 +254,14 @@ def read_depth(path: str | os.PathLike[str]) -> np.ndarray:
         if values.ndim != 2:
             raise DataError(f"depth map {path} must be an array [H, W], got {list(values.shape)}")
     else:
-        size = image_size(path)  # a file that is no image is named here
+        size = image_size(path)  # raises for a file that is not an image
         values, mode = read_grey(path)
         if mode == "RGB" and values.ndim == 3 and (values == values[..., :1]).all():
             values = values[..., 0]
         if values.ndim != 2 or values.shape != (size[1], size[0]) or mode == "P":
             raise DataError(
                 f"depth map {path} must be a grey image of 16 bits (or 8, or floats), or .npy, got one of mode {mode}; "
-                "a coloured picture of depths holds no depths"
+                "a colour-coded depth image cannot be used"
             )
     with np.errstate(invalid="ignore"):
         if not (np.isfinite(values) & (values > 0)).any():
@@ -272,18 +270,18 @@ def read_depth(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def read_normals(path: str | os.PathLike[str]) -> np.ndarray:
-    """Return unit normals [h, w, 3] float32 of a map, 0 where unknown: an RGB image of (n + 1) / 2, or an array of n.
+    """Read unit normals [h, w, 3] float32 from an RGB image of (n + 1) / 2 or an array of n; 0 = unknown.
 
-    Black, transparent, and what is no unit vector by a fifth, is unknown.
+    Black and transparent pixels and vectors of a length outside ``UNIT_LENGTH`` are unknown.
 
     Raises
     ------
     DataError
-        Missing, no such file, or no normal in it.
+        If the file is missing, not a normal map, or has no valid normal.
     """
     path = Path(path)
     if path.suffix == ".npy":
-        with np.errstate(over="ignore"):  # what is beyond float32 is no unit vector
+        with np.errstate(over="ignore"):  # such values are not unit vectors
             normals = read_npy(path, "normal map").astype(np.float32)
         normals = normals.transpose(1, 2, 0) if normals.ndim == 3 and normals.shape[0] == 3 else normals
         if normals.ndim != 3 or normals.shape[2] != 3:
@@ -303,20 +301,20 @@ def read_normals(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def _check_shape(what: str, path: Path, shape: tuple[int, ...], k: Intrinsics) -> None:
-    """Check that a map has the aspect of its photograph."""
+    """Check that a map has the aspect ratio of its image."""
     height, width = shape
     wrong = abs(width / height * k.height / k.width - 1)
     if wrong > max(_ASPECT, 1 / min(width, height)):
         raise DataError(
-            f"{what} {path} must have the size (or aspect) of its photograph, {k.width}x{k.height}, got "
+            f"{what} {path} must have the size or aspect ratio of its image, {k.width}x{k.height}, got "
             f"{width}x{height}; was it rotated, cropped or padded?"
         )
 
 
 def shrink(values: np.ndarray, factor: int) -> np.ndarray:
-    """[h, w] to [ceil(h / n), ceil(w / n)]: the middle (lower) one of the known readings of each n x n block.
+    """Reduce [h, w] to [ceil(h / n), ceil(w / n)]: the lower median of the known values of each n x n block.
 
-    0 where less than half of a block is known.
+    0 if less than half of a block is known.
     """
     if factor <= 1:
         return values
@@ -331,9 +329,9 @@ def shrink(values: np.ndarray, factor: int) -> np.ndarray:
 
 
 def sample(values: np.ndarray, positions: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Return a map [h, w] at ``positions`` [H, W, 2] px, corner origin; 0 where unknown or not ``valid``.
+    """Sample a map [h, w] at ``positions`` [H, W, 2] px, corner origin; 0 if unknown or not ``valid``.
 
-    Bilinear where the four readings around are known and agree within ``AGREE``, else the nearest one.
+    Bilinear if the four neighbours are known and agree within ``AGREE``, else nearest.
     """
     height, width = values.shape
     rows, columns = _nearest(positions, (height, width))
@@ -352,7 +350,7 @@ def sample(values: np.ndarray, positions: np.ndarray, valid: np.ndarray) -> np.n
 
 
 def _nearest(positions: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of the pixels that hold the positions."""
+    """Return rows and columns of the pixels that contain the positions."""
     columns = np.clip(np.floor(positions[..., 0]), 0, shape[1] - 1).astype(np.int64)
     rows = np.clip(np.floor(positions[..., 1]), 0, shape[0] - 1).astype(np.int64)
     return rows, columns

@@ -23,36 +23,35 @@ from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
 
 Appearance = Mapping[str, np.ndarray]
-"""Numbers of a view by the name of the quantity."""
+"""Learned parameters of a view, by the name of the quantity."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class View:
-    """One posed photograph, decoded when asked for.
+    """An image with its camera, decoded on demand.
 
     Attributes
     ----------
     name : str
-        Unique in its scene: the file's path relative to the image folder, with ``/`` (``cam0/0001.jpg``).
+        Unique in its scene: file path relative to the image folder, with ``/`` (``cam0/0001.jpg``).
     camera : Camera
-        Pinhole, at the size that ``image()`` has (downscaling and undistortion are already in it).
+        Pinhole camera of ``image()``, after undistortion and downscaling.
     decode : callable
-        Reads the picture from disk; called through the cache.
+        Decodes the image from disk; called through the cache.
     cache : ImageCache
         Shared by all views of a scene.
     path : Path or None
-        The photograph's file.
+        Image file.
     maps : PriorMaps or None
-        Its depth and normal maps, where the capture has such.
+        Depth and normal maps.
     intrinsics : Intrinsics or None
-        Of the photograph's file, before its lens was taken out and before it was shrunk; None: as ``camera``.
+        Intrinsics of the image file, before undistortion and downscaling; None: as ``camera``.
     zoom : Zoom or None
-        What training has made of the intrinsics of ``camera`` since they were read; None: nothing.
+        Learned change of the intrinsics of ``camera``; None: unchanged.
     appearance : mapping of name to ndarray
-        What training has learned of how the photograph shows the colours of the scene: numbers of each quantity
-        (``gs2d.training.learned``).
+        Learned parameters of how the image shows the colours of the scene (``gs2d.training.learned``).
     is_face : bool
-        Whether it was cut out of a panorama or a wide fisheye (``data/faces.py``): its axis is not that of a lens.
+        Whether it was cut out of a panorama or a wide fisheye (``data/faces.py``).
     """
 
     name: str
@@ -76,17 +75,16 @@ class View:
         object_mask: np.ndarray | None = None,
         valid: np.ndarray | None = None,
     ) -> View:
-        """Return a view of arrays in memory: image uint8 [H, W, 3 or 4], masks bool [H, W]."""
+        """Make a view from arrays: image uint8 [H, W, 3 or 4], masks bool [H, W]."""
         if valid is not None:
             mask = valid if mask is None else mask & valid
         picture = DecodedImage(image, mask, object_mask, valid)
         return cls(name, camera, lambda: picture)
 
     def at(self, T_cam_world: np.ndarray, zoom: Zoom | None = None) -> View:
-        """Return the same photograph, taken from elsewhere; its picture stays in the cache of this one.
+        """Return the view with another pose; its image stays in the cache of this view.
 
-        With ``zoom`` its camera gets other intrinsics, too, and its picture is straightened each time it is asked for,
-        where that says that something of the lens is left.
+        ``zoom`` also changes the intrinsics; if it has residual distortion, the image is undistorted on each access.
         """
         camera = replace(self.camera, T_cam_world=T_cam_world)
         if zoom is None:
@@ -98,17 +96,17 @@ class View:
         return replace(seen, decode=lambda: straightened_picture(self._image(), now, lens))
 
     def with_appearance(self, found: Appearance) -> View:
-        """Return the same photograph, with more that is known of how it shows colours."""
+        """Return the view with further appearance parameters."""
         return self._sharing(appearance={**self.appearance, **found})
 
     def _sharing(self, **changes: Any) -> View:
-        """Return a view with other facts whose picture stays in the cache of this one."""
+        """Return a changed view whose image stays in the cache of this view."""
         return replace(self, decode=self._image, cache=ImageCache(0), **changes)
 
     def downscaled(self, factor: int) -> View:
-        """Return the same photograph at 1 / ``factor`` of its size, with its camera, masks and maps.
+        """Return the view at 1 / ``factor`` of its size, with camera, masks and maps.
 
-        Its picture is made of that of this view each time it is asked for: nothing is held twice.
+        The image is downscaled on each access, so that nothing is stored twice.
         """
         if factor == 1:
             return self
@@ -118,49 +116,49 @@ class View:
         return replace(small, decode=lambda: self._image().downscaled(factor))
 
     def file_intrinsics(self) -> Intrinsics:
-        """Return the intrinsics of the photograph's file, lens and all."""
+        """Return the intrinsics of the image file, including its lens."""
         c = self.camera
         return self.intrinsics or Intrinsics(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
 
     def image(self) -> np.ndarray:
-        """Return the photograph, uint8 [H, W, 3] or [H, W, 4] with straight alpha; read-only.
+        """Return the image, uint8 [H, W, 3] or [H, W, 4] with straight alpha; read-only.
 
         Raises
         ------
         DataError
-            The file does not decode, or is gone.
+            If the file does not decode or no longer exists.
         """
         return self._image().image
 
     def mask(self) -> np.ndarray | None:
-        """Which pixels count, bool [H, W] (a fresh copy), or None if all do. False = ignore this pixel."""
+        """Return the mask of used pixels, bool [H, W] (a copy); None: all are used."""
         mask = self._image().mask
         return None if mask is None else mask.copy()
 
     def valid(self) -> np.ndarray | None:
-        """Return where the photograph says anything, bool [H, W] (a fresh copy), or None if everywhere.
+        """Return the mask of valid pixels, bool [H, W] (a copy); None: all are valid.
 
-        False where undistortion reaches beyond the photograph: there ``image()`` is black, and nobody may learn it,
-        score it or show it, whatever a protocol makes of masks.
+        Pixels that undistortion takes from outside the photograph are invalid. They are black in ``image()`` and never
+        trained, scored or shown, whether or not a protocol uses masks.
         """
         valid = self._image().valid
         return None if valid is None else valid.copy()
 
     def usable(self, *, masks: bool) -> np.ndarray | None:
-        """Return which pixels count where a protocol uses masks or does not, bool [H, W], or None if all do.
+        """Return the pixels that training and scores use, bool [H, W]; None: all.
 
         Parameters
         ----------
         masks : bool
-            True: ``mask()``, which leaves out unknown pixels too; False: ``valid()``.
+            Whether the protocol uses masks. True: ``mask()``, which excludes invalid pixels too; False: ``valid()``.
         """
         return self.mask() if masks else self.valid()
 
     def object_mask(self) -> np.ndarray | None:
-        """Where the object is, bool [H, W] (a fresh copy): a silhouette file (DTU), else alpha >= 0.5, else None.
+        """Return the silhouette of the object, bool [H, W] (a copy): from a file, else alpha >= 0.5, else None.
 
-        Unlike ``mask`` it says nothing about which pixels to train on: the background of DTU is trained and then
-        left out of the surface.
+        It limits the surface, not the pixels that are trained: the background of DTU is trained and then left out of
+        the mesh.
         """
         image = self._image()
         if image.object_mask is not None:
@@ -168,12 +166,12 @@ class View:
         return image.image[:, :, 3] >= 128 if image.image.shape[2] == 4 else None
 
     def alpha(self) -> np.ndarray | None:
-        """Return the alpha channel, float32 [H, W] in [0, 1], or None if the photograph has none."""
+        """Return the alpha channel, float32 [H, W] in [0, 1]; None without one."""
         image = self._image().image
         return np.divide(image[:, :, 3], np.float32(255), dtype=np.float32) if image.shape[2] == 4 else None
 
     def target(self, background: Sequence[float] | np.ndarray) -> np.ndarray:
-        """Return the target of a rendering over ``background`` (3 floats in [0, 1]), float32 [H, W, 3] in [0, 1]."""
+        """Return the image over ``background`` (3 floats in [0, 1]), float32 [H, W, 3] in [0, 1]."""
         return composite(self._image().image, background)
 
     def _image(self) -> DecodedImage:
@@ -182,7 +180,7 @@ class View:
     def _decode_checked(self) -> DecodedImage:
         image = self.decode()
         expected = (self.camera.height, self.camera.width)
-        masks = {"mask": image.mask, "object mask": image.object_mask, "mask of known pixels": image.valid}
+        masks = {"mask": image.mask, "object mask": image.object_mask, "mask of valid pixels": image.valid}
         for what, array in {"image": image.image, **masks}.items():
             if array is not None and array.shape[:2] != expected:
                 raise DataError(
@@ -205,9 +203,9 @@ class PointCloud:
     points : ndarray [P, 3] float64 world units
     colors : ndarray [P, 3] uint8 sRGB, or None
     normals : ndarray [P, 3] or None
-        Of the surface, unit, either way round; 0 where unknown.
+        Unit surface normals of either sign; 0 = unknown.
     sizes : ndarray [P] float64 world units, or None
-        Standard deviations of the splats that start there; 0: as large as the points around leave room for.
+        Standard deviations of the initial splats; 0: from the distance of neighbouring points.
     """
 
     points: np.ndarray
@@ -231,41 +229,41 @@ class PointCloud:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A capture as it is on disk: never re-centred, never rescaled.
+    """A capture in its own coordinates: never re-centred, never rescaled.
 
     Attributes
     ----------
     name : str
-        The folder's name.
+        Name of the folder.
     format : str
         One of ``gs2d.data.FORMATS``.
     train, test : tuple of View
-        Sorted by name. ``test`` is empty where all views train.
+        Sorted by name. ``test`` may be empty.
     points : PointCloud or None
-        Sparse points to start from.
+        Sparse points.
     extent : float, world units
-        1.1 x the largest distance of a training camera from the mean of all of them (> 0).
+        1.1 x the largest distance of a training camera from their mean (> 0).
     bounds : ndarray [2, 3] float64, world units
-        Smallest and largest corner of the box that the cameras look at.
+        Corners of the box that the cameras look at.
     T_metric_scene : ndarray [4, 4] float64
-        x_metric = T_metric_scene @ x_scene; for evaluation only (DTU: millimetres).
+        x_metric = T_metric_scene @ x_scene, for evaluation (DTU: millimetres).
     skipped : tuple of str
-        Views that are listed but could not be used, one sentence each, for the user to see.
+        Listed views that could not be used, one sentence each.
     notes : tuple of str
-        What loading decided that the user may have to act on, one sentence each.
+        Decisions of loading that the user should know, one sentence each.
     details : tuple of str
         Routine decisions of loading, one sentence each.
     root : Path or None
-        The folder it came from.
+        Folder of the capture.
     observe : callable or None
-        Reads which sparse points each photograph was found to show; :meth:`observed` calls it.
+        Reads which sparse points each image observes; :meth:`observed` calls it.
     ahead : int
-        Pictures that whoever goes through the views asks for before they are needed, because they come from the disk
-        each time (``gs2d.data.prepared``); 0: they are to stay in memory.
+        Number of images to read ahead, because they come from disk each time (``gs2d.data.prepared``); 0: images stay
+        in memory.
     masks : Masks
-        Which of the photographs have a mask, and what it means.
+        Masks of the images and their meaning.
     own_split : bool
-        Whether the capture itself says which views are test views, so that ``test_every`` does not apply.
+        Whether the capture defines its test views, so that ``test_every`` does not apply.
     """
 
     name: str
@@ -286,14 +284,14 @@ class Scene:
     own_split: bool = False
 
     def with_poses(self, poses: Mapping[str, np.ndarray], zooms: Mapping[str, Zoom] = MappingProxyType({})) -> Scene:
-        """Return the scene with other cameras. Images are shared.
+        """Return the scene with other poses and intrinsics. Images are shared.
 
         Parameters
         ----------
         poses : mapping
-            T_cam_world [4, 4] by the name of a training view.
+            T_cam_world [4, 4] by name of the training view.
         zooms : mapping
-            What becomes of the intrinsics of a view, training or test, by its name.
+            Change of intrinsics by name of the view, training or test.
         """
 
         def moved(view: View, pose: np.ndarray | None) -> View:
@@ -304,7 +302,7 @@ class Scene:
         return replace(self, train=train, test=tuple(moved(view, None) for view in self.test))
 
     def with_appearance(self, found: Mapping[str, Appearance]) -> Scene:
-        """Return the scene with what is known of how its photographs show colours, by the name of the view."""
+        """Return the scene with appearance parameters, by name of the view."""
 
         def seen(views: tuple[View, ...]) -> tuple[View, ...]:
             return tuple(view.with_appearance(found[view.name]) if view.name in found else view for view in views)
@@ -312,39 +310,39 @@ class Scene:
         return replace(self, train=seen(self.train), test=seen(self.test))
 
     def downscaled(self, factor: int) -> Scene:
-        """Return the scene with training photographs of 1 / ``factor`` of their size; test views stay as they are."""
+        """Return the scene with training images at 1 / ``factor`` of their size; test views are unchanged."""
         return self if factor == 1 else replace(self, train=tuple(view.downscaled(factor) for view in self.train))
 
     @property
     def views(self) -> tuple[View, ...]:
-        """Training views, then test views."""
+        """All views: training views, then test views."""
         return self.train + self.test
 
     def observed(self, *, guessed: bool = True) -> ObservedPoints | None:
-        """Return which sparse points each photograph shows, or None where that is not known.
+        """Return which sparse points each image observes; None if unknown.
 
         Parameters
         ----------
         guessed : bool
-            Whether points that were projected, because the capture does not say it, count.
+            Whether to accept observations that were guessed by projecting the points.
         """
         if self.observe is None or (self.unobserved() and not guessed):
             return None
         try:
             found = self.observe()
-        except DataError:  # of a reader that is not ours
+        except DataError:  # from a third-party reader
             return None
         return found if any(map(len, found.seen.values())) else None
 
     def unobserved(self) -> str:
-        """Return why the capture does not say which points its photographs show; "" where it does."""
+        """Return why the capture has no observations of points; "" if it has."""
         try:
             return UNOBSERVED if self.observe is None else self.observe().guessed
         except DataError as error:
             return str(error)
 
     def forget(self) -> None:
-        """Drop decoded pictures and which points they show from memory; whoever asks for one has it read again."""
+        """Drop decoded images and observations from memory; they are read again when needed."""
         for cache in {id(view.cache): view.cache for view in self.views}.values():
             cache.clear()
         clear = getattr(self.observe, "cache_clear", None)  # of functools.cache
@@ -352,14 +350,14 @@ class Scene:
             clear()
 
     def preload(self, threads: int = 2) -> Iterator[View]:
-        """Decode every picture once, yielding each view when its picture is good.
+        """Decode every image once, yielding each view.
 
-        Fills the cache as far as its bound allows, and finds broken files before hours of training do.
+        Fills the cache and detects invalid files before training.
 
         Raises
         ------
         DataError
-            The first picture (in order of ``views``) that does not decode.
+            For the first image (in order of ``views``) that does not decode.
         """
 
         def decode(view: View) -> View:

@@ -1,4 +1,4 @@
-"""Decoded photographs without what training has found to be left of their lens."""
+"""Removal of learned residual distortion from decoded images."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gs2d.data.undistort import undistort_mask
 
 
 def straightened_picture(picture: DecodedImage, camera: Camera, lens: tuple[float, float]) -> DecodedImage:
-    """Return the pinhole picture of ``camera``; what the photograph does not reach is black, and not valid."""
+    """Return the pinhole image of ``camera``; pixels outside the photograph are black and invalid."""
     places, within = seen_at(camera, torch.zeros(1), lens)
     positions, inside = places.numpy(), within.numpy()
     valid = inside if picture.valid is None else undistort_mask(picture.valid, positions, need=1.0) & inside
@@ -31,7 +31,7 @@ def _moved(image: np.ndarray, places: torch.Tensor, inside: np.ndarray) -> np.nd
         values[..., :3] *= values[..., 3:] / 255.0
     values = sampled(values, places).clamp(0, 255)
     if has_alpha:
-        values[..., :3] *= 255.0 / values[..., 3:].clamp_min(0.5)  # below half a level alpha rounds to 0
+        values[..., :3] *= 255.0 / values[..., 3:].clamp_min(0.5)  # smaller alpha rounds to 0
     pixels = values.add_(0.5).clamp_(0, 255).to(torch.uint8).contiguous().numpy()
     pixels[~inside] = 0
     return pixels

@@ -1,8 +1,8 @@
-"""What most cameras look at: the subject of a capture, and the box that holds it.
+"""The subject of a capture: what most cameras look at, and its bounding box.
 
-Every camera has one vote, spread over the surface that it sees, more in the middle of its picture than at the rim. An
-object is a place that most cameras give a fair part of their votes to, from outside; its box holds the surface there
-that most pictures show. Cameras that look at no common place (in a room, along a street) have a scene, not a subject.
+Every camera has one vote, spread over the surface that it sees and weighted towards the middle of its image. An object
+is a region outside the cameras that most of them give a fair part of their votes to; its box contains the surface there
+that most images show. Cameras without a common target (in a room, along a street) have a scene, not an object.
 """
 
 from __future__ import annotations
@@ -22,30 +22,29 @@ from gs2d.errors import DataError, ProtocolError
 from gs2d.io.run_dir import SUBJECT
 
 OBJECT, SCENE = "object", "scene"
-SPREAD = 0.5  # standard deviation of a camera's votes, in halves of the picture's shorter side
-FAIR_PART = 0.3  # of its votes, which a camera gives to a place that it looks at
-MOST = 0.6  # of the cameras look at an object
-SHOWN_BY = 0.5  # of the cameras that look at the object, in the pictures of which its surface lies
-FEW_INSIDE = 0.1  # of the cameras may stand within what they look at
-TAIL = 0.5  # per cent of the votes that may lie outside the box on each side
-MARGIN = 0.05  # of the box's longest side, on every side
-# World units, of a box that is given: the mesh is made in 32-bit numbers, of which squares and cubes are taken.
-LARGEST = 1e12
+SPREAD = 0.5  # standard deviation of the vote, in half shorter image sides
+FAIR_PART = 0.3  # smallest part of its vote that a camera gives to a region it looks at
+MOST = 0.6  # smallest fraction of cameras that look at an object
+SHOWN_BY = 0.5  # smallest fraction of these cameras that show a point of its surface
+FEW_INSIDE = 0.1  # largest fraction of cameras inside the object
+TAIL = 0.5  # per cent of the votes outside the box on each side
+MARGIN = 0.05  # of the longest side of the box, added on each side
+LARGEST = 1e12  # world units; its cube is still a float32 number
 _STEPS = 20  # of mean shift
-_SEEDS = 16  # places that are tried
+_SEEDS = 16  # start positions of the mean shift
 
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What one camera sees.
+    """The surface that one camera sees.
 
     Attributes
     ----------
     camera : Camera
     points : ndarray [P, 3] world units
-        On the surface.
+        Surface points.
     weights : ndarray [P]
-        Parts of the camera's vote; their sum is 1, or 0 where it sees nothing.
+        Parts of the vote of the camera; their sum is 1, or 0 without surface.
     """
 
     camera: Camera
@@ -55,20 +54,20 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What the cameras look at, in the capture's frame.
+    """What the cameras look at, in the coordinates of the capture.
 
     Attributes
     ----------
     kind : str
-        "object": a box that most cameras look at; "scene": no such place, the box is that of all they see.
+        "object", or "scene": no common target, the box contains everything visible.
     low, high : ndarray [3] world units
         Corners of the box.
     center : ndarray [3] world units
-        The middle of the votes, which need not be that of the box.
+        Mean of the votes, not the centre of the box.
     up : ndarray [3]
-        Unit.
+        Unit up vector.
     why : str
-        One sentence.
+        Reason, in one sentence.
     """
 
     kind: str
@@ -85,11 +84,11 @@ class Subject:
 
     @property
     def box(self) -> np.ndarray:
-        """Both corners [2, 3] world units."""
+        """Both corners of the box [2, 3], world units."""
         return np.stack([self.low, self.high])
 
     def to_json(self) -> dict[str, Any]:
-        """Return what ``subject.json`` holds."""
+        """Return the content of ``subject.json``."""
         return {
             "kind": self.kind,
             "min": self.low.tolist(),
@@ -102,12 +101,12 @@ class Subject:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Subject:
-        """Read what ``to_json`` gave.
+        """Convert the result of ``to_json``.
 
         Raises
         ------
         DataError
-            A field is missing or not what it should be.
+            If a field is missing or invalid.
         """
         try:
             low, high, center, up = (np.asarray(data[name], np.float64) for name in ("min", "max", "center", "up"))
@@ -121,12 +120,12 @@ class Subject:
 
 
 def read_subject(run: Path) -> Subject | None:
-    """Return the subject of a run folder; None where none was found yet.
+    """Read the subject of a run folder; None without one.
 
     Raises
     ------
     DataError
-        ``subject.json`` is damaged.
+        If ``subject.json`` is damaged.
     """
     path = Path(run) / SUBJECT
     if not path.exists():
@@ -137,39 +136,39 @@ def read_subject(run: Path) -> Subject | None:
             raise DataError(f"an object was expected, got {type(data).__name__}")
         return Subject.from_json(data)
     except DataError as error:
-        raise DataError(f"{path} was damaged ({error}); delete it, and `gs2d mesh {run}` finds it again") from error
+        raise DataError(f"{path} is damaged ({error}); delete it, and `gs2d mesh {run}` creates it again") from error
 
 
 def checked_box(box: Sequence[float], option: str) -> np.ndarray:
-    """Return both corners [2, 3] world units of a box x0 y0 z0 x1 y1 z1 that the user gave by an option.
+    """Return both corners [2, 3], world units, of a box x0 y0 z0 x1 y1 z1 from the command line.
 
     Raises
     ------
     DataError
-        The numbers are no box.
+        If the numbers are not a box.
     """
     corners = np.asarray(box, np.float64)
     if corners.shape != (6,) or not (np.abs(corners) <= LARGEST).all() or not (corners[:3] < corners[3:]).all():
         numbers = " ".join(f"{value:g}" for value in box)
-        raise DataError(f"{option} must be a lower corner and a higher one, x0 y0 z0 x1 y1 z1, got {numbers}")
+        raise DataError(f"{option} must be a lower and an upper corner, x0 y0 z0 x1 y1 z1, got {numbers}")
     return corners.reshape(2, 3)
 
 
 def check_subject_box(box: Sequence[float] | None, others: Mapping[str, bool]) -> None:
-    """Raise for a box of the subject that is none, or that is not the only choice of what is meshed.
+    """Check ``--subject-box``: a valid box, and no conflicting option.
 
     Parameters
     ----------
     box : sequence of 6 floats, optional
     others : mapping of str to bool
-        Options that choose something else, and whether they were given.
+        Conflicting options, and whether they are set.
 
     Raises
     ------
     DataError
-        The numbers are no box.
+        If the numbers are not a box.
     ProtocolError
-        Another choice was made too.
+        If a conflicting option is set.
     """
     if box is None:
         return
@@ -180,25 +179,25 @@ def check_subject_box(box: Sequence[float] | None, others: Mapping[str, bool]) -
 
 
 def given_subject(box: Sequence[float], cameras: Sequence[Camera]) -> Subject:
-    """Return the object in a box (x0 y0 z0 x1 y1 z1, world units) that the user named.
+    """Return the object in a box x0 y0 z0 x1 y1 z1, world units.
 
     Raises
     ------
     DataError
-        The numbers are no box.
+        If the numbers are not a box.
     """
     low, high = checked_box(box, "--subject-box")
-    return Subject(OBJECT, low, high, (low + high) / 2, up_direction(cameras), "the box was given")
+    return Subject(OBJECT, low, high, (low + high) / 2, up_direction(cameras), "set with --subject-box")
 
 
 def middle_weights(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Return how much a camera looks at each of its pixels [P, 2] px: a normal curve around the picture's middle."""
+    """Return the vote of a camera at pixels [P, 2] px: a Gaussian around the image centre."""
     off = (pixels - [camera.width / 2, camera.height / 2]) / (min(camera.width, camera.height) / 2)
     return np.asarray(np.exp(-0.5 * (off**2).sum(axis=1) / SPREAD**2))
 
 
 def shown(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Return which points [P, 3] lie in front of a camera and inside its picture, whatever is before them."""
+    """Return which points [P, 3] project into the image of a camera; occlusion is ignored."""
     pixels, depth = camera.project(points)
     return np.asarray((depth > 0) & (pixels >= 0).all(axis=1) & (pixels <= (camera.width, camera.height)).all(axis=1))
 
@@ -209,29 +208,29 @@ def find_subject(sights: Sequence[Sight]) -> Subject:
     Parameters
     ----------
     sights : sequence of Sight
-        One for each camera.
+        One per camera.
 
     Raises
     ------
     DataError
-        No camera sees anything.
+        If no camera sees any surface.
     """
     cameras = [sight.camera for sight in sights]
     voters = [sight for sight in sights if sight.weights.sum() > 0]
     if not voters:
-        raise DataError("a subject needs surface that some camera sees, got none; train longer or check the cameras")
+        raise DataError("no camera sees any surface; train longer or check the cameras")
     up = up_direction(cameras)
     center = _place(voters)
     size = frame_size([sight.camera for sight in voters], center)
     if not size > 0:
-        return _scene(sights, up, "no place is looked at by most cameras")
+        return _scene(sights, up, "most cameras have no common target")
     looking = np.array([_fraction(sight, center, size) >= FAIR_PART for sight in voters])
     inside = np.mean([np.linalg.norm(camera.center - center) < 0.5 * size for camera in cameras])
     count = f"{int(looking.sum())} of {len(cameras)} cameras"
     if looking.sum() < MOST * len(cameras):
-        return _scene(sights, up, f"no place is looked at by most cameras: at most by {count}")
+        return _scene(sights, up, f"most cameras have no common target: at most {count}")
     if inside > FEW_INSIDE:
-        return _scene(sights, up, f"{inside:.0%} of the cameras stand within what they look at")
+        return _scene(sights, up, f"{inside:.0%} of the cameras are inside what they look at")
     lookers = [sight for sight, looks in zip(voters, looking, strict=True) if looks]
     box = _object_box(lookers, center, size)
     if box is None:
@@ -240,20 +239,20 @@ def find_subject(sights: Sequence[Sight]) -> Subject:
 
 
 def frame_size(cameras: Sequence[Camera], center: np.ndarray) -> float:
-    """Return half of what an image's shorter side spans at a place [3] (world units; median; 0 behind most cameras)."""
+    """Return half the shorter image side at the distance of a point [3], world units: median; 0 behind most cameras."""
     depths = np.array([float(camera.forward @ (center - camera.center)) for camera in cameras])
     halves = np.array([0.5 * min(camera.width / camera.fx, camera.height / camera.fy) for camera in cameras])
     return max(float(np.median(depths * halves)), 0.0)
 
 
 def _fraction(sight: Sight, center: np.ndarray, radius: float) -> float:
-    """Return the part of a camera's votes in a ball."""
+    """Return the part of a camera's vote inside a ball."""
     near = ((sight.points - center) ** 2).sum(axis=1) <= radius**2
     return float(sight.weights[near].sum() / sight.weights.sum())
 
 
 def _place(sights: Sequence[Sight]) -> np.ndarray:
-    """Find the place [3] with the most votes, no camera more than it may: the best of some seeds, then mean shift."""
+    """Return the point [3] with the most votes, each camera limited: the best of some seeds, then mean shift."""
     points = np.concatenate([sight.points for sight in sights])
     weights = np.concatenate([sight.weights for sight in sights])
     seeds = [_weighted_median(points, weights)]
@@ -276,7 +275,7 @@ def _place(sights: Sequence[Sight]) -> np.ndarray:
 
 
 def _looked_at(sights: Sequence[Sight], center: np.ndarray) -> float:
-    """How much cameras look at a place, from 0 to 1: the mean over cameras of their share within half the frame."""
+    """Return how much cameras look at a point, 0 to 1: the mean part of their votes around it, limited per camera."""
     size = frame_size([sight.camera for sight in sights], center)
     return float(np.mean([min(_fraction(sight, center, 0.7 * size), 0.5) for sight in sights])) * 2 if size > 0 else 0.0
 
@@ -292,7 +291,7 @@ def _weighted_median(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def _object_box(sights: Sequence[Sight], center: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the box of the surface within a picture's reach of the middle that most of the pictures show."""
+    """Return the box of the surface near ``center`` that most images show; None without extent."""
     cameras = [sight.camera for sight in sights]
     reach = max(math.hypot(c.width, c.height) / min(c.width, c.height) for c in cameras) * size
     points = np.concatenate([sight.points for sight in sights])
@@ -314,7 +313,7 @@ def _object_box(sights: Sequence[Sight], center: np.ndarray, size: float) -> tup
 
 
 def _weighted_percentiles(values: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
-    """Below and above which lies ``TAIL`` of the weight."""
+    """Return the values below and above which ``TAIL`` of the weight lies."""
     order = np.argsort(values)
     reached = np.cumsum(weights[order]) / weights.sum()
     last = len(order) - 1
@@ -324,7 +323,7 @@ def _weighted_percentiles(values: np.ndarray, weights: np.ndarray) -> tuple[floa
 
 
 def _scene(sights: Sequence[Sight], up: np.ndarray, why: str) -> Subject:
-    """All that is seen, but for the farthest on each side."""
+    """Return a scene: the box of all visible surface except the farthest per cent on each side."""
     points = np.concatenate([sight.points[sight.weights > 0] for sight in sights])
     low, high = np.percentile(points, (1, 99), axis=0)
     margin = max(MARGIN * float((high - low).max()), 1e-9)

@@ -1,4 +1,4 @@
-"""Pinhole images of photographs whose lens distorts: where each pixel comes from, and the resampling.
+"""Undistortion: the source position of each pixel of a pinhole image, and resampling.
 
 The formulas of the lenses are in :mod:`gs2d.data.camera_models`.
 """
@@ -14,7 +14,7 @@ import torch
 from gs2d.data.camera_models import Lens
 from gs2d.errors import DataError, UnusableViewError
 
-_NEWTON = 20  # steps at the most, from the bent point to the ideal one
+_NEWTON = 20  # maximum number of iterations
 
 _COLMAP_PINHOLE = {"SIMPLE_PINHOLE", "PINHOLE"}
 #: COLMAP model -> (kind, order of its distortion parameters)
@@ -35,7 +35,7 @@ _COLMAP_LENSES = {
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Intrinsics of a photograph in pixels, and its lens unless it is a pinhole image."""
+    """Intrinsics of an image in pixels, with its lens unless it is a pinhole image."""
 
     width: int
     height: int
@@ -46,18 +46,18 @@ class Intrinsics:
     lens: Lens | None = None
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Return the pixels [..., 2] of the photograph that show ideal points [..., 2] of the plane z = 1."""
+        """Project ideal points [..., 2] of the plane z = 1 to pixels [..., 2]."""
         bent = points if self.lens is None else self.lens.distort(points)
         return np.asarray(bent * (self.fx, self.fy) + (self.cx, self.cy))
 
     def project_rays(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pixels [..., 2] that show rays [..., 3] of a camera with a lens, and which it shows [...] bool."""
+        """Project rays [..., 3] through the lens: pixels [..., 2], and which rays are visible [...] bool."""
         assert self.lens is not None
         points, shown = self.lens.project(rays)
         return points * (self.fx, self.fy) + (self.cx, self.cy), shown
 
     def ideal(self, pixels: np.ndarray) -> np.ndarray:
-        """Return the points [P, 2] of the plane z = 1 that pixels [P, 2] of the photograph show, by Newton's method.
+        """Return the points [P, 2] of the plane z = 1 at pixels [P, 2], by Newton's method.
 
         Raises
         ------
@@ -83,34 +83,34 @@ class Intrinsics:
         return x
 
     def scaled(self, width: int, height: int) -> Intrinsics:
-        """Return the same camera for another size of its images (a lens is free of scale)."""
+        """Return the intrinsics for another image size."""
         sx, sy = width / self.width, height / self.height
         return Intrinsics(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, self.lens)
 
 
 def colmap_intrinsics(camera: str, model: str, width: int, height: int, params: tuple[float, ...]) -> Intrinsics:
-    """Intrinsics of a COLMAP camera (the principal point's origin is the corner of the image, as ours).
+    """Return the intrinsics of a COLMAP camera.
 
     Parameters
     ----------
     camera : str
-        How to name the camera in an error.
+        Name of the camera in errors.
     model : str
-        COLMAP's name of the model.
+        Name of the camera model in COLMAP.
     params : tuple of float
-        In COLMAP's order.
+        In the order of COLMAP.
 
     Raises
     ------
     UnusableViewError
-        Parameters that are NaN or infinite.
+        If a parameter is not finite.
     DataError
-        A model that we do not undistort, another number of parameters, or values that are no camera.
+        If the model is not supported, or the parameters are invalid.
     """
     if model not in _COLMAP_PINHOLE and model not in _COLMAP_LENSES:
         valid = ", ".join(sorted(_COLMAP_PINHOLE | set(_COLMAP_LENSES)))
         raise DataError(
-            f"{camera} has the model {model}, which cannot be undistorted here (known: {valid}); "
+            f"{camera} has the model {model}, which is not supported (supported: {valid}); "
             "run `colmap image_undistorter` and load its output"
         )
     single = model.startswith("SIMPLE_") or model in ("RADIAL", "RADIAL_FISHEYE")
@@ -140,23 +140,23 @@ def colmap_intrinsics(camera: str, model: str, width: int, height: int, params: 
 
 
 def source_positions(intrinsics: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
-    """Where each pixel of the undistorted image comes from.
+    """Return the source position of each pixel of the undistorted image.
 
-    The undistorted camera keeps size, focal lengths and principal point, so the forward distortion of its pixel
-    centres (i + 0.5, j + 0.5) is the exact inverse map: no iteration.
+    The undistorted camera keeps size, focal lengths and principal point, so that the forward distortion of its pixel
+    centres is the exact inverse map.
 
     Returns
     -------
     positions : ndarray float32 [H, W, 2] px, corner origin
     valid : ndarray bool [H, W]
-        True where the position lies between pixel centres of the distorted image and the lens is one to one.
+        True if the position is between pixel centres of the distorted image and the lens is one to one.
     """
     k = intrinsics
     x = (np.arange(k.width) + 0.5 - k.cx) / k.fx
     y = (np.arange(k.height) + 0.5 - k.cy) / k.fy
     rays = np.stack([*np.meshgrid(x, y), np.ones((k.height, k.width))], axis=-1)  # [H, W, 3]
     positions, valid = k.project_rays(rays)
-    # Between the outer pixel centres every sample is an interpolation; a thousandth of a pixel is rounding.
+    # Samples between the outer pixel centres are interpolated; 0.001 px allows for rounding.
     low, high = 0.499, np.array((k.width, k.height)) - 0.499
     inside = ((positions >= low) & (positions <= high)).all(axis=-1)
     valid = valid & inside  # comparisons with NaN are False
@@ -164,7 +164,7 @@ def source_positions(intrinsics: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
 
 
 def undistort_image(image: np.ndarray, positions: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Sample an image bilinearly at ``positions`` (from ``source_positions``); 0 where not valid.
+    """Sample an image bilinearly at ``positions`` (from ``source_positions``); 0 where invalid.
 
     Colour is interpolated premultiplied by alpha and stored straight.
 
@@ -178,7 +178,7 @@ def undistort_image(image: np.ndarray, positions: np.ndarray, valid: np.ndarray)
         planes[:3] *= planes[3:] / 255.0
     sampled = _sample(planes, positions)
     if has_alpha:
-        sampled[:3] *= 255.0 / sampled[3:].clamp_min(0.5)  # below half a level alpha rounds to 0
+        sampled[:3] *= 255.0 / sampled[3:].clamp_min(0.5)  # smaller alpha rounds to 0
     pixels = sampled.add_(0.5).clamp_(0, 255).to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
     pixels[~valid] = 0
     return pixels
@@ -191,9 +191,9 @@ def undistort_mask(mask: np.ndarray, positions: np.ndarray, *, need: float) -> n
 
 
 def _sample(planes: torch.Tensor, positions: np.ndarray) -> torch.Tensor:
-    """Bilinear samples of planes [C, H, W] at positions [H', W', 2] px; the border's pixels extend outwards."""
+    """Sample planes [C, H, W] bilinearly at positions [H', W', 2] px; border pixels extend outwards."""
     height, width = planes.shape[1:]
-    # grid_sample with align_corners=False puts -1 and 1 at the outer edges, so pixel centres are at +0.5 as ours.
+    # With align_corners=False, -1 and 1 are the outer edges: pixel centres are at +0.5.
     grid = torch.from_numpy(positions) * torch.tensor([2.0 / width, 2.0 / height]) - 1.0
     return torch.nn.functional.grid_sample(
         planes[None], grid[None], mode="bilinear", padding_mode="border", align_corners=False

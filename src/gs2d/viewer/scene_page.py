@@ -23,7 +23,6 @@ import numpy as np
 
 from gs2d.core.camera import Camera
 from gs2d.core.files import atomic_write
-from gs2d.core.georeference import Georeference
 from gs2d.core.splats import Splats
 from gs2d.core.text import printable
 from gs2d.data.subject import OBJECT, Subject
@@ -46,6 +45,18 @@ class PageView:
 
 
 @dataclass(frozen=True, eq=False)
+class WorldScale:
+    """Metres per unit of the splats, and the rotation [3, 3] to axes with z up."""
+
+    metres: float
+    rotation: np.ndarray
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the scale as the page reads it, the rotation row by row."""
+        return {"metres": self.metres, "rotation": self.rotation.flatten().tolist()}
+
+
+@dataclass(frozen=True, eq=False)
 class PageScene:
     """What a page shows, except splats, meshes and photographs.
 
@@ -64,7 +75,7 @@ class PageScene:
         Unit vector.
     subject : Subject or None
         The page opens at the subject. None: it is guessed from the cameras.
-    world : Georeference or None
+    world : WorldScale or None
         If given, the page measures in metres, else in units of the capture.
     """
 
@@ -75,7 +86,7 @@ class PageScene:
     unit: float
     up: np.ndarray
     subject: Subject | None = None
-    world: Georeference | None = None
+    world: WorldScale | None = None
 
 
 @dataclass(frozen=True)
@@ -255,13 +266,8 @@ def _facts(scene: PageScene, subject: Subject) -> dict[str, Any]:
         "unit": scene.unit,
         "up": scene.up.tolist(),
         "cameras": [_camera(view, origin) for view in scene.views],
-        "world": None if scene.world is None else _world(scene.world),
+        "world": None if scene.world is None else scene.world.to_json(),
     }
-
-
-def _world(world: Georeference) -> dict[str, Any]:
-    """Return scale and rotation (by rows), for distances in metres."""
-    return {"metres": world.metres_per_unit, "rotation": world.rotation.flatten().tolist()}
 
 
 def _camera(view: PageView, origin: np.ndarray) -> dict[str, Any]:

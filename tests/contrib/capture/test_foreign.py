@@ -266,7 +266,7 @@ def test_of_photographs_of_one_name_the_folders_decide(tmp_path: Path) -> None:
     (tmp_path / "images" / "a_0.jpg").rename(tmp_path / "images" / "left" / "a_0.jpg")
     (tmp_path / "images" / "right").mkdir()
     Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "images" / "right" / "a_0.jpg")
-    with pytest.raises(DataError, match=r"must name one photograph, got a_0\.jpg, which may be .*left.*right.*keep"):
+    with pytest.raises(DataError, match=r"must name one image, got a_0\.jpg, which may be .*left.*right.*keep"):
         load_scene(tmp_path)
     path = tmp_path / "reconstruction.json"
     path.write_text(path.read_text().replace('"a_0.jpg"', '"D:/left/a_0.jpg"'))

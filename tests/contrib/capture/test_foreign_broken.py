@@ -160,7 +160,7 @@ def test_a_broken_file_is_one_line_that_names_it(tmp_path: Path, write: Callable
         ("scene.RCPROJ", "got scene.RCPROJ: in RealityCapture, export the registration as COLMAP"),
         (
             "a_0.xmp",
-            "got 9 photographs without any; `gs2d reconstruct .* --out RUN` makes a run",
+            "got 9 images without cameras; `gs2d reconstruct .* --out RUN` makes a run",
         ),  # any photo editor writes such
     ],
 )

@@ -14,13 +14,11 @@ import pytest
 import torch
 
 from gs2d.contrib.formats.gltf import read_gltf, write_gltf
-from gs2d.core.georeference import Georeference
 from gs2d.core.sh import sh_basis
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.errors import DataError
-from gs2d.io.formats.splat_formats import read_splat_file, read_surfels, write_layout
+from gs2d.io.formats.splat_formats import read_splat_file, read_surfels
 from gs2d.io.gaussians import Gaussians
-from gs2d.io.georeference import stamp
 from splat_scenes import a_scene, turned_by
 
 PREFIX = "KHR_gaussian_splatting:"
@@ -124,23 +122,6 @@ def test_a_glb_comes_back_in_the_same_coordinates(tmp_path: Path) -> None:
     np.testing.assert_allclose(back.opacity_logits, splats.opacity_logits, atol=5e-4)  # float32 near 1
     assert turned_by(back.quats.numpy(), splats.quats.numpy()).max() < 0.1
     assert (quats_to_matrices(back.quats) - quats_to_matrices(splats.quats)).abs().max() < 1e-5
-
-
-def test_a_glb_in_metres_has_y_up_where_the_splats_have_z(tmp_path: Path) -> None:
-    splats = a_scene(20)
-    write_layout(tmp_path / "a.glb", splats, "gltf")
-    place = Georeference(
-        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), origin=np.array([5e5, 5e6, 0.0]), method="a test"
-    )
-    assert stamp(tmp_path / "a.glb", place)
-    document, data = opened(tmp_path / "a.glb")
-    x, y, z, w = document["nodes"][0]["rotation"]
-    turn = quats_to_matrices(torch.tensor([[w, x, y, z]], dtype=torch.float64))[0].numpy()
-    shown = attributes(document, data)["POSITION"] @ turn.T
-    np.testing.assert_allclose(shown, splats.means.numpy() @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]), atol=1e-6)
-    back, _ = read_surfels(tmp_path / "a.glb")
-    assert torch.equal(back.means, splats.means)
-    assert torch.equal(back.shN, splats.shN)
 
 
 def test_whole_numbers_strides_transforms_and_buffers_beside_are_read(tmp_path: Path) -> None:

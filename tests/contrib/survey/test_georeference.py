@@ -1,4 +1,4 @@
-"""`gs2d georeference` and what is written with it: every source, every refusal, and files that know where they are."""
+"""`gs2d georeference`: every source, every error, and exported files."""
 
 from __future__ import annotations
 
@@ -16,12 +16,14 @@ from ball_runs import options as training
 from gs2d.cli import run as gs2d
 from gs2d.contrib.survey.commands import GeoreferenceOptions
 from gs2d.contrib.survey.find_georeference import georeference_run
-from gs2d.core.georeference import Georeference
-from gs2d.core.projection import Projection, to_enu
+from gs2d.contrib.survey.georeference import Georeference, read_georeference, write_georeference
+from gs2d.contrib.survey.projection import Projection
+from gs2d.core.json_files import read_json
+from gs2d.data.positions import to_enu
 from gs2d.io.formats.splat_formats import read_splat_file
-from gs2d.io.georeference import georeference_of_file, read_georeference, write_georeference
 from gs2d.io.meshes import read_mesh
 from gs2d.io.splat_ply import read_splats
+from gs2d.pipeline.look.page import page_content
 from gs2d.pipeline.train.train_run import train
 from tiny import ball_cameras, write_ball_mesh, write_capture
 
@@ -125,7 +127,7 @@ def test_positions_in_a_file_with_outliers(run: Path, tmp_path: Path) -> None:
     lines = ["name,lat,lon,height", *(f"r_{k}.png,{a:.9f},{b:.9f},{c:.4f}" for k, (a, b, c) in enumerate(places))]
     file = tmp_path / "positions.csv"
     file.write_text("\n".join(lines[:9]))  # r_0 to r_7; test views have names of their own
-    with pytest.raises(Exception, match="must name one photograph"):
+    with pytest.raises(Exception, match="must name one image"):
         found(run, positions=file, enu=True)
     file.write_text("\n".join(lines[:13]).replace("r_", "train/r_"))
     g = found(run, positions=file, enu=True)
@@ -234,48 +236,69 @@ def placed(run: Path) -> Georeference:
 
 
 @pytest.mark.parametrize(
-    ("name", "inside", "exact"),
+    ("name", "exact"),
     [
-        ("a.ply", True, 1e-3),
-        ("a.compressed.ply", True, 0.05),
-        ("a.spz", False, 0.02),
-        ("a.splat", False, 1e-3),
-        ("a.usd", True, 1e-3),
-        ("a.glb", True, 1e-3),
-        ("a.sog", False, 0.02),
+        ("a.ply", 1e-3),
+        ("a.compressed.ply", 0.05),
+        ("a.spz", 0.02),
+        ("a.splat", 1e-3),
+        ("a.usd", 1e-3),
+        ("a.glb", 1e-3),
+        ("a.sog", 0.02),
     ],
 )
-def test_splats_a_million_metres_away_come_back_to_a_millimetre(
-    run: Path, tmp_path: Path, name: str, inside: bool, exact: float
+def test_exported_splats_are_exact_a_million_metres_from_the_origin(
+    run: Path, tmp_path: Path, name: str, exact: float
 ) -> None:
     g, out = placed(run), tmp_path / name
-    assert gs2d(["export", str(run), "--out", str(out), "--georeferenced", "--quiet"]) == 0
-    beside = tmp_path / f"{name}.georeference.json"
-    assert beside.exists()
+    assert gs2d(["georeference", str(run), "--out", str(out), "--quiet"]) == 0
+    beside = Georeference.from_json(read_json(tmp_path / f"{name}.georeference.json"))
+    assert (beside.epsg, beside.origin.tolist()) == (32632, g.origin.tolist())
     assert [float(x) for x in (tmp_path / f"{out.stem}_offset.xyz").read_text().split()] == g.origin.tolist()
-    if inside:
-        beside.unlink()
-    said = georeference_of_file(out)
-    assert said is not None
-    assert (said.epsg, said.origin.tolist()) == (32632, g.origin.tolist())
-    world = said.to_world(read_splat_file(out).gaussians.means)
-    expected = g.to_world(read_splats(run / "splats.ply").means.numpy())
-    away, which = cKDTree(expected - g.origin).query(world - g.origin)  # some formats reorder
+    local = read_splat_file(out).gaussians.means
+    if name.endswith(".glb"):  # the reader turns y up into the y down of captures
+        local = local[:, [0, 2, 1]] * (-1, -1, -1)
+    expected = g.to_local(read_splats(run / "splats.ply").means.numpy())
+    away, which = cKDTree(expected).query(local)  # some formats reorder
     assert away.max() < exact
     assert exact > 1e-3 or len(set(which)) == len(expected)
 
 
-def test_the_mesh_a_million_metres_away_comes_back_to_a_millimetre(
+def test_the_exported_mesh_is_exact_a_million_metres_from_the_origin(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     g, out = placed(run), tmp_path / "mesh.ply"
     before = (run / "mesh.ply").read_bytes()
-    assert gs2d(["mesh", str(run), "--out", str(out), "--georeferenced"]) == 0
-    assert "less the offset 1000123 6000456 789" in capsys.readouterr().out
-    said = georeference_of_file(out)
-    assert said is not None
-    vertices = said.to_world(read_mesh(out).vertices)
-    assert np.abs(vertices - g.to_world(read_mesh(run / "mesh.ply").vertices)).max() < 1e-3
+    assert gs2d(["georeference", str(run), "--part", "mesh", "--out", str(out)]) == 0
+    assert "relative to the offset 1000123 6000456 789" in capsys.readouterr().out
+    vertices = read_mesh(out).vertices
+    assert np.abs(vertices - g.to_local(read_mesh(run / "mesh.ply").vertices)).max() < 1e-3
     assert (run / "mesh.ply").read_bytes() == before
-    assert gs2d(["info", str(out)]) == 0
-    assert "EPSG:32632" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["--part", "texture", "--out", "a.glb"], "mesh.glb does not exist; write it with `gs2d mesh"),
+        (["--out", "a.xyz"], "splats are written as"),
+        (["--out", "RUN/world.ply"], "inside the run"),
+    ],
+)
+def test_export_errors_are_one_line(
+    run: Path, words: list[str], text: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(run.parent)
+    assert "no georeference" in error_of(["georeference", str(run), "--out", "a.ply", "--quiet"], capsys)
+    placed(run)
+    words = [word.replace("RUN", str(run)) for word in words]
+    assert text in error_of(["georeference", str(run), "--quiet", *words], capsys)
+
+
+def test_the_page_of_a_georeferenced_run_measures_in_metres(run: Path, tmp_path: Path) -> None:
+    g = placed(run)
+    world = page_content(run).scene.world
+    assert world is not None
+    assert world.metres == g.metres_per_unit
+    assert (world.rotation == g.rotation).all()
+    (run / "georeference.json").write_text('{"rotation": [1]}')
+    assert page_content(run).scene.world is None

@@ -13,8 +13,7 @@ from PIL import Image
 
 from ball_runs import options as training
 from gs2d.cli import run as gs2d
-from gs2d.core.georeference import Georeference
-from gs2d.io.georeference import write_georeference
+from gs2d.contrib.survey.georeference import Georeference, write_georeference
 from gs2d.pipeline.train.train_run import train
 from tiny import RADIUS, write_ball_mesh, write_capture
 

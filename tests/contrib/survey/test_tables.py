@@ -1,4 +1,4 @@
-"""Tables of places as people write them: what is wrong with one is a line that names its line."""
+"""Tables of names and numbers: errors name file and line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def table(folder: Path, text: str) -> Path:
     return path
 
 
-def test_a_quote_that_is_not_closed_ends_with_its_line(tmp_path: Path) -> None:
+def test_an_unclosed_quote_ends_with_its_line(tmp_path: Path) -> None:
     """It swallowed the lines below it, and their number was a ValueError."""
     read = read_table(table(tmp_path, 'name,x,y,z\n"a, 1,2,3\n"b, c",4,5,6\n'), COLUMNS, ("name",))
     assert [(line, row["name"]) for line, row in read.rows] == [(2, "a, 1,2,3"), (3, "b, c")]
@@ -26,8 +26,8 @@ def test_a_quote_that_is_not_closed_ends_with_its_line(tmp_path: Path) -> None:
         read.number(*read.rows[0], "x")
 
 
-def test_a_word_that_is_longer_than_any_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="line 2: words between ',' were expected, got: field larger"):
+def test_a_field_beyond_the_limit_of_csv_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="line 2: values separated by ',' were expected: field larger"):
         read_table(table(tmp_path, "name,x\n" + "a" * 200_000 + ",1\n"), COLUMNS, ("name",))
 
 

@@ -53,12 +53,12 @@ def test_the_largest_model_is_read_and_a_note_gives_the_sizes_of_the_others(tmp_
     assert len(scene.views) == 9
     first = f"gs2d train {tmp_path / 'sparse/0'}"
     assert scene.notes[0] == (
-        f"the model sparse/2 is read, which has 9 images; 0 has 2, 10 has 2. Read another one by its folder: {first}"
+        f"using the model sparse/2 with 9 images; 0 has 2, 10 has 2. To use another one, give its folder: {first}"
     )
     with pytest.raises(DataError, match="images"):
         load_scene(tmp_path / "sparse/0")
     model.write(tmp_path / "sparse/0", kind)  # of two that are as large the first
-    assert "the model sparse/0 is read" in load_scene(tmp_path).notes[0]
+    assert "using the model sparse/0" in load_scene(tmp_path).notes[0]
 
 
 def test_images_in_sub_folders_keep_their_whole_name(tmp_path: Path) -> None:
@@ -282,7 +282,7 @@ def test_no_photograph_at_all_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="skipped"):
         load_scene(tmp_path)
     (tmp_path / "images").rmdir()
-    with pytest.raises(DataError, match="photographs"):
+    with pytest.raises(DataError, match="must have its images"):
         load_scene(tmp_path)
 
 
@@ -303,5 +303,5 @@ def test_colors_of_points_that_are_no_bytes_are_one_line(tmp_path: Path, word: s
     with pytest.raises(DataError, match=r"points3D\.txt"):
         read_points(tmp_path, "txt")
     path.write_text("nan 0.5 0.5 0.5 10 20 30 0.1 1 1\n")
-    with pytest.raises(DataError, match="no int64"):
+    with pytest.raises(DataError, match="not a valid int64"):
         read_points(tmp_path, "txt")

@@ -3,7 +3,7 @@
 Its one kernel is the projected ellipsoid: a disk is written with a thickness that does not show. Attributes are
 float32 and not raw: unit quaternions, linear scales, linear opacities; spherical harmonics are those of 3DGS. glTF has
 y up. As SplatTransform (PlayCanvas, MIT) does with a PLY, a half turn about z takes our coordinates there, which
-changes signs alone; a file that knows where it is in the world (``gs2d.io.georeference``) has z up before that.
+changes signs alone.
 """
 
 from __future__ import annotations
@@ -20,20 +20,16 @@ import numpy as np
 
 from gs2d.contrib.formats.gltf_document import GltfDocument, node_matrices, read_document
 from gs2d.core.files import atomic_write
-from gs2d.core.georeference import Georeference
 from gs2d.core.growth import check_growth
 from gs2d.core.sh import C0
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
 from gs2d.io.gaussians import Gaussians, Tell, drawn_bands, log_scales_of, logit, sigmoid, to_byte, unit_quats
-from gs2d.io.georeference import stamp_glb
 from gs2d.io.meshes import LINEAR_U16
 
 EXTENSION = "KHR_gaussian_splatting"
-UPRIGHT = (0.0, 0.5**0.5, 0.5**0.5, 0.0)  # of the node, x y z w: after the half turn, z up becomes y up
 _FROM_GLTF = np.diag([-1.0, -1.0, 1.0, 1.0])
-_FROM_GLTF_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 _FLOAT, _USHORT, _VERTICES = 5126, 5123, 34962
 _KNOWN = {EXTENSION, "KHR_mesh_quantization"}
 
@@ -137,13 +133,13 @@ def read_gltf(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple
     beyond = set(map(str, required)) - _KNOWN if isinstance(required, list) else set()
     if beyond:
         raise DataError(f"{path}: glTF that needs {EXTENSION} alone was expected, it needs {', '.join(sorted(beyond))}")
-    # What knows where it is has z up.
-    turn = _FROM_GLTF_Z_UP if document.extra("georeference") is not None else _FROM_GLTF
     with document.reading():
         found = list(_primitives(document))
         total = sum(document.bytes_of(index) for _, attributes in found for index in attributes.values())
         check_growth(path, document.packed_bytes() if found else 0, total, "splats")
-        parts = [_placed(path, _gaussians(document, attributes, tell), turn @ matrix) for matrix, attributes in found]
+        parts = [
+            _placed(path, _gaussians(document, attributes, tell), _FROM_GLTF @ matrix) for matrix, attributes in found
+        ]
     if not parts and "meshes" not in document.json and EXTENSION in document.json.get("extensionsUsed", ()):
         return _none(), "glTF"
     if not parts:
@@ -250,17 +246,7 @@ def _placed(path: str | os.PathLike[str], g: Gaussians, matrix: np.ndarray) -> G
         raise DataError(f"{Path(path)}: {error} of the nodes of splats; bake it into them") from error
 
 
-def _stamp(path: Path, georeference: Georeference) -> None:
-    """Write a georeference into a .glb file; splats get the node rotation of a scene whose z is up."""
-
-    def set_upright(document: dict[str, Any]) -> None:
-        if EXTENSION in document.get("extensionsUsed", ()):
-            document["nodes"][0]["rotation"] = UPRIGHT
-
-    stamp_glb(path, georeference, set_upright)
-
-
-@register_format("gltf", ending=".glb", stamp=_stamp)
+@register_format("gltf", ending=".glb")
 def _write(path: Path, splats: Splats) -> None:
     write_gltf(path, Gaussians.of(splats))
 

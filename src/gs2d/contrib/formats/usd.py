@@ -24,7 +24,6 @@ import numpy as np
 from gs2d.contrib.formats import usd_process
 from gs2d.core.extras import install
 from gs2d.core.files import atomic_write, disk_error
-from gs2d.core.georeference import Georeference
 from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader
@@ -38,7 +37,6 @@ from gs2d.io.gaussians import (
     unit_quats,
     with_thickness,
 )
-from gs2d.io.georeference import georeference_text
 
 ENDINGS = (".usd", ".usdc", ".usda", ".usdz")
 _APIS = (
@@ -152,26 +150,6 @@ def _save(pxr: Any, path: Path, layer: Any) -> None:
         with open(made, "rb") as source, atomic_write(path) as file:
             while block := source.read(1 << 20):
                 file.write(block)
-
-
-def stamp_usd(path: Path, georeference: Georeference) -> None:
-    """Write a georeference into the layer's data: JSON for gs2d, EPSG code and offset for other programs."""
-    pxr = required_usd()
-    layer = pxr.Sdf.Layer.OpenAsAnonymous(str(path))
-    offset = pxr.Gf.Vec3d(*map(float, georeference.origin))
-    place: dict[str, Any] = {"georeference": georeference_text(georeference), "offset": offset}
-    if georeference.epsg is not None:
-        place["epsg"] = georeference.epsg
-    layer.customLayerData = {**dict(layer.customLayerData), "gs2d": place}
-    _save(pxr, path, layer)
-
-
-def usd_georeference(path: str | os.PathLike[str]) -> str | None:
-    """Return the JSON in which a file says where it is; None where it does not, or is none that can be read."""
-    try:
-        return _ask(path)[0].get("georeference")
-    except DataError:
-        return None  # whoever reads the splats says what is wrong with it
 
 
 def read_usd(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Gaussians, str]:
@@ -300,9 +278,9 @@ def _placed(where: str, g: Gaussians, matrix: np.ndarray) -> Gaussians:
         raise DataError(f"{where}: {error}; bake the transform into the splats") from error
 
 
-@register_format("usd", ending=".usd", stamp=stamp_usd)
+@register_format("usd", ending=".usd")
 def _write(path: Path, splats: Splats) -> None:
     write_usd(path, Gaussians.of(splats))
 
 
-register_splat_reader("usd", endings=ENDINGS, georeference=usd_georeference)(read_usd)
+register_splat_reader("usd", endings=ENDINGS)(read_usd)

@@ -122,14 +122,12 @@ def _found(path: str) -> tuple[dict[str, Any], list[np.ndarray]]:
         cache = UsdGeom.XformCache(when)
         prims = [p for p in stage.Traverse(Usd.TraverseInstanceProxies()) if p.IsA(UsdVol.ParticleField)]
         fields = [_field(prim, when, cache) for prim in prims]
-        told = root.customLayerData.get("gs2d")
     except Tf.ErrorException as error:
         words = " ".join(str(error).split())[:200]
         raise _UnfitError(f"OpenUSD was expected, its reader says: {words}; copy or export it again") from error
     finally:
         delegate.TakeUncoalescedDiagnostics()
-    place = told.get("georeference") if isinstance(told, dict) else None
-    facts = {"fields": [fact for fact, _ in fields], "georeference": place if isinstance(place, str) else None}
+    facts = {"fields": [fact for fact, _ in fields]}
     return facts, [array for _, arrays in fields for array in arrays]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from gs2d.cli.commands import Common, RunPath
 from gs2d.cli.registry import WORLD, register_command
@@ -55,19 +55,23 @@ class OrthophotoOptions:
 
 @register_command(
     "georeference",
-    action="gs2d.contrib.survey.show:georeference",
+    action="gs2d.contrib.survey.show:show_georeference",
     group=WORLD,
-    first=("run", "gps", "positions", "control", "known_distance", "markers", "remove"),
+    first=("run", "gps", "positions", "control", "known_distance", "markers", "remove", "out", "part"),
 )
 @dataclass(frozen=True, kw_only=True)
-class Georeference(GeoreferenceOptions, Common):
-    """Find scale, up and world position of a run."""
+class GeoreferenceCommand(GeoreferenceOptions, Common):
+    """Find scale, up and world position of a run, and export in metres."""
 
     run: RunPath
     """Run folder."""
+    out: Annotated[Path | None, Arg(metavar="FILE")] = None
+    """Write the splats in world coordinates, in the format of the ending; the offset is in files beside it."""
+    part: Literal["splats", "mesh", "texture"] = "splats"
+    """With --out: write mesh.ply or the textured mesh.glb of the run instead of the splats."""
 
 
-@register_command("orthophoto", action="gs2d.contrib.survey.show:orthophoto", group=WORLD)
+@register_command("orthophoto", action="gs2d.contrib.survey.show:show_orthophoto", group=WORLD)
 @dataclass(frozen=True, kw_only=True)
 class Orthophoto(OrthophotoOptions, Common):
     """Write orthophoto and elevation model of a georeferenced run."""

@@ -11,9 +11,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from gs2d.contrib.survey.triangulate import triangulate
-from gs2d.core.projection import WGS84
 from gs2d.data import View
-from gs2d.data.csv_tables import Table, read_table
+from gs2d.data.csv_tables import WGS84, Table, read_table
 from gs2d.errors import DataError
 
 _ODM = ("x", "y", "z", "u", "v", "photo", "name")  # columns of gcp_list.txt

@@ -13,15 +13,23 @@ import numpy as np
 from gs2d.contrib.survey.commands import GeoreferenceOptions
 from gs2d.contrib.survey.control import Located, locate, read_control
 from gs2d.contrib.survey.fit import Fit, cameras_up, fit_places
+from gs2d.contrib.survey.georeference import (
+    CHECK,
+    FITTED,
+    LEFT_OUT,
+    Georeference,
+    Residual,
+    read_georeference,
+    write_georeference,
+)
 from gs2d.contrib.survey.markers import Marker, detected, detector, in_run
+from gs2d.contrib.survey.projection import MapFrame, in_frame
 from gs2d.core.camera import Camera
-from gs2d.core.georeference import CHECK, FITTED, LEFT_OUT, Georeference, Residual
 from gs2d.core.similarity import rotation_to_z
 from gs2d.data import View
 from gs2d.data.exif import read_place
-from gs2d.data.positions import Positions, WorldFrame, in_frame, matched, read_positions
+from gs2d.data.positions import Positions, matched, read_positions
 from gs2d.errors import DataError, RunError
-from gs2d.io.georeference import read_georeference, write_georeference
 from gs2d.io.run_dir import GEOREFERENCE, POSES, RunFolder, open_run
 from gs2d.pipeline.prepare.loaded import reload_run
 from gs2d.training.events import OnEvent, counted, ignore
@@ -216,7 +224,9 @@ def _of_positions(
     if epsg is None and not positions.in_degrees:
         epsg = _asked_epsg(options, positions.source)
     source = np.array([view.camera.center for view in used])
-    target, frame = in_frame(np.array([places[view.name] for view in used]), epsg, wanted=options.epsg, enu=options.enu)
+    target, frame = in_frame(
+        np.array([places[view.name] for view in used]), epsg, requested=options.epsg, enu=options.enu
+    )
     fit = fit_places(source, target, up, tilt=tilt)
     names = [view.name for view in used]
     doubts = [*_doubts_of_fit(fit, target, [view.camera for view in used])]
@@ -265,9 +275,9 @@ def _of_control(views: Sequence[View], options: GeoreferenceOptions, up: np.ndar
     epsg = control.epsg if control.epsg is not None else None if control.in_degrees else options.epsg
     if epsg is None and not control.in_degrees:
         origin = np.round(np.median(located.world, axis=0))
-        target, frame = located.world - origin, WorldFrame(None, origin, None, 1.0)
+        target, frame = located.world - origin, MapFrame(None, origin, None, 1.0)
     else:
-        target, frame = in_frame(located.world, epsg, wanted=options.epsg, enu=False)
+        target, frame = in_frame(located.world, epsg, requested=options.epsg, enu=False)
     fit = fit_control(located, target, up, tilt)
     doubts = [*located.doubts, *_doubts_of_control(fit, located)]
     source = f"{int(fitted.sum())} control points in {options.control.name}"
@@ -309,7 +319,7 @@ def _doubts_of_control(fit: Fit, located: Located) -> list[str]:
 
 
 def _georeference(
-    fit: Fit, frame: WorldFrame, names: Sequence[str], check: np.ndarray, source: str, doubts: Sequence[str]
+    fit: Fit, frame: MapFrame, names: Sequence[str], check: np.ndarray, source: str, doubts: Sequence[str]
 ) -> Georeference:
     roles = [CHECK if held else FITTED if used else LEFT_OUT for held, used in zip(check, fit.inliers, strict=True)]
     residuals = tuple(

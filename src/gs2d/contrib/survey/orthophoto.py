@@ -12,10 +12,10 @@ import numpy as np
 import torch
 
 from gs2d.contrib.survey.commands import OrthophotoOptions
+from gs2d.contrib.survey.georeference import Georeference, required_georeference
 from gs2d.contrib.survey.geotiff import NO_DATA, write_geotiff
 from gs2d.core.extras import required
 from gs2d.core.files import check_writable
-from gs2d.core.georeference import Georeference
 from gs2d.core.mesh import Mesh
 from gs2d.errors import ProtocolError, RunError
 from gs2d.io.meshes import read_mesh
@@ -23,7 +23,6 @@ from gs2d.io.run_dir import MESH, open_run
 from gs2d.meshing.raycast import Hits, cast_down
 from gs2d.meshing.texture import Texels, surface_colors
 from gs2d.pipeline.finish.run_texture import photographs
-from gs2d.pipeline.finish.world_frame import place_of
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.training.events import OnEvent, Phase, ignore
 
@@ -66,8 +65,7 @@ def orthophoto_run(
     """
     required("geo", "tifffile", "a GeoTIFF")  # before minutes are spent
     path = Path(path)
-    place = place_of(open_run(path).path, asked=True)
-    assert place is not None
+    place = required_georeference(open_run(path).path)
     target = path / "orthophoto.tif" if out is None else Path(out)
     if target.suffix.lower() not in (".tif", ".tiff"):
         raise RunError(f"--out must end in .tif or .tiff, got {target.name}")

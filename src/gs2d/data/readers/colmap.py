@@ -1,8 +1,9 @@
-"""A folder with photographs and a COLMAP model."""
+"""COLMAP captures: a folder of images and a sparse model."""
 
 from __future__ import annotations
 
 import math
+import mmap
 import os
 import shlex
 import struct
@@ -27,8 +28,8 @@ from gs2d.data.undistort import Intrinsics, colmap_intrinsics
 from gs2d.errors import DataError, UnusableViewError
 
 # -- the files of a model ----------------------------------------------------------------------------------------------
-# The layouts are those of COLMAP's documentation (https://colmap.github.io/format.html). ``rigs`` and ``frames`` files,
-# which newer versions write beside them, repeat the poses in another form and are not read.
+# Layouts: https://colmap.github.io/format.html. ``rigs`` and ``frames`` files of newer versions repeat the poses in
+# another form and are not read.
 #: model id -> (name, number of parameters)
 CAMERA_MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
@@ -56,7 +57,7 @@ PANORAMA = "EQUIRECTANGULAR"
 
 @dataclass(frozen=True)
 class ColmapCamera:
-    """One line of cameras: the model's name and its parameters in COLMAP's order, px."""
+    """A camera: name of the camera model, image size, and parameters in COLMAP's order, px."""
 
     model: str
     width: int
@@ -66,7 +67,7 @@ class ColmapCamera:
 
 @dataclass(frozen=True, eq=False)
 class ColmapImage:
-    """One registered image.
+    """A registered image.
 
     Attributes
     ----------
@@ -74,8 +75,10 @@ class ColmapImage:
     name : str
         Relative to the image folder.
     T_cam_world : ndarray [4, 4] float64
-        NaN where the file has no valid pose.
-    observations : ndarray [M, 2] px and point_ids : ndarray [M] int64 (-1 = none), or None if they were not asked for
+        NaN if the file has no valid pose.
+    observations : ndarray [M, 2] px, or None if not requested
+    point_ids : ndarray [M] int64, or None if not requested
+        -1 = no point.
     """
 
     image_id: int
@@ -88,7 +91,7 @@ class ColmapImage:
 
 @dataclass(frozen=True, eq=False)
 class ColmapPoints:
-    """ids [P] int64, xyz [P, 3] float64 world units, rgb [P, 3] uint8, error [P] px."""
+    """Sparse points: ids [P] int64, xyz [P, 3] float64 world units, rgb [P, 3] uint8, error [P] px."""
 
     ids: np.ndarray
     xyz: np.ndarray
@@ -97,7 +100,7 @@ class ColmapPoints:
 
 
 def find_model(folder: Path) -> str | None:
-    """Return "bin" or "txt" if ``folder`` holds a COLMAP model of that kind (binary is preferred), else None."""
+    """Return "bin" or "txt" if ``folder`` holds a COLMAP model (binary is preferred), else None."""
     for kind in ("bin", "txt"):
         if all(_file(folder, name, kind).is_file() for name in ("cameras", "images")):
             return kind
@@ -105,23 +108,23 @@ def find_model(folder: Path) -> str | None:
 
 
 def _file(folder: Path, name: str, kind: str) -> Path:
-    """Return a file of a model, which some programs begin with a capital (``Cameras.txt``, ``points3d.txt``)."""
+    """Return the path of a model file; some programs write ``Cameras.txt`` or ``points3d.txt``."""
     return in_any_case(folder, f"{name}.{kind}")
 
 
 def read_cameras(folder: Path, kind: str) -> dict[int, ColmapCamera]:
-    """All cameras of a model, by id. Raises DataError for a file that is cut short or not a camera list."""
+    """Read the cameras of a model, by id; raises DataError for a truncated or invalid file."""
     path = _file(folder, "cameras", kind)
     return dict(_cameras_bin(path) if kind == "bin" else _cameras_txt(path))
 
 
 def read_images(folder: Path, kind: str, *, observations: bool = False) -> list[ColmapImage]:
-    """All registered images of a model, in the file's order; ``observations`` also keeps the 2-D points.
+    """Read the registered images of a model, in file order; ``observations`` includes the 2-D points.
 
     Raises
     ------
     DataError
-        A file that is cut short or not an image list, or a pose that is not a pose.
+        If the file is truncated or invalid, or a pose is not finite.
     """
     images = list(_each_image(folder, kind, observations))
     for image in images:
@@ -130,73 +133,49 @@ def read_images(folder: Path, kind: str, *, observations: bool = False) -> list[
 
 
 def _each_image(folder: Path, kind: str, observations: bool) -> Iterator[ColmapImage]:
-    """Yield the images of ``read_images`` one by one, those without a valid pose too."""
+    """Yield the images of ``read_images``, including those without a valid pose."""
     path = _file(folder, "images", kind)
     return _images_bin(path, observations) if kind == "bin" else _images_txt(path, observations)
 
 
 def read_points(folder: Path, kind: str) -> ColmapPoints | None:
-    """Return the sparse points, or None if the model has no such file. Raises DataError as the others."""
+    """Read the sparse points; None if the model has no such file. Raises DataError like the others."""
     path = _file(folder, "points3D", kind)
     if not path.is_file():
         return None
     return _points_bin(path) if kind == "bin" else _points_txt(path)
 
 
-_IMAGE_BYTES = 64 + 1 + 8  # of an image without a name and 2-D points
-_CHUNK = 1 << 22  # bytes of points at a time
+_IMAGE_BYTES = 64 + 1 + 8  # size of an image without a name and 2-D points
+_POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8")])
+_CHUNK = 1 << 16  # points copied at a time
 
 
-class _Bytes:
-    """A binary file, read piece by piece, that says where it was cut: models are larger than what is kept of them."""
+class _ModelFile:
+    """A memory-mapped binary file; reading beyond its end is a DataError."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.at = 0
+        self.path, self.at = path, 0
         try:
-            self._file = path.open("rb")
-            self.size = os.fstat(self._file.fileno()).st_size
+            with path.open("rb") as file:
+                self.size = os.fstat(file.fileno()).st_size
+                self.data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if self.size else b""
         except OSError as error:
-            raise self._unreadable(error) from error
+            raise DataError(f"cannot read {path}: {error.strerror or error}") from error
 
-    def __enter__(self) -> _Bytes:
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        self._file.close()
-
-    def _unreadable(self, error: OSError) -> DataError:
-        return DataError(f"cannot read {self.path}: {error.strerror or error}")
-
-    def need(self, count: int, what: str) -> None:
-        """Raise DataError where the file ends before ``count`` more bytes."""
-        if self.at + count > self.size:
+    def take(self, count: int, what: str) -> int:
+        """Move past ``count`` bytes and return the offset of the first."""
+        start, self.at = self.at, self.at + count
+        if self.at > self.size:
             raise DataError(
-                f"{self.path} is truncated or not a COLMAP file: {what} needs bytes {self.at} to {self.at + count}, "
+                f"{self.path} is truncated or not a COLMAP file: {what} needs bytes {start} to {self.at}, "
                 f"got a file of {self.size} bytes; copy it again"
             )
-
-    def read(self, count: int, what: str) -> bytes:
-        """Return the next ``count`` bytes."""
-        self.need(count, what)
-        try:
-            data = self._file.read(count)
-        except OSError as error:
-            raise self._unreadable(error) from error
-        if len(data) < count:  # it became shorter meanwhile
-            self.size = self.at + len(data)
-            self.need(count, what)
-        self.at += count
-        return data
-
-    def skip(self, count: int, what: str) -> None:
-        """Move over ``count`` bytes."""
-        self.need(count, what)
-        self.at += count
-        self._file.seek(self.at)
+        return start
 
     def unpack(self, layout: str, what: str) -> tuple[int | float, ...]:
-        return struct.unpack("<" + layout, self.read(struct.calcsize("<" + layout), what))
+        """Return the next values."""
+        return struct.unpack_from("<" + layout, self.data, self.take(struct.calcsize("<" + layout), what))
 
     def count(self, what: str, smallest: int) -> int:
         """Return the number of records that follow, each of at least ``smallest`` bytes."""
@@ -209,17 +188,14 @@ class _Bytes:
         return count
 
     def name(self, what: str) -> str:
-        """Return the text up to the next byte 0."""
-        start, raw = self.at, b""
-        while b"\0" not in raw:
-            rest = self.size - self.at
-            raw += self.read(min(64, rest) if rest else 1, what)  # 1 is more than there is
-        raw = raw[: raw.index(b"\0")]
-        self.at = start + len(raw) + 1
-        self._file.seek(self.at)
-        return raw.decode("utf-8", "surrogateescape")  # as the file system has it
+        """Return the text up to the next zero byte."""
+        end = self.data.find(b"\0", self.at)
+        length = (self.size if end < 0 else end) - self.at
+        start = self.take(length + 1, what)
+        return self.data[start : start + length].decode("utf-8", "surrogateescape")  # as the file system has it
 
     def finish(self, what: str) -> None:
+        """Check that the file ends here."""
         if self.at != self.size:
             raise DataError(
                 f"{self.path} must end after its last {what} at byte {self.at}, got {self.size} bytes; "
@@ -228,83 +204,66 @@ class _Bytes:
 
 
 def _cameras_bin(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
-    with _Bytes(path) as file:
-        count = file.count("cameras", 24 + 2 * 8)  # of the model with fewest parameters
-        for number in range(1, count + 1):
-            what = f"camera {number} of {count}"
-            camera_id, model_id, width, height = map(int, file.unpack("IiQQ", what))
-            if model_id not in CAMERA_MODELS:
-                raise DataError(
-                    f"{path}: camera {camera_id} has the model id {model_id}, which is not known here (0 to "
-                    f"{max(CAMERA_MODELS)}); run `colmap image_undistorter` and load its output"
-                )
-            model, num_params = CAMERA_MODELS[model_id]
-            yield camera_id, ColmapCamera(model, width, height, file.unpack(f"{num_params}d", what))
-        file.finish("camera")
+    file = _ModelFile(path)
+    count = file.count("cameras", 24 + 2 * 8)  # size with the model of fewest parameters
+    for number in range(1, count + 1):
+        what = f"camera {number} of {count}"
+        camera_id, model_id, width, height = map(int, file.unpack("IiQQ", what))
+        if model_id not in CAMERA_MODELS:
+            raise DataError(
+                f"{path}: camera {camera_id} has the unknown model id {model_id} (known: 0 to {max(CAMERA_MODELS)}); "
+                "run `colmap image_undistorter` and load its output"
+            )
+        model, num_params = CAMERA_MODELS[model_id]
+        yield camera_id, ColmapCamera(model, width, height, file.unpack(f"{num_params}d", what))
+    file.finish("camera")
 
 
 def _images_bin(path: Path, observations: bool) -> Iterator[ColmapImage]:
-    with _Bytes(path) as file:
-        count = file.count("images", _IMAGE_BYTES)
-        for number in range(1, count + 1):
-            what = f"image {number} of {count}"
-            image_id, *pose, camera_id = file.unpack("I7dI", what)
-            name = file.name(f"the name of {what}")
-            (num_points,) = map(int, file.unpack("Q", what))
-            points = f"the {num_points} 2-D points of {what}"
-            xys = ids = None
-            if observations:
-                table = np.frombuffer(file.read(24 * num_points, points), dtype="<f8, <f8, <i8")
-                xys, ids = np.stack([table["f0"], table["f1"]], axis=1), table["f2"].astype(np.int64)
-            else:
-                file.skip(24 * num_points, points)
-            yield ColmapImage(int(image_id), int(camera_id), name, pose_matrix(pose[:4], pose[4:]), xys, ids)
-        file.finish("image")
+    file = _ModelFile(path)
+    count = file.count("images", _IMAGE_BYTES)
+    for number in range(1, count + 1):
+        what = f"image {number} of {count}"
+        image_id, *pose, camera_id = file.unpack("I7dI", what)
+        name = file.name(f"the name of {what}")
+        (num_points,) = map(int, file.unpack("Q", what))
+        start = file.take(24 * num_points, f"the {num_points} 2-D points of {what}")
+        image = ColmapImage(int(image_id), int(camera_id), name, pose_matrix(pose[:4], pose[4:]))
+        if observations:
+            table = np.frombuffer(file.data, dtype="<f8, <f8, <i8", count=num_points, offset=start)
+            xys, ids = np.stack([table["f0"], table["f1"]], axis=1), table["f2"].astype(np.int64)
+            image = replace(image, observations=xys, point_ids=ids)
+        yield image
+    file.finish("image")
 
 
 def _points_bin(path: Path) -> ColmapPoints:
-    with _Bytes(path) as file:
-        count = file.count("points", 43 + 8)
-        records = np.empty((count, 43), dtype=np.uint8)
-        done, rest = 0, b""
-        while done < count:
-            data = rest + file.read(min(_CHUNK, file.size - file.at), "points")
-            offsets, used, needed = _point_offsets(data, count - done)
-            if needed and (start := file.at - len(data) + used) + needed > file.size:
-                file.at = start
-                file.need(needed, f"point {done + len(offsets) + 1} of {count}")
-            raw = np.frombuffer(data, dtype=np.uint8)
-            records[done : done + len(offsets)] = raw[offsets[:, None] + np.arange(43, dtype=np.int32)]
-            done, rest = done + len(offsets), data[used:]
-        file.at -= len(rest)
-        file.finish("point")
+    file = _ModelFile(path)
+    count = file.count("points", _POINT.itemsize + 8)
+    starts, track_length = np.empty(count, dtype=np.int64), struct.Struct("<Q").unpack_from
+    for i in range(count):
+        starts[i] = file.at
+        length = track_length(file.data, file.at + _POINT.itemsize)[0] if file.at + 51 <= file.size else 0
+        file.take(51 + 8 * length, f"point {i + 1} of {count}")
+    file.finish("point")
+    raw, records = np.frombuffer(file.data, dtype=np.uint8), np.empty(count, _POINT)
+    for begin in range(0, count, _CHUNK):
+        part = records[begin : begin + _CHUNK]
+        part.view(np.uint8).reshape(-1, _POINT.itemsize)[:] = raw[
+            starts[begin : begin + _CHUNK, None] + np.arange(_POINT.itemsize)
+        ]
     return ColmapPoints(
-        ids=records[:, :8].copy().view("<u8")[:, 0].astype(np.int64),
-        xyz=records[:, 8:32].copy().view("<f8").astype(np.float64),
-        rgb=records[:, 32:35].copy(),
-        error=records[:, 35:43].copy().view("<f8")[:, 0].astype(np.float64),
+        ids=records["id"].astype(np.int64),
+        xyz=np.ascontiguousarray(records["xyz"], np.float64),
+        rgb=np.ascontiguousarray(records["rgb"]),
+        error=np.ascontiguousarray(records["error"], np.float64),
     )
 
 
-def _point_offsets(data: bytes, most: int) -> tuple[np.ndarray, int, int]:
-    """Return where points begin in ``data``, what they take of it, and what one that is cut needs (0: none is)."""
-    found: list[int] = []
-    at, size, track_length = 0, len(data), struct.Struct("<Q").unpack_from
-    while len(found) < most:
-        end = at + 51
-        if end <= size:
-            end += 8 * track_length(data, at + 43)[0]
-        if end > size:
-            return np.array(found, dtype=np.int32), at, end - at
-        found.append(at)
-        at = end
-    return np.array(found, dtype=np.int32), at, 0
-
-
 def _lines(path: Path) -> list[tuple[int, str]]:
-    """(line number, text) of all lines but comments; empty lines stay (an image without 2-D points has one)."""
+    """Return (line number, text) without comments; empty lines stay (an image without 2-D points has one)."""
     try:
-        text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")  # names are as the file system has them
+        text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")  # file names
     except OSError as error:
         raise DataError(f"cannot read {path}: {error.strerror or error}") from error
     return [(n, line.strip()) for n, line in enumerate(text.splitlines(), 1) if not line.lstrip().startswith("#")]
@@ -340,7 +299,7 @@ def _images_txt(path: Path, observations: bool) -> Iterator[ColmapImage]:
         except (ValueError, IndexError) as error:
             raise _wrong_line(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", error) from error
         points = ""
-        if at < len(lines) and not _is_image(lines[at][1]):  # scripts leave out the empty lines of images without any
+        if at < len(lines) and not _is_image(lines[at][1]):  # scripts omit the empty lines
             number, points = lines[at]
             at += 1
         if observations:
@@ -353,7 +312,7 @@ def _images_txt(path: Path, observations: bool) -> Iterator[ColmapImage]:
 
 
 def _image_txt(line: str) -> ColmapImage:
-    """Return the image of its line (ValueError, IndexError)."""
+    """Parse the line of an image; raises ValueError or IndexError."""
     words = line.split(maxsplit=9)  # a name may hold spaces
     image_id, camera_id, name = int(words[0]), int(words[8]), words[9]
     pose = [parsed(word) for word in words[1:8]]
@@ -361,7 +320,7 @@ def _image_txt(line: str) -> ColmapImage:
 
 
 def _is_image(line: str) -> bool:
-    """Whether a line has nine numbers and a name. A line of 2-D points has numbers only."""
+    """Whether a line has nine numbers and a name; a line of 2-D points has only numbers."""
     try:
         words = _image_txt(line).name.split()
     except (ValueError, IndexError):
@@ -395,16 +354,16 @@ def _points_txt(path: Path) -> ColmapPoints:
 
 
 def _whole(values: np.ndarray, dtype: type[np.integer]) -> np.ndarray:
-    """Floats as whole numbers; ValueError for NaN and what the type does not hold."""
+    """Convert floats to integers; raises ValueError for NaN and numbers out of range."""
     low, high = float(np.iinfo(dtype).min), float(np.iinfo(dtype).max)
     wrong = values[~((values >= low) & (values <= high) & (values < 2.0**63))]
     if wrong.size:
-        raise ValueError(f"{wrong.flat[0]:g}, which is no {np.dtype(dtype).name}")
+        raise ValueError(f"{wrong.flat[0]:g}, which is not a valid {np.dtype(dtype).name}")
     return values.astype(dtype)
 
 
 def pose_matrix(quat: list[float], translation: list[float]) -> np.ndarray:
-    """T_cam_world [4, 4] of COLMAP's (w, x, y, z) and translation; NaN for NaN, infinity or a zero quaternion."""
+    """Return T_cam_world [4, 4] of a quaternion (w, x, y, z) and a translation; NaN if they are invalid."""
     norm = math.sqrt(sum(q * q for q in quat))
     if not (math.isfinite(norm) and norm > 1e-8 and all(map(math.isfinite, translation))):
         return np.full((4, 4), np.nan)
@@ -416,7 +375,7 @@ def pose_matrix(quat: list[float], translation: list[float]) -> np.ndarray:
 
 def _check_pose(image: ColmapImage, path: Path) -> None:
     if not np.isfinite(image.T_cam_world).all():
-        raise UnusableViewError(f"{path}: image {image.name} must have a finite pose and a quaternion that is not zero")
+        raise UnusableViewError(f"{path}: image {image.name} must have a finite pose and a non-zero quaternion")
 
 
 # -- the scene ---------------------------------------------------------------------------------------------------------
@@ -424,9 +383,9 @@ MODEL_FOLDERS = ("sparse/0", "sparse", ".")
 
 
 def model_folder(root: Path) -> tuple[Path, str] | None:
-    """Find the model's folder and kind ("bin" or "txt"), or None.
+    """Return the folder and kind ("bin" or "txt") of the model, or None.
 
-    The largest of ``sparse/0``, ``sparse/1`` and so on, else ``sparse``, else ``root`` itself.
+    Takes the largest of ``sparse/0``, ``sparse/1``, ..., else ``sparse``, else ``root`` itself.
     """
     sparse = in_any_case(root, "sparse")
     numbered = [model for model in _models_in(sparse) if is_number(model.name)]
@@ -439,35 +398,34 @@ def model_folder(root: Path) -> tuple[Path, str] | None:
 
 
 def _models_in(folder: Path) -> list[Path]:
-    """Return the sub-folders that hold a model, 2 before 10."""
+    """Return the sub-folders that hold a model, in numeric order."""
     if not folder.is_dir():
         return []
     return sorted((path for path in folder.iterdir() if find_model(path)), key=lambda path: natural_key(path.name))
 
 
 def _num_images(folder: Path) -> int:
-    """Return the number of images of a model; 0 where its file is broken."""
+    """Return the number of images of a model; 0 if its file is invalid."""
     kind = find_model(folder) or "bin"
     path = _file(folder, "images", kind)
     try:
         if kind == "txt":
             return sum(1 for _ in _images_txt(path, observations=False))
-        with _Bytes(path) as file:
-            return file.count("images", _IMAGE_BYTES)
+        return _ModelFile(path).count("images", _IMAGE_BYTES)
     except DataError:
         return 0
 
 
 def read_colmap(root: Path, downscale: int) -> Capture:
-    """Read a COLMAP data set.
+    """Read a COLMAP capture.
 
-    Photographs are in ``images`` beside ``sparse`` (also in sub-folders of it), or in ``images_N`` when ``downscale``
-    is N and that folder exists. EXIF orientation is ignored, as COLMAP ignores it.
+    Images are in ``images`` beside ``sparse``, or in ``images_N`` if ``downscale`` is N and that folder exists. EXIF
+    orientation is ignored, as in COLMAP.
 
     Raises
     ------
     DataError
-        No model, a broken one, a camera model that cannot be undistorted, no folder of images.
+        If the model is missing or invalid, a camera model is not supported, or there is no folder of images.
     """
     found = model_folder(root)
     if found is None:
@@ -485,9 +443,9 @@ def read_colmap(root: Path, downscale: int) -> Capture:
         smaller = _found(images, [scaled], _file(folder, "images", kind))
         if any(photo.path is not None for photo in smaller.values()):
             photographs, factor = smaller, downscale
-            notes.append(f"photographs of 1/{downscale} size are read from {scaled.name}")
+            notes.append(f"images of 1/{downscale} size are read from {scaled.name}")
         else:
-            notes.append(f"{scaled.name} holds none of the model's photographs and is not used")
+            notes.append(f"{scaled.name} holds no images of the model and is not used")
     frames: list[PosedImage] = []
     skipped: list[str] = []
     intrinsics: dict[int, Intrinsics] = {}
@@ -517,19 +475,19 @@ def read_colmap(root: Path, downscale: int) -> Capture:
 
 
 def observed_points(folder: Path, kind: str, names: Mapping[str, str] | None = None) -> ObservedPoints:
-    """Which points of a model each of its images was found to show.
+    """Return the points that each image of a model observes.
 
     Parameters
     ----------
     folder : Path
     kind : str
     names : mapping of str to str, optional
-        The views of the images, by name in the model; the same name if left out.
+        View names by image name in the model; default: the same.
 
     Raises
     ------
     DataError
-        The model has no points, or a file is broken.
+        If the model has no points, or a file is invalid.
     """
     points = read_points(folder, kind)
     if points is None or not len(points.ids):
@@ -537,7 +495,7 @@ def observed_points(folder: Path, kind: str, names: Mapping[str, str] | None = N
     order = np.argsort(points.ids)
     track = np.zeros(len(order), dtype=np.int64)
     seen = {}
-    for image in _each_image(folder, kind, observations=True):  # their observations are most of a model
+    for image in _each_image(folder, kind, observations=True):  # one at a time: observations are large
         assert image.point_ids is not None
         ids = np.unique(image.point_ids[image.point_ids >= 0])
         at = order[np.searchsorted(points.ids, ids, sorter=order).clip(max=len(order) - 1)]
@@ -548,7 +506,7 @@ def observed_points(folder: Path, kind: str, names: Mapping[str, str] | None = N
 
 
 def model_points(folder: Path, kind: str) -> PointCloud | None:
-    """Return the sparse points of a model as a PointCloud, or None."""
+    """Return the sparse points of a model; None without any."""
     points = read_points(folder, kind)
     return None if points is None or not len(points.xyz) else PointCloud(points.xyz, points.rgb)
 
@@ -558,7 +516,7 @@ def _intrinsics(path: Path, cameras: dict[int, ColmapCamera], image: ColmapImage
     if camera is None:
         raise DataError(
             f"{path} must hold camera {image.camera_id} of image {image.name}, got {sorted(cameras)[:9] or 'none'}; is "
-            "the file complete? Copy or export it again"
+            "the file complete? Export it again"
         )
     where = f"{path}: camera {image.camera_id}"
     if camera.model == PANORAMA:
@@ -572,7 +530,7 @@ def _intrinsics(path: Path, cameras: dict[int, ColmapCamera], image: ColmapImage
 
 
 def _photographs(root: Path, model: Path, kind: str, images: list[ColmapImage]) -> tuple[Path, dict[str, Photograph]]:
-    """Return the folder that holds images, masks and sparse, and the photographs by name in the model."""
+    """Return the folder that holds ``images`` and ``sparse``, and the image files by name in the model."""
     homes = list(dict.fromkeys([root, model.parent, model.parent.parent]))
     listing = _file(model, "images", kind)
     for home in homes:
@@ -584,8 +542,8 @@ def _photographs(root: Path, model: Path, kind: str, images: list[ColmapImage]) 
     if any(photo.path is not None for photo in photographs.values()):
         return home, photographs
     raise DataError(
-        f"{root} must have its photographs in the folder images, got no such folder; put the folder that COLMAP was "
-        f"given there, under that name"
+        f"{root} must have its images in the folder images, which does not exist; copy the image folder that COLMAP "
+        "used there, under that name"
     )
 
 
@@ -595,19 +553,19 @@ def _found(images: list[ColmapImage], folders: list[Path], listing: Path) -> dic
 
 
 def _other_models(folder: Path) -> list[str]:
-    """Return a note with the sizes of the models beside the one that is read."""
+    """Return a note on other models beside the selected one."""
     others = [path for path in _models_in(folder.parent) if path != folder] if is_number(folder.name) else []
     if not others:
         return []
     sizes = ", ".join(f"{path.name} has {_num_images(path)}" for path in others)
     return [
-        f"the model {folder.parent.name}/{folder.name} is read, which has {_num_images(folder)} images; {sizes}. "
-        f"Read another one by its folder: gs2d train {shlex.quote(str(others[0]))}"
+        f"using the model {folder.parent.name}/{folder.name} with {_num_images(folder)} images; {sizes}. "
+        f"To use another one, give its folder: gs2d train {shlex.quote(str(others[0]))}"
     ]
 
 
 def _check_factor(path: Path, k: Intrinsics, factor: int) -> None:
-    """Check that a file in ``images_N`` is 1/N of its camera's size, up to rounding."""
+    """Check that a file in ``images_N`` has 1/N of the camera's image size, up to rounding."""
     got, expected = np.array(image_size(path)), np.array((k.width, k.height)) / factor
     if (np.abs(got - expected) > np.maximum(1.0, 0.01 * expected)).any():
         raise DataError(

@@ -1,4 +1,4 @@
-"""What readers of other tools' cameras share: checked numbers, images found by name, points that lie beside."""
+"""Shared parts of readers: checked numbers, image files by name, and point clouds beside the cameras."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from gs2d.io.meshes import read_points
 from gs2d.io.splat_ply import ply_kind
 
 # -- numbers in files --------------------------------------------------------------------------------------------------
-_LARGEST = 1e300  # JSON has whole numbers of any size
+_LARGEST = 1e300  # JSON integers are unbounded
 _NO_NUMBER = re.compile(r"[+-]?(nan\(\w*\)|1\.#\w+)", re.IGNORECASE)
-_BOXES = b"ftyp"  # in the head of HEIC and AVIF; other files with such an extension are read as what they are
-_HEAD = 4096  # bytes in which a file says what it is
+_BOXES = b"ftyp"  # signature of HEIC and AVIF; other files with such a suffix are read by content
+_HEAD = 4096  # bytes that identify a file
 
 
 def head(path: Path) -> bytes:
-    """Return the first bytes of a file; none of what is not there, a folder, or not ours to read."""
+    """Return the first bytes of a file; b"" if it cannot be read."""
     try:
         with open(path, "rb") as file:
             return file.read(_HEAD)
@@ -37,25 +37,25 @@ def head(path: Path) -> bytes:
 
 
 def parsed(text: str) -> float:
-    """Return the number of a text; NaN for ``-nan(ind)``, ``1.#INF`` and the like, which C programs write on Windows.
+    """Parse a number; NaN for ``-nan(ind)``, ``1.#INF`` and the like, which C programs write on Windows.
 
     Raises
     ------
     ValueError
-        The text is no number.
+        If the text is not a number.
     """
     return math.nan if _NO_NUMBER.fullmatch(text) else float(text)
 
 
 def real(value: Any, where: str) -> float:
-    """Return a finite number, which may be written as text.
+    """Convert a number or its text to a finite float.
 
     Raises
     ------
     UnusableViewError
-        NaN or infinity; names ``where``.
+        For NaN or infinity; names ``where``.
     DataError
-        Anything else; names ``where``.
+        For anything else; names ``where``.
     """
     kind: type[DataError] = DataError
     try:
@@ -71,12 +71,12 @@ def real(value: Any, where: str) -> float:
 
 
 def reals(value: Any, count: int, where: str) -> np.ndarray:
-    """So many finite numbers [count] of a list, or of a text with white space between them.
+    """Convert a list, or text separated by white space, to ``count`` finite numbers.
 
     Raises
     ------
     DataError
-        Another count, or something that is no finite number.
+        If the count differs or an item is not a finite number.
     """
     items = value.split() if isinstance(value, str) else value
     if not isinstance(items, Sequence) or len(items) != count:
@@ -86,7 +86,7 @@ def reals(value: Any, count: int, where: str) -> np.ndarray:
 
 
 def whole(value: Any, where: str) -> int:
-    """Return a whole number that is not negative."""
+    """Convert a number or its text to a non-negative integer."""
     number = real(value, where)
     if number != int(number) or number < 0:
         raise DataError(f"{where} must be a whole number >= 0, got {str(value)[:40]!r}")
@@ -94,14 +94,14 @@ def whole(value: Any, where: str) -> int:
 
 
 def entries(value: Any, where: str) -> Mapping[str, Any]:
-    """Return an object of JSON."""
+    """Return a JSON object, or raise DataError."""
     if not isinstance(value, dict):
         raise DataError(f"{where} must be an object, got {type(value).__name__}; is the file of another tool?")
     return value
 
 
 def required(entry: Mapping[str, Any], key: str, where: str) -> Any:
-    """Return the value of a key that must be there."""
+    """Return the value of a required key."""
     if key not in entry:
         raise DataError(f'{where} must have the key "{key}", got {sorted(map(str, entry))[:12]}')
     return entry[key]
@@ -110,7 +110,7 @@ def required(entry: Mapping[str, Any], key: str, where: str) -> Any:
 # -- photographs by their names ----------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Photograph:
-    """What a name of a camera file stands for: a file and its name in the scene, or the reason why there is none."""
+    """The image file of a name in a camera file: path and name in the scene, or the reason why there is none."""
 
     path: Path | None
     name: str = ""
@@ -126,26 +126,26 @@ def find_photographs(
     homes: Sequence[Path] = (),
     reason: str = "",
 ) -> dict[str, Photograph]:
-    """Return the photograph of each name in a camera file, which may lack its extension (``Files`` has the rules).
+    """Find the image file of each name in a camera file; the suffix is optional (see ``Files`` for the rules).
 
     Parameters
     ----------
     names : sequence of str
     folders : sequence of Path
-        Where photographs may be, most likely first.
+        Folders that may contain the images, most likely first.
     where : Path
         The camera file.
     base : Path, optional
-        Folder that relative paths are relative to.
+        Base folder of relative paths.
     homes : sequence of Path, optional
-        Folders below which a photograph's path is its name in the scene; ``folders`` if left out.
+        Base folders of names in the scene; default: ``folders``.
     reason : str, optional
-        Why a photograph is left out if there is no such file; names the camera file if left out.
+        Reason for a missing file; default: names the camera file.
 
     Raises
     ------
     DataError
-        Several files fit a name equally well.
+        If several files fit a name equally well.
     """
     files = Files(folders, base)
     names = list(dict.fromkeys(names))
@@ -158,14 +158,14 @@ def find_photographs(
     for name, match in zip(names, matches, strict=True):
         if match.several:
             raise DataError(
-                f"{where} must name one photograph, got {name}, which may be {match.several[0]} or {match.several[1]}; "
-                "keep only one of them below the capture, or let the camera's name tell its folder"
+                f"{where} must name one image, got {name}, which may be {match.several[0]} or {match.several[1]}; "
+                "keep only one of them in the capture, or include the folder in the name"
             )
         if match.path is None:
             why = reason or f"listed in {where.name}, but there is no such file"
             other = files.of_stem(name, IMAGES, NO_PHOTOGRAPHS)
             if other is not None:
-                why += f"; {other.parent.name}/{other.name} is there: list it under its own extension"
+                why += f"; {other.parent.name}/{other.name} exists: use its suffix in the camera file"
             found[name] = Photograph(None, reason=why)
         elif match.path.suffix.lower() in UNREAD and head(match.path)[4:8] == _BOXES:
             suffix = match.path.suffix.lower()
@@ -176,7 +176,7 @@ def find_photographs(
 
 
 def _shared(paths: Sequence[Path]) -> list[Path]:
-    """Return the folder that holds all files; none if there is no such folder."""
+    """Return the common folder of all files, if any."""
     try:
         return [Path(os.path.commonpath([path.parent for path in paths]))]
     except ValueError:  # no files, or on several drives
@@ -189,26 +189,24 @@ def _spellings(name: str) -> list[str]:
     return [name, *(name + suffix for suffix in IMAGES)]
 
 
-# -- points beside -----------------------------------------------------------------------------------------------------
+# -- point clouds ------------------------------------------------------------------------------------------------------
 _NAMES = ("points3D.ply", "points.ply", "sparse.ply", "sparse_points.ply", "tie_points.ply", "point_cloud.ply")
-_TRUTHS = ("mesh_gt.ply", "points_gt.ply")  # what a result is scored against is no place to start from
-_FEWEST = 0.5  # share of the points that two cameras must see
-_FARTHEST = 100.0  # extents of the cameras within which they must be
-_LOOKED_AT = 2000  # points and
-_LOOKED_FROM = 100  # cameras that are asked
+_TRUTHS = ("mesh_gt.ply", "points_gt.ply")  # ground truth, not for training
+_FEWEST = 0.5  # smallest fraction of points that two cameras must see
+_FARTHEST = 100.0  # largest distance of these points, in camera extents
+_LOOKED_AT, _LOOKED_FROM = 2000, 100  # largest numbers of points and cameras in this test
 
 
 def points_beside(root: Path, frames: Sequence[PosedImage]) -> tuple[PointCloud | None, list[str]]:
-    """Return the points of a PLY file in ``root``, and a note where there is one that is not used.
+    """Return the points of a PLY file in ``root``, and a note if one is not used.
 
-    One of a usual name (``points3D.ply``, ``points.ply``, ``sparse.ply``, ``sparse_points.ply``, ``tie_points.ply``,
-    ``point_cloud.ply``), else the only one. Points are exported with a coordinate system of their own choice: where
-    fewer than half are in the pictures of two cameras they are in another frame, and are left out.
+    Takes a file with a usual name (``points3D.ply``, ``points.ply``, ...), else the only one. Points may have been
+    exported in other coordinates: they are left out if two cameras see less than half of them.
 
     Raises
     ------
     DataError
-        The file of that name is broken.
+        If the file is damaged.
     """
     beside = [path for path in files_ending(root, ".ply") if path.name.lower() not in _TRUTHS]
     named = [path for name in _NAMES if (path := in_any_case(root, name)) in beside]
@@ -216,23 +214,23 @@ def points_beside(root: Path, frames: Sequence[PosedImage]) -> tuple[PointCloud 
         return None, []
     if not named and len(beside) > 1:
         names = ", ".join(path.name for path in beside[:4])
-        return None, [f"no sparse points: {names} are there; call the one to start from {_NAMES[1]}"]
+        return None, [f"no sparse points: several PLY files ({names}); name the one to use {_NAMES[1]}"]
     path = (named or beside)[0]
     if ply_kind(path) != "points":
-        return None, [f"no sparse points: {path.name} is no point cloud"]
+        return None, [f"no sparse points: {path.name} is not a point cloud"]
     cloud = read_points(path)
     points = PointCloud(np.asarray(cloud.points, dtype=np.float64), cloud.colors)
     fraction = _seen(points.points, frames)
     if fraction < _FEWEST:
         return None, [
-            f"no sparse points: two cameras see {fraction:.0%} of those of {path.name}, which are in another frame; "
-            "export them in the coordinates of the cameras"
+            f"no sparse points: two cameras see only {fraction:.0%} of the points of {path.name}, which seem to be in "
+            "other coordinates; export them in the coordinates of the cameras"
         ]
     return points, []
 
 
 def _seen(points: np.ndarray, frames: Sequence[PosedImage]) -> float:
-    """Return the fraction of points that two cameras see (lenses that bend count as straight) from near."""
+    """Return the fraction of points near the cameras that two of them see, ignoring distortion."""
     some = points[np.linspace(0, len(points) - 1, min(len(points), _LOOKED_AT)).astype(int)]
     some = some[np.isfinite(some).all(axis=1)]
     if not len(some):

@@ -1,4 +1,4 @@
-"""The readers of captures, by the name of their format."""
+"""The readers of captures, by name of the format."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ class Reader(Protocol):
     """
 
     def detect(self, path: Path) -> bool:
-        """Whether a folder holds a capture of this format; looks at names, and opens little."""
+        """Whether a folder holds a capture of this format; must be fast."""
 
     def read(self, path: Path, *, downscale: int) -> Capture | Scene:
         """Read a capture, or raise DataError.
 
-        Of a :class:`Capture` (photographs by their files, with cameras) gs2d makes the scene: it shrinks photographs,
-        splits off test views, undistorts, checks. ``downscale`` is for readers that have smaller files
-        (``Capture.downscaled_by``). A :class:`Scene` is taken as it is.
+        gs2d converts a :class:`Capture` (image files with cameras) to a scene: it checks, undistorts, downscales and
+        splits off test views. ``downscale`` is for readers with downscaled files (``Capture.downscaled_by``). A
+        :class:`Scene` is used unchanged.
         """
 
 
 READERS: Registry[Callable[[], Reader]] = Registry(
     "format", "gs2d.readers", builtin=dict.fromkeys(_CORE, "gs2d.data.load"), error=DataError
 )
-"""Names of formats -> classes of readers; in the order in which a folder is looked at."""
+"""Readers by name of the format, in the order of detection."""
 
 
 def register_reader(name: str) -> Callable[[Register], Register]:
@@ -47,18 +47,18 @@ def register_reader(name: str) -> Callable[[Register], Register]:
     Parameters
     ----------
     name : str
-        Format of the captures, also for ``--format``; must not be taken.
+        Name of the format, also for ``--format``; must not be taken.
 
     Returns
     -------
     callable
-        Decorates a class without constructor arguments. Its method ``detect(path)`` returns whether a folder is of
-        this format; ``read(path, *, downscale)`` returns a Scene or a ``gs2d.data.build.Capture``.
+        Decorates a class without constructor arguments. Its method ``detect(path)`` returns whether a folder has this
+        format; ``read(path, *, downscale)`` returns a Scene or a ``gs2d.data.build.Capture``.
 
     Raises
     ------
     DataError
-        From the decorator: the name is taken.
+        From the decorator, if the name is taken.
 
     Examples
     --------

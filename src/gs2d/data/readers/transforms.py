@@ -1,4 +1,4 @@
-"""Data sets described by JSON: Blender (NeRF-Synthetic), nerfstudio and instant-ngp."""
+"""Captures described by JSON: Blender (NeRF-Synthetic), nerfstudio and instant-ngp."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from gs2d.io.meshes import read_points
 
 TRAIN, TEST = "transforms_train.json", "transforms_test.json"  # of Blender
 CAMERAS = "transforms.json"  # of nerfstudio and instant-ngp
-_LARGEST = 1e300  # JSON has whole numbers of any size
+_LARGEST = 1e300  # JSON integers are unbounded
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 _FISHEYE = {"OPENCV_FISHEYE", "FISHEYE"}
 _PANORAMA = "EQUIRECTANGULAR"
@@ -43,7 +43,7 @@ def read_blender(root: Path) -> Capture:
     Raises
     ------
     DataError
-        A broken or incomplete JSON file; names the file, the frame and the key.
+        If the JSON file is invalid or incomplete; names the file, the frame and the key.
     """
     train, test = (in_any_case(root, name) for name in (TRAIN, TEST))
     if test.is_file():
@@ -57,22 +57,21 @@ def read_blender(root: Path) -> Capture:
 def read_nerfstudio(root: Path) -> Capture:
     """Read ``transforms.json`` of nerfstudio or instant-ngp.
 
-    Intrinsics and distortion are shared or per frame; frames whose file does not exist are skipped and reported;
-    ``train_filenames`` and ``test_filenames`` (or ``val_filenames`` where there is no test) give the split;
-    ``ply_file_path`` gives sparse points. Everything stays in the frame of the file: ``applied_transform`` and
-    ``scale`` describe what was already done to it.
+    Intrinsics and distortion are shared or per frame. Frames without a file are skipped and reported.
+    ``train_filenames`` and ``test_filenames`` (else ``val_filenames``) give the split, ``ply_file_path`` the sparse
+    points. Coordinates are those of the file; ``applied_transform`` and ``scale`` are already applied to them.
 
     Raises
     ------
     DataError
-        A broken or incomplete JSON file; names the file, the frame and the key.
+        If the JSON file is invalid or incomplete; names the file, the frame and the key.
     """
     path = in_any_case(root, CAMERAS)
     meta = _read_meta(path)
     frames, skipped, notes = _read_frames(_entries(path, meta, None), path)
     frames, unlisted = _named_split(path, meta, frames)
     if "applied_transform" in meta:
-        notes.append("the file says applied_transform: poses and results are in the file's frame, not the original's")
+        notes.append("poses and results are in the coordinates of the file, which has an applied_transform")
     points = None
     if meta.get("ply_file_path") is not None:
         name = _relative(meta["ply_file_path"], f"{path}: ply_file_path")
@@ -95,7 +94,7 @@ def _read_meta(path: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _Entry:
-    """A frame of a file, with the values that all frames share."""
+    """A frame of a file; ``both`` includes the values shared by all frames."""
 
     where: str
     name: str
@@ -105,7 +104,7 @@ class _Entry:
 
 
 def _read_frames(entries: Sequence[_Entry], path: Path) -> tuple[list[PosedImage], list[str], list[str]]:
-    """Return the frames whose file exists, why the others are left out, and notes; ``path`` names the file."""
+    """Return the frames whose file exists, reasons for skipped ones, and notes."""
     root = path.parent
     photographs = _photographs([entry.name for entry in entries], path)
     taken = {photo.path for photo in photographs.values() if photo.path is not None}
@@ -148,7 +147,7 @@ def _entries(path: Path, meta: Mapping[str, Any], split: str | None) -> list[_En
 
 
 def _named(entries: Sequence[_Entry], key: str, files: Files, taken: Collection[Path]) -> list[Path | None]:
-    """Return the file that each frame names as its mask or map; None where it names none or there is no such file."""
+    """Return the mask or map file of each frame; None if it names none or the file does not exist."""
     names = [
         None if entry.frame.get(key) is None else _relative(entry.frame[key], f"{entry.where}: {key}")
         for entry in entries
@@ -172,22 +171,22 @@ def _required(entry: Mapping[str, Any], key: str, where: str) -> Any:
 
 
 def _relative(value: Any, where: str) -> str:
-    """Return a path as written in a file, with ``/`` and without a leading ``./``."""
+    """Return a path of the file with ``/`` and without a leading ``./``."""
     if not isinstance(value, str) or not value:
         raise DataError(f"{where} must be a path, got {value!r}")
     return Path(value.replace("\\", "/")).as_posix()
 
 
 def frame_intrinsics(entry: Mapping[str, Any], image: Path, where: str) -> Intrinsics:
-    """Intrinsics of one frame, from its own keys or the file's.
+    """Return the intrinsics of a frame, from its own keys or the shared ones.
 
-    ``fl_x``, ``fl_y`` in pixels win over ``camera_angle_x``, ``camera_angle_y``, which are fields of view and so fit
-    an image of any size: f = 0.5 W / tan(0.5 angle). Without ``w``, ``h`` the size is the file's.
+    ``fl_x``, ``fl_y`` in pixels take precedence over the fields of view ``camera_angle_x``, ``camera_angle_y``:
+    f = 0.5 W / tan(0.5 angle). Without ``w``, ``h`` the size is that of the image file.
 
     Raises
     ------
     DataError
-        No focal length, a value that is no number, or a camera model that cannot be undistorted.
+        If the focal length is missing, a value is not a number, or the camera model is not supported.
     """
 
     def number(key: str) -> float | None:
@@ -206,7 +205,7 @@ def frame_intrinsics(entry: Mapping[str, Any], image: Path, where: str) -> Intri
     fl_x, fl_y = number("fl_x"), number("fl_y")
     fx = fl_x if fl_x is not None else _focal(number("camera_angle_x"), width, f"{where}: camera_angle_x")
     fy = fl_y
-    if fy is None and fl_x is None:  # square pixels of a stated fl_x are surer than an angle
+    if fy is None and fl_x is None:  # with fl_x, pixels are assumed to be square
         fy = _focal(number("camera_angle_y"), height, f"{where}: camera_angle_y")
     fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
     if fx is None or fy is None:
@@ -226,7 +225,7 @@ def frame_intrinsics(entry: Mapping[str, Any], image: Path, where: str) -> Intri
 
 
 def _focal(angle: float | None, size: int, where: str) -> float | None:
-    """Focal length in pixels of a full field of view in radians."""
+    """Return the focal length in pixels for a full field of view in radians."""
     if angle is None:
         return None
     if not 0 < angle < math.pi:
@@ -245,8 +244,8 @@ def _lens(entry: Mapping[str, Any], number: Callable[[str], float | None], where
         return Lens(name, tuple(number(key) or 0.0 for key in keys))
     if model not in _PERSPECTIVE | _FISHEYE:
         raise DataError(
-            f"{where}: camera_model {model} cannot be undistorted here "
-            f"(known: {', '.join(sorted(_PERSPECTIVE | _FISHEYE | {_PANORAMA}))}); undistort the images first, or "
+            f"{where}: camera_model {model} is not supported "
+            f"(supported: {', '.join(sorted(_PERSPECTIVE | _FISHEYE | {_PANORAMA}))}); undistort the images first, or "
             "register it with gs2d.register_camera_model"
         )
     value = {key: number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
@@ -259,7 +258,7 @@ def _lens(entry: Mapping[str, Any], number: Callable[[str], float | None], where
 
 
 def _named_split(path: Path, meta: dict[str, Any], frames: list[PosedImage]) -> tuple[list[PosedImage], list[str]]:
-    """Return the frames with the split that the file names, and sentences about frames that it does not name."""
+    """Return the frames with the split of the file, and a sentence on each frame in none of its lists."""
     written: dict[str, list[str]] = {}
     for key in ("train", "val", "test"):
         names = meta.get(f"{key}_filenames")
@@ -280,5 +279,5 @@ def _named_split(path: Path, meta: dict[str, Any], frames: list[PosedImage]) -> 
         elif frame.name in test:
             split.append(replace(frame, split="test"))
         else:
-            unlisted.append(f"{frame.name}: in none of the lists of {path.name} that are used")
+            unlisted.append(f"{frame.name}: in none of the used lists of {path.name}")
     return split, unlisted

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from gs2d.config.registry import Registry
-from gs2d.core.georeference import Georeference
 from gs2d.core.missing import instead
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
@@ -35,15 +34,12 @@ class Layout:
         Ending of the file names. One that begins with / is a whole name, of a file with others beside it.
     write : callable
         Writes a file and returns a sentence for each thing that the format cannot store.
-    stamp : callable or None
-        Writes a georeference into a file; None: as for other files of that ending.
     size : callable or None
         Returns the bytes of all files that belong to a written one; None: it is one file.
     """
 
     ending: str
     write: Writer
-    stamp: Callable[[Path, Georeference], None] | None = None
     size: Callable[[Path], int] | None = None
 
 
@@ -60,8 +56,6 @@ class SplatReader:
         for flat splats).
     ply_kind : str or None
         Reads the PLY files that ``splat_ply.ply_kind`` calls so.
-    georeference : callable or None
-        Returns the JSON text in which a file says where it is in the world, or None.
     mesh : callable or None
         Returns the facts of a mesh in a file that holds one instead of splats, or None.
     """
@@ -69,7 +63,6 @@ class SplatReader:
     endings: tuple[str, ...]
     read: Reader
     ply_kind: str | None = None
-    georeference: Callable[[Path], str | None] | None = None
     mesh: Callable[[Path], dict[str, Any] | None] | None = None
 
 
@@ -91,7 +84,6 @@ def register_format(
     name: str,
     *,
     ending: str,
-    stamp: Callable[[Path, Georeference], None] | None = None,
     size: Callable[[Path], int] | None = None,
 ) -> Callable[[Writer], Writer]:
     """Return a decorator that registers an export format, for ``Splats.save`` and ``gs2d export``.
@@ -102,8 +94,8 @@ def register_format(
         Name of the layout, for ``layout=`` and ``--layout``; must not be taken.
     ending : str
         Ending of the file names, with its dot; one that begins with / is a whole file name.
-    stamp, size : callable, optional
-        As in ``Layout``, for formats that hold georeferences or consist of several files.
+    size : callable, optional
+        As in ``Layout``, for formats that consist of several files.
 
     Returns
     -------
@@ -126,7 +118,7 @@ def register_format(
     """
 
     def registered(write: Writer) -> Writer:
-        LAYOUTS.register(name, module=write.__module__)(Layout(ending, write, stamp, size))
+        LAYOUTS.register(name, module=write.__module__)(Layout(ending, write, size))
         return write
 
     return registered
@@ -137,7 +129,6 @@ def register_splat_reader(
     *,
     endings: tuple[str, ...] = (),
     ply_kind: str | None = None,
-    georeference: Callable[[Path], str | None] | None = None,
     mesh: Callable[[Path], dict[str, Any] | None] | None = None,
 ) -> Callable[[Reader], Reader]:
     """Return a decorator that registers a reader of splat files, for ``read_splats`` and every command that reads them.
@@ -148,7 +139,7 @@ def register_splat_reader(
         Name of the format; must not be taken by another reader.
     endings : tuple of str
         Endings of the file names, with their dots; one that begins with / is a whole file name.
-    ply_kind, georeference, mesh : optional
+    ply_kind, mesh : optional
         As in ``SplatReader``.
 
     Returns
@@ -164,7 +155,7 @@ def register_splat_reader(
     """
 
     def registered(read: Reader) -> Reader:
-        reader = SplatReader(endings, read, ply_kind, georeference, mesh)
+        reader = SplatReader(endings, read, ply_kind, mesh)
         SPLAT_READERS.register(name, module=read.__module__)(reader)
         return read
 

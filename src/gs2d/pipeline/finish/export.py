@@ -9,14 +9,11 @@ from gs2d.errors import RunError
 from gs2d.io.formats.splat_formats import LAYOUTS, endings, layout_of, read_splats, write_layout, written_bytes
 from gs2d.io.run_dir import MESH, open_run
 from gs2d.pipeline.finish.run_subject import within
-from gs2d.pipeline.finish.world_frame import place_of, placed_splats, say_where
 from gs2d.pipeline.prepare.loaded import checked_output, finished_splats
 from gs2d.pipeline.prepare.options import Box
 
 
-def export_run(
-    path: Path, out: Path, layout: str | None = None, *, bbox: Box | None = None, georeferenced: bool = False
-) -> dict[str, Any]:
+def export_run(path: Path, out: Path, layout: str | None = None, *, bbox: Box | None = None) -> dict[str, Any]:
     """Write the splats of a run, or of a file of flat splats, in another layout.
 
     Parameters
@@ -25,8 +22,6 @@ def export_run(
         A name of ``io.formats.registry.LAYOUTS``; None: by the ending of ``out``.
     bbox : six floats, optional
         Only the splats with their centres in this box, x0 y0 z0 x1 y1 z1, world units of the run.
-    georeferenced : bool
-        In metres of the world, less an offset that is said in the file and beside it.
     """
     layout = layout or layout_of(Path(out))
     if layout is None:
@@ -49,8 +44,6 @@ def export_run(
         run.sweep()
         splats = finished_splats(run)
     splats = splats if bbox is None else within(splats, bbox)
-    place = place_of(path, asked=georeferenced)
-    notes += write_layout(out, splats if place is None else placed_splats(splats, place), layout)
-    told = {} if place is None else say_where(out, place)
+    notes += write_layout(out, splats, layout)
     size = written_bytes(out, layout)
-    return {"file": str(out), "splats": len(splats), "bytes": size, "layout": layout, "notes": notes, **told}
+    return {"file": str(out), "splats": len(splats), "bytes": size, "layout": layout, "notes": notes}

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 
 from gs2d.core.files import disk_error, is_full
-from gs2d.core.georeference import Georeference
 from gs2d.core.memory_limit import memory_budget
 from gs2d.core.splats import Splats
 from gs2d.data import View
@@ -22,7 +21,7 @@ from gs2d.data.reach import Reach
 from gs2d.data.subject import LARGEST, Subject, checked_box
 from gs2d.errors import ProtocolError, RunError
 from gs2d.evaluation.image_metrics import ImageMetrics
-from gs2d.io.meshes import read_mesh, write_mesh
+from gs2d.io.meshes import write_mesh
 from gs2d.io.run_dir import (
     MESH,
     PAGE,
@@ -39,7 +38,6 @@ from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.run_subject import OPAQUE, meshed_subject
 from gs2d.pipeline.finish.scoring import SeenView
 from gs2d.pipeline.finish.trusted_depth import sky_direction, sky_of, surface_reach, within_reach
-from gs2d.pipeline.finish.world_frame import placed_mesh, placed_output, say_where
 from gs2d.pipeline.look.page import page_run
 from gs2d.pipeline.prepare.limits import release, release_buffers
 from gs2d.pipeline.prepare.loaded import LoadedRun, RenderedScene, checked_output, open_finished
@@ -112,7 +110,6 @@ def extract_mesh(
     *,
     subject: Subject | None = None,
     seen: MeshFrames | None = None,
-    place: Georeference | None = None,
 ) -> dict[str, Any]:
     """Render depth of all training views, fuse it, write the mesh: of the subject, or of everything.
 
@@ -120,8 +117,6 @@ def extract_mesh(
     ----------
     seen : MeshFrames, optional
         Depth maps of these splats, by the protocol's kind of depth; where they are complete, nothing is rendered.
-    place : Georeference, optional
-        Where the run is in the world: the file is in local metres then.
 
     Returns
     -------
@@ -132,8 +127,7 @@ def extract_mesh(
         raise disk_error(out, FileNotFoundError(2, "No such file or directory"))
     result = fused(loaded, splats, options, on_event, subject=subject, seen=seen)
     release_buffers()
-    write_mesh(out, result.mesh if place is None else placed_mesh(result.mesh, place))
-    told = {} if place is None else say_where(out, place)
+    write_mesh(out, result.mesh)
     limits = asdict(result.limits)
     return {
         "file": str(out),
@@ -149,7 +143,6 @@ def extract_mesh(
         "components": result.components,
         "faces_removed": result.faces_removed,
         **_cleaned_facts(result),
-        **told,
     }
 
 
@@ -363,7 +356,6 @@ def mesh_run(
     out: Path | None = None,
     splats_file: Path | None = None,
     threads: int | None = None,
-    georeferenced: bool = False,
 ) -> dict[str, Any]:
     """Extract the mesh of a finished run; returns its file, counts and limits.
 
@@ -371,21 +363,14 @@ def mesh_run(
     ----------
     splats_file : Path or None
         Mesh the splats of this file instead of the run's, into ``out``.
-    georeferenced : bool
-        Write ``out`` in metres of the world; without options it is the run's mesh.ply, which is not made again.
     """
     path, out = Path(path), None if out is None else checked_output(path, out)
-    place = placed_output(path, out, MESH) if georeferenced else None
-    if place is not None and out is not None and _is_own(options, splats_file) and (path / MESH).exists():
-        mesh = read_mesh(path / MESH)
-        write_mesh(out, placed_mesh(mesh, place))
-        return {"file": str(out), "vertices": len(mesh.vertices), "faces": len(mesh.faces), **say_where(out, place)}
     run, loaded, splats = open_finished(path, threads, on_event, splats_file=splats_file, out=out)
     if splats_file is not None and out is not None and out.resolve() == run.file(MESH).resolve():
         raise RunError(f"--out {out} is the mesh of the run, which is that of its own splats; choose another name")
     if out is not None and out.resolve() != run.file(MESH).resolve():
         subject = meshed_subject(run, loaded, splats, options, on_event)
-        return extract_mesh(loaded, splats, options, out, on_event, subject=subject, place=place)
+        return extract_mesh(loaded, splats, options, out, on_event, subject=subject)
     with run.locked():
         subject = meshed_subject(run, loaded, splats, options, on_event)
         result = extract_mesh(loaded, splats, options, run.file(MESH), on_event, subject=subject)
@@ -401,11 +386,6 @@ def mesh_run(
             page_run(run.path, on_event=on_event, loaded=loaded)
     report_again(run, on_event)
     return result
-
-
-def _is_own(options: MeshOptions, splats_file: Path | None) -> bool:
-    """Whether nothing but the mesh that the run has is asked for."""
-    return options == MeshOptions() and splats_file is None
 
 
 def keep_facts(run: RunFolder, result: Mapping[str, Any]) -> None:

@@ -35,7 +35,6 @@ from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.run_mesh import fused, mesh_run
 from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.run_subject import OPAQUE, meshed_subject
-from gs2d.pipeline.finish.world_frame import placed_output, placed_textured, say_where
 from gs2d.pipeline.look.page import page_run
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.open_capture import read_scene
@@ -56,7 +55,6 @@ def texture_run(
     *,
     out: Path | None = None,
     threads: int | None = None,
-    georeferenced: bool = False,
 ) -> dict[str, Any]:
     """Write the mesh of a finished run with a texture; returns its files and counts.
 
@@ -67,7 +65,6 @@ def texture_run(
     for package in PACKAGES:
         required(package)  # before minutes are spent
     path = Path(path)
-    place = placed_output(path, out, TEXTURED) if georeferenced else None
     target = path / TEXTURED if out is None else Path(out)
     files = written_files(target)
     if not target.parent.is_dir() and out is not None:
@@ -85,16 +82,12 @@ def texture_run(
     mesh = _mesh(run, loaded, splats, mesh_options, on_event)
     baked = textured_mesh(loaded, splats, mesh, options, on_event)
     up = up_direction([view.camera for view in loaded.scene.train])
-    if place is None:
-        write_mesh(target, baked.mesh, up=up)
-    else:
-        write_mesh(target, placed_textured(baked.mesh, place), up=np.array([0.0, 0.0, 1.0]))
+    write_mesh(target, baked.mesh, up=up)
     if target.resolve() == run.file(TEXTURED).resolve():
         if run.file(PAGE).exists():  # it shows the textured mesh
             with attempted(PAGE, again("page", run.path), on_event):
                 page_run(run.path, on_event=on_event, loaded=loaded)
         report_again(run, on_event)
-    told = {} if place is None else say_where(target, place)
     return {
         "files": [str(file) for file in files],
         "faces": len(baked.mesh.faces),
@@ -106,7 +99,6 @@ def texture_run(
         "texels_unseen": baked.unseen,
         "texture_from": options.texture_from,
         "bytes": sum(file.stat().st_size for file in files),
-        **told,
     }
 
 

@@ -11,7 +11,6 @@ from gs2d.data.archive import is_archive, unpacked_for_a_moment
 from gs2d.data.known_captures import missing_lines
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import is_splat_file, read_splat_file, reader_of
-from gs2d.io.georeference import georeference_of_file
 from gs2d.io.meshes import FOREIGN, read_mesh, read_points
 from gs2d.io.splat_ply import ply_kind
 
@@ -56,14 +55,6 @@ def describe_file(path: Path) -> dict[str, Any]:
         remedy = instead(path, "run" if belongs_to_run(path) else "capture")
         raise DataError(f"{path}: a file of splats, a mesh or points was expected, got another file{remedy}")
     size = path.stat().st_size
-    place = georeference_of_file(path)
-    return {
-        **_facts_of(path, size),
-        **({} if place is None else {"frame": place.frame, "offset": place.origin.tolist()}),
-    }
-
-
-def _facts_of(path: Path, size: int) -> dict[str, Any]:
     reader = reader_of(path)
     if reader is not None and reader.mesh is not None and (mesh := reader.mesh(path)) is not None:
         return {**mesh, "bytes": size}

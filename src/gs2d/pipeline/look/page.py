@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from gs2d.core.camera import Camera, look_at
-from gs2d.core.georeference import Georeference
+from gs2d.core.json_files import read_json
 from gs2d.core.missing import where_it_ends
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import focus_point, up_direction
@@ -21,16 +21,15 @@ from gs2d.data import View
 from gs2d.data.subject import Subject, read_subject
 from gs2d.errors import DataError, RunError
 from gs2d.io.formats.splat_formats import read_splats
-from gs2d.io.georeference import georeference_of_file, read_georeference
 from gs2d.io.meshes import read_mesh, read_textured
-from gs2d.io.run_dir import MESH, PAGE, TEXTURED, RunFolder, is_run, open_run
+from gs2d.io.run_dir import GEOREFERENCE, MESH, PAGE, TEXTURED, RunFolder, is_run, open_run
 from gs2d.meshing.evidence import simplified_to
 from gs2d.meshing.web_mesh import web_mesh
 from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats, reload_run
 from gs2d.render.types import RasterSettings
 from gs2d.report.images import valid_image
 from gs2d.training.events import Notice, OnEvent, Phase, ignore
-from gs2d.viewer.scene_page import PageScene, PageView, write_page
+from gs2d.viewer.scene_page import PageScene, PageView, WorldScale, write_page
 
 MAX_VIEWS = 100  # photographs that one can step through
 SUFFIXES = (".html", ".htm")
@@ -158,7 +157,7 @@ def page_content(path: Path, on_event: OnEvent = ignore, loaded: LoadedRun | Non
         settings_without_run(splats) if loaded is None else loaded.settings,
         splats.means.cpu().numpy(),
         subject=_subject(path, on_event) if run is not None and photographs else None,
-        world=_world_of(path, on_event),
+        world=None if run is None else _world_of(run, on_event),
     )
     return PageContent(splats, scene, photographs, run)
 
@@ -170,7 +169,7 @@ def page_scene(
     centers: np.ndarray,
     *,
     subject: Subject | None = None,
-    world: Georeference | None = None,
+    world: WorldScale | None = None,
 ) -> PageScene:
     """Return what a page shows around splats near ``centers`` [N, 3]; without photographs it is seen from aside."""
     cameras = [view.camera for view in photographs]
@@ -208,15 +207,16 @@ def _focus(cameras: Sequence[Camera], centers: np.ndarray) -> tuple[np.ndarray, 
     return focus, unit if unit > 1e-12 and math.isfinite(unit) else 1.0
 
 
-def _world_of(path: Path, on_event: OnEvent) -> Georeference | None:
-    """Return how the splats of a run or a file lie in the world, to measure in metres; None where that is not known."""
+def _world_of(run: RunFolder, on_event: OnEvent) -> WorldScale | None:
+    """Return the scale and rotation of a georeferenced run, to measure in metres; None for any other run."""
+    if not run.file(GEOREFERENCE).exists():
+        return None
     try:
-        if is_run(path):
-            return read_georeference(path)
-        told = georeference_of_file(path)
-        return None if told is None else told.of_local_files()
-    except DataError as error:
-        on_event(Notice(f"distances are in units of the capture: {error}"))
+        world = read_json(run.file(GEOREFERENCE))
+        rotation = np.array(world["rotation"], np.float64).reshape(3, 3)
+        return WorldScale(float(world["metres_per_unit"]), rotation)
+    except (DataError, KeyError, TypeError, ValueError) as error:
+        on_event(Notice(f"distances are in units of the capture: cannot read {GEOREFERENCE}: {error}"))
         return None
 
 

@@ -27,8 +27,7 @@ from gs2d.core.memory_limit import memory_budget
 from gs2d.core.splats import Splats
 from gs2d.core.text import duration
 from gs2d.data import Scene
-from gs2d.data.prepare import packed_bytes
-from gs2d.data.prepared import decoded_bytes
+from gs2d.data.prepared import decoded_bytes, packed_bytes
 from gs2d.errors import DataError
 from gs2d.pipeline.prepare.limits import DECODING_BYTES, ITERATION_BYTES
 from gs2d.pipeline.prepare.photographs import fits

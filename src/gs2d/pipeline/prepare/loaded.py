@@ -23,7 +23,6 @@ from gs2d.data.masks import EMPTY
 from gs2d.errors import DataError, RunError
 from gs2d.io import splat_ply
 from gs2d.io.formats.splat_formats import read_splats, read_surfels
-from gs2d.io.georeference import georeference_of_file
 from gs2d.io.run_dir import SPLATS, RunFolder, open_run, versions
 from gs2d.pipeline.prepare.limits import use_threads
 from gs2d.pipeline.prepare.open_capture import SHOWN_SKIPS, open_capture, read_scene, without_masked_points
@@ -357,8 +356,6 @@ def _splats_of(path: Path, out: Path | None, on_event: OnEvent) -> Splats:
         raise RunError("--splats needs --out: what is in the run is made of its own splats; name another place")
     if path.is_dir():
         raise DataError(f"--splats must be a file of splats, got the folder {path}; give the splats.ply in it")
-    if georeference_of_file(path) is not None:
-        raise DataError(f"--splats must be in the frame of the run, {path} is in metres of the world; export it again")
     return read_splats(path, lambda text: on_event(Notice(text)))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gs2d.data.positions import Positions, in_frame, matched, read_positions
+from gs2d.data.positions import Positions, matched, read_positions, to_enu
 from gs2d.errors import DataError
 from gs2d.sfm.photos import Photo
 
@@ -73,7 +73,7 @@ def places_of(photos: Sequence[Photo], listed: Path | None) -> Places:
 
 def _metres(places: np.ndarray, positions: Positions) -> np.ndarray:
     """Places [P, 3] in metres; heights are 0 where one of them is not known."""
-    metres = in_frame(places, None, wanted=None, enu=True)[0] if positions.in_degrees else places.copy()
+    metres = to_enu(places, np.append(np.median(places[:, :2], axis=0), 0.0)) if positions.in_degrees else places.copy()
     if not np.isfinite(metres[:, 2]).all():
         metres[:, 2] = 0.0
     return metres

@@ -8,8 +8,15 @@ import torch
 
 from gs2d.core.files import disk_error
 from gs2d.data import Scene
-from gs2d.data.prepare import check_disk, packed_bytes, prepare
-from gs2d.data.prepared import decoded_bytes, forget_others, missing_views, prepared_scene
+from gs2d.data.prepared import (
+    check_disk,
+    decoded_bytes,
+    forget_others,
+    missing_views,
+    packed_bytes,
+    prepare,
+    prepared_scene,
+)
 from gs2d.errors import DataError
 from gs2d.pipeline.prepare.resolved import Execution
 from gs2d.training.events import Notice, OnEvent, Phase, Step

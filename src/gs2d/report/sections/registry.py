@@ -13,7 +13,7 @@ Section = Callable[[RunRecord], str | None]
 
 _BUILTIN = (  # in the order of the page; each is a module of this package
     *("verdict", "results", "views", "training", "surface", "subject", "capture"),
-    *("exposure", "photometry", "poses", "losses", "georeference", "files", "settings", "terms"),
+    *("exposure", "photometry", "poses", "losses", "files", "settings", "terms"),
 )
 SECTIONS: Registry[Section] = Registry(
     "report section",

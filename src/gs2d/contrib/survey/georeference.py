@@ -1,44 +1,47 @@
-"""Where a scene is in the world: a similarity from the coordinates of a run to metres, as a value.
+"""World coordinates of a run: a similarity from the coordinates of the run to metres, in ``georeference.json``.
 
-A run keeps its own coordinates; nothing moves it by stealth. What is written "georeferenced" is in *local* metres, that
-is in the world less ``origin``, so that 32-bit numbers keep their digits::
+The files of a run keep their own coordinates. Exported files are in *local* metres, that is relative to ``origin``, to
+fit 32-bit numbers::
 
     local = scale * rotation @ x + translation        world = origin + local
 
-Axes are x east, y north, z up where the frame is one of the earth's, and z up elsewhere.
+Axes are x east, y north, z up in geographic frames, and z up otherwise.
 """
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from gs2d.errors import DataError
+from gs2d.core.json_files import read_json, write_json
+from gs2d.errors import DataError, RunError
+from gs2d.io.run_dir import GEOREFERENCE
 
-FORMAT = 1  # of what `to_json` gives
+FORMAT = 1  # of georeference.json
 Role = Literal["fitted", "left out", "check"]
 FITTED: Role = "fitted"
 LEFT_OUT: Role = "left out"
 CHECK: Role = "check"
-_UP = {"places": "the places", "cameras": "how the cameras were held", "given": "--up"}
+_UP = {"places": "the positions", "cameras": "how the cameras were held", "given": "--up"}
 _ROLES: tuple[Role, ...] = (FITTED, LEFT_OUT, CHECK)
 
 
 @dataclass(frozen=True, eq=False)
 class Residual:
-    """How far a point lies from where the world says it is.
+    """Error of one image or control point.
 
     Attributes
     ----------
     name : str
-        Of the photograph or the control point.
     error : ndarray [3]
-        World by the similarity less world as given, metres, in the axes of the frame.
+        Transformed position minus measured position, metres, in the axes of the frame.
     role : "fitted", "left out" or "check"
-        Whether it decided the similarity, was left out as an outlier, or was held out as a check.
+        Used in the fit, rejected as an outlier, or held out as a check point.
     """
 
     name: str
@@ -53,29 +56,31 @@ class Residual:
 
 @dataclass(frozen=True, eq=False)
 class Georeference:
-    """Scale, rotation and place of a run in the world.
+    """Scale, rotation and position of a run in the world.
 
     Attributes
     ----------
     scale : float
-        Metres of the frame for one unit of the run.
+        Metres of the frame per unit of the run.
     rotation : ndarray [3, 3]
         From the axes of the run to those of the frame.
     translation : ndarray [3]
         Metres; small, because ``origin`` has the large part.
     origin : ndarray [3] float64
-        Where the local coordinates begin, in the frame: east, north, height; zeros where the frame is the scene's own.
+        Origin of local coordinates in the frame: east, north, height; zeros without a geographic frame.
     method : str
-        What it was found from, in words.
+        Source of the georeference, in words.
     epsg : int or None
-        The projected coordinate system; None: a frame of its own.
+        Projected coordinate system, if any.
     geodetic : ndarray [3] or None
-        Latitude, longitude (degrees, WGS 84) and height (m) of the origin, where they are known.
+        Latitude, longitude (degrees, WGS 84) and height (m) of the origin, if known.
     grid_scale : float
-        Metres of the frame for one metre on the ground, horizontally: 0.9996 to 1.0004 in UTM, else 1.
+        Metres of the frame per metre on the ground, horizontally: 0.9996 to 1.0004 in UTM, else 1.
     residuals : tuple of Residual
     doubts : tuple of str
-        What a person should look at, one sentence each.
+        Warnings, one sentence each.
+    facts : mapping
+        Further results of the method, as JSON values.
     """
 
     scale: float
@@ -90,55 +95,28 @@ class Georeference:
     doubts: tuple[str, ...] = ()
     facts: Mapping[str, Any] = field(default_factory=dict)
 
-    unit = "m"
-
     @property
     def metres_per_unit(self) -> float:
-        """Metres on the ground for one unit of the run: what measuring multiplies by."""
+        """Metres on the ground per unit of the run."""
         return self.scale / self.grid_scale
 
     @property
     def frame(self) -> str:
-        """Return the name of the frame: "EPSG:32632", "local east, north, up" or "local, z up"."""
+        """Name of the frame: "EPSG:32632", "local east, north, up" or "local, z up"."""
         if self.epsg is not None:
             return f"EPSG:{self.epsg}"
         return "local, z up" if self.geodetic is None else "local east, north, up"
 
-    @property
-    def T_local_run(self) -> np.ndarray:
-        """Return the similarity [4, 4] from the run to local metres."""
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = self.scale * self.rotation, self.translation
-        return T
-
     def to_local(self, points: np.ndarray) -> np.ndarray:
-        """Return points [P, 3] of the run in local metres, float64."""
+        """Transform points [P, 3] of the run to local metres, float64."""
         return np.asarray(self.scale * (np.asarray(points, np.float64) @ self.rotation.T) + self.translation)
 
     def to_world(self, points: np.ndarray) -> np.ndarray:
-        """Return points [P, 3] of the run in the world, float64."""
+        """Transform points [P, 3] of the run to the world, float64."""
         return np.asarray(self.to_local(points) + self.origin)
 
-    def from_world(self, points: np.ndarray) -> np.ndarray:
-        """Return points [P, 3] of the world in the run, float64."""
-        local = np.asarray(points, np.float64) - self.origin
-        return np.asarray((local - self.translation) @ self.rotation / self.scale)
-
-    def ground_way(self, way: np.ndarray) -> np.ndarray:
-        """Return a way [3] between two places of the run in metres on the ground: east, north, up."""
-        return np.asarray(self.metres_per_unit * (self.rotation @ np.asarray(way, np.float64)))
-
-    @property
-    def is_local(self) -> bool:
-        """Whether it changes nothing: what it is of is in local metres already."""
-        return bool(self.scale == 1 and not np.any(self.translation) and np.array_equal(self.rotation, np.eye(3)))
-
-    def of_local_files(self) -> Georeference:
-        """Return that of a file in local metres: only the origin and the frame are left to be said."""
-        return replace(self, scale=1.0, rotation=np.eye(3), translation=np.zeros(3), residuals=(), facts={}, doubts=())
-
     def rms(self, role: Role = "fitted") -> float | None:
-        """Return the root mean square of the residuals of a role, metres; None where there are none."""
+        """Return the root mean square of the residuals of a role, metres; None without any."""
         squares = [residual.distance**2 for residual in self.residuals if residual.role == role]
         return float(np.sqrt(np.mean(squares))) if squares else None
 
@@ -148,42 +126,43 @@ class Georeference:
         return max(of_role, key=lambda residual: residual.distance) if of_role else None
 
     def count(self, role: Role) -> int:
-        """Return how many residuals have a role."""
+        """Return the number of residuals of a role."""
         return sum(residual.role == role for residual in self.residuals)
 
     def lines(self) -> list[str]:
-        """Return what is known, in lines for people."""
+        """Return a summary, as lines."""
         error = self.facts.get("scale_error")
         accuracy = f" (+- {error:.2%})" if isinstance(error, float) else ""
-        lines = [f"georeference: {self.frame}, from {self.method}", f"scale: {self.scale:.6g} m a unit{accuracy}"]
+        lines = [f"georeference: {self.frame}, from {self.method}", f"scale: {self.scale:.6g} m per unit{accuracy}"]
         if self.grid_scale != 1:
             lines[-1] += f"; 1 m on the ground is {self.grid_scale:.5f} m of the map"
         if "up" in self.facts:
-            lines.append(f"up: by {_UP.get(self.facts['up'], self.facts['up'])}")
+            lines.append(f"up: from {_UP.get(self.facts['up'], self.facts['up'])}")
         if np.any(self.origin):
             lines.append("offset: " + " ".join(f"{value:.10g}" for value in self.origin))
         if self.geodetic is not None:
             latitude, longitude, height = self.geodetic
-            lines.append(f"at latitude {latitude:.6f}, longitude {longitude:.6f}, height {height:.1f} m")
+            lines.append(f"origin: latitude {latitude:.6f}, longitude {longitude:.6f}, height {height:.1f} m")
         roles: tuple[tuple[Role, str], ...] = (("fitted", "residuals"), ("check", "check points"))
-        for role, what in roles:
+        for role, title in roles:
             rms, worst = self.rms(role), self.worst(role)
             if rms is not None and worst is not None:
                 count = self.count(role)
-                lines.append(f"{what}: {rms:.4g} m rms of {count}, worst {worst.distance:.4g} m ({worst.name})")
+                lines.append(f"{title}: {rms:.4g} m rms of {count}, worst {worst.distance:.4g} m ({worst.name})")
         if left := self.count("left out"):
-            lines.append(f"left out: {left} that do not agree with the others")
+            lines.append(f"outliers left out: {left}")
         return [*lines, *(f"doubtful: {doubt}" for doubt in self.doubts)]
 
     def to_json(self) -> dict[str, Any]:
-        """Return what ``georeference.json`` holds, and the files that are written with it."""
+        """Return the content of ``georeference.json``."""
         return {
             "format": FORMAT,
             "frame": self.frame,
             "epsg": self.epsg,
-            "unit": self.unit,
+            "unit": "m",
             "origin": self.origin.tolist(),
             "scale": self.scale,
+            "metres_per_unit": self.metres_per_unit,
             "rotation": self.rotation.tolist(),
             "translation": self.translation.tolist(),
             "geodetic": None if self.geodetic is None else self.geodetic.tolist(),
@@ -200,12 +179,12 @@ class Georeference:
 
     @classmethod
     def from_json(cls, data: Any) -> Georeference:
-        """Read what ``to_json`` gave.
+        """Convert the result of ``to_json``.
 
         Raises
         ------
         DataError
-            A field is missing or is not what it should be.
+            If a field is missing or invalid.
         """
         if not isinstance(data, Mapping):
             raise DataError(f"a georeference must be an object, got {type(data).__name__}")
@@ -228,6 +207,45 @@ class Georeference:
         return cls(scale, rotation, translation, origin, method, epsg, geodetic, grid_scale, residuals, doubts, facts)
 
 
+def read_georeference(run: Path) -> Georeference | None:
+    """Read the georeference of a run folder; None without one.
+
+    Raises
+    ------
+    DataError
+        If ``georeference.json`` is damaged.
+    """
+    path = Path(run) / GEOREFERENCE
+    if not path.exists():
+        return None
+    try:
+        return Georeference.from_json(read_json(path))
+    except DataError as error:
+        raise DataError(
+            f"{path} is damaged ({error}); remove it with `gs2d georeference {run} --remove`, then run it again"
+        ) from error
+
+
+def required_georeference(run: Path) -> Georeference:
+    """Read the georeference of a run folder, or raise RunError if it has none."""
+    place = read_georeference(run)
+    if place is None:
+        quoted = shlex.quote(str(run))
+        raise RunError(
+            f"{run} has no georeference; find it with `gs2d georeference {quoted} --gps` if the photographs have GPS "
+            f"positions, else with `gs2d georeference {quoted} --known-distance X0 Y0 Z0 X1 Y1 Z1 METRES`, "
+            "from two points of the mesh"
+        )
+    return place
+
+
+def write_georeference(run: Path, georeference: Georeference) -> Path:
+    """Write the georeference of a run folder."""
+    path = Path(run) / GEOREFERENCE
+    write_json(path, georeference.to_json())
+    return path
+
+
 def _numbers(data: Mapping[str, Any], name: str) -> np.ndarray:
     return np.asarray(data[name], np.float64)
 
@@ -244,9 +262,9 @@ def _check(scale: float, grid_scale: float, rotation: np.ndarray, vectors: Seque
     is_rotation = rotation.shape == (3, 3) and bool(np.isfinite(rotation).all())
     is_rotation = is_rotation and bool(np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-6)
     is_rotation = is_rotation and float(np.linalg.det(rotation)) > 0
-    whole = all(vector.shape == (3,) and np.isfinite(vector).all() for vector in vectors)
-    known = epsg is None or (isinstance(epsg, int) and not isinstance(epsg, bool) and 1024 <= epsg <= 999_999)
-    if not (positive and is_rotation and whole and known):
+    finite = all(vector.shape == (3,) and np.isfinite(vector).all() for vector in vectors)
+    valid_epsg = epsg is None or (isinstance(epsg, int) and not isinstance(epsg, bool) and 1024 <= epsg <= 999_999)
+    if not (positive and is_rotation and finite and valid_epsg):
         raise DataError(
             "a georeference must hold a positive scale, a rotation, a translation and an origin of three finite "
             f"numbers, and an EPSG code or null, got scale {scale:g}, EPSG {str(epsg)[:20]}"

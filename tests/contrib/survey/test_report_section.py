@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gs2d.core.georeference import Georeference, Residual
+from gs2d.contrib.survey.georeference import Georeference, Residual, write_georeference
+from gs2d.contrib.survey.report_section import SHOWN, georeference_section
 from gs2d.errors import DataError
-from gs2d.io.georeference import write_georeference
 from gs2d.report.record import RunRecord
-from gs2d.report.sections.georeference import SHOWN, georeference_section
 
 
 def test_a_run_without_a_place_has_no_section(tmp_path: Path) -> None:
@@ -40,7 +39,7 @@ def test_check_points_stand_first_then_what_was_left_out_then_the_worst(tmp_path
     )
     html = str(georeference_section(RunRecord(tmp_path, {})))
     assert "EPSG:32632" in html
-    assert "1.25 m a unit" in html
+    assert "1.25 m per unit" in html
     assert "doubtful: the scale is known to 3.0% only" in html
     places = [html.index(f">{name}</td>") for name in ("&lt;gate&gt;", "wild.jpg", "14.jpg", "13.jpg")]
     assert places == sorted(places)
@@ -50,5 +49,5 @@ def test_check_points_stand_first_then_what_was_left_out_then_the_worst(tmp_path
 
 def test_a_damaged_file_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "georeference.json").write_text("{}", encoding="utf-8")
-    with pytest.raises(DataError, match="was damaged"):
+    with pytest.raises(DataError, match="is damaged"):
         georeference_section(RunRecord(tmp_path, {}))

@@ -1,0 +1,37 @@
+"""Report section on world coordinates: scale, position, and residuals of control points."""
+
+from __future__ import annotations
+
+from markupsafe import Markup
+
+from gs2d.contrib.survey.georeference import CHECK, FITTED, LEFT_OUT, Residual, read_georeference
+from gs2d.report.html import macro
+from gs2d.report.record import RunRecord
+from gs2d.report.sections.registry import register_section
+
+SHOWN = 12  # residuals: check points first, then the largest
+_ORDER = (CHECK, LEFT_OUT, FITTED)
+_COLUMNS = ["Name", "Used as", "Error, m", "East", "North", "Up"]
+
+
+@register_section("georeference", title="World coordinates")
+def georeference_section(run: RunRecord) -> str | None:
+    """Return the georeference and its largest residuals; None if the run has none."""
+    found = read_georeference(run.path)
+    if found is None:
+        return None
+    first, *lines = found.lines()
+    html = Markup("<p>{}.</p><ul>{}</ul>").format(
+        first[:1].upper() + first[1:], Markup().join(Markup("<li>{}</li>").format(line) for line in lines)
+    )
+    shown = sorted(found.residuals, key=lambda residual: (_ORDER.index(residual.role), -residual.distance))[:SHOWN]
+    if shown:
+        html += macro("macros.html", "table", _COLUMNS, [_row(residual) for residual in shown], texts=(0, 1))
+    if rest := len(found.residuals) - len(shown):
+        html += Markup("<p>{} more have smaller errors.</p>").format(rest)
+    return html
+
+
+def _row(residual: Residual) -> tuple[str, ...]:
+    distance = f"{residual.distance:.3f}"
+    return (residual.name, residual.role, distance, *(f"{part:+.3f}" for part in residual.error))
