@@ -1,7 +1,8 @@
-"""Fixtures for all tests: where the real captures are, one torch thread, and what saves minutes of the whole."""
+"""Fixtures for all tests: the folder of the real captures, one torch thread, and shortcuts that save minutes."""
 
 from __future__ import annotations
 
+import functools
 import gc
 import os
 from collections.abc import Callable, Iterator
@@ -12,30 +13,57 @@ import torch
 
 from gs2d.errors import BackendError
 from gs2d.kernels.library import load
-from gs2d.report import plots
+from gs2d.report import first_screen, plots
+from gs2d.synthetic import capture
 
-CURVES_ARE_LOOKED_AT = ("report", "contrib/lab/test_figures.py")
+PICTURES_MATTER = ("report", "contrib/lab/test_figures.py")
+DEMO_IS_TESTED = ("synthetic",)
 
 
 def pytest_collection_finish() -> None:
-    """What collection left is never garbage: each of the collections that training asks for took half a second."""
+    """Freeze what collection left, so that the garbage collections of each run do not visit it."""
     gc.collect()
     gc.freeze()
 
 
+def _tests_of(request: pytest.FixtureRequest, folders: tuple[str, ...]) -> bool:
+    return request.path.relative_to(Path(__file__).parent).as_posix().startswith(folders)
+
+
 @pytest.fixture(scope="module", autouse=True)
-def curves(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Draw the curves of a report only where a test looks at them: they are half of the time of a run of seconds."""
-    name = request.path.relative_to(Path(__file__).parent).as_posix()
+def cheap_reports(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Draw the curves and the mesh of a report only where a test looks at them: half of the time of a tiny run."""
     with pytest.MonkeyPatch.context() as patch:
-        if not name.startswith(CURVES_ARE_LOOKED_AT):
+        if not _tests_of(request, PICTURES_MATTER):
             patch.setattr(plots, "_figure", lambda *_, **__: "<svg></svg>")
+            patch.setattr(first_screen, "mesh_view", lambda *_: "no mesh")
+        yield
+
+
+_light: dict[capture.ToyScene, capture.BakedLight] = {}
+_demo_scene = functools.cache(capture.build_scene)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cheap_demo_captures(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Bake the light of the demo scene once per process: 4 s. Its own tests bake it each time."""
+    bake = capture.bake
+
+    def baked(scene: capture.ToyScene, *, threads: int) -> capture.BakedLight:
+        if scene not in _light:
+            _light[scene] = bake(scene, threads=threads)
+        return _light[scene]
+
+    with pytest.MonkeyPatch.context() as patch:
+        if not _tests_of(request, DEMO_IS_TESTED):
+            patch.setattr(capture, "build_scene", _demo_scene)
+            patch.setattr(capture, "bake", baked)
         yield
 
 
 @pytest.fixture(scope="session", autouse=True)
 def one_torch_thread() -> None:
-    """Tests run in parallel processes: one thread each."""
+    """Use one thread: tests run in parallel processes."""
     torch.set_num_threads(1)
 
 

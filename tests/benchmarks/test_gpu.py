@@ -12,11 +12,18 @@ from benchmarks.gpu import __main__ as command
 
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.compile import KERNEL, compile_text
+from gs2d.render import pair_budget
 
 ROOT = Path(__file__).resolve().parents[2]
 pytestmark = [
     pytest.mark.skipif(shutil.which("g++") is None, reason="no g++ here, which runs the CUDA kernels on the CPU"),
 ]
+
+
+@pytest.fixture(autouse=True)
+def little_room_for_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Round the room for pairs up to 512, not 65,536: the emulator sorts all of it."""
+    monkeypatch.setattr(pair_budget, "STEP", 512)
 
 
 def dry(name: str, folder: Path, *more: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Two seconds of mutated inputs of every family, always from the same first one, and every input that was a finding.
+"""One second of mutated inputs of every family, always from the same first one, and every input that was a finding.
 
 ``GS2D_FUZZ_SECONDS=0`` throws a dozen inputs a family. ``make fuzz`` throws new ones for an hour a family; what it
 finds goes into ``findings/FAMILY/`` as the changed file alone (``drive.py --keep`` writes it; "__" stands for "/" in
@@ -27,7 +27,7 @@ from gs2d.errors import DataError  # noqa: E402
 
 LEAST = 12  # inputs a family, whatever the time
 SLOW = {"run-files": 6, "usd": 3}
-SECONDS = float(os.environ.get("GS2D_FUZZ_SECONDS", "2"))  # a family, at least
+SECONDS = float(os.environ.get("GS2D_FUZZ_SECONDS", "1"))  # a family, at least
 FINDINGS = sorted(path for path in (HERE / "findings").rglob("*") if path.is_file())
 
 

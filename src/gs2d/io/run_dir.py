@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import functools
 import importlib.metadata
 import os
 import platform
@@ -355,12 +356,15 @@ def load_tensors(path: Path) -> dict[str, Any]:
 def versions() -> dict[str, str]:
     """Return the versions that the result depends on."""
     found = {"python": platform.python_version(), "2dgs-r": __version__}
-    for name in ("torch", "numpy", "scipy", "pillow"):
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    return found | {name: _installed_version(name) for name in ("torch", "numpy", "scipy", "pillow")}
+
+
+@functools.cache  # every checkpoint needs it, and reading the metadata takes 10 ms
+def _installed_version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
 
 
 def machine() -> dict[str, Any]:
