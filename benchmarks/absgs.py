@@ -30,7 +30,7 @@ from gs2d.contrib.lab.jobs import Job
 from gs2d.contrib.lab.options import PaperOptions
 from gs2d.contrib.lab.plan import make_job, trained_recipe
 from gs2d.contrib.lab.scenes import FoundScene, find_scenes
-from gs2d.core.files import atomic_write
+from gs2d.core.atomic_files import atomic_write
 from gs2d.core.json_files import write_json
 from gs2d.errors import Gs2dError
 from gs2d.io.run_dir import machine, versions

@@ -13,8 +13,8 @@ from PIL import Image
 
 from benchmarks.flight_files import flight_exif, write_model
 from benchmarks.land import TILE, Land, build_land, shade
+from gs2d.core.atomic_files import disk_error
 from gs2d.core.camera import Camera, look_at
-from gs2d.core.files import disk_error
 from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
 from gs2d.io.meshes import write_mesh

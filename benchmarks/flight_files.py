@@ -13,8 +13,8 @@ from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 from scipy.spatial.transform import Rotation
 
+from gs2d.core.atomic_files import atomic_write
 from gs2d.core.camera import Camera
-from gs2d.core.files import atomic_write
 
 _AXIS, _FLATTENING = 6_378_137.0, 1 / 298.257223563  # of WGS 84: m, and none
 _PINHOLE = 1  # COLMAP's number of the camera model

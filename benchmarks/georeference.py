@@ -29,10 +29,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.flight import Flight, write_flight
-from gs2d.contrib.survey.commands import GeoreferenceOptions
 from gs2d.contrib.survey.find_georeference import georeference_run
 from gs2d.contrib.survey.fit import fit_places
 from gs2d.contrib.survey.georeference import CHECK, LEFT_OUT, Georeference
+from gs2d.contrib.survey.survey_commands import GeoreferenceOptions
 from gs2d.core.camera import Camera
 from gs2d.data import View, load_scene
 from gs2d.errors import Gs2dError

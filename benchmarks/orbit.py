@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from gs2d.core.camera import Camera
-from gs2d.data.subject import OBJECT, read_subject
+from gs2d.data.subject_box import OBJECT, read_subject
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, RunFolder
 from gs2d.pipeline.finish.camera_paths import orbit_cameras

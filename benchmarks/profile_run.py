@@ -37,7 +37,7 @@ from gs2d.pipeline.train.train_run import train
 
 PHASES = (
     *RUN_PHASES,
-    Rule("photograph the demo scene", (("synthetic/capture.py", "write_demo_capture"),)),
+    Rule("photograph the demo scene", (("synthetic/demo_capture.py", "write_demo_capture"),)),
     Rule("evaluate", (("pipeline/finish/evaluate.py", "evaluate_run"),)),
 )
 PARTS = (
@@ -52,7 +52,12 @@ PARTS = (
     Rule("checks for NaN", (("training/objective.py", "first_not_finite"),)),
     Rule(
         "photographs",
-        (("gs2d/core/images.py", ""), ("data/image_files.py", ""), ("data/scene.py", ""), ("training/targets.py", "")),
+        (
+            ("gs2d/core/image_arrays.py", ""),
+            ("data/image_files.py", ""),
+            ("data/scene.py", ""),
+            ("training/targets.py", ""),
+        ),
     ),
     Rule("fusion", (("meshing/tsdf_volume.py", ""), ("meshing/sampling.py", ""))),
     Rule("depth maps", tuple((f"meshing/{name}.py", "") for name in ("depth_maps", "fusion_bounds", "consistency"))),

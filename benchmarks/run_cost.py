@@ -42,7 +42,7 @@ PARTS = (
     Rule(
         "photographs",
         (
-            ("gs2d/core/images.py", ""),
+            ("gs2d/core/image_arrays.py", ""),
             ("data/image_files.py", ""),
             ("data/scene.py", ""),
             ("data/build.py", ""),

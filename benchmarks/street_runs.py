@@ -25,7 +25,7 @@ from gs2d.core.json_files import read_json
 from gs2d.core.mesh import Mesh
 from gs2d.core.splats import Splats
 from gs2d.data import View
-from gs2d.data.subject import find_subject
+from gs2d.data.subject_box import find_subject
 from gs2d.errors import DataError
 from gs2d.evaluation.hidden_points import hidden_points, total
 from gs2d.evaluation.image_metrics import ImageMetrics

@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 
 from gs2d.core.camera import Camera
-from gs2d.core.images import composite
+from gs2d.core.image_arrays import composite
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.data import View
 from gs2d.data.image_files import write_image

@@ -65,7 +65,7 @@ from gs2d.data.scene import PointCloud
 from gs2d.errors import DataError, Gs2dError
 from gs2d.evaluation.evaluators import choose_truth
 from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
-from gs2d.synthetic.capture import write_demo_capture
+from gs2d.synthetic.demo_capture import write_demo_capture
 from gs2d.training.events import ignore
 
 DEMO, PEER = "demo", "opensplat"

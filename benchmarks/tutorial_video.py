@@ -20,8 +20,8 @@ import numpy as np
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.data.image_files import write_image
-from gs2d.synthetic.capture import CAMERA_ANGLE_X, render_image
-from gs2d.synthetic.scene import build_scene
+from gs2d.synthetic.demo_capture import CAMERA_ANGLE_X, render_image
+from gs2d.synthetic.demo_scene import build_scene
 from gs2d.synthetic.shading import bake
 
 ROUNDS, ELEVATIONS = 2, (16.0, 46.0)  # degrees

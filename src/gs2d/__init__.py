@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from gs2d.core.transforms import perturb_pose
     from gs2d.data.camera_models import register_camera_model
     from gs2d.data.load import load_scene
-    from gs2d.data.readers.registry import register_reader
+    from gs2d.data.readers.capture_readers import register_reader
     from gs2d.data.scene import Scene
     from gs2d.errors import Gs2dError
     from gs2d.evaluation.evaluators import register_evaluator
@@ -141,7 +141,7 @@ _HOME = {
     "register_format": "gs2d.io.formats.splat_formats",
     "register_loss": "gs2d.config.losses",
     "register_quantity": "gs2d.config.quantities",
-    "register_reader": "gs2d.data.readers.registry",
+    "register_reader": "gs2d.data.readers.capture_readers",
     "register_recipe": "gs2d.config.presets",
     "register_section": "gs2d.report.sections.registry",
     "register_splat_reader": "gs2d.io.formats.splat_formats",

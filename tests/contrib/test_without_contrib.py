@@ -12,7 +12,7 @@ from gs2d.cli.registry import COMMANDS
 from gs2d.config.protocols import PROTOCOLS
 from gs2d.config.registry import Registry, contrib_entries
 from gs2d.data.known_captures import DATA_SETS
-from gs2d.data.readers.registry import READERS
+from gs2d.data.readers.capture_readers import READERS
 from gs2d.evaluation.evaluators import EVALUATORS
 from gs2d.io.formats.splat_formats import LAYOUTS, SPLAT_READERS
 from gs2d.report.sections.registry import SECTIONS

@@ -10,7 +10,7 @@ import pytest
 
 from gs2d.data.float_images import FloatTiff, read_float_tiff
 from gs2d.data.image_files import image_size, read_grey, read_image
-from gs2d.data.priors import read_depth
+from gs2d.data.prior_maps import read_depth
 from gs2d.errors import DataError
 
 tifffile = pytest.importorskip("tifffile")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gs2d.core.camera import Camera
-from gs2d.data.priors import ObservedPoints, PointsInView
+from gs2d.data.prior_maps import ObservedPoints, PointsInView
 from gs2d.evaluation.hidden_points import HiddenPoints, hidden_points, total
 
 POINTS = PointsInView(np.array([[0.5, 0.5], [1.5, 0.5], [2.5, 0.5], [3.5, 0.5]]), np.full(4, 10.0))

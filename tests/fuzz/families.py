@@ -318,7 +318,7 @@ def _image(name: str, mode: str = "RGB", **options: object) -> Callable[[Path], 
 def read_picture(root: Path) -> None:
     """As a photograph, as one without a camera yet, as a mask, as depths and as normals."""
     from gs2d.data.image_files import image_size, read_image, read_mask
-    from gs2d.data.priors import read_depth, read_normals
+    from gs2d.data.prior_maps import read_depth, read_normals
     from gs2d.errors import DataError
     from gs2d.sfm.photos import _read as looked_at
 
@@ -338,7 +338,7 @@ def _array(name: str, array: object) -> Callable[[Path], object]:
 
 
 def read_map(root: Path) -> None:
-    from gs2d.data.priors import read_depth, read_normals
+    from gs2d.data.prior_maps import read_depth, read_normals
 
     (path,) = (p for p in root.iterdir() if p.is_file())
     (read_normals if "normal" in path.name else read_depth)(path)

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 
 from gs2d.core.camera import Camera, look_at
-from gs2d.data.priors import ObservedPoints
+from gs2d.data.prior_maps import ObservedPoints
 from gs2d.data.scene import PointCloud, Scene, View
 
 WALL = 4.0  # the wall is the plane z = 4; cameras stand at z = 0 and look along z

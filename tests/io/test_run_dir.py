@@ -66,7 +66,10 @@ def test_a_folder_with_other_files_is_never_taken(tmp_path: Path, overwrite: boo
 
 
 def test_a_run_without_a_complete_definition_is_started_again(tmp_path: Path) -> None:
-    kill = "import os; from gs2d.core.files import atomic_write\nwith atomic_write('run.json'): os.kill(os.getpid(), 9)"
+    kill = (
+        "import os; from gs2d.core.atomic_files import atomic_write\n"
+        "with atomic_write('run.json'): os.kill(os.getpid(), 9)"
+    )
     subprocess.run([sys.executable, "-c", kill], cwd=tmp_path, check=False)
     (left,) = names(tmp_path)
     assert left != "run.json"
@@ -75,7 +78,7 @@ def test_a_run_without_a_complete_definition_is_started_again(tmp_path: Path) ->
 
 def test_a_lock_removes_temporary_files_of_killed_processes(tmp_path: Path) -> None:
     run = new_run(tmp_path)
-    kill = "import os, sys\nfrom gs2d.core.files import atomic_write\n"
+    kill = "import os, sys\nfrom gs2d.core.atomic_files import atomic_write\n"
     kill += "with atomic_write(sys.argv[1]): os.kill(os.getpid(), 9)"
     left = ("events.jsonl", "checkpoints/0-surface-0000010.pt", "renders/surface/test__a.png", "surface/precision.ply")
     for name in left:

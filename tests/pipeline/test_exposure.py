@@ -14,7 +14,7 @@ import torch
 from ball_runs import SMALL, options
 from gs2d.data import View
 from gs2d.data.image_files import read_image, write_image
-from gs2d.data.subject import OBJECT, read_subject
+from gs2d.data.subject_box import OBJECT, read_subject
 from gs2d.errors import RunError
 from gs2d.io.run_dir import EXPOSURE, LEARNED, RunFolder
 from gs2d.pipeline.demo import demo

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from ball_runs import options
-from gs2d.core.files import disk_error
+from gs2d.core.atomic_files import disk_error
 from gs2d.errors import DiskError, ProtocolError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.attempts import attempted

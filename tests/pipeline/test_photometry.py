@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from ball_runs import SMALL, options
-from gs2d.core.photometry import reach_of
+from gs2d.core.vignetting import reach_of
 from gs2d.io.run_dir import PHOTOMETRY, REPORT, RunFolder
 from gs2d.pipeline.prepare.loaded import reload_run
 from gs2d.pipeline.prepare.run_appearance import as_scene, photographed

@@ -18,7 +18,7 @@ from gs2d.config.recipe import LearningRates, Recipe
 from gs2d.config.robust import Removal
 from gs2d.config.serialize import to_json
 from gs2d.core.camera import look_at
-from gs2d.data.priors import ObservedPoints
+from gs2d.data.prior_maps import ObservedPoints
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import RunFolder

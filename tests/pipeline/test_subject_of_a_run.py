@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gs2d.config.protocols import PROTOCOLS
-from gs2d.data.subject import OBJECT, read_subject
+from gs2d.data.subject_box import OBJECT, read_subject
 from gs2d.errors import ProtocolError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RunFolder

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gs2d.core.camera import Camera
-from gs2d.core.photometry import reach_of, squared_radii
+from gs2d.core.vignetting import reach_of, squared_radii
 from gs2d.render.camera_response import bend, show, squares_of, vignetting
 from gs2d.render.exposure_transform import expose, identity
 

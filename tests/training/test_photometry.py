@@ -13,9 +13,9 @@ from gs2d.config.presets import surface
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Exposure, LearningRates, Photometry, Recipe
 from gs2d.core.camera import look_at
-from gs2d.core.photometry import reach_of
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import camera_extent
+from gs2d.core.vignetting import reach_of
 from gs2d.data.camera_models import Lens
 from gs2d.data.scene import Appearance, PointCloud, Scene, View
 from gs2d.data.undistort import Intrinsics

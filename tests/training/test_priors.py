@@ -14,7 +14,7 @@ from gs2d.config.priors import DepthPrior
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import LearningRates, Recipe
 from gs2d.core.transforms import quats_to_matrices
-from gs2d.data.priors import MapFiles, ObservedPoints, PriorDepth
+from gs2d.data.prior_maps import MapFiles, ObservedPoints, PriorDepth
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
 from gs2d.losses.priors import MetricDepth, PointDepths, RelativeDepths

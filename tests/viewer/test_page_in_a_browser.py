@@ -17,7 +17,7 @@ from browser import Page, browser, require_browser
 from gs2d.core.camera import look_at
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.core.splats import Splats
-from gs2d.data.subject import Subject
+from gs2d.data.subject_box import Subject
 from gs2d.meshing.web_mesh import web_mesh
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings

@@ -34,7 +34,7 @@ class FusionLimits:
     depth : str or None
         "mean", "median" or "transmittance": the depth that is fused; None is the one that the losses use.
     subject : bool
-        Mesh what most cameras look at (``data.subject``), cleaned and simplified by evidence; False: all that is
+        Mesh what most cameras look at (``data.subject_box``), cleaned and simplified by evidence; False: all that is
         inside the limits, as the scripts of the data sets do.
     """
 

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from gs2d.core.files import atomic_write, disk_error
+from gs2d.core.atomic_files import atomic_write, disk_error
 from gs2d.errors import DataError
 
 __all__ = ["atomic_write", "disk_error", "read_json", "write_json"]

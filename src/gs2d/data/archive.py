@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from gs2d.core.files import disk_error
+from gs2d.core.atomic_files import disk_error
 from gs2d.core.growth import check_entries, check_growth
 from gs2d.core.missing import holds_photographs, instead
 from gs2d.data.file_names import IMAGES

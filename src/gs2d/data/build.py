@@ -24,7 +24,7 @@ from gs2d.data.faces import GLANCE, LEAST_SHOWN, Face, face_name, face_positions
 from gs2d.data.file_names import in_any_case
 from gs2d.data.image_files import image_size, read_image, read_mask
 from gs2d.data.masks import EMPTY, Masks, find_masks
-from gs2d.data.priors import (
+from gs2d.data.prior_maps import (
     DEPTH_SUFFIXES,
     DEPTHS,
     NORMAL_SUFFIXES,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gs2d.core.images import area_downscale, mask_downscale
+from gs2d.core.image_arrays import area_downscale, mask_downscale
 from gs2d.core.memory import trim
 
 TRIM_EVERY = 16  # decoded images between two calls of trim(), which take a few ms

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gs2d.core.images import is_twice_as_wide
+from gs2d.core.image_arrays import is_twice_as_wide
 from gs2d.data.camera_models import PANORAMA, Lens, model_of
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError

@@ -14,9 +14,9 @@ from typing import IO
 import numpy as np
 from PIL import Image
 
-from gs2d.core.files import atomic_write
+from gs2d.core.atomic_files import atomic_write
 from gs2d.core.growth import check_growth
-from gs2d.core.images import to_uint8
+from gs2d.core.image_arrays import to_uint8
 from gs2d.core.text import first_line
 from gs2d.data.float_images import exr_size, float_tiff, is_exr, read_exr, read_exr_map, read_float_tiff
 from gs2d.errors import DataError, ShapeError

@@ -14,9 +14,9 @@ from gs2d.data.build import Capture, build_scene
 from gs2d.data.file_names import IMAGES, in_any_case
 from gs2d.data.known_captures import missing_lines
 from gs2d.data.masks import Masks, without_masks
+from gs2d.data.readers.capture_readers import READERS, Reader, register_reader
 from gs2d.data.readers.colmap import MODEL_FOLDERS, model_folder, read_colmap
-from gs2d.data.readers.registry import READERS, Reader, register_reader
-from gs2d.data.readers.transforms import CAMERAS, TRAIN, read_blender, read_nerfstudio
+from gs2d.data.readers.json_captures import CAMERAS, TRAIN, read_blender, read_nerfstudio
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
 
@@ -24,7 +24,7 @@ FORMATS = READERS.builtin
 
 
 @dataclass(frozen=True)
-class _Reader:
+class _BuiltinReader:
     """A built-in reader."""
 
     holds: Callable[[Path], object]
@@ -51,7 +51,7 @@ class _Colmap:
 
 
 def _register(name: str, holds: Callable[[Path], object], make: Callable[[Path], Capture], looks_for: str) -> None:
-    made: Callable[[], _Reader] = partial(_Reader, holds, make, looks_for)
+    made: Callable[[], _BuiltinReader] = partial(_BuiltinReader, holds, make, looks_for)
     made.__module__ = __name__
     register_reader(name)(made)
 

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from gs2d.core.files import atomic_write
+from gs2d.core.atomic_files import atomic_write
 from gs2d.core.memory import trim
 from gs2d.core.memory_limit import cache_bytes
 from gs2d.data.build import Decoder

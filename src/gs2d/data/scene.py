@@ -13,11 +13,11 @@ import numpy as np
 
 from gs2d.core.camera import Camera, Zoom
 from gs2d.core.checks import check_shapes
-from gs2d.core.images import composite
+from gs2d.core.image_arrays import composite
 from gs2d.core.memory import trim
 from gs2d.data.cache import DecodedImage, ImageCache
 from gs2d.data.masks import Masks
-from gs2d.data.priors import UNOBSERVED, ObservedPoints, PriorMaps
+from gs2d.data.prior_maps import UNOBSERVED, ObservedPoints, PriorMaps
 from gs2d.data.straighten import straightened_picture
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError

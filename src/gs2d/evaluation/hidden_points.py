@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gs2d.data.priors import PointsInView
+from gs2d.data.prior_maps import PointsInView
 
 NEARER = 0.95  # of a point's depth: a surface before that hides it; SfM depths are good to a few percent
 
@@ -37,7 +37,7 @@ def hidden_points(depth: np.ndarray, points: PointsInView, *, nearer: float = NE
     depth : ndarray [H, W] world units
         Rendered median depth; 0 where nothing was hit, which hides nothing.
     points : PointsInView
-        From :meth:`gs2d.data.priors.ObservedPoints.in_view`.
+        From :meth:`gs2d.data.prior_maps.ObservedPoints.in_view`.
     nearer : float
         A point is hidden where the surface is nearer than this fraction of the point's depth.
     """

@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from gs2d.core.files import disk_error
+from gs2d.core.atomic_files import disk_error
 from gs2d.errors import DiskError, RunError
 
 

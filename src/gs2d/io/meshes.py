@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from gs2d.core.files import atomic_write
+from gs2d.core.atomic_files import atomic_write
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.core.text import first_line
 from gs2d.errors import DataError

@@ -9,7 +9,7 @@
       metrics.json  splats.ply  mesh.ply  mesh.glb (with --texture)  renders/  report.html
       scene.html     the splats as a web page (`gs2d export`)
       poses.json  learned.json  exposure.json  photometry.json  learned properties of images and cameras
-      subject.json   the subject that the cameras look at (data.subject.read_subject)
+      subject.json   the subject that the cameras look at (data.subject_box)
       georeference.json  position of the run in the world, if known
       .lock          held by the process that trains; the operating system releases it when that process ends
 
@@ -37,7 +37,7 @@ from pathlib import Path
 from typing import Any
 
 from gs2d import __version__
-from gs2d.core.files import atomic_write, disk_error, is_temporary, sweep
+from gs2d.core.atomic_files import atomic_write, disk_error, is_temporary, sweep
 from gs2d.core.growth import check_entries
 from gs2d.core.json_files import read_json, write_json
 from gs2d.core.locks import try_lock

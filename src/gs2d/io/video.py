@@ -15,8 +15,8 @@ from pathlib import Path
 
 from PIL import Image
 
+from gs2d.core.atomic_files import atomic_write, disk_error, temporary_beside
 from gs2d.core.extras import FFMPEG
-from gs2d.core.files import atomic_write, disk_error, temporary_beside
 from gs2d.errors import BackendError, DataError
 
 SUFFIXES = (".mp4", ".webp")

@@ -29,7 +29,7 @@ from scipy.sparse import coo_array
 
 from gs2d.core import extras
 from gs2d.core.camera import Camera
-from gs2d.core.images import area_downscale, mask_downscale
+from gs2d.core.image_arrays import area_downscale, mask_downscale
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.errors import ProtocolError
 from gs2d.meshing.agreement import VOTE, Agreement, agree, corrected

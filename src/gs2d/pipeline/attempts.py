@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from gs2d.core.files import is_full
+from gs2d.core.atomic_files import is_full
 from gs2d.errors import Gs2dError
 from gs2d.training.events import NotMade, OnEvent
 

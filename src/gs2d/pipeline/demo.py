@@ -13,7 +13,7 @@ from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, TrainOpt
 from gs2d.pipeline.prepare.resolve import check_options
 from gs2d.pipeline.run_parts import DEMO
 from gs2d.pipeline.train.train_run import check_viewer, train
-from gs2d.synthetic.capture import write_demo_capture
+from gs2d.synthetic.demo_capture import write_demo_capture
 from gs2d.synthetic.perturb_exposure import GAINS
 from gs2d.synthetic.perturb_poses import TRUTH as TRUE_POSES
 from gs2d.training.events import OnEvent, Phase, RunPlan, Step, ignore

@@ -17,7 +17,7 @@ from gs2d.config.recipe import Recipe
 from gs2d.core.mesh import Mesh
 from gs2d.core.splats import Splats
 from gs2d.data import Scene, load_scene
-from gs2d.data.subject import OBJECT
+from gs2d.data.subject_box import OBJECT
 from gs2d.errors import DataError, ProtocolError
 from gs2d.evaluation.image_metrics import ImageMetrics, mean_metrics
 from gs2d.evaluation.lpips import Lpips

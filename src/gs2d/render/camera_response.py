@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gs2d.core.camera import Camera
-from gs2d.core.photometry import squared_radii
+from gs2d.core.vignetting import squared_radii
 from gs2d.kernels.library import library_for
 from gs2d.render import photometry_native as native
 

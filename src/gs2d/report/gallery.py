@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.core.images import composite
+from gs2d.core.image_arrays import composite
 from gs2d.core.json_files import read_json
 from gs2d.data.image_files import read_image
 from gs2d.errors import DataError

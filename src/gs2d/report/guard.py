@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeVar
 
-from gs2d.core.files import is_full
+from gs2d.core.atomic_files import is_full
 from gs2d.core.memory import trim
 
 T = TypeVar("T")

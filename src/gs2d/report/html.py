@@ -20,7 +20,7 @@ from markupsafe import Markup, escape
 from PIL import Image
 
 from gs2d.config.grades import GRADES
-from gs2d.core.images import composite, to_uint8
+from gs2d.core.image_arrays import composite, to_uint8
 from gs2d.core.text import name_bytes
 
 

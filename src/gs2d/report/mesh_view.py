@@ -15,7 +15,7 @@ import numpy as np
 from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
 from gs2d.core.transforms import up_direction
-from gs2d.data.subject import read_subject
+from gs2d.data.subject_box import read_subject
 from gs2d.io.meshes import read_mesh, read_textured
 from gs2d.io.run_dir import MESH, TEXTURED
 from gs2d.meshing.simplify import collapse

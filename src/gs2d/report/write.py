@@ -12,8 +12,8 @@ from pathlib import Path
 
 from markupsafe import Markup
 
+from gs2d.core.atomic_files import atomic_write
 from gs2d.core.camera import Camera
-from gs2d.core.files import atomic_write
 from gs2d.io.run_dir import REPORT
 from gs2d.report.first_screen import first_screen
 from gs2d.report.guard import Guard, OnFailure

@@ -17,8 +17,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any
 
+from gs2d.core.atomic_files import atomic_write
 from gs2d.core.extras import install
-from gs2d.core.files import atomic_write
 from gs2d.errors import BackendError, DataError
 
 OnProgress = Callable[[str, int, int], None]  # name of the phase, finished steps, total steps

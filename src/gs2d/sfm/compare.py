@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.core.files import atomic_write
+from gs2d.core.atomic_files import atomic_write
 from gs2d.sfm.pairs import Chosen, chosen, near_pairs, neighbour_pairs, similar_pairs
 from gs2d.sfm.panoramas import FINER, PANORAMA
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from PIL import ExifTags, Image
 
-from gs2d.core.files import atomic_write, disk_error
+from gs2d.core.atomic_files import atomic_write, disk_error
 from gs2d.data.exif import DAMAGED_EXIF
 from gs2d.data.image_files import is_float, open_image, read_image
 from gs2d.errors import DataError

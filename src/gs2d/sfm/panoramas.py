@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from PIL import Image
 
-from gs2d.core.images import is_twice_as_wide
+from gs2d.core.image_arrays import is_twice_as_wide
 
 PANORAMA = "EQUIRECTANGULAR"
 FINER = 2  # times --feature-size: a panorama covers four times the field of view of a photograph

@@ -12,7 +12,7 @@ from types import MappingProxyType
 import numpy as np
 from PIL import Image
 
-from gs2d.core.files import disk_error
+from gs2d.core.atomic_files import disk_error
 from gs2d.data.file_names import in_any_case
 from gs2d.data.image_files import image_size, read_mask, write_image
 from gs2d.data.masks import FOLDER, Masks, find_masks, find_masks_in

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from gs2d.core.images import is_twice_as_wide, natural_key
+from gs2d.core.image_arrays import is_twice_as_wide, natural_key
 from gs2d.core.missing import belongs_to_run, instead, where_it_ends
 from gs2d.data.exif import Taken, read_taken
 from gs2d.data.image_files import read_image

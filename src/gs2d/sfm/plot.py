@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gs2d.core.files import atomic_write
+from gs2d.core.atomic_files import atomic_write
 from gs2d.sfm.model import SfmModel, focal_length
 
 MAX_POINTS = 20_000

@@ -8,7 +8,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from gs2d.core.files import atomic_write
+from gs2d.core.atomic_files import atomic_write
 
 
 class Steps:

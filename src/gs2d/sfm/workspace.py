@@ -12,7 +12,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from gs2d.core.files import disk_error
+from gs2d.core.atomic_files import disk_error
 from gs2d.core.json_files import read_json
 from gs2d.data.masks import FOLDER as MASKS
 from gs2d.errors import DataError, DiskError, RunError

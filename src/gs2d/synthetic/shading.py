@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gs2d.meshing.raycast import Hits, occluded
-from gs2d.synthetic.scene import ToyScene
+from gs2d.synthetic.demo_scene import ToyScene
 
 _LAMP = np.array([-0.70, -0.55, 1.0]) / np.linalg.norm([-0.70, -0.55, 1.0])  # unit, towards the lamp
 _LAMP_COLOR = np.array([1.80, 1.62, 1.36])

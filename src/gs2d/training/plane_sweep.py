@@ -21,7 +21,7 @@ from gs2d.core.memory import trim
 from gs2d.core.memory_limit import cache_bytes
 from gs2d.core.spill import Spilled
 from gs2d.core.transforms import nearest_distances
-from gs2d.data.priors import ObservedPoints
+from gs2d.data.prior_maps import ObservedPoints
 from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.errors import DataError
 from gs2d.kernels.sweep import BestPlanes, sweep_planes

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gs2d.data.priors import ObservedPoints
+from gs2d.data.prior_maps import ObservedPoints
 from gs2d.data.scene import Scene, View
 
 HALF = 2  # px: colours are means of patches of 5x5

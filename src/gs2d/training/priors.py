@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from gs2d.config.priors import DepthPrior, NormalPrior
 from gs2d.config.recipe import Recipe
 from gs2d.core.memory_limit import cache_bytes
-from gs2d.data.priors import ObservedPoints, PointsInView, PriorDepth
+from gs2d.data.prior_maps import ObservedPoints, PointsInView, PriorDepth
 from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.errors import DataError
 from gs2d.losses.priors import Depths, MetricDepth, NormalTarget, PointDepths, Prior, RelativeDepths, fit_line

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from gs2d.data.priors import ObservedPoints
+from gs2d.data.prior_maps import ObservedPoints
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gs2d.core.camera import Camera
-from gs2d.data.subject import OBJECT, SCENE, Subject
+from gs2d.data.subject_box import OBJECT, SCENE, Subject
 
 MIN_GAP = math.radians(100.0)  # angle without photographs from which a capture counts as one-sided
 MARGIN = math.radians(12.0)  # visitors may turn this far beyond the outermost photographs, sideways and down

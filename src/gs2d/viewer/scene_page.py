@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 
+from gs2d.core.atomic_files import atomic_write
 from gs2d.core.camera import Camera
-from gs2d.core.files import atomic_write
 from gs2d.core.splats import Splats
 from gs2d.core.text import printable
-from gs2d.data.subject import OBJECT, Subject
+from gs2d.data.subject_box import OBJECT, Subject
 from gs2d.render.types import NEAR_PLANE_POLICIES, RasterSettings
 from gs2d.viewer.opening_view import guessed_subject, opening_camera, photographed_arc
 from gs2d.viewer.packed_splats import PackedSplats, pack_splats

@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from ball_runs import options as training
 from gs2d.cli import run as gs2d
-from gs2d.contrib.survey.commands import GeoreferenceOptions
 from gs2d.contrib.survey.find_georeference import georeference_run
 from gs2d.contrib.survey.georeference import Georeference, read_georeference, write_georeference
 from gs2d.contrib.survey.projection import Projection
+from gs2d.contrib.survey.survey_commands import GeoreferenceOptions
 from gs2d.core.json_files import read_json
 from gs2d.data.positions import to_enu
 from gs2d.io.formats.splat_formats import read_splat_file

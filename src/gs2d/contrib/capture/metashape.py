@@ -28,8 +28,8 @@ from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world, skip
 from gs2d.data.camera_models import Lens
 from gs2d.data.faces import panorama
 from gs2d.data.file_names import files_ending, in_any_case
+from gs2d.data.readers.capture_readers import register_reader
 from gs2d.data.readers.common import find_photographs, head, points_beside, real, reals, whole
-from gs2d.data.readers.registry import register_reader
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
 

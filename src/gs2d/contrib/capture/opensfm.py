@@ -21,8 +21,8 @@ from gs2d.data.camera_models import Lens
 from gs2d.data.faces import panorama
 from gs2d.data.file_names import in_any_case
 from gs2d.data.image_files import image_size
+from gs2d.data.readers.capture_readers import register_reader
 from gs2d.data.readers.common import entries, find_photographs, real, reals, required, whole
-from gs2d.data.readers.registry import register_reader
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from gs2d.contrib.formats.gltf_document import GltfDocument, node_matrices, read_document
-from gs2d.core.files import atomic_write
+from gs2d.core.atomic_files import atomic_write
 from gs2d.core.growth import check_growth
 from gs2d.core.sh import C0
 from gs2d.core.splats import Splats

@@ -25,7 +25,7 @@ from PIL import Image
 
 from gs2d.contrib.formats.compressed_ply import morton_order
 from gs2d.contrib.formats.sog_palette import codebook, nearest_code, palette
-from gs2d.core.files import atomic_write
+from gs2d.core.atomic_files import atomic_write
 from gs2d.core.growth import check_entries, check_growth
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError

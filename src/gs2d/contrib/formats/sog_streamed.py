@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from gs2d.contrib.formats.compressed_ply import morton_order
 from gs2d.contrib.formats.levels import halved
 from gs2d.contrib.formats.sog import packed_sog
-from gs2d.core.files import atomic_write, disk_error
+from gs2d.core.atomic_files import atomic_write, disk_error
 from gs2d.core.splats import Splats
 from gs2d.io.formats.splat_formats import register_format
 from gs2d.io.gaussians import Gaussians, unit_quats

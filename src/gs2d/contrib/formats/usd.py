@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from gs2d.contrib.formats import usd_process
+from gs2d.core.atomic_files import atomic_write, disk_error
 from gs2d.core.extras import install
-from gs2d.core.files import atomic_write, disk_error
 from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, DataError
 from gs2d.io.formats.splat_formats import register_format, register_splat_reader

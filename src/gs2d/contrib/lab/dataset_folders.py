@@ -24,7 +24,7 @@ from gs2d.contrib.lab.datasets import (
     SceneFacts,
     get_dataset,
 )
-from gs2d.core.images import is_number
+from gs2d.core.image_arrays import is_number
 from gs2d.core.json_files import read_json
 from gs2d.data.known_captures import DATA_SETS
 from gs2d.data.readers.colmap import read_images

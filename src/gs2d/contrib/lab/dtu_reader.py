@@ -12,12 +12,13 @@ from scipy.linalg import rq
 
 from gs2d.contrib.lab.dataset_folders import CAMERA_FILES
 from gs2d.core.camera import Camera
-from gs2d.core.images import is_number, natural_key
+from gs2d.core.image_arrays import is_number, natural_key
 from gs2d.data.arrays import read_npz
 from gs2d.data.build import Capture, PosedImage
 from gs2d.data.file_names import in_any_case
 from gs2d.data.image_files import image_size
-from gs2d.data.priors import ObservedPoints
+from gs2d.data.prior_maps import ObservedPoints
+from gs2d.data.readers.capture_readers import register_reader
 from gs2d.data.readers.colmap import (
     ColmapCamera,
     ColmapImage,
@@ -27,7 +28,6 @@ from gs2d.data.readers.colmap import (
     read_cameras,
     read_images,
 )
-from gs2d.data.readers.registry import register_reader
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, colmap_intrinsics
 from gs2d.errors import DataError

@@ -22,7 +22,7 @@ import numpy as np
 from gs2d.contrib.lab.alignment import IcpResult, icp, uniform_downsample, voxel_downsample
 from gs2d.contrib.lab.surface_protocols import TNT_SURFACE, IcpStage, TntSurface
 from gs2d.core.checks import check_shapes
-from gs2d.core.images import natural_key
+from gs2d.core.image_arrays import natural_key
 from gs2d.core.json_files import read_json
 from gs2d.core.mesh import Mesh
 from gs2d.core.similarity import RobustFit, apply, ransac_similarity, rotation_degrees, similarity_scale

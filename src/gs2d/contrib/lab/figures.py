@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gs2d.config.recipe import RankByError, Recipe
 from gs2d.config.serialize import from_json
-from gs2d.core.files import atomic_write
+from gs2d.core.atomic_files import atomic_write
 from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.errors import Gs2dError

@@ -19,7 +19,7 @@ from gs2d.contrib.lab.scenes import FoundScene
 from gs2d.contrib.lab.surface_protocols import DTU_SURFACE, TNT_SURFACE
 from gs2d.contrib.lab.tables import DTU, TNT, PaperRow, PaperTable
 from gs2d.contrib.lab.tasks import failures
-from gs2d.core.files import atomic_write
+from gs2d.core.atomic_files import atomic_write
 from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import RunError
 from gs2d.evaluation.visible_surface import VISIBLE_SURFACE

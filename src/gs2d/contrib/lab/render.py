@@ -20,7 +20,7 @@ from markupsafe import Markup
 from gs2d.config.presets import about_recipe, get_recipe
 from gs2d.contrib.lab.aggregate import FIGURES, Cell, ClaimResult, Results, Row
 from gs2d.contrib.lab.tables import LOWER_IS_BETTER, METRICS, PaperTable, printed
-from gs2d.core.files import atomic_write
+from gs2d.core.atomic_files import atomic_write
 from gs2d.data.image_files import read_image
 from gs2d.errors import Gs2dError
 from gs2d.io.run_dir import RENDERS

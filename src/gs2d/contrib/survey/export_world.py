@@ -17,7 +17,7 @@ import numpy as np
 
 from gs2d.contrib.survey.georeference import Georeference, required_georeference
 from gs2d.contrib.survey.projection import wkt_of
-from gs2d.core.files import atomic_write
+from gs2d.core.atomic_files import atomic_write
 from gs2d.core.json_files import write_json
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import transform_splats

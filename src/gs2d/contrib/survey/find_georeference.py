@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.contrib.survey.commands import GeoreferenceOptions
 from gs2d.contrib.survey.control import Located, locate, read_control
 from gs2d.contrib.survey.fit import Fit, cameras_up, fit_places
 from gs2d.contrib.survey.georeference import (
@@ -24,6 +23,7 @@ from gs2d.contrib.survey.georeference import (
 )
 from gs2d.contrib.survey.markers import Marker, detected, detector, in_run
 from gs2d.contrib.survey.projection import MapFrame, in_frame
+from gs2d.contrib.survey.survey_commands import GeoreferenceOptions
 from gs2d.core.camera import Camera
 from gs2d.core.similarity import rotation_to_z
 from gs2d.data import View

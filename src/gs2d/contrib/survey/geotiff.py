@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from gs2d.core.atomic_files import atomic_write
 from gs2d.core.extras import required
-from gs2d.core.files import atomic_write
 
 NO_DATA = -9999.0  # of elevations; what maps of heights use
 _TILE = (256, 256)

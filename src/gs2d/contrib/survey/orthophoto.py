@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from gs2d.contrib.survey.commands import OrthophotoOptions
 from gs2d.contrib.survey.georeference import Georeference, required_georeference
 from gs2d.contrib.survey.geotiff import NO_DATA, write_geotiff
+from gs2d.contrib.survey.survey_commands import OrthophotoOptions
+from gs2d.core.atomic_files import check_writable
 from gs2d.core.extras import required
-from gs2d.core.files import check_writable
 from gs2d.core.mesh import Mesh
 from gs2d.errors import ProtocolError, RunError
 from gs2d.io.meshes import read_mesh

@@ -5,10 +5,10 @@ from __future__ import annotations
 import shlex
 
 from gs2d.cli.console import Console
-from gs2d.contrib.survey.commands import GeoreferenceCommand, Orthophoto
 from gs2d.contrib.survey.export_world import export_world
 from gs2d.contrib.survey.find_georeference import georeference_run
 from gs2d.contrib.survey.orthophoto import orthophoto_run
+from gs2d.contrib.survey.survey_commands import GeoreferenceCommand, Orthophoto
 
 
 def show_georeference(command: GeoreferenceCommand, console: Console) -> None:

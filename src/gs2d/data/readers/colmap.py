@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gs2d.core.images import is_number, natural_key
+from gs2d.core.image_arrays import is_number, natural_key
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.data.build import Capture, PosedImage, skipping
 from gs2d.data.faces import panorama
 from gs2d.data.file_names import in_any_case
 from gs2d.data.image_files import image_size
-from gs2d.data.priors import ObservedPoints
-from gs2d.data.readers.common import Photograph, find_photographs, parsed
+from gs2d.data.prior_maps import ObservedPoints
+from gs2d.data.readers.common import ImageFile, find_photographs, parsed
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, colmap_intrinsics
 from gs2d.errors import DataError, UnusableViewError
@@ -529,7 +529,7 @@ def _intrinsics(path: Path, cameras: dict[int, ColmapCamera], image: ColmapImage
     return colmap_intrinsics(where, camera.model, camera.width, camera.height, camera.params)
 
 
-def _photographs(root: Path, model: Path, kind: str, images: list[ColmapImage]) -> tuple[Path, dict[str, Photograph]]:
+def _photographs(root: Path, model: Path, kind: str, images: list[ColmapImage]) -> tuple[Path, dict[str, ImageFile]]:
     """Return the folder that holds ``images`` and ``sparse``, and the image files by name in the model."""
     homes = list(dict.fromkeys([root, model.parent, model.parent.parent]))
     listing = _file(model, "images", kind)
@@ -547,7 +547,7 @@ def _photographs(root: Path, model: Path, kind: str, images: list[ColmapImage]) 
     )
 
 
-def _found(images: list[ColmapImage], folders: list[Path], listing: Path) -> dict[str, Photograph]:
+def _found(images: list[ColmapImage], folders: list[Path], listing: Path) -> dict[str, ImageFile]:
     reason = f"no such file in {folders[0].name}"
     return find_photographs([image.name for image in images], folders, listing, reason=reason)
 

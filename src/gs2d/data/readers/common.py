@@ -109,7 +109,7 @@ def required(entry: Mapping[str, Any], key: str, where: str) -> Any:
 
 # -- photographs by their names ----------------------------------------------------------------------------------------
 @dataclass(frozen=True)
-class Photograph:
+class ImageFile:
     """The image file of a name in a camera file: path and name in the scene, or the reason why there is none."""
 
     path: Path | None
@@ -125,7 +125,7 @@ def find_photographs(
     base: Path | None = None,
     homes: Sequence[Path] = (),
     reason: str = "",
-) -> dict[str, Photograph]:
+) -> dict[str, ImageFile]:
     """Find the image file of each name in a camera file; the suffix is optional (see ``Files`` for the rules).
 
     Parameters
@@ -166,12 +166,12 @@ def find_photographs(
             other = files.of_stem(name, IMAGES, NO_PHOTOGRAPHS)
             if other is not None:
                 why += f"; {other.parent.name}/{other.name} exists: use its suffix in the camera file"
-            found[name] = Photograph(None, reason=why)
+            found[name] = ImageFile(None, reason=why)
         elif match.path.suffix.lower() in UNREAD and head(match.path)[4:8] == _BOXES:
             suffix = match.path.suffix.lower()
-            found[name] = Photograph(None, reason=f"{suffix[1:].upper()} cannot be read; {remedy(suffix)}")
+            found[name] = ImageFile(None, reason=f"{suffix[1:].upper()} cannot be read; {remedy(suffix)}")
         else:
-            found[name] = Photograph(match.path, name_below(match.path, homes))
+            found[name] = ImageFile(match.path, name_below(match.path, homes))
     return found
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import gs2d
-from gs2d.core.files import atomic_write
+from gs2d.core.atomic_files import atomic_write
 from gs2d.errors import BackendError, DiskError
 from gs2d.kernels.cuda.shipped import INTEGRATED, SHIPPED, Shipped, digest_of
 from gs2d.kernels.cuda.shipped import shipped as _shipped

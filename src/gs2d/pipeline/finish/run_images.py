@@ -15,16 +15,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gs2d.core.atomic_files import check_writable
 from gs2d.core.camera import Camera
 from gs2d.core.extras import FFMPEG
-from gs2d.core.files import check_writable
 from gs2d.core.json_files import write_json
 from gs2d.core.sh import rgb_to_sh0
 from gs2d.core.splats import Splats
 from gs2d.core.text import name_bytes
 from gs2d.data import Scene, View
 from gs2d.data.image_files import write_image
-from gs2d.data.subject import OBJECT, read_subject
+from gs2d.data.subject_box import OBJECT, read_subject
 from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import (
     LOCK,

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from gs2d.core.files import disk_error, is_full
+from gs2d.core.atomic_files import disk_error, is_full
 from gs2d.core.memory_limit import memory_budget
 from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.data.reach import Reach
-from gs2d.data.subject import LARGEST, Subject, checked_box
+from gs2d.data.subject_box import LARGEST, Subject, checked_box
 from gs2d.errors import ProtocolError, RunError
 from gs2d.evaluation.image_metrics import ImageMetrics
 from gs2d.io.meshes import write_mesh

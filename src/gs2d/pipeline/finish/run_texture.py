@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from gs2d.core.files import check_writable
-from gs2d.core.images import to_uint8
+from gs2d.core.atomic_files import check_writable
+from gs2d.core.image_arrays import to_uint8
 from gs2d.core.memory import trim
 from gs2d.core.mesh import Mesh
 from gs2d.core.splats import Splats

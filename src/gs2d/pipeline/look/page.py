@@ -18,7 +18,7 @@ from gs2d.core.missing import where_it_ends
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import focus_point, up_direction
 from gs2d.data import View
-from gs2d.data.subject import Subject, read_subject
+from gs2d.data.subject_box import Subject, read_subject
 from gs2d.errors import DataError, RunError
 from gs2d.io.formats.splat_formats import read_splats
 from gs2d.io.meshes import read_mesh, read_textured

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gs2d.config.protocols import Protocol
 from gs2d.config.recipe import Recipe
-from gs2d.core.files import atomic_write
+from gs2d.core.atomic_files import atomic_write
 from gs2d.core.splats import Splats
 from gs2d.data import Scene
 from gs2d.data.arrays import read_npz

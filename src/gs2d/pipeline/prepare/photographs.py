@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from gs2d.core.files import disk_error
+from gs2d.core.atomic_files import disk_error
 from gs2d.data import Scene
 from gs2d.data.prepared import (
     check_disk,

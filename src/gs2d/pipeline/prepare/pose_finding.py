@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gs2d.core.images import natural_key
+from gs2d.core.image_arrays import natural_key
 from gs2d.core.json_files import write_json
 from gs2d.data import load_scene
 from gs2d.data.masks import FOLDER

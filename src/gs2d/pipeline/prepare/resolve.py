@@ -21,7 +21,7 @@ from gs2d.config.robust import FEW_VIEWS
 from gs2d.config.schedule import fit_schedule, longer_steps, scale_schedule
 from gs2d.config.serialize import apply_overrides
 from gs2d.data import Scene, load_scene
-from gs2d.data.subject import check_subject_box
+from gs2d.data.subject_box import check_subject_box
 from gs2d.errors import ProtocolError, RecipeError
 from gs2d.losses.api import losses_of
 from gs2d.pipeline.prepare.open_capture import OpenCapture, without_masked_points

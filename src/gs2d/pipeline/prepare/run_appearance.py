@@ -19,7 +19,7 @@ from torch import Tensor
 from gs2d.config.quantities import QUANTITIES
 from gs2d.config.recipe import Recipe
 from gs2d.core.json_files import read_json, write_json
-from gs2d.core.photometry import reach_of
+from gs2d.core.vignetting import reach_of
 from gs2d.data import Scene, View
 from gs2d.data.scene import Appearance
 from gs2d.errors import DataError, RunError

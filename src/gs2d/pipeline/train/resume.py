@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gs2d.core.files import sweep
+from gs2d.core.atomic_files import sweep
 from gs2d.errors import RunError, ShapeError
 from gs2d.io.run_dir import (
     CheckpointFile,

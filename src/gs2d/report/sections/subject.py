@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from gs2d.core.atomic_files import atomic_write
 from gs2d.core.camera import Camera
-from gs2d.core.files import atomic_write
 from gs2d.data.image_files import read_image
-from gs2d.data.subject import OBJECT, Subject, read_subject
+from gs2d.data.subject_box import OBJECT, Subject, read_subject
 from gs2d.io.run_dir import RENDERS
 from gs2d.report.html import render
 from gs2d.report.record import RunRecord

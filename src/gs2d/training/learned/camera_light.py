@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gs2d.config.quantities import QUANTITIES, Photometry
 from gs2d.core.camera import Camera
-from gs2d.core.photometry import reach_of
+from gs2d.core.vignetting import reach_of
 from gs2d.data.scene import Scene
 from gs2d.render.camera_response import bend, show, vignetting
 from gs2d.training.learned.quantity import ImagePoints, LearnedQuantity

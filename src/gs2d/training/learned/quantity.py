@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gs2d.config.quantities import Learning
 from gs2d.core.camera import Camera
-from gs2d.core.photometry import reach_of
+from gs2d.core.vignetting import reach_of
 from gs2d.data.scene import Scene, View
 from gs2d.render.camera_response import squares_of
 from gs2d.training.targets import Target

@@ -10,7 +10,7 @@ from PIL import Image
 
 from capture_writers import small_colmap, small_nerfstudio
 from gs2d.data import load_scene
-from gs2d.data.priors import read_depth, read_normals, sample, shrink
+from gs2d.data.prior_maps import read_depth, read_normals, sample, shrink
 from gs2d.data.scene import View
 from gs2d.errors import DataError
 

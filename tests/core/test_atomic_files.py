@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from gs2d.core.files import sweep
+from gs2d.core.atomic_files import sweep
 from gs2d.core.json_files import atomic_write, read_json, write_json
 from gs2d.errors import DataError, DiskError
 

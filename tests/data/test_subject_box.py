@@ -9,7 +9,7 @@ import pytest
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.json_files import write_json
-from gs2d.data.subject import Sight, Subject, find_subject, given_subject, middle_weights, read_subject
+from gs2d.data.subject_box import Sight, Subject, find_subject, given_subject, middle_weights, read_subject
 from gs2d.errors import DataError
 
 UP = np.array([0.0, 0.0, 1.0])

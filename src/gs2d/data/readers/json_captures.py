@@ -18,8 +18,8 @@ from gs2d.data.faces import panorama
 from gs2d.data.file_names import Files, in_any_case
 from gs2d.data.image_files import image_size
 from gs2d.data.masks import FOLDER
-from gs2d.data.priors import DEPTHS, NORMALS, MapFiles
-from gs2d.data.readers.common import Photograph, find_photographs
+from gs2d.data.prior_maps import DEPTHS, NORMALS, MapFiles
+from gs2d.data.readers.common import ImageFile, find_photographs
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError, UnusableViewError
@@ -130,7 +130,7 @@ def _read_frames(entries: Sequence[_Entry], path: Path) -> tuple[list[PosedImage
     return frames, skipped, notes
 
 
-def _photographs(names: Sequence[str], path: Path) -> dict[str, Photograph]:
+def _photographs(names: Sequence[str], path: Path) -> dict[str, ImageFile]:
     root = path.parent
     return find_photographs(names, [in_any_case(root, "images"), root], path, base=root, homes=[root])
 
