@@ -14,7 +14,7 @@ import torch
 from gs2d.errors import BackendError
 from gs2d.kernels.library import load
 from gs2d.report import first_screen, plots
-from gs2d.synthetic import capture
+from gs2d.synthetic import demo_capture
 
 PICTURES_MATTER = ("report", "contrib/lab/test_figures.py")
 DEMO_IS_TESTED = ("synthetic",)
@@ -40,24 +40,24 @@ def cheap_reports(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
-_light: dict[capture.ToyScene, capture.BakedLight] = {}
-_demo_scene = functools.cache(capture.build_scene)
+_light: dict[demo_capture.ToyScene, demo_capture.BakedLight] = {}
+_demo_scene = functools.cache(demo_capture.build_scene)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def cheap_demo_captures(request: pytest.FixtureRequest) -> Iterator[None]:
     """Bake the light of the demo scene once per process: 4 s. Its own tests bake it each time."""
-    bake = capture.bake
+    bake = demo_capture.bake
 
-    def baked(scene: capture.ToyScene, *, threads: int) -> capture.BakedLight:
+    def baked(scene: demo_capture.ToyScene, *, threads: int) -> demo_capture.BakedLight:
         if scene not in _light:
             _light[scene] = bake(scene, threads=threads)
         return _light[scene]
 
     with pytest.MonkeyPatch.context() as patch:
         if not _tests_of(request, DEMO_IS_TESTED):
-            patch.setattr(capture, "build_scene", _demo_scene)
-            patch.setattr(capture, "bake", baked)
+            patch.setattr(demo_capture, "build_scene", _demo_scene)
+            patch.setattr(demo_capture, "bake", baked)
         yield
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gs2d.core import images
+from gs2d.core import image_arrays as images
 from gs2d.core.image_arrays import area_downscale, composite, natural_key, to_uint8
 from gs2d.errors import ShapeError
 

@@ -26,7 +26,7 @@ from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.loaded import open_finished
 from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, RenderOptions, TrainOptions
 from gs2d.pipeline.train.train_run import train
-from gs2d.synthetic import capture as toy
+from gs2d.synthetic import demo_capture as toy
 from gs2d.synthetic.perturb_exposure import GAINS, random_gains, with_gains
 from gs2d.training.events import Event, Notice, ignore
 

@@ -26,7 +26,7 @@ from gs2d.pipeline.prepare.loaded import open_finished, reload_run
 from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, RenderOptions, TextureOptions, TrainOptions
 from gs2d.pipeline.prepare.run_poses import aligned, how_far
 from gs2d.pipeline.train.train_run import train
-from gs2d.synthetic import capture as toy
+from gs2d.synthetic import demo_capture as toy
 from gs2d.synthetic.perturb_poses import TRUTH
 from gs2d.training.events import Event, Notice, Step, ignore
 
