@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from benchmarks.mesh_images import mesh_images
 from gs2d.core.camera import Camera
 from gs2d.data.image_files import write_image
 from gs2d.io.meshes import read_mesh
-from gs2d.report.mesh_images import mesh_images
 
 
 def views_of(run: Path) -> int:

@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
+from benchmarks.mesh_images import mesh_images
 from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, RunFolder
 from gs2d.pipeline.prepare.loaded import reload_run
-from gs2d.report.mesh_images import mesh_images
 from gs2d.training.events import ignore
 
 SHADES = 64  # of clay: a third of the bytes, and nobody sees it

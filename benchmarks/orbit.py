@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from benchmarks.mesh_images import mesh_images
 from gs2d.core.camera import Camera
 from gs2d.data.subject_box import OBJECT, read_subject
 from gs2d.io.meshes import read_mesh
@@ -23,7 +24,6 @@ from gs2d.pipeline.finish.camera_paths import orbit_cameras
 from gs2d.pipeline.finish.run_images import render_run
 from gs2d.pipeline.prepare.loaded import reload_run
 from gs2d.pipeline.prepare.options import RenderOptions
-from gs2d.report.mesh_images import mesh_images
 from gs2d.training.events import ignore
 
 

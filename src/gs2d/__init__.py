@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from gs2d.render.backends import backend_report, get_backend, register_backend
     from gs2d.render.tensor_api import rasterize_2dgs
     from gs2d.render.types import RasterSettings, RenderOutput
-    from gs2d.report.sections.registry import register_section
+    from gs2d.report.sections.section_registry import register_section
     from gs2d.training.learned.quantity import LearnedQuantity
     from gs2d.training.trainer import Trainer, TrainerOptions
 
@@ -143,7 +143,7 @@ _HOME = {
     "register_quantity": "gs2d.config.quantities",
     "register_reader": "gs2d.data.readers.capture_readers",
     "register_recipe": "gs2d.config.presets",
-    "register_section": "gs2d.report.sections.registry",
+    "register_section": "gs2d.report.sections.section_registry",
     "register_splat_reader": "gs2d.io.formats.splat_formats",
     "rgb_to_sh0": "gs2d.core.sh",
     "splat_errors": "gs2d.render.api",

@@ -184,7 +184,7 @@ def test_what_could_not_be_made_is_exit_code_3_and_names_the_command_that_makes_
         raise ValueError("broken data stream")
 
     copy = Path(shutil.copytree(trained, tmp_path / "run"))
-    monkeypatch.setattr("gs2d.report.sections.training.curves", broken)
+    monkeypatch.setattr("gs2d.report.sections.training_section.curves", broken)
     assert run(["report", str(copy), "--json", *["--quiet"] * quiet]) == app_module.INCOMPLETE == 3
     out, err = capsys.readouterr()
     said = "fault in gs2d: ValueError: broken data stream"

@@ -15,7 +15,7 @@ from gs2d.data.known_captures import DATA_SETS
 from gs2d.data.readers.capture_readers import READERS
 from gs2d.evaluation.evaluators import EVALUATORS
 from gs2d.io.formats.splat_formats import LAYOUTS, SPLAT_READERS
-from gs2d.report.sections.registry import SECTIONS
+from gs2d.report.sections.section_registry import SECTIONS
 from tiny import write_capture
 
 SOURCE = Path(gs2d.__file__).parent

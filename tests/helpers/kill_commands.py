@@ -102,7 +102,7 @@ def draw_little() -> None:
 
 def import_all(names: list[str]) -> None:
     """Import what a child had imported at its end, so that no later child takes time for it; warm what is cached."""
-    from gs2d.report.html import environment
+    from gs2d.report.html_parts import environment
 
     for name in names:
         with contextlib.suppress(Exception):

@@ -14,7 +14,7 @@ from gs2d.core.mesh import Mesh
 from gs2d.data.image_files import write_image
 from gs2d.io.meshes import write_mesh
 from gs2d.meshing.raycast import cast_camera
-from gs2d.report.images import depth_image, error_image, highlight_image, normal_image
+from gs2d.report.color_maps import depth_image, error_image, highlight_image, normal_image
 from gs2d.synthetic.shapes import torus_knot, tube
 
 STAGES = (("surface", 3000), ("appearance", 1000), ("refine", 2000))

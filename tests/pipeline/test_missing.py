@@ -114,7 +114,7 @@ def test_a_section_that_fails_loses_no_other_section(
     undisturbed: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
-    monkeypatch.setattr("gs2d.report.sections.training.curves", failing(RuntimeError("no curve today")))
+    monkeypatch.setattr("gs2d.report.sections.training_section.curves", failing(RuntimeError("no curve today")))
     (copy / "renders" / "index.json").write_text("{")
     heard: list[Event] = []
     report_run(copy, heard.append)

@@ -19,8 +19,8 @@ from gs2d.pipeline.finish.run_mesh import extract_mesh
 from gs2d.pipeline.finish.run_subject import meshed_subject, subject_line
 from gs2d.pipeline.prepare.loaded import finished_splats, reload_run
 from gs2d.pipeline.prepare.options import MeshOptions
-from gs2d.report.record import read_record
-from gs2d.report.sections.subject import subject_section
+from gs2d.report.run_record import read_record
+from gs2d.report.sections.settings_section import settings_section
 from gs2d.training.events import Notice
 
 BOX = (-0.5, -0.6, -0.7, 0.5, 0.6, 0.7)
@@ -29,11 +29,9 @@ BOX = (-0.5, -0.6, -0.7, 0.5, 0.6, 0.7)
 def test_training_writes_the_subject_and_only_the_generic_protocol_meshes_it(undisturbed: RunFolder) -> None:
     subject = read_subject(undisturbed.path)
     assert subject is not None
-    shown = str(subject_section(read_record(undisturbed.path)))  # in the report: words, the box and the picture
-    assert subject.why in shown
+    assert subject.why in str(settings_section(read_record(undisturbed.path)))
     assert subject_line(subject, meshed=True).endswith("--scene takes everything")
     assert "the mesh is of everything" in subject_line(subject, meshed=False)
-    assert "data:image/jpeg;base64," in shown
     job, splats = reload_run(undisturbed, lambda _: None), finished_splats(undisturbed)
     assert job.protocol.name == "nerf-synthetic"
     assert meshed_subject(undisturbed, job, splats, MeshOptions(), lambda _: None) is None

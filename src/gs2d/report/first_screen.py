@@ -9,11 +9,11 @@ from typing import Any
 from gs2d.core.text import duration
 from gs2d.io.run_dir import MESH, RENDERS
 from gs2d.report.gallery import compared, read_gallery
-from gs2d.report.guard import Guard
-from gs2d.report.html import Pair, render
+from gs2d.report.html_parts import Pair, render
 from gs2d.report.mesh_view import MeshView, mesh_view
-from gs2d.report.record import RunRecord, number
-from gs2d.report.sections.verdict import read_verdict
+from gs2d.report.part_guard import Guard
+from gs2d.report.run_record import RunRecord, number
+from gs2d.report.sections.verdict_section import read_verdict
 
 
 def first_screen(run: RunRecord, guard: Guard) -> str:

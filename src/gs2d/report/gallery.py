@@ -14,7 +14,7 @@ from gs2d.core.json_files import read_json
 from gs2d.data.image_files import read_image
 from gs2d.errors import DataError
 from gs2d.io.run_dir import RENDERS
-from gs2d.report.html import Pair
+from gs2d.report.html_parts import Pair
 
 PHOTOS = "photos"
 
@@ -27,6 +27,11 @@ class ShownView:
     file: str
     split: str
     depth_limits: tuple[float, float] | None = None
+
+    @property
+    def kind(self) -> str:
+        """Return "training view", "test view", or nothing if the split is unknown."""
+        return {"train": "training view", "test": "test view"}.get(self.split, "")
 
 
 @dataclass(frozen=True)
@@ -95,7 +100,7 @@ def read_index(renders: Path) -> dict[str, Any] | None:
             return {**data, "views": views, "stages": stages}
     raise DataError(
         f"{path} must hold the lists views and stages as gs2d writes them, got something else; "
-        "delete it (the report then has no pictures of views), or train again with --overwrite"
+        "delete it (the report then shows no views), or train again with --overwrite"
     )
 
 
@@ -120,11 +125,11 @@ def compared(gallery: Gallery, view: ShownView, *, width: int = 800) -> Pair | N
     photo, color = gallery.photo(view), gallery.rendering(stage, view, "color")
     if photo is None or color is None or photo.shape[:2] != color.shape[:2]:
         return None
-    split = f" ({view.split} view)" if view.split else ""
+    words = [f"{view.name} ({view.kind})" if view.kind else view.name, psnr_text(color, photo)]
     return Pair(
         (photo, color),
         ("photograph", "rendering"),
-        title=f"{view.name}{split}, {psnr_text(color, photo)}",
+        title=", ".join(words),
         full=(gallery.beside(view), gallery.beside(view, stage, "color")),
         width=width,
     )

@@ -126,66 +126,13 @@ def curves(history: History, stage_psnr: Mapping[str, float], split: str) -> dic
     return drawn
 
 
-@dataclass(frozen=True)
-class Panel:
-    """One diagram of a comparison, and the series that it shows."""
-
-    series: str
-    title: str
-    log: bool = False
-    smooth: bool = False
-
-
-def compared(histories: Mapping[str, History], panels: Sequence[Panel]) -> str | None:
-    """Compare runs: one diagram per panel, one line per run, a common legend.
-
-    Parameters
-    ----------
-    histories : mapping of label to History
-    panels : sequence of Panel
-        At most four; those without data are left out.
-
-    Returns
-    -------
-    str or None
-        SVG; None without data.
-    """
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
-
-    shown = [panel for panel in panels if any(panel.series in history.series for history in histories.values())]
-    if not shown:
-        return None
-    rows = -(-len(shown) // 2)
-    columns = -(-len(shown) // rows)
-    figure = Figure(figsize=(4.6 * columns, 2.7 * rows + 0.3), layout="constrained")
-    FigureCanvasSVG(figure)
-    longest = max(histories.values(), key=lambda history: max((span.stop for span in history.stages), default=0))
-    for axes, panel in zip(figure.subplots(rows, columns, squeeze=False).flat, shown, strict=False):
-        for k, (label, history) in enumerate(histories.items()):
-            _draw_stages(axes, history, panel.series, label=label, smooth=panel.smooth, **line_style(k))
-        _dress(axes, longest, log=panel.log, legend=False)
-        axes.set_title(panel.title, fontsize=9, color=INK, pad=16 if len(longest.stages) > 1 else 6)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(
-        handles,
-        labels,
-        loc="outside lower center",
-        ncols=min(4, len(labels)),
-        fontsize=8,
-        frameon=False,
-        labelcolor=INK,
-    )
-    return svg_text(figure)
-
-
 def line_style(k: int) -> dict[str, Any]:
     """Return colour, dashes and drawing order of line ``k``; 28 lines differ."""
     dashes = ("-", "--", ":", "-.")[k // len(_COLORS) % 4]
     return {"color": _COLORS[k % len(_COLORS)], "linestyle": dashes, "order": 3 - 0.01 * k}
 
 
-def _draw_stages(
+def draw_stages(
     axes: Any, history: History, name: str, *, label: str, smooth: bool, color: str, linestyle: str, order: float
 ) -> None:
     """Draw one line per stage, without connecting stages."""
@@ -215,7 +162,7 @@ def _figure(
     FigureCanvasSVG(figure)
     axes = figure.add_subplot()
     for k, (label, name) in enumerate(lines.items()):
-        _draw_stages(axes, history, name, label=label, smooth=smooth, **line_style(k))
+        draw_stages(axes, history, name, label=label, smooth=smooth, **line_style(k))
     if marks and marks[1]:
         x_marks, y_marks = list(marks[1]), list(marks[1].values())
         axes.plot(x_marks, y_marks, "o", color=_COLORS[1], markersize=5, label=marks[0], clip_on=False)
@@ -229,7 +176,7 @@ def _figure(
                 fontsize=8,
                 color=INK,
             )
-    _dress(axes, history, log=log, legend=any(lines) or bool(marks and marks[1]))
+    dress_axes(axes, history, log=log, legend=any(lines) or bool(marks and marks[1]))
     return svg_text(figure)
 
 
@@ -266,7 +213,7 @@ def _within(history: History, name: str, span: StageSpan) -> tuple[np.ndarray, n
     return x[chosen], y[chosen]
 
 
-def _dress(axes: Any, history: History, *, log: bool, legend: bool) -> None:
+def dress_axes(axes: Any, history: History, *, log: bool, legend: bool) -> None:
     """Style the axes, and mark the stages."""
     from matplotlib.ticker import EngFormatter
 

@@ -10,7 +10,7 @@ import pytest
 from gs2d.contrib.survey.georeference import Georeference, Residual, write_georeference
 from gs2d.contrib.survey.report_section import SHOWN, georeference_section
 from gs2d.errors import DataError
-from gs2d.report.record import RunRecord
+from gs2d.report.run_record import RunRecord
 
 
 def test_a_run_without_a_place_has_no_section(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from gs2d.config.recipe import RankByError, Recipe
 from gs2d.config.serialize import from_json
+from gs2d.contrib.lab.compared_plot import Panel, compared_runs
 from gs2d.core.atomic_files import atomic_write
 from gs2d.core.splats import Splats
 from gs2d.data import View
@@ -24,8 +25,8 @@ from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats, reload_run
 from gs2d.pipeline.prepare.run_appearance import photographed
 from gs2d.pipeline.train.resume import stage_end
 from gs2d.render.api import splat_errors
-from gs2d.report.images import ERROR_TOP, error_image, error_scale, highlight_image, valid_image
-from gs2d.report.plots import Panel, compared, read_history
+from gs2d.report.color_maps import ERROR_TOP, error_image, error_scale, highlight_image, valid_image
+from gs2d.report.plots import read_history
 from gs2d.training.events import Notice, OnEvent, counted, ignore
 from gs2d.training.learned.appearance import numbers_of, shown_splats
 from gs2d.training.rank_clone import worst
@@ -87,7 +88,7 @@ def write_figures(
     histories = {label: read_history(run.events.read()) for label, run in folders.items()}
     files = []
     for name, panels in (("traces.svg", TRACES), ("changes.svg", CHANGES)):
-        drawing = compared(histories, panels) if histories else None
+        drawing = compared_runs(histories, panels) if histories else None
         if drawing is None:
             on_event(Notice(f"no figure {name}: the logs of these runs do not hold its numbers"))
             continue

@@ -25,7 +25,7 @@ from gs2d.data.image_files import read_image
 from gs2d.errors import Gs2dError
 from gs2d.io.run_dir import RENDERS
 from gs2d.report.gallery import read_index
-from gs2d.report.html import drawing, image_tag, page
+from gs2d.report.html_parts import drawing, image_tag, page
 from gs2d.training.events import OnEvent, ignore
 
 DIGITS = {"fscore": 3, "chamfer": 3, "psnr": 2, "ssim": 4, "lpips": 4, "bytes": 2, "seconds": 0}

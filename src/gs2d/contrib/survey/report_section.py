@@ -5,9 +5,9 @@ from __future__ import annotations
 from markupsafe import Markup
 
 from gs2d.contrib.survey.georeference import CHECK, FITTED, LEFT_OUT, Residual, read_georeference
-from gs2d.report.html import macro
-from gs2d.report.record import RunRecord
-from gs2d.report.sections.registry import register_section
+from gs2d.report.html_parts import macro
+from gs2d.report.run_record import RunRecord
+from gs2d.report.sections.section_registry import register_section
 
 SHOWN = 12  # residuals: check points first, then the largest
 _ORDER = (CHECK, LEFT_OUT, FITTED)

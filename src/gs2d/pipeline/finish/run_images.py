@@ -43,8 +43,7 @@ from gs2d.pipeline.prepare.run_appearance import exposed, exposure_named, photog
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.report.gallery import read_index
-from gs2d.report.images import (
+from gs2d.report.color_maps import (
     depth_image,
     depth_limits,
     error_image,
@@ -52,6 +51,7 @@ from gs2d.report.images import (
     normal_image,
     valid_image,
 )
+from gs2d.report.gallery import read_index
 from gs2d.training.events import Notice, OnEvent, Phase, Step, counted, ignore
 
 INDEX = "index.json"

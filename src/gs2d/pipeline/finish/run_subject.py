@@ -25,14 +25,13 @@ from gs2d.data.subject_box import (
     read_subject,
     shown,
 )
-from gs2d.errors import DataError, DiskError, ProtocolError, RunError
-from gs2d.io.run_dir import RENDERS, SUBJECT, RunFolder, make_folder
+from gs2d.errors import DataError, ProtocolError, RunError
+from gs2d.io.run_dir import SUBJECT, RunFolder
 from gs2d.meshing.fusion_bounds import backproject
 from gs2d.pipeline.finish.trusted_depth import surface_reach
 from gs2d.pipeline.prepare.loaded import LoadedRun, RenderedScene
 from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.render.api import rasterize
-from gs2d.report.sections.subject import IMAGE, write_subject_image
 from gs2d.training.events import Notice, OnEvent
 
 MAX_VIEWS = 64  # cameras, evenly chosen, that vote
@@ -69,8 +68,7 @@ def subject_of(
         return known
     subject = subject_in(loaded, splats, box)
     on_event(Notice(subject_line(subject, meshed=box is not None or loaded.protocol.fusion.subject)))
-    _draw(run, loaded, subject, on_event)
-    write_json(run.file(SUBJECT), subject.to_json())  # last: where it is, the picture is too, after a kill as well
+    write_json(run.file(SUBJECT), subject.to_json())
     return subject
 
 
@@ -89,17 +87,6 @@ def subject_in(loaded: RenderedScene, splats: Splats, box: Sequence[float] | Non
         return find_subject(sights(loaded, splats)) if box is None else given_subject(box, cameras)
     except DataError as error:
         raise ProtocolError(str(error)) from error
-
-
-def _draw(run: RunFolder, loaded: LoadedRun, subject: Subject, on_event: OnEvent) -> None:
-    """Write the picture for the report; a full disk costs the picture, not the mesh."""
-    points = np.zeros((0, 3)) if loaded.scene.points is None else np.asarray(loaded.scene.points.points, np.float64)
-    try:
-        make_folder(run.file(RENDERS))
-        cameras = [view.camera for view in loaded.scene.train]
-        write_subject_image(run.file(RENDERS) / IMAGE, subject, cameras, points)
-    except DiskError as error:
-        on_event(Notice(f"no picture of the subject: {error}"))
 
 
 def meshed_subject(

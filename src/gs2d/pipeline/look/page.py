@@ -27,7 +27,7 @@ from gs2d.meshing.evidence import simplified_to
 from gs2d.meshing.web_mesh import web_mesh
 from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats, reload_run
 from gs2d.render.types import RasterSettings
-from gs2d.report.images import valid_image
+from gs2d.report.color_maps import valid_image
 from gs2d.training.events import Notice, OnEvent, Phase, ignore
 from gs2d.viewer.scene_page import PageScene, PageView, WorldScale, write_page
 

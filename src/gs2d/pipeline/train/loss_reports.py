@@ -12,7 +12,7 @@ from gs2d.data import View
 from gs2d.data.image_files import write_image
 from gs2d.io.run_dir import LOSSES, RENDERS, RunFolder, make_folder
 from gs2d.pipeline.finish.run_images import file_names
-from gs2d.report.images import depth_image, depth_limits
+from gs2d.report.color_maps import depth_image, depth_limits
 from gs2d.training.trainer import Trainer
 
 SHOWN = 3  # views whose pictures are kept

@@ -47,30 +47,35 @@ function program(gl) {
 }
 
 async function turnable(figure) {
-  const facts = JSON.parse(figure.dataset.mesh), canvas = figure.querySelector("canvas");
+  const orbit = JSON.parse(figure.dataset.orbit), canvas = figure.querySelector("canvas");
   const gl = canvas.getContext("webgl2", { antialias: true });
   if (!gl) return;
   const data = await unpacked(figure.querySelector(".packed").textContent), used = program(gl);
-  const places = 12 * facts.faces, colors = places + 6 * facts.vertices;
+  const length = new DataView(data).getUint32(0, true); // the format is that of meshing/web_mesh.py
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
+  const isPainted = header.paint === "color", places = 4 + length + 12 * header.faces, colors = places + 6 * header.vertices;
   const buffer = (target, begin, end) => {
     gl.bindBuffer(target, gl.createBuffer());
     gl.bufferData(target, new Uint8Array(data, begin, end - begin), gl.STATIC_DRAW);
   };
-  buffer(gl.ELEMENT_ARRAY_BUFFER, 0, places);
+  buffer(gl.ELEMENT_ARRAY_BUFFER, 4 + length, places);
   buffer(gl.ARRAY_BUFFER, places, colors);
   gl.vertexAttribPointer(0, 3, gl.UNSIGNED_SHORT, true, 6, 0);
-  buffer(gl.ARRAY_BUFFER, colors, colors + 3 * facts.vertices);
-  gl.vertexAttribPointer(1, 3, gl.UNSIGNED_BYTE, true, 3, 0);
-  for (const place of [0, 1]) gl.enableVertexAttribArray(place);
+  gl.enableVertexAttribArray(0);
+  if (isPainted) {
+    buffer(gl.ARRAY_BUFFER, colors, colors + 3 * header.vertices);
+    gl.vertexAttribPointer(1, 3, gl.UNSIGNED_BYTE, true, 3, 0);
+    gl.enableVertexAttribArray(1);
+  }
   gl.useProgram(used);
   const uniform = (name) => gl.getUniformLocation(used, name);
 
-  // The eye in polar coordinates about the centre.
-  const up = unit(facts.up), arm = minus(facts.eye, facts.center), distance = Math.hypot(...arm);
+  // The eye in spherical coordinates about the centre.
+  const up = unit(orbit.up), arm = minus(orbit.eye, orbit.center), distance = Math.hypot(...arm);
   const level = unit(minus(arm, up.map((x) => x * dot(arm, up)))), side = cross(up, level);
   const start = [0, Math.asin(Math.max(-0.99, Math.min(0.99, dot(unit(arm), up))))];
-  const tangent = Math.min(1, Math.max(0.25, (0.85 * facts.radius) / distance)); // half of the smaller field of view
-  let [turn, rise] = start, clay = false;
+  const tangent = Math.min(1, Math.max(0.25, (0.85 * orbit.radius) / distance)); // half of the smaller field of view
+  let [turn, rise] = start, clay = !isPainted;
 
   function draw() {
     const ratio = Math.min(devicePixelRatio || 1, 2);
@@ -83,13 +88,13 @@ async function turnable(figure) {
     gl.enable(gl.DEPTH_TEST);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    const eye = out.map((x, i) => facts.center[i] + distance * x);
-    for (const [name, value] of Object.entries({ low: facts.low, size: facts.size, eye, right, down, ahead }))
+    const eye = out.map((x, i) => orbit.center[i] + distance * x);
+    for (const [name, value] of Object.entries({ low: header.low, size: header.size, eye, right, down, ahead }))
       gl.uniform3f(uniform(name), ...value);
     gl.uniform2f(uniform("lens"), shorter / canvas.width, shorter / canvas.height);
-    gl.uniform1f(uniform("near"), 0.01 * facts.radius);
+    gl.uniform1f(uniform("near"), 0.01 * orbit.radius);
     gl.uniform1i(uniform("clay"), clay);
-    gl.drawElements(gl.TRIANGLES, 3 * facts.faces, gl.UNSIGNED_INT, 0);
+    gl.drawElements(gl.TRIANGLES, 3 * header.faces, gl.UNSIGNED_INT, 0);
     figure.dataset.drawn = `${turn.toFixed(3)} ${rise.toFixed(3)}`;
   }
   function by(x, y) {
@@ -109,8 +114,9 @@ async function turnable(figure) {
     button.setAttribute("aria-pressed", clay);
     draw();
   };
-  for (const part of [canvas, button, figure.querySelector(".drag")]) part.hidden = false;
-  figure.querySelector("img").style.visibility = "hidden";
+  for (const part of [canvas, figure.querySelector(".drag")]) part.hidden = false;
+  button.hidden = !isPainted;
+  figure.querySelector(".stage p").remove();
   new ResizeObserver(draw).observe(canvas);
   draw();
 }

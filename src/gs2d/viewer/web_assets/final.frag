@@ -8,7 +8,7 @@ uniform vec2 canvas;  // px
 uniform int kind;
 out vec4 color;
 
-vec3 depthColor(float t) {  // from near to far, as in report/images.py
+vec3 depthColor(float t) {  // from near to far, as in report/color_maps.py
     vec3 s[5] = vec3[](vec3(0.99, 0.91, 0.60), vec3(0.60, 0.81, 0.47), vec3(0.16, 0.60, 0.56), vec3(0.17, 0.36, 0.56),
                        vec3(0.19, 0.11, 0.36));
     float at = 4.0 * clamp(t, 0.0, 1.0);

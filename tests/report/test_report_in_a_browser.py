@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from browser import Page, browser, require_browser
-from gs2d.report.write import write_report
+from gs2d.report.report_page import write_report
 from report_runs import fabricate
 
 AT = "parseFloat(document.querySelector('.wipe .both').style.getPropertyValue('--at'))"

@@ -16,10 +16,10 @@ from gs2d.core.atomic_files import atomic_write
 from gs2d.core.camera import Camera
 from gs2d.io.run_dir import REPORT
 from gs2d.report.first_screen import first_screen
-from gs2d.report.guard import Guard, OnFailure
-from gs2d.report.html import macro, missing, page
-from gs2d.report.record import RunRecord, read_record
-from gs2d.report.sections.registry import SECTIONS, Section
+from gs2d.report.html_parts import macro, missing, page
+from gs2d.report.part_guard import Guard, OnFailure
+from gs2d.report.run_record import RunRecord, read_record
+from gs2d.report.sections.section_registry import SECTIONS, Section
 
 
 def write_report(run: Path, *, cameras: Sequence[Camera] = (), on_failure: OnFailure | None = None) -> Path:

@@ -11,9 +11,9 @@ from jinja2 import UndefinedError
 from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
 from gs2d.io.run_dir import VERDICT
-from gs2d.report.html import render
-from gs2d.report.record import RunRecord
-from gs2d.report.sections.registry import register_section
+from gs2d.report.html_parts import render
+from gs2d.report.run_record import RunRecord
+from gs2d.report.sections.section_registry import register_section
 
 
 def read_verdict(run: Path) -> Mapping[str, Any] | None:

@@ -6,19 +6,29 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from gs2d.report.html import render
-from gs2d.report.record import RunRecord, name_of
-from gs2d.report.sections.registry import register_section
+from gs2d.data.subject import read_subject
+from gs2d.report.html_parts import render
+from gs2d.report.run_record import RunRecord, name_of
+from gs2d.report.sections.section_registry import register_section
 
 
 @register_section("settings", title="Settings")
 def settings_section(run: RunRecord) -> str | None:
-    """Return the definition of the run in short, then ``run.json`` and ``metrics.json`` in full."""
+    """Return the main settings of the run, then ``run.json`` and ``metrics.json`` in full."""
     raw = {
         "run.json": json.dumps(run.definition, indent=2, ensure_ascii=False),
         "metrics.json": json.dumps({"stages": run.stages, "surface": run.surface}, indent=2, ensure_ascii=False),
     }
-    return render("settings.html", facts=_facts(run.definition), raw=raw)
+    return render("settings.html", facts=[*_facts(run.definition), *_subject_facts(run)], raw=raw)
+
+
+def _subject_facts(run: RunRecord) -> list[tuple[str, str]]:
+    """Return the subject and its box as an option."""
+    subject = read_subject(run.path)
+    if subject is None:
+        return []
+    box = " ".join(f"{value:.4g}" for value in subject.box.ravel())
+    return [("Subject", f"{subject.kind}: {subject.why}"), ("Subject box", f"--subject-box {box}")]
 
 
 def _facts(definition: Mapping[str, Any]) -> list[tuple[str, str]]:

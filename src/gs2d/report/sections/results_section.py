@@ -6,11 +6,17 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from gs2d.report.html import macro, missing
-from gs2d.report.record import RunRecord, number
-from gs2d.report.sections.registry import register_section
-from gs2d.report.sections.terms import titles_of
+from gs2d.report.html_parts import macro, missing
+from gs2d.report.run_record import RunRecord, number
+from gs2d.report.sections.glossary import titles_of
+from gs2d.report.sections.section_registry import register_section
 
+_SPLITS = {
+    "test": "new views",
+    "test_matched": "new views, colours matched to the photograph",
+    "test_aligned": "new views, cameras aligned with the photograph",
+    "train": "training views",
+}
 _METRICS = (("psnr", "PSNR, dB", 2, 1), ("ssim", "SSIM", 4, 1), ("lpips", "LPIPS", 4, -1))
 _COSTS: tuple[tuple[str, int, Callable[[Mapping[str, Any]], float | None]], ...] = (
     ("Transparent, %", 1, lambda stage: _scaled((stage.get("transparent") or {}).get("part"), 100)),
@@ -29,7 +35,7 @@ def results_section(run: RunRecord) -> str | None:
         return missing("No stage is finished yet.")
     rows: list[list[str]] = []
     best: list[tuple[int, int]] = []
-    for split, words in (("test", "new views"), ("train", "training views")):
+    for split, words in _SPLITS.items():
         for key, label, digits, sign in _METRICS:
             values = [number((stage.get(split) or {}).get(key)) for stage in run.stages]
             known = [sign * value for value in values if value is not None]

@@ -11,9 +11,9 @@ from jinja2 import UndefinedError
 from gs2d.core.json_files import read_json
 from gs2d.data.image_files import read_image
 from gs2d.errors import DataError
-from gs2d.report.html import render
-from gs2d.report.record import RunRecord
-from gs2d.report.sections.registry import register_section
+from gs2d.report.html_parts import render
+from gs2d.report.run_record import RunRecord
+from gs2d.report.sections.section_registry import register_section
 
 CAPTURE = "capture"  # in a run of `gs2d reconstruct`
 POSES_JSON, POSES_PNG = "poses.json", "poses.png"  # of a capture that `gs2d poses` made

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gs2d.report.html import macro
-from gs2d.report.record import RunRecord
-from gs2d.report.sections.registry import register_section
+from gs2d.report.html_parts import macro
+from gs2d.report.run_record import RunRecord
+from gs2d.report.sections.section_registry import register_section
 
-TERMS = {
+GENERAL = {
     "PSNR": "Peak signal-to-noise ratio in decibels: similarity of a rendering and its photograph, pixel by pixel. "
     "Higher is better. At 20 dB the typical error is 10 % of the brightness range, at 30 dB it is 3 %.",
     "SSIM": "Structural similarity, at most 1: agreement of edges and textures. Higher is better.",
@@ -23,24 +23,27 @@ TERMS = {
     "World unit": "The length unit of the capture. It is arbitrary unless the cameras were measured.",
     "Transparent": "Pixels of training views where the background shows through. Near 0 is good.",
     "Floater": "A splat in front of the camera or in the air that no photograph shows.",
+    "Peak memory": "Largest amount of memory that the process used.",
+}
+SURFACE = {  # only for runs that are compared with a true surface
     "Accuracy": "Mean distance from the mesh to the true surface. Lower is better.",
     "Completeness": "Mean distance from the true surface to the mesh. Lower is better.",
     "Chamfer distance": "Mean of accuracy and completeness.",
     "Precision": "Share of the mesh that is closer to the true surface than a threshold.",
     "Recall": "Share of the true surface that is closer to the mesh than a threshold.",
     "F-score": "Harmonic mean of precision and recall, at most 1. Higher is better.",
-    "Peak memory": "Largest amount of memory that the process used.",
 }
+TERMS = {**GENERAL, **SURFACE}
 _NAMES = {"Splats": "Splat"}
 
 
 def titles_of(names: Sequence[str]) -> dict[str, str]:
-    """Return the meaning of each name of a figure that has a term."""
+    """Return the meanings of those names that are terms."""
     terms = {name: _NAMES.get(name, name.split(",")[0].split(" (")[0]) for name in names}
     return {name: TERMS[term] for name, term in terms.items() if term in TERMS}
 
 
 @register_section("terms", title="Terms")
-def terms_section(_run: RunRecord) -> str | None:
-    """Return all terms with their meanings."""
-    return macro("lists.html", "glossary", TERMS)
+def terms_section(run: RunRecord) -> str | None:
+    """Return the terms of the report with their meanings."""
+    return macro("lists.html", "glossary", TERMS if run.surface else GENERAL)

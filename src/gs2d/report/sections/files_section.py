@@ -15,9 +15,9 @@ from gs2d.io.run_dir import (
     SPLATS,
     TEXTURED,
 )
-from gs2d.report.html import macro
-from gs2d.report.record import RunRecord
-from gs2d.report.sections.registry import register_section
+from gs2d.report.html_parts import macro
+from gs2d.report.run_record import RunRecord
+from gs2d.report.sections.section_registry import register_section
 
 FILES = {  # the most useful first
     PAGE: "the splats as a page for any browser",

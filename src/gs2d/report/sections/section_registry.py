@@ -1,4 +1,4 @@
-"""The sections of the report, by name: built-in ones and those of other packages."""
+"""Registry of the sections of the report."""
 
 from __future__ import annotations
 
@@ -6,19 +6,22 @@ from collections.abc import Callable
 
 from gs2d.config.registry import Registry
 from gs2d.errors import RunError
-from gs2d.report.record import RunRecord
+from gs2d.report.run_record import RunRecord
 
 Section = Callable[[RunRecord], str | None]
 """Returns the HTML of a section, or None where it has nothing to show; its attribute `title` is the heading."""
 
 _BUILTIN = (  # in the order of the page; each is a module of this package
-    *("verdict", "results", "views", "training", "surface", "subject", "capture"),
-    *("exposure", "photometry", "poses", "losses", "files", "settings", "terms"),
+    *("verdict", "results", "views", "training", "surface", "capture"),
+    *("learned", "losses", "files", "settings"),
 )
 SECTIONS: Registry[Section] = Registry(
     "report section",
     "gs2d.sections",
-    builtin={name: f"gs2d.report.sections.{name}" for name in _BUILTIN},
+    builtin={
+        **{name: f"gs2d.report.sections.{name}_section" for name in _BUILTIN},
+        "terms": "gs2d.report.sections.glossary",
+    },
     error=RunError,
 )
 """Names of sections, in the order of the page; those of other packages come last."""
@@ -37,9 +40,9 @@ def register_section(name: str, *, title: str) -> Callable[[Section], Section]:
     Returns
     -------
     callable
-        Decorates a function that takes the run (``gs2d.report.record.RunRecord``) and returns HTML, or None where it
-        has nothing to show. Text from files must be escaped. If the function raises, the report shows the error in
-        place of the section.
+        Decorates a function that takes the run (``gs2d.report.run_record.RunRecord``) and returns HTML, or None if
+        there is nothing to show. Text from files must be escaped. If the function raises, the report shows the error
+        in place of the section.
 
     Raises
     ------

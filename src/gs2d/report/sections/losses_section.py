@@ -11,10 +11,10 @@ from markupsafe import Markup
 
 from gs2d.data.image_files import read_image
 from gs2d.io.run_dir import LOSSES, RENDERS
-from gs2d.report.html import render
+from gs2d.report.html_parts import render
 from gs2d.report.plots import INK, plot_by_image, svg_text
-from gs2d.report.record import RunRecord
-from gs2d.report.sections.registry import register_section
+from gs2d.report.run_record import RunRecord
+from gs2d.report.sections.section_registry import register_section
 
 
 @register_section("losses", title="Losses by photograph")

@@ -11,8 +11,8 @@ import pytest
 
 from gs2d.data.image_files import write_image
 from gs2d.errors import DataError
-from gs2d.report.record import RunRecord
-from gs2d.report.sections.capture import capture_section
+from gs2d.report.run_record import RunRecord
+from gs2d.report.sections.capture_section import capture_section
 
 FOUND: dict[str, Any] = {
     "count": 3,

@@ -17,20 +17,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gs2d.core.camera import Camera, look_at
+from gs2d.core.camera import look_at
 from gs2d.core.json_files import write_json
-from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.errors import DataError, RunError
-from gs2d.io.meshes import write_mesh
-from gs2d.report import mesh_images as report_mesh
 from gs2d.report import mesh_view as report_view
 from gs2d.report.mesh_view import MeshView, mesh_view
 from gs2d.report.plots import curves, read_history
-from gs2d.report.record import RunRecord
-from gs2d.report.sections.registry import SECTIONS
-from gs2d.report.sections.results import results_section
-from gs2d.report.sections.surface import surface_section
-from gs2d.report.write import write_report
+from gs2d.report.report_page import write_report
+from gs2d.report.run_record import RunRecord
+from gs2d.report.sections.results_section import results_section
+from gs2d.report.sections.section_registry import SECTIONS
+from gs2d.report.sections.surface_section import surface_section
 from report_runs import KNOT, definition, events, fabricate, stage_entry
 
 VOID = {"meta", "img", "br", "input"}
@@ -92,13 +89,13 @@ def test_the_report_is_one_well_formed_file_that_loads_nothing_else(run: Path, p
 
 def test_every_image_decodes(page: str) -> None:
     images = re.findall(r'src="data:image/jpeg;base64,([^"]+)"', page)
-    # The pair and the mesh at the top, the pair of the second view; per view 3 stages x 5 kinds less the colour of the
+    # The pair at the top, the pair of the second view; per view 3 stages x 5 kinds less the colour of the
     # last stage, which is in the pair, and less the first stage, where nothing was ranked.
-    assert len(images) == 2 + 1 + 2 + 2 * (15 - 1 - 1)
+    assert len(images) == 2 + 2 + 2 * (15 - 1 - 1)
     for data in images:
         with Image.open(io.BytesIO(base64.b64decode(data))) as image:
             image.load()
-            assert image.width in (48, 640)
+            assert image.width == 48
 
 
 def test_the_first_screen_has_the_verdict_three_numbers_and_the_next_command(run: Path, page: str) -> None:
@@ -225,74 +222,29 @@ def test_there_is_a_curve_for_each_figure_with_its_stages_named() -> None:
     assert "<!-- normal_consistency -->" in drawn["Loss terms, weighted"]
 
 
-# -- colours -----------------------------------------------------------------------------------------------------------
-
-
 # -- the mesh ----------------------------------------------------------------------------------------------------------
-def test_the_mesh_is_shaded_by_its_faces_and_coloured_by_its_vertices() -> None:
-    # A square across the optical axis at depth 2, seen from behind its outside: faces are two-sided.
-    vertices = np.array([[-1, -1, 2.0], [1, -1, 2.0], [1, 1, 2.0], [-1, 1, 2.0]])
-    mesh = Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.full((4, 3), 51, np.uint8))
-    camera = Camera(40, 20, 20.0, 20.0, 20.0, 10.0, np.eye(4))
-    shown = report_mesh.mesh_images(mesh, [camera], width=40)[0]
-    assert shown.shape.shape == (20, 40, 3)
-    # The normal that faces the camera is -z; its cosine with the lamp is 1 / |(0.45, 0.65, 1)| = 0.78447.
-    expected = np.array([0.86, 0.86, 0.88]) * (0.22 + 0.78 * 0.784465)
-    np.testing.assert_allclose(shown.shape[10, 20], expected, atol=1e-4)
-    assert shown.color is not None
-    np.testing.assert_allclose(shown.color[10, 20], 0.2, atol=1e-6)
-    np.testing.assert_allclose(shown.shape[10, 2], 1.0)  # beside it: white
-
-
-def square_with_texture() -> TexturedMesh:
-    """A square across the optical axis at depth 2: red on its left, green on its right half."""
-    vertices = np.array([[-1, -1, 2.0], [1, -1, 2.0], [1, 1, 2.0], [-1, 1, 2.0]], np.float32)
-    texture = np.zeros((8, 8, 3), np.uint8)
-    texture[:, :4, 0], texture[:, 4:, 1] = 255, 255
-    uv = (vertices[:, :2] + 1) / 2
-    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    return TexturedMesh(vertices, np.tile(np.float32([0, 0, -1]), (4, 1)), faces, uv, texture)
-
-
-def test_the_mesh_is_shown_with_its_texture() -> None:
-    textured = square_with_texture()
-    mesh = Mesh(textured.vertices, textured.faces)
-    camera = Camera(40, 20, 20.0, 20.0, 20.0, 10.0, np.eye(4))
-    color = report_mesh.mesh_images(mesh, [camera], textured, width=40)[0].color
-    assert color is not None
-    np.testing.assert_allclose(color[10, 14], [1, 0, 0], atol=1e-6)
-    np.testing.assert_allclose(color[10, 25], [0, 1, 0], atol=1e-6)
-    np.testing.assert_allclose(color[10, 2], 1.0)  # beside it: white
-
-
-def test_a_broken_texture_loses_only_the_view_of_the_mesh(tmp_path: Path) -> None:
-    run = fabricate(tmp_path / "run", size=16)
-    write_mesh(run / "mesh.glb", square_with_texture())
-    assert "triangles" in text_of(write_report(run).read_text())
-    (run / "mesh.glb").write_bytes(b"not a mesh, of some length")
-    assert "expected a .glb file of <code>gs2d mesh --texture</code>" in write_report(run).read_text()
-
-
-def unpacked(view: MeshView) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray]:
-    """Return facts, faces, vertices and colours as the page decodes them."""
-    facts, data = json.loads(view.facts), gzip.decompress(base64.b64decode(view.data))
-    faces = np.frombuffer(data, np.uint32, 3 * facts["faces"]).reshape(-1, 3)
-    rest = data[faces.nbytes :]
-    steps = np.frombuffer(rest, np.uint16, 3 * facts["vertices"]).reshape(-1, 3)
-    colors = np.frombuffer(rest[steps.nbytes :], np.uint8).reshape(-1, 3)
-    return facts, faces, np.array(facts["low"]) + steps / 65535 * np.array(facts["size"]), colors
+def unpacked(view: MeshView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return faces, vertices and colours as the page decodes them."""
+    data = gzip.decompress(base64.b64decode(view.data))
+    begin = 4 + int.from_bytes(data[:4], "little")
+    header = json.loads(data[4:begin])
+    assert header["paint"] == "color"
+    faces = np.frombuffer(data, np.uint32, 3 * header["faces"], begin).reshape(-1, 3)
+    begin += faces.nbytes
+    steps = np.frombuffer(data, np.uint16, 3 * header["vertices"], begin).reshape(-1, 3)
+    colors = np.frombuffer(data, np.uint8, offset=begin + steps.nbytes).reshape(-1, 3)
+    return faces, np.array(header["low"]) + steps / 65535 * np.array(header["size"]), colors
 
 
 def test_the_mesh_of_the_page_is_that_of_the_run(run: Path) -> None:
     camera = look_at(np.array([3.0, 0, 0]), np.zeros(3), np.array([0, 0, 1.0]), width=30, height=20, fx=30)
     view = mesh_view(run, [camera])
     assert isinstance(view, MeshView)
-    facts, faces, vertices, colors = unpacked(view)
+    faces, vertices, colors = unpacked(view)
     np.testing.assert_array_equal(faces, KNOT.faces)
     np.testing.assert_allclose(vertices, KNOT.vertices, atol=1e-4)
     assert len(colors) == len(vertices)
-    np.testing.assert_allclose(facts["eye"], camera.center, atol=1e-6)
-    assert view.image.shape[1] == 640
+    np.testing.assert_allclose(json.loads(view.orbit)["eye"], camera.center, atol=1e-6)
 
 
 def test_a_large_mesh_is_simplified_for_the_page_and_keeps_its_colours(
@@ -301,7 +253,7 @@ def test_a_large_mesh_is_simplified_for_the_page_and_keeps_its_colours(
     monkeypatch.setattr(report_view, "SHOWN_FACES", 1000)
     view = mesh_view(run, ())
     assert isinstance(view, MeshView)
-    _, faces, vertices, colors = unpacked(view)
+    faces, vertices, colors = unpacked(view)
     assert view.faces == len(KNOT.faces)
     assert len(faces) == view.shown <= 1000
     assert faces.max() < len(vertices) == len(colors)

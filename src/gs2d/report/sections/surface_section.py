@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from gs2d.data.image_files import read_image
-from gs2d.report.html import missing, render
-from gs2d.report.record import RunRecord
-from gs2d.report.sections.registry import register_section
-from gs2d.report.sections.terms import titles_of
+from gs2d.report.html_parts import missing, render
+from gs2d.report.run_record import RunRecord
+from gs2d.report.sections.glossary import titles_of
+from gs2d.report.sections.section_registry import register_section
 
 _COLUMNS = {"threshold": "Threshold", "precision": "Precision", "recall": "Recall", "f_score": "F-score"}
 _COUNTED = {  # by evaluator

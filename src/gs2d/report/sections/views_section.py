@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from gs2d.io.run_dir import RENDERS
+from gs2d.report.color_maps import ERROR_TOP, depth_scale, error_scale
 from gs2d.report.gallery import Gallery, ShownView, compared, psnr_text, read_gallery
-from gs2d.report.html import missing, render
-from gs2d.report.images import ERROR_TOP, depth_scale, error_scale
-from gs2d.report.record import RunRecord
-from gs2d.report.sections.registry import register_section
+from gs2d.report.html_parts import missing, render
+from gs2d.report.run_record import RunRecord
+from gs2d.report.sections.section_registry import register_section
 
 MAX_VIEWS = 4
 KINDS = {
@@ -56,4 +56,4 @@ def _shown(gallery: Gallery, view: ShownView) -> dict[str, Any]:
             image = {"kind": kind, "pixels": pixels, "caption": ", ".join(filter(None, words))}
             images.append({**image, "full": gallery.beside(view, stage, kind)})
     on_top = pair is not None and view is gallery.views[0]
-    return {"name": view.name, "split": view.split, "pair": None if on_top else pair, "images": images}
+    return {"name": view.name, "kind": view.kind, "pair": None if on_top else pair, "images": images}

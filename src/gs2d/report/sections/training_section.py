@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from gs2d.report.html import macro, missing
+from gs2d.report.html_parts import macro, missing
 from gs2d.report.plots import curves, read_history
-from gs2d.report.record import RunRecord, number
-from gs2d.report.sections.registry import register_section
+from gs2d.report.run_record import RunRecord, number
+from gs2d.report.sections.section_registry import register_section
 
 
 @register_section("training", title="Training curves")

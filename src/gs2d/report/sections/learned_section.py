@@ -1,0 +1,73 @@
+"""Learned properties of photographs and cameras: exposure, vignetting, response, poses and intrinsics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from gs2d.core.camera import Zoom
+from gs2d.core.json_files import read_json
+from gs2d.errors import DataError
+from gs2d.io.run_dir import EXPOSURE, PHOTOMETRY, POSES
+from gs2d.report.html_parts import macro
+from gs2d.report.run_record import RunRecord
+from gs2d.report.sections.section_registry import register_section
+
+GREY = 0.5  # scene colour whose value in each photograph is in exposure.json
+
+
+@register_section("learned", title="Learned exposures and cameras")
+def learned_section(run: RunRecord) -> str | None:
+    """Return a paragraph for each file of learned properties; None if the run has none."""
+    paragraphs = []
+    for name, describe in _FILES.items():
+        path = run.path / name
+        if not path.is_file():
+            continue
+        try:
+            paragraphs.append(describe(read_json(path)))
+        except (LookupError, TypeError, ValueError, OverflowError) as error:
+            raise DataError(f"{path} is damaged: {error!r}; train again to write it") from error
+    return macro("lists.html", "paragraphs", paragraphs) if paragraphs else None
+
+
+def _exposure(data: Mapping[str, Any]) -> str:
+    gains = {str(entry["name"]): float(np.mean(entry["grey"])) / GREY for entry in data["photographs"]}
+    dark, bright = min(gains, key=gains.__getitem__), max(gains, key=gains.__getitem__)
+    return (
+        f"Exposure: {dark} is the darkest photograph ({gains[dark]:.2f} times the mean brightness), {bright} the "
+        f"brightest ({gains[bright]:.2f} times). Training views are scored in the exposure of their photograph; test "
+        "views, the mesh and new renderings use the mean exposure."
+    )
+
+
+def _photometry(data: Mapping[str, Any]) -> str:
+    cameras = [
+        f"{len(entry['photographs'])} photographs ({entry['photographs'][0]}, ...) with {float(entry['corner']):.3f} "
+        f"of the light in the corners and a response that deviates by {float(entry['shift']):+.3f}"
+        for entry in data["cameras"]
+    ]
+    return f"Vignetting and response: {'; '.join(cameras)}. New renderings and the mesh have no vignetting."
+
+
+def _poses(data: Mapping[str, Any]) -> str:
+    moved = {str(entry["name"]): entry["moved"] for entry in data["frames"] if entry["split"] == "train"}
+    pixels = {name: float(motion["pixels"]) for name, motion in moved.items()}
+    degrees, farthest = np.mean([motion["degrees"] for motion in moved.values()]), max(pixels, key=pixels.__getitem__)
+    text = (
+        f"Poses: training cameras moved by {np.mean(list(pixels.values())):.2f} px on average ({degrees:.3f} degrees); "
+        f"{farthest} moved most ({pixels[farthest]:.2f} px). Test views keep the cameras of the capture."
+    )
+    zooms = {tuple(map(float, entry["zoom"])) for entry in data["frames"] if "zoom" in entry}
+    if zooms:
+        lenses = [Zoom(*zoom) for zoom in sorted(zooms)]
+        focal = ", ".join(f"{lens.scale:.4f}" for lens in lenses)
+        distortion = ", ".join(f"k1 {lens.k1:+.4f} k2 {lens.k2:+.4f}" for lens in lenses if lens.k1 or lens.k2)
+        text += f" Focal lengths changed by a factor of {focal}."
+        text += f" Distortion: {distortion}." if distortion else ""
+    return text
+
+
+_FILES: dict[str, Callable[[Mapping[str, Any]], str]] = {EXPOSURE: _exposure, PHOTOMETRY: _photometry, POSES: _poses}
