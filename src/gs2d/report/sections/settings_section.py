@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from gs2d.data.subject import read_subject
+from gs2d.data.subject_box import read_subject
 from gs2d.report.html_parts import render
 from gs2d.report.run_record import RunRecord, name_of
 from gs2d.report.sections.section_registry import register_section
