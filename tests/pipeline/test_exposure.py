@@ -21,7 +21,6 @@ from gs2d.pipeline.demo import demo
 from gs2d.pipeline.finish.camera_paths import orbit_cameras
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.finish.run_images import render_run, render_view
-from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.loaded import open_finished
 from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, RenderOptions, TrainOptions
@@ -112,7 +111,7 @@ def test_matched_scores_are_beside_the_plain_ones_where_they_are_asked_for(run: 
     assert matched["test"]["psnr"] == plain["test"]["psnr"]
     assert matched["test_matched"]["psnr"] != plain["test"]["psnr"]
     assert run.metrics()["stages"][-1]["test_matched"] == matched["test_matched"]
-    assert "matched in colour to the other half" in " ".join(run.file("report.html").read_text().split())
+    assert "new views, colours matched to the photograph" in run.file("report.html").read_text()
 
 
 def test_any_view_can_be_rendered_in_the_exposure_of_a_photograph(run: RunFolder, tmp_path: Path) -> None:
@@ -146,14 +145,10 @@ def test_a_lost_or_damaged_file_of_exposures_is_named_with_its_remedy(run: RunFo
     copy.file(LEARNED).unlink()
     with pytest.raises(RunError, match="--resume"):
         evaluate_run(copy.path)
-    copy.file(EXPOSURE).unlink()
-    report_run(copy.path)
-    assert "exposure.json is missing" in copy.file("report.html").read_text()
 
 
 def test_the_report_shows_the_exposures(run: RunFolder) -> None:
     page = " ".join(run.file("report.html").read_text().split())
-    assert "Exposure of the photographs" in page
     entries = json.loads(run.file(EXPOSURE).read_text())["photographs"]
     darkest = min(entries, key=lambda entry: sum(entry["grey"]))
     assert f"{darkest['name']} is the darkest" in page

@@ -19,7 +19,6 @@ from gs2d.io.run_dir import POSES, RunFolder
 from gs2d.pipeline.demo import demo
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.finish.run_images import render_run, render_view
-from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.finish.run_texture import _views
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.loaded import open_finished, reload_run
@@ -116,7 +115,7 @@ def test_aligned_scores_are_beside_the_plain_ones_where_they_are_asked_for(run: 
     assert both["test"]["psnr"] == plain["test"]["psnr"]
     assert both["test_aligned"]["psnr"] > plain["test"]["psnr"]
     assert run.metrics()["stages"][-1]["test_aligned"] == both["test_aligned"]
-    assert "each camera is moved to fit its photograph" in " ".join(run.file("report.html").read_text().split())
+    assert "new views, cameras aligned with the photograph" in run.file("report.html").read_text()
 
 
 def test_a_view_is_aligned_to_where_the_splats_look_like_its_photograph(run: RunFolder) -> None:
@@ -163,5 +162,3 @@ def test_a_lost_or_damaged_file_of_poses_is_named_with_its_remedy(run: RunFolder
     copy.file(POSES).unlink()
     with pytest.raises(RunError, match="--resume"):
         evaluate_run(copy.path)
-    report_run(copy.path)
-    assert "poses.json is missing" in copy.file("report.html").read_text()
