@@ -62,7 +62,7 @@ def test_voxels_that_nobody_asked_for_are_as_large_as_memory_needs(
     assert coarse["voxel"] > 1.3 * fine["voxel"]
     assert coarse["faces"] > 0
     (told,) = {event.text for event in heard if isinstance(event, Notice) and "voxel" in event.text}
-    assert "was expected, voxels of" in told
+    assert "GiB, voxels of" in told
     with pytest.raises(ProtocolError, match="use a voxel of about"):
         mesh_run(run, MeshOptions(voxel=fine["voxel"]), out=tmp_path / "asked.ply", threads=1)
 

@@ -1,9 +1,9 @@
-"""Agreement between photographs about the colours of a surface: exposures, consensus colours and outliers.
+"""Estimate exposures, consensus colours and outliers of images from common surface points.
 
-Sample points on the surface are looked up in every photograph that sees them. Each photograph gets a gain per channel,
-each point the colour that most photographs agree on, and each pair a weight that is near 0 where the photograph shows
-something else there: an obstacle, a moving object, a highlight. Photographs are then corrected in image space, by a
-smooth weight and a smooth colour offset. See docs/math.md and docs/notebook/meshing.md.
+Sample points on the surface are looked up in every image that sees them. Each image gets a gain per channel, each point
+the colour that most images agree on, and each pair a weight, which is near 0 if the image shows something else there:
+an obstacle, a moving object, a highlight. Images are then corrected by a smooth weight and a smooth colour offset. See
+docs/math.md and docs/notebook/meshing.md.
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-VOTE = 255  # of a photograph that faces the surface, in the fourth channel of its samples; 0: it does not see the point
-MIN_SCALE, MAX_SCALE = 6.0, 16.0  # of 255: bounds of the spread between photographs that agree
-CUT = 2.0  # spreads at which the weight of a photograph falls to exp(-1/2)
-REJECTED, ACCEPTED = 0.35, 0.75  # mean weights of a neighbourhood that is left out, or used entirely
-LEAST = 1e-3  # weight of a neighbourhood that is left out: used only where no other photograph sees the surface
+VOTE = 255  # largest vote, in the fourth channel of the samples: the image faces the surface; 0: point not visible
+MIN_SCALE, MAX_SCALE = 6.0, 16.0  # of 255: bounds of the spread between images that agree
+CUT = 2.0  # spreads at which the weight of an image falls to exp(-1/2)
+REJECTED, ACCEPTED = 0.35, 0.75  # mean weights at which a neighbourhood is rejected or fully used
+LEAST = 1e-3  # weight of a rejected neighbourhood: used only if no other image sees the surface
 MAX_GAIN = 4.0
 LEVEL_CELLS = 8.0  # standard deviation of the smoothing of colour offsets, cells
 _GAIN_POINTS = 20_000
-_CHUNK = 1 << 21  # samples that are compared at a time
-_WIDE = 6.0  # cells, of the smoothing that reaches across gaps between points
+_CHUNK = 1 << 21  # samples per chunk
+_WIDE = 6.0  # cells; smoothing that fills gaps between points
 
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """Colours of points, and how photographs relate to them.
+    """Consensus colours of points, and gains of images.
 
     Attributes
     ----------
     colors : ndarray [P, 3] float32
-        Consensus, in [0, 255].
+        Consensus colours in [0, 255].
     gains : ndarray [V, 3] float32
-        A photograph shows gain * consensus.
+        An image shows gain * consensus.
     """
 
     colors: np.ndarray
@@ -44,13 +44,13 @@ class Agreement:
 
 
 def agree(samples: Sequence[np.ndarray]) -> Agreement:
-    """Find the consensus of photographs; replaces their votes by the weights of inliers, in place.
+    """Estimate the consensus of images; replaces votes by inlier weights, in place.
 
     Parameters
     ----------
     samples : sequence of ndarray [P, 4] uint8
-        For each photograph the colours of the points and its vote. Afterwards the fourth channel is 1 to 255 where
-        the photograph sees the point: 255 times the weight, rounded up.
+        For each image the colours of the points and its votes. Afterwards the fourth channel is 0 if the image does not
+        see the point, else the inlier weight scaled to 1 to 255.
     """
     count = len(samples[0])
     gains = _gains(np.stack([table[:: -(-count // _GAIN_POINTS)] for table in samples]))
@@ -61,16 +61,16 @@ def agree(samples: Sequence[np.ndarray]) -> Agreement:
         table = np.stack([table[part] for table in samples])
         votes = table[..., 3].astype(np.float32)
         colors[part], weights = _consensus(table[..., :3] / gains[:, None], votes)
-        marks = np.where(votes > 0, np.ceil(1 + 254 * weights), 0).astype(np.uint8)
-        for k, photograph in enumerate(samples):
-            photograph[part, 3] = marks[k]
+        scaled = np.where(votes > 0, np.ceil(1 + 254 * weights), 0).astype(np.uint8)
+        for k, image in enumerate(samples):
+            image[part, 3] = scaled[k]
     return Agreement(colors, gains)
 
 
 def _gains(table: np.ndarray) -> np.ndarray:
-    """Return gains [V, 3] with a mean logarithm of 0, from samples [V, p, 4] that are neither dark nor saturated.
+    """Estimate gains [V, 3] with a mean logarithm of 0 from the samples [V, p, 4] that are neither dark nor saturated.
 
-    Minimises sum_vp w_vp (log c_vp - g_v - m_p)^2 over g and m, with weights that follow the residuals.
+    Minimises sum_vp w_vp (log c_vp - g_v - m_p)^2 over g and m by iteratively reweighted least squares.
     """
     colors = table[..., :3].astype(np.float32)
     clear = (table[..., :3].min(axis=2) > 8) & (table[..., :3].max(axis=2) < 247)
@@ -97,9 +97,9 @@ def _gains(table: np.ndarray) -> np.ndarray:
 
 
 def _consensus(colors: np.ndarray, votes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return consensus colours [p, 3] of samples [V, p, 3] with votes [V, p], and the weights [V, p] of inliers.
+    """Return consensus colours [p, 3] of samples [V, p, 3] with votes [V, p], and inlier weights [V, p].
 
-    A redescending estimate (Welsch's weights) that starts at the weighted median.
+    A redescending estimator (Welsch weights), initialised with the weighted median.
     """
     middle = _weighted_median(colors, np.broadcast_to(votes[..., None], colors.shape))
     distance = np.sqrt(((colors - middle) ** 2).mean(axis=2))
@@ -129,20 +129,20 @@ def corrected(
     gain: np.ndarray,
     cell: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a photograph in the colours of the consensus [H, W, 3 or 4] uint8, and weights of its pixels [H, W].
+    """Correct an image to the consensus colours, and return weights [H, W] of its pixels.
 
     Parameters
     ----------
     image : ndarray [H, W, 3 or 4] uint8
     pixels : ndarray [n, 2] px
-        Where the photograph shows points.
+        Positions of points in the image.
     samples : ndarray [n, 4] uint8
-        As ``agree`` leaves them.
+        As returned by ``agree``.
     colors : ndarray [n, 3]
-        Consensus.
+        Consensus colours of the points.
     gain : ndarray [3]
     cell : int, px
-        Side of the cells of an image in which weights and offsets are smoothed.
+        Side of the cells in which weights and offsets are smoothed.
     """
     height, width = image.shape[:2]
     shape = -(-height // cell), -(-width // cell)

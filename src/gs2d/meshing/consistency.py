@@ -1,8 +1,8 @@
-"""How much depth maps of neighbouring views contradict each other.
+"""Measure how much depth maps of neighbouring views contradict each other.
 
-A seen point of one view that another view looks *through* (that sees farther, at the same pixel) is a contradiction
-whatever the shape of the scene; a view that sees nearer may just see something in front. So the positive residuals
-measure the error of the depth maps, without ground truth and without a guess about occlusion.
+If a view sees farther than a surface point of another view, at the same pixel, the two maps contradict each other,
+whatever the shape of the scene. If it sees nearer, something may occlude the point. The positive residuals therefore
+measure the error of the depth maps without ground truth or an occlusion test.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from gs2d.meshing.sampling import make_sampler
 
 NEIGHBOURS = 8  # views compared with each
 PERCENTILE = 75.0  # of the positive residuals
-_AT_ONCE = 64  # views whose distances from all others are in memory
-_ENOUGH = 100  # residuals, below which there is no estimate
+_AT_ONCE = 64  # views per chunk of the distance matrix
+_ENOUGH = 100  # residuals needed for an estimate
 
 
 def depth_noise(maps: Iterable[DepthMap], samples: Sequence[DepthSample], limits: FusionBounds) -> float | None:
-    """75th percentile, world units, of how far views look through points that their neighbours see.
+    """Return the 75th percentile, in world units, of how much farther views see than their neighbours' points.
 
     Parameters
     ----------
     maps : iterable of DepthMap
     samples : sequence of DepthSample
-        One for each map, in order.
+        One for each map, in the same order.
     limits : FusionBounds
-        Steeper slopes than its largest truncation in a pixel are depth edges; deeper pixels than its limit are unseen.
+        Depth limit of the pixels. A slope of more than the largest truncation per pixel is a depth edge.
 
     Returns
     -------
     float or None
-        None where too few points are seen twice.
+        None if too few points are seen by two views.
     """
     if not samples:
         return None
@@ -50,13 +50,13 @@ def depth_noise(maps: Iterable[DepthMap], samples: Sequence[DepthSample], limits
             projected = projected[projected[:, 2] > 0]
             z = projected[:, 2].copy()
             farther, _ = view.signed_distance(projected[:, 0] / z, projected[:, 1] / z, z)
-            residuals.append(farther[farther > 0])  # where unseen it is hugely negative
+            residuals.append(farther[farther > 0])  # invalid pixels give large negative values
     positive = np.concatenate(residuals)
     return float(np.percentile(positive, PERCENTILE)) if len(positive) >= _ENOUGH else None
 
 
 def _nearest(centers: np.ndarray) -> np.ndarray:
-    """Return the nearest others of each place [V, 3], some at a time: [V, NEIGHBOURS], fewer where there are fewer."""
+    """Return the indices [V, NEIGHBOURS] of the nearest other camera centres [V, 3]; fewer if there are fewer views."""
     count = min(NEIGHBOURS, len(centers) - 1)
     found = np.empty((len(centers), count), np.int64)
     for start in range(0, len(centers), _AT_ONCE):

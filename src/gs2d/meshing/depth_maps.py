@@ -1,7 +1,7 @@
-"""Depth maps on their way into the volume: one frame, and a file that holds all of them.
+"""Depth maps for fusion, and a temporary file that stores all of them.
 
-Fusion reads the frames twice (once to find the blocks, once to integrate). Frames come from rendering, so they are
-kept in a temporary file, not in memory, and not rendered again.
+Fusion reads the frames several times: to find the blocks, and to integrate. They are stored in a temporary file, so
+that they are neither kept in memory nor rendered again.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from gs2d.errors import DiskError, ShapeError
 
 @dataclass(frozen=True, eq=False)
 class RenderedView:
-    """What one camera saw.
+    """Rendered depth and colour of one view.
 
     Attributes
     ----------
     camera : Camera
     depth : ndarray or Tensor [H, W] world units
-        Depth along the optical axis at pixel centres; 0, negative and NaN carry nothing. Infinity makes no surface,
-        but says that the view sees past everything along this ray.
+        Depth along the optical axis at pixel centres. 0, negative values and NaN are invalid. Infinity means that the
+        ray hits no surface, which contradicts any surface on it.
     color : ndarray or Tensor [H, W, 3] or None
         uint8, or float in [0, 1].
     valid : ndarray or Tensor [H, W] or None
-        bool (False carries nothing: background, masked out, alpha < 0.5), or a weight >= 0 of each pixel.
+        bool (False for background, masked pixels, alpha < 0.5), or a weight >= 0 for each pixel.
     """
 
     camera: Camera
@@ -45,21 +45,21 @@ class RenderedView:
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """A frame as fusion reads it: numpy, cleaned."""
+    """A frame as numpy arrays with checked values."""
 
     camera: Camera
-    depth: np.ndarray  # [H, W] float32 world units, 0 where nothing was seen, infinite where no surface is
+    depth: np.ndarray  # [H, W] float32 world units; 0 at invalid pixels, infinite without a surface
     color: np.ndarray | None  # [H, W, 3] uint8
-    weight: np.ndarray | None  # [H, W] float32, None: 1 wherever depth > 0
+    weight: np.ndarray | None  # [H, W] float32; None means 1 wherever depth > 0
 
 
 def depth_map(frame: RenderedView) -> DepthMap:
-    """Clean a frame.
+    """Convert a frame to numpy and check it.
 
     Raises
     ------
     ShapeError
-        If depth, colour or mask are not of the camera's size, or a weight is negative or not finite.
+        If depth, colour or mask do not have the size of the camera, or a weight is negative or not finite.
     """
     camera = frame.camera
     depth = _array(frame.depth)
@@ -83,7 +83,7 @@ def depth_map(frame: RenderedView) -> DepthMap:
 
 
 def _array(value: Any) -> np.ndarray:
-    """numpy, from numpy or a torch tensor on any device (no import of torch needed)."""
+    """Convert a torch tensor on any device to numpy, without importing torch."""
     if hasattr(value, "detach"):
         value = value.detach().cpu().numpy()
     return np.asarray(value)
@@ -91,7 +91,7 @@ def _array(value: Any) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Slot:
-    """Where one depth map lies in the file."""
+    """Position of one depth map in the file."""
 
     camera: Camera
     offset: int
@@ -100,12 +100,12 @@ class _Slot:
 
 
 class Spool:
-    """Depth maps in a temporary file without a name, to be iterated over any number of times.
+    """Depth maps in an unnamed temporary file, for repeated iteration.
 
     Raises
     ------
     DiskError
-        If the file cannot be written.
+        If the file cannot be created.
     """
 
     def __init__(self) -> None:
@@ -127,8 +127,8 @@ class Spool:
             self._file.flush()
         except OSError as error:
             raise DiskError(
-                f"depth maps need a temporary file, writing number {len(self._slots) + 1} failed "
-                f"({error.strerror}); free some space or set TMPDIR to another folder"
+                f"cannot write depth map {len(self._slots) + 1} to a temporary file ({error.strerror}); free some disk "
+                "space, or set TMPDIR to another folder"
             ) from error
         has = (part is not None for part in (item.color, item.weight))
         self._slots.append(_Slot(item.camera, offset, *has))
@@ -136,10 +136,7 @@ class Spool:
     @classmethod
     @contextmanager
     def of(cls, frames: Iterable[RenderedView] | Spool) -> Iterator[Spool]:
-        """Give the frames in a file of their own, cleaned one by one, that is closed at the end; a spool as it is.
-
-        A spool stays open: whoever made it may read it again, in larger voxels.
-        """
+        """Yield a spool of the frames, which is closed at the end. A spool is passed through and stays open."""
         if isinstance(frames, Spool):
             yield frames
             return
@@ -148,7 +145,7 @@ class Spool:
             yield spool
 
     def extend(self, frames: Iterable[RenderedView]) -> None:
-        """Clean and write frames one by one."""
+        """Check and write frames one by one."""
         for frame in frames:
             self.append(depth_map(frame))
 
@@ -174,7 +171,7 @@ class Spool:
         return np.frombuffer(self._file.read(count * np.dtype(dtype).itemsize), dtype, count).reshape(shape)
 
     def close(self) -> None:
-        """Give the file back."""
+        """Close and delete the file."""
         self._file.close()
 
     def __enter__(self) -> Spool:

@@ -1,15 +1,15 @@
-"""What the photographs say about each part of a mesh, and a mesh that holds no more than they do.
+"""Compare a mesh with the depth maps it was fused from, and remove what they contradict.
 
-A view supports a vertex if it looks at its front and has its own surface there, and contradicts it if it sees farther.
-A vertex goes if more views contradict it than support it: sheets before a camera, ribbons at depth edges and shreds of
-background do. A view that says nothing, for example because of missing texture, removes nothing. Faces are as many as
-the pixels that saw the surface best, not as the voxels that it was cut from.
+A view supports a vertex if it sees its front at that depth, and contradicts it if it sees farther. Vertices with more
+contradiction than support are removed: sheets in front of a camera, ribbons at depth edges, fragments of background. A
+view without depth there, for example because of missing texture, removes nothing. The number of faces follows the
+pixels that show the surface, not the voxels.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -20,28 +20,28 @@ from gs2d.meshing.depth_maps import DepthMap
 from gs2d.meshing.marching_cubes import components, select_faces
 from gs2d.meshing.simplify import collapse
 
-SMALL = 0.01  # of the largest component's area: smaller ones go
-VIEWS = 2  # that see a vertex: a single view does not measure depth
-FACES_A_PIXEL = 2.0  # a depth map has as many
-VERTICES_AT_ONCE = 1 << 15  # by all views in turn: what is made of so many stays in a core's cache
-FACES_AT_ONCE = 1 << 16  # corners of all faces, nine numbers each, were most of what cleaning a mesh took
-GRAZING = 0.1  # cosine between a view's ray and a face, below which the view does not see it
+SMALL = 0.01  # of the area of the largest component: smaller components are removed
+VIEWS = 2  # that must see a vertex: a single view does not measure depth
+FACES_A_PIXEL = 2.0  # as many as a triangulated depth map has
+VERTICES_AT_ONCE = 1 << 15  # temporaries of this many vertices fit in the cache of a core
+FACES_AT_ONCE = 1 << 16  # bounds the memory for corners of faces
+GRAZING = 0.1  # cosine between ray and surface below which a view does not see the surface
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What the views say of the vertices of a mesh.
+    """Support and contradiction of the vertices of a mesh.
 
     Attributes
     ----------
     views : ndarray [P] int32
-        Views that see it.
+        Number of views that see the vertex.
     support : ndarray [P] float32
-        Sum of the weights of the pixels that show it, one of each view.
+        Sum of the weights of the pixels that show it, one per view.
     against : ndarray [P] float32
-        The same of the pixels that see farther where it lies.
+        Sum of the weights of the pixels that see farther.
     density : ndarray [P] float32
-        Pixels per world unit^2 of surface in the view that saw it best.
+        Pixels per world unit^2 of surface, in the view with the highest resolution.
     """
 
     views: np.ndarray
@@ -50,7 +50,7 @@ class Evidence:
     density: np.ndarray
 
     def rows(self, rows: np.ndarray | slice) -> Evidence:
-        """Return the evidence of some vertices; a view of it for a slice."""
+        """Return the evidence of some vertices; for a slice, the arrays are views."""
         return Evidence(self.views[rows], self.support[rows], self.against[rows], self.density[rows])
 
 
@@ -61,13 +61,13 @@ def gather(mesh: Mesh, maps: Iterable[DepthMap], tolerance: float) -> Evidence:
     ----------
     mesh : Mesh
     maps : iterable of DepthMap
-    tolerance : float
-        World units. Depths that differ by less are of one surface.
+    tolerance : float, world units
+        Depths that differ by less belong to one surface.
     """
-    places, normals = mesh.vertices.T, _normals(mesh).T
+    vertices_t, normals_t = mesh.vertices.T, _normals(mesh).T
     parts = [slice(start, start + VERTICES_AT_ONCE) for start in range(0, len(mesh.vertices), VERTICES_AT_ONCE)]
-    xyz = [np.ascontiguousarray(places[:, part], np.float32) for part in parts]
-    ahead = [np.ascontiguousarray(normals[:, part]) for part in parts]
+    xyz = [np.ascontiguousarray(vertices_t[:, part], np.float32) for part in parts]
+    ahead = [np.ascontiguousarray(normals_t[:, part]) for part in parts]
     count = len(mesh.vertices)
     found = Evidence(np.zeros(count, np.int32), *(np.zeros(count, np.float32) for _ in range(3)))
     for item in maps:
@@ -77,7 +77,7 @@ def gather(mesh: Mesh, maps: Iterable[DepthMap], tolerance: float) -> Evidence:
 
 
 def _count(item: DepthMap, vertices: np.ndarray, normals: np.ndarray, tolerance: float, found: Evidence) -> None:
-    """Add what one view says of some vertices [3, P] with normals [3, P] to their evidence, in place."""
+    """Add the evidence of one view for some vertices [3, P] with normals [3, P], in place."""
     camera: Camera = item.camera
     rows, z, seen, weight = _look(item, vertices)
     through = np.flatnonzero(seen > z + tolerance)
@@ -96,7 +96,7 @@ def _count(item: DepthMap, vertices: np.ndarray, normals: np.ndarray, tolerance:
 
 
 def _look(item: DepthMap, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return indices of the vertices [3, P] in the image, their depths, and the view's own depths and weights there."""
+    """Return the indices of vertices [3, P] in the image, their depths, and depths and weights of the view there."""
     camera: Camera = item.camera
     x, y, z = camera.rotation.astype(np.float32) @ vertices + camera.T_cam_world[:3, 3:].astype(np.float32)
     z[~(z > 0)] = np.nan
@@ -108,7 +108,7 @@ def _look(item: DepthMap, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 
 
 def _normals(mesh: Mesh) -> np.ndarray:
-    """Return unit normals [P, 3] of the vertices, by the areas of their faces."""
+    """Return unit vertex normals [P, 3], weighted by the areas of the faces."""
     vertices, flat = mesh.vertices.astype(np.float32), mesh.faces.ravel()
     of_face = np.empty((len(mesh.faces), 3), np.float32)
     for part in _parts(len(mesh.faces)):
@@ -134,72 +134,48 @@ def _crosses(corners: np.ndarray) -> np.ndarray:
 
 
 def _parts(count: int) -> list[slice]:
-    """Rows, some at a time."""
+    """Return chunks of ``count`` rows."""
     return [slice(start, min(start + FACES_AT_ONCE, count)) for start in range(0, count, FACES_AT_ONCE)]
 
 
 def pixels(mesh: Mesh, evidence: Evidence) -> float:
-    """Return how many pixels the surface has, each part of it in the view that saw it best."""
+    """Return how many pixels show the surface, each part counted in the view with the highest resolution."""
     found = areas(mesh)
     for part in _parts(len(found)):
         found[part] *= evidence.density[mesh.faces[part]].mean(axis=1)
     return float(found.sum())
 
 
-@dataclass(frozen=True)
-class Cleaned:
-    """A mesh that holds what the views saw, and what was found on the way.
-
-    Attributes
-    ----------
-    mesh : Mesh
-    pixels : float
-        That its surface has, each part of it in the view that saw it best.
-    unsupported, small : float
-        Parts of the area that went because views contradict them, and because they lay apart.
-    """
-
-    mesh: Mesh
-    pixels: float
-    unsupported: float
-    small: float
-
-
-def clean(mesh: Mesh, maps: Iterable[DepthMap], tolerance: float) -> Cleaned:
-    """Leave of a mesh what the views saw.
+def clean(mesh: Mesh, maps: Iterable[DepthMap], tolerance: float) -> tuple[Mesh, float]:
+    """Remove surface that the views contradict, and small components.
 
     Parameters
     ----------
     maps : iterable of DepthMap
-        Those that it was fused from.
+        The maps that the mesh was fused from.
     tolerance : float
         As for ``gather``.
+
+    Returns
+    -------
+    mesh : Mesh
+    pixels : float
+        Number of pixels that show the surface, see ``pixels``.
     """
     evidence = gather(mesh, maps, tolerance)
-    left = [float(areas(mesh).sum())]
-    mesh, evidence = supported(mesh, evidence)  # what is left takes the name: one is held, not three
-    left.append(float(areas(mesh).sum()))
-    mesh, evidence = large_components(mesh, evidence)
-    left.append(float(areas(mesh).sum()))
-    found = pixels(mesh, evidence)
-    parts = [area / max(left[0], 1e-300) for area in left[1:]]
-    return Cleaned(mesh, found, 1 - parts[0], parts[0] - parts[1])
-
-
-def simplified(cleaned: Cleaned) -> Cleaned:
-    """Return a mesh in as many faces as the pixels of its surface carry."""
-    return replace(cleaned, mesh=simplified_to(cleaned.mesh, int(FACES_A_PIXEL * cleaned.pixels)))
+    mesh, evidence = large_components(*supported(mesh, evidence))
+    return mesh, pixels(mesh, evidence)
 
 
 def supported(mesh: Mesh, evidence: Evidence) -> tuple[Mesh, Evidence]:
-    """Return the part of a mesh that two views see, and more than see through it, and its evidence."""
+    """Keep the part of a mesh that two or more views see, and more views than see through it."""
     good = (evidence.views >= VIEWS) & (evidence.support > evidence.against)
-    kept = good[mesh.faces].sum(axis=1) >= 2  # the border may hang over by a vertex
+    kept = good[mesh.faces].sum(axis=1) >= 2  # one vertex of a face may be unsupported
     return _selected(mesh, evidence, kept)
 
 
 def large_components(mesh: Mesh, evidence: Evidence, fraction: float = SMALL) -> tuple[Mesh, Evidence]:
-    """Return a mesh without components of less than ``share`` of the area of the largest."""
+    """Remove components with less than ``fraction`` of the area of the largest one."""
     if not len(mesh.faces):
         return mesh, evidence
     of_face = components(mesh)
@@ -214,7 +190,7 @@ def _selected(mesh: Mesh, evidence: Evidence, faces: np.ndarray) -> tuple[Mesh, 
 
 
 def simplified_to(mesh: Mesh, faces: int) -> Mesh:
-    """Return a mesh of about so many faces, by quadric edge collapse; vertices have the colour nearest to them."""
+    """Simplify to about ``faces`` faces by quadric edge collapse; vertices get the colour of the nearest original."""
     if len(mesh.faces) <= max(faces, 4):
         return mesh
     vertices = mesh.vertices.astype(np.float64)

@@ -1,7 +1,7 @@
-"""The limits of fusion, from what the cameras saw: the box, the voxel, the truncation, the depth limit.
+"""Derive the limits of fusion from depth maps: box, voxel, truncation, depth limit.
 
-No limit comes from the distance of the nearest camera, which is a guess about the capture. All come from percentiles
-of the depth maps over all views, so a walk along a wall is fused as well as an orbit.
+All limits come from percentiles of the depths of all views, and none from the distance of the nearest camera, so they
+fit a walk along a wall as well as an orbit.
 """
 
 from __future__ import annotations
@@ -15,36 +15,36 @@ from gs2d.core.camera import Camera
 from gs2d.errors import ProtocolError
 from gs2d.meshing.depth_maps import DepthMap
 
-FAR_FACTOR = 4.0  # times the median depth; beyond it a pixel is wider than four voxels made for the median depth
+FAR_FACTOR = 4.0  # times the median depth; beyond, a pixel is wider than four voxels that fit the median depth
 BOX_PERCENTILES = (1.0, 99.0)
 DEPTH_PERCENTILE = 99.5
-BOX_MARGIN = 0.25  # of the robust box's longest side, on every side: room for what percentiles cut off
+BOX_MARGIN = 0.25  # of the longest side of the percentile box; added on every side
 MIN_VOXELS_PER_TRUNCATION = 5.0
 MAX_VOXELS_PER_TRUNCATION = 20.0
-MAX_TRUNCATION_OF_SIDE = 0.025  # a wider band swallows thin parts
-NOISE_PER_TRUNCATION = 20.0  # times the depth noise: maps that disagree need a wider band to average in
+MAX_TRUNCATION_OF_SIDE = 0.025  # a wider truncation removes thin parts
+NOISE_PER_TRUNCATION = 20.0  # times the depth noise: averaging depth maps that disagree needs a wider truncation
 
 
 @dataclass(frozen=True)
 class FusionBounds:
-    """Limits of one fusion, with the numbers that they come from. Plain numbers, ready for JSON.
+    """Limits of one fusion, and the statistics they are derived from, as plain numbers for JSON.
 
     Attributes
     ----------
     lower, upper : tuple of 3 floats, world units
-        Box outside which nothing is fused.
+        Corners of the fused box.
     side : float, world units
-        Longest side of the box that holds the 1st to 99th percentile of the points (or of the given bbox).
+        Longest side of the box of the 1st to 99th percentile of the points, or of the requested box.
     voxel, truncation, depth_limit : float, world units
-        Depths beyond ``depth_limit`` carry nothing.
+        Depths beyond ``depth_limit`` are ignored.
     depth_median, depth_high : float, world units
         Median and 99.5th percentile of all depths.
     pixel_footprint : float, world units
         Median width of a pixel on the surface.
     cut_fraction : float
-        Part of the seen pixels that depth limit or box leave out. Large: the scene has a background that is not fused.
+        Fraction of the valid pixels outside depth limit or box. Large if a background is not fused.
     depth_noise : float or None, world units
-        How far views look through what their neighbours see (``consistency.depth_noise``), where it was measured.
+        Disagreement of neighbouring views (``consistency.depth_noise``), if it was measured.
     """
 
     lower: tuple[float, float, float]
@@ -62,26 +62,26 @@ class FusionBounds:
 
 @dataclass(frozen=True, eq=False)
 class DepthSample:
-    """Some pixels of one view."""
+    """Sampled pixels of one view."""
 
     points: np.ndarray  # [P, 3] float64 world units
     depths: np.ndarray  # [P] world units
     footprints: np.ndarray  # [P] world units, depth / focal length
-    center: np.ndarray  # [3] world units, of the camera
+    center: np.ndarray  # [3] world units; camera centre
 
 
 def backproject(camera: Camera, depth: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """World points [P, 3] of the centres of pixels (columns, rows) at ``depth`` [P]."""
+    """Return the world points [P, 3] of pixel centres (columns, rows) at ``depth`` [P]."""
     x = (columns + 0.5 - camera.cx) / camera.fx * depth
     y = (rows + 0.5 - camera.cy) / camera.fy * depth
     return (np.stack([x, y, depth], axis=1) - camera.T_cam_world[:3, 3]) @ camera.rotation
 
 
 def sample_depths(item: DepthMap, count: int = 4096) -> DepthSample:
-    """About ``count`` seen pixels of a depth map, evenly spread (no randomness)."""
+    """Sample about ``count`` valid pixels of a depth map, evenly and deterministically."""
     rows, columns = np.nonzero((item.depth > 0) & np.isfinite(item.depth))
     pick = slice(None, None, max(1, len(rows) // count))
-    rows, columns = rows[pick].copy(), columns[pick].copy()  # not a view that holds all of them
+    rows, columns = rows[pick].copy(), columns[pick].copy()  # a view would keep all of them in memory
     depth = item.depth[rows, columns].astype(np.float64)
     camera = item.camera
     footprint = depth / np.sqrt(camera.fx * camera.fy)
@@ -98,7 +98,7 @@ def derive_limits(
     truncation: float | None = None,
     depth_limit: float | None = None,
 ) -> FusionBounds:
-    """Limits from samples of all views; every named limit overrides the derived one.
+    """Derive the limits from samples of all views; requested limits override derived ones.
 
     Parameters
     ----------
@@ -106,23 +106,23 @@ def derive_limits(
         One for each view.
     cameras : sequence of Camera
     resolution : int
-        Voxels along the longest side of the box that holds the 1st to 99th percentile of the points. The voxel is
-        never finer than half the median width of a pixel on the surface: finer ones hold nothing but interpolation.
+        Voxels along the longest side of the box of the 1st to 99th percentile of the points. The voxel is at least
+        half the median width of a pixel on the surface: smaller voxels contain only interpolation.
     bbox : array [2, 3] world units, optional
-        Fuse this box, whole: it also sets the voxel and lifts the depth limit to its farthest corner.
+        Fuse this box: it also sets the voxel, and the depth limit includes its farthest corner.
     voxel, truncation, depth_limit : float world units, optional
 
     Raises
     ------
     ProtocolError
-        If no pixel has a depth, or a given limit makes no sense.
+        If no pixel has a depth, or a requested limit is invalid.
     """
     picked = list(samples)
     xyz = np.concatenate([s.points for s in picked]) if picked else np.zeros((0, 3))
     depths = np.concatenate([s.depths for s in picked]) if picked else np.zeros(0)
     footprints = np.concatenate([s.footprints for s in picked]) if picked else np.zeros(0)
     if not len(depths):
-        raise ProtocolError("depth maps with at least one seen pixel were expected, got none; is the scene empty?")
+        raise ProtocolError("expected depth maps with valid pixels, got none; is the scene empty?")
     check_positive(voxel=voxel, truncation=truncation, depth_limit=depth_limit, resolution=resolution)
     median, high = float(np.median(depths)), float(np.percentile(depths, DEPTH_PERCENTILE))
 
@@ -131,7 +131,7 @@ def derive_limits(
         limit = _farthest_corner(lower, upper, cameras)
         side = float((upper - lower).max())
     else:
-        # the margin on the percentile keeps what a few views saw just beyond it
+        # the factor keeps surface just beyond the percentile
         limit = min(high * 1.25, FAR_FACTOR * median) if depth_limit is None else depth_limit
         near = xyz[depths <= limit]
         if not len(near):
@@ -161,7 +161,7 @@ def derive_limits(
 
 
 def widen_truncation(limits: FusionBounds, noise: float | None) -> FusionBounds:
-    """Widen the truncation to 20 times the depth noise, if that is more: up to 20 voxels, a 40th of the box."""
+    """Increase the truncation to 20 times the depth noise, but at most to 20 voxels and a 40th of the box."""
     if noise is None:
         return limits
     most = min(MAX_VOXELS_PER_TRUNCATION * limits.voxel, MAX_TRUNCATION_OF_SIDE * limits.side)
@@ -181,7 +181,7 @@ def _farthest_corner(lower: np.ndarray, upper: np.ndarray, cameras: Sequence[Cam
     corners = np.array([[(lower, upper)[c >> a & 1][a] for a in range(3)] for c in range(8)])
     depths = [camera.project(corners)[1].max() for camera in cameras]
     if not depths or max(depths) <= 0:
-        raise ProtocolError("a bbox in front of some camera was expected, got one behind all; check its frame")
+        raise ProtocolError("expected a bbox in front of a camera, got one behind all; check its coordinate system")
     return float(max(depths))
 
 

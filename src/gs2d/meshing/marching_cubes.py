@@ -1,7 +1,7 @@
 """Marching cubes over the blocks of a volume, and connected components of a mesh.
 
-A cell is eight neighbouring voxels; it makes surface only where all eight are known. Vertices lie on the edges of the
-grid and are numbered by edge, so cells of neighbouring blocks share theirs exactly: no seams, nothing to weld.
+A cell consists of eight neighbouring voxels and creates surface only if all of them are known. Vertices are numbered by
+the grid edge they lie on, so cells of neighbouring blocks share vertices exactly.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from gs2d.core.mesh import Mesh
 from gs2d.meshing.tsdf_volume import BLOCK, VOXELS, Volume
 
 # -- the cases of a cube -----------------------------------------------------------------------------------------------
-# A cell has corners c = 0..7 at (c & 1, c >> 1 & 1, c >> 2 & 1), inside where the field is negative. The surface cuts
-# each face of the cell in segments that separate every run of inside corners from the rest; so on a face with inside
-# corners on one diagonal the inside is split and the outside joined, whichever cell looks at it. Segments of the six
-# faces close into loops. A loop is cut into triangles without a diagonal that lies in a face of the cell (the cell
-# behind that face could choose the same diagonal, and the edge would have four triangles). Hence meshes of neighbouring
-# cells fit: every edge away from the border of the known cells has exactly two triangles.
+# A cell has corners c = 0..7 at (c & 1, c >> 1 & 1, c >> 2 & 1); a corner is inside if the field is negative. On each
+# face of the cell, the surface consists of segments that separate each run of inside corners from the rest. On a face
+# with two diagonal inside corners, the inside is therefore split and the outside connected, for both adjacent cells.
+# The segments of the six faces form closed loops. A loop is split into triangles without a diagonal in a face of the
+# cell, because the adjacent cell could choose the same diagonal, and the edge would have four triangles. Meshes of
+# neighbouring cells therefore match: every edge inside the known cells has exactly two triangles.
 CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2 & 1] for c in range(8)])  # [8, 3] x y z
 EDGES = tuple((axis, c) for axis in range(3) for c in range(8) if not c >> axis & 1)  # axis, lower corner
 _EDGE_OF = {frozenset((c, c | 1 << axis)): e for e, (axis, c) in enumerate(EDGES)}
@@ -30,14 +30,14 @@ _EDGE_OF = {frozenset((c, c | 1 << axis)): e for e, (axis, c) in enumerate(EDGES
 
 @dataclass(frozen=True, eq=False)
 class CaseTable:
-    """Triangles of every case: those of case i are ``edges[starts[i]:starts[i + 1]]``."""
+    """Triangles of all cases; those of case i are ``edges[starts[i]:starts[i + 1]]``."""
 
     starts: np.ndarray  # [257] int64
     edges: np.ndarray  # [T, 3] int64, edge numbers of the cell
 
 
 def _faces() -> list[tuple[int, int, int, int]]:
-    """Corners of the six faces, counter-clockwise seen from outside the cell."""
+    """Return the corners of the six faces, counter-clockwise seen from outside the cell."""
     faces = []
     for axis in range(3):
         u, v = 1 << (axis + 1) % 3, 1 << (axis + 2) % 3  # u x v points along +axis
@@ -48,16 +48,16 @@ def _faces() -> list[tuple[int, int, int, int]]:
 
 
 def _face_segments(face: tuple[int, int, int, int], case: int) -> dict[int, int]:
-    """Directed segments of one face, from edge to edge, one around each run of inside corners."""
+    """Return directed segments of one face, from edge to edge, one around each run of inside corners."""
     inside = [bool(case >> c & 1) for c in face]
-    crossings = []  # (edge, leaves the inside), walking round the face
+    crossings = []  # (edge, leaves the inside), around the face
     for i in range(4):
         j = (i + 1) % 4
         if inside[i] != inside[j]:
             crossings.append((_EDGE_OF[frozenset((face[i], face[j]))], inside[i]))
     segments = {}
     for k, (edge, leaves) in enumerate(crossings):
-        if leaves:  # the run that ends here began at the crossing before
+        if leaves:  # the run that ends here started at the previous crossing
             segments[crossings[k - 1][0]] = edge
     return segments
 
@@ -74,7 +74,7 @@ def _loops(case: int) -> list[list[int]]:
         while at != start:
             loop.append(at)
             at = follow.pop(at)
-        first = loop.index(min(loop))  # the same table whatever the order of the walk
+        first = loop.index(min(loop))  # a canonical start, so that the table is unique
         loops.append(loop[first:] + loop[:first])
     return sorted(loops)
 
@@ -88,7 +88,7 @@ def _share_a_face(e: int, f: int) -> bool:
 
 
 def _triangulate(loop: list[int]) -> list[tuple[int, int, int]] | None:
-    """Triangles of a loop whose diagonals avoid the faces of the cell, or None where there are none."""
+    """Split a loop into triangles whose diagonals avoid the faces of the cell; None if impossible."""
     if len(loop) == 3:
         return [(loop[0], loop[1], loop[2])]
     for k in range(2, len(loop)):  # the triangle on the side loop[0], loop[1]
@@ -104,7 +104,7 @@ def _triangulate(loop: list[int]) -> list[tuple[int, int, int]] | None:
 
 @cache
 def case_table() -> CaseTable:
-    """Return the table, computed once per process (milliseconds)."""
+    """Return the table of cases, computed once per process (milliseconds)."""
     starts, edges = [0], []
     for case in range(256):
         for loop in _loops(case):
@@ -118,25 +118,25 @@ def case_table() -> CaseTable:
 
 # -- the surface -------------------------------------------------------------------------------------------------------
 _CHUNK = 512  # blocks at a time
-EDGES_OF_BLOCK = 3 * VOXELS  # of a block: those that go up from its voxels
-_EDGE_GUARD = np.float32(1e-3)  # of an edge: vertices keep off its ends, so that no triangle is a point
+EDGES_OF_BLOCK = 3 * VOXELS  # edges that start at its voxels
+_EDGE_GUARD = np.float32(1e-3)  # of an edge: distance of vertices from its ends, against degenerate triangles
 
 
 def marching_cubes(volume: Volume, *, min_weight: float = 1.0) -> Mesh:
-    """Return the zero set of a volume.
+    """Extract the zero level set of a volume.
 
     Parameters
     ----------
     volume : Volume
     min_weight : float
-        A voxel is known from this weight on. A view adds 1 to voxels in front of its surface and to those behind it
-        up to ``tsdf.FULL_WEIGHT_BEHIND`` of the truncation.
+        Voxels with a lower weight are unknown. A view adds 1 to voxels in front of its surface, and to those behind it
+        up to ``FULL_WEIGHT_BEHIND`` of the truncation.
 
     Returns
     -------
     Mesh
-        float32 vertices in the world, faces counter-clockwise seen from the side of positive distance (from where the
-        cameras look), colours where the volume has them. Empty where nothing is known.
+        float32 vertices in the world, faces counter-clockwise seen from the cameras' side, colours if the volume has
+        them.
     """
     edges, faces, ends = cell_surface(volume, min_weight)
     vertices, colors = edge_vertices(volume, edges, ends)
@@ -146,23 +146,23 @@ def marching_cubes(volume: Volume, *, min_weight: float = 1.0) -> Mesh:
 def cell_surface(
     volume: Volume, min_weight: float, blocks: int | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return what the cells of a volume make, before it has positions.
+    """Return the topology of the surface of a volume.
 
     Parameters
     ----------
     volume : Volume
     min_weight : float
     blocks : int, optional
-        Only the cells of the first so many blocks (default: of all).
+        Process the first ``blocks`` blocks only (default: all).
 
     Returns
     -------
     edges : ndarray [P] int64
-        The grid edges that carry a vertex, sorted: 3 * (512 * row + voxel) + axis, of the voxel at the lower end.
+        Sorted grid edges with a vertex: 3 * (512 * row + voxel) + axis, of the voxel at the lower end.
     faces : ndarray [F, 3]
-        Rows of ``edges``.
+        Indices into ``edges``.
     ends : ndarray [P] int64
-        The voxel at the upper end of each edge, as 512 * row + voxel; larger than that at the lower end.
+        Voxel at the upper end of each edge, as 512 * row + voxel; larger than that of the lower end.
     """
     count = len(volume.keys) if blocks is None else blocks
     shifted = _neighbours(volume)
@@ -176,9 +176,9 @@ def cell_surface(
 
 
 def _numbered(corners: np.ndarray, blocks: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the edges among ``corners``, sorted, each once, and where each corner's is: ``np.unique`` without sorting.
+    """Return the sorted distinct edges of ``corners``, and the index of each corner's edge.
 
-    Edges are marked in a table for the blocks that have some.
+    Equals ``np.unique`` but is faster: edges are marked in a table of the blocks that have any.
     """
     row = corners // EDGES_OF_BLOCK
     used = np.zeros(blocks, bool)
@@ -196,7 +196,7 @@ def _numbered(corners: np.ndarray, blocks: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def _neighbours(volume: Volume) -> np.ndarray:
-    """Rows [M, 8] of the blocks shifted by each corner (0 or 1 along each axis), -1 where there is none."""
+    """Return the rows [M, 8] of the blocks shifted by each corner (0 or 1 along each axis), -1 if missing."""
     blocks = volume.blocks
     rows = np.full((len(blocks), 8), -1, dtype=np.int64)
     for corner, shift in enumerate(CORNERS):
@@ -209,7 +209,7 @@ def _neighbours(volume: Volume) -> np.ndarray:
 
 
 def _padded(values: np.ndarray, shifted: np.ndarray, fill: float) -> np.ndarray:
-    """Blocks with their upper neighbours' first layer [n, 9, 9, 9], ``fill`` where there is no neighbour."""
+    """Return blocks with the first layer of their upper neighbours [n, 9, 9, 9], ``fill`` for missing neighbours."""
     cubes = values.reshape(-1, BLOCK, BLOCK, BLOCK)
     out = np.full((len(shifted), BLOCK + 1, BLOCK + 1, BLOCK + 1), fill, dtype=values.dtype)
     for corner, shift in enumerate(CORNERS):
@@ -222,7 +222,7 @@ def _padded(values: np.ndarray, shifted: np.ndarray, fill: float) -> np.ndarray:
 
 
 def _chunk_triangles(volume: Volume, shifted: np.ndarray, chunk: np.ndarray, min_weight: float) -> np.ndarray:
-    """Triangles [T, 3] of some blocks, as global edge numbers."""
+    """Return the triangles [T, 3] of some blocks, as global edge numbers."""
     inside = _padded(volume.tsdf, shifted[chunk], 0.0) < 0
     valid = _padded(volume.weight, shifted[chunk], 0.0) >= max(min_weight, 1e-12)
     case = np.zeros((len(chunk), BLOCK, BLOCK, BLOCK), np.uint8)
@@ -242,7 +242,7 @@ def _chunk_triangles(volume: Volume, shifted: np.ndarray, chunk: np.ndarray, min
 
 
 def _edge_numbers(shifted: np.ndarray, row: np.ndarray, voxel: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Global number of cell edges: 3 * (512 * row + voxel) + axis, of the voxel at the edge's lower end."""
+    """Return the global numbers of cell edges: 3 * (512 * row + voxel) + axis, of the voxel at the lower end."""
     neighbour, number = _cell_edges()
     at = voxel[:, None] * len(EDGES) + edges
     return shifted[row[:, None], neighbour[at]] * EDGES_OF_BLOCK + number[at]
@@ -250,7 +250,7 @@ def _edge_numbers(shifted: np.ndarray, row: np.ndarray, voxel: np.ndarray, edges
 
 @cache
 def _cell_edges() -> tuple[np.ndarray, np.ndarray]:
-    """For each of the 12 edges of the cell at each voxel [512 * 12]: which neighbour it lies in, its number there."""
+    """Return, for each of the 12 edges of the cell at each voxel [512 * 12], the neighbour block and edge number."""
     at = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK,) * 3), axis=1)[:, None, :]
     at = at + CORNERS[[corner for _, corner in EDGES]]  # [512, 12, 3] the lower end
     over = at >= BLOCK
@@ -271,14 +271,14 @@ def _upper_ends(shifted: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 
 def edge_vertices(volume: Volume, edges: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return positions [P, 3] of the zero crossings on edges, from their ends, and their colours."""
+    """Return the positions [P, 3] of the zero crossings on edges, and their colours."""
     low = edges // 3
     row, voxel = low // VOXELS, low % VOXELS
     at = np.stack(np.unravel_index(voxel, (BLOCK,) * 3), axis=1)
     step = np.eye(3, dtype=np.int64)[edges % 3]
     tsdf = volume.tsdf.reshape(-1)
     a, b = tsdf[low], tsdf[high]
-    t = near_plane_policy(a, b)
+    t = zero_crossing(a, b)
     grid = volume.blocks[row] * BLOCK + at + t[:, None].astype(np.float64) * step
     vertices = (np.asarray(volume.limits.lower) + grid * volume.limits.voxel).astype(np.float32)
     if volume.color is None or volume.color_weight is None:
@@ -287,8 +287,8 @@ def edge_vertices(volume: Volume, edges: np.ndarray, high: np.ndarray) -> tuple[
     return vertices, mixed_colors(t, colors[low], colors[high], weights[low] > 0, weights[high] > 0)
 
 
-def near_plane_policy(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Where the field is 0 between ends with values of different sign: 0 at a, 1 at b, and kept off both."""
+def zero_crossing(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the position of the zero between values a (0) and b (1) of different sign, kept away from both ends."""
     t = a / np.where(a == b, 1, a - b)  # signs differ, so a != b
     return np.asarray(np.clip(t, _EDGE_GUARD, 1 - _EDGE_GUARD))
 
@@ -296,16 +296,16 @@ def near_plane_policy(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def mixed_colors(
     t: np.ndarray, low: np.ndarray, high: np.ndarray, low_has: np.ndarray, high_has: np.ndarray
 ) -> np.ndarray:
-    """Colour uint8 [P, 3] at t between two ends. One that no view saw near its surface has none: the other's counts."""
+    """Interpolate colours, uint8 [P, 3], at t between two ends; an end without colour has no weight."""
     wa, wb = (1 - t) * low_has, t * high_has
     mixed = (wa[:, None] * low + wb[:, None] * high) / np.maximum(wa + wb, np.float32(1e-12))[:, None]
     return np.rint(np.clip(mixed, 0, 255)).astype(np.uint8)
 
 
 def components(mesh: Mesh) -> np.ndarray:
-    """Label the connected component of each face [F] (components share no vertex) by size: 0 is the largest.
+    """Label the connected component of each face [F] by size: 0 is the largest. Components share no vertex.
 
-    Ties go to the component with the lowest face number.
+    Of equal components, the one with the lowest face index comes first.
     """
     n, faces = len(mesh.vertices), mesh.faces
     if not len(faces):
@@ -318,17 +318,17 @@ def components(mesh: Mesh) -> np.ndarray:
     of_face = label[faces[:, 0]]
     sizes = np.bincount(of_face, minlength=count)
     first = np.full(count, len(faces))
-    first[of_face[::-1]] = np.arange(len(faces))[::-1]  # of several the last one stays
-    order = np.lexsort((first, -sizes))  # of vertices without faces last
+    first[of_face[::-1]] = np.arange(len(faces))[::-1]  # the last assignment wins
+    order = np.lexsort((first, -sizes))  # components without faces last
     rank = np.empty(count, dtype=np.int64)
     rank[order] = np.arange(count)
     return rank[of_face]
 
 
 def keep_components(mesh: Mesh, *, min_faces: int = 50, keep: int | None = None) -> Mesh:
-    """Drop small pieces: keep components of at least ``min_faces`` faces, and of those the ``keep`` largest.
+    """Keep components of at least ``min_faces`` faces, and of those the ``keep`` largest.
 
-    Faces and vertices keep their order; vertices without faces go. With no component left the mesh is empty.
+    Faces and vertices keep their order; vertices without faces are removed. The mesh may become empty.
     """
     rank = components(mesh)
     sizes = np.bincount(rank) if len(rank) else np.zeros(0, np.int64)
@@ -339,7 +339,7 @@ def keep_components(mesh: Mesh, *, min_faces: int = 50, keep: int | None = None)
 
 
 def select_faces(mesh: Mesh, mask: np.ndarray) -> Mesh:
-    """Return the faces where ``mask`` [F] is true, and only the vertices they use."""
+    """Return the faces where ``mask`` [F] is true, with the vertices they use."""
     faces = mesh.faces[mask]
     used = np.zeros(len(mesh.vertices), bool)
     used[faces] = True
@@ -349,7 +349,7 @@ def select_faces(mesh: Mesh, mask: np.ndarray) -> Mesh:
 
 
 def inside_box(mesh: Mesh, box: np.ndarray) -> Mesh:
-    """Keep the faces with all corners in a box [2, 3]: volumes are of whole voxels, and reach beyond it."""
+    """Keep the faces with all corners in a box [2, 3]; volumes consist of whole blocks and extend beyond it."""
     low, high = np.asarray(box, np.float64)
     inside = ((mesh.vertices >= low) & (mesh.vertices <= high)).all(axis=1)
     return select_faces(mesh, inside[mesh.faces].all(axis=1))

@@ -1,9 +1,8 @@
-"""Cameras and distant lights that look at triangles: beams of rays that share an origin or a direction.
+"""Cast rays of cameras and of distant lights at triangle meshes.
 
-The demo capture, textures, pictures of meshes and the visibility of surface scores are made with it. It shares nothing
-with the splat rasterizers, so that what it says is evidence about them. Every hit is an exact
-ray-triangle intersection (signed volumes, as in Pluecker tests); only the choice of candidate pairs uses that the rays
-of a camera meet on its image plane, and that the rays of a distant light meet on a plane across it.
+Used for the demo capture, textures, images of meshes and the visibility of surface scores. It shares no code with the
+splat rasterizers, so it can verify them. Every hit is an exact ray-triangle intersection (signed volumes, as in
+Pluecker tests). Candidate pairs are found on the image plane of the camera, or on a plane across the light.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import numpy as np
 
 from gs2d.core.camera import Camera
 
-_PAIRS_PER_CHUNK = 60_000  # a step of one chunk stays in the cache of a core
+_PAIRS_PER_CHUNK = 60_000  # the temporaries of a chunk fit in the cache of a core
 NEAR = 1e-3  # world units
 _MARGIN = 1e-6  # samples around the box of a triangle, for rounding
 _NO_HIT = np.uint64(0xFFFFFFFFFFFFFFFF)
@@ -29,11 +28,11 @@ class Hits:
     Attributes
     ----------
     face : ndarray [H, W] int32
-        Index of the triangle, -1 where the ray hits nothing.
+        Index of the triangle; -1 without a hit.
     depth : ndarray [H, W] float32 world units
-        Along the optical axis (not along the ray); 0 where the ray hits nothing.
+        Along the optical axis (not along the ray); 0 without a hit.
     weights : ndarray [H, W, 3] float32
-        Barycentric coordinates of the hit on its triangle; 0 where the ray hits nothing.
+        Barycentric coordinates of the hit; 0 without a hit.
     """
 
     face: np.ndarray  # [H, W]
@@ -46,10 +45,10 @@ def cast_camera(
 ) -> Hits:
     """Cast ``samples`` x ``samples`` rays through every pixel of a camera and keep the nearest triangle of each.
 
-    A ray through the camera's origin with direction d meets the triangle (a, b, c), given in camera axes, where the
-    three signed volumes d.(b x c), d.(c x a), d.(a x b) have the same sign; divided by their sum they are the
-    barycentric coordinates of the hit, and depth = a.(b x c) / sum when d has unit z (Cramer's rule). Triangles are
-    seen from both sides. Neighbours evaluate their shared edge with exactly opposite numbers, so no ray slips between.
+    A ray from the camera centre with direction d hits the triangle (a, b, c), in camera axes, if the three signed
+    volumes d.(b x c), d.(c x a), d.(a x b) have the same sign. Divided by their sum they are the barycentric
+    coordinates of the hit, and depth = a.(b x c) / sum if d has unit z (Cramer's rule). Triangles are two-sided.
+    Adjacent triangles evaluate their common edge with exactly opposite values, so no ray passes between them.
 
     Parameters
     ----------
@@ -58,8 +57,8 @@ def cast_camera(
     camera : Camera
     samples : int
         Rays per pixel along each axis, at the centres of equal sub-pixels.
-    near : float
-        Hits at a smaller depth, world units, do not count.
+    near : float, world units
+        Hits at a smaller depth are ignored.
 
     Returns
     -------
@@ -84,22 +83,23 @@ def cast_camera(
         face = pair_face[inside]
         depth = volume[face] / np.where(total == 0, np.inf, total)
         hit = depth > near
-        # Positive floats order like their bits, so one integer minimum finds the nearest hit and settles ties by index.
+        # Positive floats are ordered like their bits, so an integer minimum finds the nearest hit, and the lowest face
+        # index of equal depths.
         key = (depth[hit].astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)) | face[hit].astype(
             np.uint64
         )
         ray = (pair_y[inside] * width + pair_x[inside])[hit]
         np.minimum.at(nearest, ray, key)
     hits = _hits(nearest, edges, directions_x, directions_y)
-    numbers = np.append(met, -1).astype(np.int32)  # -1 where nothing was hit
+    numbers = np.append(met, -1).astype(np.int32)  # -1 without a hit
     return Hits(numbers[hits.face], hits.depth, hits.weights)
 
 
 def cast_down(vertices: np.ndarray, faces: np.ndarray, corner: tuple[float, float], step: float, size: Size) -> Hits:
     """Cast a ray straight down (-z) through every cell of a raster and keep the highest triangle of each.
 
-    A cell's centre (x, y, 1) and the corners (x, y, 1) of a triangle take the places of a ray and of camera axes in
-    :func:`cast_camera`: the three volumes are twice the areas of the parts of the triangle, seen from above.
+    With (x, y, 1) of a cell centre as the ray, and of the corners as the triangle, the three volumes of
+    :func:`cast_camera` are twice the areas of the parts of the triangle, seen from above.
 
     Parameters
     ----------
@@ -107,16 +107,16 @@ def cast_down(vertices: np.ndarray, faces: np.ndarray, corner: tuple[float, floa
         z is up.
     faces : ndarray [F, 3] int
     corner : (float, float), world units
-        x and y of the upper left corner of the raster: of the lowest x and the highest y.
+        x and y of the upper left corner of the raster, with the lowest x and the highest y.
     step : float, world units
-        Side of a cell. Columns go to higher x, rows to lower y.
+        Side of a cell. x increases with the column, y decreases with the row.
     size : (int, int)
         Rows and columns.
 
     Returns
     -------
     Hits
-        Of size [rows, columns]; ``depth`` is below the highest vertex, plus one.
+        Of size [rows, columns]; ``depth`` is measured downwards from one above the highest vertex.
     """
     height, width = size
     flat = np.stack([(vertices[:, 0] - corner[0]) / step, (corner[1] - vertices[:, 1]) / step], axis=1)  # in cells
@@ -137,14 +137,14 @@ def cast_down(vertices: np.ndarray, faces: np.ndarray, corner: tuple[float, floa
         total = sum(part[inside] for part in e)
         met = face[inside]
         depth = sum(part[inside] * below[met, k] for k, part in enumerate(e)) / np.where(total == 0, np.inf, total)
-        flat_on = depth > 0  # else it is seen from its edge
+        flat_on = depth > 0  # otherwise the triangle is vertical
         key = depth[flat_on].astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)
         np.minimum.at(nearest, (y[inside] * width + x[inside])[flat_on], key | met[flat_on].astype(np.uint64))
     return _hits(nearest, edges, columns, rows)
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross products [n, 3], column by column."""
+    """Return cross products [n, 3], column by column."""
     x, y, z = (a[:, i] * b[:, j] - a[:, j] * b[:, i] for i, j in ((1, 2), (2, 0), (0, 1)))
     return np.stack([x, y, z], axis=1)
 
@@ -152,20 +152,20 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _sample_boxes(
     local: np.ndarray, faces: np.ndarray, camera: Camera, samples: int, near: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the triangles [n] that may cover a sample, and the first (x, y) [n, 2] and end (exclusive) of their boxes.
+    """Return the triangles [n] that may cover a sample, and their bounding boxes: first and end (x, y) [n, 2].
 
-    Most faces of a fine mesh lie between two columns or two rows of samples. Bounds are rounded once a vertex.
+    Most faces of a fine mesh are between two columns or rows of samples. Bounds are rounded once per vertex.
     """
     ahead = local[:, 2] > near
     safe = np.where(ahead, local[:, 2], 1.0)
     size = camera.width * samples, camera.height * samples
     focal, center = (camera.fx, camera.fy), (camera.cx, camera.cy)
-    met, near_plane_policy = np.arange(len(faces)), np.zeros(0, np.int64)
+    met, crossing = np.arange(len(faces)), np.zeros(0, np.int64)
     if not ahead.all():
         corners = sum(ahead[faces[:, k]].astype(np.int8) for k in range(3))
-        met, near_plane_policy = np.flatnonzero(corners == 3), np.flatnonzero((corners == 1) | (corners == 2))
+        met, crossing = np.flatnonzero(corners == 3), np.flatnonzero((corners == 1) | (corners == 2))
     bounds: list[np.ndarray] = []
-    parts: list[np.ndarray] = []  # the same of the faces that cross the camera plane
+    parts: list[np.ndarray] = []  # bounds of the faces that cross the near plane
     for axis in range(2):
         pixels = (local[:, axis] / safe * focal[axis] + center[axis]) * samples - 0.5  # [P]
         first = np.clip(np.ceil(pixels - _MARGIN), 0, size[axis]).astype(np.int32)
@@ -176,23 +176,22 @@ def _sample_boxes(
         some = high > low
         met, bounds = met[some], [*(bound[some] for bound in bounds), low[some], high[some]]
     for axis in range(2):
-        low, high = _reach(local[faces[near_plane_policy]], axis, focal[axis], center[axis], near)
+        low, high = _reach(local[faces[crossing]], axis, focal[axis], center[axis], near)
         first = np.clip(np.ceil(low * samples - 0.5 - _MARGIN), 0, size[axis]).astype(np.int32)
         end = np.clip(np.floor(high * samples - 0.5 + _MARGIN) + 1, 0, size[axis]).astype(np.int32)
         some = end > first
-        near_plane_policy = near_plane_policy[some]
+        crossing = crossing[some]
         parts = [bound[some] for bound in parts] + [first[some], end[some]]
-    every = np.concatenate([met, near_plane_policy])
+    every = np.concatenate([met, crossing])
     order = np.argsort(every, kind="stable")
     x0, x1, y0, y1 = (np.concatenate([bound, part])[order] for bound, part in zip(bounds, parts, strict=True))
     return every[order], np.stack([x0, y0], axis=1), np.stack([x1, y1], axis=1)
 
 
 def _reach(corners: np.ndarray, axis: int, focal: float, center: float, near: float) -> tuple[np.ndarray, np.ndarray]:
-    """Between which pixels [n], [n] of an axis the part of triangles [n, 3, 3] lies that is ahead of the camera.
+    """Return the pixel range [n], [n] along an axis of the part of triangles [n, 3, 3] beyond the near plane.
 
-    A triangle that crosses the plane where hits begin is cut there; what is left is as wide as its corners. Of a room,
-    which is all around, thousands cross it, and nearly all of them beside the picture.
+    Triangles that cross the near plane are cut there. In a room thousands cross it, nearly all outside the image.
     """
     z = corners[:, :, 2]
     ahead = z > near
@@ -202,12 +201,12 @@ def _reach(corners: np.ndarray, axis: int, focal: float, center: float, near: fl
         fraction = (near - z[:, i]) / np.where(cut, z[:, j] - z[:, i], 1.0)
         at = corners[:, i, axis] + fraction * (corners[:, j, axis] - corners[:, i, axis])
         pixels.append(np.where(cut, at / near, np.nan)[:, None])
-    places = np.concatenate(pixels, axis=1) * focal + center  # [n, 6], three or four of them numbers
-    return np.fmin.reduce(places, axis=1), np.fmax.reduce(places, axis=1)
+    every = np.concatenate(pixels, axis=1) * focal + center  # [n, 6], of which three or four are not NaN
+    return np.fmin.reduce(every, axis=1), np.fmax.reduce(every, axis=1)
 
 
 def _pairs(low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """All (box, x, y) of integer boxes [low, high), in chunks of bounded size."""
+    """Yield all (box, x, y) of integer boxes [low, high), in chunks of bounded size."""
     extent = np.maximum(high - low, 0)
     area = extent[:, 0] * extent[:, 1]
     boxes = np.flatnonzero(area)
@@ -244,17 +243,17 @@ def _hits(nearest: np.ndarray, edges: np.ndarray, directions_x: np.ndarray, dire
 def occluded(
     vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, direction: np.ndarray, *, cells: int = 256
 ) -> np.ndarray:
-    """Whether the ray from each point towards a distant light meets a triangle.
+    """Whether the ray from each point towards a distant light hits a triangle.
 
-    Seen along the light, a ray is a point and a triangle is a plane triangle: points and triangles are binned on a
-    grid across the light, and a point is compared with the triangles that touch its cell.
+    Projected along the light, a ray is a point and a triangle is a 2D triangle. Points and triangles are binned on a
+    grid across the light, and a point is compared with the triangles that overlap its cell.
 
     Parameters
     ----------
     vertices : ndarray [P, 3] world units
     faces : ndarray [F, 3] int
     points : ndarray [Q, 3] world units
-        Origins; move them off their surface first.
+        Origins, moved off their surface.
     direction : ndarray [3]
         Unit vector towards the light.
     cells : int
@@ -279,7 +278,7 @@ def occluded(
     counts = np.bincount(cell, minlength=cells * cells)
     starts = np.cumsum(counts) - counts
 
-    # One cell of margin, because a point on the border of its cell was clipped or rounded into it.
+    # One cell of margin, because points on the border of a cell may have been clipped or rounded into it.
     low = np.clip(np.floor((corners[:, :, :2].min(axis=1) - origin) / cell_size).astype(np.int64), 0, cells)
     high = np.clip(np.floor((corners[:, :, :2].max(axis=1) - origin) / cell_size).astype(np.int64) + 1, 0, cells)
     low = np.minimum(low, cells - 1)
@@ -297,7 +296,7 @@ def occluded(
 
 
 def _is_under(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Whether a ray from each point [n, 3] along +z meets its triangle [n, 3, 3]."""
+    """Whether a ray from each point [n, 3] along +z hits its triangle [n, 3, 3]."""
     x, y = (triangles[:, :, axis] - points[:, axis, None] for axis in (0, 1))
     # e[k] belongs to the edge from corner k + 1 to corner k + 2, opposite to corner k.
     e = [x[:, i] * y[:, j] - y[:, i] * x[:, j] for i, j in ((1, 2), (2, 0), (0, 1))]
@@ -309,7 +308,7 @@ def _is_under(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _same_sign(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Whether three numbers are all >= 0 or all <= 0 (column by column: a reduction over an axis of 3 is slow)."""
+    """Whether three numbers are all >= 0 or all <= 0, column by column (a reduction over an axis of 3 is slow)."""
     return np.asarray(((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0)))
 
 

@@ -1,9 +1,9 @@
-"""Reading a depth map between its pixel centres, and telling which blocks a view can change.
+"""Interpolate depth maps, and find the blocks that a view can change.
 
-Between pixel centres depth is read from the plane through the nearest pixel whose slopes are, along each axis, the
-smaller of its two one-sided differences (minmod; 0 where they differ in sign). On smooth surfaces that is as exact as
-bilinear interpolation; at a depth edge the slope comes from the near side alone, so no depth is made up between two
-surfaces, and a pixel beside the background keeps its full square.
+Depth between pixel centres is that of a plane through the nearest pixel. Its slope along each axis is the smaller of
+the two one-sided differences (minmod; 0 if their signs differ). On smooth surfaces this is as exact as bilinear
+interpolation. At a depth edge the slope comes from one side alone, so no depth between two surfaces is invented, and a
+pixel beside the background keeps its full square.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from gs2d.core.camera import Camera
 from gs2d.meshing.depth_maps import DepthMap
 from gs2d.meshing.fusion_bounds import FusionBounds
 
-UNSEEN = np.float32(-1e30)  # a depth so near that nothing lies before it: the weight comes out as 0, without NaN
+UNSEEN = np.float32(-1e30)  # depth of invalid pixels: so small that every weight becomes 0, without NaN
 
 
 @dataclass(frozen=True, eq=False)
 class DepthSampler:
-    """One depth map, ready to be looked up. Pixel arrays are flat, with a border of one unseen pixel all round."""
+    """One depth map, prepared for lookups. Pixel arrays are flat, with a border of one invalid pixel on every side."""
 
-    projection: np.ndarray  # [3, 4] float64: (x z, y z, z), x and y in px shifted by the border
-    width: int  # with the border
+    projection: np.ndarray  # [3, 4] float64: (x z, y z, z), x and y in px including the border
+    width: int  # including the border
     height: int
-    focal: float  # px, the larger of the two
-    principal: tuple[float, float]  # px, with the border
-    depth: np.ndarray  # [P] float32, UNSEEN where nothing was seen
+    focal: float  # px, the larger one
+    principal: tuple[float, float]  # px, including the border
+    depth: np.ndarray  # [P] float32, UNSEEN at invalid pixels
     slope_x: np.ndarray  # [P] float32 world units/px
     slope_y: np.ndarray
     color: np.ndarray | None  # [P, 3] float32
     weight: np.ndarray | None  # [P] float32
-    farthest: tuple[np.ndarray, ...]  # pyramid: level l is the largest depth around tiles of 2^(l + 2) px, 0 unseen
+    farthest: tuple[np.ndarray, ...]  # pyramid: largest depth around tiles of 2^(l + 2) px; 0 if invalid
 
     def signed_distance(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Depth of the surface at (x, y) px minus z, hugely negative where unseen; and the flat pixel. Reuses x, y."""
+        """Return the depth at (x, y) px minus z (large and negative if invalid), and flat pixels. Overwrites x, y."""
         np.clip(x, 0, self.width - 1, out=x)
         np.clip(y, 0, self.height - 1, out=y)
         column, row = np.floor(x), np.floor(y)
@@ -57,16 +57,16 @@ class DepthSampler:
 
 
 def make_sampler(item: DepthMap, limits: FusionBounds, truncation: np.ndarray | None = None) -> DepthSampler:
-    """Make a depth map ready: cut at the depth limit, pad, take slopes, build the pyramid of farthest depths.
+    """Prepare a depth map: apply the depth limit, pad, compute slopes and the pyramid of largest depths.
 
-    ``truncation`` [H, W] world units is that of each pixel, where it is not the same everywhere.
+    ``truncation`` [H, W] world units is that of each pixel, if it varies.
     """
     camera = item.camera
     K = camera.K.copy()
     K[:2, 2] += 1.0  # the border
     depth = np.pad(np.where(item.depth <= limits.depth_limit, item.depth, 0), 1).astype(np.float32)
     seen = np.where(depth > 0, depth, np.float32(np.nan))
-    # A slope moves depth by at most half a truncation within the pixel; steeper is an edge, not a surface.
+    # A slope changes depth by at most half a truncation within the pixel; a steeper one is an edge.
     largest = limits.truncation if truncation is None else np.pad(truncation, 1)
     slope_x = _minmod(seen, axis=1, largest=largest)
     slope_y = _minmod(seen, axis=0, largest=largest)
@@ -87,7 +87,7 @@ def make_sampler(item: DepthMap, limits: FusionBounds, truncation: np.ndarray | 
 
 
 def _minmod(depth: np.ndarray, *, axis: int, largest: float | np.ndarray) -> np.ndarray:
-    """Return the smaller one-sided difference along an axis; 0 at unseen neighbours, sign changes and edges."""
+    """Return the smaller one-sided difference along an axis; 0 beside invalid pixels, at sign changes and edges."""
     step = np.diff(depth, axis=axis)
     pad = [(0, 0), (0, 0)]
     pad[axis] = (1, 0)
@@ -95,13 +95,13 @@ def _minmod(depth: np.ndarray, *, axis: int, largest: float | np.ndarray) -> np.
     pad[axis] = (0, 1)
     ahead = np.pad(step, pad, constant_values=np.nan)
     slope = np.where(np.abs(back) < np.abs(ahead), back, ahead)
-    slope = np.where(np.isnan(ahead), back, np.where(np.isnan(back), ahead, slope))  # at a border: the one there is
+    slope = np.where(np.isnan(ahead), back, np.where(np.isnan(back), ahead, slope))  # at a border, only one exists
     slope = np.where(back * ahead < 0, 0, slope)
     return np.where(np.abs(slope) <= largest, slope, 0).astype(np.float32)
 
 
 def _pyramid(depth: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Largest depth of tiles of 4, 8, 16, ... px and their eight neighbours, up to one tile."""
+    """Return the largest depth of tiles of 4, 8, 16, ... px and their eight neighbours, up to one tile."""
     levels = []
     size = 4
     while True:
@@ -118,21 +118,21 @@ def _pyramid(depth: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def may_see(camera: Camera, corners: np.ndarray) -> bool:
-    """Whether a camera could see some of what lies between corners [8, 3]; False only where it sees none of it.
+    """Whether a camera may see a part of a box with these corners [8, 3].
 
-    All corners lie behind the camera, or beyond one side of its image, widened by the sampler's border.
+    False if all corners are behind the camera or beyond one side of the image, including the border.
     """
     x, y, z = (corners @ camera.rotation.T + camera.T_cam_world[:3, 3]).T
     across, down = camera.fx * x + camera.cx * z, camera.fy * y + camera.cy * z  # px times z, which may be negative
-    beyond = (z <= 0, across < -z, across > (camera.width + 1) * z, down < -z, down > (camera.height + 1) * z)
-    return not any(side.all() for side in beyond)
+    outside = (z <= 0, across < -z, across > (camera.width + 1) * z, down < -z, down > (camera.height + 1) * z)
+    return not any(side.all() for side in outside)
 
 
 def block_visibility(view: DepthSampler, centers: np.ndarray, radius: float, truncation: float) -> np.ndarray:
-    """Return rows [n] of the blocks that a view may change.
+    """Return the indices [n] of the blocks (spheres with ``centers`` [M, 3] and ``radius``) that a view may change.
 
-    Spheres (centers [M, 3], radius) in front of the camera, in the image, over some seen pixel, and not wholly behind
-    the surface by more than the truncation.
+    These are in front of the camera, in the image over a valid pixel, and not more than the truncation behind the
+    surface.
     """
     projected = centers @ view.projection[:, :3].T + view.projection[:, 3]
     z = projected[:, 2]

@@ -1,7 +1,7 @@
-"""Fewer faces by quadric edge collapse, of large meshes in a process of its own.
+"""Simplify meshes by quadric edge collapse; large meshes in a separate process.
 
-The library keeps what it took, 280 bytes a face, for as long as its process lives, and a run that is meshed has a page
-and a report to write yet.
+The library does not release its memory, 280 bytes per face, before its process ends, and a run needs that memory later
+for its page and report.
 """
 
 from __future__ import annotations
@@ -16,10 +16,9 @@ import numpy as np
 
 from gs2d.core.memory import trim
 
-# Of glibc. Its vectors double as they grow, beyond 2^18 faces to 46 MB; what they leave then goes back at once, which
-# spares a mesh just above 20 MB.
+# Setting of glibc: memory of large vectors, which double as they grow, is returned at once (up to 46 MB).
 _MAPPED_BYTES = "131072"
-OWN_PROCESS_FACES = 100_000  # from which a process of its own (a fifth of a second) is worth what it gives back
+OWN_PROCESS_FACES = 100_000  # from this number on, a separate process (0.2 s) saves enough memory
 _PROGRAM = """
 import io, sys
 import numpy as np
@@ -31,7 +30,7 @@ np.savez(sys.stdout.buffer, points=points, faces=faces)
 
 
 def collapse(points: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return points [P, 3] and faces [F, 3] of about ``count`` faces; the same bytes in whichever process.
+    """Simplify to about ``count`` faces; returns points [P, 3] and faces [F, 3], the same bytes in either process.
 
     Parameters
     ----------
@@ -44,7 +43,7 @@ def collapse(points: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.ndar
     ModuleNotFoundError
         The package fast_simplification is missing.
     """
-    import fast_simplification  # here: it is slow to import
+    import fast_simplification  # slow to import
 
     points, faces = np.ascontiguousarray(points, np.float32), np.ascontiguousarray(faces, np.int32)
     if len(faces) >= OWN_PROCESS_FACES and (found := _elsewhere(points, faces, count)) is not None:
@@ -54,10 +53,10 @@ def collapse(points: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.ndar
 
 
 def _elsewhere(points: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """Collapse in another process; None where none can be had, or it came to grief."""
+    """Simplify in another process; None if it cannot be started or fails."""
     packed = io.BytesIO()
     np.savez(packed, points=points, faces=faces, count=count)
-    trim()  # the other process comes beside this one, which looked views up until now
+    trim()  # returns memory before the other process needs it
     try:
         done = subprocess.run(
             [sys.executable, "-P", "-c", _PROGRAM],

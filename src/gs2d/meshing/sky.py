@@ -1,8 +1,8 @@
-"""Pixels that show the sky.
+"""Find pixels that show the sky.
 
-Training gives the sky some depth, because any depth explains it, and often that of the roof beside it: a sheet on whose
-depth neighbouring views agree. Depth alone cannot tell such a sheet from a plain wall or a table, but a photograph can:
-the sky is smooth, has no sparse points, reaches the rim of the image, and lies above the horizon.
+Training assigns an arbitrary depth to the sky, often that of an adjacent roof, on which neighbouring views agree. Depth
+alone cannot distinguish such a sheet from a wall, but the image can: sky is smooth, has no sparse points, reaches the
+border of the image, and is above the horizon.
 """
 
 from __future__ import annotations
@@ -10,27 +10,27 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_propagation, distance_transform_edt, label, uniform_filter
 
-SIDE = 400  # px, longer side to which images are shrunk
-RADIUS = 3  # px there: texture is the difference from the mean of 7x7 pixels
-SMOOTH = 2.5 / 255  # standard deviation of texture: above the noise of photographs, below plaster
-APART = 1 / 20  # of the longer side: sky is seeded this far from every sparse point, and grows as far from a seed
-BESIDE = 1 / 100  # of the longer side: nearer to a sparse point there is no sky
-LEAST = 0.03  # of the image: smaller smooth areas belong to a thing
-ALIKE = 0.05  # colour difference, [0, 1], up to which pixels at the edge of an area still belong to it
+SIDE = 400  # px; images are downscaled to this longer side
+RADIUS = 3  # px there; texture is the difference from the mean of 7x7 pixels
+SMOOTH = 2.5 / 255  # standard deviation of texture: above image noise, below plaster
+APART = 1 / 20  # of the longer side: distance of seeds from sparse points, and of pixels from seeds
+BESIDE = 1 / 100  # of the longer side: smallest distance of sky from a sparse point
+LEAST = 0.03  # of the image: smallest area of sky
+ALIKE = 0.05  # colour difference, [0, 1], up to which pixels at the edge of an area belong to it
 
 
 def sky_pixels(image: np.ndarray, points: np.ndarray, above: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
-    """Find the large smooth areas above the horizon, at the rim of an image, in which no sparse point lies.
+    """Find large smooth areas without sparse points, above the horizon and at the border of an image.
 
     Parameters
     ----------
     image : ndarray [H, W, 3] float in [0, 1]
     points : ndarray [M, 2] px
-        Sparse points within the image, whether the image has a keypoint of them or not.
+        Projections of all sparse points in the image.
     above : ndarray [H, W] bool
-        Pixels whose rays rise.
+        Pixels whose rays point above the horizon.
     valid : ndarray [H, W] bool, optional
-        Where the image has content: undistortion may leave wedges. An area that touches a wedge is at the rim.
+        Pixels with content; undistortion may leave empty wedges, whose edges count as border.
 
     Returns
     -------
@@ -48,7 +48,7 @@ def sky_pixels(image: np.ndarray, points: np.ndarray, above: np.ndarray, valid: 
 
 
 def _shrunk(image: np.ndarray, factor: int) -> np.ndarray:
-    """Return the mean of blocks of [H, W, ...]; what is left over at two sides is cut."""
+    """Average blocks of [H, W, ...]; incomplete blocks at two sides are dropped."""
     height, width = (max(1, size // factor) for size in image.shape[:2])
     high, wide = (min(factor, size) for size in image.shape[:2])
     blocks = image[: height * high, : width * wide].reshape(height, high, width, wide, *image.shape[2:])
@@ -60,7 +60,7 @@ def _smooth_areas(image: np.ndarray, points: np.ndarray, above: np.ndarray, vali
     longest, window = max(height, width), 2 * RADIUS + 1
     if not valid.any():
         return valid
-    if not valid.all():  # the edge of what is known is no texture
+    if not valid.all():  # the edge of the valid area must not count as texture
         image = image[tuple(distance_transform_edt(~valid, return_distances=False, return_indices=True))]
     detail = image - uniform_filter(image, (window, window, 1))
     smooth = valid & above & (uniform_filter((detail * detail).max(axis=2), window) < SMOOTH**2)
@@ -75,7 +75,7 @@ def _smooth_areas(image: np.ndarray, points: np.ndarray, above: np.ndarray, vali
 
 
 def _large_at_rim(mask: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Return the connected areas of a mask that are large and touch the rim of the valid pixels."""
+    """Keep connected areas of a mask that are large and touch the border of the valid pixels."""
     areas, count = label(mask)
     inner = np.zeros_like(mask)
     inner[1:-1, 1:-1] = True
@@ -87,7 +87,7 @@ def _large_at_rim(mask: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 def _with_seams(image: np.ndarray, areas: np.ndarray) -> np.ndarray:
-    """Grow areas up to the edges that bound them: the windows of the texture test end before those."""
+    """Grow areas up to their bounding edges, which the windows of the texture test do not reach."""
     if not areas.any():
         return areas
     distance, (rows, columns) = distance_transform_edt(~areas, return_indices=True)

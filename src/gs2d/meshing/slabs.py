@@ -1,8 +1,8 @@
-"""The surface of a box, slab by slab: only a slab's part of the volume is in memory at a time.
+"""Fuse and extract a volume slab by slab, with only one slab in memory.
 
-Blocks do not meet in fusion, and their keys go by layers along x, so a slab is a range of keys, fused alone. The cells
-of its last layer need the first voxels of the next one, which is therefore fused twice. Vertices on the plane between
-two slabs have the same number and the same bits in both: the mesh is that of the whole volume, byte for byte.
+Blocks are fused independently, and their keys are ordered in layers along x, so a slab is a range of keys. The cells of
+its last layer need the first voxels of the next layer, which is fused twice. Vertices on the plane between two slabs
+have the same index and value in both, so the mesh is byte-identical to that of the whole volume.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from gs2d.meshing.marching_cubes import EDGES_OF_BLOCK, cell_surface, edge_verti
 from gs2d.meshing.tsdf_volume import VolumeBlocks, block_bytes, fuse_blocks
 from gs2d.render.backends import Backend
 
-SLAB_BYTES = 192 << 20  # of the volume: much less and its views are prepared too often, much more and it is the peak
+SLAB_BYTES = 192 << 20  # smaller slabs prepare views more often, larger ones raise the peak memory
 
 
 def fused_surface(
@@ -31,7 +31,7 @@ def fused_surface(
     threads: int | None = None,
     backend: str | Backend = "auto",
 ) -> Mesh:
-    """Return what ``marching_cubes(fuse(...))`` returns, without all of the volume in memory.
+    """Return the mesh of ``marching_cubes(fuse(...))`` without the whole volume in memory.
 
     Parameters
     ----------
@@ -39,11 +39,11 @@ def fused_surface(
         Read once for each slab: a sequence or a ``Spool``.
     limits : FusionBounds
     blocks : VolumeBlocks
-        Those that the frames touch, as ``find_blocks`` finds them.
+        From ``find_blocks``.
     min_weight : float
         See ``marching_cubes``.
     slab_bytes : int
-        The volume of a slab stays below it where more than one layer of blocks, and the next one, fit.
+        Limit for a slab; exceeded only if a single layer of blocks and the next one do not fit.
     threads, backend
         As for ``fuse``.
     """
@@ -51,7 +51,7 @@ def fused_surface(
     vertices: list[np.ndarray] = []
     colors: list[np.ndarray] = []
     faces: list[np.ndarray] = []
-    before = 0  # vertices of the slabs so far
+    before = 0  # number of vertices of the earlier slabs
     for start, own, stop in slabs(blocks, slab_bytes):
         volume = fuse_blocks(frames, limits, blocks.part(start, stop), threads=threads, backend=backend)
         found, corners, ends = cell_surface(volume, min_weight, own - start)
@@ -70,9 +70,9 @@ def fused_surface(
 
 
 def slabs(blocks: VolumeBlocks, slab_bytes: int) -> Iterator[tuple[int, int, int]]:
-    """Yield rows (start, own, stop) of slabs: those from ``start`` to ``own`` make surface, the rest is read alone."""
+    """Yield (start, own, stop) of slabs: blocks from ``start`` to ``own`` create surface, the rest is only read."""
     layer = blocks.keys // (blocks.dims[1] * blocks.dims[2])
-    starts = np.searchsorted(layer, np.arange(blocks.dims[0] + 2))  # first row of each layer; none is beyond the last
+    starts = np.searchsorted(layer, np.arange(blocks.dims[0] + 2))  # first block of each layer
     most = slab_bytes // block_bytes(blocks.colored)
     first = 0
     while first < blocks.dims[0]:

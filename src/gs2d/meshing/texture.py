@@ -1,18 +1,18 @@
-"""The colours of a texture: for every texel, a mean of the few photographs that see its point of the surface best.
+"""Bake a texture: each texel is a weighted mean of the few images with the best view of its surface point.
 
-All photographs are compared first (``agreement``): each is brought to the colours that most photographs agree on, and
-its scores fall where it shows something else, such as an obstacle.
+First, all images are compared (``agreement``): each is corrected to the consensus colours, and its scores decrease
+where it shows something else, such as an obstacle.
 
-A photograph with focal lengths f_x, f_y that sees the point at depth z, along the ray r, on a surface of unit normal n,
-has q = f_x f_y |n . r| / z^3 pixels per unit of surface (the Jacobian of the projection): the cosine and the resolution
-in one number. Its score is s = q b a, where b falls from 1 to 0.01 over the last ``FEATHER`` pixels before an outline,
-a border of the image or of its mask, and a falls to 0.001 where the photograph disagrees with the others. The highest
-``best`` + 1 scores of a texel are kept, and its colour is
+An image with focal lengths f_x, f_y that sees the point at depth z, along the ray r, on a surface with unit normal n,
+has q = f_x f_y |n . r| / z^3 pixels per unit of surface (the Jacobian of the projection), which combines cosine and
+resolution. Its score is s = q b a, where b decreases from 1 to 0.01 over the last ``FEATHER`` pixels before an outline,
+the image border or a mask, and a decreases to 0.001 where the image disagrees with the others. The highest ``best`` + 1
+scores of a texel are kept, and its colour is
 
     sum_v w_v c_v / sum_v w_v,    w_v = s_v - (the lowest of them)
 
-so the weights of ``best`` photographs, continuous across the surface: where one photograph takes the place of another
-in the choice, both have weight 0. See docs/math.md and docs/notebook/meshing.md.
+so the weights of ``best`` images are continuous across the surface: where one image replaces another, both have weight
+0. See docs/math.md and docs/notebook/meshing.md.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ from gs2d.meshing.raycast import cast_camera
 from gs2d.meshing.simplify import collapse
 
 # -- charts and texels -------------------------------------------------------------------------------------------------
-PADDING = 4  # texels between charts: two smaller copies of the texture do not mix them
-_BAND = 1 << 20  # texels that are drawn at a time
+PADDING = 4  # texels between charts: two mipmap levels do not mix them
+_BAND = 1 << 20  # texels per chunk
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,13 +49,13 @@ class Atlas:
     Attributes
     ----------
     mesh : Mesh
-        As it was before the split.
+        The mesh before the split.
     source : ndarray [Q] int64
-        Vertex of ``mesh`` that each split vertex is.
+        Vertex of ``mesh`` of each split vertex.
     faces : ndarray [F, 3] int32
-        Split vertices; face f is face f of ``mesh``.
+        Indices of split vertices; face f is face f of ``mesh``.
     uv : ndarray [Q, 2] float32
-        In [0, 1], from the upper left corner.
+        Texture coordinates in [0, 1], from the upper left corner.
     charts : int
     """
 
@@ -68,7 +68,7 @@ class Atlas:
 
 @dataclass(frozen=True, eq=False)
 class Texels:
-    """The T texels of a texture that lie on the mesh, in the order of rows.
+    """The T texels of a texture that lie on the mesh, row by row.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class Texels:
     weights: np.ndarray
 
     def interpolated(self, values: np.ndarray, faces: np.ndarray, part: slice = slice(None)) -> np.ndarray:
-        """Vertex values [P, C] at the texels of ``part``, float32 [t, C]."""
+        """Interpolate vertex values [P, C] at the texels of ``part``, float32 [t, C]."""
         corners = faces[self.face[part]]
         w = self.weights[part]
         values = values.astype(np.float32, copy=False)
@@ -98,42 +98,42 @@ class Texels:
 
 
 def required(module: str) -> Any:
-    """Return a package of the extra ``texture``.
+    """Import a package of the extra ``texture``.
 
     Raises
     ------
     BackendError
-        It is not installed.
+        If it is not installed.
     """
     return extras.required("texture", module, "--texture", "leave --texture out")
 
 
 def simplified(mesh: Mesh, faces: int) -> Mesh:
-    """Simplify to at most ``faces`` triangles, by quadric edge collapse; a changed mesh has no vertex colours."""
+    """Simplify to at most ``faces`` triangles by quadric edge collapse; a simplified mesh has no vertex colours."""
     if faces < 4:
-        raise ProtocolError(f"--faces must be a whole number >= 4, got {faces}")
+        raise ProtocolError(f"--faces must be an integer >= 4, got {faces}")
     if len(mesh.faces) <= faces:
         return mesh
     vertices = mesh.vertices.astype(np.float64)
-    middle, size = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max()) or 1.0  # the library works in floats
+    middle, size = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max()) or 1.0  # the library uses float32
     required("fast_simplification")
     points, triangles = collapse((vertices - middle) / size, mesh.faces, faces)
     return Mesh((points.astype(np.float64) * size + middle).astype(mesh.vertices.dtype), triangles.astype(np.int32))
 
 
 def unwrap(mesh: Mesh, size: int) -> Atlas:
-    """Cut a mesh into charts and pack them into the unit square, ``PADDING`` texels of a texture of ``size`` apart.
+    """Split a mesh into charts and pack them into the unit square, ``PADDING`` texels apart at this ``size``.
 
     Raises
     ------
     BackendError
-        The package xatlas is missing.
+        If the package xatlas is missing.
     ProtocolError
-        The mesh has no faces.
+        If the mesh has no faces.
     """
     xatlas = required("xatlas")
     if not len(mesh.faces):
-        raise ProtocolError("a texture needs a mesh with faces, got none; extract it with other limits")
+        raise ProtocolError("a texture needs a mesh with faces, got an empty mesh; extract it with other limits")
     atlas, pack = xatlas.Atlas(), xatlas.PackOptions()
     pack.resolution, pack.padding, pack.bilinear = size, PADDING, True
     vertices = mesh.vertices.astype(np.float64)
@@ -141,14 +141,14 @@ def unwrap(mesh: Mesh, size: int) -> Atlas:
     atlas.add_mesh(np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(mesh.faces, np.uint32))
     atlas.generate(xatlas.ChartOptions(), pack, False)
     source, faces, uv = atlas[0]
-    uv = np.nan_to_num(uv.astype(np.float32))  # faces without area have no place in it
+    uv = np.nan_to_num(uv.astype(np.float32))  # faces without area have no coordinates
     return Atlas(mesh, source.astype(np.int64), faces.astype(np.int32), uv, int(atlas.chart_count))
 
 
 def texels_of(atlas: Atlas, size: int) -> Texels:
-    """Return the texels whose centres lie in a chart, drawn a band of rows at a time.
+    """Return the texels whose centres are in a chart.
 
-    The charts lie on the plane z = 1 before a camera with f = 1, so the ray caster of the demo draws them.
+    The charts are rasterized by the ray caster, as a mesh on the plane z = 1 of a camera with f = 1.
     """
     rows = max(1, _BAND // size)
     flat = np.concatenate([atlas.uv.astype(np.float64) * size, np.ones((len(atlas.uv), 1))], axis=1)
@@ -164,7 +164,7 @@ def texels_of(atlas: Atlas, size: int) -> Texels:
 
 
 def vertex_normals(mesh: Mesh) -> np.ndarray:
-    """Return unit normals [P, 3] float32: face normals weighted by area; (0, 0, 1) at vertices of no area."""
+    """Return unit vertex normals [P, 3] float32, weighted by face area; (0, 0, 1) if the area is 0."""
     vertices = mesh.vertices.astype(np.float64)
     a, b, c = (vertices[mesh.faces[:, k]] for k in range(3))
     areas = np.cross(b - a, c - a)
@@ -177,33 +177,33 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
 
 
 # -- colours -----------------------------------------------------------------------------------------------------------
-BEST = 4  # photographs in the mean
+BEST = 4  # images in the mean
 FEATHER = 4.0  # px
 MIN_FEATHER = 0.01
-GRAZING = 0.1  # cosine below which a surface is not seen
-JUMP = 3.0  # bend of the depth between pixels that is an outline, in footprints of a pixel
-MAX_SIDE = 1600  # px, of the depth maps that decide what is hidden
+GRAZING = 0.1  # cosine below which a surface is not visible
+JUMP = 3.0  # pixel footprints; a larger bend of the depth between pixels is an outline
+MAX_SIDE = 1600  # px; of the depth maps for occlusion
 MIN_SIZE, MAX_SIZE, MAX_AUTO_SIZE = 64, 8192, 4096
 _CHUNK = 1 << 17  # texels
-_TYPICAL_USE = 0.55  # part of the atlas that charts cover
-_FINER = 2.0  # texels in the length of a pixel: a picture drawn twice over keeps its edges
-_SAMPLES = 5000  # faces that choose the size
-COARSE = 2  # px: photographs are compared in images smaller by this factor
-_STRIDE = 4  # texels between points at which photographs are compared
-TABLE_BYTES = 512 << 20  # of the colours of these points in all photographs
+_TYPICAL_USE = 0.55  # fraction of the atlas that charts cover
+_FINER = 2.0  # texels per pixel length; keeps edges sharp after resampling twice
+_SAMPLES = 5000  # faces that determine the texture size
+COARSE = 2  # images are downscaled by this factor for the comparison
+_STRIDE = 4  # texels between points of the comparison
+TABLE_BYTES = 512 << 20  # limit for the colours of these points in all images
 
 
 @dataclass(frozen=True, eq=False)
 class ColorSource:
-    """A picture to take colours from.
+    """An image to take colours from.
 
     Attributes
     ----------
     camera : Camera
     image : ndarray [H, W, 3 or 4] uint8
-        Straight alpha; pixels below one half show nothing of the surface.
+        Straight alpha; pixels with alpha below one half are ignored.
     valid : ndarray [H, W] bool or None
-        False: not to be used.
+        False for pixels to ignore.
     """
 
     camera: Camera
@@ -211,31 +211,30 @@ class ColorSource:
     valid: np.ndarray | None = None
 
     def shrunk(self, factor: int) -> ColorSource:
-        """Return the averages of ``factor`` x ``factor`` pixels."""
+        """Downscale by averaging ``factor`` x ``factor`` pixels."""
         factor = min(factor, *self.image.shape[:2])
         valid = None if self.valid is None else mask_downscale(self.valid, factor, need=1.0)
         return ColorSource(self.camera.downscaled(factor), area_downscale(self.image, factor), valid)
 
 
 ColorSources = Callable[[int], Iterable[ColorSource]]
-"""Reads all images, one at a time, in the same order each time: smaller by the factor that it is given."""
+"""Reads all images one at a time, in a fixed order, downscaled by the factor that is its argument."""
 
 
 @dataclass(frozen=True, eq=False)
 class Baked:
-    """A textured mesh and how much of it the photographs know."""
+    """A textured mesh, and how many of its texels no image sees."""
 
     mesh: TexturedMesh
     texels: int  # on the surface
-    unseen: int  # of them, filled from their neighbours
+    unseen: int  # of them filled from their neighbours
     charts: int
 
 
 def texture_size(mesh: Mesh, cameras: list[Camera]) -> int:
-    """Return the side, a power of two, of a texture with at least two texels in the length of the pixels that see best.
+    """Return the side, a power of two, of a texture with at least two texels per pixel length of the best views.
 
-    Of some faces (spread evenly over the list) the camera that has most pixels per unit area before it decides; what
-    hides them does not.
+    Determined from a sample of the faces and the camera with the highest resolution for each, without occlusion.
     """
     vertices = mesh.vertices.astype(np.float64)
     a, b, c = (vertices[mesh.faces[:, k]] for k in range(3))
@@ -258,23 +257,23 @@ def texture_size(mesh: Mesh, cameras: list[Camera]) -> int:
 
 
 def bake(atlas: Atlas, images: ColorSources, size: int, *, best: int = BEST, threads: int | None = None) -> Baked:
-    """Colour the texels of an atlas from photographs.
+    """Colour the texels of an atlas from images.
 
     Parameters
     ----------
     atlas : Atlas
     images : callable
-        Reads the photographs; called twice.
-    size : int
-        Side of the texture, texels. Memory: about 70 bytes for each texel on the surface.
+        Reads the images; called twice.
+    size : int, texels
+        Side of the texture. Needs about 70 bytes of memory per texel on the surface.
     best : int
-        Photographs that a texel's colour is made of.
+        Number of images that contribute to a texel.
     threads : int, optional
 
     Raises
     ------
     ProtocolError
-        The size is out of bounds, or no photograph sees any of the surface.
+        If the size is out of range, or no image sees the surface.
     """
     if not MIN_SIZE <= size <= MAX_SIZE:
         raise ProtocolError(f"--texture-size must be {MIN_SIZE} to {MAX_SIZE} texels, got {size}")
@@ -294,23 +293,23 @@ def bake(atlas: Atlas, images: ColorSources, size: int, *, best: int = BEST, thr
 def surface_colors(
     mesh: Mesh, texels: Texels, images: ColorSources, *, best: int = BEST, threads: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return colours [T, 3] uint8 of points on a mesh from photographs, and which of them some photograph sees [T].
+    """Return colours [T, 3] uint8 of points on a mesh from images, and which points any image sees [T].
 
     Parameters
     ----------
     mesh : Mesh
     texels : Texels
-        On the faces of the mesh.
+        Points on the faces of the mesh.
     images : callable
-        Reads the photographs; called twice.
+        Reads the images; called twice.
     best : int
-        Photographs that a colour is made of.
+        Number of images that contribute to a colour.
     threads : int, optional
 
     Raises
     ------
     ProtocolError
-        No photograph sees any of them.
+        If no image sees any point.
     """
     origin = mesh.vertices.astype(np.float64).mean(axis=0)
     points = _Points.of(mesh, texels, origin)
@@ -325,17 +324,15 @@ def surface_colors(
         chooser.add(looked)
     colors, seen = chooser.colors()
     if not seen.any():
-        raise ProtocolError(
-            f"photographs that see the mesh were expected, none of {chooser.count} does; is it of this capture?"
-        )
+        raise ProtocolError(f"none of {chooser.count} photographs sees the mesh; does it belong to this capture?")
     return colors, seen
 
 
 @dataclass(frozen=True, eq=False)
 class _Points:
-    """Points of a surface relative to an origin, float32: places [n, 3], normals [n, 3] and heights n . x [n]."""
+    """Surface points relative to an origin, float32: positions x [n, 3], normals n [n, 3] and n . x [n]."""
 
-    places: np.ndarray
+    positions: np.ndarray
     normals: np.ndarray
     heights: np.ndarray
 
@@ -344,51 +341,51 @@ class _Points:
         """Return the points of texels."""
         vertices, vertex_normal = mesh.vertices - origin, vertex_normals(mesh)
         n = len(texels.index)
-        places, normals = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
+        positions, normals = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
         for start in range(0, n, _CHUNK):
             part = slice(start, start + _CHUNK)
-            places[part] = texels.interpolated(vertices, mesh.faces, part)
+            positions[part] = texels.interpolated(vertices, mesh.faces, part)
             normal = texels.interpolated(vertex_normal, mesh.faces, part)
             normals[part] = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-        return cls(places, normals, (places * normals).sum(axis=1))
+        return cls(positions, normals, (positions * normals).sum(axis=1))
 
     def subset(self, rows: np.ndarray | slice) -> _Points:
         """Return some of the points."""
-        return _Points(self.places[rows], self.normals[rows], self.heights[rows])
+        return _Points(self.positions[rows], self.normals[rows], self.heights[rows])
 
 
 class _Compared:
-    """Colours of points of the surface in all photographs, and what they agree on."""
+    """Colours of surface points in all images, and their consensus."""
 
     def __init__(self, points: _Points, texels: Texels, area: float) -> None:
         row, column = np.divmod(texels.index, texels.size)
         self._points = points.subset(np.flatnonzero((row % _STRIDE == 0) & (column % _STRIDE == 0)))
-        self._area = area / max(len(self._points.places), 1)  # world units^2 for each point
+        self._area = area / max(len(self._points.positions), 1)  # world units^2 per point
         self._samples: list[np.ndarray] = []  # [P, 4] uint8: colour and vote, later the weight
         self._agreement: Agreement | None = None
 
     def add(self, looked: _Looked) -> None:
-        """Look the points up in an image; every second point is dropped where the table would become too large."""
-        while (len(self._samples) + 1) * len(self._points.places) * 4 > TABLE_BYTES:
+        """Look the points up in an image; every second point is dropped if the table becomes too large."""
+        while (len(self._samples) + 1) * len(self._points.positions) * 4 > TABLE_BYTES:
             self._points = self._points.subset(slice(None, None, 2))
             self._samples = [samples[::2].copy() for samples in self._samples]
-        samples = np.zeros((len(self._points.places), 4), np.uint8)
+        samples = np.zeros((len(self._points.positions), 4), np.uint8)
         seen = looked.see(self._points, np.zeros(len(samples), np.float32))
-        resolved = np.minimum(seen.density * self._area, 1)  # pixels for each point
+        resolved = np.minimum(seen.density * self._area, 1)  # pixels per point
         samples[seen.rows, :3] = np.rint(seen.colors)
         samples[seen.rows, 3] = np.ceil(VOTE * seen.clear * seen.cosine * resolved)
         self._samples.append(samples)
 
     def agree(self) -> None:
-        """Find the consensus."""
+        """Estimate the consensus."""
         self._agreement = agree(self._samples)
 
     def correct(self, looked: _Looked, number: int) -> None:
-        """Correct the photograph that was added as this ``number``."""
+        """Correct the image with this index."""
         assert self._agreement is not None
         rows = np.flatnonzero(self._samples[number][:, 3])
         looked.correct(
-            self._points.places[rows],
+            self._points.positions[rows],
             self._samples[number][rows],
             self._agreement.colors[rows],
             self._agreement.gains[number],
@@ -396,19 +393,19 @@ class _Compared:
 
 
 class _Chooser:
-    """The best photographs of each texel so far."""
+    """The best images of each texel so far."""
 
     def __init__(self, points: _Points, best: int, threads: int) -> None:
         self._points, self._threads = points, threads
         self.count = 0
-        n = len(points.places)
+        n = len(points.positions)
         self._parts = [slice(start, min(start + _CHUNK, n)) for start in range(0, n, _CHUNK)]
         self._scores = np.zeros((n, best + 1), np.float32)
-        self._least = np.zeros(n, np.float32)  # of the scores
+        self._least = np.zeros(n, np.float32)  # lowest score of each texel
         self._colors = np.zeros((n, best + 1, 3), np.uint8)
 
     def add(self, looked: _Looked) -> None:
-        """Let every texel choose whether it wants this photograph."""
+        """Replace the lowest score of every texel for which this image is better."""
         self.count += 1
         with ThreadPoolExecutor(self._threads) as pool:
             for _ in pool.map(lambda part: self._choose(looked, part), self._parts):
@@ -422,10 +419,10 @@ class _Chooser:
         least[seen.rows] = scores[seen.rows].min(axis=1)
 
     def colors(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean colours [T, 3] uint8 of the texels, and which of them some photograph saw [T]."""
+        """Return mean colours [T, 3] uint8 of the texels, and which of them any image sees [T]."""
         colors = np.zeros((len(self._scores), 3), np.uint8)
         for part in self._parts:
-            weights = self._scores[part] - 0.999 * self._least[part][:, None]  # equal scores: equal weights, not none
+            weights = self._scores[part] - 0.999 * self._least[part][:, None]  # 0.999: equal scores must not give 0
             total = np.maximum(weights.sum(axis=1), 1e-30)
             mean = np.einsum("tk,tkc->tc", weights, self._colors[part].astype(np.float32)) / total[:, None]
             colors[part] = np.rint(mean)
@@ -434,7 +431,7 @@ class _Chooser:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """Points that a photograph sees.
+    """Points that an image sees.
 
     Attributes
     ----------
@@ -442,7 +439,7 @@ class _Seen:
     density : ndarray [m]
         q, pixels per unit of surface.
     clear : ndarray [m]
-        b, how far from an outline.
+        b, factor for the distance from an outline.
     cosine : ndarray [m]
     colors : ndarray [m, 3]
     """
@@ -455,7 +452,7 @@ class _Seen:
 
 
 class _Looked:
-    """A photograph, with what of the mesh it sees and how near to an outline."""
+    """An image with its depth map of the mesh, and the distances of its pixels from outlines."""
 
     def __init__(self, mesh: Mesh, image: ColorSource, origin: np.ndarray) -> None:
         camera = image.camera
@@ -470,9 +467,9 @@ class _Looked:
         self._depth = cast_camera(mesh.vertices.astype(np.float64), mesh.faces, small).depth
         self._clear = feather(self._depth, small.fx, _shown(image, small))
 
-    def correct(self, places: np.ndarray, samples: np.ndarray, colors: np.ndarray, gain: np.ndarray) -> None:
-        """Bring the image to the colours of the consensus, and lower its score where it does not agree."""
-        pixels = np.stack(self._project(places)[:2], axis=1)
+    def correct(self, positions: np.ndarray, samples: np.ndarray, colors: np.ndarray, gain: np.ndarray) -> None:
+        """Correct the image to the consensus colours, and lower its score where it disagrees."""
+        pixels = np.stack(self._project(positions)[:2], axis=1)
         self._image, weights = corrected(self._image, pixels, samples, colors, gain, COARSE)
         height, width = self._clear.shape
         row = ((np.arange(height) + 0.5) * (weights.shape[0] / height)).astype(np.int64)[:, None]
@@ -480,14 +477,14 @@ class _Looked:
         self._clear *= weights[row, column]
 
     def see(self, points: _Points, least: np.ndarray) -> _Seen:
-        """Look up the points that are visible with a score above ``least`` [n]."""
+        """Return the visible points with a score above ``least`` [n]."""
         facing = points.normals @ self._center - points.heights
-        z = points.places @ self._rotation[2] + self._shift[2]
+        z = points.positions @ self._rotation[2] + self._shift[2]
         with np.errstate(divide="ignore", invalid="ignore"):
             density = np.float32(self._camera.fx * self._camera.fy) * facing / (z * z * z)
-        rows = np.flatnonzero((facing > 0) & (z > 0) & (density > least))  # cheap, for all
+        rows = np.flatnonzero((facing > 0) & (z > 0) & (density > least))  # a cheap test for all points
         camera, small = self._camera, self._small
-        x, y, z = self._project(points.places[rows])
+        x, y, z = self._project(points.positions[rows])
         inside = (x >= 0.5) & (y >= 0.5) & (x <= camera.width - 0.5) & (y <= camera.height - 0.5)
         rows, x, y, z = rows[inside], x[inside], y[inside], z[inside]
         column = np.minimum((x * (small.width / camera.width)).astype(np.int32), small.width - 1)
@@ -496,23 +493,23 @@ class _Looked:
         clear = self._clear.reshape(-1)[pixel]
         better = density[rows] * clear > least[rows]
         rows, x, y, z, pixel, clear = (values[better] for values in (rows, x, y, z, pixel, clear))
-        ray = points.places[rows] - self._center
+        ray = points.positions[rows] - self._center
         cosine = facing[rows] / np.sqrt((ray * ray).sum(axis=1))
-        # depth changes by tan(incidence) footprints within a pixel of a plane; twice that, and a footprint of its own
+        # On a plane, depth changes by tan(incidence) footprints per pixel; the tolerance is twice that plus one.
         tolerance = z / small.fx * (1 + 2 / np.maximum(cosine, GRAZING))
         seen = (cosine > GRAZING) & (np.abs(z - self._depth.reshape(-1)[pixel]) <= tolerance)
         rows = rows[seen]
         return _Seen(rows, density[rows], clear[seen], cosine[seen], bilinear(self._image, x[seen], y[seen]))
 
-    def _project(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _project(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return x and y in px, and the depth."""
-        x, y, z = (places @ self._rotation[i] + self._shift[i] for i in range(3))
+        x, y, z = (positions @ self._rotation[i] + self._shift[i] for i in range(3))
         return self._camera.fx * x / z + self._camera.cx, self._camera.fy * y / z + self._camera.cy, z
 
 
-def _shown(photograph: ColorSource, small: Camera) -> np.ndarray:
-    """Which pixels [H, W] of the smaller camera's image may be used."""
-    image, valid = photograph.image, photograph.valid
+def _shown(source: ColorSource, small: Camera) -> np.ndarray:
+    """Return which pixels [H, W] of the downscaled camera may be used."""
+    image, valid = source.image, source.valid
     height, width = image.shape[:2]
     row = ((np.arange(small.height) + 0.5) * height / small.height).astype(np.int64)[:, None]
     column = ((np.arange(small.width) + 0.5) * width / small.width).astype(np.int64)[None]
@@ -525,10 +522,10 @@ def _shown(photograph: ColorSource, small: Camera) -> np.ndarray:
 
 
 def feather(depth: np.ndarray, focal: float, shown: np.ndarray) -> np.ndarray:
-    """How far pixels are from what must not bleed into them, float32 [H, W]; 0 where nothing may be taken.
+    """Return the feather factor of pixels, float32 [H, W]; 0 for unusable pixels.
 
-    1 at ``FEATHER`` pixels or more from an outline, the border of the image and pixels that are not ``shown``, falling
-    to ``MIN_FEATHER`` beside them. An outline is where 1 / depth, which is linear on a plane, bends.
+    It is 1 at ``FEATHER`` pixels or more from outlines, the image border and pixels that are not ``shown``, and falls
+    to ``MIN_FEATHER`` beside them. An outline is a bend of 1 / depth, which is linear on a plane.
     """
     inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0)
     bend = np.zeros_like(inverse)
@@ -537,13 +534,13 @@ def feather(depth: np.ndarray, focal: float, shown: np.ndarray) -> np.ndarray:
     middle = inverse[1:-1]
     bend[1:-1] = np.maximum(bend[1:-1], np.abs(inverse[:-2] + inverse[2:] - 2 * middle))
     usable = (depth > 0) & shown
-    clear = np.pad(usable & (bend * depth * focal <= JUMP), 1)  # nothing is known beyond the border
+    clear = np.pad(usable & (bend * depth * focal <= JUMP), 1)  # pixels beyond the border are unknown
     distance = distance_transform_edt(clear)[1:-1, 1:-1]
     return np.where(usable, np.clip(distance / FEATHER, MIN_FEATHER, 1), 0).astype(np.float32)
 
 
 def bilinear(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Colours [m, 3] float32 of an image [H, W, >= 3] at places in px (pixel centres at +0.5), clamped to it."""
+    """Sample an image [H, W, >= 3] bilinearly at positions in px (pixel centres at +0.5), clamped; float32 [m, 3]."""
     height, width = image.shape[:2]
     flat = image.reshape(height * width, -1)
     x, y = np.clip(x - 0.5, 0, width - 1), np.clip(y - 0.5, 0, height - 1)
@@ -557,10 +554,10 @@ def bilinear(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def fill_unseen(atlas: Atlas, texels: Texels, colors: np.ndarray, seen: np.ndarray) -> None:
-    """Colour the texels that no photograph saw, in place, from what lies beside them on the surface, across charts.
+    """Colour the texels that no image sees, in place, from adjacent surface, across charts.
 
-    Vertices take the mean of the seen texels around them; the others, ring after ring, the mean of their coloured
-    neighbours; a piece without any, the mean of all. Unseen texels are interpolated between the vertices of their face.
+    Vertices get the mean of the visible texels around them. Other vertices get the mean of their coloured neighbours,
+    ring by ring, or the mean of all colours if their component has none. Texels interpolate the vertices of their face.
     """
     if seen.all():
         return
@@ -591,9 +588,9 @@ def fill_unseen(atlas: Atlas, texels: Texels, colors: np.ndarray, seen: np.ndarr
 
 
 def spread(texels: Texels, colors: np.ndarray) -> np.ndarray:
-    """Return the texture [S, S, 3] uint8: texels of no chart take the colour of the nearest one that is of some.
+    """Return the texture [S, S, 3] uint8. Texels outside all charts get the colour of the nearest texel in a chart.
 
-    So neither filtering at the border of a chart nor a smaller copy of the texture mixes in a colour of nothing.
+    Filtering at chart borders and mipmaps then do not mix in a background colour.
     """
     size = texels.size
     texture, empty = np.zeros((size * size, 3), np.uint8), np.ones(size * size, bool)

@@ -1,10 +1,10 @@
 """A block-sparse truncated signed distance field (Curless and Levoy 1996), fused from depth maps.
 
-Space is a grid of voxels; only blocks of 8^3 that lie near some seen surface exist. A voxel starts unknown (weight 0),
-never as inside or outside, so what no view saw makes no surface and no second layer. A view changes a voxel at depth
-z, seen through a pixel of depth d, by the running mean of min(1, (d - z) / truncation): free space in front of the
-surface clears voxels of existing blocks, and behind the surface the weight falls to zero at the truncation, so that
-the two sides of a thin plate do not fight.
+Space is a grid of voxels, of which only blocks of 8^3 near observed surfaces are allocated. A voxel starts as unknown
+(weight 0), neither inside nor outside, so unobserved space creates no surface. A view updates a voxel at depth z, seen
+through a pixel of depth d, with a running mean of min(1, (d - z) / truncation). Free space in front of the surface
+clears voxels of allocated blocks. Behind the surface the weight falls to zero at the truncation, so that the two sides
+of a thin plate do not interfere.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 # -- the volume --------------------------------------------------------------------------------------------------------
 BLOCK = 8  # voxels along the side of a block
 VOXELS = BLOCK**3
-_ALL_OF_LEAST = 16  # all blocks of a scene, in units of the least that one view needs: 5 to 15 were met
+_ALL_OF_LEAST = 16  # all blocks of a scene / lower bound for one view; 5 to 15 in measured scenes
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,17 +46,17 @@ class Volume:
     ----------
     limits : FusionBounds
     dims : tuple of 3 ints
-        Blocks that the box would hold along x, y, z.
+        Size of the box in blocks along x, y, z.
     keys : ndarray [M] int64
         Sorted: (x * dims[1] + y) * dims[2] + z of each block.
     tsdf : ndarray [M, 512] float32
         In units of the truncation, positive towards the cameras; voxels in x, y, z order, z fastest.
     weight : ndarray [M, 512] float32
-        0: unknown.
+        0 means unknown.
     color, color_weight : ndarray [M, 512, 3] and [M, 512] float32, or None
-        0 to 255, from views that saw the voxel near their surface.
+        0 to 255, from views with a surface near the voxel.
     frames : int
-        How many depth maps were fused.
+        Number of fused depth maps.
     """
 
     limits: FusionBounds
@@ -75,20 +75,20 @@ class Volume:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all arrays."""
+        """Size of all arrays in bytes."""
         arrays = (self.keys, self.tsdf, self.weight, self.color, self.color_weight)
         return sum(a.nbytes for a in arrays if a is not None)
 
 
 def block_bytes(colored: bool) -> int:
-    """Bytes of one block in a Volume."""
+    """Return the size of one block of a volume in bytes."""
     return 8 + VOXELS * 4 * (6 if colored else 2)
 
 
 def invalid_volume(
     limits: FusionBounds, dims: tuple[int, int, int], keys: np.ndarray, *, colored: bool, frames: int
 ) -> Volume:
-    """Blocks of which nothing is known yet."""
+    """Allocate blocks with unknown voxels."""
     m = len(keys)
     return Volume(
         limits=limits,
@@ -103,33 +103,33 @@ def invalid_volume(
 
 
 def check_truncation(limits: FusionBounds) -> None:
-    """Raise ProtocolError for a truncation beyond the box and many voxels: all of it would be near a surface."""
+    """Raise ProtocolError if the truncation exceeds the box: then all of it would be near a surface."""
     if not limits.truncation <= max(limits.side, 20 * limits.voxel):
         raise ProtocolError(
-            f"a truncation of at most the side of the box, {limits.side:.4g} world units, was expected, "
-            f"got {limits.truncation:.4g}; leave it out, or give a larger bbox"
+            f"the truncation must not exceed the side of the box, {limits.side:.4g} world units, got "
+            f"{limits.truncation:.4g}; omit it, or use a larger bbox"
         )
 
 
 def block_grid(limits: FusionBounds) -> tuple[int, int, int]:
-    """How many blocks the box holds along x, y, z.
+    """Return the size of the box in blocks along x, y, z.
 
     Raises
     ------
     ProtocolError
-        If the box is so large that blocks cannot be numbered: the voxel is far too small for it.
+        If the voxel is so small that the blocks cannot be numbered.
     """
     size = np.subtract(limits.upper, limits.lower)
     dims = np.ceil(size / (BLOCK * limits.voxel)) + 1
     if not np.isfinite(dims).all() or np.prod(dims) > 2**60:
         raise ProtocolError(
-            f"a voxel that fits the box of {size.max():.4g} world units was expected, got {limits.voxel:.4g}"
+            f"the voxel is too small for a box of {size.max():.4g} world units, got {limits.voxel:.4g}; increase it"
         )
     return int(dims[0]), int(dims[1]), int(dims[2])
 
 
 class VolumeTooLargeError(ProtocolError):
-    """A volume over the bound; ``voxel`` is about the one at which it is not, world units."""
+    """The volume exceeds its limit; ``voxel``, in world units, is estimated to fit."""
 
     def __init__(self, voxel: float, message: str) -> None:
         super().__init__(message)
@@ -138,24 +138,24 @@ class VolumeTooLargeError(ProtocolError):
 
 @dataclass(frozen=True)
 class Budget:
-    """The bound on memory, and the advice when it is reached."""
+    """Memory limit of a volume, with a hint in its error."""
 
     limits: FusionBounds
     max_bytes: int
-    side: float | None = None  # world units, of a cube that is made of whole steps of blocks
+    side: float | None = None  # world units; of a cube that consists of whole steps
     step: int = 1  # voxels
 
     def check(self, blocks: int, colored: bool, *, partial: bool) -> None:
-        """Stop when over the bound. While frames still come, count on (keys are small) up to 16 times the bound."""
+        """Raise if over the limit. While frames are still counted (``partial``), only at 16 times the limit."""
         need = blocks * block_bytes(colored)
         if need <= self.max_bytes or (partial and need <= 16 * self.max_bytes):
             return
         self._refuse(need, need, "at least " if partial else "")
 
     def check_least(self, blocks: int, colored: bool) -> None:
-        """Stop when blocks that one view alone needs for sure are over the bound: to count them could take for ever.
+        """Raise if a lower bound for one view exceeds the limit, because counting could take very long.
 
-        The voxel that is named is a guess; where it is still too small, it can be counted.
+        The suggested voxel is an estimate.
         """
         need = blocks * block_bytes(colored)
         if need > self.max_bytes:
@@ -167,15 +167,14 @@ class Budget:
             voxel = 1.005 * self.side / (max(1, int(self.side / voxel) // self.step) * self.step)
         raise VolumeTooLargeError(
             voxel,
-            f"a volume of at most {self.max_bytes / 2**30:.3g} GiB was expected, voxels of {self.limits.voxel:.4g} "
-            "world units "
-            f"need {least}{need / 2**30:.3g} GiB; use a voxel of about {voxel:.3g} or more, a smaller bbox, or "
+            f"expected a volume of at most {self.max_bytes / 2**30:.3g} GiB, voxels of {self.limits.voxel:.4g} world "
+            f"units need {least}{need / 2**30:.3g} GiB; use a voxel of about {voxel:.3g} or more, a smaller bbox, or "
             "more memory",
         )
 
 
 # -- one view ----------------------------------------------------------------------------------------------------------
-# numpy is the reference, and runs everywhere. Which of the three adds a view is the matter of a backend.
+# The backend selects one of three implementations; numpy is the reference and runs everywhere.
 FULL_WEIGHT_BEHIND = 0.75  # of the truncation: the weight falls from 1 here to 0 at the truncation
 _CHUNK = 48  # blocks at a time in numpy: the temporaries of a chunk fit the second-level cache
 
@@ -183,12 +182,12 @@ Add = Callable[[DepthSampler], None]
 
 
 def fusion_backend(backend: str | Backend) -> Backend:
-    """Return what will add views: "auto" is the processor's, the native library where it was built, else numpy.
+    """Return the backend of the fusion: "auto" is the native CPU library if it is built, else numpy.
 
     Raises
     ------
     BackendError
-        If the name is unknown, or that backend cannot run here.
+        If the name is unknown or the backend cannot run here.
     """
     return get_backend(backend, "cpu") if isinstance(backend, str) else backend
 
@@ -196,15 +195,15 @@ def fusion_backend(backend: str | Backend) -> Backend:
 def integrator(
     volumes: Sequence[Volume], backend: str | Backend, threads: int | None = None
 ) -> AbstractContextManager[Add]:
-    """Return a context in which views can be added to all volumes; their arrays hold the result after it.
+    """Return a context that yields a function which adds a view; afterwards the volumes hold the result.
 
     Parameters
     ----------
     volumes : sequence of Volume
     backend : str or Backend
-        "auto", "cpu", "cuda", "reference", or another's name.
+        "auto", "cpu", "cuda", "reference", or a registered name.
     threads : int, optional
-        Default: as many as the machine has. The result does not depend on it.
+        Default: all cores. The result does not depend on it.
 
     Raises
     ------
@@ -222,7 +221,7 @@ def integrator(
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """Where the blocks of a volume lie."""
+    """Positions of the blocks of a volume."""
 
     volume: Volume
     origins: np.ndarray  # [M, 3] world units, of each block's first voxel
@@ -231,7 +230,7 @@ class _Grid:
 
 @dataclass(frozen=True, eq=False)
 class _Change:
-    """The blocks that a view may change, and where it sees them."""
+    """The blocks that a view may change, projected into it."""
 
     rows: np.ndarray  # [n] int64
     bases: np.ndarray  # [n, 3] float32 (x z, y z, z) of each block's first voxel
@@ -262,7 +261,7 @@ def _change(grid: _Grid, view: DepthSampler) -> _Change:
 
 @contextmanager
 def add_in_numpy(volumes: Sequence[Volume], threads: int) -> Iterator[Add]:
-    """By numpy, on so many threads; the reference of the others."""
+    """Add views with numpy: the reference implementation."""
     grids = _grids(volumes)
     with ThreadPoolExecutor(threads) as pool:
 
@@ -275,19 +274,19 @@ def add_in_numpy(volumes: Sequence[Volume], threads: int) -> Iterator[Add]:
                     for i in starts
                 ]
                 for done in pool.map(lambda chunk, volume=grid.volume: _add_chunk(volume, view, chunk), chunks):
-                    assert done is None  # exhausts the map: an exception in a thread is raised here
+                    assert done is None  # consuming the map raises exceptions of threads
 
         yield add
 
 
 def _add_chunk(volume: Volume, view: DepthSampler, chunk: _Change) -> None:
-    """Add one view to some blocks; chunks share no block, so threads do not meet."""
+    """Add one view to a chunk of blocks; chunks share no block, so threads do not conflict."""
     rows, bases, offsets = chunk.rows, chunk.bases, chunk.offsets
     truncation = np.float32(volume.limits.truncation)
     z = bases[:, 2:] + offsets[2]  # [n, 512]
     x = (bases[:, :1] + offsets[0]) / z
     y = (bases[:, 1:2] + offsets[1]) / z
-    distance, pixel = view.signed_distance(x, y, z)  # hugely negative where the pixel saw nothing
+    distance, pixel = view.signed_distance(x, y, z)  # large and negative at invalid pixels
     distance /= truncation
     weight = (distance + np.float32(1)) / np.float32(1 - FULL_WEIGHT_BEHIND)
     np.clip(weight, 0, 1, out=weight)
@@ -316,9 +315,9 @@ def _blend_colors(
     weight: np.ndarray,
     pixel: np.ndarray,
 ) -> None:
-    """Update the mean colour of the voxels near the surface of this view; the nearer, the more it counts."""
+    """Update the mean colour of the voxels near the surface of this view, weighted by their distance."""
     assert view.color is not None
-    near = np.flatnonzero((weight > 0) & (distance < 1))  # flat in the chunk
+    near = np.flatnonzero((weight > 0) & (distance < 1))  # flat index in the chunk
     flat = rows[near >> 9] * VOXELS + (near & (VOXELS - 1))
     w = weight.reshape(-1)[near] * (1 - np.abs(distance.reshape(-1)[near]))
     colors, weights = color.reshape(-1, 3), color_weight.reshape(-1)
@@ -331,7 +330,7 @@ def _blend_colors(
 
 @contextmanager
 def add_natively(volumes: Sequence[Volume], library: Library, threads: int) -> Iterator[Add]:
-    """By the native library, on so many threads."""
+    """Add views with the native CPU library."""
     from gs2d.kernels.tsdf import arguments_of, fuse_on_cpu
 
     grids = _grids(volumes)
@@ -350,7 +349,7 @@ def add_natively(volumes: Sequence[Volume], library: Library, threads: int) -> I
 
 @contextmanager
 def add_on_gpu(volumes: Sequence[Volume], launcher: Launcher, device: torch.device) -> Iterator[Add]:
-    """On a device: the volumes lie there until the end; each view and its list of blocks go there."""
+    """Add views on a GPU: the volumes stay there until the end; each view and its blocks are copied there."""
     import torch
 
     from gs2d.kernels.tsdf import arguments_of, fuse_on_gpu
@@ -379,19 +378,19 @@ def add_on_gpu(volumes: Sequence[Volume], launcher: Launcher, device: torch.devi
 
 
 def _view_arrays(view: DepthSampler, *, colored: bool) -> dict[str, np.ndarray | None]:
-    """Return the pixels of a view, by the names of the kernels' arguments."""
+    """Return the pixel arrays of a view, by kernel argument."""
     arrays = {"depth": view.depth, "slope_x": view.slope_x, "slope_y": view.slope_y}
     return arrays | {"pixel_weight": view.weight, "pixel_color": view.color if colored else None}
 
 
 def _volume_arrays(volume: Volume) -> dict[str, np.ndarray | None]:
-    """Return what fusion changes, by the names of the kernels' arguments."""
+    """Return the arrays that fusion changes, by kernel argument."""
     return {name: getattr(volume, name) for name in ("tsdf", "weight", "color", "color_weight")}
 
 
 # -- all views ---------------------------------------------------------------------------------------------------------
 _MAX_MARKS = 1 << 27  # bytes
-_FEW_SAMPLES = 1e8  # of one depth map: seconds
+_FEW_SAMPLES = 1e8  # of one depth map; takes seconds
 
 
 def fuse(
@@ -410,18 +409,17 @@ def fuse(
         Read twice, one at a time: a sequence or a ``Spool``, not a generator.
     limits : FusionBounds
     max_bytes : int
-        The volume will not grow beyond this.
+        Limit of the volume.
     threads : int, optional
-        Default: as many as the machine has. The result does not depend on it.
+        Default: all cores. The result does not depend on it.
     backend : str or Backend
-        What adds the views: "reference" (numpy), "cpu" (native, the same bits), "cuda", or "auto" (see
-        ``fusion_backend``).
+        "reference" (numpy), "cpu" (native, bit-identical), "cuda", or "auto" (see ``fusion_backend``).
 
     Raises
     ------
     ProtocolError
-        If the blocks near the surface need more than ``max_bytes`` (the message names a voxel that fits), the
-        truncation is larger than the box, or the depth maps see nothing inside the limits.
+        If the blocks near the surface need more than ``max_bytes`` (the message suggests a voxel), the truncation
+        exceeds the box, or no depth is inside the limits.
     BackendError
         If the backend is unknown or cannot run here.
     """
@@ -431,16 +429,16 @@ def fuse(
 
 @dataclass(frozen=True, eq=False)
 class VolumeBlocks:
-    """The blocks near what depth maps saw.
+    """The blocks near the surfaces of depth maps.
 
     Attributes
     ----------
     dims, keys
-        As of a ``Volume``.
+        As in ``Volume``.
     colored : bool
         Whether a depth map has colour.
     frames : int
-        How many depth maps there are.
+        Number of depth maps.
     """
 
     dims: tuple[int, int, int]
@@ -450,11 +448,11 @@ class VolumeBlocks:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of a volume of them."""
+        """Size in bytes of a volume with these blocks."""
         return len(self.keys) * block_bytes(self.colored)
 
     def part(self, start: int, stop: int) -> VolumeBlocks:
-        """Return the blocks of these rows."""
+        """Return a range of the blocks."""
         return replace(self, keys=self.keys[start:stop])
 
 
@@ -466,7 +464,7 @@ def find_blocks(
     threads: int | None = None,
     backend: str | Backend = "auto",
 ) -> VolumeBlocks:
-    """Find the blocks that are fused; parameters and errors as of ``fuse``."""
+    """Find the blocks to fuse; parameters and errors as for ``fuse``."""
     if iter(frames) is frames:
         raise TypeError("frames are read twice: pass a list or a Spool, not an iterator")
     check_truncation(limits)
@@ -481,7 +479,7 @@ def find_blocks(
         budget.check(len(keys), colored, partial=True)
     budget.check(len(keys), colored, partial=False)
     if not len(keys):
-        raise ProtocolError("depth inside the fusion limits was expected, got none; widen bbox or depth_limit")
+        raise ProtocolError("no depth is inside the limits of the fusion; increase bbox or depth_limit")
     return VolumeBlocks(dims, keys, colored, count)
 
 
@@ -493,7 +491,7 @@ def fuse_blocks(
     threads: int | None = None,
     backend: str | Backend = "auto",
 ) -> Volume:
-    """Fuse depth maps into these blocks; parameters as of ``fuse``."""
+    """Fuse depth maps into these blocks; parameters as for ``fuse``."""
     volume = invalid_volume(limits, blocks.dims, blocks.keys, colored=blocks.colored, frames=blocks.frames)
     add_all([volume], frames, lambda item: make_sampler(item, limits), threads=threads, backend=backend)
     return volume
@@ -507,7 +505,7 @@ def add_all(
     threads: int | None,
     backend: str | Backend,
 ) -> None:
-    """Add depth maps to volumes, in place; those that see nothing of them are not prepared, which takes most time."""
+    """Add depth maps to volumes, in place. Views that see no volume are skipped, since preparing a view is slow."""
     boxes = [box_corners(volume) for volume in volumes if len(volume.keys)]
     with integrator(volumes, backend, threads) as add:
         for item in frames:
@@ -516,18 +514,18 @@ def add_all(
 
 
 def box_corners(volume: Volume) -> np.ndarray:
-    """Return the corners [8, 3], world units, of the box that the voxels of a volume lie in."""
+    """Return the corners [8, 3], world units, of the bounding box of a volume's blocks."""
     blocks, size = volume.blocks, BLOCK * volume.limits.voxel
     box = np.array([blocks.min(axis=0) * size, (blocks.max(axis=0) + 1) * size]) + np.asarray(volume.limits.lower)
     return np.array([[box[c >> axis & 1, axis] for axis in range(3)] for c in range(8)])
 
 
 def min_blocks(item: DepthMap, limits: FusionBounds) -> int:
-    """Return a number below which ``touched_blocks`` cannot stay, without its work, which grows as voxels shrink.
+    """Return a lower bound for the number of ``touched_blocks``, without their cost for small voxels; 0 if it is low.
 
-    0 where that work is small. The bands of the pixels, one truncation before and behind what they saw, cut to the box,
-    are disjoint pieces of space, z^3 / (3 fx fy) between two depths, and a block is b^3 of it. What they saw is at
-    least d^2 / (fx fy) wide, seen face on, and the shadow of a block is at most sqrt(3) b^2.
+    Pixels cover disjoint pieces of space of (z1^3 - z0^3) / (3 fx fy), one truncation in front of and behind the
+    surface and inside the box, and a block covers b^3. The surface has at least d^2 / (fx fy) per pixel, seen face-on,
+    and the projection of a block at most sqrt(3) b^2.
     """
     rows, columns = np.nonzero((item.depth > 0) & (item.depth <= limits.depth_limit))
     depth = item.depth[rows, columns].astype(np.float64)
@@ -546,7 +544,7 @@ def min_blocks(item: DepthMap, limits: FusionBounds) -> int:
 
 
 def _samples(item: DepthMap, depth: np.ndarray, limits: FusionBounds) -> tuple[int, int]:
-    """At how many places along a side of each pixel, and along each ray, a depth map is sampled."""
+    """Return the number of samples along a side of each pixel, and along each ray."""
     half = 0.5 * BLOCK * limits.voxel
     width = float(depth.max(initial=0.0)) / min(item.camera.fx, item.camera.fy)
     return max(1, int(np.ceil(width / half))), int(np.ceil(2 * limits.truncation / half)) + 1
@@ -555,11 +553,11 @@ def _samples(item: DepthMap, depth: np.ndarray, limits: FusionBounds) -> tuple[i
 def touched_blocks(
     item: DepthMap, limits: FusionBounds, dims: tuple[int, int, int], library: Library | None = None
 ) -> np.ndarray:
-    """Keys [K] of the blocks near what one depth map saw: sorted, each once.
+    """Return the sorted keys [K] of the blocks near the surface of one depth map.
 
-    Each seen pixel is sampled along its ray from one truncation before to one behind the surface, in steps of half a
-    block; a sample takes the 2^3 blocks nearest to it. Where a pixel is wider than half a block, it is sampled at
-    several places of its square. The native library does the same operations as numpy.
+    Each valid pixel is sampled along its ray from one truncation in front of the surface to one behind it, in steps of
+    half a block; a sample touches the nearest 2^3 blocks. Pixels wider than half a block are sampled at several
+    positions. The native library performs the same operations as numpy.
     """
     half = 0.5 * BLOCK * limits.voxel
     rows, columns = np.nonzero((item.depth > 0) & (item.depth <= limits.depth_limit))
@@ -569,10 +567,10 @@ def touched_blocks(
     parts, steps = _samples(item, depth, limits)
     shifts = (np.arange(parts) + 0.5) / parts - 0.5
     offsets = np.linspace(-limits.truncation, limits.truncation, steps)
-    # The lower of the two nearest blocks along each axis, counted from a border of one block round the grid.
+    # The lower of the two nearest blocks along each axis; the grid has a border of one block.
     padded = (dims[0] + 2, dims[1] + 2, dims[2] + 2)
     strides = (padded[1] * padded[2], padded[2], 1)
-    start = (item.camera.center - limits.lower) / half  # in half blocks, as is all below
+    start = (item.camera.center - limits.lower) / half  # in half blocks, as everything below
     end = 2 * np.asarray(dims)
     rays = (
         (backproject(item.camera, np.ones(len(rows)), rows + dy, columns + dx) - item.camera.center).T / half
@@ -598,7 +596,7 @@ def touched_blocks(
 def _lowest_blocks(
     ray: np.ndarray, depth: np.ndarray, offsets: np.ndarray, start: np.ndarray, end: np.ndarray, strides: Sequence[int]
 ) -> Iterator[np.ndarray]:
-    """For each offset the blocks that ``start + (depth + offset) ray`` lies in, where that is in the grid."""
+    """Yield, for each offset, the blocks that contain ``start + (depth + offset) ray``, inside the grid."""
     for offset in offsets:
         at = start[:, None] + (depth + offset) * ray  # [3, P]
         cells = at[:, ((at >= 0) & (at < end[:, None])).all(axis=0)].astype(np.int64)
@@ -608,7 +606,7 @@ def _lowest_blocks(
 
 
 def block_finder(backend: str | Backend, threads: int | None) -> Library | None:
-    """Return the native library for ``touched_blocks``, on so many threads; None (numpy) for the reference."""
+    """Return the native library for ``touched_blocks``; None (numpy) for the reference backend."""
     if fusion_backend(backend).fusion() is None:
         return None
     from gs2d.kernels.library import available_variants, load
@@ -621,17 +619,17 @@ def block_finder(backend: str | Backend, threads: int | None) -> Library | None:
 
 
 def _distinct(numbers: list[np.ndarray], dims: tuple[int, int, int]) -> np.ndarray:
-    """Numbers of a grid's places, sorted, each once: by marking them, or, where the grid is too large, by sorting."""
-    places = dims[0] * dims[1] * dims[2]
-    if places > _MAX_MARKS:
+    """Return the sorted distinct cell numbers of a grid, by marking cells, or by sorting if the grid is too large."""
+    cells = dims[0] * dims[1] * dims[2]
+    if cells > _MAX_MARKS:
         return np.unique(np.concatenate(numbers))
-    marks = np.zeros(places, bool)
+    marks = np.zeros(cells, bool)
     for some in numbers:
         marks[some] = True
     return np.flatnonzero(marks)
 
 
 def merged(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """All of two sorted arrays of keys >= 0, sorted, each once."""
-    both = np.sort(np.concatenate([one, other]), kind="stable")  # merges what is sorted
+    """Return the sorted union of two sorted arrays of keys >= 0."""
+    both = np.sort(np.concatenate([one, other]), kind="stable")  # fast, because both parts are sorted
     return both[np.flatnonzero(np.diff(both, prepend=-1))]

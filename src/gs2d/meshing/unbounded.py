@@ -1,10 +1,10 @@
-"""Fusion into a nest of levels, and one mesh of all of them without gaps.
+"""Fuse unbounded scenes into nested levels of increasing voxel size, and extract one mesh without gaps.
 
-Each level is a volume of its own (``fuse``). Between two levels the cells of marching cubes are those of the dual grid:
-around every corner of the finer voxels on the border lie eight voxels, fine ones inside and coarse ones (some of them
-several times over) outside. Such a cell is a cube with some edges of no length, so the table of cases holds, faces of
-neighbouring cells have the same four voxels, and a vertex is known by the two voxels it lies between. Hence the mesh
-is as closed as within a level. (Dual marching cubes on an octree: Schaefer and Warren 2004.)
+Each level is a separate volume. Between two levels, the cells of marching cubes are those of the dual grid: each corner
+of a fine voxel on the border is surrounded by eight voxels, fine ones inside and coarse ones outside, of which some
+occur several times. Such a cell is a cube with some edges of length zero, so the table of cases is valid, faces of
+neighbouring cells have the same four voxels, and a vertex is identified by the two voxels it lies between. The mesh is
+therefore as closed as within a level. (Dual marching cubes on an octree: Schaefer and Warren 2004.)
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from gs2d.meshing.fusion_bounds import (
     check_positive,
     checked_box,
 )
-from gs2d.meshing.marching_cubes import CORNERS, EDGES, case_table, cell_surface, mixed_colors, near_plane_policy
+from gs2d.meshing.marching_cubes import CORNERS, EDGES, case_table, cell_surface, mixed_colors, zero_crossing
 from gs2d.meshing.sampling import DepthSampler, make_sampler
 from gs2d.meshing.slabs import SLAB_BYTES, slabs
 from gs2d.meshing.tsdf_volume import (
@@ -54,12 +54,12 @@ if TYPE_CHECKING:
 
 
 # -- the volumes -------------------------------------------------------------------------------------------------------
-# All cubes have one centre and the same number of voxels along a side. A level owns its cube without the cube inside,
-# so every place belongs to exactly one level, and a voxel grows with the distance from the centre as the width of a
-# pixel does. Truncation follows the voxel.
-STEP = 4 * BLOCK  # voxels along a side are a multiple: the middle half of a level is made of whole blocks
+# All cubes have the same centre and the same number of voxels along a side. A level owns its cube except for the inner
+# cube, so every point belongs to exactly one level, and voxels grow with the distance from the centre like the width of
+# a pixel. The truncation is proportional to the voxel.
+STEP = 4 * BLOCK  # the voxels along a side are a multiple, so that the middle half of a level consists of whole blocks
 MAX_LEVELS = 24
-PIXEL_ERROR = 0.5  # px, of matching between views: decides how far away depth is still known
+PIXEL_ERROR = 0.5  # px; matching error between views, which limits how far away depth is valid
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,9 @@ class TsdfCascade:
     Attributes
     ----------
     levels : tuple of FusionBounds
-        ``lower`` of a level is its first voxel, half a voxel inside its cube.
+        ``lower`` of a level is the centre of its first voxel.
     voxels : int
-        Along a side of every level, a multiple of ``STEP``.
+        Number of voxels along a side of every level, a multiple of ``STEP``.
     center : tuple of 3 floats, world units
     half : float, world units
         Half the side of the innermost cube.
@@ -89,16 +89,16 @@ class TsdfCascade:
 
     @property
     def hole(self) -> tuple[int, int]:
-        """First block of the middle half of a level, along each axis, and the first one after it."""
+        """Range of blocks (first, end) of the middle half of a level, along each axis."""
         return self.voxels // STEP, 3 * self.voxels // STEP
 
     def level_of(self, points: np.ndarray) -> np.ndarray:
-        """Level [P] that owns each point [P, 3]; ``len(levels)`` outside of all."""
+        """Return the level [P] that owns each point [P, 3]; ``len(levels)`` outside all levels."""
         distance = np.abs(points - np.asarray(self.center)).max(axis=1) / self.half
         return np.clip(np.ceil(np.log2(np.maximum(distance, 1.0))), 0, len(self.levels)).astype(np.int64)
 
     def with_truncation(self, truncation: float, noise: float | None) -> TsdfCascade:
-        """Another truncation of the innermost level; the others follow."""
+        """Return a copy with another truncation of the innermost level, and proportional ones of the others."""
         levels = tuple(
             replace(level, truncation=truncation * 2**k, depth_noise=noise) for k, level in enumerate(self.levels)
         )
@@ -115,20 +115,20 @@ def derive_cascade(
     truncation: float | None = None,
     depth_limit: float | None = None,
 ) -> TsdfCascade:
-    """Return the nest of a scene, from samples of all views; every named limit overrides the derived one.
+    """Derive the levels of a scene from samples of all views; requested limits override derived ones.
 
-    The innermost cube holds the 1st to 99th percentile of the nearer half of all that was seen. The outermost holds
-    what is nearer than the depth limit: 1.25 times the 99.5th percentile of depth, but no farther than depth is known
-    to within the truncation (``valid_depth``); beyond it the sky and bare walls make surfaces of their own.
+    The innermost cube contains the 1st to 99th percentile of the nearer half of the points. The outermost contains all
+    points up to the depth limit: 1.25 times the 99.5th percentile of depth, but not beyond the depth that is known to
+    within the truncation (``valid_depth``), where sky and textureless walls create false surfaces.
 
     Parameters
     ----------
     samples : sequence of DepthSample
     cameras : sequence of Camera
     resolution : int
-        Voxels along the side of the innermost cube, not finer than half the median pixel on the nearer half.
+        Voxels along the side of the innermost cube, not finer than half the median pixel of the nearer half.
     bbox : array [2, 3] world units, optional
-        The innermost cube is the cube around it.
+        Contained in the innermost cube.
     voxel, truncation : float world units, optional
         Of the innermost level.
     depth_limit : float world units, optional
@@ -136,12 +136,12 @@ def derive_cascade(
     Raises
     ------
     ProtocolError
-        If no pixel has a depth, or a given limit makes no sense.
+        If no pixel has a depth, or a requested limit is invalid.
     """
     xyz = np.concatenate([s.points for s in samples]) if samples else np.zeros((0, 3))
     depths = np.concatenate([s.depths for s in samples]) if samples else np.zeros(0)
     if not len(depths):
-        raise ProtocolError("depth maps with at least one seen pixel were expected, got none; is the scene empty?")
+        raise ProtocolError("expected depth maps with valid pixels, got none; is the scene empty?")
     check_positive(voxel=voxel, truncation=truncation, depth_limit=depth_limit, resolution=resolution)
     footprints = np.concatenate([s.footprints for s in samples])
     median, high = float(np.median(depths)), float(np.percentile(depths, DEPTH_PERCENTILE))
@@ -150,7 +150,7 @@ def derive_cascade(
     lower, upper = np.percentile(xyz[near], BOX_PERCENTILES, axis=0) if bbox is None else checked_box(bbox)
     side = float((upper - lower).max())
     if not side > 0:
-        raise ProtocolError("depth maps that span some space were expected, got a single point; give a bbox")
+        raise ProtocolError("expected depth maps of several points, got a single point; set a bbox")
     size = voxel if voxel is not None else max(side / resolution, 0.5 * footprint)
     voxels = max(1, int(np.ceil(side / size / STEP - 1e-9))) * STEP
     half, center = 0.5 * voxels * size, (lower + upper) / 2
@@ -186,11 +186,11 @@ def derive_cascade(
 
 
 def valid_depth(cameras: Sequence[Camera], band: float) -> float:
-    """Depth, world units, at which half a pixel of parallax moves a point by as much as the truncation there.
+    """Return the depth, in world units, at which the depth uncertainty equals the truncation.
 
-    A point at depth z seen from a baseline b with a focal length f has a depth uncertainty of e z^2 / (b f), with e the
-    error of matching in px; the truncation is ``band`` z. So z = band b f / e. The baseline is twice the median
-    distance of the cameras from their mean. Infinite for cameras in one place, which know no depth by parallax.
+    A point at depth z with baseline b and focal length f has a depth uncertainty of e z^2 / (b f), where e is the
+    matching error in px; the truncation there is ``band`` z. So z = band b f / e. The baseline is twice the median
+    distance of the cameras from their mean. Infinite if all cameras have the same centre.
     """
     centers = np.array([camera.center for camera in cameras])
     baseline = 2 * float(np.median(np.linalg.norm(centers - centers.mean(axis=0), axis=1)))
@@ -199,7 +199,7 @@ def valid_depth(cameras: Sequence[Camera], band: float) -> float:
 
 
 # -- the surface -------------------------------------------------------------------------------------------------------
-FAR_VIEWS = 5.0  # weight from which a voxel outside the innermost level is known: so many views seldom agree on a sky
+FAR_VIEWS = 5.0  # smallest weight of known voxels outside the innermost level: few views agree on a false sky depth
 
 
 def fuse_cascade(
@@ -210,7 +210,7 @@ def fuse_cascade(
     threads: int | None = None,
     backend: str | Backend = "auto",
 ) -> tuple[Volume, ...]:
-    """Fuse depth maps into every level of a nest.
+    """Fuse depth maps into all levels.
 
     Parameters
     ----------
@@ -218,16 +218,14 @@ def fuse_cascade(
         Read twice, one at a time: a sequence or a ``Spool``, not a generator.
     cascade : TsdfCascade
     max_bytes : int
-        The volumes together will not grow beyond this.
-    threads : int, optional
-        Default: as many as the machine has. The result does not depend on it.
-    backend : str or Backend
+        Limit of all volumes together.
+    threads, backend
         As for ``fuse``.
 
     Returns
     -------
     tuple of Volume
-        One for each level, finest first; levels where nothing was seen have no blocks.
+        One for each level, finest first; a level may have no blocks.
 
     Raises
     ------
@@ -248,7 +246,7 @@ def find_cascade_blocks(
     threads: int | None = None,
     backend: str | Backend = "auto",
 ) -> tuple[VolumeBlocks, ...]:
-    """Find the blocks that are fused, of each level; parameters and errors as of ``fuse_cascade``."""
+    """Find the blocks of each level; parameters and errors as for ``fuse_cascade``."""
     if iter(frames) is frames:
         raise TypeError("frames are read twice: pass a list or a Spool, not an iterator")
     check_truncation(cascade.levels[0])
@@ -263,7 +261,7 @@ def find_cascade_blocks(
         budget.check(sum(map(len, keys)), colored, partial=True)
     budget.check(sum(map(len, keys)), colored, partial=False)
     if not any(map(len, keys)):
-        raise ProtocolError("depth inside the fusion limits was expected, got none; widen bbox or depth_limit")
+        raise ProtocolError("no depth is inside the limits of the fusion; increase bbox or depth_limit")
     return tuple(VolumeBlocks(cascade.dims, found, colored, count) for found in keys)
 
 
@@ -278,7 +276,7 @@ def _fuse_into(
     threads: int | None,
     backend: str | Backend,
 ) -> None:
-    """Add all views to volumes of any levels."""
+    """Add all views to volumes of some levels."""
 
     def prepare(item: DepthMap) -> DepthSampler:
         return make_sampler(item, cascade.levels[0], truncation=_truncations(item, cascade))
@@ -287,7 +285,7 @@ def _fuse_into(
 
 
 def _distances(item: DepthMap, cascade: TsdfCascade) -> np.ndarray:
-    """Distance [H, W] of what each pixel saw from the centre, along the farthest axis, in halves; 0 where nothing."""
+    """Return the largest coordinate [H, W] of pixels' points from the centre, in units of ``half``; 0 if invalid."""
     rows, columns = np.nonzero((item.depth > 0) & np.isfinite(item.depth))
     points = backproject(item.camera, item.depth[rows, columns].astype(np.float64), rows, columns)
     distance = np.zeros(item.depth.shape)
@@ -296,23 +294,23 @@ def _distances(item: DepthMap, cascade: TsdfCascade) -> np.ndarray:
 
 
 def _truncations(item: DepthMap, cascade: TsdfCascade) -> np.ndarray:
-    """Return truncation [H, W] world units of the level that owns what each pixel saw."""
+    """Return the truncation [H, W] world units of the level that owns each pixel's point."""
     level = np.ceil(np.log2(np.maximum(_distances(item, cascade), 1.0)))
     return cascade.levels[0].truncation * np.exp2(np.minimum(level, len(cascade.levels) - 1))
 
 
 def _touched(item: DepthMap, cascade: TsdfCascade, library: Library | None) -> list[np.ndarray]:
-    """Keys of each level's own blocks near what a depth map saw."""
+    """Return the keys of each level's own blocks near the surface of a depth map."""
     distance = _distances(item, cascade)
     first, last = cascade.hole
     found = []
     for k, limits in enumerate(cascade.levels):
-        # what lies so near the level that a band round it, slanted, may reach in
+        # points outside the level whose truncation band may reach into it
         margin = (3 * limits.truncation + 2 * BLOCK * limits.voxel) / cascade.half
         inner = 2.0 ** (k - 1) if k else 0.0
         near = (distance > inner - margin) & (distance < 2.0**k + margin)
         part = replace(item, depth=np.where(near, item.depth, np.float32(0)))
-        # a block more on every side: what lies just outside the level touches its border too
+        # one more block on every side, because points just outside the level touch its border blocks
         step = BLOCK * limits.voxel
         lower = (limits.lower[0] - step, limits.lower[1] - step, limits.lower[2] - step)
         dims = (cascade.dims[0] + 2,) * 3
@@ -327,7 +325,7 @@ def _touched(item: DepthMap, cascade: TsdfCascade, library: Library | None) -> l
 
 @dataclass(frozen=True, eq=False)
 class _Nodes:
-    """The voxels of all levels under one numbering: offset of the level + 512 * row + voxel."""
+    """The voxels of several levels with a common numbering: offset of the level + 512 * row + voxel."""
 
     volumes: Sequence[Volume]
     known_from: Sequence[float]
@@ -337,7 +335,7 @@ class _Nodes:
         return np.concatenate([[0], np.cumsum([len(v.keys) * VOXELS for v in self.volumes])])
 
     def gather(self, arrays: Sequence[np.ndarray], ids: np.ndarray) -> np.ndarray:
-        """``arrays`` [M, 512, ...] of each level, at node numbers ``ids`` [...]."""
+        """Return ``arrays`` [M, 512, ...] of the levels at the nodes ``ids`` [...]."""
         tail = arrays[0].shape[2:]
         out = np.zeros((*ids.shape, *tail), arrays[0].dtype)
         offsets = self.offsets
@@ -347,7 +345,7 @@ class _Nodes:
         return out
 
     def distances(self, ids: np.ndarray) -> np.ndarray:
-        """Signed distance, world units: truncations differ between levels."""
+        """Return signed distances in world units, because truncations differ between levels."""
         out = np.zeros(ids.shape, np.float32)
         offsets = self.offsets
         for k, volume in enumerate(self.volumes):
@@ -356,7 +354,7 @@ class _Nodes:
         return out
 
     def valid(self, ids: np.ndarray) -> np.ndarray:
-        """Whether enough views saw the voxel."""
+        """Whether voxels have enough weight to be known."""
         out = np.zeros(ids.shape, bool)
         offsets = self.offsets
         for k, volume in enumerate(self.volumes):
@@ -365,7 +363,7 @@ class _Nodes:
         return out
 
     def positions(self, ids: np.ndarray) -> np.ndarray:
-        """World points [P, 3] of nodes [P]."""
+        """Return the world points [P, 3] of nodes [P]."""
         out = np.zeros((*ids.shape, 3))
         offsets = self.offsets
         for k, volume in enumerate(self.volumes):
@@ -380,20 +378,15 @@ class _Nodes:
 def cascade_marching_cubes(
     volumes: Sequence[Volume], cascade: TsdfCascade, *, min_weight: float = 1.0, far_weight: float
 ) -> Mesh:
-    """Return the zero set of all levels as one mesh.
+    """Extract the zero level set of all levels as one mesh, as ``marching_cubes`` does for one volume.
 
     Parameters
     ----------
     volumes : sequence of Volume
-        Of ``fuse_cascade``.
+        From ``fuse_cascade``.
     cascade : TsdfCascade
     min_weight, far_weight : float
-        A voxel of the innermost level, and of all others, is known from this weight on.
-
-    Returns
-    -------
-    Mesh
-        As of ``surface.marching_cubes``.
+        Smallest weight of known voxels in the innermost level, and in all others.
     """
     surface = _CascadeSurface(cascade, [len(volume.keys) for volume in volumes], min_weight, far_weight)
     for level, volume in enumerate(volumes):
@@ -412,18 +405,18 @@ def fused_cascade_surface(
     threads: int | None = None,
     backend: str | Backend = "auto",
 ) -> Mesh:
-    """Return what ``cascade_marching_cubes(fuse_cascade(...))`` returns, byte for byte, without all of it in memory.
+    """Return the mesh of ``cascade_marching_cubes(fuse_cascade(...))`` without all volumes in memory, byte-identical.
 
-    Levels are fused slab by slab (``slabs``), several small ones at a time; the blocks at the border between two levels
-    stay in memory until both are done.
+    Levels are fused slab by slab (``slabs``), several small slabs at a time. Blocks at the border between two levels
+    stay in memory until both are finished.
 
     Parameters
     ----------
     frames : iterable of DepthMap
-        Read once for each slab: a sequence or a ``Spool``.
+        Read once for each batch of slabs: a sequence or a ``Spool``.
     cascade : TsdfCascade
     blocks : sequence of VolumeBlocks
-        Of each level, as ``find_cascade_blocks`` finds them.
+        Of each level, from ``find_cascade_blocks``.
     min_weight, far_weight : float
         See ``cascade_marching_cubes``.
     slab_bytes : int
@@ -446,7 +439,7 @@ def fused_cascade_surface(
 
 
 def _batches(blocks: Sequence[VolumeBlocks], slab_bytes: int) -> Iterator[list[tuple[int, int, int, int]]]:
-    """Yield slabs (level, start, own, stop; as of ``slabs``) in order, as many at a time as fit."""
+    """Yield batches of slabs (level, and start, own, stop of ``slabs``) in order, as many as fit."""
     batch: list[tuple[int, int, int, int]] = []
     held = 0
     for level, part in enumerate(blocks):
@@ -462,13 +455,13 @@ def _batches(blocks: Sequence[VolumeBlocks], slab_bytes: int) -> Iterator[list[t
 
 
 class _CascadeSurface:
-    """The surface of levels that come in parts. Nodes have one numbering over all levels, as in ``_Nodes``."""
+    """Collects the surface of levels that are processed in parts. Nodes are numbered over all levels (``_Nodes``)."""
 
     def __init__(self, cascade: TsdfCascade, counts: Sequence[int], min_weight: float, far_weight: float) -> None:
         self._cascade = cascade
         self._known_from = [min_weight if k == 0 else max(min_weight, far_weight) for k in range(len(counts))]
         self._offsets = np.concatenate([[0], np.cumsum([count * VOXELS for count in counts])])
-        self._kept: list[list[tuple[Volume, np.ndarray]]] = [[] for _ in counts]  # at joins, and their rows
+        self._kept: list[list[tuple[Volume, np.ndarray]]] = [[] for _ in counts]  # border blocks, and their rows
         self._pairs = [np.zeros((0, 2), np.int64)]
         self._triangles = [np.zeros((0, 3), np.int64)]
         self._vertices = [np.zeros((0, 3), np.float32)]
@@ -476,7 +469,7 @@ class _CascadeSurface:
         self._count = 0
 
     def add(self, volume: Volume, level: int, start: int, own: int) -> None:
-        """Take the cells of the first ``own`` blocks of a part, which begins at block ``start`` of its level."""
+        """Add the cells of the first ``own`` blocks of a part that starts at block ``start`` of its level."""
         edges, faces, ends = cell_surface(volume, self._known_from[level], own)
         pairs = np.stack([edges // 3, ends], axis=1)
         nodes = _Nodes([volume], [self._known_from[level]])
@@ -493,13 +486,13 @@ class _CascadeSurface:
         self._count += len(pairs)
 
     def _at_joins(self, blocks: np.ndarray) -> np.ndarray:
-        """VolumeBlocks [M] at the outer border of a level, or around the hole in it."""
+        """Return which blocks [M, 3] are at the outer border of a level, or around the hole in it."""
         first, last = self._cascade.hole
         outermost = ((blocks == 0) | (blocks == np.asarray(self._cascade.dims) - 1)).any(axis=1)
         return np.asarray(outermost | ((blocks >= first - 1) & (blocks <= last)).all(axis=1))
 
     def mesh(self) -> Mesh:
-        """Join the levels."""
+        """Connect the levels, and return the mesh."""
         levels = [_kept_level(parts) for parts in self._kept]
         for k in range(len(levels) - 1):
             volumes, rows = [volume for volume, _ in levels[k : k + 2]], [kept for _, kept in levels[k : k + 2]]
@@ -514,12 +507,12 @@ class _CascadeSurface:
             corners = np.arange(len(local)).reshape(-1, 3)
             self._append(nodes, local, np.concatenate(numbers)[local], corners)
         both = np.concatenate(self._pairs)
-        # a vertex is a pair of nodes, the same from whichever cell it is seen
+        # a vertex is identified by its pair of nodes, which is the same in all adjacent cells
         flat = both[:, 0] * int(self._offsets[-1] + 1) + both[:, 1]
         _, first, number = np.unique(flat, return_index=True, return_inverse=True)
         faces = number.reshape(-1)[np.concatenate(self._triangles)]
         a, b, c = faces.T
-        faces = faces[(a != b) & (b != c) & (c != a)]  # edges of no length in the cells of a join
+        faces = faces[(a != b) & (b != c) & (c != a)]  # cells between levels have edges of length zero
         colors = np.concatenate(self._colors)[first] if self._colors else None
         return Mesh(np.concatenate(self._vertices)[first], faces.astype(np.int32), colors)
 
@@ -537,7 +530,7 @@ def _rows_of(volume: Volume, rows: np.ndarray) -> Volume:
 
 
 def _kept_level(parts: Sequence[tuple[Volume, np.ndarray]]) -> tuple[Volume, np.ndarray]:
-    """Return the blocks that were kept of a level as one volume, and their rows in the level."""
+    """Merge the kept blocks of a level into one volume; also returns their rows in the level."""
     volumes = [volume for volume, _ in parts]
     colors = [volume.color for volume in volumes if volume.color is not None]
     weights = [volume.color_weight for volume in volumes if volume.color_weight is not None]
@@ -553,8 +546,8 @@ def _kept_level(parts: Sequence[tuple[Volume, np.ndarray]]) -> tuple[Volume, np.
 
 
 def _vertices(nodes: _Nodes, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Positions [P, 3] of the zero crossings between nodes, and their colours."""
-    t = near_plane_policy(nodes.distances(low), nodes.distances(high))
+    """Return the positions [P, 3] of the zero crossings between nodes, and their colours."""
+    t = zero_crossing(nodes.distances(low), nodes.distances(high))
     start = nodes.positions(low)
     vertices = (start + t[:, None].astype(np.float64) * (nodes.positions(high) - start)).astype(np.float32)
     colors = [volume.color for volume in nodes.volumes if volume.color is not None]
@@ -566,7 +559,7 @@ def _vertices(nodes: _Nodes, low: np.ndarray, high: np.ndarray) -> tuple[np.ndar
 
 
 def _join_cells(inner: Volume, outer: Volume, cascade: TsdfCascade, inner_offset: int, outer_offset: int) -> np.ndarray:
-    """Nodes [C, 8] of the cells across the border of a level, where all eight voxels exist."""
+    """Return the nodes [C, 8] of the cells across the border of a level, if all eight voxels exist."""
     n = cascade.voxels
     local = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK,) * 3), axis=1)
     corners = [np.zeros(0, np.int64)]
@@ -591,7 +584,7 @@ def _join_cells(inner: Volume, outer: Volume, cascade: TsdfCascade, inner_offset
 
 
 def _find(volume: Volume, voxels: np.ndarray) -> np.ndarray:
-    """512 * row + voxel of grid voxels [P, 3], -1 where there is no block."""
+    """Return 512 * row + voxel of grid voxels [P, 3], -1 if their block does not exist."""
     block, at = voxels // BLOCK, voxels % BLOCK
     key = (block[:, 0] * volume.dims[1] + block[:, 1]) * volume.dims[2] + block[:, 2]
     if not len(volume.keys):
@@ -602,7 +595,7 @@ def _find(volume: Volume, voxels: np.ndarray) -> np.ndarray:
 
 
 def _join_triangles(nodes: _Nodes, cells: np.ndarray) -> np.ndarray:
-    """Triangles [T, 3, 2] of cells [C, 8], each vertex by the two nodes that it lies between, the smaller first."""
+    """Return triangles [T, 3, 2] of cells [C, 8]; a vertex is its pair of nodes, the smaller first."""
     cells = cells[nodes.valid(cells).all(axis=1)]
     case = ((nodes.distances(cells) < 0) << np.arange(8)).sum(axis=1)
     table = case_table()

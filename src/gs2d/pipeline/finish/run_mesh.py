@@ -50,7 +50,7 @@ ONE_SURFACE = 0.02  # of the depth: where mean and median differ by more, a pixe
 SEVERAL = 0.25  # weight of such a pixel
 KEPT = (  # of what is said of a mesh, in metrics.json
     *("vertices", "faces", "voxel", "truncation", "depth_limit", "depth", "unbounded"),
-    *("pixels", "faces_per_pixel", "area_unsupported", "area_apart"),
+    *("pixels", "faces_per_pixel"),
 )
 VOLUME_BYTES = 4 << 30  # of the fused volume, where it is not known how much memory there is
 LEAST_SLAB_BYTES = 32 << 20  # less, and preparing views again for each slab takes most of the time
@@ -138,11 +138,8 @@ def extract_mesh(
         "levels": result.levels,
         "fused_by": result.backend,
         **limits,
-        "blocks": result.blocks,
         "volume_bytes": result.volume_bytes,
-        "components": result.components,
-        "faces_removed": result.faces_removed,
-        **_cleaned_facts(result),
+        **_pixel_facts(result),
     }
 
 
@@ -177,17 +174,11 @@ def fused(
     return result
 
 
-def _cleaned_facts(result: Extraction) -> dict[str, Any]:
-    """Return what was left of the surface, where it was made to hold what the views saw."""
-    if result.cleaned is None:
+def _pixel_facts(result: Extraction) -> dict[str, Any]:
+    """Return the number of pixels that show the surface, if it was cleaned by evidence."""
+    if result.pixels is None:
         return {}
-    found = result.cleaned
-    return {
-        "pixels": round(found.pixels),
-        "faces_per_pixel": len(result.mesh.faces) / max(found.pixels, 1.0),
-        "area_unsupported": found.unsupported,
-        "area_apart": found.small,
-    }
+    return {"pixels": round(result.pixels), "faces_per_pixel": len(result.mesh.faces) / max(result.pixels, 1.0)}
 
 
 def _cut_text(result: Extraction, options: MeshOptions) -> str:
