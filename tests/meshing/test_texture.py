@@ -99,7 +99,7 @@ def test_pixels_that_are_masked_or_transparent_are_not_used() -> None:
     clear = np.concatenate([plain(1, GREEN, 256).image, np.zeros((256, 256, 1), np.uint8)], axis=2)
     images = [masked, ColorSource(above(1, 256), clear), plain(2, BLUE, 256)]
     assert middle(bake(flat_atlas(grid_plane()), listed(images), 64, threads=1).mesh.texture) == [0, 0, 255]
-    with pytest.raises(ProtocolError, match="none of 1 does"):
+    with pytest.raises(ProtocolError, match="none of 1 photographs"):
         bake(flat_atlas(grid_plane()), listed([masked]), 64, threads=1)
 
 
