@@ -36,10 +36,11 @@ from gs2d.meshing.evidence import gather, pixels
 from gs2d.pipeline.finish.run_images import render_view
 from gs2d.pipeline.finish.run_mesh import fusion_frame
 from gs2d.pipeline.finish.run_subject import sights, surface_reach
-from gs2d.pipeline.finish.scoring import score_views
+from gs2d.pipeline.finish.scoring import ScoreOptions, score_views
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
+from gs2d.pipeline.prepare.open_capture import FEW
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
-from gs2d.pipeline.reconstruct import CAPTURE, FEW
+from gs2d.pipeline.reconstruct import CAPTURE
 from gs2d.render.api import rasterize
 from gs2d.sfm.photos import find_photos
 from gs2d.sfm.workspace import POSES_JSON
@@ -225,7 +226,7 @@ def score_run(path: Path) -> dict[str, Any]:
     scene = with_predicted(job.scene, metered(splats, *drawing))
 
     def scores(views: Sequence[View], **how: Any) -> dict[str, Any] | None:
-        return summary_of(score_views(splats, views, *drawing, name="", on_event=ignore, **how))
+        return summary_of(score_views(splats, views, *drawing, name="", on_event=ignore, options=ScoreOptions(**how)))
 
     return {
         "test": scores(scene.test),

@@ -4,7 +4,7 @@
 
     python -m benchmarks.texture RUN [--downscale N] [--faces 50000] [--every 1] [--hold-out 4] [--pictures FOLDER]
 
-Bakes a texture from the photographs and one from the renderings of a run with a ``mesh.ply``. Draws the mesh with each
+Bakes a texture from the photographs of a run with a ``mesh.ply``. Draws the mesh with the
 texture and with its vertex colours, by the ray caster of the demo (2 x 2 rays per pixel), from the test views. A run
 without test views leaves every N-th training view out of the baking (``--hold-out``). Prints means over these views:
 
@@ -37,7 +37,7 @@ from gs2d.io.run_dir import MESH, open_run
 from gs2d.meshing.raycast import Hits, cast_camera
 from gs2d.meshing.texture import bilinear
 from gs2d.pipeline.finish.run_texture import textured_mesh
-from gs2d.pipeline.prepare.loaded import finished_splats, reload_run
+from gs2d.pipeline.prepare.loaded import reload_run
 from gs2d.pipeline.prepare.open_capture import read_scene
 from gs2d.pipeline.prepare.options import TextureOptions
 from gs2d.pipeline.prepare.run_appearance import as_scene
@@ -128,7 +128,7 @@ def main() -> None:
     parser.add_argument("--pictures", type=Path, help="an existing folder")
     arguments = parser.parse_args()
     run = open_run(arguments.run)
-    job, splats, mesh = reload_run(run, lambda _event: None), finished_splats(run), read_mesh(run.file(MESH))
+    job, mesh = reload_run(run, lambda _event: None), read_mesh(run.file(MESH))
     shrink = arguments.downscale or job.downscale
     if shrink != job.downscale and job.scene.root is not None:
         scene = read_scene(job.scene.root, job.scene.format, shrink, job.protocol, lambda _event: None)
@@ -139,14 +139,12 @@ def main() -> None:
         rest = tuple(view for view in job.scene.train if view not in views)
         job = replace(job, scene=replace(job.scene, train=rest, test=views))
     meshes: dict[str, Mesh | TexturedMesh] = {"vertex colours": mesh}
-    for source in ("photographs", "renders"):
-        options = TextureOptions(faces=arguments.faces, texture_size=arguments.size, texture_from=source)
-        start, cpu = time.perf_counter(), time.process_time()
-        baked = textured_mesh(job, splats, mesh, options)
-        took = f"{time.perf_counter() - start:.1f} s ({time.process_time() - cpu:.1f} s of CPU)"
-        size, unseen = len(baked.mesh.texture), baked.unseen / baked.texels
-        print(f"from {source}: {size}x{size}, {len(baked.mesh.faces):,} faces, {unseen:.2%} unseen, {took}", flush=True)
-        meshes[f"from {source}"] = baked.mesh
+    start, cpu = time.perf_counter(), time.process_time()
+    baked = textured_mesh(job, mesh, TextureOptions(faces=arguments.faces, texture_size=arguments.size))
+    took = f"{time.perf_counter() - start:.1f} s ({time.process_time() - cpu:.1f} s of CPU)"
+    size, unseen = len(baked.mesh.texture), baked.unseen / baked.texels
+    print(f"texture: {size}x{size}, {len(baked.mesh.faces):,} faces, {unseen:.2%} unseen, {took}", flush=True)
+    meshes["texture"] = baked.mesh
     compare(meshes, views[:: arguments.every], job.settings.background, arguments.pictures)
 
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from gs2d.losses.api import Loss, LossView, compute_losses
     from gs2d.losses.reference import normals_from_depth
     from gs2d.pipeline.in_memory import Trained, evaluate, extract_mesh, train
-    from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
+    from gs2d.pipeline.prepare.options import MeshOptions, Training, TrainOptions
     from gs2d.render.api import rasterize, splat_errors
     from gs2d.render.backends import backend_report, get_backend, register_backend
     from gs2d.render.tensor_api import rasterize_2dgs
@@ -64,6 +64,7 @@ __all__ = [
     "Trained",
     "Trainer",
     "TrainerOptions",
+    "Training",
     "__version__",
     "backend_report",
     "compute_losses",
@@ -117,6 +118,7 @@ _HOME = {
     "Stage": "gs2d.config.recipe",
     "TrainOptions": "gs2d.pipeline.prepare.options",
     "Trained": "gs2d.pipeline.in_memory",
+    "Training": "gs2d.pipeline.prepare.options",
     "Trainer": "gs2d.training.trainer",
     "TrainerOptions": "gs2d.training.trainer",
     "backend_report": "gs2d.render.backends",

@@ -99,8 +99,8 @@ def test_the_splats_of_a_file_are_drawn_and_meshed_with_the_cameras_of_a_run(
     assert run([*mesh, "--out", str(tmp_path / "m.ply"), "--quiet"]) == 0
     assert (tmp_path / "m.ply").stat().st_size > 100
     for words, told in (
-        (mesh, "--splats needs --out: what is in the run is made of its own splats"),
-        ([*mesh, "--out", str(trained / "mesh.ply")], "is the mesh of the run, which is that of its own splats"),
+        (mesh, "--splats needs --out: files in the run are made from its own splats"),
+        ([*mesh, "--out", str(trained / "mesh.ply")], "is the mesh of the run's own splats"),
         ([*mesh, "--texture"], "--splats has no texture"),
         (["render", str(trained), "--splats", str(glb)], "--splats needs --out"),
         (["render", str(trained), "--splats", str(trained), "--out", str(tmp_path / "x")], "got the folder"),

@@ -9,8 +9,8 @@ import pytest
 from cli_runs import TINY
 from gs2d.cli import run
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.prepare.quality import QUALITIES, quality_of
-from gs2d.render.backends import BACKENDS, ReferenceBackend
+from gs2d.pipeline.prepare.quality import QUALITIES, quality_level
+from gs2d.render.backends import BACKENDS, ReferenceBackend, get_backend
 
 
 class OnNamedDevice(ReferenceBackend):
@@ -38,8 +38,11 @@ def test_it_trains_meshes_and_scores_by_the_command_line(
     assert run(["evaluate", str(out), "--quiet"]) == 0
 
 
-def test_another_device_is_trained_on_like_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_qualities_of_another_device_are_those_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    def normal() -> object:
+        return quality_level("normal", is_data_set=False, on_host=get_backend("guest").on_host)
+
     monkeypatch.setitem(BACKENDS._things, "guest", OnMetal)
-    assert quality_of("normal", "guest") == QUALITIES["normal"]["gpu"]
+    assert normal() == QUALITIES["normal"]["gpu"]
     monkeypatch.setitem(BACKENDS._things, "guest", OnNamedDevice)
-    assert quality_of("normal", "guest") == QUALITIES["normal"]["cpu"]
+    assert normal() == QUALITIES["normal"]["cpu"]

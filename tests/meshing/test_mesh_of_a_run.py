@@ -76,7 +76,7 @@ def test_a_training_whose_mesh_does_not_fit_has_it_in_larger_voxels_from_the_sam
     overrides = ("init_points=400", "surface.iterations=40", "surface.densify.max_splats=400")
     run = train(TrainOptions(scene=capture, out=tmp_path / "run", recipe="2dgs", schedule_scale=0.002, threads=1,
                              overrides=overrides), heard.append)  # fmt: skip
-    assert any("the mesh has such voxels" in event.text for event in heard if isinstance(event, Notice))
+    assert any("using voxels of this size" in event.text for event in heard if isinstance(event, Notice))
     assert run.metrics()["mesh"]["faces"] == len(read_mesh(run.file("mesh.ply")).faces) > 10
 
 

@@ -1,4 +1,4 @@
-"""A tiny capture and an undisturbed run of it, for all tests of the pipeline; they are never changed."""
+"""A tiny capture and a run of it, shared by all tests of the pipeline and never changed."""
 
 from __future__ import annotations
 

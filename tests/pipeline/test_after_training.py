@@ -1,4 +1,4 @@
-"""Once training is over, the splats are written first, and no later step can end the run."""
+"""After training, the splats are written first, and no later step can end the run."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Event, NotMade
 
 LATER = {  # of a training, with what is missing then
-    "train.stage_results.write_poses": "learned cameras and exposures",
-    "train.stage_results.write_appearance": "learned cameras and exposures",
+    "train.stage_results.write_poses": "refined cameras and exposures",
+    "train.stage_results.write_appearance": "refined cameras and exposures",
     "train.stage_results.score_views": "scores of train views, stage refine",
     "train.stage_results.split_metrics": "scores of train views, stage refine",
-    "train.stage_results.report_losses": "what the losses say of stage refine",
-    "train.stage_results.draw_stage": "pictures of stage refine",
+    "train.stage_results.report_losses": "reports of the losses, stage refine",
+    "train.stage_results.draw_stage": "images of stage refine",
     "train.stage_results.StageScored": "scores of stage refine",
     "finish.run_mesh.fusion_frame": "mesh.ply",
-    "finish.verdict.Collector._measure": "verdict.json",
+    "finish.run_verdict.Collector._measure": "verdict.json",
     "train.train_run.meshed_subject": "mesh.ply",
     "train.train_run.extract_mesh": "mesh.ply",
     "train.train_run.keep_facts": "mesh.ply",
@@ -56,7 +56,7 @@ def trained(undisturbed: RunFolder, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(("place", "error"), list(zip(LATER, itertools.cycle(ERRORS), strict=False)))
-def test_a_step_that_fails_after_training_is_named_and_costs_no_splats(
+def test_a_step_that_fails_after_training_is_reported_and_the_splats_remain(
     place: str,
     error: Exception,
     capture: Path,
@@ -76,7 +76,7 @@ def test_a_step_that_fails_after_training_is_named_and_costs_no_splats(
     assert (trained / "splats.ply").read_bytes() == undisturbed.file("splats.ply").read_bytes()
 
 
-def test_a_training_whose_views_cannot_be_scored_has_its_splats(
+def test_the_splats_are_written_even_if_views_cannot_be_scored(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gs2d.pipeline.train.stage_results.score_views", failing(DataError("no points")))

@@ -1,4 +1,4 @@
-"""How far rendered depths are believed, and what of them a picture shows."""
+"""Limits of rendered depth, in meshes and in images."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gs2d.pipeline.finish.trusted_depth import BEYOND, believed_reach, within_re
 from wall_scene import wall
 
 
-def test_depths_past_what_points_reach_are_not_believed() -> None:
+def test_depths_beyond_the_sparse_points_are_ignored() -> None:
     scene = wall()
     reach = believed_reach(scene)
     assert reach is not None

@@ -1,4 +1,4 @@
-"""Checkpoints that torch reads and that are not whole: training goes on from the one before, and says so."""
+"""Damaged checkpoints that torch can read are skipped, with a notice."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def half(tensor: torch.Tensor) -> torch.Tensor:
         (("state", "learned"), lambda _: {"exposure": {"values": torch.zeros(6, 3, 4)}}),
     ],
 )
-def test_a_checkpoint_whose_entries_do_not_fit_together_is_passed_over(
+def test_a_checkpoint_with_inconsistent_entries_is_skipped(
     capture: Path,
     stopped: RunFolder,
     job: LoadedRun,
@@ -111,7 +111,7 @@ def test_a_checkpoint_whose_entries_do_not_fit_together_is_passed_over(
     assert "\n" not in said[0]
 
 
-def test_training_from_the_one_before_ends_with_the_same_bytes(
+def test_training_from_the_previous_checkpoint_ends_with_the_same_bytes(
     capture: Path, stopped: RunFolder, undisturbed: RunFolder, tmp_path: Path
 ) -> None:
     run = RunFolder(Path(shutil.copytree(stopped.path, tmp_path / "run")))
@@ -120,7 +120,7 @@ def test_training_from_the_one_before_ends_with_the_same_bytes(
     assert comparable(train(options(capture, run.path, resume=True))) == comparable(undisturbed)
 
 
-def test_a_damaged_stage_of_a_cache_is_trained_again_and_kept(
+def test_a_damaged_stage_in_a_cache_is_trained_and_stored_again(
     capture: Path, undisturbed: RunFolder, tmp_path: Path
 ) -> None:
     cache = tmp_path / "cache"
@@ -138,7 +138,7 @@ def test_a_damaged_stage_of_a_cache_is_trained_again_and_kept(
     assert run.metrics()["stages"][0]["reused_from"] == str(files[0])
 
 
-def test_a_checkpoint_under_the_name_of_another_is_passed_over(
+def test_a_checkpoint_with_the_name_of_another_is_skipped(
     capture: Path, stopped: RunFolder, job: LoadedRun, tmp_path: Path
 ) -> None:
     run = RunFolder(Path(shutil.copytree(stopped.path, tmp_path / "run")))

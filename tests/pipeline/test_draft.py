@@ -1,7 +1,8 @@
-"""``gs2d train --quality``: the schedule and picture size that `gs2d reconstruct` takes, of known cameras."""
+"""``--quality`` sets training length and image size, with the same defaults in `gs2d train` and `gs2d reconstruct`."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,41 +10,64 @@ import pytest
 
 import gs2d.pipeline.prepare.quality as module
 from ball_runs import options
+from capture_writers import small_colmap
 from gs2d.config.presets import get_recipe
 from gs2d.errors import RecipeError
-from gs2d.pipeline.prepare.quality import Quality
-from gs2d.pipeline.prepare.resolve import by_quality
+from gs2d.pipeline.prepare.open_capture import FEW, OpenCapture, open_capture
+from gs2d.pipeline.prepare.options import ReconstructOptions, TrainOptions
+from gs2d.pipeline.prepare.quality import QualityLevel
+from gs2d.pipeline.prepare.resolve import schedule_scale_of
+from gs2d.pipeline.reconstruct import CAPTURE, train_options
 from gs2d.pipeline.train.train_run import train
-from gs2d.training.events import Event, Notice
+from gs2d.training.events import Event, Notice, ignore
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A draft that fits the ball: 24 iterations on pictures of about 12 px (it has 24)."""
-    monkeypatch.setattr(module, "QUALITIES", {"draft": {"cpu": Quality(24, 12)}, "full": {"cpu": Quality(None, 999)}})
+    """A draft for small images: 24 iterations at about 12 px."""
+    level = {"cpu": QualityLevel(24, 12)}
+    monkeypatch.setattr(
+        module, "QUALITIES", {"draft": level, "normal": level, "full": {"cpu": QualityLevel(None, 999)}}
+    )
 
 
-def test_a_draft_of_a_capture_says_what_it_is_and_how_long_it_takes(capture: Path, tmp_path: Path) -> None:
-    told: list[Event] = []
-    run = train(options(capture, tmp_path / "run", quality="draft", schedule_scale=None), told.append)
-    scale = 24 / get_recipe("2dgs-r").iterations
-    notices = [event.text for event in told if isinstance(event, Notice)]
-    assert any(text.startswith("quality draft: ") and text.endswith("(--downscale 2)") for text in notices), notices
-    assert any(text.startswith("training will take about ") for text in notices)
-    assert any("as they are trained on (--downscale 2)" in text for text in notices)
+def test_a_draft_is_short_and_shrunk_and_its_time_is_estimated(capture: Path, tmp_path: Path) -> None:
+    heard: list[Event] = []
+    run = train(options(capture, tmp_path / "run", quality="draft", schedule_scale=None), heard.append)
+    notices = [event.text for event in heard if isinstance(event, Notice)]
+    assert any("(--downscale 2) for 24 iterations" in text for text in notices), notices
+    assert any(text.startswith("the run will take about ") for text in notices)
     assert run.definition()["downscale"] == 2
-    assert run.definition()["schedule_scale"] == scale
+    assert run.definition()["schedule_scale"] == 24 / get_recipe("2dgs-r").iterations
     train(options(capture, tmp_path / "run", quality="draft", schedule_scale=None, resume=True))  # is the same run
 
 
-def test_a_schedule_and_a_size_that_are_given_stay(capture: Path, tmp_path: Path) -> None:
-    asked = options(capture, tmp_path / "run", quality="draft", schedule_scale=None)
-    assert by_quality(replace(asked, schedule_scale=0.25), lambda _: None).schedule_scale == 0.25
-    assert by_quality(replace(asked, downscale=1), lambda _: None).downscale == 1
-    assert by_quality(replace(asked, quality="full"), lambda _: None).schedule_scale == 1.0
+def test_options_override_the_quality(capture: Path, tmp_path: Path) -> None:
+    draft = options(capture, tmp_path / "run", quality="draft", schedule_scale=None)
+
+    def scale_and_downscale(chosen: TrainOptions) -> tuple[float, int]:
+        opened: OpenCapture = open_capture(chosen, ignore)
+        return schedule_scale_of(chosen, opened), opened.downscale
+
+    assert scale_and_downscale(replace(draft, schedule_scale=0.25)) == (0.25, 2)
+    assert scale_and_downscale(replace(draft, downscale=1))[1] == 1
+    assert scale_and_downscale(replace(draft, quality="full")) == (1.0, 1)
+    assert scale_and_downscale(replace(draft, quality="auto")) == (1.0, 1)  # Blender: a known data set
 
 
-def test_a_quality_that_there_is_not_leaves_nothing(capture: Path, tmp_path: Path) -> None:
+def test_train_and_reconstruct_have_the_same_defaults_for_a_capture(tmp_path: Path) -> None:
+    capture = tmp_path / "run" / CAPTURE
+    small_colmap(capture)
+    ours = train_options(ReconstructOptions(photos=tmp_path / "photos", out=tmp_path / "run"))
+    theirs = TrainOptions(scene=capture, out=tmp_path / "other")
+    for placed, test in ((FEW - 1, 0), (FEW, 2)):
+        (capture / "poses.json").write_text(json.dumps({"placed": placed}))
+        for chosen in (ours, theirs):
+            opened = open_capture(chosen, ignore)
+            assert (opened.quality, len(opened.scene.test)) == (QualityLevel(24, 12), test)
+
+
+def test_an_unknown_quality_is_an_error_and_leaves_nothing(capture: Path, tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match="--quality"):
         train(options(capture, tmp_path / "run", quality="best"))
     assert not (tmp_path / "run").exists()

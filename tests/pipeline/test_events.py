@@ -1,4 +1,4 @@
-"""Events: what is left of a phase."""
+"""Events: the time left of a phase."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ import pytest
 from gs2d.training.events import Phase
 
 
-def test_the_time_left_of_a_phase_follows_how_its_steps_grow() -> None:
+def test_the_time_left_accounts_for_growing_steps() -> None:
     """A quarter of equal steps in 10 s: 30 s are left. Of steps that grow, it was a sixteenth: 150 s are left."""
     assert Phase("matching pairs", 40).seconds_left(10, 10.0) == pytest.approx(30.0)
     assert Phase("placing cameras", 40, growth=2.0).seconds_left(10, 10.0) == pytest.approx(150.0)
     assert Phase("placing cameras", 40, growth=2.0).seconds_left(40, 99.0) == 0.0
 
 
-def test_steps_of_different_cost_count_by_their_cost() -> None:
+def test_the_time_left_accounts_for_the_cost_of_steps() -> None:
     phase = Phase("training", 100, costs=((80, 0.25), (20, 1.0)))  # a quarter of the pixels first
     assert phase.seconds_left(40, 10.0) == pytest.approx(30.0)
     assert phase.seconds_left(80, 20.0) == pytest.approx(20.0)
     assert phase.seconds_left(90, 30.0) == pytest.approx(10.0)
 
 
-def test_nobody_can_tell_where_nobody_knows_the_number_of_steps() -> None:
+def test_the_time_left_is_unknown_without_a_number_of_steps() -> None:
     assert Phase("fusing", 0).seconds_left(3, 5.0) is None

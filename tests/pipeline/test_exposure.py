@@ -1,4 +1,4 @@
-"""Exposures through a whole run: its files and scores, pictures in an exposure, resuming, and what is refused."""
+"""Exposures in a whole run: files, scores, resuming and errors."""
 
 from __future__ import annotations
 
@@ -9,21 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from ball_runs import SMALL, options
-from gs2d.data import View
 from gs2d.data.image_files import read_image, write_image
-from gs2d.data.subject_box import OBJECT, read_subject
 from gs2d.errors import RunError
 from gs2d.io.run_dir import EXPOSURE, LEARNED, RunFolder
 from gs2d.pipeline.demo import demo
-from gs2d.pipeline.finish.camera_paths import orbit_cameras
 from gs2d.pipeline.finish.evaluate import evaluate_run
-from gs2d.pipeline.finish.run_images import render_run, render_view
+from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.loaded import open_finished
-from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, RenderOptions, TrainOptions
+from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, TrainOptions
 from gs2d.pipeline.train.train_run import train
 from gs2d.synthetic import demo_capture as toy
 from gs2d.synthetic.perturb_exposure import GAINS, random_gains, with_gains
@@ -57,9 +53,7 @@ def run(varied: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     return made
 
 
-def test_the_demo_s_training_pictures_have_gains_whose_mean_is_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_gains_of_the_demo_have_mean_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn = np.random.default_rng(0).integers(0, 256, (16, 16, 4)).astype(np.uint8)
     monkeypatch.setattr(toy, "bake", lambda *_, **__: None)  # a picture that takes no rays
     monkeypatch.setattr(toy, "render_image", lambda *_: toy.SyntheticImage(drawn, np.zeros(1, bool)))
@@ -80,7 +74,7 @@ def test_the_demo_s_training_pictures_have_gains_whose_mean_is_one(
         demo(DemoOptions(out=tmp_path / "demo", resume=True, vary_exposure=True))
 
 
-def test_the_transforms_lie_beside_the_run_and_their_mean_is_the_identity(run: RunFolder) -> None:
+def test_the_transforms_are_written_and_their_mean_is_the_identity(run: RunFolder) -> None:
     entries = json.loads(run.file(EXPOSURE).read_text())["photographs"]
     assert [entry["name"] for entry in entries] == [f"train/r_{i}.png" for i in range(6)]
     transforms = np.array([entry["transform"] for entry in entries])
@@ -91,7 +85,7 @@ def test_the_transforms_lie_beside_the_run_and_their_mean_is_the_identity(run: R
     assert run.definition()["recipe"]["name"] == "2dgs-r-exposure"
 
 
-def test_training_views_are_scored_in_their_exposures_and_test_views_as_they_are(run: RunFolder) -> None:
+def test_training_views_are_scored_in_their_exposures(run: RunFolder) -> None:
     _, job, splats = open_finished(run.path, 1, ignore)
     drawing = {"settings": job.settings, "backend": job.backend, "name": "", "on_event": ignore}
     last = run.metrics()["stages"][-1]
@@ -104,7 +98,7 @@ def test_training_views_are_scored_in_their_exposures_and_test_views_as_they_are
         assert (plain == own) == (split == "test")
 
 
-def test_matched_scores_are_beside_the_plain_ones_where_they_are_asked_for(run: RunFolder) -> None:
+def test_matched_scores_are_added_on_request(run: RunFolder) -> None:
     plain = run.metrics()["stages"][-1]
     assert "test_matched" not in plain
     matched = evaluate_run(run.path, EvaluateOptions(match_exposure=True))
@@ -114,33 +108,13 @@ def test_matched_scores_are_beside_the_plain_ones_where_they_are_asked_for(run: 
     assert "new views, colours matched to the photograph" in run.file("report.html").read_text()
 
 
-def test_any_view_can_be_rendered_in_the_exposure_of_a_photograph(run: RunFolder, tmp_path: Path) -> None:
-    render_run(run.path, RenderOptions(orbit=2, exposure_of="train/r_1.png"), out=tmp_path)
-    _, job, splats = open_finished(run.path, 1, ignore)
-    subject = read_subject(run.path)
-    assert subject is not None
-    focus = subject.center if subject.kind == OBJECT else None
-    camera = orbit_cameras([view.camera for view in job.scene.train], 2, focus)[0]
-    output = render_view(
-        splats, View.from_arrays("0", camera, np.zeros((1, 1, 3), np.uint8)), job.settings, job.backend
-    )
-    A, b = torch.from_numpy(job.scene.train[1].appearance["exposure"]).float().split([3, 1], dim=1)
-    alpha = output.alpha[..., None]
-    light = (output.color - (1 - alpha)) @ A.T + alpha * b[:, 0]  # the white behind the ball is no photograph
-    expected = 255 * (light + 1 - alpha).clamp(0, 1).numpy()
-    assert np.abs(read_image(tmp_path / "0000.png") - expected).max() <= 0.51
-    assert np.abs(255 * output.color.clamp(0, 1).numpy() - expected).max() > 2
-    with pytest.raises(RunError, match="r_9"):
-        render_run(run.path, RenderOptions(exposure_of="train/r_9.png"))
-
-
-def test_a_lost_or_damaged_file_of_exposures_is_named_with_its_remedy(run: RunFolder, tmp_path: Path) -> None:
+def test_a_missing_or_damaged_file_of_exposures_is_an_error_with_a_remedy(run: RunFolder, tmp_path: Path) -> None:
     copy = RunFolder(tmp_path / "copy")
     shutil.copytree(run.path, copy.path)
     whole = copy.file(LEARNED).read_text()
     for damage in ('{"views": {"a": [1]}}', '{"views": {"a": {"exposure": [[1]]}}}', "{", whole.replace("r_0", "r_99")):
         copy.file(LEARNED).write_text(damage)
-        with pytest.raises(RunError, match=r"learned\.json must hold .*--resume"):
+        with pytest.raises(RunError, match=r"learned\.json .*--resume"):
             evaluate_run(copy.path)
     copy.file(LEARNED).unlink()
     with pytest.raises(RunError, match="--resume"):

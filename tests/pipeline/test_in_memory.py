@@ -21,30 +21,28 @@ from gs2d.pipeline.prepare.options import MeshOptions
 @pytest.fixture(scope="module")
 def trained(capture: Path) -> Trained:
     """What ``undisturbed`` is, in memory."""
-    return gs2d.train(gs2d.load_scene(capture), "2dgs-r", schedule_scale=SCALE, overrides=SMALL)
+    return gs2d.train(gs2d.load_scene(capture), "2dgs-r", schedule_scale=SCALE, options=gs2d.Training(overrides=SMALL))
 
 
-def test_training_in_memory_ends_with_the_bytes_of_a_run(
-    trained: Trained, undisturbed: RunFolder, tmp_path: Path
-) -> None:
+def test_training_in_memory_gives_the_bytes_of_a_run(trained: Trained, undisturbed: RunFolder, tmp_path: Path) -> None:
     gs2d.write_splats(tmp_path / "splats.ply", trained.splats)
     assert (tmp_path / "splats.ply").read_bytes() == undisturbed.file("splats.ply").read_bytes()
 
 
-def test_the_scores_are_those_of_the_run(trained: Trained, undisturbed: RunFolder) -> None:
+def test_scores_in_memory_equal_those_of_the_run(trained: Trained, undisturbed: RunFolder) -> None:
     entry = undisturbed.metrics()["stages"][-1]
     for split in ("test", "train"):
         assert gs2d.evaluate(trained, split=split).to_json() == entry[split]
 
 
-def test_the_mesh_is_that_of_the_run(trained: Trained, undisturbed: RunFolder) -> None:
+def test_the_mesh_in_memory_equals_that_of_the_run(trained: Trained, undisturbed: RunFolder) -> None:
     ours, theirs = gs2d.extract_mesh(trained), read_mesh(undisturbed.file("mesh.ply"))
     assert len(ours.faces) > 0
     assert np.array_equal(ours.faces, theirs.faces)
     assert np.array_equal(np.float32(ours.vertices), np.float32(theirs.vertices))
 
 
-def test_splats_from_elsewhere_are_scored_and_meshed_with_their_scene(trained: Trained, undisturbed: RunFolder) -> None:
+def test_splats_from_a_file_are_scored_and_meshed_with_their_scene(trained: Trained, undisturbed: RunFolder) -> None:
     splats = gs2d.read_splats(undisturbed.file("splats.ply"))
     with pytest.raises(DataError, match="splats"):
         gs2d.evaluate(splats)
@@ -56,7 +54,7 @@ def test_splats_from_elsewhere_are_scored_and_meshed_with_their_scene(trained: T
     assert half.vertices[:, 2].min() >= -1e-6
 
 
-def test_mistakes_are_named_before_anything_is_trained(trained: Trained) -> None:
+def test_invalid_arguments_are_errors_before_training(trained: Trained) -> None:
     scene = trained.scene
     with pytest.raises(RecipeError, match="no recipe '2dgz'"):
         gs2d.train(scene, "2dgz")
@@ -64,9 +62,9 @@ def test_mistakes_are_named_before_anything_is_trained(trained: Trained) -> None
         gs2d.evaluate(trained, split="val")
 
 
-def test_a_total_of_iterations_is_trained_and_shown(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_iterations_set_the_length_and_progress_is_shown(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     events: list[Any] = []
-    small = {"overrides": ("init_points=60",), "backend": "cpu", "on_event": events.append}
+    small = {"options": gs2d.Training(overrides=("init_points=60",)), "backend": "cpu", "on_event": events.append}
     short = gs2d.train(capture, "2dgs-r", iterations=41, progress=True, **small)
     assert [stage.iterations for stage in short.recipe.stages] == [20, 7, 14]
     out, err = capsys.readouterr()

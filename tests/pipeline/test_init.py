@@ -1,4 +1,4 @@
-"""`gs2d train --init`: what is read, what is written into the run, what is refused."""
+"""`gs2d train --init`: initial splats from a file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def options(tmp_path_factory: pytest.TempPathFactory) -> TrainOptions:
     )
 
 
-def test_a_run_starts_from_the_file_and_resumes_with_it_alone(options: TrainOptions) -> None:
+def test_a_run_starts_from_a_file_and_resumes_only_with_it(options: TrainOptions) -> None:
     told: list[object] = []
     run = train(options, told.append)
     assert any("starting from start.ply: 30 flat splats" in str(event) for event in told)
@@ -40,7 +40,7 @@ def test_a_run_starts_from_the_file_and_resumes_with_it_alone(options: TrainOpti
         check_same_run(run, other.resolved)
 
 
-def test_what_cannot_start_a_training_is_one_line(options: TrainOptions, tmp_path: Path) -> None:
+def test_invalid_initial_splats_are_errors(options: TrainOptions, tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match="--init"):
         prepare_run(replace(options, start_from=tmp_path), lambda event: None)
     with pytest.raises(DataError, match="--init"):

@@ -73,7 +73,7 @@ def test_a_run_interrupted_before_its_first_checkpoint_resumes_to_the_same_bytes
     assert stages == comparable(undisturbed)[2]
 
 
-def test_a_checkpoint_that_cannot_be_saved_is_said_and_the_interrupt_acts_all_the_same(
+def test_a_failing_checkpoint_is_reported_and_does_not_stop_the_interrupt(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_args: object) -> None:
@@ -88,28 +88,28 @@ def test_a_checkpoint_that_cannot_be_saved_is_said_and_the_interrupt_acts_all_th
     assert not (tmp_path / "run").exists()
 
 
-def test_a_second_signal_acts_at_once_unless_it_is_the_first_one_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_signal_acts_at_once_unless_it_repeats_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
     held, clock = HeldSignals(), [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: clock[0])
     held.hold()
     os.kill(os.getpid(), signal.SIGINT)
     clock[0] = SAME / 2
     os.kill(os.getpid(), signal.SIGINT)
-    assert held.asked
+    assert held.pending
     clock[0] = SAME * 2
     with pytest.raises(KeyboardInterrupt):
         os.kill(os.getpid(), signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
         held.release()
-    assert not held.asked
+    assert not held.pending
 
 
-def test_a_signal_that_is_ignored_stays_ignored() -> None:
+def test_an_ignored_signal_stays_ignored() -> None:
     stop = signal.signal(signal.SIGINT, signal.SIG_IGN)
     held = HeldSignals()
     held.hold()
     os.kill(os.getpid(), signal.SIGINT)
-    assert not held.asked
+    assert not held.pending
     held.release()
     assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     signal.signal(signal.SIGINT, stop)

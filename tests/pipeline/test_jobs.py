@@ -1,4 +1,4 @@
-"""What is done with a trained run: mesh, render, score, export, report again."""
+"""Commands on a trained run: mesh, render, evaluate, export, report."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from gs2d.training.events import Event, StageScored
 from tiny import ball_cameras, write_ball_mesh
 
 
-def test_meshing_again_keeps_to_the_box_and_the_voxel(undisturbed: RunFolder, tmp_path: Path) -> None:
+def test_meshing_again_uses_the_box_and_the_voxel_size(undisturbed: RunFolder, tmp_path: Path) -> None:
     out = tmp_path / "half.ply"
     result = mesh_run(undisturbed.path, MeshOptions(bbox=(-1, -1, 0, 1, 1, 1), voxel=0.1, depth="median"), out=out)
     assert result["voxel"] == pytest.approx(0.1)
@@ -41,7 +41,7 @@ def test_meshing_again_keeps_to_the_box_and_the_voxel(undisturbed: RunFolder, tm
 
 
 @pytest.mark.parametrize(("text", "kind"), [("splats.ply", "splats"), ("bad", "vertex indices below 1")])
-def test_a_ground_truth_of_another_kind_is_refused_before_the_run_is_read(
+def test_an_invalid_ground_truth_is_an_error_before_the_run_is_read(
     undisturbed: RunFolder, tmp_path: Path, text: str, kind: str
 ) -> None:
     file = undisturbed.file("splats.ply")
@@ -53,7 +53,7 @@ def test_a_ground_truth_of_another_kind_is_refused_before_the_run_is_read(
         evaluate_run(tmp_path / "no run", EvaluateOptions(ground_truth=file))
 
 
-def test_two_commands_do_not_render_into_the_same_folder_of_a_run(undisturbed: RunFolder, tmp_path: Path) -> None:
+def test_two_commands_cannot_render_into_the_same_folder(undisturbed: RunFolder, tmp_path: Path) -> None:
     """The second would delete the frames of the first, which it then could not make a film of."""
     copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
     render_run(copy, RenderOptions(orbit=3), threads=1)
@@ -67,7 +67,7 @@ def test_two_commands_do_not_render_into_the_same_folder_of_a_run(undisturbed: R
     assert len(list((copy / "renders" / "orbit").glob("*.png"))) == 2
 
 
-def test_views_whose_names_differ_in_the_ending_or_the_case_only_have_files_of_their_own() -> None:
+def test_views_with_similar_names_have_different_files() -> None:
     wanted = ["x.png", "x.jpg", "a/b.png", "a__b.png", "Y.png", "y.png", "z.png"]
     views = [View.from_arrays(name, ball_cameras(1, 2)[0], np.zeros((2, 2, 3), np.uint8)) for name in wanted]
     names = file_names(views)
@@ -78,7 +78,7 @@ def test_views_whose_names_differ_in_the_ending_or_the_case_only_have_files_of_t
 
 
 @pytest.mark.parametrize("command", [export_run, mesh_run, page_run, report_run])
-def test_a_command_removes_what_a_killed_one_left_in_the_run(
+def test_a_command_removes_temporary_files_of_a_killed_one(
     undisturbed: RunFolder, tmp_path: Path, command: Callable[..., Any]
 ) -> None:
     run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
@@ -114,7 +114,7 @@ def test_evaluating_scores_the_surface_against_a_mesh(undisturbed: RunFolder, tm
     assert result["test"]["psnr"] == pytest.approx(undisturbed.metrics()["stages"][-1]["test"]["psnr"], abs=0.02)
 
 
-def test_a_capture_that_moved_is_named(undisturbed: RunFolder, tmp_path: Path) -> None:
+def test_a_missing_capture_is_an_error_with_its_path(undisturbed: RunFolder, tmp_path: Path) -> None:
     copy = tmp_path / "run"
     shutil.copytree(undisturbed.path, copy)
     definition = json.loads((copy / "run.json").read_text())
@@ -125,7 +125,7 @@ def test_a_capture_that_moved_is_named(undisturbed: RunFolder, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("name", ["x.obj", "photo.png", "x", "run/run.json", "run/splats.ply"])
-def test_a_result_is_not_written_under_a_name_that_it_is_not_nor_over_the_splats_of_the_run(
+def test_outputs_need_the_right_ending_and_do_not_overwrite_the_splats(
     undisturbed: RunFolder, tmp_path: Path, name: str
 ) -> None:
     copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
@@ -140,7 +140,7 @@ def test_a_result_is_not_written_under_a_name_that_it_is_not_nor_over_the_splats
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
-def test_a_rendering_is_not_written_over_a_photograph(
+def test_a_rendering_does_not_overwrite_a_photograph(
     capture: Path, undisturbed: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def plain(views: Sequence[View]) -> list[str]:
@@ -155,7 +155,7 @@ def test_a_rendering_is_not_written_over_a_photograph(
     assert render_run(undisturbed.path, out=tmp_path / "out", threads=1)["images"] == 2
 
 
-def test_a_rendering_that_fails_leaves_none_of_its_pictures_and_no_folder(
+def test_a_failed_rendering_leaves_no_images_and_no_folder(
     undisturbed: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from gs2d.pipeline.finish import run_images as render
@@ -177,7 +177,7 @@ def test_a_rendering_that_fails_leaves_none_of_its_pictures_and_no_folder(
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["0001.png"]
 
 
-def test_splats_with_nan_are_not_rendered_as_if_they_were_not_there(undisturbed: RunFolder, tmp_path: Path) -> None:
+def test_splats_with_nan_are_an_error(undisturbed: RunFolder, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
     splats = read_splats(copy / "splats.ply")
     splats.means[3, 1], splats.shN[5, 0, 0] = float("nan"), float("inf")

@@ -1,4 +1,4 @@
-"""What a kill, a full disk, a stop or a second command does at any call that changes a file: nothing is lost by it.
+"""Kills, full disks, signals and concurrent commands at any call that changes a file lose nothing.
 
 ``kill_runs`` says how; the counts that were reached are in docs/notebook/reliability.md.
 """
@@ -52,23 +52,20 @@ def tried(layer: Path, work: Path, commands: str, actions: str, *more: str) -> l
     return results
 
 
-def test_a_page_that_ends_at_any_of_its_calls_leaves_the_old_file_or_the_new_one(layer: Path, tmp_path: Path) -> None:
-    """The next test does the same to an export."""
-    for result in tried(layer, tmp_path, "page", "kill,tear,full"):
+def test_a_killed_page_or_export_leaves_the_old_or_the_new_file(layer: Path, tmp_path: Path) -> None:
+    for result in tried(layer, tmp_path, "page,export", "kill,tear,full"):
         assert result["kinds"].keys() >= {"open", "write", "fsync", "rename"}
         assert result["tried"] == result["calls"] >= 5
 
 
-def test_what_is_looked_at_at_a_call_is_what_a_kill_a_torn_write_and_a_full_disk_leave(
-    layer: Path, tmp_path: Path
-) -> None:
+def test_the_recorded_states_are_those_after_a_kill_a_torn_write_and_a_full_disk(layer: Path, tmp_path: Path) -> None:
     """``--states``, for long commands, looks at a process that stands still, instead of ending one at each call."""
     for result in tried(layer, tmp_path, "export", "kill,tear,full", "--states", "--compare"):
         assert result["tried"] == result["calls"] >= 5
         assert 3 <= result["states"] < result["calls"]
 
 
-def test_the_layer_would_notice_a_file_that_is_written_in_place(layer: Path, tmp_path: Path) -> None:
+def test_the_harness_detects_a_file_that_is_written_in_place(layer: Path, tmp_path: Path) -> None:
     """A stand-in for an export that writes in place: killed half-way it leaves half a file, which must be found."""
     code = (
         "import kill_commands, kill_runs, sys\n"
@@ -89,13 +86,13 @@ def test_the_layer_would_notice_a_file_that_is_written_in_place(layer: Path, tmp
 
 @pytest.mark.slow
 @pytest.mark.timeout(3000)
-def test_a_training_that_ends_at_any_of_its_calls_is_resumed_to_the_same_bytes(layer: Path, tmp_path: Path) -> None:
+def test_a_training_killed_at_any_call_resumes_to_the_same_bytes(layer: Path, tmp_path: Path) -> None:
     for result in tried(layer, tmp_path, "train", "kill,tear,full", "--states"):
         assert result["tried"] == result["calls"] > 200
 
 
 @pytest.mark.slow
-def test_a_mesh_and_a_report_that_end_at_any_of_their_calls_are_made_again(layer: Path, tmp_path: Path) -> None:
+def test_a_mesh_or_report_killed_at_any_call_can_be_made_again(layer: Path, tmp_path: Path) -> None:
     for result in tried(layer, tmp_path, "mesh,report", "kill,tear,full"):
         assert result["tried"] == result["calls"] >= 5
 
@@ -105,7 +102,7 @@ def test_a_mesh_and_a_report_that_end_at_any_of_their_calls_are_made_again(layer
 @pytest.mark.parametrize(("command", "how"), [
     ("sweep", ["kill,tear,full", "--states"]), ("reconstruct", ["kill,tear", "--states"]), ("reconstruct", ["full"])
 ])  # fmt: skip
-def test_a_reconstruction_and_a_sweep_that_end_at_any_of_their_calls_are_gone_on_with(
+def test_a_reconstruction_or_sweep_killed_at_any_call_can_continue(
     layer: Path, tmp_path: Path, command: str, how: list[str]
 ) -> None:
     if command == "reconstruct":
@@ -115,15 +112,15 @@ def test_a_reconstruction_and_a_sweep_that_end_at_any_of_their_calls_are_gone_on
 
 
 @pytest.mark.slow
-def test_kills_by_chance_stops_and_a_clock_that_goes_back_change_nothing(layer: Path, tmp_path: Path) -> None:
+def test_random_kills_stops_and_clock_changes_do_not_change_the_result(layer: Path, tmp_path: Path) -> None:
     tried(layer, tmp_path, "train", "random,stop,clock", "--times", "10")
 
 
 @pytest.mark.slow
-def test_two_commands_in_one_folder_end_as_one(layer: Path, tmp_path: Path) -> None:
+def test_two_commands_in_one_folder_give_the_result_of_one(layer: Path, tmp_path: Path) -> None:
     tried(layer, tmp_path, "train,mesh,page", "twice", "--times", "10")
 
 
 @pytest.mark.slow
-def test_a_photograph_that_changes_between_kill_and_resume_is_refused(layer: Path, tmp_path: Path) -> None:
+def test_a_photograph_that_changes_before_a_resume_is_an_error(layer: Path, tmp_path: Path) -> None:
     tried(layer, tmp_path, "train", "photograph")

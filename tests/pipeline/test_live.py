@@ -1,4 +1,4 @@
-"""A training that is watched: the same bytes, whole copies, and no wait for anybody."""
+"""`--viewer`: the same bytes, complete copies, and no waiting."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def fetch(url: str, path: str) -> tuple[Any, bytes]:
         return answer.headers, answer.read()
 
 
-def test_a_watched_training_has_the_bytes_of_an_unwatched_one(
+def test_the_viewer_does_not_change_the_bytes(
     undisturbed: RunFolder, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every progress report is fetched by a page, with images beside it."""
@@ -111,7 +111,7 @@ def version_of(live: Live) -> int:
     return int(json.loads(bytes(live._answer_state({}).parts[0]))["version"])
 
 
-def test_what_is_shown_is_a_copy_taken_at_an_event(live: Live, splats: Splats) -> None:
+def test_the_page_shows_a_copy_of_the_splats(live: Live, splats: Splats) -> None:
     assert version_of(live) == 0
     with pytest.raises(DataError, match="there are no splats yet"):
         live._answer_splats({})
@@ -129,7 +129,7 @@ def test_what_is_shown_is_a_copy_taken_at_an_event(live: Live, splats: Splats) -
     assert bytes(live._answer_splats({}).parts[0]) == bytes(answer.parts[0])  # another page gets the same
 
 
-def test_nothing_is_copied_without_a_page_or_too_soon_or_before_the_last_copy_was_fetched(
+def test_splats_are_copied_only_for_an_open_page_after_the_previous_copy_was_fetched(
     live: Live, splats: Splats, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     live.on_training_event(progress(), state_of(splats), None)
@@ -151,15 +151,15 @@ def test_nothing_is_copied_without_a_page_or_too_soon_or_before_the_last_copy_wa
     assert version_of(live) == 2
 
 
-def test_a_viewer_that_fails_is_told_once_and_training_goes_on(live: Live, heard: list[Event]) -> None:
+def test_a_failing_viewer_is_reported_once_and_training_continues(live: Live, heard: list[Event]) -> None:
     live._server.failure = OSError("no memory")
     for _ in range(2):
         live.on_event(Phase("scoring", 3))
     told = [event.text for event in heard if isinstance(event, Notice)]
-    assert told[1:] == ["the viewer failed, training goes on: OSError: no memory"]
+    assert told[1:] == ["the viewer failed, training continues: OSError: no memory"]
 
 
-def test_a_watched_command_ends_when_the_work_is_done(capture: Path, tmp_path: Path) -> None:
+def test_a_command_with_the_viewer_ends_after_training(capture: Path, tmp_path: Path) -> None:
     words = ["train", str(capture), "--out", str(tmp_path / "run"), "--threads", "1", "--viewer", *TINY]
     done = subprocess.run([sys.executable, "-m", "gs2d", *words], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""How often a view is rendered: once for the last scores, the pictures and the mesh; some of them before."""
+"""Views are rendered once for final scores, images and mesh; early stages render some of them."""
 
 from __future__ import annotations
 
@@ -24,9 +24,7 @@ def few(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
         return train(options(capture, tmp_path_factory.mktemp("few") / "run"))
 
 
-def test_stages_before_the_last_are_scored_on_some_training_views_and_say_so(
-    few: RunFolder, undisturbed: RunFolder
-) -> None:
+def test_early_stages_are_scored_on_some_training_views(few: RunFolder, undisturbed: RunFolder) -> None:
     stages, whole = few.metrics()["stages"], undisturbed.metrics()["stages"]
     assert [stage["train"].get("views") for stage in stages] == [2, 2, None]
     assert stages[2]["after_clone"]["train"]["views"] == 2
@@ -37,9 +35,7 @@ def test_stages_before_the_last_are_scored_on_some_training_views_and_say_so(
     assert few.file("splats.ply").read_bytes() == undisturbed.file("splats.ply").read_bytes()
 
 
-def test_the_mesh_of_what_was_rendered_for_the_scores_is_that_of_rendering_again(
-    few: RunFolder, tmp_path: Path
-) -> None:
+def test_the_mesh_from_scored_renderings_equals_that_of_new_renderings(few: RunFolder, tmp_path: Path) -> None:
     shutil.copytree(few.path, tmp_path / "run")
     mesh_run(tmp_path / "run")
     assert (tmp_path / "run" / "mesh.ply").read_bytes() == few.file("mesh.ply").read_bytes()

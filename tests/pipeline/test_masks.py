@@ -1,4 +1,4 @@
-"""Masked pixels take part in nothing, and an empty pixel is empty, from loading to the mesh."""
+"""Masked pixels are ignored, and empty pixels are empty, from loading to the mesh."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def everything(root: Path, **options: Any) -> tuple[Splats, dict[str, Any], np.n
     return trained.splats, {"psnr": evaluate(trained).psnr}, mesh.vertices, np.concatenate([s.points for s in votes])
 
 
-def test_what_a_masked_pixel_shows_changes_nothing(tmp_path: Path) -> None:
+def test_the_values_of_masked_pixels_do_not_matter(tmp_path: Path) -> None:
     first, second = (everything(write_ball(tmp_path / str(noise), noise)) for noise in (0, 100))
     for name, tensor in first[0].items():
         assert torch.equal(
@@ -77,7 +77,7 @@ def test_what_a_masked_pixel_shows_changes_nothing(tmp_path: Path) -> None:
     assert not torch.equal(seen.sh0, first[0].sh0)  # so the test can fail
 
 
-def test_fusion_and_the_subject_leave_masked_pixels_out(tmp_path: Path) -> None:
+def test_fusion_and_subject_ignore_masked_pixels(tmp_path: Path) -> None:
     scene = load_scene(write_ball(tmp_path, 0), test_every=0)
     splats = train(scene, Recipe("plain", (Stage("surface", 2, losses=(LossTerm("l1", 1.0),)),)), backend="cpu").splats
     opaque = replace(splats, opacity_logits=torch.full_like(splats.opacity_logits, 8.0))
@@ -107,7 +107,7 @@ def test_fusion_and_the_subject_leave_masked_pixels_out(tmp_path: Path) -> None:
     )
 
 
-def test_points_that_lie_in_masked_pixels_alone_start_nothing(tmp_path: Path) -> None:
+def test_points_in_masked_pixels_only_are_not_used(tmp_path: Path) -> None:
     cameras = ring(3, width=24, height=24)
     model = ColmapModel(cameras={1: ("PINHOLE", 24, 24, (35.0, 35.0, 12.0, 12.0))})
     right = [camera.center + camera.forward * 4 + camera.rotation[0] * 0.8 for camera in cameras]
@@ -126,16 +126,16 @@ def test_points_that_lie_in_masked_pixels_alone_start_nothing(tmp_path: Path) ->
     scene = without_masked_points(load_scene(tmp_path, test_every=0), GENERIC, said.append)
     assert scene.points is not None
     np.testing.assert_allclose(scene.points.points, [*left, np.array([0.3, 0, 0])])
-    assert said == [Notice("3 of 7 sparse points lie in masked pixels alone: left out", detail=True)]
+    assert said == [Notice("3 of 7 sparse points are in masked pixels only: left out", detail=True)]
     scene = without_masked_points(load_scene(tmp_path, test_every=0, masked="off"), GENERIC, said.append)
     assert scene.points is not None
     assert len(scene.points) == 7
 
 
-def test_masks_that_leave_nothing_are_told_and_all_of_them_refused(tmp_path: Path) -> None:
+def test_empty_masks_are_reported_and_an_error_if_all_are_empty(tmp_path: Path) -> None:
     small_colmap(tmp_path)
     (tmp_path / "masks").mkdir()
-    for count, words in ((1, "masks of 1 of 9 views leave no pixel, first 0.png"), (9, "are they inverted")):
+    for count, words in ((1, "masks of 1 of 9 views leave no pixel, first 0.png"), (9, "are the masks inverted")):
         for index in range(count):
             Image.fromarray(np.zeros((30, 40), np.uint8)).save(tmp_path / "masks" / f"{index}.png")
         for masked in ("ignore", "empty"):

@@ -1,4 +1,4 @@
-"""Memory that was freed goes back to the system, and what can be had again goes when a run says so."""
+"""Freed memory is returned to the system, and cached images are dropped on request."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gs2d.data.cache import DecodedImage, ImageCache
 from gs2d.pipeline.prepare.limits import release
 
 
-def test_a_scene_that_forgets_its_pictures_decodes_them_again(tmp_path: Path) -> None:
+def test_a_scene_decodes_forgotten_images_again(tmp_path: Path) -> None:
     cache, decoded = ImageCache(1 << 20), []
     camera = look_at(np.array([0.0, 0.0, -3.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]), width=4, height=4, fx=5.0)
 

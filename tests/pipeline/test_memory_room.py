@@ -1,4 +1,4 @@
-"""Photographs that cannot fit into the memory that a process may have."""
+"""Photographs that do not fit into the available memory."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def limited(monkeypatch: pytest.MonkeyPatch, total: float, used: float) -> None:
     monkeypatch.setattr(module, "memory_limit", lambda: limit)
 
 
-def test_what_cannot_fit_is_refused_with_the_number_and_a_remedy_that_works(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_photographs_that_do_not_fit_into_memory_are_an_error_with_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     limited(monkeypatch, 1.3, 0.35)
     with pytest.raises(DataError) as refused:
         check_memory(scene(5888, 3926), 1, on_host=True)
@@ -48,9 +48,7 @@ def test_what_cannot_fit_is_refused_with_the_number_and_a_remedy_that_works(monk
     assert needed < 0.6 * 0.95 * GB  # caches have room beside it
 
 
-def test_a_training_that_nobody_said_the_size_of_shrinks_its_photographs_until_they_fit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_photographs_shrink_to_fit_into_memory_by_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = write_capture(tmp_path / "ball", train=3, test=1, size=24)
     need = 24 * 24 * module.DECODING_BYTES + 12 * 12 * module.ITERATION_BYTES
     limit = MemoryLimit(10**6, 10**6 - need * 10 // 6 - 2, "the control group (memory.max)")
@@ -68,7 +66,7 @@ def test_a_training_that_nobody_said_the_size_of_shrinks_its_photographs_until_t
         prepare_run(replace(mine, downscale=1), heard.append)
 
 
-def test_what_is_gone_on_with_is_shrunk_as_it_was_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_resumed_run_keeps_its_downscale(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = write_capture(tmp_path / "ball", train=3, test=1, size=24)
     mine = options(capture, tmp_path / "run", schedule_scale=0.0002)
     train(replace(mine, downscale=2))

@@ -1,4 +1,4 @@
-"""A picture, a mesh, a report or a page that cannot be made is said, and leaves all else as it is."""
+"""A failing image, mesh, report or page is reported and does not affect the other results."""
 
 from __future__ import annotations
 
@@ -59,13 +59,13 @@ def finished(undisturbed: RunFolder, tmp_path: Path) -> Path:
         (
             "train.stage_results.draw_stage",
             ValueError("x"),
-            "pictures of stage refine",
+            "images of stage refine",
             "fault in gs2d: ValueError: x",
             None,
         ),
     ],
 )
-def test_what_cannot_be_made_is_said_and_leaves_the_others(
+def test_a_failing_result_is_reported_and_the_others_are_made(
     place: str,
     error: Exception,
     what: str,
@@ -85,7 +85,7 @@ def test_what_cannot_be_made_is_said_and_leaves_the_others(
     assert {name for name in MADE if (finished / name).exists()} == set(MADE) - {what}
 
 
-def test_a_full_disk_ends_the_run_all_the_same(capture: Path, finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_ends_the_run(capture: Path, finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     full = disk_error(finished / "report.html", OSError(errno.ENOSPC, "No space left on device"))
     monkeypatch.setattr("gs2d.pipeline.train.train_run.report_run", failing(full))
     with pytest.raises(DiskError, match="No space left"):
@@ -93,14 +93,14 @@ def test_a_full_disk_ends_the_run_all_the_same(capture: Path, finished: Path, mo
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), BrokenPipeError(), OSError(errno.EDQUOT, "quota")])
-def test_interrupts_closed_pipes_and_quotas_pass(error: BaseException) -> None:
+def test_interrupts_closed_pipes_and_full_disks_are_raised(error: BaseException) -> None:
     heard: list[Event] = []
     with pytest.raises(type(error)), attempted("x", None, heard.append):
         raise error
     assert heard == []
 
 
-def test_a_page_is_written_unless_it_is_not_wanted(capture: Path, finished: Path) -> None:
+def test_the_page_is_written_unless_disabled(capture: Path, finished: Path) -> None:
     train(options(capture, finished, resume=True, page=False))
     assert not (finished / "scene.html").exists()
     train(options(capture, finished, resume=True))
@@ -110,7 +110,7 @@ def test_a_page_is_written_unless_it_is_not_wanted(capture: Path, finished: Path
     assert (finished / "scene.html").read_bytes() == page
 
 
-def test_a_section_that_fails_loses_no_other_section(
+def test_a_failing_section_does_not_affect_others(
     undisturbed: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))

@@ -1,4 +1,4 @@
-"""Runs that compare views: from the command's recipe to the run folder, stopped and resumed, and refused."""
+"""Runs with multi-view losses: results, resuming and errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def comparing(capture: Path, out: Path, **changes: Any) -> TrainOptions:
     return replace(made, **changes)
 
 
-def test_a_run_that_compares_views_resumes_to_the_same_bytes_and_logs_its_loss(capture: Path, tmp_path: Path) -> None:
+def test_a_multi_view_run_resumes_to_the_same_bytes_and_logs_its_loss(capture: Path, tmp_path: Path) -> None:
     whole = train(comparing(capture, tmp_path / "whole"))
     logged = [line["losses"] for line in whole.events.read() if line["kind"] == "progress"]
     assert any(losses.get("multiview_photometric", 0) > 0 for losses in logged)
@@ -40,7 +40,7 @@ def test_a_run_that_compares_views_resumes_to_the_same_bytes_and_logs_its_loss(c
     assert comparable(resumed) == comparable(whole)
 
 
-def test_cameras_that_all_look_elsewhere_are_refused_and_leave_nothing(capture: Path, tmp_path: Path) -> None:
+def test_cameras_without_common_views_are_an_error_and_leave_nothing(capture: Path, tmp_path: Path) -> None:
     narrow = (*SMALL, "multiview.max_angle=0.1")
     with pytest.raises(DataError, match="max_angle"):
         train(comparing(capture, tmp_path / "run", overrides=narrow))

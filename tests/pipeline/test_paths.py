@@ -1,4 +1,4 @@
-"""Flights along the photographs: where they pass, how evenly, what stays level."""
+"""Camera paths: flights along the photographs, and orbits."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def paces(flight: list[Camera]) -> np.ndarray:
     return np.linalg.norm(np.diff([camera.center for camera in flight], axis=0), axis=1)
 
 
-def test_a_flight_along_a_ring_stays_on_it_and_is_closed() -> None:
+def test_a_flight_along_a_ring_is_closed_and_stays_on_it() -> None:
     flight = flight_cameras(ring(24), 90)
     assert len(flight) == 90
     centers = np.array([camera.center for camera in flight])
@@ -44,7 +44,7 @@ def test_a_flight_along_a_ring_stays_on_it_and_is_closed() -> None:
     np.testing.assert_allclose(steps, 2 * np.pi * 3 / 90, rtol=0.1)
 
 
-def test_a_flight_along_a_walk_keeps_its_order_its_direction_and_its_ends() -> None:
+def test_a_flight_along_a_walk_keeps_order_direction_and_ends() -> None:
     walk = corridor(30)
     flight = flight_cameras(walk, 60)
     np.testing.assert_allclose(flight[0].T_cam_world, walk[0].T_cam_world, atol=1e-6)
@@ -55,14 +55,14 @@ def test_a_flight_along_a_walk_keeps_its_order_its_direction_and_its_ends() -> N
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_few_photographs_make_a_flight_too(count: int) -> None:
+def test_a_flight_works_with_few_photographs(count: int) -> None:
     flight = flight_cameras(ball_cameras(6)[:count], 7)
     assert len(flight) == 7
     assert np.isfinite([camera.T_cam_world for camera in flight]).all()
     np.testing.assert_allclose(flight[0].center, ball_cameras(6)[0].center, atol=1e-9)
 
 
-def test_an_orbit_stays_within_the_arc_that_was_photographed() -> None:
+def test_an_orbit_stays_within_the_photographed_arc() -> None:
     turns = np.radians(np.linspace(-40, 70, 12))
     spread = [looking(((3 + a) * np.cos(a), (3 + a) * np.sin(a), 0.5 + a), (0, 0, 0)) for a in turns]
     orbit = orbit_cameras(spread, 48, np.zeros(3))

@@ -1,4 +1,4 @@
-"""Photographs on the disk while a run trains: the same result, where they would not fit, and within limits."""
+"""Photographs prepared on disk: the same results, by default if they do not fit into memory, within limits."""
 
 from __future__ import annotations
 
@@ -57,9 +57,7 @@ def digest(run: Path, name: str = "splats.ply") -> str:
 
 
 @pytest.mark.parametrize("recipe", ["2dgs-r", "best"])
-def test_splats_trained_from_prepared_photographs_have_the_bits_of_those_trained_from_memory(
-    capture: Path, tmp_path: Path, recipe: str
-) -> None:
+def test_prepared_photographs_give_the_same_splats(capture: Path, tmp_path: Path, recipe: str) -> None:
     scene = load_scene(capture, test_every=0)
     chosen = photographs.with_prepared(scene, tmp_path, Execution(prepare="always"), lambda event: None)
     assert chosen.ahead > 0
@@ -71,9 +69,7 @@ def test_splats_trained_from_prepared_photographs_have_the_bits_of_those_trained
 
 @pytest.mark.slow
 @pytest.mark.parametrize("recipe", ["2dgs-r", "best"])
-def test_prepared_photographs_train_to_the_same_bytes_as_photographs_in_memory(
-    capture: Path, tmp_path: Path, recipe: str
-) -> None:
+def test_prepared_photographs_give_the_same_bytes_of_a_run(capture: Path, tmp_path: Path, recipe: str) -> None:
     heard: list[Event] = []
     train(options(capture, tmp_path / "disk", "always", recipe), heard.append)
     train(options(capture, tmp_path / "memory", "never", recipe))
@@ -86,7 +82,7 @@ def test_prepared_photographs_train_to_the_same_bytes_as_photographs_in_memory(
 
 
 @pytest.mark.slow
-def test_a_run_that_is_meshed_and_reported_again_reads_what_it_has_prepared(capture: Path, tmp_path: Path) -> None:
+def test_later_commands_use_prepared_photographs(capture: Path, tmp_path: Path) -> None:
     run = train(options(capture, tmp_path / "run", "always"))
     _, job, _ = open_finished(run.path, None, lambda event: None)
     assert all(isinstance(view.decode, Stored) for view in job.scene.views)
@@ -101,7 +97,7 @@ def test_a_run_that_is_meshed_and_reported_again_reads_what_it_has_prepared(capt
     assert not any(isinstance(view.decode, Stored) for view in job.scene.views)
 
 
-def test_photographs_are_prepared_by_themselves_where_they_would_not_stay_in_memory(
+def test_photographs_that_do_not_fit_into_memory_are_prepared(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene, heard = load_scene(capture), []
@@ -112,13 +108,11 @@ def test_photographs_are_prepared_by_themselves_where_they_would_not_stay_in_mem
     chosen = photographs.with_prepared(small, tmp_path, Execution(prepare="auto"), heard.append)
     assert all(isinstance(view.decode, Stored) for view in chosen.views)
     said = next(event.text for event in heard if isinstance(event, Notice))
-    assert "do not stay in memory: prepared in" in said
+    assert "do not fit into memory: prepared in" in said
     assert photographs.with_prepared(small, tmp_path / "no", Execution(prepare="never"), heard.append) is small
 
 
-def test_a_run_that_was_broken_off_while_it_prepared_goes_on(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_preparation_continues(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "run"
 
     def stop(event: Event) -> None:
@@ -134,7 +128,7 @@ def test_a_run_that_was_broken_off_while_it_prepared_goes_on(
     assert {path: path.stat().st_mtime_ns for path in (out / PREPARED).iterdir()} == times
 
 
-def test_a_budget_bounds_caches_and_refuses_photographs_that_are_too_large(
+def test_a_memory_limit_bounds_caches_and_the_size_of_photographs(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     use_memory(3.0)

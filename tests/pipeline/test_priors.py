@@ -1,4 +1,4 @@
-"""Runs with known depths and normals: from the option to the run folder and the report, resumed, refused."""
+"""Runs with depth and normal priors: results, report, resuming and errors."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def run(valid: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     return train(knowing(valid, tmp_path_factory.mktemp("runs") / "known"))
 
 
-def test_a_run_logs_measures_and_shows_what_was_known(run: RunFolder) -> None:
+def test_a_run_with_priors_logs_and_reports_them(run: RunFolder) -> None:
     logged = [line["losses"] for line in run.events.read() if line["kind"] == "progress"]
     assert any(losses.get("depth_prior", 0) > 0 for losses in logged)
     assert any(losses.get("normal_prior", 0) > 0 for losses in logged)
@@ -76,7 +76,7 @@ def test_a_run_logs_measures_and_shows_what_was_known(run: RunFolder) -> None:
     assert "rendered normals" in report
 
 
-def test_maps_of_a_run_that_is_resumed_must_be_the_same(valid: Path, tmp_path: Path) -> None:
+def test_a_run_resumes_only_with_the_same_maps(valid: Path, tmp_path: Path) -> None:
     from gs2d.errors import RunError
 
     changed = tmp_path / "changed"
@@ -94,15 +94,15 @@ def test_maps_of_a_run_that_is_resumed_must_be_the_same(valid: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("source", ["auto", "relative"])
-def test_relative_maps_without_points_are_fitted_to_what_is_rendered(valid: Path, tmp_path: Path, source: str) -> None:
+def test_relative_maps_without_points_are_fitted_to_renderings(valid: Path, tmp_path: Path, source: str) -> None:
     said: list[str] = []
     made = knowing(valid, tmp_path / "run", depth_prior=source, normal_prior=False, recipe="2dgs")
     found = train(made, lambda event: said.append(event.text) if isinstance(event, Notice) else None)
-    assert any("scale and shift by what is rendered in 6" in text for text in said)
+    assert any("depth prior (relative): 6 of 6" in text for text in said)
     assert found.metrics()["stages"][-1]["losses"]["depth_prior"]["median"] >= 0
 
 
-def test_a_broken_map_is_named_before_anything_is_trained_and_leaves_nothing(valid: Path, tmp_path: Path) -> None:
+def test_a_broken_map_is_an_error_before_training_and_leaves_nothing(valid: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken"
     shutil.copytree(valid, broken)
     coloured = np.full((SIZE, SIZE, 3), (90, 120, 90), np.uint8)
@@ -114,7 +114,7 @@ def test_a_broken_map_is_named_before_anything_is_trained_and_leaves_nothing(val
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere names of files are text")
-def test_names_that_are_no_utf_8_and_hold_escape_sequences_have_known_depths_too(valid: Path, tmp_path: Path) -> None:
+def test_depth_maps_work_with_file_names_that_are_not_utf_8(valid: Path, tmp_path: Path) -> None:
     named, name = tmp_path / "named", os.fsdecode(b"\xe9\x1b]0;owned\x07")
     shutil.copytree(valid, named)
     for folder in ("train", "depths/train", "normals/train"):

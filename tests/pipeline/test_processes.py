@@ -1,4 +1,4 @@
-"""``gs2d train`` in several processes: who writes, what a kill and Ctrl-C leave, resuming, and what is refused."""
+"""``gs2d train`` in several processes: files, kills, Ctrl-C, resuming and errors."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def whole(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_a_run_of_two_processes_is_written_by_one(whole: Path) -> None:
+def test_one_of_two_processes_writes_the_run(whole: Path) -> None:
     run = RunFolder(whole)
     kinds = [entry["kind"] for entry in run.events.read()]
     assert kinds.count("initialised") == kinds.count("processes") == kinds.count("stage_finished") == 1
@@ -46,9 +46,7 @@ def test_a_run_of_two_processes_is_written_by_one(whole: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_killed_process_ends_the_run_which_goes_on_from_its_checkpoint(
-    capture: Path, whole: Path, tmp_path: Path
-) -> None:
+def test_a_killed_process_ends_the_run_which_can_resume(capture: Path, whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     (code, line), (killed, silent) = in_processes(2, words(capture, out), f"signal=1:5:{int(signal.SIGKILL)}")
     assert (code, killed, silent) == (2, -signal.SIGKILL, "")
@@ -60,7 +58,7 @@ def test_a_killed_process_ends_the_run_which_goes_on_from_its_checkpoint(
 
 
 @pytest.mark.slow
-def test_a_signal_to_any_process_keeps_a_checkpoint(capture: Path, whole: Path, tmp_path: Path) -> None:
+def test_a_signal_to_any_process_saves_a_checkpoint(capture: Path, whole: Path, tmp_path: Path) -> None:
     """At the fourth iteration, of views 6 and 7 of the schedule."""
     out = tmp_path / "run"
     (code, line), (_, silent) = in_processes(2, words(capture, out), f"signal=1:4:{int(signal.SIGTERM)}")
@@ -73,7 +71,7 @@ def test_a_signal_to_any_process_keeps_a_checkpoint(capture: Path, whole: Path, 
 
 
 @pytest.mark.slow
-def test_two_processes_then_one_then_two(capture: Path, whole: Path, tmp_path: Path) -> None:
+def test_the_number_of_processes_may_change_between_resumes(capture: Path, whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     in_processes(2, words(capture, out), f"signal=0:3:{int(signal.SIGINT)}")
     ((code, _),) = in_processes(1, words(capture, out, "--resume"), f"signal=0:3:{int(signal.SIGINT)}")
@@ -85,18 +83,18 @@ def test_two_processes_then_one_then_two(capture: Path, whole: Path, tmp_path: P
     assert RunFolder(out).metrics()["stages"][0]["iterations"] == ITERATIONS
 
 
-def test_another_command_in_one_of_them_is_one_line(capture: Path, tmp_path: Path) -> None:
+def test_different_commands_are_an_error(capture: Path, tmp_path: Path) -> None:
     found = in_processes(2, words(capture, tmp_path / "run"), "seed=1:5")
     assert [code for code, _ in found] == [2, 2]
     (line,) = "".join(text for _, text in found).splitlines()
     assert line.startswith(
-        "error: process 1 of 2: all processes must train the same, got another recipe than in process 0"
+        "error: process 1 of 2: all processes must train the same, got another recipe than process 0"
     )
     assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("rank", ["0", "1"])
-def test_other_commands_are_refused_by_process_0(
+def test_process_0_reports_differences(
     rank: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     said = {"RANK": rank, "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "1"}
@@ -117,7 +115,7 @@ def test_prepared_photographs_of_an_archive_give_the_same_bytes(capture: Path, w
 
 
 @pytest.mark.slow
-def test_torchrun_starts_again_what_was_killed(capture: Path, whole: Path, tmp_path: Path) -> None:
+def test_torchrun_restarts_a_killed_process(capture: Path, whole: Path, tmp_path: Path) -> None:
     program = [
         together_run.__file__,
         f"signal=1:5:{int(signal.SIGKILL)}",
@@ -129,7 +127,7 @@ def test_torchrun_starts_again_what_was_killed(capture: Path, whole: Path, tmp_p
 
 
 @pytest.mark.slow
-def test_torchrun_starts_four_and_their_states_agree(tmp_path: Path) -> None:
+def test_four_processes_of_torchrun_agree(tmp_path: Path) -> None:
     """The real launcher, the whole command with mesh and report, all stages of 2DGS-R."""
     out = tmp_path / "run"
     given = [

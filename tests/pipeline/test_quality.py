@@ -31,25 +31,25 @@ def best(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     return _demo(tmp_path_factory, "best", 0.03)
 
 
-def test_new_views_have_the_psnr_that_they_had(run: RunFolder) -> None:
+def test_the_psnr_of_test_views(run: RunFolder) -> None:
     psnr = {stage["name"]: stage["test"]["psnr"] for stage in run.metrics()["stages"]}
     assert 25.40 <= psnr["refine"] <= 27, psnr
     assert psnr["refine"] >= psnr["surface"] + 0.1, psnr  # 0.22 to 0.26: what 2DGS-R is for
 
 
-def test_the_surface_has_the_f_score_that_it_had(run: RunFolder) -> None:
+def test_the_f_score_of_the_surface(run: RunFolder) -> None:
     f_scores = [entry["f_score"] for entry in run.metrics()["surface"]["thresholds"]]
     assert f_scores[1] >= 0.38, f_scores
     assert f_scores[2] >= 0.69, f_scores
 
 
-def test_the_splats_are_as_many_as_they_were(run: RunFolder) -> None:
+def test_the_number_of_splats(run: RunFolder) -> None:
     splats = [stage["splats"] for stage in run.metrics()["stages"]]
     assert splats[1] == splats[0]
     assert 1.005 <= splats[2] / splats[1] <= 1.02  # one percent is cloned
 
 
-def test_the_default_recipe_is_better_in_half_of_the_iterations(best: RunFolder, run: RunFolder) -> None:
+def test_the_default_recipe_is_better_with_half_of_the_iterations(best: RunFolder, run: RunFolder) -> None:
     (stage,) = best.metrics()["stages"]
     assert 2 * stage["iterations"] == sum(entry["iterations"] for entry in run.metrics()["stages"])
     assert 25.5 <= stage["test"]["psnr"] <= 28, stage["test"]

@@ -1,4 +1,4 @@
-"""Refined focal lengths through a whole run: its file, its report, and who uses them afterwards."""
+"""Refined focal lengths in a whole run: file, report, and later commands."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
     folder = tmp_path_factory.mktemp("runs") / "cameras"
     made = train(options(capture, folder, refine_cameras=True, overrides=EARLY), listen)
-    assert any(text.startswith("focal lengths became ") for text in notices)
+    assert any(text.startswith("refined focal lengths are ") for text in notices)
     return made
 
 
-def test_every_view_has_the_focal_length_that_was_found_and_the_file_can_be_loaded(
+def test_views_have_the_refined_focal_length_and_the_file_can_be_loaded(
     run: RunFolder, capture: Path, tmp_path: Path
 ) -> None:
     given, job = load_scene(capture), reload_run(run, ignore)
@@ -63,7 +63,7 @@ def test_every_view_has_the_focal_length_that_was_found_and_the_file_can_be_load
         np.testing.assert_allclose(again[view.name].camera.T_cam_world, view.camera.T_cam_world, atol=1e-9)
 
 
-def test_photographs_of_another_size_have_it_too(run: RunFolder) -> None:
+def test_resized_photographs_have_the_refined_focal_length(run: RunFolder) -> None:
     job = reload_run(run, ignore)
     larger = _views(job, TextureOptions(texture_downscale=2), ignore)
     for view, here in zip(larger, job.scene.train, strict=True):
@@ -71,10 +71,10 @@ def test_photographs_of_another_size_have_it_too(run: RunFolder) -> None:
         assert view.camera.fx == pytest.approx(here.camera.fx / 2)
 
 
-def test_a_file_without_focal_lengths_is_refused(run: RunFolder, tmp_path: Path) -> None:
+def test_a_file_without_focal_lengths_is_an_error(run: RunFolder, tmp_path: Path) -> None:
     copy = RunFolder(Path(shutil.copytree(run.path, tmp_path / "run")))
     data = json.loads(copy.file(POSES).read_text())
-    for broken, words in (([1.0, np.nan, 0.0], "finite numbers"), ([-1.0, 0.0, 0.0], "positive"), (None, "zoom")):
+    for broken, words in (([1.0, np.nan, 0.0], "finite"), ([-1.0, 0.0, 0.0], "positive"), (None, "zoom")):
         for entry in data["frames"]:
             entry["zoom"] = broken
             if broken is None:

@@ -1,4 +1,4 @@
-"""Refined poses through a whole run: its file, who uses them, aligned scores, resuming, and what is refused."""
+"""Refined poses in a whole run: file, later commands, aligned scores, resuming and errors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gs2d.pipeline.finish.run_texture import _views
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.loaded import open_finished, reload_run
 from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, RenderOptions, TextureOptions, TrainOptions
-from gs2d.pipeline.prepare.run_poses import aligned, how_far
+from gs2d.pipeline.prepare.run_poses import aligned, camera_motion
 from gs2d.pipeline.train.train_run import train
 from gs2d.synthetic import demo_capture as toy
 from gs2d.synthetic.perturb_poses import TRUTH
@@ -48,9 +48,7 @@ def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     return made
 
 
-def test_the_demo_s_training_cameras_are_off_and_the_true_ones_beside_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_demo_disturbs_cameras_and_writes_the_true_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(toy, "bake", lambda *_, **__: None)  # a picture that takes no rays
     image = toy.SyntheticImage(np.full((16, 16, 4), 200, np.uint8), np.zeros(1, bool))
     monkeypatch.setattr(toy, "render_image", lambda *_: image)
@@ -67,9 +65,7 @@ def test_the_demo_s_training_cameras_are_off_and_the_true_ones_beside_them(
         demo(DemoOptions(out=tmp_path / "demo", resume=True, vary_poses=True))
 
 
-def test_the_poses_lie_beside_the_run_as_transforms_that_can_be_loaded(
-    run: RunFolder, capture: Path, tmp_path: Path
-) -> None:
+def test_the_poses_are_written_as_transforms_that_can_be_loaded(run: RunFolder, capture: Path, tmp_path: Path) -> None:
     frames = json.loads(run.file(POSES).read_text())["frames"]
     assert [frame["split"] for frame in frames] == ["train"] * 6 + ["test"] * (len(frames) - 6)
     assert frames[0]["file_path"] == "train/r_0.png"
@@ -85,7 +81,7 @@ def test_the_poses_lie_beside_the_run_as_transforms_that_can_be_loaded(
         assert again[view.name].fx == pytest.approx(view.camera.fx)
 
 
-def test_everybody_takes_the_cameras_that_were_found(run: RunFolder, capture: Path, tmp_path: Path) -> None:
+def test_later_commands_use_the_refined_cameras(run: RunFolder, capture: Path, tmp_path: Path) -> None:
     _, job, splats = open_finished(run.path, 1, ignore)
     given = load_scene(capture)
     for view, before in zip(job.scene.train, given.train, strict=True):
@@ -108,7 +104,7 @@ def test_everybody_takes_the_cameras_that_were_found(run: RunFolder, capture: Pa
     assert texture[0].camera.width == job.scene.train[0].camera.width // 2
 
 
-def test_aligned_scores_are_beside_the_plain_ones_where_they_are_asked_for(run: RunFolder) -> None:
+def test_aligned_scores_are_added_on_request(run: RunFolder) -> None:
     plain = run.metrics()["stages"][-1]
     assert "test_aligned" not in plain
     both = evaluate_run(run.path, EvaluateOptions(match_poses=True))
@@ -118,7 +114,7 @@ def test_aligned_scores_are_beside_the_plain_ones_where_they_are_asked_for(run: 
     assert "new views, cameras aligned with the photograph" in run.file("report.html").read_text()
 
 
-def test_a_view_is_aligned_to_where_the_splats_look_like_its_photograph(run: RunFolder) -> None:
+def test_a_view_is_aligned_to_its_photograph(run: RunFolder) -> None:
     _, job, splats = open_finished(run.path, 1, ignore)
     view, drawing = job.scene.train[0], (job.settings, job.backend)
     color = render_view(splats, view, *drawing).color.clamp(0, 1).numpy()
@@ -126,11 +122,11 @@ def test_a_view_is_aligned_to_where_the_splats_look_like_its_photograph(run: Run
     off = perturb_pose(view.camera, torch.tensor([0.01, -0.01, 0, 0.01, 0.02, 0], dtype=torch.float64))
     (found,) = aligned(splats, [image.at(off.T_cam_world)], *drawing, job.scene.extent, ignore)
     middle = np.zeros(3)
-    before, after = (how_far(view.camera, c, middle, job.scene.extent)["pixels"] for c in (off, found.camera))
+    before, after = (camera_motion(view.camera, c, middle, job.scene.extent)["pixels"] for c in (off, found.camera))
     assert after < 0.3 * before
 
 
-def test_a_stopped_run_resumes_to_the_same_splats_and_poses(run: RunFolder, capture: Path, tmp_path: Path) -> None:
+def test_an_interrupted_run_resumes_to_the_same_splats_and_poses(run: RunFolder, capture: Path, tmp_path: Path) -> None:
     def listen(event: Event) -> None:
         if isinstance(event, Step) and event.done >= 37 and "loss" in event.detail:  # in the second stage
             raise Stop
@@ -146,7 +142,7 @@ def test_a_stopped_run_resumes_to_the_same_splats_and_poses(run: RunFolder, capt
     assert resumed.file(POSES).read_bytes() == run.file(POSES).read_bytes()
 
 
-def test_a_lost_or_damaged_file_of_poses_is_named_with_its_remedy(run: RunFolder, tmp_path: Path) -> None:
+def test_a_missing_or_damaged_file_of_poses_is_an_error_with_a_remedy(run: RunFolder, tmp_path: Path) -> None:
     copy = RunFolder(tmp_path / "copy")
     shutil.copytree(run.path, copy.path)
     one = {"name": "train/r_0.png", "split": "train", "T_cam_world": np.eye(4).tolist()}

@@ -1,4 +1,4 @@
-"""Exact resume, stages shared by runs, and the same bytes from the same seed."""
+"""Exact resume, shared stages, and the same bytes from the same seed."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_a_run_stopped_at_any_iteration_resumes_to_the_same_bytes(
     assert comparable(resumed) == comparable(undisturbed)
 
 
-def test_a_run_stopped_between_the_end_of_a_stage_and_its_scores_is_scored_on_resume(
+def test_a_run_stopped_before_the_scores_of_a_stage_is_scored_on_resume(
     capture: Path, undisturbed: RunFolder, tmp_path: Path
 ) -> None:
     def listen(event: Event) -> None:
@@ -72,7 +72,7 @@ def test_resuming_a_finished_run_changes_nothing(capture: Path, undisturbed: Run
     assert RunFolder(copy).metrics()["mesh"] == undisturbed.metrics()["mesh"]
 
 
-def test_resume_goes_back_one_checkpoint_when_the_last_is_damaged_and_says_so(
+def test_resume_uses_the_previous_checkpoint_if_the_last_is_damaged(
     capture: Path, undisturbed: RunFolder, tmp_path: Path
 ) -> None:
     copy = tmp_path / "run"
@@ -96,7 +96,7 @@ def test_resume_goes_back_one_checkpoint_when_the_last_is_damaged_and_says_so(
         ({"stage2_cache_mb": 0}, "stage2_cache_bytes"),
     ],
 )
-def test_resuming_with_other_options_is_refused_and_names_the_difference(
+def test_resuming_with_other_options_is_an_error_with_the_difference(
     capture: Path, undisturbed: RunFolder, changes: dict[str, Any], named: str
 ) -> None:
     before = comparable(undisturbed)
@@ -120,7 +120,7 @@ def test_a_cache_gives_the_same_bytes_without_training_the_shared_stages(
     assert len(list(cache.glob("*.pt"))) == 3
 
 
-def test_another_seed_or_setting_does_not_take_a_stage_from_the_cache(capture: Path, tmp_path: Path) -> None:
+def test_another_seed_or_setting_does_not_use_the_cache(capture: Path, tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     first = options(capture, tmp_path / "a", recipe="2dgs", cache=cache)
     train(first)
@@ -131,7 +131,7 @@ def test_another_seed_or_setting_does_not_take_a_stage_from_the_cache(capture: P
     assert all("reused_from" not in open_run(tmp_path / x).metrics()["stages"][0] for x in "abcd")
 
 
-def test_a_run_starts_from_the_stages_it_shares_with_another(
+def test_a_run_starts_from_the_stages_that_it_shares_with_another(
     capture: Path, undisturbed: RunFolder, tmp_path: Path
 ) -> None:
     overrides = (*SMALL, "refine.iterations=6")
@@ -149,7 +149,7 @@ def test_a_run_starts_from_the_stages_it_shares_with_another(
         ({"cache": "other/run.json/cache"}, DiskError, "part"),
     ],
 )
-def test_an_overwrite_that_has_nothing_to_start_from_keeps_the_old_run(
+def test_a_failing_overwrite_keeps_the_old_run(
     capture: Path, undisturbed: RunFolder, tmp_path: Path, changes: dict[str, Any], error: type[Exception], named: str
 ) -> None:
     for name in ("run", "other"):
@@ -168,13 +168,13 @@ def test_the_same_seed_gives_the_same_bytes(capture: Path, undisturbed: RunFolde
     assert other.file("splats.ply").read_bytes() != undisturbed.file("splats.ply").read_bytes()
 
 
-def test_a_finished_run_whose_checkpoints_were_deleted_is_never_touched_by_resume(
+def test_a_finished_run_without_checkpoints_is_not_changed_by_resume(
     capture: Path, undisturbed: RunFolder, tmp_path: Path
 ) -> None:
     copy = tmp_path / "run"
     shutil.copytree(undisturbed.path, copy)
     shutil.rmtree(copy / "checkpoints")  # to save space
-    for changes, words in (({}, "finished and its checkpoints are gone"), ({"seed": 1}, "another recipe")):
+    for changes, words in (({}, "is finished and has no checkpoints"), ({"seed": 1}, "another recipe")):
         with pytest.raises(RunError, match=words):
             train(options(capture, copy, resume=True, **changes))
         for name in ("splats.ply", "mesh.ply", "metrics.json", "report.html"):

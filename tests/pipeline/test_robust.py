@@ -1,4 +1,4 @@
-"""Which captures are trained robustly, and in which exposure a view is that nobody photographed."""
+"""The choice of robust training, and predicted exposures of new views."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def exposed(scene: Scene, gains: np.ndarray) -> Scene:
     return scene.with_appearance({view.name: {"exposure": np.eye(3, 4) * gain} for view, gain in known})
 
 
-def test_where_neighbours_have_similar_exposures_a_view_between_them_has_theirs() -> None:
+def test_a_view_between_neighbours_with_similar_exposures_has_theirs() -> None:
     gains = 1 + 0.3 * np.cos(np.linspace(0, 2 * np.pi, 24, endpoint=False))
     assert predicted(gains) == pytest.approx(gains[-1], abs=0.05)
 
@@ -136,14 +136,14 @@ def by_meter(gains: np.ndarray, seen: np.ndarray) -> float:
     return float(found.test[0].appearance["exposure"][0, 0])
 
 
-def test_where_exposures_follow_what_the_camera_sees_a_view_has_that_of_its_brightness() -> None:
+def test_exposures_that_follow_brightness_are_predicted_from_it() -> None:
     seen = 0.4 + 0.2 * np.sin(1.7 * np.arange(24) ** 2)  # as if by chance: neighbours say nothing
     gains = (seen + 0.02) ** -0.8
     gains /= gains[:-1].mean()
     assert by_meter(gains, seen) == pytest.approx(gains[-1], rel=0.02)
 
 
-def test_another_removal_makes_another_stage_and_another_run(undisturbed: RunFolder, tmp_path: Path) -> None:
+def test_another_removal_changes_stage_keys_and_runs(undisturbed: RunFolder, tmp_path: Path) -> None:
     run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
     job = reload_run(run, lambda _: None)
     recipe = with_robustness(job.recipe)
@@ -159,7 +159,7 @@ def test_another_removal_makes_another_stage_and_another_run(undisturbed: RunFol
 
 
 @pytest.mark.parametrize(("brightness", "proposed"), [(1.0, False), (0.1, True)])
-def test_splats_in_the_colour_of_an_unlit_backdrop_are_proposed_and_those_of_a_white_floor_are_not(
+def test_splats_of_an_unlit_backdrop_are_proposed_for_removal_but_not_those_of_a_white_floor(
     brightness: float, proposed: bool
 ) -> None:
     heard: list[Event] = []

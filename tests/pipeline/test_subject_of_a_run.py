@@ -1,4 +1,4 @@
-"""The subject of a tiny run: written beside its results, taken by the mesh where it should be, and overridden."""
+"""The subject of a tiny run: written, meshed and overridden."""
 
 from __future__ import annotations
 
@@ -26,11 +26,12 @@ from gs2d.training.events import Notice
 BOX = (-0.5, -0.6, -0.7, 0.5, 0.6, 0.7)
 
 
-def test_training_writes_the_subject_and_only_the_generic_protocol_meshes_it(undisturbed: RunFolder) -> None:
+def test_training_writes_the_subject_and_the_generic_protocol_meshes_it(undisturbed: RunFolder) -> None:
     subject = read_subject(undisturbed.path)
     assert subject is not None
-    assert subject.why in str(settings_section(read_record(undisturbed.path)))
-    assert subject_line(subject, meshed=True).endswith("--scene takes everything")
+    shown = str(subject_section(read_record(undisturbed.path)))  # in the report: words, the box and the picture
+    assert subject.why in shown
+    assert subject_line(subject, meshed=True).endswith("--scene meshes everything")
     assert "the mesh is of everything" in subject_line(subject, meshed=False)
     job, splats = reload_run(undisturbed, lambda _: None), finished_splats(undisturbed)
     assert job.protocol.name == "nerf-synthetic"
@@ -38,7 +39,7 @@ def test_training_writes_the_subject_and_only_the_generic_protocol_meshes_it(und
     assert [name for name, protocol in PROTOCOLS.working() if protocol.fusion.subject] == ["generic"]
 
 
-def test_a_box_of_the_user_becomes_the_subject_and_limits_the_mesh(undisturbed: RunFolder, tmp_path: Path) -> None:
+def test_a_subject_box_becomes_the_subject_and_limits_the_mesh(undisturbed: RunFolder, tmp_path: Path) -> None:
     run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
     job, splats, said = reload_run(run, lambda _: None), finished_splats(run), []
     subject = meshed_subject(run, job, splats, MeshOptions(subject_box=BOX), said.append)
@@ -47,8 +48,8 @@ def test_a_box_of_the_user_becomes_the_subject_and_limits_the_mesh(undisturbed: 
     assert json.loads((run.path / "subject.json").read_text())["min"] == list(BOX[:3])
     assert said == [
         Notice(
-            "subject: 1 x 1.2 x 1.4 world units, box -0.5 -0.6 -0.7 0.5 0.6 0.7 (set with --subject-box); "
-            "--scene takes everything"
+            "subject: 1 x 1.2 x 1.4 world units, box -0.5 -0.6 -0.7 0.5 0.6 0.7 (the box was given); "
+            "--scene meshes everything"
         )
     ]
     out = tmp_path / "part.ply"

@@ -1,4 +1,4 @@
-"""``gs2d evaluate`` with the ground truth that lies beside the capture."""
+"""``gs2d evaluate`` with the ground truth in the capture."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def beside(undisturbed: RunFolder, capture: Path, tmp_path: Path, monkeypatch: p
     return run, folder
 
 
-def test_a_true_mesh_beside_the_capture_is_used_and_meshing_again_forgets_its_score(beside: tuple[Path, Path]) -> None:
+def test_a_true_mesh_in_the_capture_is_used_and_meshing_again_removes_its_score(beside: tuple[Path, Path]) -> None:
     run, folder = beside
     heard: list[Event] = []
     surface = evaluate_run(run, EvaluateOptions(), heard.append)["surface"]

@@ -1,4 +1,4 @@
-"""The verdict: hand-made measures give the grades, sentences and advice that they should."""
+"""The verdict: grades, sentences and advice for constructed measures."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from gs2d.config import grades
 from gs2d.core.json_files import write_json
 from gs2d.errors import DataError
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.finish.verdict import Finding, Measures, ViewMeasures, judge
-from gs2d.report.run_record import RunRecord
-from gs2d.report.sections.verdict_section import verdict_section
+from gs2d.pipeline.finish.run_verdict import Finding, Measures, ViewMeasures, judge
+from gs2d.report.record import RunRecord
+from gs2d.report.sections.verdict import verdict_section
 
 
 def views(train: float = 29.0, test: float = 27.0, **changes: Any) -> tuple[ViewMeasures, ...]:
@@ -71,7 +71,7 @@ def recorded(name: str) -> Measures:
 
 
 @pytest.mark.parametrize("name", RECORDED)
-def test_recorded_captures_get_the_grade_that_a_person_gives(name: str) -> None:
+def test_recorded_captures_get_the_grades_of_a_person(name: str) -> None:
     verdict, grade = judge(recorded(name)), RECORDED[name][-1]
     assert verdict.grade == grade
     assert any(finding.advice for finding in verdict.findings) == (grade != "good")
@@ -92,7 +92,7 @@ def test_new_views_are_graded_by_their_psnr(psnr: float, grade: str) -> None:
         ({"hidden": 900}, "floaters", "usable", "22.5 % of 4,000 points"),
     ],
 )
-def test_a_single_bad_view_is_named_with_advice(change: dict[str, Any], name: str, grade: str, text: str) -> None:
+def test_a_bad_view_is_reported_with_advice(change: dict[str, Any], name: str, grade: str, text: str) -> None:
     finding = found(Measures(views(**change)), name)
     assert finding.grade == grade
     assert text in f"{finding.figure} {finding.text} {finding.advice}"
@@ -100,7 +100,7 @@ def test_a_single_bad_view_is_named_with_advice(change: dict[str, Any], name: st
     assert finding.advice
 
 
-def test_lost_photographs_are_named_and_many_of_them_get_advice() -> None:
+def test_photographs_without_a_camera_are_reported_and_many_get_advice() -> None:
     few, many = (Measures(views(), placed, 24, ("lost.jpg",)) for placed in (23, 10))
     assert judge(few).grade == judge(many).grade == "good"
     assert not found(few, "placed").advice
@@ -108,7 +108,7 @@ def test_lost_photographs_are_named_and_many_of_them_get_advice() -> None:
     assert "lost.jpg" in found(many, "placed").advice
 
 
-def test_what_was_not_measured_is_reported_and_lowers_nothing() -> None:
+def test_missing_measures_are_reported_and_do_not_change_the_grade() -> None:
     measures = Measures(views(train=31.0)[:20])
     verdict = judge(measures)
     assert verdict.grade == "good"

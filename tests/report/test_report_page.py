@@ -166,9 +166,6 @@ def test_the_table_of_results_marks_the_best_and_has_no_empty_row() -> None:
     assert '<td class="best">27.35</td>' in table
     assert table.count('class="best"') == 4  # PSNR and SSIM of both splits, once each
     assert "LPIPS" not in table
-    assert "Transparent" not in table
-    counted = {**stage_entry(2), "transparent": {"part": 0.0123, "view": "b.jpg", "worst": 0.2}}
-    assert "<td>1.2</td>" in str(results_section(record(stages=(counted,))))
 
 
 def test_surface_scores_are_shown_or_the_reason_why_there_are_none() -> None:

@@ -193,7 +193,7 @@ def test_an_interrupted_search_continues_and_gives_the_same_bytes(
     with pytest.raises(KeyboardInterrupt):
         find_poses(options, first := Events(interrupt_at=phase))
     work = tmp_path / "new" / ".capture.poses"
-    assert first.lines[-1].startswith(f"what was found is kept in {work}")
+    assert first.lines[-1].startswith(f"intermediate results are kept in {work}")
     assert [path.name for path in out.parent.iterdir()] == [".capture.poses"]
     find_poses(options, second := Events())
     assert any(re.fullmatch(f"continuing the interrupted search: {kept}", line) for line in second.lines)

@@ -117,8 +117,6 @@ def test_a_video_becomes_a_capture_with_its_frames(tmp_path: Path, monkeypatch: 
     names = [row["name"] for row in result["photographs"]]
     assert names == [f"frame_{2 * i + 1:06d}.jpg" for i in range(len(photos))]
     assert sorted(path.name for path in (tmp_path / "capture/images").iterdir()) == names
-    assert f"{len(photos)} of {2 * len(photos)} frames were taken" in "".join(
-        e.text for e in said if isinstance(e, Notice)
-    )
+    assert f"using {len(photos)} of {2 * len(photos)} frames" in "".join(e.text for e in said if isinstance(e, Notice))
     assert read_json(tmp_path / "capture/poses.json")["photos"] == str(video.resolve())
     assert not list(tmp_path.glob(".*"))

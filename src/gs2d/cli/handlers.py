@@ -21,8 +21,8 @@ EVERYDAY = ("best", "best-surface", "2dgs")  # recipes that `gs2d recipes` shows
 
 def plan(command: c.Plan, console: Console) -> None:
     """``gs2d plan``."""
+    from gs2d.pipeline.prepare.estimate import plan as make_plan
     from gs2d.pipeline.prepare.estimate import set_words
-    from gs2d.pipeline.prepare.plan import plan as make_plan
 
     found = make_plan(command, console.on_event)
     console.close()

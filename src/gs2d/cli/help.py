@@ -10,7 +10,7 @@ from gs2d.cli.arguments import NAMES, Option, about, options_of
 from gs2d.cli.commands import Common
 from gs2d.cli.layout import terminal_width
 from gs2d.cli.registry import COMMANDS, GROUPS
-from gs2d.pipeline.prepare.options import CommonTraining, Finding, HowItRuns, Training
+from gs2d.pipeline.prepare.options import CommonTraining, HowItRuns, PoseEstimation, Training
 
 _SLOGAN = "Turns photographs into a surface mesh and a 3D scene that you can view from any angle."
 _FIRST_DAY = """usage: gs2d COMMAND [OPTIONS]
@@ -24,7 +24,7 @@ _FIRST_DAY = """usage: gs2d COMMAND [OPTIONS]
 All commands: gs2d --help. Options of one: gs2d COMMAND --help."""
 _OWN = "Of this command"
 TITLES = {  # headings of shared options, in order
-    Finding: "Cameras of photographs",
+    PoseEstimation: "Cameras of photographs",
     CommonTraining: "Training",
     Training: "Training",
     HowItRuns: "How it runs",

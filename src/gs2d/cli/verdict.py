@@ -17,7 +17,7 @@ _GRADES = 8
 def say_verdict(path: Path, console: Console) -> dict[str, Any]:
     """Print the verdict of a run; return it for the JSON, null where there is none."""
     from gs2d.io.run_dir import RunFolder
-    from gs2d.pipeline.finish.verdict import read_verdict
+    from gs2d.pipeline.finish.run_verdict import read_verdict
 
     verdict = read_verdict(RunFolder(path))
     for line in verdict_lines(verdict) if verdict is not None else ():

@@ -1,1 +1,1 @@
-"""Scene, training, evaluation, mesh and report joined: the one place that knows them all. Never prints."""
+"""Runs from photographs to the report: prepare, train, finish, look. Nothing here prints."""

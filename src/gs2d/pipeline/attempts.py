@@ -1,4 +1,4 @@
-"""Finished splats are a result: a picture, a report or a page that cannot be made beside them does not end the run."""
+"""Report failures of single results as events, so that they do not end the run."""
 
 from __future__ import annotations
 
@@ -16,19 +16,17 @@ LONGEST = 500  # characters of a message that is not ours
 
 @contextmanager
 def attempted(what: str, command: str | None, on_event: OnEvent) -> Iterator[None]:
-    """Try to make something; where it fails, say so in one line and go on.
+    """Send a :class:`~gs2d.training.events.NotMade` event if the body fails, and continue.
 
-    A full disk ends the run all the same (nothing else could be written either), and so does a reader of the output
-    that went away.
+    A full disk and a closed output pipe end the run all the same.
 
     Parameters
     ----------
     what : str
-        What is made: a file or a section.
+        The file or section that is made.
     command : str or None
-        What makes it again (:func:`again`); None: the same command with ``--resume``; "": nothing does.
+        Makes it later (:func:`again`); None: the same command with ``--resume``; "": nothing does.
     on_event : callable
-        Is told :class:`~gs2d.training.events.NotMade`.
     """
     try:
         yield
@@ -39,12 +37,12 @@ def attempted(what: str, command: str | None, on_event: OnEvent) -> Iterator[Non
 
 
 def again(verb: str, path: Path, *more: object) -> str:
-    """Return the command that makes something of a run again."""
+    """Return the command line of ``gs2d VERB`` for a run."""
     return shlex.join(["gs2d", verb, str(path), *map(str, more)])
 
 
 def reason_of(error: Exception) -> str:
-    """Return what went wrong in one line; a fault of ours is called one."""
+    """Return an error in one line; an unexpected one is marked as a fault of gs2d."""
     text = " ".join(str(error).split())
     if isinstance(error, Gs2dError):
         return text

@@ -9,7 +9,7 @@ from gs2d.io.run_dir import RunFolder, check_claim, is_run, open_run
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.prepare.limits import use_threads
-from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, TrainOptions
+from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, HowItRuns, TrainOptions, values
 from gs2d.pipeline.prepare.resolve import check_options
 from gs2d.pipeline.run_parts import DEMO
 from gs2d.pipeline.train.train_run import check_viewer, train
@@ -20,7 +20,7 @@ from gs2d.training.events import OnEvent, Phase, RunPlan, Step, ignore
 
 CAPTURE, TRUTH = "capture", "mesh_gt.ply"
 CAPTURE_FILES = ("train", "test", "transforms_train.json", "transforms_test.json", GAINS, TRUE_POSES)  # and mesh_gt*
-TITLE = "gs2d demo: a still life whose true surface is known"
+TITLE = "gs2d demo: a still life with a known surface"
 SCHEDULE_SCALE = 0.15
 
 
@@ -28,7 +28,7 @@ def demo(
     options: DemoOptions = DemoOptions(),  # noqa: B008 (frozen)
     on_event: OnEvent = ignore,
 ) -> RunFolder:
-    """Run the demo. An earlier demo in the same folder is replaced, any other run there is not."""
+    """Run the demo. An earlier demo in the same folder is replaced; any other run is an error."""
     capture = options.out / CAPTURE
     overwrite = options.overwrite
     if is_run(options.out) and not options.resume and not overwrite:
@@ -38,16 +38,15 @@ def demo(
                 f"{options.out} holds a run that is not a demo; choose another --out or replace it with --overwrite"
             )
         overwrite = True
-    training = _training(options, overwrite=overwrite)
-    check_options(training)  # all that can be refused, before the photographs are taken: that lasts
+    training = _train_options(options, overwrite=overwrite)
+    check_options(training)  # before the photographs are rendered, which takes a while
     check_claim(options.out, resume=options.resume, overwrite=overwrite, allowed=(CAPTURE,))
     check_viewer(training)
     use_threads(options.threads)
     on_event(RunPlan(DEMO))
     if not (options.resume and (capture / "transforms_train.json").exists()):
         _check_capture(capture)
-        total = options.train_views + options.test_views
-        on_event(Phase("photographing the demo scene", total))
+        on_event(Phase("photographing the demo scene", options.train_views + options.test_views))
         write_demo_capture(
             capture,
             seed=0,
@@ -76,29 +75,26 @@ def demo(
 
 
 def _check_capture(folder: Path) -> None:
-    """Raise for a folder with files that no demo has written, not even one that was broken off."""
+    """Raise if a folder has files that are not of a demo."""
     names = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
     others = [name for name in names if name not in CAPTURE_FILES and not name.startswith((".", "mesh_gt"))]
     if others:
-        raise RunError(f"{folder} must be a demo's, or not be there, got {others[0]} in it; choose another --out")
+        raise RunError(f"{folder} is not the capture of a demo: it holds {others[0]}; choose another --out")
 
 
-def _training(options: DemoOptions, *, overwrite: bool) -> TrainOptions:
-    """Return what is trained."""
+def _train_options(options: DemoOptions, *, overwrite: bool) -> TrainOptions:
+    """Return the options of the training."""
+    shared = {**values(HowItRuns, options), "overwrite": overwrite}
     return TrainOptions(
         scene=options.out / CAPTURE,
         out=options.out,
         recipe=options.recipe,
-        backend=options.backend,
-        seed=options.seed,
         exposure=options.exposure,
         no_exposure=not options.exposure,
         viewer=options.viewer,
         viewer_port=options.viewer_port,
         refine_poses=options.refine_poses,
-        threads=options.threads,
-        resume=options.resume,
-        overwrite=overwrite,
         schedule_scale=SCHEDULE_SCALE if options.schedule_scale is None else options.schedule_scale,
         page=options.page,
+        **shared,
     )

@@ -15,12 +15,12 @@ from benchmarks.flight import Flight, write_flight
 
 from flown import digest, tiny_blocks, write_tiny_flight
 from gs2d.contrib.lab import blocks as module
+from gs2d.contrib.lab.block_start import FROZEN, OWN, read_start
 from gs2d.contrib.lab.blocks import blocks
 from gs2d.contrib.lab.split import read_split
 from gs2d.errors import DataError, Gs2dError, RecipeError, RunError
 from gs2d.io.run_dir import open_run
 from gs2d.io.splat_ply import read_splats
-from gs2d.pipeline.prepare.part import FROZEN, OWN, read_start
 from gs2d.training.events import Event
 
 
@@ -108,7 +108,7 @@ def test_a_damaged_beginning_of_a_block_is_one_line_and_is_made_again_when_it_is
     shutil.rmtree(job / "blocks/0-1")
     (job / "splats.ply").unlink()
     (job / "jobs/merge.json").unlink()
-    with pytest.raises(RunError, match=r"block-0-1 failed: .*0-1.npz must say which splats a block trains"):
+    with pytest.raises(RunError, match=r"block-0-1 failed: .*0-1.npz is not the start of a block"):
         blocks(tiny_blocks(capture, job))
     assert (job / "blocks/1-1/splats.ply").exists()
     start.unlink()

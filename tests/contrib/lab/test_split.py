@@ -10,11 +10,11 @@ import torch
 
 from gs2d.config.presets import get_recipe
 from gs2d.config.recipe import Exposure
+from gs2d.contrib.lab.block_start import ABSENT, FROZEN, OWN, read_start
 from gs2d.contrib.lab.partition import Partition
 from gs2d.contrib.lab.settle import block_recipe, budget_of, with_budget
 from gs2d.contrib.lab.split import Block, Split, choose_views, merge, read_split, split_model, start_file
 from gs2d.core.splats import Splats
-from gs2d.pipeline.prepare.part import ABSENT, FROZEN, OWN, read_start
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training.events import Event, Notice, ignore

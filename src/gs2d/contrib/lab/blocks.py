@@ -14,6 +14,7 @@ from typing import Any
 from gs2d.config.protocols import Protocol
 from gs2d.config.serialize import decode
 from gs2d.config.serialize import from_json as recipe_from_json
+from gs2d.contrib.lab.block_start import load_start
 from gs2d.contrib.lab.execute import execute
 from gs2d.contrib.lab.merged import MERGED, SEAM_VIEWS, finish_merged, read_seam_views, write_merged, write_result
 from gs2d.contrib.lab.options import BlocksOptions
@@ -40,10 +41,10 @@ from gs2d.io.run_dir import LOCK, REPORT, SPLATS, RunFolder, check_claim, is_run
 from gs2d.pipeline.prepare.limits import use_memory, use_threads
 from gs2d.pipeline.prepare.loaded import finished_splats
 from gs2d.pipeline.prepare.options import CommonTraining, TrainOptions, values
-from gs2d.pipeline.prepare.part import Part
 from gs2d.pipeline.prepare.resolve import check_options
 from gs2d.pipeline.prepare.resolved import difference
 from gs2d.pipeline.prepare.run_appearance import with_learned_appearance
+from gs2d.pipeline.prepare.scene_part import ScenePart
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Notice, OnEvent, ignore
 from gs2d.training.trainer import raster_settings
@@ -78,7 +79,7 @@ class BlocksTask(Task):
         protocol: Protocol = decode(settled_of(self.options.out)["protocol"], Protocol, "protocol")
         return protocol
 
-    def train(self, part: Part, out: Path, on_event: OnEvent, *, downscale: int | None = None) -> RunFolder:
+    def train(self, part: ScenePart, out: Path, on_event: OnEvent, *, downscale: int | None = None) -> RunFolder:
         """Train a part of everything, or go on."""
         self.limit()
         downscale = self.options.downscale if downscale is None else downscale
@@ -113,7 +114,7 @@ class CoarseTask(BlocksTask):
         settled, partition = self.settled(on_event), self.partition()
         downscale = coarse_downscale(settled.scene, partition, self.options.downscale or 1)
         recipe, out = coarse_recipe(settled.recipe, partition), coarse_folder(self.options.out)
-        run = self.train(Part(recipe=recipe, protocol=settled.protocol), out, on_event, downscale=downscale)
+        run = self.train(ScenePart(recipe=recipe, protocol=settled.protocol), out, on_event, downscale=downscale)
         return {"stages": run.metrics()["stages"]}
 
 
@@ -160,13 +161,14 @@ class BlockTask(BlocksTask):
         if block.skipped:
             return {"skipped": block.skipped}
         whole = recipe_from_json(settled_of(out)["recipe"])
-        part = Part(
-            recipe=block_recipe(whole, partition, block),
+        recipe = block_recipe(whole, partition, block)
+        region = split.cells.region(split.cells.names.index(self.block))
+        start = start_file(partition_folder(out), self.block)
+        part = ScenePart(
+            recipe=recipe,
             protocol=self.protocol(),
             views=block.views,
-            splats=coarse_folder(out) / SPLATS,
-            start=start_file(partition_folder(out), self.block),
-            region=split.cells.region(split.cells.names.index(self.block)),
+            start=load_start(coarse_folder(out) / SPLATS, start, recipe, region),
             extent=block.extent if partition.extent == "block" else None,
             prepared=out,
         )
@@ -195,12 +197,11 @@ class SeamsTask(BlocksTask):
             start = start_file(partition_folder(out), SEAMS)
             trained = [len(block.views) for block in read_split(partition_folder(out)).blocks if not block.skipped]
             recipe = seam_recipe(settled.recipe, partition, len(views) * len(trained) / max(1, sum(trained)))
-            part = Part(
+            part = ScenePart(
                 recipe=recipe,
                 protocol=settled.protocol,
                 views=views,
-                splats=out / MERGED,
-                start=start,
+                start=load_start(out / MERGED, start, recipe),
                 prepared=out,
             )
             self.train(part, seam_folder(out), on_event)

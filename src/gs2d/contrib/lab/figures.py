@@ -20,7 +20,7 @@ from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.errors import Gs2dError
 from gs2d.io.run_dir import RunFolder, load_tensors, make_folder, open_run
-from gs2d.pipeline.finish.run_images import choose_views, fraction_of_group, render_view, splatted
+from gs2d.pipeline.finish.run_images import choose_views, render_view, splatted
 from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats, reload_run
 from gs2d.pipeline.prepare.run_appearance import photographed
 from gs2d.pipeline.train.resume import stage_end
@@ -249,7 +249,7 @@ def draw_error_maps(
     limits = map_limits(ranking.errors)
     positions = error_positions(ranking.errors, limits)
     shown = choose_views(job.scene, views)
-    fractions = [fraction_of_group(ranking.splats, ranking.worst, v, job.settings, job.backend) for _, v in shown]
+    fractions = [splatted(ranking.splats, ranking.worst, v, job.settings, job.backend) for _, v in shown]
     top = max(
         SMALLEST_TOP, *(float(np.percentile(fraction, 99.9)) for fraction in fractions)
     )  # these splats are often faint

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from gs2d.contrib.lab.block_start import OWN, read_start
 from gs2d.contrib.lab.partition import Partition
 from gs2d.contrib.lab.partition import to_json as partition_json
 from gs2d.contrib.lab.settle import Settled, block_folder, coarse_folder, partition_folder, seam_folder
@@ -22,12 +23,11 @@ from gs2d.io.splat_ply import read_splats, write_splats
 from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.finish.run_images import choose_views, draw_stage
 from gs2d.pipeline.finish.run_mesh import MeshFrames
-from gs2d.pipeline.finish.scoring import PeakMemory, score_views, split_metrics
-from gs2d.pipeline.finish.verdict import Collector
+from gs2d.pipeline.finish.run_verdict import Collector
+from gs2d.pipeline.finish.scoring import PeakMemory, ScoreOptions, score_views, split_metrics
 from gs2d.pipeline.prepare.limits import release
 from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats
 from gs2d.pipeline.prepare.options import TrainOptions, values
-from gs2d.pipeline.prepare.part import OWN, read_start
 from gs2d.pipeline.prepare.photographs import with_prepared
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.prepare.resolved import CaptureRecord, Execution, ResolvedRun
@@ -152,8 +152,7 @@ def finish_merged(settled: Settled, options: TrainOptions, on_event: OnEvent) ->
                 loaded.backend,
                 name=f"scoring {split} views",
                 on_event=on_event,
-                split=split,
-                visitors=[frames.visit, collected.visit],
+                options=ScoreOptions(split=split, visitors=[frames.visit, collected.visit]),
             )
             entry |= split_metrics(scores, split)
         shown = choose_views(seen)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gs2d.contrib.lab.block_start import FROZEN, OWN, write_start
 from gs2d.contrib.lab.cells import Cells, cut, spread_of
 from gs2d.contrib.lab.partition import Partition
 from gs2d.core.json_files import read_json, write_json
@@ -17,7 +18,6 @@ from gs2d.core.splats import Splats
 from gs2d.core.transforms import camera_extent
 from gs2d.data import Scene, View
 from gs2d.errors import DataError, RunError
-from gs2d.pipeline.prepare.part import FROZEN, OWN, write_start
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 from gs2d.training.events import Notice, OnEvent, counted

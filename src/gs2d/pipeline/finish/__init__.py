@@ -1,1 +1,1 @@
-"""Results of trained splats: images, scores, mesh, texture, exports and report."""
+"""Results of trained splats: images, scores, verdict, mesh, texture, exports and report."""

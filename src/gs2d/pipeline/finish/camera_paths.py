@@ -1,4 +1,4 @@
-"""Where cameras go that nobody photographed from: what is up, circles, flights along the photographs."""
+"""Camera paths: orbits around the subject, and flights along the photographs."""
 
 from __future__ import annotations
 
@@ -11,30 +11,29 @@ from scipy.interpolate import Akima1DInterpolator
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.transforms import focus_point, up_direction
 
-_UNSEEN_ARC = np.radians(100.0)  # without a camera: nobody photographed that side; orbits have gaps of up to 60
-_FADE = 0.15  # of the arc: over so much of it distances and heights of photographs are averaged
-_MAX_IN_TOUR = 300  # cameras; more are passed by without being looked at
-_DETOUR = 1.6  # a way in the order of names may be so many times longer than a short one
-_FRAMES_A_STOP = 15  # of a flight: half a second from one photograph to the next
+_UNSEEN_ARC = np.radians(100.0)  # a larger gap between cameras is not photographed; orbits have gaps of up to 60
+_FADE = 0.15  # of the arc, over which distances and heights of photographs are averaged
+_MAX_IN_TOUR = 300  # cameras considered for a flight
+_DETOUR = 1.6  # a path in the order of names may be longer than a tour by this factor
+_FRAMES_A_STOP = 15  # between two photographs of a flight: half a second
 _MIN_STOPS = 4
-_AIMED = 0.5  # cosine between the axis of each camera and the way to what they look at
-_LEVEL = 0.1  # a level camera's x axis rises no more than this
-_STEEP = 0.98  # how far down a camera may look and still be kept level
+_AIMED = 0.5  # cosine between the axis of each camera and its direction to the focus
+_LEVEL = 0.1  # largest rise of the x axis of a level camera
+_STEEP = 0.98  # steepest view of a camera that is kept level
 
 
 def orbit_cameras(cameras: Sequence[Camera], frames: int, focus: np.ndarray | None = None) -> list[Camera]:
-    """Return a circle through the middle of where the cameras are, around what they look at.
+    """Return the cameras of a circle around the focus, with the median radius and height of the photographs.
 
-    The axis is what is up; radius and height are those of the median camera. Where the photographs leave a part of the
-    circle out (``photographed_arc``), the path swings to and fro over the rest, at the distance and the height of the
-    photographs there: what nobody photographed is not shown.
+    If a part of the circle was not photographed (``photographed_arc``), the path swings back and forth over the rest,
+    at the local distance and height of the photographs.
 
     Parameters
     ----------
     cameras : sequence of Camera
     frames : int
     focus : ndarray [3], optional
-        What is looked at, world units (default: the point nearest to the optical axes).
+        World units (default: the point nearest to the optical axes).
     """
     focus = focus_point(cameras) if focus is None else np.asarray(focus, np.float64)
     up = up_direction(cameras)
@@ -52,7 +51,7 @@ def orbit_cameras(cameras: Sequence[Camera], frames: int, focus: np.ndarray | No
         places = [(angle, float(np.median(radii)), float(np.median(heights))) for angle in turns]
     else:
         start, width = arc
-        turns = start + width / 2 * (1 - np.cos(2 * np.pi * np.arange(frames) / frames))  # slow where it turns round
+        turns = start + width / 2 * (1 - np.cos(2 * np.pi * np.arange(frames) / frames))  # slow at the turning points
         places = [(angle, *_photographed_at(angle, angles, radii, heights, width)) for angle in turns]
     like = cameras[0]
     circle = []
@@ -63,12 +62,12 @@ def orbit_cameras(cameras: Sequence[Camera], frames: int, focus: np.ndarray | No
 
 
 def photographed_arc(angles: np.ndarray) -> tuple[float, float] | None:
-    """Return where the cameras' arc starts and how wide it is, rad; None if they stand all around.
+    """Return start and width of the arc of the cameras, rad; None if they are all around.
 
     Parameters
     ----------
     angles : ndarray [V]
-        Directions from the middle to the cameras, rad.
+        Directions from the focus to the cameras, rad.
     """
     ordered = np.sort(np.mod(angles, 2 * np.pi))
     gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
@@ -81,24 +80,23 @@ def photographed_arc(angles: np.ndarray) -> tuple[float, float] | None:
 def _photographed_at(
     angle: float, angles: np.ndarray, radii: np.ndarray, heights: np.ndarray, width: float
 ) -> tuple[float, float]:
-    """Radius and height of the photographs around a direction: a mean that fades over a part of the arc."""
+    """Return radius and height of the photographs near a direction, as a weighted mean."""
     off = np.abs(np.mod(angles - angle + np.pi, 2 * np.pi) - np.pi)
     weights = np.exp(-0.5 * (off / max(_FADE * width, 0.05)) ** 2) + 1e-12
     return float(np.average(radii, weights=weights)), float(np.average(heights, weights=weights))
 
 
 def flight_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """Return a smooth flight past the photographs, at an even pace (of place and of direction together).
+    """Return the cameras of a smooth flight past the photographs, at constant speed of position and direction.
 
-    Splines that hardly overshoot (Akima 1970) through some of the cameras: in the order of their names where that is a
-    way, else the most different ones, on a short tour. Where all cameras look at about one point, distance and
-    direction from there are interpolated, so that the flight goes round it; elsewhere places are. Cameras held level
-    stay level. The flight is closed if its ends meet; at the photographs on the way it is where they were taken.
+    Akima splines go through some of the cameras: in the order of their names if that is a short path, else through the
+    most different ones on a short tour. If all cameras look at about one point, distance and direction from it are
+    interpolated, so that the flight goes around it. Level cameras stay level. The flight is closed if its ends meet.
 
     Parameters
     ----------
     cameras : sequence of Camera
-        In the order of their names. Size and focal lengths are those of the first.
+        In the order of their names. Size and focal lengths of the path are those of the first.
     frames : int
     """
     if len(cameras) == 1:
@@ -128,16 +126,16 @@ def flight_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
 @dataclass(frozen=True)
 class _FlightFrame:
-    """What a flight's poses are made of: a place (or a direction and a distance), where it looks, what is up.
+    """Coordinates in which poses are interpolated: position (or direction and distance), view direction, up.
 
     Attributes
     ----------
     unit : float
-        The length that counts as much as a turn by a radian: the median distance to the focus, world units.
+        Length that counts as much as a rotation by a radian: the median distance to the focus, world units.
     focus : ndarray [3] or None
-        What the flight goes round, in units; None if the cameras do not look at one point.
+        Centre of the flight, in units; None if the cameras do not look at one point.
     up : ndarray [3] or None
-        Up for all of it; None if the cameras were not held level.
+        Common up direction; None if the cameras are not level.
     """
 
     unit: float
@@ -154,15 +152,15 @@ class _FlightFrame:
         up = up_direction(cameras)
         unit = float(np.median(distances))
         round_it, level = float(aims.min()) > _AIMED, float(np.abs(rotations[:, 0] @ up).max()) < _LEVEL
-        # seen from straight above a level camera could turn about its axis at any moment
+        # a camera that looks straight down could turn about its axis at any moment
         level = level and float(np.abs(rotations[:, 2] @ up).max()) < _STEEP
         return cls(unit, focus / unit if round_it else None, up if level else None)
 
     def poses(self, cameras: Sequence[Camera]) -> np.ndarray:
-        """Numbers [V, 11] that may be interpolated.
+        """Return coordinates [V, 11] for interpolation.
 
-        Place [3]; distance and rise, for flights round a focus, where the place is the direction from there; where the
-        camera looks [3], then as tangents aside and above the focus; what is up [3].
+        Position [3] (around a focus: direction from it); distance and rise; view direction [3] (around a focus:
+        tangents to the right of and above it); up [3].
         """
         centers = np.array([camera.center for camera in cameras]) / self.unit
         rotations = np.stack([camera.rotation for camera in cameras])
@@ -180,11 +178,11 @@ class _FlightFrame:
         return np.concatenate([centers, distance, rise, forward, up], axis=1)
 
     def seen(self, poses: np.ndarray) -> np.ndarray:
-        """Places in units, unit directions, unit up vectors [n, 9] of interpolated poses."""
+        """Return positions in units, unit view directions and unit up vectors [n, 9] of interpolated coordinates."""
         place, forward = poses[:, :3], poses[:, 5:8]
         up = poses[:, 8:11] if self.up is None else np.broadcast_to(self.up, place.shape)
         if self.focus is not None:
-            if self.up is not None:  # a great circle between two low places would go below both
+            if self.up is not None:  # a great circle between two low positions would go below both
                 rise = np.clip(poses[:, 4:5], -1, 1)
                 place = np.sqrt(1 - rise**2) * _unit_rows(place - (place @ self.up)[:, None] * self.up) + rise * self.up
             place = _unit_rows(place)
@@ -195,7 +193,7 @@ class _FlightFrame:
         return np.concatenate([place, forward, _unit_rows(up - (up * forward).sum(1, keepdims=True) * forward)], axis=1)
 
     def _axes(self, ahead: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """To the right of and above unit directions [n, 3]."""
+        """Return unit vectors to the right of and above view directions [n, 3]."""
         aside = _unit_rows(np.cross(ahead, up if self.up is None else self.up))
         return aside, np.cross(aside, ahead)
 
@@ -205,10 +203,10 @@ def _unit_rows(vectors: np.ndarray) -> np.ndarray:
 
 
 def stops(poses: np.ndarray, count: int) -> np.ndarray:
-    """Return indices of at most ``count`` of the poses [V, C], in the order in which a flight passes them.
+    """Return indices of at most ``count`` of the poses [V, C], in the order of the flight.
 
-    Evenly along the way from the first to the last where that is hardly longer than a tour (a walk, a film); else those
-    that are farthest from all chosen before, on a short tour from the first.
+    Evenly spaced from first to last if that path is hardly longer than a tour (a walk, a video); else the poses
+    that are farthest from those chosen before, on a tour from the first.
     """
     some = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _MAX_IN_TOUR)).round().astype(np.int64))
     steps = np.linalg.norm(np.diff(poses[some], axis=0), axis=1)
@@ -225,10 +223,7 @@ def stops(poses: np.ndarray, count: int) -> np.ndarray:
 
 
 def tour(poses: np.ndarray) -> np.ndarray:
-    """Return a short order in which to pass by all poses [n, C], from the first: indices [n].
-
-    Always to the nearest that was not visited, and then uncrossed (2-opt: parts are reversed as long as that shortens).
-    """
+    """Return a short path through all poses [n, C] from the first, as indices [n]: nearest neighbour, then 2-opt."""
     distance = np.linalg.norm(poses[:, None] - poses[None], axis=2)  # [n, n]
     n = len(poses)
     left, way = np.ones(n, bool), [0]
@@ -242,10 +237,7 @@ def tour(poses: np.ndarray) -> np.ndarray:
     while shorter:
         shorter = False
         for i in range(n - 2):
-            ends, after = (
-                order[i + 2 :],
-                np.append(order[i + 3 :], -1),
-            )  # order[i + 1 ..] is reversed up to one of these
+            ends, after = order[i + 2 :], np.append(order[i + 3 :], -1)  # candidates for the end of a reversed part
             gain = distance[order[i], order[i + 1]] - distance[order[i], ends]
             gain += np.where(after >= 0, distance[ends, after] - distance[order[i + 1], after], 0)
             best = int(gain.argmax())

@@ -1,23 +1,22 @@
-"""Score a finished run: its splats on the views, its mesh against a ground truth."""
+"""Score a finished run: its splats against photographs, its mesh against a true surface."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from gs2d.data import View
 from gs2d.errors import RunError
 from gs2d.evaluation.evaluators import check_thresholds, choose_truth, score_surface
+from gs2d.evaluation.image_metrics import ImageMetrics
 from gs2d.evaluation.lpips import load_lpips
 from gs2d.io.meshes import read_mesh
-from gs2d.io.run_dir import (
-    MESH,
-    SURFACE,
-    VERDICT,
-)
+from gs2d.io.run_dir import MESH, SURFACE, VERDICT
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.run_report import report_again
-from gs2d.pipeline.finish.scoring import score_views, split_metrics
-from gs2d.pipeline.finish.verdict import Collector, write_verdict
+from gs2d.pipeline.finish.run_verdict import Collector, write_verdict
+from gs2d.pipeline.finish.scoring import ScoreOptions, score_views, split_metrics
 from gs2d.pipeline.prepare.loaded import open_finished
 from gs2d.pipeline.prepare.options import EvaluateOptions
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
@@ -32,39 +31,38 @@ def evaluate_run(
     *,
     threads: int | None = None,
 ) -> dict[str, Any]:
-    """Score the final splats of a run, and its mesh against a ground truth; updates ``metrics.json`` and the report."""
+    """Score the splats of a run, and its mesh if there is a true surface; update metrics, verdict and report."""
 
     def tell(text: str) -> None:
         on_event(Notice(text))
 
     check_thresholds(options.thresholds)
-    path, given = Path(path), options.ground_truth
-    truth = None if given is None or given.is_dir() else choose_truth(given, given.parent, tell)
+    path, named = Path(path), options.ground_truth
+    truth = None if named is None or named.is_dir() else choose_truth(named, named.parent, tell)
     lpips = None if options.lpips_weights is None else load_lpips(options.lpips_weights)
     run, loaded, splats = open_finished(path, threads, on_event)
     lpips = None if lpips is None else lpips.to(loaded.backend.device)
     result: dict[str, Any] = {"run": str(run.path), "surface": run.metrics().get("surface")}
     if truth is None and loaded.scene.root is not None:
-        truth = choose_truth(given, loaded.scene.root, tell)
+        truth = choose_truth(named, loaded.scene.root, tell)
     has_mesh = run.file(MESH).exists()
-    if truth is not None and not has_mesh and given is not None:
+    if truth is not None and not has_mesh and named is not None:
         raise RunError(f"{path} has no {MESH}; make it with `gs2d mesh {path}`")
     drawing = (loaded.settings, loaded.backend)
-    scene = with_predicted(loaded.scene, metered(splats, *drawing))
+
+    def scores_of(views: Sequence[View], name: str, **how: Any) -> dict[str, ImageMetrics]:
+        chosen = ScoreOptions(lpips=lpips, **how)
+        return score_views(splats, views, *drawing, name=name, on_event=on_event, options=chosen)
+
     if options.match_exposure:
-        name = "scoring test views, colours matched"
-        scores = score_views(splats, loaded.scene.test, *drawing, name=name, on_event=on_event, lpips=lpips, match=True)
+        scores = scores_of(loaded.scene.test, "scoring test views, colours matched", match=True)
         result |= split_metrics(scores, "test_matched", "test")
     if options.match_poses:
-        name = "scoring test views, cameras aligned"
         best = tuple(aligned(splats, loaded.scene.test, *drawing, loaded.scene.extent, on_event))
-        scores = score_views(splats, best, *drawing, name=name, on_event=on_event, lpips=lpips)
-        result |= split_metrics(scores, "test_aligned", "test")
-    collected = Collector(loaded.scene)
+        result |= split_metrics(scores_of(best, "scoring test views, cameras aligned"), "test_aligned", "test")
+    scene, collected = with_predicted(loaded.scene, metered(splats, *drawing)), Collector(loaded.scene)
     for split, views in (("train", scene.train), ("test", scene.test)):
-        name = f"scoring {split} views"
-        more: dict[str, Any] = {"split": split, "visitors": [collected.visit]}
-        scores = score_views(splats, views, *drawing, name=name, on_event=on_event, lpips=lpips, **more)
+        scores = scores_of(views, f"scoring {split} views", split=split, visitors=[collected.visit])
         result |= split_metrics(scores, split)
         result[f"{split}_views"] = {view: metrics.to_json() for view, metrics in scores.items()}
     if truth is not None and has_mesh:

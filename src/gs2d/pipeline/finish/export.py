@@ -1,4 +1,4 @@
-"""The splats of a run in another layout."""
+"""Export the splats of a run in another format."""
 
 from __future__ import annotations
 
@@ -14,28 +14,26 @@ from gs2d.pipeline.prepare.options import Box
 
 
 def export_run(path: Path, out: Path, layout: str | None = None, *, bbox: Box | None = None) -> dict[str, Any]:
-    """Write the splats of a run, or of a file of flat splats, in another layout.
+    """Write the splats of a run, or of a file of flat splats, in another format.
 
     Parameters
     ----------
     layout : str or None
-        A name of ``io.formats.registry.LAYOUTS``; None: by the ending of ``out``.
+        A name in ``io.formats.splat_formats.LAYOUTS``; None: by the ending of ``out``.
     bbox : six floats, optional
-        Only the splats with their centres in this box, x0 y0 z0 x1 y1 z1, world units of the run.
+        Only splats with their centres in this box, x0 y0 z0 x1 y1 z1, world units of the run.
     """
     layout = layout or layout_of(Path(out))
     if layout is None:
         raise RunError(
-            f"splats are written as {', '.join(endings()).replace('/', '')} files, got --out {out}; choose such a name "
-            "(meshes are written by `gs2d mesh RUN`: .ply, with --texture .glb or .obj)"
+            f"--out must end in {', '.join(endings()).replace('/', '')}, got {out} (meshes are written by `gs2d mesh "
+            "RUN`: .ply, with --texture .glb or .obj)"
         )
     if layout not in LAYOUTS:
         raise RunError(LAYOUTS.unknown(layout))
-    path, out = Path(path), checked_output(path, out, LAYOUTS.get(layout).ending, f"layout {layout} is")
-    if out.resolve() == (path / MESH).resolve():
-        raise RunError(f"--out {out} is the mesh of the run, which stays as it is; choose another name")
-    if path.is_file() and out.resolve() == path.resolve():
-        raise RunError(f"--out {out} is the file that is read; choose another name")
+    path, out = Path(path), checked_output(path, out, LAYOUTS.get(layout).ending, f"layout {layout}")
+    if out.resolve() in ((path / MESH).resolve(), path.resolve()):
+        raise RunError(f"--out {out} is the mesh of the run or the input file; choose another name")
     notes: list[str] = []
     if path.is_file():
         splats = read_splats(path, notes.append)

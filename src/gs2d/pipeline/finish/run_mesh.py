@@ -1,10 +1,10 @@
-"""The mesh of a run: depth maps of the training views, fused."""
+"""The mesh of a run: fused depth maps of the training views."""
 
 from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import TracebackType
@@ -36,7 +36,7 @@ from gs2d.meshing.tsdf_volume import VolumeTooLargeError
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.run_subject import OPAQUE, meshed_subject
-from gs2d.pipeline.finish.scoring import SeenView
+from gs2d.pipeline.finish.scoring import RenderedPhotograph
 from gs2d.pipeline.finish.trusted_depth import sky_direction, sky_of, surface_reach, within_reach
 from gs2d.pipeline.look.page import page_run
 from gs2d.pipeline.prepare.limits import release, release_buffers
@@ -46,50 +46,43 @@ from gs2d.render.api import rasterize
 from gs2d.render.types import RenderOutput
 from gs2d.training.events import Notice, OnEvent, Phase, counted, ignore
 
-ONE_SURFACE = 0.02  # of the depth: where mean and median differ by more, a pixel sees several surfaces
+ONE_SURFACE = 0.02  # of the depth; if mean and median differ by more, a pixel shows several surfaces
 SEVERAL = 0.25  # weight of such a pixel
-KEPT = (  # of what is said of a mesh, in metrics.json
+KEPT = (  # facts of a mesh in metrics.json
     *("vertices", "faces", "voxel", "truncation", "depth_limit", "depth", "unbounded"),
     *("pixels", "faces_per_pixel"),
 )
-VOLUME_BYTES = 4 << 30  # of the fused volume, where it is not known how much memory there is
-LEAST_SLAB_BYTES = 32 << 20  # less, and preparing views again for each slab takes most of the time
-MOSTLY_CUT = 0.5  # part of the depth left out from which the user is told
-COARSER = 3  # times that larger voxels are tried: the size that fits is a guess
+VOLUME_BYTES = 4 << 30  # limit of the fused volume, if the memory of the machine is unknown
+LEAST_SLAB_BYTES = 32 << 20  # smaller slabs spend most of the time on preparing views again
+MOSTLY_CUT = 0.5  # fraction of the depth outside the mesh from which a notice is sent
+COARSER = 3  # attempts with larger voxels: the first size is an estimate
 
 
 class MeshFrames:
-    """Depth maps of the training views, kept in a temporary file while others look at the same renderings.
+    """Depth maps of the training views in a temporary file, collected while the views are scored.
 
-    Its :meth:`visit` is for :func:`~gs2d.pipeline.finish.scoring.score_views`.
+    Pass :meth:`visit` to :func:`~gs2d.pipeline.finish.scoring.score_views`.
     """
 
     def __init__(self, loaded: LoadedRun) -> None:
         self._loaded, self._reach, self._up = loaded, surface_reach(loaded), sky_direction(loaded)
         self.spool = Spool()
 
-    def visit(self, seen: SeenView, scores: ImageMetrics) -> None:
-        """Keep what is fused of a training view; without any one of them, the mesh renders all again.
-
-        Raises
-        ------
-        DiskError
-            The disk is full.
-        """
+    def visit(self, seen: RenderedPhotograph, scores: ImageMetrics) -> None:
+        """Keep the depth map of a training view; if one is missing, the mesh renders all again."""
         if seen.split != "train":
             return
         try:
-            frame = fusion_frame(
-                self._loaded, seen.view, seen.output, self._loaded.protocol.fused_depth, self._reach, self._up
-            )
+            depth = self._loaded.protocol.fused_depth
+            frame = fusion_frame(self._loaded, seen.view, seen.output, depth, self._reach, self._up)
             self.spool.append(depth_map(frame))
-        except Exception as error:  # must not cost the scores; the mesh meets and reports it
+        except Exception as error:  # must not prevent the scores; the mesh reports it
             if is_full(error):
                 raise
 
     @property
     def complete(self) -> bool:
-        """Whether every training view was seen."""
+        """Whether every training view was collected."""
         return len(self.spool) == len(self._loaded.scene.train)
 
     def __enter__(self) -> MeshFrames:
@@ -101,6 +94,7 @@ class MeshFrames:
         self.spool.close()
 
 
+# -- extraction --------------------------------------------------------------------------------------------------------
 def extract_mesh(
     loaded: LoadedRun,
     splats: Splats,
@@ -111,24 +105,28 @@ def extract_mesh(
     subject: Subject | None = None,
     seen: MeshFrames | None = None,
 ) -> dict[str, Any]:
-    """Render depth of all training views, fuse it, write the mesh: of the subject, or of everything.
+    """Fuse rendered depth of the training views, write the mesh, and return its file, counts and limits.
 
     Parameters
     ----------
+    subject : Subject or None
+        Mesh the subject only.
     seen : MeshFrames, optional
-        Depth maps of these splats, by the protocol's kind of depth; where they are complete, nothing is rendered.
-
-    Returns
-    -------
-    dict
-        File, counts and the limits that were used.
+        Depth maps of these splats; used instead of rendering if they are complete and of the requested kind.
     """
     if not out.parent.is_dir():
         raise disk_error(out, FileNotFoundError(2, "No such file or directory"))
     result = fused(loaded, splats, options, on_event, subject=subject, seen=seen)
     release_buffers()
     write_mesh(out, result.mesh)
-    limits = asdict(result.limits)
+    cleaned: dict[str, Any] = {}
+    if result.cleaned is not None:
+        cleaned = {
+            "pixels": round(result.cleaned.pixels),
+            "faces_per_pixel": len(result.mesh.faces) / max(result.cleaned.pixels, 1.0),
+            "area_unsupported": result.cleaned.unsupported,
+            "area_apart": result.cleaned.small,
+        }
     return {
         "file": str(out),
         "vertices": len(result.mesh.vertices),
@@ -137,9 +135,12 @@ def extract_mesh(
         "unbounded": options.unbounded,
         "levels": result.levels,
         "fused_by": result.backend,
-        **limits,
+        **asdict(result.limits),
+        "blocks": result.blocks,
         "volume_bytes": result.volume_bytes,
-        **_pixel_facts(result),
+        "components": result.components,
+        "faces_removed": result.faces_removed,
+        **cleaned,
     }
 
 
@@ -152,81 +153,62 @@ def fused(
     subject: Subject | None = None,
     seen: MeshFrames | None = None,
 ) -> Extraction:
-    """Render depth of all training views and fuse it; arguments as of :func:`extract_mesh`, which writes the mesh."""
+    """Fuse rendered depth of the training views; arguments as of :func:`extract_mesh`.
+
+    Without a voxel size or a limit of memory, voxels are as large as memory requires.
+    """
     if not len(splats):
-        raise ProtocolError("a scene with splats was expected, got none; train longer or check the cameras")
+        raise ProtocolError("there are no splats to mesh; train longer or check the cameras")
     check_mesh_options(options)
     depth = options.depth or loaded.protocol.fused_depth
     usable = seen is not None and seen.complete and depth == loaded.protocol.fused_depth and not options.whole_scene
 
     def frames() -> Iterable[RenderedView] | Spool:
-        return (
-            seen.spool
-            if seen is not None and usable
-            else _frames(loaded, splats, depth, on_event, whole=options.whole_scene)
-        )
+        if seen is not None and usable:
+            return seen.spool
+        return _frames(loaded, splats, depth, on_event, whole=options.whole_scene)
 
-    result = _extract_that_fits(loaded, frames, options, on_event, subject)
+    free = options.voxel is None and options.max_gib is None and loaded.protocol.fusion.voxel is None
+    chosen = options
+    for attempt in range(COARSER * free + 1):
+        try:
+            result = _extract(loaded, frames(), chosen, on_event, subject)
+            break
+        except VolumeTooLargeError as error:
+            if attempt == COARSER * free:
+                raise
+            on_event(Notice(f"{error}; using voxels of this size (--max-gib or --memory allow more)"))
+            chosen = replace(chosen, voxel=error.voxel)
     if seen is not None:
-        seen.spool.close()  # its room on the disk
+        seen.spool.close()  # frees disk space
     if subject is None and result.limits.cut_fraction > MOSTLY_CUT:
-        on_event(Notice(_cut_text(result, options)))
+        part = f"{result.limits.cut_fraction:.0%} of the depth is"
+        if options.unbounded:
+            limit = result.limits.depth_limit
+            line = (
+                f"{part} beyond {limit:.4g} world units, where depth is too uncertain; --depth-limit extends the mesh"
+            )
+        else:
+            line = (
+                f"{part} outside the fused box; --unbounded meshes everything, --bbox or --depth-limit extend the box"
+            )
+        on_event(Notice(line))
     return result
 
 
-def _pixel_facts(result: Extraction) -> dict[str, Any]:
-    """Return the number of pixels that show the surface, if it was cleaned by evidence."""
-    if result.pixels is None:
-        return {}
-    return {"pixels": round(result.pixels), "faces_per_pixel": len(result.mesh.faces) / max(result.pixels, 1.0)}
-
-
-def _cut_text(result: Extraction, options: MeshOptions) -> str:
-    """Return what was left out, and the option that brings it back."""
-    part = f"{result.limits.cut_fraction:.0%} of the depth lies"
-    if options.unbounded:
-        limit = result.limits.depth_limit
-        return (
-            f"{part} beyond {limit:.4g} world units, where these cameras no longer tell depth; --depth-limit widens it"
-        )
-    return (
-        f"{part} outside the fused box: the scene has a background that is not in the mesh; --unbounded takes all of "
-        "it, --bbox or --depth-limit widen the box"
-    )
-
-
 def check_mesh_options(options: MeshOptions) -> None:
-    """Raise for limits that are none, before anything is rendered."""
+    """Raise for invalid options, before anything is rendered."""
     for name in ("voxel", "truncation", "depth_limit", "max_gib"):
-        value = getattr(options, name)
+        value, option = getattr(options, name), f"--{name.replace('_', '-')}"
         if value is not None and not (value > 0 and math.isfinite(value)):
             unit = "GiB" if name == "max_gib" else "world units"
-            raise ProtocolError(f"--{name.replace('_', '-')} must be a positive number of {unit}, got {value}")
+            raise ProtocolError(f"{option} must be a positive number of {unit}, got {value}")
         if value is not None and name != "max_gib" and not 1 / LARGEST <= value <= LARGEST:
-            bounds = f"between {1 / LARGEST:g} and {LARGEST:g} world units"
-            raise ProtocolError(f"--{name.replace('_', '-')} must be {bounds}, got {value:g}")
+            raise ProtocolError(f"{option} must be between {1 / LARGEST:g} and {LARGEST:g} world units, got {value:g}")
     if options.bbox is not None:
         checked_box(options.bbox, "--bbox")
     if options.keep_components is not None and options.keep_components < 0:
         raise ProtocolError(f"--keep-components must be a whole number >= 0 (0 = all), got {options.keep_components}")
-
-
-def _extract_that_fits(
-    loaded: RenderedScene,
-    frames: Callable[[], Iterable[RenderedView] | Spool],
-    options: MeshOptions,
-    on_event: OnEvent,
-    subject: Subject | None,
-) -> Extraction:
-    """Extract a mesh; where nobody says how large its voxels are, they are as large as memory needs."""
-    free = options.voxel is None and options.max_gib is None and loaded.protocol.fusion.voxel is None
-    for _ in range(COARSER * free):
-        try:
-            return _extract(loaded, frames(), options, on_event, subject)
-        except VolumeTooLargeError as error:
-            on_event(Notice(f"{error}; the mesh has such voxels (--max-gib or --memory allow more)"))
-            options = replace(options, voxel=error.voxel)
-    return _extract(loaded, frames(), options, on_event, subject)
 
 
 def _extract(
@@ -236,9 +218,9 @@ def _extract(
     on_event: OnEvent,
     subject: Subject | None,
 ) -> Extraction:
-    fusion = loaded.protocol.fusion
+    fusion, budget = loaded.protocol.fusion, memory_budget()
     keep = fusion.clusters if options.keep_components is None else options.keep_components
-    # A box or a voxel of the user's own makes the protocol's other limits meaningless.
+    # A box or a voxel size of the user replaces all limits of the protocol.
     bbox = None if options.bbox is None else np.asarray(options.bbox, np.float64).reshape(2, 3)
     bbox = bbox if subject is None else subject.box
     own = bbox is not None or options.unbounded
@@ -253,20 +235,20 @@ def _extract(
         keep=keep or None,
         by_evidence=fusion.subject,
         max_bytes=_volume_bytes(options),
-        slab_bytes=_slab_bytes(),
+        slab_bytes=SLAB_BYTES if budget is None else min(SLAB_BYTES, max(LEAST_SLAB_BYTES, budget // 32)),
     )
     fuse_frames = extract_unbounded if options.unbounded else extract
     result = fuse_frames(frames, chosen, threads=torch.get_num_threads(), backend=loaded.backend)
     if not len(result.mesh.faces):
-        on_event(Notice("the mesh is empty: no surface was covered well enough"))
+        on_event(Notice("the mesh is empty: no surface is covered well enough"))
     return result
 
 
 def _volume_bytes(options: MeshOptions) -> int:
-    """Return how large the volume may be.
+    """Return the limit of the volume.
 
-    It is fused a slab at a time, but the surface is in memory: while it is joined and cleaned it takes about half of
-    what the whole volume would.
+    Slabs are fused one at a time, but the surface, while it is joined and cleaned, needs about half of the memory of
+    the whole volume.
     """
     if options.max_gib is not None:
         return int(options.max_gib * 2**30)
@@ -274,23 +256,18 @@ def _volume_bytes(options: MeshOptions) -> int:
     return VOLUME_BYTES if budget is None else budget
 
 
-def _slab_bytes() -> int:
-    """Return how much of it may be in memory at a time."""
-    budget = memory_budget()
-    return SLAB_BYTES if budget is None else min(SLAB_BYTES, max(LEAST_SLAB_BYTES, budget // 32))
-
-
+# -- depth maps --------------------------------------------------------------------------------------------------------
 def _frames(
     loaded: RenderedScene, splats: Splats, depth: str, on_event: OnEvent, *, whole: bool
 ) -> Iterator[RenderedView]:
-    """Yield what is fused of each training view; of the ``whole`` scene the sky may be a ceiling, and stays."""
+    """Yield the input of fusion for each training view; sky is kept in meshes of the ``whole`` scene."""
     views, settings = loaded.scene.train, replace(loaded.settings, with_distortion=False).for_depths(depth)
     reach, up = surface_reach(loaded), None if whole else sky_direction(loaded)
     for view in counted(views, "rendering depth", len(views), on_event):
         with torch.no_grad():
             output = rasterize(splats, view.camera, settings, backend=loaded.backend)
         yield fusion_frame(loaded, view, output, depth, reach, up)
-    release(loaded.scene)  # photographs were looked at for where they are known
+    release(loaded.scene)  # decoded photographs
     on_event(Phase("fusing", 0))
 
 
@@ -302,15 +279,14 @@ def fusion_frame(
     reach: Reach | None = None,
     up: np.ndarray | None = None,
 ) -> RenderedView:
-    """Return what fusion takes of a view: depth of a kind and colour, where it is covered well enough.
+    """Return the input of fusion for a view: depth and colour where it is covered well enough.
 
-    Depth beyond ``reach``, and of the sky where its direction ``up`` is known, is infinite: the view sees past all
-    surfaces there.
+    Depth beyond ``reach``, and of the sky if its direction ``up`` is known, is infinite: no surface is there.
     """
     sky = np.zeros(output.alpha.shape, bool) if up is None else sky_of(loaded, view, up)
     valid = (output.alpha >= OPAQUE).cpu().numpy() | sky
     mask = view.object_mask() if loaded.protocol.use_mask_in_fusion else None
-    # Beyond the photograph, and where it is ignored, nothing has said how far the surface is.
+    # Outside the photograph and in ignored pixels nothing constrains the surface.
     for pixels in (mask, view.usable(masks=loaded.protocol.use_mask_in_fusion)):
         if pixels is not None:
             valid = valid & pixels
@@ -324,21 +300,22 @@ def fusion_frame(
 
 
 def confidence(output: RenderOutput) -> np.ndarray:
-    """Return how much the depths [H, W] count: less where the light of a pixel ends at several depths.
+    """Return the weights [H, W] of depths: lower if the light of a pixel ends at several depths.
 
-    Such pixels lie at the outline of a thing, in fog, or on a surface without texture, whose splats lie loosely.
+    Such pixels are at outlines, in floaters, or on surfaces without texture.
     """
     mean, median = output.depth_mean, output.depth_median
     return np.where(((mean - median).abs() <= ONE_SURFACE * median).cpu().numpy(), 1.0, SEVERAL)
 
 
 def surface_color(output: RenderOutput, loaded: RenderedScene) -> torch.Tensor:
-    """Colour without the background that shows through, [H, W, 3] in [0, 1]."""
+    """Return the colour without the background, [H, W, 3] in [0, 1]."""
     alpha = output.alpha[..., None]
     background = output.color.new_tensor(loaded.settings.background)
     return ((output.color - (1 - alpha) * background) / alpha.clamp(min=1e-3)).clamp(0, 1)
 
 
+# -- gs2d mesh ---------------------------------------------------------------------------------------------------------
 def mesh_run(
     path: Path,
     options: MeshOptions = MeshOptions(),  # noqa: B008 (frozen)
@@ -348,30 +325,30 @@ def mesh_run(
     splats_file: Path | None = None,
     threads: int | None = None,
 ) -> dict[str, Any]:
-    """Extract the mesh of a finished run; returns its file, counts and limits.
+    """Extract the mesh of a finished run; return its file, counts and limits.
 
     Parameters
     ----------
     splats_file : Path or None
-        Mesh the splats of this file instead of the run's, into ``out``.
+        Mesh the splats of this file into ``out``.
     """
     path, out = Path(path), None if out is None else checked_output(path, out)
     run, loaded, splats = open_finished(path, threads, on_event, splats_file=splats_file, out=out)
-    if splats_file is not None and out is not None and out.resolve() == run.file(MESH).resolve():
-        raise RunError(f"--out {out} is the mesh of the run, which is that of its own splats; choose another name")
     if out is not None and out.resolve() != run.file(MESH).resolve():
         subject = meshed_subject(run, loaded, splats, options, on_event)
         return extract_mesh(loaded, splats, options, out, on_event, subject=subject)
+    if splats_file is not None:
+        raise RunError(f"--out {out} is the mesh of the run's own splats; choose another name")
     with run.locked():
         subject = meshed_subject(run, loaded, splats, options, on_event)
         result = extract_mesh(loaded, splats, options, run.file(MESH), on_event, subject=subject)
-        if run.metrics().get("surface"):  # was of the mesh before
+        if run.metrics().get("surface"):  # scores of the previous mesh
             run.write_metrics({**run.metrics(), "surface": None})
             shutil.rmtree(run.file(SURFACE), ignore_errors=True)
         keep_facts(run, result)
         if run.file(TEXTURED).exists():
             run.file(TEXTURED).unlink()
-            on_event(Notice(f"{TEXTURED} was of the mesh before: removed"))
+            on_event(Notice(f"removed {TEXTURED}, which belonged to the previous mesh"))
     if run.file(PAGE).exists():  # it shows the mesh
         with attempted(PAGE, again("page", run.path), on_event):
             page_run(run.path, on_event=on_event, loaded=loaded)
@@ -380,5 +357,5 @@ def mesh_run(
 
 
 def keep_facts(run: RunFolder, result: Mapping[str, Any]) -> None:
-    """Write what is said of a run's mesh into ``metrics.json``, beside the scores."""
+    """Write the facts of a run's mesh into ``metrics.json``."""
     run.write_metrics({**run.metrics(), "mesh": {name: result[name] for name in KEPT if name in result}})

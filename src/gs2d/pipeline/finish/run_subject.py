@@ -1,4 +1,4 @@
-"""What the cameras of a run look at: found from rendered depth and sparse points, said, written beside the results."""
+"""The subject of a run: found from rendered depth and sparse points, reported, and written into the run."""
 
 from __future__ import annotations
 
@@ -34,52 +34,46 @@ from gs2d.pipeline.prepare.options import MeshOptions
 from gs2d.render.api import rasterize
 from gs2d.training.events import Notice, OnEvent
 
-MAX_VIEWS = 64  # cameras, evenly chosen, that vote
-SIDE = 56  # px, the shorter side of the depth maps that are looked at
-OPAQUE = 0.5  # a pixel is surface where at least this much of it is covered
-BEHIND = 1.1  # times the rendered depth, beyond which a sparse point is hidden
-POINTS_PART = 0.5  # of a camera's vote is that of the sparse points it sees, where there are enough of them
+MAX_VIEWS = 64  # cameras that vote, evenly spaced
+SIDE = 56  # px, shorter side of the depth maps
+OPAQUE = 0.5  # least alpha of a pixel that shows a surface
+BEHIND = 1.1  # times the rendered depth; sparse points beyond it are hidden
+POINTS_PART = 0.5  # of the vote of a camera: its visible sparse points, if there are enough
 ENOUGH_POINTS = 20
-MAX_POINTS = 2000  # sparse points of a camera, evenly from the list
+MAX_POINTS = 2000  # sparse points per camera
 
 
 def subject_of(
     run: RunFolder, loaded: LoadedRun, splats: Splats, on_event: OnEvent, *, box: Sequence[float] | None = None
 ) -> Subject:
-    """Return the subject of a run: the given box, else what ``subject.json`` says, else what is found; then kept there.
+    """Return the subject of a run: ``box``, else that of ``subject.json``, else the one found; write it there.
 
     Parameters
     ----------
     box : sequence of 6 floats, optional
-        x0 y0 z0 x1 y1 z1, world units: the user's own.
+        x0 y0 z0 x1 y1 z1, world units.
 
     Raises
     ------
     ProtocolError
-        The box is none, or the splats show no surface.
+        If the box is invalid, or the splats show no surface.
     RunError
-        There is no splat in the box: what would be kept is a mistake.
+        If there is no splat in the box.
     DataError
-        ``subject.json`` is damaged.
-    DiskError
+        If ``subject.json`` is damaged.
     """
     known = read_subject(run.path) if box is None else None
     if known is not None:
         return known
     subject = subject_in(loaded, splats, box)
     on_event(Notice(subject_line(subject, meshed=box is not None or loaded.protocol.fusion.subject)))
-    write_json(run.file(SUBJECT), subject.to_json())
+    _draw(run, loaded, subject, on_event)
+    write_json(run.file(SUBJECT), subject.to_json())  # last: after a kill, the image exists if this file does
     return subject
 
 
 def subject_in(loaded: RenderedScene, splats: Splats, box: Sequence[float] | None = None) -> Subject:
-    """Return the subject of a scene: the given box, or what is found; nothing is read or written.
-
-    Raises
-    ------
-    ProtocolError, RunError
-        As :func:`subject_of`.
-    """
+    """Return the subject of a scene without reading or writing files; errors are as in :func:`subject_of`."""
     if box is not None:
         within(splats, box, "--subject-box")
     try:
@@ -89,63 +83,68 @@ def subject_in(loaded: RenderedScene, splats: Splats, box: Sequence[float] | Non
         raise ProtocolError(str(error)) from error
 
 
+def _draw(run: RunFolder, loaded: LoadedRun, subject: Subject, on_event: OnEvent) -> None:
+    """Write the image for the report; a full disk is reported and does not prevent the mesh."""
+    points = np.zeros((0, 3)) if loaded.scene.points is None else np.asarray(loaded.scene.points.points, np.float64)
+    try:
+        make_folder(run.file(RENDERS))
+        cameras = [view.camera for view in loaded.scene.train]
+        write_subject_image(run.file(RENDERS) / IMAGE, subject, cameras, points)
+    except DiskError as error:
+        on_event(Notice(f"no image of the subject: {error}"))
+
+
 def meshed_subject(
     run: RunFolder, loaded: LoadedRun, splats: Splats, options: MeshOptions, on_event: OnEvent
 ) -> Subject | None:
-    """Find the subject of a run; return it if the mesh is of it, None if it is of everything or of a box of its own."""
+    """Find the subject of a run; return it if it is meshed, None if everything or another box is meshed."""
     wanted = wants_subject(loaded, options)
     subject = subject_of(run, loaded, splats, on_event, box=options.subject_box)
     return subject if wanted and subject.kind == OBJECT else None
 
 
 def wants_subject(loaded: RenderedScene, options: MeshOptions) -> bool:
-    """Whether the mesh is to be of the subject, if there is one.
-
-    Raises
-    ------
-    ProtocolError, DataError
-        Options that exclude each other, or a box that is none.
-    """
-    given = options.subject_box
+    """Return whether the subject is meshed, if there is one; raise for options that exclude each other."""
+    box = options.subject_box
     others = {"--bbox": options.bbox is not None, "--scene": options.whole_scene, "--unbounded": options.unbounded}
-    check_subject_box(given, others)
-    return given is not None or (loaded.protocol.fusion.subject and not any(others.values()))
+    check_subject_box(box, others)
+    return box is not None or (loaded.protocol.fusion.subject and not any(others.values()))
 
 
 def within(splats: Splats, box: Sequence[float], option: str = "--bbox") -> Splats:
-    """Return the splats whose centres lie in a box, x0 y0 z0 x1 y1 z1, world units, which the user gave by an option.
+    """Return the splats with their centres in a box, x0 y0 z0 x1 y1 z1, world units; ``option`` is its name in errors.
 
     Raises
     ------
     DataError
-        The numbers are no box.
+        If the box is invalid.
     RunError
-        There is no splat in it.
+        If there is no splat in it.
     """
     low, high = torch.from_numpy(checked_box(box, option)).to(splats.means)
     inside = ((splats.means >= low) & (splats.means <= high)).all(dim=1)
     if not bool(inside.any()):
         ends = torch.cat([splats.means.min(dim=0).values, splats.means.max(dim=0).values])
-        raise RunError(f"{option} must hold splats, got none of {len(splats):,}; all lie in {_numbers(ends.tolist())}")
+        raise RunError(f"{option} contains none of the {len(splats):,} splats; all are in {_numbers(ends.tolist())}")
     return splats.rows(inside)
 
 
 def _numbers(box: Iterable[float]) -> str:
-    """Return a box as options take it."""
+    """Format a box as options expect it."""
     return " ".join(f"{value:.4g}" for value in box)
 
 
 def subject_line(subject: Subject, *, meshed: bool) -> str:
-    """Return one line on what was found, with the numbers that --bbox takes; ``meshed``: the mesh is of it alone."""
+    """Describe the subject in one line, with the numbers for --bbox; ``meshed``: only the subject is meshed."""
     if subject.kind != OBJECT:
-        return f"subject: the whole scene ({subject.why}); --subject-box x0 y0 z0 x1 y1 z1 names a part of it"
-    end = "--scene takes everything" if meshed else "the mesh is of everything, --subject-box limits it"
+        return f"subject: the whole scene ({subject.why}); --subject-box x0 y0 z0 x1 y1 z1 selects a part"
+    end = "--scene meshes everything" if meshed else "everything is meshed, --subject-box limits it"
     size = " x ".join(f"{side:.3g}" for side in subject.high - subject.low)
     return f"subject: {size} world units, box {_numbers(subject.box.ravel())} ({subject.why}); {end}"
 
 
 def sights(loaded: RenderedScene, splats: Splats) -> list[Sight]:
-    """Return what some of the training cameras see: rendered depth, and the sparse points that it does not hide."""
+    """Return the votes of some training cameras: rendered depth, and visible sparse points."""
     views = loaded.scene.train
     count = min(len(views), MAX_VIEWS)
     chosen = [views[i] for i in np.linspace(0, len(views) - 1, count).round().astype(int)]
@@ -158,7 +157,7 @@ def sights(loaded: RenderedScene, splats: Splats) -> list[Sight]:
 
 
 def _kept(loaded: RenderedScene, view: View) -> np.ndarray | None:
-    """Return where a photograph may say what it looks at, [H, W] bool: where its mask keeps it. None: anywhere."""
+    """Return the pixels of a photograph that may vote, [H, W] bool, by its mask; None: all."""
     used = loaded.scene.masks.found and loaded.protocol.use_mask_in_training
     return view.mask() if used else None
 
@@ -169,7 +168,7 @@ def _small(camera: Camera) -> Camera:
 
 
 def _depth(loaded: RenderedScene, splats: Splats, camera: Camera) -> np.ndarray:
-    """Return the median depth, 0 where little is covered: unlike the mean it lies on some surface."""
+    """Return the median depth, which unlike the mean is on a surface; 0 where alpha is low."""
     with torch.no_grad():
         output = rasterize(splats, camera, loaded.settings, backend=loaded.backend)
     return np.asarray(torch.where(output.alpha >= OPAQUE, output.depth_median, 0).cpu().numpy(), np.float64)
@@ -178,7 +177,7 @@ def _depth(loaded: RenderedScene, splats: Splats, camera: Camera) -> np.ndarray:
 def _sight(
     camera: Camera, depth: np.ndarray, points: np.ndarray, kept: np.ndarray | None, reach: Reach | None
 ) -> Sight:
-    """Return the votes of one camera; ``kept`` [H, W] bool, of any size: pixels that may vote."""
+    """Return the votes of one camera; ``kept`` [H, W] bool, of any size, marks the pixels that may vote."""
     points = points[shown(camera, points)]
     if kept is not None:
         image = Image.fromarray(kept).resize((camera.width, camera.height), Image.Resampling.NEAREST)
@@ -205,7 +204,7 @@ def _sight(
 
 
 def _visible(camera: Camera, depth: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the points, in a camera's picture, that no rendered surface hides."""
+    """Return the points in the image of a camera that no rendered surface hides."""
     points = points[:: max(1, -(-len(points) // MAX_POINTS))]
     pixels, z = camera.project(points)
     column = np.minimum(pixels[:, 0].astype(np.int64), camera.width - 1)

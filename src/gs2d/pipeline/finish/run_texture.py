@@ -1,4 +1,4 @@
-"""The textured mesh of a run: its surface, with colours from the photographs."""
+"""Texture the mesh of a run from its photographs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from gs2d.core.atomic_files import check_writable
-from gs2d.core.image_arrays import to_uint8
 from gs2d.core.memory import trim
 from gs2d.core.mesh import Mesh
 from gs2d.core.splats import Splats
@@ -34,13 +33,12 @@ from gs2d.meshing.texture import (
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.run_mesh import fused, mesh_run
 from gs2d.pipeline.finish.run_report import report_again
-from gs2d.pipeline.finish.run_subject import OPAQUE, meshed_subject
+from gs2d.pipeline.finish.run_subject import meshed_subject
 from gs2d.pipeline.look.page import page_run
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.open_capture import read_scene
 from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions
 from gs2d.pipeline.prepare.run_appearance import as_scene
-from gs2d.render.api import rasterize
 from gs2d.training.events import Notice, OnEvent, Phase, counted, ignore
 
 PACKAGES = ("xatlas",)  # of the extra `texture`
@@ -56,10 +54,10 @@ def texture_run(
     out: Path | None = None,
     threads: int | None = None,
 ) -> dict[str, Any]:
-    """Write the mesh of a finished run with a texture; returns its files and counts.
+    """Write the textured mesh of a finished run; return its files and counts.
 
-    The mesh is ``mesh.ply`` of the run as it is, unless some mesh option is given or it is not there: then it is
-    extracted anew, and takes the place of ``mesh.ply`` if ``out`` is None.
+    The mesh is the run's ``mesh.ply``. If that is missing, or ``mesh_options`` are set, it is extracted again, and
+    replaces ``mesh.ply`` if ``out`` is None.
     """
     check_texture_options(options)
     for package in PACKAGES:
@@ -67,22 +65,21 @@ def texture_run(
     path = Path(path)
     target = path / TEXTURED if out is None else Path(out)
     files = written_files(target)
-    if not target.parent.is_dir() and out is not None:
-        raise RunError(f"--out {out} must be in a folder that exists; make {target.parent} first")
     if out is not None:
+        if not target.parent.is_dir():
+            raise RunError(f"--out {out} must be in an existing folder; create {target.parent} first")
         for file in files:
             check_writable(file)
-    if out is None and (mesh_options != MeshOptions() or not (path / MESH).exists()):
+    elif mesh_options != MeshOptions() or not (path / MESH).exists():
         mesh_run(path, mesh_options, on_event, threads=threads)
         mesh_options = MeshOptions()
     run, loaded, splats = open_finished(path, threads, on_event)
     for view in loaded.scene.views:
         if view.path is not None and view.path.resolve() in {file.resolve() for file in files}:
-            raise RunError(f"--out {target} would write over the photograph {view.name}; choose another name")
+            raise RunError(f"--out {target} would overwrite the photograph {view.name}; choose another name")
     mesh = _mesh(run, loaded, splats, mesh_options, on_event)
-    baked = textured_mesh(loaded, splats, mesh, options, on_event)
-    up = up_direction([view.camera for view in loaded.scene.train])
-    write_mesh(target, baked.mesh, up=up)
+    baked = textured_mesh(loaded, mesh, options, on_event)
+    write_mesh(target, baked.mesh, up=up_direction([view.camera for view in loaded.scene.train]))
     if target.resolve() == run.file(TEXTURED).resolve():
         if run.file(PAGE).exists():  # it shows the textured mesh
             with attempted(PAGE, again("page", run.path), on_event):
@@ -97,35 +94,25 @@ def texture_run(
         "charts": baked.charts,
         "texels": baked.texels,
         "texels_unseen": baked.unseen,
-        "texture_from": options.texture_from,
         "bytes": sum(file.stat().st_size for file in files),
     }
 
 
-def textured_mesh(
-    loaded: LoadedRun,
-    splats: Splats,
-    mesh: Mesh,
-    options: TextureOptions,
-    on_event: OnEvent = ignore,
-) -> Baked:
-    """Simplify a mesh of a run, cut it into charts and colour them.
-
-    Photographs are taken back to the colours of the scene first, as far as it is known how they show them.
-    """
+def textured_mesh(loaded: LoadedRun, mesh: Mesh, options: TextureOptions, on_event: OnEvent = ignore) -> Baked:
+    """Simplify a mesh of a run, cut it into charts and colour them, with the appearance of photographs removed."""
     on_event(Phase("cutting the surface into charts", 0))
     views, small = _views(loaded, options, on_event), simplified(mesh, options.faces)
     if len(small.faces) > options.faces:
         on_event(
-            Notice(f"simplified to {len(small.faces):,} triangles, as near as it comes to --faces {options.faces}")
+            Notice(f"simplified to {len(small.faces):,} triangles, the closest possible to --faces {options.faces}")
         )
     size = options.texture_size or texture_size(small, [view.camera for view in views])
-    images = partial(_images, loaded, views, splats, options, on_event)
+    images = partial(photographs, loaded, views, on_event)
     return bake(unwrap(small, size), images, size, threads=torch.get_num_threads())
 
 
 def check_texture_options(options: TextureOptions) -> None:
-    """Raise for numbers that make no texture."""
+    """Raise for invalid options."""
     if options.faces < 4:
         raise ProtocolError(f"--faces must be a whole number >= 4, got {options.faces}")
     if options.texture_downscale is not None and options.texture_downscale < 1:
@@ -135,7 +122,7 @@ def check_texture_options(options: TextureOptions) -> None:
 
 
 def _mesh(run: RunFolder, loaded: LoadedRun, splats: Splats, options: MeshOptions, on_event: OnEvent) -> Mesh:
-    """Return the run's mesh as it is, or one of its own for other options."""
+    """Return the mesh of the run, or one extracted with other options."""
     if options == MeshOptions() and run.file(MESH).exists():
         return read_mesh(run.file(MESH))
     subject = meshed_subject(run, loaded, splats, options, on_event)
@@ -145,40 +132,15 @@ def _mesh(run: RunFolder, loaded: LoadedRun, splats: Splats, options: MeshOption
 
 
 def _views(loaded: LoadedRun, options: TextureOptions, on_event: OnEvent) -> Sequence[View]:
-    """Return the training views, in another size if one is asked for, from where those of the run are."""
-    if options.texture_downscale in (None, loaded.downscale) or loaded.scene.root is None:
-        return loaded.scene.train
-    scene = read_scene(
-        loaded.scene.root,
-        loaded.scene.format,
-        options.texture_downscale or 1,
-        loaded.protocol,
-        on_event,
-        loaded.scene.masks,
-    )
-    zooms = {view.name: view.zoom for view in loaded.scene.train if view.zoom is not None}
-    scene = scene.with_poses({view.name: view.camera.T_cam_world for view in loaded.scene.train}, zooms)
-    return scene.with_appearance({view.name: view.appearance for view in loaded.scene.train}).train
-
-
-def _images(
-    loaded: LoadedRun,
-    views: Sequence[View],
-    splats: Splats,
-    options: TextureOptions,
-    on_event: OnEvent,
-    factor: int,
-) -> Iterator[ColorSource]:
-    """Yield the views, or renderings of the splats from them, smaller by ``factor``."""
-    if options.texture_from == "photographs":
-        yield from photographs(loaded, views, on_event, factor)
-        return
-    for view in counted(views, PASSES[factor > 1], len(views), on_event):
-        camera = view.camera.downscaled(factor)
-        with torch.no_grad():
-            output = rasterize(splats, camera, loaded.settings, backend=loaded.backend)
-        shown = (output.alpha >= OPAQUE).cpu().numpy()
-        yield ColorSource(camera, to_uint8(output.color.clamp(0, 1).cpu().numpy()), shown)
+    """Return the training views at the requested size, with refined cameras and learned appearance."""
+    scene = loaded.scene
+    if options.texture_downscale in (None, loaded.downscale) or scene.root is None:
+        return scene.train
+    downscale = options.texture_downscale or 1
+    resized = read_scene(scene.root, scene.format, downscale, loaded.protocol, on_event, scene.masks)
+    zooms = {view.name: view.zoom for view in scene.train if view.zoom is not None}
+    resized = resized.with_poses({view.name: view.camera.T_cam_world for view in scene.train}, zooms)
+    return resized.with_appearance({view.name: view.appearance for view in scene.train}).train
 
 
 def photographs(loaded: LoadedRun, views: Sequence[View], on_event: OnEvent, factor: int) -> Iterator[ColorSource]:
@@ -188,7 +150,7 @@ def photographs(loaded: LoadedRun, views: Sequence[View], on_event: OnEvent, fac
 
 
 def usable_pixels(view: View, loaded: LoadedRun) -> np.ndarray | None:
-    """Return the pixels that show the surface: not masked out, and on the object if fusion looked only there."""
+    """Return the pixels that show the surface: not masked, and on the object if fusion used its mask."""
     masks = [view.mask(), view.object_mask() if loaded.protocol.use_mask_in_fusion else None]
-    given = [mask for mask in masks if mask is not None]
-    return np.logical_and.reduce(given) if given else None
+    present = [mask for mask in masks if mask is not None]
+    return np.logical_and.reduce(present) if present else None

@@ -1,4 +1,4 @@
-"""Image metrics of a scene of splats over many views, and how much memory it took."""
+"""Image metrics of splats over many views, and peak memory."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from gs2d.training.events import OnEvent, Phase, Step
 
 
 @dataclass(frozen=True, eq=False)
-class SeenView:
-    """A view that was rendered, beside its photograph: what whoever looks at it needs, so that it is rendered once.
+class RenderedPhotograph:
+    """A rendered view with its photograph.
 
     Attributes
     ----------
     view : View
     split : str
-        "train", "test", or "" where nobody said.
+        "train", "test" or "".
     output : RenderOutput
-        As the scene is, without its distortion.
+        Without distortion, in the colours of the scene.
     image : Tensor [H, W, 3]
-        Its colour in the exposure of the photograph; may exceed 1.
+        Colour with the appearance of the photograph; may exceed 1.
     target : Tensor [H, W, 3]
         The photograph over the background, in [0, 1].
     mask : Tensor [H, W] bool or None
@@ -50,27 +50,28 @@ class SeenView:
     mask: torch.Tensor | None
 
 
-CLEAR = 0.9  # alpha below which a pixel of an opaque photograph lets the background through
+Visitor = Callable[[RenderedPhotograph, ImageMetrics], None]
+"""Receives each view with its scores; must not keep the images."""
 
 
-def transparent_part(seen: SeenView) -> float | None:
-    """Return the part of a view's pixels whose alpha is below 0.9; None where the photograph has an alpha channel."""
-    if seen.view.alpha() is not None:
-        return None
-    clear = seen.output.alpha < CLEAR
-    return float((clear if seen.mask is None else clear[seen.mask]).float().mean())
+@dataclass(frozen=True, kw_only=True)
+class ScoreOptions:
+    """How views are scored.
 
+    Attributes
+    ----------
+    split : str
+        Passed to ``visitors``.
+    lpips : Lpips or None
+    match : bool
+        Match colours by :func:`~gs2d.pipeline.prepare.run_appearance.matched_by_halves`.
+    visitors : sequence of Visitor
+    """
 
-def transparent_entry(parts: Mapping[str, float]) -> dict[str, Any]:
-    """Return the mean of ``transparent_part`` over the views, by name, and the worst view, for ``metrics.json``."""
-    if not parts:
-        return {}
-    worst = max(parts, key=parts.__getitem__)
-    return {"transparent": {"part": sum(parts.values()) / len(parts), "view": worst, "worst": parts[worst]}}
-
-
-Visitor = Callable[[SeenView, ImageMetrics], None]
-"""Is shown each view with its scores while it is in memory, and keeps what it needs of it, not the view."""
+    split: str = ""
+    lpips: Lpips | None = None
+    match: bool = False
+    visitors: Sequence[Visitor] = ()
 
 
 def score_views(
@@ -81,48 +82,34 @@ def score_views(
     *,
     name: str,
     on_event: OnEvent,
-    lpips: Lpips | None = None,
-    match: bool = False,
-    split: str = "",
-    visitors: Sequence[Visitor] = (),
+    options: ScoreOptions = ScoreOptions(),
 ) -> dict[str, ImageMetrics]:
-    """Image metrics of each view by its name; pixels that the view's mask leaves out count nowhere.
+    """Return the image metrics of each view by its name, as a phase called ``name``.
 
-    A view is rendered as its photograph shows the scene, as far as its ``appearance`` is known; with ``match`` by
-    :func:`~gs2d.pipeline.prepare.run_appearance.matched_by_halves`.
-    ``visitors`` see each view, named ``split``.
+    Views are rendered with the appearance of their photographs, if known. Masked pixels are ignored.
     """
     on_event(Phase(name, len(views)))
     scores: dict[str, ImageMetrics] = {}
-    for done, seen in enumerate(_seen(splats, views, settings, backend, match, split), start=1):
-        metrics = image_metrics(seen.image, seen.target, seen.mask, backend=backend, lpips=lpips)
+    for done, seen in enumerate(_rendered(splats, views, settings, backend, options), start=1):
+        metrics = image_metrics(seen.image, seen.target, seen.mask, backend=backend, lpips=options.lpips)
         scores[seen.view.name] = metrics
-        for visit in visitors:
+        for visit in options.visitors:
             visit(seen, metrics)
         on_event(Step(done))
     return scores
 
 
-def mean_psnr(
-    splats: Splats,
-    views: Sequence[View],
-    settings: RasterSettings,
-    backend: Backend,
-) -> float | None:
-    """Mean ``psnr_float`` of the views that have one, as by :func:`score_views`, without the other metrics."""
-    values = [psnr_float(s.image, s.target, s.mask) for s in _seen(splats, views, settings, backend)]
+def mean_psnr(splats: Splats, views: Sequence[View], settings: RasterSettings, backend: Backend) -> float | None:
+    """Return the mean PSNR of views, of images that are not rounded to 8 bits."""
+    rendered = _rendered(splats, views, settings, backend, ScoreOptions())
+    values = [psnr_float(seen.image, seen.target, seen.mask) for seen in rendered]
     finite = [value for value in values if math.isfinite(value)]
     return sum(finite) / len(finite) if finite else None
 
 
-def _seen(
-    splats: Splats,
-    views: Sequence[View],
-    settings: RasterSettings,
-    backend: Backend,
-    match: bool = False,
-    split: str = "",
-) -> Iterator[SeenView]:
+def _rendered(
+    splats: Splats, views: Sequence[View], settings: RasterSettings, backend: Backend, options: ScoreOptions
+) -> Iterator[RenderedPhotograph]:
     settings = replace(settings, sh_degree=splats.sh_degree, with_distortion=False)
     for view in views:
         with torch.no_grad():
@@ -130,19 +117,19 @@ def _seen(
         target = torch.from_numpy(view.target(settings.background)).to(output.color)
         pixels = view.mask()
         mask = None if pixels is None else torch.from_numpy(pixels).to(target.device)
-        if match:
+        if options.match:
             image = matched_by_halves(view, output.color, target, mask, settings.background)
         else:
             image = photographed(view, output.color, settings.background)
-        yield SeenView(view, split, output, image, target, mask)
+        yield RenderedPhotograph(view, options.split, output, image, target, mask)
 
 
 def split_metrics(
     scores: dict[str, ImageMetrics], name: str, split: str | None = None, *, of: int | None = None
 ) -> dict[str, Any]:
-    """``{name: means}``; null with the reason where the scene has no views of the split (by default ``name``).
+    """Return ``{name: means}``, or null with the reason if the scene has no views of ``split`` (default: ``name``).
 
-    Where fewer views than the split has, ``of``, were scored, ``views`` says how many.
+    ``views`` is the number of scored views, if it is below the size ``of`` of the split.
     """
     if not scores:
         return {name: None, f"{name}_reason": f"the scene has no {split or name} views"}
@@ -151,42 +138,42 @@ def split_metrics(
 
 
 def is_partial(entry: Mapping[str, Any]) -> bool:
-    """Whether the scores of a stage in ``metrics.json`` are of some of the views only."""
+    """Return whether a stage in ``metrics.json`` was scored on some of its views only."""
     return any("views" in (entry.get(split) or {}) for split in ("train", "test"))
 
 
 def evenly(views: Sequence[View], most: int) -> Sequence[View]:
-    """At most so many of the views, from all along their order."""
+    """Return at most ``most`` views, evenly spaced."""
     count = min(most, len(views))
     return [views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)]
 
 
 class PeakGpuMemory:
-    """Peak of torch's memory on the current GPU since :meth:`reset`; 0 where the backend uses none."""
+    """Peak of torch's memory on the GPU since :meth:`reset`; 0 if the backend uses none."""
 
     def __init__(self, backend: Backend) -> None:
         self._used = torch.device(backend.device).type == "cuda"
 
     def reset(self) -> None:
-        """Start again from what is allocated now."""
+        """Restart from the current allocation."""
         if self._used:
             torch.cuda.reset_peak_memory_stats()
 
     def read(self) -> int:
-        """Bytes."""
+        """Return bytes."""
         return int(torch.cuda.max_memory_allocated()) if self._used else 0
 
 
 class PeakMemory:
-    """Peak resident memory of this process since :meth:`reset` (Linux), or since it started (elsewhere)."""
+    """Peak resident memory of this process since :meth:`reset` (Linux), or since its start (elsewhere)."""
 
     def reset(self) -> None:
-        """Start again from what is resident now."""
+        """Restart from the current resident memory."""
         with contextlib.suppress(OSError):
             Path("/proc/self/clear_refs").write_text("5")
 
     def read(self) -> int:
-        """Bytes."""
+        """Return bytes."""
         with contextlib.suppress(OSError):
             for line in Path("/proc/self/status").read_text().splitlines():
                 if line.startswith("VmHWM:"):

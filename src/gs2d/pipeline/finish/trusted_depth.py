@@ -1,4 +1,4 @@
-"""Where rendered depths are believed: training also draws the sky and what is beyond any known depth, at some depth."""
+"""Decide where rendered depth is a surface: splats also render the sky and the distant background."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from gs2d.meshing.fusion_bounds import backproject
 from gs2d.meshing.sky import sky_pixels
 from gs2d.pipeline.prepare.loaded import RenderedScene
 
-BEYOND = 1.25  # times the reach of a scene (``data/reach.py``), past which no depth is believed
-MIN_POINTS = 20  # sparse points in a photograph, below which they do not say where it shows nothing
+BEYOND = 1.25  # times the reach of a scene (``data/reach.py``); depth beyond it is ignored
+MIN_POINTS = 20  # sparse points in a photograph to search it for sky
 
 
 def believed_reach(scene: Scene) -> Reach | None:
-    """Return how far depths are believed: a little farther than sparse points go; None where there are no points.
+    """Return the region of valid depths, a little larger than that of the sparse points; None without points.
 
-    What is drawn beyond stands on a sphere (``training/background_sphere.py``).
+    Splats of the background sphere (``training/background_sphere.py``) are beyond it.
     """
     if scene.points is None:
         return None
@@ -30,21 +30,21 @@ def believed_reach(scene: Scene) -> Reach | None:
 
 
 def surface_reach(loaded: RenderedScene) -> Reach | None:
-    """Return how far surfaces are taken; None, as far as they go, by the protocols of data sets: they have limits."""
+    """Return the region of surfaces; None (unlimited) for protocols of data sets, which have limits of their own."""
     return believed_reach(loaded.scene) if loaded.protocol.fusion.subject else None
 
 
 def within_reach(reach: Reach, camera: Camera, depths: np.ndarray) -> np.ndarray:
-    """Return the pixels [H, W] bool of depths that show places within reach."""
+    """Return which depths [H, W] are of points within reach, [H, W] bool."""
     rows, columns = np.indices(depths.shape).reshape(2, -1)
     places = backproject(camera, depths.reshape(-1).astype(np.float64), rows, columns)
     return reach.holds(places).reshape(depths.shape)
 
 
 def sky_direction(loaded: RenderedScene) -> np.ndarray | None:
-    """Return the direction [3] of the sky: up. None where the photographs are not searched for sky.
+    """Return the up direction [3], in which sky is searched; None if the photographs are not searched.
 
-    The fusions of data sets have limits of their own, and an alpha channel says itself what is empty.
+    Protocols of data sets have limits of their own, and alpha channels mark what is empty.
     """
     scene = loaded.scene
     if not loaded.protocol.fusion.subject or scene.observed() is None or scene.train[0].alpha() is not None:
@@ -53,7 +53,7 @@ def sky_direction(loaded: RenderedScene) -> np.ndarray | None:
 
 
 def sky_of(loaded: RenderedScene, view: View, up: np.ndarray) -> np.ndarray:
-    """Return the pixels [H, W] bool in which a photograph shows the sky, which is in the direction ``up`` [3]."""
+    """Return the pixels of a photograph that show sky, [H, W] bool; ``up`` [3] is the direction of the sky."""
     camera = view.camera
     observed = loaded.scene.observed()
     points = np.zeros((0, 2)) if observed is None else observed.inside(camera, min_track=2).pixels

@@ -1,1 +1,1 @@
-"""Show splats: the page for a browser, its server, and the facts of a file."""
+"""Show splats: the page, its server, and descriptions of files."""

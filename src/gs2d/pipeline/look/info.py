@@ -1,4 +1,4 @@
-"""What a capture or a file holds, in a few facts."""
+"""Describe a capture or a file: ``gs2d info``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _OF_MODELS = (".ply", *FOREIGN)
 
 
 def describe_capture(path: Path) -> dict[str, Any]:
-    """Facts of a capture: a folder, or a ZIP file, which is unpacked for a moment."""
+    """Describe a capture: a folder, or a ZIP file, which is unpacked temporarily."""
     if is_archive(path):
         with unpacked_for_a_moment(path) as folder:
             return {**describe_capture(folder), "capture": str(path)}
@@ -44,16 +44,16 @@ def describe_capture(path: Path) -> dict[str, Any]:
 
 
 def describe_file(path: Path) -> dict[str, Any]:
-    """Facts of a file: splats of any layout, a mesh or points.
+    """Describe a file of splats, a mesh or points.
 
     Raises
     ------
     DataError
-        The file is none of these, or is broken.
+        If the file is none of these, or is broken.
     """
     if path.suffix.lower() not in _OF_MODELS and not is_splat_file(path):
         remedy = instead(path, "run" if belongs_to_run(path) else "capture")
-        raise DataError(f"{path}: a file of splats, a mesh or points was expected, got another file{remedy}")
+        raise DataError(f"{path} is no file of splats, mesh or points{remedy}")
     size = path.stat().st_size
     reader = reader_of(path)
     if reader is not None and reader.mesh is not None and (mesh := reader.mesh(path)) is not None:

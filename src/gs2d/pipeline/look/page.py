@@ -1,4 +1,4 @@
-"""``gs2d page``: the splats of a run, or of a file, as one file for any browser."""
+"""``gs2d page``: the splats of a run or a file as one HTML file."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from gs2d.report.color_maps import valid_image
 from gs2d.training.events import Notice, OnEvent, Phase, ignore
 from gs2d.viewer.scene_page import PageScene, PageView, WorldScale, write_page
 
-MAX_VIEWS = 100  # photographs that one can step through
+MAX_VIEWS = 100  # photographs on the page
 SUFFIXES = (".html", ".htm")
 EMBEDDED_SIDE = 320  # px, longer side of the photographs in a page
 EMBEDDED_FACES = 200_000  # of the mesh in a page
 EMBEDDED_TEXTURE = 2048  # px, side of its texture
-LARGE = 50_000_000  # bytes, from which phones take long, and mail refuses
+LARGE = 50_000_000  # bytes; slow on phones, too large for e-mail
 
 
 def page_run(
@@ -53,12 +53,12 @@ def page_run(
     ----------
     path : Path
     out : Path or None
-        None: ``scene.html`` in the run, or beside the file.
+        None: ``scene.html`` in the run, or next to the file.
     sh_degree : int
-        0 to 3: how much of the colours' dependence on the direction is stored.
+        Degree of the view-dependent colours, 0 to 3.
     on_event : callable
     loaded : LoadedRun or None
-        What defines the run, where it is at hand; None: it is read.
+        The run, if it is already loaded.
 
     Returns
     -------
@@ -69,7 +69,7 @@ def page_run(
     of_run = path.is_dir() or is_run(path)
     out = (path / PAGE if of_run else path.with_suffix(".html")) if out is None else Path(out)
     if out.suffix.lower() not in SUFFIXES:
-        raise RunError(f"--out must name an .html file, which is what is written, got {out}")
+        raise RunError(f"--out must name an .html file, got {out}")
     if not 0 <= sh_degree <= 3:
         raise RunError(f"--sh-degree must be 0, 1, 2 or 3, got {sh_degree}")
     content = page_content(path, on_event, loaded)
@@ -87,7 +87,7 @@ def page_run(
         photographs=photographs,
     )
     if written["bytes"] > LARGE:
-        on_event(Notice(f"{written['bytes'] / 1e6:.0f} MB are much for a page: --sh-degree 1 or 0 makes it smaller"))
+        on_event(Notice(f"the page is large ({written['bytes'] / 1e6:.0f} MB): --sh-degree 1 or 0 makes it smaller"))
     return {"file": str(out), "views": len(content.scene.views), **written}
 
 
@@ -117,16 +117,16 @@ def _embedded_meshes(run: RunFolder) -> dict[str, bytes]:
 
 @dataclass(frozen=True, eq=False)
 class PageContent:
-    """Splats, and what a page shows around them.
+    """Content of a page.
 
     Attributes
     ----------
     splats : Splats
     scene : PageScene
     photographs : sequence of View
-        Those of ``scene.views``, in order; empty where the capture is not there.
+        Those of ``scene.views``, in order; empty if the capture is missing.
     run : RunFolder or None
-        None: the splats are a file's.
+        None: the splats are of a file.
     """
 
     splats: Splats
@@ -136,7 +136,7 @@ class PageContent:
 
 
 def page_content(path: Path, on_event: OnEvent = ignore, loaded: LoadedRun | None = None) -> PageContent:
-    """Return what a page shows of a run (defined by ``loaded``, where it is at hand) or of a file of splats."""
+    """Return the content of the page of a run (``loaded``, if it is already loaded) or of a file of splats."""
     run = open_run(path) if path.is_dir() or is_run(path) else None
     if run is not None:
         splats = finished_splats(run)
@@ -148,7 +148,7 @@ def page_content(path: Path, on_event: OnEvent = ignore, loaded: LoadedRun | Non
             on_event(Notice(f"without the cameras of the photographs: {error}"))
     else:
         if not path.exists():
-            raise DataError(f"expected a run folder or a file of splats at {path}, found nothing{where_it_ends(path)}")
+            raise DataError(f"{path} is no run folder or file of splats{where_it_ends(path)}")
         splats, title = read_splats(path, lambda text: on_event(Notice(text))), path.stem
     photographs = [] if loaded is None else some_views(loaded.scene.train)
     scene = page_scene(
@@ -171,7 +171,7 @@ def page_scene(
     subject: Subject | None = None,
     world: WorldScale | None = None,
 ) -> PageScene:
-    """Return what a page shows around splats near ``centers`` [N, 3]; without photographs it is seen from aside."""
+    """Return cameras and focus of a page for splats at ``centers`` [N, 3]; by default a view from the side."""
     cameras = [view.camera for view in photographs]
     focus, unit = _focus(cameras, centers)
     up = up_direction(cameras) if cameras else np.array([0.0, 0.0, 1.0])
@@ -189,14 +189,14 @@ def some_views(views: Sequence[View]) -> list[View]:
 
 
 def settings_without_run(splats: Splats) -> RasterSettings:
-    """Of splats without a run: over white, near plane at a hundredth of what they spread over."""
+    """Return settings for splats without a run: white background, near plane at a hundredth of their spread."""
     spread = float((splats.means - splats.means.median(dim=0).values).norm(dim=1).median()) if len(splats) else 1.0
     near = max(0.01 * spread, 1e-9)
     return RasterSettings(near=near, far=1e4 * near, background=(1.0, 1.0, 1.0), sh_degree=splats.sh_degree)
 
 
 def _focus(cameras: Sequence[Camera], centers: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return what to look at, and about how far away it is seen from (without cameras: the spread of the splats)."""
+    """Return the focus, and the typical distance of cameras (without cameras: the spread of the splats)."""
     centers = centers[np.isfinite(centers).all(axis=1)]
     if len(cameras) > 1:
         focus = focus_point(list(cameras))
@@ -221,9 +221,9 @@ def _world_of(run: RunFolder, on_event: OnEvent) -> WorldScale | None:
 
 
 def _subject(folder: Path, on_event: OnEvent) -> Subject | None:
-    """Return what the run says that it is about; None where it says nothing, or its file is damaged, which is told."""
+    """Return the subject of the run, if known; report a damaged file."""
     try:
         return read_subject(folder)
     except DataError as error:
-        on_event(Notice(f"the page opens at what the cameras look at: {error}"))
+        on_event(Notice(f"the page does not open at the subject: {error}"))
         return None

@@ -1,4 +1,4 @@
-"""``gs2d view``: the page of a run, or of a file of splats, served on this machine."""
+"""``gs2d view``: serve the page of a run or of a file of splats on this machine."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from gs2d.viewer.scene_page import PageOffer, PageScene, pack_for, served_page, 
 
 FINAL = "final"
 PHOTOGRAPH_SIDE = 640  # px, longer side
-_TICK = 0.2  # s between looks at Ctrl-C
+_TICK = 0.2  # s between checks for Ctrl-C
 
 
 def open_viewer(path: Path, port: int | None = None, on_event: OnEvent = ignore) -> tuple[PageServer, list[str]]:
-    """Start to serve a run, or a file of splats; ``close`` the server at the end.
+    """Start a server of a run or a file of splats; the caller must ``close`` it.
 
     Returns
     -------
     server : PageServer
     shown : list of str
-        What there is to see: "cameras", "mesh", "splats".
+        What the page shows: "cameras", "mesh", "splats".
     """
     content = page_content(path, on_event)
     stages: dict[str, Callable[[], Splats]] = {FINAL: lambda: content.splats}
@@ -55,15 +55,9 @@ def open_viewer(path: Path, port: int | None = None, on_event: OnEvent = ignore)
 
 
 def serve(server: PageServer, on_event: OnEvent = ignore) -> None:
-    """Wait until KeyboardInterrupt (from ``on_event`` or Ctrl-C), or until a request failed.
-
-    Raises
-    ------
-    Exception
-        The unexpected error of a request.
-    """
+    """Wait until Ctrl-C, or until a request fails; raise its error."""
     while server.failure is None:
-        on_event(Step(0))  # where a Ctrl-C that somebody swallowed is raised again
+        on_event(Step(0))  # raises a Ctrl-C that was swallowed elsewhere
         time.sleep(_TICK)
     raise server.failure
 

@@ -1,1 +1,1 @@
-"""Before training: options, captures, priors and memory become one resolved run; finished runs are opened."""
+"""Resolve options and a capture into a run, before training; load finished runs."""

@@ -1,10 +1,8 @@
-"""Estimate what a training takes, by arithmetic from the capture and the recipe: splats, memory, disk and time.
+"""Estimate a training by arithmetic from the capture and the recipe: splats, memory, disk and time.
 
-Nothing is trained. The number of splats is the least certain: it depends on what the photographs show. The constants
-were compared with ten finished runs (docs/notebook/scale.md); each estimate has bounds.
-
-Work is counted in units: a unit is the time in which the rasterizer renders one pixel of a small test scene, forwards
-and backwards. ``rasterizer_speed`` measures it on the machine that trains, in less than a second.
+The number of splats is the least certain: it depends on what the photographs show. The constants were compared with
+ten finished runs (docs/notebook/scale.md). Work is counted in units of the time in which the rasterizer renders one
+pixel of a small test scene, forwards and backwards; ``rasterizer_speed`` measures that time.
 """
 
 from __future__ import annotations
@@ -13,8 +11,8 @@ import itertools
 import math
 import shlex
 import time
-from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,90 +25,78 @@ from gs2d.core.memory_limit import memory_budget
 from gs2d.core.splats import Splats
 from gs2d.core.text import duration
 from gs2d.data import Scene
+from gs2d.data.archive import is_archive, unpacked_for_a_moment
 from gs2d.data.prepared import decoded_bytes, packed_bytes
 from gs2d.errors import DataError
-from gs2d.pipeline.prepare.limits import DECODING_BYTES, ITERATION_BYTES
+from gs2d.pipeline.prepare.limits import DECODING_BYTES, ITERATION_BYTES, use_memory, use_threads
+from gs2d.pipeline.prepare.loaded import read_init
+from gs2d.pipeline.prepare.open_capture import open_capture
+from gs2d.pipeline.prepare.options import PlanOptions
 from gs2d.pipeline.prepare.photographs import fits
+from gs2d.pipeline.prepare.resolve import check_options, resolve, schedule_scale_of
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
+from gs2d.training.events import OnEvent, ignore
 from gs2d.training.plane_sweep import sweep_downscale
-from gs2d.training.robust import MAX_WITNESSES, ends_part, looks_at_free_space
 
-# Memory and disk, bytes.
+# Bytes
 PROGRAM_BYTES = 384 << 20  # torch, the kernels, the scene
-SPLAT_BYTES = 1200  # a splat's parameters, moments, gradients and rasterizer state (docs/notebook/performance.md)
-FUSION_BYTES = 220 << 20  # the mesh: a slab of the volume and its surface; comes when the gradients are gone
+SPLAT_BYTES = 1200  # parameters, moments, gradients and rasterizer state of a splat (docs/notebook/performance.md)
+FUSION_BYTES = 220 << 20  # a slab of the volume and its surface, after the gradients are freed
 CHECKPOINT_BYTES = 59 * 3 * 4  # of a splat; two checkpoints are kept
 FILE_BYTES = 4 * 61 + 80 + 40  # of a splat: splats.ply, scene.html, the mesh
-# Number of splats at the end over that at the start: least, expected, most, in the finished runs.
-GROWTH = (0.5, 3.0, 9.0)
-DOUBLING = 2.0  # a densification at most doubles the splats
-# Work, in units, fitted to trainings and to parts of them on two cores.
-PIXEL_WORK = 1.2  # of an iteration, for each pixel: rendering, losses and their gradients
-SPLAT_WORK = 0.8  # of an iteration, for each splat: projection, sorting, Adam
-SWEEP_WORK = 8.0  # of the dense start, for each pixel of a swept photograph
-LOOK_WORK = 0.4  # of a look at free space, for each splat and swept photograph
-SEEN_WORK = 2.0  # of a look at what is mostly unseen, for each splat and training photograph
-TRIAL_ITERATIONS = 50  # that a trial of removal with all its witnesses takes the time of (training/robust.py)
-TRIALS_BETWEEN = 8  # beside those at the ends of parts: looks with enough new proposals for a trial
-FINISH_ITERATIONS = 5  # for each photograph after training: it is scored, and its depth is rendered and fused
-FIXED_SECONDS = 15  # to start, find the subject, extract the mesh, write page and report
-DOUBT = 2.0  # factor of the bounds of time: other work on the machine, and scenes that differ
-# The test scene of ``rasterizer_speed``: its side doubles until it takes so many seconds.
-SIDES, ENOUGH_SECONDS = (16, 32, 64, 128, 256, 512, 1024), 0.03
+TEMPORARY_BYTES = 8  # of a pixel: depth maps
+GROWTH = (0.5, 3.0, 9.0)  # final over initial number of splats in the finished runs: least, expected, most
+# Work, in units
+PIXEL_WORK = 1.2  # of an iteration, per pixel: rendering, losses, gradients
+SPLAT_WORK = 0.8  # of an iteration, per splat: projection, sorting, Adam
+SWEEP_WORK = 8.0  # of the dense start, per pixel of a swept photograph
+REMOVAL_WORK = (30.0, 0.006)  # of floater removal, per splat and swept photograph: fixed, and per iteration
+FINISH_ITERATIONS = 5  # per photograph after training: scoring, rendering and fusing depth
+FIXED_SECONDS = 15  # start, subject, mesh extraction, page, report
+UNCERTAINTY = 2.0  # factor of the bounds of time
+SIDES, ENOUGH_SECONDS = (16, 32, 64, 128, 256, 512, 1024), 0.03  # of the test scene: the side doubles until it is slow
 
 
-@dataclass(frozen=True)
-class Range:
-    """A figure: at least, expected, at most."""
+class Range(NamedTuple):
+    """Least, expected and most."""
 
     least: float
     expected: float
     most: float
 
-    def scaled(self, factor: float) -> Range:
-        """Return all three times a factor."""
-        return Range(self.least * factor, self.expected * factor, self.most * factor)
-
 
 @dataclass(frozen=True)
 class Estimate:
-    """What training on a capture takes.
+    """What training on a capture needs.
 
     Attributes
     ----------
-    photographs : int
-    pixels : int
-        Of all photographs, as files, and ``trained_pixels`` at the size of training.
-    trained_pixels : int
-    downscale : int
-    iterations : int
+    photographs, pixels : int
+        Training size, all photographs together.
+    downscale, iterations : int
     start : int
-        Splats that training starts from.
+        Initial splats.
     splats : Range
-        At the end.
+        Final splats.
     max_splats : int or None
-        Largest number of splats that fits into memory; None: as many as may come do.
+        Largest number of splats that fits into memory, where that limits them.
     memory : Range
-        Bytes.
+        Bytes; ``allowed`` is the limit.
     allowed : int or None
-        Bytes of memory to keep to.
     prepared : bool
-        Whether photographs are kept on the disk, undistorted and shrunk.
+        Whether photographs are kept on disk, undistorted and shrunk.
     disk : float
-        Bytes in the run folder, and ``temporary`` in the temporary folder, for depth maps.
-    temporary : float
-    training : Range
-        Seconds of training alone; ``seconds`` of everything.
+        Bytes, including temporary files.
     seconds : Range
+        Of the whole run.
     budget : tuple of str
-        Overrides that keep the recipe to ``max_splats``.
+        Overrides that limit the recipe to ``max_splats``.
     """
 
     photographs: int
     pixels: int
-    trained_pixels: int
     downscale: int
     iterations: int
     start: int
@@ -120,38 +106,62 @@ class Estimate:
     allowed: int | None
     prepared: bool
     disk: float
-    temporary: float
-    training: Range
     seconds: Range
     budget: tuple[str, ...] = ()
 
     def line(self) -> str:
-        """Return time and memory in one line, as it is told before training."""
-        training, memory = self.training, self.memory.scaled(2.0**-30)
+        """Return time and memory in one line."""
         return (
-            f"training will take about {duration(training.least)} to {duration(training.most)} for {self.iterations:,} "
-            f"iterations and {memory.least:.2g} to {memory.most:.2g} GiB of memory"
+            f"the run will take about {duration(self.seconds.least)} to {duration(self.seconds.most)} and "
+            f"{self.memory.least / 2**30:.2g} to {self.memory.most / 2**30:.2g} GiB of memory"
         )
 
     def lines(self) -> list[str]:
-        """Return the estimate for people."""
-        shrunk = f"{self.trained_pixels / 1e6:.3g} as they are trained on (--downscale {self.downscale}), "
-        where = "prepared on the disk" if self.prepared else "in memory"
-        of = "" if self.allowed is None else f" of {self.allowed / 2**30:.3g} GiB allowed"
-        limited = shlex.join(set_words(self.budget)) or "more --memory"  # not every densifier takes a limit
+        """Return the estimate as text."""
+        shrunk = f" (--downscale {self.downscale})" if self.downscale > 1 else ""
+        where = "prepared on disk" if self.prepared else "in memory"
+        allowed = "" if self.allowed is None else f" of {self.allowed / 2**30:.3g} GiB allowed"
+        limited = shlex.join(set_words(self.budget)) or "more --memory"  # not every densifier has a limit
         budget = "" if self.max_splats is None else f"; only with {limited}"
-        memory, splats, seconds = self.memory.scaled(2.0**-30), self.splats, self.seconds
+        least, expected, most = (value / 2**30 for value in self.memory)
         return [
-            f"photographs: {self.photographs:,} with {self.pixels / 1e6:.3g} megapixels together, "
-            f"{shrunk if self.downscale > 1 else ''}{where}",
-            f"splats: {rounded(splats.expected):,} ({rounded(splats.least):,} to {rounded(splats.most):,}), from "
-            f"{rounded(self.start):,}{budget}",
-            f"memory: {memory.expected:.2g} GiB ({memory.least:.2g} to {memory.most:.2g}){of}",
-            f"disk: {self.disk / 2**30:.2g} GiB in the run, {self.temporary / 2**30:.2g} GiB for a while in the "
-            "temporary folder",
-            f"time: {duration(seconds.expected)} ({duration(seconds.least)} to {duration(seconds.most)}), "
-            f"{self.iterations:,} iterations, mesh and report",
+            f"photographs: {self.photographs:,} with {self.pixels / 1e6:.3g} megapixels in total{shrunk}, {where}",
+            f"splats: {rounded(self.splats.expected):,} ({rounded(self.splats.least):,} to "
+            f"{rounded(self.splats.most):,}), initially {rounded(self.start):,}{budget}",
+            f"memory: {expected:.2g} GiB ({least:.2g} to {most:.2g}){allowed}",
+            f"disk: {self.disk / 2**30:.2g} GiB",
+            f"time: {duration(self.seconds.expected)} ({duration(self.seconds.least)} to "
+            f"{duration(self.seconds.most)}), {self.iterations:,} iterations, mesh and report",
         ]
+
+
+def plan(options: PlanOptions, on_event: OnEvent = ignore) -> Estimate:
+    """Estimate the training that ``gs2d train`` would run with these options; nothing is trained or written.
+
+    Raises
+    ------
+    Gs2dError
+        If the capture cannot be read, or the training does not fit into memory or on disk.
+    """
+    if is_archive(options.scene):
+        with unpacked_for_a_moment(options.scene) as folder:
+            return plan(replace(options, scene=folder), on_event)
+    check_options(options)
+    use_threads(options.threads)
+    use_memory(options.memory)
+    start = None if options.init is None else len(read_init(options.init, on_event)[0])
+    capture = open_capture(options, on_event)
+    scale = schedule_scale_of(options, capture)
+    recipe, capture = resolve(options, capture, on_event, seed=options.seed, schedule_scale=scale)
+    found = estimate(
+        capture.scene, recipe, capture.backend, downscale=capture.downscale, prepare=options.prepare, start=start
+    )
+    if options.disk is not None and found.disk > options.disk * 2**30:
+        raise DataError(
+            f"{found.photographs:,} photographs need about {found.disk / 2**30:.2g} GiB of disk, --disk allows "
+            f"{options.disk:g} GiB; use a larger --downscale or allow more"
+        )
+    return found
 
 
 def estimate(
@@ -163,7 +173,7 @@ def estimate(
     prepare: str = "auto",
     start: int | None = None,
 ) -> Estimate:
-    """Estimate the training of a scene, whose photographs are ``downscale`` times smaller than their files.
+    """Estimate the training of a scene.
 
     Parameters
     ----------
@@ -171,65 +181,59 @@ def estimate(
     recipe : Recipe
     backend : Backend
     downscale : int
+        Factor by which the photographs are smaller than their files.
     prepare : str
-        "auto", "always" or "never": whether photographs are kept on the disk.
+        "auto", "always" or "never", as in ``TrainOptions``.
     start : int, optional
-        Splats that training starts from, if they are known.
+        Initial number of splats, if known.
 
     Raises
     ------
     DataError
-        What training starts from does not fit into memory.
+        If the initial splats do not fit into memory.
     """
     allowed = memory_budget()
-    start = start_of(scene, recipe) if start is None else start
+    start = initial_splats(scene, recipe) if start is None else start
     splats, budget = expected_splats(recipe, start), None
     prepared = prepare == "always" or (prepare == "auto" and not fits(scene))
-    largest = max(view.camera.width * view.camera.height for view in scene.views)
-    fixed = PROGRAM_BYTES + largest * (ITERATION_BYTES * backend.on_host + DECODING_BYTES * downscale**2)
-    fixed += 0 if prepared else decoded_bytes(scene)
-    memory = _memory(fixed, splats)
-    if allowed is not None and memory.most > allowed:
-        budget = int((allowed - fixed - FUSION_BYTES) / SPLAT_BYTES)
+    sizes = [view.camera.width * view.camera.height for view in scene.views]
+    fixed = PROGRAM_BYTES + max(sizes) * (ITERATION_BYTES * backend.on_host + DECODING_BYTES * downscale**2)
+    fixed += FUSION_BYTES + (0 if prepared else decoded_bytes(scene))
+    if allowed is not None and fixed + splats.most * SPLAT_BYTES > allowed:
+        budget = int((allowed - fixed) / SPLAT_BYTES)
         if budget < start:
             raise DataError(
-                f"{len(scene.views):,} photographs start from about {rounded(start):,} splats, which need "
-                f"{(fixed + FUSION_BYTES + start * SPLAT_BYTES) / 2**30:.2g} GiB, got {allowed / 2**30:.2g} GiB to "
-                "keep to; allow more --memory, or train on a part of the capture"
+                f"{len(scene.views):,} photographs start with about {rounded(start):,} splats, which need "
+                f"{(fixed + start * SPLAT_BYTES) / 2**30:.2g} GiB, got {allowed / 2**30:.2g} GiB; allow more --memory, "
+                "or train on a part of the capture"
             )
-        splats = Range(min(splats.least, budget), min(splats.expected, budget), min(splats.most, budget))
-        memory = _memory(fixed, splats)
+        splats = Range(*(min(count, budget) for count in splats))
         budget = None if splats.most < budget else rounded(0.95 * budget)
-    trained = sum(view.camera.width * view.camera.height for view in scene.views)
-    packed = packed_bytes(scene.views) if prepared else 0.0
-    training, seconds = _seconds(scene, recipe, start, splats, rasterizer_speed(backend))
+    memory = Range(*(fixed + count * SPLAT_BYTES for count in splats))
+    disk = (packed_bytes(scene.views) if prepared else 0.0) + TEMPORARY_BYTES * sum(sizes)
     return Estimate(
         photographs=len(scene.views),
-        pixels=sum(k.width * k.height for k in (view.file_intrinsics() for view in scene.views)),
-        trained_pixels=trained,
+        pixels=sum(sizes),
         downscale=downscale,
         iterations=recipe.iterations,
         start=start,
         splats=splats,
         max_splats=budget,
-        memory=memory,
+        memory=memory._replace(least=memory.least - FUSION_BYTES / 2),  # a small surface needs half
         allowed=allowed,
         prepared=prepared,
-        disk=packed + splats.expected * (2 * CHECKPOINT_BYTES + FILE_BYTES),
-        temporary=trained * 8,
-        training=training,
-        seconds=seconds,
+        disk=disk + splats.expected * (2 * CHECKPOINT_BYTES + FILE_BYTES),
+        seconds=_seconds(scene, recipe, start, splats, rasterizer_speed(backend)),
         budget=() if budget is None else budget_overrides(recipe, budget),
     )
 
 
-# -- splats and memory -------------------------------------------------------------------------------------------------
-def start_of(scene: Scene, recipe: Recipe) -> int:
-    """Return the number of splats that training starts from, about.
+# -- splats ------------------------------------------------------------------------------------------------------------
+def initial_splats(scene: Scene, recipe: Recipe) -> int:
+    """Estimate the number of splats that training starts with, to a factor of two for most captures.
 
-    A dense start has a splat for a cell of a swept photograph. Photographs overlap: V of them have as many new cells as
-    the square root of V that do not. About half of the sparse points lie apart from those. It holds within a factor of
-    1.7 for seven of eight captures, and 3.4 for the other.
+    A dense start has one splat per cell of a swept photograph. V overlapping photographs have as many new cells as
+    sqrt(V) photographs that do not overlap. About half of the sparse points are apart from those.
     """
     dense, sparse = recipe.dense_start, 0 if scene.points is None else len(scene.points)
     if dense is None:
@@ -239,109 +243,70 @@ def start_of(scene: Scene, recipe: Recipe) -> int:
 
 
 def expected_splats(recipe: Recipe, start: int) -> Range:
-    """Return the splats at the end of a recipe that starts from so many."""
+    """Estimate the final number of splats of a recipe that starts with ``start`` splats."""
     densifiers = [stage.densify for stage in recipe.stages if stage.densify is not None]
-    times = 0.0
-    for densify in densifiers:
-        if isinstance(densify, GradDensify):
-            times += sum(map(densify.densifies, range(densify.stop)))
-        else:  # a registered densifier decides by itself how often
-            times = math.inf
-    if times == 0:
+    if not densifiers:
         return Range(start, start, start)
-    least, expected, most = (start * min(growth, DOUBLING ** min(times, 10)) for growth in GROWTH)
     limits = [limit for limit in map(limit_of, densifiers) if limit is not None]
-    if limits:
-        least, expected, most = (min(count, max(start, *limits)) for count in (least, expected, most))
-    return Range(least, expected, most)
+    most = max(start, *limits) if limits else math.inf
+    return Range(*(min(start * growth, most) for growth in GROWTH))
 
 
 def limit_of(densify: GradDensify | Densify) -> int | None:
-    """Return the number of splats beyond which a densifier adds none; None: it has no limit."""
+    """Return the number of splats beyond which a densifier adds none; None: no limit."""
     limit = densify.max_splats if isinstance(densify, GradDensify) else densify.options.get("max_splats")
     return None if limit is None else int(limit)
 
 
 def budget_overrides(recipe: Recipe, splats: int) -> tuple[str, ...]:
-    """Return the overrides that limit the splats of a recipe: one for each stage whose densifier takes a limit."""
-    found = []
+    """Return the overrides that limit the splats of a recipe, one for each stage whose densifier has a limit."""
+    fields = {stage.name: "max_splats" for stage in recipe.stages if isinstance(stage.densify, GradDensify)}
     for stage in recipe.stages:
-        if isinstance(stage.densify, GradDensify):
-            found.append(f"{stage.name}.densify.max_splats={splats}")
-        elif stage.densify is not None and "max_splats" in stage.densify.options:
-            found.append(f"{stage.name}.densify.options.max_splats={splats}")
-    return tuple(found)
+        if isinstance(stage.densify, Densify) and "max_splats" in stage.densify.options:
+            fields[stage.name] = "options.max_splats"
+    return tuple(f"{stage}.densify.{field}={splats}" for stage, field in fields.items())
 
 
-def set_words(overrides: Sequence[str]) -> list[str]:
+def set_words(overrides: tuple[str, ...]) -> list[str]:
     """Return overrides as words of a command line."""
     return [word for override in overrides for word in ("--set", override)]
 
 
 def rounded(number: float) -> int:
-    """Return a number to two digits."""
+    """Round a number to two digits."""
     return 0 if number < 1 else int(round(number, 1 - math.floor(math.log10(number))))
 
 
 def _mean_pixels(scene: Scene) -> float:
-    """Return the mean number of pixels of a training photograph."""
     return float(np.mean([view.camera.width * view.camera.height for view in scene.train]))
-
-
-def _memory(fixed: float, splats: Range) -> Range:
-    """Return bytes; a small surface takes half of what a mesh may."""
-    least, expected, most = (fixed + FUSION_BYTES + count * SPLAT_BYTES for count in astuple(splats))
-    return Range(least - FUSION_BYTES / 2, expected, most)
 
 
 # -- time --------------------------------------------------------------------------------------------------------------
 def iteration_costs(recipe: Recipe) -> tuple[tuple[int, float], ...]:
-    """Return runs of iterations of a recipe, with the fraction of pixels that its photographs have there."""
+    """Return consecutive numbers of iterations with the fraction of pixels that their images have."""
     each = (1 / stage.downscale_at(i) ** 2 for stage in recipe.stages for i in range(1, stage.iterations + 1))
     return tuple((sum(1 for _ in run), cost) for cost, run in itertools.groupby(each))
 
 
-def full_iterations(recipe: Recipe) -> float:
-    """Return the iterations of a recipe, each counted as the fraction of pixels that its photographs have."""
-    return sum(count * cost for count, cost in iteration_costs(recipe))
-
-
-def training_work(scene: Scene, recipe: Recipe, splats: float) -> float:
-    """Return the work of all iterations with so many splats on average, and of the removal of floaters, in units."""
-    work = PIXEL_WORK * _mean_pixels(scene) * full_iterations(recipe) + SPLAT_WORK * splats * recipe.iterations
-    if recipe.removal is None:
-        return work
-    each = [(stage, i) for stage in recipe.stages for i in range(1, stage.iterations + 1)]
-    looks = sum(looks_at_free_space(recipe, *at) for at in each)
-    parts = sum(ends_part(recipe, *at) for at in each)
-    views, swept = len(scene.train), min(len(scene.train), (recipe.dense_start or DenseStart()).max_views)
-    trials = (parts + min(looks, TRIALS_BETWEEN)) * min(1.0, views / MAX_WITNESSES)
-    work += trials * TRIAL_ITERATIONS * _iteration_work(scene, splats)
-    return work + splats * (LOOK_WORK * looks * swept + SEEN_WORK * parts * views)
-
-
-def _iteration_work(scene: Scene, splats: float) -> float:
-    """Return the work of an iteration on photographs of full size, in units."""
-    return PIXEL_WORK * _mean_pixels(scene) + SPLAT_WORK * splats
-
-
-def _seconds(scene: Scene, recipe: Recipe, start: int, splats: Range, unit: float) -> tuple[Range, Range]:
-    """Return the seconds of training, and of everything: the dense start before and the mesh after it."""
-    before = 0.0
-    if (dense := recipe.dense_start) is not None:
-        swept = min(len(scene.train), dense.max_views)
-        before = SWEEP_WORK * swept * _mean_pixels(scene) / sweep_downscale(scene, dense) ** 2
-    training, whole = [], []
-    for count, doubt in zip(astuple(splats), (1 / DOUBT, 1.0, DOUBT), strict=True):
-        trained = training_work(scene, recipe, (start + 3 * count) / 4)  # most splats are added in the first half
-        after = FINISH_ITERATIONS * len(scene.views) * _iteration_work(scene, count)
-        training.append(trained * unit * doubt)
-        whole.append((FIXED_SECONDS + (before + trained + after) * unit) * doubt)
-    return Range(*training), Range(*whole)
+def _seconds(scene: Scene, recipe: Recipe, start: int, splats: Range, unit: float) -> Range:
+    """Estimate the seconds of a run; ``unit`` is the result of :func:`rasterizer_speed`."""
+    pixels, dense = _mean_pixels(scene), recipe.dense_start
+    swept = min(len(scene.train), (dense or DenseStart()).max_views)
+    full_size = sum(count * cost for count, cost in iteration_costs(recipe))
+    before = 0.0 if dense is None else SWEEP_WORK * swept * pixels / sweep_downscale(scene, dense) ** 2
+    seconds = []
+    for final, factor in zip(splats, (1 / UNCERTAINTY, 1.0, UNCERTAINTY), strict=True):
+        count = (start + 3 * final) / 4  # most splats are added in the first half
+        work = before + PIXEL_WORK * pixels * full_size + SPLAT_WORK * count * recipe.iterations
+        if recipe.removal is not None:
+            work += (REMOVAL_WORK[0] + REMOVAL_WORK[1] * recipe.iterations) * count * swept
+        work += FINISH_ITERATIONS * len(scene.views) * (PIXEL_WORK * pixels + SPLAT_WORK * final)
+        seconds.append((FIXED_SECONDS + work * unit) * factor)
+    return Range(*seconds)
 
 
 def rasterizer_speed(backend: Backend) -> float:
-    """Measure a unit of work, seconds: rendering, forwards and backwards, of a pixel of random splats.
+    """Measure a unit of work in seconds: a pixel of random splats, rendered forwards and backwards.
 
     There is a splat for four pixels, with a standard deviation of 1.5 px.
     """

@@ -1,4 +1,4 @@
-"""Open a capture for training: choose its protocol, the image size that fits into memory, and the backend."""
+"""Open a capture for training: choose its protocol, image size and backend."""
 
 from __future__ import annotations
 
@@ -9,19 +9,23 @@ import numpy as np
 import torch
 
 from gs2d.config.protocols import Protocol, get_protocol, protocol_for
+from gs2d.core.json_files import read_json
 from gs2d.data import Scene, detect_format, load_scene
 from gs2d.data.known_captures import protocol_of
 from gs2d.data.load import reader_of
 from gs2d.data.masks import EMPTY, Masks
 from gs2d.data.scene import PointCloud, View
-from gs2d.errors import ProtocolError
+from gs2d.errors import DataError, ProtocolError
 from gs2d.io.run_dir import RunFolder, is_run
 from gs2d.pipeline.prepare.limits import check_memory, least_downscale
 from gs2d.pipeline.prepare.options import TrainOptions
+from gs2d.pipeline.prepare.quality import QualityLevel, quality_level
 from gs2d.render.backends import Backend, backend_report, get_backend
+from gs2d.sfm.workspace import POSES_JSON
 from gs2d.training.events import Event, Notice, OnEvent
 
 SHOWN_SKIPS = 3
+FEW = 24  # photographs found by `gs2d poses`; with fewer, all are needed for the surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,15 +34,20 @@ class OpenCapture:
 
     Attributes
     ----------
-    scene, protocol, backend
+    scene : Scene
+    protocol : Protocol
+    backend : Backend
     downscale : int
-        By which the photographs are smaller than their files.
+        Factor by which the photographs are smaller than their files.
+    quality : QualityLevel or None
+        Training length, where the options do not set it; None: the whole recipe.
     """
 
     scene: Scene
     protocol: Protocol
     backend: Backend
     downscale: int
+    quality: QualityLevel | None = None
 
 
 def open_capture(options: TrainOptions, on_event: OnEvent) -> OpenCapture:
@@ -49,17 +58,17 @@ def open_capture(options: TrainOptions, on_event: OnEvent) -> OpenCapture:
     protocol = choose_protocol(options.protocol, options.scene, scene_format, on_event)
     if options.test_every is not None:
         protocol = replace(protocol, test_every=options.test_every)
-    downscale, scene = scene_that_fits(options, scene_format, protocol, backend, on_event)
+    elif options.protocol == "auto" and _has_few_photographs(options.scene):
+        protocol = replace(protocol, test_every=0)
+    quality = quality_level(options.quality, is_data_set=not protocol.robust, on_host=backend.on_host)
+    downscale, scene = _load_shrunk(options, scene_format, protocol, backend, quality, on_event)
     if options.test_every is not None and scene.own_split:
-        raise ProtocolError(
-            f"--test-every is for captures without a split of their own, got {options.scene}, which has one; "
-            "leave it out"
-        )
-    return OpenCapture(scene, with_masks(protocol, scene, on_event), backend, downscale)
+        raise ProtocolError(f"--test-every: {options.scene} has a split of its own; leave the option out")
+    return OpenCapture(scene, with_masks(protocol, scene, on_event), backend, downscale, quality)
 
 
 def capture_in_memory(scene: Scene, protocol: str | Protocol, backend: str, on_event: OnEvent) -> OpenCapture:
-    """Choose backend and protocol for a capture that is loaded already."""
+    """Choose backend and protocol for a capture that is already loaded."""
     chosen = choose_backend(backend, on_event)
     rules = choose_protocol(protocol, scene.root or Path("."), scene.format, on_event)
     return OpenCapture(scene, with_masks(rules, scene, on_event), chosen, downscale=1)
@@ -71,24 +80,24 @@ def choose_protocol(named: str | Protocol, path: Path, scene_format: str, on_eve
         return get_protocol(named) if isinstance(named, str) else named
     protocol = protocol_of(path, scene_format)
     if protocol is not protocol_for(scene_format):
-        on_event(Notice(f"protocol {protocol.name}: {path.name} is a scene of that data set", detail=True))
+        on_event(Notice(f"protocol {protocol.name}: {path.name} belongs to that data set", detail=True))
     return protocol
 
 
 def choose_backend(name: str, on_event: OnEvent) -> Backend:
-    """Return the backend of a name; say what "auto" took if that is a GPU, not one that is here, or the reference."""
+    """Return the backend of a name; report the choice of "auto", and why a faster backend cannot run."""
     backend = get_backend(name)
     if name != "auto":
         return backend
-    report = backend_report()  # best first: all before the one that was taken cannot run
-    taken = [status.name for status in report].index(backend.name)
+    report = backend_report()  # best first: those before the chosen one cannot run
+    chosen = [status.name for status in report].index(backend.name)
     if not backend.on_host:
-        on_event(Notice(f"training on {report[taken].details} (--backend cpu for the processor)", detail=True))
+        on_event(Notice(f"training on {report[chosen].details} (--backend cpu for the CPU)", detail=True))
     elif torch.version.cuda is not None and torch.cuda.device_count() > 0:
         on_event(Notice(f"training without the GPU: {report[0].reason}; {report[0].remedy}"))
     if backend.slow:
-        better = report[taken - 1]
-        on_event(Notice(f"training with a slow backend, {backend.name}: {better.reason}; {better.remedy}"))
+        better = report[chosen - 1]
+        on_event(Notice(f"training with the slow backend {backend.name}: {better.reason}; {better.remedy}"))
     return backend
 
 
@@ -100,7 +109,7 @@ def read_scene(
     on_event: OnEvent,
     masks: Masks = Masks(),  # noqa: B008 (frozen)
 ) -> Scene:
-    """Load a capture and tell what was decided or skipped."""
+    """Load a capture and report what was decided or skipped."""
     chosen = masks.options()
     scene = load_scene(path, format=scene_format, downscale=downscale, test_every=protocol.test_every, **chosen)
     for text in scene.notes:
@@ -108,60 +117,83 @@ def read_scene(
     for text in scene.details:
         on_event(Notice(text, detail=True))
     if scene.skipped:
-        on_event(Notice(_about_skipped(scene), is_warning=True))
+        on_event(Notice(_skipped_line(scene), is_warning=True))
     return scene
 
 
-def scene_that_fits(
-    options: TrainOptions, scene_format: str, protocol: Protocol, backend: Backend, on_event: OnEvent
+def _load_shrunk(
+    options: TrainOptions,
+    scene_format: str,
+    protocol: Protocol,
+    backend: Backend,
+    quality: QualityLevel | None,
+    on_event: OnEvent,
 ) -> tuple[int, Scene]:
-    """Load a capture, and by what it is shrunk: as asked for, as the run was begun, or as much as memory needs.
+    """Load a capture at its downscale: that of the options, of the resumed run, or by quality and memory.
 
     Raises
     ------
     DataError
-        At the downscale that was asked for it cannot be trained in the memory there is, or at none.
+        If training at the requested downscale, or at any, does not fit into memory.
     """
     masks = Masks(options.masks, options.masked)
-    fixed = options.downscale or _begun_with(options)
-    said: list[Event] = []
-    scene = read_scene(options.scene, scene_format, fixed or 1, protocol, said.append, masks)
-    fitting, need = (1, "") if fixed else least_downscale(scene, 1, on_host=backend.on_host)
-    if fitting is not None and fitting > 1:
-        said = [Notice(f"{need}: they are shrunk by {fitting}, as by --downscale {fitting}")]
-        scene = read_scene(options.scene, scene_format, fitting, protocol, said.append, masks)
-    for event in said:
+    downscale = options.downscale or _downscale_of_resumed(options)
+    notices: list[Event] = []
+    scene = read_scene(options.scene, scene_format, downscale or 1, protocol, notices.append, masks)
+    if downscale is None:
+        downscale = 1 if quality is None else quality.downscale([view.camera for view in scene.views])
+        if downscale > 1:
+            notices.clear()
+            scene = read_scene(options.scene, scene_format, downscale, protocol, notices.append, masks)
+        fitting, need = least_downscale(scene, downscale, on_host=backend.on_host)
+        if fitting is not None and fitting > downscale:
+            downscale = fitting
+            notices[:] = [Notice(f"{need}: they are shrunk by {fitting}, as by --downscale {fitting}")]
+            scene = read_scene(options.scene, scene_format, fitting, protocol, notices.append, masks)
+    for event in notices:
         on_event(event)
-    check_memory(scene, fixed or fitting or 1, on_host=backend.on_host)
-    return fixed or fitting or 1, scene
+    check_memory(scene, downscale, on_host=backend.on_host)
+    return downscale, scene
 
 
-def _begun_with(options: TrainOptions) -> int | None:
-    """Return the downscale of the run that is resumed; None if there is none or it was not recorded."""
+def _has_few_photographs(capture: Path) -> bool:
+    """Return whether `gs2d poses` made the capture and placed fewer than ``FEW`` photographs."""
+    path = capture / POSES_JSON
+    if not path.is_file():
+        return False
+    try:
+        return int(read_json(path)["placed"]) < FEW
+    except (DataError, LookupError, TypeError, ValueError):  # a file of another program
+        return False
+
+
+def _downscale_of_resumed(options: TrainOptions) -> int | None:
+    """Return the downscale of the run that is resumed; None: there is none, or it was not recorded."""
     if not (options.resume and is_run(options.out)):
         return None
     begun = RunFolder(options.out).definition().get("downscale")
     return begun if isinstance(begun, int) and begun >= 1 else None
 
 
-def _about_skipped(scene: Scene) -> str:
-    """Return one line about the views that are left out: how many, and which for each reason."""
+def _skipped_line(scene: Scene) -> str:
+    """Return one line about skipped photographs: how many, and which for each reason."""
     reasons: dict[str, list[tuple[str, str]]] = {}
     for line in scene.skipped:
         name, _, reason = line.partition(": ")
         reasons.setdefault(reason.partition("; ")[0], []).append((name, reason))
     parts = []
-    for found in reasons.values():
-        names = ", ".join(name for name, _ in found[:SHOWN_SKIPS])
-        more = f" and {len(found) - SHOWN_SKIPS} more" if len(found) > SHOWN_SKIPS else ""
-        parts.append(f"{names}{more}: {found[0][1]}")
-    wholes = len({view.path or view.name for view in scene.views})
-    count = f"{len(scene.skipped)} of {len(scene.skipped) + wholes} photographs are left out"
+    for skipped in reasons.values():
+        names = ", ".join(name for name, _ in skipped[:SHOWN_SKIPS])
+        more = f" and {len(skipped) - SHOWN_SKIPS} more" if len(skipped) > SHOWN_SKIPS else ""
+        parts.append(f"{names}{more}: {skipped[0][1]}")
+    used = len({view.path or view.name for view in scene.views})
+    count = f"{len(scene.skipped)} of {len(scene.skipped) + used} photographs are left out"
     return f"{count} (`gs2d info` lists them): {'; '.join(parts)}"
 
 
+# -- masks -------------------------------------------------------------------------------------------------------------
 def with_masks(protocol: Protocol, scene: Scene, on_event: OnEvent) -> Protocol:
-    """Return the protocol under which the scene's masks are what the user says; one that passes them over is told."""
+    """Return the protocol with masks used as requested; report masks that the protocol ignores."""
     masks = scene.masks
     if not masks.found or masks.masked == EMPTY or protocol.use_mask_in_training:
         return protocol
@@ -172,14 +204,12 @@ def with_masks(protocol: Protocol, scene: Scene, on_event: OnEvent) -> Protocol:
 
 
 def without_masked_points(scene: Scene, protocol: Protocol, on_event: OnEvent) -> Scene:
-    """Return the scene without the sparse points that training photographs show in masked pixels alone.
+    """Return the scene without the sparse points that are visible in masked pixels only.
 
-    Nothing would ever move or prune splats there.
+    Splats there would have no gradients and would never be pruned.
     """
     points, masks = scene.points, scene.masks
-    if not masks.found or points is None:
-        return scene
-    if masks.masked != EMPTY and not protocol.use_mask_in_training:
+    if not masks.found or points is None or (masks.masked != EMPTY and not protocol.use_mask_in_training):
         return scene
     observed = scene.observed()
     if observed is None or len(observed.points) != len(points):
@@ -192,30 +222,25 @@ def without_masked_points(scene: Scene, protocol: Protocol, on_event: OnEvent) -
         shown = _kept_pixels(view)
         pixels, depth = view.camera.project(observed.points[rows])
         with np.errstate(invalid="ignore"):
-            column, row = (
-                np.floor(pixels[:, k]).clip(0, size - 1) for k, size in ((0, shown.shape[1]), (1, len(shown)))
-            )
-        there = (depth > 0) & np.isfinite(pixels).all(axis=1)
-        keeps = shown[row[there].astype(np.int64), column[there].astype(np.int64)]
-        np.add.at(kept, rows[there][keeps], 1)
-        np.add.at(masked, rows[there][~keeps], 1)
+            column = np.floor(pixels[:, 0]).clip(0, shown.shape[1] - 1)
+            row = np.floor(pixels[:, 1]).clip(0, len(shown) - 1)
+        inside = (depth > 0) & np.isfinite(pixels).all(axis=1)
+        keeps = shown[row[inside].astype(np.int64), column[inside].astype(np.int64)]
+        np.add.at(kept, rows[inside][keeps], 1)
+        np.add.at(masked, rows[inside][~keeps], 1)
     out = (masked > 0) & (kept == 0)
     if not out.any() or out.all():
         return scene
-    line = f"{int(out.sum()):,} of {len(points):,} sparse points lie in masked pixels alone: left out"
+    line = f"{int(out.sum()):,} of {len(points):,} sparse points are in masked pixels only: left out"
     on_event(Notice(line, detail=True))
-    return replace(scene, points=_rows(points, ~out))
+    arrays = (None if a is None else a[~out] for a in (points.colors, points.normals, points.sizes))
+    return replace(scene, points=PointCloud(points.points[~out], *arrays))
 
 
 def _kept_pixels(view: View) -> np.ndarray:
-    """Return where a mask keeps a photograph, [H, W] bool; the rim that undistortion leaves counts as kept."""
+    """Return the pixels that a mask keeps, [H, W] bool; the border that undistortion leaves counts as kept."""
     kept = np.ones((view.camera.height, view.camera.width), dtype=bool)
     mask, valid, alpha = view.mask(), view.valid(), view.alpha()
     if mask is not None:
         kept &= mask if valid is None else mask | ~valid
     return kept if alpha is None else kept & (alpha >= 0.5)
-
-
-def _rows(points: PointCloud, rows: np.ndarray) -> PointCloud:
-    colors, normals, sizes = (None if a is None else a[rows] for a in (points.colors, points.normals, points.sizes))
-    return PointCloud(points.points[rows], colors, normals, sizes)

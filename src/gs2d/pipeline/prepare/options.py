@@ -1,7 +1,7 @@
 """Options of each command, for Python and the command line.
 
-`gs2d.cli` makes the command line of these classes: a field is an option, its docstring the help, its default the
-default; `gs2d.config.arguments` has the marks for the rest. Pure Python: `gs2d --help` is instant.
+`gs2d.cli` derives the command line from these classes: a field is an option, its docstring is the help.
+`gs2d.config.arguments` marks what differs. This module imports no torch, so that `gs2d --help` is fast.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from gs2d.config.recipe import Recipe
 from gs2d.errors import RecipeError
 
 Robust = Literal["auto", "on", "off"]
-Quality = Literal["draft", "normal", "full"]
+Quality = Literal["auto", "draft", "normal", "full"]
 LensModel = Literal[
     "auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "EQUIRECTANGULAR"
 ]
@@ -28,21 +28,21 @@ Photos = Annotated[Path, Arg(metavar="PHOTOS", positional=True)]
 
 
 def paths_of(options: object, *names: str) -> None:
-    """Turn the fields of these names that are strings into paths: in Python people write both."""
+    """Convert string values of the named fields to paths."""
     for name in names:
         if isinstance(value := getattr(options, name), str):
             object.__setattr__(options, name, Path(value))
 
 
 def values(kind: type[Any], options: Any) -> dict[str, Any]:
-    """Return the values that ``options`` has for the fields of a class of options, by name."""
+    """Return the values of ``options`` for the fields of a class of options, by name."""
     return {entry.name: getattr(options, entry.name) for entry in fields(kind)}
 
 
-# -- what several verbs share ------------------------------------------------------------------------------------------
+# -- shared by several commands ----------------------------------------------------------------------------------------
 @dataclass(frozen=True, kw_only=True)
 class HowItRuns:
-    """How training runs: options of every verb that trains."""
+    """How training runs: options of every command that trains."""
 
     backend: str = "auto"
     """Rasterizer: auto (the fastest here), cpu, cuda or reference. `gs2d doctor` lists them."""
@@ -58,7 +58,7 @@ class HowItRuns:
 
 @dataclass(frozen=True, kw_only=True)
 class Resources:
-    """What a training may take of the machine."""
+    """Limits of memory and disk."""
 
     memory: Annotated[float | None, Arg(metavar="GIB")] = None
     """Memory limit in GiB (default: half of the memory of this machine or container)."""
@@ -67,6 +67,20 @@ class Resources:
     prepare: Literal["auto", "always", "never"] = "auto"
     """Keep undistorted, shrunk photographs on disk instead of in memory, with the same result. auto: if they do not fit
     into memory."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effort:
+    """Training length and image size, with the same defaults in `gs2d train` and `gs2d reconstruct`."""
+
+    quality: Quality = "auto"
+    """Training length and image size. On a CPU: draft is 1800 iterations at 400 px, normal 6000 at 800 px, full the
+    whole recipe at 1600 px; on a GPU: 6000 at 800 px, 30000 or the whole recipe at 1600 px. auto: normal, except for
+    known data sets: the whole recipe on full-size images."""
+    schedule_scale: float | None = None
+    """Fraction of the iterations of the recipe (default: by --quality)."""
+    downscale: int | None = None
+    """Shrink the photographs by this integer factor (default: by --quality, or more if memory needs it)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +98,8 @@ class CommonTraining:
     no_exposure: bool = False
     """Assume the same exposure for all photographs."""
     test_every: int | None = None
-    """Hold out every N-th view (sorted by name) for testing; 0 trains on all (default: by protocol, usually 8)."""
+    """Hold out every N-th view (sorted by name) for testing; 0 trains on all (default: 8, or by
+    protocol; 0 for captures of `gs2d poses` with fewer than 24 photographs)."""
     depth_prior: Literal["auto", "sparse", "sensor", "relative"] | None = None
     """Train with known depths: sparse points, or sensor or relative maps in depths/. auto: whatever exists."""
     normal_prior: bool = False
@@ -109,12 +124,12 @@ class CommonTraining:
 
     @property
     def learns_exposure(self) -> bool | None:
-        """Whether exposures are learned; None: in robust training where the photographs differ.
+        """Whether exposures are learned; None: in robust training, if the photographs differ.
 
         Raises
         ------
         RecipeError
-            Both are asked for.
+            If both options are set.
         """
         if self.exposure and self.no_exposure:
             raise RecipeError("--exposure and --no-exposure contradict each other, got both; leave one out")
@@ -144,8 +159,8 @@ class Training(CommonTraining):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finding:
-    """How the cameras of photographs are found: options of `gs2d poses`, and of every command that begins with it."""
+class PoseEstimation:
+    """How the cameras of photographs are estimated: options of `gs2d poses` and `gs2d reconstruct`."""
 
     cameras: Literal["auto", "one", "each"] = "auto"
     """Photographs that share a camera: those with equal folder, size, camera, lens and focal length (auto), all, or
@@ -178,26 +193,19 @@ class Finding:
     """Hard-link the photographs instead of copying them."""
 
 
-# -- verbs that make a run ---------------------------------------------------------------------------------------------
+# -- commands that create a run ----------------------------------------------------------------------------------------
 @dataclass(frozen=True, kw_only=True)
-class TrainOptions(Training, Resources, HowItRuns):
-    """One training run. Overrides are applied after the schedule is scaled: a number means what it says."""
+class TrainOptions(Training, Effort, Resources, HowItRuns):
+    """Options of a training run. Overrides are applied after the schedule is scaled."""
 
     scene: Annotated[Path, Arg(metavar="CAPTURE", positional=True)]
     """Folder or .zip of a capture: COLMAP, Blender, nerfstudio, DTU, OpenSfM, OpenDroneMap, Metashape or Meshroom."""
     out: Annotated[Path, Arg(metavar="RUN")]
     """Run folder to create."""
-    quality: Quality | None = None
-    """Training length and image size; a draft takes minutes (default: the full recipe on full-size images, hours on a
-    CPU)."""
     format: str = "auto"
     """Format of the capture: blender, nerfstudio, dtu, colmap, opensfm, metashape, alicevision, or one of a package."""
-    downscale: int | None = None
-    """Shrink the photographs by this integer factor (default: 1, or what fits into memory)."""
     masks: Annotated[Path | None, Arg(metavar="DIR")] = None
     """Folder of masks of the photographs, white = keep (default: where COLMAP, nerfstudio and Metashape put them)."""
-    schedule_scale: float | None = None
-    """Fraction of the iterations of the recipe (default: 1, or by --quality)."""
     init: Annotated[Path | None, Arg(metavar="FILE")] = None
     """Start from the splats of a file (PLY, .spz, .splat, .usd, .glb, .sog) instead of points, in the frame of the
     capture. 3D Gaussians are flattened along their smallest scale."""
@@ -208,15 +216,15 @@ class TrainOptions(Training, Resources, HowItRuns):
 
 @dataclass(frozen=True, kw_only=True)
 class PlanOptions(TrainOptions):
-    """A training that is estimated: it takes the options of `gs2d train`."""
+    """Options of the estimate of a training: those of `gs2d train`."""
 
     out: Annotated[Path, Arg(metavar="RUN")] = Path("RUN")
     """Run folder of the training; nothing is written."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class PosesOptions(Finding):
-    """One run of structure from motion."""
+class PosesOptions(PoseEstimation):
+    """Options of structure from motion."""
 
     photos: Photos
     """Folder of photographs, or a video. It is only read."""
@@ -234,25 +242,18 @@ class PosesOptions(Finding):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReconstructOptions(Resources, HowItRuns):
-    """From photographs to a mesh."""
+class ReconstructOptions(Effort, Resources, HowItRuns):
+    """Options of a reconstruction, from photographs to a mesh."""
 
     photos: Photos
     """Folder of photographs, or a video. It is only read."""
     out: Annotated[Path, Arg(metavar="RUN")]
     """Run folder to create. Photographs and cameras go to its sub-folder `capture`."""
-    quality: Quality = "normal"
-    """Training length and image size. On a CPU: 1800 iterations at 400 px, 6000 at 800 px, the full recipe at 1600 px;
-    on a GPU: 6000 at 800 px, 30000 or the full recipe at 1600 px."""
-    schedule_scale: float | None = None
-    """Fraction of the iterations of the recipe (default: by --quality)."""
-    downscale: int | None = None
-    """Shrink the photographs by this integer factor (default: by --quality)."""
     texture: bool = False
     """Also write mesh.glb, textured from the photographs."""
     training: Training = field(default_factory=Training)
     """As in `gs2d train`."""
-    finding: Finding = field(default_factory=Finding)
+    finding: PoseEstimation = field(default_factory=PoseEstimation)
     """As in `gs2d poses`."""
 
     def __post_init__(self) -> None:
@@ -261,14 +262,14 @@ class ReconstructOptions(Resources, HowItRuns):
 
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions(HowItRuns):
-    """Where and how a synthetic capture is made and trained."""
+    """Options of the demo."""
 
     out: Path = Path("runs/demo")
     """Run folder; an earlier demo there is replaced."""
     recipe: str | Recipe = DEFAULT_RECIPE
     """Recipe. `gs2d recipes` lists them."""
     schedule_scale: float | None = None
-    """Fraction of the iterations of the recipe (default: 0.2, two minutes on two cores)."""
+    """Fraction of the iterations of the recipe (default: 0.15, two minutes on two cores)."""
     vary_exposure: bool = False
     """Vary exposure and white balance of the training images."""
     exposure: bool = False
@@ -292,10 +293,10 @@ class DemoOptions(HowItRuns):
         paths_of(self, "out")
 
 
-# -- verbs on a run that is there --------------------------------------------------------------------------------------
+# -- commands that need a finished run ---------------------------------------------------------------------------------
 @dataclass(frozen=True, kw_only=True)
 class MeshOptions:
-    """How the surface is extracted; what is None is derived from the scene or taken from the run's protocol."""
+    """How the surface is extracted. None: derived from the scene, or taken from the protocol of the run."""
 
     voxel: float | None = None
     """Voxel size in world units (default: from the scene)."""
@@ -321,14 +322,12 @@ class MeshOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class TextureOptions:
-    """How the mesh gets its texture."""
+    """How the mesh is textured."""
 
     faces: int = 50_000
     """With --texture: simplify a larger mesh to this number of triangles."""
     texture_size: int | None = None
     """With --texture: side of the texture in texels (default: two per image pixel, at most 4096)."""
-    texture_from: Literal["photographs", "renders"] = "photographs"
-    """With --texture: take colours from the photographs or from renderings."""
     texture_downscale: int | None = None
     """With --texture: shrink the photographs by this integer factor (default: as in training)."""
 
@@ -349,8 +348,6 @@ class RenderOptions:
     """With --orbit or --flight: also write a video, .mp4 (H.264, needs ffmpeg) or .webp."""
     fps: float = 30.0
     """Frames per second of the video."""
-    exposure_of: Annotated[str | None, Arg(metavar="PHOTOGRAPH")] = None
-    """Render in the learned exposure of this training photograph (default: the mean exposure)."""
 
     def __post_init__(self) -> None:
         paths_of(self, "video")
@@ -358,7 +355,7 @@ class RenderOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateOptions:
-    """What is measured."""
+    """What `gs2d evaluate` measures."""
 
     ground_truth: Annotated[Path | None, Arg(metavar="MESH_OR_POINTS")] = None
     """True surface (PLY or OBJ) in the frame of the capture, or the official folder of DTU or Tanks and Temples."""

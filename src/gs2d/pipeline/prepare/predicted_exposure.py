@@ -1,10 +1,9 @@
-"""The exposure that a view nobody photographed would have: what photographs nearby say, and what the camera would see.
+"""Predict the exposure of views without a photograph, from neighbouring photographs and the brightness of the view.
 
-A camera on automatic chooses by what it sees. So photographs of nearly the same view have nearly the same exposure, and
-a view on which more light falls has a shorter one: over the training photographs, the logarithm of an exposure falls in
-a straight line with that of the scene's brightness in its picture. How far either holds is asked of the training
-photographs themselves, each predicted from the others (leave one out): where neighbours say nothing, the prediction is
-the mean exposure, and where brightness says nothing beyond them, it is left out. No test photograph is looked at.
+Automatic cameras give similar views similar exposures, and bright views shorter ones: the logarithm of the exposure
+falls linearly with that of the brightness of the rendered scene. Both predictors are weighted by how well they predict
+each training photograph from the others (leave one out); without any gain the prediction is the mean exposure. Test
+photographs are not used.
 """
 
 from __future__ import annotations
@@ -23,21 +22,21 @@ from gs2d.render.backends import Backend
 from gs2d.render.exposure_transform import identity
 from gs2d.render.types import RasterSettings
 
-NEIGHBOURS = 5  # training photographs that a prediction is made of
-CLOSE = 0.02  # added to distances, in extents: poses are never quite the same, and one photograph is no mean
+NEIGHBOURS = 5  # training photographs used by a prediction
+CLOSE = 0.02  # added to distances, in extents
 GREY = 0.5
-WORTH = 0.9  # brightness is believed where what it leaves unsaid (variance) is less than that of what neighbours do
-ENOUGH = 8  # training photographs, for a line of two numbers to be more than chance
-METERED = 256  # px of the longer side of a picture whose brightness is looked at; smaller ones widen thin splats
+MAX_VARIANCE = 0.9  # brightness is used if its residual variance is below this times that of neighbours
+ENOUGH = 8  # training photographs to fit a line
+METERED = 256  # px, longer side of the rendering that is metered; smaller ones widen thin splats
 LUMA = (0.299, 0.587, 0.114)
-DARK = 0.02  # added to a brightness: a picture of nothing has a logarithm too
+DARK = 0.02  # added to a brightness before its logarithm
 LEAST_GAIN = 0.05
 
 Brightness = Callable[[View], float]
 
 
 def metered(splats: Splats, settings: RasterSettings, backend: Backend) -> Brightness:
-    """Return a function that tells how bright the scene is in a view: the mean of its picture, in the mean exposure."""
+    """Return a function that measures the brightness of a view: the mean of its rendering in the mean exposure."""
 
     def brightness(view: View) -> float:
         camera = view.camera
@@ -52,21 +51,21 @@ def metered(splats: Splats, settings: RasterSettings, backend: Backend) -> Brigh
 
 
 def with_predicted(scene: Scene, brightness: Brightness | None = None) -> Scene:
-    """Return a scene whose test views have predicted exposures; as it is where training views have none.
+    """Return a scene with predicted exposures of test views; unchanged if training views have none.
 
     Parameters
     ----------
     scene : Scene
-        With what was learned of its training views.
+        With the learned appearance of its training views.
     brightness : callable, optional
-        How bright the scene is in a view (:func:`metered`); without it neighbours alone decide.
+        See :func:`metered`; without it only neighbours are used.
     """
     if not scene.test or any("exposure" not in view.appearance for view in scene.train):
         return scene
     cameras = [view.camera for view in scene.train]
     offsets = torch.from_numpy(np.stack([view.appearance["exposure"] for view in scene.train]))
     offsets = offsets - identity(offsets)
-    greys = (GREY * offsets[:, :, :3].sum(dim=2) + offsets[:, :, 3]).mean(dim=1).numpy()  # [V] what grey gains
+    greys = (GREY * offsets[:, :, :3].sum(dim=2) + offsets[:, :, 3]).mean(dim=1).numpy()  # [V] offset of grey
     around = np.stack([_weights(camera, cameras, scene.extent, without=i) for i, camera in enumerate(cameras)])
     trust = _trust(around @ greys, greys)
     meter = None
@@ -87,22 +86,22 @@ def with_predicted(scene: Scene, brightness: Brightness | None = None) -> Scene:
 
 @dataclass(frozen=True)
 class _Meter:
-    """A camera's automatic: log gain = level + slope (log brightness - middle), and what neighbours have beside it."""
+    """Automatic exposure: log gain = level + slope (log brightness - middle), plus residuals of neighbours."""
 
     level: float
     slope: float
     middle: float
-    beside: np.ndarray  # [V] log gains of the training views less the line
-    trust: float  # in what neighbours have beside it
+    residuals: np.ndarray  # [V] log gains minus the line, of the training views
+    trust: float  # in the residuals of neighbours
 
     def gain(self, brightness: float, weights: np.ndarray) -> float:
-        """Return the gain of a view so bright, whose neighbours have weights [V]."""
+        """Return the gain of a view from its brightness and the weights [V] of its neighbours."""
         line = self.level + self.slope * (np.log(max(brightness, 0.0) + DARK) - self.middle)
-        return float(np.exp(line + self.trust * (weights @ self.beside)))
+        return float(np.exp(line + self.trust * (weights @ self.residuals)))
 
     @classmethod
     def fitted(cls, brightness: np.ndarray, gains: np.ndarray, around: np.ndarray, trust: float) -> _Meter | None:
-        """Return the line of training views, or None where it predicts no better than neighbours alone.
+        """Fit the line to training views; None if it predicts no better than neighbours alone.
 
         Parameters
         ----------
@@ -110,7 +109,7 @@ class _Meter:
         around : ndarray [V, V]
             Weights of the others in a prediction of each.
         trust : float
-            In what neighbours say without it.
+            In neighbours alone.
         """
         x, y = np.log(np.maximum(brightness, 0.0) + DARK), np.log(np.maximum(gains, LEAST_GAIN))
         middle, level = float(x.mean()), float(y.mean())
@@ -119,23 +118,23 @@ class _Meter:
             return None
         slope = min(0.0, float(((x - middle) * (y - level)).sum()) / spread)  # more light: a shorter exposure
         leverage = 1 / len(x) + (x - middle) ** 2 / spread
-        beside = y - level - slope * (x - middle)
-        left_out = beside / np.maximum(1 - leverage, 1e-6)  # of each view, from the line of the others
-        own = _trust(around @ beside, beside)
-        unsaid = np.mean((left_out - own * (around @ beside)) ** 2)
+        residuals = y - level - slope * (x - middle)
+        left_out = residuals / np.maximum(1 - leverage, 1e-6)  # from the line fitted to the other views
+        own = _trust(around @ residuals, residuals)
+        residual = np.mean((left_out - own * (around @ residuals)) ** 2)
         by_neighbours = np.mean((y - trust * (around @ y)) ** 2)
-        return cls(level, slope, middle, beside, own) if unsaid < WORTH * by_neighbours else None
+        return cls(level, slope, middle, residuals, own) if residual < MAX_VARIANCE * by_neighbours else None
 
 
 def _trust(predicted: np.ndarray, found: np.ndarray) -> float:
-    """How much of a prediction to believe, in [0, 1]: the least-squares factor over training views, each left out."""
+    """Return the least-squares factor of a prediction over training views, each left out, clipped to [0, 1]."""
     if len(found) < 3:
         return 0.0
     return float(np.clip((predicted @ found) / max(predicted @ predicted, 1e-12), 0.0, 1.0))
 
 
 def _weights(camera: Camera, cameras: Sequence[Camera], extent: float, *, without: int | None = None) -> np.ndarray:
-    """Weights [V] of the training views in a prediction; they sum to 1."""
+    """Return the weights [V] of the training views in a prediction; they sum to 1."""
     if len(cameras) == 1 and without is not None:
         return np.zeros(1)
     centers = np.stack([other.center for other in cameras])

@@ -1,4 +1,4 @@
-"""What is trained, and on what: options and the capture become a recipe, a protocol, a scene and a backend."""
+"""Resolve options and a capture into the recipe, protocol and scene that are trained."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from gs2d.config.recipe import Recipe, validate
 from gs2d.config.robust import FEW_VIEWS
 from gs2d.config.schedule import fit_schedule, longer_steps, scale_schedule
 from gs2d.config.serialize import apply_overrides
-from gs2d.data import Scene, load_scene
+from gs2d.data import Scene
 from gs2d.data.subject_box import check_subject_box
 from gs2d.errors import ProtocolError, RecipeError
 from gs2d.losses.api import losses_of
 from gs2d.pipeline.prepare.open_capture import OpenCapture, without_masked_points
 from gs2d.pipeline.prepare.options import Training, TrainOptions
-from gs2d.pipeline.prepare.photographs import HOW
-from gs2d.pipeline.prepare.quality import quality_of
+from gs2d.pipeline.prepare.photographs import PREPARE
+from gs2d.pipeline.prepare.quality import check_quality
 from gs2d.training.backdrop import find_backdrop
 from gs2d.training.events import Notice, OnEvent
 from gs2d.training.point_gains import point_gains
@@ -35,7 +35,7 @@ from gs2d.training.robust import check_free_space
 
 MAX_VIEWS = 1_000_000
 ROBUST = ("auto", "on", "off")
-DIFFERS = 0.03  # standard deviation of the logarithm of gains from which photographs are said to differ in exposure
+DIFFERS = 0.03  # standard deviation of the logarithm of gains; more: the exposures of the photographs differ
 
 
 def recipe_of(recipe: str | Recipe) -> Recipe:
@@ -55,7 +55,7 @@ def build_recipe(
     robust: bool = False,
     exposure: bool = False,
 ) -> Recipe:
-    """Return the recipe as it is trained: with what the options add, scaled, seeded, overridden and validated.
+    """Return the trained recipe: with the additions of the options, scaled, seeded, overridden and validated.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def build_recipe(
     iterations : int, optional
         Total iterations, instead of ``schedule_scale``.
     robust, exposure : bool
-        Whether training is robust, and learns exposures; the options may leave both to the capture.
+        Whether training is robust, and whether it learns exposures.
     """
     value = recipe_of(training.recipe)
     value = with_exposure(value) if exposure else value
@@ -102,24 +102,24 @@ def build_recipe(
 
 
 def check_options(options: TrainOptions) -> None:
-    """Refuse options that mean nothing, before anything is read."""
+    """Raise for invalid options, before anything is read."""
     if options.robust not in ROBUST:
         raise RecipeError(f"--robust must be one of {', '.join(ROBUST)}, got {options.robust}")
-    expected_recipe(options)
+    check_quality(options.quality)
+    scale = 1.0 if options.schedule_scale is None else options.schedule_scale
+    robust, exposure = options.robust != "off", bool(options.learns_exposure)
+    build_recipe(options, seed=options.seed, schedule_scale=scale, robust=robust, exposure=exposure)
     check_execution(options)
     if options.test_every is not None and options.test_every not in (0, *range(2, MAX_VIEWS)):
-        raise ProtocolError(
-            f"--test-every must be 0 (all views train) or a whole number >= 2 (every n-th is a test view), got "
-            f"{options.test_every}"
-        )
+        raise ProtocolError(f"--test-every must be 0 (no test views) or at least 2, got {options.test_every}")
     if isinstance(options.protocol, str) and options.protocol != "auto":
         get_protocol(options.protocol)
 
 
 def check_execution(options: TrainOptions) -> None:
-    """Refuse options that mean nothing, of those that do not choose the recipe and the protocol."""
+    """Raise for invalid options that choose neither recipe nor protocol."""
     if options.init is not None and options.start_from is not None:
-        raise RecipeError("--init starts from splats, --from takes finished stages of another run, got both; give one")
+        raise RecipeError("--init and --from exclude each other: both set the start of training; leave one out")
     if options.downscale is not None and options.downscale < 1:
         raise RecipeError(f"--downscale must be a whole number >= 1, got {options.downscale}")
     if options.checkpoint_every < 1:
@@ -128,44 +128,18 @@ def check_execution(options: TrainOptions) -> None:
         raise RecipeError(f"--checkpoint-seconds must be a positive number, got {options.checkpoint_seconds}")
     if options.stage2_cache_mb < 0:
         raise RecipeError(f"--stage2-cache-mb must be a whole number >= 0, got {options.stage2_cache_mb}")
-    if options.prepare not in HOW:
-        raise RecipeError(f"--prepare must be one of {', '.join(HOW)}, got {options.prepare}")
+    if options.prepare not in PREPARE:
+        raise RecipeError(f"--prepare must be one of {', '.join(PREPARE)}, got {options.prepare}")
     if options.disk is not None and not options.disk > 0:
         raise RecipeError(f"--disk must be a positive number of GiB, got {options.disk}")
     check_subject_box(options.subject_box, {"--scene": options.whole_scene})
 
 
-def expected_recipe(options: TrainOptions) -> Recipe:
-    """Return the recipe that options ask for, as far as it is known before the capture is read."""
-    robust, exposure = options.robust != "off", bool(options.learns_exposure)
-    scale = schedule_scale_of(options)
-    return build_recipe(options, seed=options.seed, schedule_scale=scale, robust=robust, exposure=exposure)
-
-
-def schedule_scale_of(options: TrainOptions) -> float:
-    """Return the fraction of the schedule that is trained: the given one, or that of the quality."""
-    if options.quality is None:
-        return 1.0 if options.schedule_scale is None else options.schedule_scale
-    quality = quality_of(options.quality, options.backend)
-    scale = options.schedule_scale
-    return quality.schedule_scale(recipe_of(options.recipe)) if scale is None else scale
-
-
-def by_quality(options: TrainOptions, on_event: OnEvent) -> TrainOptions:
-    """Return options with the schedule and the image size of their quality; a given schedule or size stays."""
-    if options.quality is None:
-        return options
-    cameras = [view.camera for view in load_scene(options.scene, format=options.format, test_every=0).views]
-    scale, downscale = schedule_scale_of(options), options.downscale
-    downscale = downscale or quality_of(options.quality, options.backend).downscale(cameras)
-    iterations = expected_recipe(options).iterations
-    shown = max(cameras, key=lambda camera: max(camera.width, camera.height)).downscaled(downscale)
-    line = (
-        f"quality {options.quality}: {iterations:,} iterations (--schedule-scale {scale:g}) "
-        f"on pictures of {shown.width}x{shown.height} (--downscale {downscale})"
-    )
-    on_event(Notice(line, detail=True))
-    return replace(options, schedule_scale=scale, downscale=downscale)
+def schedule_scale_of(options: TrainOptions, capture: OpenCapture) -> float:
+    """Return the trained fraction of the recipe: that of the options, else by quality."""
+    if options.schedule_scale is not None:
+        return options.schedule_scale
+    return 1.0 if capture.quality is None else capture.quality.schedule_scale(recipe_of(options.recipe))
 
 
 def resolve(
@@ -177,14 +151,13 @@ def resolve(
     schedule_scale: float = 1.0,
     iterations: int | None = None,
 ) -> tuple[Recipe, OpenCapture]:
-    """Return the recipe and the capture that are trained; every command decides them here.
+    """Return the recipe and the capture that are trained; the same for all commands.
 
     Parameters
     ----------
     training : Training
     capture : OpenCapture
     on_event : callable
-        Hears what was decided.
     seed, schedule_scale, iterations
         As for :func:`build_recipe`.
     """
@@ -197,62 +170,50 @@ def resolve(
     recipe, protocol = with_backdrop(recipe, capture.protocol, scene, on_event)
     if len(scene.train) <= FEW_VIEWS and (slower := with_few_views(recipe)) != recipe:
         recipe = slower
-        few = f"{len(scene.train)} training photographs"
-        on_event(Notice(f"{few}: SH beyond degree 0 learn as in 2DGS, not faster, and L2 is left out", detail=True))
+        on_event(Notice(f"{len(scene.train)} training photographs: settings against overfitting", detail=True))
     return recipe, replace(capture, scene=scene, protocol=with_fused_depth(protocol, recipe))
 
 
 def robust_and_exposure(training: Training, scene: Scene, protocol: Protocol, on_event: OnEvent) -> tuple[bool, bool]:
-    """Return whether this capture is trained robustly, and with exposures, and say what was decided.
+    """Return whether this capture is trained robustly, and whether exposures are learned.
 
-    Where ``training.robust`` is "auto" it is robust under a protocol that says so, if the capture has sparse points
-    that its photographs show; where ``training.learns_exposure`` is None, exposures are learned if those points say
-    that the photographs differ.
+    ``training.robust`` "auto" is robust if the protocol is and the capture has sparse points with the views that
+    observe them. ``training.learns_exposure`` None learns exposures if the colours of those points vary.
     """
     robust = training.robust == "on" or (training.robust == "auto" and protocol.robust)
     lacks = scene.unobserved() if robust else ""
     if lacks and scene.observed() is not None:
-        on_event(Notice(f"sparse points are projected into the images: {lacks}"))
+        on_event(Notice(f"sparse points are projected into the images: {lacks}", detail=True))
     elif lacks and training.robust == "auto":
         robust = False
-        own = recipe_of(training.recipe).dense_start is not None
-        what = "no known free space" if own else "no dense start and no known free space"
-        on_event(Notice(f"{what}: {lacks}"))
+        on_event(Notice(f"training is not robust: {lacks}"))
     exposure = bool(training.learns_exposure)
     if robust and training.learns_exposure is None and (found := point_gains(scene)) is not None:
         exposure = found.spread >= DIFFERS
         least, most = found.gains.mean(axis=1).min(), found.gains.mean(axis=1).max()
-        what = "learned for each" if exposure else "taken to be one (--exposure learns them)"
+        decision = "one is learned for each" if exposure else "treated as equal (--exposure learns them)"
         on_event(
-            Notice(f"exposures of the photographs: {least:.2f} to {most:.2f} times their mean; {what}", detail=True)
+            Notice(f"exposures of the photographs: {least:.2f} to {most:.2f} times the mean; {decision}", detail=True)
         )
-    if training.response and len({view.file_intrinsics() for view in scene.train}) == 1:
-        on_event(Notice("--response learns by what cameras differ: of one camera, as here, it learns nothing"))
-    faces = sum(view.is_face for view in scene.train)
-    if faces and (training.refine_cameras or training.vignetting):
-        both = (("lenses", training.refine_cameras), ("vignetting", training.vignetting))
-        what = " and ".join(name for name, wanted in both if wanted)
-        on_event(Notice(f"{faces} faces of panoramas or fisheyes: of their {what} nothing is learned"))
     return robust, exposure
 
 
 def with_backdrop(recipe: Recipe, protocol: Protocol, scene: Scene, on_event: OnEvent) -> tuple[Recipe, Protocol]:
-    """Put the colour of sky and bare walls behind everything, where floaters are removed.
+    """Use the colour of sky and bare walls as background, if the recipe removes floaters.
 
-    Before an even, unlit backdrop, splats of its colour are proposed for removal.
+    On a uniform, unlit backdrop, splats of its colour are proposed for removal.
     """
     found = find_backdrop(scene) if recipe.removal is not None and protocol.background == BLACK else None
     if found is None or recipe.removal is None:
         return recipe, protocol
-    shown = ", ".join(f"{value:.2f}" for value in found.color)
     if found.is_unlit:
         recipe = replace(recipe, removal=replace(recipe.removal, backdrop=True))
-    also = "; splats of that colour are removed where no image misses them" if found.is_unlit else ""
-    on_event(Notice(f"background ({shown}): the colour of what shows no sparse points{also}", detail=True))
+    color = ", ".join(f"{value:.2f}" for value in found.color)
+    on_event(Notice(f"background: ({color}), the colour of regions without sparse points", detail=True))
     return recipe, replace(protocol, background=found.color)
 
 
 def with_fused_depth(protocol: Protocol, recipe: Recipe) -> Protocol:
-    """Return the protocol that fuses the depth which the recipe says, where it says one."""
+    """Return the protocol with the fused depth of the recipe, if the recipe sets one."""
     depth = recipe.fused_depth
     return protocol if depth is None else replace(protocol, fusion=replace(protocol.fusion, depth=depth))

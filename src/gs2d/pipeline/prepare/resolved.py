@@ -1,4 +1,4 @@
-"""One training run as a value: what decides its result, and how it is executed. ``run.json`` holds it."""
+"""A training run as a value, which ``run.json`` holds: what determines its result, and how it is executed."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class CaptureRecord:
     extent : float
         World units.
     skipped : tuple of str
-        Photographs that are left out, with the reason.
+        Photographs that were skipped, with the reason.
     masks : Masks
     digest : str
         Hash of all decoded images, masks, cameras, points and priors.
@@ -70,12 +70,8 @@ class CaptureRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class Execution:
-    """How a run is executed. No field changes the splats, and each may differ when the run is resumed.
+    """How a run is executed: the fields of ``TrainOptions`` that may differ when the run is resumed."""
 
-    The fields have the names and meanings of those of ``TrainOptions``.
-    """
-
-    quality: str | None = None
     threads: int | None = None
     memory: float | None = None
     disk: float | None = None
@@ -92,7 +88,7 @@ class Execution:
 
     @property
     def disk_bytes(self) -> int | None:
-        """Bytes of disk to keep to."""
+        """Disk limit in bytes."""
         return None if self.disk is None else int(self.disk * 2**30)
 
 
@@ -103,14 +99,14 @@ class ResolvedRun:
     Attributes
     ----------
     recipe : Recipe
-        As it is trained, with its seed.
+        As trained, with its seed.
     protocol : Protocol
     scene : CaptureRecord
     downscale : int
-        Photographs are this factor smaller than their files.
+        Factor by which the photographs are smaller than their files.
     raster : RasterSettings
     backend : mapping
-        What decides its results (``Backend.facts``).
+        What determines its results (``Backend.facts``).
     stage2_cache_bytes : int
         Memory for cached views; see ``Trainer``.
     schedule_scale : float
@@ -118,9 +114,9 @@ class ResolvedRun:
     title : str
         Heading of the report; empty: the name of the capture.
     init : str or None
-        Hash of the file of splats that training starts from.
+        Hash of the file of initial splats.
     part : str or None
-        Hash of what a part of a larger training starts from.
+        Hash of the initial state of a part of a scene.
     execution : Execution
     """
 
@@ -142,15 +138,15 @@ class ResolvedRun:
         return {**encode(self), "raster": self.raster.facts(), "seed": self.recipe.seed}
 
     def decisive_facts(self) -> dict[str, Any]:
-        """Return as JSON what decides the bytes of the splats: runs with equal facts train the same.
+        """Return what determines the bytes of the splats, as JSON values.
 
-        The background is in ``raster``; the mesh alone depends on the fused depth and the subject.
+        The background is part of ``raster``. Fused depth and subject affect the mesh only.
         """
         data = self.to_json()
         fusion = {name: value for name, value in data["protocol"]["fusion"].items() if name not in ("depth", "subject")}
         protocol = {name: value for name, value in data["protocol"].items() if name not in ("robust", "background")}
         return {
-            "backend": data["backend"],  # first: another processor decodes cameras with other last digits
+            "backend": data["backend"],  # first: cameras differ by rounding between CPUs
             "recipe": data["recipe"],
             "protocol": {**protocol, "fusion": fusion},
             "downscale": self.downscale,
@@ -161,12 +157,12 @@ class ResolvedRun:
 
 
 def read_resolved(run: RunFolder) -> ResolvedRun:
-    """Return what ``run.json`` holds.
+    """Return the run that ``run.json`` holds.
 
     Raises
     ------
     RunError
-        If another version wrote it, or it was changed by hand.
+        If another version wrote it, or it was edited.
     """
     data = run.definition()
     known = {entry.name: data[entry.name] for entry in fields(ResolvedRun) if entry.name in data}
@@ -177,40 +173,31 @@ def read_resolved(run: RunFolder) -> ResolvedRun:
         check_settings(resolved.raster)
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RecipeError, DataError, ShapeError) as e:
         raise RunError(
-            f"{run.file(RUN_JSON)} must define a run as gs2d writes it, got another entry ({e}); restore it, or train "
-            "again with --overwrite"
+            f"{run.file(RUN_JSON)} is not a run as this version writes it ({e}); restore it, or train again with "
+            "--overwrite"
         ) from e
     protocol = resolved.protocol
     return replace(resolved, raster=resolved.raster.for_depths(protocol.depth, protocol.fused_depth))
 
 
 def check_same_run(run: RunFolder, resolved: ResolvedRun) -> None:
-    """Refuse to resume a run that is defined otherwise.
-
-    Raises
-    ------
-    RunError
-        Names the first difference.
-    """
-    before, after = read_resolved(run).decisive_facts(), resolved.decisive_facts()
-    name = next((name for name in after if before[name] != after[name]), None)
+    """Raise RunError with the first difference, if the run in a folder cannot be resumed as ``resolved``."""
+    old, new = read_resolved(run).decisive_facts(), resolved.decisive_facts()
+    name = next((name for name in new if old[name] != new[name]), None)
     if name is None:
         return
-    what = f"{name}{difference(before[name], after[name])}"
-    robust = ["off" if facts["recipe"]["removal"] is None else "on" for facts in (before, after)]
-    if name == "recipe" and robust[0] != robust[1]:
-        what = f"--robust, {robust[0]}, now {robust[1]}"
-    elif name == "scene" and before[name]["masks"] == after[name]["masks"]:
-        what = "scene: its photographs, cameras, points or maps changed, or this is another kind of processor"
+    what = f"{name}{difference(old[name], new[name])}"
+    if name == "scene" and old[name]["masks"] == new[name]["masks"]:
+        what = "scene: its photographs, cameras, points or maps changed, or the CPU is of another kind"
     elif name == "init":
-        what = "--init: another file, or none"
+        what = "--init file"
     elif name == "part":
-        what = "start: the model that this part is cut of changed"
+        what = "start of this part"
     raise RunError(f"{run.path} was made with another {what}; resume with the same options, or choose another --out")
 
 
 def difference(old: Any, new: Any, where: str = "") -> str:
-    """Describe where two JSON values first differ."""
+    """Return the first difference of two JSON values, as text."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in new:
             if old.get(key) != new[key]:

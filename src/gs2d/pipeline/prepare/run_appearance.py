@@ -1,15 +1,12 @@
-"""How photographs show a scene, as a run has learned it: its files, and images as photographs show them.
+"""Learned appearance of photographs (exposure, vignetting, response): files of a run, and its effect on images.
 
-``learned.json`` has the numbers of every view, which later commands read. ``exposure.json`` and ``photometry.json`` say
-the same for people.
+Later commands read ``learned.json``. ``exposure.json`` and ``photometry.json`` hold the same in readable form.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
-from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
@@ -25,26 +22,25 @@ from gs2d.data.scene import Appearance
 from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import EXPOSURE, LEARNED, PHOTOMETRY, SPLATS, RunFolder
 from gs2d.render.exposure_transform import expose, fit_exposure
-from gs2d.render.types import RenderOutput
 from gs2d.training.events import Notice, OnEvent
 from gs2d.training.learned.appearance import numbers_of, shown, unshown
 from gs2d.training.learned.quantity import ImagePoints
 
-ABOUT = "numbers by which each view shows the colours of the scene, by the name of the quantity (docs/math.md)"
+ABOUT = "learned quantities of each view, by name (docs/math.md)"
 ABOUT_EXPOSURE = (
-    "color as photographed = A c + b for the scene's color c (sRGB values in [0, 1]), transform = [A | b]; "
-    "the mean over the photographs is the identity; grey: what the scene's (0.5, 0.5, 0.5) becomes"
+    "color in the photograph = A c + b for color c of the scene (sRGB values in [0, 1]), transform = [A | b]; "
+    "the mean over the photographs is the identity; grey: the transformed (0.5, 0.5, 0.5)"
 )
 ABOUT_PHOTOMETRY = (
-    "at a pixel whose distance from the principal point is r times reach, counted in focal lengths, a camera has "
-    "exp(-(a r^2 + b r^4 + c r^6)) of the light, falloff = [a, b, c]; corner: what is left at r = 1. f(x) = k x / (1 + "
-    "(k - 1) x), k = e^s, turns light into values, s = shift; the scene is in that of s = 0, the photographs' mean"
+    "at a pixel whose distance from the principal point is r times reach, in focal lengths, a camera receives "
+    "exp(-(a r^2 + b r^4 + c r^6)) of the light, falloff = [a, b, c]; corner: this at r = 1. f(x) = k x / (1 + "
+    "(k - 1) x), k = e^s, maps light to values, s = shift; the scene has s = 0, the mean of the photographs"
 )
 GREY = 0.5
 
 
 def write_appearance(run: RunFolder, scene: Scene, on_event: OnEvent) -> None:
-    """Write what was learned of the colours of photographs beside the splats, and report it in a line each."""
+    """Write the learned appearance of photographs into the run, and report it."""
     known = {view.name: view.appearance for view in scene.views if view.appearance}
     if not known:
         return
@@ -83,7 +79,9 @@ def _write_photometry(run: RunFolder, scene: Scene, on_event: OnEvent) -> None:
     write_json(run.file(PHOTOMETRY), {"format": 1, "about": ABOUT_PHOTOMETRY, "cameras": cameras})
     corners, shifts = (sorted(camera[name] for camera in cameras) for name in ("corner", "shift"))
     many = f" ({len(cameras)} cameras)" if len(cameras) > 1 else ""
-    line = f"corners have {_range(corners, '.3f')} of the light, responses are bent by {_range(shifts, '+.3f')}"
+    line = (
+        f"vignetting leaves {_range(corners, '.3f')} of the light in corners, response shift {_range(shifts, '+.3f')}"
+    )
     on_event(Notice(f"{line}{many}: {PHOTOMETRY}"))
 
 
@@ -93,7 +91,7 @@ def _range(values: list[float], form: str) -> str:
 
 
 def with_learned_appearance(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
-    """Return a scene with what :func:`write_appearance` wrote; as it is if the run has learned none, or is unfinished.
+    """Return a scene with its learned appearance; unchanged if the run learns none, or is unfinished.
 
     Raises
     ------
@@ -108,16 +106,16 @@ def with_learned_appearance(run: RunFolder, recipe: Recipe, scene: Scene) -> Sce
         views = read_json(run.file(LEARNED))["views"]
         found = {view: {name: _numbers(name, values) for name, values in views[view].items()} for view in views}
     except (DataError, LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise RunError(f"{run.file(LEARNED)} must hold the numbers of this run, got: {error}; {remedy}") from error
+        raise RunError(f"{run.file(LEARNED)} does not hold the appearance of this run ({error}); {remedy}") from error
     for view in scene.train:
         missing = (names & set(QUANTITIES.builtin)) - found.get(view.name, {}).keys()
         if missing:
-            raise RunError(f"{run.file(LEARNED)} must hold the {min(missing)} of {view.name}, got none; {remedy}")
+            raise RunError(f"{run.file(LEARNED)} lacks the {min(missing)} of {view.name}; {remedy}")
     return scene.with_appearance(found)
 
 
 def _numbers(name: str, values: list[float]) -> np.ndarray:
-    """Return the numbers of a quantity (ValueError: they cannot be)."""
+    """Return the numbers of a quantity; raise ValueError for impossible ones."""
     numbers = np.array(values, dtype=np.float64)
     if not np.isfinite(numbers).all() or np.abs(numbers).max(initial=0) > 1e6:
         raise ValueError(f"{name} that is not finite")
@@ -127,14 +125,14 @@ def _numbers(name: str, values: list[float]) -> np.ndarray:
 
 
 def photographed(view: View, color: Tensor, background: tuple[float, float, float]) -> Tensor:
-    """Return an image [H, W, 3] rendered from a view as its photograph shows it, as far as that is known."""
+    """Return a rendering [H, W, 3] of a view with the appearance of its photograph, if known."""
     if not view.appearance:
         return color
     return shown(color, numbers_of(view, color), ImagePoints(view.camera, *over(view, color, background)))
 
 
 def as_scene(view: View) -> np.ndarray:
-    """Return the photograph of a view, uint8 [H, W, 3 or 4], in the colours of the scene, as far as that is known."""
+    """Return the photograph of a view, uint8 [H, W, 3 or 4], with its appearance removed, if known."""
     image = view.image()
     if not view.appearance:
         return image
@@ -144,40 +142,12 @@ def as_scene(view: View) -> np.ndarray:
     return result
 
 
-def exposure_named(name: str, views: Sequence[View]) -> Tensor:
-    """Return the transform [3, 4] of a training photograph.
-
-    Raises
-    ------
-    RunError
-        If no exposure was learned, or none of a photograph of this name.
-    """
-    known = {view.name: view.appearance["exposure"] for view in views if "exposure" in view.appearance}
-    if not known:
-        raise RunError(f"the exposure of {name} was asked for, and this run learned none; train with --exposure")
-    if name not in known:
-        near = get_close_matches(name, known, n=3) or list(known)[:3]
-        raise RunError(f"no training photograph {name!r}; there is {', '.join(near)}, ...: {EXPOSURE} lists all")
-    return torch.from_numpy(known[name])
-
-
-def exposed(output: RenderOutput, transform: Tensor, like: View, background: tuple[float, float, float]) -> Tensor:
-    """Return the image of any view [H, W, 3] in an exposure.
-
-    If photographs have an alpha channel, as that of the view ``like``, the background is no part of them and stays.
-    """
-    behind = torch.tensor(background, dtype=output.color.dtype, device=output.color.device)
-    cover = () if like.alpha() is None else (output.alpha, behind)
-    return expose(output.color, transform.to(output.color), *cover)
-
-
 def matched_by_halves(
     view: View, color: Tensor, target: Tensor, mask: Tensor | None, background: tuple[float, float, float]
 ) -> Tensor:
-    """Return a rendered picture whose colours are matched to the photograph, no pixel by itself.
+    """Return a rendering with its colours matched to the photograph.
 
-    The left half gets the transform that fits the right half best (least squares), the right half that of the left. So
-    the photograph is looked at, but nothing is scored that was fitted to: not a score of the scene alone.
+    Each half gets the transform that fits the other half best (least squares), so that no pixel is matched to itself.
 
     Parameters
     ----------
@@ -201,7 +171,7 @@ def matched_by_halves(
 
 
 def over(view: View, color: Tensor, background: tuple[float, float, float]) -> tuple[Tensor, ...]:
-    """Coverage and background for ``expose``, where the view's photograph has an alpha channel."""
+    """Return alpha and background for ``expose``, or () if the photograph of the view has no alpha channel."""
     alpha = view.alpha()
     if alpha is None:
         return ()

@@ -1,4 +1,4 @@
-"""The poses that a run found: its file ``poses.json``, and cameras of test views moved to where they fit best."""
+"""Refined cameras of a run: its file ``poses.json``, and the alignment of test cameras to their photographs."""
 
 from __future__ import annotations
 
@@ -24,35 +24,34 @@ from gs2d.render.types import RasterSettings
 from gs2d.training.events import Notice, OnEvent, counted
 
 ABOUT = (
-    "cameras of the training photographs as refined, then those of the test photographs as given, in the layout of "
-    "nerfstudio's transforms.json (OpenGL camera to world), for pictures of size w x h without distortion; "
-    "T_cam_world: the same for OpenCV, world to camera; moved: from the given pose, shift as a share of the extent; "
-    "zoom: what became of the given focal lengths (a factor) and principal point (moved right and down, focal "
-    "lengths), then k1 and k2 of what is left of the lens, as in docs/math.md; the frame's own k1 and k2 are "
-    "the way back from it"
+    "refined cameras of the training photographs and original cameras of the test photographs, in the layout of "
+    "nerfstudio's transforms.json (OpenGL camera to world), for undistorted images of size w x h; T_cam_world: the "
+    "same for OpenCV, world to camera; moved: from the original pose, shift as a fraction of the extent; zoom: factor "
+    "of the original focal lengths, shift of the principal point to the right and down (focal lengths), then k1 and "
+    "k2 of the residual lens, as in docs/math.md; the frame's own k1 and k2 are its inverse"
 )
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-GRID = 5  # points along each side of a picture, whose motion is measured
+GRID = 5  # points along each side of an image, by which motion is measured
 STEPS = 80  # of Adam, to align a test view
 RATE, RATE_FINAL = 2e-3, 2e-5  # rad and extents
 PHOTOMETRIC = (LossTerm("l1", 0.8), LossTerm("ssim", 0.2))
 
 
 def write_poses(run: RunFolder, scene: Scene, refined: Scene, on_event: OnEvent) -> None:
-    """Write ``poses.json`` beside the splats if cameras of a scene were refined, and report how far they moved."""
-    if all(now.camera is given.camera for now, given in zip(refined.train, scene.train, strict=True)):
+    """Write ``poses.json`` if the cameras of a scene were refined, and report how far they moved."""
+    if all(now.camera is original.camera for now, original in zip(refined.train, scene.train, strict=True)):
         return
-    middle = focus_point([view.camera for view in scene.train])
+    focus = focus_point([view.camera for view in scene.train])
     frames, far = [], []
-    for given, view in zip(scene.train, refined.train, strict=True):
-        far.append(how_far(given.camera, view.camera, middle, scene.extent))
+    for original, view in zip(scene.train, refined.train, strict=True):
+        far.append(camera_motion(original.camera, view.camera, focus, scene.extent))
         frames.append({**_frame(view, scene.root), "split": "train", "moved": far[-1]})
     frames += [{**_frame(view, scene.root), "split": "test"} for view in refined.test]
     write_json(run.file(POSES), {"format": 1, "about": ABOUT, "frames": frames})
     mean = {name: float(np.mean([entry[name] for entry in far])) for name in far[0]}
     on_event(
         Notice(
-            f"cameras moved by {mean['pixels']:.2f} px in the mean ({mean['degrees']:.3f} degrees, "
+            f"cameras moved by {mean['pixels']:.2f} px on average ({mean['degrees']:.3f} degrees, "
             f"{100 * mean['shift']:.3f} % of the extent): {POSES}"
         )
     )
@@ -62,14 +61,14 @@ def write_poses(run: RunFolder, scene: Scene, refined: Scene, on_event: OnEvent)
 
 
 def zoom_line(zooms: Sequence[Zoom]) -> str:
-    """Return a line on what became of the focal lengths and lenses of training views."""
+    """Describe the refinement of focal lengths and lenses of training views in one line."""
     scales = sorted({zoom.scale for zoom in zooms})
     factor = f"{scales[0]:.4f}" if len(scales) == 1 else f"{scales[0]:.4f} to {scales[-1]:.4f} ({len(scales)} cameras)"
     moved = max(max(abs(zoom.right), abs(zoom.down)) for zoom in zooms)
     also = f", principal points moved by up to {moved:.4f} focal lengths" if moved else ""
     bends = max((zoom.lens for zoom in zooms if zoom.lens), default=None, key=lambda lens: abs(lens[0]))
-    left = "" if bends is None else f", of the lens is left k1 {bends[0]:+.4f}, k2 {bends[1]:+.4f}"
-    return f"focal lengths became {factor} times those of the capture{also}{left}"
+    residual = "" if bends is None else f", residual lens k1 {bends[0]:+.4f}, k2 {bends[1]:+.4f}"
+    return f"refined focal lengths are {factor} times those of the capture{also}{residual}"
 
 
 def _frame(view: View, root: Path | None) -> dict[str, Any]:
@@ -89,37 +88,35 @@ def _frame(view: View, root: Path | None) -> dict[str, Any]:
 
 
 def _refined(zoom: Zoom) -> dict[str, Any]:
-    """Return what became of the intrinsics; of a lens the coefficients that nerfstudio has, from pinhole to photograph.
-
-    These are the inverse to the fourth power of the radius.
-    """
+    """Return the refined intrinsics; a lens as nerfstudio's coefficients, its inverse to fourth order of the radius."""
     if zoom.lens is None:
         return {"zoom": list(zoom[:3])}
     k1, k2 = zoom.lens
     return {"zoom": list(zoom), "camera_model": "OPENCV", "k1": -k1, "k2": 3 * k1 * k1 - k2, "p1": 0.0, "p2": 0.0}
 
 
-def how_far(given: Camera, now: Camera, middle: np.ndarray, extent: float) -> dict[str, float]:
+def camera_motion(original: Camera, now: Camera, focus: np.ndarray, extent: float) -> dict[str, float]:
     """Measure a camera's motion: degrees, shift of the centre in extents, and pixels (rms over a grid of the image).
 
-    Pixels are those of points as far away as ``middle`` [3], what all cameras look at (at least a tenth of the extent).
+    Pixels are measured at the distance of ``focus`` [3], the point that all cameras look at, or a tenth of the extent.
     """
-    turn = now.rotation @ given.rotation.T
+    turn = now.rotation @ original.rotation.T
     sine = np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
-    depth = max(float((middle - given.center) @ given.forward), 0.1 * extent)
-    columns, rows = np.meshgrid(*((np.arange(GRID) + 0.5) / GRID * size for size in (given.width, given.height)))
-    rays = np.stack([(columns - given.cx) / given.fx, (rows - given.cy) / given.fy, np.ones_like(rows)], axis=-1)
-    points = depth * rays.reshape(-1, 3) @ given.rotation + given.center
-    shift = now.project(points)[0] - given.project(points)[0]
+    depth = max(float((focus - original.center) @ original.forward), 0.1 * extent)
+    columns, rows = np.meshgrid(*((np.arange(GRID) + 0.5) / GRID * size for size in (original.width, original.height)))
+    x, y = (columns - original.cx) / original.fx, (rows - original.cy) / original.fy
+    rays = np.stack([x, y, np.ones_like(rows)], axis=-1)
+    points = depth * rays.reshape(-1, 3) @ original.rotation + original.center
+    shift = now.project(points)[0] - original.project(points)[0]
     return {
         "degrees": float(np.degrees(np.arctan2(sine, (np.trace(turn) - 1) / 2))),
-        "shift": float(np.linalg.norm(now.center - given.center) / extent),
+        "shift": float(np.linalg.norm(now.center - original.center) / extent),
         "pixels": float(np.sqrt((shift**2).sum(axis=1).mean())),
     }
 
 
-def with_found_poses(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
-    """Return a scene with the cameras of ``poses.json``; as it is if the run has refined none, or is unfinished.
+def with_refined_poses(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
+    """Return a scene with the cameras of ``poses.json``; unchanged if the run refines none, or is unfinished.
 
     Raises
     ------
@@ -135,13 +132,13 @@ def with_found_poses(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
         poses = {entry["name"]: np.array(entry["T_cam_world"], dtype=np.float64) for entry in frames}
         zooms = {entry["name"]: Zoom(*map(float, entry["zoom"])) for entry in every if "zoom" in entry}
         if not all(np.isfinite(zoom).all() for zoom in zooms.values()):
-            raise ValueError("a zoom that is not of finite numbers")
+            raise ValueError("a zoom that is not finite")
         refined = scene.with_poses(poses, zooms)
     except (DataError, ShapeError, KeyError, TypeError, ValueError, OverflowError) as error:
-        raise RunError(f"{run.file(POSES)} must hold the cameras of this run, got: {error}; {remedy}") from error
+        raise RunError(f"{run.file(POSES)} does not hold the cameras of this run ({error}); {remedy}") from error
     for view in scene.train:
         if view.name not in poses or (recipe.intrinsics is not None and view.name not in zooms):
-            raise RunError(f"{run.file(POSES)} must hold pose and zoom of {view.name}, got none; {remedy}")
+            raise RunError(f"{run.file(POSES)} lacks pose or zoom of {view.name}; {remedy}")
     return refined
 
 
@@ -153,9 +150,9 @@ def aligned(
     extent: float,
     on_event: OnEvent,
 ) -> Iterator[View]:
-    """Yield views whose cameras are moved to where the splats, which stay, look most like their photographs.
+    """Yield views with their cameras aligned to their photographs, by the photometric loss of the fixed splats.
 
-    The photograph is looked at: a score from there says how good the scene is where its cameras are not, and no more.
+    Scores of aligned views measure the scene apart from errors of its test cameras.
     """
     for view in counted(views, "aligning cameras of test views", len(views), on_event):
         target = torch.from_numpy(view.target(settings.background)).to(splats.means)

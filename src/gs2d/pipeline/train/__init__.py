@@ -1,1 +1,1 @@
-"""Run a training in a run folder: log, checkpoints, stages, interruption and resume."""
+"""Train in a run folder: log, checkpoints, results of stages, interruption and resume."""

@@ -1,4 +1,4 @@
-"""How much each attribute of the splats changes in an iteration: the traces of the paper's attribute figure."""
+"""Mean change of each attribute of the splats per iteration, for the attribute figure of the paper."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from torch import Tensor
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
 
-SAMPLE = 2_000  # splats: enough for a curve of a mean, at a tenth of the time of 20,000
-CHANGES = ("mean", "covariance", "opacity", "sh")  # mu, Sigma, alpha and SHs in the paper
+SAMPLE = 2_000  # splats
 
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """Every so many-th splat as it was after an iteration of a stage."""
+    """Evenly spaced splats after an iteration of a stage."""
 
     iteration: int
     rows: Tensor  # [n] int64
@@ -24,20 +23,20 @@ class Snapshot:
 
 
 def take_snapshot(splats: Splats, iteration: int) -> Snapshot:
-    """Return a copy of at most ``SAMPLE`` evenly spaced splats, to compare with later."""
+    """Return a copy of at most ``SAMPLE`` evenly spaced splats."""
     rows = torch.arange(0, len(splats), max(1, -(-len(splats) // SAMPLE)), device=splats.device)
     return Snapshot(iteration, rows, splats.rows(rows))
 
 
 @torch.no_grad()
 def mean_changes(snapshot: Snapshot, splats: Splats, *, iterations: int, extent: float) -> dict[str, float]:
-    """Mean over the sampled splats of how far each attribute moved in one of ``iterations`` iterations.
+    """Return the mean change of each attribute per iteration, over the sampled splats.
 
     Parameters
     ----------
     snapshot : Snapshot
     splats : Splats
-        The same splats (no row came or went) after so many iterations more.
+        The same splats, with the same rows, ``iterations`` later.
     iterations : int
     extent : float
         Of the scene, world units.
@@ -45,8 +44,8 @@ def mean_changes(snapshot: Snapshot, splats: Splats, *, iterations: int, extent:
     Returns
     -------
     dict
-        ``mean``: |change of mu| as a share of the extent; ``covariance``: Frobenius norm of the change of
-        Sigma = s_u^2 t_u t_u' + s_v^2 t_v t_v' as a share of that of Sigma; ``opacity``: |change of o|; ``sh``:
+        ``mean``: |change of mu| as a fraction of the extent; ``covariance``: Frobenius norm of the change of
+        Sigma = s_u^2 t_u t_u' + s_v^2 t_v t_v' relative to that of Sigma; ``opacity``: |change of o|; ``sh``:
         Euclidean norm of the change of all SH coefficients.
     """
     before, after = snapshot.splats, splats.rows(snapshot.rows)
@@ -63,7 +62,7 @@ def mean_changes(snapshot: Snapshot, splats: Splats, *, iterations: int, extent:
 
 
 def _covariances(splats: Splats) -> Tensor:
-    """Sigma [N, 3, 3] world units^2, in double: its changes are small."""
+    """Return Sigma [N, 3, 3], world units^2, in double precision: its changes are small."""
     axes = quats_to_matrices(splats.quats.double())[:, :, :2] * splats.scales.double()[:, None]
-    # No matrix product: on a GPU torch refuses it where deterministic algorithms are asked for.
+    # Not a matrix product, which torch on a GPU refuses with deterministic algorithms.
     return (axes[:, :, None] * axes[:, None]).sum(dim=3)

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM while training waits for a moment at which all of it can be saved."""
+"""Delay Ctrl-C and SIGTERM until the training state can be saved."""
 
 from __future__ import annotations
 
@@ -9,37 +9,37 @@ from types import FrameType
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-SAME = 1.0  # s; a second signal so soon is the first one, sent to the whole group
+SAME = 1.0  # s; a second signal within this time is the first one, sent to the whole process group
 
 
 class HeldSignals:
-    """Between :meth:`hold` and :meth:`release` signals are kept for later; a second one acts at once.
+    """Delays signals between :meth:`hold` and :meth:`release`; a second signal acts at once.
 
-    What a signal does is decided by the handler of before. One that is ignored, or that ends the process, stays so.
-    In another thread than the main one, nothing is held.
+    Delayed signals are passed to the previous handlers. Signals that are ignored, or that end the process, are not
+    delayed, nor is any signal outside the main thread.
     """
 
     def __init__(self) -> None:
         self._previous: dict[int, Any] = {}
-        self._heard: tuple[int, float] | None = None  # number, and when, s
+        self._heard: tuple[int, float] | None = None  # number, time in s
 
     @property
-    def asked(self) -> bool:
-        """Whether a signal is waiting."""
+    def pending(self) -> bool:
+        """Whether a signal is delayed."""
         return self._heard is not None
 
     def hold(self) -> None:
-        """Keep signals from now on."""
+        """Start to delay signals."""
         if self._previous:
             return
-        with contextlib.suppress(ValueError):  # not the main thread: others have the signals
+        with contextlib.suppress(ValueError):  # not the main thread
             for number in SIGNALS:
                 if callable(handler := signal.getsignal(number)):
                     signal.signal(number, self._keep)
                     self._previous[number] = handler
 
     def release(self) -> None:
-        """Let signals act again, and the one that was kept act now."""
+        """Restore the handlers and deliver a delayed signal."""
         previous, heard = self._previous, self._heard
         self._previous, self._heard = {}, None
         for number, handler in previous.items():
@@ -48,7 +48,7 @@ class HeldSignals:
             previous[heard[0]](heard[0], None)
 
     def forget(self) -> None:
-        """Let signals act again; the work has ended in another way."""
+        """Restore the handlers and drop a delayed signal."""
         self._heard = None
         self.release()
 

@@ -1,4 +1,4 @@
-"""What the losses of a recipe have to say of a finished stage: figures for ``metrics.json``, pictures beside."""
+"""Reports of the losses on a finished stage: values for ``metrics.json`` and images."""
 
 from __future__ import annotations
 
@@ -15,28 +15,23 @@ from gs2d.pipeline.finish.run_images import file_names
 from gs2d.report.color_maps import depth_image, depth_limits
 from gs2d.training.trainer import Trainer
 
-SHOWN = 3  # views whose pictures are kept
+SHOWN = 3  # views whose images are kept
 
 
 def report_losses(run: RunFolder, trainer: Trainer, views: Sequence[View]) -> dict[str, Any]:
-    """Ask the losses that have a report about each training view; keep the pictures of a few in ``renders/losses``.
+    """Collect the reports of losses on each training view; write the images of a few views to ``renders/losses``.
 
     Returns
     -------
     dict
-        Empty where no loss has one; else ``losses``, by name of the loss: ``title`` and ``figure`` in words,
-        ``median`` over views and ``by_view`` (both left out without figures), and ``shown``: views with their pictures.
+        Empty if no loss has a report; else ``losses``, by name: ``title`` and ``figure`` as text, ``median`` over views
+        and ``by_view`` (absent without values), and ``shown``, the views with their images.
     """
     reporters = trainer.loss_reporters
     if not reporters:
         return {}
     found: dict[str, dict[str, Any]] = {
-        name: {
-            "title": loss.title,
-            "figure": loss.figure or name,
-            "by_view": {},
-            "shown": [],
-        }
+        name: {"title": loss.title, "figure": loss.figure or name, "by_view": {}, "shown": []}
         for name, loss in reporters.items()
     }
     files = file_names(views)
@@ -44,12 +39,12 @@ def report_losses(run: RunFolder, trainer: Trainer, views: Sequence[View]) -> di
     folder = run.file(RENDERS) / LOSSES
     make_folder(folder)
     for index, view in enumerate(views):
-        for name, said in trainer.report_losses(index).items():
-            if said.figure is not None:
-                found[name]["by_view"][view.name] = float(said.figure)
-            if index in chosen and said.images:
+        for name, report in trainer.report_losses(index).items():
+            if report.figure is not None:
+                found[name]["by_view"][view.name] = float(report.figure)
+            if index in chosen and report.images:
                 stem = f"{files[index]}.{re.sub('[^A-Za-z0-9_-]+', '-', name)}"
-                images = _draw(said.images)
+                images = _draw(report.images)
                 paths = {title: f"{stem}.{number}.png" for number, title in enumerate(images, start=1)}
                 for title, image in images.items():
                     write_image(folder / paths[title], image)
@@ -63,7 +58,7 @@ def _with_median(entry: dict[str, Any]) -> dict[str, Any]:
 
 
 def _draw(images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return colours [H, W, 3] for all; the first map of depths has the scale of the others."""
+    """Return colour images [H, W, 3]; all depth maps have the colour scale of the first."""
     maps = [(image, (image > 0).astype(np.float32)) for image in images.values() if image.ndim == 2]
     limits = depth_limits(*maps[0]) if maps else None
     return {

@@ -1,7 +1,7 @@
-"""One training in several processes, as ``torchrun`` starts them: process 0 is the command, the others follow it.
+"""Train one run in several processes, as ``torchrun`` starts them.
 
-Process 0 reads, decides, prints and writes as if it were alone. The others read the same capture, train along and end
-with the last iteration: they write nothing, and say nothing but why they fail.
+Process 0 reads, decides, reports and writes as if it were alone. The others read the same capture and train along; they
+write nothing.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from gs2d.training.events import Notice, OnEvent, ignore
 from gs2d.training.parallel import ONE_PROCESS, LostContactError, ManyProcesses, OneProcess
 from gs2d.training.trainer import Trainer, TrainerOptions
 
-PATIENCE = timedelta(days=7)  # the others wait while process 0 scores; who is gone is noticed by its connection
+PATIENCE = timedelta(days=7)  # the others wait while process 0 scores; a lost process is noticed by its connection
 GIB = 2**30
 
 
 @contextmanager
 def connected(backend: str) -> Iterator[OneProcess]:
-    """Meet the other processes, if the environment says that there are any.
+    """Connect to the other processes, if the environment defines any.
 
     Parameters
     ----------
     backend : str
-        As it was asked for: each process of a machine takes a GPU of its own, unless it is of the CPU.
+        The requested backend: unless it is of the CPU, each process uses a GPU of its own.
 
     Raises
     ------
@@ -62,53 +62,44 @@ def connected(backend: str) -> Iterator[OneProcess]:
         if isinstance(error, Gs2dError) and not place.leads:
             error.args = (f"process {place.rank} of {place.size}: {error}", *error.args[1:])
         raise
-    gc.collect()  # work that cycles keep would end with the interpreter, on threads of gloo, which then abort
+    gc.collect()  # work in reference cycles would end with the interpreter, in threads of gloo, which then abort
     torch.distributed.destroy_process_group()
 
 
 def _connect(place: Place, backend: str) -> ManyProcesses:
-    """Join the group of all processes."""
+    """Join the group of all processes, on a GPU of its own."""
     if not torch.distributed.is_available():
-        raise BackendError("several processes need torch.distributed, which this torch is built without; use one")
-    on_gpu = backend not in ("cpu", "reference") and torch.cuda.is_available()
+        raise BackendError("several processes need torch.distributed, which this torch does not have; use one")
+    on_gpu, count = backend not in ("cpu", "reference") and torch.cuda.is_available(), torch.cuda.device_count()
+    if on_gpu and place.local_size > count:
+        message = (
+            f"each process needs a GPU of its own, got {place.local_size} processes and {count} GPUs on this machine; "
+            f"use torchrun --nproc-per-node {count}, or --backend cpu"
+        )
+        raise BackendError(message) if place.local_rank == 0 else LostContactError(message, told=True)
     if on_gpu:
-        _take_gpu(place)
+        torch.cuda.set_device(place.local_rank)
     both = on_gpu and torch.distributed.is_nccl_available()
     torch.distributed.init_process_group("cpu:gloo,cuda:nccl" if both else "gloo", timeout=PATIENCE)
     return ManyProcesses(place)
 
 
-def _take_gpu(place: Place) -> None:
-    """Let this process use the GPU of its number on this machine, and no other."""
-    count = torch.cuda.device_count()
-    if place.local_size > count:
-        message = (
-            f"each process needs a GPU of its own, got {place.local_size} processes and {count} on this machine; "
-            f"torchrun --nproc-per-node {count}, or --backend cpu"
-        )
-        if place.local_rank == 0:
-            raise BackendError(message)
-        raise LostContactError(message, told=True)
-    torch.cuda.set_device(place.local_rank)
-
-
 def memory_of(place: Place, gib: float | None) -> float | None:
-    """Return what of the memory this process keeps to, GiB: of ``--memory``, or of what there is, an equal part."""
+    """Return the memory limit of this process in GiB: an equal part of ``--memory``, or of the machine's memory."""
     if place.local_size == 1:
         return gib
     limit = memory_limit()
-    whole = gib if gib is not None else None if limit is None else limit.bytes / GIB
-    return None if whole is None else whole / place.local_size
+    total = gib if gib is not None else None if limit is None else limit.bytes / GIB
+    return None if total is None else total / place.local_size
 
 
 def lead(loaded: LoadedRun, together: OneProcess, on_event: OnEvent) -> LoadedRun:
-    """Tell the others what this process trains, and the user that there are others."""
+    """Send the run to the other processes, and report how many there are."""
     if not isinstance(together, ManyProcesses):
         return loaded
     rates = loaded.recipe.stages[0].lr
     rate = rates.for_views(together.size).sh0 / rates.sh0
-    text = f"{together.size} processes: as many photographs an iteration, each a view; rates times {rate:.3g}"
-    on_event(Notice(text))
+    on_event(Notice(f"{together.size} processes: {together.size} views per iteration, learning rates times {rate:.3g}"))
     prepare = "always" if loaded.scene.ahead else "never"
     path = str(loaded.resolved.scene.path)
     together.tell({"scene": path, "prepare": prepare, "facts": _shared_facts(loaded)})
@@ -121,14 +112,18 @@ def follow(options: TrainOptions, together: ManyProcesses) -> RunFolder:
     Raises
     ------
     RunError
-        This process reads something else than process 0 does.
+        If this process would train something else.
     LostContactError
-        Process 0 has ended.
+        If process 0 has ended.
     """
-    told: dict[str, Any] = together.tell({})
-    same = replace(options, scene=Path(told["scene"]), prepare=told["prepare"])
-    loaded = prepare_run(same, ignore)
-    _check_same(told["facts"], _shared_facts(loaded))
+    sent: dict[str, Any] = together.tell({})
+    loaded = prepare_run(replace(options, scene=Path(sent["scene"]), prepare=sent["prepare"]), ignore)
+    for name, value in _shared_facts(loaded).items():
+        if sent["facts"][name] != value:
+            raise RunError(
+                f"all processes must train the same, got another {'versions' if name == 'key' else name} than process "
+                "0; use the same command, capture and versions, on CPUs of one kind"
+            )
     trainer = Trainer(
         loaded.scene,
         loaded.recipe,
@@ -141,8 +136,8 @@ def follow(options: TrainOptions, together: ManyProcesses) -> RunFolder:
         ),
     )
     signals = HeldSignals()
-    together.hears = lambda: signals.asked
-    signals.hold()  # process 0 decides when to stop; a second one acts at once
+    together.hears = lambda: signals.pending
+    signals.hold()  # process 0 decides when to stop; a second signal acts at once
     try:
         trainer.run()
     finally:
@@ -152,15 +147,5 @@ def follow(options: TrainOptions, together: ManyProcesses) -> RunFolder:
 
 
 def _shared_facts(loaded: LoadedRun) -> dict[str, Any]:
-    """Return what must be the same in all processes."""
+    """Return what must be equal in all processes."""
     return {**loaded.resolved.decisive_facts(), "key": loaded.stage_key(len(loaded.recipe.stages) - 1)}
-
-
-def _check_same(first: dict[str, Any], own: dict[str, Any]) -> None:
-    for name, value in own.items():
-        if first[name] != value:
-            what = "versions" if name == "key" else name
-            raise RunError(
-                f"all processes must train the same, got another {what} than in process 0; give each the same command, "
-                "capture and versions, on processors of one kind"
-            )

@@ -1,4 +1,4 @@
-"""Where training starts: at a checkpoint, after the stages of another run or of a cache, or from nothing."""
+"""Choose where training starts: at a checkpoint, after the stages of another run or of a cache, or from nothing."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ class ResumePoint:
     Attributes
     ----------
     state : TrainState or None
-        None = from nothing.
+        None: from nothing.
     seconds : float
-        Training time already spent in the stage that is under way.
+        Training time already spent in the current stage.
     peak_memory : int
-        Bytes, of that stage so far.
+        Bytes, of the current stage so far.
     at_entry : dict
-        Scores taken after the entry actions of that stage.
+        Scores after the entry actions of the current stage.
     """
 
     state: TrainState | None = None
@@ -52,7 +52,7 @@ class ResumePoint:
 
 @dataclass(frozen=True, eq=False)
 class FinishedStage:
-    """The end of a stage that another run trained: its checkpoint, metrics and log up to there."""
+    """A stage that another run trained: its final checkpoint, and metrics and log up to there."""
 
     index: int
     payload: dict[str, Any]
@@ -62,75 +62,69 @@ class FinishedStage:
 
 
 def choose_start(run: RunFolder, loaded: LoadedRun, on_event: OnEvent) -> ResumePoint:
-    """Return the furthest valid start; the log and the metrics are cut to it.
+    """Return the furthest valid start; log and metrics are cut to it.
 
     Raises
     ------
     RunError
-        ``start_from`` has no stage in common with this run, or no checkpoint is readable.
+        If ``start_from`` has no stage in common with this run, or no checkpoint is readable.
     """
     execution = loaded.resolved.execution
     if run.checkpoints():
-        start = _resume(run, loaded, on_event)
-        if execution.cache is not None:
-            _keep_scored(run, execution.cache)
-        return start
+        return _resume(run, loaded, on_event)
     run.events.cut(0)
-    found = [
-        stage
-        for stage in (
-            _from_run(loaded, execution.start_from) if execution.start_from else None,
-            _from_cache(loaded, execution.cache, on_event) if execution.cache else None,
-        )
-        if stage is not None
+    stages = [
+        _from_run(loaded, execution.start_from) if execution.start_from else None,
+        _from_cache(loaded, execution.cache, on_event) if execution.cache else None,
     ]
-    if not found:
+    usable = [stage for stage in stages if stage is not None]
+    if not usable:
         run.write_metrics({"stages": [], "surface": None})
         return ResumePoint()
-    return _adopt(run, loaded, max(found, key=lambda stage: stage.index), on_event)
+    return _adopt(run, loaded, max(usable, key=lambda stage: stage.index), on_event)
 
 
 def check_sources(out: Path, loaded: LoadedRun) -> None:
-    """Raise what would be raised for ``start_from`` and ``cache``, before the run that is to be overwritten goes."""
+    """Raise for an invalid ``start_from`` or ``cache``, before the run to be overwritten is deleted."""
     execution = loaded.resolved.execution
     if execution.start_from is not None:
         if execution.start_from.resolve() == out.resolve():
-            raise RunError(f"--from and --out are the same run, {out}; take another --out")
+            raise RunError(f"--from and --out are the same run, {out}; choose another --out")
         _from_run(loaded, execution.start_from)
     if execution.cache is not None:
         remove_made(make_folder(execution.cache))
 
 
 def _resume(run: RunFolder, loaded: LoadedRun, on_event: OnEvent) -> ResumePoint:
-    checkpoints = run.checkpoints()
-    for checkpoint in reversed(checkpoints):
+    for checkpoint in reversed(run.checkpoints()):
         try:
             payload = _read(checkpoint.path)
             state = _state_at(checkpoint, payload, loaded)
         except RunError as error:
-            on_event(Notice(f"{error}; going back to the checkpoint before it"))
+            on_event(Notice(f"{error}; using the previous checkpoint"))
             continue
         run.events.cut(payload["events_bytes"])
         finished = checkpoint.stage_index + (checkpoint.iteration is None)
-        metrics = run.metrics()
-        unchanged = finished == len(loaded.recipe.stages)  # then what is said of the mesh still holds
-        of_mesh: dict[str, Any] = {name: metrics[name] for name in ("surface", "mesh") if unchanged and name in metrics}
-        run.write_metrics({"stages": metrics["stages"][:finished], "surface": None, **of_mesh})
+        metrics, kept = run.metrics(), {"surface": None}
+        if finished == len(loaded.recipe.stages):  # facts of the mesh are still valid
+            kept |= {name: metrics[name] for name in ("surface", "mesh") if name in metrics}
+        run.write_metrics({"stages": metrics["stages"][:finished], **kept})
         on_event(Notice(f"resuming after {checkpoint.path.stem}"))
         extra = json.loads(payload["extra"])
         return ResumePoint(state, extra["seconds"], extra["peak_memory"], extra["at_entry"])
     raise RunError(f"no checkpoint in {run.path} is readable; train again with --overwrite")
 
 
+# -- reading checkpoints -----------------------------------------------------------------------------------------------
 def _read(path: Path) -> dict[str, Any]:
-    """Return what a checkpoint holds: all of it is there, and of the types that ``RunLogger`` writes."""
+    """Return the contents of a checkpoint, complete and of the types that ``RunLogger`` writes."""
     payload = load_tensors(path)
     try:
         size, extra = payload["events_bytes"], json.loads(payload["extra"])
         seconds, peak, at_entry = extra["seconds"], extra["peak_memory"], extra["at_entry"]
-        whole = isinstance(size, int) and isinstance(peak, int) and min(size, peak) >= 0
-        whole = whole and isinstance(seconds, int | float) and 0 <= seconds < math.inf and isinstance(at_entry, dict)
-        if not (whole and isinstance(payload["key"], str) and isinstance(payload["state"], dict)):
+        valid = isinstance(size, int) and isinstance(peak, int) and min(size, peak) >= 0
+        valid = valid and isinstance(seconds, int | float) and 0 <= seconds < math.inf and isinstance(at_entry, dict)
+        if not (valid and isinstance(payload["key"], str) and isinstance(payload["state"], dict)):
             raise ValueError("a value of another type")
     except (LookupError, TypeError, ValueError, RecursionError) as error:
         raise _unreadable(path, f"{type(error).__name__}: {error}") from error
@@ -142,7 +136,7 @@ def _unreadable(path: Path, reason: str) -> RunError:
 
 
 def _state(path: Path, payload: dict[str, Any]) -> TrainState:
-    """Return the state in a checkpoint that was read."""
+    """Return the state of a checkpoint."""
     try:
         return TrainState.from_state_dict(payload["state"])
     except RunError as error:
@@ -150,102 +144,19 @@ def _state(path: Path, payload: dict[str, Any]) -> TrainState:
 
 
 def _state_at(checkpoint: CheckpointFile, payload: dict[str, Any], loaded: LoadedRun) -> TrainState:
-    """Return the state in a checkpoint of this run, if it is where its name says and training can go on from it."""
+    """Return the state of a checkpoint, if it matches the name of its file and training can resume from it."""
     state, ended = _state(checkpoint.path, payload), checkpoint.iteration is None
-    place = (checkpoint.stage_index + ended, 0 if ended else checkpoint.iteration)
     try:
         check_resumable(state, loaded.recipe, loaded.scene)
     except (RunError, ShapeError) as error:
         raise _unreadable(checkpoint.path, str(error)) from error
-    if (state.stage, state.step) != place:
+    if (state.stage, state.step) != (checkpoint.stage_index + ended, 0 if ended else checkpoint.iteration):
         raise _unreadable(checkpoint.path, f"it holds stage {state.stage}, iteration {state.step}")
     return state
 
 
-def _adopt(run: RunFolder, loaded: LoadedRun, stage: FinishedStage, on_event: OnEvent) -> ResumePoint:
-    """Make another run's finished stages this run's own."""
-    name = loaded.recipe.stages[stage.index].name
-    run.events.append_text(stage.log)
-    run.write_metrics({"stages": [{**m, "reused_from": stage.source} for m in stage.metrics], "surface": None})
-    payload = {k: v for k, v in stage.payload.items() if k != "events_bytes"}
-    run.save_checkpoint(stage.index, name, None, payload)
-    on_event(Notice(f"stages up to {name!r} are taken from {stage.source}"))
-    return ResumePoint(_state(Path(stage.source), stage.payload))
-
-
-def _from_run(loaded: LoadedRun, path: Path) -> FinishedStage:
-    """Return the furthest stage that another run has in common with this one."""
-    other = open_run(path)
-    ends = [c for c in other.checkpoints() if c.iteration is None]
-    for checkpoint in reversed(ends):
-        index = checkpoint.stage_index
-        if index >= len(loaded.recipe.stages):
-            continue
-        payload = _read(checkpoint.path)
-        metrics = other.metrics()["stages"]
-        if payload["key"] == loaded.stage_key(index) and len(metrics) > index:
-            _state_at(checkpoint, payload, loaded)
-            log = other.events.read_bytes(payload["events_bytes"])
-            return FinishedStage(index, payload, metrics[: index + 1], log, str(path))
-    have = ", ".join(c.stage for c in ends) or "none"
-    raise RunError(
-        f"--from {path} has no finished stage in common with this run (its stages: {have}); scene, protocol, "
-        "downscale, seed, backend, versions and the stages' settings must be the same"
-    )
-
-
-# -- the stage cache ------------------------------------------------------------------------------------------
-def _cache_file(folder: Path, key: str) -> Path:
-    return folder / f"{key[:32]}.pt"
-
-
-def _from_cache(loaded: LoadedRun, folder: Path, on_event: OnEvent) -> FinishedStage | None:
-    """Return the furthest stage that the cache has; what is damaged in it goes, and is trained and kept again."""
-    sweep(folder)
-    for index in reversed(range(len(loaded.recipe.stages))):
-        key = loaded.stage_key(index)
-        path = _cache_file(folder, key)
-        if path.exists():
-            try:
-                return _cached(loaded, index, path, key)
-            except RunError as error:
-                on_event(Notice(f"{error}: done, that stage is trained again"))
-                with contextlib.suppress(OSError):
-                    path.unlink()
-    return None
-
-
-def _cached(loaded: LoadedRun, index: int, path: Path, key: str) -> FinishedStage:
-    """Return what a file of the cache holds.
-
-    Raises
-    ------
-    RunError
-        It is damaged.
-    """
-    payload = _read(path)
-    end = CheckpointFile(path, index, loaded.recipe.stages[index].name, None)
-    _state_at(end, payload, loaded)
-    try:
-        metrics, log = json.loads(payload.pop("metrics")), payload.pop("log").encode()
-    except (LookupError, TypeError, AttributeError, ValueError, RecursionError) as error:
-        raise _unreadable(path, f"{type(error).__name__}: {error}") from error
-    check_shape(path, {"stages": metrics}, METRICS_SHAPE, "delete it")
-    if payload["key"] != key or len(metrics) != index + 1:
-        raise _unreadable(path, "it is of another stage")
-    return FinishedStage(index, payload, metrics, log, str(path))
-
-
 def stage_end(run: RunFolder, loaded: LoadedRun, index: int) -> TrainState | None:
-    """Return the state at the end of a stage: from the run's own checkpoint, or from where the stage was taken.
-
-    None where neither is there any more.
-
-    Raises
-    ------
-    RunError
-        The run's own checkpoint is broken.
-    """
+    """Return the state at the end of a stage, from the run or from the source of a reused stage; None if it is gone."""
     for checkpoint in run.checkpoints():
         if (checkpoint.stage_index, checkpoint.iteration) == (index, None):
             return _state_at(checkpoint, _read(checkpoint.path), loaded)
@@ -257,26 +168,78 @@ def stage_end(run: RunFolder, loaded: LoadedRun, index: int) -> TrainState | Non
         ends = RunFolder(source).checkpoints()
         paths = [c.path for c in ends if (c.stage_index, c.iteration) == (index, None)]
     for path in paths:
-        with contextlib.suppress(RunError):  # somebody else's: gone or broken, it is not there
+        with contextlib.suppress(RunError):  # missing or broken
             payload = _read(path)
             if payload["key"] == key:
                 return _state(path, payload)
     return None
 
 
-def _keep_scored(run: RunFolder, folder: Path) -> None:
-    """Keep the last stage that a killed process had scored but not kept; remove what it left half-written."""
+# -- stages of other runs ----------------------------------------------------------------------------------------------
+def _adopt(run: RunFolder, loaded: LoadedRun, stage: FinishedStage, on_event: OnEvent) -> ResumePoint:
+    """Copy the finished stages of another run into this one."""
+    name = loaded.recipe.stages[stage.index].name
+    run.events.append_text(stage.log)
+    run.write_metrics({"stages": [{**m, "reused_from": stage.source} for m in stage.metrics], "surface": None})
+    payload = {k: v for k, v in stage.payload.items() if k != "events_bytes"}
+    run.save_checkpoint(stage.index, name, None, payload)
+    on_event(Notice(f"stages up to {name!r} are reused from {stage.source}"))
+    return ResumePoint(_state(Path(stage.source), stage.payload))
+
+
+def _from_run(loaded: LoadedRun, path: Path) -> FinishedStage:
+    """Return the last stage that another run has in common with this one."""
+    other = open_run(path)
+    ends = [c for c in other.checkpoints() if c.iteration is None and c.stage_index < len(loaded.recipe.stages)]
+    for checkpoint in reversed(ends):
+        index, payload, metrics = checkpoint.stage_index, _read(checkpoint.path), other.metrics()["stages"]
+        if payload["key"] == loaded.stage_key(index) and len(metrics) > index:
+            _state_at(checkpoint, payload, loaded)
+            log = other.events.read_bytes(payload["events_bytes"])
+            return FinishedStage(index, payload, metrics[: index + 1], log, str(path))
+    have = ", ".join(c.stage for c in ends) or "none"
+    raise RunError(
+        f"--from {path} has no finished stage in common with this run (its stages: {have}); scene, protocol, "
+        "downscale, seed, backend, versions and the stages' settings must be the same"
+    )
+
+
+def _cache_file(folder: Path, key: str) -> Path:
+    return folder / f"{key[:32]}.pt"
+
+
+def _from_cache(loaded: LoadedRun, folder: Path, on_event: OnEvent) -> FinishedStage | None:
+    """Return the last stage that the cache has; damaged files are deleted."""
     sweep(folder)
-    stages = run.metrics()["stages"]
-    ends = [c for c in run.checkpoints() if c.iteration is None and c.stage_index < len(stages)]
-    for end in ends[-1:]:
-        if "reused_from" not in stages[end.stage_index]:  # that is whose it is
-            with contextlib.suppress(RunError):  # damaged: training goes on from the one before
-                put_in_cache(folder, run, end.stage_index, _read(end.path))
+    for index in reversed(range(len(loaded.recipe.stages))):
+        key = loaded.stage_key(index)
+        path = _cache_file(folder, key)
+        if path.exists():
+            try:
+                return _cached(loaded, index, path, key)
+            except RunError as error:
+                on_event(Notice(f"{error}: deleted, the stage is trained again"))
+                with contextlib.suppress(OSError):
+                    path.unlink()
+    return None
+
+
+def _cached(loaded: LoadedRun, index: int, path: Path, key: str) -> FinishedStage:
+    """Return a stage from a file of the cache."""
+    payload = _read(path)
+    _state_at(CheckpointFile(path, index, loaded.recipe.stages[index].name, None), payload, loaded)
+    try:
+        metrics, log = json.loads(payload.pop("metrics")), payload.pop("log").encode()
+    except (LookupError, TypeError, AttributeError, ValueError, RecursionError) as error:
+        raise _unreadable(path, f"{type(error).__name__}: {error}") from error
+    check_shape(path, {"stages": metrics}, METRICS_SHAPE, "delete it")
+    if payload["key"] != key or len(metrics) != index + 1:
+        raise _unreadable(path, "it is of another stage")
+    return FinishedStage(index, payload, metrics, log, str(path))
 
 
 def put_in_cache(folder: Path, run: RunFolder, index: int, payload: dict[str, Any]) -> None:
-    """Keep a finished and scored stage for other runs."""
+    """Store a finished and scored stage for other runs."""
     make_folder(folder)
     path = _cache_file(folder, payload["key"])
     if not path.exists():

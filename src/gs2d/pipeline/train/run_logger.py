@@ -21,45 +21,45 @@ from gs2d.pipeline.train.attribute_changes import Snapshot, mean_changes, take_s
 from gs2d.pipeline.train.interruption import HeldSignals
 from gs2d.pipeline.train.resume import ResumePoint
 from gs2d.pipeline.train.stage_results import StageResults
-from gs2d.training import events as train_events
+from gs2d.training import events
 from gs2d.training.events import Notice, OnEvent, Phase, Step
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
 
-LOG_LINES = 300  # step lines a stage
-PROBES = 30  # times a stage at which the probe views are scored for the PSNR curve
+LOG_LINES = 300  # progress lines per stage
+PROBES = 30  # times per stage at which the probe views are scored for the PSNR curve
 GROWTH = 1.1  # of the cost of iterations, while splats are added (``Phase.growth``)
 REPORT_EVERY, REPORT_EVERY_ON_GPU = 10, 50  # iterations between progress events, for which the host waits for a GPU
-_ROWS_OR_JUMPS = (train_events.Densified, train_events.OpacityLimited, train_events.FloatersRemoved)
+_ROWS_OR_JUMPS = (events.Densified, events.OpacityLimited, events.FloatersRemoved)
 
 
 class StageClock:
-    """Seconds of training in a stage, without breaks for scores, log lines and checkpoints."""
+    """Training time of a stage in seconds, without pauses for scores, log lines and checkpoints."""
 
     def __init__(self, seconds: float = 0.0) -> None:
         self.seconds = seconds
         self._started: float | None = None
 
     def start(self) -> None:
-        """Go on."""
+        """Start or continue."""
         self._started = time.perf_counter()
 
     def stop(self) -> None:
-        """Stop; ``seconds`` is up to date then."""
+        """Stop and update ``seconds``."""
         if self._started is not None:
             self.seconds += time.perf_counter() - self._started
             self._started = None
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Stand still inside."""
+        """Pause inside the context."""
         self.stop()
         yield
         self.start()
 
 
 class RunLogger:
-    """The memory of a training run. Nothing it does changes what is trained.
+    """Records a training run. It does not change what is trained.
 
     Parameters
     ----------
@@ -67,10 +67,9 @@ class RunLogger:
     loaded : LoadedRun
     trainer : Trainer
     start : ResumePoint
-        Where training starts.
     on_event : callable
     visitors : sequence of Visitor
-        See every view of the finished splats, while they are scored.
+        Receive every view of the finished splats while they are scored.
     """
 
     def __init__(
@@ -88,20 +87,20 @@ class RunLogger:
         self._memory, self._gpu_memory = PeakMemory(), PeakGpuMemory(loaded.backend)
         self._clock, self._peak, self._at_entry = StageClock(start.seconds), start.peak_memory, dict(start.at_entry)
         self._saved_at, self._saved_iteration = time.perf_counter(), 0
-        self.psnr: float | None = None  # of the probe views, the last time that they were scored
-        self._before: Snapshot | None = None  # of the last step line, until it is compared with the next progress
+        self.psnr: float | None = None  # of the probe views
+        self._before: Snapshot | None = None  # taken at a logged progress, compared with the next progress
         self._signals = HeldSignals()
 
     # -- called by the pipeline ----------------------------------------------------------------------------------------
     def begin(self) -> None:
-        """Take up the state: score a finished stage that was not scored before the break, start the clock."""
+        """Take over the state: score a finished stage that was not scored before an interruption, start the clock."""
         state = self._state
         if state.step == 0 and not state.entered:
             if state.stage > 0:
                 self._results.take_over(state.stage - 1, self._facts())
             self._reset_stage()
         elif state.step and self._due(state.step, self._stage(state.stage).iterations, LOG_LINES):
-            self._before = take_snapshot(state.splats, state.step)  # as the run that was broken off had it
+            self._before = take_snapshot(state.splats, state.step)  # as in the interrupted run
         self._saved_iteration = state.step
         if state.processes and state.processes[-1][:2] == (state.stage, state.step):
             stage, count = min(state.stage, len(self._loaded.recipe.stages) - 1), self._trainer.processes.size
@@ -112,28 +111,28 @@ class RunLogger:
         if state.entered:
             self._signals.hold()
 
-    def stop_if_asked(self) -> None:
-        """Save a checkpoint and stop, where a signal asks for it and this iteration can be gone on from."""
+    def stop_if_requested(self) -> None:
+        """Save a checkpoint and stop, if a signal requests it and training can resume from this iteration."""
         state, processes = self._state, self._trainer.processes
-        if not (self._signals.asked or processes.stop_asked) or not state.entered:
+        if not (self._signals.pending or processes.stop_asked) or not state.entered:
             return
         if self._before is not None and self._before.iteration != state.step:
-            return  # the line of changes that is due would be lost: at most until the next progress
+            return  # a line of changes is due at the next progress
         if state.step == self._stage(state.stage).iterations:
             return  # the checkpoint at the end of the stage is due
         if state.step > 0:
             self._clock.stop()
             try:
                 self._save(state.stage, state.step)
-            except Gs2dError as error:  # one that cannot be saved stops nothing
+            except Gs2dError as error:
                 self._on_event(Notice(f"no checkpoint at iteration {state.step}: {error}"))
         self._signals.release()
-        if processes.stop_asked:  # another process heard it
+        if processes.stop_asked:  # another process received the signal
             raise KeyboardInterrupt
 
     @contextmanager
     def ending_well(self) -> Iterator[None]:
-        """Say in a DivergedError from where training can go on; signals act as before in the end."""
+        """Name the last checkpoint in a DivergedError; restore the signal handlers at the end."""
         try:
             yield
         except DivergedError as error:
@@ -143,35 +142,35 @@ class RunLogger:
         finally:
             self._signals.forget()
 
-    def on_training_event(self, event: train_events.TrainingEvent) -> None:
-        """Log an event, and do what is due."""
-        if isinstance(event, train_events.Progress):
+    def on_training_event(self, event: events.TrainingEvent) -> None:
+        """Log an event and do what is due."""
+        if isinstance(event, events.Progress):
             self._on_progress(event)
             return
-        if isinstance(event, train_events.StageEntering):
+        if isinstance(event, events.StageEntering):
             self._reset_stage()
             self._memory.reset()
             self._gpu_memory.reset()
             self._clock.start()
-        elif isinstance(event, train_events.StageFinished):
+        elif isinstance(event, events.StageFinished):
             self._clock.stop()
-        elif isinstance(event, train_events.Initialised):
+        elif isinstance(event, events.Initialised):
             self._on_event(Notice(start_text(event), detail=True))
         elif isinstance(event, _ROWS_OR_JUMPS):
-            self._before = None  # other rows, or a jump that no gradient made
+            self._before = None  # other rows, or a change without gradients
         self._log(event)
-        if isinstance(event, train_events.StageStarted):
+        if isinstance(event, events.StageStarted):
             self._score_entry(event)
             self._signals.hold()
-        elif isinstance(event, train_events.StageFinished):
+        elif isinstance(event, events.StageFinished):
             self._finish_stage(event.index)
 
     # -- the log -------------------------------------------------------------------------------------------------------
-    def _log(self, event: train_events.TrainingEvent, **extra: Any) -> None:
+    def _log(self, event: events.TrainingEvent, **extra: Any) -> None:
         facts = {name: value for name, value in asdict(event).items() if _storable(value)}
         self._run.events.append({"kind": event.kind, **facts, **extra})
 
-    def _on_progress(self, event: train_events.Progress) -> None:
+    def _on_progress(self, event: events.Progress) -> None:
         last, total = event.iteration == event.iterations, self._iterations_before(event.index) + event.iteration
         self._log_changes(event)
         if last or self._due(event.iteration, event.iterations, LOG_LINES):
@@ -196,12 +195,12 @@ class RunLogger:
                 self._save(event.index, event.iteration)
 
     def _due(self, iteration: int, iterations: int, count: int) -> bool:
-        """Whether a multiple of the progress that is one of about ``count`` of a stage was in the last iteration."""
+        """Return whether something that happens about ``count`` times per stage was due in the last iteration."""
         every = max(1, math.ceil(iterations / count / self._progress_every)) * self._progress_every
         return iteration // every > (iteration - self._trainer.views) // every
 
-    def _log_changes(self, event: train_events.Progress) -> None:
-        """Log what the iterations since the last step line changed, if that was one progress ago."""
+    def _log_changes(self, event: events.Progress) -> None:
+        """Log the changes since the previous progress, if a snapshot was taken there."""
         before, self._before = self._before, None
         if before is None:
             return
@@ -211,29 +210,27 @@ class RunLogger:
             fact = {"stage": event.stage, "iteration": event.iteration, "over": over}
             self._run.events.append({"kind": "changes", **fact, **changes})
 
-    # -- checkpoints ---------------------------------------------------------------------------------------------------
+    # -- checkpoints and stages ----------------------------------------------------------------------------------------
     def _save(self, index: int, iteration: int | None) -> None:
         """Write a checkpoint; ``iteration`` None: at the end of the stage."""
         self._peak = max(self._peak, self._memory.read())
         extra = {"seconds": self._clock.seconds, "peak_memory": self._peak, "at_entry": self._at_entry}
-        state = self._state
-        key = self._loaded.stage_key(index, state.processes)
-        payload = {"state": state.state_dict(), "extra": json.dumps(extra), "key": key}
+        key = self._loaded.stage_key(index, self._state.processes)
+        payload = {"state": self._state.state_dict(), "extra": json.dumps(extra), "key": key}
         self._run.save_checkpoint(index, self._stage(index).name, iteration, payload)
         self._saved_at, self._saved_iteration = time.perf_counter(), iteration or 0
 
-    # -- stages --------------------------------------------------------------------------------------------------------
     def _reset_stage(self) -> None:
         self._clock, self._peak, self._at_entry, self._saved_iteration = StageClock(), 0, {}, 0
 
     def _facts(self) -> dict[str, Any]:
-        """Return what is known of a stage without scoring it, for ``metrics.json``."""
+        """Return the entry of a stage in ``metrics.json`` without its scores."""
         facts: dict[str, Any] = {"seconds": round(self._clock.seconds, 3), "peak_memory_bytes": self._peak}
         if self._gpu_memory.read():
             facts["peak_gpu_memory_bytes"] = self._gpu_memory.read()  # before scoring adds to it
         return {**facts, "after_clone": self._at_entry} if self._at_entry else facts
 
-    def _score_entry(self, event: train_events.StageStarted) -> None:
+    def _score_entry(self, event: events.StageStarted) -> None:
         """Score a stage that begins with a clone, before its first iteration."""
         if not any(isinstance(action, CloneInPlace) for action in self._stage(event.index).on_enter):
             return
@@ -253,7 +250,7 @@ class RunLogger:
         if index + 1 < len(stages):
             self._phase()
 
-    # -- small things --------------------------------------------------------------------------------------------------
+    # -- helpers -------------------------------------------------------------------------------------------------------
     @property
     def _state(self) -> TrainState:
         return self._trainer.state
@@ -281,16 +278,15 @@ def _storable(value: Any) -> bool:
     return not isinstance(value, float) or math.isfinite(value)
 
 
-def start_text(event: train_events.Initialised) -> str:
-    """Return what training starts from, in words."""
+def start_text(event: events.Initialised) -> str:
+    """Return the source of the initial splats as text."""
     sources = {
         "points": "points of the capture",
-        "sweep": "places on which neighbouring photographs agree, and points of the capture",
+        "sweep": "points on which neighbouring photographs agree, and points of the capture",
         "depths": "points of the capture and of its known depths",
         "splats": "given splats",
-        "random": "random points in the box the cameras look at",
+        "random": "random points in the box that the cameras look at",
     }
-    source = sources[event.source]
     dropped = f" ({event.dropped:,} were not usable)" if event.dropped else ""
     lacks = f"; no dense start: {event.lacks}" if event.lacks else ""
-    return f"starting from {event.splats:,} {source}{dropped}{lacks}"
+    return f"starting from {event.splats:,} {sources[event.source]}{dropped}{lacks}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import MappingProxyType
@@ -16,15 +15,14 @@ from gs2d.io.splat_ply import write_splats
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.run_images import choose_views, draw_stage
 from gs2d.pipeline.finish.scoring import (
-    SeenView,
+    RenderedPhotograph,
+    ScoreOptions,
     Visitor,
     evenly,
     is_partial,
     mean_psnr,
     score_views,
     split_metrics,
-    transparent_entry,
-    transparent_part,
 )
 from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
@@ -37,11 +35,11 @@ from gs2d.training.events import OnEvent, StageScored
 from gs2d.training.trainer import Trainer
 
 PROBE_VIEWS = 4
-EARLY_VIEWS = 16  # training views that score a stage before the last, where stages are compared by test views
+EARLY_VIEWS = 16  # training views that score a stage before the last, if the scene has test views
 
 
 class StageResults:
-    """Scores and draws the stages of a training, and writes what comes of them.
+    """Scores and draws the stages of a training, and writes their results.
 
     Parameters
     ----------
@@ -50,7 +48,7 @@ class StageResults:
     trainer : Trainer
     on_event : callable
     visitors : sequence of Visitor
-        See every view of the finished splats, while they are scored.
+        Receive every view of the finished splats while they are scored.
     """
 
     def __init__(
@@ -61,16 +59,16 @@ class StageResults:
         self._shown = choose_views(loaded.scene)
         probes = loaded.scene.test or loaded.scene.train
         self._probes = probes[:: max(1, len(probes) // PROBE_VIEWS)][:PROBE_VIEWS]
-        self._predicted: tuple[tuple[int, int], Scene] | None = None  # of stage and step
+        self._predicted: tuple[tuple[int, int], Scene] | None = None  # with its stage and step
 
     def probe_psnr(self) -> float | None:
-        """Return the mean PSNR of a few fixed views (test views where there are any)."""
-        # By neighbours alone: what the camera would see costs a rendering of every photograph.
+        """Return the mean PSNR of a few fixed views, test views if there are any."""
+        # Exposures are predicted from neighbours only: measuring brightness would render every photograph.
         views, loaded = self._now(self._probes, with_predicted(self._trainer.scene_now())), self._loaded
         return mean_psnr(self._trainer.drawn, views, loaded.settings, loaded.backend)
 
     def score_entry(self) -> dict[str, Any]:
-        """Score just after the entry actions, to compare with the stage before: the price of the clone."""
+        """Score the splats just after the entry actions of a stage."""
         entry: dict[str, Any] = {}
         for split, views in self._scored(last=False):
             with attempted(f"scores of {split} views after the clone", "", self._on_event):
@@ -79,12 +77,12 @@ class StageResults:
         return entry
 
     def score(self, index: int, facts: Mapping[str, Any]) -> None:
-        """Score and draw a finished stage; ``facts`` go into its entry. After the last stage an error ends nothing."""
+        """Score and draw a finished stage; ``facts`` go into its entry. After the last stage, errors are reported."""
         with self._attempted_at_end(index):
             self._score_stage(index, facts)
 
     def take_over(self, index: int, facts: Mapping[str, Any]) -> None:
-        """Draw a stage of another run or process, and score it if it was not, or if every view has to be seen."""
+        """Draw a stage of another run or process, and score it if its scores are missing or partial."""
         stages = self._run.metrics()["stages"]
         if self._is_last(index):
             self.write_splats()
@@ -98,17 +96,16 @@ class StageResults:
                 self._draw(self._stage(index).name)
 
     def write_splats(self) -> None:
-        """Write the splats and what belongs to them, before anything that is made of them can fail."""
-        run, loaded = self._run, self._loaded
-        with attempted("learned cameras and exposures", None, self._on_event):
+        """Write the splats, refined cameras and learned appearance, before anything that could fail uses them."""
+        with attempted("refined cameras and exposures", None, self._on_event):
             now = self._trainer.scene_now()
-            write_poses(run, loaded.scene, now, self._on_event)
-            write_appearance(run, now, self._on_event)
-        write_splats(run.file(SPLATS), self._trainer.splats)
+            write_poses(self._run, self._loaded.scene, now, self._on_event)
+            write_appearance(self._run, now, self._on_event)
+        write_splats(self._run.file(SPLATS), self._trainer.splats)
 
     @contextmanager
     def _attempted_at_end(self, index: int) -> Iterator[None]:
-        """After the last stage, report an error and go on; before it, raise it."""
+        """Report errors after the last stage; raise them before."""
         if not self._is_last(index):
             yield
             return
@@ -116,7 +113,7 @@ class StageResults:
             yield
 
     def _score_stage(self, index: int, facts: Mapping[str, Any]) -> None:
-        """Score a finished stage, draw it, write its entry of ``metrics.json``, put it in the cache."""
+        """Score and draw a finished stage, write its entry of ``metrics.json``, put it into the cache."""
         stage, last, splats = self._stage(index), self._is_last(index), self._trainer.splats
         entry: dict[str, Any] = {
             "name": stage.name,
@@ -127,14 +124,10 @@ class StageResults:
         }
         shown = {view.name for _, view in self._shown}
         outputs: dict[str, RenderOutput] = {}
-        transparent: dict[str, float] = {}
 
-        def keep(seen: SeenView, scores: ImageMetrics) -> None:
+        def keep(seen: RenderedPhotograph, scores: ImageMetrics) -> None:
             if seen.view.name in shown:
                 outputs[seen.view.name] = seen.output
-            part = transparent_part(seen) if seen.split == "train" else None
-            if part is not None and math.isfinite(part):  # a mask may leave no pixel
-                transparent[seen.view.name] = part
 
         for split, views in self._scored(last=last):
             entry |= {split: None, f"{split}_reason": "its views could not be scored"}
@@ -143,8 +136,7 @@ class StageResults:
                 scores = self._score(split, views, f"scoring {split} views", visitors)
                 del entry[f"{split}_reason"]
                 entry |= split_metrics(scores, split, of=len(self._views(split)))
-        entry |= transparent_entry(transparent)
-        with attempted(f"what the losses say of stage {stage.name}", None, self._on_event):
+        with attempted(f"reports of the losses, stage {stage.name}", None, self._on_event):
             entry |= report_losses(self._run, self._trainer, self._loaded.scene.train)
         self._draw(stage.name, outputs)
         stages = [*self._run.metrics()["stages"][:index], entry]
@@ -156,9 +148,9 @@ class StageResults:
         self._on_event(StageScored(entry))
 
     def _scored(self, *, last: bool) -> list[tuple[str, Sequence[View]]]:
-        """Return the views that score a stage: all, but before the last stage some of the training views.
+        """Return the views that score a stage: all, but only some training views before the last stage.
 
-        Where training views are what stages are compared by (DTU, captures without test views) all of them do.
+        If stages are compared by training views (DTU, captures without test views), all of them are scored.
         """
         scene = self._loaded.scene
         compared = self._loaded.protocol.test_on == "train" or not scene.test
@@ -168,27 +160,21 @@ class StageResults:
     def _score(
         self, split: str, views: Sequence[View], name: str, visitors: Sequence[Visitor] = ()
     ) -> dict[str, ImageMetrics]:
-        return score_views(
-            self._trainer.drawn,
-            self._now(views, self._shown_scene()),
-            self._loaded.settings,
-            self._loaded.backend,
-            name=name,
-            on_event=self._on_event,
-            split=split,
-            visitors=visitors,
-        )
+        views, loaded = self._now(views, self._shown_scene()), self._loaded
+        options = ScoreOptions(split=split, visitors=visitors)
+        drawing = (loaded.settings, loaded.backend)
+        return score_views(self._trainer.drawn, views, *drawing, name=name, on_event=self._on_event, options=options)
 
     def _draw(self, stage: str, outputs: Mapping[str, RenderOutput] = MappingProxyType({})) -> None:
         drawn, state = self._trainer.drawn, self._trainer.state
         views = self._now([view for _, view in self._shown], self._shown_scene())
         shown = zip((split for split, _ in self._shown), views, strict=True)
-        with attempted(f"pictures of stage {stage}", None, self._on_event):
-            group = state.groups.get("high_error") if len(drawn) == len(state.splats) else None  # none of the frozen
+        with attempted(f"images of stage {stage}", None, self._on_event):
+            group = state.groups.get("high_error") if len(drawn) == len(state.splats) else None  # no frozen splats
             draw_stage(self._run, self._loaded, list(shown), stage, drawn, group, outputs)
 
     def _shown_scene(self) -> Scene:
-        """Return the scene with what was learned of it, and predicted exposures of its test views."""
+        """Return the scene with its learned appearance, and predicted exposures of its test views."""
         at = (self._trainer.state.stage, self._trainer.state.step)
         if self._predicted is None or self._predicted[0] != at:
             brightness = metered(self._trainer.drawn, self._loaded.settings, self._loaded.backend)
@@ -196,7 +182,7 @@ class StageResults:
         return self._predicted[1]
 
     def _now(self, views: Sequence[View], scene: Scene) -> list[View]:
-        """Return views of the capture as they are in ``scene``, which is the capture as it is now."""
+        """Return the views of ``scene`` that correspond to views of the capture."""
         now = dict(zip(map(id, self._loaded.scene.views), scene.views, strict=True))
         return [now.get(id(view), view) for view in views]
 

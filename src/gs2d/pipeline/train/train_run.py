@@ -1,4 +1,4 @@
-"""Train a run: prepare, train stage by stage with checkpoints, score, render, mesh, report; resume exactly."""
+"""Train a run: prepare, train stage by stage with checkpoints, score, mesh, report; resume exactly."""
 
 from __future__ import annotations
 
@@ -30,29 +30,27 @@ from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.run_mesh import MeshFrames, extract_mesh, keep_facts
 from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.finish.run_subject import meshed_subject
+from gs2d.pipeline.finish.run_verdict import Collector, write_verdict
 from gs2d.pipeline.finish.scoring import Visitor
-from gs2d.pipeline.finish.verdict import Collector, write_verdict
 from gs2d.pipeline.look.page import page_run
 from gs2d.pipeline.prepare.estimate import estimate
 from gs2d.pipeline.prepare.limits import release, use_memory, use_threads
 from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
 from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
-from gs2d.pipeline.prepare.part import Part
 from gs2d.pipeline.prepare.photographs import PREPARED
 from gs2d.pipeline.prepare.resolve import check_options
-from gs2d.pipeline.prepare.resolved import Execution, check_same_run
+from gs2d.pipeline.prepare.resolved import check_same_run
+from gs2d.pipeline.prepare.scene_part import ScenePart
 from gs2d.pipeline.run_parts import TRAINED
 from gs2d.pipeline.train.live import Live
 from gs2d.pipeline.train.process_group import connected, follow, lead, memory_of
 from gs2d.pipeline.train.resume import ResumePoint, check_sources, choose_start
 from gs2d.pipeline.train.run_logger import RunLogger, progress_every
-from gs2d.training import events
-from gs2d.training.events import Event, Notice, OnEvent, Phase, RunPlan, ignore
+from gs2d.training.events import Event, Notice, OnEvent, Phase, Progress, RunPlan, TrainingEvent, ignore
 from gs2d.training.parallel import ONE_PROCESS, ManyProcesses, OneProcess
 from gs2d.viewer.page_server import free_port
 
-MANY = 500  # photographs, from which time and memory are estimated before training
-UNPACKED = "unpacked"  # in the run folder: what came as a ZIP file
+UNPACKED = "unpacked"  # in the run folder: the contents of a ZIP file
 
 
 def train(
@@ -61,24 +59,24 @@ def train(
     *,
     title: str = "",
     allowed: tuple[str, ...] = (),
-    part: Part | None = None,
+    part: ScenePart | None = None,
 ) -> RunFolder:
-    """Train a run to its end: splats, mesh, metrics, report.
+    """Train a run and write splats, mesh, metrics, page and report.
 
-    A run that fails before its first checkpoint leaves nothing behind; one that fails or is killed later can be
-    resumed, and then ends with the same ``splats.ply``, byte for byte, as if it had never stopped.
+    A run that fails before its first checkpoint leaves nothing behind. One that is interrupted later can be resumed,
+    with a byte-identical ``splats.ply``.
 
     Parameters
     ----------
     options : TrainOptions
     on_event : callable
-        Gets :mod:`gs2d.training.events`.
+        Receives :mod:`gs2d.training.events`.
     title : str
         Heading of the report; empty: the name of the capture.
     allowed : tuple of str
-        Names that may already be in ``options.out``.
-    part : Part or None
-        The part of a larger training that this is; only its splats are written.
+        Names of files that may already be in ``options.out``.
+    part : ScenePart or None
+        Trains a part of the scene and writes its splats only.
 
     Returns
     -------
@@ -88,7 +86,7 @@ def train(
     Raises
     ------
     Gs2dError
-        Anything that the user can mend.
+        If options, capture or machine do not allow the run; the message says what to do.
     """
     with connected(options.backend) as together:
         if isinstance(together, ManyProcesses) and not together.leads:
@@ -109,9 +107,9 @@ def _train(
     together: OneProcess,
     title: str,
     allowed: tuple[str, ...],
-    part: Part | None,
+    part: ScenePart | None,
 ) -> RunFolder:
-    """Train a run that is the only one, or that others follow."""
+    """Train in this process, which leads the others if there are any."""
     check_viewer(options)
     allowed = (*allowed, PREPARED)
     check_claim(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
@@ -121,31 +119,30 @@ def _train(
     details: list[str] = []
     on_event = keeping_details(on_event, details)
     loaded = prepare_run(options, on_event, title=title, part=part)
-    if unlike := _unlike_its_run(options.out, loaded):
-        on_event(Notice(unlike))
     if options.overwrite:
         check_sources(options.out, loaded)
     run = claim_run(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
     with run.locked(), discard_on_failure(run), watched(loaded, on_event) as live:
         on_event = on_event if live is None else live.on_event
-        if options.cache is not None:  # now, not when the first stage has been trained
+        if options.cache is not None:  # an unusable folder fails here, not after the first stage
             run.made += make_folder(options.cache)
         if is_run(run.path):
             check_same_run(run, loaded.resolved)
             if run.file(SPLATS).exists() and not run.checkpoints():
                 raise RunError(
-                    f"{run.path} is finished and its checkpoints are gone: nothing to resume; "
-                    "train it again with --overwrite, or choose another --out"
+                    f"{run.path} is finished and has no checkpoints to resume; train it again with --overwrite, or "
+                    "choose another --out"
                 )
         else:
             run.write_definition(loaded.resolved.to_json())
         loaded = lead(loaded, together, on_event)
         start = choose_start(run, loaded, on_event)
         if start.state is None:
-            for event in pretraining_notices(loaded, is_part=part is not None):
-                on_event(event)
+            on_event(Notice(_training_line(loaded)))
+            if part is None:
+                on_event(Notice(_estimate_line(loaded)))
             for text in details:
-                run.events.append({"kind": "notice", "text": text})
+                run.events.append({"kind": Notice.kind, "text": text})
         hold()
         if part is not None:
             train_stages(run, loaded, start, on_event, live=live)
@@ -160,30 +157,9 @@ def _train(
     return run
 
 
-def _unlike_its_run(out: Path, loaded: LoadedRun) -> str:
-    """Return how this training differs from that of the run whose folder the capture lies in, as of `reconstruct`."""
-    resolved = loaded.resolved
-    home = resolved.scene.path.parent
-    if not is_run(home) or home == out.resolve():
-        return ""
-    run = RunFolder(home).definition()
-    pairs = (
-        ("--schedule-scale", run.get("schedule_scale"), resolved.schedule_scale),
-        ("--downscale", run.get("downscale"), resolved.downscale),
-        ("--test-every", (run.get("protocol") or {}).get("test_every"), resolved.protocol.test_every),
-    )
-    others = " ".join(f"{name} {theirs:g}" for name, theirs, ours in pairs if theirs not in (None, ours))
-    return f"{home} was trained with {others}; give the same for comparable results" if others else ""
-
-
-def _is_planned(execution: Execution, views: int) -> bool:
-    """Whether time and memory are estimated before a training begins."""
-    return bool(execution.quality or execution.memory or execution.disk or views >= MANY)
-
-
 @contextmanager
 def _unpacked(options: TrainOptions, allowed: tuple[str, ...], on_event: OnEvent) -> Iterator[Path]:
-    """Unpack the ZIP file of a capture into the run folder, where later commands find it."""
+    """Unpack the ZIP file of a capture into the run folder, where later commands read it."""
     allowed = (*allowed, UNPACKED)
     check_claim(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
     home = options.out / UNPACKED
@@ -193,7 +169,7 @@ def _unpacked(options: TrainOptions, allowed: tuple[str, ...], on_event: OnEvent
         scene = unpack(options.scene, home)
         with named_by(options.scene, scene):
             yield scene
-    finally:  # what the run is not of goes: all of it where there is no run, the older one where a run was replaced
+    finally:  # remove what the run does not use: everything if there is no run, the older copy if it was replaced
         used = RunFolder(options.out).definition()["scene"]["path"] if is_run(options.out) else ""
         for folder in home.iterdir():
             if folder.resolve() not in Path(used).resolve().parents:
@@ -203,7 +179,7 @@ def _unpacked(options: TrainOptions, allowed: tuple[str, ...], on_event: OnEvent
 
 @contextmanager
 def watched(loaded: LoadedRun, on_event: OnEvent) -> Iterator[Live | None]:
-    """Serve the page of a training while it lasts, with ``--viewer``."""
+    """Serve the page of a training while it runs, with ``--viewer``."""
     if not loaded.resolved.execution.viewer:
         yield None
         return
@@ -215,17 +191,16 @@ def watched(loaded: LoadedRun, on_event: OnEvent) -> Iterator[Live | None]:
 
 
 def check_viewer(options: TrainOptions) -> None:
-    """Raise for a page that cannot be served, before anything slow happens."""
-    if not options.viewer:
-        if options.viewer_port is not None:
-            raise RecipeError("--viewer-port belongs to --viewer, which was not given; give both")
-        return
-    free_port(options.viewer_port, option="--viewer-port")
+    """Raise if the page of ``--viewer`` cannot be served."""
+    if options.viewer:
+        free_port(options.viewer_port, option="--viewer-port")
+    elif options.viewer_port is not None:
+        raise RecipeError("--viewer-port needs --viewer")
 
 
 @contextmanager
 def discard_on_failure(run: RunFolder) -> Iterator[None]:
-    """Delete a run that fails before it has a checkpoint or a result: there is nothing in it to go on from."""
+    """Delete a run that fails before it has a checkpoint or a result."""
     try:
         yield
     except BaseException:
@@ -243,20 +218,20 @@ def train_stages(
     together: OneProcess = ONE_PROCESS,
     live: Live | None = None,
 ) -> tuple[Splats, Scene]:
-    """Train from where ``start`` is to the end of the last stage; return the splats and the cameras as they are now.
+    """Train from ``start`` to the end of the last stage; return the splats and the scene with its refined cameras.
 
-    The splats are written before they are scored. ``visitors`` see every view of the finished splats.
+    The splats are written before they are scored. ``visitors`` receive every view of the finished splats.
     """
     from gs2d.training.trainer import Trainer, TrainerOptions
 
-    part = loaded.part
+    part, from_nothing = loaded.start, start.state is None
 
-    def listen(event: events.TrainingEvent) -> None:
+    def listen(event: TrainingEvent) -> None:
         recorder.on_training_event(event)
         if live is not None:
             live.on_training_event(event, trainer.state, recorder.psnr)
-        if isinstance(event, events.Progress):  # on a GPU the only time when nothing is under way
-            recorder.stop_if_asked()
+        if isinstance(event, Progress):  # on a GPU, the only event at which no work is queued
+            recorder.stop_if_requested()
 
     trainer = Trainer(
         loaded.scene,
@@ -265,9 +240,9 @@ def train_stages(
         backend=loaded.backend,
         on_event=listen,
         state=start.state,
-        init=None if start.state is not None else loaded.init if part is None else part.own,
+        init=None if not from_nothing else loaded.init if part is None else part.own,
         options=TrainerOptions(
-            between=lambda: recorder.stop_if_asked(),
+            between=lambda: recorder.stop_if_requested(),
             frozen=None if part is None else part.frozen,
             within=None if part is None or loaded.recipe.dense_start is None else part.within,
             exposures=None if part is None else part.exposures,
@@ -284,7 +259,7 @@ def train_stages(
 
 
 def keeping_details(on_event: OnEvent, details: list[str]) -> OnEvent:
-    """Return a listener that adds the text of each detail to ``details`` and passes every event on."""
+    """Return a listener that adds the text of each detail to ``details`` and forwards every event."""
 
     def listen(event: Event) -> None:
         if isinstance(event, Notice) and event.detail:
@@ -294,40 +269,32 @@ def keeping_details(on_event: OnEvent, details: list[str]) -> OnEvent:
     return listen
 
 
-def pretraining_notices(loaded: LoadedRun, *, is_part: bool = False) -> list[Event]:
-    """Return what the user should know before training: photographs, image size, length and expected time."""
-    scene, resolved, shrunk, shortened = loaded.scene, loaded.resolved, "", ""
+def _training_line(loaded: LoadedRun) -> str:
+    """Return photographs, image size and length of a training in one line."""
+    scene, resolved = loaded.scene, loaded.resolved
     camera = max((view.camera for view in scene.views), key=lambda camera: max(camera.width, camera.height))
-    if resolved.downscale > 1:
-        shrunk = f" (--downscale {resolved.downscale})"
-    if resolved.schedule_scale != 1:
-        shortened = f" (--schedule-scale {resolved.schedule_scale:g})"
+    shrunk = f" (--downscale {resolved.downscale})" if resolved.downscale > 1 else ""
+    shortened = f" (--schedule-scale {resolved.schedule_scale:g})" if resolved.schedule_scale != 1 else ""
     if scene.test:
-        held_out = f"{len(scene.test)} do not train, they score the result"
-        held_out += "" if scene.own_split else " (--test-every 0 trains on all)"
+        split = f"{len(scene.test)} are held out for testing" + ("" if scene.own_split else " (--test-every 0: none)")
     else:
-        held_out = "none is held out to score the result"
-        held_out += "" if scene.own_split else " (--test-every 8 holds some out)"
-    told: list[Event] = [
-        Notice(
-            f"{len(scene.train)} of {len(scene.views)} photographs train at {camera.width}x{camera.height}{shrunk} for "
-            f"{loaded.recipe.iterations:,} iterations{shortened}; {held_out}"
-        )
-    ]
-    execution = resolved.execution
-    if not is_part and _is_planned(execution, len(scene.views)):
-        start = None if loaded.init is None else len(loaded.init)
-        found = estimate(
-            scene,
-            loaded.recipe,
-            loaded.backend,
-            downscale=resolved.downscale,
-            prepare=execution.prepare,
-            start=start,
-        )
-        told += [Notice(line, detail=True) for line in found.lines()]
-        told += [Notice(found.line())] if execution.quality is not None else []
-    return told
+        split = "none is held out for testing" + ("" if scene.own_split else " (--test-every 8: every eighth)")
+    return (
+        f"{len(scene.train)} of {len(scene.views)} photographs train at {camera.width}x{camera.height}{shrunk} for "
+        f"{loaded.recipe.iterations:,} iterations{shortened}; {split}"
+    )
+
+
+def _estimate_line(loaded: LoadedRun) -> str:
+    """Return the expected time and memory of a training in one line."""
+    return estimate(
+        loaded.scene,
+        loaded.recipe,
+        loaded.backend,
+        downscale=loaded.downscale,
+        prepare=loaded.resolved.execution.prepare,
+        start=None if loaded.init is None else len(loaded.init),
+    ).line()
 
 
 def finish(
@@ -338,7 +305,7 @@ def finish(
     frames: MeshFrames,
     collected: Collector,
 ) -> None:
-    """Write each thing that is made of the splats of a run, whatever the others do."""
+    """Write mesh, page, verdict and report of a run; a failure of one does not prevent the others."""
     execution = loaded.resolved.execution
     mesh = MeshOptions(subject_box=execution.subject_box, whole_scene=execution.whole_scene)
     with attempted(MESH, again("mesh", run.path), on_event):

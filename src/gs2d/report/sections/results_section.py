@@ -19,7 +19,6 @@ _SPLITS = {
 }
 _METRICS = (("psnr", "PSNR, dB", 2, 1), ("ssim", "SSIM", 4, 1), ("lpips", "LPIPS", 4, -1))
 _COSTS: tuple[tuple[str, int, Callable[[Mapping[str, Any]], float | None]], ...] = (
-    ("Transparent, %", 1, lambda stage: _scaled((stage.get("transparent") or {}).get("part"), 100)),
     ("Iterations", 0, lambda stage: number(stage.get("iterations"))),
     ("Splats", 0, lambda stage: number(stage.get("splats"))),
     ("Size, MB", 1, lambda stage: _scaled(stage.get("bytes"), 1e-6)),

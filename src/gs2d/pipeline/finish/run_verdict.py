@@ -1,7 +1,7 @@
 """The verdict on a run: a grade, the measures behind it, and advice; ``verdict.json``.
 
-The grade is the worse of two measures: PSNR of new views (of training views where none was held out), and floaters.
-What was not measured is listed and does not change the grade.
+The grade is the worse of two measures: PSNR of test views (training views if there are none), and floaters. Missing
+measures are listed and do not change the grade.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from gs2d.evaluation.hidden_points import hidden_points
 from gs2d.evaluation.image_metrics import ImageMetrics
 from gs2d.io.run_dir import VERDICT, RunFolder
 from gs2d.io.run_schema import VERDICT_SHAPE, check_shape
-from gs2d.pipeline.finish.scoring import SeenView
+from gs2d.pipeline.finish.scoring import RenderedPhotograph
 from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.sfm.workspace import POSES_JSON
 
 FORMAT = 3
-NAMED = 3  # views that a sentence names; verdict.json has all
+NAMED = 3  # views named in a sentence; verdict.json has all
 HEADLINES: Mapping[str | None, str] = {
     GOOD: "New views look like photographs of the scene.",
     USABLE: "The scene is recognisable but has visible flaws.",
@@ -50,7 +50,7 @@ class ViewMeasures:
     psnr : float or None
         dB, of 8-bit images.
     points, hidden : int or None
-        Sparse points that a test view shows, and those of them that its rendering hides.
+        Sparse points visible in a test view, and how many of them its rendering hides.
     """
 
     name: str
@@ -68,7 +68,7 @@ class Measures:
     ----------
     views : tuple of ViewMeasures
     placed, count : int or None
-        Photographs with a camera and all photographs, where ``gs2d poses`` found the cameras.
+        Photographs with a camera and all photographs, if ``gs2d poses`` made the capture.
     lost : tuple of str
         Names of the photographs without a camera.
     """
@@ -85,7 +85,7 @@ class Collector:
     Attributes
     ----------
     failure : Exception or None
-        The error that stopped the measuring; scoring goes on.
+        The error that stopped the measuring; scoring continues.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -98,7 +98,7 @@ class Collector:
         """Return the views measured so far."""
         return tuple(self._views.values())
 
-    def visit(self, seen: SeenView, scores: ImageMetrics) -> None:
+    def visit(self, seen: RenderedPhotograph, scores: ImageMetrics) -> None:
         """Measure a view."""
         if self.failure is not None:
             return
@@ -107,7 +107,7 @@ class Collector:
         except Exception as error:
             self.failure = error
 
-    def _measure(self, seen: SeenView, scores: ImageMetrics) -> ViewMeasures:
+    def _measure(self, seen: RenderedPhotograph, scores: ImageMetrics) -> ViewMeasures:
         view, psnr = seen.view, scores.psnr.value
         measured = ViewMeasures(view.name, seen.split, psnr if psnr is not None and math.isfinite(psnr) else None)
         if seen.split != "test" or self._observed is None:
@@ -118,7 +118,7 @@ class Collector:
 
 
 def placed_images(capture: Path | None) -> tuple[int | None, int | None, tuple[str, ...]]:
-    """Return photographs with a camera, all photographs, and the names without one; None where unknown."""
+    """Return the number of photographs with a camera, of all photographs, and the names without one, if known."""
     path = None if capture is None else capture / POSES_JSON
     if path is None or not path.is_file():
         return None, None, ()
@@ -133,7 +133,7 @@ def placed_images(capture: Path | None) -> tuple[int | None, int | None, tuple[s
 # -- judging -----------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Finding:
-    """One measure: its name, grade (None: not graded), value in words, meaning, advice, and the views it is about."""
+    """One measure: name, grade (None: not graded), value and meaning as text, advice, and the views concerned."""
 
     name: str
     grade: str | None
@@ -229,7 +229,7 @@ def _placed(measures: Measures) -> list[Finding]:
 
 
 def _some(names: Sequence[str]) -> str:
-    """Return the first names in words."""
+    """Return the first names as text."""
     more = len(names) - NAMED
     return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
 
@@ -255,7 +255,7 @@ def write_verdict(run: RunFolder, loaded: LoadedRun, collected: Collector) -> di
 
 
 def read_verdict(run: RunFolder) -> dict[str, Any] | None:
-    """Return the verdict of a run, or None where there is none that can be read."""
+    """Return the verdict of a run, or None if there is none, or it cannot be read."""
     try:
         return dict(_read(run)["verdict"]) if run.file(VERDICT).exists() else None
     except (DataError, RunError):

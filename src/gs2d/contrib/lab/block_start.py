@@ -1,0 +1,85 @@
+"""The initial state of a block, on disk: which splats of the coarse model it trains, and exposures of its views."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gs2d.config.recipe import Recipe
+from gs2d.core.atomic_files import atomic_write
+from gs2d.data.arrays import read_npz
+from gs2d.errors import DataError, RunError
+from gs2d.io.splat_ply import read_splats
+from gs2d.pipeline.prepare.scene_part import PartStart
+from gs2d.training.initialize import splats_as_start
+
+ABSENT, FROZEN, OWN = 0, 1, 2  # of a row of the splats that were trained before
+
+
+def write_start(path: Path, rows: np.ndarray, exposures: np.ndarray | None) -> None:
+    """Write rows [N] uint8 (``ABSENT``, ``FROZEN`` or ``OWN``) and exposures [V, 3, 4] of the views."""
+    packed, none = io.BytesIO(), np.zeros((0, 3, 4), np.float32)
+    np.savez_compressed(packed, rows=rows, exposures=none if exposures is None else exposures)
+    with atomic_write(path) as file:
+        file.write(packed.getvalue())
+
+
+def read_start(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the rows and exposures that :func:`write_start` wrote."""
+    try:
+        data = read_npz(path, "start of a block", lambda name: name in ("rows", "exposures"))
+        rows, exposures = data["rows"], data["exposures"]
+        if rows.dtype != np.uint8 or rows.ndim != 1 or rows.max(initial=0) > OWN:
+            raise ValueError(f"rows are {rows.dtype} {rows.shape}")
+    except (DataError, KeyError, ValueError) as error:
+        raise RunError(
+            f"{path} is not the start of a block ({' '.join(str(error).split())[:120]}); delete the folder "
+            f"{path.parent} and run the command again"
+        ) from error
+    return rows, exposures if len(exposures) else None
+
+
+def load_start(
+    splats_file: Path, start_file: Path, recipe: Recipe, region: tuple[tuple[Any, ...], ...] = ()
+) -> PartStart:
+    """Return the initial state of a block.
+
+    Parameters
+    ----------
+    splats_file : Path
+        The splats that were trained before.
+    start_file : Path
+        Written by :func:`write_start` for these splats.
+    recipe : Recipe
+        Of the block.
+    region : three tuples, or ()
+        Axes of the block, lower and upper limits along them, world units; a dense start is limited to it.
+    """
+    splats = splats_as_start(read_splats(splats_file), sh_degree=recipe.sh_degree)
+    rows, saved = read_start(start_file)
+    if len(rows) != len(splats):
+        raise RunError(
+            f"{start_file} is of {len(rows):,} splats, {splats_file} has {len(splats):,}; delete the first and run the "
+            "command again"
+        )
+    digest, exposures = hashlib.sha256(splats_file.read_bytes() + rows.tobytes()), None
+    if saved is not None and recipe.exposure is not None:
+        exposures = torch.from_numpy(np.ascontiguousarray(saved, np.float32))
+        digest.update(exposures.numpy().tobytes())
+    digest.update(repr(region).encode() if region else b"")
+    kinds, within = torch.from_numpy(rows), partial(inside, region) if region else None
+    return PartStart(splats.rows(kinds == OWN), splats.rows(kinds == FROZEN), exposures, digest.hexdigest(), within)
+
+
+def inside(region: tuple[tuple[Any, ...], ...], points: Tensor) -> Tensor:
+    """Return whether points [M, 3] are in a region, [M] bool."""
+    axes, low, high = (np.array(part, np.float64) for part in region)
+    along = points.detach().cpu().numpy().astype(np.float64) @ axes.T
+    return torch.from_numpy(((along >= low) & (along < high)).all(axis=1)).to(points.device)
