@@ -140,7 +140,7 @@ def test_what_is_wrong_inside_an_archive_names_the_archive(
 def test_a_run_without_scale_gets_one_and_then_an_orthophoto(there: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["orthophoto", "run"]) == 2
     line = one_line(capsys.readouterr().err)
-    assert "scale and world position of run are unknown" in line
+    assert "run has no georeference" in line
     (command,) = re.findall(r"`gs2d (georeference run --known-distance) X0 Y0 Z0 X1 Y1 Z1 METRES`", line)
     assert run([*command.split(), *"0 0 0 1 0 0 2".split()]) == 0
     capsys.readouterr()
