@@ -16,7 +16,6 @@ from gs2d.errors import RunError
 from gs2d.io.run_dir import EXPOSURE, LEARNED, RunFolder
 from gs2d.pipeline.demo import demo
 from gs2d.pipeline.finish.evaluate import evaluate_run
-from gs2d.pipeline.finish.run_report import report_run
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.loaded import open_finished
 from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, TrainOptions

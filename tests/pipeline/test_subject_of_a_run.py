@@ -29,10 +29,9 @@ BOX = (-0.5, -0.6, -0.7, 0.5, 0.6, 0.7)
 def test_training_writes_the_subject_and_the_generic_protocol_meshes_it(undisturbed: RunFolder) -> None:
     subject = read_subject(undisturbed.path)
     assert subject is not None
-    shown = str(subject_section(read_record(undisturbed.path)))  # in the report: words, the box and the picture
-    assert subject.why in shown
+    assert subject.why in str(settings_section(read_record(undisturbed.path)))
     assert subject_line(subject, meshed=True).endswith("--scene meshes everything")
-    assert "the mesh is of everything" in subject_line(subject, meshed=False)
+    assert "everything is meshed" in subject_line(subject, meshed=False)
     job, splats = reload_run(undisturbed, lambda _: None), finished_splats(undisturbed)
     assert job.protocol.name == "nerf-synthetic"
     assert meshed_subject(undisturbed, job, splats, MeshOptions(), lambda _: None) is None

@@ -67,8 +67,7 @@ def subject_of(
         return known
     subject = subject_in(loaded, splats, box)
     on_event(Notice(subject_line(subject, meshed=box is not None or loaded.protocol.fusion.subject)))
-    _draw(run, loaded, subject, on_event)
-    write_json(run.file(SUBJECT), subject.to_json())  # last: after a kill, the image exists if this file does
+    write_json(run.file(SUBJECT), subject.to_json())
     return subject
 
 
@@ -81,17 +80,6 @@ def subject_in(loaded: RenderedScene, splats: Splats, box: Sequence[float] | Non
         return find_subject(sights(loaded, splats)) if box is None else given_subject(box, cameras)
     except DataError as error:
         raise ProtocolError(str(error)) from error
-
-
-def _draw(run: RunFolder, loaded: LoadedRun, subject: Subject, on_event: OnEvent) -> None:
-    """Write the image for the report; a full disk is reported and does not prevent the mesh."""
-    points = np.zeros((0, 3)) if loaded.scene.points is None else np.asarray(loaded.scene.points.points, np.float64)
-    try:
-        make_folder(run.file(RENDERS))
-        cameras = [view.camera for view in loaded.scene.train]
-        write_subject_image(run.file(RENDERS) / IMAGE, subject, cameras, points)
-    except DiskError as error:
-        on_event(Notice(f"no image of the subject: {error}"))
 
 
 def meshed_subject(
