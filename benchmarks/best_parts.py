@@ -93,11 +93,8 @@ VARIANTS: dict[str, Recipe] = {
     "silhouette_thrice": _term("silhouette", weight=3 * SILHOUETTE),
     "short_memory": _stage(lambda stage: replace(stage, lr=replace(stage.lr, beta2=0.99))),
     "size_cull": _densify(scale_cull_start=0),
-    "by_error": _densify(absolute=True, error_views=8, max_splats=40_000),
-    "normals_by_edges": _term("normal_consistency", options={"edge_power": 2.0}),
     "normals_of_transmittance": _term("normal_consistency", depth="transmittance"),
     "squares_in_2dgs": _squares_in_2dgs(),
-    "half_size_first": _stage(lambda stage: replace(stage, downscale=2, halve_at=(round(0.3 * stage.iterations),))),
 }
 globals().update({name: replace(recipe, name=name.replace("_", "-")) for name, recipe in VARIANTS.items()})
 

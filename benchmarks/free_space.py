@@ -23,7 +23,7 @@ from gs2d.config.presets import get_recipe, with_robustness
 from gs2d.config.protocols import GENERIC
 from gs2d.data import Scene, load_scene
 from gs2d.errors import Gs2dError
-from gs2d.training import free_space
+from gs2d.training.robust import free_space_maps as free_space
 from gs2d.training.trainer import Trainer
 
 

@@ -31,7 +31,6 @@ from benchmarks.fuse import orbit, sphere_map
 from benchmarks.stages import densification_case, optimizer_step
 from benchmarks.timing import machine
 from benchmarks.workload import Workload, camera, places, room
-from gs2d.config.recipe import CloneInPlace, RankByError
 from gs2d.core.splats import Splats
 from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.evaluation.image_metrics import image_metrics
@@ -40,8 +39,10 @@ from gs2d.meshing.fusion_bounds import derive_limits, sample_depths
 from gs2d.meshing.marching_cubes import keep_components, marching_cubes
 from gs2d.meshing.tsdf_volume import fuse
 from gs2d.render.api import rasterize, splat_errors
-from gs2d.training.initialize import initial_splats
-from gs2d.training.rank_clone import clone_in_place, rank_by_error
+from gs2d.training.actions.clone_in_place import CloneInPlace
+from gs2d.training.actions.entry_action import StageEntry
+from gs2d.training.actions.rank_by_error import RankByError
+from gs2d.training.start.initialize import initial_splats
 from gs2d.training.state import TrainState
 
 SPLATS = (20_000, 100_000, 500_000, 1_000_000)
@@ -88,9 +89,12 @@ def ranking(splats: Splats) -> Step:
     state = TrainState(splats.clone(), generator)
     errors = [torch.rand(len(splats), generator=generator) for _ in range(4)]
 
+    scene = small_scene(splats.means.double().numpy())
+    entry = StageEntry("refine", scene, lambda occlusion: iter(errors))
+
     def step() -> None:
-        rank_by_error(state, RankByError(), errors)
-        clone_in_place(state, CloneInPlace())
+        RankByError("high_error").run(state, entry)
+        CloneInPlace("high_error", "clones").run(state, entry)
 
     return step
 

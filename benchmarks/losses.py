@@ -25,7 +25,7 @@ from benchmarks.timing import Timing, machine, measure, peak_probe
 from gs2d.core.camera import Camera, look_at
 from gs2d.kernels import native_losses as ops
 from gs2d.kernels.library import load, ready_library
-from gs2d.losses import reference
+from gs2d.losses import formulas as reference
 
 
 @dataclass(frozen=True)

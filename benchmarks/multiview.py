@@ -30,7 +30,7 @@ from benchmarks.workload import room_workload
 from gs2d.config.protocols import GENERIC
 from gs2d.kernels.library import ready_library
 from gs2d.kernels.native_multiview import compare_views
-from gs2d.losses.multiview import ViewPair, geometric, photometric
+from gs2d.losses.view_pair import ViewPair, geometric, photometric
 from gs2d.render.api import rasterize
 from gs2d.training.trainer import Trainer
 

@@ -44,9 +44,9 @@ PARTS = (
     Rule("rasterizer", (("render/cpu_backend.py", ""), ("render/cpu_cached.py", ""))),
     Rule(
         "losses and metrics",
-        (("gs2d/losses/api.py", ""), ("kernels/native_losses.py", ""), ("evaluation/image_metrics.py", "")),
+        (("gs2d/losses/base.py", ""), ("kernels/native_losses.py", ""), ("evaluation/image_metrics.py", "")),
     ),
-    Rule("Adam", (("training/adam.py", ""),)),
+    Rule("Adam", (("training/optimizer.py", ""),)),
     Rule("densification", (("training/densify/gradient.py", "densify_and_prune"),)),
     Rule("densification statistics", (("training/densify/gradient.py", "accumulate"),)),
     Rule("checks for NaN", (("training/objective.py", "first_not_finite"),)),

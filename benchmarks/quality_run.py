@@ -115,7 +115,7 @@ def train(spec: dict[str, Any], folder: Path, clocks: Clocks) -> dict[str, Any]:
     state, course = _saved(folder / STATE, clocks)
     waiting = [mark for mark in marks(job.recipe.iterations, spec["points"]) if mark > _done(job, state)]
 
-    def listen(event: events.Event) -> None:
+    def listen(event: events.TrainingEvent) -> None:
         if not isinstance(event, events.Progress):
             return
         done = sum(stage.iterations for stage in job.recipe.stages[: event.index]) + event.iteration

@@ -55,7 +55,7 @@ METHODS = (
     Method("2dgs-60k", "2DGS, as long as 2DGS-R", "2dgs-60k"),
     Method("best", "`best`", "best"),
 )
-PRESERVE = ("refine.on_enter.clone_in_place.opacity=preserve",)
+PRESERVE = ("refine.on_enter.clone_in_place.options.opacity=preserve",)
 LONG_STAGE_3 = ("appearance.iterations=1", "refine.iterations=2999")
 # Where the gain of stage 3 comes from. The numbers of iterations are for --scale 0.1.
 WHY = (

@@ -50,7 +50,7 @@ PARTS = (
         ),
     ),
     Rule(
-        "metrics", (("evaluation/image_metrics.py", ""), ("gs2d/losses/api.py", ""), ("kernels/native_losses.py", ""))
+        "metrics", (("evaluation/image_metrics.py", ""), ("gs2d/losses/base.py", ""), ("kernels/native_losses.py", ""))
     ),
     Rule("evidence", tuple(("meshing/evidence.py", name) for name in ("gather", "_count", "_look", "_normals"))),
     Rule("clean by evidence", (("meshing/evidence.py", ""),)),

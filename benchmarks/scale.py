@@ -36,7 +36,7 @@ from gs2d.data.scene import PointCloud
 from gs2d.errors import Gs2dError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.splat_ply import write_splats
-from gs2d.training.initialize import initial_splats
+from gs2d.training.start.initialize import initial_splats
 
 EVERY = 0.02  # s, between looks at memory
 ITERATIONS_OF_ALL = 30_000  # of the recipe 2dgs

@@ -23,8 +23,8 @@ from gs2d.kernels.library import Library
 from gs2d.render.backends import get_backend
 from gs2d.render.cpu_backend import IMAGES, rasterize_with
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.training.adam import adam_step, begin_stage
 from gs2d.training.densify.gradient import densify_and_prune
+from gs2d.training.optimizer import adam_step, begin_stage
 from gs2d.training.state import TrainState
 
 NATIVE = ("project", "sort", "bin", "blend_forward", "index_slots", "blend_backward", "project_backward")

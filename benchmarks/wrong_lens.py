@@ -25,7 +25,7 @@ WAYS = {
     "known, `--refine-cameras`": (True, ("--refine-cameras",)),
     "none": (False, ()),
     "none, `--refine-poses`": (False, ("--refine-poses",)),
-    "none, focal length": (False, ("--refine-cameras", "--set", "intrinsics.distortion=false")),
+    "none, focal length": (False, ("--refine-cameras", "--set", "learned.intrinsics.options.distortion=false")),
     "none, `--refine-cameras`": (False, ("--refine-cameras",)),
 }
 

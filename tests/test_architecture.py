@@ -64,6 +64,12 @@ INSIDE = {
         "camera_models image_files photo_formats positions": 2,
         "arrays csv_tables float_images": 1,
     },
+    "losses": {
+        "prior_terms": 3,
+        "known_maps view_terms": 2,
+        "base prior_formulas": 1,
+        "formulas view_pair": 0,
+    },
     "pipeline": {
         "demo in_memory reconstruct": 6,
         "train": 5,
@@ -82,6 +88,15 @@ INSIDE = {
         "pair_budget whole_step cuda_works reference_projection reference_transmittance": 1,
         "pose_gradient_native exposure_native": 1,
         "types": 0,
+    },
+    "training": {
+        "trainer": 6,
+        "cached_objective whole_steps": 5,
+        "first_splats objective resumable": 4,
+        "actions densify robust": 3,
+        "optimizer parallel rows": 2,
+        "learned neighbours state": 1,
+        "events learned_rows start step_result targets": 0,
     },
 }
 

@@ -14,8 +14,8 @@ from typing import Any
 import gs2d
 from gs2d.config.multiview import MultiView
 from gs2d.config.presets import get_recipe
-from gs2d.config.priors import DepthPrior, NormalPrior
-from gs2d.config.recipe import Exposure, IntrinsicsRefinement, Photometry, PoseRefinement
+from gs2d.config.prior_settings import DepthPrior, NormalPrior
+from gs2d.config.quantities import EXPOSURE, INTRINSICS, POSES, RESPONSE, VIGNETTING
 from gs2d.config.serialize import apply_overrides
 
 PACKAGE = Path(gs2d.__file__).parent
@@ -110,10 +110,7 @@ def test_every_set_path_that_a_message_prints_exists_in_a_recipe_whose_stages_ha
     whole = replace(
         base,
         stages=(replace(base.stages[0], name="mine"),),
-        exposure=Exposure(),
-        poses=PoseRefinement(),
-        intrinsics=IntrinsicsRefinement(),
-        photometry=Photometry(),
+        learned=(EXPOSURE, POSES, INTRINSICS, VIGNETTING, RESPONSE),
         multiview=MultiView(),
         depth_prior=DepthPrior(),
         normal_prior=NormalPrior(),

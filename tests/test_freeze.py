@@ -38,7 +38,7 @@ LIMITS = {
     "options of all commands": 392,
     "options by name": 109,
     "recipes": 24,
-    "fields of recipes": 178,
+    "fields of recipes": 103,
 }
 
 

@@ -22,6 +22,7 @@ FACE = (
     *("Camera", "Splats", "Scene", "Mesh", "MeshOptions", "TrainOptions", "Protocol", "LossTerm"),
     *(
         "register_loss",
+        "register_action",
         "register_densifier",
         "register_quantity",
         "register_recipe",

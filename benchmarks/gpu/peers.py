@@ -15,7 +15,7 @@ from torch import Tensor
 from gs2d.core.camera import Camera
 from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import BackendError
-from gs2d.losses import reference as losses_reference
+from gs2d.losses import formulas as losses_reference
 
 NEAR, FAR = 0.2, 100.0
 

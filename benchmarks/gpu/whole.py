@@ -89,7 +89,9 @@ def differences(bench: Bench) -> dict[str, Any]:
     first = recipe.stages[0]
     assert first.densify is not None
     iterations = 6 if bench.dry else 60
-    quiet = replace(first, iterations=iterations, densify=replace(first.densify, start=10**5, stop=10**6, reset_at=()))
+    quiet = replace(
+        first, iterations=iterations, densify=replace(first.densify, start=10**5, stop=10**6, reset_every=0)
+    )
     scene, ends = train_toys.make_scene(), {}
     for chosen in WAYS:
         with _way(chosen, bench.dry):

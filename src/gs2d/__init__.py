@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gs2d.cli.registry import register_command
+    from gs2d.config.actions import register_action
     from gs2d.config.densify import register_densifier
-    from gs2d.config.losses import register_loss
+    from gs2d.config.loss_registry import register_loss
     from gs2d.config.presets import get_recipe, list_recipes, register_recipe
     from gs2d.config.protocols import Protocol
     from gs2d.config.quantities import Quantity, register_quantity
@@ -29,8 +30,8 @@ if TYPE_CHECKING:
     from gs2d.evaluation.evaluators import register_evaluator
     from gs2d.io.formats.splat_formats import read_splats, register_format, register_splat_reader, write_splats
     from gs2d.io.meshes import write_mesh
-    from gs2d.losses.api import Loss, LossView, compute_losses
-    from gs2d.losses.reference import normals_from_depth
+    from gs2d.losses.base import Loss, LossView, compute_losses
+    from gs2d.losses.formulas import normals_from_depth
     from gs2d.pipeline.in_memory import Trained, evaluate, extract_mesh, train
     from gs2d.pipeline.prepare.options import MeshOptions, Training, TrainOptions
     from gs2d.render.api import rasterize, splat_errors
@@ -80,6 +81,7 @@ __all__ = [
     "rasterize",
     "rasterize_2dgs",
     "read_splats",
+    "register_action",
     "register_backend",
     "register_camera_model",
     "register_command",
@@ -102,10 +104,10 @@ __all__ = [
 _HOME = {
     "Camera": "gs2d.core.camera",
     "Gs2dError": "gs2d.errors",
-    "Loss": "gs2d.losses.api",
+    "Loss": "gs2d.losses.base",
     "LearnedQuantity": "gs2d.training.learned.quantity",
     "LossTerm": "gs2d.config.recipe",
-    "LossView": "gs2d.losses.api",
+    "LossView": "gs2d.losses.base",
     "Mesh": "gs2d.core.mesh",
     "MeshOptions": "gs2d.pipeline.prepare.options",
     "Protocol": "gs2d.config.protocols",
@@ -122,7 +124,7 @@ _HOME = {
     "Trainer": "gs2d.training.trainer",
     "TrainerOptions": "gs2d.training.trainer",
     "backend_report": "gs2d.render.backends",
-    "compute_losses": "gs2d.losses.api",
+    "compute_losses": "gs2d.losses.base",
     "evaluate": "gs2d.pipeline.in_memory",
     "extract_mesh": "gs2d.pipeline.in_memory",
     "get_backend": "gs2d.render.backends",
@@ -130,18 +132,19 @@ _HOME = {
     "list_recipes": "gs2d.config.presets",
     "load_scene": "gs2d.data.load",
     "look_at": "gs2d.core.camera",
-    "normals_from_depth": "gs2d.losses.reference",
+    "normals_from_depth": "gs2d.losses.formulas",
     "perturb_pose": "gs2d.core.transforms",
     "rasterize": "gs2d.render.api",
     "rasterize_2dgs": "gs2d.render.tensor_api",
     "read_splats": "gs2d.io.formats.splat_formats",
+    "register_action": "gs2d.config.actions",
     "register_backend": "gs2d.render.backends",
     "register_camera_model": "gs2d.data.camera_models",
     "register_command": "gs2d.cli.registry",
     "register_densifier": "gs2d.config.densify",
     "register_evaluator": "gs2d.evaluation.evaluators",
     "register_format": "gs2d.io.formats.splat_formats",
-    "register_loss": "gs2d.config.losses",
+    "register_loss": "gs2d.config.loss_registry",
     "register_quantity": "gs2d.config.quantities",
     "register_reader": "gs2d.data.readers.capture_readers",
     "register_recipe": "gs2d.config.presets",

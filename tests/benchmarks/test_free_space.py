@@ -8,7 +8,7 @@ import pytest
 from benchmarks.flight import Flight, write_flight
 from benchmarks.free_space import main
 
-from gs2d.training import free_space
+from gs2d.training.robust import free_space_maps as free_space
 
 
 @pytest.mark.usefixtures("native")

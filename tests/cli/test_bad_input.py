@@ -106,10 +106,9 @@ def test_a_capture_that_cannot_be_read_gives_one_line_and_exit_code_2_and_leaves
 @pytest.mark.parametrize(
     ("start", "said"),
     [
-        ('{"min_angle": 1.0, "max_angle": 1.1}', "photographs"),
-        ('{"min_ncc": 2.0, "max_angle": 170.0}', "photographs"),
-        ('{"planes": 1}', "dense_start.planes"),
-        ('{"fit": {"opacity": 1.5}}', "dense_start.fit.opacity"),
+        ('{"min_angle": 34.9}', "photographs"),
+        ('{"side": 1}', "dense_start.side"),
+        ('{"fit": 3}', "dense_start.fit must be true or false"),
     ],
 )
 def test_a_plane_sweep_that_finds_nothing_is_told_in_one_line_and_leaves_no_run(
@@ -147,7 +146,6 @@ def test_masks_that_leave_nothing_to_learn_from_are_an_error(
         (["--recipe", "3dgs"], "no recipe '3dgs'"),
         (["--set", "appearance.train.sh0=nobody"], "row group 'nobody'"),
         (["--set", "surface.densify.max_splats=0"], "integer"),
-        (["--set", "surface.halve_at=[99]"], "iterations"),
         (["--set", "fused_depth=nearest"], "transmittance"),
         (["--protocol", "tanks"], "no protocol 'tanks'"),
         (["--downscale", "0"], "--downscale"),

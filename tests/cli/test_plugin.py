@@ -73,6 +73,7 @@ def test_a_run_uses_all_of_them_and_says_so(trained: Path) -> None:
     assert losses["example-tint"] > 0
     state = torch.load(sorted((trained / "checkpoints").glob("*.pt"))[-1], weights_only=True)["state"]
     assert state["learned"]["example-tint"]["values"].abs().max() > 0.005
+    assert 0 < state["groups"]["near"].sum() < 58
     views = json.loads((trained / "learned.json").read_text())["views"]
     assert len(views) == 6
     assert all(len(view["example-tint"]) == 3 for view in views.values())
@@ -151,7 +152,11 @@ def test_a_run_goes_on_with_the_recipe_from_a_file(gs2d: CliProcess, trained: Pa
 
 @pytest.mark.parametrize(
     ("field", "guest"),
-    [("surface.densify", "densifier 'example-prune'"), ("learned.example-tint", "quantity 'example-tint'")],
+    [
+        ("surface.densify", "densifier 'example-prune'"),
+        ("surface.on_enter.example-near", "action 'example-near'"),
+        ("learned.example-tint", "quantity 'example-tint'"),
+    ],
 )
 def test_a_wrong_option_of_a_guest_is_one_line(gs2d: CliProcess, trained: Path, field: str, guest: str) -> None:
     wrong = ("--recipe", "example-2dgs", "--set", f'{field}.options={{"when": 3}}')

@@ -18,7 +18,7 @@ from gs2d.config.presets import (
     with_robustness,
 )
 from gs2d.config.recipe import GradDensify
-from gs2d.config.robust import BackgroundSphere, DenseStart, Removal
+from gs2d.config.robust import DenseStart, Removal
 from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import from_json, to_json
 
@@ -31,7 +31,7 @@ def test_the_default_is_listed_first() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_their_schedule_is_that_of_2dgs_in_fewer_iterations_with_longer_steps(name: str) -> None:
+def test_best_recipes_have_shorter_schedules_with_larger_rates(name: str) -> None:
     (stage,), (official,) = get_recipe(name).stages, get_recipe("2dgs").stages
     part = stage.iterations / OFFICIAL_ITERATIONS
     assert isinstance(stage.densify, GradDensify)
@@ -47,7 +47,7 @@ def test_their_schedule_is_that_of_2dgs_in_fewer_iterations_with_longer_steps(na
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("scale", [1.0, 0.1])
-def test_all_rates_are_low_at_the_end(name: str, scale: float) -> None:
+def test_rates_of_best_recipes_settle_at_the_end(name: str, scale: float) -> None:
     (stage,) = scale_schedule(get_recipe(name), scale).stages
     end = stage.iterations
     assert (stage.lr.settled_at(round(0.69 * end)), stage.lr.settled_at(end)) == (1.0, pytest.approx(0.1))
@@ -56,7 +56,7 @@ def test_all_rates_are_low_at_the_end(name: str, scale: float) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("scale", [1.0, 0.1])
-def test_colours_by_direction_learn_faster_but_from_few_photographs(name: str, scale: float) -> None:
+def test_view_dependent_colours_learn_faster_except_with_few_images(name: str, scale: float) -> None:
     recipe = with_robustness(scale_schedule(get_recipe(name), scale))
     (stage,), (slow,) = recipe.stages, with_few_views(recipe).stages
     assert stage.lr.shN == pytest.approx(SH_FASTER * stage.lr.sh0 / 20)
@@ -69,33 +69,33 @@ def test_colours_by_direction_learn_faster_but_from_few_photographs(name: str, s
     assert not any("SH beyond" in line for line in describe_recipe(with_few_views(recipe)))
 
 
-def test_best_surface_is_best_but_for_views_compared_in_its_last_fifth_and_a_start_that_is_not_fitted() -> None:
+def test_best_surface_is_best_with_multiview_losses_and_no_fitted_start() -> None:
     recipe, best = get_recipe("best-surface"), get_recipe("best")
     stage = recipe.stages[0]
     terms = {term.kind: (term.weight, term.start, term.every) for term in stage.losses if "multiview" in term.kind}
     assert terms == {"multiview_photometric": (0.6, 16_000, 2), "multiview_geometric": (0.04, 16_000, 2)}
     plain = tuple(term for term in stage.losses if "multiview" not in term.kind)
     assert best.dense_start is not None
-    assert best.dense_start.fit is not None
-    swept = replace(best, dense_start=replace(best.dense_start, fit=None))
+    assert best.dense_start.fit
+    swept = replace(best, dense_start=replace(best.dense_start, fit=False))
     assert replace(recipe, name="best", multiview=best.multiview, stages=(replace(stage, losses=plain),)) == swept
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_they_are_written_read_and_described(name: str) -> None:
+def test_best_recipes_are_written_read_and_described(name: str) -> None:
     recipe = get_recipe(name)
     assert from_json(to_json(recipe)) == recipe
     said = "\n".join(describe_recipe(recipe))
     assert "the mesh is of the transmittance depth" in said
     fitted = "" if name == "best-surface" else ", its splats fitted to them"
-    assert f"dense start: a sweep over photographs of about 256 px{fitted}, and 500 on a" in said
-    assert "on a sphere around; without where they agree on nothing" in said
+    assert f"dense start: a sweep over photographs of about 256 px{fitted}, and a sphere of splats" in said
+    assert "around the scene; without where they agree on nothing" in said
     assert "rates but that of the means fall after iteration" in said
 
 
-def test_robust_training_starts_as_it_was_tried_and_spares_sky_and_ground() -> None:
+def test_robust_training_has_its_own_start_and_no_prune_by_size() -> None:
     robust = with_robustness(get_recipe("best"))
-    assert robust.dense_start == DenseStart(sphere=BackgroundSphere())
+    assert robust.dense_start == DenseStart(sphere=True)
     (stage,) = robust.stages
     assert isinstance(stage.densify, GradDensify)
     assert not any(stage.densify.culls_scale(i) for i in range(1, stage.iterations + 1))

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from gs2d.config.actions import CLONE_IN_PLACE, RANK_BY_ERROR
 from gs2d.config.presets import (
     DEPTH_WEIGHT,
     RECIPES,
@@ -14,8 +15,8 @@ from gs2d.config.presets import (
     with_depth_prior,
     with_normal_prior,
 )
-from gs2d.config.priors import DepthPrior, NormalPrior
-from gs2d.config.recipe import ALL, CloneInPlace, GradDensify, RankByError, Recipe, Stage, validate
+from gs2d.config.prior_settings import DepthPrior, NormalPrior
+from gs2d.config.recipe import ALL, GradDensify, Recipe, Stage, validate
 from gs2d.errors import RecipeError
 
 
@@ -56,10 +57,10 @@ def test_2dgs_r_has_the_three_stages_of_the_paper() -> None:
     surface, appearance, refine = get_recipe("2dgs-r").stages
     assert surface == get_recipe("2dgs").stages[0]
     assert [s.iterations for s in (surface, appearance, refine)] == [30_000, 10_000, 20_000]
-    assert appearance.on_enter == (RankByError(top_percent=1.0),)
+    assert appearance.on_enter == (RANK_BY_ERROR,)
     assert dict(appearance.train) == {"sh0": "high_error", "shN": "high_error"}
     assert weights(appearance) == {"l1": (0.8, 0), "ssim": (0.2, 0)}
-    assert refine.on_enter == (CloneInPlace("high_error", "copy"),)
+    assert refine.on_enter == (CLONE_IN_PLACE,)
     assert dict(refine.train) == {n: "all" for n in ("means", "quats", "log_scales", "sh0", "shN")}
     assert weights(refine) == {"l1": (0.8, 0), "ssim": (0.2, 0), "normal_consistency": (0.05, 0)}
     for stage in (appearance, refine):
@@ -69,7 +70,7 @@ def test_2dgs_r_has_the_three_stages_of_the_paper() -> None:
         assert stage.sh_interval == 0
 
 
-def test_the_fair_control_shares_its_first_stage_and_trains_as_long_as_2dgs_r() -> None:
+def test_2dgs_60k_trains_as_long_as_2dgs_r() -> None:
     control = get_recipe("2dgs-60k")
     assert control.stages[0] == get_recipe("2dgs").stages[0]
     assert control.iterations == get_recipe("2dgs-r").iterations == 60_000
@@ -103,7 +104,7 @@ def frozen(stage: Stage) -> set[str]:
 def test_module_rows() -> None:
     def facts(recipe: Recipe) -> tuple[bool, bool, bool]:
         last = recipe.stages[-1]
-        clone = any(isinstance(action, CloneInPlace) for action in last.on_enter)
+        clone = CLONE_IN_PLACE in last.on_enter
         return clone, "opacity_logits" in frozen(last), "normal_consistency" in weights(last)
 
     rows = {row: get_recipe(name) for row, name in TABLES["modules"].items()}
@@ -126,7 +127,7 @@ def test_absgs_rows_densify_in_stage_3_instead_of_the_clone() -> None:
     assert adjusted.densify is not None
     d = default.densify
     assert (d.grad_threshold, d.abs_threshold, d.percent_dense, d.opacity_cull) == (2e-4, 4e-4, 0.001, 0.005)
-    assert (d.opacity_cap, d.cap_every, d.reset_every) == (0.8, 500, 3000)
+    assert (d.cap_every, d.reset_every) == (500, 3000)
     assert adjusted.densify.abs_threshold < d.abs_threshold
     assert adjusted.densify.percent_dense < d.percent_dense
 

@@ -6,18 +6,16 @@ from dataclasses import replace
 
 import pytest
 
+from gs2d.config.actions import CLONE_IN_PLACE, RANK_BY_ERROR
 from gs2d.config.densify import Densify
 from gs2d.config.multiview import MultiView
-from gs2d.config.priors import DepthPrior, NormalPrior
+from gs2d.config.prior_settings import DepthPrior, NormalPrior
+from gs2d.config.quantities import EXPOSURE, POSES
 from gs2d.config.recipe import (
     ALPHA,
-    CloneInPlace,
-    Exposure,
     GradDensify,
     LearningRates,
     LossTerm,
-    PoseRefinement,
-    RankByError,
     Recipe,
     Stage,
     validate,
@@ -41,7 +39,7 @@ def test_the_rate_of_the_means_is_log_linear_and_stays_at_its_end() -> None:
     assert lr.means_at(5000) == pytest.approx(1e-6)
 
 
-def test_rates_at_the_end_are_constant_and_leave_the_others() -> None:
+def test_rates_at_the_end_are_constant() -> None:
     assert LearningRates().at_end(30_000) == replace(LearningRates(), means=1.6e-6, means_final=1.6e-6)
     half = LearningRates(means=1e-4, means_final=1e-6, means_decay_steps=100).at_end(50)
     assert half.means == half.means_final == pytest.approx(1e-5)
@@ -51,7 +49,7 @@ def test_rates_at_the_end_are_constant_and_leave_the_others() -> None:
     assert settling.sh0 == pytest.approx(0.1 * LearningRates().sh0)
 
 
-def test_rates_over_again_go_through_what_they_were() -> None:
+def test_rates_over_again_repeat_the_decay() -> None:
     rates = LearningRates(means_decay_steps=100, settle_start=60, settle_steps=40, settle_factor=0.1)
     again = rates.over_again(80, 100, 50)
     for step in (0, 5, 20):
@@ -72,23 +70,9 @@ def test_official_resets_are_every_3000_before_15000_and_at_500_on_white() -> No
     assert [i for i in range(1, 30_001) if densify.resets(i, white=True)] == [500, 3000, 6000, 9000, 12000]
 
 
-def test_a_reset_on_white_may_stand_alone() -> None:
-    densify = GradDensify(reset_every=0, reset_at_on_white=(500,))
-    assert [i for i in range(1, 30_001) if densify.resets(i, white=True)] == [500]
-    assert [i for i in range(1, 30_001) if densify.resets(i, white=False)] == []
-
-
-def test_large_splats_may_be_pruned_after_densification_as_often_as_in_it() -> None:
-    densify = GradDensify(stop=15_000, prune_until=15_300)
-    assert [i for i in range(1, 30_001) if densify.only_prunes(i)] == [15_000, 15_100, 15_200, 15_300]
-    assert not any(GradDensify().only_prunes(i) for i in range(1, 30_001))
-    alone = GradDensify(start=0, stop=0, reset_every=0, prune_until=300)
-    assert [i for i in range(1, 1001) if alone.only_prunes(i)] == [100, 200, 300]
-
-
-def test_last_reset_ends_resets_and_reset_at_adds_some() -> None:
-    densify = GradDensify(last_reset=6000, reset_at=(40, 7000))
-    assert [i for i in range(1, 15_000) if densify.resets(i, white=False)] == [40, 3000, 6000]
+def test_last_reset_ends_resets() -> None:
+    densify = GradDensify(last_reset=6000)
+    assert [i for i in range(1, 15_000) if densify.resets(i, white=False)] == [3000, 6000]
 
 
 def test_faint_splats_are_spared_for_exactly_the_grace_after_a_reset() -> None:
@@ -103,12 +87,6 @@ def test_the_sh_degree_rises_every_interval_up_to_the_most() -> None:
     assert [stage.active_sh_degree(i, 3) for i in (1, 999, 1000, 2000, 3000, 4999)] == [0, 0, 1, 2, 3, 3]
     assert Stage("s", 10).active_sh_degree(1, 3) == 3
     assert stage.active_sh_degree(4000, 1) == 1
-
-
-def test_photographs_are_twice_as_large_after_each_iteration_that_says_so() -> None:
-    stage = Stage("s", 10, downscale=12, halve_at=(3, 6))
-    assert [stage.downscale_at(i) for i in range(1, 11)] == [12, 12, 12, 6, 6, 6, 3, 3, 3, 3]
-    assert {Stage("s", 10, downscale=2).downscale_at(i) for i in (1, 10)} == {2}
 
 
 @pytest.mark.parametrize(
@@ -131,30 +109,22 @@ def test_photographs_are_twice_as_large_after_each_iteration_that_says_so() -> N
         (one(train={"opacity": "all"}), "quats"),
         (one(train={}), "names no attribute"),
         (one(train={"sh0": "high_error"}), "high_error"),
-        (one(on_enter=(CloneInPlace(),)), "high_error"),
-        (one(on_enter=(RankByError(), CloneInPlace("clones"))), "high_error"),
-        (one(on_enter=(RankByError(), CloneInPlace(opacity="halve"))), "preserve"),
-        (one(on_enter=(RankByError(top_percent=0.0),)), "top_percent"),
-        (one(on_enter=(RankByError(top_percent=101.0),)), "top_percent"),
-        (one(on_enter=(RankByError(writes="all"),)), "cannot be called 'all'"),
+        (one(on_enter=(CLONE_IN_PLACE,)), "high_error"),
+        (one(on_enter=(RANK_BY_ERROR, CLONE_IN_PLACE.with_options(rows="clones"))), "high_error"),
+        (one(on_enter=(RANK_BY_ERROR.with_options(writes="all"),)), "cannot be called 'all'"),
+        (one(on_enter=(RANK_BY_ERROR.with_options(writes=3),)), "cannot be called 3"),
         (one(moments="old"), "moments"),
         (one(lr=LearningRates(sh0=-1.0)), "lr.sh0"),
         (one(lr=LearningRates(means=0.0)), "must be positive"),
         (one(lr=LearningRates(beta2=1.0)), "lr.beta2"),
         (one(lr=LearningRates(means_decay_steps=0)), "lr.means_decay_steps"),
         (one(densify=GradDensify(every=0)), "densify.every"),
-        (one(densify=GradDensify(reset_opacity=0.0)), "reset_opacity"),
         (one(densify=GradDensify(max_splats=0)), "max_splats"),
-        (one(densify=GradDensify(prune_until=11)), "densify.prune_until"),
-        (one(downscale=0), "downscale"),
-        (one(downscale=4, halve_at=(3, 11)), "halve_at"),
-        (one(downscale=2, halve_at=(3, 6)), "multiple"),
         (one(densify=GradDensify(scale_cull_start=-1)), "densify.scale_cull_start"),
-        (one(densify=GradDensify(reset_at_on_white=(0,))), "densify.reset_at_on_white"),
         (one(densify=GradDensify(), train={"means": "all"}), "resets or caps opacity"),
     ],
 )
-def test_validate_names_the_stage_and_what_exists(recipe: Recipe, message: str) -> None:
+def test_validate_names_the_stage_and_the_field(recipe: Recipe, message: str) -> None:
     with pytest.raises(RecipeError) as caught:
         validate(recipe)
     assert message in str(caught.value)
@@ -163,8 +133,6 @@ def test_validate_names_the_stage_and_what_exists(recipe: Recipe, message: str) 
 
 MOVING = replace(one(), stages=(Stage("s", 1, train={"means": "all"}, losses=L1),))
 WHOLE = {  # valid recipes with the part that is changed
-    "exposure": replace(one(), exposure=Exposure()),
-    "poses": replace(MOVING, poses=PoseRefinement()),
     "multiview": replace(one(losses=(*L1, LossTerm("multiview_photometric", 0.1))), multiview=MultiView()),
     "depth_prior": replace(one(losses=(*L1, LossTerm("depth_prior", 0.1))), depth_prior=DepthPrior()),
 }
@@ -173,12 +141,6 @@ WHOLE = {  # valid recipes with the part that is changed
 @pytest.mark.parametrize(
     ("path", "value"),
     [
-        ("exposure.rate", 0.0),
-        ("exposure.rate_final", -1.0),
-        ("exposure.prior", float("nan")),
-        ("exposure.beta1", 1.0),
-        ("exposure.decay_steps", 0),
-        ("exposure.start", -1),
         ("multiview.patches", 0),
         ("multiview.patches", 10**11),
         ("multiview.radius", 1.5),
@@ -193,19 +155,12 @@ WHOLE = {  # valid recipes with the part that is changed
         ("depth_prior.source", "lidar"),
         ("depth_prior.final_factor", 0.0),
         ("depth_prior.decay_steps", 0),
-        ("depth_prior.opacity", 1.0),
-        ("depth_prior.noise", 0.0),
         ("depth_prior.min_track", 1),
         ("depth_prior.max_error", 0.0),
         ("depth_prior.unit", -1.0),
         ("depth_prior.unit", 0.0),
         ("depth_prior.space", "log"),
         ("depth_prior.align", "prayer"),
-        ("poses.rate", 0.0),
-        ("poses.rate", 1e30),
-        ("poses.beta2", 1.0),
-        ("poses.decay_steps", 0),
-        ("poses.start", -1),
     ],
 )
 def test_the_parts_of_a_recipe_are_checked_like_its_stages(path: str, value: object) -> None:
@@ -214,6 +169,24 @@ def test_the_parts_of_a_recipe_are_checked_like_its_stages(path: str, value: obj
     assert validate(recipe) is recipe
     with pytest.raises(RecipeError, match=path):
         validate(replace(recipe, **{part: replace(getattr(recipe, part), **{field: value})}))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("rate", 0.0),
+        ("rate", 1e30),
+        ("rate_final", -1.0),
+        ("decay_steps", 0),
+        ("start", -1),
+        ("prior", float("nan")),
+        ("stretch", -1.0),
+    ],
+)
+def test_learned_quantities_are_checked(field: str, value: object) -> None:
+    assert validate(MOVING.with_learned(POSES, EXPOSURE)).learns("exposure")
+    with pytest.raises(RecipeError, match=f"learned.exposure.{field}"):
+        validate(MOVING.with_learned(POSES, replace(EXPOSURE, **{field: value})))  # type: ignore[arg-type]
 
 
 def test_the_weight_of_a_prior_falls_log_linearly_to_its_share() -> None:
@@ -225,14 +198,14 @@ def test_the_weight_of_a_prior_falls_log_linearly_to_its_share() -> None:
 
 
 def test_poses_need_a_stage_that_moves_all_splats() -> None:
-    still = replace(one(), stages=(Stage("s", 1, train={"sh0": "all"}, losses=L1),), poses=PoseRefinement())
-    with pytest.raises(RecipeError, match="poses learn while the means of all splats do, and no stage trains those"):
+    still = replace(one(), stages=(Stage("s", 1, train={"sh0": "all"}, losses=L1),), learned=(POSES,))
+    with pytest.raises(RecipeError, match="poses need a stage that trains the means of all splats, got none"):
         validate(still)
 
 
 def test_a_group_may_be_written_by_an_action_of_the_same_stage() -> None:
-    stage = Stage("s", 1, train={"sh0": "high_error"}, losses=L1, on_enter=(RankByError(),))
-    later = Stage("t", 1, train=dict.fromkeys(ALPHA, "clones"), losses=L1, on_enter=(CloneInPlace(),))
+    stage = Stage("s", 1, train={"sh0": "high_error"}, losses=L1, on_enter=(RANK_BY_ERROR,))
+    later = Stage("t", 1, train=dict.fromkeys(ALPHA, "clones"), losses=L1, on_enter=(CLONE_IN_PLACE,))
     assert validate(Recipe("r", (stage, later))).name == "r"
 
 
@@ -243,8 +216,8 @@ def test_densification_may_freeze_opacity_only_without_resets() -> None:
         validate(one(densify=GradDensify(reset_every=100), train={"means": "all"}))
 
 
-def test_every_loss_that_a_recipe_may_name_is_there() -> None:
-    from gs2d.config.losses import LOSSES
+def test_every_registered_loss_can_be_loaded() -> None:
+    from gs2d.config.loss_registry import LOSSES
 
     assert all(callable(LOSSES.get(kind)) for kind in LOSSES.builtin)
 
@@ -256,11 +229,11 @@ def test_an_unknown_loss_or_densifier_is_refused_where_a_recipe_is_built() -> No
         replace(L1[0], kind="crisp")
     with pytest.raises(RecipeError, match="loss must be one of .*, got '3'"):
         LossTerm(3, 1.0)  # type: ignore[arg-type]
-    with pytest.raises(RecipeError, match=r"densifier must be one of .*, got 'relocate'; did you mean relocation\?"):
-        Densify("relocate")
+    with pytest.raises(RecipeError, match=r"densifier must be one of .*, got 'gradients'; did you mean gradient\?"):
+        Densify("gradients")
 
 
-def test_zero_and_none_are_written_apart() -> None:
+def test_zero_and_none_are_written_differently() -> None:
     recipe = one(densify=GradDensify(scale_cull_start=0))  # the default, None, means something else
     assert to_json(recipe)["stages"][0]["densify"]["scale_cull_start"] == 0
     assert from_json(to_json(recipe)) == recipe

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gs2d.config.losses import LOSSES
+from gs2d.config.loss_registry import LOSSES
 from gs2d.config.presets import RECIPES, about_recipe, get_recipe, register_recipe
 from gs2d.config.recipe import LossTerm
 from gs2d.config.serialize import from_json, to_json
@@ -18,7 +18,7 @@ from gs2d.errors import RecipeError
 FILE = '''
 """Mine."""
 from dataclasses import replace
-from gs2d.config.losses import register_loss
+from gs2d.config.loss_registry import register_loss
 from gs2d.config.presets import get_recipe
 from gs2d.config.recipe import LossTerm
 
@@ -63,7 +63,7 @@ def test_a_python_file_has_recipes_and_functions_that_make_them(file: Path) -> N
         (":broken", "ZeroDivisionError"),
     ],
 )
-def test_what_is_no_recipe_of_a_file_is_refused_in_one_line(file: Path, end: str, message: str) -> None:
+def test_a_file_without_a_recipe_is_refused_in_one_line(file: Path, end: str, message: str) -> None:
     with pytest.raises(RecipeError, match=message) as error:
         get_recipe(f"{file}{end}")
     assert "\n" not in str(error.value)
@@ -94,7 +94,7 @@ def test_a_json_file_is_what_recipes_show_prints(tmp_path: Path) -> None:
         get_recipe(f"{tmp_path / 'bad.py'}:mine")
 
 
-def test_a_run_whose_guests_are_gone_can_be_read_but_not_trained_on(file: Path) -> None:
+def test_a_run_with_missing_plug_ins_can_be_read_but_not_trained(file: Path) -> None:
     written = to_json(get_recipe(f"{file}:mine"))
     del LOSSES._things["of-a-file"]
     assert from_json(written, to_train=False).stages[0].losses[-1].kind == "of-a-file"

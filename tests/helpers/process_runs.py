@@ -23,7 +23,7 @@ SMALL = (
         "surface.densify.every=5",
     ),
     *("--set", "surface.densify.stop=11", "--set", "surface.densify.max_splats=120"),
-    *("--set", "surface.densify.opacity_cull=0.001", "--set", "surface.densify.scale_cull=9"),
+    *("--set", "surface.densify.opacity_cull=0.001", "--set", "surface.densify.scale_cull_start=100000"),
 )
 
 

@@ -20,18 +20,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gs2d.config.densify import Densify
 from gs2d.config.presets import two_dgs, with_robustness
 from gs2d.config.protocols import GENERIC
-from gs2d.config.recipe import Exposure, PoseRefinement, Recipe
+from gs2d.config.quantities import EXPOSURE, POSES
+from gs2d.config.recipe import Recipe
 from gs2d.config.robust import DenseStart, Removal
 from gs2d.config.schedule import scale_schedule
 from gs2d.core.processes import Place
 from gs2d.errors import Gs2dError
 from gs2d.training import events
-from gs2d.training.objective import StepResult
 from gs2d.training.parallel import OneProcess, Turn
 from gs2d.training.state import TrainState
+from gs2d.training.step_result import StepResult
 from gs2d.training.trainer import Trainer
 from train_toys import backends, compared, grouped, make_scene, short
 from wall_scene import wall
@@ -87,21 +87,7 @@ def _own_signal(result: StepResult) -> StepResult:
 
 def learning() -> Recipe:
     """``short`` with exposures and poses learned from the third iteration on."""
-    exposure, poses = Exposure(start=2, decay_steps=20), PoseRefinement(start=2, decay_steps=20)
-    return replace(short(), exposure=exposure, poses=poses)
-
-
-def relocating() -> Recipe:
-    """Splats that are relocated in the fourth and the eighth iteration, and wander in the sixth."""
-    first = short().stages[0]
-    options = {"max_splats": 80, "start": 0, "stop": 8, "rounds": 2, "noise_every": 6}
-    return Recipe("relocating", (replace(first, densify=Densify("relocation", options)),))
-
-
-def by_error() -> Recipe:
-    """Densification by the error of four views."""
-    first = short(absgs=True).stages[0]
-    return Recipe("by-error", (replace(first, densify=replace(first.densify, error_views=4)),))
+    return short().with_learned(*(replace(quantity, start=2, decay_steps=20) for quantity in (EXPOSURE, POSES)))
 
 
 def cached() -> Recipe:
@@ -118,7 +104,7 @@ def dropping() -> Recipe:
 def robust() -> Recipe:
     """15 iterations on a wall: a dense start, and floaters removed."""
     made = scale_schedule(with_robustness(two_dgs()), 0.0005)
-    start = DenseStart(side=48, planes=32, min_angle=1.0, cell=3.0)
+    start = DenseStart(side=48, min_angle=1.0)
     made = replace(made, dense_start=start, removal=Removal(every=5, decay=0.1))
     return replace(made, stages=(replace(made.stages[0], densify=None),), sh_degree=1)
 
@@ -132,8 +118,6 @@ RECIPES: dict[str, Callable[[], Recipe]] = {
     "compared": compared,
     "dropping": dropping,
     "learning": learning,
-    "relocating": relocating,
-    "by_error": by_error,
 }
 
 
@@ -143,7 +127,7 @@ def trained(
     """Train to the end; the state, and what was heard: losses, and the states that could be gone on from."""
     heard: dict[str, Any] = {"losses": [], "states": []}
 
-    def on_event(event: events.Event) -> None:
+    def on_event(event: events.TrainingEvent) -> None:
         if isinstance(event, events.Progress):
             heard["losses"].append((event.stage, event.iteration, dict(event.losses), dict(event.lr)))
             heard["states"].append(trainer.state.state_dict())

@@ -93,7 +93,7 @@ def make_scene() -> Scene:
 def short(absgs: bool = False) -> Recipe:
     """2DGS-R in 10 + 4 + 5 iterations: densified at 3, 6 and 9, reset after 5, normal consistency after 4."""
     densify = GradDensify(
-        every=3, start=1, stop=10, reset_every=0, reset_at=(5,), opacity_cull=0.005, max_splats=75, absolute=absgs
+        every=3, start=1, stop=10, reset_every=5, scale_cull_start=0, opacity_cull=0.005, max_splats=75, absolute=absgs
     )
     first = surface()
     return Recipe(
@@ -138,11 +138,11 @@ class RunLogger:
     """Keeps the events, and a copy of the splats at each."""
 
     def __init__(self) -> None:
-        self.events: list[events.Event] = []
+        self.events: list[events.TrainingEvent] = []
         self.splats: list[Splats] = []
         self.trainer: Trainer | None = None
 
-    def __call__(self, event: events.Event) -> None:
+    def __call__(self, event: events.TrainingEvent) -> None:
         self.events.append(event)
         assert self.trainer is not None
         self.splats.append(self.trainer.splats.clone())

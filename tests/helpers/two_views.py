@@ -11,7 +11,7 @@ from torch import Tensor
 from gs2d.config.multiview import MultiView
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.transforms import perturb_pose
-from gs2d.losses.multiview import Neighbour, ViewPair, geometric, photometric, prepare_image
+from gs2d.losses.view_pair import Neighbour, ViewPair, geometric, photometric, prepare_image
 
 NORMAL = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
 

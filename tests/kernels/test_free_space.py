@@ -8,9 +8,9 @@ from torch import Tensor
 
 from gs2d.config.robust import DenseStart
 from gs2d.core.splats import Splats
-from gs2d.training import free_space
-from gs2d.training.free_space import FreeSpaceMaps
-from gs2d.training.plane_sweep import sweep_views
+from gs2d.training.robust import free_space_maps as free_space
+from gs2d.training.robust.free_space_maps import FreeSpaceMaps
+from gs2d.training.start.plane_sweep import sweep_views
 from train_toys import random_splats
 from wall_scene import WALL, wall
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("native")
 
 @pytest.fixture(scope="module")
 def maps() -> FreeSpaceMaps:
-    return FreeSpaceMaps(sweep_views(wall(), DenseStart(side=48, planes=16, min_angle=1.0)))
+    return FreeSpaceMaps(sweep_views(wall(), DenseStart(side=48, min_angle=1.0)))
 
 
 def scattered(count: int, seed: int = 0) -> Splats:

@@ -12,7 +12,7 @@ from gs2d.errors import BackendError
 from gs2d.kernels import native_losses as ops
 from gs2d.kernels.library import Library, available_variants, load
 from gs2d.kernels.native_losses import NormalOptions
-from gs2d.losses import reference
+from gs2d.losses import formulas as reference
 
 SIZES = [(1, 1), (2, 9), (5, 3), (11, 16), (37, 53), (70, 21)]
 

@@ -10,8 +10,8 @@ import torch
 
 from gs2d.config.robust import DenseStart
 from gs2d.kernels.library import Library, available_variants, library_for
-from gs2d.training import plane_sweep
-from gs2d.training.plane_sweep import SmallView, best_planes, best_planes_reference, sweep_views
+from gs2d.training.start import plane_sweep
+from gs2d.training.start.plane_sweep import SmallView, best_planes, best_planes_reference, sweep_views
 from wall_scene import WALL, wall
 
 Z = 1 / torch.linspace(1 / 7.0, 1 / 2.5, 23)
@@ -26,7 +26,7 @@ def variant(native: Library, monkeypatch: pytest.MonkeyPatch) -> str:
 
 @pytest.fixture(scope="module")
 def views() -> list[SmallView]:
-    return list(sweep_views(wall(), DenseStart(side=48, planes=8, min_angle=1.0)).views)
+    return list(sweep_views(wall(), DenseStart(side=48, min_angle=1.0)).views)
 
 
 def assert_like(score: torch.Tensor, true: torch.Tensor, view: SmallView) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 import train_toys
 from emulate import Emulator
 from fake_backends import cuda_on_host
-from gs2d.config.losses import LOSSES, register_loss
+from gs2d.config.loss_registry import LOSSES, register_loss
 from gs2d.config.recipe import LossTerm, Recipe, validate
 from gs2d.config.serialize import from_json, to_json
 from gs2d.data.scene import Scene, View
@@ -21,7 +21,7 @@ from gs2d.errors import RecipeError
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.library import available_variants
 from gs2d.kernels.native_losses import LossOperations
-from gs2d.losses.api import Loss, Losses, LossView, compute_losses
+from gs2d.losses.base import Loss, Losses, LossView, compute_losses
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RenderOutput
 from gs2d.training import events
@@ -67,7 +67,7 @@ def test_a_function_is_a_loss_with_its_options_and_weight() -> None:
     assert found["blackness"].item() == pytest.approx((3 * color.pow(2).mean() + color.mean()).item())
 
 
-def test_a_recipe_with_a_guest_is_written_and_read_with_its_options() -> None:
+def test_a_recipe_with_a_registered_loss_is_written_and_read() -> None:
     register_loss("blackness")(blackness)
     recipe = train_toys.short()
     first = replace(recipe.stages[0], losses=(LossTerm("blackness", 3.0, options={"power": 2.0}),))
@@ -75,7 +75,7 @@ def test_a_recipe_with_a_guest_is_written_and_read_with_its_options() -> None:
     assert from_json(to_json(made)) == made
 
 
-def test_a_class_is_prepared_for_the_scene_and_may_leave_a_view_out() -> None:
+def test_a_loss_class_is_prepared_and_may_skip_views() -> None:
     register_loss("mean")(Mean)
     recipe, scene = train_toys.short(), train_toys.make_scene()
     stage = replace(recipe.stages[0], losses=(*recipe.stages[0].losses, LossTerm("mean", 1.0, options={"only": 1})))
@@ -85,7 +85,7 @@ def test_a_class_is_prepared_for_the_scene_and_may_leave_a_view_out() -> None:
 
 
 @pytest.mark.parametrize("kind", ["depth_prior", "normal_prior"])
-def test_losses_on_known_maps_are_classes_too_and_ask_for_their_data(kind: str) -> None:
+def test_losses_on_known_maps_load_their_data(kind: str) -> None:
     with pytest.raises(RecipeError, match=f"loss '{kind}' must be prepared for a scene"):
         losses_of([LossTerm(kind, 0.1)])
 
@@ -164,7 +164,7 @@ def test_an_unknown_need_is_refused(needs: Sequence[str]) -> None:
 
 def test_a_class_must_be_a_loss() -> None:
     register_loss("bare")(type("Bare", (), {}))
-    with pytest.raises(RecipeError, match="loss 'bare' must be a function or a subclass of gs2d.losses.api.Loss"):
+    with pytest.raises(RecipeError, match="loss 'bare' must be a function or a subclass of gs2d.losses.base.Loss"):
         losses_of([LossTerm("bare", 1.0)])
 
 
@@ -183,7 +183,7 @@ class Fused(Loss):
         return {"l1": 1.0}
 
 
-def test_a_guest_has_a_fused_form_and_may_train_from_cached_views(native: None) -> None:
+def test_a_registered_loss_may_be_fused_and_use_cached_views(native: None) -> None:
     register_loss("own")(Fused)
     term = LossTerm("own", 1.0)
     view, output = LossView(torch.rand(5, 6, 3), make_camera(6, 5)), make_output(5, 6, dtype=torch.float32)

@@ -12,11 +12,9 @@ from torch import Tensor
 from gs2d.config.multiview import MultiView
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.transforms import perturb_pose
-from gs2d.losses.multiview import (
+from gs2d.losses.view_pair import (
     Neighbour,
     ViewPair,
-    _sample,
-    _Sampled,
     choose_pixels,
     geometric,
     photometric,
@@ -76,7 +74,7 @@ def case() -> Case:
     return Case(plane_depth(HERE), normal, neighbour)
 
 
-def test_at_the_true_plane_patches_look_alike_and_pixels_come_back_to_themselves(case: Case) -> None:
+def test_at_the_true_plane_patches_and_round_trips_agree(case: Case) -> None:
     views = case.views()
     ncc, valid = views.similarity
     error, back = views.round_trip
@@ -127,7 +125,7 @@ def test_gradients_are_those_of_finite_differences(case: Case) -> None:
     assert torch.autograd.gradcheck(values, (d.requires_grad_(), n.requires_grad_()), eps=1e-7, atol=1e-6)
 
 
-def test_the_mean_runs_over_all_pixels_that_are_not_masked_whatever_the_number_asked(case: Case) -> None:
+def test_the_mean_does_not_depend_on_the_number_of_patches(case: Case) -> None:
     depth = case.depth + 0.02
     everything = replace(case.neighbour, draws=torch.full((2000,), 0.5, dtype=torch.float64))
     views = ViewPair(depth, case.normal, everything.reference.textured, HERE, everything)
@@ -143,7 +141,7 @@ def test_the_mean_runs_over_all_pixels_that_are_not_masked_whatever_the_number_a
     assert float(np.mean(sampled)) == pytest.approx(whole.item(), rel=0.1)
 
 
-def test_a_camera_that_learns_gets_the_gradient_of_finite_differences(case: Case) -> None:
+def test_the_gradient_of_a_learned_pose_is_that_of_finite_differences(case: Case) -> None:
     start = torch.tensor([0.01, -0.02, 0.015, 0.02, 0.01, -0.02], dtype=torch.float64)
 
     def values(motion: Tensor) -> tuple[Tensor, Tensor]:
@@ -160,20 +158,6 @@ def test_a_camera_that_learns_gets_the_gradient_of_finite_differences(case: Case
         case.depth, case.normal, case.neighbour.reference.textured, perturb_pose(HERE, held), case.neighbour
     )
     torch.testing.assert_close(photometric(learning), photometric(still))
-
-
-def test_a_gpu_samples_photographs_like_a_cpu() -> None:
-    g = torch.Generator().manual_seed(4)
-    image = torch.rand(7, 9, generator=g, dtype=torch.float64)
-    u, v, given = (2 * torch.rand(3, 20, 5, generator=g, dtype=torch.float64) - 1).unbind()
-    value, pull = _sample(image, u, v)
-    sampled = _Sampled.at(image, u, v)
-    torch.testing.assert_close(sampled.value, value)
-    inside = (u.abs() < 1 - 1 / 9) & (v.abs() < 1 - 1 / 7)  # between pixel centres: nothing beyond them counts
-    for by, derivative in zip(pull(given), (sampled.by_u, sampled.by_v), strict=True):
-        torch.testing.assert_close(by[inside], (derivative * given)[inside])
-    one = torch.rand(1, 1, dtype=torch.float64)
-    assert _Sampled.at(one, u, v).value.eq(one).all()
 
 
 def test_values_and_gradients_have_the_same_bits_for_any_number_of_threads() -> None:

@@ -6,13 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from gs2d.losses.priors import (
+from gs2d.losses.prior_formulas import (
     MIN_POINTS,
     Depths,
     MetricDepth,
     NormalTarget,
     PointDepths,
-    Prior,
     RelativeDepths,
     aligned,
     depth_prior,
@@ -39,38 +38,43 @@ def points(pixels: list[list[int]], weights: list[list[float]], depth: list[floa
 
 
 # -- values ---------------------------------------------------------------------------------------------------------
-def test_a_map_counts_relative_errors_over_all_pixels_and_unknown_ones_as_none() -> None:
+@pytest.fixture
+def no_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make the loss the absolute error."""
+    monkeypatch.setattr("gs2d.losses.prior_formulas.NOISE", 1e-9)
+
+
+@pytest.mark.usefixtures("no_noise")
+def test_the_loss_of_a_map_is_the_mean_relative_error() -> None:
     depth, truth = torch.full((4, 5), 2.0).double(), torch.zeros(4, 5).double()
     truth[0, 0], truth[1, 2], truth[3, 4] = 1.0, 2.0, 4.0  # errors 1, 0, 1/2; 17 pixels unknown
-    loss = depth_prior(Prior(valid(truth), noise=1e-9), depth, HIT)
+    loss = depth_prior(valid(truth), depth, HIT)
     assert loss.item() == pytest.approx(1.5 / 20)
-    assert depth_prior(Prior(valid(truth), depth_weight=0.25, noise=1e-9), depth, HIT).item() == pytest.approx(
-        0.25 * 1.5 / 20
-    )
 
 
-def test_pixels_that_are_hardly_covered_are_not_asked() -> None:
+@pytest.mark.usefixtures("no_noise")
+def test_pixels_that_are_hardly_covered_do_not_count() -> None:
     depth, alpha = torch.full((4, 5), 2.0).double(), HIT.clone()
     alpha[0, 0], depth[1, 1] = 0.4, 0.0  # too thin, nothing hit
-    loss = depth_prior(Prior(valid(torch.ones(4, 5).double()), opacity=0.5, noise=1e-9), depth, alpha)
+    loss = depth_prior(valid(torch.ones(4, 5).double()), depth, alpha)
     assert loss.item() == pytest.approx(18 / 20)
 
 
+@pytest.mark.usefixtures("no_noise")
 def test_a_point_between_pixels_is_compared_with_the_plane_through_them() -> None:
     # On a plane disparity is linear: 1/2 and 1/4 at the pixels, 3/8 in the middle, so z = 8/3.
     depth = torch.full((2, 2), 2.0).double()
     depth[:, 1] = 4.0
     middle = points([[0, 1, 2, 3]], [[0.25] * 4], [2.0])
-    assert depth_prior(Prior(middle, noise=1e-9), depth, HIT[:2, :2]).item() == pytest.approx(
-        (8 / 3 / 2 - 1) / MIN_POINTS
-    )
+    assert depth_prior(middle, depth, HIT[:2, :2]).item() == pytest.approx((8 / 3 / 2 - 1) / MIN_POINTS)
 
 
-def test_errors_that_are_to_be_expected_cost_their_square() -> None:
+def test_errors_below_the_noise_cost_their_square(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gs2d.losses.prior_formulas.NOISE", 0.1)
     truth = torch.ones(4, 5).double()
     for depth, expected in ((1.05, 0.05**2 / 0.2), (0.9, 0.05), (1.5, 0.45)):  # noise 0.1: e^2 / 0.2, then e - 0.05
         rendered = torch.full((4, 5), depth, dtype=torch.float64)
-        loss = depth_prior(Prior(valid(truth), noise=0.1), rendered, HIT)
+        loss = depth_prior(valid(truth), rendered, HIT)
         assert loss.item() == pytest.approx(expected)
 
 
@@ -81,7 +85,7 @@ def test_normals_cost_one_minus_their_cosine_by_blending_weight() -> None:
     normal[0, 1], truth[0, 1] = torch.tensor([0.8, 0, 0]), torch.tensor([0, 1.0, 0])  # 0.8 (1 - 0)
     normal[1, 0], truth[1, 0] = torch.tensor([0, 0, -0.5]), torch.tensor([0, 0, 1.0])  # 0.5 (1 + 1)
     normal[1, 1] = torch.tensor([1.0, 0, 0])  # unknown
-    assert normal_prior(Prior(normal=directed(truth)), normal, alpha).item() == pytest.approx((0.8 + 1.0) / 4)
+    assert normal_prior(directed(truth), normal, alpha).item() == pytest.approx((0.8 + 1.0) / 4)
 
 
 # -- gradients ------------------------------------------------------------------------------------------------------
@@ -101,7 +105,7 @@ def priors() -> dict[str, Depths]:
 @pytest.mark.parametrize("kind", ["map", "points"])
 def test_gradients_of_depths_are_those_of_finite_differences(kind: str) -> None:
     output = make_output(6, 7, seed=1)
-    prior = Prior(priors()[kind], depth_weight=0.3)
+    prior = priors()[kind]
     assert torch.autograd.gradcheck(lambda z: depth_prior(prior, z, output.alpha), (output.depth_mean,), atol=1e-7)
 
 
@@ -109,7 +113,7 @@ def test_gradients_of_normals_are_those_of_finite_differences() -> None:
     output = make_output(6, 7, seed=2)
     truth = torch.nn.functional.normalize(make_output(6, 7, seed=3).normal.detach(), dim=2)
     truth[2, 3] = 0
-    prior = Prior(normal=directed(truth))
+    prior = directed(truth)
     assert torch.autograd.gradcheck(lambda n: normal_prior(prior, n, output.alpha), (output.normal,), atol=1e-7)
 
 
@@ -117,26 +121,26 @@ def test_no_gradient_goes_into_alpha_or_into_the_fit_of_a_relative_map() -> None
     output, truth = make_output(6, 7), torch.rand(6, 7).double()
     relative = RelativeDepths(truth, truth >= 0, "disparity")
     (with_fit,) = torch.autograd.grad(
-        depth_prior(Prior(relative), output.depth_mean, output.alpha), [output.depth_mean], retain_graph=True
+        depth_prior(relative, output.depth_mean, output.alpha), [output.depth_mean], retain_graph=True
     )
     hit = (output.alpha > 0.5) & (output.depth_mean > 0)
     fixed = aligned(relative, output.depth_mean.detach(), hit)
-    (constant,) = torch.autograd.grad(depth_prior(Prior(fixed), output.depth_mean, output.alpha), [output.depth_mean])
+    (constant,) = torch.autograd.grad(depth_prior(fixed, output.depth_mean, output.alpha), [output.depth_mean])
     assert torch.equal(with_fit, constant)
-    loss = depth_prior(Prior(relative), output.depth_mean, output.alpha)
+    loss = depth_prior(relative, output.depth_mean, output.alpha)
     assert torch.autograd.grad(loss, [output.alpha], allow_unused=True) == (None,)
 
 
 # -- relative maps --------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("space", ["disparity", "depth"])
-def test_a_relative_map_of_the_very_surface_costs_nothing(space: str) -> None:
+def test_a_relative_map_of_the_rendered_surface_has_no_loss(space: str) -> None:
     depth = 1 + torch.rand(12, 13, generator=torch.Generator().manual_seed(0)).double()
     values = 0.3 * (1 / depth if space == "disparity" else depth) + 0.2
     relative = RelativeDepths(values, values >= 0, space)
-    assert depth_prior(Prior(relative), depth, torch.ones_like(depth)).item() == pytest.approx(0, abs=1e-12)
+    assert depth_prior(relative, depth, torch.ones_like(depth)).item() == pytest.approx(0, abs=1e-12)
 
 
-def test_a_fifth_of_wrong_pixels_hardly_moves_the_fit() -> None:
+def test_the_fit_is_robust_to_a_fifth_of_outliers() -> None:
     g = torch.Generator().manual_seed(0)
     x = torch.rand(500, generator=g).double()
     y = 2 * x + 1

@@ -13,8 +13,8 @@ from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from gs2d.errors import ShapeError
-from gs2d.losses import reference
-from gs2d.losses.api import normals_from_depth
+from gs2d.losses import formulas as reference
+from gs2d.losses.base import normals_from_depth
 from loss_images import make_camera, make_output, plane_depth
 
 
@@ -99,7 +99,7 @@ def test_with_camera_edges_an_empty_neighbour_lies_at_the_cameras_centre() -> No
     torch.testing.assert_close(found[~beside], normals_from_depth(depth, camera)[~beside])
 
 
-def test_with_camera_edges_a_normal_beside_the_background_is_across_the_rays_of_the_rim() -> None:
+def test_with_camera_edges_normals_beside_the_background_are_across_the_rays() -> None:
     # Half of a plane in front of the camera, the right half empty. At the last hit column but one all is as ever; at
     # the next two pixels P_right is the centre: N is across P_left, and so are all planes through the centre.
     camera = make_camera(8, 5)
@@ -163,7 +163,7 @@ def test_weights_multiply_the_part_of_each_pixel_and_the_count_stays() -> None:
         torch.testing.assert_close(loss(*images, mask, weights=torch.ones_like(whole)), loss(*images, mask))
 
 
-def test_the_object_is_where_the_photograph_s_alpha_is_more_than_a_half_else_as_much_as_is_rendered() -> None:
+def test_object_weights_use_the_alpha_of_the_image_or_the_rendered_alpha() -> None:
     rendered, photographed = torch.tensor([[0.25, 0.75]], requires_grad=True), torch.tensor([[0.51, 0.5]])
     assert reference.object_weights(rendered, photographed).tolist() == [[1.0, 0.0]]
     assert reference.object_weights(rendered).tolist() == [[0.25, 0.75]]

@@ -9,16 +9,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from gs2d.config.losses import LOSSES
+from gs2d.config.loss_registry import LOSSES
 from gs2d.config.multiview import MultiView
-from gs2d.config.priors import DepthPrior, NormalPrior
+from gs2d.config.prior_settings import DepthPrior, NormalPrior
 from gs2d.config.recipe import LossTerm, Recipe, Stage
 from gs2d.core.camera import Camera
 from gs2d.errors import BackendError, RecipeError, ShapeError
-from gs2d.losses import reference
-from gs2d.losses.api import Losses, LossView, compute_losses, losses_of, target_maps
-from gs2d.losses.multiview import Neighbour, prepare_image
-from gs2d.losses.priors import MetricDepth, NormalTarget, Prior
+from gs2d.losses import formulas as reference
+from gs2d.losses.base import Losses, LossView, compute_losses, losses_of, target_mean
+from gs2d.losses.prior_formulas import MetricDepth, NormalTarget
+from gs2d.losses.view_pair import Neighbour, prepare_image
 from gs2d.render.types import RenderOutput
 from loss_images import make_camera, make_output
 
@@ -48,6 +48,7 @@ def one_loss(
     losses = Losses(terms)
     if kind in PRIORS:
         losses[terms[0]]._priors = OnePrior(target)  # type: ignore[attr-defined]
+        losses[terms[0]]._prior = NormalPrior()  # type: ignore[attr-defined]
     return compute_losses(output, view, terms, backend=backend, losses=losses)[kind]
 
 
@@ -56,10 +57,10 @@ class OnePrior:
 
     def __init__(self, target: Tensor) -> None:
         valid, directions = torch.ones_like(target[..., 0]), torch.nn.functional.normalize(target, dim=2)
-        self._prior = Prior(MetricDepth(0.5 + target[..., 1], valid > 0), NormalTarget(directions, valid), opacity=0.2)
+        self._known = MetricDepth(0.5 + target[..., 1], valid > 0), NormalTarget(directions, valid)
 
-    def of(self, *_: object) -> Prior:
-        return self._prior
+    def at(self, *_: object) -> tuple[MetricDepth, NormalTarget]:
+        return self._known
 
 
 def one_neighbour(target: Tensor, mask: Tensor | None, camera: Camera) -> Neighbour:
@@ -74,9 +75,7 @@ def one_neighbour(target: Tensor, mask: Tensor | None, camera: Camera) -> Neighb
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
-def test_what_was_rendered_at_an_ignored_pixel_has_no_influence(
-    kind: str, backend: str, request: pytest.FixtureRequest
-) -> None:
+def test_ignored_pixels_have_no_influence(kind: str, backend: str, request: pytest.FixtureRequest) -> None:
     if backend == "cpu":
         request.getfixturevalue("native")
     height, width = 14, 17
@@ -167,7 +166,7 @@ def test_the_official_total_is_the_sum_of_the_weighted_terms_that_have_started(
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 @pytest.mark.parametrize("kind", ["normal_consistency", "normal_consistency_per_splat"])
-def test_a_term_says_how_normals_are_taken_beside_empty_pixels(
+def test_the_edges_option_sets_normals_beside_empty_pixels(
     kind: str, backend: str, request: pytest.FixtureRequest
 ) -> None:
     if backend == "cpu":
@@ -186,9 +185,7 @@ def test_a_term_says_how_normals_are_taken_beside_empty_pixels(
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
-def test_a_term_of_the_object_alone_pays_for_no_cover_of_the_empty_background(
-    backend: str, request: pytest.FixtureRequest
-) -> None:
+def test_object_weights_give_no_gradient_to_the_background(backend: str, request: pytest.FixtureRequest) -> None:
     if backend == "cpu":
         request.getfixturevalue("native")
     output, camera, target = make_output(8, 9, dtype=torch.float32), make_camera(9, 8), torch.zeros(8, 9, 3)
@@ -205,22 +202,6 @@ def test_a_term_of_the_object_alone_pays_for_no_cover_of_the_empty_background(
     assert (inner["image"][empty] != 0).all()
     assert (inner["object"][empty] == 0).all()
     torch.testing.assert_close(inner["object"][~empty], inner["image"][~empty])
-
-
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
-def test_a_term_counts_less_at_edges_of_the_photograph_and_can_be_asked_of_the_object_too(
-    backend: str, request: pytest.FixtureRequest
-) -> None:
-    if backend == "cpu":
-        request.getfixturevalue("native")
-    output, camera, target = make_output(8, 9, dtype=torch.float32), make_camera(9, 8), torch.rand(8, 9, 3)
-    alpha = torch.rand(8, 9)
-    term = LossTerm("normal_consistency", 1.0, options={"where": "object", "edge_power": 2.0})
-    view = LossView(target, camera, silhouette=alpha)
-    found = compute_losses(output, view, [term], backend=backend)["normal_consistency"]
-    weights = reference.edge_weights(target, 2.0) * (alpha > 0.5)
-    expected = reference.normal_consistency(output.normal, output.depth_mean, output.alpha, camera, weights=weights)
-    assert found.item() == pytest.approx(expected.item(), rel=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -243,25 +224,14 @@ def test_a_wrong_argument_is_refused_in_one_line(change: dict[str, object], erro
     assert "\n" not in str(caught.value)
 
 
-def test_a_cache_of_another_target_is_refused(native: None) -> None:
-    output, camera = make_output(8, 9, dtype=torch.float32), make_camera(9, 8)
-    target, other = torch.rand(8, 9, 3), torch.rand(8, 9, 3)
-
-    def ssim(of: Tensor | None) -> float:
-        view = LossView(target, camera, maps=maps[of])
-        losses = compute_losses(output, view, [LossTerm("ssim", 1.0)], backend="cpu")
-        return losses["ssim"].item()
-
-    maps = {target: target_maps(target), other: target_maps(other), None: None}
-    assert ssim(target) == ssim(None)
-    with pytest.raises(ShapeError, match="another target"):
-        ssim(other)
-    target.mul_(0.5)
-    with pytest.raises(ShapeError, match="changed in place"):
-        ssim(target)
+def test_the_mean_of_a_target_changes_no_value(native: None) -> None:
+    output, camera, target = make_output(8, 9, dtype=torch.float32), make_camera(9, 8), torch.rand(8, 9, 3)
+    views = LossView(target, camera), LossView(target, camera, target_mean=target_mean(target))
+    plain, kept = (compute_losses(output, view, [LossTerm("ssim", 1.0)], backend="cpu")["ssim"] for view in views)
+    assert torch.equal(plain, kept)
 
 
-def test_a_silhouette_term_without_an_alpha_channel_says_so_or_is_left_out_where_none_is_required() -> None:
+def test_a_required_silhouette_needs_an_alpha_channel() -> None:
     output, camera, alpha = make_output(5, 6), make_camera(6, 5), torch.rand(5, 6)
     view = LossView(torch.rand(5, 6, 3), camera)
     with pytest.raises(RecipeError, match="alpha channel, got one without"):
@@ -291,7 +261,6 @@ def trained_with(*terms: LossTerm, **settings: Any) -> Recipe:
             LossTerm("normal_consistency_per_splat", 1.0, options={"where": "alpha"}),
             "loss 'normal_consistency_per_splat': where must be one of image, object; got 'alpha'",
         ),
-        (LossTerm("normal_consistency", 1.0, options={"edge_power": -1.0}), "edge_power must be a finite number >= 0"),
         (LossTerm("silhouette", 1.0, options={"required": "no"}), "required must be true or false, got 'no'"),
     ],
 )
@@ -303,7 +272,7 @@ def test_each_loss_checks_its_options(term: LossTerm, words: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["depth_prior", "normal_prior", "multiview_geometric"])
-def test_a_loss_and_the_settings_that_it_needs_come_together(kind: str) -> None:
+def test_a_loss_and_its_settings_are_required_together(kind: str) -> None:
     name = "multiview" if "multiview" in kind else kind
     settings = {"multiview": MultiView(), "depth_prior": DepthPrior(), "normal_prior": NormalPrior()}
     with pytest.raises(RecipeError, match=f"{name} is null, but loss '{kind}' needs it"):
@@ -313,7 +282,7 @@ def test_a_loss_and_the_settings_that_it_needs_come_together(kind: str) -> None:
     assert losses_of(trained_with(LossTerm(kind, 0.1), **{name: settings[name]}))
 
 
-def test_losses_between_views_are_of_one_depth() -> None:
+def test_losses_between_views_use_one_depth() -> None:
     pair = (LossTerm("multiview_photometric", 1.0, depth="median"), LossTerm("multiview_geometric", 1.0))
-    with pytest.raises(RecipeError, match="so of one depth; got median and the protocol's"):
+    with pytest.raises(RecipeError, match="must use the same depth, got median and the protocol's"):
         losses_of(trained_with(*pair, multiview=MultiView()))

@@ -14,12 +14,5 @@ def test_the_time_left_accounts_for_growing_steps() -> None:
     assert Phase("placing cameras", 40, growth=2.0).seconds_left(40, 99.0) == 0.0
 
 
-def test_the_time_left_accounts_for_the_cost_of_steps() -> None:
-    phase = Phase("training", 100, costs=((80, 0.25), (20, 1.0)))  # a quarter of the pixels first
-    assert phase.seconds_left(40, 10.0) == pytest.approx(30.0)
-    assert phase.seconds_left(80, 20.0) == pytest.approx(20.0)
-    assert phase.seconds_left(90, 30.0) == pytest.approx(10.0)
-
-
 def test_the_time_left_is_unknown_without_a_number_of_steps() -> None:
     assert Phase("fusing", 0).seconds_left(3, 5.0) is None

@@ -24,7 +24,7 @@ from gs2d.synthetic import demo_capture as toy
 from gs2d.synthetic.perturb_exposure import GAINS, random_gains, with_gains
 from gs2d.training.events import Event, Notice, ignore
 
-EARLY = (*SMALL, "exposure.start=5", "exposure.rate=0.2")  # so that 60 iterations show something
+EARLY = (*SMALL, "learned.exposure.start=5", "learned.exposure.rate=0.2")  # so that 60 iterations show something
 
 
 @pytest.fixture(scope="module")

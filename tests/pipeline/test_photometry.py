@@ -17,7 +17,10 @@ from gs2d.pipeline.prepare.run_appearance import as_scene, photographed
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Event, Notice, ignore
 
-EARLY = (*SMALL, "photometry.start=5", "photometry.rate=0.02")
+EARLY = (
+    *SMALL,
+    *(f"learned.{name}.{value}" for name in ("vignetting", "response") for value in ("start=5", "rate=0.02")),
+)
 
 
 @pytest.fixture(scope="module")

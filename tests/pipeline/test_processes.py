@@ -50,7 +50,7 @@ def test_a_killed_process_ends_the_run_which_can_resume(capture: Path, whole: Pa
     out = tmp_path / "run"
     (code, line), (killed, silent) = in_processes(2, words(capture, out), f"signal=1:5:{int(signal.SIGKILL)}")
     assert (code, killed, silent) == (2, -signal.SIGKILL, "")
-    assert line.startswith("error: process 0 of 2 lost contact with another one")
+    assert line.startswith("error: process 0 of 2 lost contact with another process")
     assert line.count("\n") == 1
     assert [checkpoint.iteration for checkpoint in RunFolder(out).checkpoints()] == [4, 8]
     assert in_processes(2, words(capture, out, "--resume")) == [(0, ""), (0, "")]

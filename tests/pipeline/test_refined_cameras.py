@@ -19,7 +19,7 @@ from gs2d.pipeline.prepare.options import TextureOptions
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Event, Notice, ignore
 
-EARLY = (*SMALL, "poses.start=5", "intrinsics.start=5", "intrinsics.rate=0.01")
+EARLY = (*SMALL, "learned.poses.start=5", "learned.intrinsics.start=5", "learned.intrinsics.rate=0.01")
 
 
 @pytest.fixture(scope="module")

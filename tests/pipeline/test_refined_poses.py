@@ -29,7 +29,7 @@ from gs2d.synthetic import demo_capture as toy
 from gs2d.synthetic.perturb_poses import TRUTH
 from gs2d.training.events import Event, Notice, Step, ignore
 
-EARLY = (*SMALL, "poses.start=5", "poses.rate=0.01")  # so that 60 iterations show something
+EARLY = (*SMALL, "learned.poses.start=5", "learned.poses.rate=0.01")  # so that 60 iterations show something
 
 
 def learning(capture: Path, out: Path, **changes: object) -> TrainOptions:

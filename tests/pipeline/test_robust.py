@@ -105,7 +105,7 @@ def test_training_is_robust_where_protocol_and_capture_allow_it(
     recipe = fitted(options(**asked), scene, protocol, lambda _: None)  # type: ignore[arg-type]
     for part in (recipe.dense_start, recipe.removal):
         assert (part is not None) == robust
-    assert (recipe.exposure is not None) == exposure
+    assert recipe.learns("exposure") == exposure
     assert (recipe.stages[0].lr.sh0 > LearningRates().sh0) == robust  # a tenth of the schedule: longer steps
 
 

@@ -9,13 +9,15 @@ import torch
 
 import gs2d
 from gs2d.cli.commands import Common
+from gs2d.config.actions import Action
 from gs2d.config.arguments import Arg
 from gs2d.config.densify import Densify
 from gs2d.data.camera_models import CameraModel
 from gs2d.errors import DivergedError
 from gs2d.io.gaussians import Gaussians
-from gs2d.losses.api import LossReport
+from gs2d.losses.base import LossReport
 from gs2d.render.backends import CpuBackend
+from gs2d.training.actions.entry_action import EntryAction
 from gs2d.training.densify.densifier import Densifier
 from gs2d.training.events import Densified
 from gs2d.training.rows import keep_rows
@@ -98,6 +100,19 @@ class PruneFaint(Densifier):
         return (Densified(self.surroundings.stage, iteration, 0, 0, self.count, 0, len(state.splats)),)
 
 
+@gs2d.register_action("example-near")
+class SelectNear(EntryAction):
+    """Write the row group of the splats nearest to the origin."""
+
+    def __init__(self, writes, fraction=0.5):
+        self.writes, self.fraction = writes, fraction
+
+    def run(self, state, entry):
+        distance = state.splats.means.norm(dim=1)
+        state.groups[self.writes] = distance <= distance.quantile(self.fraction)
+        return ()
+
+
 @gs2d.register_quantity("example-tint")
 class Tint(gs2d.LearnedQuantity):
     """A gain of each channel of each photograph, whose mean over all photographs is 1."""
@@ -117,7 +132,8 @@ def recipe():
     """Like 2dgs, with losses and a densifier of this package."""
     base = gs2d.get_recipe("2dgs").with_loss(gs2d.LossTerm("example-contrast", 0.1, options={"gain": 2.0}))
     base = base.with_loss(gs2d.LossTerm("example-brightness", 0.1)).with_loss(gs2d.LossTerm("example-outside", 0.1))
-    stage = replace(base.stages[0], densify=Densify("example-prune", {"at": 3, "count": 2}))
+    densify = Densify("example-prune", {"at": 3, "count": 2})
+    stage = replace(base.stages[0], densify=densify, on_enter=(Action("example-near", {"writes": "near"}),))
     tint = gs2d.Quantity("example-tint", rate=0.01, start=2, prior=0.001)
     return replace(base, name="example-2dgs", learned=(tint,), stages=(stage, *base.stages[1:]))
 

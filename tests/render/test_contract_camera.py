@@ -21,8 +21,8 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import perturb_pose
 from gs2d.errors import ShapeError
-from gs2d.losses.api import LossView, compute_losses
-from gs2d.losses.reference import normal_consistency, normal_consistency_per_splat
+from gs2d.losses.base import LossView, compute_losses
+from gs2d.losses.formulas import normal_consistency, normal_consistency_per_splat
 from gs2d.render import pose_gradient as camera_gradient
 from gs2d.render import reference_rasterizer as reference
 from gs2d.render.api import rasterize, splat_errors

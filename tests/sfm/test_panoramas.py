@@ -33,7 +33,7 @@ from gs2d.pipeline.prepare.pose_finding import find_poses
 from gs2d.sfm.panoramas import meets_itself
 from gs2d.sfm.photos import Photo, camera_groups, find_photos, panorama_groups, read_photos
 from gs2d.training.events import Event, Notice
-from gs2d.training.plane_sweep import start_points, sweep_views
+from gs2d.training.start.plane_sweep import start_points, sweep_views
 from room_photos import room_cameras, room_image, textures
 
 WIDTH = 768

@@ -9,7 +9,7 @@ import torch
 
 from gs2d.config.recipe import LearningRates, Stage
 from gs2d.core.splats import ATTRIBUTES
-from gs2d.training.adam import adam_step, begin_stage, lr_at
+from gs2d.training.optimizer import adam_step, begin_stage, lr_at
 from gs2d.training.state import TrainState
 from train_toys import full_state, random_splats
 
@@ -43,7 +43,7 @@ def test_twenty_steps_equal_torch_adam() -> None:
         assert state.moments[name].steps == 20
 
 
-def test_rows_outside_the_group_and_attributes_outside_the_stage_keep_their_bits() -> None:
+def test_untrained_rows_and_attributes_keep_their_bits() -> None:
     state = fresh_state()
     state.groups["g"] = torch.tensor([0, 1, 0, 0, 1, 0, 0, 1, 0], dtype=torch.bool)
     before = state.splats.clone()

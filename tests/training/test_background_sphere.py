@@ -5,20 +5,22 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
-from gs2d.config.robust import BackgroundSphere, DenseStart
+from gs2d.config.robust import DenseStart
 from gs2d.data.scene import View
-from gs2d.training.background_sphere import sphere_points
-from gs2d.training.plane_sweep import sweep_views
+from gs2d.training.start.background_sphere import sphere_points
+from gs2d.training.start.plane_sweep import sweep_views
 from wall_scene import WALL, WIDTH, wall
 
-SMALL = DenseStart(side=48, planes=32, min_angle=1.0, cell=3.0)
-SPHERE = BackgroundSphere(splats=4_000, radius=2.0, size=0.5)
+SMALL = DenseStart(side=48, min_angle=1.0)
 
 
-def test_they_stand_where_photographs_show_what_no_depth_is_known_of() -> None:
+def test_splats_are_placed_where_images_show_pixels_of_unknown_depth(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = wall()
-    places, colors, normals, sizes = sphere_points(scene, sweep_views(scene, SMALL), SPHERE)
+    for name, value in (("SPLATS", 4_000), ("RADIUS", 2.0), ("SIZE", 0.5)):
+        monkeypatch.setattr(f"gs2d.training.start.background_sphere.{name}", value)
+    places, colors, normals, sizes = sphere_points(scene, sweep_views(scene, SMALL))
     center = np.mean([view.camera.center for view in scene.train], axis=0)
     assert scene.points is not None
     reach = np.linalg.norm(scene.points.points - center, axis=1).max()  # swept places lie beside the points
@@ -38,7 +40,7 @@ def test_they_stand_where_photographs_show_what_no_depth_is_known_of() -> None:
     assert bare[to_the_left].mean() > 0.9
 
 
-def test_there_are_none_where_an_alpha_channel_says_what_is_empty() -> None:
+def test_images_with_an_alpha_channel_have_no_sphere() -> None:
     scene = wall()
 
     def with_alpha(view: View) -> View:
@@ -47,5 +49,5 @@ def test_there_are_none_where_an_alpha_channel_says_what_is_empty() -> None:
         return View.from_arrays(view.name, view.camera, np.concatenate([color, alpha], axis=2))
 
     cut = replace(scene, train=tuple(map(with_alpha, scene.train)))
-    found = sphere_points(cut, sweep_views(scene, SMALL), SPHERE)
+    found = sphere_points(cut, sweep_views(scene, SMALL))
     assert [len(array) for array in found] == [0, 0, 0, 0]

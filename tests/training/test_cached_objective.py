@@ -69,7 +69,7 @@ def views_of(made: Trainer, room: int = ROOM) -> CachedViews:
 
 
 @needs_cpu
-def test_every_view_has_the_losses_and_gradients_of_the_plain_path(masked: Scene) -> None:
+def test_cached_views_have_the_losses_and_gradients_of_full_renderings(masked: Scene) -> None:
     made = entered(masked)
     stage, cached = made.recipe.stages[0], views_of(made)
     assert len(cached.views) == VIEWS
@@ -86,7 +86,7 @@ def test_every_view_has_the_losses_and_gradients_of_the_plain_path(masked: Scene
 
 
 @needs_cpu
-def test_the_first_views_that_fit_are_cached_and_the_others_are_evaluated_plainly(masked: Scene) -> None:
+def test_the_first_views_that_fit_are_cached(masked: Scene) -> None:
     made = entered(masked)
     sizes = [view.nbytes for view in views_of(made).views]
     two = sizes[0] + sizes[1]
@@ -103,11 +103,11 @@ def test_the_first_views_that_fit_are_cached_and_the_others_are_evaluated_plainl
 
 @needs_cpu
 @pytest.mark.parametrize("part", [False, True])
-def test_the_bytes_do_not_depend_on_threads_or_on_where_a_run_resumes(masked: Scene, part: bool) -> None:
+def test_bytes_do_not_depend_on_threads_or_on_resuming(masked: Scene, part: bool) -> None:
     room = views_of(entered(masked)).views[0].nbytes * (2 * VIEWS - 3) // 2 if part else ROOM
-    kept: list[tuple[events.Event, bytes]] = []
+    kept: list[tuple[events.TrainingEvent, bytes]] = []
 
-    def keep(event: events.Event) -> None:
+    def keep(event: events.TrainingEvent) -> None:
         file = io.BytesIO()
         torch.save(made.state.state_dict(), file)
         kept.append((event, file.getvalue()))
@@ -124,7 +124,7 @@ def test_the_bytes_do_not_depend_on_threads_or_on_where_a_run_resumes(masked: Sc
         assert same(trainer(masked, room, state=state).run(), end), event
 
 
-def test_only_stages_that_train_colours_of_a_group_by_colour_losses_on_the_native_backend_are_cached() -> None:
+def test_which_stages_use_cached_views() -> None:
     plain, caching = replace(appearance(), iterations=100), altered(PLAIN, caches_views=True)
 
     def cacheable(stage: Stage, backend: Backend = caching, views: int = 50) -> bool:

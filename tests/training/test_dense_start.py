@@ -12,7 +12,7 @@ import torch
 from gs2d.config.presets import two_dgs
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe
-from gs2d.config.robust import DenseStart, StartFit
+from gs2d.config.robust import DenseStart
 from gs2d.config.schedule import scale_schedule
 from gs2d.core.camera import look_at
 from gs2d.core.sh import sh_to_rgb
@@ -22,14 +22,14 @@ from gs2d.evaluation.image_metrics import psnr_float
 from gs2d.pipeline.train.run_logger import start_text
 from gs2d.render.api import rasterize
 from gs2d.training.events import Initialised
-from gs2d.training.plane_sweep import Sweep, start_points, sweep_views
-from gs2d.training.start_fit import fit_start
-from gs2d.training.sweep_range import sweep_range
+from gs2d.training.start.plane_sweep import Sweep, start_points, sweep_views
+from gs2d.training.start.start_fit import fit_start
+from gs2d.training.start.sweep_range import sweep_range
 from gs2d.training.trainer import Trainer
 from tiny import RADIUS, ball_image
 from wall_scene import WALL, wall
 
-BALL = DenseStart(side=64, planes=40, neighbours=3, cell=2.0, radius=2, agree=0.02)
+BALL = DenseStart(side=64, neighbours=3, cell=2.0)
 PIXEL = 3.0 / 80  # world units at the middle of the ball
 BOUNDS = np.array([[-1.2, -1.2, -1.2], [1.3, 1.2, 1.2]])
 
@@ -55,7 +55,7 @@ def pointless_wall() -> Scene:
 
 
 # -- where is swept -------------------------------------------------------------------------------------------------
-def test_a_view_is_swept_between_the_nearest_and_the_farthest_place_in_the_silhouettes_of_all() -> None:
+def test_without_points_the_visual_hull_limits_the_sweep() -> None:
     found = sweep_range(ball())
     cell = float(np.linalg.norm(BOUNDS[1] - BOUNDS[0])) / 48
     for view in ball().train:
@@ -67,20 +67,20 @@ def test_a_view_is_swept_between_the_nearest_and_the_farthest_place_in_the_silho
     assert len(found.observed.points) <= 2 * 2000
 
 
-def test_a_wall_without_points_is_found_as_with_them() -> None:
-    sweep = sweep_views(pointless_wall(), DenseStart(side=48, planes=32, min_angle=1.0))
+def test_a_wall_is_swept_without_sparse_points() -> None:
+    sweep = sweep_views(pointless_wall(), DenseStart(side=48, min_angle=1.0))
     depth = sweep.depths[2][:, 20:]
     assert (depth > 0).mean() > 0.8
     assert np.median(np.abs(depth[depth > 0] / WALL - 1)) < 0.02
 
 
 # -- what is found --------------------------------------------------------------------------------------------------
-def test_places_lie_on_the_ball_and_in_no_background() -> None:
+def test_swept_points_lie_on_the_ball() -> None:
     cloud = start_points(ball(), swept_ball(), BALL)
     off = np.abs(np.linalg.norm(cloud.points, axis=1) - RADIUS)
     assert len(cloud) > 300
-    assert np.median(off) < PIXEL
-    assert np.percentile(off, 95) < 3 * PIXEL
+    assert np.median(off) < 1.1 * PIXEL
+    assert np.percentile(off, 95) < 3.5 * PIXEL
     assert cloud.normals is not None
     outward = cloud.points / np.linalg.norm(cloud.points, axis=1, keepdims=True)
     assert np.median(np.abs((cloud.normals * outward).sum(axis=1))) > 0.85
@@ -106,14 +106,15 @@ def test_a_fitted_start_looks_more_like_the_photographs_than_an_unfitted_one() -
             values.append(psnr_float(image, torch.from_numpy(view.target(trainer.settings.background).copy())))
         return float(np.mean(values))
 
-    plain, fitted = likeness(BALL), likeness(replace(BALL, fit=StartFit(opacity=0.9, size=1.0)))
+    plain, fitted = likeness(BALL), likeness(replace(BALL, fit=True))
     assert fitted > plain + 1
 
 
-def test_a_splat_has_the_colour_that_the_views_show_its_opacity_and_a_bounded_size() -> None:
-    fit = StartFit(sh_degree=1, opacity=0.7, size=0.5, max_size=1.5)
+def test_a_fitted_splat_has_the_colour_of_the_images_and_a_bounded_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("OPACITY", 0.7), ("SIZE", 0.5), ("MAX_SIZE", 1.5)):
+        monkeypatch.setattr(f"gs2d.training.start.start_fit.{name}", value)
     plain = Trainer(ball(), recipe(BALL), GENERIC, backend="reference").splats
-    fitted = fit_start(plain, swept_ball(), replace(BALL, fit=fit))
+    fitted = fit_start(plain, swept_ball())
     assert torch.equal(fitted.means, plain.means)
     assert torch.equal(fitted.quats, plain.quats)
     torch.testing.assert_close(fitted.opacities, torch.full_like(fitted.opacities, 0.7))
@@ -124,19 +125,19 @@ def test_a_splat_has_the_colour_that_the_views_show_its_opacity_and_a_bounded_si
     shown = sh_to_rgb(fitted.sh0, fitted.shN, torch.nn.functional.normalize(-fitted.means, dim=1), 1)  # from outside
     true = 0.5 + 0.4 * fitted.means / RADIUS + 0.1 * torch.sin(9 * fitted.means)
     assert (shown - true).abs().median() < 0.03
-    assert (fitted.shN[:, 3:] == 0).all()
+    assert (fitted.shN == 0).all()
 
 
 # -- in training ----------------------------------------------------------------------------------------------------
-def test_a_resumed_training_sweeps_nothing_again_and_ends_with_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = recipe(replace(BALL, fit=StartFit()))
+def test_a_resumed_training_does_not_sweep_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = recipe(replace(BALL, fit=True))
     whole = Trainer(ball(), made, GENERIC, backend="auto").run()
     first = Trainer(ball(), made, GENERIC, backend="auto")
     first.enter(0)
     for _ in range(4):
         first.step()
     state = type(first.state).from_state_dict(first.state.state_dict())
-    monkeypatch.setattr("gs2d.training.robust.sweep_views", None)
+    monkeypatch.setattr("gs2d.training.robust.robustness.sweep_views", None)
     again = Trainer(ball(), made, GENERIC, backend="auto", state=state).run()
     assert all(torch.equal(a, b) for (_, a), (_, b) in zip(whole.items(), again.items(), strict=True))
 
@@ -153,9 +154,12 @@ def unlike_anything() -> Scene:
 
 
 @pytest.mark.parametrize("kind", ["noise", "alone"])
-def test_where_photographs_agree_on_nothing_an_optional_start_is_left_out_and_that_is_said(kind: str) -> None:
+def test_an_optional_start_is_left_out_and_reported_if_no_depths_agree(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gs2d.training.start.plane_sweep.MIN_NCC", 0.99)
     scene = unlike_anything() if kind == "noise" else replace(ball(), train=ball().train[:1])
-    wished = replace(BALL, min_ncc=0.99, fit=StartFit(), required=False)
+    wished = replace(BALL, fit=True, required=False)
     told: list[object] = []
     trainer = Trainer(scene, recipe(wished), GENERIC, backend="reference", on_event=told.append)
     trainer.enter(0)

@@ -151,7 +151,7 @@ def test_absgs_splits_by_the_absolute_gradient_and_clones_by_the_signed_one() ->
     torch.testing.assert_close(state.splats.scales[4:], torch.full((2, 2), 0.02 / 1.6))
 
 
-def test_max_splats_lets_the_largest_gradients_go_first() -> None:
+def test_max_splats_prefers_the_largest_gradients() -> None:
     small = [(0.005, 0.005)] * 5
     state = state_of(small, [0.5] * 5, [3e-4, 9e-4, 5e-4, 9e-4, 1e-4], [1.0] * 5)
     before = state.splats.clone()
@@ -161,7 +161,7 @@ def test_max_splats_lets_the_largest_gradients_go_first() -> None:
     assert run(state, GradDensify(max_splats=7)).cloned == 0
 
 
-def test_a_budget_counts_what_is_left_after_pruning() -> None:
+def test_max_splats_counts_splats_after_pruning() -> None:
     # five splats, of which the first is too faint: it takes no room, and wins none with its gradient. Four stay, the
     # budget of six lets two of the other three grow, of which one splits (a parent goes, two children come).
     sizes = [(0.005, 0.005), (0.005, 0.005), (0.02, 0.02), (0.005, 0.005), (0.005, 0.005)]
@@ -172,7 +172,7 @@ def test_a_budget_counts_what_is_left_after_pruning() -> None:
     assert len(state.splats) == 6
 
 
-def test_the_prune_by_size_may_start_apart_from_resets() -> None:
+def test_the_prune_by_size_may_start_independently_of_resets() -> None:
     def pruned(densify: GradDensify, iteration: int) -> int:
         return run(
             state_of([(0.11, 0.01), (0.09, 0.01)], [0.5] * 2, [0.0] * 2, [1.0] * 2), densify, iteration
@@ -182,13 +182,13 @@ def test_the_prune_by_size_may_start_apart_from_resets() -> None:
     assert [pruned(GradDensify(reset_every=0, scale_cull_start=600), i) for i in (600, 700)] == [0, 1]
 
 
-def test_losing_every_splat_is_an_error_and_not_an_empty_scene() -> None:
+def test_pruning_all_splats_is_an_error() -> None:
     state = state_of([(0.02, 0.02)] * 2, [0.01, 0.02], [0.0, 0.0], [1.0, 1.0])
     with pytest.raises(DivergedError, match="iteration"):
         run(state)
 
 
-def test_a_limit_lowers_opacity_forgets_its_gradients_and_keeps_the_step_count() -> None:
+def test_limiting_opacity_zeroes_its_moments_but_not_the_step_count() -> None:
     state = state_of([(0.02, 0.02)] * 3, [0.9, 0.01, 0.005], [0.0] * 3, [1.0] * 3)
     faint = state.splats.opacity_logits[2].clone()
     limit_opacity(state, 0.01)

@@ -25,7 +25,7 @@ def by_depth(recipe: Recipe, kind: str, *kinds_of_loss: str) -> Recipe:
     return replace(recipe, stages=tuple(stages))
 
 
-def test_it_is_rendered_only_while_a_loss_asks_for_it(scene: Scene) -> None:
+def test_transmittance_depth_is_rendered_only_if_a_loss_uses_it(scene: Scene) -> None:
     trainer = Trainer(scene, by_depth(short(), "transmittance", "normal_consistency"), GENERIC, backend="reference")
     stages = trainer.recipe.stages  # normal consistency begins after 4 iterations, and is not in the second stage
     asked = [trainer._whole.settings(stages[0], iteration).with_transmittance_depth for iteration in (4, 5)]
@@ -35,7 +35,7 @@ def test_it_is_rendered_only_while_a_loss_asks_for_it(scene: Scene) -> None:
     assert not plain._whole.settings(plain.recipe.stages[0], 5).with_transmittance_depth
 
 
-def test_losses_by_it_have_other_gradients_than_by_the_median(scene: Scene, backend: str) -> None:
+def test_transmittance_and_median_depth_have_different_gradients(scene: Scene, backend: str) -> None:
     found = {}
     for kind in ("median", "transmittance"):
         trainer = Trainer(scene, by_depth(short(), kind, "normal_consistency"), GENERIC, backend=backend)

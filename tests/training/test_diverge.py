@@ -24,7 +24,7 @@ from gs2d.training.trainer import Trainer
 from train_toys import random_splats, short, train
 
 
-def test_bad_recipes_and_empty_scenes_stop_before_anything_is_trained(scene: Scene) -> None:
+def test_bad_recipes_and_empty_scenes_are_refused_before_training(scene: Scene) -> None:
     with pytest.raises(RecipeError, match="at least one stage"):
         Trainer(scene, Recipe("r", ()), GENERIC, backend="reference")
     with pytest.raises(DataError, match="no training views"):
@@ -66,7 +66,7 @@ def test_nan_in_a_gradient_names_the_attribute(scene: Scene, name: str) -> None:
         train(scene, short(), backend=spoiled(spoil, 2))
 
 
-def test_nan_in_a_parameter_stops_at_the_door_though_the_rasterizer_would_skip_it(scene: Scene) -> None:
+def test_nan_in_a_parameter_stops_training(scene: Scene) -> None:
     splats = random_splats(5)
     splats.log_scales[3, 1] = float("nan")
     state = TrainState(splats, torch.Generator())
@@ -74,7 +74,7 @@ def test_nan_in_a_parameter_stops_at_the_door_though_the_rasterizer_would_skip_i
         Trainer(scene, short(), GENERIC, backend="reference", state=state).run()
 
 
-def test_an_update_that_leaves_the_finite_numbers_stops(scene: Scene) -> None:
+def test_an_update_to_infinity_stops_training(scene: Scene) -> None:
     wild = replace(surface(), iterations=3, densify=None, lr=LearningRates(sh0=1e39))
     with pytest.raises(DivergedError, match="iteration"):
         train(scene, Recipe("r", (wild,)))

@@ -11,7 +11,7 @@ from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe
 from gs2d.config.robust import FEW_VIEWS, Removal
 from gs2d.render.api import rasterize
-from gs2d.training.dropout import dropout_rate, dropped_out, kept_splats
+from gs2d.training.robust.dropout import dropout_rate, dropped_out, kept_splats
 from gs2d.training.trainer import Trainer
 from train_toys import make_scene, short
 
@@ -20,14 +20,14 @@ def dropping(rate: float) -> Recipe:
     return replace(short(), removal=Removal(dropout=rate))
 
 
-def test_only_stages_that_train_all_of_geometry_and_opacity_drop_splats_and_only_of_few_views() -> None:
+def test_which_stages_use_dropout() -> None:
     recipe = replace(two_dgs_r(), removal=Removal(dropout=0.2))
     assert [dropout_rate(recipe, stage, FEW_VIEWS) for stage in recipe.stages] == [0.2, 0.0, 0.0]
     assert dropout_rate(recipe, recipe.stages[0], FEW_VIEWS + 1) == 0
     assert dropout_rate(two_dgs_r(), recipe.stages[0], 3) == 0
 
 
-def test_an_iteration_leaves_out_the_same_splats_whenever_it_is_done() -> None:
+def test_dropout_of_an_iteration_is_reproducible() -> None:
     recipe = dropping(0.25)
     first = kept_splats(recipe, 0, 7, 40_000, 0.25)
     assert torch.equal(first, kept_splats(recipe, 0, 7, 40_000, 0.25))
@@ -38,7 +38,7 @@ def test_an_iteration_leaves_out_the_same_splats_whenever_it_is_done() -> None:
     assert not torch.equal(first, kept_splats(replace(recipe, seed=1), 0, 7, 40_000, 0.25))
 
 
-def test_those_that_are_left_out_are_not_drawn_and_learn_nothing() -> None:
+def test_dropped_splats_are_not_rendered_and_get_no_gradients() -> None:
     trainer = Trainer(make_scene(), short(), GENERIC, backend="cpu")
     splats = trainer.splats
     kept = torch.arange(len(splats)) % 2 == 0

@@ -13,7 +13,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from fake_backends import lacking
 from gs2d.config.presets import appearance, refine, surface, with_exposure
 from gs2d.config.protocols import GENERIC, NERF_SYNTHETIC
-from gs2d.config.recipe import Exposure, LearningRates, Recipe
+from gs2d.config.quantities import EXPOSURE, Quantity
+from gs2d.config.recipe import LearningRates, Recipe
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import camera_extent
@@ -25,6 +26,7 @@ from gs2d.synthetic.perturb_exposure import random_gains
 from gs2d.training import events
 from gs2d.training.cached_objective import CachedViews
 from gs2d.training.learned.appearance import shown, shown_splats
+from gs2d.training.learned.image_exposure import ImageExposure
 from gs2d.training.learned.quantity import ImagePoints
 from gs2d.training.objective import clipped_pixels
 from gs2d.training.state import TrainState
@@ -36,13 +38,13 @@ from train_toys import SIZE, VIEWS, backends, random_splats, same, short
 needs_cpu = pytest.mark.skipif("cpu" not in backends(), reason="the native library is not built")
 
 
-def by(settings: Exposure, iterations: int = 100) -> Recipe:
-    return Recipe("one", (replace(surface(), iterations=iterations),), exposure=settings)
+def by(settings: Quantity, iterations: int = 100) -> Recipe:
+    return Recipe("one", (replace(surface(), iterations=iterations),), learned=(settings,))
 
 
 # -- one update ---------------------------------------------------------------------------------------------------
 def test_the_mean_of_all_transforms_is_the_identity(scene: Scene) -> None:
-    made = Learner(by(Exposure()), scene)
+    made = Learner(by(EXPOSURE), scene)
     made.step("exposure", 1, torch.ones(3, 4), 0.1)
     transforms = torch.stack([made.numbers("exposure", index) for index in range(VIEWS)])
     assert torch.allclose(transforms.mean(dim=0), torch.eye(3, 4), atol=1e-7)
@@ -60,8 +62,8 @@ class Looks(TorchDispatchMode):
         return function(*args, **(kwargs or {}))
 
 
-def test_on_a_device_neither_the_transform_nor_its_update_waits(scene: Scene) -> None:
-    made, backend = Learner(by(Exposure()), scene), lacking(0)
+def test_on_a_device_transform_and_update_do_not_wait(scene: Scene) -> None:
+    made, backend = Learner(by(EXPOSURE), scene), lacking(0)
     color, coverage, white = torch.rand(4, 5, 3), torch.rand(4, 5), torch.ones(3)
     view = scene.train[1]
     with Looks() as looks:
@@ -100,11 +102,12 @@ def test_the_gradient_of_a_transform_is_that_of_the_whole_loss(scene: Scene) -> 
         assert float(found.learned["exposure"][row, column]) == pytest.approx(slope, rel=1e-4), (row, column)
 
 
-def test_exposures_that_stay_where_they_are_change_no_bit_of_the_splats(scene: Scene, backend: str) -> None:
-    still = Exposure(rate=1e-30, rate_final=1e-30, eps=1e30, start=0)  # updates underflow
-    trainers = [
-        Trainer(scene, replace(short(), exposure=exposure), GENERIC, backend=backend) for exposure in (None, still)
-    ]
+def test_constant_exposures_change_no_bit_of_the_splats(
+    scene: Scene, backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ImageExposure, "eps", 1e30)  # updates underflow
+    still = short().with_learned(replace(EXPOSURE, rate=1e-30, rate_final=1e-30, start=0))
+    trainers = [Trainer(scene, recipe, GENERIC, backend=backend) for recipe in (short(), still)]
     assert same(*(trainer.run() for trainer in trainers))
     off, on = (trainer.state for trainer in trainers)
     assert off.learned == {}
@@ -112,29 +115,29 @@ def test_exposures_that_stay_where_they_are_change_no_bit_of_the_splats(scene: S
     assert sum(on.learned["exposure"].steps) == 10 + 4 + 5
 
 
-def test_the_white_behind_a_photograph_with_an_alpha_channel_has_no_exposure(scene: Scene, backend: str) -> None:
+def test_exposure_does_not_change_the_white_background(scene: Scene, backend: str) -> None:
     # The photograph is empty and so is the rendering: both are white, whatever the transform, and the loss is 0.
     empty = View.from_arrays("empty", scene.train[0].camera, np.zeros((SIZE, SIZE, 4), np.uint8))
     splats = random_splats(5)
     splats.opacity_logits.fill_(-20.0)
     state = TrainState(splats, torch.Generator().manual_seed(0))
     views = replace(scene, train=(empty, scene.train[1]))
-    begun(state, by(Exposure()), views).learned["exposure"].values[0] = -0.5
-    trainer = Trainer(views, by(Exposure()), NERF_SYNTHETIC, backend=backend, state=state)
+    begun(state, by(EXPOSURE), views).learned["exposure"].values[0] = -0.5
+    trainer = Trainer(views, by(EXPOSURE), NERF_SYNTHETIC, backend=backend, state=state)
     trainer.enter(0)
     found = trainer._whole.evaluate(state, trainer.recipe.stages[0], 1, 0)
     assert found.losses["l1"] == pytest.approx(0, abs=1e-6)
     assert found.losses["exposure"] > 0
 
 
-def test_pixels_at_the_ceiling_are_clipped_but_not_the_white_behind_a_photograph() -> None:
+def test_clipped_pixels_exclude_the_white_background() -> None:
     image = torch.tensor([[[1.0, 0.9, 1.0], [1.0, 1.0, 1.0]]])
     assert clipped_pixels(Target(image, None, None)).tolist() == [[[True, False, True], [True, True, True]]]
     cut_out = Target(image, None, None, silhouette=torch.tensor([[0.5, 0.0]]))
     assert clipped_pixels(cut_out).tolist() == [[[True, False, True], [False, False, False]]]
 
 
-def test_a_clipped_pixel_says_this_bright_or_brighter(scene: Scene) -> None:
+def test_a_clipped_pixel_allows_brighter_colours(scene: Scene) -> None:
     rendered = torch.tensor([[[1.3, 1.3, 0.7]]], requires_grad=True)
     clipped = torch.tensor([[[True, False, True]]])  # red is no error, green and blue are
     at = ImagePoints(scene.train[0].camera)
@@ -158,8 +161,8 @@ def test_errors_are_ranked_in_the_exposure_of_the_photograph(scene: Scene, backe
 
 
 @needs_cpu
-def test_cached_views_have_the_losses_and_gradients_of_the_plain_path(scene: Scene) -> None:
-    recipe = Recipe("colors", (replace(appearance(k=20.0), iterations=3 * VIEWS),), exposure=Exposure())
+def test_cached_views_have_the_losses_and_gradients_of_full_renderings(scene: Scene) -> None:
+    recipe = Recipe("colors", (replace(appearance(k=20.0), iterations=3 * VIEWS),), learned=(EXPOSURE,))
     state = TrainState(random_splats(90, seed=5), torch.Generator().manual_seed(0))
     begun(state, recipe, scene).learned["exposure"].values += 0.1 * torch.randn(VIEWS, 3, 4, generator=state.generator)
     trainer = Trainer(scene, recipe, GENERIC, backend="cpu", state=state)
@@ -219,16 +222,16 @@ def varied() -> tuple[Scene, Splats, np.ndarray]:
 
 
 @needs_cpu
-def test_the_gains_are_found_and_new_views_gain_by_it(varied: tuple[Scene, Splats, np.ndarray]) -> None:
+def test_exposure_gains_are_recovered_and_improve_new_views(varied: tuple[Scene, Splats, np.ndarray]) -> None:
     scene, truth, gains = varied
     stage = replace(surface(), iterations=480, densify=None, sh_interval=50, lr=LearningRates(means_decay_steps=480))
     plain = Recipe("plain", (stage,))
     scores, grey = [], np.empty(0)
-    for recipe in (plain, replace(plain, exposure=Exposure(decay_steps=480, start=0))):
+    for recipe in (plain, plain.with_learned(replace(EXPOSURE, decay_steps=480, start=0))):
         state = TrainState(truth.clone(), torch.Generator().manual_seed(0))
         trainer = Trainer(scene, recipe, GENERIC, backend="cpu", state=begun(state, recipe, scene))
         scores.append(held_out_psnr(scene, trainer))
-        if recipe.exposure is not None:
+        if recipe.learned:
             transforms = np.stack([view.appearance["exposure"] for view in trainer.scene_now().train])
             grey = (0.5 * transforms[:, :, :3].sum(axis=2) + transforms[:, :, 3]) / 0.5  # what a middle grey becomes
     errors = np.abs(grey / gains - 1)  # the gains are 13 % from 1 in the mean
@@ -251,11 +254,11 @@ def held_out_psnr(scene: Scene, trainer: Trainer) -> float:
 def test_the_events_name_the_prior_among_the_losses(scene: Scene) -> None:
     seen: list[events.Progress] = []
 
-    def listen(event: events.Event) -> None:
+    def listen(event: events.TrainingEvent) -> None:
         if isinstance(event, events.Progress):
             seen.append(event)
 
-    recipe = Recipe("one", (replace(refine(), iterations=2, on_enter=()),), exposure=Exposure(start=0))
+    recipe = Recipe("one", (replace(refine(), iterations=2, on_enter=()),), learned=(replace(EXPOSURE, start=0),))
     Trainer(
         scene, recipe, GENERIC, backend="reference", on_event=listen, options=TrainerOptions(progress_every=1)
     ).run()

@@ -20,13 +20,13 @@ from gs2d.training import events
 from gs2d.training.trainer import Trainer
 
 
-def trainer_from(splats: Splats, **options: object) -> tuple[Trainer, list[events.Event]]:
-    told: list[events.Event] = []
+def trainer_from(splats: Splats, **options: object) -> tuple[Trainer, list[events.TrainingEvent]]:
+    told: list[events.TrainingEvent] = []
     given = {"backend": "reference", "init": splats, "on_event": told.append} | options
     return Trainer(train_toys.make_scene(), train_toys.short(), GENERIC, **given), told  # type: ignore[arg-type]
 
 
-def test_training_starts_from_the_given_splats_and_leaves_them_alone() -> None:
+def test_training_starts_from_a_copy_of_init() -> None:
     given = train_toys.random_splats(12)
     before = given.clone()
     trainer, told = trainer_from(given)
@@ -37,7 +37,7 @@ def test_training_starts_from_the_given_splats_and_leaves_them_alone() -> None:
     assert not torch.equal(trainer.splats.means[:1], before.means[:1])
 
 
-def test_coefficients_follow_the_recipes_degree() -> None:
+def test_init_gets_the_sh_degree_of_the_recipe() -> None:
     """What the recipe's degree lacks is left out; what the splats lack begins at 0."""
     degree = train_toys.short().sh_degree
     wanted = (degree + 1) ** 2 - 1
@@ -47,7 +47,7 @@ def test_coefficients_follow_the_recipes_degree() -> None:
     assert torch.equal(trainer_from(full)[0].splats.shN, full.shN[:, :wanted])
 
 
-def test_splats_that_are_none_or_not_finite_and_a_state_beside_them_are_refused() -> None:
+def test_empty_or_broken_init_and_init_with_a_state_are_refused() -> None:
     given = train_toys.random_splats(3)
     with pytest.raises(DataError, match="least"):
         trainer_from(given.rows(torch.zeros(0, dtype=torch.int64)))
@@ -76,7 +76,7 @@ def test_a_3d_gaussian_loses_its_smallest_scale_and_its_normal_points_there() ->
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.builtin)
-def test_every_layout_that_is_written_can_start_a_training(layout: str, tmp_path: Path) -> None:
+def test_every_splat_layout_can_start_a_training(layout: str, tmp_path: Path) -> None:
     given = train_toys.random_splats(20)
     path = tmp_path / f"a{LAYOUTS[layout].ending}"
     write_layout(path, given, layout)

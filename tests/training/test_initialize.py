@@ -11,7 +11,7 @@ import torch
 
 from gs2d.data.scene import PointCloud, Scene
 from gs2d.errors import DataError, ProtocolError
-from gs2d.training.initialize import Initial, initial_splats, usable_points
+from gs2d.training.start.initialize import Initial, initial_splats, usable_points
 
 
 def start(scene: Scene, *, near: float = 0.1, degree: int = 3, count: int = 500, seed: int = 0) -> Initial:
@@ -40,7 +40,7 @@ def test_points_give_places_colours_opacity_and_scales(scene: Scene) -> None:
     assert splats.shN.shape == (4, 15, 3)
 
 
-def test_points_that_no_camera_sees_or_that_touch_one_or_are_not_finite_are_dropped(scene: Scene) -> None:
+def test_unusable_points_are_dropped(scene: Scene) -> None:
     beside_camera = scene.train[0].camera.center + 0.05
     good = [[0, 0, 0], [0.1, 0, 0]]
     cloud = with_points(scene, [*good, list(beside_camera), [float("nan"), 0, 0], [float("inf"), 0, 0]])
@@ -50,7 +50,7 @@ def test_points_that_no_camera_sees_or_that_touch_one_or_are_not_finite_are_drop
     assert usable_points(np.array([[9.0, 0.0, 1.0], [0.0, 0.0, 0.0]]), behind, 0.1).tolist() == [False, True]
 
 
-def test_without_points_they_are_random_in_the_bounds_and_grey(scene: Scene) -> None:
+def test_without_points_splats_are_random_in_the_bounds_and_grey(scene: Scene) -> None:
     bare = replace(scene, points=None, bounds=np.array([[-0.5, -0.2, 0.0], [0.5, 0.2, 0.1]]))
     initial = start(bare)
     splats = initial.splats
@@ -64,12 +64,12 @@ def test_without_points_they_are_random_in_the_bounds_and_grey(scene: Scene) -> 
     assert not torch.equal(start(bare, seed=1).splats.means, splats.means)
 
 
-def test_a_near_that_swallows_the_scene_says_so(scene: Scene) -> None:
+def test_a_near_plane_beyond_the_scene_is_refused(scene: Scene) -> None:
     with pytest.raises(ProtocolError, match="near = 50"):
         start(scene, near=50.0)
 
 
-def test_points_that_are_all_behind_the_cameras_are_a_data_error(scene: Scene) -> None:
+def test_points_behind_all_cameras_are_refused(scene: Scene) -> None:
     one = replace(with_points(scene, [[9.0, 0, 1], [10.0, 0, 1]]), train=scene.train[:1])
     with pytest.raises(DataError, match="fewer than 2"):
         start(one)

@@ -11,7 +11,7 @@ import torch
 from fake_backends import lacking
 from gs2d.config.presets import surface
 from gs2d.config.protocols import GENERIC
-from gs2d.config.quantities import Exposure, IntrinsicsRefinement, Learning, Photometry, PoseRefinement, Quantity
+from gs2d.config.quantities import EXPOSURE, INTRINSICS, POSES, RESPONSE, VIGNETTING, Quantity
 from gs2d.config.recipe import Recipe
 from gs2d.config.serialize import apply_overrides, from_json, to_json
 from gs2d.data.scene import Scene
@@ -29,13 +29,8 @@ NAMES = ("intrinsics", "poses", "vignetting", "exposure", "response")
 def everything(**changes: float) -> Recipe:
     """``short`` with all quantities from its third iteration on."""
     given = {"start": 2, "decay_steps": 10, "rate": 1e-2, "rate_final": 1e-3, **changes}
-    return replace(
-        short(),
-        exposure=Exposure(**given),  # type: ignore[arg-type]
-        poses=PoseRefinement(**given),  # type: ignore[arg-type]
-        intrinsics=IntrinsicsRefinement(**given, distortion=True),  # type: ignore[arg-type]
-        photometry=Photometry(**given),  # type: ignore[arg-type]
-    )
+    quantities = EXPOSURE, POSES, INTRINSICS.with_options(distortion=True), RESPONSE, VIGNETTING
+    return short().with_learned(*(replace(quantity, **given) for quantity in quantities))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -50,20 +45,20 @@ def test_the_first_step_of_a_row_is_the_rate_and_the_second_is_adam_s(scene: Sce
     assert not rows.values[others].any()
     assert [rows.steps[k] for k in (row, *others)] == [1, *[0] * len(others)]
     made.step(name, 1, torch.full(shape, -1.0), 0.1)
-    b1, b2 = quantity.settings.beta1, quantity.settings.beta2
+    b1, b2 = quantity.beta1, quantity.beta2
     mean = (b1 * (1 - b1) * 3 - (1 - b1)) / (1 - b1**2)
     square = (b2 * (1 - b2) * 9 + (1 - b2)) / (1 - b2**2)
     assert torch.allclose(rows.values[row], -rates - rates * mean / math.sqrt(square), rtol=1e-5)
 
 
 def test_rates_decay_over_the_whole_run_after_the_start() -> None:
-    settings = Learning(rate=0.1, rate_final=0.001, decay_steps=100, start=5)
+    settings = replace(POSES, rate=0.1, rate_final=0.001, decay_steps=100, start=5)
     assert settings.rate_at(50) == pytest.approx(0.01)  # the geometric mean, half way
     assert settings.rate_at(100) == settings.rate_at(500) == pytest.approx(0.001)
     assert settings.rate_at(5) == 0 < settings.rate_at(6)
 
 
-def test_cameras_are_learned_where_all_splats_move_and_light_always(scene: Scene) -> None:
+def test_poses_are_learned_only_while_all_splats_move(scene: Scene) -> None:
     table = LearnedTable(everything(), scene)
     assert table.learning(0, 2) == {}
     assert set(table.learning(0, 3)) == set(NAMES)
@@ -73,7 +68,7 @@ def test_cameras_are_learned_where_all_splats_move_and_light_always(scene: Scene
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_an_update_that_a_device_cancelled_is_none(scene: Scene, name: str) -> None:
+def test_a_cancelled_update_changes_nothing(scene: Scene, name: str) -> None:
     made = Learner(everything(), scene)
     made.step(name, 1, torch.ones(made.table.shapes[name]), 0.1, lacking(1))
     made.table.rollback(made.rows, 1, {name: 0.1} if sum(made.rows[name].steps) else {})
@@ -126,13 +121,13 @@ def test_bytes_do_not_depend_on_the_number_of_threads(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_state_with_other_rows_or_broken_ones_is_refused(scene: Scene, name: str) -> None:
+def test_a_state_with_wrong_learned_rows_is_refused(scene: Scene, name: str) -> None:
     state = begun(TrainState(random_splats(5), torch.Generator()), everything(), scene)
     rows = state.learned.pop(name)
-    with pytest.raises(RunError, match=rf"must have \d rows of '{name}', as recipe and scene say, got 0"):
+    with pytest.raises(RunError, match=rf"must have \d rows of '{name}', for this recipe and scene, got 0"):
         Trainer(scene, everything(), GENERIC, backend="reference", state=state)
     state.learned = {name: rows}
-    with pytest.raises(RunError, match=rf"must have 0 rows of '{name}', as recipe and scene say, got {len(rows)}"):
+    with pytest.raises(RunError, match=rf"must have 0 rows of '{name}', for this recipe and scene, got {len(rows)}"):
         Trainer(scene, short(), GENERIC, backend="reference", state=state)
     rows.values.view(-1)[0] = torch.nan
     with pytest.raises(RunError, match=f"{name} hold NaN or infinity"):
@@ -142,7 +137,7 @@ def test_a_state_with_other_rows_or_broken_ones_is_refused(scene: Scene, name: s
         TrainState.from_state_dict(state.state_dict())
 
 
-def test_numbers_that_are_not_finite_end_training(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_learned_numbers_that_are_not_finite_stop_training(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = Trainer(scene, everything(start=0), GENERIC, backend=backends()[-1])
     trainer.enter(0)
     monkeypatch.setattr(CameraPose, "gradient", lambda *_: torch.full((6,), torch.nan))
@@ -158,10 +153,11 @@ def test_a_recipe_names_registered_quantities_once() -> None:
     recipe = Recipe("one", (surface(),))
     with pytest.raises(RecipeError, match=r"quantity must be one of intrinsics, poses.*got 'warmth'"):
         Quantity("warmth")
-    twice = replace(recipe, learned=(Quantity("exposure"),))
-    with pytest.raises(RecipeError, match="'exposure' must not be in learned; set exposure instead"):
+    twice = replace(recipe, learned=(EXPOSURE, EXPOSURE))
+    with pytest.raises(RecipeError, match="learned 'exposure' is there twice"):
         from_json(to_json(twice))
-    with pytest.raises(RecipeError, match="'response' must not be in learned; set photometry instead"):
-        from_json(to_json(replace(recipe, learned=(Quantity("response"),))))
-    changed = apply_overrides(replace(recipe, exposure=Exposure()), ["exposure.start=7"])
-    assert changed.exposure == Exposure(start=7)
+    learning = recipe.with_learned(EXPOSURE, INTRINSICS, POSES)
+    assert list(learning.quantities) == ["intrinsics", "poses", "exposure"]  # as they are applied
+    changed = apply_overrides(learning, ["learned.exposure.start=7", "learned.intrinsics.options.distortion=true"])
+    assert changed.quantities["exposure"] == replace(EXPOSURE, start=7)
+    assert changed.quantities["intrinsics"].options == {"distortion": True}

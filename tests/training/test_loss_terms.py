@@ -12,7 +12,7 @@ import torch
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import LossTerm, Recipe, Stage
 from gs2d.data.scene import Scene, View
-from gs2d.losses import reference
+from gs2d.losses import formulas as reference
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
 from gs2d.training import objective
@@ -47,13 +47,13 @@ def entered(scene: Scene, recipe: Recipe, backend: str) -> Trainer:
     return trainer
 
 
-def test_a_term_is_there_in_the_iterations_that_every_divides() -> None:
+def test_a_term_is_active_in_iterations_that_every_divides() -> None:
     term = LossTerm("l1", 1.0, start=4, every=3)
     assert [i for i in range(1, 13) if term.is_active(i)] == [6, 9, 12]
     assert [i for i in range(1, 7) if LossTerm("l1", 1.0, start=4).is_active(i)] == [5, 6]
 
 
-def test_an_iteration_without_a_term_is_that_of_a_recipe_without_it(scene: Scene, backend: str) -> None:
+def test_an_inactive_term_changes_nothing(scene: Scene, backend: str) -> None:
     trainer = entered(scene, short(), backend)
     stage = trainer.recipe.stages[0]
     rare = with_terms(trainer.recipe, normal_consistency={"every": 3}).stages[0]
@@ -65,9 +65,7 @@ def test_an_iteration_without_a_term_is_that_of_a_recipe_without_it(scene: Scene
     assert set(trainer._whole.evaluate(trainer.state, rare, 9, 0).losses) == {"l1", "ssim", "normal_consistency"}
 
 
-def test_what_a_term_needs_is_not_made_in_an_iteration_without_it(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_inputs_of_an_inactive_term_are_not_rendered(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     rendered: list[RasterSettings] = []
 
     def counted(splats: Any, camera: Any, settings: RasterSettings, **options: Any) -> Any:
@@ -89,8 +87,8 @@ def test_what_a_term_needs_is_not_made_in_an_iteration_without_it(
     assert counts == [(1, False), (2, True)]  # the second view, and the map of distortion
 
 
-def test_a_resumed_training_gives_the_same_bytes_whatever_the_terms_say(scene: Scene, backend: str) -> None:
-    said = {"every": 2, "options": {"where": "object", "edge_power": 2.0, "edges": "camera"}}
+def test_a_training_with_options_resumes_to_the_same_bytes(scene: Scene, backend: str) -> None:
+    said = {"every": 2, "options": {"where": "object", "edges": "camera"}}
     recipe, made = with_terms(short(), normal_consistency=said), cut_out(scene)
     end = Trainer(made, recipe, GENERIC, backend=backend).run()
     assert not same(end, Trainer(made, short(), GENERIC, backend=backend).run())
@@ -101,7 +99,7 @@ def test_a_resumed_training_gives_the_same_bytes_whatever_the_terms_say(scene: S
 
 
 @pytest.mark.parametrize("has_alpha", [True, False])
-def test_the_object_is_where_the_photograph_s_alpha_says_else_the_rendered_one(
+def test_object_weights_use_the_alpha_of_the_image_or_the_rendered_alpha(
     scene: Scene, backend: str, has_alpha: bool
 ) -> None:
     made = cut_out(scene) if has_alpha else scene

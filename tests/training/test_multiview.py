@@ -15,7 +15,7 @@ from gs2d.core.camera import look_at
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError
 from gs2d.render.api import rasterize
-from gs2d.training.multiview import ImageFiles, draw_turn, find_neighbours
+from gs2d.training.neighbours import ImageFiles, draw_turn, find_neighbours
 from gs2d.training.targets import Targets
 from gs2d.training.trainer import Trainer
 from saved_states import resumed_everywhere
@@ -69,7 +69,7 @@ def test_an_iteration_draws_from_the_seed_the_stage_and_the_iteration_alone() ->
 
 
 # -- photographs --------------------------------------------------------------------------------------------------
-def test_patches_that_touch_what_is_masked_or_transparent_are_not_asked() -> None:
+def test_patches_with_masked_or_transparent_pixels_are_not_compared() -> None:
     rng = np.random.default_rng(0)
     camera = ring([0]).train[0].camera
     image = rng.integers(0, 255, (20, 20, 4), dtype=np.uint8)
@@ -89,7 +89,7 @@ def test_patches_that_touch_what_is_masked_or_transparent_are_not_asked() -> Non
 
 
 # -- training -----------------------------------------------------------------------------------------------------
-def test_both_losses_are_there_once_they_have_started_and_move_depths(scene: Scene, backend: str) -> None:
+def test_both_multiview_losses_change_depths_after_their_start(scene: Scene, backend: str) -> None:
     trainer = Trainer(scene, compared(), GENERIC, backend=backend)
     trainer.enter(0)
     whole, stage = trainer._whole, trainer.recipe.stages[0]
@@ -117,7 +117,7 @@ def test_a_resumed_training_gives_the_same_bytes(scene: Scene, backend: str) -> 
     assert not same(end, Trainer(scene, short(), GENERIC, backend=backend).run())
 
 
-def test_the_neighbour_s_depth_is_rendered_as_the_splats_are_now(scene: Scene) -> None:
+def test_the_depth_of_the_neighbour_uses_the_current_splats(scene: Scene) -> None:
     trainer = Trainer(scene, compared(), GENERIC, backend="reference")
     trainer.enter(0)
     neighbour = trainer._whole.neighbour_of(trainer.state, trainer.recipe.stages[0], 9, 0, trainer.splats)

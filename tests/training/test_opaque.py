@@ -16,7 +16,7 @@ from gs2d.core.sh import rgb_to_sh0
 from gs2d.data.scene import View
 from gs2d.render.backends import get_backend
 from gs2d.training.objective import FullRender
-from gs2d.training.opaque import BACKGROUNDS, FROM, another_background
+from gs2d.training.robust.opaque import BACKGROUNDS, FROM, another_background
 from gs2d.training.targets import Targets
 from train_toys import full_state, make_scene
 
@@ -54,7 +54,7 @@ def opacity_gradient(iterations: range, *, channels: int) -> float:
     return float(torch.stack(found).sum())
 
 
-def test_a_hole_in_the_colour_of_the_background_is_filled_only_where_the_photograph_is_opaque() -> None:
+def test_holes_are_filled_in_opaque_images_only() -> None:
     last = robust().stages[0].iterations
     late = range(last - len(BACKGROUNDS) + 1, last + 1)
     assert opacity_gradient(late, channels=3) < -1e-3  # a step against it raises opacity

@@ -16,8 +16,8 @@ from gs2d.config.recipe import LearningRates, Recipe, Stage
 from gs2d.data.scene import Scene
 from gs2d.errors import RecipeError
 from gs2d.render.backends import PLAIN
-from gs2d.training.adam import adam_step
 from gs2d.training.densify.densifier import Densifier
+from gs2d.training.optimizer import adam_step
 from gs2d.training.parallel import ONE_PROCESS
 from gs2d.training.state import Moments, TrainState
 from gs2d.training.trainer import Trainer, TrainerOptions
@@ -41,13 +41,13 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
 
 
 @pytest.mark.parametrize("case", RECIPES)
-def test_two_processes_have_the_same_state_to_the_bit(case: str, two: dict[str, list[Any]]) -> None:
+def test_two_processes_have_identical_states(case: str, two: dict[str, list[Any]]) -> None:
     first, second = two[case]
     assert differing(first["state"], second["state"]) == []
 
 
 @pytest.mark.parametrize("case", RECIPES)
-def test_two_processes_train_what_one_does_with_batches_of_two(case: str, two: dict[str, list[Any]]) -> None:
+def test_two_processes_equal_one_with_batches_of_two(case: str, two: dict[str, list[Any]]) -> None:
     """To the bit: the sum of two numbers has no order. What sums up all views (E_i, errors) does, to rounding."""
     state, heard = trained(RECIPES[case](), Batch(2))
     found = two[case][0]
@@ -58,7 +58,7 @@ def test_two_processes_train_what_one_does_with_batches_of_two(case: str, two: d
         assert other_lr == lr
 
 
-def test_a_run_of_two_processes_goes_on_to_the_same_bytes(two: dict[str, list[Any]]) -> None:
+def test_a_run_of_two_processes_resumes_to_the_same_bytes(two: dict[str, list[Any]]) -> None:
     for found in two["resumed"]:
         assert found["at"] == (0, 7)
         assert differing(found["state"], found["whole"]) == []
@@ -66,13 +66,13 @@ def test_a_run_of_two_processes_goes_on_to_the_same_bytes(two: dict[str, list[An
 
 def test_processes_whose_states_differ_stop_with_one_line(two: dict[str, list[Any]]) -> None:
     for line in two["differing"]:
-        assert line.startswith("the processes must have the same state at iteration 4 of stage 1, got another one in")
+        assert line.startswith("the states of processes 0 and 1 differ at iteration 4 of stage 1, got another one in")
         assert "--resume" in line
         assert "\n" not in line
 
 
 @pytest.mark.slow
-def test_four_processes_train_what_one_does_with_batches_of_four(tmp_path: Path) -> None:
+def test_four_processes_equal_one_with_batches_of_four(tmp_path: Path) -> None:
     """To rounding: sums of four numbers have an order. Iterations of fewer views leave processes idle."""
     cases = ["short", "learning", "relocating", "cached"]
     for case, found in together_in(4, cases, tmp_path).items():
@@ -88,7 +88,7 @@ def test_four_processes_train_what_one_does_with_batches_of_four(tmp_path: Path)
                 assert torch.equal(theirs[name], tensor), name
 
 
-def test_views_that_learn_are_moved_once_a_turn(two: dict[str, list[Any]]) -> None:
+def test_each_view_of_an_iteration_updates_its_learned_rows(two: dict[str, list[Any]]) -> None:
     """19 iterations of six views, in pairs and alone: none is left out, none counted twice."""
     state = two["learning"][0]["state"]
     assert state["processes"] == [[0, 0, 2]]
@@ -97,7 +97,7 @@ def test_views_that_learn_are_moved_once_a_turn(two: dict[str, list[Any]]) -> No
     assert state["moments"]["means"]["steps"] <= 5  # views of the last stage: of five that count as five
 
 
-def test_rates_of_a_step_of_several_views_are_grendels() -> None:
+def test_rates_for_several_views_follow_grendel() -> None:
     rates = LearningRates().for_views(4)
     assert rates.means == pytest.approx(2 * 1.6e-4)
     assert rates.shN == pytest.approx(2 * 2.5e-3 / 20)
@@ -107,7 +107,7 @@ def test_rates_of_a_step_of_several_views_are_grendels() -> None:
     assert LearningRates().for_views(1) == LearningRates()
 
 
-def test_a_step_of_four_views_is_a_step_of_adam_with_the_memory_of_four() -> None:
+def test_a_step_of_four_views_keeps_the_memory_of_four_steps() -> None:
     """By the formulas, in float64, after steps of one view and of four: the bias correction counts views."""
     stage = Stage("s", 9, train={"opacity_logits": "all"})
     state = TrainState(random_splats(5, dtype=torch.float64), torch.Generator())
@@ -128,7 +128,7 @@ def test_a_step_of_four_views_is_a_step_of_adam_with_the_memory_of_four() -> Non
     )  # torch counts steps in float32
 
 
-def test_a_run_goes_on_with_another_number_of_processes(scene: Scene) -> None:
+def test_a_run_resumes_with_another_number_of_processes(scene: Scene) -> None:
     """2, then 1, then 2: the schedule is one of views, and each of them is in it once."""
     _, heard = trained(short(), Batch(2))
     state, heard = trained(short(), ONE_PROCESS, heard["states"][1])
@@ -157,7 +157,7 @@ def test_densifiers_that_cannot_share_an_iteration_are_refused(
     guest: type[Densifier], says: str, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gs2d.training.trainer.densifier_of", lambda densify, around: densify and guest(around))
-    recipe = Recipe("guest", (replace(short().stages[0], densify=Densify("relocation")),))
+    recipe = Recipe("guest", (replace(short().stages[0], densify=Densify("gradient")),))
     with pytest.raises(RecipeError, match=says):
         Trainer(scene, recipe, GENERIC, backend="reference", options=TrainerOptions(processes=Batch(2)))
     Trainer(scene, recipe, GENERIC, backend="reference")

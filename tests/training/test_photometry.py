@@ -11,7 +11,8 @@ import torch
 
 from gs2d.config.presets import surface
 from gs2d.config.protocols import GENERIC
-from gs2d.config.recipe import Exposure, LearningRates, Photometry, Recipe
+from gs2d.config.quantities import EXPOSURE, RESPONSE, VIGNETTING
+from gs2d.config.recipe import LearningRates, Recipe
 from gs2d.core.camera import look_at
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import camera_extent
@@ -35,8 +36,8 @@ needs_cpu = pytest.mark.skipif("cpu" not in backends(), reason="the native libra
 
 def quick() -> Recipe:
     """``short`` with everything of photographs and cameras from its third iteration on."""
-    learned = Photometry(start=2, decay_steps=10, rate=0.02)
-    return replace(short(), exposure=Exposure(start=2, decay_steps=10), photometry=learned)
+    light = (replace(quantity, start=2, decay_steps=10, rate=0.02) for quantity in (VIGNETTING, RESPONSE))
+    return short().with_learned(replace(EXPOSURE, start=2, decay_steps=10), *light)
 
 
 def seen_through(views: tuple[View, ...], cameras: int) -> list[View]:
@@ -46,9 +47,9 @@ def seen_through(views: tuple[View, ...], cameras: int) -> list[View]:
 
 
 # -- one update ---------------------------------------------------------------------------------------------------
-def test_photographs_of_one_camera_share_its_light(scene: Scene) -> None:
+def test_images_of_one_camera_share_vignetting_and_response(scene: Scene) -> None:
     views = replace(scene, train=tuple(seen_through(scene.train, 2)))
-    made = Learner(replace(short(), photometry=Photometry()), views)
+    made = Learner(short().with_learned(VIGNETTING, RESPONSE), views)
     assert made.table.quantities["vignetting"].row_of == [0, 1, 0, 1, 0, 1]
     made.step("vignetting", 2, [5.0, -5.0, 1.0], 0.01)
     made.step("response", 2, [-1.0], 0.01)
@@ -59,11 +60,11 @@ def test_photographs_of_one_camera_share_its_light(scene: Scene) -> None:
         assert seen[index]["response"] == pytest.approx(0.005)  # half of the photographs are its own
     assert not seen[1]["vignetting"].any()
     assert seen[1]["response"] == pytest.approx(-0.005)
-    only = replace(short(), photometry=Photometry(response=False))
+    only = short().with_learned(VIGNETTING)
     assert [*Learner(only, views).rows] == ["vignetting"]
 
 
-def test_of_faces_of_a_panorama_the_response_alone_is_learned(scene: Scene) -> None:
+def test_panorama_faces_learn_no_vignetting(scene: Scene) -> None:
     views = seen_through(scene.train, 2)
     for is_face in (False, True):
         seen = replace(scene, train=tuple(replace(view, is_face=is_face) for view in views))
@@ -75,8 +76,8 @@ def test_of_faces_of_a_panorama_the_response_alone_is_learned(scene: Scene) -> N
 
 
 # -- the loss -----------------------------------------------------------------------------------------------------
-def test_the_gradient_of_a_camera_s_numbers_is_that_of_the_whole_loss(scene: Scene) -> None:
-    recipe = Recipe("one", (replace(surface(), iterations=5),), photometry=Photometry(), exposure=Exposure())
+def test_gradients_of_vignetting_and_response_are_those_of_the_loss(scene: Scene) -> None:
+    recipe = Recipe("one", (replace(surface(), iterations=5),), learned=(VIGNETTING, RESPONSE, EXPOSURE))
     views = replace(scene, train=tuple(seen_through(scene.train, 2)))
     trainer = Trainer(views, recipe, GENERIC, backend="reference", options=TrainerOptions(dtype=torch.float64))
     trainer.enter(0)
@@ -97,16 +98,17 @@ def test_the_gradient_of_a_camera_s_numbers_is_that_of_the_whole_loss(scene: Sce
         assert float(found.learned[name][column]) == pytest.approx(slope, rel=1e-3, abs=1e-9), (name, column)
 
 
-def test_cameras_that_stay_as_they_are_leave_splats_the_same_but_for_rounding(scene: Scene, backend: str) -> None:
-    still = Photometry(rate=1e-30, rate_final=1e-30, start=0)
-    plain, learned = (Trainer(scene, replace(short(), photometry=p), GENERIC, backend=backend) for p in (None, still))
+def test_constant_photometry_leaves_splats_unchanged_up_to_rounding(scene: Scene, backend: str) -> None:
+    still = [replace(quantity, rate=1e-30, rate_final=1e-30, start=0) for quantity in (VIGNETTING, RESPONSE)]
+    recipes = short(), short().with_learned(*still)
+    plain, learned = (Trainer(scene, recipe, GENERIC, backend=backend) for recipe in recipes)
     before, after = plain.run(), learned.run()
     assert sum(learned.state.learned["vignetting"].steps) == 10 + 4 + 5
     assert len(before) == len(after)
     assert torch.allclose(before.means, after.means, atol=1e-3)
 
 
-def test_errors_are_ranked_as_the_camera_shows_the_splats(scene: Scene) -> None:
+def test_ranking_uses_the_vignetting_of_the_image(scene: Scene) -> None:
     # A falloff that is even over the whole picture is a gain.
     splats, view = random_splats(40, seed=1), scene.train[0]
     image, settings = torch.from_numpy(view.target((0.0, 0.0, 0.0))), RasterSettings()
@@ -121,7 +123,7 @@ def test_errors_are_ranked_as_the_camera_shows_the_splats(scene: Scene) -> None:
     assert (darker.sh0 < even.sh0 - 0.01).any()
 
 
-def test_a_photograph_is_taken_back_to_the_colours_of_the_scene(scene: Scene) -> None:
+def test_unshown_inverts_shown(scene: Scene) -> None:
     color, at = 0.2 + 0.5 * torch.rand(SIZE, SIZE, 3, dtype=torch.float64), ImagePoints(scene.train[0].camera)
     transform = identity(color) + torch.tensor([[0.1, 0.02, 0.0, 0.03]] * 3, dtype=torch.float64)
     known = {"response": torch.tensor([0.5]), "exposure": transform, "vignetting": torch.tensor([0.3, 0.1, 0.0])}
@@ -180,26 +182,26 @@ def short_stage(iterations: int) -> Recipe:
 
 
 @needs_cpu
-def test_the_falloff_is_found_beside_exposures_and_new_views_gain_by_it() -> None:
+def test_vignetting_is_recovered_and_improves_new_views() -> None:
     gains = np.concatenate([random_gains(TRAIN, 0), np.ones((TEST, 3))])
     powers = (math.hypot(SIZE, SIZE) / 2 / 30) ** torch.tensor([2.0, 4.0, 6.0])
     scene, truth = taken(({"vignetting": torch.tensor(FALLOFF) / powers},), gains)
-    plain = replace(short_stage(600), exposure=Exposure(decay_steps=600, start=0))
-    light = Photometry(response=False, rate=0.01, rate_final=1e-3, decay_steps=600, start=0)
+    plain = short_stage(600).with_learned(replace(EXPOSURE, decay_steps=600, start=0))
+    light = replace(VIGNETTING, rate=0.01, rate_final=1e-3, decay_steps=600, start=0)
     without, _ = learned(scene, truth, plain)
-    score, (found, *_) = learned(scene, truth, replace(plain, photometry=light))
+    score, (found, *_) = learned(scene, truth, plain.with_learned(light))
     assert score > without + 8  # measured: 35.4 and 51.7 dB
     corner = math.exp(-(found["vignetting"] * powers.numpy()).sum())
     assert corner == pytest.approx(math.exp(-0.5), rel=0.08)  # measured: 0.583 for 0.607
 
 
 @needs_cpu
-def test_the_curves_of_two_cameras_are_found_and_new_views_gain_by_it() -> None:
+def test_response_curves_are_recovered_and_improve_new_views() -> None:
     lights = {"response": torch.tensor([0.5])}, {"response": torch.tensor([-0.5])}
     scene, truth = taken(lights, np.ones((TRAIN + TEST, 3)))
-    light = Photometry(vignetting=False, rate=0.01, rate_final=1e-3, decay_steps=600, start=0)
+    light = replace(RESPONSE, rate=0.01, rate_final=1e-3, decay_steps=600, start=0)
     without, _ = learned(scene, truth, short_stage(600))
-    score, (first, second, *_) = learned(scene, truth, replace(short_stage(600), photometry=light))
+    score, (first, second, *_) = learned(scene, truth, short_stage(600).with_learned(light))
     assert score > without + 20  # measured: 21.2 and 55.6 dB
     assert (*first["response"], *second["response"]) == pytest.approx((0.5, -0.5), abs=0.03)  # measured: within 0.002
 

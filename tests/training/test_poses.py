@@ -10,7 +10,8 @@ import torch
 
 from gs2d.config.presets import appearance, surface
 from gs2d.config.protocols import GENERIC
-from gs2d.config.recipe import LearningRates, PoseRefinement, Recipe
+from gs2d.config.quantities import POSES
+from gs2d.config.recipe import LearningRates, Recipe
 from gs2d.core.camera import look_at
 from gs2d.core.transforms import common_motion, perturb_pose, se3_exp, similarity_motions
 from gs2d.data.scene import Scene
@@ -19,6 +20,7 @@ from gs2d.render.types import RasterSettings
 from gs2d.synthetic.perturb_poses import disturbed
 from gs2d.training.cached_objective import CachedViews
 from gs2d.training.learned.camera_pose import CameraPose
+from gs2d.training.objective import Rendered
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
 from learned_rows import begun
@@ -34,7 +36,7 @@ def scene() -> Scene:
 
 def quick() -> Recipe:
     """``short`` with poses from its third iteration on."""
-    return replace(short(), poses=PoseRefinement(rate=1e-2, rate_final=1e-3, start=2, decay_steps=10))
+    return short().with_learned(replace(POSES, rate=1e-2, rate_final=1e-3, start=2, decay_steps=10))
 
 
 def motions(quantity: CameraPose, values: torch.Tensor) -> torch.Tensor:
@@ -42,8 +44,8 @@ def motions(quantity: CameraPose, values: torch.Tensor) -> torch.Tensor:
 
 
 # -- one update ---------------------------------------------------------------------------------------------------
-def test_what_a_similarity_of_the_scene_does_to_all_cameras_is_no_motion(scene: Scene) -> None:
-    made, g = CameraPose(PoseRefinement(), scene), torch.Generator().manual_seed(0)
+def test_a_similarity_of_the_scene_is_no_camera_motion(scene: Scene) -> None:
+    made, g = CameraPose(POSES, scene), torch.Generator().manual_seed(0)
     values = 1e-3 * torch.randn(VIEWS, 6, generator=g, dtype=torch.float64)
     before = motions(made, values)
     assert before.abs().max() > 1e-4
@@ -55,9 +57,9 @@ def test_what_a_similarity_of_the_scene_does_to_all_cameras_is_no_motion(scene: 
 
 
 @pytest.mark.parametrize("k", range(7))
-def test_the_motions_by_a_similarity_are_those_of_cameras_that_keep_their_picture(scene: Scene, k: int) -> None:
+def test_similarity_motions_keep_the_images(scene: Scene, k: int) -> None:
     # The scene moves, and each camera with it: x_cam stays (scaled, where the scene grows).
-    given, step, extent = CameraPose(PoseRefinement(), scene).given, 1e-6, 2.0
+    given, step, extent = CameraPose(POSES, scene).given, 1e-6, 2.0
     middle = np.mean([view.camera.center for view in scene.train], axis=0)
     w, v, grow = np.eye(7)[k, :3] * step, np.eye(7)[k, 3:6] * step * extent, 1 + step * (k == 6)
     S = se3_exp(torch.tensor([*w, 0.0, 0.0, 0.0], dtype=torch.float64)).numpy()
@@ -70,14 +72,14 @@ def test_the_motions_by_a_similarity_are_those_of_cameras_that_keep_their_pictur
         np.testing.assert_allclose(now.rotation, camera.rotation @ S[:3, :3].T, atol=1e-10)
 
 
-def test_a_single_camera_stays_where_it_is(scene: Scene) -> None:
-    made = CameraPose(PoseRefinement(), replace(scene, train=scene.train[:1]))
+def test_a_single_camera_does_not_move(scene: Scene) -> None:
+    made = CameraPose(POSES, replace(scene, train=scene.train[:1]))
     pose = made.pose(torch.full((1, 6), 0.1, dtype=torch.float64), 0)
     torch.testing.assert_close(pose, torch.from_numpy(made.given[0]))
 
 
-def test_the_gradient_is_that_of_the_loss_by_a_motion(scene: Scene) -> None:
-    recipe, found = replace(quick(), poses=PoseRefinement(start=0)), {}
+def test_the_pose_gradient_is_that_of_the_loss(scene: Scene) -> None:
+    recipe, found = short().with_learned(replace(POSES, start=0)), {}
     for backend in backends():
         dtype = torch.float64 if backend == "reference" else torch.float32
         state = TrainState(random_splats(40, seed=1, dtype=dtype), torch.Generator().manual_seed(0))
@@ -94,14 +96,14 @@ def test_the_gradient_is_that_of_the_loss_by_a_motion(scene: Scene) -> None:
             for sign in (1, -1):
                 there = perturb_pose(camera, sign * motion * torch.tensor([1.0] * 3 + [scene.extent] * 3))
                 output = rasterize(state.splats, there, whole.settings(recipe.stages[0], 1), backend=backend)
-                terms = whole.differentiate(state, recipe.stages[0], 1, 2, there, output, {}).losses
+                terms = whole.differentiate(state, recipe.stages[0], 1, Rendered(2, there, output, {})).losses
                 values.append(float(sum(terms.values())))
             slope = (values[0] - values[1]) / (2 * step)
             assert slope == pytest.approx(float(found[backend][k]), rel=1e-3, abs=1e-5)
 
 
 # -- where they learn ---------------------------------------------------------------------------------------------
-def test_cameras_stand_still_while_colours_learn_and_the_cached_views_are_theirs(scene: Scene) -> None:
+def test_cameras_are_constant_while_only_colours_learn(scene: Scene) -> None:
     trainer = Trainer(scene, quick(), GENERIC, backend=backends()[-1])
     kept = {}
     trainer._on_event = lambda event: (
@@ -117,10 +119,10 @@ def test_cameras_stand_still_while_colours_learn_and_the_cached_views_are_theirs
 
 
 @needs_cpu
-def test_cached_views_are_of_the_cameras_that_were_found(scene: Scene) -> None:
+def test_cached_views_use_the_learned_cameras(scene: Scene) -> None:
     learned = Recipe(
         "colors", (replace(surface(), iterations=1), replace(appearance(k=20.0), iterations=3 * VIEWS)),
-        poses=PoseRefinement(),
+        learned=(POSES,),
     )  # fmt: skip
     state = TrainState(random_splats(90, seed=5), torch.Generator().manual_seed(0))
     state.stage = 1
@@ -136,7 +138,7 @@ def test_cached_views_are_of_the_cameras_that_were_found(scene: Scene) -> None:
         assert "poses" not in a.learned
 
 
-def test_errors_are_ranked_from_where_the_cameras_are(scene: Scene) -> None:
+def test_ranking_uses_the_learned_cameras(scene: Scene) -> None:
     backend, state = backends()[-1], TrainState(random_splats(40, seed=1), torch.Generator())
     begun(state, quick(), scene).learned["poses"].values += 0.05 * torch.eye(VIEWS, dtype=torch.float64)
     learning = Trainer(scene, quick(), GENERIC, backend=backend, state=state)
@@ -149,7 +151,7 @@ def test_errors_are_ranked_from_where_the_cameras_are(scene: Scene) -> None:
         assert np.array_equal(view.image(), given.image())
 
 
-def test_a_view_from_elsewhere_has_the_same_picture(scene: Scene) -> None:
+def test_a_view_at_another_pose_keeps_its_image(scene: Scene) -> None:
     view = scene.train[0]
     there = view.at(scene.train[1].camera.T_cam_world)
     assert np.array_equal(there.image(), view.image())
@@ -159,7 +161,7 @@ def test_a_view_from_elsewhere_has_the_same_picture(scene: Scene) -> None:
 
 # -- what they are worth ------------------------------------------------------------------------------------------
 @needs_cpu
-def test_cameras_that_are_off_are_found_and_new_views_gain() -> None:
+def test_poses_are_recovered_and_improve_new_views() -> None:
     truth, angles = random_splats(80, seed=3), 2.4 * np.arange(20)
     heights = np.linspace(-1.5, 1.5, 20)[np.argsort(np.sin(7 * angles))]
     cameras = [
@@ -176,10 +178,10 @@ def test_cameras_that_are_off_are_found_and_new_views_gain() -> None:
         views.append(type(base.train[0]).from_arrays(f"{k:02d}.png", camera, image).at(said.T_cam_world))
     scene = replace(base, train=tuple(views[:16]), test=tuple(views[16:]))
     stage = replace(surface(), iterations=600, densify=None, sh_interval=300, lr=LearningRates(means_decay_steps=600))
-    settings = PoseRefinement(rate=3e-3, rate_final=1e-4, start=100, decay_steps=600)
+    settings = replace(POSES, rate=3e-3, rate_final=1e-4, start=100, decay_steps=600)
     psnr, left = [], []
-    for learned in (None, settings):
-        trainer = Trainer(scene, Recipe("one", (stage,), poses=learned, init_points=60), GENERIC, backend="cpu")
+    for learned in ((), (settings,)):
+        trainer = Trainer(scene, Recipe("one", (stage,), learned=learned, init_points=60), GENERIC, backend="cpu")
         splats = trainer.run()
         errors = []
         for view in scene.test:

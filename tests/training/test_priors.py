@@ -10,23 +10,19 @@ import pytest
 import torch
 
 from gs2d.config.presets import with_depth_prior, with_normal_prior
-from gs2d.config.priors import DepthPrior
+from gs2d.config.prior_settings import DepthPrior
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import LearningRates, Recipe
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.data.prior_maps import MapFiles, ObservedPoints, PriorDepth
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
-from gs2d.losses.priors import MetricDepth, PointDepths, RelativeDepths
+from gs2d.losses.known_maps import metric_depths, plan_depths
+from gs2d.losses.prior_formulas import MetricDepth, PointDepths, RelativeDepths
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
-from gs2d.training.initialize import initial_splats, turned_to
-from gs2d.training.priors import (
-    metric_depths,
-    plan_depths,
-    plane_normals,
-    with_known_points,
-)
+from gs2d.training.start.initialize import initial_splats, turned_to
+from gs2d.training.start.known_points import plane_normals, with_known_points
 from gs2d.training.trainer import Trainer
 from saved_states import resumed_everywhere
 from train_toys import SIZE, random_splats, same, short
@@ -76,7 +72,7 @@ def eager(recipe: Recipe) -> Recipe:
 
 
 # -- what is read ---------------------------------------------------------------------------------------------------
-def test_auto_takes_a_sensor_s_maps_then_relative_ones_then_points(scene: Scene) -> None:
+def test_auto_prefers_sensor_maps_then_relative_maps_then_points(scene: Scene) -> None:
     def keep(_: int, depth: np.ndarray) -> np.ndarray:
         return depth
 
@@ -87,7 +83,7 @@ def test_auto_takes_a_sensor_s_maps_then_relative_ones_then_points(scene: Scene)
     assert plan_depths(mapped(both, keep, metric=True), DepthPrior("sparse")).source == "sparse"
 
 
-def test_a_capture_without_anything_known_is_refused(scene: Scene) -> None:
+def test_a_capture_without_known_depths_is_refused(scene: Scene) -> None:
     with pytest.raises(DataError, match="sparse"):
         Trainer(scene, with_depth_prior(short()), GENERIC, backend="reference")
     with pytest.raises(DataError, match="training"):
@@ -96,7 +92,7 @@ def test_a_capture_without_anything_known_is_refused(scene: Scene) -> None:
         Trainer(scene, with_normal_prior(short()), GENERIC, backend="reference")
 
 
-def test_points_are_where_the_camera_sees_them_with_the_pixels_around(scene: Scene) -> None:
+def test_point_depths_have_the_four_pixels_around_them(scene: Scene) -> None:
     both, view = observed(scene), scene.train[2]
     plan = plan_depths(both, DepthPrior())
     valid = metric_depths(view, plan, DepthPrior(), torch.float64)
@@ -111,7 +107,7 @@ def test_points_are_where_the_camera_sees_them_with_the_pixels_around(scene: Sce
         assert places[(round(a, 6), round(b, 6))] == pytest.approx(d)
 
 
-def test_a_sensor_s_unit_is_fitted_to_the_points_where_cameras_come_from_photographs(scene: Scene) -> None:
+def test_the_unit_of_sensor_maps_is_fitted_to_the_points(scene: Scene) -> None:
     made = mapped(observed(scene), lambda _, depth: 700 * depth, whole=True, metric=True)
     assert plan_depths(made, DepthPrior()).unit == pytest.approx(1 / 700, rel=0.1)  # the points are noisy
     assert plan_depths(made, DepthPrior(unit=0.3)).unit == 0.3
@@ -124,7 +120,7 @@ def test_a_sensor_s_unit_is_fitted_to_the_points_where_cameras_come_from_photogr
 
 
 @pytest.mark.parametrize("space", ["disparity", "depth"])
-def test_relative_maps_are_brought_to_the_points_and_tell_what_they_are_linear_in(scene: Scene, space: str) -> None:
+def test_relative_maps_are_fitted_to_the_points_in_the_better_space(scene: Scene, space: str) -> None:
     def make(index: int, depth: np.ndarray) -> np.ndarray:
         hit = depth > 0
         value = 1 / np.where(hit, depth, 1) if space == "disparity" else depth
@@ -172,7 +168,7 @@ def facing(scene: Scene, flip: tuple[int, int, int]) -> Scene:
 
 
 # -- the start ------------------------------------------------------------------------------------------------------
-def test_training_starts_from_places_on_the_maps_too(scene: Scene) -> None:
+def test_training_starts_from_points_on_depth_maps(scene: Scene) -> None:
     made = mapped(scene, lambda _, depth: np.where(depth > 0, 3.0, 0))  # planes in front of the cameras
     recipe = replace(with_depth_prior(short(), "sensor"), init_points=120)
     cloud, own = with_known_points(made, recipe).points, scene.points
@@ -200,7 +196,7 @@ def test_training_starts_from_places_on_the_maps_too(scene: Scene) -> None:
     assert (other.points[:9] != cloud.points[:9]).any()
 
 
-def test_splats_on_known_depths_lie_in_their_surface(scene: Scene) -> None:
+def test_splats_on_depth_maps_are_tangential_to_the_surface(scene: Scene) -> None:
     made = mapped(replace(scene, train=scene.train[:1]), lambda _, depth: np.full_like(depth, 3.0))
     start = with_known_points(replace(made, points=None), replace(with_depth_prior(short(), "sensor"), init_points=200))
     generator = torch.Generator().manual_seed(0)
@@ -240,7 +236,7 @@ def test_known_depths_move_means_and_no_colours(scene: Scene, backend: str, sour
     assert torch.equal(with_it.gradients["sh0"], without.gradients["sh0"])
 
 
-def test_known_depths_bring_the_splats_nearer_to_the_surface(scene: Scene) -> None:
+def test_known_depths_improve_the_surface(scene: Scene) -> None:
     made, _ = cases(scene)["sensor"]
     first = short().stages[0]
     lr = LearningRates(means=5e-3, means_final=1e-3, means_decay_steps=40)

@@ -21,7 +21,7 @@ from train_toys import backends, random_splats, same, short, train
 
 @pytest.mark.parametrize("absgs", [False, True])
 def test_resuming_from_any_event_gives_the_same_bytes(scene: Scene, absgs: bool) -> None:
-    kept: list[tuple[events.Event, bytes]] = []
+    kept: list[tuple[events.TrainingEvent, bytes]] = []
     backend = backends()[-1]
     trainer = Trainer(
         scene,
@@ -50,14 +50,14 @@ def test_a_run_that_is_killed_in_an_event_resumes_from_its_last_save_to_the_same
     end = Trainer(scene, short(), GENERIC, backend=backend, options=TrainerOptions(progress_every=1)).run()
     saves: list[bytes] = []
 
-    def on_event(event: events.Event) -> None:
+    def on_event(event: events.TrainingEvent) -> None:
         if isinstance(event, events.Progress) and event.iteration % 3 == 0:
             saves.append(saved(trainer))
         seen.append(event)
         if len(seen) == when:
             raise Killed
 
-    seen: list[events.Event] = []
+    seen: list[events.TrainingEvent] = []
     trainer = Trainer(
         scene, short(), GENERIC, backend=backend, on_event=on_event, options=TrainerOptions(progress_every=1)
     )
@@ -72,7 +72,7 @@ def test_a_finished_stage_can_be_shared_with_a_recipe_of_the_same_first_stage(sc
     longer = Recipe("longer", (first, replace(continue_training(), iterations=4)))
     at_finish: list[bytes] = []
 
-    def on_event(event: events.Event) -> None:
+    def on_event(event: events.TrainingEvent) -> None:
         if isinstance(event, events.StageFinished) and event.index == 0:
             at_finish.append(saved(trainer))
 
@@ -83,7 +83,7 @@ def test_a_finished_stage_can_be_shared_with_a_recipe_of_the_same_first_stage(sc
     assert shared.state.moments["means"].steps > 4  # kept
 
 
-def test_a_finished_run_has_nothing_left_to_do(scene: Scene) -> None:
+def test_a_finished_run_trains_nothing(scene: Scene) -> None:
     trainer, _ = train(scene, short())
     again = Trainer(scene, short(), GENERIC, backend="reference", state=reload(saved(trainer)))
     assert again.done

@@ -13,7 +13,7 @@ from fake_backends import lacking
 from gs2d.config.presets import appearance, two_dgs, with_robustness
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe
-from gs2d.config.robust import DenseStart, Removal, StartFit
+from gs2d.config.robust import DenseStart, Removal
 from gs2d.config.schedule import scale_schedule
 from gs2d.core.camera import Camera
 from gs2d.core.sh import rgb_to_sh0
@@ -24,20 +24,20 @@ from gs2d.render.api import rasterize
 from gs2d.render.backends import PLAIN, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events
-from gs2d.training.backdrop import EVEN, find_backdrop
-from gs2d.training.free_space import FreeSpaceMaps
-from gs2d.training.initialize import initial_splats
-from gs2d.training.plane_sweep import start_points, sweep_views
-from gs2d.training.point_gains import point_gains
-from gs2d.training.robust import Robustness
-from gs2d.training.seen_area import LARGEST, largest_log_scales, mostly_unseen
+from gs2d.training.learned.point_gains import point_gains
+from gs2d.training.robust.backdrop import EVEN, find_backdrop
+from gs2d.training.robust.free_space_maps import FreeSpaceMaps
+from gs2d.training.robust.robustness import Robustness
+from gs2d.training.robust.seen_area import LARGEST, largest_log_scales, mostly_unseen
+from gs2d.training.robust.trial import Witness, missed
+from gs2d.training.start.initialize import initial_splats
+from gs2d.training.start.plane_sweep import start_points, sweep_views
 from gs2d.training.trainer import Trainer
-from gs2d.training.trial import Witness, missed
 from train_toys import full_state, make_scene, random_splats
 from wall_scene import HEIGHT, WALL, WIDTH, wall
 
 RASTER, BACKEND = RasterSettings(), get_backend("reference")
-SMALL = DenseStart(side=48, planes=32, min_angle=1.0, cell=3.0)
+SMALL = DenseStart(side=48, min_angle=1.0)
 
 
 @cache
@@ -55,7 +55,7 @@ def splat_at(*places: tuple[float, float, float], scale: float = 0.02) -> Splats
 
 
 # -- the plane sweep ------------------------------------------------------------------------------------------------
-def test_a_sweep_finds_the_depth_of_a_textured_wall_and_says_nothing_of_a_bare_one() -> None:
+def test_a_sweep_finds_the_depth_of_a_textured_wall_only() -> None:
     sweep = swept_wall()
     depth = sweep.depths[2][:, 20:]  # type: ignore[attr-defined]
     valid = depth > 0
@@ -74,13 +74,13 @@ def test_training_starts_on_the_wall_facing_the_cameras() -> None:
     assert np.median(np.abs(cloud.normals[turned][:, 2])) > 0.9
 
 
-def test_a_sparse_point_far_from_swept_ones_starts_a_splat_as_large_as_among_sparse_ones() -> None:
+def test_sparse_points_far_from_swept_ones_keep_their_size() -> None:
     scene = wall()
     assert scene.points is not None
     alone = np.array([[0.0, 0.0, 9.0], [0.3, 0.0, 9.0], [0.0, 0.4, 9.0], [0.0, 0.0, 8.5]])
     more = replace(scene, points=PointCloud(np.concatenate([scene.points.points, alone])))
     assert start_points(more, swept_wall(), SMALL).sizes is None  # type: ignore[arg-type]
-    cloud = start_points(more, swept_wall(), replace(SMALL, fit=StartFit()))  # type: ignore[arg-type]
+    cloud = start_points(more, swept_wall(), replace(SMALL, fit=True))  # type: ignore[arg-type]
     assert cloud.sizes is not None
     assert np.flatnonzero(cloud.sizes).tolist() == list(range(len(cloud) - 4, len(cloud)))
     assert cloud.sizes[-4] == pytest.approx(np.sqrt((0.3**2 + 0.4**2 + 0.5**2) / 3))
@@ -108,20 +108,20 @@ def maps() -> FreeSpaceMaps:
     return FreeSpaceMaps(swept_wall())  # type: ignore[arg-type]
 
 
-def test_splats_before_the_wall_are_in_free_space_and_those_on_it_or_behind_are_not(maps: FreeSpaceMaps) -> None:
+def test_only_splats_in_front_of_the_wall_are_in_free_space(maps: FreeSpaceMaps) -> None:
     splats = splat_at((0.5, 0, 2.0), (0.5, 0, 0.97 * WALL), (0.5, 0, WALL), (0.5, 0, 6.0), (0.5, 0, -2.0))
     assert (maps.against(splats) > 0).tolist() == [True, False, False, False, False]
 
 
 def test_the_images_that_see_through_a_splat_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gs2d.training.free_space.BALL", 0.0)
+    monkeypatch.setattr("gs2d.training.robust.free_space_maps.BALL", 0.0)
     maps = FreeSpaceMaps(swept_wall())  # type: ignore[arg-type]
     all_of_them, some = maps.against(splat_at((0.2, 0.0, 2.0), (2.1, 0.0, 3.0))).tolist()
     assert all_of_them == len(wall().train)
     assert 0 < some < all_of_them
 
 
-def test_images_that_show_a_surface_on_a_splat_are_counted_for_its_ends_too(maps: FreeSpaceMaps) -> None:
+def test_a_surface_at_an_end_of_a_splat_counts(maps: FreeSpaceMaps) -> None:
     splats = splat_at((0.5, 0, WALL), (0.5, 0, 2.0), (0.5, 60.0, WALL), (0.5, 60.0, WALL))
     splats.log_scales[3, 1] = np.log(60.0)  # from outside of all images down to the middle of the wall
     images = len(wall().train)
@@ -154,7 +154,7 @@ def with_fog(splats: Splats, place: tuple[float, float, float]) -> Splats:
     return Splats(**{name: torch.cat([tensor, getattr(fog, name)]) for name, tensor in splats.items()})
 
 
-def test_what_the_images_miss_stays_though_depths_speak_against_it() -> None:
+def test_splats_that_the_images_miss_are_kept() -> None:
     """A mirror: one of five depth maps sees through the middle of the wall, and all five images show it."""
     splats, witnesses = wall_of_splats()
     middle = (splats.means[:, :2].norm(dim=1) < 0.6).to(torch.int32)
@@ -162,7 +162,7 @@ def test_what_the_images_miss_stays_though_depths_speak_against_it() -> None:
     assert not missed(splats, 0 * middle, witnesses, RASTER, BACKEND).any()
 
 
-def test_fog_that_one_image_was_trained_with_goes() -> None:
+def test_floaters_that_overfit_one_image_are_removed() -> None:
     splats, witnesses = wall_of_splats()
     place = tuple(witnesses[0].camera.center + np.array([0.0, 0.0, 1.0]))
     foggy = with_fog(splats, place)  # type: ignore[arg-type]
@@ -182,7 +182,7 @@ def short(**changes: object) -> Recipe:
     return replace(made, **changes)  # type: ignore[arg-type]
 
 
-def test_floaters_are_removed_at_every_turn_and_that_is_an_event() -> None:
+def test_removed_floaters_are_reported_as_events() -> None:
     happened: list[object] = []
     trainer = Trainer(wall(), short(), GENERIC, backend="auto", on_event=happened.append)
     trainer.enter(0)
@@ -202,7 +202,7 @@ def test_floaters_are_removed_at_every_turn_and_that_is_an_event() -> None:
 
 
 @pytest.mark.parametrize("behind", [True, False])
-def test_frozen_splats_stand_behind_what_is_tried(behind: bool) -> None:
+def test_trials_render_frozen_splats(behind: bool) -> None:
     """Dark fog is missed over black, which is darker, and not where the wall behind it is drawn."""
     frozen = wall_of_splats()[0] if behind else None
     state = full_state(20)
@@ -228,11 +228,11 @@ def test_the_largest_scale_is_a_fraction_of_the_image_at_the_nearest_camera(monk
     expected = LARGEST * angle * distance
     whole = largest_log_scales(splats, cameras)
     torch.testing.assert_close(whole.exp().squeeze(1), expected)
-    monkeypatch.setattr("gs2d.training.seen_area.PAIRS", len(cameras))  # one splat at a time
+    monkeypatch.setattr("gs2d.training.robust.seen_area.PAIRS", len(cameras))  # one splat at a time
     assert torch.equal(largest_log_scales(splats, cameras), whole)
 
 
-def test_large_splats_shrink_where_images_show_a_surface_and_nowhere_else() -> None:
+def test_large_splats_shrink_only_on_known_surfaces() -> None:
     state, stage = full_state(20), short().stages[0]
     splats = state.splats
     splats.means[:10], splats.means[10:] = torch.tensor([0.5, 0.0, WALL]), torch.tensor([0.5, 0.0, 3 * WALL])
@@ -249,7 +249,7 @@ def test_large_splats_shrink_where_images_show_a_surface_and_nowhere_else() -> N
     assert torch.equal(state.splats.log_scales[10:], kept[10:])
 
 
-def test_a_resumed_run_starts_from_the_same_places_and_ends_with_the_same_bits() -> None:
+def test_a_resumed_robust_training_ends_with_the_same_bits() -> None:
     whole = Trainer(wall(), short(), GENERIC, backend="auto").run()
     first = Trainer(wall(), short(), GENERIC, backend="auto")
     first.enter(0)
@@ -261,7 +261,7 @@ def test_a_resumed_run_starts_from_the_same_places_and_ends_with_the_same_bits()
 
 
 def test_a_capture_without_observations_is_refused_in_one_line() -> None:
-    with pytest.raises(DataError, match="ball must say which sparse points .* train with --robust off"):
+    with pytest.raises(DataError, match="ball must have sparse points .* train with --robust off"):
         Trainer(make_scene(), short(), GENERIC, backend="auto")
 
 
@@ -278,7 +278,7 @@ def cameras_of_the_wall() -> list[Camera]:
     return [view.camera for view in wall().train]
 
 
-def test_large_splats_of_which_only_a_border_is_photographed_are_found() -> None:
+def test_large_splats_that_are_barely_visible_are_detected() -> None:
     beside = (9.0, WALL, 3.0, 3.0, 0.99)  # pictures end at x = 3.2 at the most
     behind = (0.2, 2 * WALL, 1.0, 1.0, 0.99)
     before = (0.2, WALL, 4.0, 4.0, 0.99)
@@ -287,7 +287,7 @@ def test_large_splats_of_which_only_a_border_is_photographed_are_found() -> None
     assert found.tolist() == [False, True, False]  # what is behind another hides nothing
 
 
-def test_what_is_hardly_photographed_is_proposed_at_the_end_of_each_fifth() -> None:
+def test_barely_visible_splats_are_proposed_at_the_end_of_each_fifth() -> None:
     recipe = short(dense_start=SMALL)
     robust, stage = Robustness(wall(), recipe, RASTER, BACKEND), recipe.stages[0]
     due = [n for n in range(1, stage.iterations + 1) if robust.removes(stage, n)]
@@ -317,7 +317,7 @@ def test_opacity_decays_by_its_rate_every_ten_iterations_and_not_below_the_least
     assert state.splats.opacities == pytest.approx(torch.tensor([0.81, 0.45, 0.005, 0.001]), abs=1e-6)
 
 
-def test_what_has_the_colour_of_the_background_does_not_decay() -> None:
+def test_splats_in_the_colour_of_the_background_do_not_decay() -> None:
     """No image would ask for it again: a white floor before a white background would become transparent."""
     recipe = short(dense_start=None, removal=Removal(decay=0.1))
     raster = RasterSettings(background=(0.2, 0.6, 1.0))
@@ -330,7 +330,7 @@ def test_what_has_the_colour_of_the_background_does_not_decay() -> None:
 
 
 # -- exposures by points --------------------------------------------------------------------------------------------
-def test_gains_come_out_of_the_colours_of_points() -> None:
+def test_gains_follow_from_the_colours_of_points() -> None:
     gains = (0.7, 0.85, 1.0, 0.9, 0.8)
     found = point_gains(wall(gains))
     assert found is not None
@@ -343,16 +343,14 @@ def test_gains_come_out_of_the_colours_of_points() -> None:
 
 
 # -- the colour behind everything ------------------------------------------------------------------------------------
-def test_the_backdrop_is_the_colour_of_what_shows_no_sparse_points() -> None:
+def test_the_backdrop_is_the_colour_of_pixels_without_sparse_points() -> None:
     found = find_backdrop(wall())
     assert found is not None
     assert found.color == pytest.approx((0.5, 0.5, 0.5), abs=0.02)
 
 
 @pytest.mark.parametrize(("base", "most", "unlit"), [(0, 0, True), (0, 200, False), (60, 0, False)])
-def test_a_backdrop_is_unlit_where_nearly_all_that_is_bare_has_one_dark_colour(
-    base: int, most: int, unlit: bool
-) -> None:
+def test_an_unlit_backdrop_is_dark_and_even(base: int, most: int, unlit: bool) -> None:
     shades = (base + np.linspace(0, most, HEIGHT)).astype(np.uint8)[:, None, None]
     views = [View.from_arrays(view.name, view.camera, view.image() // 16 + shades) for view in wall().train]
     found = find_backdrop(replace(wall(), train=tuple(views)))

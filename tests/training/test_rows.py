@@ -23,7 +23,7 @@ def row_tensors(state: TrainState) -> dict[str, torch.Tensor]:
     return tensors | state.statistics
 
 
-def test_keep_rows_keeps_the_same_rows_of_everything_in_order() -> None:
+def test_keep_rows_keeps_the_same_rows_of_all_tensors() -> None:
     state = full_state(10)
     before = {name: tensor.clone() for name, tensor in row_tensors(state).items()}
     mask = torch.tensor([0, 1, 1, 0, 0, 1, 0, 0, 0, 1], dtype=torch.bool)
@@ -82,7 +82,7 @@ def test_broken_checkpoints_are_run_errors() -> None:
         TrainState.from_state_dict(data)
 
 
-def test_views_come_in_epochs_without_replacement_and_in_a_new_order_each() -> None:
+def test_views_come_in_shuffled_epochs() -> None:
     state = full_state(1)
     epochs = [[state.next_view(7) for _ in range(7)] for _ in range(4)]
     assert all(sorted(epoch) == list(range(7)) for epoch in epochs)

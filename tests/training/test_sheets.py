@@ -66,16 +66,14 @@ def with_sheets(scene: Scene) -> Outcome:
     return outcome(scene, recipe_with("image"))
 
 
-def test_normal_consistency_of_the_whole_image_grows_sheets(with_sheets: Outcome) -> None:
+def test_normal_consistency_of_the_whole_image_makes_sheets(with_sheets: Outcome) -> None:
     """The other tests say something only where there are any."""
     assert with_sheets.longest > 2 * RADIUS  # longer than the ball is wide
     assert with_sheets.covered > 0.2
 
 
 @pytest.mark.parametrize("cure", ["object", "silhouette"])
-def test_there_are_no_sheets_where_it_is_asked_of_the_object_or_silhouettes_are_kept(
-    scene: Scene, with_sheets: Outcome, cure: str
-) -> None:
+def test_object_weights_or_a_silhouette_loss_prevent_sheets(scene: Scene, with_sheets: Outcome, cure: str) -> None:
     recipe = recipe_with("object") if cure == "object" else recipe_with("image").with_loss(LossTerm("silhouette", 0.1))
     found = outcome(scene, recipe)
     assert found.longest < RADIUS

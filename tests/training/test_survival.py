@@ -33,7 +33,7 @@ def test_a_real_short_run_keeps_its_splats_and_learns(scene: Scene, factor: floa
     recipe = Recipe("r", (replace(stage, densify=replace(stage.densify, max_splats=150)),))
     counts, losses = [60], []
 
-    def on_event(event: events.Event) -> None:
+    def on_event(event: events.TrainingEvent) -> None:
         if isinstance(event, events.Densified):
             counts.append(event.splats)
         elif isinstance(event, events.Progress):

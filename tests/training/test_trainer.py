@@ -15,12 +15,13 @@ from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene, View
 from gs2d.render.api import rasterize
 from gs2d.training import events
+from gs2d.training.densify.gradient import OPACITY_CAP, RESET_OPACITY
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import raster_settings
 from train_toys import random_splats, same, short, train
 
 
-def test_the_stages_run_in_order_and_tell_what_they_do(scene: Scene) -> None:
+def test_stages_run_in_order_and_send_events(scene: Scene) -> None:
     trainer, recorder = train(scene, short())
     kinds = [type(event).__name__ for event in recorder.events if not isinstance(event, events.Progress)]
     assert kinds == [
@@ -55,7 +56,7 @@ def test_training_lowers_the_loss(scene: Scene) -> None:
     assert np.mean(losses[-6:]) < 0.7 * np.mean(losses[:6])  # six views: means over epochs
 
 
-def test_frozen_rows_and_attributes_are_bit_identical_through_a_stage(scene: Scene, backend: str) -> None:
+def test_frozen_rows_and_attributes_do_not_change(scene: Scene, backend: str) -> None:
     trainer, recorder = train(scene, short(), backend=backend)
     start, end = (recorder.at(kind, "appearance") for kind in (events.StageStarted, events.StageFinished))
     high_error = trainer.state.groups["high_error"][: len(start)]
@@ -77,7 +78,7 @@ def test_frozen_rows_and_attributes_are_bit_identical_through_a_stage(scene: Sce
 
 
 @pytest.mark.parametrize(("near_plane_policy", "unseen"), [("cull", 2), ("box", 1), ("draw", 0)])
-def test_splats_that_no_training_view_sees_go_at_the_end_of_a_stage_unless_crossing_ones_are_drawn(
+def test_invisible_splats_are_dropped_at_the_end_of_a_stage(
     scene: Scene, backend: str, near_plane_policy: str, unseen: int
 ) -> None:
     # A needle of 50 along x: no camera of the ring (3 away, at 0, 60, ... degrees) has x in its image plane, so
@@ -115,13 +116,11 @@ def test_a_densification_updates_nothing_and_a_reset_everything_but_opacity(scen
     densify = GradDensify(
         grad_threshold=1e9,
         opacity_cull=0.0,
-        scale_cull=1e9,
+        scale_cull_start=1000,
         every=3,
         start=1,
         stop=8,
-        reset_every=0,
-        reset_at=(5,),
-        reset_opacity=0.05,
+        reset_every=5,
     )
     stage = replace(surface(), iterations=8, densify=densify, sh_interval=0)
     _, recorder = train(scene, Recipe("r", (stage,)))
@@ -137,7 +136,7 @@ def test_a_densification_updates_nothing_and_a_reset_everything_but_opacity(scen
             continue
         for name, tensor in after.items():
             if iteration == 5 and name == "opacity_logits":
-                limit = torch.tensor(0.05).logit()
+                limit = torch.tensor(RESET_OPACITY, dtype=torch.float64).logit()
                 assert torch.equal(tensor, before.opacity_logits.clamp(max=limit.item()))
             else:
                 assert not torch.equal(tensor, dict(before.items())[name]), (iteration, name)
@@ -157,12 +156,13 @@ def test_white_backgrounds_reset_opacity_when_densification_starts(scene: Scene)
 
 
 def test_absgs_caps_opacity_and_gathers_absolute_gradients(scene: Scene) -> None:
-    densify = GradDensify(
-        absolute=True, abs_threshold=1e-9, start=1, stop=6, every=4, reset_every=0, cap_every=2, opacity_cap=0.09
-    )
+    densify = GradDensify(absolute=True, abs_threshold=1e-9, start=1, stop=6, every=4, reset_every=0, cap_every=2)
     _, recorder = train(scene, Recipe("r", (replace(surface(), iterations=5, densify=densify),)))
     caps = [event for event in recorder.events if isinstance(event, events.OpacityLimited)]
-    assert [(cap.iteration, cap.ceiling, cap.reset) for cap in caps] == [(2, 0.09, False), (4, 0.09, False)]
+    assert [(cap.iteration, cap.ceiling, cap.reset) for cap in caps] == [
+        (2, OPACITY_CAP, False),
+        (4, OPACITY_CAP, False),
+    ]
     (densified,) = [event for event in recorder.events if isinstance(event, events.Densified)]
     assert densified.split > 0
 
@@ -174,7 +174,7 @@ def test_a_stage_of_no_iterations_runs_its_actions(scene: Scene) -> None:
     assert int(trainer.state.groups["clones"].sum()) > 0
 
 
-def test_a_view_in_which_nothing_is_visible_is_survived(scene: Scene) -> None:
+def test_a_view_without_visible_splats_is_skipped(scene: Scene) -> None:
     """The picture is background, no gradient flows, and training goes on."""
     away = replace(scene.train[0].camera, T_cam_world=np.diag([1.0, 1.0, 1.0, 1.0]) + np.eye(4, k=3) * 1e3)
     view = View.from_arrays("away.png", away, scene.train[0].image())
@@ -182,7 +182,7 @@ def test_a_view_in_which_nothing_is_visible_is_survived(scene: Scene) -> None:
     assert trainer.done
 
 
-def test_masks_count_only_where_the_protocol_says_so(scene: Scene) -> None:
+def test_masks_count_only_if_the_protocol_uses_them(scene: Scene) -> None:
     masked = tuple(
         View.from_arrays(v.name, v.camera, v.image(), mask=np.indices((24, 24))[1] < 12) for v in scene.train
     )

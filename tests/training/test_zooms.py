@@ -12,7 +12,8 @@ import torch
 
 from gs2d.config.presets import get_recipe, surface, with_intrinsics, with_multiview
 from gs2d.config.protocols import GENERIC
-from gs2d.config.recipe import IntrinsicsRefinement, LearningRates, LossTerm, PoseRefinement, Recipe, Stage, validate
+from gs2d.config.quantities import INTRINSICS, POSES
+from gs2d.config.recipe import LearningRates, LossTerm, Recipe, validate
 from gs2d.core.camera import Zoom, look_at
 from gs2d.core.residual_lens import through_lens
 from gs2d.core.splats import Splats
@@ -23,6 +24,8 @@ from gs2d.errors import RecipeError
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
 from gs2d.training.learned.camera_intrinsics import CameraIntrinsics
+from gs2d.training.learned.learned_table import LearnedTable
+from gs2d.training.objective import Rendered
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
 from learned_rows import Learner, begun
@@ -39,21 +42,16 @@ def scene() -> Scene:
 def quick(**changes: Any) -> Recipe:
     """``short`` with poses and focal lengths from its third iteration on."""
     learned = {"rate": 1e-2, "rate_final": 1e-3, "start": 2, "decay_steps": 10}
-    return replace(short(), poses=PoseRefinement(**learned), intrinsics=IntrinsicsRefinement(**{**learned, **changes}))
+    intrinsics = replace(INTRINSICS, **learned, options=changes)  # type: ignore[arg-type]
+    return short().with_learned(replace(POSES, **learned), intrinsics)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("kind", ["normal_consistency", "normal_consistency_per_splat"])
-def test_the_gradient_is_that_of_the_whole_loss_by_focal_length_principal_point_and_lens(
-    scene: Scene, kind: str
-) -> None:
+def test_gradients_of_the_intrinsics_are_those_of_the_loss(scene: Scene, kind: str) -> None:
     terms = (LossTerm("l1", 0.8), LossTerm("ssim", 0.2), LossTerm(kind, 5.0), LossTerm("distortion", 10.0))
     stage = replace(surface(), losses=terms, densify=None)
-    recipe = Recipe(
-        "all",
-        (stage,),
-        poses=PoseRefinement(start=0),
-        intrinsics=IntrinsicsRefinement(start=0, principal_point=True, distortion=True),
-    )
+    intrinsics = replace(INTRINSICS, start=0).with_options(principal_point=True, distortion=True)
+    recipe = Recipe("all", (stage,), learned=(replace(POSES, start=0), intrinsics))
     found = {}
     for backend in backends():
         dtype = torch.float64 if backend == "reference" else torch.float32
@@ -78,13 +76,15 @@ def test_the_gradient_is_that_of_the_whole_loss_by_focal_length_principal_point_
                 rows.values[:, k] += sign * step
                 there = whole.camera(state, 2)
                 output = rasterize(state.splats, there, whole.settings(stage, 1), backend=backend)
-                values.append(float(sum(whole.differentiate(state, stage, 1, 2, there, output, {}).losses.values())))
+                values.append(
+                    float(sum(whole.differentiate(state, stage, 1, Rendered(2, there, output, {})).losses.values()))
+                )
             rows.values[:] = start
             slope = (values[0] - values[1]) / (2 * step)
             assert slope == pytest.approx(float(found[backend][k]), rel=1e-3, abs=1e-5)
 
 
-def test_photographs_of_one_camera_share_a_focal_length_and_the_first_step_is_the_rate(scene: Scene) -> None:
+def test_images_of_one_camera_share_a_focal_length(scene: Scene) -> None:
     first, second = (
         Intrinsics(64, 64, 60.0, 60.0, 32.0, 32.0),
         Intrinsics(64, 64, 70.0, 70.0, 32.0, 32.0, Lens("fov", (0.9,))),
@@ -103,14 +103,14 @@ def test_photographs_of_one_camera_share_a_focal_length_and_the_first_step_is_th
     assert quantity.zoom(values, 0) == quantity.zoom(values, 3) == Zoom()
 
 
-def test_only_the_numbers_that_the_recipe_names_are_learned(scene: Scene) -> None:
+def test_only_the_requested_intrinsics_are_learned(scene: Scene) -> None:
     for recipe, moves in ((quick(), 1), (quick(distortion=True), 3), (quick(principal_point=True), 3)):
         trainer = Trainer(scene, recipe, GENERIC, backend=backends()[-1])
         trainer.run()
         assert int(trainer.state.learned["intrinsics"].values.count_nonzero()) == moves
 
 
-def test_faces_of_a_panorama_keep_their_intrinsics_while_their_poses_learn(scene: Scene) -> None:
+def test_panorama_faces_keep_their_intrinsics(scene: Scene) -> None:
     faces = replace(scene, train=tuple(replace(view, is_face=True) for view in scene.train))
     for views, stays in ((faces, True), (scene, False)):
         trainer = Trainer(views, quick(distortion=True), GENERIC, backend="reference")
@@ -120,24 +120,31 @@ def test_faces_of_a_panorama_keep_their_intrinsics_while_their_poses_learn(scene
         assert bool(learned["poses"].values.any())
 
 
-def test_what_cannot_be_learned_is_refused() -> None:
+def test_invalid_intrinsics_recipes_are_refused() -> None:
     recipe = with_intrinsics(get_recipe("2dgs"))
     assert recipe.name == "2dgs-cameras"
-    assert recipe.poses is not None
+    assert recipe.learns("poses")
     validate(recipe)
-    with pytest.raises(RecipeError, match="intrinsics learn with poses, got poses=null"):
-        validate(replace(recipe, poses=None))
-    with pytest.raises(RecipeError, match="intrinsics cannot learn with multiview"):
+    with pytest.raises(RecipeError, match="intrinsics need poses in learned, got none"):
+        validate(replace(recipe, learned=(INTRINSICS,)))
+    with pytest.raises(RecipeError, match="intrinsics cannot be learned with multiview"):
         validate(with_multiview(recipe, 0.6, 0.04))
-    with pytest.raises(RecipeError, match=r"intrinsics\.rate must be positive, got 0.* \(intrinsics=null leaves"):
-        validate(replace(recipe, intrinsics=IntrinsicsRefinement(rate=0.0)))
-    with pytest.raises(RecipeError, match=r"principal_point must be true or false, got 3"):
-        validate(replace(recipe, intrinsics=IntrinsicsRefinement(principal_point=3)))  # type: ignore[arg-type]
-    with pytest.raises(RecipeError, match=r"distortion must be true or false, got 'k1'"):
-        validate(replace(recipe, intrinsics=IntrinsicsRefinement(distortion="k1")))  # type: ignore[arg-type]
+    with pytest.raises(RecipeError, match=r"intrinsics\.rate must be in \(0, 1\], got 0"):
+        validate(recipe.with_learned(replace(INTRINSICS, rate=0.0)))
 
 
-def test_test_photographs_of_the_same_camera_get_its_focal_length(scene: Scene) -> None:
+def test_options_that_a_quantity_does_not_take_are_refused(scene: Scene) -> None:
+    recipe = with_intrinsics(get_recipe("2dgs"))
+    for options, message in (
+        ({"principal_point": 3}, "principal_point must be true or false, got 3"),
+        ({"distortion": "k1"}, "distortion must be true or false, got 'k1'"),
+        ({"lens": 1}, "'intrinsics' does not take the options"),
+    ):
+        with pytest.raises(RecipeError, match=message):
+            LearnedTable(recipe.with_learned(replace(INTRINSICS, options=options)), scene)
+
+
+def test_test_views_of_the_same_camera_get_its_focal_length(scene: Scene) -> None:
     whole = replace(scene, test=(replace(scene.train[0], name="t.png"),))
     made = Learner(quick(), whole)
     made.rows["intrinsics"].values[:, 0] = 0.1
@@ -165,12 +172,13 @@ def seen_with_a_wrong_focal_length(factor: float) -> tuple[Splats, Scene]:
 
 
 @needs_cpu
-def test_the_focal_length_of_a_scene_that_is_known_is_found_to_the_last_digits() -> None:
+def test_the_focal_length_of_a_known_scene_is_recovered(monkeypatch: pytest.MonkeyPatch) -> None:
     truth, scene = seen_with_a_wrong_focal_length(1.02)
     stage = replace(surface(), iterations=120, densify=None, losses=(LossTerm("l1", 0.8), LossTerm("ssim", 0.2)))
     learned = {"start": 0, "decay_steps": 120}
-    settings = IntrinsicsRefinement(rate=2e-3, rate_final=1e-5, beta2=0.9, **learned)
-    recipe = Recipe("one", (stage,), poses=PoseRefinement(**learned), intrinsics=settings)
+    settings = replace(INTRINSICS, rate=2e-3, rate_final=1e-5, **learned)
+    recipe = Recipe("one", (stage,), learned=(replace(POSES, **learned), settings))
+    monkeypatch.setattr(CameraIntrinsics, "beta2", 0.9)
     trainer = Trainer(scene, recipe, GENERIC, backend="cpu", init=truth)
     trainer.enter(0)
     state, quantity = trainer.state, trainer.learned.quantities["intrinsics"]
@@ -186,13 +194,13 @@ def test_the_focal_length_of_a_scene_that_is_known_is_found_to_the_last_digits()
 
 @needs_cpu
 @pytest.mark.slow
-def test_a_focal_length_that_is_two_per_cent_off_is_found_with_the_scene_and_the_poses() -> None:
+def test_a_focal_length_is_recovered_together_with_scene_and_poses() -> None:
     truth, scene = seen_with_a_wrong_focal_length(1.02)
     lr = LearningRates(means_decay_steps=1500, means=8e-4, means_final=8e-5)
     stage = replace(surface(), iterations=1500, densify=None, sh_interval=300, lr=lr)
-    poses = PoseRefinement(rate=1e-3, rate_final=5e-5, start=20, decay_steps=1500)
-    intrinsics = IntrinsicsRefinement(rate=3e-3, rate_final=1.5e-4, start=20, decay_steps=1500)
-    trainer = Trainer(scene, Recipe("one", (stage,), poses=poses, intrinsics=intrinsics), GENERIC, init=truth)
+    poses = replace(POSES, rate=1e-3, rate_final=5e-5, start=20, decay_steps=1500)
+    intrinsics = replace(INTRINSICS, rate=3e-3, rate_final=1.5e-4, start=20, decay_steps=1500)
+    trainer = Trainer(scene, Recipe("one", (stage,), learned=(poses, intrinsics)), GENERIC, init=truth)
     trainer.run()
     now = trainer.scene_now()
     assert now.train[0].camera.fx / 50 == pytest.approx(1.0, abs=0.006)
@@ -215,18 +223,19 @@ def seen_through_a_lens() -> tuple[Splats, Scene]:
 
 
 @needs_cpu
-def test_the_lens_of_a_scene_that_is_known_is_found_with_its_focal_length() -> None:
+def test_the_lens_of_a_known_scene_is_recovered(monkeypatch: pytest.MonkeyPatch) -> None:
     truth, scene = seen_through_a_lens()
     stage = replace(surface(), iterations=240, densify=None, losses=(LossTerm("l1", 0.8), LossTerm("ssim", 0.2)))
     learned = {"start": 0, "decay_steps": 240}
-    settings = IntrinsicsRefinement(rate=2e-3, rate_final=2e-5, beta2=0.9, distortion=True, **learned)
-    recipe = Recipe("one", (stage,), poses=PoseRefinement(**learned), intrinsics=settings)
+    settings = replace(INTRINSICS, rate=2e-3, rate_final=2e-5, options={"distortion": True}, **learned)
+    recipe = Recipe("one", (stage,), learned=(replace(POSES, **learned), settings))
+    monkeypatch.setattr(CameraIntrinsics, "beta2", 0.9)
     trainer = Trainer(scene, recipe, GENERIC, backend="cpu", init=truth)
     trainer.enter(0)
     state, quantity = trainer.state, trainer.learned.quantities["intrinsics"]
     assert isinstance(quantity, CameraIntrinsics)
     rows = state.learned["intrinsics"]
-    before = residual_of(trainer, state, stage)
+    before = residual_of(trainer, state)
     for iteration in range(1, 241):
         index = iteration % 16
         found = trainer._whole.evaluate(state, replace(stage, sh_interval=0), iteration, index)
@@ -238,29 +247,34 @@ def test_the_lens_of_a_scene_that_is_known_is_found_with_its_focal_length() -> N
         got = (1 + found_lens.k1 * square + found_lens.k2 * square**2) * found_lens.scale
         assert got == pytest.approx(wanted, abs=2e-3)
     # The ranking of splats and E_i look at photographs that were straightened.
-    assert residual_of(trainer, state, stage) < before / 3
+    assert residual_of(trainer, state) < before / 3
 
 
-def residual_of(trainer: Trainer, state: TrainState, stage: Stage) -> float:
-    """What renderings of all photographs differ by in the mean, as E_i sees it."""
-    plain = replace(stage, sh_interval=0)
-    return float(np.mean([trainer._whole.residual(state, plain, 1, k).error.mean() for k in range(16)]))
+@torch.no_grad()
+def residual_of(trainer: Trainer, state: TrainState) -> float:
+    """Return the mean difference of all renderings from their images, without the residual lens."""
+    errors = []
+    for k in range(16):
+        camera, target = trainer._whole._seen(state, k)
+        color = rasterize(state.splats, camera, trainer.settings, backend="cpu").color
+        error = (color - target.image).abs().mean(dim=2)
+        errors.append(float((error if target.mask is None else error * target.mask).mean()))
+    return float(np.mean(errors))
 
 
 @needs_cpu
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_lens_is_found_with_the_scene_and_new_views_gain(seed: int) -> None:
+def test_a_lens_is_recovered_and_improves_new_views(seed: int) -> None:
     truth, scene = seen_through_a_lens()
     lr = LearningRates(means_decay_steps=1500, means=8e-4, means_final=8e-5)
     stage = replace(surface(), iterations=1500, densify=None, sh_interval=300, lr=lr)
-    poses = PoseRefinement(rate=1e-3, rate_final=5e-5, start=20, decay_steps=1500)
+    poses = replace(POSES, rate=1e-3, rate_final=5e-5, start=20, decay_steps=1500)
     psnr = []
     for distortion in (False, True):
-        intrinsics = IntrinsicsRefinement(
-            rate=3e-3, rate_final=1.5e-4, start=20, decay_steps=1500, distortion=distortion
-        )
-        recipe = Recipe("one", (stage,), seed=seed, poses=poses, intrinsics=intrinsics)
+        intrinsics = replace(INTRINSICS, rate=3e-3, rate_final=1.5e-4, start=20, decay_steps=1500)
+        learned = poses, intrinsics.with_options(distortion=distortion)
+        recipe = Recipe("one", (stage,), seed=seed, learned=learned)
         trainer = Trainer(scene, recipe, GENERIC, init=truth)
         splats = trainer.run()
         errors = []
@@ -274,7 +288,7 @@ def test_a_lens_is_found_with_the_scene_and_new_views_gain(seed: int) -> None:
     assert psnr[1] > psnr[0] + 1.0, psnr
 
 
-def test_photographs_of_a_lens_that_was_found_are_straightened_wherever_they_are_asked_for() -> None:
+def test_targets_are_undistorted_by_the_learned_lens() -> None:
     camera = look_at(np.array([3.0, 0, 0]), np.zeros(3), np.eye(3)[2], width=40, height=30, fx=36.0)
     picture = np.zeros((30, 40, 3), np.uint8)
     picture[14:16], picture[:, 19:21], picture[3] = 255, 255, 255

@@ -1,4 +1,4 @@
-"""The densifiers that there are, by name, and one that a recipe names. Pure Python: checked without torch."""
+"""Densifiers by name. Pure Python: a name is checked without torch."""
 
 from __future__ import annotations
 
@@ -14,9 +14,6 @@ DENSIFIERS: Registry[Any] = Registry(
     "gs2d.densifiers",
     builtin={
         "gradient": "gs2d.training.densify.gradient",
-        "absolute-gradient": "gs2d.training.densify.absolute",
-        "multi-view-error": "gs2d.training.densify.by_error",
-        "relocation": "gs2d.training.densify.relocation",
     },
     error=RecipeError,
 )
@@ -35,7 +32,7 @@ def register_densifier(name: str) -> Callable[[Register], Register]:
     -------
     callable
         Decorates a subclass of ``gs2d.training.densify.densifier.Densifier``. Its constructor takes the surroundings
-        and the options; ``before_backward`` and ``after_backward`` are called in every iteration.
+        and the options as keyword arguments; ``before_backward`` and ``after_backward`` are called in every iteration.
 
     Raises
     ------
@@ -55,14 +52,14 @@ def register_densifier(name: str) -> Callable[[Register], Register]:
 
 @dataclass(frozen=True)
 class Densify:
-    """A registered densifier, by its name; ``GradDensify`` is that of 2DGS and of AbsGS, with their numbers as fields.
+    """A registered densifier. ``GradDensify`` is that of 2DGS and AbsGS, with its options as fields.
 
     Attributes
     ----------
     name : str
     options : mapping of str to values of JSON
-        The keyword arguments of its constructor. ``start`` and ``stop``, where it has them, are iterations of the
-        stage, and scale with the schedule.
+        Keyword arguments of its constructor. Options called ``start`` and ``stop`` are iterations of the stage, and
+        scale with the schedule.
 
     Raises
     ------
@@ -78,10 +75,10 @@ class Densify:
 
     @property
     def stop(self) -> int:
-        """The iteration from which splats come and go no more, where the options say it; else 0."""
+        """The option ``stop``, or 0."""
         return int(self.options.get("stop", 0))
 
     def scaled(self, factor: float) -> Densify:
-        """Return it for a schedule ``factor`` times as long."""
+        """Return the densifier for a schedule ``factor`` times as long."""
         scaled = {name: round(self.options[name] * factor) for name in ("start", "stop") if name in self.options}
         return Densify(self.name, {**self.options, **scaled})

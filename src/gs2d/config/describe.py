@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 
 from gs2d.config.densify import Densify
-from gs2d.config.recipe import ALL, CloneInPlace, GradDensify, LearningRates, RankByError, Recipe, Stage
+from gs2d.config.recipe import ALL, GradDensify, LearningRates, Recipe, Stage
 from gs2d.config.robust import FEW_VIEWS
 
 
@@ -21,9 +21,9 @@ def describe_recipe(recipe: Recipe) -> Iterator[str]:
     yield from _describe_priors(recipe)
     if recipe.dense_start is not None:
         start = recipe.dense_start
-        fitted = ", its splats fitted to them" if start.fit is not None else ""
+        fitted = ", its splats fitted to them" if start.fit else ""
         otherwise = "" if start.required else "; without where they agree on nothing"
-        around = "" if start.sphere is None else f", and {start.sphere.splats:,} on a sphere around"
+        around = ", and a sphere of splats around the scene" if start.sphere else ""
         yield f"dense start: a sweep over photographs of about {start.side} px{fitted}{around}{otherwise}"
     if recipe.removal is not None:
         r = recipe.removal
@@ -38,22 +38,19 @@ def describe_recipe(recipe: Recipe) -> Iterator[str]:
 
 
 def _describe_learned(recipe: Recipe) -> Iterator[str]:
-    intrinsics = recipe.intrinsics
-    lens = ["focal length"]
-    if intrinsics is not None:
-        lens += [*["principal point"] * intrinsics.principal_point, *["lens"] * intrinsics.distortion]
     words = {
         "exposure": "a colour transform for each image",
-        "poses": "a motion (rad, shares of the extent) for each training camera, while all splats move",
-        "intrinsics": f"{', '.join(lens)} of each camera, with the poses",
-        "vignetting": "falloff of light of each camera",
+        "poses": "a motion (rad, scene extents) for each training camera, while all splats move",
+        "intrinsics": "focal length of each camera, with the poses",
+        "vignetting": "light falloff of each camera",
         "response": "response curve of each camera",
     }
-    for name, learning in recipe.quantities.items():
-        prior = f", prior {learning.prior:g}" if hasattr(learning, "prior") else ""
+    for name, quantity in recipe.quantities.items():
+        options = "".join(f", {key}={value}" for key, value in quantity.options.items())
         yield (
-            f"{name}: {words.get(name, 'registered quantity')}; after iteration {learning.start:,}, rate "
-            f"{learning.rate:g} to {learning.rate_final:g} over {learning.decay_steps:,} iterations{prior}"
+            f"{name}: {words.get(name, 'registered quantity')}{options}; after iteration {quantity.start:,}, rate "
+            f"{quantity.rate:g} to {quantity.rate_final:g} over {quantity.decay_steps:,} iterations, "
+            f"prior {quantity.prior:g}"
         )
 
 
@@ -75,13 +72,8 @@ def _describe_priors(recipe: Recipe) -> Iterator[str]:
 
 def _describe_stage(stage: Stage) -> Iterator[str]:
     for action in stage.on_enter:
-        if isinstance(action, RankByError):
-            yield f"first: the {action.top_percent:g} % of splats with the largest E_i become '{action.writes}'"
-        elif isinstance(action, CloneInPlace):
-            yield f"first: clone '{action.rows}' in place (opacity: {action.opacity}); the clones are '{action.writes}'"
-    if stage.downscale > 1:
-        halved = ", twice that after " + " and ".join(f"{at:,}" for at in stage.halve_at) if stage.halve_at else ""
-        yield f"photographs of 1/{stage.downscale} of their size{halved}"
+        options = ", ".join(f"{name}={value}" for name, value in action.options.items())
+        yield f"first: {action.name}{f' ({options})' if options else ''}"
     groups: dict[str, list[str]] = {}
     for attribute, rows in stage.train.items():
         groups.setdefault(rows, []).append(attribute)
@@ -116,12 +108,9 @@ def _describe_densify(d: GradDensify) -> Iterator[str]:
     signal = "absolute" if d.absolute else "signed"
     if d.stop > 0:
         resets = f"opacity reset every {d.reset_every:,}" if d.reset_every else "no opacity resets"
-        caps = f", capped at {d.opacity_cap:g} every {d.cap_every:,}" if d.cap_every else ""
-        errors = f" times the error of {d.error_views} views to the power {d.error_power:g}" if d.error_views else ""
+        caps = f", opacity capped every {d.cap_every:,}" if d.cap_every else ""
         budget = f", up to {d.max_splats:,} splats" if d.max_splats is not None else ""
         yield (
             f"densifies every {d.every} iterations from {d.start:,} to {d.stop:,}{budget} by {signal} gradients over "
-            f"{d.abs_threshold if d.absolute else d.grad_threshold:g}{errors}; {resets}{caps}"
+            f"{d.abs_threshold if d.absolute else d.grad_threshold:g}; {resets}{caps}"
         )
-    if d.prune_until > d.stop:
-        yield f"prunes splats larger than {d.scale_cull:g} of the extent until {d.prune_until:,}"

@@ -1,4 +1,4 @@
-"""What a recipe says about comparing two photographs of the same surface. Pure Python; never imports torch."""
+"""Settings of the losses between two views. Pure Python; never imports torch."""
 
 from __future__ import annotations
 
@@ -6,34 +6,33 @@ from dataclasses import dataclass
 
 from gs2d.config.validate import integer, number, require
 
-LARGEST = {"patches": 1_000_000, "radius": 50, "depth_downscale": 16}  # more is a slip
+LARGEST = {"patches": 1_000_000, "radius": 50, "depth_downscale": 16}  # more is a typing error
 
 
 @dataclass(frozen=True)
 class MultiView:
-    """How training views are compared with a neighbour of theirs (``losses/multiview.py``, ``training/multiview.py``).
+    """Comparison of training views with a neighbour (``losses/view_pair.py``, ``training/neighbours.py``).
 
     Attributes
     ----------
     patches : int
-        Pixels asked in an iteration.
-    radius : int
-        px. A patch has 2 radius + 1 pixels a side.
+        Pixels that are compared in an iteration.
+    radius : int, px
+        A patch has 2 radius + 1 pixels a side.
     texture : float
-        Least standard deviation of grey, in [0, 1], over a patch that is asked: below, noise decides.
+        Smallest standard deviation of grey in [0, 1] over a patch, above noise.
     opacity : float
-        Least rendered alpha of a pixel that is asked.
-    occluded : float
-        px. A pixel that comes back so far from itself through the neighbour's depth is hidden there: it does not count.
+        Smallest rendered alpha of a compared pixel.
+    occluded : float, px
+        Pixels with a larger round-trip error through the neighbour's depth are hidden there and do not count.
     neighbours : int
-        Nearest training views that each view is compared with, one of them in an iteration.
-    max_angle : float
-        Degrees. Largest angle between the optical axes of neighbours.
+        Nearest training views that each view is compared with, one in each iteration.
+    max_angle : float, degrees
+        Largest angle between the optical axes of neighbours.
     min_baseline, max_baseline : float
-        Distance between the cameras of neighbours, as a share of the distance to what they look at.
+        Distance between the cameras of neighbours, as a fraction of the distance to the scene.
     depth_downscale : int
-        The neighbour's depth is rendered that much smaller. Depth is smooth but at edges, and this render is the
-        larger part of what comparing costs.
+        Factor by which the rendered depth of the neighbour is smaller. This rendering is the larger part of the cost.
     """
 
     patches: int = 2048
@@ -49,7 +48,7 @@ class MultiView:
 
     @property
     def side(self) -> int:
-        """Pixels along a patch."""
+        """Side of a patch in pixels."""
         return 2 * self.radius + 1
 
 

@@ -14,27 +14,23 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any
 
+from gs2d.config.actions import CLONE_IN_PLACE, RANK_BY_ERROR
 from gs2d.config.multiview import MultiView
-from gs2d.config.priors import DepthPrior, NormalPrior
+from gs2d.config.prior_settings import DepthPrior, NormalPrior
+from gs2d.config.quantities import EXPOSURE, INTRINSICS, POSES, RESPONSE, VIGNETTING
 from gs2d.config.recipe import (
     ALL,
     ALPHA,
     SH,
-    CloneInPlace,
-    Exposure,
     GradDensify,
-    IntrinsicsRefinement,
     LearningRates,
     LossTerm,
-    Photometry,
-    PoseRefinement,
-    RankByError,
     Recipe,
     Stage,
 )
 from gs2d.config.recipe_files import is_recipe_file, made_recipe, read_recipe_file
 from gs2d.config.registry import Register, Registry
-from gs2d.config.robust import BackgroundSphere, DenseStart, Removal, StartFit
+from gs2d.config.robust import DenseStart, Removal
 from gs2d.config.schedule import LONGER
 from gs2d.errors import RecipeError
 
@@ -52,8 +48,8 @@ BEST_NC, NC_WITHOUT_SQUARES = 0.035, 0.02
 SQUARES, SQUARES_START = 10.0, 0.5  # weight of L2 in best, and from which part of its iterations on: the same page
 SH_FASTER = 2.5  # times the official rate of SH beyond degree 0: docs/notebook/training.md
 SETTLING, SETTLED = 0.3, 0.1  # of the iterations, at the end, in which rates fall, and to what: notebook/training.md
-DENSE_START = DenseStart(side=256, neighbours=3, fit=StartFit())  # docs/notebook/training.md
-STREET_START = DenseStart(sphere=BackgroundSphere())  # docs/notebook/floaters.md
+DENSE_START = DenseStart(side=256, neighbours=3, fit=True)  # docs/notebook/training.md
+STREET_START = DenseStart(sphere=True)  # docs/notebook/floaters.md
 
 # AbsGS, the numbers of its released code: clone 2e-4 signed, split 4e-4 absolute, percent_dense 0.001, cull 0.005,
 # reset every 3000, opacity capped at 0.8 every 500. "D" in the paper's table.
@@ -89,7 +85,7 @@ def appearance(k: float = 1.0) -> Stage:
         train=dict.fromkeys(SH, "high_error"),
         losses=PHOTOMETRIC,
         lr=_lr_after_surface(),
-        on_enter=(RankByError(top_percent=k),),
+        on_enter=(RANK_BY_ERROR.with_options(top_percent=k),),
     )
 
 
@@ -105,7 +101,7 @@ def refine(nc: float = 0.05, freeze: tuple[str, ...] = ALPHA, *, densify: GradDe
         losses=(*PHOTOMETRIC, *_normal_consistency(nc, 0)),
         lr=_lr_after_surface(),
         densify=densify,
-        on_enter=(CloneInPlace("high_error", "copy"),) if densify is None else (),
+        on_enter=(CLONE_IN_PLACE,) if densify is None else (),
     )
 
 
@@ -161,10 +157,11 @@ def with_exposure(recipe: Recipe) -> Recipe:
     Not in the paper. For photographs of a camera on automatic, whose exposure or white balance changes. View-dependent
     colour comes three times as late: it can feign exposures (docs/notebook/exposure.md).
     """
-    if recipe.exposure is not None:
+    if recipe.learns("exposure"):
         return recipe
     stages = (replace(stage, sh_interval=SH_PATIENCE * stage.sh_interval) for stage in recipe.stages)
-    return replace(recipe, name=f"{recipe.name}-exposure", stages=tuple(stages), exposure=Exposure())
+    learning = recipe.with_learned(EXPOSURE)
+    return replace(learning, name=f"{recipe.name}-exposure", stages=tuple(stages))
 
 
 def with_photometry(recipe: Recipe, *, vignetting: bool = True, response: bool = True) -> Recipe:
@@ -173,10 +170,10 @@ def with_photometry(recipe: Recipe, *, vignetting: bool = True, response: bool =
     Not in the paper. For lenses that darken corners, and for several cameras whose curves differ
     (docs/notebook/exposure.md).
     """
-    if recipe.photometry is not None:
+    if recipe.learns("vignetting", "response"):
         return recipe
-    learned = Photometry(vignetting=vignetting, response=response)
-    return replace(recipe, name=f"{recipe.name}-photometry", photometry=learned)
+    learned = ([VIGNETTING] if vignetting else []) + ([RESPONSE] if response else [])
+    return replace(recipe.with_learned(*learned), name=f"{recipe.name}-photometry")
 
 
 def with_multiview(
@@ -283,7 +280,7 @@ def best(
         ),
         sh_interval=round(1_000 * part),
     )
-    start = replace(DENSE_START, required=False, sphere=BackgroundSphere())
+    start = replace(DENSE_START, required=False, sphere=True)
     return Recipe(name, (stage,), dense_start=start, fused_depth="transmittance")
 
 
@@ -326,7 +323,7 @@ def best_surface(*, name: str = "best-surface") -> Recipe:
     """
     recipe = best()
     assert recipe.dense_start is not None
-    swept = replace(recipe, dense_start=replace(recipe.dense_start, fit=None))
+    swept = replace(recipe, dense_start=replace(recipe.dense_start, fit=False))
     return with_multiview(swept, 0.6, 0.04, every=2, last=0.2, multiview=MultiView(depth_downscale=2), name=name)
 
 
@@ -358,9 +355,9 @@ def with_poses(recipe: Recipe) -> Recipe:
 
     Not in the paper. For cameras that are off by a pixel or more (docs/guides/poses.md).
     """
-    if recipe.poses is not None:
+    if recipe.learns("poses"):
         return recipe
-    return replace(recipe, name=f"{recipe.name}-poses", poses=PoseRefinement())
+    return replace(recipe.with_learned(POSES), name=f"{recipe.name}-poses")
 
 
 def with_intrinsics(recipe: Recipe) -> Recipe:
@@ -368,9 +365,9 @@ def with_intrinsics(recipe: Recipe) -> Recipe:
 
     Not in the paper. For cameras whose focal length is off by a few per mille to per cent (docs/guides/poses.md).
     """
-    if recipe.intrinsics is not None:
+    if recipe.learns("intrinsics"):
         return recipe
-    refined = replace(with_poses(recipe), intrinsics=IntrinsicsRefinement(distortion=True))
+    refined = with_poses(recipe).with_learned(INTRINSICS.with_options(distortion=True))
     return replace(refined, name=f"{recipe.name.removesuffix('-poses')}-cameras")
 
 

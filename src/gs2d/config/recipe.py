@@ -1,9 +1,8 @@
-"""What is trained, as data: losses, rates, densification, entry actions, stages, recipes.
+"""Recipes: training methods as values, with stages, losses, learning rates and densification.
 
-A variant is a value, never an ``if``: every ablation of the paper is another :class:`Recipe` (``config/presets.py``).
-Iterations are counted from 1 within a stage; ``start`` fields mean "active when iteration > start", as in the
-official 2DGS code. ``config.serialize`` writes and reads recipes and applies ``--set``; ``schedule`` scales them.
-This module never imports torch.
+Every ablation of the paper is a :class:`Recipe` (``config/presets.py``). Iterations are counted from 1 within a stage;
+``start`` fields mean "active when iteration > start", as in the official 2DGS code. ``config.serialize`` writes and
+reads recipes and applies ``--set``; ``config.schedule`` scales them. This module never imports torch.
 """
 
 from __future__ import annotations
@@ -14,50 +13,44 @@ from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any
 
+from gs2d.config.actions import Action
 from gs2d.config.densify import Densify
-from gs2d.config.losses import LOSSES
+from gs2d.config.loss_registry import LOSSES
 from gs2d.config.multiview import MultiView, check_multiview
-from gs2d.config.priors import DepthPrior, NormalPrior, check_priors
-from gs2d.config.quantities import QUANTITIES, Learning, Quantity
-from gs2d.config.quantities import Exposure as Exposure  # a field's type: whoever reads a recipe finds it here
-from gs2d.config.quantities import IntrinsicsRefinement as IntrinsicsRefinement
-from gs2d.config.quantities import Photometry as Photometry
-from gs2d.config.quantities import PoseRefinement as PoseRefinement
+from gs2d.config.prior_settings import DepthPrior, NormalPrior, check_priors
+from gs2d.config.quantities import QUANTITIES, Quantity
 from gs2d.config.robust import DenseStart, Removal, check_robust
 from gs2d.config.validate import group, integer, number, one_of, require
 
 MU, SIGMA, ALPHA, SH = ("means",), ("quats", "log_scales"), ("opacity_logits",), ("sh0", "shN")
 ALL = MU + SIGMA + ALPHA + SH
-LARGEST_SEED = 2**63 - 1  # torch takes no larger one
+LARGEST_SEED = 2**63 - 1  # the largest of torch
 DEPTH_KINDS = ("mean", "median", "transmittance")
 
 
 @dataclass(frozen=True)
 class LossTerm:
-    """One term of the loss: ``weight * LOSSES[kind]``, in every ``every``-th iteration > start.
+    """A loss of a stage: ``weight * LOSSES[kind]``, in every ``every``-th iteration > start.
 
     Attributes
     ----------
     kind : str
-        "l1", "ssim" (1 - SSIM), "l2" (the mean squared difference), "normal_consistency",
-        "normal_consistency_per_splat" (the paper's Eq. 7 form), "distortion", "silhouette" (alpha against that of the
-        photographs), or, in a recipe with ``multiview``, "multiview_photometric" (1 - NCC of warped patches),
-        "multiview_geometric" (round trip, px); with ``depth_prior`` "depth_prior" (relative error of depth),
-        with ``normal_prior`` "normal_prior" (1 - cosine); or one that a package or a program has registered
-        (docs/extending.md).
+        "l1", "ssim" (1 - SSIM), "l2" (mean squared difference), "normal_consistency", "normal_consistency_per_splat"
+        (the paper's Eq. 7), "distortion" or "silhouette" (alpha compared with that of the images). In recipes with
+        ``multiview``: "multiview_photometric" (1 - NCC of warped patches) and "multiview_geometric" (round trip, px);
+        with ``depth_prior``: "depth_prior" (relative error of depth); with ``normal_prior``: "normal_prior"
+        (1 - cosine). Or a registered loss (docs/extending.md).
     weight : float or None
-        None: the protocol's weight of this kind (Table 1 of the paper writes that of "distortion" 100/10).
+        None: the weight of the protocol (Table 1 of the paper: 100/10 for "distortion").
     start : int
         Iterations of the stage without this term.
     depth : "mean", "median", "transmittance" or None
-        Depth that surface normals come from; None takes the protocol's.
+        Depth that the loss uses; None: that of the protocol.
     options : mapping of str to values of JSON
-        Keyword arguments of the loss, which are checked before training: ``edges``, ``where`` and ``edge_power`` of
-        both normal consistencies, ``required`` of "silhouette" (``gs2d.losses.terms``); those of other losses are
-        what their function or constructor takes.
+        Keyword arguments of the loss, checked before training: ``edges`` and ``where`` of both normal consistencies,
+        ``required`` of "silhouette" (``gs2d.losses.view_terms``).
     every : int
-        Iterations of which one has this term (those that it divides); the others cost nothing for it. The weight is as
-        written, not multiplied by ``every``.
+        The loss is active in iterations that this number divides. The weight is not multiplied by it.
 
     Raises
     ------
@@ -76,26 +69,25 @@ class LossTerm:
         LOSSES.check(self.kind)
 
     def is_active(self, iteration: int) -> bool:
-        """Whether an iteration (from 1) of the stage has this term."""
+        """Return whether the loss is active in an iteration (from 1) of the stage."""
         return iteration > self.start and iteration % self.every == 0
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam learning rates (``reference/2dgs`` facts: the official 2DGS values).
+    """Learning rates and constants of Adam; the defaults are those of the official 2DGS code.
 
-    ``means`` decays log-linearly from ``means`` to ``means_final`` over ``means_decay_steps`` iterations of the
-    stage, and both are multiplied by the scene's extent. ``stretch`` is of scaled schedules: one ``f`` times as long,
-    f < 1, has all rates times ``f ** -stretch`` (2.1 times at a twentieth with 0.25). Adam's steps do not grow with
-    gradients: in fewer of them a splat gets as far only if each is longer. 0 = rates as they are.
+    The rate of the means decays log-linearly from ``means`` to ``means_final`` over ``means_decay_steps`` iterations of
+    the stage. Both are multiplied by the extent of the scene. With ``stretch``, a schedule ``f`` < 1 times as long has
+    all rates times ``f ** -stretch``, because the size of Adam's steps does not depend on the gradients: with fewer
+    steps, each must be longer. 0 keeps the rates.
 
-    ``view_power`` is of steps that several views share (several processes): a step on the mean of B views has all rates
-    times ``B ** view_power``. 1/2 is what Grendel found (Zhao et al., "On Scaling Up 3D Gaussian Splatting Training",
-    ICLR 2025); 0 = rates as they are.
+    ``view_power`` is for steps that several processes share: a step on the mean gradient of B views has all rates
+    times ``B ** view_power``. Grendel (Zhao et al., ICLR 2025) uses 1/2; 0 keeps the rates.
 
-    The other rates are constant, but for ``settle_steps`` iterations after ``settle_start``, over which they fall
-    linearly to ``settle_factor`` times what they were, and stay there: a splat learns from one view at a time, and with
-    constant steps it wanders to the end between what its views ask for. 0 steps = constant, as in the official code.
+    The other rates are constant up to ``settle_start``, then fall linearly to ``settle_factor`` of their value over
+    ``settle_steps`` iterations. A splat learns from one view at a time, and with constant rates it would keep moving
+    between the optima of its views. 0 steps: constant, as in the official code.
     """
 
     means: float = 1.6e-4
@@ -116,28 +108,29 @@ class LearningRates:
     settle_factor: float = 0.0
 
     def settled_at(self, iteration: int) -> float:
-        """Factor of all rates but the means' at an iteration (1-based): 1, then linear, then constant."""
+        """Return the factor of all rates but that of the means at an iteration (1-based)."""
         if self.settle_steps == 0:
             return 1.0
         t = min(max((iteration - self.settle_start) / self.settle_steps, 0.0), 1.0)
         return 1.0 - t * (1.0 - self.settle_factor)
 
     def means_at(self, iteration: int) -> float:
-        """Rate of ``means`` at an iteration (1-based), without the extent: log-linear, then constant."""
+        """Return the rate of the means at an iteration (1-based), without the extent."""
         t = min(max(iteration / self.means_decay_steps, 0.0), 1.0)
         return math.exp((1.0 - t) * math.log(self.means) + t * math.log(self.means_final))
 
     def times(self, factor: float) -> LearningRates:
-        """Return all rates times a factor."""
+        """Return the rates, all multiplied by a factor."""
         names = ("means", "means_final", "quats", "log_scales", "opacity_logits", "sh0", "shN")
         return replace(self, **{name: getattr(self, name) * factor for name in names})
 
     def for_views(self, views: int) -> LearningRates:
-        """Return what a step on the mean gradient of so many views takes, by Grendel's rule.
+        """Return the rates for steps on the mean gradient of several views, by the rule of Grendel (ICLR 2025).
 
-        The gradients of views are nearly independent, so that one step should do what the steps of each would have
-        done. The mean of B of them has a second moment 1/B as large, by whose root Adam divides: rates times
-        ``B ** view_power``, eps / sqrt(B). Memory is of as many views as before: both betas to the power of B.
+        The gradients of views are nearly independent, so one step should replace the steps of all views. The second
+        moment of the mean of B gradients is smaller by 1/B, and Adam divides by its root. So rates are multiplied by
+        ``B ** view_power``, eps / sqrt(B). Both betas are raised to the power of B, so that the memory covers as many
+        views.
         """
         if views == 1:
             return self
@@ -145,13 +138,13 @@ class LearningRates:
         return replace(self.times(views**self.view_power), beta1=beta1, beta2=beta2, eps=eps)
 
     def at_end(self, iterations: int) -> LearningRates:
-        """Constant rates, at the values that these reach after so many iterations."""
+        """Return constant rates, equal to these rates after ``iterations``."""
         means = self.means_final if iterations >= self.means_decay_steps else self.means_at(iterations)
         settled = self.times(self.settled_at(iterations))
         return replace(settled, means=means, means_final=means, settle_start=0, settle_steps=0, settle_factor=0.0)
 
     def over_again(self, start: int, stop: int, iterations: int) -> LearningRates:
-        """Return rates that in so many iterations go through what these are between two iterations."""
+        """Return rates that decay within ``iterations`` as these do between two iterations."""
         before, after = self.settled_at(start), self.settled_at(stop)
         return replace(
             self.times(before),
@@ -166,54 +159,38 @@ class LearningRates:
 
 @dataclass(frozen=True)
 class GradDensify:
-    """Densification by screen-space gradients: clone, split, prune, opacity reset (official 2DGS; AbsGS as values).
+    """Densification by screen gradients: clone, split, prune and reset opacity (official 2DGS, and AbsGS by values).
 
     Attributes
     ----------
     grad_threshold : float
-        Mean signed screen gradient from which a splat is cloned (small) or split (large).
+        Mean signed screen gradient above which small splats are cloned and large ones split.
     every, start, stop : int
-        Densify when start < iteration < stop and iteration % every == 0; statistics are gathered before ``stop``.
+        Splats are densified if start < iteration < stop and iteration % every == 0. Statistics are gathered until
+        ``stop``.
     absolute : bool
-        Gather absolute gradients too (AbsGS).
+        Whether splits use absolute gradients (AbsGS).
     abs_threshold : float
-        With ``absolute``: splits test the absolute gradient against this; clones still test the signed one.
+        With ``absolute``: threshold of the absolute gradient for splits. Clones still use the signed gradient.
     percent_dense : float
         Splats with max scale <= percent_dense * extent are cloned, larger ones split.
-    split_count, split_shrink : int, float
-        Children of a split, and the divisor of their scales.
     opacity_cull : float
-        Prune below this opacity.
-    scale_cull : float
-        Prune when max scale > scale_cull * extent: with every densification after ``scale_cull_start``.
+        Splats of lower opacity are pruned.
     scale_cull_start : int or None
-        None = reset_every, as in the official code.
-    prune_until : int
-        The prune by ``scale_cull`` goes on after ``stop``, every so many iterations as densification, up to this one.
-        A stage that only does that has ``start`` and ``stop`` 0.
-    reset_every, reset_opacity : int, float
-        Every so many iterations (before ``stop``) opacity = min(opacity, reset_opacity); 0 = never.
-    reset_at : tuple of int
-        Further iterations with a reset.
+        Large splats are pruned after this iteration; None = ``reset_every``, as in the official code.
+    reset_every : int
+        Iterations between opacity resets, before ``stop``; 0 = no resets.
     reset_at_start_on_white : bool
-        A reset at iteration ``start`` too when the background is white, as in the official code (and, as there, none
-        where ``reset_every`` is 0).
-    reset_at_on_white : tuple of int
-        Further iterations with a reset when the background is white, whatever ``reset_every`` is.
+        With ``reset_every``, also reset at iteration ``start`` if the background is white, as in the official code.
     last_reset : int or None
         No reset after this iteration; None = any before ``stop``.
     prune_grace : int
-        Nothing is pruned for opacity within so many iterations of a reset (0 in the official code).
-    opacity_cap, cap_every : float, int
-        AbsGS: every cap_every iterations opacity = min(opacity, opacity_cap); cap_every 0 = never.
+        Iterations after a reset in which no splat is pruned by opacity (0 in the official code).
+    cap_every : int
+        Iterations between caps of the opacity, as in AbsGS; 0 = no caps.
     max_splats : int or None
-        A budget: no densification goes beyond this count. Where more splats ask to be cloned or split, those whose
-        signal is the largest multiple of its threshold win. None = no limit.
-    error_views : int
-        Training views that are rendered at each densification, to multiply the gradients of a splat by how wrong they
-        are where it is drawn (``training/densify/by_error.py``); 0 = none, gradients alone.
-    error_power : float
-        Of the error in units of its median.
+        No densification exceeds this count. If more splats qualify, those with the largest ratio of signal to threshold
+        win. None = no limit.
     """
 
     grad_threshold: float = 2e-4
@@ -223,106 +200,57 @@ class GradDensify:
     absolute: bool = False
     abs_threshold: float = 4e-4
     percent_dense: float = 0.01
-    split_count: int = 2
-    split_shrink: float = 1.6
     opacity_cull: float = 0.05
-    scale_cull: float = 0.1
     reset_every: int = 3_000
-    reset_opacity: float = 0.01
-    reset_at: tuple[int, ...] = ()
     reset_at_start_on_white: bool = True
     last_reset: int | None = None
     prune_grace: int = 0
-    opacity_cap: float = 0.8
     cap_every: int = 0
     max_splats: int | None = None
     scale_cull_start: int | None = None
-    prune_until: int = 0
-    reset_at_on_white: tuple[int, ...] = ()
-    error_views: int = 0
-    error_power: float = 0.5
 
     def resets(self, iteration: int, *, white: bool) -> bool:
-        """Whether opacity is reset at the end of this iteration."""
+        """Return whether opacity is reset at the end of an iteration."""
         if iteration >= self.stop or (self.last_reset is not None and iteration > self.last_reset):
             return False
-        regular = self.reset_every > 0 and iteration % self.reset_every == 0
-        at_start = white and self.reset_at_start_on_white and self.reset_every > 0 and iteration == self.start
-        return regular or at_start or iteration in self.reset_at or (white and iteration in self.reset_at_on_white)
+        if self.reset_every == 0:
+            return False
+        at_start = white and self.reset_at_start_on_white and iteration == self.start
+        return iteration % self.reset_every == 0 or at_start
 
     def densifies(self, iteration: int) -> bool:
-        """Whether splats are cloned, split and pruned at the end of this iteration."""
+        """Return whether splats are cloned, split and pruned at the end of an iteration."""
         return self.start < iteration < self.stop and iteration % self.every == 0
 
     def culls_scale(self, iteration: int) -> bool:
-        """Whether a prune at the end of this iteration takes large splats too."""
+        """Return whether a prune at the end of an iteration includes large splats."""
         return iteration > (self.reset_every if self.scale_cull_start is None else self.scale_cull_start)
 
-    def only_prunes(self, iteration: int) -> bool:
-        """Whether large splats are pruned at the end of this iteration, after densification."""
-        return (
-            self.stop <= iteration <= self.prune_until and iteration % self.every == 0 and self.culls_scale(iteration)
-        )
-
     def in_prune_grace(self, iteration: int, *, white: bool) -> bool:
-        """Whether faint splats are spared because a reset is at most ``prune_grace`` iterations back."""
+        """Return whether faint splats are kept because of a reset within the last ``prune_grace`` iterations."""
         first = max(1, iteration - self.prune_grace)
         return any(self.resets(earlier, white=white) for earlier in range(first, iteration))
 
 
 @dataclass(frozen=True)
-class RankByError:
-    """Entry action: E_i over all training views (paper Eq. 8); the worst ``top_percent`` become a row group.
-
-    With ``occlusion`` a pixel counts only for the splats that are blended there.
-    """
-
-    top_percent: float = 1.0
-    writes: str = "high_error"
-    occlusion: bool = False
-
-
-@dataclass(frozen=True)
-class CloneInPlace:
-    """Entry action: append an exact copy of the rows of a group.
-
-    ``opacity="copy"`` keeps the opacity of both (the paper); ``"preserve"`` gives both 1 - sqrt(1 - o), so that the
-    pair transmits at its centre what one splat did (between centre and rim it is a little denser).
-    """
-
-    rows: str = "high_error"
-    opacity: str = "copy"
-    writes: str = "clones"
-
-
-Action = RankByError | CloneInPlace
-
-
-@dataclass(frozen=True)
 class Stage:
-    """A stretch of training with one set of trainable attributes and losses.
+    """A part of training with one set of trained attributes and losses.
 
     Attributes
     ----------
     name : str
     iterations : int
     train : mapping of attribute name to "all" or a row group
-        Attributes that are absent are frozen: bit-identical through the stage.
+        Missing attributes are frozen: they do not change in the stage.
     losses : tuple of LossTerm
     lr : LearningRates
     densify : GradDensify, Densify or None
-    on_enter : tuple of actions
+    on_enter : tuple of Action
         Run once, in order, before the first iteration.
     sh_interval : int
-        Raise the SH degree every so many iterations from 0; 0 = full degree from the start.
+        Iterations after which the SH degree, 0 at first, rises by one; 0 = full degree from the start.
     moments : "fresh" or "kept"
-        Adam moments at entry.
-    downscale : int
-        The stage trains on photographs of 1 / ``downscale`` of their size (what ``gs2d train --downscale`` leaves of
-        them), with their masks, silhouettes and maps. Scores and meshes are of the full size.
-    halve_at : tuple of int
-        Iterations after which ``downscale`` is half of what it was: 4 with (3000, 9000) is 4 up to iteration 3000, 2 up
-        to 9000, and 1 from then on.
+        Adam moments when the stage begins.
     """
 
     name: str
@@ -334,8 +262,6 @@ class Stage:
     on_enter: tuple[Action, ...] = ()
     sh_interval: int = 0
     moments: str = "fresh"
-    downscale: int = 1
-    halve_at: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "train", MappingProxyType(dict(self.train)))
@@ -345,33 +271,27 @@ class Stage:
         """Whether the means of all splats are trained."""
         return self.train.get("means") == "all"
 
-    def downscale_at(self, iteration: int) -> int:
-        """Return by how much photographs are downscaled at an iteration (1-based)."""
-        return self.downscale >> sum(iteration > at for at in self.halve_at)
-
     def active_sh_degree(self, iteration: int, max_degree: int) -> int:
-        """SH degree that is trained at an iteration (1-based): 0, then one more every ``sh_interval`` iterations."""
+        """Return the SH degree that is trained at an iteration (1-based)."""
         return max_degree if self.sh_interval == 0 else min(max_degree, iteration // self.sh_interval)
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """A training method: stages in order, and settings that hold for all of them.
+    """A training method: stages in order, and settings for all of them.
 
     Attributes
     ----------
     name : str
     stages : tuple of Stage
     seed : int
-        Of every random choice.
+        Seed of all random choices.
     sh_degree : int
         Highest SH degree of the splats, 0 to 3.
     init_points : int
-        Random points that training starts from if the scene has no sparse points.
-    exposure : Exposure or None
-        Learns an exposure for each image; None: all images have the same.
-    poses : PoseRefinement or None
-        Learns camera poses; None: those of the capture.
+        Number of random points that training starts from if the scene has no sparse points.
+    learned : tuple of Quantity
+        Quantities of images and cameras that are learned with the splats, each at most once.
     multiview : MultiView or None
         Settings of the multi-view losses.
     depth_prior, normal_prior : DepthPrior, NormalPrior or None
@@ -382,12 +302,6 @@ class Recipe:
         Removes floaters.
     fused_depth : "mean", "median", "transmittance" or None
         Depth that is fused into the mesh; None: that of the protocol.
-    intrinsics : IntrinsicsRefinement or None
-        Learns focal lengths and lenses with the poses; None: those of the capture.
-    photometry : Photometry or None
-        Learns vignetting and response of the cameras; None: neither.
-    learned : tuple of Quantity
-        Further quantities of images and cameras that are learned: registered ones, by name.
 
     Examples
     --------
@@ -402,31 +316,28 @@ class Recipe:
     seed: int = 0
     sh_degree: int = 3
     init_points: int = 100_000
-    exposure: Exposure | None = None
-    poses: PoseRefinement | None = None
+    learned: tuple[Quantity, ...] = ()
     multiview: MultiView | None = None
     depth_prior: DepthPrior | None = None
     normal_prior: NormalPrior | None = None
     dense_start: DenseStart | None = None
     removal: Removal | None = None
     fused_depth: str | None = None
-    intrinsics: IntrinsicsRefinement | None = None
-    photometry: Photometry | None = None
-    learned: tuple[Quantity, ...] = ()
 
     @property
-    def quantities(self) -> dict[str, Learning]:
-        """What is learned of images and cameras: settings by the name of the quantity, in the order of application."""
-        light = self.photometry
-        settings = {
-            "intrinsics": self.intrinsics,
-            "poses": self.poses,
-            "vignetting": light if light is not None and light.vignetting else None,
-            "exposure": self.exposure,
-            "response": light if light is not None and light.response else None,
-        }
-        known: dict[str, Learning] = {name: value for name, value in settings.items() if value is not None}
-        return known | {quantity.name: quantity for quantity in self.learned}
+    def quantities(self) -> dict[str, Quantity]:
+        """The learned quantities by name, in the order in which they are applied: that of the registry."""
+        order = (*QUANTITIES.builtin, *(quantity.name for quantity in self.learned))
+        return {quantity.name: quantity for quantity in sorted(self.learned, key=lambda q: order.index(q.name))}
+
+    def learns(self, *names: str) -> bool:
+        """Whether any of these quantities is learned."""
+        return not self.quantities.keys().isdisjoint(names)
+
+    def with_learned(self, *quantities: Quantity) -> Recipe:
+        """Return a recipe that learns these quantities, in place of those of the same names."""
+        named = {quantity.name: quantity for quantity in (*self.learned, *quantities)}
+        return replace(self, learned=tuple(named.values()))
 
     @property
     def iterations(self) -> int:
@@ -468,12 +379,12 @@ class Recipe:
 
 
 def validate(recipe: Recipe) -> Recipe:
-    """Check that a recipe can be trained as written; returns it.
+    """Check that a recipe can be trained, and return it.
 
     Raises
     ------
     RecipeError
-        Names the stage, what was found and what exists.
+        Names the stage, the value and what was expected.
     """
     where = f"recipe {recipe.name!r}"
     require(bool(recipe.stages), f"{where}: expected at least one stage, got none")
@@ -483,23 +394,17 @@ def validate(recipe: Recipe) -> Recipe:
     require(recipe.sh_degree in (0, 1, 2, 3), f"{where}: sh_degree must be 0, 1, 2 or 3, got {recipe.sh_degree!r}")
     integer(f"{where}: init_points", recipe.init_points, low=1)
     require(recipe.init_points < 2**31, f"{where}: init_points must be at most 2^31 - 1, got {recipe.init_points}")
-    for name in ("exposure", "photometry", "poses", "intrinsics"):
-        if (settings := getattr(recipe, name)) is not None:
-            settings.check(f"{where}: {name}")
-    if recipe.poses is not None:
-        learns = any(stage.moves_all for stage in recipe.stages)
-        require(learns, f"{where}: poses learn while the means of all splats do, and no stage trains those")
-    if recipe.intrinsics is not None:
-        require(recipe.poses is not None, f"{where}: intrinsics learn with poses, got poses=null; set both or neither")
-        fixed = "views are compared by the intrinsics that the capture says"
-        require(recipe.multiview is None, f"{where}: intrinsics cannot learn with multiview: {fixed}; leave one out")
     learned = [quantity.name for quantity in recipe.learned]
     for quantity in recipe.learned:
-        name = quantity.name
-        quantity.check(f"{where}: learned {name!r}")
-        require(learned.count(name) == 1, f"{where}: learned {name!r} is there twice; leave one out")
-        setting = "photometry" if name in ("vignetting", "response") else name
-        require(name not in QUANTITIES.builtin, f"{where}: {name!r} must not be in learned; set {setting} instead")
+        quantity.check(f"{where}: learned.{quantity.name}")
+        require(learned.count(quantity.name) == 1, f"{where}: learned {quantity.name!r} is there twice; remove one")
+    if "poses" in learned:
+        moves = any(stage.moves_all for stage in recipe.stages)
+        require(moves, f"{where}: poses need a stage that trains the means of all splats, got none")
+    if "intrinsics" in learned:
+        require("poses" in learned, f"{where}: intrinsics need poses in learned, got none; add them")
+        fixed = "it compares views by the intrinsics of the capture"
+        require(recipe.multiview is None, f"{where}: intrinsics cannot be learned with multiview: {fixed}; remove one")
     if recipe.multiview is not None:
         check_multiview(f"{where}: multiview", recipe.multiview)
     check_priors(where, recipe.depth_prior, recipe.normal_prior)
@@ -519,28 +424,17 @@ def validate(recipe: Recipe) -> Recipe:
 
 
 def _check_stage(where: str, stage: Stage, groups: list[str]) -> None:
-    """Check one stage; ``groups`` are the row groups written so far, and is extended."""
+    """Check one stage; ``groups`` are the row groups that earlier actions write, and is extended."""
     integer(f"{where}: iterations", stage.iterations, low=0)
     integer(f"{where}: sh_interval", stage.sh_interval, low=0)
     one_of(f"{where}: moments", stage.moments, ("fresh", "kept"))
-    integer(f"{where}: downscale", stage.downscale, low=1)
-    for at in stage.halve_at:
-        integer(f"{where}: halve_at", at, low=0)
-        require(at <= stage.iterations, f"{where}: halve_at must lie in its {stage.iterations} iterations, got {at}")
-    times = len(stage.halve_at)
-    require(
-        stage.downscale % (1 << times) == 0,
-        f"{where}: downscale must be a multiple of {1 << times} to be halved {times} times, got {stage.downscale}",
-    )
     for action in stage.on_enter:
-        if isinstance(action, RankByError):
-            percent = number(f"{where}: RankByError.top_percent", action.top_percent, low=0.0)
-            require(0 < percent <= 100, f"{where}: RankByError.top_percent must be in (0, 100], got {percent}")
-        else:
-            one_of(f"{where}: CloneInPlace.opacity", action.opacity, ("copy", "preserve"))
-            group(f"{where}: CloneInPlace.rows", action.rows, groups)
-        require(action.writes not in ("", "all"), f"{where}: a row group cannot be called {action.writes!r}")
-        groups.append(action.writes)
+        if "rows" in action.options:
+            group(f"{where}: {action.name}.rows", action.options["rows"], groups)
+        if (writes := action.writes) is not None:
+            named = isinstance(writes, str) and writes not in ("", "all")
+            require(named, f"{where}: a row group cannot be called {writes!r}")
+            groups.append(writes)
     for attribute, rows in stage.train.items():
         one_of(f"{where}: train", attribute, ALL)
         if rows != "all":
@@ -581,29 +475,15 @@ def _check_losses(where: str, stage: Stage) -> None:
 
 
 def _check_densify(where: str, densify: GradDensify, stage: Stage) -> None:
-    for name in ("start", "stop", "reset_every", "prune_grace", "cap_every", "prune_until", "error_views"):
+    for name in ("start", "stop", "reset_every", "prune_grace", "cap_every"):
         integer(f"{where}.{name}", getattr(densify, name), low=0)
     integer(f"{where}.every", densify.every, low=1)
-    integer(f"{where}.split_count", densify.split_count, low=2)
-    for name in ("grad_threshold", "abs_threshold", "percent_dense", "opacity_cull", "scale_cull", "error_power"):
+    for name in ("grad_threshold", "abs_threshold", "percent_dense", "opacity_cull"):
         number(f"{where}.{name}", getattr(densify, name), low=0.0)
-    shrink = number(f"{where}.split_shrink", densify.split_shrink, low=0.0)
-    require(shrink > 0, f"{where}.split_shrink must be positive, got {shrink}")
-    for name in ("reset_opacity", "opacity_cap"):
-        value = number(f"{where}.{name}", getattr(densify, name), low=0.0)
-        require(0 < value < 1, f"{where}.{name} must be in (0, 1), got {value}")
-    for name in ("reset_at", "reset_at_on_white"):
-        for value in getattr(densify, name):
-            integer(f"{where}.{name}", value, low=1)
     for name, low in (("last_reset", 0), ("scale_cull_start", 0), ("max_splats", 1)):
         if getattr(densify, name) is not None:
             integer(f"{where}.{name}", getattr(densify, name), low=low)
-    require(
-        densify.prune_until <= stage.iterations,
-        f"{where}.prune_until must be at most the stage's {stage.iterations} iterations, got {densify.prune_until}",
-    )
-    resets = bool(densify.reset_at or densify.reset_at_on_white) or densify.reset_every > 0
-    touches_opacity = resets or densify.cap_every > 0
+    touches_opacity = densify.reset_every > 0 or densify.cap_every > 0
     require(
         not touches_opacity or stage.train.get("opacity_logits") == "all",
         f"{where} resets or caps opacity, which the stage must then train for all rows; "

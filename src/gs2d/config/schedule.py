@@ -1,13 +1,10 @@
-"""Short runs that still behave: a recipe scaled by a factor.
+"""Scale the schedule of a recipe to a shorter or longer training.
 
-Scaled: stage lengths, loss starts, the SH interval, where ``downscale`` halves, start and stop of densification and of
-the prune by size, the horizons of the rates of means, exposures, poses and cameras (so that rates end where they
-should) and of the weights of priors, and resets of white backgrounds alone (``reset_at_on_white``), which go with the
-start.
-*Not* scaled: the densification interval, as long as ten densifications fit, the first iterations without exposures and
-poses, and opacity resets. A reset puts opacity at 0.01, below the 0.05 at which splats are pruned; Adam moves a logit
-by about its rate, 0.05, a step, and 1.65 are missing, so a splat needs dozens of views to come back.
-Pure Python; never imports torch.
+Scaled: the lengths of stages, the starts of losses, the SH interval, start and stop of densification and of the prune
+by size, and the decay of learning rates and of the weights of priors. *Not* scaled: the densification interval, as long
+as ten densifications fit, a minimum of iterations without learned quantities, and opacity resets. After a reset, the
+opacity of a splat is below the limit of pruning, and it needs dozens of views to recover. Pure Python; never imports
+torch.
 """
 
 from __future__ import annotations
@@ -18,36 +15,33 @@ from dataclasses import replace
 from typing import TypeVar
 
 from gs2d.config.densify import Densify
-from gs2d.config.priors import DepthPrior, NormalPrior
-from gs2d.config.quantities import Learning
+from gs2d.config.prior_settings import DepthPrior, NormalPrior
 from gs2d.config.recipe import GradDensify, LearningRates, Recipe, Stage
 from gs2d.errors import RecipeError
 
 MIN_DENSIFICATIONS = 10
-PRUNE_GRACE = 100  # iterations after a reset in which nothing is pruned for opacity
-RESET_MARGIN = 200  # iterations of densification that a reset must leave
+PRUNE_GRACE = 100  # iterations after a reset in which no splat is pruned by opacity
+RESET_MARGIN = 200  # iterations of densification that must follow a reset
 MIN_INIT_POINTS = 10_000
-LONGER = 0.25  # power of 1 / factor by which steps are longer: docs/notebook/floaters.md
-VIEWS_WAIT = 200  # iterations before exposures and poses are learned, where the schedule has them
-Learned = TypeVar("Learned", bound=Learning)
+LONGER = 0.25  # power of 1 / factor by which rates are larger: docs/notebook/floaters.md
 Prior = TypeVar("Prior", DepthPrior, NormalPrior)
-MAX_SCALE = 100.0  # six million iterations of 2DGS-R: more is a slip of the keyboard
+MAX_SCALE = 100.0  # six million iterations of 2DGS-R: more is a typing error
 
 
 def scale_schedule(recipe: Recipe, factor: float) -> Recipe:
-    """Return the same recipe, ``factor`` times as long; at factor 1 the recipe itself.
+    """Return a recipe with a schedule ``factor`` times as long.
 
     Parameters
     ----------
     recipe : Recipe
     factor : float
-        Positive. The random start shrinks with its square root (never below 10 000 points, nor above what it was): a
+        Positive. The number of random points to start from shrinks with its square root, to 10 000 at least, because a
         short run cannot place as many splats.
 
     Raises
     ------
     RecipeError
-        A factor that is not in (0, ``MAX_SCALE``].
+        If the factor is not in (0, ``MAX_SCALE``].
     """
     if not 0 < factor <= MAX_SCALE:
         raise RecipeError(f"--schedule-scale must be a positive number up to {MAX_SCALE:g}, got {factor}")
@@ -55,13 +49,13 @@ def scale_schedule(recipe: Recipe, factor: float) -> Recipe:
 
 
 def fit_schedule(recipe: Recipe, iterations: int) -> Recipe:
-    """Return the same recipe with a total of ``iterations``, scaled like :func:`scale_schedule`.
+    """Return a recipe with a total of ``iterations``, scaled like :func:`scale_schedule`.
 
     Parameters
     ----------
     recipe : Recipe
     iterations : int
-        Total of all stages. Each stage has its share of them, to within one, and at least one.
+        Total of all stages. Each stage keeps its fraction of them, to within one, and at least one.
 
     Raises
     ------
@@ -77,7 +71,7 @@ def fit_schedule(recipe: Recipe, iterations: int) -> Recipe:
         )
     factor = iterations / recipe.iterations
     found = [max(1, math.floor(length * factor)) if length else 0 for length in lengths]
-    while missing := iterations - sum(found):  # at most one a stage: the stage that is farthest from its share
+    while missing := iterations - sum(found):  # at most one per stage
         step = 1 if missing > 0 else -1
         open_stages = [i for i, length in enumerate(lengths) if length and found[i] + step >= 1]
         found[max(open_stages, key=lambda i: step * (lengths[i] * factor - found[i]))] += step
@@ -92,22 +86,18 @@ def _scale(recipe: Recipe, factor: float, of_stages: Sequence[float]) -> Recipe:
         recipe,
         stages=tuple(map(_scale_stage, recipe.stages, of_stages)),
         init_points=min(recipe.init_points, points),
-        exposure=None if recipe.exposure is None else _scale_views(recipe.exposure, factor),
-        poses=None if recipe.poses is None else _scale_poses(recipe.poses, factor),
-        intrinsics=None if recipe.intrinsics is None else _scale_poses(recipe.intrinsics, factor),
-        photometry=None if recipe.photometry is None else _scale_poses(recipe.photometry, factor),
-        learned=tuple(_scale_poses(quantity, factor) for quantity in recipe.learned),
+        learned=tuple(quantity.scaled(factor) for quantity in recipe.learned),
         depth_prior=None if recipe.depth_prior is None else _scale_prior(recipe.depth_prior, factor),
         normal_prior=None if recipe.normal_prior is None else _scale_prior(recipe.normal_prior, factor),
     )
 
 
 def longer_steps(recipe: Recipe, factor: float) -> Recipe:
-    """Return the recipe with rates for a schedule ``factor`` times as long as they were chosen for.
+    """Return a recipe with larger rates for a schedule that was scaled by ``factor`` < 1.
 
-    Adam's steps do not grow with gradients: in fewer of them a splat gets as far only if each is longer. All rates of
-    splats are multiplied by ``factor ** -LONGER`` (2.1 at a twentieth); at factor 1 and above nothing changes. Stages
-    whose own rates say how they grow (``LearningRates.stretch``) are left as they are.
+    With fewer steps of Adam, each must be longer. All rates of splats are multiplied by ``factor ** -LONGER`` (2.1 at a
+    twentieth). Stages with ``LearningRates.stretch`` do not change, because :func:`scale_schedule` has scaled their
+    rates.
     """
     if factor >= 1:
         return recipe
@@ -123,19 +113,6 @@ def _scale_prior(prior: Prior, factor: float) -> Prior:
     return replace(prior, decay_steps=_scaled(prior.decay_steps, factor))
 
 
-def _scale_views(learned: Learned, factor: float) -> Learned:
-    """Splats become a scene, and leave the grey they start from, by the count of iterations, not by its share."""
-    decay_steps = _scaled(learned.decay_steps, factor)
-    least = min(learned.start, VIEWS_WAIT, decay_steps // 6)
-    return replace(learned, decay_steps=decay_steps, start=max(least, round(learned.start * factor)))
-
-
-def _scale_poses(learned: Learned, factor: float) -> Learned:
-    """Scale the steps of cameras: one moves when its image has its turn, and takes longer steps with fewer."""
-    longer = 1 / math.sqrt(factor)
-    return replace(_scale_views(learned, factor), rate=learned.rate * longer, rate_final=learned.rate_final * longer)
-
-
 def _scale_stage(stage: Stage, factor: float) -> Stage:
     return replace(
         stage,
@@ -143,7 +120,6 @@ def _scale_stage(stage: Stage, factor: float) -> Stage:
         losses=tuple(replace(term, start=round(term.start * factor)) for term in stage.losses),
         lr=_scale_lr(stage.lr, factor),
         sh_interval=_scaled(stage.sh_interval, factor),
-        halve_at=tuple(round(at * factor) for at in stage.halve_at),
         densify=None if stage.densify is None else _scale_densify(stage.densify, factor),
     )
 
@@ -166,8 +142,6 @@ def _scale_densify(densify: GradDensify | Densify, factor: float) -> GradDensify
     densify = replace(
         densify,
         scale_cull_start=None if cull is None else round(cull * factor),
-        prune_until=round(densify.prune_until * factor),
-        reset_at_on_white=tuple(_scaled(at, factor) for at in densify.reset_at_on_white),
     )
     wanted = min(MIN_DENSIFICATIONS, count_densifications(densify))
     every = densify.every
@@ -187,10 +161,10 @@ def _scale_densify(densify: GradDensify | Densify, factor: float) -> GradDensify
 
 
 def count_densifications(densify: GradDensify) -> int:
-    """How many multiples of ``every`` lie strictly between ``start`` and ``stop``."""
+    """Return the number of densifications of a stage."""
     return max(0, (densify.stop - 1) // densify.every - densify.start // densify.every)
 
 
 def _scaled(count: int, factor: float) -> int:
-    """Return a count of iterations, scaled; something stays something, and 0 (off) stays 0."""
+    """Return a scaled number of iterations, at least 1; 0 (off) stays 0."""
     return max(1, round(count * factor)) if count > 0 else 0

@@ -16,12 +16,9 @@ from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from gs2d.config.densify import Densify
-from gs2d.config.recipe import CloneInPlace, GradDensify, RankByError, Recipe, validate
+from gs2d.config.recipe import GradDensify, Recipe, validate
 from gs2d.config.registry import absent_guests
 from gs2d.errors import RecipeError
-
-ACTIONS: Mapping[str, type] = {"rank_by_error": RankByError, "clone_in_place": CloneInPlace}
-ACTION_KEY = "action"
 
 
 def to_json(recipe: Recipe) -> dict[str, Any]:
@@ -59,7 +56,7 @@ def apply_overrides(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
         more dots: ``surface.densify.grad_threshold=1e-4``, ``refine.lr.sh0=0.001``; losses by their kind,
         ``surface.losses.normal_consistency.weight=0.1``, their options by
         ``surface.losses.normal_consistency.options.where=object``; entry actions by their name,
-        ``refine.on_enter.clone_in_place.opacity=preserve``; ``refine.train.means=null`` freezes an attribute.
+        ``refine.on_enter.clone_in_place.options.opacity=preserve``; ``refine.train.means=null`` freezes an attribute.
         Values are JSON; what is not JSON is taken as a string.
 
     Returns
@@ -131,9 +128,8 @@ def _set_trained(train: dict[str, Any], attribute: str, rows: Any) -> None:
 
 def _entry(entries: list[Any], word: str, override: str) -> Any:
     """Return the loss of a kind, or the action or the learned quantity of a name."""
-    keys = ("kind", ACTION_KEY, "name")
     known = [entry if isinstance(entry, dict) else {} for entry in entries]
-    tags = [next((str(entry[key]) for key in keys if key in entry), "?") for entry in known]
+    tags = [str(entry.get("kind", entry.get("name", "?"))) for entry in known]
     if word not in tags:
         raise RecipeError(f"override {override!r}: no entry {word!r}; there is {', '.join(tags) or 'none'}")
     return entries[tags.index(word)]
@@ -142,9 +138,7 @@ def _entry(entries: list[Any], word: str, override: str) -> Any:
 def encode(value: Any) -> Any:
     """Return a dataclass, with all it holds, as plain dicts, lists, numbers and strings."""
     if is_dataclass(value) and not isinstance(value, type):
-        encoded = {entry.name: encode(getattr(value, entry.name)) for entry in fields(value)}
-        tags = [name for name, kind in ACTIONS.items() if type(value) is kind]
-        return {ACTION_KEY: tags[0], **encoded} if tags else encoded
+        return {entry.name: encode(getattr(value, entry.name)) for entry in fields(value)}
     if isinstance(value, Mapping):
         return {str(key): encode(entry) for key, entry in value.items()}
     if isinstance(value, tuple | list):
@@ -184,13 +178,8 @@ def _decode_union(value: Any, kinds: tuple[Any, ...], where: str) -> Any:
     if Densify in kinds:  # by its name, or by the fields of 2DGS's own
         named = isinstance(value, Mapping) and "name" in value
         kinds = (Densify if named else GradDensify,)
-    if len(kinds) == 1:
-        return decode(value, kinds[0], where)
-    tag = value.get(ACTION_KEY) if isinstance(value, Mapping) else None
-    if tag not in ACTIONS:
-        raise RecipeError(f"{where} needs {ACTION_KEY!r}, one of {', '.join(ACTIONS)}; got {tag!r}")
-    rest = {key: entry for key, entry in value.items() if key != ACTION_KEY}
-    return decode(rest, ACTIONS[str(tag)], where)
+    (only,) = kinds
+    return decode(value, only, where)
 
 
 @cache  # looked up in the names of a module each time, by typing: some ms for a recipe

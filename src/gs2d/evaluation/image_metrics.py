@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gs2d.core.checks import check_shapes
 from gs2d.evaluation.lpips import MIN_SIZE, REMEDY, Lpips
-from gs2d.losses import api as losses
+from gs2d.losses import base as losses
 from gs2d.render.backends import Backend
 
 

@@ -1,4 +1,4 @@
-"""Splats in the free space of a photograph, natively (``cpu/free_space.cpp``); ``training/free_space.py`` judges it."""
+"""Splats in the free space of a photograph, natively; ``training/robust/free_space_maps.py`` has the same in torch."""
 
 from __future__ import annotations
 

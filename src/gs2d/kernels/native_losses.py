@@ -2,7 +2,7 @@
 
 Each function computes the gradient in its forward pass, for the cotangent that the caller expects (the weights of the
 loss terms), and hands it out in the backward pass. Another cotangent gives the right gradient too, at the price of a
-second pass. The formulas are in ``kernels/core/losses.h``; ``losses.reference`` has the same in torch.
+second pass. The formulas are in ``kernels/core/losses.h``; ``losses.formulas`` has the same in torch.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class NormalOptions:
     weights : Tensor [H, W] or None
         By which each pixel's part is multiplied; a constant.
     at_camera : bool
-        Whether empty pixels lie at the camera's centre: ``edges`` of ``losses.reference.normals_from_depth``.
+        Whether empty pixels lie at the camera's centre: ``edges`` of ``losses.formulas.normals_from_depth``.
     per_splat : bool
         The paper's form, mean(alpha - <n, N>), instead of the official mean(1 - alpha <n, N>) with alpha detached.
     """
@@ -272,7 +272,7 @@ def normal_consistency(
     expected: float = 0.05,
     library: Library | None = None,
 ) -> Tensor:
-    """Return normal consistency [], the native form of the functions of the same name in ``losses.reference``.
+    """Return normal consistency [], the native form of the functions of the same name in ``losses.formulas``.
 
     Parameters
     ----------

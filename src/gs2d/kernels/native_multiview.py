@@ -1,6 +1,6 @@
 """Patches of a view beside those of a neighbour, for autograd: values, and gradients made on the way forward.
 
-The formulas are in ``kernels/core/multiview.h``; ``losses.multiview`` has the same in torch. The same bits for any
+The formulas are in ``kernels/core/multiview.h``; ``losses.view_pair`` has the same in torch. The same bits for any
 number of threads. A backend adds a :data:`Run`, which fills rows of numbers for each pixel; the rest is here.
 """
 

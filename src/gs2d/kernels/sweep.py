@@ -1,4 +1,4 @@
-"""The plane sweep of one image, natively (``cpu/sweep.cpp``); ``training/plane_sweep.py`` has the same in torch."""
+"""The plane sweep of one image, natively; ``training/start/plane_sweep.py`` has the same in torch."""
 
 from __future__ import annotations
 

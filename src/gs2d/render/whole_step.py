@@ -45,7 +45,7 @@ class StepNormals(NamedTuple):
     depth : "mean" or "median"
         Depth that the normals come from.
     at_camera : bool
-        Whether empty pixels lie at the camera's centre (``losses.reference.normals_from_depth``).
+        Whether empty pixels lie at the camera's centre (``losses.formulas.normals_from_depth``).
     of_object : bool
         Whether only the object counts: by the image's alpha, else the rendered one.
     """

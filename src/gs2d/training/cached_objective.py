@@ -1,8 +1,7 @@
 """Loss and gradients from cached views, for a stage in which only the colours of a row group learn (stage 2).
 
-Each view is then affine in those colours (:mod:`gs2d.render.cpu_cached`). Everything in the cache depends on what is
-frozen alone, so a resumed run builds the same cache. Which views have a place is decided when the stage begins, by
-their order and size: the same for any number of threads, and after any resume.
+Each view is then affine in those colours (:mod:`gs2d.render.cpu_cached`). The cache depends on frozen attributes only,
+so a resumed run builds the same cache. The cached views are chosen when the stage begins, by their order and size.
 """
 
 from __future__ import annotations
@@ -12,23 +11,24 @@ from dataclasses import replace
 from torch import Tensor
 
 from gs2d.config.recipe import Recipe, Stage
-from gs2d.losses.api import Losses
+from gs2d.losses.base import Losses
 from gs2d.render.backends import Backend
 from gs2d.render.cpu_cached import CachedView
 from gs2d.render.types import RenderOutput
-from gs2d.training.objective import FullRender, Objective, StepResult
+from gs2d.training.objective import FullRender, Objective, Rendered
 from gs2d.training.state import TrainState
+from gs2d.training.step_result import StepResult
 
 COLORS = frozenset({"sh0", "shN"})
-MIN_FRACTION = 0.5  # of the views: a cache for fewer saves little of a stage, and takes its memory all the same
-WORTH = 2  # visits per view from which filling, about two forward passes, is repaid
+MIN_FRACTION = 0.5  # of the views: a cache for fewer saves little time
+WORTH = 2  # visits per view that repay filling the cache, which costs about two forward passes
 
 
 def is_cacheable(recipe: Recipe, stage: Stage, *, backend: Backend, views: int, processes: int = 1) -> bool:
-    """Whether a stage can train from cached views, and is long enough to gain by it.
+    """Return whether a stage can train from cached views, and is long enough to gain from it.
 
-    It trains the colours of one row group and nothing else, at one SH degree, by losses of the colour image. Each of
-    several ``processes`` visits each view so many times less.
+    Such a stage trains only the colours of one row group, at one SH degree, with losses of the colour image. Each of
+    several ``processes`` visits only its share of the views.
     """
     groups = set(stage.train.values())
     return (
@@ -37,7 +37,6 @@ def is_cacheable(recipe: Recipe, stage: Stage, *, backend: Backend, views: int, 
         and len(groups) == 1
         and "all" not in groups
         and stage.densify is None
-        and not stage.halve_at
         and all(loss.only_color for _, loss in Losses(stage.losses))
         and stage.active_sh_degree(1, recipe.sh_degree) == stage.active_sh_degree(stage.iterations, recipe.sh_degree)
         and stage.iterations >= WORTH * views * processes
@@ -47,7 +46,7 @@ def is_cacheable(recipe: Recipe, stage: Stage, *, backend: Backend, views: int, 
 def choose_objective(
     whole: FullRender, state: TrainState, stage: Stage, limit_bytes: int, processes: int = 1
 ) -> Objective:
-    """Return cached views where the stage allows them and ``limit_bytes`` hold enough of them, else ``whole``."""
+    """Return cached views if the stage allows them and enough fit in ``limit_bytes``, else ``whole``."""
     backend, views = whole.backend, len(whole.scene.train)
     fits = is_cacheable(whole.recipe, stage, backend=backend, views=views, processes=processes)
     if limit_bytes > 0 and whole.frozen is None and fits:
@@ -57,26 +56,26 @@ def choose_objective(
 
 
 class CachedViews:
-    """The first training views that fit in ``limit_bytes`` are cached; ``whole`` evaluates the others.
+    """Caches the first training views that fit in ``limit_bytes``; ``whole`` evaluates the others.
 
     Parameters
     ----------
     whole : FullRender
     state : TrainState
-        The geometry, the opacity and the colours outside the group stay as they are here.
+        Geometry, opacity and the colours outside the group stay constant.
     stage : Stage
-        One that ``is_cacheable``.
+        A stage for which :func:`is_cacheable` is true.
     limit_bytes : int
-        Of all cached views together.
+        Limit for all cached views together.
     least : float
-        Where fewer views than that would fit, were all as large as the first, none is cached.
+        If fewer views of the size of the first would fit, none is cached.
 
     Attributes
     ----------
     rows : Tensor [M] int64
-        The group.
+        Rows of the group.
     views : list of CachedView
-        Of training views 0, 1, ...
+        Training views 0, 1, ...
     """
 
     def __init__(
@@ -98,14 +97,14 @@ class CachedViews:
     def evaluate(
         self, state: TrainState, stage: Stage, iteration: int, index: int, probe: Tensor | None = None
     ) -> StepResult:
-        """Loss and gradients of training view ``index``, checked to be finite (DivergedError)."""
+        """Return loss and gradients of training view ``index``."""
         if index >= len(self.views):
             return self._whole.evaluate(state, stage, iteration, index, probe)
         parameters = dict(state.splats.items())
         leaves = {name: parameters[name][self.rows].requires_grad_(name in stage.train) for name in sorted(COLORS)}
         color = self.views[index].render(leaves["sh0"], leaves["shN"])
-        unseen = color.new_empty(0)  # the losses of such a stage look at nothing else
+        unseen = color.new_empty(0)  # losses of such a stage read only the colour
         output = RenderOutput(color, unseen, unseen, unseen, unseen, unseen, unseen)
-        camera = self._whole.camera(state, index)  # of a stage that moves no splats: it stands still
-        found = self._whole.differentiate(state, stage, iteration, index, camera, output, leaves)
+        camera = self._whole.camera(state, index)  # constant in a stage that moves no splats
+        found = self._whole.differentiate(state, stage, iteration, Rendered(index, camera, output, leaves))
         return replace(found, rows=self.rows)

@@ -177,15 +177,12 @@ class Phase:
         Steps that an interrupted run had done.
     growth : float
         For steps of increasing cost: the first fraction s of the steps takes the fraction s ** growth of the time.
-    costs : tuple of (int, float)
-        Numbers of steps with the relative cost of each, where costs differ.
     """
 
     name: str
     total: int
     done: int = 0
     growth: float = 1.0
-    costs: tuple[tuple[int, float], ...] = ()
 
     def seconds_left(self, done: int, elapsed: float) -> float | None:
         """Return the seconds until the phase ends, after ``elapsed`` seconds; None: too early to estimate."""
@@ -203,12 +200,7 @@ class Phase:
 
     def _time_share(self, steps: int) -> float:
         """Return the fraction of the time of the phase that its first ``steps`` take."""
-        costs = self.costs or ((self.total, 1.0),)
-        spent, left = 0.0, steps
-        for count, cost in costs:
-            spent += min(count, left) * cost
-            left -= min(count, left)
-        return float((spent / sum(count * cost for count, cost in costs)) ** self.growth)
+        return float((steps / self.total) ** self.growth)
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,10 @@
-"""Loss and gradients of one training view, by rendering all of it."""
+"""Loss and gradients of one training view, rendered in full."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Protocol as Interface
 
 import torch
@@ -16,25 +16,26 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DivergedError
-from gs2d.losses.api import LossReport, LossView, compute_losses, losses_of
-from gs2d.losses.multiview import Neighbour
+from gs2d.losses.base import LossReport, LossView, compute_losses, losses_of
+from gs2d.losses.view_pair import Neighbour
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.training.dropout import dropout_rate, dropped_out, kept_splats
 from gs2d.training.learned.appearance import shown, shown_splats
 from gs2d.training.learned.learned_table import LearnedTable, first_not_finite_quantity
 from gs2d.training.learned.quantity import ImagePoints
-from gs2d.training.multiview import PATCH_BYTES, ImageFiles, draw_turn, find_neighbours
-from gs2d.training.opaque import another_background
+from gs2d.training.neighbours import PATCH_BYTES, ImageFiles, draw_turn, find_neighbours
+from gs2d.training.robust.dropout import dropout_rate, dropped_out, kept_splats
+from gs2d.training.robust.opaque import another_background
 from gs2d.training.state import TrainState
+from gs2d.training.step_result import StepResult
 from gs2d.training.targets import Target, TargetSource
 
 
 def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> RasterSettings:
-    """Return the rasterizer's constants for a scene of this extent (world units) under a protocol."""
+    """Return the rasterizer settings for a scene of this extent (world units) under a protocol."""
     near = protocol.near_for(extent)
-    # far only scales the distortion; in a large frame it keeps the ratio to near that 0.2 and 100 have.
+    # far only scales the distortion; in a large frame it keeps its default ratio to near.
     far = max(RasterSettings.far, near * RasterSettings.far / RasterSettings.near)
     return RasterSettings(
         near=near,
@@ -47,7 +48,7 @@ def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> Raster
 
 @torch.no_grad()
 def visible_mask(splats: Splats, views: Sequence[View], settings: RasterSettings, backend: Backend) -> Tensor:
-    """Splats [N] bool whose footprint reaches a pixel of some view, hidden there or not."""
+    """Return the splats [N] bool whose footprint reaches a pixel of any view, hidden there or not."""
     bare = replace(settings, sh_degree=0, with_distortion=False)
     seen = torch.zeros(len(splats), dtype=torch.bool, device=splats.device)
     for view in views:
@@ -56,56 +57,31 @@ def visible_mask(splats: Splats, views: Sequence[View], settings: RasterSettings
 
 
 @dataclass(frozen=True, eq=False)
-class StepResult:
-    """Loss terms of one iteration with the gradients of the trained attributes and, if gathered, screen gradients.
+class Rendered:
+    """A rendered training view, to be compared with its image.
 
     Attributes
     ----------
-    losses : mapping of kind to float or Tensor []
-        Weighted. Tensors on a GPU: to read them is to wait for it.
-    gradients : mapping of attribute to Tensor
-        Like the attributes; only of ``rows``, in their order, where those are given.
-    signal : Tensor [N, 2] or [N, 4], or None
-    radii : Tensor [N] px or None
-        None where nothing was projected.
-    rows : Tensor [M] int64 or None
-    learned : mapping of name to Tensor
-        Gradients of what is learned of the image and its camera (``gs2d.training.learned``).
-    """
-
-    losses: Mapping[str, float | Tensor]
-    gradients: Mapping[str, Tensor]
-    signal: Tensor | None
-    radii: Tensor | None
-    rows: Tensor | None = None
-    learned: Mapping[str, Tensor] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
-class ViewResidual:
-    """How a rendered training view differs from its photograph.
-
-    Attributes
-    ----------
-    error : Tensor [H, W]
-        Mean absolute difference of the channels; 0 where a mask says that the pixel does not count.
+    index : int
+        Index of the training view.
     camera : Camera
-        That it was seen by, and ``settings`` that it was rendered with.
-    settings : RasterSettings
-    frozen : Splats or None
-        Splats that were rendered too, and are not in training.
+    output : RenderOutput
+    leaves : mapping of attribute to Tensor
+        Tensors that ``output`` was rendered from.
+    neighbour : Neighbour or None
     """
 
-    error: Tensor
+    index: int
     camera: Camera
-    settings: RasterSettings
-    frozen: Splats | None = None
+    output: RenderOutput
+    leaves: Mapping[str, Tensor]
+    neighbour: Neighbour | None = None
 
 
 class Objective(Interface):
-    """How a stage gets the loss and the gradients of a view.
+    """Computes the loss and the gradients of a view in a stage.
 
-    ``rows`` [M] int64 are those of which gradients may come alone; None: they come of all.
+    ``rows`` [M] int64: gradients may be of these rows alone; None: of all rows.
     """
 
     rows: Tensor | None
@@ -113,11 +89,11 @@ class Objective(Interface):
     def evaluate(
         self, state: TrainState, stage: Stage, iteration: int, index: int, probe: Tensor | None = None
     ) -> StepResult:
-        """Loss and gradients of a training view, and of a screen probe; checked to be finite (DivergedError)."""
+        """Return loss and gradients of a training view; raise DivergedError if they are not finite."""
 
 
 class FullRender:
-    """Every splat is rendered each time, and with them those of ``frozen``, which stay as they are."""
+    """Renders all splats in each iteration, followed by those of ``frozen``, which get no gradients."""
 
     rows: Tensor | None = None
 
@@ -146,7 +122,7 @@ class FullRender:
     def settings(
         self, stage: Stage, iteration: int, background: tuple[float, float, float] | None = None
     ) -> RasterSettings:
-        """Return the rasterizer's constants at an iteration (1-based), over the protocol's background or another."""
+        """Return the rasterizer settings at an iteration (1-based), over the protocol's background or another."""
         degree = stage.active_sh_degree(iteration, self.recipe.sh_degree)
         active = [term for term in stage.losses if term.is_active(iteration)]
         settings = replace(
@@ -158,33 +134,33 @@ class FullRender:
         return settings.for_depths(*(term.depth or self.protocol.depth for term in active))
 
     def drawn(self, splats: Splats) -> Splats:
-        """Return the splats, and in rows behind them those that are frozen: what photographs show."""
+        """Return the splats, followed by the frozen ones."""
         return splats if self.frozen is None else splats.followed_by(self.frozen)
 
     def drops(self, stage: Stage) -> float:
-        """Return the part of the splats that iterations of a stage leave out."""
+        """Return the fraction of the splats that iterations of a stage leave out."""
         return dropout_rate(self.recipe, stage, len(self.scene.train))
 
     def _left(self, splats: Splats, state: TrainState, stage: Stage, iteration: int) -> Splats:
-        """Return what an iteration draws: all but those of the splats that it leaves out."""
+        """Return the splats that an iteration renders."""
         rate = self.drops(stage)
         if rate > 0:
             splats = dropped_out(splats, kept_splats(self.recipe, state.stage, iteration, len(splats), rate))
         return self.drawn(splats)
 
     def camera(self, state: TrainState, index: int, *, learning: Collection[str] = ()) -> Camera:
-        """Return the camera of training view ``index`` where it is now; with gradients of what is ``learning``."""
+        """Return the current camera of training view ``index``, with gradients for the quantities in ``learning``."""
         return self.learned.camera(state.learned, index, self.scene.train[index].camera, learning)
 
     def _seen(self, state: TrainState, index: int) -> tuple[Camera, Target]:
-        """Return the camera of a view and its photograph, as a rendering of that camera would show it."""
+        """Return the current camera of a view, and its image as that camera shows it."""
         camera = self.camera(state, index)
         return camera, self.learned.target(state.learned, index, camera, self.targets[index])
 
     def evaluate(
         self, state: TrainState, stage: Stage, iteration: int, index: int, probe: Tensor | None = None
     ) -> StepResult:
-        """Render one view; loss and gradients, checked to be finite (DivergedError; not on a GPU)."""
+        """Render one view and return loss and gradients; on the CPU, raise DivergedError if they are not finite."""
         splats = state.splats
         leaves = Splats(**{k: t.detach().requires_grad_(k in stage.train) for k, t in splats.items()})
         camera = self.camera(state, index, learning=self.learned.learning(state.stage, iteration))
@@ -192,42 +168,30 @@ class FullRender:
         if another is not None and self.targets[index].silhouette is not None:
             another = None
         settings = self.settings(stage, iteration, another)
-        rows = learning_rows(state, stage) if probe is None else None  # the signal is of every splat
+        rows = learning_rows(state, stage) if probe is None else None  # the signal covers all splats
         drawn, of_all = self._left(leaves, state, stage, iteration), probe
         rows = self._with_frozen(rows, len(splats), camera)
         if self.frozen is not None and probe is not None:
             of_all = torch.cat([probe, probe.new_zeros(len(self.frozen), probe.shape[1])])
         output = rasterize(drawn, camera, settings, backend=self.backend, screen_probe=of_all, gradient_rows=rows)
         neighbour = self.neighbour_of(state, stage, iteration, index, splats)
-        given = (index, camera, output, dict(leaves.items()), neighbour)
-        found = self.differentiate(state, stage, iteration, *given)
+        rendered = Rendered(index, camera, output, dict(leaves.items()), neighbour)
+        found = self.differentiate(state, stage, iteration, rendered)
         signal = None if probe is None else _gradient(probe)
         return replace(found, signal=signal, radii=output.radii[: len(splats)])
 
     def _with_frozen(self, rows: Tensor | None, count: int, camera: Camera) -> Tensor | None:
-        """Return the rows [N + frozen] that have gradients, of those [N] among ``count`` splats in training."""
-        if self.frozen is None or camera.pose is not None:  # a camera's gradient is a sum over all splats
+        """Extend the rows [N] with gradients by the frozen splats, which have none."""
+        if self.frozen is None or camera.pose is not None:  # the gradient of a camera sums over all splats
             return rows
         own = self.frozen.means.new_ones(count, dtype=torch.bool) if rows is None else rows
         return torch.cat([own, own.new_zeros(len(self.frozen))])
 
     @torch.no_grad()
-    def residual(self, state: TrainState, stage: Stage, iteration: int, index: int) -> ViewResidual:
-        """Render view ``index`` as it is trained on at an iteration (from 1), beside its photograph."""
-        camera, target = self._seen(state, index)
-        settings = replace(self.settings(stage, iteration), with_distortion=False)
-        color = rasterize(self.drawn(state.splats), camera, settings, backend=self.backend).color
-        numbers = self.learned.numbers(state.learned, index, color)
-        color = shown(color, numbers, self._points(camera, target), clipped_pixels(target))
-        error = (color - target.image).abs().mean(dim=2)
-        error = error if target.mask is None else error * target.mask
-        return ViewResidual(error, camera, settings, self.frozen)
-
-    @torch.no_grad()
     def errors(
         self, state: TrainState, index: int, splats: Splats, settings: RasterSettings, *, occlusion: bool
     ) -> Tensor:
-        """Return the inner sum of E_i of splats [N] in training view ``index``, in the colours that it shows."""
+        """Return the inner sum of E_i [N] in training view ``index``, in the colours of its image."""
         camera, target = self._seen(state, index)
         if self.learned.changes_color:
             numbers = self.learned.numbers(state.learned, index, splats.means)
@@ -237,14 +201,14 @@ class FullRender:
         return splat_errors(splats, camera, target.image, settings, **given)  # type: ignore[arg-type]
 
     def _points(self, camera: Camera, target: Target) -> ImagePoints:
-        """Return the pixels of a photograph."""
+        """Return the pixels of a training image."""
         return ImagePoints(camera, target.silhouette, None if target.silhouette is None else self._background)
 
     @torch.no_grad()
     def neighbour_of(
         self, state: TrainState, stage: Stage, iteration: int, index: int, splats: Splats
     ) -> Neighbour | None:
-        """Return the view that view ``index`` is compared with in an iteration, rendered; None: with none."""
+        """Return the neighbour that view ``index`` is compared with in an iteration, rendered; None without one."""
         settings, terms = self.recipe.multiview, self.losses.needing("neighbour", stage.losses)
         if settings is None or not any(term.weight and term.is_active(iteration) for term in terms):
             return None
@@ -263,7 +227,7 @@ class FullRender:
     def report(
         self, state: TrainState, index: int, settings: RasterSettings, backend: Backend
     ) -> dict[str, LossReport]:
-        """Return what the losses say of training view ``index`` as it is now."""
+        """Return the reports of the losses on the current rendering of training view ``index``."""
         camera, target = self.camera(state, index), self.targets[index]
         output = rasterize(self.drawn(state.splats), camera, settings, backend=backend)
         view = LossView(
@@ -277,34 +241,26 @@ class FullRender:
         reports = {name: loss.report(output, view) for name, loss in self.losses.reporters.items()}
         return {name: report for name, report in reports.items() if report is not None}
 
-    def differentiate(
-        self,
-        state: TrainState,
-        stage: Stage,
-        iteration: int,
-        index: int,
-        camera: Camera,
-        output: RenderOutput,
-        leaves: Mapping[str, Tensor],
-        neighbour: Neighbour | None = None,
-    ) -> StepResult:
-        """Weighted loss terms of a rendered view, and the gradients of the leaves that the stage trains.
+    def differentiate(self, state: TrainState, stage: Stage, iteration: int, rendered: Rendered) -> StepResult:
+        """Return the weighted losses of a rendered view, and the gradients of the leaves that the stage trains.
 
-        Colours are compared as the photograph shows them. What is learned of the image and of its camera has gradients,
-        too; that of the camera if it is the one that ``output`` was rendered by.
+        Colours are compared as the training image shows them. Learned quantities of the image and its camera get
+        gradients, too.
 
         Raises
         ------
         DivergedError
-            If one of them is not finite. On a GPU nothing is looked at here, because a look waits for the device; the
-            trainer looks at losses and parameters together, before anything is reported or saved.
+            If a loss or a gradient is not finite. Not on a GPU, where reading a value waits for the device: there the
+            trainer checks losses and parameters together, before anything is reported or saved.
         """
+        index, camera, output = rendered.index, rendered.camera, rendered.output
+        leaves, neighbour = rendered.leaves, rendered.neighbour
         target = self.targets[index]
         at = self._points(camera, target)
         numbers = self.learned.leaves(state.learned, index, camera, output.color)
         if numbers:
             color = shown(output.color, numbers, at, clipped_pixels(target))
-            if at.inside is not None:  # what the rendering does not reach teaches nothing
+            if at.inside is not None:  # pixels outside the rendering have no loss
                 color = torch.where(at.inside[..., None], color, target.image)
             output = replace(output, color=color)
         view = LossView(
@@ -317,7 +273,7 @@ class FullRender:
             depth_kind=self.protocol.depth,
             silhouette=target.silhouette,
             neighbour=neighbour,
-            maps=target.maps,
+            target_mean=target.mean,
         )
         resolved = self.protocol.resolve(stage.losses)
         if neighbour is None:
@@ -332,7 +288,7 @@ class FullRender:
         }
         if watched:
             check_losses(stage, iteration, values)
-        if loss.requires_grad:  # not where no splat is in the picture
+        if loss.requires_grad:  # False if no splat is in the image
             loss.backward()
         gradients = {name: _gradient(tensor) for name, tensor in leaves.items() if name in stage.train}
         learned = self.learned.gradients(numbers, index, camera)
@@ -344,20 +300,20 @@ class FullRender:
 
 
 def no_view(state: TrainState, stage: Stage, probe: Tensor | None) -> StepResult:
-    """Return the result of an iteration that shows nothing: zeros."""
+    """Return the result of a process without a view: zeros."""
     gradients = {name: torch.zeros_like(tensor) for name, tensor in state.splats.items() if name in stage.train}
     radii = state.splats.opacity_logits.new_zeros(len(state.splats))
     return StepResult({}, gradients, None if probe is None else torch.zeros_like(probe).detach(), radii)
 
 
 def clipped_pixels(target: Target) -> Tensor:
-    """Where a photograph is at its ceiling [H, W, 3]; not in the white that is put behind one with an alpha channel."""
+    """Return where an image is clipped [H, W, 3], except in the background of images with an alpha channel."""
     clipped = target.image >= 1
     return clipped if target.silhouette is None else clipped & (target.silhouette[..., None] > 0)
 
 
 def is_async(device: torch.device) -> bool:
-    """Whether the host would wait to look at a tensor there."""
+    """Return whether reading a tensor on this device makes the host wait."""
     return device.type != "cpu"
 
 
@@ -376,7 +332,7 @@ def check_losses(stage: Stage, iteration: int, losses: Mapping[str, float | Tens
 
 
 def learning_rows(state: TrainState, stage: Stage) -> Tensor | None:
-    """Return the splats [N] of which the stage trains anything; None where it trains an attribute of all."""
+    """Return the splats [N] bool that the stage trains; None if it trains an attribute of all splats."""
     groups = set(stage.train.values())
     if not groups or "all" in groups:
         return None
@@ -384,7 +340,7 @@ def learning_rows(state: TrainState, stage: Stage) -> Tensor | None:
 
 
 def diverged(stage: Stage, iteration: int, what: str) -> DivergedError:
-    """Return the error for something that is not finite."""
+    """Return the error for a value that is not finite."""
     return DivergedError(
         f"training diverged at iteration {iteration} of stage {stage.name!r}: {what} is NaN or infinite; "
         f"lower a rate (--set {stage.name}.lr.means=...) or check the cameras and photographs"
@@ -392,11 +348,11 @@ def diverged(stage: Stage, iteration: int, what: str) -> DivergedError:
 
 
 def _gradient(leaf: Tensor) -> Tensor:
-    """Return the gradient of a leaf; zero where nothing depends on it."""
+    """Return the gradient of a leaf; zeros if the loss does not depend on it."""
     return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
 
 
 def first_not_finite(tensors: Mapping[str, Tensor], backend: Backend) -> str | None:
-    """Return the name of the first tensor that holds a NaN or an infinity; None if all are finite."""
+    """Return the name of the first tensor with a NaN or an infinity; None if all are finite."""
     number = backend.first_not_finite(list(tensors.values()))
     return None if number is None else list(tensors)[number]

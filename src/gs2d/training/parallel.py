@@ -1,12 +1,12 @@
 """Several processes that train one scene, each with another view of the same iteration (views in parallel).
 
-All of them hold the whole state. An iteration takes as many views as there are processes: each process renders one,
-the gradients become those of the mean of the losses, and each does the same update. What is drawn comes from the same
-generator everywhere; what is decided by a look at all views is summed up, or decided by process 0 for all. So the
-states stay the same to the bit, which :meth:`ManyProcesses.check` watches.
+Each process holds the whole state. An iteration takes as many views as there are processes: each process renders one,
+the gradients are averaged, and all processes do the same update. Random numbers come from generators with the same
+state. Sums over all views are reduced over the processes, and process 0 decides for all. So the states stay identical
+bit by bit, which :meth:`ManyProcesses.check` verifies.
 
-The trainer asks one object: :data:`ONE_PROCESS`, which does nothing, or :class:`ManyProcesses` (``torch.distributed``:
-gloo in the host's memory, NCCL on GPUs). docs/notebook/processes.md says why it is so.
+The trainer uses one object: :data:`ONE_PROCESS`, which does nothing, or :class:`ManyProcesses` (``torch.distributed``
+with gloo on the CPU and NCCL on GPUs). Reasons: docs/notebook/processes.md.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ from torch import Tensor
 from gs2d.core.processes import Place
 from gs2d.core.splats import Splats
 from gs2d.errors import RunError
-from gs2d.training.objective import StepResult
 from gs2d.training.state import TrainState
+from gs2d.training.step_result import StepResult
 
 T = TypeVar("T")
 Statistics = Mapping[str, Tensor]
-FAILED = "gs2d/failed"  # key of the store: a process has said why it ended
+FAILED = "gs2d/failed"  # key of the store, set when a process reports why it ends
 
 
 @dataclass(frozen=True)
 class Turn:
-    """A view in an iteration (from 1 in its stage): ``index`` of the training views."""
+    """An iteration (from 1 in its stage) and the index of its training view."""
 
     iteration: int
     index: int
 
 
 class LostContactError(RunError):
-    """Another process of the training is gone. ``told``: another one says so, or why."""
+    """Another process of the training has ended. ``told``: another process reports that."""
 
     def __init__(self, message: str, *, told: bool) -> None:
         super().__init__(message)
@@ -50,13 +50,13 @@ class LostContactError(RunError):
 
 
 class OneProcess:
-    """A training by itself: what several processes do together is done here, and costs nothing.
+    """Training in a single process: all collective operations do nothing.
 
     Attributes
     ----------
     place : Place
     stop_asked : bool
-        Whether any process was asked to stop, as of the last meeting.
+        Whether any process had received a request to stop at the last :meth:`meet`.
     """
 
     place = Place()
@@ -64,7 +64,7 @@ class OneProcess:
 
     @property
     def size(self) -> int:
-        """Processes in all: views of a full iteration."""
+        """Number of processes, and of views in a full iteration."""
         return self.place.size
 
     @property
@@ -73,14 +73,14 @@ class OneProcess:
         return self.place.leads
 
     def share(self, make: Callable[[], TrainState]) -> TrainState:
-        """Return the state that process 0 makes, or goes on from."""
+        """Return the state that ``make`` returns in process 0."""
         return make()
 
     def meet(self, state: TrainState) -> None:
-        """Wait for the others at the beginning of an iteration."""
+        """Wait for the other processes at the beginning of an iteration."""
 
     def check(self, state: TrainState) -> None:
-        """Raise RunError where the states of the processes differ."""
+        """Raise RunError if the states of the processes differ."""
 
     def evaluate(
         self,
@@ -96,20 +96,21 @@ class OneProcess:
         Parameters
         ----------
         turns : sequence of Turn
-            At most as many as there are processes.
+            At most one for each process.
         one : callable
-            Loss and gradients of one of them.
+            Returns loss and gradients of one view.
         idle : callable
-            The result of a process without a view: zeros.
+            Returns the result of a process without a view: zeros.
         rows : Tensor [M] int64, or None
-            Gradients of splats may come of these rows alone; then all do.
+            Rows that the gradients of splats are restricted to.
         learned : mapping of name to shape
-            What is learned of images and cameras: shape of a row.
+            Shape of a row of each learned quantity.
 
         Returns
         -------
         StepResult
-            ``losses``, ``signal`` and ``radii`` are of this process's own view (:meth:`mean_losses`, :meth:`gather`).
+            ``losses``, ``signal`` and ``radii`` belong to the view of this process (:meth:`mean_losses`,
+            :meth:`gather`).
         sequence of mapping
             ``StepResult.learned`` of each view.
         """
@@ -117,19 +118,19 @@ class OneProcess:
         return result, (result.learned,)
 
     def gather(self, statistics: Statistics, result: StepResult, add: Callable[[Statistics, StepResult], Any]) -> None:
-        """Add what a densifier gathers of each view of the iteration to tensors, in place: ``add`` does it for one."""
+        """Add the statistics of all views of the iteration in place; ``add`` adds those of one view."""
         add(statistics, result)
 
     def mean_losses(self, losses: Mapping[str, float | Tensor], views: int) -> Mapping[str, float | Tensor]:
-        """Return the mean of the losses of the views; a term that a view lacks counts as 0 there."""
+        """Return the mean of the losses over the views; a missing term counts 0."""
         return losses
 
     def part(self, things: Sequence[T]) -> Sequence[T]:
-        """Return the things that this process looks at, where all processes together look at all."""
+        """Return the part of a sequence that this process works on."""
         return things
 
     def sum(self, tensor: Tensor) -> Tensor:
-        """Return the sum of a tensor over the processes, in its place."""
+        """Sum a tensor over the processes in place, and return it."""
         return tensor
 
     def any(self, mask: Tensor) -> Tensor:
@@ -137,7 +138,7 @@ class OneProcess:
         return mask
 
     def decide(self, judge: Callable[[Splats, Tensor], Tensor], splats: Splats, known: Tensor) -> Tensor:
-        """Return what ``judge`` says of each splat, uint8 [N], in process 0; ``known`` is what it knows, bool [N]."""
+        """Return ``judge(splats, known)``, uint8 [N], as computed by process 0; ``known`` is bool [N]."""
         return judge(splats, known)
 
 
@@ -145,13 +146,13 @@ ONE_PROCESS = OneProcess()
 
 
 class ManyProcesses(OneProcess):
-    """The processes of ``torch.distributed``'s default group, which must be there.
+    """The processes of the default group of ``torch.distributed``, which must be initialised.
 
     Parameters
     ----------
     place : Place
     hears : callable
-        Whether this process was asked to stop.
+        Returns whether this process has received a request to stop.
     """
 
     def __init__(self, place: Place, hears: Callable[[], bool] = lambda: False) -> None:
@@ -160,9 +161,9 @@ class ManyProcesses(OneProcess):
         self._group = distributed
         self.place, self.hears = place, hears
 
-    # -- words ---------------------------------------------------------------------------------------------------------
+    # -- messages ------------------------------------------------------------------------------------------------------
     def tell(self, facts: T) -> T:
-        """Return what process 0 says, whatever the others do."""
+        """Return the value of process 0."""
         box: list[Any] = [facts]
         with self.contact():
             self._group.broadcast_object_list(box, src=0)
@@ -170,24 +171,25 @@ class ManyProcesses(OneProcess):
         return told
 
     def announce(self) -> bool:
-        """Let the others know that this process ends, and says why; False where another one was first."""
+        """Announce that this process ends and reports why; return False if another one was first."""
         try:
             store = self._store()
             return store is None or store.add(FAILED, 1) == 1
-        except RuntimeError:  # it was process 0's, and went with it
+        except RuntimeError:  # the store ended with process 0
             return False
 
     @contextmanager
     def contact(self) -> Iterator[None]:
-        """Say in one line that another process is gone."""
+        """Turn a failed operation into one line: another process has ended."""
         try:
             yield
         except RuntimeError as error:
             if not isinstance(error, torch.OutOfMemoryError):
                 reason = " ".join(str(error).split())[:120]
                 raise LostContactError(
-                    f"process {self.place.rank} of {self.size} lost contact with another one, which has ended or is "
-                    f"out of reach ({reason}); go on from the last checkpoint with --resume, with any number of them",
+                    f"process {self.place.rank} of {self.size} lost contact with another process, which has ended or "
+                    f"cannot be reached ({reason}); continue from the last checkpoint with --resume, with any number "
+                    "of processes",
                     told=self._was_told(),
                 ) from error
             raise
@@ -199,7 +201,7 @@ class ManyProcesses(OneProcess):
             return None
 
     def _was_told(self) -> bool:
-        if not self.leads:  # process 0 says it; and the store may be gone with it
+        if not self.leads:  # process 0 reports it; the store may have ended with it
             return True
         try:
             store = self._store()
@@ -209,7 +211,7 @@ class ManyProcesses(OneProcess):
 
     # -- the state -----------------------------------------------------------------------------------------------------
     def share(self, make: Callable[[], TrainState]) -> TrainState:
-        """Return the state that process 0 makes, or goes on from."""
+        """Return the state that ``make`` returns in process 0."""
         state = make() if self.leads else None
         file = io.BytesIO()
         if state is not None:
@@ -226,14 +228,14 @@ class ManyProcesses(OneProcess):
         return TrainState.from_state_dict(torch.load(io.BytesIO(data.numpy().tobytes()), weights_only=True))
 
     def meet(self, state: TrainState) -> None:
-        """Wait for the others, however long process 0 scores or saves; hear who was asked to stop."""
+        """Wait for the other processes, while process 0 may score or save; share requests to stop."""
         own = torch.tensor([state.stage, state.step, len(state.splats), len(state.queue), int(self.hears())])
         met = self._all(own)
         self.stop_asked = bool(met[:, -1].any())
         self._same(met[:, :-1], state)
 
     def check(self, state: TrainState) -> None:
-        """Compare a hash of the splats, Adam's memory, statistics, the generator and what is learned of views."""
+        """Compare a hash of the splats, moments, statistics, generator and learned quantities."""
         digest = hashlib.sha256(state.generator.get_state().numpy().tobytes() + repr(state.queue).encode())
         for tensor in _tensors(state):
             digest.update(repr((tuple(tensor.shape), _checksum(tensor))).encode())
@@ -243,12 +245,12 @@ class ManyProcesses(OneProcess):
         differing = [rank for rank, own in enumerate(met.tolist()) if own != met[0].tolist()]
         if differing:
             raise RunError(
-                f"the processes must have the same state at iteration {state.step} of stage {state.stage + 1}, got "
-                f"another one in process {differing[0]} than in process 0; go on from the last checkpoint with --resume"
+                f"the states of processes 0 and {differing[0]} differ at iteration {state.step} of stage "
+                f"{state.stage + 1}; continue from the last checkpoint with --resume"
             )
 
     def _all(self, own: Tensor) -> Tensor:
-        """Return a small tensor of the host's memory [n] of all processes [W, n]."""
+        """Gather a small host tensor [n] from all processes, [W, n]."""
         met = [torch.empty_like(own) for _ in range(self.size)]
         with self.contact():
             self._group.all_gather(met, own)
@@ -264,7 +266,7 @@ class ManyProcesses(OneProcess):
         rows: Tensor | None,
         learned: Mapping[str, tuple[int, ...]],
     ) -> tuple[StepResult, Sequence[Mapping[str, Tensor]]]:
-        """Return the gradients of the mean loss of some views, of which this process renders one."""
+        """Return the gradients of the mean loss of some views; this process renders one of them."""
         rank = self.place.rank
         result = one(turns[rank]) if rank < len(turns) else idle()
         splats = dict(result.gradients)
@@ -281,9 +283,9 @@ class ManyProcesses(OneProcess):
         return replace(result, gradients=splats, rows=rows), each
 
     def _of_views(self, own: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]]) -> list[dict[str, Tensor]]:
-        """Return the learned gradients of the views of all processes, float64 in host memory; the same bits."""
+        """Gather the learned gradients of all views, float64 in host memory."""
         parts = []
-        for name, shape in shapes.items():  # whether there is a gradient, then its numbers
+        for name, shape in shapes.items():  # a flag for a present gradient, then its numbers
             numbers = own[name].double().cpu().flatten() if name in own else torch.zeros(math.prod(shape)).double()
             parts += [numbers.new_tensor([float(name in own)]), numbers]
         found = []
@@ -294,27 +296,27 @@ class ManyProcesses(OneProcess):
         return found
 
     def gather(self, statistics: Statistics, result: StepResult, add: Callable[[Statistics, StepResult], Any]) -> None:
-        """Add what a densifier gathers of each view of the iteration to tensors, in place."""
+        """Add the statistics of all views of the iteration in place."""
         own = {name: torch.zeros_like(tensor) for name, tensor in statistics.items()}
         add(own, result)
         for name in sorted(own):
             statistics[name].add_(self.sum(own[name]))
 
     def mean_losses(self, losses: Mapping[str, float | Tensor], views: int) -> Mapping[str, float | Tensor]:
-        """Return the mean of the losses of the views."""
+        """Return the mean of the losses over the views."""
         found: list[Any] = [None] * self.size
         with self.contact():
             self._group.all_gather_object(found, {kind: float(value) for kind, value in losses.items()})
         kinds = dict.fromkeys(kind for one in found for kind in one)
         return {kind: sum(one.get(kind, 0.0) for one in found) / views for kind in kinds}
 
-    # -- looks at all views --------------------------------------------------------------------------------------------
+    # -- work on all views ---------------------------------------------------------------------------------------------
     def part(self, things: Sequence[T]) -> Sequence[T]:
-        """Return every so many-th thing."""
+        """Return every W-th entry."""
         return things[self.place.rank :: self.size]
 
     def sum(self, tensor: Tensor) -> Tensor:
-        """Return the sum of a tensor over the processes, in its place."""
+        """Sum a tensor over the processes in place, and return it."""
         with self.contact():
             self._group.all_reduce(tensor)
         return tensor
@@ -324,7 +326,7 @@ class ManyProcesses(OneProcess):
         return self.sum(mask.to(torch.int32)) > 0
 
     def decide(self, judge: Callable[[Splats, Tensor], Tensor], splats: Splats, known: Tensor) -> Tensor:
-        """Return what ``judge`` says in process 0."""
+        """Return the result of ``judge`` in process 0."""
         nothing = torch.empty(len(splats), dtype=torch.uint8, device=splats.device)
         found = judge(splats, known) if self.leads else nothing
         with self.contact():
@@ -347,6 +349,6 @@ def _tensors(state: TrainState) -> Iterator[Tensor]:
 
 
 def _checksum(tensor: Tensor) -> int:
-    """Return the sum of a tensor's bits, as whole numbers: cheap, and another one where a single bit is."""
+    """Return the sum of the bits of a tensor as integers; it changes with any single bit."""
     bits = tensor.detach().contiguous().view(torch.uint8 if tensor.element_size() < 4 else torch.int32)
     return int(bits.sum(dtype=torch.int64))

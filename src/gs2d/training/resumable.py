@@ -1,4 +1,4 @@
-"""Whether training can go on from a state that came from a file: it must be whole, and of this recipe and scene."""
+"""Check that training can continue from a state of a file: it must be complete and fit the recipe and the scene."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gs2d.training.state import TrainState
 
 
 def check_resumable(state: TrainState, recipe: Recipe, scene: Scene) -> None:
-    """Raise unless training of a recipe on a scene can go on from a state."""
+    """Raise RunError unless training of a recipe on a scene can continue from a state."""
     state.check()
     if state.splats.sh_degree != recipe.sh_degree:
         raise RunError(
@@ -22,14 +22,14 @@ def check_resumable(state: TrainState, recipe: Recipe, scene: Scene) -> None:
     last, views = max(state.queue, default=0), len(scene.train)
     if last >= views:
         raise RunError(
-            f"the checkpoint waits for training view {last}, but the scene has {views}; is it of another scene?"
+            f"the checkpoint refers to training view {last}, but the scene has {views}; is it of another scene?"
         )
     LearnedTable(recipe, scene).check(state.learned)
     _check_stage(state, recipe)
 
 
 def _check_place(state: TrainState, recipe: Recipe) -> None:
-    """Raise unless the recipe has the stage and the iteration."""
+    """Raise RunError unless the recipe has the stage and the iteration."""
     stages = recipe.stages
     inside = 0 <= state.stage < len(stages) and 0 <= state.step <= stages[state.stage].iterations
     at_end = state.stage == len(stages) and state.step == 0
@@ -41,9 +41,10 @@ def _check_place(state: TrainState, recipe: Recipe) -> None:
 
 
 def _check_stage(state: TrainState, recipe: Recipe) -> None:
-    """Raise unless the state has what the stages until now have made, and the stage under way goes on with."""
+    """Raise RunError unless the state has the row groups, moments and statistics that the current stage needs."""
     begun = recipe.stages[: state.stage + state.entered]
-    missing = {action.writes for stage in begun for action in stage.on_enter} - state.groups.keys()
+    written = (action.writes for stage in begun for action in stage.on_enter)
+    missing = {name for name in written if name is not None} - state.groups.keys()
     if missing:
         raise RunError(f"the checkpoint lacks the row group {min(missing)!r}; start a new run")
     if not state.entered or state.stage >= len(recipe.stages):

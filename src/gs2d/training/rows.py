@@ -1,6 +1,6 @@
-"""The only functions that change N: parameters, moments, statistics and row groups move together or not at all.
+"""The only functions that change N: parameters, moments, statistics and row groups change together.
 
-Either is one pass: what stays of each tensor is gathered once, straight into storage that has room for what comes.
+Each makes one pass: the kept rows of each tensor are gathered into new storage with room for the added rows.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def append_rows(
     *,
     keep: Tensor | None = None,
 ) -> None:
-    """Append M splats: zero moments and statistics.
+    """Append M splats with zero moments and statistics.
 
     Parameters
     ----------
@@ -37,8 +37,8 @@ def append_rows(
     splats : Splats
         M rows.
     groups : mapping of name to bool Tensor [M], optional
-        Membership of the new rows. Groups of the state that are not named get False; a new name becomes a group in
-        which no old row is.
+        Membership of the new rows; False in groups of the state that are not named. A new name becomes a group without
+        old rows.
     keep : Tensor [N] bool, optional
         Drop the old rows where it is False, in the same pass.
     """
@@ -59,7 +59,7 @@ def append_rows(
 
 
 class _Rows:
-    """Which old rows stay, and how many new ones follow them."""
+    """Old rows that are kept, and the number of new rows."""
 
     def __init__(self, state: TrainState, added: int, keep: Tensor | None) -> None:
         self.before, self.added = len(state.splats), added
@@ -72,7 +72,7 @@ class _Rows:
             self.kept = None if len(kept) == self.before else kept
 
     def of(self, old: Tensor, new: Tensor | None = None) -> Tensor:
-        """Return the rows of ``old`` that stay, then those of ``new``, or zeros."""
+        """Return the kept rows of ``old``, followed by those of ``new`` or zeros."""
         if self.kept is None and self.added == 0:
             return old
         stay = self.before if self.kept is None else len(self.kept)

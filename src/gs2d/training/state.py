@@ -1,4 +1,4 @@
-"""All that training is at a moment: enough to go on from, byte for byte."""
+"""The state of a training, complete enough to continue with identical bytes."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from torch import Tensor
 from gs2d.core.checks import check_shapes
 from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import RunError, ShapeError
-from gs2d.training.learned.learned_rows import LearnedRows
+from gs2d.training.learned_rows import LearnedRows
 
 FORMAT = 1  # of the state dict
-# What a mapping that is no state, or one with other values in it, makes of the steps of reading it.
+# Errors that reading a damaged state dict raises.
 _BROKEN = (LookupError, TypeError, AttributeError, RuntimeError, ValueError, ArithmeticError)
 
 
 @dataclass(eq=False)
 class Moments:
-    """Adam's memory of one attribute.
+    """Adam's moments of one attribute.
 
     Attributes
     ----------
     mean, square : Tensor, like the attribute
         Running means of the gradient and of its square.
     steps : int
-        Updates so far; kept when rows are appended or zeroed, as in the official code.
+        Number of updates; kept when rows are appended or zeroed, as in the official code.
     """
 
     mean: Tensor
@@ -37,36 +37,36 @@ class Moments:
 
     @classmethod
     def zeros_like(cls, parameter: Tensor) -> Moments:
-        """No memory."""
+        """Return zero moments."""
         return cls(torch.zeros_like(parameter), torch.zeros_like(parameter))
 
 
 @dataclass(eq=False)
 class TrainState:
-    """Mutable state of a training run. Only the functions of ``training.rows`` change N.
+    """Mutable state of a training. Only the functions of ``training.rows`` change N.
 
     Attributes
     ----------
     splats : Splats
         Plain tensors without autograd history.
     generator : torch.Generator
-        On the CPU; every random choice of training comes from it.
+        CPU generator of all random choices of training.
     moments : dict of attribute to Moments
-        Of the attributes that the stage trains.
+        Moments of the attributes that the stage trains.
     groups : dict of name to bool Tensor [N]
         Row groups that entry actions wrote.
     statistics : dict of name to Tensor [N, ...], or None
-        What the densifier of the stage gathers; None in stages without one.
+        Statistics of the densifier; None in stages without one.
     stage, step : int
-        Index of the stage, and its iterations that are done.
+        Index of the stage, and its finished iterations.
     entered : bool
         Whether the entry actions of the stage are done.
     queue : list of int
-        Training views that are still to come in this epoch; the next is the last.
+        Remaining training views of this epoch; the last entry comes next.
     learned : dict of name to LearnedRows
-        What the recipe learns of images and cameras (``gs2d.training.learned``).
+        Learned quantities of images and cameras (``gs2d.training.learned``).
     processes : list of (stage, step, count)
-        The number of processes from this stage and step on; empty for one process throughout.
+        Number of processes from a stage and step on; empty for one process throughout.
     """
 
     splats: Splats
@@ -82,12 +82,12 @@ class TrainState:
     processes: list[tuple[int, int, int]] = field(default_factory=list)
 
     def trained_by(self, count: int) -> None:
-        """Note the number of processes that train from here on: the result depends on it."""
+        """Record the number of processes that train from here on, because the result depends on it."""
         if count != (self.processes[-1][2] if self.processes else 1):
             self.processes.append((self.stage, self.step, count))
 
     def next_view(self, count: int) -> int:
-        """Index of the next training view: shuffled epochs, without replacement."""
+        """Return the index of the next training view, in shuffled epochs."""
         if not self.queue:
             self.queue = torch.randperm(count, generator=self.generator).tolist()
         return self.queue.pop()
@@ -116,7 +116,7 @@ class TrainState:
 
     @classmethod
     def from_state_dict(cls, data: Mapping[str, Any]) -> TrainState:
-        """Return the state that :meth:`state_dict` described (tensors are copied).
+        """Return the state of a :meth:`state_dict`; tensors are copied.
 
         Raises
         ------
@@ -170,14 +170,14 @@ class TrainState:
             self.statistics = {k: v.to(device) for k, v in self.statistics.items()}
 
     def check(self) -> None:
-        """Raise unless everything has the same N, the types that training writes, and counts that can be.
+        """Check that all tensors have the same N and the expected types, and that counts are valid.
 
         Raises
         ------
         ShapeError
-            Another N, or another type.
+            If a tensor has another N or type.
         RunError
-            A count below zero, or moments of what has none.
+            If a count is negative, or moments belong to no attribute.
         """
         parameters = dict(self.splats.items())
         unknown = self.moments.keys() - parameters.keys()

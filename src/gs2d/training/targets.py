@@ -1,4 +1,4 @@
-"""The photographs as training wants them: float tensors over the background, kept as far as memory allows."""
+"""Training images as tensors over the background, kept in memory as far as it allows."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from gs2d.config import protocols as config
 from gs2d.core.memory_limit import cache_bytes
-from gs2d.data.scene import View
-from gs2d.losses.api import TargetMaps
+from gs2d.core.splats import Splats
+from gs2d.data.scene import Scene, View
+from gs2d.render.backends import Backend
 
-TARGET_BYTES = 1 << 28  # small captures stay whole
-# Part of the views that must fit, or none stays: of 292 photographs of 780x520 a tenth would, for less than 1 % of an
-# iteration's time, because to make a target anew from its bytes takes a few ms.
+TARGET_BYTES = 1 << 28  # enough for all images of a small capture
+# Fraction of the images that must fit, or none is kept: making a target from decoded bytes takes only a few ms.
 WORTH_KEEPING = 0.5
 PINNED_BYTES = 1 << 33
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """What one view should look like.
+    """Expected rendering of a training view.
 
     Attributes
     ----------
@@ -30,27 +31,27 @@ class Target:
         In [0, 1], over the background.
     mask : Tensor [H, W] bool or None
         False = ignore this pixel.
-    maps : TargetMaps or None
-        What the native SSIM needs of the image alone; kept with images that are kept.
+    mean : Tensor [H, W, 3] or None
+        Local mean of the image for the native SSIM, of images that are kept.
     silhouette : Tensor [H, W] or None
-        Alpha of the photograph in [0, 1], where it has one and a loss asks for it.
+        Alpha of the image in [0, 1], if it has an alpha channel and a loss needs it.
     """
 
     image: Tensor
     mask: Tensor | None
-    maps: TargetMaps | None
+    mean: Tensor | None
     silhouette: Tensor | None = None
 
     @property
     def nbytes(self) -> int:
         """Bytes of all tensors."""
-        tensors = [self.image, self.mask, self.silhouette, None if self.maps is None else self.maps.mean]
-        return sum(tensor.numel() * tensor.element_size() for tensor in tensors if tensor is not None)
+        tensors = (self.image, self.mask, self.silhouette, self.mean)
+        return sum(tensor.nbytes for tensor in tensors if tensor is not None)
 
 
 @dataclass(frozen=True, eq=False)
-class Photograph:
-    """A training view as it was decoded, on the device.
+class ImageBytes:
+    """A decoded training image.
 
     Attributes
     ----------
@@ -58,12 +59,21 @@ class Photograph:
     mask : Tensor [H, W] bool or None
         False = ignore this pixel.
     valid : int
-        Pixels that count.
+        Number of pixels that count.
     """
 
     image: Tensor
     mask: Tensor | None
     valid: int
+
+    def nbytes(self, place: str) -> int:
+        """Return the bytes on the "device", or in "pinned" memory, where torch rounds up to powers of two."""
+        sizes = [self.image.nbytes, 0 if self.mask is None else self.mask.nbytes]
+        return sum(1 << (size - 1).bit_length() if place == "pinned" and size else size for size in sizes)
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> ImageBytes:
+        """Return the image with a function applied to its tensors."""
+        return ImageBytes(change(self.image), None if self.mask is None else change(self.mask), self.valid)
 
 
 class TargetSource(Protocol):
@@ -71,18 +81,55 @@ class TargetSource(Protocol):
 
     def __getitem__(self, index: int) -> Target: ...
 
-    def photograph(self, index: int) -> Photograph | None:
-        """Return the bytes of a view, where they wait on the device of training; None: targets are floats."""
+    def photograph(self, index: int) -> ImageBytes | None:
+        """Return the bytes of an image on the device of training; None if targets are kept as floats."""
+
+
+def make_targets(
+    scene: Scene,
+    protocol: config.Protocol,
+    backend: Backend,
+    splats: Splats,
+    with_silhouettes: bool,
+    limit_bytes: int | None,
+) -> TargetSource:
+    """Return the targets of the training views of a scene, on the device of the splats."""
+    views, background, device = scene.train, protocol.background, splats.device
+    use_masks = protocol.use_mask_in_training
+    if device.type != "cpu":
+        limit = 1 << 31 if limit_bytes is None else limit_bytes
+        pinned = 0 if scene.ahead else cache_bytes(PINNED_BYTES)
+        options = {"dtype": splats.dtype, "limit_bytes": limit, "pinned_bytes": pinned}
+        return DeviceTargets(views, background, use_masks=use_masks, device=device, **options)  # type: ignore[arg-type]
+    operations = backend.loss_operations(device)
+    return Targets(
+        views,
+        background,
+        use_masks=use_masks,
+        mean=None if operations is None or operations.blur is None else operations.blur,
+        with_silhouettes=with_silhouettes,
+        dtype=splats.dtype,
+        device=device,
+        limit_bytes=limit_bytes if limit_bytes is not None else 0 if scene.ahead else TARGET_BYTES,
+    )
 
 
 class Targets:
-    """Targets of the training views. The first ones that fit in ``limit_bytes`` stay; the others are made anew.
+    """Targets as float tensors. The first ones that fit in ``limit_bytes`` are kept, unless they are few.
 
-    Where most of them would be, none stays.
+    Nothing is evicted: views come in shuffled epochs, so the least recently used one is needed next.
 
-    ``maps`` makes what the losses need of an image alone, which stays with it.
-
-    Nothing is evicted: views come in shuffled epochs, where the least recently used is the next to be wanted.
+    Parameters
+    ----------
+    views : sequence of View
+    background : 3 floats in [0, 1]
+    use_masks : bool
+    mean : callable, optional
+        Computes the local mean of an image, which is kept with it.
+    with_silhouettes : bool
+    dtype : torch.dtype
+    device : torch.device
+    limit_bytes : int
     """
 
     def __init__(
@@ -91,27 +138,22 @@ class Targets:
         background: tuple[float, float, float],
         *,
         use_masks: bool,
-        maps: Callable[[Tensor], TargetMaps | None] | None = None,
+        mean: Callable[[Tensor], Tensor | None] | None = None,
         with_silhouettes: bool = False,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
         limit_bytes: int = TARGET_BYTES,
     ) -> None:
-        self._views = views
-        self._background = background
-        self._use_masks = use_masks
-        self._maps, self._with_silhouettes = maps, with_silhouettes
+        self._views, self._background, self._use_masks = views, background, use_masks
+        self._mean, self._with_silhouettes = mean, with_silhouettes
         self._dtype, self._device = dtype, device
-        room, all_bytes = cache_bytes(limit_bytes), self._bytes_of_all()
+        pixels = sum(view.camera.width * view.camera.height for view in views)
+        all_bytes = pixels * 3 * dtype.itemsize * (1 if mean is None else 2)
+        room = cache_bytes(limit_bytes)
         self._room = room if room >= WORTH_KEEPING * all_bytes else 0
         self._kept: dict[int, Target] = {}
 
-    def _bytes_of_all(self) -> int:
-        """Return what the images of all views take, and what is made of them alone."""
-        pixels = sum(view.camera.width * view.camera.height for view in self._views)
-        return pixels * 3 * self._dtype.itemsize * (1 if self._maps is None else 2)
-
-    def photograph(self, index: int) -> Photograph | None:
+    def photograph(self, index: int) -> ImageBytes | None:
         """Return None: targets are kept as floats."""
         return None
 
@@ -129,38 +171,20 @@ class Targets:
             None,
             None if alpha is None else torch.as_tensor(alpha).to(self._device, self._dtype),
         )
-        if target.nbytes + (0 if self._maps is None else image.nbytes) > self._room:
+        if target.nbytes + (0 if self._mean is None else image.nbytes) > self._room:
             return target
-        if self._maps is not None:
-            target = replace(target, maps=self._maps(image))
+        if self._mean is not None:
+            target = replace(target, mean=self._mean(image))
         self._room -= target.nbytes
         self._kept[index] = target
         return target
 
 
-@dataclass(frozen=True, eq=False)
-class _DecodedImage:
-    """A photograph as it was decoded."""
-
-    image: Tensor  # [H, W, 3 or 4] uint8
-    mask: Tensor | None  # [H, W] bool
-    valid: int
-
-    def nbytes(self, place: str) -> int:
-        """Return the bytes it takes on the device or (torch rounds up to powers of two) in pinned memory."""
-        sizes = [self.image.nbytes, 0 if self.mask is None else self.mask.nbytes]
-        return sum(1 << (size - 1).bit_length() if place == "pinned" and size else size for size in sizes)
-
-    def map(self, change: Callable[[Tensor], Tensor]) -> _DecodedImage:
-        return _DecodedImage(change(self.image), None if self.mask is None else change(self.mask), self.valid)
-
-
 class DeviceTargets:
-    """Targets on a GPU: photographs wait there as bytes, 3 or 4 a pixel, and become floats when they are wanted.
+    """Targets on a GPU, kept as bytes, 3 or 4 a pixel, and converted to floats on demand.
 
-    The first ones that fit in ``limit_bytes`` stay on the device. The next ones, up to ``pinned_bytes`` or what the
-    system gives, stay in pinned memory of the host, from which they are copied without waiting; any others are decoded
-    anew each time.
+    The first images that fit in ``limit_bytes`` stay on the device. The next ones, up to ``pinned_bytes`` or what the
+    system allows, stay in pinned host memory, from which they are copied without waiting. Others are decoded each time.
 
     Parameters
     ----------
@@ -190,31 +214,15 @@ class DeviceTargets:
         self._background = torch.tensor(background, dtype=dtype, device=device)
         self._dtype, self._device, self._pin = dtype, device, pin
         self._room = {"device": limit_bytes, "pinned": pinned_bytes}
-        self._kept: dict[int, _DecodedImage] = {}
-        self._places: dict[tuple[torch.Size, torch.dtype], Tensor] = {}  # for what comes from the host's memory
+        self._kept: dict[int, ImageBytes] = {}
+        self._buffers: dict[tuple[torch.Size, torch.dtype], Tensor] = {}  # for images from host memory
 
-    def photograph(self, index: int) -> Photograph | None:
-        """Return a view's bytes; those of views that wait elsewhere are good until the next one is asked for."""
-        image = self._kept.get(index)
-        if image is None:
-            image = self._take_in(index)
-        there = image.map(self._brought)
-        return Photograph(there.image, there.mask, there.valid)
-
-    def _brought(self, tensor: Tensor) -> Tensor:
-        """Return a tensor on the device; a copy goes to the same place each time."""
-        if tensor.device == self._device:
-            return tensor
-        key = tensor.shape, tensor.dtype
-        if key not in self._places:
-            self._places[key] = torch.empty(tensor.shape, dtype=tensor.dtype, device=self._device)
-        return self._places[key].copy_(tensor, non_blocking=True)
+    def photograph(self, index: int) -> ImageBytes | None:
+        """Return the bytes of an image; one from host memory is valid until the next call."""
+        return self._decoded(index).map(self._brought)
 
     def __getitem__(self, index: int) -> Target:
-        image = self._kept.get(index)
-        if image is None:
-            image = self._take_in(index)
-        there = image.map(lambda tensor: tensor.to(self._device, non_blocking=True))
+        there = self._decoded(index).map(lambda tensor: tensor.to(self._device, non_blocking=True))
         color = there.image[..., :3].to(self._dtype) / 255
         alpha = None
         if there.image.shape[2] == 4:  # as images.composite
@@ -222,13 +230,24 @@ class DeviceTargets:
             color = (color - self._background) * alpha[..., None] + self._background
         return Target(color, there.mask, None, alpha)
 
-    def _take_in(self, index: int) -> _DecodedImage:
-        """Decode a photograph, and keep it where there is room."""
+    def _brought(self, tensor: Tensor) -> Tensor:
+        """Return a tensor on the device; copies of one shape share a buffer."""
+        if tensor.device == self._device:
+            return tensor
+        key = tensor.shape, tensor.dtype
+        if key not in self._buffers:
+            self._buffers[key] = torch.empty(tensor.shape, dtype=tensor.dtype, device=self._device)
+        return self._buffers[key].copy_(tensor, non_blocking=True)
+
+    def _decoded(self, index: int) -> ImageBytes:
+        """Return an image that is kept, or decode it and keep it if there is room."""
+        if index in self._kept:
+            return self._kept[index]
         view = self._views[index]
         mask = view.usable(masks=self._use_masks)
         pixels = torch.tensor(view.image())
         valid = pixels.shape[0] * pixels.shape[1] if mask is None else int(mask.sum())
-        image = _DecodedImage(pixels, None if mask is None else torch.tensor(mask), valid)
+        image = ImageBytes(pixels, None if mask is None else torch.tensor(mask), valid)
         for place in ("device", "pinned"):
             if image.nbytes(place) > self._room[place]:
                 continue

@@ -1,4 +1,4 @@
-"""Iterations that a backend does in one piece: which are of that kind, and how they are described to it."""
+"""Iterations that a backend does in one piece: which ones it can do, and their description for it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from torch import Tensor
 from gs2d.config.recipe import LossTerm, Stage
 from gs2d.render.types import RasterSettings
 from gs2d.render.whole_step import Learned, StepLosses, WholeStep
-from gs2d.training.adam import lr_at
 from gs2d.training.densify.densifier import Densifier
 from gs2d.training.objective import FullRender, Objective, learning_rows
-from gs2d.training.opaque import another_background
+from gs2d.training.optimizer import lr_at
+from gs2d.training.robust.opaque import another_background
 from gs2d.training.state import TrainState
 
 __all__ = ["WholeSteps"]
@@ -23,15 +23,16 @@ NOTHING: Mapping[str, Tensor] = MappingProxyType({})
 
 
 class WholeSteps:
-    """The iterations of a stage that a backend does in one piece: those whose losses allow it (``Loss.in_step``).
+    """Describes iterations of a stage to a backend that does them in one piece.
 
-    Nothing may be learned of images and cameras; :class:`~gs2d.training.objective.FullRender` does everything else.
+    All active losses must allow it (``Loss.in_step``), and no quantity of images or cameras may be learned. Other
+    iterations are done by :class:`~gs2d.training.objective.FullRender`.
 
     Parameters
     ----------
     whole : FullRender
     objective : Objective
-        Of the stage.
+        Objective of the stage.
     stage : Stage
     """
 
@@ -40,10 +41,10 @@ class WholeSteps:
         self._terms = whole.protocol.resolve(stage.losses)
         self._possible = objective is whole and whole.frozen is None and whole.drops(stage) == 0
         self._settings: dict[object, RasterSettings] = {}  # by SH degree and background
-        self._rows: tuple[tuple[Tensor, ...], Tensor | None] | None = None  # groups, and what they are together
+        self._rows: tuple[tuple[Tensor, ...], Tensor | None] | None = None  # groups, and their union
 
     def learn(self, state: TrainState, iteration: int, index: int, densifier: Densifier | None) -> bool:
-        """Do an iteration; False: it is of another kind, and nothing was done."""
+        """Do an iteration; return False if it cannot be done in one piece, and nothing was done."""
         if not self._possible or state.learned:
             return False
         active = [term for term in self._terms if term.is_active(iteration)]
@@ -80,7 +81,7 @@ class WholeSteps:
         return True
 
     def _losses(self, active: Sequence[LossTerm], *, opaque: bool) -> StepLosses | None:
-        """Return what the active losses add to the step; None if a step cannot have them."""
+        """Return the losses of the step; None if a step cannot have all active ones."""
         fields: dict[str, Any] = {}
         for term in active:
             added = self._whole.losses[term].in_step(term, opaque=opaque)
@@ -99,7 +100,7 @@ class WholeSteps:
         return found
 
     def _settings_at(self, iteration: int, *, opaque: bool) -> RasterSettings:
-        """Return the rasterizer's constants: the same object while they are the same."""
+        """Return the rasterizer settings; the same object while they are equal."""
         recipe = self._whole.recipe
         background = another_background(recipe, self._stage, iteration) if opaque else None
         key = self._stage.active_sh_degree(iteration, recipe.sh_degree), background
@@ -108,7 +109,7 @@ class WholeSteps:
         return self._settings[key]
 
     def _learning_rows(self, state: TrainState) -> Tensor | None:
-        """Return the splats of which the stage trains anything; worked out anew where the groups are others."""
+        """Return the splats that the stage trains, computed anew when the groups have changed."""
         groups = tuple(state.groups[group] for group in set(self._stage.train.values()) - {"all"})
         if self._rows is None or len(groups) != len(self._rows[0]) or any(map(_differ, groups, self._rows[0])):
             self._rows = groups, learning_rows(state, self._stage)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from gs2d.config.presets import get_recipe
-from gs2d.config.recipe import Exposure
+from gs2d.config.quantities import EXPOSURE
 from gs2d.contrib.lab.block_start import ABSENT, FROZEN, OWN, read_start
 from gs2d.contrib.lab.partition import Partition
 from gs2d.contrib.lab.settle import block_recipe, budget_of, with_budget
@@ -89,14 +89,13 @@ BLOCK = Block("0-0", ("a",), floor=0, own=1, frozen=1, core=1, weight=0.4, exten
 
 
 def test_recipes_of_a_block_have_a_share_of_the_budget_given_exposures_and_all_degrees_from_the_start() -> None:
-    recipe = with_budget(replace(get_recipe("best"), exposure=Exposure()), 1000)
+    recipe = with_budget(get_recipe("best").with_learned(EXPOSURE), 1000)
     assert budget_of(recipe) == 1000
     found = block_recipe(recipe, Partition(grid=(2, 2)), BLOCK)
     assert budget_of(found) == 400
     assert found.dense_start is not None
     assert not found.dense_start.required
     assert block_recipe(recipe, Partition(grid=(2, 2), start="coarse"), BLOCK).dense_start is None
-    assert found.exposure is not None
-    assert found.exposure.initial == "given"
+    assert found.quantities["exposure"].options == {"initial": "given"}
     assert [stage.sh_interval for stage in found.stages] == [0]
     assert budget_of(block_recipe(get_recipe("best"), Partition(grid=(2, 2), splats=77), BLOCK)) == 77

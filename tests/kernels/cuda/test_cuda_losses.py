@@ -13,7 +13,7 @@ import emulate
 from gs2d.core.camera import Camera, look_at
 from gs2d.kernels.cuda import cuda_losses as ops
 from gs2d.kernels.native_losses import NormalOptions
-from gs2d.losses import reference
+from gs2d.losses import formulas as reference
 
 # Smaller than the window; a row and a strip of 128 reals (43 pixels) and of 32 rows begun and passed.
 SIZES = [(1, 1), (5, 3), (37, 44), (33, 20)]

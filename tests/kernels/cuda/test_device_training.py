@@ -21,9 +21,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import train_toys
 from emulate import Emulator
 from fake_backends import altered, cuda_on_host
-from gs2d.config.densify import Densify
 from gs2d.config.protocols import GENERIC
-from gs2d.config.recipe import Exposure, GradDensify, PoseRefinement, Recipe
+from gs2d.config.quantities import EXPOSURE, POSES
+from gs2d.config.recipe import GradDensify, Recipe
 from gs2d.data.scene import Scene, View
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import launch
@@ -69,14 +69,9 @@ def in_first_stage(**fields: Any) -> Recipe:
 
 VARIANTS = {
     "plain": train_toys.short(),
-    "exposure": replace(train_toys.short(), exposure=Exposure(start=2, decay_steps=10)),
-    "poses": replace(train_toys.short(), poses=PoseRefinement(start=2, decay_steps=10)),
+    "exposure": train_toys.short().with_learned(replace(EXPOSURE, start=2, decay_steps=10)),
+    "poses": train_toys.short().with_learned(replace(POSES, start=2, decay_steps=10)),
     "multiview": train_toys.compared(),
-    "sizes": in_first_stage(downscale=2, halve_at=(5,)),
-    "errors": in_first_stage(densify=replace(GROWS, error_views=2)),
-    "relocation": in_first_stage(
-        densify=Densify("relocation", {"max_splats": 70, "start": 0, "stop": 10, "rounds": 3, "noise_every": 4})
-    ),
 }
 
 
@@ -160,7 +155,7 @@ def quiet(recipe: Recipe) -> Recipe:
     """Nothing is densified or reset in the iterations that are watched."""
     first = recipe.stages[0]
     assert first.densify is not None
-    densify = replace(first.densify, start=1000, stop=2000, reset_at=())
+    densify = replace(first.densify, start=1000, stop=2000, reset_every=0)
     longer = [replace(stage, iterations=100) for stage in (replace(first, densify=densify), *recipe.stages[1:])]
     return replace(recipe, stages=(longer[0], *recipe.stages[1:]))
 

@@ -56,7 +56,7 @@ ITERATIONS = """
 import train_toys
 from gs2d.config.protocols import GENERIC
 from gs2d.training import trainer as loop
-from gs2d.training.initialize import initial_splats
+from gs2d.training.start.initialize import initial_splats
 from gs2d.training.state import TrainState
 
 backend = CudaBackend()
@@ -71,7 +71,7 @@ loop.Trainer._check_parameters = lambda *_: None
 torch.Tensor.backward = lambda self: None  # torch's engine wants a real device: the other test has the gradients
 
 def quiet(stage):
-    densify = stage.densify and replace(stage.densify, start=10**5, stop=10**6, reset_at=(), cap_every=0)
+    densify = stage.densify and replace(stage.densify, start=10**5, stop=10**6, reset_every=0, cap_every=0)
     losses = tuple(replace(term, start=0) for term in stage.losses)  # two views are compared too
     return replace(stage, densify=densify, iterations=10**4, on_enter=(), losses=losses)
 

@@ -20,7 +20,8 @@ from emulate import Emulator
 from fake_backends import cuda_on_host
 from fake_driver import FakeDriver, Result
 from gs2d.config.protocols import GENERIC, Protocol
-from gs2d.config.recipe import GradDensify, LossTerm, PoseRefinement, Recipe
+from gs2d.config.quantities import POSES
+from gs2d.config.recipe import GradDensify, LossTerm, Recipe
 from gs2d.data.scene import Scene, View
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import launch
@@ -258,7 +259,7 @@ def test_what_is_learned_of_cameras_and_densifiers_with_steps_of_their_own_go_th
     recipe = train_toys.short()
     short = replace(recipe, stages=(replace(recipe.stages[0], iterations=5),))
     assert trained(emulator, scene, short, "launches")[1] == 2  # 1 and 3 are looked at, 5 is the last
-    posed = replace(short, poses=PoseRefinement(start=2, decay_steps=10))
+    posed = short.with_learned(replace(POSES, start=2, decay_steps=10))
     assert trained(emulator, scene, posed, "launches")[1] == 0
     made = loop.densifier_of
     monkeypatch.setattr(

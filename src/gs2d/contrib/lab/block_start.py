@@ -70,7 +70,7 @@ def load_start(
             "command again"
         )
     digest, exposures = hashlib.sha256(splats_file.read_bytes() + rows.tobytes()), None
-    if saved is not None and recipe.exposure is not None:
+    if saved is not None and recipe.learns("exposure"):
         exposures = torch.from_numpy(np.ascontiguousarray(saved, np.float32))
         digest.update(exposures.numpy().tobytes())
     digest.update(repr(region).encode() if region else b"")

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gs2d.config.recipe import RankByError, Recipe
+from gs2d.config.actions import RANK_BY_ERROR, Action
+from gs2d.config.recipe import Recipe
 from gs2d.config.serialize import from_json
 from gs2d.contrib.lab.compared_plot import Panel, compared_runs
 from gs2d.core.atomic_files import atomic_write
@@ -27,9 +28,9 @@ from gs2d.pipeline.train.resume import stage_end
 from gs2d.render.api import splat_errors
 from gs2d.report.color_maps import ERROR_TOP, error_image, error_scale, highlight_image, valid_image
 from gs2d.report.plots import read_history
+from gs2d.training.actions.rank_by_error import RankByError, worst
 from gs2d.training.events import Notice, OnEvent, counted, ignore
 from gs2d.training.learned.appearance import numbers_of, shown_splats
-from gs2d.training.rank_clone import worst
 from gs2d.training.state import TrainState
 
 TRACES = (
@@ -44,7 +45,7 @@ CHANGES = (
 )
 MAP_PERCENTILES = (50.0, 99.9)  # of E_i: the ends of the colour scale, which is logarithmic
 SMALLEST_TOP = 0.01  # of a pixel: less than this is not worth a colour
-DEFAULT_RANK = RankByError()  # of runs whose recipe ranks nothing
+DEFAULT_RANK = RANK_BY_ERROR  # of runs whose recipe ranks nothing
 
 
 def write_figures(
@@ -130,7 +131,7 @@ def _value_at(iterations: np.ndarray, values: np.ndarray, end: int) -> float:
 
 def _ranks(run: RunFolder) -> bool:
     stages = from_json(run.definition()["recipe"]).stages
-    return any(isinstance(action, RankByError) for stage in stages for action in stage.on_enter)
+    return any(action.name == "rank_by_error" for stage in stages for action in stage.on_enter)
 
 
 # -- E_i maps ----------------------------------------------------------------------------------------------------------
@@ -167,6 +168,7 @@ def rank_run(run: RunFolder, job: LoadedRun, on_event: OnEvent = ignore) -> Rank
     """
     index, action = _first_ranking(job.recipe)
     splats, group, when = _ranked(run, job, index, action)
+    ranking = RankByError(**action.options)
     splats = splats.to(job.backend.device)
     total = torch.zeros(len(splats), dtype=torch.float64, device=splats.device)
     views = job.scene.train
@@ -185,16 +187,16 @@ def rank_run(run: RunFolder, job: LoadedRun, on_event: OnEvent = ignore) -> Rank
             settings,
             backend=job.backend,
             mask=None if mask is None else torch.from_numpy(mask).to(splats.device),
-            occlusion=action.occlusion,
+            occlusion=ranking.occlusion,
         )
         total += errors
     if group is None:
         group = torch.zeros(len(splats), dtype=torch.bool)
-        group[worst(total, action.top_percent).cpu()] = True
+        group[worst(total, ranking.top_percent).cpu()] = True
     return Ranking(splats, total, group.to(splats.device), when)
 
 
-def _ranked(run: RunFolder, job: LoadedRun, index: int, action: RankByError) -> tuple[Splats, Tensor | None, str]:
+def _ranked(run: RunFolder, job: LoadedRun, index: int, action: Action) -> tuple[Splats, Tensor | None, str]:
     """Return the splats nearest to those that stage ``index`` ranked, the group it found if known, and when."""
     stages = job.recipe.stages
     before = stage_end(run, job, index - 1) if index else None
@@ -203,15 +205,15 @@ def _ranked(run: RunFolder, job: LoadedRun, index: int, action: RankByError) -> 
     own = [c.path for c in run.checkpoints() if (c.stage_index, c.iteration) == (index, None)]
     if own and stages[index].on_enter == (action,):  # nothing was cloned since: the same splats in the same places
         state = TrainState.from_state_dict(load_tensors(own[0])["state"])
-        return state.splats, state.groups.get(action.writes), f"after {stages[index].name}"
+        return state.splats, state.groups.get(str(action.writes)), f"after {stages[index].name}"
     return finished_splats(run), None, "final splats"
 
 
-def _first_ranking(recipe: Recipe) -> tuple[int, RankByError]:
+def _first_ranking(recipe: Recipe) -> tuple[int, Action]:
     """Return the stage that first ranks, and how; (0, default) where none does."""
     for index, stage in enumerate(recipe.stages):
         for action in stage.on_enter:
-            if isinstance(action, RankByError):
+            if action.name == "rank_by_error":
                 return index, action
     return 0, DEFAULT_RANK
 

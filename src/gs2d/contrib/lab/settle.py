@@ -83,12 +83,12 @@ def settle(options: TrainOptions, on_event: OnEvent) -> Settled:
     opened = open_capture(replace(options, downscale=options.downscale or 1), on_event)
     scale = 1.0 if options.schedule_scale is None else options.schedule_scale
     recipe, resolved = resolve(options, opened, on_event, seed=options.seed, schedule_scale=scale)
-    if recipe.poses is not None:
+    if recipe.learns("poses"):
         raise RecipeError(
             "blocks need cameras that stay where they are, got a recipe that refines poses; refine them in a run of "
             "its own, or leave --refine-poses out"
         )
-    if recipe.photometry is not None:
+    if recipe.learns("vignetting", "response"):
         raise RecipeError(
             "blocks need cameras whose light is known, got a recipe that learns vignetting or response; leave "
             "--vignetting and --response out"
@@ -210,13 +210,12 @@ def block_recipe(recipe: Recipe, partition: Partition, block: Block) -> Recipe:
     """
     whole = budget_of(recipe)
     most = partition.splats if whole is None else min(partition.splats, math.ceil(whole * block.weight))
-    exposure = None if recipe.exposure is None else replace(recipe.exposure, initial="given")
     stages = tuple(replace(stage, sh_interval=0) for stage in recipe.stages)
     dense = recipe.dense_start if partition.start == "dense" else None
     dense = (
         None if dense is None else replace(dense, required=False)
     )  # where it finds nothing there is the coarse model
-    value = replace(recipe, stages=stages, exposure=exposure, dense_start=dense)
+    value = replace(_with_given_exposure(recipe), stages=stages, dense_start=dense)
     return validate(with_budget(value, max(2, most)))
 
 
@@ -238,11 +237,14 @@ def seam_recipe(recipe: Recipe, partition: Partition, photographs: float) -> Rec
         densify=None,
         on_enter=(),
         sh_interval=0,
-        downscale=1,
-        halve_at=(),
     )
-    exposure = None if recipe.exposure is None else replace(recipe.exposure, initial="given")
-    return validate(replace(recipe, stages=(stage,), exposure=exposure, dense_start=None, removal=None))
+    return validate(replace(_with_given_exposure(recipe), stages=(stage,), dense_start=None, removal=None))
+
+
+def _with_given_exposure(recipe: Recipe) -> Recipe:
+    """Return the recipe with exposures that stay as they are given, if it learns any."""
+    exposure = recipe.quantities.get("exposure")
+    return recipe if exposure is None else recipe.with_learned(exposure.with_options(initial="given"))
 
 
 def seam_folder(out: Path) -> Path:

@@ -21,7 +21,7 @@ from gs2d.errors import DataError, RunError
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 from gs2d.training.events import Notice, OnEvent, counted
-from gs2d.training.seen_area import shown_weights, shrunk
+from gs2d.training.robust.seen_area import shown_weights, shrunk
 
 SIDE = 200  # px, of the pictures in which is looked at what shows what: fractions do not need more
 LEAST_WEIGHT = 1e-3  # px of a splat in a picture, from which it is shown there

@@ -2,7 +2,7 @@
 
 Values are reduced in a fixed order, so they are the same from run to run. Unlike the native ones, gradients wait for
 the backward pass: their cotangents are read on the device, and nothing has to be guessed (``expected`` is accepted and
-not needed). The formulas are in ``kernels/core/losses.h``; ``losses.reference`` has the same in torch.
+not needed). The formulas are in ``kernels/core/losses.h``; ``losses.formulas`` has the same in torch.
 """
 
 from __future__ import annotations
@@ -251,7 +251,7 @@ def normal_consistency(
     expected: float = 0.05,
     launcher: Launcher,
 ) -> Tensor:
-    """Return normal consistency [], the form on a GPU of the functions of the same name in ``losses.reference``.
+    """Return normal consistency [], the form on a GPU of the functions of the same name in ``losses.formulas``.
 
     Parameters
     ----------

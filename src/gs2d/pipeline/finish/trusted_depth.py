@@ -21,7 +21,7 @@ MIN_POINTS = 20  # sparse points in a photograph to search it for sky
 def believed_reach(scene: Scene) -> Reach | None:
     """Return the region of valid depths, a little larger than that of the sparse points; None without points.
 
-    Splats of the background sphere (``training/background_sphere.py``) are beyond it.
+    Splats of the background sphere (``training/start/background_sphere.py``) are beyond it.
     """
     if scene.points is None:
         return None

@@ -7,7 +7,6 @@ pixel of a small test scene, forwards and backwards; ``rasterizer_speed`` measur
 
 from __future__ import annotations
 
-import itertools
 import math
 import shlex
 import time
@@ -19,7 +18,6 @@ import torch
 
 from gs2d.config.densify import Densify
 from gs2d.config.recipe import GradDensify, Recipe
-from gs2d.config.robust import DenseStart
 from gs2d.core.camera import Camera
 from gs2d.core.memory_limit import memory_budget
 from gs2d.core.splats import Splats
@@ -38,7 +36,7 @@ from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 from gs2d.training.events import OnEvent, ignore
-from gs2d.training.plane_sweep import sweep_downscale
+from gs2d.training.start.plane_sweep import MAX_VIEWS, sweep_downscale
 
 # Bytes
 PROGRAM_BYTES = 384 << 20  # torch, the kernels, the scene
@@ -239,7 +237,7 @@ def initial_splats(scene: Scene, recipe: Recipe) -> int:
     if dense is None:
         return max(2, recipe.init_points if scene.points is None else sparse)
     cells = _mean_pixels(scene) / sweep_downscale(scene, dense) ** 2 / dense.cell**2
-    return max(2, round(cells * math.sqrt(min(len(scene.train), dense.max_views)) + sparse / 2))
+    return max(2, round(cells * math.sqrt(min(len(scene.train), MAX_VIEWS)) + sparse / 2))
 
 
 def expected_splats(recipe: Recipe, start: int) -> Range:
@@ -282,22 +280,15 @@ def _mean_pixels(scene: Scene) -> float:
 
 
 # -- time --------------------------------------------------------------------------------------------------------------
-def iteration_costs(recipe: Recipe) -> tuple[tuple[int, float], ...]:
-    """Return consecutive numbers of iterations with the fraction of pixels that their images have."""
-    each = (1 / stage.downscale_at(i) ** 2 for stage in recipe.stages for i in range(1, stage.iterations + 1))
-    return tuple((sum(1 for _ in run), cost) for cost, run in itertools.groupby(each))
-
-
 def _seconds(scene: Scene, recipe: Recipe, start: int, splats: Range, unit: float) -> Range:
     """Estimate the seconds of a run; ``unit`` is the result of :func:`rasterizer_speed`."""
     pixels, dense = _mean_pixels(scene), recipe.dense_start
-    swept = min(len(scene.train), (dense or DenseStart()).max_views)
-    full_size = sum(count * cost for count, cost in iteration_costs(recipe))
+    swept = min(len(scene.train), MAX_VIEWS)
     before = 0.0 if dense is None else SWEEP_WORK * swept * pixels / sweep_downscale(scene, dense) ** 2
     seconds = []
     for final, factor in zip(splats, (1 / UNCERTAINTY, 1.0, UNCERTAINTY), strict=True):
         count = (start + 3 * final) / 4  # most splats are added in the first half
-        work = before + PIXEL_WORK * pixels * full_size + SPLAT_WORK * count * recipe.iterations
+        work = before + (PIXEL_WORK * pixels + SPLAT_WORK * count) * recipe.iterations
         if recipe.removal is not None:
             work += (REMOVAL_WORK[0] + REMOVAL_WORK[1] * recipe.iterations) * count * swept
         work += FINISH_ITERATIONS * len(scene.views) * (PIXEL_WORK * pixels + SPLAT_WORK * final)

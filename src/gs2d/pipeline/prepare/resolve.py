@@ -23,15 +23,15 @@ from gs2d.config.serialize import apply_overrides
 from gs2d.data import Scene
 from gs2d.data.subject_box import check_subject_box
 from gs2d.errors import ProtocolError, RecipeError
-from gs2d.losses.api import losses_of
+from gs2d.losses.base import losses_of
 from gs2d.pipeline.prepare.open_capture import OpenCapture, without_masked_points
 from gs2d.pipeline.prepare.options import Training, TrainOptions
 from gs2d.pipeline.prepare.photographs import PREPARE
 from gs2d.pipeline.prepare.quality import check_quality
-from gs2d.training.backdrop import find_backdrop
 from gs2d.training.events import Notice, OnEvent
-from gs2d.training.point_gains import point_gains
-from gs2d.training.robust import check_free_space
+from gs2d.training.learned.point_gains import point_gains
+from gs2d.training.robust.backdrop import find_backdrop
+from gs2d.training.robust.robustness import check_free_space
 
 MAX_VIEWS = 1_000_000
 ROBUST = ("auto", "on", "off")
@@ -77,8 +77,9 @@ def build_recipe(
     value = with_depth_prior(value, training.depth_prior) if training.depth_prior is not None else value
     value = with_normal_prior(value) if training.normal_prior else value
     value = with_robustness(value) if robust else value
-    if robust and value.exposure is not None:
-        value = replace(value, exposure=replace(value.exposure, initial="points"))
+    exposures = value.quantities.get("exposure")
+    if robust and exposures is not None:
+        value = value.with_learned(exposures.with_options(initial="points"))
     if iterations is not None and schedule_scale != 1:
         both = f"{iterations} and {schedule_scale}"
         raise RecipeError(f"iterations and schedule_scale both set the length of training, got {both}; give one")
@@ -87,11 +88,6 @@ def build_recipe(
     value = longer_steps(value, schedule_scale if iterations is None else iterations / full) if robust else value
     value = apply_overrides(replace(value, seed=seed), training.overrides)
     for option, wanted, field in (
-        ("--exposure", exposure, "exposure"),
-        ("--refine-poses", training.refine_poses, "poses"),
-        ("--refine-cameras", training.refine_cameras, "intrinsics"),
-        ("--vignetting", training.vignetting, "photometry"),
-        ("--response", training.response, "photometry"),
         ("--depth-prior", training.depth_prior is not None, "depth_prior"),
         ("--normal-prior", training.normal_prior, "normal_prior"),
     ):

@@ -17,7 +17,7 @@ from gs2d.core.transforms import focus_point, perturb_pose
 from gs2d.data import Scene, View
 from gs2d.errors import DataError, RunError, ShapeError
 from gs2d.io.run_dir import POSES, SPLATS, RunFolder
-from gs2d.losses.api import LossView, compute_losses
+from gs2d.losses.base import LossView, compute_losses
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
@@ -123,7 +123,7 @@ def with_refined_poses(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
     RunError
         If the file is missing, damaged or of other photographs.
     """
-    if recipe.poses is None or not (run.file(POSES).exists() or run.file(SPLATS).exists()):
+    if not recipe.learns("poses") or not (run.file(POSES).exists() or run.file(SPLATS).exists()):
         return scene
     remedy = f"continue with `gs2d train ... --out {run.path} --resume`, which writes it again"
     try:
@@ -137,7 +137,7 @@ def with_refined_poses(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
     except (DataError, ShapeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise RunError(f"{run.file(POSES)} does not hold the cameras of this run ({error}); {remedy}") from error
     for view in scene.train:
-        if view.name not in poses or (recipe.intrinsics is not None and view.name not in zooms):
+        if view.name not in poses or (recipe.learns("intrinsics") and view.name not in zooms):
             raise RunError(f"{run.file(POSES)} lacks pose or zoom of {view.name}; {remedy}")
     return refined
 

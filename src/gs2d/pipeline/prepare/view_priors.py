@@ -12,9 +12,9 @@ from gs2d.config.recipe import Recipe
 from gs2d.core.text import name_bytes
 from gs2d.data import Scene, View
 from gs2d.errors import DataError
-from gs2d.losses.priors import NormalTarget
+from gs2d.losses.known_maps import DepthPlan, Priors, has_priors
+from gs2d.losses.prior_formulas import NormalTarget
 from gs2d.training.events import Notice, OnEvent, Phase, Step
-from gs2d.training.priors import DepthPlan, Priors, has_priors
 
 
 def with_priors(digest: str, scene: Scene, recipe: Recipe, on_event: OnEvent) -> str:

@@ -10,11 +10,10 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any
 
-from gs2d.config.recipe import CloneInPlace, Stage
+from gs2d.config.recipe import Stage
 from gs2d.errors import DivergedError, Gs2dError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.finish.scoring import PeakGpuMemory, PeakMemory, Visitor
-from gs2d.pipeline.prepare.estimate import iteration_costs
 from gs2d.pipeline.prepare.limits import release_buffers
 from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.pipeline.train.attribute_changes import Snapshot, mean_changes, take_snapshot
@@ -232,7 +231,7 @@ class RunLogger:
 
     def _score_entry(self, event: events.StageStarted) -> None:
         """Score a stage that begins with a clone, before its first iteration."""
-        if not any(isinstance(action, CloneInPlace) for action in self._stage(event.index).on_enter):
+        if not any(action.name == "clone_in_place" for action in self._stage(event.index).on_enter):
             return
         with self._clock.paused():
             self._at_entry |= self._results.score_entry()
@@ -264,8 +263,7 @@ class RunLogger:
     def _phase(self) -> None:
         state, recipe = self._state, self._loaded.recipe
         done = self._iterations_before(state.stage) + state.step
-        costs = iteration_costs(recipe)
-        self._on_event(Phase(f"training {recipe.name}", recipe.iterations, done, growth=GROWTH, costs=costs))
+        self._on_event(Phase(f"training {recipe.name}", recipe.iterations, done, growth=GROWTH))
 
 
 def progress_every(loaded: LoadedRun) -> int:

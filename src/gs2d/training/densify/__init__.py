@@ -1,1 +1,1 @@
-"""How splats come and go while a stage trains: one file for each way."""
+"""Densifiers, which add and remove splats while a stage trains."""

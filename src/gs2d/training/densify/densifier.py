@@ -1,10 +1,9 @@
-"""What a densifier is: the object that a stage asks, in every iteration, which splats come and go."""
+"""The interface of densifiers, which add and remove splats while a stage trains. docs/extending.md adds one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from torch import Tensor
 
@@ -17,36 +16,28 @@ from gs2d.render.types import RasterSettings
 from gs2d.training import events
 from gs2d.training.parallel import ONE_PROCESS, OneProcess
 from gs2d.training.state import TrainState
-
-if TYPE_CHECKING:
-    from gs2d.training.objective import StepResult
+from gs2d.training.step_result import StepResult
 
 __all__ = ["Densifier", "Surroundings", "densifier_of"]
 
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """Where a densifier works.
+    """Context of a densifier.
 
     Attributes
     ----------
     stage : str
-        Its name, for events.
+        Name of the stage, for events.
     scene : Scene
-        Its ``extent`` (world units) is what sizes are compared with.
+        Sizes are compared with its ``extent`` (world units).
     settings : RasterSettings
-        To render with.
     white : bool
         Whether the background is white.
     backend : Backend
-        That of the training: see ``assign`` and ``accumulate`` there.
-    blame : callable
-        ``blame(state, iteration, index)`` renders training view ``index`` as the stage trains on it now, and returns of
-        each splat [N] the sum over pixels of its blending weight times how the pixel differs from the photograph, and
-        that of its blending weight.
+        Backend of the training; see its ``assign`` and ``accumulate``.
     processes : OneProcess
-        Those that train together: what a densifier gathers of views goes through ``gather``, or ``part`` and
-        ``sum``.
+        Processes that train together. Statistics of views go through ``gather``, or ``part`` and ``sum``.
     """
 
     stage: str
@@ -54,28 +45,27 @@ class Surroundings:
     settings: RasterSettings
     white: bool
     backend: Backend
-    blame: Callable[[TrainState, int, int], tuple[Tensor, Tensor]]
     processes: OneProcess = ONE_PROCESS
 
 
 class Densifier:
-    """How splats come and go in a stage; this one lets them be.
+    """Base class of densifiers; changes nothing.
 
-    N changes by ``training.rows.append_rows`` and ``keep_rows`` alone, which take all that belongs to a splat along:
-    what a densifier gathers of each splat is in ``state.statistics``, tensors [N, ...] by name, and is saved with the
-    run. All else that it needs follows from its options and the iteration, so that a run that is resumed does the same.
+    Only ``training.rows.append_rows`` and ``keep_rows`` change the number of splats; they keep all data of a splat
+    together. Statistics of splats are in ``state.statistics``, tensors [N, ...] by name, and are saved with the run.
+    Everything else must follow from the options and the iteration, so that a resumed run does the same.
 
     Parameters
     ----------
     surroundings : Surroundings
     **options
-        Of the recipe (``Densify.options``); a wrong one is a TypeError.
+        Options of the recipe (``Densify.options``); a wrong one raises TypeError.
 
     Attributes
     ----------
     shares_views : bool
-        Whether it may train in several processes, where an iteration has a view in each: it takes what ``output`` says
-        of the view (``losses``, ``signal``, ``radii``) through ``surroundings.processes`` alone, or not at all.
+        Whether it works in several processes, each with another view. It then reads ``losses``, ``signal`` and
+        ``radii`` of the output only through ``surroundings.processes``, or not at all.
     """
 
     shares_views = False
@@ -84,58 +74,57 @@ class Densifier:
         self.surroundings = surroundings
 
     def begin(self, state: TrainState) -> None:
-        """Make the statistics, when the stage begins."""
+        """Create the statistics when the stage begins."""
         state.statistics = {}
 
     def changes(self, iteration: int) -> bool:
-        """Whether :meth:`after_backward` may change splats in this iteration, or look at a device."""
+        """Return whether :meth:`after_backward` may change splats or read from the device in this iteration."""
         return True
 
     def gathers(self, state: TrainState, iteration: int) -> Mapping[str, Tensor] | None:
         """Return the statistics that a backend may gather by itself in an iteration that changes nothing.
 
-        Tensors [N], to which the norms of the screen gradients of the splats with a radius are added: "signed" and
-        "count", and "absolute" where that is wanted; empty where nothing is gathered. :meth:`before_backward` and
-        :meth:`after_backward` are then not called. None: they must be.
+        The backend adds the norms of the screen gradients of visible splats to "signed", "count" and optionally
+        "absolute", Tensors [N]. An empty mapping gathers nothing. :meth:`before_backward` and :meth:`after_backward`
+        are then not called. None: the backend may not do that.
         """
         return None
 
     def before_backward(self, state: TrainState, iteration: int) -> Tensor | None:
-        """Return the screen probe (rule 13 of ``render/api.py``) whose gradient is wanted, zeros [N, 2 or 4], or None.
+        """Return a screen probe (rule 13 of ``render/api.py``), zeros [N, 2 or 4], or None.
 
-        Called before the view of an iteration (from 1) is rendered.
+        Called before the view of an iteration (from 1) is rendered. The gradient of the probe becomes
+        ``output.signal``.
         """
         return None
 
     def after_backward(self, state: TrainState, output: StepResult, iteration: int) -> Sequence[events.TrainingEvent]:
-        """Gather, and change splats where that is due; return what happened.
+        """Gather statistics, change splats if that is due, and return events.
 
-        Adam follows, but for an iteration with an event ``Densified`` (its rows are new), and but for opacity in one
-        with ``OpacityLimited``. In an iteration that does not change anything (:meth:`changes`) statistics are written
-        by ``backend.assign`` or ``backend.accumulate`` alone: on a GPU it may be done again.
+        An Adam step follows, except after an event ``Densified`` (its rows are new); after ``OpacityLimited`` it skips
+        the opacity. In iterations without changes (:meth:`changes`), statistics are written only by ``backend.assign``
+        or ``backend.accumulate``, because a GPU may repeat the iteration.
         """
         return ()
 
 
 def densifier_of(densify: GradDensify | Densify | None, surroundings: Surroundings) -> Densifier | None:
-    """Return the densifier that a stage names.
+    """Return the densifier of a stage.
 
     Raises
     ------
     RecipeError
-        Unknown, of a package that cannot be imported, or with options that it does not take.
+        If its package cannot be imported, or it does not take its options.
     """
     if densify is None:
         return None
     if isinstance(densify, GradDensify):
-        name = "multi-view-error" if densify.error_views else "absolute-gradient" if densify.absolute else "gradient"
-        made: Densifier = DENSIFIERS.get(name)(surroundings, densify)
-        return made
+        densify = Densify("gradient", vars(densify))
     try:
-        found: Densifier = DENSIFIERS.get(densify.name)(surroundings, **densify.options)
+        made: Densifier = DENSIFIERS.get(densify.name)(surroundings, **densify.options)
     except TypeError as error:
         raise RecipeError(
             f"stage {surroundings.stage!r}: densifier {densify.name!r} does not take the options "
             f"{dict(densify.options)}: {error}"
         ) from error
-    return found
+    return made

@@ -1,14 +1,14 @@
 """Densification by screen gradients: clone, split, prune, opacity reset (official 2DGS), and its AbsGS form.
 
-The official screen-size prune is dead code there (its statistic is zeroed just before the test), and stays dead here.
+The screen-size prune of the official code never acts (its statistic is zeroed just before the test); it is left out.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,43 +21,42 @@ from gs2d.errors import DivergedError
 from gs2d.render.backends import PLAIN, Backend
 from gs2d.training import events
 from gs2d.training.densify.densifier import Densifier, Surroundings
-from gs2d.training.rows import append_rows, keep_rows
+from gs2d.training.rows import append_rows
 from gs2d.training.state import Moments, TrainState
+from gs2d.training.step_result import StepResult
 
-if TYPE_CHECKING:
-    from gs2d.training.objective import StepResult
+CHILDREN, SHRINK = 2, 1.6  # of a split, and the divisor of their scales (official)
+LARGE = 0.1  # of the scene's extent: larger splats are pruned (official)
+RESET_OPACITY = 0.01  # official
+OPACITY_CAP = 0.8  # AbsGS
 
 
 @register_densifier("gradient")
 class GradientDensifier(Densifier):
-    """Splats with a large mean screen gradient are cloned or split, faint and large ones pruned, opacities reset.
+    """Clones or splits splats with a large mean screen gradient, prunes faint and large ones, resets opacities.
 
     Parameters
     ----------
     surroundings : Surroundings
-    densify : GradDensify, optional
     **options
-        Fields of GradDensify, instead.
+        Fields of GradDensify.
     """
 
-    absolute: bool | None = False  # None: as the options say
     shares_views = True
 
-    def __init__(self, surroundings: Surroundings, densify: GradDensify | None = None, **options: Any) -> None:
+    def __init__(self, surroundings: Surroundings, **options: Any) -> None:
         super().__init__(surroundings)
-        given = GradDensify() if densify is None else densify
-        fixed = {} if self.absolute is None else {"absolute": self.absolute}
-        self._options = replace(given, **{**fixed, **options})
+        self._options = GradDensify(**options)
 
     def begin(self, state: TrainState) -> None:
-        """Nothing is gathered yet."""
+        """Create empty statistics."""
         state.statistics = no_statistics(state.splats) if self._options.stop > 0 else {}
 
     def changes(self, iteration: int) -> bool:
-        """Whether splats come and go, or opacities are limited, at the end of an iteration."""
+        """Return whether splats are densified or opacities limited at the end of an iteration."""
         options = self._options
         if iteration >= options.stop:
-            return options.only_prunes(iteration)
+            return False
         resets = options.resets(iteration, white=self.surroundings.white)
         return options.densifies(iteration) or resets or self._caps(iteration)
 
@@ -65,7 +64,7 @@ class GradientDensifier(Densifier):
         return self._options.cap_every > 0 and iteration % self._options.cap_every == 0
 
     def gathers(self, state: TrainState, iteration: int) -> Mapping[str, Tensor] | None:
-        """Return the statistics, until densification stops; a class with steps of its own is asked for them."""
+        """Return the statistics until densification stops; None for a subclass with steps of its own."""
         steps = (type(self).before_backward, type(self).after_backward)
         if steps != (GradientDensifier.before_backward, GradientDensifier.after_backward):
             return None
@@ -76,75 +75,51 @@ class GradientDensifier(Densifier):
         return {name: state.statistics[name] for name in names}
 
     def before_backward(self, state: TrainState, iteration: int) -> Tensor | None:
-        """Return the screen probe, until densification stops."""
+        """Return the screen probe until densification stops."""
         if iteration >= self._options.stop:
             return None
         columns = 4 if self._options.absolute else 2
         return state.splats.means.new_zeros(len(state.splats), columns, requires_grad=True)
 
     def after_backward(self, state: TrainState, output: StepResult, iteration: int) -> Sequence[events.TrainingEvent]:
-        """Statistics, densification and opacity resets of one iteration."""
+        """Gather statistics, densify and reset opacities, if due."""
         options, around = self._options, self.surroundings
         happened: list[events.TrainingEvent] = []
         if iteration >= options.stop:
-            return self._prune_large(state, iteration)
+            return ()
         assert state.statistics is not None
         around.processes.gather(state.statistics, output, self._add)
         white = around.white
         if options.densifies(iteration):
             extent = around.scene.extent
             try:
-                factor = self.urgency(state, iteration)
-                counts = densify_and_prune(
-                    state, options, iteration=iteration, extent=extent, white=white, factor=factor
-                )
+                counts = densify_and_prune(state, options, iteration=iteration, extent=extent, white=white)
             except DivergedError as error:
                 raise DivergedError(f"stage {around.stage!r}: {error}") from error
             happened.append(events.Densified(around.stage, iteration, **vars(counts), splats=len(state.splats)))
         reset = options.resets(iteration, white=white)
         if reset or self._caps(iteration):
-            ceiling = options.reset_opacity if reset else options.opacity_cap
+            ceiling = RESET_OPACITY if reset else OPACITY_CAP
             limit_opacity(state, ceiling)
             happened.append(events.OpacityLimited(around.stage, iteration, ceiling, reset))
         return happened
 
     def _add(self, statistics: Mapping[str, Tensor], output: StepResult) -> None:
-        """Add what the view of this process says."""
+        """Add the statistics of the view of this process."""
         assert output.signal is not None
         assert output.radii is not None
         accumulate(statistics, output.signal, output.radii, self.surroundings.backend)
 
-    def urgency(self, state: TrainState, iteration: int) -> Tensor | None:
-        """Return by how much the gradients of splats count more [N], at a densification; None: all as they are."""
-        return None
-
-    def _prune_large(self, state: TrainState, iteration: int) -> Sequence[events.TrainingEvent]:
-        """Prune splats that have grown too large after densification, where that is due."""
-        options, around = self._options, self.surroundings
-        if not options.only_prunes(iteration):
-            return ()
-        large = _largest(state.splats.scales) > options.scale_cull * around.scene.extent
-        count = int(large.sum())
-        if count == 0:
-            return ()
-        if count == len(large):
-            raise DivergedError(
-                f"stage {around.stage!r}: all {count} splats were pruned at iteration {iteration}: none is of size <= "
-                f"{options.scale_cull * around.scene.extent:g}; check the cameras, or scale_cull"
-            )
-        keep_rows(state, ~large)
-        return (events.Densified(around.stage, iteration, 0, 0, 0, count, len(state.splats)),)
-
 
 def no_statistics(splats: Splats) -> dict[str, Tensor]:
-    """Nothing gathered yet: over views the sums of the norms of signed and absolute screen gradients, and the views."""
+    """Return zero statistics: sums of the norms of signed and absolute screen gradients, and the number of views."""
     zeros = torch.zeros_like(splats.opacity_logits, requires_grad=False)
     return {"signed": zeros, "absolute": zeros.clone(), "count": zeros.clone()}
 
 
 @dataclass(frozen=True)
 class DensifyCounts:
-    """What a densification did: splats cloned, split, pruned for opacity and pruned for size."""
+    """Numbers of splats that were cloned, split, pruned by opacity and pruned by size."""
 
     cloned: int
     split: int
@@ -154,7 +129,7 @@ class DensifyCounts:
 
 @torch.no_grad()
 def accumulate(statistics: Mapping[str, Tensor], signal: Tensor, radii: Tensor, backend: Backend = PLAIN) -> None:
-    """Add one view.
+    """Add the statistics of one view.
 
     Parameters
     ----------
@@ -165,7 +140,7 @@ def accumulate(statistics: Mapping[str, Tensor], signal: Tensor, radii: Tensor, 
     radii : Tensor [N] px
         Splats with radius 0 are not counted.
     backend : Backend
-        Does it; by default plain torch.
+        By default plain torch.
     """
     backend.accumulate(statistics["signed"], statistics["absolute"], statistics["count"], signal, radii)
 
@@ -178,39 +153,36 @@ def densify_and_prune(
     iteration: int,
     extent: float,
     white: bool,
-    factor: Tensor | None = None,
 ) -> DensifyCounts:
     """Clone small splats and split large ones where the mean screen gradient is high, then prune; N changes.
 
     Parameters
     ----------
     state : TrainState
-        With statistics, which are zeroed.
+        Its statistics are used and then zeroed.
     densify : GradDensify
     iteration : int
         1-based, of the stage.
     extent : float, world units
-        Scale of the scene: sizes are compared with it.
+        Scale that sizes are compared with.
     white : bool
-        Whether the background is white (there is one more reset then, with its grace).
-    factor : Tensor [N], optional
-        Times which mean gradients count.
+        Whether the background is white, which adds an opacity reset.
 
     Raises
     ------
     DivergedError
-        If no splat would be left.
+        If no splat would remain.
     """
     splats, sizes = state.splats, _largest(state.splats.scales)
     faint, large = _prunable(splats.opacities, sizes, densify, iteration=iteration, extent=extent, white=white)
-    clone, split = _select(state, densify, sizes, extent, (faint, large), factor)
+    clone, split = _select(state, densify, sizes, extent, (faint, large))
     parents = split.nonzero().squeeze(1)  # [P]
-    children = parents.repeat(densify.split_count)  # [C] all first children, then all second ones
-    shrunk = splats.log_scales[children] - math.log(densify.split_shrink)  # [C, 2]
+    children = parents.repeat(CHILDREN)  # [C] all first children, then all second ones
+    shrunk = splats.log_scales[children] - math.log(SHRINK)  # [C, 2]
     ends = _prunable(
         splats.opacities[children], _largest(shrunk.exp()), densify, iteration=iteration, extent=extent, white=white
     )
-    # draws for all children, whether they live or not
+    # random numbers for all children, also for those that are pruned
     means = points_in_plane(state, children)
     keep, living = ~(split | faint | large), ~(ends[0] | ends[1])
     cloned = (clone & keep).nonzero().squeeze(1)
@@ -218,14 +190,14 @@ def densify_and_prune(
     if int(keep.sum()) + len(cloned) + int(living.sum()) == 0:
         raise DivergedError(
             f"all {counts.pruned_by_opacity + counts.pruned_large} splats were pruned at iteration {iteration}: none "
-            f"has opacity >= {densify.opacity_cull} and size <= {densify.scale_cull * extent:g}; check the cameras, or "
+            f"has opacity >= {densify.opacity_cull} and size <= {LARGE * extent:g}; check the cameras, or "
             "opacity_cull"
         )
     rows = torch.cat([cloned, children[living]])
     new = splats.rows(rows)
     new.means[len(cloned) :] = means[living]
     new.log_scales[len(cloned) :] = shrunk[living]
-    state.statistics = None  # of rows that are no more
+    state.statistics = None  # refers to the old rows
     append_rows(state, new, {name: group[rows] for name, group in state.groups.items()}, keep=keep)
     state.statistics = no_statistics(state.splats)
     return counts
@@ -233,7 +205,7 @@ def densify_and_prune(
 
 @torch.no_grad()
 def limit_opacity(state: TrainState, ceiling: float) -> None:
-    """Opacity = min(opacity, ceiling) for all splats, and no memory of its gradients (Adam's step count stays)."""
+    """Set opacity = min(opacity, ceiling) for all splats, and zero its moments (Adam's step count stays)."""
     state.splats.opacity_logits.clamp_(max=math.log(ceiling / (1.0 - ceiling)))
     moments = state.moments.get("opacity_logits")
     if moments is not None:
@@ -248,15 +220,12 @@ def _select(
     sizes: Tensor,
     extent: float,
     ends: tuple[Tensor, Tensor],
-    factor: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """Rows to clone and rows to split, bool [N] each; ``ends`` are those that are too faint, and too large."""
+    """Return the rows to clone and to split, bool [N] each; ``ends`` are the too faint and too large rows."""
     statistics = state.statistics
     assert statistics is not None
-    count = statistics["count"].clamp(min=1.0)  # never seen: sum 0, mean 0
+    count = statistics["count"].clamp(min=1.0)
     signed, absolute = statistics["signed"] / count, statistics["absolute"] / count
-    if factor is not None:
-        signed, absolute = signed * factor, absolute * factor
     small = sizes <= densify.percent_dense * extent
     for_split, split_threshold = (
         (absolute, densify.abs_threshold) if densify.absolute else (signed, densify.grad_threshold)
@@ -276,12 +245,12 @@ def _within_budget(
     urgency: Tensor,
     ends: tuple[Tensor, Tensor],
 ) -> tuple[Tensor, Tensor]:
-    """Of the rows [N] bool to clone and to split the most urgent, so that no more than ``max_splats`` are left."""
+    """Return the most urgent rows to clone and to split, so that at most ``max_splats`` remain."""
     assert densify.max_splats is not None
     faint, large = ends
     stays = ~(faint | large)
-    to_clone, to_split = to_clone & stays, to_split & ~faint  # what would be pruned at once takes no room
-    growth = torch.where(to_split, densify.split_count - stays.long(), to_clone.long())  # [N] rows gained
+    to_clone, to_split = to_clone & stays, to_split & ~faint  # splats that are pruned at once take no room
+    growth = torch.where(to_split, CHILDREN - stays.long(), to_clone.long())  # [N] rows gained
     wanted = urgency.where(growth > 0, -torch.ones_like(urgency))
     order = torch.sort(wanted, descending=True, stable=True).indices
     chosen = torch.zeros_like(wanted, dtype=torch.bool)
@@ -289,16 +258,12 @@ def _within_budget(
     return to_clone & chosen, to_split & chosen
 
 
-def points_in_plane(state: TrainState, rows: Tensor, reach: Tensor | None = None) -> Tensor:
-    """Return a point [M, 3] world units drawn from the Gaussian of each of these splats, in its plane.
-
-    ``reach`` [M]: standard deviations, of a Gaussian that much as wide.
-    """
+def points_in_plane(state: TrainState, rows: Tensor) -> Tensor:
+    """Draw a point [M, 3] world units from the Gaussian of each of these splats, in its plane."""
     splats = state.splats
     if len(rows) == 0:
         return splats.means[rows]
     draws = torch.randn(len(rows), 2, generator=state.generator, dtype=splats.dtype).to(splats.device)
-    draws = draws if reach is None else draws * reach[:, None]
     in_plane = draws * splats.log_scales[rows].exp()  # [M, 2] world units
     frames = quats_to_matrices(splats.quats[rows])[:, :, :2]  # [M, 3, 2] columns t_u, t_v
     return splats.means[rows] + (frames * in_plane[:, None, :]).sum(dim=2)
@@ -312,11 +277,11 @@ def _largest(scales: Tensor) -> Tensor:
 def _prunable(
     opacities: Tensor, sizes: Tensor, densify: GradDensify, *, iteration: int, extent: float, white: bool
 ) -> tuple[Tensor, Tensor]:
-    """Splats that are too faint, and splats that are too large, bool [M] each."""
+    """Return the splats that are too faint, and those that are too large, bool [M] each."""
     faint = opacities < densify.opacity_cull
     if densify.in_prune_grace(iteration, white=white):
         faint = torch.zeros_like(faint)
-    large = sizes > densify.scale_cull * extent
+    large = sizes > LARGE * extent
     if not densify.culls_scale(iteration):
         large = torch.zeros_like(large)
     return faint, large
@@ -328,9 +293,9 @@ def _counts(
     ends: tuple[Tensor, Tensor],
     ends_of_children: tuple[Tensor, Tensor],
 ) -> DensifyCounts:
-    """Count what happened to old splats, clones and children together; a faint large one counts as faint."""
+    """Count the changes of splats, clones and children; a faint large splat counts as faint."""
     faint, large = ends
-    copies = (~split).long() + clone.long()  # [N] a splat that is not split and its clone have one fate
+    copies = (~split).long() + clone.long()  # [N] a clone is pruned with its original
     child_faint, child_large = ends_of_children
     figures = (
         clone.sum(),

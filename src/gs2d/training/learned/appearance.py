@@ -1,4 +1,4 @@
-"""Colours as a photograph shows them, by the numbers that were learned of it."""
+"""Colours of the scene as an image shows them, according to the learned numbers of its view."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Numbers = Mapping[str, Tensor]
 
 
 def shown(color: Tensor, numbers: Numbers, at: ImagePoints, clipped: Tensor | None = None) -> Tensor:
-    """Return colours [H, W, 3] of the scene as a photograph shows them, with gradients for colours and numbers.
+    """Return colours [H, W, 3] of the scene as an image shows them, differentiable in colours and numbers.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ def shown(color: Tensor, numbers: Numbers, at: ImagePoints, clipped: Tensor | No
     numbers : mapping of name to Tensor
     at : ImagePoints
     clipped : Tensor [H, W, 3] bool, optional
-        Where the photograph is at its ceiling, so that it says "this bright or brighter": there at most 1.
+        Clipped pixels of the image, which may be brighter in the scene: there the result is at most 1.
     """
     quantities = _ordered(numbers)
     for quantity, found in quantities:
@@ -39,7 +39,7 @@ def shown(color: Tensor, numbers: Numbers, at: ImagePoints, clipped: Tensor | No
 
 @torch.no_grad()
 def shown_splats(splats: Splats, camera: Camera, numbers: Numbers, sh_degree: int) -> Splats:
-    """Return splats in the colours that a photograph shows, to be rendered at SH degree 0."""
+    """Return splats in the colours of an image, to be rendered at SH degree 0."""
     center = torch.as_tensor(camera.center).to(splats.means)
     directions = torch.nn.functional.normalize(splats.means - center, dim=1)
     rgb = sh_to_rgb(splats.sh0, splats.shN, directions, min(sh_degree, splats.sh_degree))  # [N, 3]
@@ -48,17 +48,17 @@ def shown_splats(splats: Splats, camera: Camera, numbers: Numbers, sh_degree: in
 
 
 def unshown(color: Tensor, numbers: Numbers, at: ImagePoints) -> Tensor:
-    """Return colours [H, W, 3] of a photograph as the scene has them: the inverse of :func:`shown`."""
+    """Return colours [H, W, 3] of an image as the scene has them: the inverse of :func:`shown`."""
     for quantity, found in reversed(_ordered(numbers)):
         color = quantity.undo(color, found, at)
     return color
 
 
 def numbers_of(view: View, like: Tensor) -> dict[str, Tensor]:
-    """Return what is known of how the photograph of a view shows colours, of the type of ``like`` where that is."""
+    """Return the numbers of the appearance of a view, with the dtype and device of ``like``."""
     return {name: torch.as_tensor(found).to(like) for name, found in view.appearance.items()}
 
 
 def _ordered(numbers: Numbers) -> list[tuple[type[LearnedQuantity], Tensor]]:
-    """Return quantities and numbers in the order in which they are applied: that of the registry."""
+    """Return quantities and numbers in the order of the registry, in which they are applied."""
     return [(QUANTITIES.get(name), numbers[name]) for name in QUANTITIES if name in numbers]

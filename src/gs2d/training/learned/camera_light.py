@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gs2d.config.quantities import QUANTITIES, Photometry
+from gs2d.config.quantities import QUANTITIES, Quantity
 from gs2d.core.camera import Camera
 from gs2d.core.vignetting import reach_of
 from gs2d.data.scene import Scene
@@ -15,17 +15,17 @@ from gs2d.training.learned.quantity import ImagePoints, LearnedQuantity
 
 @QUANTITIES.register("vignetting")
 class Vignetting(LearnedQuantity):
-    """Falloff of the light towards the corners of each camera; 1 at the principal point.
+    """Light falloff of each camera towards the corners; 1 at the principal point.
 
-    Rows are a, b and c at radii whose 1 is the farthest corner. The numbers of a view are the same at radii in focal
+    Rows are a, b and c for radii relative to the farthest corner. The numbers of a view are the same for radii in focal
     lengths.
     """
 
     shape = (3,)
     per_camera = True
-    limit = 1.0  # beyond, a corner has a twentieth of the light, or twenty times too much
+    limit = 1.0  # beyond, a corner is twenty times too dark or too bright
 
-    def __init__(self, settings: Photometry, scene: Scene) -> None:
+    def __init__(self, settings: Quantity, scene: Scene) -> None:
         super().__init__(settings, scene)
         cameras: list[list[Camera]] = [[] for _ in range(self.rows)]
         for row, view in zip(self.row_of, scene.train, strict=True):
@@ -33,7 +33,7 @@ class Vignetting(LearnedQuantity):
         self.reach = list(map(reach_of, cameras))
 
     def _powers(self, index: int) -> Tensor:
-        """Return the powers of the reach [3] by which numbers are smaller than rows."""
+        """Return the powers of the corner radius [3], the ratios of rows and numbers."""
         return self.reach[self.row_of[index]] ** torch.tensor([2.0, 4.0, 6.0], dtype=torch.float64)
 
     def numbers(self, values: Tensor, index: int) -> Tensor:
@@ -42,7 +42,7 @@ class Vignetting(LearnedQuantity):
 
     @staticmethod
     def apply(color: Tensor, numbers: Tensor, at: ImagePoints) -> Tensor:
-        """Return colours with what vignetting leaves of them."""
+        """Return colours darkened by the falloff."""
         curve = torch.cat([numbers, numbers.new_zeros(1)])
         return show(color, curve, at.squared_radii(color), at.coverage, at.background)
 
@@ -56,17 +56,17 @@ class Vignetting(LearnedQuantity):
         return super().penalty(numbers * self._powers(index).to(numbers), index)
 
     def gradient(self, leaf: Tensor | None, index: int, camera: Camera) -> Tensor | None:
-        """Return that of a row; zero for a face of a panorama, whose centre is not that of a lens."""
+        """Return the gradient of a row; zero for panorama faces, whose centre is not that of a lens."""
         found = super().gradient(leaf, index, camera)
         return None if found is None else found.double().cpu() / self._powers(index) * (not self.views[index].is_face)
 
 
 @QUANTITIES.register("response")
 class Response(LearnedQuantity):
-    """Curve of each camera by which light becomes a value: one number s.
+    """Response curve of each camera, from light to values: one number s.
 
-    The mean of s over all images is taken off: a scene in another curve would have the same images. So a single camera
-    has none, and those of several are what they differ by.
+    The mean of s over all images is subtracted, because a scene with another curve has the same images. So only the
+    differences between cameras are learned.
     """
 
     per_camera = True
@@ -78,7 +78,7 @@ class Response(LearnedQuantity):
 
     @staticmethod
     def apply(color: Tensor, numbers: Tensor, at: ImagePoints) -> Tensor:
-        """Return the values into which a camera turns light."""
+        """Return the values that a camera makes of light."""
         return show(color, torch.cat([numbers.new_zeros(3), numbers]), None, at.coverage, at.background)
 
     @staticmethod
@@ -87,7 +87,7 @@ class Response(LearnedQuantity):
         return bend(color, -numbers[0])
 
     def gradient(self, leaf: Tensor | None, index: int, camera: Camera) -> Tensor | None:
-        """Return that of s, less its share of the mean."""
+        """Return the gradient of s, without its part in the mean."""
         found = super().gradient(leaf, index, camera)
         share = self.row_of.count(self.row_of[index]) / len(self.row_of)
         return None if found is None else found.double().cpu() * (1 - share)

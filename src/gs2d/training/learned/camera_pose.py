@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gs2d.config.quantities import QUANTITIES, Learning
+from gs2d.config.quantities import QUANTITIES, Quantity
 from gs2d.core.camera import Camera
 from gs2d.core.transforms import common_motion, se3_exp, similarity_motions
 from gs2d.data.scene import Scene
@@ -19,18 +19,19 @@ from gs2d.training.learned.quantity import LearnedQuantity
 
 @QUANTITIES.register("poses")
 class CameraPose(LearnedQuantity):
-    """A motion xi_k of each camera: it is at se3_exp(xi_k) T_k, T_k its pose in the capture.
+    """A motion xi_k of each camera, whose pose is se3_exp(xi_k) T_k with the pose T_k of the capture.
 
-    xi = P theta: P takes out of the free numbers theta of all cameras what one similarity of the whole scene (a motion,
-    a scale) would do to all of them, which no image could show. So the scene stays in the frame of the capture. A row
-    is a rotation vector, rad, and a shift in extents of the scene, in the frame of the camera.
+    xi = P theta. The projection P removes from the free numbers theta of all cameras the part that a similarity of the
+    whole scene explains, because it changes no image. So the scene stays in the frame of the capture. A row is a
+    rotation vector, rad, and a shift in scene extents, in the frame of the camera.
     """
 
     shape = (6,)
     changes_color = False
     needs_moving_splats = True
+    beta2 = 0.99  # a camera has one update per epoch, some hundred in all, too few for a longer memory
 
-    def __init__(self, settings: Learning, scene: Scene) -> None:
+    def __init__(self, settings: Quantity, scene: Scene) -> None:
         super().__init__(settings, scene)
         self.given = np.stack([view.camera.T_cam_world for view in scene.train])
         self.extent = scene.extent
@@ -50,18 +51,18 @@ class CameraPose(LearnedQuantity):
         return se3_exp(self.numbers(values, index)) @ torch.from_numpy(self.given[index])
 
     def camera(self, values: Tensor, index: int, camera: Camera, *, learns: bool) -> Camera:
-        """Return the camera of a view at its pose; with ``learns`` the pose gets a gradient."""
+        """Return the camera of a view at its pose; with ``learns``, the pose gets a gradient."""
         pose: Any = self.pose(values, index)
         return replace(camera, T_cam_world=pose.requires_grad_() if learns else pose)
 
     def gradient(self, leaf: Tensor | None, index: int, camera: Camera) -> Tensor | None:
-        """Return that of a motion [6], rad and extents, at where the camera is, from the gradient of its pose."""
+        """Return the gradient of a motion [6], rad and extents, at the current pose."""
         pose = camera.pose
         if pose is None:
             return None
         if pose.grad is None:  # no splat is in the image
             return torch.zeros(6, dtype=torch.float64)
-        by = pose.grad @ pose.detach().T  # T moves to (1 + D) T: the gradient of D
+        by = pose.grad @ pose.detach().T  # gradient of D, for a pose (1 + D) T
         turn = (by[2, 1] - by[1, 2], by[0, 2] - by[2, 0], by[1, 0] - by[0, 1])
         return torch.stack([*turn, *(by[:3, 3] * self.extent)])
 

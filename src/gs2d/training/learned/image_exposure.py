@@ -5,43 +5,43 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gs2d.config.quantities import QUANTITIES, Exposure
+from gs2d.config.quantities import QUANTITIES, Quantity
+from gs2d.config.validate import one_of
 from gs2d.data.scene import Scene
 from gs2d.errors import RecipeError
 from gs2d.render.exposure_transform import expose, identity
+from gs2d.training.learned.point_gains import point_gains
 from gs2d.training.learned.quantity import ImagePoints, LearnedQuantity
-from gs2d.training.point_gains import point_gains
 
 
 @QUANTITIES.register("exposure")
 class ImageExposure(LearnedQuantity):
     """A transform T_k = I + theta_k - mean_j theta_j of each image.
 
-    The mean of all transforms is the identity: a scene that is twice as bright, seen by cameras half as sensitive, has
-    the same images. So the scene is in the mean exposure of its images. Given transforms are I + theta_k, and stay.
+    The mean of all transforms is the identity, because a brighter scene with darker exposures has the same images. So
+    the scene has the mean exposure of its images. Given transforms are I + theta_k, and are constant.
     """
 
     shape = (3, 4)
     on_device = True
-    settings: Exposure
 
-    def __init__(self, settings: Exposure, scene: Scene) -> None:
+    def __init__(self, settings: Quantity, scene: Scene, initial: str = "identity") -> None:
         super().__init__(settings, scene)
-        self.learns = settings.initial != "given"
-        self._scene = scene
+        one_of("learned.exposure.options.initial", initial, ("identity", "points", "given"))
+        self.learns = initial != "given"
+        self._initial, self._scene = initial, scene
 
     def begin(self, given: Tensor | None = None) -> Tensor:
-        """Return theta [V, 3, 4]: zeros, gains of sparse points, or what was given."""
+        """Return theta [V, 3, 4]: zeros, gains of sparse points, or given transforms."""
         values = super().begin()
-        if self.settings.initial == "given":
+        if self._initial == "given":
             if given is None or len(given) != len(values):
                 raise RecipeError(
-                    f"exposure.initial=given needs a transform of each of {len(values)} training views, got "
-                    f"{'none' if given is None else len(given)}; `gs2d blocks` gives them, elsewhere take points or "
-                    "identity"
+                    f"learned.exposure.options.initial=given needs {len(values)} transforms, one per view, got "
+                    f"{0 if given is None else len(given)}; only `gs2d blocks` sets it, use points or identity"
                 )
             return given.detach().to(values) - identity(values)
-        found = point_gains(self._scene) if self.settings.initial == "points" else None
+        found = point_gains(self._scene) if self._initial == "points" else None
         if found is not None:
             for channel in range(3):
                 values[:, channel, channel] = torch.as_tensor(found.gains[:, channel] - 1)
@@ -53,7 +53,7 @@ class ImageExposure(LearnedQuantity):
 
     @staticmethod
     def apply(color: Tensor, numbers: Tensor, at: ImagePoints) -> Tensor:
-        """Return colours in the exposure of the photograph."""
+        """Return colours in the exposure of the image."""
         return expose(color, numbers, at.coverage, at.background)
 
     @staticmethod
@@ -62,5 +62,5 @@ class ImageExposure(LearnedQuantity):
         return (color - numbers[:, 3]) @ torch.linalg.inv(numbers[:, :3]).T
 
     def penalty(self, numbers: Tensor, index: int) -> Tensor:
-        """Return the weighted squares of what the transform differs from the identity by."""
+        """Return the weighted squared difference of the transform from the identity."""
         return self.settings.prior * (numbers - identity(numbers)).square().sum()

@@ -1,4 +1,4 @@
-"""All that a recipe learns of images and cameras, as the training loop sees it: one table and one Adam."""
+"""The table of all learned quantities of a recipe, with one Adam."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from collections.abc import Collection, Mapping
 import torch
 from torch import Tensor
 
-from gs2d.config.quantities import QUANTITIES, Learning, Quantity
+from gs2d.config.quantities import QUANTITIES, Quantity
 from gs2d.config.recipe import Recipe
 from gs2d.core.camera import Camera
 from gs2d.data.scene import Appearance, Scene
 from gs2d.errors import RecipeError, RunError
 from gs2d.kernels.torch_kernels import finite
 from gs2d.render.backends import Backend
-from gs2d.training.learned.learned_rows import LearnedRows
 from gs2d.training.learned.quantity import LearnedQuantity
+from gs2d.training.learned_rows import LearnedRows
 from gs2d.training.targets import Target
 
 Rows = Mapping[str, LearnedRows]
@@ -23,13 +23,13 @@ Rows = Mapping[str, LearnedRows]
 
 
 class LearnedTable:
-    """The quantities of a recipe on a scene. Their rows are in the state of training.
+    """The learned quantities of a recipe on a scene. Their rows are in the training state.
 
     Parameters
     ----------
     recipe : Recipe
     scene : Scene
-        With the cameras of the capture, at full size.
+        Scene with the cameras of the capture, at full size.
 
     Attributes
     ----------
@@ -39,16 +39,16 @@ class LearnedTable:
     Raises
     ------
     RecipeError
-        If a quantity is of a package that cannot be imported, or does not take its options.
+        If the package of a quantity cannot be imported, or a quantity does not take its options.
     """
 
     def __init__(self, recipe: Recipe, scene: Scene) -> None:
         self._stages, self._scene = recipe.stages, scene
-        self.quantities = {name: _quantity(name, settings, scene) for name, settings in recipe.quantities.items()}
+        self.quantities = {name: _made(settings, scene) for name, settings in recipe.quantities.items()}
 
     @property
     def changes_color(self) -> bool:
-        """Whether photographs have other colours than the scene."""
+        """Whether images have other colours than the scene."""
         return any(quantity.changes_color for quantity in self.quantities.values())
 
     @property
@@ -58,12 +58,12 @@ class LearnedTable:
 
     # -- rows ------------------------------------------------------------------------------------------------------
     def start(self, like: Tensor, given: Mapping[str, Tensor | None]) -> dict[str, LearnedRows]:
-        """Return the rows that training starts from; ``given`` are those that another training has found.
+        """Return the initial rows; ``given`` are numbers of another training.
 
         Raises
         ------
         RecipeError
-            If the recipe needs given rows and gets none, or for another number of views.
+            If a quantity needs given numbers for each view and does not get them.
         """
         found = {}
         for name, quantity in self.quantities.items():
@@ -72,24 +72,24 @@ class LearnedTable:
         return found
 
     def check(self, rows: Rows) -> None:
-        """Raise RunError unless there are rows of each quantity, and of nothing else."""
+        """Raise RunError unless there are rows of each quantity, and no others."""
         for name in {**self.quantities, **rows}:
             have = len(rows[name]) if name in rows else 0
             need = self.quantities[name].rows if name in self.quantities else 0
             if have != need or (need and tuple(rows[name].values.shape[1:]) != self.quantities[name].shape):
                 raise RunError(
-                    f"the checkpoint must have {need} rows of {name!r}, as recipe and scene say, got {have}; start a "
+                    f"the checkpoint must have {need} rows of {name!r} for this recipe and scene, got {have}; start a "
                     "new run"
                 )
 
     def move_to(self, rows: Rows, device: torch.device | str) -> None:
-        """Move the rows that are stored beside the splats to their device."""
+        """Move the rows of quantities with ``on_device`` to a device."""
         for name, quantity in self.quantities.items():
             if quantity.on_device:
                 rows[name].move_to(device)
 
     def learning(self, stage: int, iteration: int) -> dict[str, float]:
-        """Return the learning rates of the quantities that are learned in an iteration (from 1) of a stage."""
+        """Return the learning rates of the quantities that an iteration (from 1) of a stage updates."""
         of_run = sum(earlier.iterations for earlier in self._stages[:stage]) + iteration
         found = {}
         for name, quantity in self.quantities.items():
@@ -109,39 +109,39 @@ class LearnedTable:
                 quantity.row_of[index],
                 gradients[name],
                 quantity.rates(rate, index),
-                quantity.settings,
+                constants=(quantity.beta1, quantity.beta2, quantity.eps),
                 assign=backend.assign if quantity.on_device else Tensor.copy_,
                 limit=quantity.limit,
             )
 
     def rollback(self, rows: Rows, index: int, rates: Mapping[str, float]) -> None:
-        """Take back the count of an update that was cancelled on the device."""
+        """Undo the count of an update that the device cancelled."""
         for name in rates:
             if self.quantities[name].on_device:
                 rows[name].steps[self.quantities[name].row_of[index]] -= 1
 
     # -- one view ----------------------------------------------------------------------------------------------------
     def camera(self, rows: Rows, index: int, given: Camera, learning: Collection[str] = ()) -> Camera:
-        """Return the camera of a training view as it is now; of quantities in ``learning`` with a gradient."""
+        """Return the current camera of a training view, with gradients for the quantities in ``learning``."""
         for name, quantity in self.quantities.items():
             given = quantity.camera(rows[name].values, index, given, learns=name in learning)
         return given
 
     def target(self, rows: Rows, index: int, camera: Camera, target: Target) -> Target:
-        """Return the photograph of a training view as a rendering of ``camera`` would show it."""
+        """Return the target of a training view as a rendering of ``camera`` shows it."""
         for name, quantity in self.quantities.items():
             target = quantity.target(rows[name].values, index, camera, target)
         return target
 
     def leaves(self, rows: Rows, index: int, camera: Camera, like: Tensor) -> dict[str, Tensor]:
-        """Return the tensors that ``appearance.shown`` applies to a rendering; gradients of the loss go to them."""
+        """Return the tensors that ``appearance.shown`` applies to a rendering, as leaves of autograd."""
         found = {
             name: quantity.leaf(rows[name].values, index, camera, like) for name, quantity in self.quantities.items()
         }
         return {name: leaf for name, leaf in found.items() if leaf is not None}
 
     def numbers(self, rows: Rows, index: int, like: Tensor) -> dict[str, Tensor]:
-        """Return the numbers of a view by which photographs have other colours than the scene."""
+        """Return the numbers of a view that change colours."""
         return {
             name: quantity.numbers(rows[name].values, index).to(like)
             for name, quantity in self.quantities.items()
@@ -158,9 +158,9 @@ class LearnedTable:
         found = {name: quantity.gradient(leaves.get(name), index, camera) for name, quantity in self.quantities.items()}
         return {name: gradient for name, gradient in found.items() if gradient is not None}
 
-    # -- afterwards ----------------------------------------------------------------------------------------------------
+    # -- after training ------------------------------------------------------------------------------------------------
     def scene_now(self, rows: Rows) -> Scene:
-        """Return the scene with what was learned of its views."""
+        """Return the scene with the learned cameras and appearances of its views."""
         scene = self._scene
         for name, quantity in self.quantities.items():
             scene = quantity.place(rows[name].values, scene)
@@ -172,14 +172,14 @@ class LearnedTable:
 def first_not_finite_quantity(tensors: Mapping[str, Tensor], *, waits: bool) -> str | None:
     """Return the first quantity with a NaN or an infinity; None if all are finite.
 
-    ``waits``: also tensors on a GPU are looked at.
+    ``waits``: also read tensors on a GPU.
     """
     seen = ((name, tensor) for name, tensor in tensors.items() if waits or tensor.device.type == "cpu")
     return next((name for name, tensor in seen if not finite(tensor)), None)
 
 
 def _appearances(name: str, quantity: LearnedQuantity, values: Tensor, scene: Scene) -> dict[str, Appearance]:
-    """Return the numbers of training views by their names, and of test views that share a camera with them."""
+    """Return the numbers of training views by name, and of test views that share a camera with them."""
     index_of = {view.name: index for index, view in enumerate(scene.train)}
     if quantity.per_camera:
         first = {view.file_intrinsics(): index for index, view in reversed(list(enumerate(scene.train)))}
@@ -189,10 +189,10 @@ def _appearances(name: str, quantity: LearnedQuantity, values: Tensor, scene: Sc
     return {view: {name: found.detach().double().numpy()} for view, found in numbers.items()}
 
 
-def _quantity(name: str, settings: Learning, scene: Scene) -> LearnedQuantity:
-    options = settings.options if isinstance(settings, Quantity) else {}
+def _made(settings: Quantity, scene: Scene) -> LearnedQuantity:
     try:
-        made: LearnedQuantity = QUANTITIES.get(name)(settings, scene, **options)
+        made: LearnedQuantity = QUANTITIES.get(settings.name)(settings, scene, **settings.options)
     except TypeError as error:
-        raise RecipeError(f"quantity {name!r} does not take the options {dict(options)}: {error}") from error
+        options = dict(settings.options)
+        raise RecipeError(f"quantity {settings.name!r} does not take the options {options}: {error}") from error
     return made

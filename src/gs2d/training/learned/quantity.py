@@ -1,4 +1,4 @@
-"""A learned quantity: what the numbers of an image, or of a camera, do to a rendering.
+"""The interface of learned quantities: numbers of an image or a camera that change its rendering.
 
 ``QUANTITIES`` (``gs2d.config.quantities``) names the quantities. docs/extending.md adds one.
 """
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gs2d.config.quantities import Learning
+from gs2d.config.quantities import Quantity
 from gs2d.core.camera import Camera
 from gs2d.core.vignetting import reach_of
 from gs2d.data.scene import Scene, View
@@ -21,20 +21,19 @@ from gs2d.training.targets import Target
 
 @dataclass
 class ImagePoints:
-    """Where the colours are that a quantity changes: the pixels of an image, or the centres of splats.
+    """Positions of the colours that a quantity changes: pixels of an image, or centres of splats.
 
     Attributes
     ----------
     camera : Camera
-        That sees them.
     coverage : Tensor [H, W], optional
-        Alpha of the photograph: 0 where there is nothing but the background. None: 1 everywhere.
+        Alpha of the image; None: 1 everywhere.
     background : Tensor [3], optional
-        Colour behind the photograph; given with ``coverage``.
+        Background colour; given with ``coverage``.
     points : Tensor [N, 3], optional
         Centres of splats; the colours are then [1, N, 3]. None: the colours are an image [H, W, 3].
     inside : Tensor [H, W] bool, optional
-        Where the rendering reaches, once a quantity has moved its pixels. Elsewhere nothing is learned.
+        Pixels that the rendering covers after a quantity has moved it. Other pixels have no loss.
     """
 
     camera: Camera
@@ -44,9 +43,9 @@ class ImagePoints:
     inside: Tensor | None = None
 
     def squared_radii(self, like: Tensor) -> Tensor:
-        """Return squared distances from the principal point [H, W], in focal lengths; those of points up to a corner.
+        """Return squared distances from the principal point [H, W] in focal lengths, at most that of a corner.
 
-        They have the type of ``like`` and are on its device.
+        They have the dtype and device of ``like``.
         """
         if self.points is None:
             return squares_of(self.camera, 1.0, like)
@@ -57,22 +56,22 @@ class ImagePoints:
 
 
 class LearnedQuantity:
-    """Numbers of each training image, or of each camera, that are learned with the splats.
+    """Base class of learned quantities: numbers of each training image, or of each camera.
 
     A subclass sets ``shape`` and overrides :meth:`apply`, or :meth:`camera` and :meth:`gradient`. Rows of zeros must
     change nothing.
 
     Parameters
     ----------
-    settings : Learning
-        Learning rate and the constants of Adam.
+    settings : Quantity
+        The entry of the recipe: learning rate, prior and options. A subclass takes its options as keyword arguments.
     scene : Scene
-        With the cameras of the capture.
+        Scene with the cameras of the capture.
 
     Attributes
     ----------
     shape : tuple of int
-        Of the numbers in a row.
+        Shape of a row.
     per_camera : bool
         Whether images whose files have the same intrinsics share a row. False: each image has its own.
     on_device : bool
@@ -85,6 +84,8 @@ class LearnedQuantity:
         Whether rows are updated.
     limit : float or None
         Largest absolute value in a row.
+    beta1, beta2, eps : float
+        Constants of Adam.
     row_of : list of int
         Row of each training view.
     """
@@ -96,8 +97,9 @@ class LearnedQuantity:
     needs_moving_splats = False
     learns = True
     limit: float | None = None
+    beta1, beta2, eps = 0.9, 0.999, 1e-15
 
-    def __init__(self, settings: Learning, scene: Scene) -> None:
+    def __init__(self, settings: Quantity, scene: Scene) -> None:
         self.settings = settings
         self.views: Sequence[View] = scene.train
         self.row_of = list(range(len(scene.train)))
@@ -111,48 +113,45 @@ class LearnedQuantity:
         return max(self.row_of) + 1
 
     def begin(self, given: Tensor | None = None) -> Tensor:
-        """Return the initial rows, a Tensor [G, ...] of this shape; ``given`` are rows of another training."""
+        """Return the initial rows [G, ...]; ``given`` are numbers of another training."""
         return torch.zeros(self.rows, *self.shape, dtype=torch.float64)
 
     def numbers(self, values: Tensor, index: int) -> Tensor:
-        """Return the numbers of training view ``index`` from all rows, with the gauge fixed: a new tensor.
+        """Return the numbers of training view ``index`` from all rows, with the gauge fixed, as a new tensor.
 
-        Where a change of the whole scene could stand for one of all rows, subclasses take that part out.
+        Subclasses remove the part of all rows that a change of the whole scene could replace.
         """
         return values[self.row_of[index]].clone()
 
     def leaf(self, values: Tensor, index: int, camera: Camera, like: Tensor) -> Tensor | None:
-        """Return the tensor that :meth:`apply` gets in training, on the device of ``like``; None: it is not applied."""
+        """Return the tensor for :meth:`apply` in training, on the device of ``like``; None: it is not applied."""
         return self.numbers(values, index).to(like).requires_grad_() if self.changes_color else None
 
     def camera(self, values: Tensor, index: int, camera: Camera, *, learns: bool) -> Camera:
-        """Return the camera of a training view as it is now; with ``learns`` so that it gets a gradient."""
+        """Return the current camera of a training view; with ``learns``, it gets a gradient."""
         return camera
 
     def target(self, values: Tensor, index: int, camera: Camera, target: Target) -> Target:
-        """Return the photograph of a training view as a rendering of ``camera`` would show it."""
+        """Return the target of a training view as a rendering of ``camera`` shows it."""
         return target
 
     @staticmethod
     def apply(color: Tensor, numbers: Tensor, at: ImagePoints) -> Tensor:
-        """Return colours [H, W, 3] of the scene as the photograph shows them, differentiable in both tensors."""
+        """Return colours [H, W, 3] of the scene as the image shows them, differentiable in both tensors."""
         return color
 
     @staticmethod
     def undo(color: Tensor, numbers: Tensor, at: ImagePoints) -> Tensor:
-        """Return colours [H, W, 3] of a photograph as the scene has them: the inverse of :meth:`apply`, for textures.
-
-        By default colours stay.
-        """
+        """Return colours [H, W, 3] of an image as the scene has them: the inverse of :meth:`apply`, for textures."""
         return color
 
     def penalty(self, numbers: Tensor, index: int) -> Tensor | None:
         """Return a term of the loss on the numbers of a view, or None."""
-        prior = getattr(self.settings, "prior", 0.0)
+        prior = self.settings.prior
         return prior * numbers.square().sum() if prior else None
 
     def gradient(self, leaf: Tensor | None, index: int, camera: Camera) -> Tensor | None:
-        """Return the gradient of the row of a view after the backward pass; None: nothing is learned from it."""
+        """Return the gradient of the row of a view after the backward pass; None: the row is not updated."""
         if leaf is None:
             return None
         return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
@@ -162,5 +161,5 @@ class LearnedQuantity:
         return rate
 
     def place(self, values: Tensor, scene: Scene) -> Scene:
-        """Return a scene whose views have what was learned of them."""
+        """Return a scene with the learned numbers in its cameras."""
         return scene

@@ -1,0 +1,242 @@
+"""The losses of gs2d on one or two views: options, reference form and fused form of each.
+
+The reference forms are the formulas of ``losses.formulas`` and ``losses.view_pair``. Definitions: ``docs/math.md``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gs2d.config.loss_registry import register_loss
+from gs2d.config.recipe import LossTerm
+from gs2d.config.validate import one_of, require
+from gs2d.errors import RecipeError
+from gs2d.kernels.native_losses import LossOperations, NormalOptions
+from gs2d.losses import formulas, view_pair
+from gs2d.losses.base import Loss, LossView
+from gs2d.losses.formulas import EDGES
+from gs2d.losses.view_pair import ViewPair
+from gs2d.render.pose_gradient import normals_without_pose_grad
+from gs2d.render.types import RenderOutput
+from gs2d.render.whole_step import StepNormals
+
+__all__: list[str] = []  # by name only: LOSSES
+
+WHERE = ("image", "object")
+
+
+class _ColorLoss(Loss):
+    """L1, SSIM and L2 have one fused pass, which returns all three."""
+
+    only_color = True
+    field: str
+    index: int
+
+    def fused(self, output: RenderOutput, view: LossView, operations: LossOperations) -> Tensor:
+        """Return this one of the three values."""
+
+        def compare() -> tuple[Tensor, Tensor, Tensor]:
+            weights = view.weights
+            expected = (weights.get("l1", 0.0), -weights.get("ssim", 0.0), weights.get("l2", 0.0))
+            return operations.photometric(output.color, view.target, view.mask, view.target_mean, expected=expected)
+
+        value: Tensor = view.once("photometric", compare)[self.index]
+        return value
+
+    def in_step(self, term: LossTerm, *, opaque: bool) -> Mapping[str, Any]:
+        """Return the weight."""
+        return {self.field: float(term.weight or 0.0)}
+
+
+@register_loss("l1")
+class L1(_ColorLoss):
+    """Mean absolute difference of colours."""
+
+    field, index = "l1", 0
+
+    def __call__(self, output: RenderOutput, view: LossView) -> Tensor:
+        return formulas.l1(output.color, view.target, view.mask)
+
+
+@register_loss("ssim")
+class StructuralSimilarity(_ColorLoss):
+    """1 - SSIM."""
+
+    field, index = "ssim", 1
+
+    def __call__(self, output: RenderOutput, view: LossView) -> Tensor:
+        return 1 - formulas.ssim(output.color, view.target, view.mask)
+
+    def fused(self, output: RenderOutput, view: LossView, operations: LossOperations) -> Tensor:
+        """Return 1 - SSIM of the fused pass."""
+        return 1 - super().fused(output, view, operations)
+
+
+@register_loss("l2")
+class L2(_ColorLoss):
+    """Mean squared difference of colours."""
+
+    field, index = "l2", 2
+
+    def __call__(self, output: RenderOutput, view: LossView) -> Tensor:
+        return formulas.l2(output.color, view.target, view.mask)
+
+
+@register_loss("normal_consistency")
+class NormalConsistency(Loss):
+    """1 - alpha <n, N> of rendered normals n and normals N of the depth map, the form of the official 2DGS code.
+
+    Parameters
+    ----------
+    edges : "undefined" or "camera"
+        Beside empty pixels: N is undefined, or empty pixels lie at the camera's centre as in the official code.
+    where : "image" or "object"
+        All pixels count, or those of the object alone, so that covering the empty background earns nothing. The object
+        is where alpha of the image is above 1/2; in images without alpha, each pixel counts by the rendered alpha.
+    """
+
+    kind, per_splat = "normal_consistency", False
+
+    def __init__(self, edges: str = "undefined", where: str = "image") -> None:
+        one_of("edges", edges, EDGES)
+        one_of("where", where, WHERE)
+        self.edges, self.where = edges, where
+        if where == "object":
+            self.needs = frozenset({"silhouette"})
+
+    def _weights(self, output: RenderOutput, view: LossView) -> Tensor | None:
+        """Return the weights [H, W] of the pixels; None if all count alike."""
+        return None if self.where == "image" else formulas.object_weights(output.alpha, view.silhouette)
+
+    def _images(self, output: RenderOutput, view: LossView) -> tuple[Tensor, Tensor, Tensor]:
+        """Return normals, depth and alpha."""
+        pose, normal = view.camera.pose, output.normal
+        if pose is not None and normal.requires_grad:
+            normal = normals_without_pose_grad(output, pose)  # both normals turn with the camera: nothing changes
+        return normal, output.depth(view.depth_kind), output.alpha
+
+    def _plain(self, images: tuple[Tensor, Tensor, Tensor], view: LossView, weights: Tensor | None) -> Tensor:
+        form = formulas.normal_consistency_per_splat if self.per_splat else formulas.normal_consistency
+        return form(*images, view.camera, view.mask, edges=self.edges, weights=weights)
+
+    def __call__(self, output: RenderOutput, view: LossView) -> Tensor:
+        return self._plain(self._images(output, view), view, self._weights(output, view))
+
+    def fused(self, output: RenderOutput, view: LossView, operations: LossOperations) -> Tensor:
+        """Return the loss by the fused operation; its gradient to intrinsics that learn comes from the reference."""
+        images, weights = self._images(output, view), self._weights(output, view)
+        how = NormalOptions(view.camera, view.mask, weights, self.edges == "camera", self.per_splat)
+        value = operations.normal_consistency(*images, how, expected=view.weights.get(self.kind, 1.0))
+        if view.camera.intrinsics is None or not torch.is_grad_enabled():
+            return value
+        # The fused form takes the intrinsics for constants.
+        normal, depth, alpha = (image.detach() for image in images)
+        by_camera = self._plain((normal, depth, alpha), view, weights)
+        return value + (by_camera - by_camera.detach())
+
+    def in_step(self, term: LossTerm, *, opaque: bool) -> Mapping[str, Any] | None:
+        """Return the weight and the options, except for depth by transmittance."""
+        if self.per_splat or term.depth not in ("mean", "median"):
+            return None
+        at_camera, of_object = self.edges == "camera", self.where == "object"
+        return {"normals": StepNormals(float(term.weight or 0.0), term.depth, at_camera, of_object)}
+
+
+@register_loss("normal_consistency_per_splat")
+class NormalConsistencyPerSplat(NormalConsistency):
+    """The form of the 2DGS paper, Eq. 7: alpha - <n, N>; options as of "normal_consistency"."""
+
+    kind, per_splat = "normal_consistency_per_splat", True
+
+
+@register_loss("distortion", needs=["distortion"])
+class Distortion(Loss):
+    """Mean of the distortion map."""
+
+    def __call__(self, output: RenderOutput, view: LossView) -> Tensor:
+        return formulas.distortion(output.distortion, view.mask)
+
+    def fused(self, output: RenderOutput, view: LossView, operations: LossOperations) -> Tensor:
+        """Return the mean by the fused operation."""
+        return operations.masked_mean(output.distortion, view.mask)
+
+
+@register_loss("silhouette", needs=["silhouette"])
+class SilhouetteLoss(Loss):
+    """Absolute difference of the rendered alpha and that of the image.
+
+    Parameters
+    ----------
+    required : bool
+        Whether images must have an alpha channel; if not, those without skip the loss.
+    """
+
+    def __init__(self, required: bool = True) -> None:
+        require(isinstance(required, bool), f"required must be true or false, got {required!r}")
+        self._required = required
+
+    def __call__(self, output: RenderOutput, view: LossView) -> Tensor | None:
+        if view.silhouette is None and self._required:
+            raise RecipeError(
+                "loss 'silhouette' needs photographs with an alpha channel, got one without; use a recipe without it"
+            )
+        return None if view.silhouette is None else formulas.silhouette(output.alpha, view.silhouette, view.mask)
+
+    def in_step(self, term: LossTerm, *, opaque: bool) -> Mapping[str, Any] | None:
+        """Return the weight, for images with an alpha channel."""
+        if opaque:
+            return None if self._required else {}
+        return {"silhouette": float(term.weight or 0.0)}
+
+
+class _TwoViews(Loss):
+    """Base class of losses between a view and its neighbour. A backend may compute both by one operation."""
+
+    index: int
+
+    def _pair(self, output: RenderOutput, view: LossView) -> ViewPair:
+        """Return the view and its neighbour, shared by the losses of one kind of depth."""
+        if view.neighbour is None:
+            raise RecipeError("losses of two views need a neighbour, got none; pass one or use a recipe without them")
+        neighbour, depth = view.neighbour, output.depth(view.depth_kind)
+
+        def pair() -> ViewPair:
+            hit = (output.alpha.detach() > neighbour.settings.opacity) & (depth.detach() > 0)
+            candidates = hit & neighbour.reference.textured
+            return ViewPair(depth, output.normal, candidates, view.camera, neighbour, view.mask)
+
+        made: ViewPair = view.once(("pair", view.depth_kind), pair)
+        return made
+
+    def fused(self, output: RenderOutput, view: LossView, operations: LossOperations) -> Tensor | None:
+        """Return the loss by the operation of the backend, if it has one."""
+        compare = operations.compare_views
+        if compare is None:
+            return self(output, view)
+        pair = self._pair(output, view)
+        value: Tensor = view.once(("compared", view.depth_kind), lambda: pair.compared(compare))[self.index]
+        return value
+
+
+@register_loss("multiview_photometric", needs=["neighbour"])
+class MultiviewPhotometric(_TwoViews):
+    """1 - NCC of patches that the surface warps into the neighbour."""
+
+    index = 0
+
+    def __call__(self, output: RenderOutput, view: LossView) -> Tensor:
+        return view_pair.photometric(self._pair(output, view))
+
+
+@register_loss("multiview_geometric", needs=["neighbour"])
+class MultiviewGeometric(_TwoViews):
+    """Distance in px between pixels and their round trip through the neighbour's depth."""
+
+    index = 1
+
+    def __call__(self, output: RenderOutput, view: LossView) -> Tensor:
+        return view_pair.geometric(self._pair(output, view))

@@ -1,0 +1,1 @@
+"""Entry actions: what runs once when a stage begins."""

@@ -1,0 +1,1 @@
+"""Robust training: floaters are removed, few images are not overfitted, opaque images stay opaque."""

@@ -1,0 +1,262 @@
+"""Robust training: the dense start, the removal of floaters and the decay of opacity."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from gs2d.config.protocols import BLACK
+from gs2d.config.recipe import Recipe, Stage
+from gs2d.config.robust import DenseStart, Removal
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
+from gs2d.data.scene import Scene
+from gs2d.errors import DataError
+from gs2d.render.backends import Backend
+from gs2d.render.types import RasterSettings
+from gs2d.training import events
+from gs2d.training.learned.appearance import shown
+from gs2d.training.learned.learned_table import LearnedTable
+from gs2d.training.learned.quantity import ImagePoints
+from gs2d.training.parallel import ONE_PROCESS, OneProcess
+from gs2d.training.robust.backdrop import in_color
+from gs2d.training.robust.free_space_maps import FreeSpaceMaps
+from gs2d.training.robust.opaque import is_opaque
+from gs2d.training.robust.seen_area import largest_log_scales, mostly_unseen
+from gs2d.training.robust.trial import Witness, missed
+from gs2d.training.rows import keep_rows
+from gs2d.training.start.background_sphere import sphere_points
+from gs2d.training.start.initialize import Initial
+from gs2d.training.start.plane_sweep import SmallView, Sweep, start_points, sweep_views
+from gs2d.training.start.start_fit import fit_start
+from gs2d.training.state import TrainState
+
+PARTS = 5  # of a stage: at the end of each, all proposed splats are tried again, also those that were missed before
+FEW_NEW = 0.002  # fraction of the splats: fewer new proposals wait, because a trial costs about 50 iterations
+SHOWN = 0.25  # fraction of the images, and at least 3, that must show a surface on which splats are kept small
+MAX_WITNESSES = 24  # images of a trial; with more images, each trial uses others
+DECAY_EVERY, LEAST_OPACITY = 10, 0.005  # iterations between decays; opacity that decay does not go below
+NEEDED, REMOVED = 1, 2  # verdicts; 0: not tried
+MISSED = "missed"  # row group of the splats that a trial found to be needed
+
+
+def check_free_space(scene: Scene, recipe: Recipe) -> None:
+    """Raise DataError if floaters are to be removed, and no sparse points tell where space is free."""
+    if recipe.removal is not None and scene.observed() is None:
+        raise DataError(
+            f"{scene.name} must have sparse points and the images that show them to remove floaters (COLMAP has both), "
+            f"got {scene.unobserved()}; train with --robust off"
+        )
+
+
+class Robustness:
+    """Dense start, removal of floaters and opacity decay of a recipe on a scene, as far as the recipe has them.
+
+    Parameters
+    ----------
+    scene : Scene
+    recipe : Recipe
+    raster : RasterSettings
+        Rasterizer settings of training.
+    backend : Backend
+        Renders the trials.
+    processes : OneProcess
+        Processes that train together. Process 0 makes the start and the trials for all.
+    frozen : Splats, optional
+        Further splats of the scene, which are not trained.
+
+    Attributes
+    ----------
+    scene : Scene
+        Scene with the points that training starts from.
+    lacks : str
+        Reason if an optional dense start failed, else empty.
+
+    Raises
+    ------
+    DataError
+        From the constructor, if floaters are to be removed and the capture lacks sparse points and the images that show
+        them, or if a required dense start finds nothing.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        recipe: Recipe,
+        raster: RasterSettings,
+        backend: Backend,
+        processes: OneProcess = ONE_PROCESS,
+        frozen: Splats | None = None,
+    ) -> None:
+        self._processes, self._frozen = processes, frozen
+        self.scene, self._learned, self._recipe = scene, LearnedTable(recipe, scene), recipe
+        self._raster, self._backend = raster, backend
+        self._free: FreeSpaceMaps | None = None
+        self._images: Sequence[SmallView] = ()
+        self._sweep: Sweep | None = None  # kept until the first splats are fitted
+        self.lacks = ""
+        if (recipe.dense_start is None and recipe.removal is None) or not processes.leads:
+            return
+        check_free_space(scene, recipe)
+        start = recipe.dense_start
+        try:
+            sweep = sweep_views(scene, start or DenseStart())
+            if start is not None:
+                # The large splats of a sphere need the removal of those that hide something.
+                around = sphere_points(scene, sweep) if start.sphere and is_opaque(recipe) else None
+                self.scene = replace(scene, points=start_points(scene, sweep, start, around))
+        except DataError as error:
+            if start is None or start.required or recipe.removal is not None:
+                raise
+            self.lacks = str(error).partition("; ")[0]  # without the advice
+            return
+        self._sweep = sweep if start is not None and start.fit else None
+        if recipe.removal is not None:
+            self._free = FreeSpaceMaps(sweep, spilled=scene.ahead > 0)
+            self._images = sweep.views
+
+    @property
+    def starts_densely(self) -> bool:
+        """Whether training starts from a plane sweep."""
+        return self._recipe.dense_start is not None and not self.lacks
+
+    def fitted(self, first: Initial) -> Splats:
+        """Return the first splats, fitted if the dense start does that. Frees the sweep."""
+        sweep, self._sweep = self._sweep, None
+        return first.splats if sweep is None else fit_start(first.splats, sweep, first.sized)
+
+    def move_to(self, device: torch.device | str) -> None:
+        """Move all tensors to a device."""
+        if self._free is not None:
+            self._free.move_to(device)
+
+    def removes(self, stage: Stage, iteration: int) -> bool:
+        """Return whether splats may be removed at the end of an iteration (1-based) of a stage."""
+        return looks_at_free_space(self._recipe, stage, iteration) or ends_part(self._recipe, stage, iteration)
+
+    def remove(self, state: TrainState, stage: Stage, iteration: int) -> list[events.TrainingEvent]:
+        """Shrink splats that are too large for a known surface and remove floaters, if due."""
+        if not self.removes(stage, iteration):
+            return []
+        if iteration < stage.iterations:  # other splats must still learn to cover what shrinking uncovers
+            self._limit_scales(state)
+        nobody = torch.zeros(state.splats.means.shape[0], dtype=torch.bool, device=state.splats.device)
+        known = nobody if ends_part(self._recipe, stage, iteration) else state.groups.get(MISSED, nobody)
+        verdict = self._processes.decide(
+            lambda splats, spared: self._tried(state, stage, iteration, splats, spared), state.splats, known
+        )
+        guilty = verdict == REMOVED
+        state.groups[MISSED] = known | (verdict == NEEDED)
+        removed = int(guilty.sum())
+        if removed == 0 or removed == len(state.splats):  # all: the images contradict each other
+            return []
+        keep_rows(state, ~guilty)
+        return [events.FloatersRemoved(stage.name, iteration, removed, len(state.splats))]
+
+    @torch.no_grad()
+    def _limit_scales(self, state: TrainState) -> None:
+        """Shrink large splats on surfaces of known depth, where they hide detail.
+
+        Elsewhere large splats stay, because they are all that new views show in regions with few images.
+        """
+        cameras = [view.camera for view in self._learned.scene_now(state.learned).train]
+        most = largest_log_scales(state.splats, cameras)
+        large = (state.splats.log_scales > most).any(dim=1)
+        shrinks = self._processes.decide(self._are_shown, state.splats, large).bool()
+        scales = state.splats.log_scales
+        self._backend.assign(scales, torch.where(shrinks[:, None], torch.minimum(scales, most), scales))
+
+    def _are_shown(self, splats: Splats, large: Tensor) -> Tensor:
+        """Return which of the large splats lie on a surface that many images show, uint8 [N]."""
+        assert self._free is not None
+        result = torch.zeros(len(splats), dtype=torch.uint8, device=splats.device)
+        rows = large.nonzero().squeeze(1)
+        result[rows] = (self._free.showing(splats.rows(rows)) >= max(3, SHOWN * len(self._images))).byte()
+        return result
+
+    def _tried(self, state: TrainState, stage: Stage, iteration: int, splats: Splats, spared: Tensor) -> Tensor:
+        """Propose splats that are not spared, and try them: NEEDED, REMOVED or 0, uint8 [N]."""
+        last = ends_part(self._recipe, stage, iteration)
+        against = self._proposed(state, splats, last=last).masked_fill(spared, 0)
+        verdict = torch.zeros(len(splats), dtype=torch.uint8, device=splats.device)
+        proposed = against > 0
+        if not proposed.any() or (not last and int(proposed.sum()) < FEW_NEW * len(splats)):
+            return verdict
+        # Over black, splats in the colour of the background are missed, too, unless that is an unlit backdrop.
+        raster = self._raster if self._removal.backdrop else replace(self._raster, background=BLACK)
+        step = max(1, -(-len(self._images) // MAX_WITNESSES))
+        rows = range(iteration // self._removal.every % step, len(self._images), step)
+        whole = splats if self._frozen is None else splats.followed_by(self._frozen)
+        needed = missed(
+            whole,
+            torch.cat([against, against.new_zeros(len(whole) - len(splats))]),
+            self._witnesses(state, rows),
+            raster,
+            self._backend,
+            stands_for=len(self._images) / len(rows),
+        )[: len(splats)]
+        verdict[proposed] = REMOVED
+        verdict[needed] = NEEDED
+        return verdict
+
+    @property
+    def _removal(self) -> Removal:
+        assert self._recipe.removal is not None
+        return self._recipe.removal
+
+    def _proposed(self, state: TrainState, splats: Splats, *, last: bool) -> Tensor:
+        """Return the number of images that speak against each splat, int32 [N]."""
+        assert self._free is not None
+        against = self._free.against(splats)
+        if last:
+            cameras = [view.camera for view in self._learned.scene_now(state.learned).train]
+            against = against.maximum(mostly_unseen(splats, cameras, self._raster, self._backend).to(against))
+        if self._removal.backdrop:
+            against = against.maximum(in_color(splats, self._raster.background).to(against))
+        return against
+
+    def _witnesses(self, state: TrainState, rows: range) -> Iterator[Witness]:
+        views = self._learned.scene_now(state.learned).train
+        for row in rows:
+            image, device = self._images[row], state.splats.device
+            height, width = image.size
+            (fx, _, cx), (_, fy, cy), _ = image.K.tolist()
+            camera = Camera(width, height, fx, fy, cx, cy, views[row].camera.T_cam_world)
+            color = image.color.permute(1, 2, 0).to(device)
+            numbers = self._learned.numbers(state.learned, row, color)
+            photographed = partial(shown, numbers=numbers, at=ImagePoints(camera))
+            yield Witness(camera, color, torch.from_numpy(image.usable).to(device), photographed)
+
+    @torch.no_grad()
+    def decay(self, state: TrainState, stage: Stage, iteration: int, backend: Backend) -> None:
+        """Let opacity decay, if due, except for splats in the colour of the background.
+
+        Over that background, their loss would change no image.
+        """
+        removal = self._recipe.removal
+        if removal is None or removal.decay == 0 or stage.train.get("opacity_logits") != "all":
+            return
+        if iteration % DECAY_EVERY:
+            return
+        logits = state.splats.opacity_logits
+        least = math.log(LEAST_OPACITY / (1 - LEAST_OPACITY))
+        faded = torch.logit(torch.sigmoid(logits) * (1 - removal.decay)).clamp_min(least)
+        fades = ~in_color(state.splats, self._raster.background).reshape(logits.shape) & (logits > least)
+        backend.assign(logits, torch.where(fades, faded, logits))
+
+
+def looks_at_free_space(recipe: Recipe, stage: Stage, iteration: int) -> bool:
+    """Return whether splats in free space are proposed at the end of an iteration (1-based) of a stage."""
+    return recipe.removal is not None and stage.moves_all and iteration % recipe.removal.every == 0
+
+
+def ends_part(recipe: Recipe, stage: Stage, iteration: int) -> bool:
+    """Return whether one of ``PARTS`` of a stage ends with an iteration (1-based)."""
+    if recipe.removal is None or not stage.moves_all:
+        return False
+    return iteration * PARTS // stage.iterations > (iteration - 1) * PARTS // stage.iterations

@@ -1,0 +1,1 @@
+"""The splats that training starts from: sparse, swept, known or random points."""

@@ -1,0 +1,95 @@
+"""Splats on a sphere around the scene, to start from where no depth is known.
+
+Behind a subject there are walls, people and sky in few images, where sparse points and a plane sweep find nothing.
+Without a splat there is no gradient that could create one. A few large splats far away are enough to begin with;
+training moves, splits and colours them as all others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+
+from gs2d.data.reach import reach_of
+from gs2d.data.scene import Scene
+from gs2d.training.start.plane_sweep import Sweep, project, unproject
+
+SPLATS = 500  # on the whole sphere; more of them would overfit the background of each image (notebook/floaters.md)
+RADIUS = 3.0  # of the sphere, in units of the scene's reach: its cameras and nearly all sparse and swept points
+SIZE = 0.8  # standard deviation of a splat, in units of the distance between neighbours
+BESIDE_KNOWN = 3  # px: nearer to a pixel of known depth, a pixel probably shows the same surface
+MAX_VIEWS = 200  # images that are used, evenly chosen
+STRIDE = 5  # px between swept points that estimate the reach of the scene
+
+
+def sphere_points(scene: Scene, sweep: Sweep) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return positions, colours in [0, 1], normals (all [P, 3]) and sizes [P] of splats around the scene.
+
+    Positions that no image shows in a pixel of unknown depth are left out; a colour is the median of such pixels. There
+    are none for images with an alpha channel.
+
+    Parameters
+    ----------
+    scene : Scene
+    sweep : Sweep
+        Downscaled images of the scene, and their depth maps.
+    """
+    looked_at = range(0, len(sweep.views), max(1, -(-len(sweep.views) // MAX_VIEWS)))
+    reach = reach_of(scene, _swept_places(sweep, looked_at))
+    if reach is None or scene.train[0].alpha() is not None:
+        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+    radius, directions = RADIUS * reach.radius, evenly_on_sphere(SPLATS)
+    rows, colors = _looks(sweep, looked_at, reach.center + radius * directions)
+    kept, median = _medians(rows, colors)
+    size = SIZE * math.sqrt(4 * math.pi / SPLATS) * radius
+    return reach.center + radius * directions[kept], median, -directions[kept], np.full(len(kept), size)
+
+
+def evenly_on_sphere(count: int) -> np.ndarray:
+    """Return evenly distributed unit vectors [count, 3] (Fibonacci spiral)."""
+    index = np.arange(count) + 0.5
+    z = 1 - 2 * index / max(1, count)
+    turn = math.pi * (1 + math.sqrt(5)) * index
+    across = np.sqrt(1 - z * z)
+    return np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
+
+
+def _swept_places(sweep: Sweep, looked_at: Sequence[int]) -> np.ndarray:
+    """Return some of the swept points [P, 3]."""
+    found = [np.zeros((0, 3))]
+    for index in looked_at:
+        depth = sweep.depths[index]
+        places, known = unproject(sweep.views[index], depth)[::STRIDE, ::STRIDE], (depth > 0)[::STRIDE, ::STRIDE]
+        found.append(places[known])
+    return np.concatenate(found)
+
+
+def _unknown(sweep: Sweep, index: int) -> np.ndarray:
+    """Return the pixels [H, W] of a downscaled image with unknown depth."""
+    known = binary_dilation(sweep.depths[index] > 0, iterations=BESIDE_KNOWN)
+    return np.asarray(sweep.views[index].usable & ~known)
+
+
+def _looks(sweep: Sweep, looked_at: Sequence[int], places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows [L] of points [N, 3] that images show in pixels of unknown depth, and their colours [L, 3]."""
+    rows, colors = [np.zeros(0, dtype=np.int64)], [np.zeros((0, 3))]
+    for index in looked_at:
+        view = sweep.views[index]
+        unknown = _unknown(sweep, index)
+        _, column, row, inside = project(view, places)
+        shown = np.flatnonzero(inside)
+        shown = shown[unknown[row[shown], column[shown]]]
+        rows.append(shown)
+        colors.append(view.color[:, row[shown], column[shown]].numpy().T.astype(np.float64))
+    return np.concatenate(rows), np.concatenate(colors)
+
+
+def _medians(rows: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distinct rows [P] among [L], ascending, and the median colour of each [P, 3]."""
+    order = np.argsort(rows, kind="stable")
+    kept, first = np.unique(rows[order], return_index=True)
+    groups = np.split(colors[order], first[1:]) if len(kept) else []
+    return kept, np.array([np.median(group, axis=0) for group in groups]).reshape(-1, 3)

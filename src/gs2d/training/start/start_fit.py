@@ -1,0 +1,76 @@
+"""Fit the splats of a dense start to the images that show them: colour by least squares, opacity and size."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gs2d.core.sh import C0
+from gs2d.core.splats import Splats
+from gs2d.training.start.plane_sweep import AGREE, Sweep, project
+
+OPACITY = 0.5  # of every fitted splat
+SIZE = 0.7  # standard deviation of a splat, in units of the mean distance to its three nearest neighbours
+MAX_SIZE = 6.0  # px of the nearest view that shows a splat, so that isolated splats stay small
+# The same for splats at sparse points apart from all swept points. They represent surroundings where no depths agree
+# (bare tables, cloth), start as large as in 2DGS and must cover much.
+MAX_SPARSE_SIZE = 24.0
+_TINY = 1e-9  # keeps the equations of splats that no view shows solvable
+
+
+@torch.no_grad()
+def fit_start(splats: Splats, sweep: Sweep, kept: Tensor | None = None) -> Splats:
+    """Return the splats with colour, opacity and size fitted to the views of a sweep (formulas: docs/math.md).
+
+    A view shows a splat if its swept depth is that of the splat, to ``AGREE``. Splats that no view shows keep their
+    colour.
+
+    Parameters
+    ----------
+    splats : Splats
+        Result of :func:`gs2d.training.start.initialize.initial_splats`.
+    sweep : Sweep
+    kept : Tensor [N] bool, optional
+        Splats of sparse points apart from the swept ones: they keep their opacity, and their size up to
+        ``MAX_SPARSE_SIZE``.
+    """
+    sums, weights, pixel = _observations(splats.means.double().numpy(), sweep)
+    sh0, shown = splats.sh0.clone(), weights > 0
+    colors = sums / (weights[:, None] + _TINY)
+    sh0[shown] = colors.to(sh0)[shown, None]
+    of_pixel = torch.from_numpy(np.log(pixel)).to(splats.log_scales)[:, None]
+    log_scales = torch.minimum(splats.log_scales + math.log(SIZE), of_pixel + math.log(MAX_SIZE))
+    logits = torch.full_like(splats.opacity_logits, math.log(OPACITY / (1 - OPACITY)))
+    if kept is not None:
+        log_scales[kept] = torch.minimum(splats.log_scales, of_pixel + math.log(MAX_SPARSE_SIZE))[kept]
+        logits[kept] = splats.opacity_logits[kept]
+    return replace(splats, log_scales=log_scales, opacity_logits=logits, sh0=sh0)
+
+
+def _observations(means: np.ndarray, sweep: Sweep) -> tuple[Tensor, Tensor, np.ndarray]:
+    """Return what the views of a sweep show of points [N, 3].
+
+    Returns
+    -------
+    sums : Tensor [N, 3] float64
+        Sum of C0 (colour - 1/2) over the views that show a point.
+    weights : Tensor [N] float64
+        Sum of C0^2 over the same views.
+    pixel : ndarray [N] world units
+        Size of a pixel at the point in the nearest view whose image contains it; infinite where none does.
+    """
+    sums, weights = torch.zeros(len(means), 3, dtype=torch.float64), torch.zeros(len(means), dtype=torch.float64)
+    pixel = np.full(len(means), np.inf)
+    for view, depth in zip(sweep.views, sweep.depths, strict=True):
+        z, column, row, inside = project(view, means)
+        pixel = np.where(inside, np.minimum(pixel, z / view.K[0, 0]), pixel)
+        swept = depth[row, column]
+        rows = np.flatnonzero(inside & (swept > 0) & (np.abs(swept - z) <= AGREE * z))
+        color = view.color[:, row[rows], column[rows]].double().T - 0.5  # [M, 3]
+        sums[rows] += C0 * color
+        weights[rows] += C0 * C0
+    return sums, weights, pixel
