@@ -124,10 +124,10 @@ def test_bytes_do_not_depend_on_the_number_of_threads(scene: Scene) -> None:
 def test_a_state_with_wrong_learned_rows_is_refused(scene: Scene, name: str) -> None:
     state = begun(TrainState(random_splats(5), torch.Generator()), everything(), scene)
     rows = state.learned.pop(name)
-    with pytest.raises(RunError, match=rf"must have \d rows of '{name}', for this recipe and scene, got 0"):
+    with pytest.raises(RunError, match=rf"must have \d rows of '{name}' for this recipe and scene, got 0"):
         Trainer(scene, everything(), GENERIC, backend="reference", state=state)
     state.learned = {name: rows}
-    with pytest.raises(RunError, match=rf"must have 0 rows of '{name}', for this recipe and scene, got {len(rows)}"):
+    with pytest.raises(RunError, match=rf"must have 0 rows of '{name}' for this recipe and scene, got {len(rows)}"):
         Trainer(scene, short(), GENERIC, backend="reference", state=state)
     rows.values.view(-1)[0] = torch.nan
     with pytest.raises(RunError, match=f"{name} hold NaN or infinity"):
