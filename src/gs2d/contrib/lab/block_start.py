@@ -18,7 +18,7 @@ from gs2d.data.arrays import read_npz
 from gs2d.errors import DataError, RunError
 from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.prepare.scene_part import PartStart
-from gs2d.training.initialize import splats_as_start
+from gs2d.training.start.initialize import splats_as_start
 
 ABSENT, FROZEN, OWN = 0, 1, 2  # of a row of the splats that were trained before
 
