@@ -1,13 +1,13 @@
-# Each target does its own set-up in .venv, on any machine with Python >= 3.11 (and a C++ compiler for the native kernels).
-#   make demo      the main job on a small synthetic capture: runs/demo/report.html
-#   make test      ruff, mypy and the tests that take minutes, not hours
-#   make test-all  the slow tests too
-#   make test-gpu  what needs an NVIDIA GPU: the contract and parity on it, streams, waiting, training; skipped without one
-#   make fuzz      new mutated inputs, an hour a reader (SECONDS=60 FAMILIES="ply-mesh images"), findings in runs/fuzz
+# Each target sets up .venv by itself. Requires Python >= 3.11, and a C++ compiler for the native kernels.
+#   make demo      train and mesh a small synthetic scene: runs/demo/report.html
+#   make test      ruff, mypy and the fast tests (8 minutes on two cores)
+#   make test-all  all tests (hours)
+#   make test-gpu  tests that need an NVIDIA GPU; skipped without one
+#   make fuzz      new mutated inputs, an hour per reader (SECONDS=60 FAMILIES="ply-mesh images"); findings in runs/fuzz
 #   make docs      the documentation as a site: build/site/index.html; warnings and dead links are errors
-#   make audit     licences and known vulnerabilities of what gs2d depends on (the latter by pip-audit, if installed)
+#   make audit     licences and known vulnerabilities of the dependencies (the latter with pip-audit, if installed)
 #   make lint      ruff, its formatter and mypy (`make types`: mypy alone)
-#   make kernels   the native library into the source tree, for development with PYTHONPATH=src
+#   make kernels   build the native library in the source tree, for development with PYTHONPATH=src
 VENV := .venv
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check -q
@@ -83,11 +83,12 @@ $(VENV)/docs: $(VENV)/dependencies
 	@touch $@
 
 $(VENV)/dependencies: constraints.txt pyproject.toml
-	@test -n "$(PYTHON)" || { echo "error: no Python >= 3.11 found; install one, or run make PYTHON=/path/to/python" >&2; exit 1; }
+	@test -n "$(PYTHON)" || { \
+		echo "error: no Python >= 3.11 found; install one, or run make PYTHON=/path/to/python" >&2; exit 1; }
 	@test -x $(PY) || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
 		echo "error: $(PYTHON) cannot make a virtual environment; on Debian: apt install python3-venv" >&2; exit 1; }
-	$(PIP) install -c constraints.txt scikit-build-core cmake ninja
 	$(PY) -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
-		print(*p["dependencies"], *p["optional-dependencies"]["dev"], sep="\n")' > $(VENV)/requirements.txt
-	$(PIP) install -c constraints.txt -r $(VENV)/requirements.txt
+		print("scikit-build-core", "cmake", "ninja", \
+		*p["dependencies"], *p["optional-dependencies"]["dev"], sep="\n")' > $(VENV)/requirements.txt
+	$(PIP) install --no-compile -c constraints.txt -r $(VENV)/requirements.txt
 	@touch $@

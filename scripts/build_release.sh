@@ -1,5 +1,5 @@
 #!/bin/sh
-# Builds what is released into dist/: the sdist, and from it the wheel of this machine's processor, with a manylinux tag.
+# Build the sdist, and from it a manylinux wheel for the processor of this machine, in dist/.
 # Usage: scripts/build_release.sh [--aarch64] [PYTHON]
 #        (Linux, g++ >= 12 or clang++ >= 14; the tools go to build/release-tools)
 #
