@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gs2d.contrib.lab.alignment import ransac_similarity
 from gs2d.contrib.lab.evaluate_dtu import DtuTruth, evaluate_dtu, mesh_points
 from gs2d.contrib.lab.evaluate_tnt import CropVolume, TntTruth, evaluate_tnt
 from gs2d.core.mesh import Mesh
-from gs2d.core.similarity import ransac_similarity, umeyama
+from gs2d.core.similarity import umeyama
 from oracle_scenes import OBSERVED_RESOLUTION, TAU, dtu_scene, moved, tnt_scene
 
 FIGURES = json.loads((Path(__file__).resolve().parents[1] / "helpers" / "oracle_open3d.json").read_text())

@@ -57,7 +57,7 @@ def test_the_gains_of_the_demo_have_mean_one(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(toy, "bake", lambda *_, **__: None)  # a picture that takes no rays
     monkeypatch.setattr(toy, "render_image", lambda *_: toy.SyntheticImage(drawn, np.zeros(1, bool)))
     for name, vary in (("plain", False), ("varied", True)):
-        toy.write_demo_capture(tmp_path / name, train_views=3, test_views=1, size=16, vary_exposure=vary)
+        toy.write_demo_capture(tmp_path / name, train_views=3, test_views=1, size=16, vary=["exposure"] * vary)
     truth = json.loads((tmp_path / "varied" / GAINS).read_text())
     assert list(truth) == [f"train/r_{k}.png" for k in range(3)]
     assert np.array(list(truth.values())).mean(axis=0) == pytest.approx([1, 1, 1])

@@ -53,7 +53,7 @@ def test_the_demo_disturbs_cameras_and_writes_the_true_ones(tmp_path: Path, monk
     image = toy.SyntheticImage(np.full((16, 16, 4), 200, np.uint8), np.zeros(1, bool))
     monkeypatch.setattr(toy, "render_image", lambda *_: image)
     for name, vary in (("plain", False), ("varied", True)):
-        toy.write_demo_capture(tmp_path / name, train_views=5, test_views=1, size=16, vary_poses=vary)
+        toy.write_demo_capture(tmp_path / name, train_views=5, test_views=1, size=16, vary=["poses"] * vary)
     plain, varied = (tmp_path / name for name in ("plain", "varied"))
     assert (varied / TRUTH).read_bytes() == (plain / "transforms_train.json").read_bytes()
     assert (varied / "transforms_train.json").read_bytes() != (plain / "transforms_train.json").read_bytes()

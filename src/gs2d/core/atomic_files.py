@@ -1,8 +1,7 @@
-"""Atomic file writes: a file is either the old one or the complete new one, never a part.
+"""Atomic file writes: a file is either the old one or the complete new one.
 
-What a killed write leaves is a file ``.NAME.gs2d.tmp`` beside NAME. Its writer held a lock on it, which died with the
-process: the next write of NAME removes it, and so does :func:`sweep`. The temporary file of a process that lives is
-never touched.
+A killed process leaves ``.NAME.gs2d.tmp`` beside NAME, without its lock. The next write of NAME and :func:`sweep`
+remove it; locked temporary files of running processes are never touched.
 """
 
 from __future__ import annotations
@@ -24,16 +23,16 @@ from gs2d.core.locks import try_lock
 from gs2d.errors import DiskError
 
 _TEMPORARY = re.compile(r"\..+\.gs2d\.tmp", re.DOTALL)
-_LONGEST = 200  # bytes of a file's name that are in the temporary one
-_ATTEMPTS = 100  # at a temporary name
-_ESCAPED = "backslashreplace"  # a file name that is not UTF-8 is written as \udcff, which JSON reads back
+_LONGEST = 200  # bytes of the file name kept in the temporary name
+_ATTEMPTS = 100  # to find a free temporary name
+_ESCAPED = "backslashreplace"  # surrogates of file names become \udcff, which JSON reads back
 _REMEDIES = {
     errno.ENOSPC: "free some space or choose another folder",
     errno.EDQUOT: "free some of your quota or choose another folder",
-    errno.EFBIG: "the file-size limit is too small (ulimit -f)",
-    errno.EACCES: "choose a folder that you may write to",
-    errno.EPERM: "choose a folder that you may write to",
-    errno.EROFS: "choose a folder on a disk that is not read-only",
+    errno.EFBIG: "raise the file-size limit (ulimit -f)",
+    errno.EACCES: "choose a writable folder",
+    errno.EPERM: "choose a writable folder",
+    errno.EROFS: "choose a writable folder",
     errno.ENOTDIR: "a part of the path is a file, not a folder",
     errno.ENOENT: "the folder does not exist: create it first",
     errno.EISDIR: "a folder has this name: remove it or choose another name",
@@ -43,18 +42,18 @@ _REMEDIES = {
 
 
 def disk_error(path: str | os.PathLike[str], error: OSError) -> DiskError:
-    """Return the one-line DiskError for a failed write of ``path``."""
+    """Return a DiskError for a failed write of ``path``."""
     remedy = _REMEDIES.get(error.errno or 0, "choose another folder")
     return DiskError(f"cannot write {os.fspath(path)}: {error.strerror or error}; {remedy}", error.errno)
 
 
 def is_full(error: BaseException) -> bool:
-    """Whether nothing more can be written: a full disk, a quota, a limit of file sizes."""
+    """Whether an error means a full disk, a quota or a file-size limit."""
     return isinstance(error, DiskError | OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class _RecordingFile(io.FileIO):
-    """A raw file that remembers its write error, because libraries (torch.save) may turn it into another one."""
+    """A raw file that records its write error, because libraries (torch.save) may replace it."""
 
     failure: OSError | None = None
 
@@ -68,10 +67,10 @@ class _RecordingFile(io.FileIO):
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[Any]]:
-    r"""Open a file for writing that appears under its name only when it is complete.
+    r"""Open a file for writing that gets its name only when it is complete.
 
-    The bytes go to a temporary name in the same folder (hidden, ending in ``.gs2d.tmp``), reach the disk (fsync) and
-    are renamed. When the body or the disk fails, the temporary file is removed and an older file stays as it was.
+    Data is written to a hidden temporary file in the same folder, synchronised to disk (fsync) and renamed. If writing
+    fails, the temporary file is removed and an existing file stays unchanged.
 
     Parameters
     ----------
@@ -83,7 +82,7 @@ def atomic_write(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[
     Raises
     ------
     DiskError
-        Full disk, no permission, no such folder, a file where a folder is needed.
+        If the file cannot be written.
     """
     if mode not in ("wb", "w"):
         raise ValueError(f"mode must be 'wb' or 'w', got {mode!r}")
@@ -97,13 +96,13 @@ def atomic_write(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[
                 yield file
                 file.flush()
             finally:
-                with contextlib.suppress(OSError):  # a failed flush is already on its way up
+                with contextlib.suppress(OSError):  # a failed flush is already being raised
                     file.close()
                 raw.close()
         except BaseException as error:
             failure = raw.failure
             if failure is None and isinstance(error, OSError) and error.errno in _REMEDIES:
-                # Only errors of this very write: an OSError about another file (an input) passes unchanged.
+                # Only errors of this write: an OSError about another file passes unchanged.
                 named = error.filename
                 failure = error if named is None or Path(os.fsdecode(named)) in (temporary, target) else None
             if failure is not None:
@@ -113,10 +112,10 @@ def atomic_write(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[
 
 @contextlib.contextmanager
 def temporary_beside(target: Path) -> Iterator[tuple[Path, int]]:
-    """Hold an empty file in the folder of ``target``, which takes its name at the end; it goes where the body fails.
+    """Create a temporary file beside ``target`` that is renamed to it at the end, or removed if the body fails.
 
-    Yields its path, which other programs may write to as long as they do not replace it, and a descriptor that is open
-    for writing. At the end the bytes reach the disk (fsync) before the file is renamed.
+    Yields its path, which other programs may write to but not replace, and a writable descriptor. The file is
+    synchronised to disk (fsync) before it is renamed.
     """
     try:
         temporary, descriptor = _claimed(target)
@@ -126,7 +125,7 @@ def temporary_beside(target: Path) -> Iterator[tuple[Path, int]]:
         yield temporary, descriptor
         try:
             os.fsync(descriptor)
-            if sys.platform == "win32":  # which renames no open file
+            if sys.platform == "win32":  # cannot rename open files
                 os.close(descriptor)
                 descriptor = -1
             os.replace(temporary, target)
@@ -136,36 +135,36 @@ def temporary_beside(target: Path) -> Iterator[tuple[Path, int]]:
         with contextlib.suppress(OSError):
             os.unlink(temporary)
         raise
-    finally:  # the lock is held until there is nothing left to sweep
+    finally:  # the lock is held until the file is renamed or removed
         if descriptor >= 0:
             os.close(descriptor)
     _sync_folder(target.parent)
 
 
 def _claimed(target: Path) -> tuple[Path, int]:
-    """Make and lock a temporary file; one of this name that a killed process left goes first."""
+    """Create and lock a temporary file; removes one that a killed process left."""
     name = target.name
     while len(os.fsencode(name)) > _LONGEST:
         name = name[:-1]
     temporary = target.with_name(f".{name}.gs2d.tmp")
     for _ in range(_ATTEMPTS):
         try:
-            # 0o666: the user's umask decides, as for any other file (mkstemp would make it private).
+            # 0o666: the umask applies, as for any other file (mkstemp would make it private).
             flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0)
             descriptor = os.open(temporary, flags, 0o666)
         except FileExistsError:
-            if not _removed(temporary):  # another process writes the same file: the last one wins
+            if not _removed(temporary):  # another process writes the same file; the last one wins
                 temporary = target.with_name(f".{name}.{secrets.token_hex(4)}.gs2d.tmp")
             continue
         if _is_ours(temporary, descriptor):
             return temporary, descriptor
-        os.close(descriptor)  # swept between the two lines above
+        os.close(descriptor)  # swept by another process before it was locked
     raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(temporary))
 
 
 def _is_ours(temporary: Path, descriptor: int) -> bool:
-    """Lock a new file; False where another process took it for what a killed one left."""
-    if sys.platform == "win32":  # which deletes no open file
+    """Lock a new file; False if another process has swept it."""
+    if sys.platform == "win32":  # cannot delete open files
         return True
     try:
         if not try_lock(descriptor):
@@ -173,12 +172,12 @@ def _is_ours(temporary: Path, descriptor: int) -> bool:
         return os.path.samestat(os.stat(temporary), os.fstat(descriptor))
     except FileNotFoundError:
         return False
-    except OSError:  # a file system without locks, where nothing can be swept either
+    except OSError:  # a file system without locks; nothing is swept there
         return True
 
 
 def _removed(temporary: Path) -> bool:
-    """Remove a temporary file, if nobody writes it any more."""
+    """Remove a temporary file unless it is being written."""
     try:
         if sys.platform == "win32":
             os.unlink(temporary)
@@ -198,12 +197,12 @@ def _removed(temporary: Path) -> bool:
 
 
 def is_temporary(name: str) -> bool:
-    """Whether a file has the name of one that is being written, or was when its process was killed."""
+    """Whether a file name is that of a temporary file."""
     return _TEMPORARY.fullmatch(name) is not None
 
 
 def sweep(folder: Path) -> int:
-    """Remove the temporary files in a folder that killed processes left; returns how many. Never raises OSError."""
+    """Remove temporary files of killed processes in a folder; returns their number. Never raises OSError."""
     swept = 0
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         for entry in list(entries):
@@ -213,10 +212,10 @@ def sweep(folder: Path) -> int:
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Raise now what ``atomic_write`` would raise at the end: no such folder, no permission, a folder."""
+    """Raise DiskError early if ``atomic_write`` would fail: missing folder, no permission, path is a folder."""
     target = Path(path)
     try:
-        # Not Path.is_dir: from Python 3.14 on it answers False where the system has an error, as for too long a name.
+        # Not Path.is_dir: since Python 3.14 it returns False for errors such as a name that is too long.
         with contextlib.suppress(FileNotFoundError):
             if stat.S_ISDIR(target.stat().st_mode):
                 raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
@@ -226,7 +225,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make the rename itself durable, where the file system lets folders be synced."""
+    """Make the rename durable, if the file system supports it."""
     with contextlib.suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:

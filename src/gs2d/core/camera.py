@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
 
 class Zoom(NamedTuple):
-    """What intrinsics become: focal lengths ``scale`` times as long, the principal point moved by focal lengths.
+    """A change of intrinsics, independent of the image size.
 
-    ``k1`` and ``k2`` are what is left of the lens (``core/residual_lens.py``). Free of the image's size, so that it
-    holds for a photograph at any downscale.
+    Focal lengths are multiplied by ``scale``; the principal point moves by ``right`` and ``down`` focal lengths; ``k1``
+    and ``k2`` are residual distortion (``core/residual_lens.py``).
     """
 
     scale: float = 1.0
@@ -28,7 +28,7 @@ class Zoom(NamedTuple):
 
     @property
     def lens(self) -> tuple[float, float] | None:
-        """k1 and k2, or None where nothing bends."""
+        """k1 and k2; None without residual distortion."""
         return (self.k1, self.k2) if self.k1 or self.k2 else None
 
 
@@ -46,11 +46,11 @@ class Camera:
     fx, fy, cx, cy : float
         Focal lengths and principal point, px, in the corner-origin convention above.
     T_cam_world : ndarray [4, 4] float64
-        x_cam = T_cam_world @ x_world (homogeneous). May be given as a torch tensor, which ``pose`` keeps if it learns.
+        x_cam = T_cam_world @ x_world (homogeneous). A torch tensor that requires a gradient is kept as ``pose``.
     pose : Tensor [4, 4] or None
-        The tensor that ``T_cam_world`` was given as, where it requires a gradient (``rasterize``, rule 20).
+        ``T_cam_world`` as a tensor that requires a gradient (``rasterize``, rule 20).
     intrinsics : Tensor [4] or None
-        fx, fy, cx and cy as a tensor that requires a gradient, with the same numbers (``rasterize``, rule 21).
+        fx, fy, cx and cy as a tensor that requires a gradient, with equal values (``rasterize``, rule 21).
     """
 
     width: int
@@ -65,21 +65,21 @@ class Camera:
 
     def __post_init__(self) -> None:
         given: Any = self.T_cam_world
-        if hasattr(given, "requires_grad"):  # a torch tensor: this module does without torch
+        if hasattr(given, "requires_grad"):  # a torch tensor; this module does not import torch
             object.__setattr__(self, "pose", given if given.requires_grad else None)
             given = given.detach().cpu().numpy()
-        T = np.array(given, dtype=np.float64)  # a copy: a camera stays where it is when an optimizer moves its pose
+        T = np.array(given, dtype=np.float64)  # a copy: an optimizer that changes the tensor must not move the camera
         if T.shape != (4, 4):
             raise ShapeError(f"T_cam_world must be [4, 4], got {list(T.shape)}")
         if not (np.isfinite(T).all() and np.allclose(T[3], (0, 0, 0, 1), atol=1e-6)):
             raise ShapeError("T_cam_world must be finite with last row (0, 0, 0, 1)")
         R = T[:3, :3]
-        with np.errstate(all="ignore"):  # what overflows is no rotation either
+        with np.errstate(all="ignore"):  # overflow fails the check
             off, determinant = np.abs(R @ R.T - np.eye(3)).max(), np.linalg.det(R)
         if not (off < 1e-2 and determinant > 0):
             raise ShapeError(
-                f"T_cam_world must be a rotation and a translation, got determinant {determinant:.4g} and rows "
-                f"that are orthonormal to {off:.2g}; take scale and mirroring out of it"
+                f"T_cam_world must be a rotation and a translation, got determinant {determinant:.4g} and an "
+                f"orthonormality error of {off:.2g}; remove scale and mirroring"
             )
         if not np.isfinite((self.fx, self.fy, self.cx, self.cy)).all():
             raise ShapeError(f"fx, fy, cx, cy must be finite, got {self.fx}, {self.fy}, {self.cx}, {self.cy}")
@@ -92,24 +92,20 @@ class Camera:
             )
         object.__setattr__(self, "T_cam_world", T)
         if not self.is_at_pose:
-            raise ShapeError(
-                "pose must be the tensor that T_cam_world was made of, got another; give the new T_cam_world as a "
-                "tensor, or with pose=None"
-            )
+            raise ShapeError("pose must equal T_cam_world; pass the new T_cam_world as a tensor, or pose=None")
         if not self.has_its_intrinsics:
             raise ShapeError(
-                "intrinsics must be a tensor [4] of fx, fy, cx and cy, got other numbers; give the tensor of the new "
-                "ones, or intrinsics=None"
+                "intrinsics must be a tensor [4] equal to fx, fy, cx and cy; pass the new tensor, or intrinsics=None"
             )
 
     @property
     def is_at_pose(self) -> bool:
-        """Whether ``pose``, if there is one, still holds the numbers of ``T_cam_world``."""
+        """Whether ``pose``, if any, equals ``T_cam_world``."""
         return self.pose is None or np.array_equal(self.T_cam_world, self.pose.detach().cpu().numpy())
 
     @property
     def has_its_intrinsics(self) -> bool:
-        """Whether ``intrinsics``, if there is one, still holds fx, fy, cx and cy."""
+        """Whether ``intrinsics``, if any, equals fx, fy, cx and cy."""
         return self.intrinsics is None or self.intrinsics.tolist() == [self.fx, self.fy, self.cx, self.cy]
 
     @property
@@ -133,7 +129,7 @@ class Camera:
         return np.asarray(self.rotation[2])
 
     def resized(self, width: int, height: int) -> Camera:
-        """Return the same camera with another image size (intrinsics scale with each axis)."""
+        """Return the camera for another image size; intrinsics scale with each axis."""
         sx, sy = width / self.width, height / self.height
         return self._with(width, height, (self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy), (sx, sy, sx, sy))
 
@@ -152,13 +148,13 @@ class Camera:
         return self._with(width, height, (self.fx / f, self.fy / f, self.cx / f, self.cy / f), (1 / f,) * 4)
 
     def zoomed(self, zoom: Zoom) -> Camera:
-        """Return the same camera with other intrinsics; those that learn are let go, and the lens is no part of it."""
+        """Return the camera with changed intrinsics, without their tensor; residual distortion is not applied."""
         scale, right, down, *_ = zoom
         cx, cy = self.cx + self.fx * right, self.cy + self.fy * down
         return replace(self, fx=self.fx * scale, fy=self.fy * scale, cx=cx, cy=cy, intrinsics=None)
 
     def _with(self, width: int, height: int, numbers: tuple[float, ...], factors: tuple[float, ...]) -> Camera:
-        """Another size, and these fx, fy, cx and cy; those that learn are a function of what they were."""
+        """Return the camera with another size and intrinsics; an intrinsics tensor is scaled differentiably."""
         learning = None
         if self.intrinsics is not None:
             learning = self.intrinsics * self.intrinsics.new_tensor(factors)
@@ -219,7 +215,7 @@ def look_at(
     right = np.cross(target - eye, up)
     if not np.linalg.norm(right) > 0:
         raise ShapeError(
-            f"look_at needs an eye away from its target and an up that is not the way it looks, got eye "
+            f"look_at needs an eye away from its target and an up that is not the viewing direction, got eye "
             f"{eye.tolist()}, target {target.tolist()}, up {up.tolist()}; choose another up"
         )
     forward = (target - eye) / np.linalg.norm(target - eye)

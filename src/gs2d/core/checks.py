@@ -1,4 +1,4 @@
-"""Shape checks with named dimensions: the same name must mean the same size."""
+"""Shape checks with named dimensions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gs2d.errors import ShapeError
 
 @lru_cache(maxsize=256)
 def _parsed(pattern: str) -> tuple[tuple[str, int | None], ...]:
-    """Return the words of a pattern, each with its value if it is a number."""
+    """Return the words of a pattern, with their values if they are numbers."""
     return tuple((word, int(word) if word.lstrip("-").isdigit() else None) for word in pattern.split())
 
 
@@ -32,7 +32,7 @@ def check_shapes(arrays: Mapping[str, tuple[Any, str]]) -> dict[str, int]:
     Raises
     ------
     ShapeError
-        Names the first array that does not fit, and the array that fixed the dimension.
+        Names the first array that does not match, and the array that defined the dimension.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Optional packages and programs: what installs them, and their import when they are needed."""
+"""Optional packages: install commands and deferred imports."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from gs2d.errors import BackendError
 
-# extra -> what pyproject.toml says of it (a test compares them)
+# Requirements of each extra, as in pyproject.toml (a test compares them).
 EXTRAS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "cluster": ("ray>=2.60,<3",),
@@ -28,24 +28,23 @@ FFMPEG = "apt install ffmpeg, brew install ffmpeg, or ffmpeg.org"
 
 
 def install(extra: str) -> str:
-    """Return the command that installs an extra's packages.
+    """Return the command that installs the packages of an extra.
 
-    They are named themselves: that works from a clone, from a wheel and in a container, where ``2dgs-r[...]`` would be
-    looked for on an index that does not have it.
+    The packages are listed because ``2dgs-r[...]`` only works if the package index has it.
     """
     return "pip install " + " ".join(f"'{requirement}'" for requirement in EXTRAS[extra])
 
 
 def required(extra: str, module: str, what: str, otherwise: str = "") -> Any:
-    """Return a module of an extra, imported when it is needed.
+    """Import a module of an extra.
 
     Parameters
     ----------
     extra, module : str
     what : str
-        What needs the module, for the message.
+        Feature that needs the module, for the message.
     otherwise : str
-        What to do without it.
+        Alternative without the module.
 
     Raises
     ------

@@ -12,28 +12,28 @@ from gs2d.errors import ShapeError
 
 
 def natural_key(name: str) -> tuple[list[str | int], str]:
-    """Sorts names as people count: ``frame_2`` before ``frame_10``. Names padded with zeros keep the order of text.
+    """Return a sort key in numeric order: ``frame_2`` before ``frame_10``.
 
-    For pairing files with something else by their place. The views of a scene are sorted as text, as the official
-    loaders have them, so that every 8th is the same view.
+    For pairing files by index. The views of a scene are sorted as text, as in the official loaders, so that every 8th
+    is the same view.
     """
-    parts: list[str | int] = list(re.split("([0-9]+)", name))  # text, number, text ...: neighbours are of one kind
+    parts: list[str | int] = list(re.split("([0-9]+)", name))  # text, number, text ...
     parts[1::2] = [int(part) for part in parts[1::2]]
     return parts, name
 
 
 def is_twice_as_wide(width: int, height: int) -> bool:
-    """Whether an image has the shape of an equirectangular panorama, up to a hundredth."""
+    """Whether an image has the aspect ratio of an equirectangular panorama, within 1 %."""
     return min(width, height) >= 1 and abs(width / (2 * height) - 1) <= 0.01
 
 
 def is_number(text: str) -> bool:
-    """Whether a name is a whole number: digits 0 to 9 (``str.isdigit`` takes ² too), and no more than a number has."""
+    """Whether text consists of 1 to 18 ASCII digits."""
     return re.fullmatch("[0-9]{1,18}", text) is not None
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
-    """Float in [0, 1] (clipped) or bool to uint8; uint8 passes through."""
+    """Convert float in [0, 1] (clipped) or bool to uint8; uint8 is returned unchanged."""
     image = np.asarray(image)
     if image.dtype == np.uint8:
         return image
@@ -42,12 +42,12 @@ def to_uint8(image: np.ndarray) -> np.ndarray:
     if not np.issubdtype(image.dtype, np.floating):
         raise ShapeError(f"image must be uint8, bool or float, got {image.dtype}")
     if np.isnan(image).any():
-        raise ShapeError("image must not hold NaN")
+        raise ShapeError("image must not contain NaN")
     return np.asarray((np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8))
 
 
 def composite(image: np.ndarray, background: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Straight-alpha image over a background: c alpha + (1 - alpha) b.
+    """Composite an image with straight alpha over a background: c alpha + (1 - alpha) b.
 
     Parameters
     ----------
@@ -70,13 +70,13 @@ def composite(image: np.ndarray, background: Sequence[float] | np.ndarray) -> np
     return np.asarray(rgb)
 
 
-_BAND = 1 << 21  # px that are averaged at a time
+_BAND = 1 << 21  # px averaged at a time
 
 
 def area_downscale(image: np.ndarray, factor: int) -> np.ndarray:
-    """Average n x n blocks of pixels; rows and columns left over at the end are cut.
+    """Average n x n blocks of pixels; leftover rows and columns are cut.
 
-    Colour is weighted by alpha (averaged premultiplied, stored straight), so transparent pixels do not bleed.
+    Colour is averaged premultiplied by alpha and stored straight.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def area_downscale(image: np.ndarray, factor: int) -> np.ndarray:
     if factor == 1:
         return image
     _block_parts(image, factor)  # raises
-    rows = max(1, _BAND // (image.shape[1] * factor)) * factor  # wider numbers of a part at a time
+    rows = max(1, _BAND // (image.shape[1] * factor)) * factor  # in bands, to bound memory
     whole = image.shape[0] // factor * factor
     return np.concatenate([_area_average(image[y : min(y + rows, whole)], factor) for y in range(0, whole, rows)])
 
@@ -119,7 +119,7 @@ def _area_average(image: np.ndarray, factor: int) -> np.ndarray:
 
 
 def mask_downscale(mask: np.ndarray, factor: int, *, need: float) -> np.ndarray:
-    """Bool [H, W] to bool [H // n, W // n]: True where at least the share ``need`` of the n x n block is True."""
+    """Reduce bool [H, W] to [H // n, W // n]: True where at least the fraction ``need`` of the block is True."""
     if factor == 1:
         return mask
     fraction = sum(part.astype(np.float64) for part in _block_parts(mask, factor)) / factor**2
@@ -127,7 +127,7 @@ def mask_downscale(mask: np.ndarray, factor: int, *, need: float) -> np.ndarray:
 
 
 def _block_parts(image: np.ndarray, factor: int) -> list[np.ndarray]:
-    """Return the n x n pictures [H // n, W // n, ...] of the pixels at each place in the blocks (views, no copies)."""
+    """Return n x n views [H // n, W // n, ...], one per position in the blocks."""
     height, width = image.shape[0] // factor, image.shape[1] // factor
     if factor < 1 or height < 1 or width < 1:
         raise ShapeError(f"downscale must leave at least one pixel of {image.shape[1]}x{image.shape[0]}, got {factor}")

@@ -1,4 +1,4 @@
-"""Files of any kind: atomic writes, and JSON with errors that name the file."""
+"""JSON files with errors that name the file."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
     Raises
     ------
     DiskError
-        The file could not be written.
+        If the file could not be written.
     ValueError
-        NaN or infinity, which JSON does not have: say ``null`` and the reason.
+        For NaN or infinity, which JSON does not have.
     """
     text = json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False)
     with atomic_write(path, "w") as file:
@@ -34,13 +34,13 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     Raises
     ------
     DataError
-        Missing, unreadable or not JSON; names the file, and the line where it stops being JSON.
+        If the file is missing or not JSON; names the file and the line.
     """
     name = os.fspath(path)
     try:
         text = Path(path).read_text(encoding="utf-8-sig")  # Windows tools write a byte-order mark
     except UnicodeDecodeError as error:
-        raise DataError(f"{name} must be JSON in UTF-8, got a byte that is not at offset {error.start}") from error
+        raise DataError(f"{name} must be JSON in UTF-8, got an invalid byte at offset {error.start}") from error
     except OSError as error:
         raise DataError(f"cannot read {name}: {error.strerror or error}") from error
     try:
@@ -48,4 +48,4 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     except ValueError as error:
         raise DataError(f"{name} must be JSON, got: {error}; is the file complete?") from error
     except RecursionError as error:
-        raise DataError(f"{name} must be JSON, got brackets nested too deeply to read") from error
+        raise DataError(f"{name} must be JSON, got brackets nested too deeply") from error

@@ -1,4 +1,4 @@
-"""Locks on open files: the system gives those of a killed process back."""
+"""Locks on open files, which the operating system releases when the process ends."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ if sys.platform == "win32":
     import msvcrt
 
     def try_lock(descriptor: int) -> bool:
-        """Lock an open file until it is closed; False where another process (or another opening of it) holds it."""
+        """Lock an open file until it is closed; False if another handle holds the lock."""
         try:
             msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
         except OSError:
@@ -19,12 +19,12 @@ else:
     import fcntl
 
     def try_lock(descriptor: int) -> bool:
-        """Lock an open file until it is closed; False where another process (or another opening of it) holds it.
+        """Lock an open file until it is closed; False if another handle holds the lock.
 
         Raises
         ------
         OSError
-            The file system has no locks.
+            If the file system has no locks.
         """
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,7 +1,7 @@
-"""Memory that was freed: given back to the system between phases, kept within them.
+"""Freed memory: returned to the operating system between phases, kept by the C library within them.
 
-The C library keeps what is freed for the next request. Between the pictures of a capture, which stay, lie the holes of
-the arrays that they were decoded through, and threads have heaps of their own: 93 MB of pictures took 549 MB.
+The C library keeps freed memory for later requests. Fragmentation while images are decoded and separate heaps of
+threads can multiply the memory use: 93 MB of images took 549 MB.
 """
 
 from __future__ import annotations
@@ -15,22 +15,21 @@ from typing import Any
 __all__ = ["hold", "trim"]
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
-MAPPED_BYTES = 32 << 20  # from which a block is mapped for itself: the most that glibc takes
-HELD_BYTES = 256 << 20  # free at the end of the heap: what an iteration at 300,000 splats frees, and more
+MAPPED_BYTES = 32 << 20  # larger blocks are mapped separately; the maximum of glibc
+HELD_BYTES = 256 << 20  # free memory kept at the end of the heap; more than an iteration with 300,000 splats frees
 
 
 @cache
 def hold() -> bool:
-    """Let the C library keep what an iteration frees for the next one; ``trim`` still gives it back.
+    """Let the C library keep the memory that an iteration frees for the next one; ``trim`` still returns it.
 
-    By itself glibc gives the end of its heap back as soon as more than twice the largest block is free there. An
-    iteration frees 100 MB of gradients and images, so at some sizes each one gets its pages anew, zeroed: 12,000 of
-    them and a sixth of its time at 181,000 splats.
+    By default glibc returns the end of its heap when more than twice the largest block is free there. Then every
+    iteration gets new, zeroed pages, which took a sixth of its time at 181,000 splats.
 
     Returns
     -------
     bool
-        Whether this platform has a way to say so (glibc), and the user has not said something else (MALLOC_...).
+        Whether it took effect: with glibc, unless the user configures malloc (MALLOC_...).
     """
     if any(name.startswith("MALLOC_") for name in os.environ) or "glibc.malloc" in os.environ.get("GLIBC_TUNABLES", ""):
         return False
@@ -43,7 +42,7 @@ def hold() -> bool:
 
 @cache
 def _malloc_trim() -> Callable[[int], Any] | None:
-    """Return the call of glibc that does it; None elsewhere."""
+    """Return glibc's ``malloc_trim``; None with another C library."""
     try:
         return ctypes.CDLL(None).malloc_trim
     except (AttributeError, OSError, TypeError):
@@ -51,12 +50,12 @@ def _malloc_trim() -> Callable[[int], Any] | None:
 
 
 def trim() -> bool:
-    """Give all free pages of the C library's heaps back to the system.
+    """Return the free pages of the C library to the operating system.
 
     Returns
     -------
     bool
-        Whether this platform has a way to do so (glibc). Nothing else needs one: without it, memory is used again.
+        Whether the C library supports it (glibc).
     """
     call = _malloc_trim()
     if call is not None:

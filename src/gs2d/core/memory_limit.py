@@ -1,7 +1,7 @@
-"""How much memory this process may have: the least of what the kernel, the container and the machine set.
+"""The memory limit of this process: the smallest of control group, address space, machine and ``--memory``.
 
-What is beyond a cgroup's limit is no MemoryError but the end of the process by SIGKILL, without a word. So caches are
-made as large as fits under the limit that is in force, and work that cannot fit is refused before it begins.
+Beyond the limit of a control group the process is killed without a MemoryError. Therefore caches are sized by the
+limit, and work that cannot fit is refused before it begins.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ __all__ = [
     "set_memory_budget",
 ]
 
-CACHE_FRACTION = 0.2  # of what is left, that a cache may take: what the work itself needs must fit beside it
-BUDGET_FRACTION = 0.5  # of the limit in force, that a command takes if nobody says how much
-LEAST_ADDRESSES = 1 << 30  # bytes of address space that Python, numpy, scipy and torch take to be loaded
-THREAD_ADDRESSES = 80 << 20  # and for each more thread of OpenBLAS, of which numpy and scipy have one each
-_UNLIMITED = 1 << 60  # cgroup v1 says 2^63 less a page where there is no limit
+CACHE_FRACTION = 0.2  # of the free memory, for a cache
+BUDGET_FRACTION = 0.5  # of the limit, default budget of a command
+LEAST_ADDRESSES = 1 << 30  # bytes of address space for loading Python, NumPy, SciPy and torch
+THREAD_ADDRESSES = 80 << 20  # bytes for each further thread of OpenBLAS, in NumPy and SciPy
+_UNLIMITED = 1 << 60  # cgroup v1 reports about 2^63 for no limit
 
 
 @dataclass(frozen=True)
 class MemoryLimit:
-    """A limit, and what of it this process has already.
+    """A memory limit and its use by this process.
 
     Attributes
     ----------
     bytes : int
     used : int
-        Bytes of it that this process has.
+        Bytes used by this process.
     source : str
-        Who sets it, in words.
+        Description of the limit.
     """
 
     bytes: int
@@ -49,19 +49,17 @@ class MemoryLimit:
 
     @property
     def room(self) -> int:
-        """Bytes that are left."""
+        """Free bytes."""
         return max(self.bytes - self.used, 0)
 
 
 def memory_limit(root: Path = Path("/")) -> MemoryLimit | None:
-    """Return the limit that leaves the least, of cgroup (v1 and v2), RLIMIT_AS, the machine and the user.
-
-    None: none is known.
+    """Return the limit with the least free memory: cgroup (v1, v2), RLIMIT_AS, machine, ``--memory``; None if unknown.
 
     Parameters
     ----------
     root : path
-        Where ``proc`` and ``sys`` are.
+        Folder of ``proc`` and ``sys``.
     """
     mapped, resident = _own_pages(root)
     found = [MemoryLimit(limit, resident, source) for limit, source in (*_cgroups(root), *_physical(root))]
@@ -72,16 +70,16 @@ def memory_limit(root: Path = Path("/")) -> MemoryLimit | None:
     return min(found, key=lambda limit: limit.room, default=None)
 
 
-_budget: list[int] = []  # of this process: what the user allows it, if anything
+_budget: list[int] = []  # at most one value: the limit set by the user
 
 
 def set_memory_budget(budget: int | None) -> None:
-    """Let this process have so many bytes, or (None) as many as the kernel, the container and the machine leave."""
+    """Set the memory budget of this process, bytes; None: no budget."""
     _budget[:] = [] if budget is None else [budget]
 
 
 def memory_budget() -> int | None:
-    """Return the bytes that this process is to keep to: what was set, or half of the limit; None: none is known."""
+    """Return the budget in bytes: as set, else half of the limit; None if unknown."""
     if _budget:
         return _budget[0]
     limit = memory_limit()
@@ -89,28 +87,27 @@ def memory_budget() -> int | None:
 
 
 def cache_bytes(wanted: int) -> int:
-    """Return the bytes that a cache may take: ``wanted``, or less where memory is limited."""
+    """Return the size of a cache in bytes: ``wanted``, or less if memory is limited."""
     limit = memory_limit()
     return wanted if limit is None else min(wanted, int(CACHE_FRACTION * limit.room))
 
 
 def check_address_space() -> None:
-    """Refuse to go on where so little address space is allowed that the libraries cannot be loaded.
+    """Raise BackendError if the address space is too small for loading the libraries.
 
-    Looked at before they are: OpenBLAS asks for its buffers again and again for ever if it gets none, and C++ ends the
-    process. Python's package for CUDA takes more, and says so itself.
+    To be called before: OpenBLAS would loop forever, and C++ would end the process.
     """
     limit = address_space()
     needed = LEAST_ADDRESSES + THREAD_ADDRESSES * (_blas_threads() - 1)
     if limit is not None and limit < needed:
         raise BackendError(
-            f"at least {needed / 2**30:.2f} GiB of address space are needed, got a limit of {limit / 2**30:.2f} GiB; "
+            f"the address space must be at least {needed / 2**30:.2f} GiB, got a limit of {limit / 2**30:.2f} GiB; "
             "raise it (ulimit -v unlimited), and limit memory by a control group instead"
         )
 
 
 def _blas_threads() -> int:
-    """Return the threads that OpenBLAS makes when it is loaded."""
+    """Return the number of threads that OpenBLAS starts."""
     for name in ("OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS"):
         if (value := os.environ.get(name, "")).isdecimal() and int(value[:6]):
             return int(value[:6])
@@ -118,7 +115,7 @@ def _blas_threads() -> int:
 
 
 def _own_pages(root: Path) -> tuple[int, int]:
-    """Bytes of this process: its address space, and what of it is in memory."""
+    """Return address space and resident memory of this process, bytes."""
     try:
         fields = (root / "proc/self/statm").read_text().split()
         page = os.sysconf("SC_PAGE_SIZE")
@@ -128,7 +125,7 @@ def _own_pages(root: Path) -> tuple[int, int]:
 
 
 def _cgroups(root: Path) -> Iterator[tuple[int, str]]:
-    """Yield the limits of the control groups that this process is in, and of those that these are in."""
+    """Yield the limits of the control groups of this process and of their ancestors."""
     try:
         lines = (root / "proc/self/cgroup").read_text().splitlines()
     except OSError:
@@ -144,10 +141,10 @@ def _cgroups(root: Path) -> Iterator[tuple[int, str]]:
         else:
             continue
         parts = [part for part in path.split("/") if part not in ("", "..", ".")]
-        for depth in range(len(parts), -1, -1):  # in a container the path may be that of the host: what is there counts
+        for depth in range(len(parts), -1, -1):  # in a container, the path may be that of the host
             try:
                 limit = int((mount.joinpath(*parts[:depth]) / name).read_text())
-            except (OSError, ValueError):  # not there, or "max"
+            except (OSError, ValueError):  # missing, or "max"
                 continue
             if 0 < limit < _UNLIMITED:
                 yield limit, words
@@ -168,7 +165,7 @@ def _physical(root: Path) -> Iterator[tuple[int, str]]:
 
 
 def address_space() -> int | None:
-    """Return the limit on address space (RLIMIT_AS), bytes; None: there is none."""
+    """Return the limit on address space (RLIMIT_AS), bytes; None without one."""
     try:
         import resource  # not on Windows
     except ImportError:

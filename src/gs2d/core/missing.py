@@ -1,4 +1,4 @@
-"""Remedies for a path that does not exist, or that exists and is not what a command needs."""
+"""Suggestions for a path that does not exist or is not what a command needs."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ import shlex
 import zipfile
 from pathlib import Path
 
-_ALIKE = 0.6  # of difflib's ratio, from which a name is proposed
-_UP = 3  # folders above a path that are looked at
+_ALIKE = 0.6  # smallest ratio of difflib for a suggested name
+_UP = 3  # number of parent folders that are searched
 _PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".avif", ".exr")
-_CAPTURES = (  # names in a capture's folder, without those that photographs alone have
+_CAPTURES = (  # files and folders of captures
     *("transforms.json", "transforms_train.json", "cameras.npz", "cameras_sphere.npz", "sparse"),
     *("reconstruction.json", "opensfm", "cameras.xml", "*.sfm"),
 )
 
 
 def where_it_ends(path: Path) -> str:
-    """Return "; did you mean scans/chair?", or "; there is no chair in /home/me/scans", of a path that is not there.
+    """Return a hint on a missing path: "; did you mean scans/chair?" or "; there is no chair in /home/me/scans".
 
     Parameters
     ----------
     path : Path
-        Relative to the working folder, or absolute.
+        A path that does not exist.
     """
     missing, rest = path, Path()
     while missing.parent != missing and not missing.parent.exists():
         missing, rest = missing.parent, missing.name / rest
     try:
         names = sorted(os.listdir(missing.parent))
-    except OSError:  # a file where a folder is needed, or one that may not be read
+    except OSError:  # not a folder, or not readable
         return "; check the path"
     close = difflib.get_close_matches(missing.name.casefold(), [name.casefold() for name in names], 1, _ALIKE)
     for name in names:
@@ -44,9 +44,9 @@ def where_it_ends(path: Path) -> str:
 
 
 def instead(path: Path, needed: str) -> str:
-    """Return what to do with a path that exists, but is not what a command needs; begins with "; ".
+    """Return a suggestion for an existing path that is not what a command needs; begins with "; ".
 
-    Judges by names alone. Paths in the result exist, and its commands work; RUN and FOLDER are for the user to choose.
+    Only file names are examined. RUN in a suggested command is a name that the user chooses.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def instead(path: Path, needed: str) -> str:
 
 
 def belongs_to_run(path: Path) -> bool:
-    """Whether a folder is a run, a part of one, or holds runs and no photographs; a capture in a run is none of it."""
+    """Whether a folder is a run, inside one, or contains runs but no images; a capture inside a run is not."""
     for folder in (path, *list(path.parents)[:_UP]):
         if (folder / "run.json").is_file():
             return True
@@ -96,12 +96,12 @@ def belongs_to_run(path: Path) -> bool:
 
 
 def _run_in(folder: Path) -> Path | None:
-    """Return the first run folder in a folder, by name."""
+    """Return the first run folder in a folder; None without any."""
     return next(iter(sorted(path.parent for path in folder.glob("*/run.json"))), None)
 
 
 def holds_photographs(path: Path) -> bool:
-    """Whether a folder or a ZIP file holds photographs and no cameras, by the names in it."""
+    """Whether a folder or a ZIP file contains images but no cameras, by file names."""
     names = _names_in(path)
     return any(name.lower().endswith(_PHOTOS) for name in names) and not _holds_capture(path)
 
@@ -111,7 +111,7 @@ def _holds_capture(path: Path) -> bool:
 
 
 def _names_in(path: Path) -> set[str]:
-    """Return the names in a folder, or the parts of all names in a ZIP file; none of what cannot be read."""
+    """Return the names in a folder, or all path parts in a ZIP file; empty if it cannot be read."""
     try:
         if path.suffix.lower() == ".zip" and path.is_file():
             with zipfile.ZipFile(path) as file:
@@ -122,7 +122,7 @@ def _names_in(path: Path) -> set[str]:
 
 
 def _capture_of(run: Path) -> Path | None:
-    """Return the capture of a run; None where it is gone."""
+    """Return the capture of a run; None if it no longer exists."""
     try:
         capture = Path(json.loads((run / "run.json").read_text(encoding="utf-8"))["scene"]["path"])
     except (OSError, ValueError, LookupError, TypeError):
@@ -131,14 +131,14 @@ def _capture_of(run: Path) -> Path | None:
 
 
 def _with_cameras(photos: Path) -> str:
-    """Return how to make a run of photographs, which may be in a ZIP file."""
+    """Return how to make a run from images, which may be in a ZIP file."""
     unpack, folder = _unpacking(photos) if photos.is_file() else ("", photos)
     first = f"unpack it with `{unpack}`, then " if unpack else ""
     return f"; {first}`gs2d reconstruct {_quoted(folder)} --out RUN` makes a run of its photographs"
 
 
 def _unpacking(archive: Path) -> tuple[str, Path]:
-    """Return a command that unpacks a ZIP file, and the new folder that it makes."""
+    """Return a command that unpacks a ZIP file, and the folder that it creates."""
     folder = archive.with_suffix("")
     while folder.exists():
         folder = folder.with_name(folder.name + "_unpacked")

@@ -1,4 +1,4 @@
-"""Which of the processes of a training this one is, as ``torchrun`` says in the environment. Never imports torch."""
+"""Rank of this process in a distributed training, from the environment of ``torchrun``. Does not import torch."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from dataclasses import dataclass
 
 from gs2d.errors import BackendError
 
-NEEDED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")  # without one of them nobody can be met
+NEEDED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 
 
 @dataclass(frozen=True)
 class Place:
-    """The place of this process among those that train together.
+    """Rank of this process among those that train together.
 
     Attributes
     ----------
     rank : int
-        From 0, over all machines. Process 0 leads: it alone writes and prints.
+        Over all machines, from 0. Only rank 0 writes and prints.
     size : int
-        Processes in all.
+        Number of processes.
     local_rank, local_size : int
-        The same on this machine; the GPU is chosen by the first.
+        Rank and number on this machine; the local rank selects the GPU.
     """
 
     rank: int = 0
@@ -32,31 +32,28 @@ class Place:
 
     @property
     def leads(self) -> bool:
-        """Whether this is process 0."""
+        """Whether this is rank 0."""
         return self.rank == 0
 
 
 def here(environment: Mapping[str, str] = os.environ) -> Place:
-    """Return the place of this process; that of the only one where nothing, or not all, of it is said.
+    """Return the rank of this process; that of a single process if the environment is not complete.
 
     Raises
     ------
     BackendError
-        What is said cannot be.
+        If the environment is contradictory.
     """
     if not all(environment.get(name) for name in NEEDED):
         return Place()
-    said = {name: environment[name] for name in ("RANK", "WORLD_SIZE")}
-    said["LOCAL_RANK"] = environment.get("LOCAL_RANK") or said["RANK"]
-    said["LOCAL_WORLD_SIZE"] = environment.get("LOCAL_WORLD_SIZE") or said["WORLD_SIZE"]
+    variables = {name: environment[name] for name in ("RANK", "WORLD_SIZE")}
+    variables["LOCAL_RANK"] = environment.get("LOCAL_RANK") or variables["RANK"]
+    variables["LOCAL_WORLD_SIZE"] = environment.get("LOCAL_WORLD_SIZE") or variables["WORLD_SIZE"]
     try:
-        place = Place(*map(int, said.values()))
+        place = Place(*map(int, variables.values()))
     except ValueError:
         place = Place(-1)
     if not (0 <= place.rank < place.size and 0 <= place.local_rank < place.local_size <= place.size):
-        shown = ", ".join(f"{name}={value}" for name, value in said.items())
-        raise BackendError(
-            f"the environment must say which process this is as torchrun does, got {shown}; start with torchrun, or "
-            "unset WORLD_SIZE"
-        )
+        shown = ", ".join(f"{name}={value}" for name, value in variables.items())
+        raise BackendError(f"the environment has an invalid rank, {shown}; start with torchrun, or unset WORLD_SIZE")
     return place

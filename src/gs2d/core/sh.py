@@ -28,7 +28,7 @@ def num_coefficients(degree: int) -> int:
 
 
 def sh_degree_of(coefficients: int) -> int:
-    """Return the degree whose coefficients number K.
+    """Return the SH degree with K coefficients.
 
     Raises
     ------
@@ -44,7 +44,7 @@ def sh_degree_of(coefficients: int) -> int:
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """Values of the first K = (degree + 1)^2 basis functions.
+    """Return the values of the first K = (degree + 1)^2 basis functions.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def harmonics(x: Any, y: Any, z: Any, degree: int) -> list[Any]:
 
 
 def sh_to_rgb(sh0: Tensor, shN: Tensor, directions: Tensor, degree: int) -> Tensor:
-    """Colour of N splats seen along N directions: SH + 0.5, clamped at 0 (not above 1).
+    """Return the colour of N splats along N directions: SH + 0.5, clamped at 0 (not above 1).
 
     Parameters
     ----------
@@ -107,12 +107,12 @@ def sh_to_rgb(sh0: Tensor, shN: Tensor, directions: Tensor, degree: int) -> Tens
     directions : Tensor [N, 3]
         Unit vectors from the camera to the splat.
     degree : int
-        Degree that is evaluated; coefficients above it are ignored.
+        Evaluated degree; higher coefficients are ignored.
 
     Returns
     -------
     Tensor [N, 3]
-        RGB; 0.5 where all coefficients are 0. A clamped channel has zero gradient.
+        RGB; 0.5 if all coefficients are 0. A clamped channel has zero gradient.
 
     Raises
     ------
@@ -129,7 +129,7 @@ def sh_to_rgb(sh0: Tensor, shN: Tensor, directions: Tensor, degree: int) -> Tens
 
 
 def rgb_to_sh0(rgb: Tensor) -> Tensor:
-    """Return the degree-0 SH coefficients of colours that look the same from every direction.
+    """Return the degree-0 SH coefficients of view-independent colours.
 
     Parameters
     ----------

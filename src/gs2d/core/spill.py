@@ -1,4 +1,4 @@
-"""A sequence of which only so much is in memory; the rest waits in a temporary file."""
+"""A sequence with bounded memory use; the rest is in a temporary file."""
 
 from __future__ import annotations
 
@@ -13,19 +13,18 @@ from typing import IO, Any, Generic, TypeVar, overload
 from gs2d.errors import DiskError
 
 T = TypeVar("T")
-RECENT = 32  # of those in the file that stay at hand: neighbours of a view are asked for again soon
+RECENT = 32  # values from the file that are cached: neighbouring views are requested again soon
 
 
 class Spilled(Sequence[T], Generic[T]):
-    """Values in order; the first that fit in ``limit_bytes`` stay in memory, later ones are pickled into a file.
+    """A sequence whose first values stay in memory up to ``limit_bytes``; later ones are pickled to a file.
 
-    The file has no name, lies in the system's temporary folder (``TMPDIR``) and vanishes with the sequence. What comes
-    back from it is equal to what went in, bit for bit.
+    The file is anonymous, in the temporary folder (``TMPDIR``), and is deleted with the sequence.
 
     Parameters
     ----------
     values : iterable
-        Taken one by one: a generator makes each when the one before is put away.
+        Consumed one by one.
     limit_bytes : int
 
     Raises
@@ -57,8 +56,8 @@ class Spilled(Sequence[T], Generic[T]):
             self._file.write(packed)
         except OSError as error:
             raise DiskError(
-                f"a temporary file for what does not fit in memory cannot be written ({error.strerror or error}); free "
-                "some space, set TMPDIR to a folder with room, or allow more --memory",
+                f"cannot write a temporary file for data that does not fit in memory ({error.strerror or error}); free "
+                "some space, set TMPDIR to another folder, or allow more --memory",
                 error.errno,
             ) from error
 
@@ -67,7 +66,7 @@ class Spilled(Sequence[T], Generic[T]):
 
     @property
     def in_memory(self) -> int:
-        """How many of the values stay in memory."""
+        """Number of values in memory."""
         return len(self._kept)
 
     @overload
@@ -86,14 +85,14 @@ class Spilled(Sequence[T], Generic[T]):
         assert self._file is not None
         offset, size = self._slots[at - len(self._kept)]
         self._file.seek(offset)
-        value: T = pickle.loads(self._file.read(size))  # our own file, which nobody else can open
+        value: T = pickle.loads(self._file.read(size))  # an anonymous file of this process
         self._recent[at] = value
         if len(self._recent) > RECENT:
             self._recent.popitem(last=False)
         return value
 
     def column(self, number: int) -> Sequence[Any]:
-        """Return the sequence of one entry of each value, where values are tuples."""
+        """Return the sequence of one entry of each value; values are tuples."""
         return _Column(self, number)
 
     def __iter__(self) -> Iterator[T]:

@@ -20,7 +20,7 @@ IMAGES = (
     "depth_median",
     "distortion",
 )
-"""Images of a rendering, in the order of the kernels."""
+"""Output images of a rendering, in the order of the kernels."""
 
 
 @dataclass(eq=False)
@@ -32,7 +32,7 @@ class Splats:
     means : Tensor [N, 3] world units
         Centres p (the paper's mu).
     quats : Tensor [N, 4]
-        Rotations, (w, x, y, z), normalised where they are used. Columns of the matrix: t_u, t_v, normal t_w.
+        Rotations, (w, x, y, z), normalised on use. Columns of the matrix: t_u, t_v, normal t_w.
     log_scales : Tensor [N, 2]
         log of s_u, s_v (world units), the standard deviations along t_u and t_v.
     opacity_logits : Tensor [N]
@@ -66,7 +66,7 @@ class Splats:
         return int(self.means.shape[0])
 
     def items(self) -> Iterator[tuple[str, Tensor]]:
-        """(attribute name, tensor) in the fixed order of ``ATTRIBUTES``."""
+        """Yield (attribute name, tensor) in the order of ``ATTRIBUTES``."""
         for field in fields(self):
             yield field.name, getattr(self, field.name)
 
@@ -120,11 +120,10 @@ class Splats:
         Parameters
         ----------
         path : path
-            Ends in .ply (as viewers open it), .compressed.ply, .spz, .splat, .usd, .glb, .sog or the ending of a
-            registered format. ``gs2d.read_splats`` reads all of gs2d's own.
+            Ends in .ply (for viewers), .compressed.ply, .spz, .splat, .usd, .glb, .sog or the ending of a registered
+            format.
         layout : str, optional
-            A format by its name, as for ``gs2d.write_splats``: "2dgs" is the PLY of the official code, which holds
-            float32 bit for bit.
+            Name of the format, as for ``gs2d.write_splats``: "2dgs" is the PLY of the official code, lossless.
 
         Raises
         ------
@@ -137,15 +136,15 @@ class Splats:
         --------
         >>> trained.splats.save("garden.spz")  # doctest: +SKIP
         """
-        import gs2d  # the writers lie above this layer; the package imports them when they are used
+        import gs2d  # writers are in a higher layer
 
         gs2d.write_splats(path, self, layout=layout)
 
     def followed_by(self, others: Splats) -> Splats:
-        """Return these splats and then others, of the same SH degree; gradients reach both."""
+        """Concatenate splats of the same SH degree, differentiably."""
         rest = dict(others.items())
         return Splats(**{name: torch.cat([tensor, rest[name]]) for name, tensor in self.items()})
 
     def rows(self, index: Tensor) -> Splats:
-        """Return the rows picked by a boolean mask or an index tensor, detached."""
+        """Return the rows of a boolean mask or an index tensor, detached."""
         return Splats(**{name: tensor.detach()[index] for name, tensor in self.items()})

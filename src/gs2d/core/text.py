@@ -1,36 +1,36 @@
-r"""Text with names of files in it, which may be any bytes: as bytes again, and as what a terminal or a page may show.
+r"""Text that may contain file names: conversion to bytes, and to text that is safe to print.
 
-A name that is not UTF-8 is a string with surrogates (``os.fsdecode``); one with an escape sequence could write over the
-screen, change its title, or type.
+File names that are not UTF-8 become strings with surrogates (``os.fsdecode``); escape sequences in a name could control
+the terminal.
 """
 
 from __future__ import annotations
 
 import re
 
-# Controls of C0 and C1, lone surrogates, and what changes the direction or the line of the text that follows.
+# Controls (C0, C1), lone surrogates, and characters that change text direction or break lines.
 _HIDDEN = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff\u2028\u2029\u202a-\u202e\u2066-\u2069]")
 _HIDDEN_IN_LINES = re.compile(_HIDDEN.pattern.replace(r"\x00-\x1f", r"\x00-\x08\x0b-\x1f"))
 
 
 def name_bytes(text: str) -> bytes:
-    """Return a text as UTF-8, and the bytes of a name in it that is not UTF-8 as they are."""
+    """Encode text as UTF-8; surrogates become the original bytes of the file name."""
     return text.encode("utf-8", "surrogateescape" if not _has_other_surrogates(text) else "surrogatepass")
 
 
 def _has_other_surrogates(text: str) -> bool:
-    """Whether there are surrogates that stand for no byte: a name that JSON was asked to hold, not a file system."""
+    """Whether there are surrogates that do not stand for a byte, as from JSON."""
     return any("\ud800" <= letter <= "\udfff" and not "\udc80" <= letter <= "\udcff" for letter in text)
 
 
 def printable(text: str, *, lines: bool = False) -> str:
-    r"""Return a text that does nothing to a terminal: ``\x1b`` and the like are spelled out.
+    r"""Return text that is safe to print: control characters are escaped, such as ``\x1b``.
 
     Parameters
     ----------
     text : str
     lines : bool
-        Whether it has several lines: line ends and tabs stay.
+        Whether to keep line ends and tabs.
     """
     return (_HIDDEN_IN_LINES if lines else _HIDDEN).sub(_spelled, text)
 
@@ -44,12 +44,12 @@ def _spelled(found: re.Match[str]) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of an error's message, or the name of its class where it has none."""
+    """Return the first line of an error message, or the class name if it is empty."""
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def duration(seconds: float) -> str:
-    """Return a time with its unit: "40 s", "12 min", "3.5 h", "2.1 days"."""
+    """Format a duration: "40 s", "12 min", "3.5 h", "2.1 days"."""
     for unit, size, until in (("s", 1, 90), ("min", 60, 90 * 60), ("h", 3600, 48 * 3600)):
         if seconds < until:
             digits = 1 if unit == "h" and seconds < 10 * size else 0

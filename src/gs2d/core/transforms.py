@@ -1,4 +1,4 @@
-"""Rotations, rigid motions, neighbour distances, and what a set of cameras says about the size of a scene."""
+"""Rotations, rigid motions, neighbour distances, and scale, focus and up direction from cameras."""
 
 from __future__ import annotations
 
@@ -32,25 +32,24 @@ __all__ = [
     "up_direction",
 ]
 
-OUTLIER = 50  # times the median distance; up to here training is as good as without the camera
-_SPREAD = 0.02  # of the cameras' horizontal axes, mean square, from which they tell what is up
+OUTLIER = 50  # multiple of the median distance; below, training is not affected
+_SPREAD = 0.02  # smallest mean square spread of the horizontal axes for estimating up
 
 
 def quats_to_matrices(quats: Tensor) -> Tensor:
-    """Rotation matrices of quaternions, which are normalised here.
+    """Convert quaternions to rotation matrices.
 
     Parameters
     ----------
     quats : Tensor [N, 4]
-        (w, x, y, z), any non-zero length that can be squared, and any longer one. A zero quaternion gives NaN: the
-        rasterizers cull it.
+        (w, x, y, z) of any non-zero length. A zero quaternion gives NaN, which the rasterizers cull.
 
     Returns
     -------
     Tensor [N, 3, 3]
     """
     check_shapes({"quats": (quats, "N 4")})
-    too_long = quats.detach().abs().amax(dim=1, keepdim=True) > 1e15  # for a square in float32
+    too_long = quats.detach().abs().amax(dim=1, keepdim=True) > 1e15  # its square overflows float32
     quats = torch.where(too_long, quats * 2.0**-80, quats)
     w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
     rows = (
@@ -62,13 +61,13 @@ def quats_to_matrices(quats: Tensor) -> Tensor:
 
 
 def se3_exp(motion: Tensor) -> Tensor:
-    """Return the rigid motion of a twist, a rotation and a translation: exact, and differentiable at 0 too.
+    """Return the rigid motion of a twist: exact, and differentiable at 0 too.
 
     Parameters
     ----------
     motion : Tensor [..., 6]
-        A rotation vector (axis times angle, rad), then a velocity (world units): the motion of a body that turns
-        and moves at these rates for one unit of time. Without rotation the velocity is the translation.
+        Rotation vector (axis times angle, rad), then velocity (world units): the motion of a body that rotates and
+        moves at these rates for one unit of time.
 
     Returns
     -------
@@ -105,12 +104,12 @@ def perturb_pose(camera: Camera | Tensor, motion: Tensor) -> Camera | Tensor:
     Returns
     -------
     Camera or Tensor [..., 4, 4]
-        What was given, moved; a tensor has the dtype and the device of ``motion``.
+        The moved camera or poses; a tensor has the dtype and the device of ``motion``.
 
     Raises
     ------
     ShapeError
-        If a shape is wrong, the leading dimensions do not broadcast, or several motions are given for one Camera.
+        If a shape is wrong, leading dimensions do not broadcast, or there are several motions for one Camera.
 
     Examples
     --------
@@ -123,7 +122,7 @@ def perturb_pose(camera: Camera | Tensor, motion: Tensor) -> Camera | Tensor:
     if isinstance(camera, Camera):
         if motion.ndim != 1:
             raise ShapeError(
-                f"motion must be [6] for one camera, got {list(motion.shape)}; give poses [..., 4, 4] to move several"
+                f"motion must be [6] for one camera, got {list(motion.shape)}; pass poses [..., 4, 4] to move several"
             )
         pose = torch.as_tensor(camera.T_cam_world) if camera.pose is None else camera.pose
         placed: Any = T @ pose.to(T)
@@ -134,12 +133,12 @@ def perturb_pose(camera: Camera | Tensor, motion: Tensor) -> Camera | Tensor:
         torch.broadcast_shapes(camera.shape[:-2], motion.shape[:-1])
     except RuntimeError as error:
         shapes = f"poses {list(camera.shape)} and motion {list(motion.shape)}"
-        raise ShapeError(f"leading dimensions must broadcast, got {shapes}; give one motion for each pose") from error
+        raise ShapeError(f"leading dimensions must broadcast, got {shapes}; pass one motion per pose") from error
     return T @ camera.to(T)
 
 
 def similarity_motions(poses: np.ndarray, extent: float) -> np.ndarray:
-    """Return what a small similarity of a whole scene does to each of its cameras, which stay where they are in it.
+    """Return the derivative of camera motions by a small similarity of the scene.
 
     Parameters
     ----------
@@ -151,8 +150,8 @@ def similarity_motions(poses: np.ndarray, extent: float) -> np.ndarray:
     Returns
     -------
     ndarray [V, 6, 7]
-        Motions of the cameras in their own frames (``moved``; rotations in rad, shifts in extents) by the scene's
-        rotation about the mean of their centres (rad), its shift (extents) and the growth of its size.
+        Derivative of the motions in camera frames (rad, extents) by the rotation of the scene about the mean camera
+        centre (rad), its translation (extents) and its relative scale.
     """
     R = poses[:, :3, :3]
     centers = -np.einsum("vji,vj->vi", R, poses[:, :3, 3])
@@ -167,24 +166,24 @@ def similarity_motions(poses: np.ndarray, extent: float) -> np.ndarray:
 
 
 def common_motion(motions: np.ndarray, by_similarity: np.ndarray) -> np.ndarray:
-    """Fit the similarity [7] whose motions of the cameras come nearest to these [V, 6] (least squares)."""
+    """Fit the similarity [7] whose camera motions are nearest to ``motions`` [V, 6] (least squares)."""
     products = np.einsum("via,vib->ab", by_similarity, by_similarity)
-    inverse = np.linalg.pinv(products, rcond=1e-9, hermitian=True)  # of one camera, or of all in one place
+    inverse = np.linalg.pinv(products, rcond=1e-9, hermitian=True)  # singular for one camera, or equal centres
     return np.asarray(inverse @ np.einsum("via,vi->a", by_similarity, motions))
 
 
 def nearest_distances(points: np.ndarray, k: int = 3) -> np.ndarray:
-    """Root mean square distance of each point to its k nearest others (initial scale of a splat).
+    """Return the root mean square distance of each point to its k nearest others (initial scale of a splat).
 
     Parameters
     ----------
     points : ndarray [P, 3] world units
     k : int
-        Neighbours; fewer are used where the set holds fewer.
+        Number of neighbours, if there are as many.
 
     Returns
     -------
-    ndarray [P] float64, world units. Coincident points give 0: the caller sets a floor.
+    ndarray [P] float64, world units; 0 for coincident points
 
     Raises
     ------
@@ -196,17 +195,16 @@ def nearest_distances(points: np.ndarray, k: int = 3) -> np.ndarray:
     if len(points) < 2 or k < 1:
         raise ShapeError(f"nearest_distances needs at least 2 points and k >= 1, got {len(points)} points and k={k}")
     if not np.isfinite(points).all():
-        raise ShapeError("nearest_distances needs finite points, got NaN or infinity: drop those points")
+        raise ShapeError("nearest_distances needs finite points, got NaN or infinity; remove those points")
     k = min(k, len(points) - 1)
-    distances = np.asarray(cKDTree(points).query(points, k=k + 1)[0])  # first: the point itself, or a twin of it
+    distances = np.asarray(cKDTree(points).query(points, k=k + 1)[0])  # the first is the point itself
     return np.asarray(np.sqrt(np.mean(distances[:, 1:] ** 2, axis=1)))
 
 
 def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the point nearest to all optical axes in the least-squares sense.
+    """Return the point with the least sum of squared distances to the optical axes.
 
-    Minimises the sum of squared distances to the lines ``center + t forward``. Where the axes leave it free (all
-    parallel, or one camera), the free part is that of the mean camera centre.
+    Where the axes do not determine it (parallel axes, one camera), the point nearest to the mean camera centre is used.
 
     Returns
     -------
@@ -229,11 +227,10 @@ def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return what is up [3], unit, for people who hold cameras level: across the cameras' horizontal axes.
+    """Estimate the up direction [3], unit, from cameras held level: perpendicular to their horizontal axes.
 
-    The direction with the least sum of squares of its products with the cameras' x axes; where these are all but
-    parallel (everybody looks the same way), the mean of the cameras' own up vectors. Unlike that mean it is not tilted
-    where all look down from one side.
+    If these are nearly parallel, the mean of the up vectors of the cameras is returned. Unlike that mean, the estimate
+    is not tilted if all cameras look down from one side.
     """
     rotations = np.stack([camera.rotation for camera in cameras])  # [V, 3, 3]
     mean_up = -rotations[:, 1].mean(axis=0)
@@ -246,9 +243,9 @@ def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:
-    """1.1 x the largest distance of a camera centre from the mean centre, world units (official 2DGS scene extent).
+    """Return 1.1 x the largest distance of a camera from the mean centre, world units (scene extent of 2DGS).
 
-    Outliers (:func:`camera_outliers`) do not count. 0 for a single camera: the caller chooses what stands in for it.
+    Ignores outliers (:func:`camera_outliers`). 0 for a single camera.
 
     Raises
     ------
@@ -263,11 +260,10 @@ def camera_extent(cameras: Sequence[Camera]) -> float:
 
 
 def camera_outliers(cameras: Sequence[Camera]) -> dict[int, float]:
-    """Return cameras whose position cannot be right: their index, and how many times too far away they stand.
+    """Return cameras with implausible positions, which structure from motion leaves sometimes.
 
-    An outlier is more than ``OUTLIER`` times as far from the median centre as the median camera. Structure from motion
-    leaves such cameras. If more than a quarter of the cameras are that far away, or most stand at one place, none is an
-    outlier: the capture has two scales.
+    An outlier is more than ``OUTLIER`` times as far from the median centre as the median camera. If this holds for more
+    than a quarter of the cameras, or most centres coincide, none is an outlier.
 
     Returns
     -------
@@ -288,10 +284,10 @@ def camera_outliers(cameras: Sequence[Camera]) -> dict[int, float]:
 
 
 def harmonics_rotation(rotation: np.ndarray, degree: int) -> np.ndarray:
-    """Return what a rotation [3, 3] of the world does to the SH coefficients of degrees 1 to ``degree``, [K-1, K-1].
+    """Return the matrix [K-1, K-1] that rotates SH coefficients of degrees 1 to ``degree`` with the world.
 
-    Seen along d the colour was Y(d) c; in the turned world it is seen along R d, so that Y(R d) c' = Y(d) c. Each
-    degree turns into itself; its block is solved from more directions than it has functions, exact to rounding.
+    It satisfies Y(R d) c' = Y(d) c for directions d. The block of each degree is solved from more directions than it
+    has functions, exact to rounding.
     """
     directions = torch.from_numpy(np.random.default_rng(0).normal(size=(64, 3)))
     directions = directions / directions.norm(dim=1, keepdim=True)
@@ -306,9 +302,9 @@ def harmonics_rotation(rotation: np.ndarray, degree: int) -> np.ndarray:
 
 
 def transform_splats(splats: Splats, scale: float, rotation: np.ndarray, translation: np.ndarray) -> Splats:
-    """Return splats after a similarity of the world, x to scale * rotation @ x + translation; colours turn with it.
+    """Apply x -> scale * rotation @ x + translation to splats, including their SH.
 
-    Computed in float64; float32 on the CPU comes back.
+    Computed in float64; returns float32 on the CPU.
     """
     from scipy.spatial.transform import Rotation
 

@@ -1,4 +1,4 @@
-"""Distances from the principal point, in which the vignetting of a camera is counted (docs/math.md)."""
+"""Distances from the principal point, the coordinates of vignetting (docs/math.md)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gs2d.core.camera import Camera
 
 
 def reach_of(cameras: Sequence[Camera]) -> float:
-    """Return the radius of the farthest corner of the images of cameras, in focal lengths."""
+    """Return the largest distance of an image corner from the principal point, in focal lengths."""
     corners = [math.hypot(max(c.cx, c.width - c.cx) / c.fx, max(c.cy, c.height - c.cy) / c.fy) for c in cameras]
     return max(corners)
 

@@ -13,7 +13,7 @@ from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, HowItRun
 from gs2d.pipeline.prepare.resolve import check_options
 from gs2d.pipeline.run_parts import DEMO
 from gs2d.pipeline.train.train_run import check_viewer, train
-from gs2d.synthetic.demo_capture import write_demo_capture
+from gs2d.synthetic.demo_capture import VARIED, write_demo_capture
 from gs2d.synthetic.perturb_exposure import GAINS
 from gs2d.synthetic.perturb_poses import TRUTH as TRUE_POSES
 from gs2d.training.events import OnEvent, Phase, RunPlan, Step, ignore
@@ -53,8 +53,7 @@ def demo(
             train_views=options.train_views,
             test_views=options.test_views,
             size=options.size,
-            vary_exposure=options.vary_exposure,
-            vary_poses=options.vary_poses,
+            vary=[name for name in VARIED if getattr(options, f"vary_{name}")],
             on_progress=lambda done, _total: on_event(Step(done)),
             threads=options.threads,
         )

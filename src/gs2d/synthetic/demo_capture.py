@@ -1,9 +1,9 @@
-"""The demo's capture: a still life with an exactly known mesh, photographed by a ray caster of its own."""
+"""The capture of the demo: a still life with an exactly known mesh, rendered by ray casting."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +26,7 @@ from gs2d.synthetic.shapes import merge_vertices
 from gs2d.synthetic.textures import linear_to_srgb
 
 CAMERA_ANGLE_X = 0.6911112  # radians, the horizontal field of view of NeRF-Synthetic
+VARIED = ("exposure", "poses")
 _SAMPLES = 4  # rays per pixel along each axis
 _OPENGL = np.diag([1.0, -1.0, -1.0])  # OpenCV camera axes (y down, z forward) to OpenGL (y up, z back)
 
@@ -39,7 +40,7 @@ class SyntheticImage:
     rgba : ndarray [H, W, 4] uint8
         sRGB, straight alpha; colour is 0 where alpha is 0.
     seen : ndarray [F] bool
-        Triangles that at least one ray hit first.
+        Visible triangles.
     """
 
     rgba: np.ndarray
@@ -53,43 +54,40 @@ def write_demo_capture(
     train_views: int = 40,
     test_views: int = 8,
     size: int = 256,
-    vary_exposure: bool = False,
-    vary_poses: bool = False,
+    vary: Collection[str] = (),
     on_progress: Callable[[int, int], None] | None = None,
     threads: int | None = None,
 ) -> None:
     """Write a small synthetic capture in the NeRF-Synthetic layout, with the mesh that was rendered.
 
-    ``transforms_{train,test}.json`` (last, so that an unfinished capture is not mistaken for one), RGBA PNG in
-    ``train/`` and ``test/``, ``mesh_gt.ply``, and ``mesh_gt_seen.npy``: how many training views see each face, uint8.
-    The same arguments give the same bytes, for any number of threads (one machine, same versions).
+    Writes RGBA PNG in ``train/`` and ``test/``, ``mesh_gt.ply``, ``mesh_gt_seen.npy`` (number of training views that
+    see each face, uint8) and, last, ``transforms_{train,test}.json``. Deterministic for any number of threads.
 
     Parameters
     ----------
     folder : path
-        Made where it does not exist; files of an earlier capture are replaced.
+        Created if missing; files of an earlier capture are replaced.
     seed : int
-        Chooses the twigs, the mottle of the textures, and small motions of the cameras.
+        For the twigs, the textures, and small motions of the cameras.
     train_views, test_views : int
     size : int
         Width and height, px.
-    vary_exposure : bool
-        Training pictures get random gains (``perturb_exposure``), which ``exposure_gt.json`` holds; test pictures keep
-        the gain 1, the mean of the others.
-    vary_poses : bool
-        The poses of training pictures are said to be a little off where they are (``perturb_poses``); ``poses_gt.json``
+    vary : collection of str
+        Names of ``VARIED``.
+        "exposure": training images get random gains (``perturb_exposure``), stored in ``exposure_gt.json``; test images
+        keep the gain 1. "poses": the written training poses are slightly wrong (``perturb_poses``); ``poses_gt.json``
         has the true ones.
     on_progress : callable, optional
-        Called with (pictures done, pictures in all) after each picture, always from the calling thread.
+        Called with (images done, number of images) after each image, from the calling thread.
     threads : int, optional
-        Default: the cores of this machine, at most 8.
+        Default: the number of cores, at most 8.
 
     Raises
     ------
     DataError
-        No training view, or fewer than 16 px.
+        If there is no training view, or the size is less than 16 px.
     DiskError
-        A file could not be written.
+        If a file could not be written.
     """
     if train_views < 1 or test_views < 0 or size < 16:
         raise DataError(
@@ -99,11 +97,11 @@ def write_demo_capture(
     root = Path(folder)
     _make_folders(root, ("train", "test") if test_views else ("train",))
     cameras = demo_cameras(seed, train_views, test_views, size)
-    gains = random_gains(train_views, seed) if vary_exposure else None
+    gains = random_gains(train_views, seed) if "exposure" in vary else None
     _photograph(root, build_scene(seed), cameras, gains, on_progress, threads)
     if gains is not None:
         write_json(root / GAINS, {f"train/r_{k}.png": list(map(float, gain)) for k, gain in enumerate(gains)})
-    if vary_poses:
+    if "poses" in vary:
         write_json(root / TRUTH, _transforms("train", cameras["train"]))
         cameras["train"] = disturbed(cameras["train"], seed)
     _write_cameras(root, cameras)
@@ -117,21 +115,21 @@ def write_capture(
     on_progress: Callable[[int, int], None] | None = None,
     threads: int | None = None,
 ) -> None:
-    """Write photographs of any scene as ``write_demo_capture`` writes those of the demo.
+    """Write a capture of any scene, like ``write_demo_capture``.
 
     Parameters
     ----------
     folder : path
     scene : ToyScene
     cameras : mapping of "train" and "test" to cameras
-        Of ``CAMERA_ANGLE_X``, as those of ``demo_cameras`` are.
+        With the field of view ``CAMERA_ANGLE_X``.
     on_progress, threads
         As in ``write_demo_capture``.
 
     Raises
     ------
     DiskError
-        A file could not be written.
+        If a file could not be written.
     """
     root = Path(folder)
     _make_folders(root, tuple(split for split, of_split in cameras.items() if of_split))
@@ -147,7 +145,7 @@ def _photograph(
     on_progress: Callable[[int, int], None] | None,
     threads: int | None,
 ) -> None:
-    """Write pictures, the mesh, and how many training views see each face; training pictures get the gains."""
+    """Write images, mesh, and the number of training views that see each face; applies gains to training images."""
     workers = threads or min(os.cpu_count() or 1, 8)
     light = bake(scene, threads=workers)
     jobs = [(split, k, camera) for split, split_cameras in cameras.items() for k, camera in enumerate(split_cameras)]
@@ -172,7 +170,7 @@ def _photograph(
 
 
 def _write_cameras(root: Path, cameras: Mapping[str, Sequence[Camera]]) -> None:
-    for split in ("test", "train"):  # the last file is what makes the folder a capture
+    for split in ("test", "train"):  # the last file marks the capture as complete
         if cameras.get(split):
             write_json(root / f"transforms_{split}.json", _transforms(split, cameras[split]))
 
@@ -188,13 +186,13 @@ def _make_folders(root: Path, splits: tuple[str, ...]) -> None:
 
 
 def demo_mesh(scene: ToyScene) -> Mesh:
-    """Return the triangles that are rendered, in the same order, with the vertices on texture seams made one."""
+    """Return the rendered triangles, in the same order, with vertices merged across texture seams."""
     vertices, faces = merge_vertices(scene.patch.vertices, scene.patch.faces)
     return Mesh(vertices, faces.astype(np.int32))
 
 
 def demo_cameras(seed: int, train_views: int, test_views: int, size: int) -> dict[str, list[Camera]]:
-    """Cameras around the scene, spread by the golden angle at elevations of -8 to 74 (test: 6 to 64) degrees."""
+    """Return cameras around the scene, spread by the golden angle at elevations of -8 to 74 (test: 6 to 64) degrees."""
     rng = np.random.default_rng([seed, 1])
     return {
         "train": _spiral(rng, train_views, size, lowest=-8.0, highest=74.0, start=0.0),
@@ -205,7 +203,7 @@ def demo_cameras(seed: int, train_views: int, test_views: int, size: int) -> dic
 def _spiral(
     rng: np.random.Generator, count: int, size: int, *, lowest: float, highest: float, start: float
 ) -> list[Camera]:
-    """Equal areas of the sphere between two elevations (degrees) get equally many cameras."""
+    """Return cameras with uniform density on the sphere between two elevations, degrees."""
     low, high = np.sin(np.radians([lowest, highest]))
     cameras = []
     for k in range(count):
@@ -244,7 +242,7 @@ def render_image(scene: ToyScene, light: BakedLight, camera: Camera) -> Syntheti
 
 
 def _pixel_means(rays: np.ndarray) -> np.ndarray:
-    """Means [H, W, C] over blocks of rays [H * samples, W * samples, C]."""
+    """Average blocks of rays [H * samples, W * samples, C] to pixels [H, W, C]."""
     height, width, channels = rays.shape
     blocks = rays.reshape(height // _SAMPLES, _SAMPLES, width // _SAMPLES, _SAMPLES, channels)
     return np.asarray(blocks.mean(axis=(1, 3)))

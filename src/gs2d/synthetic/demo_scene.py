@@ -15,7 +15,7 @@ RADIUS = 1.08  # world units, of the plinth
 
 @dataclass(frozen=True, eq=False)
 class ScenePart:
-    """A thing in the scene.
+    """An object of the scene.
 
     Attributes
     ----------
@@ -23,7 +23,7 @@ class ScenePart:
     patch : Patch
     texture : ndarray [rows, columns, 3] float32, linear light
     gloss : float
-        Strength of the highlight of the lamp; 0 is matt.
+        Strength of the highlight; 0 is matt.
     """
 
     name: str
@@ -34,7 +34,7 @@ class ScenePart:
 
 @dataclass(frozen=True, eq=False)
 class ToyScene:
-    """All parts in one list of triangles.
+    """All parts as one list of triangles.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class ToyScene:
 
 
 def build_scene(seed: int) -> ToyScene:
-    """Return the still life within [-1.2, 1.2]^3; ``seed`` chooses the twigs and the mottle of every texture."""
+    """Build the still life within [-1.2, 1.2]^3; ``seed`` is for the twigs and textures."""
     parts = tuple(_parts(np.random.default_rng(seed)))
     sizes = [len(part.patch.faces) for part in parts]
     return ToyScene(parts, shapes.join([part.patch for part in parts]), np.repeat(np.arange(len(parts)), sizes))
@@ -97,13 +97,13 @@ def _parts(rng: np.random.Generator) -> Iterator[ScenePart]:
 
 
 def _laid_down(patch: shapes.Patch) -> shapes.Patch:
-    """Turn by a quarter about y, so that z becomes x."""
+    """Rotate by 90 degrees about y: z becomes x."""
     R = np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]])
     return shapes.Patch(patch.vertices @ R.T, patch.normals @ R.T, patch.uvs, patch.faces)
 
 
 def _trellis(*, width: float = 0.62, height: float = 0.52, radius: float = 0.0125) -> shapes.Patch:
-    """Return a round-topped frame of wire in the xz plane with crossing diagonals: the occluder."""
+    """Return a round-topped wire trellis in the xz plane, an occluder."""
     half = width / 2
     arch = np.linspace(np.pi, 0, 25)
     frame = np.concatenate(
@@ -123,7 +123,7 @@ def _trellis(*, width: float = 0.62, height: float = 0.52, radius: float = 0.012
 
 
 def _twigs(rng: np.random.Generator, mouth: np.ndarray) -> tuple[shapes.Patch, shapes.Patch, shapes.Patch]:
-    """Twigs out of the vase's mouth with leaves along them and a bud at each end."""
+    """Return twigs in the vase, their leaves, and a bud at each end."""
     twigs, blades, buds = [], [], []
     count = 6
     for k in range(count):

@@ -1,18 +1,18 @@
-"""Photographs as by a camera on automatic: gains of their own, for captures whose exposures are known."""
+"""Random exposure gains, for captures with known exposure."""
 
 from __future__ import annotations
 
 import numpy as np
 
 GAINS = "exposure_gt.json"  # view name -> gains of red, green and blue
-GAIN, BALANCE = 1.35, 1.08  # largest gain (its inverse is the smallest), and what a channel has more or less than that
+GAIN, BALANCE = 1.35, 1.08  # largest gain and largest ratio between channels; their inverses are the smallest
 
 
 def random_gains(count: int, seed: int, *, gain: float = GAIN, balance: float = BALANCE) -> np.ndarray:
-    """Gains of the three channels of ``count`` photographs [count, 3]; the mean of each channel is 1.
+    """Return gains of the three channels of ``count`` images [count, 3]; the mean of each channel is 1.
 
-    log gain is uniform within ``gain``, log balance within ``balance``. A photograph's values are sRGB: where the curve
-    of a camera is a power of the light, a longer exposure is a gain there too.
+    The logarithms of gain and balance are uniform. Gains apply to sRGB values, which is exact for a power-law camera
+    response.
     """
     rng = np.random.default_rng([seed, 2])
     logs = np.log(gain) * rng.uniform(-1, 1, (count, 1)) + np.log(balance) * rng.uniform(-1, 1, (count, 3))
@@ -21,7 +21,7 @@ def random_gains(count: int, seed: int, *, gain: float = GAIN, balance: float = 
 
 
 def with_gains(image: np.ndarray, gains: np.ndarray) -> np.ndarray:
-    """Return a picture uint8 [H, W, 3 or 4] times the gains [3] of its channels, clipped at 255; alpha stays."""
+    """Multiply an image uint8 [H, W, 3 or 4] by gains [3], clipped at 255; alpha is unchanged."""
     changed = image.copy()
     changed[..., :3] = np.rint(np.minimum(image[..., :3] * gains, 255))
     return changed

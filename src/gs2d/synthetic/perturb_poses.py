@@ -1,4 +1,4 @@
-"""Cameras that are a little off, as a phone or a poor reconstruction leaves them, for captures with known poses."""
+"""Slightly wrong camera poses, for captures with known true poses."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import torch
 from gs2d.core.camera import Camera
 from gs2d.core.transforms import camera_extent, common_motion, focus_point, perturb_pose, similarity_motions
 
-TRUTH = "poses_gt.json"  # the true cameras of the training photographs, in the layout of transforms_train.json
-DEGREES, FRACTION = 0.5, 0.005  # root mean square of the rotations, and of the shifts as shares of the distance
+TRUTH = "poses_gt.json"  # true poses of the training views, in the layout of transforms_train.json
+DEGREES, FRACTION = 0.5, 0.005  # root mean square of rotations, and of translations relative to the distance
 
 
 def disturbed(
     cameras: Sequence[Camera], seed: int, *, degrees: float = DEGREES, fraction: float = FRACTION
 ) -> list[Camera]:
-    """Return the cameras after random small motions, normally distributed.
+    """Return the cameras after small random motions, normally distributed.
 
-    What a similarity of the whole scene would do is taken out of them, since no photograph could show it: so the truth
-    that refinement can find is in the frame of the capture.
+    The motion of a similarity of the whole scene is removed, because images do not determine it: refined poses are then
+    comparable with the true ones.
     """
     rng, views = np.random.default_rng([seed, 3]), len(cameras)
     extent = camera_extent(cameras) or 1.0

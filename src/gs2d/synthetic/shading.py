@@ -1,4 +1,4 @@
-"""Light in the demo scene: a sky with occlusion, a large lamp with soft shadows, a highlight, and texture."""
+"""Lighting of the demo scene: sky with occlusion, an area lamp with soft shadows, highlights and texture."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from gs2d.synthetic.demo_scene import ToyScene
 _LAMP = np.array([-0.70, -0.55, 1.0]) / np.linalg.norm([-0.70, -0.55, 1.0])  # unit, towards the lamp
 _LAMP_COLOR = np.array([1.80, 1.62, 1.36])
 _LAMP_SPREAD = 0.16  # half-angle of the lamp, radians
-_LIFT = 2e-3  # world units, shadow rays start this far above the surface
+_LIFT = 2e-3  # world units, offset of shadow rays from the surface
 
 
 @dataclass(frozen=True, eq=False)
 class BakedLight:
-    """Light that reaches each vertex, computed once: nothing here depends on the camera.
+    """View-independent light at each vertex.
 
     Attributes
     ----------
     sky : ndarray [P, 3]
         Irradiance from the sky and the ground, divided by pi; 1 is an open, white, upward-facing patch.
     lamp : ndarray [P]
-        Fraction of the lamp that is seen, times the cosine of its incidence.
+        Visible fraction of the lamp, times the cosine of incidence.
     """
 
     sky: np.ndarray
@@ -55,7 +55,7 @@ def bake(scene: ToyScene, *, sky_directions: int = 72, lamp_directions: int = 14
 def _sum(
     items: Iterable[np.ndarray], weigh: Callable[[int, np.ndarray], np.ndarray], shape: tuple[int, ...]
 ) -> np.ndarray:
-    """Return a sum in the order of the items, so that it does not depend on the threads."""
+    """Return a weighted sum in the order of the items, for determinism."""
     total = np.zeros(shape)
     for k, item in enumerate(items):
         total += weigh(k, item)
@@ -63,14 +63,14 @@ def _sum(
 
 
 def _sky(direction: np.ndarray) -> np.ndarray:
-    """Radiance of the surroundings: bluish above, white at the horizon, a warm ground below."""
+    """Return the radiance of the environment: blue zenith, white horizon, warm ground."""
     z = float(direction[2])
     zenith, horizon, ground = np.array([0.66, 0.76, 0.92]), np.array([0.86, 0.84, 0.80]), np.array([0.42, 0.38, 0.34])
     return horizon + (zenith - horizon) * z if z > 0 else horizon + (ground - horizon) * min(-3 * z, 1.0)
 
 
 def _sphere(count: int) -> np.ndarray:
-    """Directions [count, 3] spread evenly by the golden angle."""
+    """Return directions [count, 3] on the sphere, spread by the golden angle."""
     k = np.arange(count) + 0.5
     z, angle = 1 - 2 * k / count, np.pi * (1 + np.sqrt(5)) * k
     r = np.sqrt(1 - z * z)
@@ -78,7 +78,7 @@ def _sphere(count: int) -> np.ndarray:
 
 
 def _cone(axis: np.ndarray, spread: float, count: int) -> np.ndarray:
-    """Directions [count, 3] spread evenly within an angle of an axis."""
+    """Return directions [count, 3] within an angle of an axis, evenly spread."""
     k = np.arange(count) + 0.5
     r, angle = np.tan(spread) * np.sqrt(k / count), np.pi * (1 + np.sqrt(5)) * k
     across = np.cross([0.0, 0.0, 1.0], axis)
@@ -88,7 +88,7 @@ def _cone(axis: np.ndarray, spread: float, count: int) -> np.ndarray:
 
 
 def shade(scene: ToyScene, light: BakedLight, hits: Hits, eye: np.ndarray) -> np.ndarray:
-    """Linear colour [H, W, 3] of every ray of a camera at ``eye``; 0 where nothing was hit.
+    """Return the linear colour [H, W, 3] of every ray of a camera at ``eye``; 0 for rays without hit.
 
     Diffuse: texture times the interpolated baked light. Highlight: Blinn-Phong, lamp only.
     """
@@ -124,7 +124,7 @@ def shade(scene: ToyScene, light: BakedLight, hits: Hits, eye: np.ndarray) -> np
 
 
 def _albedo(scene: ToyScene, uv: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """Texture colour [hits, 3] at (u, v), the nearest texel (pixels are supersampled)."""
+    """Return the colour [hits, 3] of the nearest texel at (u, v)."""
     albedo = np.empty((len(uv), 3), dtype=np.float32)
     for k, item in enumerate(scene.parts):
         chosen = np.flatnonzero(part == k)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
-_SAME_POINT = 1e-7  # world units, vertices nearer than this are one
+_SAME_POINT = 1e-7  # world units, vertices closer than this are merged
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,21 +29,21 @@ class Patch:
     faces: np.ndarray
 
     def moved(self, *, offset: Sequence[float] | np.ndarray = (0, 0, 0), turn: float = 0.0) -> Patch:
-        """Return the patch turned about z by ``turn`` radians, then moved by ``offset`` world units."""
+        """Return the patch rotated about z by ``turn`` radians, then translated by ``offset`` world units."""
         c, s = np.cos(turn), np.sin(turn)
         R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
         return Patch(self.vertices @ R.T + np.asarray(offset), self.normals @ R.T, self.uvs, self.faces)
 
 
 def merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Make vertices at the same place one; faces keep their order and number."""
+    """Merge coincident vertices; faces keep order and number."""
     keys = np.round(vertices / _SAME_POINT).astype(np.int64)
     _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     return vertices[first], inverse.reshape(-1)[faces]
 
 
 def join(patches: Sequence[Patch]) -> Patch:
-    """Several patches as one; normals are kept, so an edge between patches stays sharp."""
+    """Join patches to one; normals are kept, so that edges between patches stay sharp."""
     starts = np.cumsum([0, *(len(p.vertices) for p in patches)])
     return Patch(
         np.concatenate([p.vertices for p in patches]),
@@ -54,9 +54,9 @@ def join(patches: Sequence[Patch]) -> Patch:
 
 
 def grid(points: np.ndarray, uvs: np.ndarray) -> Patch:
-    """Triangulate a grid of points [m, n, 3] with uvs [m, n, 2]; quads that shrink to an edge give one triangle.
+    """Triangulate a grid of points [m, n, 3] with uvs [m, n, 2]; degenerate quads give one triangle.
 
-    The outside is on the side of (along the first index) x (along the second).
+    The outside is the direction (first index) x (second index).
     """
     m, n = points.shape[:2]
     index = np.arange(m * n).reshape(m, n)
@@ -74,7 +74,7 @@ def _face_crosses(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area-weighted vertex normals; vertices at the same place share one."""
+    """Return area-weighted vertex normals, shared by coincident vertices."""
     keys = np.round(vertices / _SAME_POINT).astype(np.int64)
     _, shared = np.unique(keys, axis=0, return_inverse=True)
     shared = shared.reshape(-1)
@@ -87,9 +87,9 @@ def _smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def lathe(profile: np.ndarray, texture_v: np.ndarray, around: int) -> Patch:
-    """Return a profile [m, 2] of (radius, height) turned about z; ``texture_v`` [m] goes along it, u once around.
+    """Return a surface of revolution about z of a profile [m, 2] of (radius, height); u is around, ``texture_v`` along.
 
-    Walking along the profile, the outside is on the right (so upwards on the outer wall).
+    The outside is on the right of the profile (an outer wall goes upwards).
     """
     angle = np.linspace(0, 2 * np.pi, around + 1)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -119,7 +119,7 @@ def vase(outline: np.ndarray, *, wall: float, rows: int = 44, around: int = 72, 
 
 
 def plinth(radius: float, thickness: float, *, rings: int = 46, around: int = 128) -> tuple[Patch, Patch]:
-    """Return a round plate whose upper face is z = 0: the upper face (planar texture) and the bevelled rest."""
+    """Return a round plate with upper face z = 0, as two patches: the upper face and the bevelled rest."""
     bevel = thickness / 4
     r = np.linspace(0, radius - bevel, rings)
     upper = lathe(np.stack([r[::-1], np.zeros(rings)], axis=1), np.zeros(rings), around)
@@ -135,7 +135,7 @@ def plinth(radius: float, thickness: float, *, rings: int = 46, around: int = 12
 
 
 def tube(path: np.ndarray, radius: np.ndarray | float, *, around: int = 8, closed: bool = False) -> Patch:
-    """Return a tube along a path [m, 3] (rounded off to points at its ends unless closed); u around, v along."""
+    """Return a tube along a path [m, 3] with rounded ends unless closed; u is around, v along."""
     if closed:
         path = np.concatenate([path, path[:1]])
         tangent = np.roll(path[:-1], -1, axis=0) - np.roll(path[:-1], 1, axis=0)
@@ -148,7 +148,7 @@ def tube(path: np.ndarray, radius: np.ndarray | float, *, around: int = 8, close
     cosine, sine = np.cos(angle), np.sin(angle)
     cosine[-1], sine[-1] = 1.0, 0.0
     sizes = np.broadcast_to(np.asarray(radius, dtype=np.float64), (len(path),)).copy()
-    if not closed:  # half an ellipsoid of one radius at each end
+    if not closed:  # rounded ends
         path = np.concatenate([path[:1], path, path[-1:]])
         path[0] -= tangent[0] * sizes[0] * 0.7
         path[-1] += tangent[-1] * sizes[-1] * 0.7
@@ -164,7 +164,7 @@ def tube(path: np.ndarray, radius: np.ndarray | float, *, around: int = 8, close
 
 
 def _transported_frames(tangent: np.ndarray, closed: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return normals and binormals [m, 3] that turn as little as possible along the tangents (and meet, if closed)."""
+    """Return rotation-minimising normals and binormals [m, 3] along the tangents (continuous, if closed)."""
     normal = np.empty_like(tangent)
     helper = np.eye(3)[int(np.argmin(np.abs(tangent[0])))]
     normal[0] = np.cross(helper, tangent[0])
@@ -173,7 +173,7 @@ def _transported_frames(tangent: np.ndarray, closed: bool) -> tuple[np.ndarray, 
         moved = normal[k - 1] - tangent[k] * (normal[k - 1] @ tangent[k])
         normal[k] = moved / np.linalg.norm(moved)
     binormal = np.cross(tangent, normal)
-    if closed:  # spread the angle by which the last frame misses the first
+    if closed:  # distribute the angle between last and first frame
         twist = np.arctan2(normal[0] @ binormal[-1], normal[0] @ normal[-1]) * np.linspace(0, 1, len(tangent))
         c, s = np.cos(twist)[:, None], np.sin(twist)[:, None]
         normal = c * normal + s * binormal

@@ -22,12 +22,12 @@ _LETTERS = {
 
 
 def srgb_to_linear(color: np.ndarray) -> np.ndarray:
-    """Return the sRGB transfer curve undone (IEC 61966-2-1)."""
+    """Convert sRGB to linear light (IEC 61966-2-1)."""
     return np.where(color <= 0.04045, color / 12.92, ((np.maximum(color, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
 def linear_to_srgb(color: np.ndarray) -> np.ndarray:
-    """Return the sRGB transfer curve (IEC 61966-2-1), after clipping to [0, 1]."""
+    """Convert linear light, clipped to [0, 1], to sRGB (IEC 61966-2-1)."""
     color = np.clip(color, 0, 1)
     return np.where(color <= 0.0031308, 12.92 * color, 1.055 * np.maximum(color, 0.0031308) ** (1 / 2.4) - 0.055)
 
@@ -35,9 +35,9 @@ def linear_to_srgb(color: np.ndarray) -> np.ndarray:
 def noise(
     rng: np.random.Generator, rows: int, columns: int, low: float, high: float, *, aspect: float = 1.0
 ) -> np.ndarray:
-    """Periodic noise of mean 0 and deviation 1, with ``low`` to ``high`` waves along a row of the image.
+    """Return periodic noise of mean 0 and standard deviation 1, with ``low`` to ``high`` waves per row.
 
-    ``aspect`` is the length of a row over the length of a column on the surface, so that grains are round there.
+    ``aspect`` is the length of a row divided by that of a column on the surface.
     """
     spectrum = np.fft.rfft2(rng.standard_normal((rows, columns)))
     fy, fx = np.meshgrid(np.fft.fftfreq(rows) * rows, np.fft.rfftfreq(columns) * columns, indexing="ij")
@@ -51,7 +51,7 @@ def _paint(image: np.ndarray, where: np.ndarray, color: tuple[float, float, floa
 
 
 def _finish(image: np.ndarray, mottle: np.ndarray) -> np.ndarray:
-    """Modulate brightness by a field of deviation ~0.05 and go to linear light."""
+    """Modulate the brightness and convert to linear light."""
     return srgb_to_linear(np.clip(image * (1 + mottle[..., None]), 0.02, 0.98)).astype(np.float32)
 
 
@@ -105,7 +105,7 @@ def _terrazzo_ring(image: np.ndarray, radius: np.ndarray, rng: np.random.Generat
 
 
 def plinth_side(rng: np.random.Generator, *, aspect: float) -> np.ndarray:
-    """Terrazzo for the rim of the plinth (upper half of the rows) and its underside (lower half)."""
+    """Return terrazzo for the rim of the plinth (upper half) and its underside (lower half)."""
     rows, columns = 64, 2048
     image = np.empty((rows, columns, 3))
     image[:] = (0.87, 0.83, 0.77)
@@ -154,7 +154,7 @@ def _meander(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _write(image: np.ndarray, text: str, *, left: int, top: int, scale: int, color: tuple[float, float, float]) -> None:
-    """Letters into an image whose row 0 is its lower edge; ``top`` counts down from the upper edge."""
+    """Draw text into an image whose row 0 is the lower edge; ``top`` counts from the upper edge."""
     for letter in text:
         bitmap = np.array([[c == "1" for c in row] for row in _LETTERS[letter].split()])
         large = np.kron(bitmap, np.ones((scale, scale), dtype=bool))
@@ -201,7 +201,7 @@ def speckled(
     level: float = 1.5,
     mottle: float = 0.05,
 ) -> np.ndarray:
-    """One colour with fine spots and slow mottle; a high ``level`` leaves it nearly plain."""
+    """Return a plain colour with fine spots and mottle; a higher ``level`` has fewer spots."""
     image = np.empty((256, 512, 3))
     image[:] = color
     _paint(image, noise(rng, 256, 512, 20, 50) > level, spots)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gs2d.contrib.lab.alignment import icp, voxel_downsample
-from gs2d.core.similarity import ransac_similarity, rotation_degrees, similarity_scale, umeyama
+from gs2d.contrib.lab.alignment import icp, ransac_similarity, rotation_degrees, voxel_downsample
+from gs2d.core.similarity import similarity_scale, umeyama
 from gs2d.errors import DataError
 from oracle_scenes import moved, rotation, similarity
 

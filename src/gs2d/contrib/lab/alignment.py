@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gs2d.core.similarity import apply, umeyama
+from gs2d.core.checks import check_shapes
+from gs2d.core.similarity import apply, similarity_scale, umeyama, umeyama_batch
+from gs2d.errors import DataError
 from gs2d.evaluation.nearest import Cloud
 
 # -- iterative closest points ------------------------------------------------------------------------------------------
@@ -135,3 +137,114 @@ def _paired(cloud: Cloud, points: np.ndarray, threshold: float) -> tuple[float, 
     paired = np.isfinite(distances)
     rms = float(np.sqrt(np.square(distances[paired]).mean())) if paired.any() else 0.0
     return float(paired.mean()), rms, index, paired
+
+
+# -- camera centres ----------------------------------------------------------------------------------------------------
+_BATCH = 256  # samples fitted at a time
+
+
+def rotation_degrees(T: np.ndarray) -> float:
+    """Return the rotation angle of a similarity [4, 4], degrees."""
+    cosine = (np.trace(T[:3, :3]) / similarity_scale(T) - 1) / 2
+    return math.degrees(math.acos(min(1.0, max(-1.0, float(cosine)))))
+
+
+@dataclass(frozen=True, eq=False)
+class RobustFit:
+    """A similarity that most pairs agree with.
+
+    Attributes
+    ----------
+    T_target_source : ndarray [4, 4]
+    inliers : ndarray [P] bool
+        Pairs closer than the threshold.
+    rms, worst : float
+        Root mean square and largest distance of the inliers, target units.
+    """
+
+    T_target_source: np.ndarray
+    inliers: np.ndarray
+    rms: float
+    worst: float
+
+    @property
+    def fraction(self) -> float:
+        """Fraction of inliers."""
+        return float(self.inliers.mean())
+
+
+def ransac_similarity(
+    source: np.ndarray,
+    target: np.ndarray,
+    *,
+    threshold: float,
+    sample: int = 6,
+    iterations: int = 10_000,
+    confidence: float = 0.9999,
+    seed: int = 0,
+) -> RobustFit:
+    """Find the similarity with most pairs within ``threshold`` by random sampling (Fischler and Bolles 1981).
+
+    The best sample is refined on its inliers until they no longer change. Stops early when a better sample is less
+    likely than 1 - confidence.
+
+    Parameters
+    ----------
+    source, target : ndarray [P, 3]
+        Corresponding points, such as the camera centres of two reconstructions.
+    threshold : float
+        Target units.
+    sample : int
+        Pairs per sample, if there are as many.
+
+    Raises
+    ------
+    DataError
+        If there are fewer than three pairs, all are on one line, or no three agree.
+    """
+    check_shapes({"source": (source, "P 3"), "target": (target, "P 3")})
+    source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
+    count = len(source)
+    whole = umeyama(source, target)  # raises for what cannot be aligned at all
+    best = _pair_distances(whole, source, target) < threshold
+    sample = min(sample, count)
+    rng = np.random.default_rng(seed)
+    tried = 0
+    while tried < min(iterations, _needed(best.mean(), sample, confidence)):
+        rows = np.argsort(rng.random((_BATCH, count)), axis=1)[:, :sample]
+        T, determined = umeyama_batch(source[rows], target[rows], True)
+        moved = np.einsum("bij,nj->bni", T[:, :3, :3], source) + T[:, None, :3, 3]
+        inside = (np.linalg.norm(moved - target, axis=2) < threshold) & determined[:, None]
+        counts = inside.sum(axis=1)
+        if counts.max() > best.sum():
+            best = inside[int(counts.argmax())]
+        tried += _BATCH
+    if best.sum() < 3:
+        raise DataError(
+            f"only {int(best.sum())} of {count} corresponding points agree within {threshold:g}; are both lists of the "
+            "same images, in the same order?"
+        )
+    return _refined(source, target, best, threshold)
+
+
+def _refined(source: np.ndarray, target: np.ndarray, inliers: np.ndarray, threshold: float) -> RobustFit:
+    """Fit to the inliers and update them, until they no longer change."""
+    T = umeyama(source[inliers], target[inliers])
+    for _ in range(20):
+        again = _pair_distances(T, source, target) < threshold
+        if again.sum() < 3 or (again == inliers).all():
+            break
+        inliers = again
+        T = umeyama(source[inliers], target[inliers])
+    distances = _pair_distances(T, source, target)[inliers]
+    return RobustFit(T, inliers, float(np.sqrt(np.square(distances).mean())), float(distances.max()))
+
+
+def _pair_distances(T: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    return np.asarray(np.linalg.norm(apply(T, source) - target, axis=1))
+
+
+def _needed(fraction: float, sample: int, confidence: float) -> float:
+    """Return the number of samples that contain one of inliers only, with this confidence."""
+    good = float(fraction) ** sample
+    return math.inf if good <= 0 else 0 if good >= 1 else math.log(1 - confidence) / math.log1p(-good)

@@ -19,13 +19,21 @@ from pathlib import Path
 
 import numpy as np
 
-from gs2d.contrib.lab.alignment import IcpResult, icp, uniform_downsample, voxel_downsample
+from gs2d.contrib.lab.alignment import (
+    IcpResult,
+    RobustFit,
+    icp,
+    ransac_similarity,
+    rotation_degrees,
+    uniform_downsample,
+    voxel_downsample,
+)
 from gs2d.contrib.lab.surface_protocols import TNT_SURFACE, IcpStage, TntSurface
 from gs2d.core.checks import check_shapes
 from gs2d.core.image_arrays import natural_key
 from gs2d.core.json_files import read_json
 from gs2d.core.mesh import Mesh
-from gs2d.core.similarity import RobustFit, apply, ransac_similarity, rotation_degrees, similarity_scale
+from gs2d.core.similarity import apply, similarity_scale
 from gs2d.errors import DataError
 from gs2d.evaluation.nearest import Cloud
 from gs2d.evaluation.surface_score import ScoredClouds
