@@ -35,5 +35,5 @@ def test_a_disk_that_is_full_is_one_line(monkeypatch: pytest.MonkeyPatch) -> Non
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(tempfile, "TemporaryFile", full)
-    with pytest.raises(DiskError, match="written"):
+    with pytest.raises(DiskError, match="cannot write a temporary file"):
         Spilled(values(2), 0)

@@ -47,7 +47,7 @@ def test_a_mirror_image_is_never_the_answer() -> None:
 
 
 def test_centres_that_do_not_correspond_are_an_error() -> None:
-    with pytest.raises(DataError, match="agree within 0.5 were expected, at most . of 40 do; are both lists"):
+    with pytest.raises(DataError, match="only . of 40 corresponding points agree within 0.5; are both lists"):
         ransac_similarity(cube(40), 100 * cube(40, seed=9), threshold=0.5, iterations=512)
 
 
