@@ -114,7 +114,7 @@ def test_each_projection_of_opensfm_becomes_its_lens(tmp_path: Path) -> None:
     six = of("fisheye62", k1=1, k2=2, k3=3, k4=4, k5=5, k6=6, p1=7, p2=8)
     assert six == OurLens("fisheye", (1, 2, 3, 4, 5, 6), (), (7, 8))
     for model in ("dual", "fisheye624"):
-        with pytest.raises(DataError, match=f"camera has the projection {model}, which no pinhole"):
+        with pytest.raises(DataError, match=f"camera has the unsupported projection {model}"):
             of(model)
 
 

@@ -80,9 +80,9 @@ def test_heights_and_colours_lie_where_the_ball_is(run: Path, capsys: pytest.Cap
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--resolution", "0"], "--resolution must be metres above 0, got 0"),
-        (["--resolution", "nan"], "--resolution must be metres above 0, got nan"),
-        (["--resolution", "0.0001"], "at most 36,000,000 are written; take 0.0027 m or more"),
+        (["--resolution", "0"], "--resolution must be a positive number of metres, got 0"),
+        (["--resolution", "nan"], "--resolution must be a positive number of metres, got nan"),
+        (["--resolution", "0.0001"], "more than 36,000,000; use 0.0027 m or more"),
         (["--out", "map.png"], "--out must end in .tif or .tiff, got map.png"),
         (["--out", "nowhere/map.tif"], "nowhere"),
     ],

@@ -1,11 +1,10 @@
-"""Captures of Meshroom (AliceVision): its scene as JSON (``cameras.sfm``, ``sfm.json``) and the photographs.
+"""Captures of Meshroom (AliceVision): scene as JSON (``cameras.sfm``, ``sfm.json``) and images.
 
 Conventions (AliceVision's sfmDataIO and camera modules, and its own export to COLMAP): ``rotation`` is the world-to-
-camera matrix column by column, ``center`` the place of the camera; x right, y down, z ahead. Views of a rig share a
-pose, and the sub-poses of the rig are those of its cameras in the frame of that pose. What a number means
-depends on the version of the file: the principal point is relative to the middle of the image from 1.2.1 on and to its
-corner before; the focal length is in pixels before 1.2.2 and in millimetres of a sensor of ``sensorWidth`` since;
-``pixelRatio`` is fx / fy before 1.2.5 and fy / fx since. Numbers are written as text.
+camera matrix column by column, ``center`` the camera centre; x right, y down, z forward. Views of a rig share a pose;
+the sub-poses of the rig are relative to it. The meaning of numbers depends on the file version: the principal point is
+relative to the image centre since 1.2.1, before to the corner; the focal length is in millimetres of a sensor of
+``sensorWidth`` since 1.2.2, before in pixels; ``pixelRatio`` is fy / fx since 1.2.5, before fx / fy. Numbers are text.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
 
-#: distortion -> (kind of lens, number of its parameters); in older files it is in the name of the type
+#: distortion -> (kind of lens, number of parameters); in older files it is part of the type name
 _LENSES: Mapping[str, tuple[str, int]] = {
     "none": ("perspective", 0),
     "radialk1": ("perspective", 1),
@@ -44,7 +43,7 @@ _FILES = ("cameras.sfm", "sfm.json", "cameras.json")
 
 
 def scene_file(root: Path) -> Path | None:
-    """Find the file of a folder with a scene of AliceVision with poses: ``cameras.sfm`` first; None without."""
+    """Return the scene file of AliceVision in a folder, ``cameras.sfm`` first; None without one."""
     files = [in_any_case(root, name) for name in _FILES] + files_ending(root, ".sfm")
     return next((path for path in files if _is_scene(path)), None)
 
@@ -57,15 +56,15 @@ def _is_scene(path: Path) -> bool:
 
 
 def read_alicevision(root: Path) -> Capture:
-    """Read the views that have a pose, also those of rigs; the others are skipped and named.
+    """Read the views with a pose, including those of rigs; other views are skipped.
 
-    Photographs are at the paths in the file, else found by name in ``images`` or elsewhere below the folder.
-    Points are those of the file (``structure``), else of a PLY file beside.
+    Images are at the paths in the file, else found by name in ``images`` or elsewhere below the folder. Points are in
+    the file (``structure``), else in a PLY file beside it.
 
     Raises
     ------
     DataError
-        No such file or a broken one, or a camera that no pinhole image can hold; names the file and the entry.
+        If the file is missing or invalid, or a camera is not supported; names the file and the entry.
     """
     path = scene_file(root)
     if path is None:
@@ -78,7 +77,7 @@ def read_alicevision(root: Path) -> Capture:
     cameras = {str(camera.get("intrinsicId")): camera for camera in _list(data, "intrinsics", path)}
     if not poses:
         raise DataError(
-            f"{path} must hold poses, got none; take the file of the node StructureFromMotion (cameras.sfm), or of "
+            f"{path} must hold poses, got none; use the file of the node StructureFromMotion (cameras.sfm), or of "
             "ConvertSfMFormat with SfM File Format json"
         )
     frames: list[PosedImage] = []
@@ -121,11 +120,11 @@ class Meshroom:
     looks_for = "cameras.sfm (Meshroom)"
 
     def detect(self, path: Path) -> bool:
-        """Return whether a folder holds the cameras of such a capture."""
+        """Whether a folder has a scene of Meshroom."""
         return scene_file(path) is not None
 
     def read(self, path: Path, *, downscale: int) -> Capture:
-        """Read the cameras, and find their photographs."""
+        """Read cameras and images."""
         return read_alicevision(path)
 
 
@@ -137,7 +136,7 @@ def _version(data: Mapping[str, Any], path: Path) -> tuple[int, ...]:
 
 
 def _list(data: Mapping[str, Any], key: str, path: Path) -> Sequence[Mapping[str, Any]]:
-    """Return a list of objects; an empty one is written as an empty text."""
+    """Return a list of objects; an empty list may be written as empty text."""
     value = data.get(key) or []
     if not isinstance(value, list):
         raise DataError(f"{path}: {key} must be a list, got {type(value).__name__}")
@@ -153,7 +152,7 @@ def _pose_id(view: Mapping[str, Any]) -> str:
 
 
 def _is_independent(view: Mapping[str, Any], views_of_pose: int) -> bool:
-    """Whether the pose of a view in a rig is the view's own; if the file does not say so, whether no view shares it."""
+    """Whether a view in a rig has its own pose; if the file does not state it, whether no other view shares it."""
     return str(view.get("isPoseIndependant", views_of_pose < 2)).lower() in ("true", "1")  # Meshroom's spelling
 
 
@@ -163,7 +162,7 @@ def _pose(
     rigs: Mapping[str, Sequence[Mapping[str, Any]]] | None,
     where: str,
 ) -> np.ndarray | str:
-    """Return T_cam_world [4, 4] of a view, or the reason why it has no pose; ``rigs`` if it is in one."""
+    """Return T_cam_world [4, 4] of a view, or the reason why it has none; ``rigs`` for views in a rig."""
     key = _pose_id(view)
     if key not in poses:
         return "not placed by Meshroom"
@@ -179,8 +178,8 @@ def _pose(
 
 
 def _rigid(transform: Mapping[str, Any], where: str) -> np.ndarray:
-    """T_cam_world [4, 4] of a rotation and a centre."""
-    # Column by column, so that rows are the columns: the camera-to-world rotation.
+    """Return T_cam_world [4, 4] of a rotation and a centre."""
+    # Stored column by column: reading rows gives the camera-to-world rotation.
     columns = reals(required(transform, "rotation", where), 9, f"{where}: rotation").reshape(3, 3)
     center = reals(required(transform, "center", where), 3, f"{where}: center")
     return pose_from_camera_to_world(np.column_stack([columns, center]), f"{where}: transform", opengl=False)
@@ -192,8 +191,8 @@ def _intrinsics(camera: Mapping[str, Any], version: tuple[int, ...], where: str)
     undistortion = str(camera.get("undistortionType", "none"))
     if model not in _LENSES or undistortion != "none":
         raise DataError(
-            f"{where} is of type {kind} with distortion {model} and undistortion {undistortion}, which is not read "
-            f"here (known: {', '.join(_LENSES)}); give the folder of Meshroom's node PrepareDenseScene or "
+            f"{where} is of type {kind} with distortion {model} and undistortion {undistortion}, which is not "
+            f"supported (supported: {', '.join(_LENSES)}); use the folder of Meshroom's node PrepareDenseScene or "
             "ExportColmap"
         )
     width, height = (whole(required(camera, side, where), f"{where}: {side}") for side in ("width", "height"))
@@ -206,7 +205,7 @@ def _intrinsics(camera: Mapping[str, Any], version: tuple[int, ...], where: str)
     shape, count = _LENSES[model]
     written = camera.get("distortionParams") or []
     lens = None
-    if count and written:  # without parameters the lens was not estimated
+    if count and written:  # without parameters, the lens was not estimated
         value = tuple(reals(written, count, f"{where}: distortionParams").tolist())
         lens = Lens(shape, value[:3], (), (value[3], value[4])) if model == "brown" else Lens(shape, value)
     return Intrinsics(
@@ -215,7 +214,7 @@ def _intrinsics(camera: Mapping[str, Any], version: tuple[int, ...], where: str)
 
 
 def _focal(camera: Mapping[str, Any], version: tuple[int, ...], width: int, where: str) -> tuple[float, float]:
-    """fx, fy in pixels."""
+    """Return fx, fy in pixels."""
     if version < (1, 2, 0):
         f = real(required(camera, "pxFocalLength", where), f"{where}: pxFocalLength")
         return f, f

@@ -1,11 +1,11 @@
-"""Captures of Agisoft Metashape: the cameras of ``File > Export > Export Cameras`` (XML) and the photographs.
+"""Captures of Agisoft Metashape: cameras of ``File > Export > Export Cameras`` (XML) and images.
 
-Conventions (Metashape's manual, appendix "Camera models"; its support on ``camera.transform``): a camera's transform
-takes camera to chunk coordinates, with x right, y down, z ahead; the transform of its component (or chunk) is a
-similarity that takes those to the world. In a multi-camera system (Metashape's manual, "Multi-camera system") only
+Conventions (Metashape's manual, appendix "Camera models"; its support on ``camera.transform``): the transform of a
+camera maps camera to chunk coordinates, with x right, y down, z forward; the transform of its component (or chunk) is a
+similarity from there to the world. In a multi-camera system (Metashape's manual, "Multi-camera system") only
 the cameras of the master sensor have a transform; T_world_camera of another is T_world_master [R t] with the rotation R
-and the location t of its sensor. Pixels have their origin in the corner of the image. Of (x, y) = (X/Z, Y/Z),
-for a fisheye (x, y) t / r with t = atan(r):
+and the location t of its sensor. The origin of pixels is the image corner. With (x, y) = (X/Z, Y/Z), or (x, y) t / r
+with t = atan(r) for a fisheye:
 
 x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + p1 (r^2 + 2 x^2) + 2 p2 x y     (p1 and p2 are OpenCV's p2 and p1)
 y' = y (1 + ...)                               + p2 (r^2 + 2 y^2) + 2 p1 x y
@@ -35,7 +35,7 @@ from gs2d.errors import DataError
 
 _KINDS = {"frame": "perspective", "fisheye": "fisheye"}
 _PANORAMA = "spherical"
-_EARTH = (6.2e6, 6.5e6)  # m from the centre of the Earth: cameras there are in geocentric coordinates
+_EARTH = (6.2e6, 6.5e6)  # m, distance from the origin of geocentric coordinates
 _AXES = (6378137.0, 6378137.0, 6356752.314245)  # m, WGS 84
 
 
@@ -52,21 +52,21 @@ _SAME = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
 def camera_file(root: Path) -> Path | None:
-    """Find the XML file with Metashape's cameras: ``cameras.xml``, else the first by name; or None."""
+    """Return the XML file with cameras of Metashape: ``cameras.xml``, else the first by name; or None."""
     files = sorted(files_ending(root, ".xml"), key=lambda path: (path.name.lower() != "cameras.xml", path.name))
     return next((path for path in files if b"<document" in (begins := head(path)) and b"<chunk" in begins), None)
 
 
 def read_metashape(root: Path) -> Capture:
-    """Read Metashape's cameras; those without a place, switched off or of another component are skipped and named.
+    """Read the cameras of Metashape; unaligned and disabled cameras and those of other components are skipped.
 
-    Photographs are in ``images`` or elsewhere below the folder and found by their labels, with or without ending;
-    sparse points in a PLY file beside (``common.points_beside``).
+    Images are found by their labels in ``images`` or elsewhere below the folder, sparse points in a PLY file beside the
+    cameras (``common.points_beside``).
 
     Raises
     ------
     DataError
-        No such file or a broken one, or a camera that no pinhole image can hold; names the file and the entry.
+        If the file is missing or invalid, or a camera is not supported; names the file and the entry.
     """
     path = camera_file(root)
     if path is None:
@@ -78,7 +78,7 @@ def read_metashape(root: Path) -> Capture:
     component, more = _component(placed)
     world = _world(chunk, component, path)
     poses = [(pose.camera, pose.label, _to_world(pose.M, world)) for pose in placed if pose.component == component]
-    poses, moved = _off_the_globe(poses)
+    poses, moved = _from_geocentric(poses)
     photographs = find_photographs([label for _, label, _ in poses], [in_any_case(root, "images"), root], path)
     frames: list[PosedImage] = []
     lost = [*skipped, *more]
@@ -106,20 +106,20 @@ class Metashape:
     looks_for = "cameras.xml (Metashape)"
 
     def detect(self, path: Path) -> bool:
-        """Return whether a folder holds the cameras of such a capture."""
+        """Whether a folder has cameras of Metashape."""
         return camera_file(path) is not None
 
     def read(self, path: Path, *, downscale: int) -> Capture:
-        """Read the cameras, and find their photographs."""
+        """Read cameras and images."""
         return read_metashape(path)
 
 
 def _chunk(path: Path) -> tuple[ElementTree.Element, list[str]]:
-    """Return the chunk with most cameras, and a note where there are several."""
+    """Return the chunk with most cameras, and a note if there are several."""
     try:
         text = path.read_bytes()
         if any(word in text.replace(b"\0", b"") for word in (b"<!DOCTYPE", b"<!ENTITY")):  # in UTF-16 too
-            raise DataError(f"{path} must be XML as Metashape writes it, got one with definitions of its own")
+            raise DataError(f"{path} must be XML of Metashape, got XML with document type definitions")
         document = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise DataError(f"{path} must be XML, got: {error}; is the file complete?") from error
@@ -132,12 +132,12 @@ def _chunk(path: Path) -> tuple[ElementTree.Element, list[str]]:
     best = int(np.argmax(counts))
     if len(chunks) == 1:
         return chunks[0], []
-    return chunks[best], [f"{path.name} holds {len(chunks)} chunks: the one of {counts[best]} cameras is read"]
+    return chunks[best], [f"{path.name} holds {len(chunks)} chunks: using the one with {counts[best]} cameras"]
 
 
 @dataclass(frozen=True)
 class _Placed:
-    """A camera with its pose in the chunk: ``M`` [4, 4] takes camera to chunk coordinates."""
+    """A camera with its pose: ``M`` [4, 4] maps camera to chunk coordinates."""
 
     camera: ElementTree.Element
     label: str
@@ -148,10 +148,10 @@ class _Placed:
 def _placed(
     listed: Sequence[ElementTree.Element], sensors: Mapping[str, ElementTree.Element], path: Path
 ) -> tuple[list[_Placed], list[str]]:
-    """Return the cameras that are enabled and have a pose, and why each of the others is left out.
+    """Return the enabled cameras with a pose, and the reasons for skipping others.
 
-    In a multi-camera system only the camera of the master sensor has a transform. The sensors of the others have a
-    rotation and a location: their pose in the frame of the master.
+    In a multi-camera system only the camera of the master sensor has a transform; the other sensors have a rotation and
+    a location relative to the master.
     """
     placed: list[_Placed] = []
     skipped: list[str] = []
@@ -161,7 +161,7 @@ def _placed(
         master = camera if camera.find("transform") is not None else cameras.get(camera.get("master_id"))
         where = f"{path}: camera {label}"
         if camera.get("enabled", "true").lower() in ("false", "0"):
-            skipped.append(f"{label}: switched off in Metashape")
+            skipped.append(f"{label}: disabled in Metashape")
         elif master is None or master.find("transform") is None:
             skipped.append(f"{label}: not aligned in Metashape")
         else:
@@ -178,7 +178,7 @@ def _placed(
 
 
 def _in_master(sensor: ElementTree.Element | None, where: str) -> np.ndarray | None:
-    """[4, 4]: takes coordinates of a camera to those of the master of its multi-camera system; None if not stated."""
+    """Return the transform [4, 4] from a camera to the master of its multi-camera system; None if not stated."""
     texts = [None if sensor is None else sensor.findtext(name) for name in ("rotation", "location")]
     if all(text is None for text in texts):
         return None
@@ -191,7 +191,7 @@ def _in_master(sensor: ElementTree.Element | None, where: str) -> np.ndarray | N
 
 
 def _component(placed: Sequence[_Placed]) -> tuple[str | None, list[str]]:
-    """Return the component with most cameras: others have no known place relative to it."""
+    """Return the component with most cameras, and the reasons for skipping others."""
     counts = Counter(pose.component for pose in placed)
     if not counts:
         return None, []
@@ -200,7 +200,7 @@ def _component(placed: Sequence[_Placed]) -> tuple[str | None, list[str]]:
 
 
 def _world(chunk: ElementTree.Element, component: str | None, path: Path) -> Similarity:
-    """Return the similarity of a component, or of the chunk where the component has none."""
+    """Return the similarity of a component, or of the chunk if the component has none."""
     own = next((c for c in chunk.iterfind("components/component") if c.get("id") == component), None)
     transform = None if own is None else own.find("transform")
     transform = chunk.find("transform") if transform is None else transform
@@ -223,7 +223,7 @@ def _world(chunk: ElementTree.Element, component: str | None, path: Path) -> Sim
 
 
 def _to_world(M: np.ndarray, world: Similarity) -> np.ndarray:
-    """[4, 4]: a rotation and a place; the similarity's scale moves the place only."""
+    """Apply a similarity to a pose [4, 4]; its scale applies to the translation only."""
     moved = np.eye(4)
     moved[:3, :3] = world.R @ M[:3, :3]
     moved[:3, 3] = world.scale * world.R @ M[:3, 3] + world.t
@@ -233,8 +233,8 @@ def _to_world(M: np.ndarray, world: Similarity) -> np.ndarray:
 Poses = list[tuple[ElementTree.Element, str, np.ndarray]]
 
 
-def _off_the_globe(poses: Poses) -> tuple[Poses, list[str]]:
-    """Geocentric poses in metres east, north and up of the mean camera: 32 bits cannot hold the others."""
+def _from_geocentric(poses: Poses) -> tuple[Poses, list[str]]:
+    """Convert geocentric poses to metres east, north and up of the mean camera, which fit 32-bit numbers."""
     if not poses:
         return poses, []
     middle = np.mean([M[:3, 3] for _, _, M in poses], axis=0)
@@ -252,7 +252,7 @@ def _off_the_globe(poses: Poses) -> tuple[Poses, list[str]]:
 
 
 def _intrinsics(sensor: ElementTree.Element, where: str) -> Intrinsics:
-    """Return the adjusted calibration of a sensor, else its first."""
+    """Return the intrinsics of a sensor, from its adjusted calibration if there is one."""
     every = sensor.findall("calibration")
     calibration = next((c for c in every if c.get("class") == "adjusted"), every[0] if every else None)
     kind = (None if calibration is None else calibration.get("type")) or sensor.get("type") or "frame"
@@ -262,7 +262,7 @@ def _intrinsics(sensor: ElementTree.Element, where: str) -> Intrinsics:
         raise DataError(f"{where} must have a calibration, got none; align the photographs, then export again")
     if kind not in _KINDS:
         raise DataError(
-            f"{where} is of type {kind}, which no pinhole image holds (known: {', '.join((*_KINDS, _PANORAMA))}); "
+            f"{where} has the unsupported type {kind} (supported: {', '.join((*_KINDS, _PANORAMA))}); "
             "export undistorted photographs from Metashape and their cameras"
         )
     width, height = _size(calibration, sensor, where)
@@ -278,8 +278,8 @@ def _intrinsics(sensor: ElementTree.Element, where: str) -> Intrinsics:
         )
     if value["p3"] or value["p4"]:
         raise DataError(
-            f"{where} has the coefficients p3 and p4, which cannot be undistorted here; "
-            "switch them off in Optimize Cameras, or export undistorted photographs and their cameras"
+            f"{where} has the coefficients p3 and p4, which are not supported; "
+            "disable them in Optimize Cameras, or export undistorted photographs and their cameras"
         )
     radial = tuple(value[f"k{i}"] for i in (1, 2, 3, 4))
     lens = Lens(_KINDS[kind], radial, (), (value["p2"], value["p1"]), value["b2"] / fx)
@@ -288,7 +288,7 @@ def _intrinsics(sensor: ElementTree.Element, where: str) -> Intrinsics:
 
 
 def _size(calibration: ElementTree.Element | None, sensor: ElementTree.Element, where: str) -> tuple[int, int]:
-    """Return width and height of a sensor's photographs, as its calibration or itself says, px."""
+    """Return width and height, px, from the calibration or the sensor."""
     stated = (entry.find("resolution") for entry in (calibration, sensor) if entry is not None)
     size = next((found for found in stated if found is not None), None)
     if size is None:

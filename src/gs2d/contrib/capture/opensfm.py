@@ -1,9 +1,9 @@
-"""Captures of OpenSfM, and of OpenDroneMap and WebODM, which run it: ``reconstruction.json`` and the photographs.
+"""Captures of OpenSfM, OpenDroneMap and WebODM: ``reconstruction.json`` and images.
 
 Conventions (OpenSfM's documentation, "Geometric Models" and "Dataset Structure"): rotation (axis times angle) and
-translation take world to camera coordinates; x right, y down, z ahead. Normalised image coordinates have their origin
-in the middle of the image and its larger side as unit; pixels of OpenSfM have whole numbers at their centres, so that
-the middle is ((w - 1) / 2, (h - 1) / 2) there and (w / 2, h / 2) here.
+translation map world to camera coordinates; x right, y down, z forward. Normalised image coordinates have their origin
+in the image centre and the larger side as unit. Pixel centres of OpenSfM are integers, so that the image centre is
+((w - 1) / 2, (h - 1) / 2) there and (w / 2, h / 2) here.
 """
 
 from __future__ import annotations
@@ -42,19 +42,19 @@ FILES = ("reconstruction.json", "opensfm/reconstruction.json")
 
 
 def reconstruction_file(root: Path) -> Path | None:
-    """Return the file of a data set of OpenSfM, or of a project of OpenDroneMap; None where there is none."""
+    """Return the reconstruction of an OpenSfM data set or an OpenDroneMap project; None without one."""
     return next((path for name in FILES if (path := in_any_case(root, name)).is_file()), None)
 
 
 def read_opensfm(root: Path) -> Capture:
-    """Read ``reconstruction.json``: of several reconstructions the one with most photographs.
+    """Read the largest reconstruction in ``reconstruction.json``.
 
-    Photographs are in ``images`` (of OpenDroneMap: beside the folder ``opensfm``).
+    Images are in ``images`` (OpenDroneMap: beside the folder ``opensfm``).
 
     Raises
     ------
     DataError
-        A broken or incomplete file, or a camera that no pinhole image can hold; names the file and the entry.
+        If the file is invalid, or a camera is not supported; names the file and the entry.
     """
     path = reconstruction_file(root)
     if path is None:
@@ -92,16 +92,16 @@ class OpenSfM:
     looks_for = "reconstruction.json (OpenSfM, OpenDroneMap)"
 
     def detect(self, path: Path) -> bool:
-        """Return whether a folder holds the cameras of such a capture."""
+        """Whether a folder has a reconstruction of OpenSfM."""
         return reconstruction_file(path) is not None
 
     def read(self, path: Path, *, downscale: int) -> Capture:
-        """Read the cameras, and find their photographs."""
+        """Read cameras and images."""
         return read_opensfm(path)
 
 
 def _largest(path: Path) -> tuple[Mapping[str, Any], list[str]]:
-    """Return the reconstruction with most shots, and a note where there are several."""
+    """Return the reconstruction with most shots, and a note if there are several."""
     data = read_json(path)
     if isinstance(data, dict) and "shots" in data:
         data = [data]
@@ -115,13 +115,13 @@ def _largest(path: Path) -> tuple[Mapping[str, Any], list[str]]:
         return every[0], []
     others = ", ".join(str(count) for index, count in enumerate(counts) if index != best)
     return every[best], [
-        f"{path.name} holds {len(every)} reconstructions that do not hang together: the one of {counts[best]} "
-        f"photographs is read, not those of {others}"
+        f"{path.name} holds {len(every)} separate reconstructions: using the one with {counts[best]} images, "
+        f"not those with {others}"
     ]
 
 
 def _pose(shot: Mapping[str, Any], where: str) -> np.ndarray:
-    """T_cam_world [4, 4]."""
+    """Return T_cam_world [4, 4]."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec(reals(required(shot, "rotation", where), 3, f"{where}: rotation")).as_matrix()
     T[:3, 3] = reals(required(shot, "translation", where), 3, f"{where}: translation")
@@ -129,7 +129,7 @@ def _pose(shot: Mapping[str, Any], where: str) -> np.ndarray:
 
 
 def _intrinsics(camera: Mapping[str, Any], image: Path, where: str) -> Intrinsics:
-    """Pixels of normalised numbers, whose unit is the larger side."""
+    """Convert normalised intrinsics, whose unit is the larger side, to pixels."""
     model = str(camera.get("projection_type", "perspective"))
     if model in _PANORAMAS:
         size = [whole(camera.get(side, 0), f"{where}: {side}") for side in ("width", "height")]
@@ -137,8 +137,8 @@ def _intrinsics(camera: Mapping[str, Any], image: Path, where: str) -> Intrinsic
         return panorama(width, height, where)
     if model not in _MODELS:
         raise DataError(
-            f"{where} has the projection {model}, which no pinhole image holds (known: {', '.join(sorted(_MODELS))}); "
-            "run `opensfm undistort` and give the folder undistorted, or calibrate with another --camera-lens"
+            f"{where} has the unsupported projection {model} (supported: {', '.join(sorted(_MODELS))}); "
+            "run `opensfm undistort` and use its folder undistorted, or calibrate with another --camera-lens"
         )
     kind, radial, has_center, has_tangential = _MODELS[model]
 
@@ -168,7 +168,7 @@ def _intrinsics(camera: Mapping[str, Any], image: Path, where: str) -> Intrinsic
 
 
 def _points(value: Any, path: Path) -> PointCloud | None:
-    """Return the points of a reconstruction; numbers that are not finite are found later, as for other formats."""
+    """Return the points of a reconstruction; non-finite ones are removed later."""
     if not value:
         return None
     rows = entries(value, f"{path}: points")

@@ -1,4 +1,4 @@
-"""Control points: places that somebody measured, and where they are in the photographs or in the run."""
+"""Control points: measured world positions, and their marks in photographs or positions in the run."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from gs2d.errors import DataError
 
 _ODM = ("x", "y", "z", "u", "v", "photo", "name")  # columns of gcp_list.txt
 _TRUE = ("1", "yes", "true", "check", "y", "x")
-DOUBTFUL_PIXELS = 5.0  # distance of a mark from the image of its point, from which it is doubted
+DOUBTFUL_PIXELS = 5.0  # reprojection error from which a mark is reported
 
 
 @dataclass
 class ControlPoint:
-    """A point by its name: its place in the world, and its marks in photographs or its place in the run."""
+    """A named point: world position, and marks in photographs or position in the run."""
 
     name: str
     world: np.ndarray
@@ -33,7 +33,7 @@ class ControlPoint:
 
 @dataclass(frozen=True, eq=False)
 class ControlPoints:
-    """Control points of a file: ``epsg`` of their world, or None; ``in_degrees``: latitude, longitude and height."""
+    """Control points of a file; ``in_degrees``: latitude, longitude and height."""
 
     points: tuple[ControlPoint, ...]
     epsg: int | None
@@ -42,7 +42,7 @@ class ControlPoints:
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """Control points found in the run: ``source`` [P, 3] there, ``pixels`` [P], rms distances of the marks or NaN."""
+    """Control points located in the run: ``source`` [P, 3]; ``pixels`` [P], rms reprojection error or NaN."""
 
     names: tuple[str, ...]
     source: np.ndarray
@@ -53,7 +53,7 @@ class Located:
 
 
 def read_control(path: Path) -> ControlPoints:
-    """Read control points: CSV, or OpenDroneMap's ``gcp_list.txt``; see docs/guides/georeference.md for the columns."""
+    """Read control points from CSV or OpenDroneMap's ``gcp_list.txt`` (columns: docs/guides/georeference.md)."""
     table = read_table(path, _ODM, ("name",))
     in_degrees = {"lat", "lon"} <= set(table.columns) or table.epsg == WGS84
     world = ("lat", "lon", "height") if "lat" in table.columns else ("y", "x", "z") if in_degrees else ("x", "y", "z")
@@ -68,18 +68,18 @@ def read_control(path: Path) -> ControlPoints:
 def _add(
     table: Table, line: int, row: Mapping[str, str], world: tuple[str, ...], points: dict[str, ControlPoint]
 ) -> None:
-    """Take a row: a mark of a point, or its place in the run."""
+    """Add a row: a mark of a point, or its position in the run."""
     where = f"{table.path}, line {line}"
     place = np.array([table.number(line, row, column) for column in world])
     name = row.get("name", "").strip() or "point at " + " ".join(f"{value:.10g}" for value in place)
     point = points.setdefault(name, ControlPoint(name, place))
     if not np.allclose(point.world, place, rtol=0, atol=1e-9 * max(1.0, float(np.abs(place).max()))):
-        raise DataError(f"{where}: {name} has another place in the world above; give each point one name")
+        raise DataError(f"{where}: {name} has another world position above; use one name per point")
     point.check = point.check or row.get("check", "").strip().lower() in _TRUE
     if table.has(row, "photo", "u", "v"):
         photo = row["photo"].strip()
         if photo in point.marks:
-            raise DataError(f"{where}: {name} is marked in {photo} already; keep one of the marks")
+            raise DataError(f"{where}: {name} is already marked in {photo}; keep one of the marks")
         point.marks[photo] = (table.number(line, row, "u"), table.number(line, row, "v"))
     elif table.has(row, "run_x", "run_y", "run_z"):
         point.run = np.array([table.number(line, row, f"run_{axis}") for axis in "xyz"])
@@ -88,21 +88,21 @@ def _add(
 
 
 def locate(points: Sequence[ControlPoint], views: Sequence[View], held_out: Sequence[str] = ()) -> Located:
-    """Find control points in the run: triangulate their marks.
+    """Locate control points in the run by triangulating their marks.
 
     Parameters
     ----------
     held_out : sequence of str
-        Names of further check points.
+        Names of additional check points.
 
     Raises
     ------
     DataError
-        A photograph that is not there, a point with too few marks, a check point that is none of the points.
+        If a photograph is missing, a point has too few marks, or a check point is unknown.
     """
     if unknown := [name for name in held_out if name not in {point.name for point in points}]:
         raise DataError(
-            f"--check-points must name control points, got {unknown[0]}; there are "
+            f"--check-points must name control points, got {unknown[0]}; known are "
             f"{', '.join(point.name for point in points[:8])}"
         )
     by_name = {view.name: view for view in views}
@@ -126,7 +126,7 @@ def locate(points: Sequence[ControlPoint], views: Sequence[View], held_out: Sequ
         pixels.append(float(np.sqrt(np.mean(found.pixels**2))))
         if found.pixels.max() > DOUBTFUL_PIXELS:
             photo = list(point.marks)[int(found.pixels.argmax())]
-            doubts.append(f"{point.name} is {found.pixels.max():.1f} px from its mark in {photo}: look at that mark")
+            doubts.append(f"{point.name} is {found.pixels.max():.1f} px from its mark in {photo}: check that mark")
     return Located(
         tuple(point.name for point in points),
         np.array(source),

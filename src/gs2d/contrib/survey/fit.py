@@ -1,9 +1,8 @@
-"""The similarity between a run and the world: from places that both know, robustly; up by the cameras where it must be.
+"""Robust fit of the similarity between a run and the world from corresponding positions.
 
-A similarity of all seven parameters needs three places that are not on a line. Its tilt is only as good as the places
-are exact and spread: of a capture of ten metres, placed by a phone's receiver, it would be ten degrees off. People (and
-gimbals) hold cameras level to a degree: where that is the better knowledge, up is taken from the cameras, and only the
-heading, the scale and the shift are fitted.
+A similarity of seven parameters needs three positions that are not on a line. Its tilt depends on the accuracy and
+spread of the positions: a phone's GPS over ten metres gives errors of ten degrees, while cameras are held level to a
+degree. If the cameras are more accurate, up is taken from them, and only heading, scale and translation are fitted.
 """
 
 from __future__ import annotations
@@ -19,31 +18,31 @@ from gs2d.core.similarity import rotation_to_z, similarity_scale, umeyama
 from gs2d.core.transforms import up_direction
 from gs2d.errors import DataError
 
-LEVEL = 1.0  # degrees, to which the cameras' horizon is believed
-SNAP = 1.5  # degrees, within which up is taken to be an axis of the run
-AGREEMENT = 0.3  # length of the mean of the cameras' up vectors, from which they tell what is up
-SAMPLES = 500  # random subsets that are tried
-WIDE = 2.5  # medians of the residuals, beyond which a place is an outlier: 3.8 standard deviations in space
-ROBUST_FROM = 6  # places; fewer cannot outvote a wrong one
+LEVEL = 1.0  # degrees, assumed accuracy of the horizon of the cameras
+SNAP = 1.5  # degrees, within which up is rounded to an axis of the run
+AGREEMENT = 0.3  # smallest length of the mean up vector of the cameras
+SAMPLES = 500  # random subsets
+WIDE = 2.5  # residual of an outlier, relative to the median: 3.8 standard deviations in 3D
+ROBUST_FROM = 6  # smallest number of positions for outlier removal
 
 Solver = Callable[[np.ndarray, np.ndarray], np.ndarray | None]
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A similarity that most places agree on.
+    """A similarity that most positions agree with.
 
     Attributes
     ----------
     T : ndarray [4, 4]
-        From the run to the places' frame, metres.
+        From the run to the frame of the positions, metres.
     inliers : ndarray [P] bool
     residuals : ndarray [P, 3]
-        T source less target; the height's is 0 where nobody knows it.
+        T source minus target; 0 for an unknown height.
     tilt : str
-        "places": from the fit; "cameras", "given": up was taken from there.
+        Source of up: "places" (the fit), "cameras" or "given".
     scale_error, tilt_error : float
-        Standard errors: of the scale, relative; of the tilt of a fit of all parameters, degrees.
+        Relative standard error of the scale; standard error of the tilt in a fit of all parameters, degrees.
     """
 
     T: np.ndarray
@@ -55,19 +54,19 @@ class Fit:
 
     @property
     def scale(self) -> float:
-        """Metres for a unit of the run."""
+        """Metres per unit of the run."""
         return similarity_scale(self.T)
 
     @property
     def rotation(self) -> np.ndarray:
-        """Return the rotation [3, 3]."""
+        """Rotation [3, 3]."""
         return np.asarray(self.T[:3, :3] / self.scale)
 
 
 def cameras_up(cameras: Sequence[Camera]) -> np.ndarray | None:
-    """Return what is up in a run [3], by how its cameras were held; an axis of the run where that is all but one.
+    """Return the up direction [3] of a run from how its cameras were held, rounded to an axis if it is close.
 
-    None where they do not agree on anything.
+    None if the cameras do not agree.
     """
     if not cameras:
         return None
@@ -83,28 +82,28 @@ def cameras_up(cameras: Sequence[Camera]) -> np.ndarray | None:
 def fit_places(
     source: np.ndarray, target: np.ndarray, up: np.ndarray | None, *, tilt: str = "cameras", robust: bool = True
 ) -> Fit:
-    """Fit a similarity to places, outliers left out.
+    """Fit a similarity to positions, without outliers.
 
     Parameters
     ----------
     source, target : ndarray [P, 3]
-        Of the run, and metres (z up) less an origin; an unknown height is NaN.
+        Positions in the run, and in metres (z up) relative to an origin; an unknown height is NaN.
     up : ndarray [3] or None
-        What is up in the run, if that is known; used where the places tell it worse.
+        Up direction of the run, used if the positions are less accurate.
     tilt : "cameras" or "given"
-        Who knows that; what was given is always used.
+        Source of ``up``; "given" is always used.
     robust : bool
-        Whether places that do not agree with the others are left out.
+        Whether to leave out outliers.
 
     Raises
     ------
     DataError
-        Too few places, or places that tell nothing.
+        If there are too few positions, or they do not determine the fit.
     """
     _check_spread(target)
     whole = np.isfinite(target[:, 2])
     full: Fit | None = None
-    reason = "places without heights"
+    reason = "positions without heights"
     if tilt != "given" and whole.all():
         try:
             full = _fit(source, target, _solve_all, 3, "places", robust)
@@ -113,7 +112,7 @@ def fit_places(
     if full is not None and (up is None or full.tilt_error < LEVEL):
         return full
     if up is None:
-        raise DataError(f"what is up cannot be told ({reason}), and the cameras do not agree on it; give --up X Y Z")
+        raise DataError(f"up is not determined ({reason}), and the cameras do not agree; set --up X Y Z")
     turn = rotation_to_z(up / np.linalg.norm(up))
     fit = _fit(source @ turn.T, target, _solve_level, 2, tilt, robust)
     T = fit.T.copy()
@@ -123,25 +122,23 @@ def fit_places(
 
 
 def _check_spread(target: np.ndarray) -> None:
-    """Raise for places of which too many are one: phones repeat a position until the receiver has another."""
+    """Raise DataError if all positions are equal, as without a GPS fix."""
     different = np.unique(np.round(target[:, :2], 3), axis=0)
     if len(different) < 2:
-        raise DataError(
-            f"places that differ were expected, all {len(target)} photographs have the same; the receiver had no fix"
-        )
+        raise DataError(f"all {len(target)} photographs have the same position; the receiver had no fix")
 
 
 def _fit(source: np.ndarray, target: np.ndarray, solve: Solver, least: int, tilt: str, robust: bool) -> Fit:
-    """Fit to most places: least median of squares over random subsets, then to all that agree until those stay.
+    """Fit by least median of squares over random subsets, then to all inliers until they no longer change.
 
-    The threshold is not a number to be guessed: it follows from the median, whatever the receiver was.
+    The threshold of inliers follows from the median residual.
     """
     count = len(source)
     if count < least:
-        raise DataError(f"{least} places at the least were expected, got {count}")
+        raise DataError(f"at least {least} positions are needed, got {count}")
     T = solve(source, target)
     if T is None:
-        raise DataError("places that do not lie on a line were expected")
+        raise DataError("all positions are on a line")
     inliers = np.ones(count, bool)
     if robust and count >= ROBUST_FROM:
         size, rng = min(max(least, 4), count), np.random.default_rng(0)
@@ -184,7 +181,7 @@ def _solve_all(source: np.ndarray, target: np.ndarray) -> np.ndarray | None:
 
 
 def _solve_level(source: np.ndarray, target: np.ndarray) -> np.ndarray | None:
-    """Fit scale, heading and shift [4, 4] of a source whose z is up already; heights count where they are known."""
+    """Fit scale, heading and translation [4, 4] of a source with z up; unknown heights are ignored."""
     if len(source) < 2:
         return None
     known = np.isfinite(target[:, 2])
@@ -207,7 +204,7 @@ def _solve_level(source: np.ndarray, target: np.ndarray) -> np.ndarray | None:
 
 
 def _errors(T: np.ndarray, source: np.ndarray, residuals: np.ndarray, least: int) -> tuple[float, float]:
-    """Return standard errors: of the scale, relative, and of the tilt, degrees."""
+    """Return the relative standard error of the scale, and that of the tilt, degrees."""
     parameters = 7 if least == 3 else 5
     spare = 3 * len(source) - parameters
     if spare <= 0:

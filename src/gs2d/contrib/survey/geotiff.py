@@ -1,4 +1,4 @@
-"""GeoTIFF: rasters that lie in a projected coordinate system (OGC 19-008r4). Needs tifffile, of the extra ``geo``."""
+"""GeoTIFF rasters in a projected coordinate system (OGC 19-008r4), written by tifffile (extra ``geo``)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from gs2d.core.atomic_files import atomic_write
 from gs2d.core.extras import required
 
-NO_DATA = -9999.0  # of elevations; what maps of heights use
+NO_DATA = -9999.0  # for missing elevations
 _TILE = (256, 256)
 _DOUBLE, _SHORT, _ASCII = 12, 3, 2  # types of TIFF fields
 _PIXEL_SCALE, _TIE_POINT, _KEYS, _KEY_TEXTS, _NO_DATA = 33550, 33922, 34735, 34737, 42113  # TIFF tags
@@ -22,21 +22,21 @@ _METRE, _IS_PROJECTED, _PIXEL_IS_AREA, _OF_ITS_OWN = 9001, 1, 1, 32767
 def write_geotiff(
     path: Path, raster: np.ndarray, *, corner: tuple[float, float], step: float, epsg: int | None, frame: str
 ) -> None:
-    """Write a raster whose rows go south and whose columns go east.
+    """Write a raster with rows from north to south and columns from west to east.
 
     Parameters
     ----------
     path : Path
     raster : ndarray [H, W, 4] uint8 or [H, W] float32
-        Colours with alpha, or elevations in metres with :data:`NO_DATA` where there are none.
+        Colours with alpha, or elevations in metres with :data:`NO_DATA`.
     corner : (float, float), metres
-        Easting and northing of the upper left corner of the first cell.
+        Easting and northing of the upper left corner.
     step : float, metres
-        Side of a cell.
+        Cell size.
     epsg : int or None
-        The projected coordinate system; None: one of the scene's own.
+        Projected coordinate system; None: a local one.
     frame : str
-        Its name, for people.
+        Name of the coordinate system.
     """
     tifffile = required("geo", "tifffile", "a GeoTIFF")
     colored = raster.ndim == 3
@@ -64,7 +64,7 @@ def write_geotiff(
 
 
 def _key_tags(epsg: int | None, frame: str) -> list[tuple[int, int, int, Any, bool]]:
-    """Return the directory of GeoKeys (their number, where their value lies, how many, value) and their texts."""
+    """Return the tags of the GeoKey directory and its texts."""
     text = frame.encode("ascii", "replace").decode() + "|"
     keys = [
         (_MODEL, 0, 1, _OF_ITS_OWN if epsg is None else _IS_PROJECTED),

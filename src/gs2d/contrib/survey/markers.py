@@ -1,4 +1,4 @@
-"""Printed ArUco markers of a known side, found in the photographs by OpenCV (extra ``markers``): they tell scale."""
+"""Scale from printed ArUco markers of known size, detected by OpenCV (extra ``markers``)."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ DICTIONARIES = {
     "aruco_original": "DICT_ARUCO_ORIGINAL",
     "apriltag_36h11": "DICT_APRILTAG_36h11",
 }
-MAX_PIXELS = 3.0  # distance of a corner from the image of its point, from which a marker is not believed
-MAX_PLANARITY = 0.1  # of its side, by which a corner may lie off the others' parallelogram
+MAX_PIXELS = 3.0  # largest reprojection error of a corner
+MAX_PLANARITY = 0.1  # largest deviation from a parallelogram, relative to the side
 
 
 @dataclass(frozen=True, eq=False)
 class Marker:
-    """A marker in the run: its corners [4, 3], its mean side in units of the run, and in how many photographs it is."""
+    """A marker in the run: corners [4, 3], mean side in units of the run, and number of photographs."""
 
     number: int
     corners: np.ndarray
@@ -39,7 +39,7 @@ def required_cv2() -> Any:
     Raises
     ------
     BackendError
-        It is not installed, or without ArUco.
+        If it is not installed, or has no ArUco.
     """
     cv2 = required("markers", "cv2", "--markers")
     if not hasattr(getattr(cv2, "aruco", None), "ArucoDetector"):
@@ -60,20 +60,20 @@ def detector(dictionary: str) -> Any:
     return cv2.aruco.ArucoDetector(known, parameters)
 
 
-def detected(found: Any, view: View) -> dict[int, np.ndarray]:
-    """Return the markers of a photograph: corners [4, 2] px from the outer corner, by number.
+def detected(aruco: Any, view: View) -> dict[int, np.ndarray]:
+    """Detect markers in a photograph: corners [4, 2] px, by number.
 
-    ``found`` is the detector. What is there twice is left out: which is which, nobody can tell.
+    Numbers that occur more than once are left out.
     """
     if view.path is None:
         return {}
     image = read_image(view.path)
     grey = np.ascontiguousarray(image[:, :, :3].mean(axis=2).astype(np.uint8))
-    corners, numbers, _ = found.detectMarkers(grey)
+    corners, numbers, _ = aruco.detectMarkers(grey)
     if numbers is None:
         return {}
     every = [int(number) for number in np.ravel(numbers)]
-    return {  # OpenCV's origin is the middle of the first pixel
+    return {  # the origin of OpenCV is the centre of the first pixel
         number: np.asarray(c, np.float64).reshape(4, 2) + 0.5
         for number, c in zip(every, corners, strict=True)
         if every.count(number) == 1
@@ -81,7 +81,7 @@ def detected(found: Any, view: View) -> dict[int, np.ndarray]:
 
 
 def in_run(seen: Iterable[tuple[View, dict[int, np.ndarray]]]) -> tuple[list[Marker], list[str]]:
-    """Return the markers that two or more photographs show, and a sentence for each that was left out."""
+    """Locate the markers that at least two photographs show; returns them and a sentence per rejected marker."""
     by_number: dict[int, list[tuple[View, np.ndarray]]] = {}
     for view, markers in seen:
         for number, corners in markers.items():
@@ -100,14 +100,14 @@ def in_run(seen: Iterable[tuple[View, dict[int, np.ndarray]]]) -> tuple[list[Mar
         sides = np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1)
         bend = float(np.linalg.norm(corners[0] - corners[1] + corners[2] - corners[3]))
         if worst > MAX_PIXELS or bend > MAX_PLANARITY * sides.mean():
-            left.append(f"marker {number} moved between photographs, or is there twice ({worst:.1f} px off)")
+            left.append(f"marker {number} moved between photographs, or exists twice (error {worst:.1f} px)")
             continue
         kept.append(Marker(number, corners, float(sides.mean()), len(marks)))
     return kept, left
 
 
 def _corners(number: int, marks: Sequence[tuple[View, np.ndarray]]) -> tuple[np.ndarray, float]:
-    """Return the four corners in the run, and the largest median distance of one from its marks, px."""
+    """Return the four corners in the run, and the largest median reprojection error, px."""
     views = [view for view, _ in marks]
     points = [
         triangulate(views, np.array([corners[k] for _, corners in marks]), f"corner {k} of marker {number}")

@@ -1,4 +1,4 @@
-"""A run from straight above, in metres of the world: an orthophoto and an elevation model as GeoTIFF."""
+"""``gs2d orthophoto``: orthophoto and elevation model of a georeferenced run as GeoTIFF."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from gs2d.pipeline.finish.run_texture import photographs
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.training.events import OnEvent, Phase, ignore
 
-ELEVATION = "_elevation"  # after the name of the orthophoto
-MAX_CELLS = 36_000_000  # a colour's choice takes about 70 bytes a cell: 2.5 GB
-_AUTO_SIDE = 4_000  # cells, of a raster whose resolution nobody says
-_NICE = (1.0, 2.0, 2.5, 5.0, 10.0)  # times a power of ten: resolutions that nobody says
+ELEVATION = "_elevation"  # appended to the name of the orthophoto
+MAX_CELLS = 36_000_000  # at about 70 bytes per cell: 2.5 GB
+_AUTO_SIDE = 4_000  # largest side of a raster of default resolution, cells
+_NICE = (1.0, 2.0, 2.5, 5.0, 10.0)  # default resolutions, times a power of ten
 
 
 @dataclass(frozen=True)
 class Raster:
-    """Where the cells of a raster lie.
+    """Position and size of a raster.
 
     Attributes
     ----------
     corner : (float, float), metres
-        x and y of the upper left corner, local.
+        Local x and y of the upper left corner.
     step : float, metres
     size : (int, int)
         Rows and columns.
@@ -58,12 +58,12 @@ def orthophoto_run(
     *,
     threads: int | None = None,
 ) -> dict[str, Any]:
-    """Write the orthophoto of a georeferenced run, and beside it its elevation model; returns files and counts.
+    """Write orthophoto and elevation model of a georeferenced run; returns files and counts.
 
-    The surface is the run's mesh; a cell shows the highest of it, in the colours of the photographs that see it best,
-    or in those of the mesh where none does.
+    A cell shows the highest surface of the mesh, in the colours of the photographs that see it best, else those of the
+    mesh.
     """
-    required("geo", "tifffile", "a GeoTIFF")  # before minutes are spent
+    required("geo", "tifffile", "a GeoTIFF")  # fail early
     path = Path(path)
     place = required_georeference(open_run(path).path)
     target = path / "orthophoto.tif" if out is None else Path(out)
@@ -73,14 +73,14 @@ def orthophoto_run(
     for file in files:
         check_writable(file)
     if not (path / MESH).is_file():
-        raise RunError(f"{path} has no {MESH}, which is looked at from above; write it with `gs2d mesh {path}`")
+        raise RunError(f"{path} has no {MESH}; write it with `gs2d mesh {path}`")
     mesh = read_mesh(path / MESH)
     if not len(mesh.faces):
-        raise RunError(f"{path / MESH} has no triangles to look at; extract it again with `gs2d mesh {path}`")
+        raise RunError(f"{path / MESH} has no triangles; extract it again with `gs2d mesh {path}`")
     _, job, _ = open_finished(path, threads, on_event)
     local = place.to_local(mesh.vertices)
     raster = _raster(local, options.resolution, _pixel(job, mesh) * place.scale)
-    on_event(Phase("looking from above", 0))
+    on_event(Phase("rendering from above", 0))
     hits = cast_down(local, mesh.faces, raster.corner, raster.step, raster.size)
     colors, unseen = _colors(job, mesh, hits, on_event)
     _write(files, colors, _elevations(local, mesh, hits, place), raster, place)
@@ -97,7 +97,7 @@ def orthophoto_run(
 
 
 def _pixel(job: LoadedRun, mesh: Mesh) -> float:
-    """Size of a pixel on the surface, world units: the median over the surface of what its nearest view has."""
+    """Return the pixel size on the surface, world units: median over the surface, by the nearest view."""
     some = mesh.vertices[:: max(1, len(mesh.vertices) // 2_000)].astype(np.float64)
     size = np.full(len(some), np.inf)
     for view in job.scene.train:
@@ -107,33 +107,33 @@ def _pixel(job: LoadedRun, mesh: Mesh) -> float:
         size = np.where(shown, np.minimum(size, depth / camera.fx), size)
     known = np.isfinite(size)
     if not known.any():
-        raise RunError("photographs that show the mesh were expected, none does; is it of this capture?")
+        raise RunError("no photograph shows the mesh; does it belong to this capture?")
     return float(np.median(size[known]))
 
 
 def _raster(local: np.ndarray, resolution: float | None, pixel: float) -> Raster:
-    """Return the raster over a surface, on whole multiples of its step; by default as fine as the photographs are."""
+    """Return the raster of a surface, aligned to multiples of its step; default: the resolution of the photographs."""
     low, high = local[:, :2].min(axis=0), local[:, :2].max(axis=0)
     if resolution is None:
         least = max(pixel, float((high - low).max()) / _AUTO_SIDE)
         power = 10.0 ** math.floor(math.log10(least))
         resolution = next(nice * power for nice in _NICE if nice * power >= least * (1 - 1e-9))
     if not (math.isfinite(resolution) and resolution > 0):
-        raise ProtocolError(f"--resolution must be metres above 0, got {resolution:g}")
+        raise ProtocolError(f"--resolution must be a positive number of metres, got {resolution:g}")
     first, last = np.floor(low / resolution), np.ceil(high / resolution)
     columns, rows = np.maximum(last - first, 1)
     if rows * columns > MAX_CELLS:
         finest = math.sqrt(float(np.prod(high - low)) / MAX_CELLS)
         raise ProtocolError(
-            f"--resolution {resolution:g} makes {rows * columns:,.0f} cells, at most {MAX_CELLS:,} are written; "
-            f"take {finest:.2g} m or more"
+            f"--resolution {resolution:g} needs {rows * columns:,.0f} cells, more than {MAX_CELLS:,}; "
+            f"use {finest:.2g} m or more"
         )
     corner = float(first[0] * resolution), float(last[1] * resolution)
     return Raster(corner, resolution, (int(rows), int(columns)))
 
 
 def _colors(job: LoadedRun, mesh: Mesh, hits: Hits, on_event: OnEvent) -> tuple[np.ndarray, int]:
-    """Return colours [H, W, 4] uint8 with alpha 0 where there is no surface, and how many cells no photograph sees."""
+    """Return colours [H, W, 4] uint8, alpha 0 without surface, and the number of cells that no photograph sees."""
     height, width = hits.face.shape
     index = np.flatnonzero(hits.face.reshape(-1) >= 0)
     texels = Texels(
@@ -153,7 +153,7 @@ def _colors(job: LoadedRun, mesh: Mesh, hits: Hits, on_event: OnEvent) -> tuple[
 
 
 def _elevations(local: np.ndarray, mesh: Mesh, hits: Hits, place: Georeference) -> np.ndarray:
-    """Return heights in the world [H, W] float32, metres; NO_DATA where there is no surface."""
+    """Return world heights [H, W] float32, metres; NO_DATA without surface."""
     heights = np.full(hits.face.shape, NO_DATA, dtype=np.float32)
     hit = hits.face >= 0
     corners = local[mesh.faces[hits.face[hit]], 2]  # [M, 3]

@@ -1,4 +1,4 @@
-"""What the commands georeference and orthophoto print."""
+"""Output of the commands georeference and orthophoto."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The commands of the survey, georeference and orthophoto, and their options. No torch: `--help` is instant."""
+"""The commands georeference and orthophoto, and their options. Imports neither torch nor NumPy."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ KnownDistance = tuple[float, float, float, float, float, float, float]  # two po
 
 @dataclass(frozen=True, kw_only=True)
 class GeoreferenceOptions:
-    """Where a run is in the world; one source at a time, none: what the run says is shown."""
+    """Source and coordinate system of a georeference; without a source, the current one is shown."""
 
     gps: bool = False
     """Use the GPS positions in the EXIF of the photographs."""
@@ -47,7 +47,7 @@ class GeoreferenceOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class OrthophotoOptions:
-    """How the view from above is made."""
+    """Options of the orthophoto."""
 
     resolution: Annotated[float | None, Arg(metavar="METRES")] = None
     """Cell size (default: pixel size on the surface, rounded up to 1, 2, 2.5 or 5)."""
