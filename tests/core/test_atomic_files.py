@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from gs2d.core.atomic_files import sweep
-from gs2d.core.json_files import atomic_write, read_json, write_json
+from gs2d.core.atomic_files import atomic_write, sweep
+from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import DataError, DiskError
 
 
@@ -91,7 +91,8 @@ def test_a_disk_that_fills_up_is_one_line_and_leaves_nothing_behind(tmp_path: Pa
         """
         import resource, sys
         from gs2d.errors import DiskError
-        from gs2d.core.json_files import atomic_write, write_json
+        from gs2d.core.atomic_files import atomic_write
+        from gs2d.core.json_files import write_json
         path = sys.argv[1]
         if "torch" in sys.argv[2]: import torch
         resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
@@ -117,7 +118,7 @@ def test_a_disk_that_fills_up_is_one_line_and_leaves_nothing_behind(tmp_path: Pa
 def kill_while_writing(path: Path) -> None:
     """Let a process die half-way through an atomic write."""
     code = (
-        "import os, sys, signal\nfrom gs2d.core.json_files import atomic_write\n"
+        "import os, sys, signal\nfrom gs2d.core.atomic_files import atomic_write\n"
         "with atomic_write(sys.argv[1]) as f:\n    f.write(b'new'); f.flush(); os.kill(os.getpid(), signal.SIGKILL)"
     )
     source = Path(__file__).resolve().parents[2] / "src"

@@ -7,10 +7,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-from gs2d.core.atomic_files import atomic_write, disk_error
+from gs2d.core.atomic_files import atomic_write
 from gs2d.errors import DataError
-
-__all__ = ["atomic_write", "disk_error", "read_json", "write_json"]
 
 
 def write_json(path: str | os.PathLike[str], value: Any) -> None:

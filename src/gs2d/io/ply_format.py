@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.core.json_files import atomic_write
+from gs2d.core.atomic_files import atomic_write
 from gs2d.errors import DataError
 
 _TYPES = {

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gs2d.core.json_files import atomic_write
+from gs2d.core.atomic_files import atomic_write
 from gs2d.core.sh import C0
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError

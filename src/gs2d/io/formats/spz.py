@@ -22,9 +22,9 @@ from typing import Any
 
 import numpy as np
 
+from gs2d.core.atomic_files import atomic_write
 from gs2d.core.extras import required
 from gs2d.core.growth import check_growth
-from gs2d.core.json_files import atomic_write
 from gs2d.errors import DataError
 from gs2d.io.gaussians import (
     THIN,
