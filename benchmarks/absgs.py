@@ -27,9 +27,9 @@ from gs2d.config.presets import ABSGS_DEFAULT
 from gs2d.contrib.lab.aggregate import Cell, read_cell
 from gs2d.contrib.lab.execute import execute
 from gs2d.contrib.lab.jobs import Job
-from gs2d.contrib.lab.options import PaperOptions
-from gs2d.contrib.lab.plan import make_job, trained_recipe
+from gs2d.contrib.lab.lab_options import PaperOptions
 from gs2d.contrib.lab.scenes import FoundScene, find_scenes
+from gs2d.contrib.lab.table_plan import make_job, trained_recipe
 from gs2d.core.atomic_files import atomic_write
 from gs2d.core.json_files import write_json
 from gs2d.errors import Gs2dError
@@ -140,7 +140,7 @@ def lost(cell: Cell) -> bool:
 
 def sweep(options: PaperOptions) -> Candidate | None:
     """Train all candidates, and write ``absgs.json`` and ``absgs.md``."""
-    scenes = find_scenes(options.data, options.scenes, truths=options.truth)
+    scenes = find_scenes(options.data, options.scenes, truths=options.ground_truth)
     jobs = make_jobs(options, scenes)
     todo = tuple(jobs.values())
     execute(todo, options.out, say, slots=options.slots, threads=options.threads, backend=options.backend)
@@ -184,7 +184,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int)
     parser.add_argument("--backend", default="auto")
     parser.add_argument("--cache", type=Path)
-    parser.add_argument("--truth", type=Path)
+    parser.add_argument("--ground-truth", type=Path)
     given = vars(parser.parse_args())
     given |= {"scenes": tuple(given["scenes"]), "seeds": tuple(given["seeds"])}
     try:

@@ -12,7 +12,7 @@ with the most seam go to ``FOLDER/JOB-seam-*.png``: photograph, whole, blocks, a
 goes to standard output, figures to ``FOLDER/JOB-figures.json``; then PSNR by distance from a seam, of one training and
 of the blocks before and after what lies at seams learned once more. JOB is ``blocks``, or ``blocks-N`` with
 ``--block-iterations N``, so that both fit in one folder, beside one training; ``--job`` is another name, for another
-``--partition FIELD=VALUE``.
+``--partition FIELD=VALUE`` of this script.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import json
 import math
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,8 +32,8 @@ from PIL import Image
 from benchmarks.flight import Flight, write_flight
 from gs2d.contrib.lab.blocks import blocks
 from gs2d.contrib.lab.cells import Cells
+from gs2d.contrib.lab.lab_options import BlocksOptions
 from gs2d.contrib.lab.merged import MERGED
-from gs2d.contrib.lab.options import BlocksOptions
 from gs2d.contrib.lab.partition import make_partition
 from gs2d.contrib.lab.split import read_split
 from gs2d.core.camera import Camera
@@ -75,7 +76,7 @@ def train_both(folder: Path, args: argparse.Namespace) -> None:
     parts = partition.blocks + args.coarse_schedule + partition.seam_schedule
     scale = args.iterations / ALL_OF[args.recipe]
     of_block = scale / parts if args.block_iterations is None else args.block_iterations / ALL_OF[args.recipe]
-    common = {
+    common: dict[str, Any] = {
         "scene": capture,
         "recipe": args.recipe,
         "robust": args.robust,
@@ -91,15 +92,14 @@ def train_both(folder: Path, args: argparse.Namespace) -> None:
             print(event.text, file=sys.stderr, flush=True)
 
     if not (folder / "whole/splats.ply").exists():
-        whole = TrainOptions(out=folder / "whole", schedule_scale=scale, resume=True, **common)  # type: ignore[arg-type]
+        whole = TrainOptions(out=folder / "whole", schedule_scale=scale, resume=True, **common)
         train(whole, tell)
     options = BlocksOptions(
         out=job_folder(folder, args),
         schedule_scale=of_block,
         blocks=args.grid,
-        partition=changes,
         slots=args.slots,
-        **common,  # type: ignore[arg-type]
+        **(common | {"overrides": (*common["overrides"], *(f"partition.{change}" for change in changes))}),
     )
     blocks(options, tell)
 

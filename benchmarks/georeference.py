@@ -5,7 +5,7 @@
     python -m benchmarks.georeference FOLDER [--photographs 60] [--size 400] [--seeds 10] [--results FILE.json]
 
 A flown capture (``benchmarks/flown_capture.py``) is rendered; ``gs2d poses`` finds cameras from its photographs alone,
-and ``gs2d train`` makes a run of a few iterations of them. Then `gs2d georeference` is given, for each seed,
+and ``gs2d train`` makes a run of a few iterations of them. Then `gs2d survey` is given, for each seed,
 
 - positions of the photographs with noise, of which some are outliers by 50 m: a receiver with corrections (0.02 m), a
   drone's (0.5 m), a phone's (2 m and 5 m, along each axis);
@@ -64,7 +64,7 @@ def prepared(folder: Path, photographs: int, size: int) -> tuple[Path, Truth]:
         program = [sys.executable, "-m", "gs2d"]
         if not capture.exists():
             subprocess.run([*program, "poses", flown / "images", "--out", capture], check=True)
-        short = ["--schedule-scale", "0.0005", "--prepare", "never"]
+        short = ["--schedule-scale", "0.0005", "--set", "prepare=never"]
         subprocess.run([*program, "train", capture, "--out", run, "--recipe", "2dgs", *short], check=True)
     true = load_scene(flown)
     points = true.points

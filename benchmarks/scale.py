@@ -109,14 +109,14 @@ def surface_splats(capture: Path, count: int) -> Splats:
 def train_arguments(capture: Path, run: Path, args: argparse.Namespace, prepare: str) -> list[str]:
     """Return those of a training that is short and of a fixed number of splats."""
     words = ["train", capture, "--out", run, "--overwrite", "--init", capture / "start.ply", "--recipe", "2dgs"]
-    words += ["--robust", "off", "--set", "surface.densify=null", "--prepare", prepare, "--quiet", "--scene"]
+    words += ["--robust", "off", "--set", "surface.densify=null", "--set", f"prepare={prepare}", "--quiet", "--scene"]
     words += ["--schedule-scale", args.iterations / ITERATIONS_OF_ALL, "--memory", args.memory]
     words += ["--threads", args.threads]
     return [str(word) for word in words]
 
 
 def run_one(folder: Path, photographs: int, args: argparse.Namespace) -> list[Measured]:
-    """Make a capture, train, mesh and report."""
+    """Make a capture, train and mesh."""
     capture, run = folder / f"capture-{photographs}", folder / f"run-{photographs}"
     if not (capture / "sparse/0/cameras.bin").exists():
         flight = Flight(photographs, args.size, args.size * 3 // 4, points=args.splats, side=args.side, land=args.land)
@@ -129,7 +129,6 @@ def run_one(folder: Path, photographs: int, args: argparse.Namespace) -> list[Me
     found = [
         measure(photographs, "train", train_arguments(capture, run, args, "always"), log),
         measure(photographs, "mesh", ["mesh", str(run), "--scene", "--threads", str(args.threads), *limits], log),
-        measure(photographs, "report", ["report", str(run), *limits], log),
     ]
     if args.bbox:
         words = ["mesh", str(run), "--out", str(folder / f"part-{photographs}.ply"), "--threads", str(args.threads)]

@@ -4,7 +4,7 @@
 
     python -m benchmarks.street --data ../shared/data --out runs/street [--quality draft] [--captures fox bust]
                                 [--opensplat BINARY] [--gallery FOLDER] [--results benchmarks/results/street.json]
-                                [--options=--exposure]
+                                [--options=--learn=exposure]
 
 ``--data`` holds the captures in the folders that ``CAPTURES`` names; only their photographs are used. Each is run once,
 in a process of its own, and scored; what is finished is not repeated, so that the command can be stopped and started
@@ -165,7 +165,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--captures", nargs="+", choices=[c.name for c in CAPTURES], default=list(STREET))
     parser.add_argument("--quality", choices=("draft", "normal", "full"), default="draft")
     parser.add_argument(
-        "--options", default="", help="more options of `gs2d reconstruct`, in one word: --options='--exposure --seed 1'"
+        "--options",
+        default="",
+        help="options of `gs2d reconstruct`, in one word: --options='--learn exposure --seed 1'",
     )
     parser.add_argument("--opensplat", type=Path, metavar="BINARY", help="the peer; without it there is none")
     parser.add_argument("--gallery", type=Path, metavar="FOLDER", help="write pictures of what is finished")

@@ -1,4 +1,4 @@
-"""What `--refine-cameras` is worth on a capture whose lens nobody knows: its distortion is taken out of the file.
+"""What `--learn intrinsics` is worth on a capture whose lens nobody knows: its distortion is taken out of the file.
 
 ::
 
@@ -21,12 +21,12 @@ from typing import Any
 BENDS = ("k1", "k2", "k3", "k4", "p1", "p2")
 WAYS = {
     "known": (True, ()),
-    "known, `--refine-poses`": (True, ("--refine-poses",)),
-    "known, `--refine-cameras`": (True, ("--refine-cameras",)),
+    "known, `--learn poses`": (True, ("--learn", "poses")),
+    "known, `--learn intrinsics`": (True, ("--learn", "intrinsics")),
     "none": (False, ()),
-    "none, `--refine-poses`": (False, ("--refine-poses",)),
-    "none, focal length": (False, ("--refine-cameras", "--set", "learned.intrinsics.options.distortion=false")),
-    "none, `--refine-cameras`": (False, ("--refine-cameras",)),
+    "none, `--learn poses`": (False, ("--learn", "poses")),
+    "none, focal length": (False, ("--learn", "intrinsics", "--set", "learned.intrinsics.options.distortion=false")),
+    "none, `--learn intrinsics`": (False, ("--learn", "intrinsics")),
 }
 
 
@@ -52,7 +52,7 @@ def run(capture: Path, out: Path, words: tuple[str, ...], args: argparse.Namespa
         command = ["train", str(capture), "--out", str(out), "--recipe", args.recipe, "--seed", str(seed)]
         command += ["--downscale", str(args.downscale), "--schedule-scale", str(args.scale), "--threads", "1"]
         subprocess.run([sys.executable, "-m", "gs2d", *command, *words, "--overwrite", "--quiet"], check=True)
-        subprocess.run([sys.executable, "-m", "gs2d", "evaluate", str(out), "--match-poses", "--quiet"], check=True)
+        subprocess.run([sys.executable, "-m", "gs2d", "evaluate", str(out), "--match", "poses", "--quiet"], check=True)
     return dict(json.loads((out / "metrics.json").read_text())["stages"][-1])
 
 

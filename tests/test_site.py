@@ -15,7 +15,7 @@ from types import ModuleType
 import pytest
 
 import gs2d
-from gs2d.cli.arguments import NAMES, options_of
+from gs2d.cli.command_line import NAMES, options_of
 
 ROOT = Path(__file__).resolve().parents[1]
 SITE = ROOT / "docs" / "site"

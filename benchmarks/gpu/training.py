@@ -78,7 +78,6 @@ def whole_run(
         downscale=downscale,
         schedule_scale=scale,
         overrides=overrides,
-        checkpoint_seconds=1e9,
         checkpoint_every=10**9,
     )
     if not bench.dry:

@@ -64,6 +64,6 @@ def test_photographs_alone_are_used_and_a_finished_run_is_not_repeated(
     assert len(started) == 1
     (folder / "process.json").unlink()  # as if it had been cut off
     street_runs.run_reconstruct(source, folder, "draft")
-    street_runs.run_reconstruct(source, folder, "draft", ["--exposure"])  # another command is another run
+    street_runs.run_reconstruct(source, folder, "draft", ["--learn=exposure"])  # another command is another run
     assert len(started) == 3
     assert started[0][1:3] == ["-m", "gs2d"]

@@ -147,7 +147,7 @@ def test_masks_that_leave_nothing_to_learn_from_are_an_error(
         (["--set", "appearance.train.sh0=nobody"], "row group 'nobody'"),
         (["--set", "surface.densify.max_splats=0"], "integer"),
         (["--set", "fused_depth=nearest"], "transmittance"),
-        (["--protocol", "tanks"], "no protocol 'tanks'"),
+        (["--protocol", "tanks"], "protocol must be one of"),
         (["--downscale", "0"], "--downscale"),
         (["--downscale", "1000"], "1000"),
         (["--schedule-scale", "-1"], "--schedule-scale must be"),
@@ -156,7 +156,7 @@ def test_masks_that_leave_nothing_to_learn_from_are_an_error(
         (["--subject-box", "1", "1", "1", "0", "0", "0"], "corner"),
         (["--subject-box", "0", "0", "0", "1", "1", "nan"], "got 0 0 0 1 1 nan"),
         (["--subject-box", "0", "0", "0", "1", "1", "1", "--scene"], "exclude"),
-        (["--exposure", "--no-exposure"], "contradict"),
+        (["--learn", "exposures"], "did you mean exposure?"),
         (["--robust", "perhaps"], "invalid"),
     ],
 )
@@ -212,7 +212,7 @@ def test_a_failing_overwrite_keeps_the_old_run(
     assert {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()} == before
 
 
-@pytest.mark.parametrize("command", ["mesh", "render", "evaluate", "report"])
+@pytest.mark.parametrize("command", ["mesh", "render", "evaluate"])
 def test_a_command_on_what_is_no_run_says_what_it_found(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -225,11 +225,11 @@ def test_a_command_on_what_is_no_run_says_what_it_found(
     ("name", "old", "new", "command", "code"),
     [
         # The report is written without its pictures, and says so: 3.
-        ("renders/index.json", '"camera"', '"cam"', "report", 3),
-        ("renders/index.json", '"file": "', '"file": 5, "x": "', "report", 3),
-        ("renders/index.json", '"stages": [', '"stages": 5, "x": [', "report", 3),
+        ("renders/index.json", '"camera"', '"cam"', "evaluate", 3),
+        ("renders/index.json", '"file": "', '"file": 5, "x": "', "evaluate", 3),
+        ("renders/index.json", '"stages": [', '"stages": 5, "x": [', "evaluate", 3),
         ("metrics.json", '"iterations": ', '"iterations": "x", "y": ', "info", 2),
-        ("metrics.json", '"name": "', '"name": [], "x": "', "report", 2),
+        ("metrics.json", '"name": "', '"name": [], "x": "', "evaluate", 2),
         ("run.json", '"path": "', '"path": 5, "x": "', "render", 2),
     ],
 )

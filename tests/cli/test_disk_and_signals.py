@@ -40,18 +40,18 @@ def test_a_full_disk_stops_training_with_one_line_and_leaves_nothing(capture: Pa
 def test_a_fault_of_ours_is_exit_code_1_with_a_traceback_only_for_debug(
     trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gs2d.pipeline.finish import run_report as report
+    from gs2d.pipeline.finish import evaluate
 
-    def broken(_path: Path, _on_event: object) -> Path:
+    def broken(*_args: object, **_options: object) -> Path:
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr(report, "report_run", broken)
-    assert run(["report", str(trained)]) == 1
+    monkeypatch.setattr(evaluate, "evaluate_run", broken)
+    assert run(["evaluate", str(trained)]) == 1
     err = capsys.readouterr().err
     assert err.splitlines() == [
         "fault in gs2d: ZeroDivisionError: a bug; run again with --debug and report it with the traceback"
     ]
-    assert run(["report", str(trained), "--debug"]) == 1
+    assert run(["evaluate", str(trained), "--debug"]) == 1
     assert "Traceback" in capsys.readouterr().err
 
 
@@ -87,7 +87,7 @@ class Press:
                 pass  # as torch does in places
 sys.meta_path.insert(0, Press())
 from gs2d.cli import main
-main(["report", {str(trained)!r}])
+main(["evaluate", {str(trained)!r}])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
@@ -166,13 +166,13 @@ def test_ctrl_c_before_the_first_iteration_leaves_nothing_and_says_so(
 def test_out_of_memory_names_the_remedy(
     error: Exception, trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gs2d.pipeline.finish import run_report as report
+    from gs2d.pipeline.finish import evaluate
 
-    def hungry(_path: Path, _on_event: object) -> Path:
+    def hungry(*_args: object, **_options: object) -> Path:
         raise error
 
-    monkeypatch.setattr(report, "report_run", hungry)
-    assert run(["report", str(trained)]) == 2
+    monkeypatch.setattr(evaluate, "evaluate_run", hungry)
+    assert run(["evaluate", str(trained)]) == 2
     assert "--downscale" in one_line(capsys.readouterr().err)
 
 
@@ -185,10 +185,10 @@ def test_what_could_not_be_made_is_exit_code_3_and_names_the_command_that_makes_
 
     copy = Path(shutil.copytree(trained, tmp_path / "run"))
     monkeypatch.setattr("gs2d.report.sections.training_section.curves", broken)
-    assert run(["report", str(copy), "--json", *["--quiet"] * quiet]) == app_module.INCOMPLETE == 3
+    assert run(["evaluate", str(copy), "--json", *["--quiet"] * quiet]) == app_module.INCOMPLETE == 3
     out, err = capsys.readouterr()
     said = "fault in gs2d: ValueError: broken data stream"
     assert json.loads(out)["missing"] == [{"what": "section training in report.html", "reason": said}]
     last = err.splitlines()[-1]
-    assert last == f"not made: section training in report.html{f' ({said})' * quiet}; again: gs2d report {copy}"
+    assert last == f"not made: section training in report.html{f' ({said})' * quiet}; again: gs2d evaluate {copy}"
     assert err.count(said) == 1

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gs2d.cli import run
-from gs2d.cli.doctor_extras import CPU_TORCH
+from gs2d.cli.doctor import CPU_TORCH
 from gs2d.core.extras import EXTRAS, install
 
 ROOT = Path(__file__).parents[2]
@@ -27,20 +27,16 @@ def test_the_doctor_looks_for_all_that_single_commands_need(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("PATH", "")
-    monkeypatch.setattr(
-        "gs2d.cli.doctor_extras._version", lambda name: None if name in ("xatlas", "pi-heif") else "1.2.3"
-    )
+    monkeypatch.setattr("gs2d.cli.doctor._version", lambda name: None if name in ("xatlas", "pi-heif") else "1.2.3")
     assert run(["doctor", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
-    assert report["extras"] == {
-        "sfm": True, "geo": True, "exr": True, "markers": True, "ffmpeg": False, "heic": True, "texture": False,
-        "spz4": True, "usd": True, "cluster": True
-    }  # fmt: skip
+    missing = {name for name, entry in report["optional"].items() if not entry["available"]}
+    assert missing == {"ffmpeg", "texture"}
     assert report["optional"]["heic"]["details"] == "pillow-heif 1.2.3"
     assert run(["doctor"]) == 0
     text = capsys.readouterr().out
     assert "no   textured meshes (--texture): xatlas missing\n       to get it: pip install 'xatlas" in text
-    ffmpeg = "no   videos, read and made (gs2d render --video x.mp4): no ffmpeg and no ffprobe on the PATH"
+    ffmpeg = "no   videos, read and written (gs2d render --video x.mp4): ffmpeg, ffprobe missing"
     assert f"{ffmpeg}\n       to get it: apt" in text
 
 

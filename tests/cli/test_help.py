@@ -12,7 +12,7 @@ import pytest
 import gs2d
 from cli_runs import one_line
 from gs2d.cli import run
-from gs2d.cli.arguments import NAMES, Option, options_of
+from gs2d.cli.command_line import NAMES, Option, options_of
 from gs2d.cli.parser import parse
 
 
@@ -28,7 +28,7 @@ from gs2d.cli.parser import parse
         ("train here --out there --iterations 900", "--schedule-scale"),
         ("train here --out there --resolution 2", "--downscale"),
         ("train here --out there --quality best", "--quality"),
-        ("train here --out there --ground-truth a", "gs2d evaluate has one"),
+        ("train here --out there --ground-truth a", "gs2d evaluate"),
         ("train . --out there --backend gpu", "reference"),
         ("train . --out there --format=colmp", "colmap"),
         ("recipes shwo 2dgs", "ACTION"),
@@ -36,6 +36,9 @@ from gs2d.cli.parser import parse
         ("train a b --out there", "'b'"),
         ("train here --out there --downscale two", "--downscale"),
         ("mesh here --bbox 1 2 3", "--bbox"),
+        ("mesh here --faces 9", "--set faces=N"),
+        ("mesh here --set facets=9", "did you mean faces?"),
+        ("mesh here --set faces=many", "got 'many'"),
         ("train here --out", "--out"),
         ("train here --out there --resume --overwrite", "exclude each other"),
     ],
@@ -89,7 +92,7 @@ def test_every_option_is_parsed_and_fills_its_field() -> None:
         options = options_of(command)
         for option in options:
             given = sorted(
-                (o for o in options if o.required or not o.flags or o is option), key=lambda o: bool(o.flags)
+                (o for o in options if o.required or o.positional or o is option), key=lambda o: not o.positional
             )
             parsed = parse([name, *(word for other in given for word in written(other))])
             assert option.default not in values_of(parsed, option.field), option
@@ -99,8 +102,11 @@ def test_every_option_is_parsed_and_fills_its_field() -> None:
 def written(option: Option) -> list[str]:
     """An option with a value that is not its default, in words."""
     value = option.choices[-1] if option.choices else "-1.5e-1" if option.kind is float else "97"
+    if option.mark.setting:
+        value = "true" if option.kind is bool else value
+        return ["--set", f"{option.field}={','.join([value] * (option.count or 2))}"]
     values = [] if option.kind is bool else [value] * (option.count or 2)
-    return [*option.flags[-1:], *values]
+    return [*option.flags, *values]
 
 
 def values_of(parsed: object, field: str) -> list[object]:
@@ -119,7 +125,13 @@ def values_of(parsed: object, field: str) -> list[object]:
         ("train in --no-page --out out", "page", False),
         ("recipes --json show 2dgs", "name", "2dgs"),
         ("sweep a --data here --out there b", "recipes", ("a", "b")),
-        ("blocks in --out out --jobs 3", "slots", 3),
+        ("train in --out out --viewer", "viewer", 0),
+        ("train --viewer in --out out", "viewer", 0),
+        ("train --viewer 81 in --out out", "viewer", 81),
+        ("mesh run --set depth=median --set faces=9", "faces", 9),
+        ("poses in --out out --set link=true", "link", True),
+        ("survey run --set up=0,1,0", "up", (0, 1, 0)),
+        ("train in --out out --set prepare=never --set a=1", "overrides", ("a=1",)),
     ],
 )
 def test_words_become_values(words: str, field: str, value: object) -> None:

@@ -1,4 +1,4 @@
-"""``gs2d page``."""
+"""``gs2d export --format html``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def some_splats(count: int) -> Splats:
 
 def test_a_file_of_splats_becomes_a_page_beside_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_splats(tmp_path / "cloud.ply", some_splats(50))
-    assert run(["page", str(tmp_path / "cloud.ply"), "--sh-degree", "1", "--json"]) == 0
+    assert run(["export", str(tmp_path / "cloud.ply"), "--format", "html", "--set", "sh_degree=1", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["file"] == str(tmp_path / "cloud.html")
     assert (result["sh_degree"], result["views"]) == (1, 1)
@@ -32,13 +32,14 @@ def test_a_file_of_splats_becomes_a_page_beside_it(tmp_path: Path, capsys: pytes
 
 def test_a_run_becomes_a_page_in_it(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(trained, tmp_path / "run")
-    assert run(["page", str(tmp_path / "run")]) == 0
+    assert run(["export", str(tmp_path / "run"), "--format", "html"]) == 0
     assert f"{tmp_path / 'run/scene.html'}: " in capsys.readouterr().out
     text = (tmp_path / "run/scene.html").read_text()
     facts = json.loads(text.split('id="facts">')[1].split("</script>")[0])
     assert [camera["name"] for camera in facts["cameras"]] == [f"train/r_{i}.png" for i in range(len(facts["cameras"]))]
     assert len(facts["cameras"]) > 1
-    assert run(["page", str(tmp_path / "run"), "--out", str(tmp_path / "b.HTML"), "--sh-degree", "0", "--quiet"]) == 0
+    words = ["--out", str(tmp_path / "b.HTML"), "--set", "sh_degree=0", "--quiet"]
+    assert run(["export", str(tmp_path / "run"), *words]) == 0
     assert (tmp_path / "b.HTML").stat().st_size < len(text)
 
 
@@ -47,7 +48,8 @@ def test_a_run_becomes_a_page_in_it(trained: Path, tmp_path: Path, capsys: pytes
     [
         (["nowhere"], "folder"),
         (["cloud.ply", "--out", "cloud.png"], "written"),
-        (["cloud.ply", "--sh-degree", "4"], "--sh-degree must be 0, 1, 2 or 3, got 4"),
+        (["cloud.ply", "--set", "sh_degree=4"], "sh_degree must be 0, 1, 2 or 3, got 4"),
+        (["cloud.ply", "--bbox", *"0 0 0 1 1 1".split()], "leave them out"),
     ],
 )
 def test_what_cannot_become_a_page_is_one_line(
@@ -55,6 +57,6 @@ def test_what_cannot_become_a_page_is_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write_splats(tmp_path / "cloud.ply", some_splats(5))
-    assert run(["page", *words]) == 2
+    assert run(["export", *words, "--format", "html"]) == 2
     assert message in one_line(capsys.readouterr().err)
     assert [path.name for path in tmp_path.iterdir()] == ["cloud.ply"]

@@ -48,11 +48,11 @@ def test_the_runs_mesh_gets_a_texture_of_what_the_photographs_show(
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (["--faces", "100"], "--texture"),
-        (["--texture-size", "64"], "needs --texture"),
-        (["--texture", "--faces", "2"], "number"),
-        (["--texture", "--texture-size", "10"], "texels"),
-        (["--texture", "--texture-downscale", "0"], "number"),
+        (["--set", "faces=100"], "--texture"),
+        (["--set", "texture_size=64"], "needs --texture"),
+        (["--texture", "--set", "faces=2"], "number"),
+        (["--texture", "--set", "texture_size=10"], "texels"),
+        (["--texture", "--set", "texture_downscale=0"], "number"),
         (["--texture", "--out", "mesh.ply"], "written"),
         (["--texture", "--out", "no/such/folder/a.glb"], "exists"),
     ],

@@ -18,7 +18,7 @@ def test_a_flight_becomes_pictures_and_a_video(
 ) -> None:
     copy, video = tmp_path / "run", tmp_path / "video.webp"
     shutil.copytree(trained, copy)
-    words = ["--flight", "5", "--video", str(video), "--fps", "10", "--threads", "1"]
+    words = ["--flight", "5", "--video", str(video), "--set", "fps=10", "--threads", "1"]
     assert run(["render", str(copy), *words]) == 0
     out, err = capsys.readouterr()
     assert "5 images in" in out
@@ -59,7 +59,7 @@ def test_a_video_without_an_ending_is_what_can_be_made_here_and_mp4_without_ffmp
         (["--orbit", "0", "--video", "a.webp"], "frames"),
         (["--orbit", "9", "--flight", "9"], "exclude"),
         (["--flight", "-1"], "number"),
-        (["--orbit", "9", "--fps", "25"], "--video"),
+        (["--orbit", "9", "--set", "fps=25"], "--video"),
         (["--orbit", "9", "--video", "a.mov"], "name"),
         (["--orbit", "1", "--video", "a.webp"], "frames"),
         (["--orbit", "9", "--video", "no/such/folder/a.webp"], "the folder does not exist"),

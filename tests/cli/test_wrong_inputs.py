@@ -22,9 +22,9 @@ from gs2d.core.missing import holds_photographs, instead
 from gs2d.data import detect_format
 
 NEEDS = {  # what each command reads
-    **dict.fromkeys(("mesh", "render", "evaluate", "georeference", "orthophoto", "report"), "run"),
-    **dict.fromkeys(("view", "page", "export"), "run or splats"),
-    **dict.fromkeys(("train", "plan", "blocks"), "capture"),
+    **dict.fromkeys(("mesh", "render", "evaluate", "survey"), "run"),
+    **dict.fromkeys(("view", "export"), "run or splats"),
+    **dict.fromkeys(("train", "blocks"), "capture"),
     **dict.fromkeys(("poses", "reconstruct"), "photographs"),
     "info": "anything",
 }
@@ -45,7 +45,7 @@ INPUTS = {  # relative path -> what it is, and what the remedy names in place of
 TAKEN = {  # what a command reads although its name for it is another one
     *(("poses", path) for path in ("capture", "capture/images")),
     ("reconstruct", "capture/images"),
-    *((command, "capture.zip") for command in ("train", "plan", "info")),
+    *((command, "capture.zip") for command in ("train", "info")),
     *(("info", path) for path in ("mesh.ply", "run/mesh.ply", "capture", "run")),
 }
 OUT = {"train": "new", "blocks": "new", "poses": "new", "reconstruct": "new", "export": "new.ply"}
@@ -111,7 +111,7 @@ def test_a_wrong_input_is_one_line_whose_remedy_names_what_is_there(
         assert better in named(line), line
 
 
-@pytest.mark.parametrize("command", ["reconstruct", "train", "view", "plan", "info"])
+@pytest.mark.parametrize("command", ["reconstruct", "train", "view", "info"])
 def test_photographs_in_an_archive_are_unpacked_as_the_message_says(
     there: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
@@ -131,20 +131,20 @@ def test_what_is_wrong_inside_an_archive_names_the_archive(
     small_nerfstudio(tmp_path / "broken", count=3)
     (tmp_path / "broken" / "images" / "f_01.png").write_bytes(b"no image")
     packed(tmp_path / "broken")
-    for words in (["info"], ["plan"], ["train", "--out", str(tmp_path / "run"), "--quiet"]):
+    for words in (["info"], ["train", "--dry-run"], ["train", "--out", str(tmp_path / "run"), "--quiet"]):
         assert run([words[0], str(tmp_path / "broken.zip"), *words[1:]]) == 2
         line = capsys.readouterr().err.splitlines()[-1]
         assert f"{tmp_path / 'broken.zip'}/images/f_01.png" in line
 
 
 def test_a_run_without_scale_gets_one_and_then_an_orthophoto(there: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["orthophoto", "run"]) == 2
+    assert run(["survey", "run", "--orthophoto"]) == 2
     line = one_line(capsys.readouterr().err)
     assert "run has no georeference" in line
-    (command,) = re.findall(r"`gs2d (georeference run --known-distance) X0 Y0 Z0 X1 Y1 Z1 METRES`", line)
+    (command,) = re.findall(r"`gs2d (survey run --known-distance) X0 Y0 Z0 X1 Y1 Z1 METRES`", line)
     assert run([*command.split(), *"0 0 0 1 0 0 2".split()]) == 0
     capsys.readouterr()
-    assert run(["orthophoto", "run", "--out", "above.png"]) == 2
+    assert run(["survey", "run", "--orthophoto", "--out", "above.png"]) == 2
     assert "--out must end in .tif" in one_line(capsys.readouterr().err)  # that is all that is left to say
     Path("run/georeference.json").unlink()
 
@@ -163,14 +163,14 @@ def test_captures_of_every_format_are_told_from_photographs_by_names(tmp_path: P
 
 
 MISSPELT = (
-    *([command, "photoz"] for command in ("info", "view", "page", "mesh", "render", "evaluate", "report", "plan")),
+    *([command, "photoz"] for command in ("info", "view", "mesh", "render", "evaluate", "survey")),
     *([command, "photoz", "--out", "new"] for command in ("train", "blocks", "poses", "reconstruct")),
     ["export", "photoz", "--out", "new.ply"],
     *(["train", "capture", "--out", "new", option, "photoz"] for option in ("--masks", "--init", "--from")),
     ["reconstruct", "photos", "--out", "new", "--from", "photoz"],
     ["mesh", "run", "--splats", "photoz", "--out", "new.ply"],
     ["evaluate", "run", "--ground-truth", "photoz"],
-    ["georeference", "run", "--positions", "photoz"],
+    ["survey", "run", "--positions", "photoz"],
     ["sweep", "best", "--data", "photoz", "--out", "new"],
 )
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import gs2d
 from cli_process import CliProcess
-from gs2d.cli.registry import COMMANDS
+from gs2d.cli.command_registry import COMMANDS
 from gs2d.config.protocols import PROTOCOLS
 from gs2d.config.registry import Registry, contrib_entries
 from gs2d.data.known_captures import DATA_SETS
@@ -43,7 +43,7 @@ def test_the_core_trains_and_exports_without_contrib(tmp_path: Path) -> None:
 
     listed = run("--help").stdout
     assert "reconstruct" in listed
-    assert "orthophoto" not in listed
+    assert "survey" not in listed
     capture = write_capture(tmp_path / "ball")
     few = ("--set", "init_points=60", "--schedule-scale", "0.0003", "--no-page", "--recipe", "2dgs")
     run("train", capture, "--out", tmp_path / "run", *few)

@@ -68,14 +68,14 @@ def run_seeds() -> list[dict[str, bytes]]:
 
 
 def read_run(root: Path) -> None:
-    """`gs2d info`, `export`, and `page` or `render`; `report` and `train --resume` for one in so many."""
+    """`gs2d info`, `export`, and a page or `render`; `evaluate` and `train --resume` for one in so many."""
     from gs2d.errors import Gs2dError
 
     changed = sum((root / "run" / name).stat().st_size for name in ("run.json", "metrics.json", "events.jsonl"))
     commands = [["info", "run"], ["export", "run", "--out", "out.spz"]]
-    commands += [["page", "run", "--out", "out.html"] if changed % 2 else ["render", "run", "--out", "out"]]
+    commands += [["export", "run", "--out", "out.html"] if changed % 2 else ["render", "run", "--out", "out"]]
     if changed % _RARE == 0:
-        commands += [["report", "run"]]
+        commands += [["evaluate", "run"]]
     if changed % _RARE == 1:
         commands += [["train", "capture", "--out", "run", "--resume", *TINY, "--threads", "1", "--downscale", "2"]]
     refused: Gs2dError | None = None
@@ -108,9 +108,9 @@ def _parsed(words: tuple[str, ...]) -> Any:
 LINES = (
     "train CAPTURE --out RUN --recipe 2dgs-r --schedule-scale 0.1 --set init_points=100 --downscale 2 --seed 3",
     "train CAPTURE --out RUN --set surface.densify.max_splats=150 --threads 2 --checkpoint-every 100 --resume",
-    "mesh RUN --voxel 0.01 --depth median --texture --texture-size 512",
-    "render RUN --split test --out FOLDER --fps 24 --orbit 30",
-    "export RUN --out a.spz --layout spz --bbox -1 -1 -1 1 1 1",
+    "mesh RUN --voxel 0.01 --set depth=median --texture --set texture_size=512",
+    "render RUN --split test --out FOLDER --set fps=24 --orbit 30",
+    "export RUN --out a.spz --format spz --bbox -1 -1 -1 1 1 1",
     "evaluate RUN --mesh-gt a.ply --json",
     "poses PHOTOS --out CAPTURE",
     "sweep A B --recipes 2dgs,2dgs-r --out TABLE",

@@ -373,7 +373,7 @@ _TABLES = {
 
 
 def read_places(root: Path) -> None:
-    """As `gs2d georeference` reads its tables."""
+    """As `gs2d survey` reads its tables."""
     from gs2d.contrib.survey.control import read_control
     from gs2d.data.positions import matched, read_positions
     from gs2d.errors import DataError

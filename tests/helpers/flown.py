@@ -9,7 +9,7 @@ from typing import Any
 
 from benchmarks.flight import Flight, write_flight
 
-from gs2d.contrib.lab.options import BlocksOptions
+from gs2d.contrib.lab.lab_options import BlocksOptions
 
 WORDS = (
     "surface.densify.start=3",
@@ -25,17 +25,19 @@ def write_tiny_flight(folder: Path, photographs: int = 12) -> Path:
     return folder
 
 
+PARTITION = ("partition.min_views=3", "partition.coarse.schedule=0.5")
+
+
 def tiny_blocks(capture: Path, out: Path, **changes: Any) -> BlocksOptions:
     """Return options of 2x2 blocks of 18 iterations each."""
     options = BlocksOptions(
         scene=capture,
         out=out,
         blocks="2x2",
-        partition=("min_views=3", "coarse.schedule=0.5"),
         recipe="2dgs",
         robust="off",
         schedule_scale=0.0006,
-        overrides=(*WORDS, "surface.densify.max_splats=600"),
+        overrides=(*WORDS, "surface.densify.max_splats=600", *PARTITION),
         backend="cpu",
         threads=1,
         page=False,

@@ -26,7 +26,7 @@ from typing import Any
 
 from ball_runs import comparable, options
 from gs2d.config.registry import Registry
-from gs2d.contrib.lab.options import SweepOptions
+from gs2d.contrib.lab.lab_options import SweepOptions
 from gs2d.contrib.lab.paper import paper
 from gs2d.errors import DataError, Gs2dError
 from gs2d.io.run_dir import RunFolder
@@ -218,7 +218,7 @@ class Export(OfRun):
 
 
 class Page(OfRun):
-    """``gs2d page``."""
+    """``gs2d export --format html``."""
 
     name = "page"
 
@@ -228,7 +228,7 @@ class Page(OfRun):
 
 
 class Report(OfRun):
-    """``gs2d report``."""
+    """The report, which several commands write."""
 
     name, draws = "report", True
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from gs2d.contrib.lab.aggregate import FIGURES, Cell, Row
-from gs2d.contrib.lab.tables import TNT
+from gs2d.contrib.lab.paper_tables import TNT
 
 TINY = ["--schedule-scale", "0.0005", "--set", "init_points=100", "--set", "surface.densify.max_splats=150"]
 

@@ -44,7 +44,14 @@ def lose(cluster: subprocess.Popen[str], *which: int) -> None:
 def blocks_words(capture: Path, job: Path, address: str, schedule: float) -> list[str]:
     """Return the words that do what ``tiny_blocks`` does, on a cluster."""
     words = ["blocks", str(capture), "--out", str(job), "--blocks", "2x2", "--recipe", "2dgs", "--robust", "off"]
-    words += ["--partition", "min_views=3", "--partition", "coarse.schedule=0.5", "--schedule-scale", str(schedule)]
+    words += [
+        "--set",
+        "partition.min_views=3",
+        "--set",
+        "partition.coarse.schedule=0.5",
+        "--schedule-scale",
+        str(schedule),
+    ]
     words += [word for change in (*WORDS, "surface.densify.max_splats=600") for word in ("--set", change)]
     words += ["--backend", "cpu", "--threads", "1", "--no-page", "--checkpoint-every", "4"]
     return [*words, "--cluster", address]

@@ -37,7 +37,7 @@ def varied(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def learning(varied: Path, out: Path, **changes: object) -> TrainOptions:
-    return options(varied, out, exposure=True, overrides=EARLY, **changes)
+    return options(varied, out, learn="exposure", overrides=EARLY, **changes)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def test_the_gains_of_the_demo_have_mean_one(tmp_path: Path, monkeypatch: pytest
     assert (tmp_path / "varied/test/r_0.png").read_bytes() == (tmp_path / "plain/test/r_0.png").read_bytes()
     (tmp_path / "demo").mkdir()
     (tmp_path / "plain").rename(tmp_path / "demo" / "capture")
-    with pytest.raises(RunError, match="--vary-exposure"):
+    with pytest.raises(RunError, match="vary_exposure"):
         demo(DemoOptions(out=tmp_path / "demo", resume=True, vary_exposure=True))
 
 
@@ -100,7 +100,7 @@ def test_training_views_are_scored_in_their_exposures(run: RunFolder) -> None:
 def test_matched_scores_are_added_on_request(run: RunFolder) -> None:
     plain = run.metrics()["stages"][-1]
     assert "test_matched" not in plain
-    matched = evaluate_run(run.path, EvaluateOptions(match_exposure=True))
+    matched = evaluate_run(run.path, EvaluateOptions(match="exposure"))
     assert matched["test"]["psnr"] == plain["test"]["psnr"]
     assert matched["test_matched"]["psnr"] != plain["test"]["psnr"]
     assert run.metrics()["stages"][-1]["test_matched"] == matched["test_matched"]

@@ -57,7 +57,7 @@ def test_a_run_interrupted_before_its_first_checkpoint_resumes_to_the_same_bytes
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    never: dict[str, Any] = {"checkpoint_every": 10_000, "checkpoint_seconds": 1e9}
+    never: dict[str, Any] = {"checkpoint_every": 10_000}
     progress = {"checkpoint_every": 4}  # of `undisturbed`: it decides how often there is a line in the log
     with monkeypatch.context() as patch:
         interrupted_at(patch, {iteration}, number)

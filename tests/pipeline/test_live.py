@@ -67,7 +67,7 @@ def test_the_viewer_does_not_change_the_bytes(
         if isinstance(event, Step) and event.detail and not done.is_set():
             time.sleep(0.2)
 
-    watched = train(options(capture, tmp_path / "run", viewer=True), on_event)
+    watched = train(options(capture, tmp_path / "run", viewer=0), on_event)
     assert done.wait(600)
     assert wrong == []
     assert comparable(watched) == comparable(undisturbed)

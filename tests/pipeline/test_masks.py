@@ -55,7 +55,7 @@ def write_ball(root: Path, noise: int) -> Path:
 
 def everything(root: Path, **options: Any) -> tuple[Splats, dict[str, Any], np.ndarray, np.ndarray]:
     recipe = Recipe("plain", (Stage("surface", 12, losses=(LossTerm("l1", 1.0),)),))
-    trained = train(load_scene(root, test_every=4, **options), recipe, exposure=True, robust="off", backend="cpu")
+    trained = train(load_scene(root, test_every=4, **options), recipe, learn="exposure", robust="off", backend="cpu")
     solid = replace(trained.splats, opacity_logits=trained.splats.opacity_logits + 9)
     mesh = extract_mesh(replace(trained, splats=solid), options=MeshOptions(whole_scene=True, voxel=0.1))
     votes = sights(trained, trained.splats)

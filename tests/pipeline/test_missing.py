@@ -47,14 +47,14 @@ def finished(undisturbed: RunFolder, tmp_path: Path) -> Path:
             OSError("broken data stream"),
             "report.html",
             "fault in gs2d: OSError: broken data stream",
-            "gs2d report {run}",
+            "gs2d evaluate {run}",
         ),
         (
             "train.train_run.page_run",
             ZeroDivisionError(),
             "scene.html",
             "fault in gs2d: ZeroDivisionError: no message",
-            "gs2d page {run}",
+            "gs2d export {run} --format html",
         ),
         (
             "train.stage_results.draw_stage",
@@ -125,7 +125,7 @@ def test_a_failing_section_does_not_affect_others(
         "section views in report.html",
         "section training in report.html",
     ]
-    assert {event.command for event in heard if isinstance(event, NotMade)} == {f"gs2d report {copy}"}
+    assert {event.command for event in heard if isinstance(event, NotMade)} == {f"gs2d evaluate {copy}"}
     text = (copy / "report.html").read_text()
     assert "The section training could not be made: no curve today" in text
     assert "Settings" in text

@@ -31,7 +31,7 @@ def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
         notices.extend([event.text] if isinstance(event, Notice) else [])
 
     folder = tmp_path_factory.mktemp("runs") / "photometry"
-    made = train(options(capture, folder, vignetting=True, response=True, overrides=EARLY), listen)
+    made = train(options(capture, folder, learn="vignetting,response", overrides=EARLY), listen)
     assert any(text.startswith("vignetting leaves ") and text.endswith(PHOTOMETRY) for text in notices)
     return made
 

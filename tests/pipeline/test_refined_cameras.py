@@ -30,7 +30,7 @@ def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
         notices.extend([event.text] if isinstance(event, Notice) else [])
 
     folder = tmp_path_factory.mktemp("runs") / "cameras"
-    made = train(options(capture, folder, refine_cameras=True, overrides=EARLY), listen)
+    made = train(options(capture, folder, learn="intrinsics", overrides=EARLY), listen)
     assert any(text.startswith("refined focal lengths are ") for text in notices)
     return made
 

@@ -33,7 +33,7 @@ EARLY = (*SMALL, "learned.poses.start=5", "learned.poses.rate=0.01")  # so that 
 
 
 def learning(capture: Path, out: Path, **changes: object) -> TrainOptions:
-    return options(capture, out, refine_poses=True, overrides=EARLY, **changes)
+    return options(capture, out, learn="poses", overrides=EARLY, **changes)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def test_the_demo_disturbs_cameras_and_writes_the_true_ones(tmp_path: Path, monk
     assert not (plain / TRUTH).exists()
     (tmp_path / "demo").mkdir()
     plain.rename(tmp_path / "demo" / "capture")
-    with pytest.raises(RunError, match="--vary-poses"):
+    with pytest.raises(RunError, match="vary_poses"):
         demo(DemoOptions(out=tmp_path / "demo", resume=True, vary_poses=True))
 
 
@@ -107,7 +107,7 @@ def test_later_commands_use_the_refined_cameras(run: RunFolder, capture: Path, t
 def test_aligned_scores_are_added_on_request(run: RunFolder) -> None:
     plain = run.metrics()["stages"][-1]
     assert "test_aligned" not in plain
-    both = evaluate_run(run.path, EvaluateOptions(match_poses=True))
+    both = evaluate_run(run.path, EvaluateOptions(match="poses"))
     assert both["test"]["psnr"] == plain["test"]["psnr"]
     assert both["test_aligned"]["psnr"] > plain["test"]["psnr"]
     assert run.metrics()["stages"][-1]["test_aligned"] == both["test_aligned"]

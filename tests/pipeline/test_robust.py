@@ -94,9 +94,9 @@ EMPTY = replace(EQUAL, observe=no_points)
         ({}, EMPTY, GENERIC, False, False),
         ({"robust": "off"}, VARIED, GENERIC, False, False),
         ({"robust": "on"}, VARIED, DTU, True, True),
-        ({"no_exposure": True}, VARIED, GENERIC, True, False),
-        ({"exposure": True}, EQUAL, GENERIC, True, True),
-        ({"exposure": True, "robust": "off"}, EQUAL, GENERIC, False, True),
+        ({"learn": "none"}, VARIED, GENERIC, True, False),
+        ({"learn": "exposure"}, EQUAL, GENERIC, True, True),
+        ({"learn": "exposure", "robust": "off"}, EQUAL, GENERIC, False, True),
     ],
 )
 def test_training_is_robust_where_protocol_and_capture_allow_it(

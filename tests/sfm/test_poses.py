@@ -173,7 +173,7 @@ def test_a_camera_that_only_turned_is_doubted(colmap: None, tmp_path: Path, caps
         camera = look_at(np.array([2.5, 2.0, 1.2]), target, UP, width=SIZE, height=SIZE, fx=FOCAL)
         (tmp_path / "photos").mkdir(exist_ok=True)
         Image.fromarray(room_image(camera, textures())).save(tmp_path / "photos" / f"{i}.png")
-    assert poses(tmp_path / "photos", tmp_path / "capture", "--matching", "similar", "--overlap", "1") == 0
+    assert poses(tmp_path / "photos", tmp_path / "capture", "--matching", "similar", "--set", "overlap=1") == 0
     assert "photographs" in capsys.readouterr().err
 
 

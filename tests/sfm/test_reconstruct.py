@@ -85,8 +85,8 @@ def test_cameras_that_were_found_are_not_found_again(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--feature-size", "1000"], "resume"),
-        (["--cameras", "one"], "made"),
+        (["--set", "feature_size=1000"], "resume"),
+        (["--set", "cameras=one"], "made"),
         (["--seed", "3"], "made"),
     ],
 )
@@ -138,8 +138,7 @@ def a_capture(photos: Path) -> None:
         (lambda photos: write_room(photos, 3), ["--protocol", "x"], "protocol must be one of"),
         (lambda photos: write_room(photos, 3), ["--from", "/nowhere"], "folder"),
         (lambda photos: write_room(photos, 3), ["--cache", "/dev/null/x"], "cannot write /dev/null/x"),
-        (lambda photos: write_room(photos, 3), ["--viewer-port", "1"], "belongs"),
-        (lambda photos: write_room(photos, 3), ["--max-size", "3"], "number"),
+        (lambda photos: write_room(photos, 3), ["--set", "max_size=3"], "number"),
     ],
 )
 def test_what_makes_no_run_is_refused_before_anything_is_made(
@@ -238,10 +237,21 @@ def test_ctrl_c_in_training_keeps_the_cameras(room: Room, tmp_path: Path) -> Non
 
 def test_every_option_of_train_is_one_of_reconstruct() -> None:
     """But those that it decides itself; a new option of `Training` is there by itself."""
-    words = ["--recipe", "2dgs", "--exposure", "--test-every", "5", "--set", "init_points=9", "--cameras", "each"]
+    words = [
+        "--recipe",
+        "2dgs",
+        "--learn",
+        "exposure",
+        "--test-every",
+        "5",
+        "--set",
+        "init_points=9",
+        "--set",
+        "cameras=each",
+    ]
     command = parse(["reconstruct", "photos", "--out", "run", *words])
-    assert isinstance(command, commands.Reconstruct)
+    assert isinstance(command, commands.ReconstructCommand)
     training = train_options(command)
     assert values(Training, training) == values(Training, command.training)
-    assert (training.recipe, training.test_every, training.learns_exposure) == ("2dgs", 5, True)
+    assert (training.recipe, training.test_every, training.learned) == ("2dgs", 5, ("exposure",))
     assert poses_options(command).cameras == "each"

@@ -293,7 +293,7 @@ def test_two_clicks_measure_a_distance_on_the_surface(page: Page) -> None:
     assert page.ask("$('ruler').querySelector('text').textContent") == "0.6 units"
     page.ask("$('metres').value = 1.25; $('metres').oninput()")
     words = page.ask("$('scalecommand').value").split()
-    assert words[:4] == ["gs2d", "georeference", "RUN", "--known-distance"]
+    assert words[:4] == ["gs2d", "survey", "RUN", "--known-distance"]
     np.testing.assert_allclose([float(word) for word in words[4:]], [100, -199.7, 50, 100, -200.3, 50, 1.25], atol=3e-3)
     page.key("Escape")
     assert values(page, "ruler.on", "$('measurepanel').hidden") == [False, True]

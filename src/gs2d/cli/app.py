@@ -20,21 +20,20 @@ from typing import NoReturn
 
 import gs2d
 from gs2d.cli import layout
-from gs2d.cli.arguments import NAMES
+from gs2d.cli.command_line import NAMES
+from gs2d.cli.command_registry import COMMANDS
 from gs2d.cli.commands import (
     Common,
-    Completion,
-    Demo,
-    Doctor,
-    Info,
-    Recipes,
-    Reconstruct,
-    Train,
+    DemoCommand,
+    DoctorCommand,
+    InfoCommand,
+    RecipesCommand,
+    ReconstructCommand,
+    TrainCommand,
 )
 from gs2d.cli.console import Console, show_help
 from gs2d.cli.interrupts import INTERRUPTED, Interruptible
 from gs2d.cli.parser import HELP_WORDS, UsageError, check_inputs, parse
-from gs2d.cli.registry import COMMANDS
 from gs2d.core.memory_limit import address_space, check_address_space
 from gs2d.core.processes import here
 from gs2d.core.text import printable
@@ -56,8 +55,8 @@ _MENDABLE = {
     errno.EISDIR,
     errno.EIO,
 }
-_LIGHT = (Recipes, Completion)  # which load no numbers
-_NO_TRAINING = (*_LIGHT, Doctor, Info)  # which load torch themselves, if at all
+_LIGHT = (RecipesCommand,)  # which load no numbers
+_NO_TRAINING = (*_LIGHT, DoctorCommand, InfoCommand)  # which load torch themselves, if at all
 # How torch says it on the CPU and on a GPU, how C++ does, and the loader of shared libraries.
 _NO_MEMORY = re.compile(
     "can't allocate memory|out of memory|std::bad_alloc|failed to map segment|cannot allocate memory", re.IGNORECASE
@@ -166,7 +165,7 @@ def _of_this_process(command: Common) -> Common:
         It is for one process.
     """
     place = here()
-    if place.size > 1 and not isinstance(command, Train):
+    if place.size > 1 and not isinstance(command, TrainCommand):
         raise UsageError(f"gs2d {_name_of(command)} runs in one process, got {place.size}; gs2d train is for torchrun")
     return command if place.leads else replace(command, quiet=True, json=False)
 
@@ -234,10 +233,10 @@ def _resumed(argv: Sequence[str]) -> str:
 
 def _interrupted(argv: Sequence[str], command: Common) -> int:
     line = "interrupted"
-    if isinstance(command, Train | Demo | Reconstruct):
+    if isinstance(command, TrainCommand | DemoCommand | ReconstructCommand):
         trained = any((command.out / "checkpoints").glob("*.pt"))
-        found = isinstance(command, Reconstruct) and (command.out / "capture").exists()
-        if trained or isinstance(command, Reconstruct):  # which starts where there is nothing yet
+        found = isinstance(command, ReconstructCommand) and (command.out / "capture").exists()
+        if trained or isinstance(command, ReconstructCommand):  # which starts where there is nothing yet
             kept = "the cameras are kept; " if found else _search(command)
             line += f"; {'' if trained else kept}resume with: {_resumed(argv)}"
         else:
@@ -246,7 +245,7 @@ def _interrupted(argv: Sequence[str], command: Common) -> int:
     return INTERRUPTED
 
 
-def _search(command: Train | Demo | Reconstruct) -> str:
+def _search(command: TrainCommand | DemoCommand | ReconstructCommand) -> str:
     """Return what a search for cameras that was interrupted leaves, in words."""
     from gs2d.sfm.search import SEARCH
     from gs2d.sfm.workspace import hidden_workspace

@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from gs2d.cli.registry import BEGIN, LOOK, MEASURE, STEPS, register_command
-from gs2d.config.arguments import Arg
+from gs2d.cli.command_registry import BEGIN, LOOK, MEASURE, STEPS, register_command
+from gs2d.config.arguments import SETTING, Arg
 from gs2d.pipeline.prepare.options import (
     BoxOption,
     DemoOptions,
     EvaluateOptions,
     MeshOptions,
     Overrides,
-    PlanOptions,
     PosesOptions,
     ReconstructOptions,
     RenderOptions,
@@ -52,7 +51,7 @@ class Common:
     first=("out", "schedule_scale", "viewer", "resume", "overwrite"),
 )
 @dataclass(frozen=True, kw_only=True)
-class Demo(DemoOptions, Common):
+class DemoCommand(DemoOptions, Common):
     """Render a small synthetic capture, train on it and score the result."""
 
 
@@ -63,7 +62,7 @@ class Demo(DemoOptions, Common):
     first=("photos", "out", "quality", "texture", "viewer", "resume", "overwrite"),
 )
 @dataclass(frozen=True, kw_only=True)
-class Reconstruct(ReconstructOptions, Common):
+class ReconstructCommand(ReconstructOptions, Common):
     """Turn photographs or a video into splats, mesh and report."""
 
 
@@ -71,40 +70,32 @@ class Reconstruct(ReconstructOptions, Common):
     "poses",
     action="gs2d.cli.handlers:poses",
     group=STEPS,
-    first=("photos", "out", "frames", "camera_model", "max_size", "overwrite"),
+    first=("photos", "out", "frames", "camera_model", "matching", "overwrite"),
 )
 @dataclass(frozen=True, kw_only=True)
-class Poses(PosesOptions, Common):
+class PosesCommand(PosesOptions, Common):
     """Find the cameras of photographs, with COLMAP."""
-
-
-@register_command(
-    "plan",
-    action="gs2d.cli.handlers:plan",
-    group=STEPS,
-    first=("scene", "quality", "recipe", "schedule_scale", "downscale", "memory", "disk"),
-)
-@dataclass(frozen=True, kw_only=True)
-class Plan(PlanOptions, Common):
-    """Estimate splats, memory, disk and time of a training."""
 
 
 @register_command(
     "train",
     action="gs2d.cli.handlers:train",
     group=STEPS,
-    first=("scene", "out", "quality", "recipe", "schedule_scale", "downscale", "viewer", "resume", "overwrite"),
+    first=("scene", "out", "quality", "recipe", "downscale", "dry_run", "viewer", "resume", "overwrite"),
 )
 @dataclass(frozen=True, kw_only=True)
-class Train(TrainOptions, Common):
+class TrainCommand(TrainOptions, Common):
     """Train on photographs whose cameras are known."""
+
+    dry_run: bool = False
+    """Only estimate splats, memory, disk and time. Needs no --out."""
 
 
 @register_command(
     "mesh", action="gs2d.cli.handlers:mesh", group=STEPS, first=("run", "out", "texture", "voxel", "bbox", "unbounded")
 )
 @dataclass(frozen=True, kw_only=True)
-class Mesh(TextureOptions, MeshOptions, Common):
+class MeshCommand(TextureOptions, MeshOptions, Common):
     """Extract the mesh of a run again, with other settings."""
 
     run: RunPath
@@ -129,7 +120,7 @@ class Mesh(TextureOptions, MeshOptions, Common):
     first=("run", "split", "orbit", "flight", "width", "video", "out"),
 )
 @dataclass(frozen=True, kw_only=True)
-class Render(RenderOptions, Common):
+class RenderCommand(RenderOptions, Common):
     """Render images or a video of a run."""
 
     run: RunPath
@@ -146,26 +137,13 @@ class Render(RenderOptions, Common):
 
 @register_command("view", action="gs2d.cli.handlers:view", group=BEGIN)
 @dataclass(frozen=True, kw_only=True)
-class View(Common):
+class ViewCommand(Common):
     """Show splats, mesh and cameras of a run in the browser."""
 
     path: Annotated[Path, Arg(metavar="RUN", positional=True)]
     """Run folder, or a file of splats: PLY, .spz, .splat, .usd, .glb or .sog."""
     port: int | None = None
     """Port of the page (default: the first free port from 8080)."""
-
-
-@register_command("page", action="gs2d.cli.handlers:page", group=LOOK)
-@dataclass(frozen=True, kw_only=True)
-class Page(Common):
-    """Write the splats as one HTML file that works offline in any browser."""
-
-    path: Annotated[Path, Arg(metavar="RUN", positional=True)]
-    """Run folder, or a file of splats: PLY, .spz, .splat, .usd, .glb or .sog."""
-    out: Annotated[Path | None, Arg(metavar="FILE")] = None
-    """HTML file (default: scene.html in the run, or next to the file)."""
-    sh_degree: int = 3
-    """Degree of the view-dependent colours, 0 to 3. Lower is smaller: 32 to 80 bytes per splat."""
 
 
 @register_command(
@@ -175,7 +153,7 @@ class Page(Common):
     first=("run", "ground_truth", "thresholds", "lpips_weights"),
 )
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(EvaluateOptions, Common):
+class EvaluateCommand(EvaluateOptions, Common):
     """Score images (PSNR, SSIM, LPIPS) and the mesh of a run."""
 
     run: RunPath
@@ -188,34 +166,26 @@ class Evaluate(EvaluateOptions, Common):
 
 @register_command("export", action="gs2d.cli.handlers:export", group=LOOK)
 @dataclass(frozen=True, kw_only=True)
-class Export(Common):
-    """Write the splats of a run in another format."""
+class ExportCommand(Common):
+    """Write the splats of a run in another format, or as a web page."""
 
     run: RunPath
     """Run folder, or a file of splats: PLY, .spz, .splat, .usd, .glb or .sog."""
-    out: Annotated[Path, Arg(metavar="FILE")]
-    """File to write. Its ending selects the format."""
-    layout: str | None = None
-    """Format: 2dgs (of the 2DGS paper), 3dgs (opens in common viewers), compressed, spz, spz4, splat, usd, gltf, sog,
-    streamed, or one of a package (default: by the ending of --out; .ply is 3dgs)."""
+    out: Annotated[Path | None, Arg(metavar="FILE")] = None
+    """File to write. Its ending selects the format (default: scene.html in the run, with --format html)."""
+    format: str | None = None
+    """Format: html (a page that works offline in any browser), 2dgs (of the 2DGS paper), 3dgs (opens in common
+    viewers), compressed, spz, spz4, splat, usd, gltf, sog, streamed, or one of a package (default: by the ending of
+    --out; .ply is 3dgs)."""
     bbox: BoxOption = None
     """Export only splats whose centre is in this box. `gs2d view` shows its numbers."""
-
-
-@register_command("report", action="gs2d.cli.handlers:report", group=LOOK)
-@dataclass(frozen=True, kw_only=True)
-class Report(Common):
-    """Write report.html of a run again."""
-
-    run: RunPath
-    """Run folder."""
-    memory: MemoryOption = None
-    """Memory limit in GiB (default: half of the memory of this machine or container)."""
+    sh_degree: Annotated[int, SETTING] = 3
+    """With html: degree of the view-dependent colours, 0 to 3. Lower is smaller: 32 to 80 bytes per splat."""
 
 
 @register_command("recipes", action="gs2d.cli.handlers:recipes", group=MEASURE)
 @dataclass(frozen=True, kw_only=True)
-class Recipes(Common):
+class RecipesCommand(Common):
     """List recipes, or show one: `gs2d recipes show NAME`."""
 
     action: Annotated[Literal["list", "show"], Arg(positional=True)] = "list"
@@ -230,24 +200,15 @@ class Recipes(Common):
     """Change the recipe, as in `gs2d train`; may be repeated."""
 
 
-@register_command("doctor", action="gs2d.cli.handlers:doctor", group=BEGIN)
+@register_command("doctor", action="gs2d.cli.doctor:doctor", group=BEGIN)
 @dataclass(frozen=True, kw_only=True)
-class Doctor(Common):
+class DoctorCommand(Common):
     """Check what this machine can run, and what is missing."""
-
-
-@register_command("completion", action="gs2d.cli.handlers:completion", group=BEGIN)
-@dataclass(frozen=True, kw_only=True)
-class Completion(Common):
-    """Print the completion script of a shell."""
-
-    shell: Annotated[Literal["bash", "zsh", "fish"], Arg(positional=True)]
-    """Shell. The first line of the output says where it goes."""
 
 
 @register_command("info", action="gs2d.cli.handlers:info", group=LOOK)
 @dataclass(frozen=True, kw_only=True)
-class Info(Common):
+class InfoCommand(Common):
     """Describe a run, a capture, or a file of splats, mesh or points."""
 
     path: Annotated[Path, Arg(metavar="PATH", positional=True)]

@@ -1,23 +1,37 @@
-"""``gs2d doctor``: what this machine can run, and how to get the rest."""
+"""``gs2d doctor``: what this machine can run, and how to install the rest."""
 
 from __future__ import annotations
 
+import importlib.metadata
+import shutil
 from typing import Any
 
-from gs2d.cli import commands as c
+from gs2d.cli.commands import DoctorCommand
 from gs2d.cli.console import Console
-from gs2d.cli.doctor_extras import OPTIONAL, torch_advice
+from gs2d.core.extras import FFMPEG, install
+
+CPU_TORCH = "pip install torch --index-url https://download.pytorch.org/whl/cpu"  # as pytorch.org has it
+_EXTRAS = {  # extra -> (the commands that need it, its packages)
+    "sfm": ("cameras of photographs (gs2d reconstruct, poses)", ("pycolmap",)),
+    "exr": ("float photographs, OpenEXR depth maps", ("OpenEXR", "tifffile")),
+    "geo": ("maps (gs2d survey --gps, --orthophoto)", ("pyproj", "tifffile")),
+    "markers": ("printed markers (gs2d survey --markers)", ("opencv-python-headless",)),
+    "texture": ("textured meshes (--texture)", ("xatlas",)),
+    "spz4": ("SPZ of version 4 (gs2d export --format spz4)", ("zstandard",)),
+    "usd": ("OpenUSD files (gs2d export --out x.usd)", ("usd-core",)),
+    "cluster": ("several machines (gs2d sweep, paper, blocks --cluster)", ("ray",)),
+}
+_HEIC = "pip install pi-heif (its wheel holds LGPL code), or convert to JPEG"
 
 
-def doctor(_command: c.Doctor, console: Console) -> None:
-    """Look at everything and say what is there."""
+def doctor(_command: DoctorCommand, console: Console) -> None:
+    """Show the machine, the rasterizers and the optional packages and programs."""
     from gs2d.io.run_dir import machine, versions
     from gs2d.render.backends import backend_report
 
     host, installed, backends = machine(), versions(), backend_report()
     chosen = next((status.name for status in backends if status.available), "none")
-    found = {thing.name: thing.look() for thing in OPTIONAL}
-    advice = torch_advice()
+    optional, advice = _optional(), _torch_advice()
     console.say(f"{host['processor']}, {host['cores']} cores, {host['system']}")
     console.say(", ".join(f"{name} {version}" for name, version in installed.items()))
     console.heading(f"Rasterizers (--backend auto takes: {chosen})")
@@ -26,18 +40,60 @@ def doctor(_command: c.Doctor, console: Console) -> None:
     if advice:
         console.say(advice, indent="       ")
     console.heading("For some commands")
-    for thing in OPTIONAL:
-        finding = found[thing.name]
-        _show(console, thing.command, finding.available, finding.details, finding.remedy)
+    for entry in optional.values():
+        _show(console, entry["used_by"], entry["available"], entry["details"], entry["remedy"])
     fields = ("name", "available", "reason", "remedy", "details")
-    result: dict[str, Any] = {"machine": host, "versions": installed, "auto": chosen, "advice": advice}
-    result["backends"] = [{field: getattr(status, field) for field in fields} for status in backends]
-    result["extras"] = {name: finding.available for name, finding in found.items()}
-    result["optional"] = {name: vars(finding) for name, finding in found.items()}
-    console.result(result)
+    console.result(
+        {
+            "machine": host,
+            "versions": installed,
+            "auto": chosen,
+            "advice": advice,
+            "backends": [{field: getattr(status, field) for field in fields} for status in backends],
+            "optional": optional,
+        }
+    )
 
 
 def _show(console: Console, name: str, available: bool, details: str, remedy: str) -> None:
     console.say(f"  {'yes' if available else 'no ':<3}  {name}: {details}", indent="       ")
     if not available and remedy:
         console.say(f"       to get it: {remedy}", indent="         ")
+
+
+def _optional() -> dict[str, dict[str, Any]]:
+    """Return what commands need beyond every installation: whether it is available, its version, how to get it."""
+    entries = {}
+    for extra, (used_by, packages) in _EXTRAS.items():
+        entries[extra] = _entry(used_by, {name: _version(name) for name in packages}, install(extra))
+    heic = next((name for name in ("pi-heif", "pillow-heif") if _version(name) is not None), "pi-heif")
+    entries["heic"] = _entry("HEIC photographs, as of an iPhone", {heic: _version(heic)}, _HEIC)
+    programs = {name: shutil.which(name) for name in ("ffmpeg", "ffprobe")}
+    entries["ffmpeg"] = _entry("videos, read and written (gs2d render --video x.mp4)", programs, FFMPEG)
+    return entries
+
+
+def _entry(used_by: str, found: dict[str, str | None], remedy: str) -> dict[str, Any]:
+    missing = [name for name, version in found.items() if version is None]
+    versions = ", ".join(f"{name} {version}" for name, version in found.items())
+    details = f"{', '.join(missing)} missing" if missing else versions
+    return {"used_by": used_by, "available": not missing, "details": details, "remedy": remedy if missing else ""}
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _torch_advice() -> str:
+    """Return advice if torch was built for CUDA and there is no usable GPU, else ""."""
+    import torch
+
+    if torch.version.cuda is None or torch.cuda.is_available():
+        return ""
+    return (
+        f"torch was built for CUDA {torch.version.cuda} (gigabytes), and no GPU is usable. The CPU build is enough "
+        f"here; install it in a fresh environment: {CPU_TORCH}"
+    )

@@ -8,29 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.cli import commands as c
-from gs2d.cli.arguments import options_of
-from gs2d.cli.commands import Common
 from gs2d.cli.console import Console
-from gs2d.cli.tables import score_rows, show_run, show_surface
+from gs2d.cli.results import score_rows, show_run, show_surface
 from gs2d.core.processes import here
-from gs2d.errors import ProtocolError, RecipeError
+from gs2d.errors import ProtocolError, RecipeError, RunError
 from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions, values
 
 EVERYDAY = ("best", "best-surface", "2dgs")  # recipes that `gs2d recipes` shows without --all
-
-
-def plan(command: c.Plan, console: Console) -> None:
-    """``gs2d plan``."""
-    from gs2d.pipeline.prepare.estimate import plan as make_plan
-    from gs2d.pipeline.prepare.estimate import set_words
-
-    found = make_plan(command, console.on_event)
-    console.close()
-    again = shlex.join(["gs2d", "train", *_words_of(command, c.Train), *set_words(found.budget)])
-    for line in found.lines():
-        console.say(line)
-    console.say(f"train with: {again}")
-    console.result({**asdict(found), "command": again})
 
 
 def _keep_to(gib: float | None) -> None:
@@ -40,30 +24,11 @@ def _keep_to(gib: float | None) -> None:
     use_memory(gib)
 
 
-def _words_of(command: Common, kind: type) -> list[str]:
-    """Return the options of a command that differ from their defaults, as words of the command line of ``kind``."""
-    words: list[str] = []
-    for option in sorted(options_of(kind), key=lambda option: (bool(option.flags), option.field != "out")):
-        value = getattr(command, option.field)
-        if value == option.default or option.owner is Common:
-            continue
-        values = [f"{each:g}" if isinstance(each, float) else str(each) for each in _listed(value)]
-        flag = list(option.flags[:1])
-        if option.kind is bool:
-            words += flag
-        elif option.repeated:
-            words += [word for each in values for word in (*flag, each)]
-        else:
-            words += [*flag, *values]
-    return words
-
-
-def _listed(value: object) -> tuple[object, ...]:
-    return value if isinstance(value, tuple) else (value,)
-
-
-def train(command: c.Train, console: Console) -> None:
+def train(command: c.TrainCommand, console: Console) -> None:
     """``gs2d train``."""
+    if command.dry_run:
+        _estimate(command, console)
+        return
     from gs2d.pipeline.train.train_run import train as run_training
 
     run = run_training(command, console.on_event)
@@ -72,7 +37,18 @@ def train(command: c.Train, console: Console) -> None:
         show_run(run.path, run.metrics(), console)
 
 
-def demo(command: c.Demo, console: Console) -> None:
+def _estimate(command: c.TrainCommand, console: Console) -> None:
+    """Show what a training would take."""
+    from gs2d.pipeline.prepare.estimate import plan
+
+    estimate = plan(command, console.on_event)
+    console.close()
+    for line in estimate.lines():
+        console.say(line)
+    console.result(asdict(estimate))
+
+
+def demo(command: c.DemoCommand, console: Console) -> None:
     """``gs2d demo``."""
     from gs2d.pipeline.demo import demo as run_demo
 
@@ -81,7 +57,7 @@ def demo(command: c.Demo, console: Console) -> None:
     show_run(run.path, run.metrics(), console)
 
 
-def mesh(command: c.Mesh, console: Console) -> None:
+def mesh(command: c.MeshCommand, console: Console) -> None:
     """``gs2d mesh``."""
     from gs2d.pipeline.finish.run_mesh import mesh_run
 
@@ -106,7 +82,7 @@ def mesh(command: c.Mesh, console: Console) -> None:
     console.result(result)
 
 
-def _textured_mesh(command: c.Mesh, mesh_options: Any, console: Console) -> None:
+def _textured_mesh(command: c.MeshCommand, mesh_options: Any, console: Console) -> None:
     from gs2d.pipeline.finish.run_texture import texture_run
 
     if command.splats is not None:
@@ -128,14 +104,14 @@ def _textured_mesh(command: c.Mesh, mesh_options: Any, console: Console) -> None
     console.result(result)
 
 
-def _refuse_texture_options(command: c.Mesh) -> None:
+def _refuse_texture_options(command: c.MeshCommand) -> None:
     """Refuse an option that would do nothing."""
     for name, default in values(TextureOptions, TextureOptions()).items():
         if getattr(command, name) != default:
-            raise ProtocolError(f"--{name.replace('_', '-')} needs --texture; give both")
+            raise ProtocolError(f"--set {name} needs --texture; give both")
 
 
-def render(command: c.Render, console: Console) -> None:
+def render(command: c.RenderCommand, console: Console) -> None:
     """``gs2d render``."""
     from gs2d.pipeline.finish.run_images import render_run
 
@@ -155,7 +131,7 @@ def render(command: c.Render, console: Console) -> None:
     console.result(result)
 
 
-def view(command: c.View, console: Console) -> None:
+def view(command: c.ViewCommand, console: Console) -> None:
     """``gs2d view``: until Ctrl-C."""
     from gs2d.pipeline.look.view import open_viewer, serve
 
@@ -170,17 +146,7 @@ def view(command: c.View, console: Console) -> None:
         server.close()
 
 
-def page(command: c.Page, console: Console) -> None:
-    """``gs2d page``."""
-    from gs2d.pipeline.look.page import page_run
-
-    result = page_run(command.path, command.out, sh_degree=command.sh_degree, on_event=console.on_event)
-    console.close()
-    console.say(f"{result['file']}: {result['splats']:,} splats, {result['bytes'] / 1e6:.1f} MB; open it in a browser")
-    console.result(result)
-
-
-def evaluate(command: c.Evaluate, console: Console) -> None:
+def evaluate(command: c.EvaluateCommand, console: Console) -> None:
     """``gs2d evaluate``."""
     from gs2d.pipeline.finish.evaluate import evaluate_run
 
@@ -188,9 +154,9 @@ def evaluate(command: c.Evaluate, console: Console) -> None:
     result = evaluate_run(command.run, command, console.on_event, threads=command.threads)
     console.close()
     rows = [row for split in ("train", "test") for row in score_rows(split, result.get(split))]
-    if command.match_exposure:
+    if "exposure" in command.matched:
         rows += score_rows("test, matched", result["test_matched"])
-    if command.match_poses:
+    if "poses" in command.matched:
         rows += score_rows("test, aligned", result["test_aligned"])
     console.table("", ["views", "images", "PSNR dB", "SSIM", "LPIPS 0..1", "LPIPS -1..1"], rows)
     for split in ("train", "test"):
@@ -201,30 +167,37 @@ def evaluate(command: c.Evaluate, console: Console) -> None:
     console.result(result)
 
 
-def export(command: c.Export, console: Console) -> None:
+def export(command: c.ExportCommand, console: Console) -> None:
     """``gs2d export``."""
     from gs2d.pipeline.finish.export import export_run
+    from gs2d.pipeline.look.page import SUFFIXES
 
-    result = export_run(command.run, command.out, command.layout, bbox=command.bbox)
+    if command.format == "html" or (command.out is not None and command.out.suffix.lower() in SUFFIXES):
+        _export_page(command, console)
+        return
+    if command.out is None:
+        raise RunError("gs2d export needs --out FILE, whose ending selects the format")
+    result = export_run(command.run, command.out, command.format, bbox=command.bbox)
     console.say(
-        f"{result['file']}: {result['splats']:,} splats, {result['bytes'] / 1e6:.1f} MB, layout {result['layout']}"
+        f"{result['file']}: {result['splats']:,} splats, {result['bytes'] / 1e6:.1f} MB, format {result['layout']}"
     )
     for note in result["notes"]:
         console.say(note)
     console.result(result)
 
 
-def report(command: c.Report, console: Console) -> None:
-    """``gs2d report``."""
-    from gs2d.pipeline.finish.run_report import report_run
+def _export_page(command: c.ExportCommand, console: Console) -> None:
+    from gs2d.pipeline.look.page import page_run
 
-    _keep_to(command.memory)
-    path = report_run(command.run, console.on_event)
-    console.say(str(path))
-    console.result({"file": str(path)})
+    if command.format not in (None, "html") or command.bbox is not None:
+        raise RunError("an .html page takes neither another --format nor --bbox; leave them out")
+    result = page_run(command.run, command.out, sh_degree=command.sh_degree, on_event=console.on_event)
+    console.close()
+    console.say(f"{result['file']}: {result['splats']:,} splats, {result['bytes'] / 1e6:.1f} MB; open it in a browser")
+    console.result(result)
 
 
-def recipes(command: c.Recipes, console: Console) -> None:
+def recipes(command: c.RecipesCommand, console: Console) -> None:
     """``gs2d recipes``."""
     from gs2d.config.describe import describe_recipe
     from gs2d.config.presets import RECIPES, about_recipe, get_recipe
@@ -251,7 +224,7 @@ def recipes(command: c.Recipes, console: Console) -> None:
     console.result(to_json(recipe))
 
 
-def reconstruct(command: c.Reconstruct, console: Console) -> None:
+def reconstruct(command: c.ReconstructCommand, console: Console) -> None:
     """``gs2d reconstruct``: then the figures, the files and the next command."""
     from gs2d.core.json_files import read_json
     from gs2d.io.run_dir import PAGE
@@ -265,9 +238,9 @@ def reconstruct(command: c.Reconstruct, console: Console) -> None:
     console.say(f"look at it: open {PAGE} in a browser, or gs2d view {shlex.quote(str(run.path))}")
 
 
-def poses(command: c.Poses, console: Console) -> None:
+def poses(command: c.PosesCommand, console: Console) -> None:
     """``gs2d poses``."""
-    from gs2d.cli.poses import poses_lines
+    from gs2d.cli.results import poses_lines
     from gs2d.pipeline.prepare.pose_finding import find_poses
 
     result = find_poses(command, console.on_event)
@@ -277,24 +250,7 @@ def poses(command: c.Poses, console: Console) -> None:
     console.result(result)
 
 
-def completion(command: c.Completion, console: Console) -> None:
-    """Print a script for a shell, unwrapped."""
-    from gs2d.cli.completion import script  # start-up time
-
-    if console.as_json:
-        console.result({"shell": command.shell, "script": script(command.shell)})
-    else:
-        print(script(command.shell), end="")
-
-
-def doctor(command: c.Doctor, console: Console) -> None:
-    """``gs2d doctor``."""
-    from gs2d.cli.doctor import doctor as look
-
-    look(command, console)
-
-
-def info(command: c.Info, console: Console) -> None:
+def info(command: c.InfoCommand, console: Console) -> None:
     """``gs2d info``."""
     from gs2d.data.archive import is_archive
     from gs2d.io.run_dir import is_run, open_run

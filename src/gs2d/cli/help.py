@@ -6,10 +6,10 @@ import argparse
 from collections.abc import Sequence
 
 import gs2d
-from gs2d.cli.arguments import NAMES, Option, about, options_of
+from gs2d.cli.command_line import NAMES, Option, about, options_of
+from gs2d.cli.command_registry import COMMANDS, GROUPS
 from gs2d.cli.commands import Common
 from gs2d.cli.layout import terminal_width
-from gs2d.cli.registry import COMMANDS, GROUPS
 from gs2d.pipeline.prepare.options import CommonTraining, HowItRuns, PoseEstimation, Training
 
 _SLOGAN = "Turns photographs into a surface mesh and a 3D scene that you can view from any angle."
@@ -61,7 +61,7 @@ def program_help(*, everything: bool = False) -> list[str]:
 def command_help(name: str, *, everything: bool = False) -> list[str]:
     """Return the help of a command: its most used options and the number of the others, or all options in groups."""
     options = options_of(NAMES[name])
-    needed = sorted((o for o in options if o.required or not o.flags), key=lambda o: bool(o.flags))
+    needed = sorted((o for o in options if o.required or o.positional), key=lambda o: not o.positional)
     words = [o.usage if o.required else f"[{o.usage}]" for o in needed]
     titled = _groups(name, options)
     more = sum(len(group) for title, group in titled.items() if title)
@@ -71,7 +71,10 @@ def command_help(name: str, *, everything: bool = False) -> list[str]:
         if everything or not title:
             shown = parser.add_argument_group(title or None)
             for option in group:
-                option.add_to(shown, option_text(option))
+                if option.mark.setting:
+                    shown.add_argument(option.field, metavar=option.usage, help=option_text(option).replace("%", "%%"))
+                else:
+                    option.add_to(shown, option_text(option))
     return parser.format_help().splitlines()
 
 
@@ -87,7 +90,7 @@ def _parser(prog: str, usage: str, description: str, epilog: str) -> argparse.Ar
 def _groups(name: str, options: Sequence[Option]) -> dict[str, list[Option]]:
     """Return all options by heading: the most used ones under "", then those of the command, then shared ones."""
     by_field = {option.field: option for option in options}
-    own = sorted((o for o in options if o.owner is not Common), key=lambda o: (bool(o.flags), not o.required))
+    own = sorted((o for o in options if o.owner is not Common), key=lambda o: (not o.positional, not o.required))
     first = [by_field[field] for field in COMMANDS[name].first] or own
     groups: dict[str, list[Option]] = {title: [] for title in ("", _OWN, *TITLES.values())}
     groups[""] = first
@@ -100,8 +103,9 @@ def _groups(name: str, options: Sequence[Option]) -> dict[str, list[Option]]:
 def option_text(option: Option) -> str:
     """Return the help of an option: its docstring, choices that its metavar does not list, and the default."""
     values = "" if all(choice in option.usage for choice in option.choices) else f" {', '.join(option.choices)}."
-    said = "default:" in option.about or option.kind is bool or option.default in (None, (), "")
-    return option.about + values + ("" if said else f" (default: {_shown(option.default)})")
+    no_default = option.kind is bool or option.required or option.default in (None, (), "")
+    stated = "default:" in option.about or no_default
+    return option.about + values + ("" if stated else f" (default: {_shown(option.default)})")
 
 
 def _shown(value: object) -> str:

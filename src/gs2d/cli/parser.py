@@ -5,18 +5,20 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import difflib
+import itertools
 import re
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from gs2d.cli.arguments import NAMES, fields_of, options_of
+from gs2d.cli.command_line import NAMES, Option, fields_of, options_of
 from gs2d.cli.commands import Common
 from gs2d.core.missing import where_it_ends
 from gs2d.pipeline.prepare.options import HowItRuns
 
 HELP_WORDS = ("-h", "--help", "--help-all")
+_OVERRIDES = "overrides"  # the field of --set, where a command trains
 _ALIKE = 0.6  # difflib's ratio from which a word is proposed
 _MOST = 3  # proposed words
 _NUMBER = re.compile(r"-\.?\d")  # a value, not an option
@@ -52,8 +54,12 @@ class _Parser(argparse.ArgumentParser):
     def __init__(self, name: str) -> None:
         super().__init__(usage="", add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS)
         self._negative_number_matcher = _NUMBER  # as in Python 3.14; before, -1e-3 was an option
-        for option in options_of(NAMES[name]):
-            option.add_to(self)
+        options = options_of(NAMES[name])
+        for option in options:
+            if not option.mark.setting:
+                option.add_to(self)
+        if _has_settings(options) and not _trains(options):
+            self.add_argument("--set", dest=_OVERRIDES, action="append")
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(message.removeprefix("argument "))
@@ -71,7 +77,7 @@ def parse(argv: Sequence[str]) -> Common:
     if name not in NAMES:
         raise UsageError(_with_help(_no_command(name, words), "gs2d --help"))
     try:
-        command: Common = _made(NAMES[name], _given(name, [_with_dashes(word) for word in words]))
+        command: Common = _made(NAMES[name], _given(name, _spelled(name, words)))
     except UsageError as error:
         raise UsageError(_with_help(str(error), f"gs2d {name} --help")) from None
     if isinstance(command, HowItRuns) and command.resume and command.overwrite:
@@ -79,18 +85,29 @@ def parse(argv: Sequence[str]) -> Common:
     return command
 
 
+def _has_settings(options: Sequence[Option]) -> bool:
+    return any(option.mark.setting for option in options)
+
+
+def _trains(options: Sequence[Option]) -> bool:
+    """Whether ``--set`` also changes the recipe."""
+    return any(option.field == _OVERRIDES for option in options)
+
+
 def _given(name: str, words: Sequence[str]) -> dict[str, Any]:
     """Return the values of a command line by field."""
     parsed, left = _Parser(name).parse_known_intermixed_args(words)
     options = options_of(NAMES[name])
     if unknown := next((word for word in left if _is_flag(word)), None):
-        flags = [flag for option in options for flag in option.flags]
-        raise UsageError(_no_option(name, unknown.partition("=")[0], flags))
+        raise UsageError(_no_option(name, unknown.partition("=")[0], options))
     if left:
-        arguments = " ".join(option.usage for option in options if not option.flags)
+        arguments = " ".join(option.usage for option in options if option.positional)
         takes = f"{arguments} and options; a path with spaces needs quotes" if arguments else "options only"
         raise UsageError(f"unexpected {left[0]!r}: the command takes {takes}")
     given = {field: value for field, value in vars(parsed).items() if value not in (None, [])}
+    given |= _settings(name, given.pop(_OVERRIDES, ()), options)
+    if given.get("dry_run"):
+        given.setdefault("out", Path("RUN"))  # nothing is written
     if missing := [option.usage for option in options if option.required and option.field not in given]:
         raise UsageError(f"gs2d {name} needs {' and '.join(missing)}")
     return given
@@ -108,10 +125,36 @@ def _made(kind: type, given: Mapping[str, Any]) -> Any:
     return kind(**chosen)
 
 
-def _with_dashes(word: str) -> str:
-    """Return an option with dashes for underscores: --max_size."""
-    flag, equals, value = word.partition("=")
-    return flag.replace("_", "-") + equals + value if word.startswith("--") else word
+def _settings(name: str, changes: Sequence[str], options: Sequence[Option]) -> dict[str, Any]:
+    """Return the values of ``--set`` by field: settings of the command, and changes of the recipe if it trains."""
+    settings = {option.field: option for option in options if option.mark.setting}
+    given: dict[str, Any] = {}
+    for change in changes:
+        word, _, text = change.partition("=")
+        if word in settings:
+            try:
+                given[word] = settings[word].read(text)
+            except ValueError as error:
+                raise UsageError(str(error)) from None
+        elif _trains(options):
+            given.setdefault(_OVERRIDES, []).append(change)
+        else:
+            known = f"--set NAME=VALUE takes {', '.join(settings)}"
+            raise UsageError(f"{known}; got {change!r}{_meant(word, settings)}")
+    return given
+
+
+def _spelled(name: str, words: Sequence[str]) -> list[str]:
+    """Return the words with dashes for underscores in options (--max_size), and values of options that have none."""
+    spelled = []
+    bare = {option.name: option.mark.bare for option in options_of(NAMES[name]) if option.mark.bare}
+    for word, following in itertools.zip_longest(words, words[1:], fillvalue=""):
+        flag, equals, value = word.partition("=")
+        flag = flag.replace("_", "-") if word.startswith("--") else flag
+        if flag in bare and not equals and not following.isdecimal():
+            equals, value = "=", bare[flag]
+        spelled.append(flag + equals + value)
+    return spelled
 
 
 def _is_flag(word: str) -> bool:
@@ -165,11 +208,15 @@ def _no_command(name: str, words: Sequence[str]) -> str:
     return f"no command {name!r}{_meant(name.lower(), NAMES, 'gs2d ')}"
 
 
-def _no_option(name: str, flag: str, known: Sequence[str]) -> str:
+def _no_option(name: str, flag: str, options: Sequence[Option]) -> str:
     """Return the message for an unknown option: a similar one, or the commands that have it."""
+    known = [word for option in options for word in option.flags]
     here, advice = _ELSEWHERE.get(flag, ("", ""))
     if here in known or (advice and not here):
         return f"gs2d {name} has no option {flag}; {advice}"
+    setting = next((o for o in options if o.mark.setting and o.field == flag.strip("-").replace("-", "_")), None)
+    if setting is not None:
+        return f"gs2d {name} has no option {flag}; did you mean {setting.usage}?"
     others = [
         f"gs2d {other}"
         for other, command in NAMES.items()

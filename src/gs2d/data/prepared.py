@@ -162,7 +162,7 @@ def _is_archive(file: Path) -> bool:
         return False
 
 
-def check_disk(folder: Path, views: Sequence[View], disk: int | None) -> None:
+def check_disk(folder: Path, views: Sequence[View]) -> None:
     """Raise DiskError if the prepared images of views do not fit on the disk.
 
     Parameters
@@ -170,16 +170,13 @@ def check_disk(folder: Path, views: Sequence[View], disk: int | None) -> None:
     folder : Path
         Target folder; need not exist.
     views : sequence of View
-    disk : int or None
-        Limit in bytes set by the user.
     """
     existing = next(path for path in (folder, *folder.resolve().parents) if path.exists())
     free, need = shutil.disk_usage(existing).free, packed_bytes(views)
-    room, source = (free, f"free at {existing}") if disk is None or free < disk else (disk, "allowed by --disk")
-    if need > room:
+    if need > free:
         raise DiskError(
-            f"{len(views):,} prepared images need about {need / 2**30:.2g} GiB of disk, got {room / 2**30:.2g} GiB "
-            f"{source}; use a larger --downscale, another --out, or --prepare never"
+            f"{len(views):,} prepared images need about {need / 2**30:.2g} GiB of disk, got {free / 2**30:.2g} GiB "
+            f"free at {existing}; use a larger --downscale, another --out, or --set prepare=never"
         )
 
 

@@ -46,7 +46,7 @@ def check_video(path: Path, fps: float, frames: int) -> Path:
     if suffix not in SUFFIXES:
         raise DataError(f"--video must name a .mp4 or .webp file, got {path}")
     if not 0.1 <= fps <= 240:
-        raise DataError(f"--fps must be 0.1 to 240 frames a second, got {fps:g}")
+        raise DataError(f"fps must be 0.1 to 240 frames a second, got {fps:g}")
     if frames < 2:
         raise DataError(f"--video needs at least 2 frames, got {frames}; ask for more")
     if suffix == ".mp4" and (missing := _missing()):

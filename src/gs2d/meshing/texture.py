@@ -111,7 +111,7 @@ def required(module: str) -> Any:
 def simplified(mesh: Mesh, faces: int) -> Mesh:
     """Simplify to at most ``faces`` triangles by quadric edge collapse; a simplified mesh has no vertex colours."""
     if faces < 4:
-        raise ProtocolError(f"--faces must be an integer >= 4, got {faces}")
+        raise ProtocolError(f"faces must be an integer >= 4, got {faces}")
     if len(mesh.faces) <= faces:
         return mesh
     vertices = mesh.vertices.astype(np.float64)
@@ -276,7 +276,7 @@ def bake(atlas: Atlas, images: ColorSources, size: int, *, best: int = BEST, thr
         If the size is out of range, or no image sees the surface.
     """
     if not MIN_SIZE <= size <= MAX_SIZE:
-        raise ProtocolError(f"--texture-size must be {MIN_SIZE} to {MAX_SIZE} texels, got {size}")
+        raise ProtocolError(f"texture_size must be {MIN_SIZE} to {MAX_SIZE} texels, got {size}")
     texels = texels_of(atlas, size)
     colors, seen = surface_colors(atlas.mesh, texels, images, best=best, threads=threads)
     fill_unseen(atlas, texels, colors, seen)

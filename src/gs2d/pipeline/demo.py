@@ -9,7 +9,7 @@ from gs2d.io.run_dir import RunFolder, check_claim, is_run, open_run
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.prepare.limits import use_threads
-from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, HowItRuns, TrainOptions, values
+from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, HowItRuns, TrainOptions, learned_names, values
 from gs2d.pipeline.prepare.resolve import check_options
 from gs2d.pipeline.run_parts import DEMO
 from gs2d.pipeline.train.train_run import check_viewer, train
@@ -58,8 +58,8 @@ def demo(
             threads=options.threads,
         )
     for file, varied, option in (
-        (GAINS, options.vary_exposure, "--vary-exposure"),
-        (TRUE_POSES, options.vary_poses, "--vary-poses"),
+        (GAINS, options.vary_exposure, "vary_exposure"),
+        (TRUE_POSES, options.vary_poses, "vary_poses"),
     ):
         if (capture / file).exists() != varied:
             raise RunError(
@@ -68,8 +68,9 @@ def demo(
             )
     run = train(training, on_event, title=TITLE, allowed=(CAPTURE,))
     truth = capture / TRUTH
+    matched = tuple(name for name in learned_names(options.learn) if name == "poses")
     with attempted("scores of the surface", again("evaluate", run.path, "--ground-truth", truth), on_event):
-        evaluate_run(run.path, EvaluateOptions(ground_truth=truth, match_poses=options.refine_poses), on_event)
+        evaluate_run(run.path, EvaluateOptions(ground_truth=truth, match=matched), on_event)
     return run
 
 
@@ -88,11 +89,8 @@ def _train_options(options: DemoOptions, *, overwrite: bool) -> TrainOptions:
         scene=options.out / CAPTURE,
         out=options.out,
         recipe=options.recipe,
-        exposure=options.exposure,
-        no_exposure=not options.exposure,
+        learn=options.learn,
         viewer=options.viewer,
-        viewer_port=options.viewer_port,
-        refine_poses=options.refine_poses,
         schedule_scale=SCHEDULE_SCALE if options.schedule_scale is None else options.schedule_scale,
         page=options.page,
         **shared,

@@ -91,7 +91,7 @@ def train(
     on_event : callable
         Receives the events of :mod:`gs2d.training.events`.
     options : gs2d.Training
-        Further options of ``gs2d train``: protocol, robust, exposure, overrides, refine_poses and so on. Its recipe is
+        Further options of ``gs2d train``: protocol, robust, learn, overrides and so on. Its recipe is
         not used, nor are options of run folders and of loading the capture.
 
     Returns

@@ -248,7 +248,7 @@ def _last_words(phase: str, code: int, log: Path) -> str:
     lines = [line.strip() for line in log.read_text("utf-8", "replace").splitlines() if line.strip()]
     how = f"was ended by signal {-code}" if code < 0 else f"ended with code {code}"
     output = lines[-1][:300] if lines else "no output"
-    remedy = "use less memory: --threads 2, --feature-size 1000" if code < 0 else "if the disk is not full, report it"
+    remedy = "use less memory: --threads 2, --set feature_size=1000" if code < 0 else "if the disk has room, report it"
     if (free := shutil.disk_usage(log.parent).free) < _LITTLE_SPACE:  # the log may be cut short too
         remedy = f"{free / 1e6:.0f} MB are free on the disk of --out: free some space or choose another folder"
     return f"COLMAP {how} while {_PHASES.get(phase, 'starting')}: {output}; {remedy}"

@@ -11,7 +11,7 @@ from PIL import Image
 from gs2d.core.image_arrays import is_twice_as_wide
 
 PANORAMA = "EQUIRECTANGULAR"
-FINER = 2  # times --feature-size: a panorama covers four times the field of view of a photograph
+FINER = 2  # times feature_size: a panorama covers four times the field of view of a photograph
 _SMALL = (512, 256)  # px; size at which edges are compared, to average out noise and compression
 _STEP, _LEVELS = 3.0, 2.0  # largest difference across the seam: factor of that between columns, plus grey levels
 _ONE_COLOUR = 0.5  # of the spread of middle rows: largest spread of the top row, which is a single direction

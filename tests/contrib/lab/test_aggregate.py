@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
-from gs2d.cli.commands import Train
+from gs2d.cli.commands import TrainCommand
 from gs2d.cli.parser import parse
 from gs2d.config.protocols import MetricConventions
 from gs2d.contrib.lab.aggregate import Cell, Results, check_claim, read_cell
 from gs2d.contrib.lab.deviations import deviations_of
-from gs2d.contrib.lab.options import PaperOptions
-from gs2d.contrib.lab.plan import commands_of, make_plan
-from gs2d.contrib.lab.tables import DTU, NERF_SYNTHETIC, PAPER_TABLES, TNT, Claim
+from gs2d.contrib.lab.lab_options import PaperOptions
+from gs2d.contrib.lab.paper_tables import DTU, NERF_SYNTHETIC, PAPER_TABLES, TNT, Claim
+from gs2d.contrib.lab.table_plan import commands_of, make_plan
 from gs2d.pipeline.prepare.options import TrainOptions, values
 from paper_cells import make_cell, make_row
 from tiny import write_capture
@@ -122,5 +122,5 @@ def test_the_printed_commands_are_the_ones_that_were_run(tmp_path: Path) -> None
         words = shlex.split(commands_of(job)[0])
         assert words[0] == "gs2d"
         command = parse(words[1:])
-        assert isinstance(command, Train)
+        assert isinstance(command, TrainCommand)
         assert values(TrainOptions, command) == values(TrainOptions, replace(job.train, resume=False))

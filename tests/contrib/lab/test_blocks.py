@@ -122,7 +122,9 @@ def test_blocks_of_the_default_recipe_begin_with_a_dense_start_of_their_own_cell
 ) -> None:
     capture, job = tmp_path / "capture", tmp_path / "job"
     write_flight(capture, Flight(16, width=64, height=48, points=800, side=90.0), threads=1)
-    options = tiny_blocks(capture, job, recipe="best", robust="auto", exposure=True, overrides=(), schedule_scale=0.002)
+    options = tiny_blocks(
+        capture, job, recipe="best", robust="auto", learn="exposure", overrides=(), schedule_scale=0.002
+    )
     blocks(options)
     split, starts = read_split(job / "partition"), []
     for cell, block in enumerate(split.blocks):

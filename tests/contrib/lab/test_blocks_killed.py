@@ -22,7 +22,7 @@ KILLS = 20
 def command(capture: Path, job: Path) -> list[str]:
     """Return the command that does what ``tiny_blocks`` does, two blocks at a time."""
     words = ["blocks", str(capture), "--out", str(job), "--blocks", "2x2", "--recipe", "2dgs", "--robust", "off"]
-    words += ["--partition", "min_views=3", "--partition", "coarse.schedule=0.5", "--schedule-scale", "0.0006"]
+    words += ["--set", "partition.min_views=3", "--set", "partition.coarse.schedule=0.5", "--schedule-scale", "0.0006"]
     words += [word for change in (*WORDS, "surface.densify.max_splats=600") for word in ("--set", change)]
     words += ["--backend", "cpu", "--threads", "1", "--no-page", "--checkpoint-every", "4", "--slots", "2", "--quiet"]
     return [sys.executable, "-m", "gs2d", *words]

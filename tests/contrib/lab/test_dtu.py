@@ -14,7 +14,7 @@ from gs2d.contrib.lab import evaluate_dtu as dtu
 from gs2d.contrib.lab.dataset_folders import dtu_truth_files
 from gs2d.contrib.lab.evaluate_dtu import (
     DtuTruth,
-    Silhouette,
+    ViewSilhouette,
     evaluate_dtu,
     inside_silhouettes,
     read_dtu_truth,
@@ -145,7 +145,7 @@ def test_thinning_keeps_points_apart_and_leaves_no_gap(slab_size: int, flatten: 
 # culling
 
 
-def views(width: int = 160) -> list[Silhouette]:
+def views(width: int = 160) -> list[ViewSilhouette]:
     """Three cameras that see [-1, 1]^2 as 80 of 160 pixels; the silhouette is its left half."""
     out = []
     for shift in (-0.05, 0.0, 0.05):
@@ -153,7 +153,7 @@ def views(width: int = 160) -> list[Silhouette]:
         camera = look_at(eye, np.array([0, shift, 0.0]), np.array([0, 1.0, 0]), width=160, height=160, fx=160)
         mask = np.zeros((width, width), bool)
         mask[:, : width // 2] = True
-        out.append(Silhouette(camera, mask))
+        out.append(ViewSilhouette(camera, mask))
     return out
 
 
@@ -165,7 +165,7 @@ def test_vertices_outside_a_widened_silhouette_go_and_those_outside_the_image_st
     """
     points = np.array([[-0.5, 0, 0], [0.04, 0, 0], [0.06, 0, 0], [0.5, 0, 0], [9, 0, 0], [0.5, 0, 9]])
     assert inside_silhouettes(points, views(width)).tolist() == [True, True, False, False, True, True]
-    nothing = [Silhouette(views()[0].camera, np.zeros((160, 160), bool))]
+    nothing = [ViewSilhouette(views()[0].camera, np.zeros((160, 160), bool))]
     assert inside_silhouettes(points[:2], nothing).tolist() == [False, False]
 
 

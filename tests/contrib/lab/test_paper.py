@@ -16,12 +16,12 @@ import pytest
 from gs2d.cli import run
 from gs2d.contrib.lab import jobs as jobs_module
 from gs2d.contrib.lab.aggregate import FIGURES, Results, Row, check_claim
-from gs2d.contrib.lab.options import PaperOptions
+from gs2d.contrib.lab.lab_options import PaperOptions
 from gs2d.contrib.lab.paper import paper
-from gs2d.contrib.lab.plan import make_plan
+from gs2d.contrib.lab.paper_tables import PAPER_TABLES, TNT, Claim, recipe_table
 from gs2d.contrib.lab.render import parts_of, to_csv, to_latex, to_markdown
 from gs2d.contrib.lab.scenes import find_scenes, missing_scenes
-from gs2d.contrib.lab.tables import PAPER_TABLES, TNT, Claim, recipe_table
+from gs2d.contrib.lab.table_plan import make_plan
 from gs2d.errors import DataError, RunError
 from paper_cells import TINY, draw_nothing, make_cell, make_row
 from tiny import write_ball_mesh, write_capture

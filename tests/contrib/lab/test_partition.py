@@ -1,4 +1,4 @@
-"""Partitions as data: what `--blocks` and `--partition` say, and what is refused."""
+"""Partitions as data: what `--blocks` and `--set partition.NAME=VALUE` say, and what is refused."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ def test_fields_are_changed_by_name_and_come_back_from_json() -> None:
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ("margins=1", "--partition must be field=value with margin, min_share"),
-        ("margin", "--partition must be field=value with margin, min_share"),
-        ("coarse=3", "--partition must be field=value with margin, min_share"),
-        ("grid.x=3", "--partition must be field=value with margin, min_share"),
+        ("margins=1", "--set partition.FIELD=VALUE takes the fields margin, min_share"),
+        ("margin", "--set partition.FIELD=VALUE takes the fields margin, min_share"),
+        ("coarse=3", "--set partition.FIELD=VALUE takes the fields margin, min_share"),
+        ("grid.x=3", "--set partition.FIELD=VALUE takes the fields margin, min_share"),
         ("margin=wide", "partition.margin must be a number, got 'wide'"),
         ("margin=-1", "partition.margin must be a finite number >= 0, got -1"),
         ("margin=1.5", "partition.margin must be at most 1 side of a cell, got 1.5"),

@@ -13,7 +13,7 @@ from gs2d.config.quantities import EXPOSURE
 from gs2d.contrib.lab.block_start import ABSENT, FROZEN, OWN, read_start
 from gs2d.contrib.lab.partition import Partition
 from gs2d.contrib.lab.settle import block_recipe, budget_of, with_budget
-from gs2d.contrib.lab.split import Block, Split, choose_views, merge, read_split, split_model, start_file
+from gs2d.contrib.lab.split import BlockOfSplit, Split, choose_views, merge, read_split, split_model, start_file
 from gs2d.core.splats import Splats
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
@@ -85,7 +85,7 @@ def test_a_merge_takes_from_each_block_what_lies_in_its_cell_and_the_rest_from_t
     assert len(merge(splats, found, {**trained, "0-0": beyond}, rows)) < 200  # what left its cell is cropped
 
 
-BLOCK = Block("0-0", ("a",), floor=0, own=1, frozen=1, core=1, weight=0.4, extent=1.0)
+BLOCK = BlockOfSplit("0-0", ("a",), floor=0, own=1, frozen=1, core=1, weight=0.4, extent=1.0)
 
 
 def test_recipes_of_a_block_have_a_share_of_the_budget_given_exposures_and_all_degrees_from_the_start() -> None:

@@ -1,4 +1,4 @@
-"""`gs2d georeference`: every source, every error, and exported files."""
+"""`gs2d survey`: every source, every error, and exported files."""
 
 from __future__ import annotations
 
@@ -200,7 +200,8 @@ def test_a_known_distance_and_up(run: Path) -> None:
         (["--positions", "no-such.csv"], "expected a file at no-such.csv"),
         (["--control", "control.csv"], "has no photograph of that name|no photograph of"),
         (["--markers", "0"], "positive number"),
-        (["--up", "0", "0", "0", "--gps"], "--up must be a direction"),
+        (["--set", "up=0,0,0", "--gps"], "up must be a direction"),
+        (["--resolution", "1"], "belongs to --orthophoto"),
     ],
 )
 def test_bad_input_is_one_line(
@@ -214,7 +215,7 @@ def test_bad_input_is_one_line(
     pytest.importorskip("pyproj")
     monkeypatch.chdir(tmp_path)
     Path("control.csv").write_text("name,x,y,z,photo,u,v\nA,1,2,3,nowhere.jpg,1,1\nB,2,2,3,nowhere.jpg,1,1\n")
-    line = error_of(["georeference", str(run), "--quiet", *words], capsys)
+    line = error_of(["survey", str(run), "--quiet", *words], capsys)
     assert any(part in line for part in text.split("|")), line
 
 
@@ -251,7 +252,7 @@ def test_exported_splats_are_exact_a_million_metres_from_the_origin(
     run: Path, tmp_path: Path, name: str, exact: float
 ) -> None:
     g, out = placed(run), tmp_path / name
-    assert gs2d(["georeference", str(run), "--out", str(out), "--quiet"]) == 0
+    assert gs2d(["survey", str(run), "--out", str(out), "--quiet"]) == 0
     beside = Georeference.from_json(read_json(tmp_path / f"{name}.georeference.json"))
     assert (beside.epsg, beside.origin.tolist()) == (32632, g.origin.tolist())
     assert [float(x) for x in (tmp_path / f"{out.stem}_offset.xyz").read_text().split()] == g.origin.tolist()
@@ -269,7 +270,7 @@ def test_the_exported_mesh_is_exact_a_million_metres_from_the_origin(
 ) -> None:
     g, out = placed(run), tmp_path / "mesh.ply"
     before = (run / "mesh.ply").read_bytes()
-    assert gs2d(["georeference", str(run), "--part", "mesh", "--out", str(out)]) == 0
+    assert gs2d(["survey", str(run), "--part", "mesh", "--out", str(out)]) == 0
     assert "relative to the offset 1000123 6000456 789" in capsys.readouterr().out
     vertices = read_mesh(out).vertices
     assert np.abs(vertices - g.to_local(read_mesh(run / "mesh.ply").vertices)).max() < 1e-3
@@ -288,10 +289,10 @@ def test_export_errors_are_one_line(
     run: Path, words: list[str], text: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(run.parent)
-    assert "no georeference" in error_of(["georeference", str(run), "--out", "a.ply", "--quiet"], capsys)
+    assert "no georeference" in error_of(["survey", str(run), "--out", "a.ply", "--quiet"], capsys)
     placed(run)
     words = [word.replace("RUN", str(run)) for word in words]
-    assert text in error_of(["georeference", str(run), "--quiet", *words], capsys)
+    assert text in error_of(["survey", str(run), "--quiet", *words], capsys)
 
 
 def test_the_page_of_a_georeferenced_run_measures_in_metres(run: Path, tmp_path: Path) -> None:

@@ -61,5 +61,5 @@ def test_a_marker_in_one_photograph_is_left_out_and_said(tmp_path: Path) -> None
     markers, left = in_run((view, detected(found, view)) for view in views(tmp_path)[:1])
     assert markers == []
     assert left == ["marker 3 is in one photograph only", "marker 7 is in one photograph only"]
-    with pytest.raises(DataError, match="--marker-dictionary"):
+    with pytest.raises(DataError, match="marker_dictionary"):
         detector("no_such")

@@ -1,4 +1,4 @@
-"""`gs2d orthophoto`: cells where the ground is, colours of the photographs, heights, and what other programs read."""
+"""`gs2d survey --orthophoto`: cells, colours and heights, as other programs read them."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def cells(tags: dict[str, Any], shape: tuple[int, ...]) -> tuple[np.ndarray, np.
 
 
 def test_heights_and_colours_lie_where_the_ball_is(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert gs2d(["orthophoto", str(run), "--resolution", "0.25", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    assert gs2d(["survey", str(run), "--orthophoto", "--resolution", "0.25", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)["orthophoto"]
     assert (told["epsg"], told["resolution"]) == (32632, 0.25)
     with tifffile.TiffFile(run / "orthophoto_elevation.tif") as file:
         heights, tags = file.asarray(), file.pages[0].geotiff_tags
@@ -91,7 +91,7 @@ def test_bad_input_is_one_line(
     run: Path, words: list[str], said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(run)
-    assert gs2d(["orthophoto", str(run), "--quiet", *words]) == 2
+    assert gs2d(["survey", str(run), "--orthophoto", "--quiet", *words]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
     assert not list(run.glob("*.tif"))
@@ -99,8 +99,8 @@ def test_bad_input_is_one_line(
 
 def test_a_run_that_is_nowhere_or_has_no_mesh_is_told_what_to_do(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (run / "mesh.ply").unlink()
-    assert gs2d(["orthophoto", str(run), "--quiet"]) == 2
+    assert gs2d(["survey", str(run), "--orthophoto", "--quiet"]) == 2
     assert "write it with `gs2d mesh" in capsys.readouterr().err
     (run / "georeference.json").unlink()
-    assert gs2d(["orthophoto", str(run), "--quiet"]) == 2
-    assert "gs2d georeference" in capsys.readouterr().err
+    assert gs2d(["survey", str(run), "--orthophoto", "--quiet"]) == 2
+    assert "gs2d survey" in capsys.readouterr().err

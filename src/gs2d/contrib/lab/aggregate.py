@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.config.protocols import MetricConventions
-from gs2d.contrib.lab.tables import DTU, LOWER_IS_BETTER, METRICS, NERF_SYNTHETIC, TNT, Claim, PaperTable
+from gs2d.contrib.lab.paper_tables import DTU, LOWER_IS_BETTER, METRICS, NERF_SYNTHETIC, TNT, Claim, PaperTable
 from gs2d.errors import Gs2dError
 from gs2d.io.run_dir import open_run
 
@@ -271,7 +271,7 @@ def surface_figures(surface: dict[str, Any] | None, data_set: str) -> dict[str, 
 
 # -- claims ----------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
-class Step:
+class StageStep:
     """The difference of two neighbouring rows of a claim, in the direction in which the paper has it.
 
     Attributes
@@ -309,7 +309,7 @@ class ClaimResult:
     kind: str
     data_set: str
     holds: str
-    steps: tuple[Step, ...]
+    steps: tuple[StageStep, ...]
     reason: str = ""
 
     def to_json(self) -> dict[str, Any]:
@@ -355,7 +355,7 @@ def _pairs(claim: Claim) -> list[tuple[str, str]]:
     return list(itertools.pairwise(rows))
 
 
-def _step(lower: Row, upper: Row, metric: str, data_set: str, claim: Claim) -> Step:
+def _step(lower: Row, upper: Row, metric: str, data_set: str, claim: Claim) -> StageStep:
     sign = -1.0 if metric in LOWER_IS_BETTER else 1.0
     values = {row.name: {(c.scene, c.seed): c.figures[metric] for c in row.of(data_set)} for row in (lower, upper)}
     found: dict[str, dict[int, float]] = {}
@@ -373,7 +373,7 @@ def _step(lower: Row, upper: Row, metric: str, data_set: str, claim: Claim) -> S
         right = [d > 0 for d in differences]
     spread = statistics.stdev(differences) if len(differences) > 1 else None
     mean = statistics.fmean(differences) if differences else 0.0
-    return Step(lower.name, upper.name, metric, mean, spread, len(right), sum(right))
+    return StageStep(lower.name, upper.name, metric, mean, spread, len(right), sum(right))
 
 
 ROUNDING = {"fscore": 0.005, "chamfer": 0.005, "psnr": 0.005, "ssim": 0.0005, "lpips": 0.0005}

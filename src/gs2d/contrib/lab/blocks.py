@@ -16,8 +16,8 @@ from gs2d.config.serialize import decode
 from gs2d.config.serialize import from_json as recipe_from_json
 from gs2d.contrib.lab.block_start import load_start
 from gs2d.contrib.lab.execute import execute
+from gs2d.contrib.lab.lab_options import BlocksOptions
 from gs2d.contrib.lab.merged import MERGED, SEAM_VIEWS, finish_merged, read_seam_views, write_merged, write_result
-from gs2d.contrib.lab.options import BlocksOptions
 from gs2d.contrib.lab.partition import Partition, from_json, make_partition
 from gs2d.contrib.lab.settle import (
     Settled,
@@ -260,7 +260,7 @@ def blocks(options: BlocksOptions, on_event: OnEvent = ignore) -> RunFolder:
     Gs2dError
         Anything that the user can mend; what was done stays.
     """
-    partition = make_partition(options.blocks, options.partition)
+    partition = make_partition(options.blocks, options.partition_changes)
     if options.slots is not None and options.slots < 1:
         raise RecipeError(f"--slots must be a whole number >= 1, got {options.slots}")
     training = training_of(options)
@@ -329,9 +329,8 @@ def training_of(options: BlocksOptions) -> TrainOptions:
         threads=options.threads,
         resume=True,
         memory=options.memory,
-        disk=options.disk,
         prepare=options.prepare,
-        **values(CommonTraining, options),
+        **(values(CommonTraining, options) | {"overrides": options.recipe_changes}),
     )
 
 

@@ -25,7 +25,7 @@ from typing import Any
 import gs2d
 from gs2d.contrib.lab import cluster_worker
 from gs2d.contrib.lab.cluster_task import Begun, token_file
-from gs2d.contrib.lab.schedule import Executor
+from gs2d.contrib.lab.task_order import Executor
 from gs2d.contrib.lab.tasks import AnyTask, Task
 from gs2d.core.extras import install
 from gs2d.errors import BackendError
@@ -225,7 +225,7 @@ class OnCluster(Executor[AnyTask]):
         here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
         self._queue = Queue(actor_options={"num_cpus": 0, "scheduling_strategy": here})
         self._running: dict[Any, AnyTask] = {}
-        self._progress: dict[str, Progress] = {}
+        self._progress: dict[str, TaskProgress] = {}
         self._token, self._stopped = secrets.token_hex(8), False
 
     def fitted(self, task: AnyTask) -> AnyTask:
@@ -273,7 +273,7 @@ class OnCluster(Executor[AnyTask]):
         for name, event in self._told():
             self._pass_on(name, event, on_event)
         for ref, task in self._running.items():  # Ray begins a task without end that the memory is too small for
-            if ref not in ready and self._progress.get(task.name, Progress()).begun > 1 + _retries(task):
+            if ref not in ready and self._progress.get(task.name, TaskProgress()).begun > 1 + _retries(task):
                 self._ray.cancel(ref, force=True)
         ended = []
         for ref in ready:
@@ -309,7 +309,7 @@ class OnCluster(Executor[AnyTask]):
 
     def _pass_on(self, name: str, event: Event | Begun, on_event: OnEvent) -> None:
         """Pass on what a task tells, with its name."""
-        at = self._progress.setdefault(name, Progress())
+        at = self._progress.setdefault(name, TaskProgress())
         if isinstance(event, Begun):
             if at.host:
                 on_event(Notice(f"{name}: its process or its machine ({at.host}) was lost; it goes on on {event.host}"))
@@ -361,7 +361,7 @@ def _retries(task: Task) -> int:
 
 
 @dataclass
-class Progress:
+class TaskProgress:
     """How far a task is, on which machine."""
 
     host: str = ""

@@ -41,7 +41,7 @@ CAMERA_FILES = ("cameras_sphere.npz", "cameras.npz")  # DTU
 
 
 @dataclass(frozen=True)
-class MissingFile:
+class MissingPiece:
     """A file that is not there.
 
     Attributes
@@ -62,7 +62,7 @@ class MissingFile:
         return f"{self.path} is missing ({self.purpose}): {self.source}"
 
 
-def whole_folders(pieces: Iterable[MissingFile]) -> tuple[MissingFile, ...]:
+def whole_folders(pieces: Iterable[MissingPiece]) -> tuple[MissingPiece, ...]:
     """Return the pieces, with one for a folder that is not there instead of one for each of its files."""
     named = (piece if piece.path.parent.is_dir() else replace(piece, path=piece.path.parent) for piece in pieces)
     return tuple(dict.fromkeys(named))
@@ -73,7 +73,7 @@ def has_dtu_cameras(root: Path) -> bool:
     return any((root / name).is_file() for name in CAMERA_FILES)
 
 
-def dtu_pieces(root: Path) -> list[MissingFile]:
+def dtu_pieces(root: Path) -> list[MissingPiece]:
     """Check a DTU scan as 2DGS (``images``, ``mask``, ``sparse/0``, both archives) or NeuS (``image``) prepares it.
 
     With one of the two archives the other is not needed.
@@ -84,9 +84,9 @@ def dtu_pieces(root: Path) -> list[MissingFile]:
     there = [path for path in archives if path.is_file()]
     missing = []
     if not there:
-        missing.append(MissingFile(archives[0], TRAINING, source))
+        missing.append(MissingPiece(archives[0], TRAINING, source))
     elif ours:
-        missing += [MissingFile(path, NOTHING, source) for path in archives if path not in there]
+        missing += [MissingPiece(path, NOTHING, source) for path in archives if path not in there]
     views = _archive_views(there[0]) if there else set()
     images = next((root / name for name in ("image", "images") if (root / name).is_dir()), root / "images")
     missing += _numbered(images, views, 6 if images.name == "images" else 3, TRAINING, source)
@@ -107,7 +107,7 @@ def _archive_views(path: Path) -> set[int]:
     return {int(hit.group(1)) for name in names if (hit := re.fullmatch(r"world_mat_([0-9]{1,18})\.npy", name))}
 
 
-def _numbered(folder: Path, views: set[int], digits: int, purpose: str, source: str) -> list[MissingFile]:
+def _numbered(folder: Path, views: set[int], digits: int, purpose: str, source: str) -> list[MissingPiece]:
     """Files named by the number of their view, one for each view."""
     files = [p for p in folder.iterdir() if p.suffix.lower() in _IMAGES] if folder.is_dir() else []
     numbers = {int(p.stem) for p in files if is_number(p.stem)}
@@ -115,17 +115,17 @@ def _numbered(folder: Path, views: set[int], digits: int, purpose: str, source: 
     width = len(files[0].stem) if files and is_number(files[0].stem) else digits
     if files and not numbers:  # named otherwise: their count is all that can be said
         return []
-    return [MissingFile(folder / f"{n:0{width}}{suffix}", purpose, source) for n in sorted(views - numbers)]
+    return [MissingPiece(folder / f"{n:0{width}}{suffix}", purpose, source) for n in sorted(views - numbers)]
 
 
-def _model_files(folder: Path, source: str, *, purpose: str = TRAINING) -> list[MissingFile]:
+def _model_files(folder: Path, source: str, *, purpose: str = TRAINING) -> list[MissingPiece]:
     """Return the three files of a COLMAP model, binary unless one is text."""
     suffix = ".txt" if any(folder.glob("*.txt")) and not any(folder.glob("*.bin")) else ".bin"
     names = [f"{stem}{suffix}" for stem in ("cameras", "images", "points3D")]
-    return [MissingFile(folder / name, purpose, source) for name in names if not (folder / name).is_file()]
+    return [MissingPiece(folder / name, purpose, source) for name in names if not (folder / name).is_file()]
 
 
-def colmap_pieces(root: Path, folders: Iterable[str], source: str) -> list[MissingFile]:
+def colmap_pieces(root: Path, folders: Iterable[str], source: str) -> list[MissingPiece]:
     """Return a COLMAP model in ``sparse/0`` and the photographs that it names, in each of the folders."""
     model, flat = root / "sparse" / "0", root / "sparse"
     if not model.is_dir() and any((*flat.glob("*.bin"), *flat.glob("*.txt"))):
@@ -138,17 +138,19 @@ def colmap_pieces(root: Path, folders: Iterable[str], source: str) -> list[Missi
     last = tuple(folders)
     for folder in last:
         purpose = TRAINING if folder == last[-1] else FULL_SIZE
-        missing += [MissingFile(root / folder / n, purpose, source) for n in names if not (root / folder / n).is_file()]
+        missing += [
+            MissingPiece(root / folder / n, purpose, source) for n in names if not (root / folder / n).is_file()
+        ]
     return missing
 
 
-def blender_pieces(root: Path, source: str) -> list[MissingFile]:
+def blender_pieces(root: Path, source: str) -> list[MissingPiece]:
     """Return a NeRF-Synthetic scene: three splits with the pictures that their lists name."""
     missing = []
     for split, purpose in (("train", TRAINING), ("test", TESTING), ("val", NOTHING)):
         listing = root / f"transforms_{split}.json"
         if not listing.is_file():
-            missing.append(MissingFile(listing, purpose, source))
+            missing.append(MissingPiece(listing, purpose, source))
             continue
         data = read_json(listing)
         try:
@@ -158,7 +160,7 @@ def blender_pieces(root: Path, source: str) -> list[MissingFile]:
         for name in names:
             path = root / (name if Path(name).suffix.lower() in _IMAGES else f"{name}.png")
             if not path.is_file():
-                missing.append(MissingFile(path, purpose, source))
+                missing.append(MissingPiece(path, purpose, source))
     return missing
 
 
@@ -192,7 +194,7 @@ class SceneFolder:
     truth : mapping of str to Path
         The pieces of the ground truth that are there: "scan", "mask", "plane" (DTU), "scan", "crop", "transform", "log"
         (Tanks and Temples), "mesh" (NeRF-Synthetic).
-    missing : tuple of MissingFile
+    missing : tuple of MissingPiece
         Of the capture and of the ground truth.
     """
 
@@ -200,7 +202,7 @@ class SceneFolder:
     facts: SceneFacts
     root: Path
     truth: Mapping[str, Path] = field(default_factory=dict)
-    missing: tuple[MissingFile, ...] = ()
+    missing: tuple[MissingPiece, ...] = ()
 
     @property
     def can_train(self) -> bool:
@@ -313,7 +315,7 @@ def missing_lines(root: Path) -> tuple[str, ...]:
 
 def find_truth(
     dataset: DataSet, facts: SceneFacts, root: Path, folder: Path | None = None
-) -> tuple[dict[str, Path], tuple[MissingFile, ...]]:
+) -> tuple[dict[str, Path], tuple[MissingPiece, ...]]:
     """Return the pieces of a scene's ground truth that are there, and those that are not.
 
     Parameters
@@ -351,7 +353,7 @@ def find_truth(
     else:
         return {}, ()
     lacking = tuple(
-        MissingFile(places[0] / name, SCORING, _TRUTH_SOURCES[dataset.name, what])
+        MissingPiece(places[0] / name, SCORING, _TRUTH_SOURCES[dataset.name, what])
         for what, name in names.items()
         if what not in found
     )
@@ -404,9 +406,9 @@ def published_log(root: Path, scene: str) -> Path:
     return root / tnt_truth_files(scene)["log"]
 
 
-def _published_log(facts: SceneFacts, root: Path) -> list[MissingFile]:
+def _published_log(facts: SceneFacts, root: Path) -> list[MissingPiece]:
     path = published_log(root, facts.name)
-    return [] if path.is_file() else [MissingFile(path, "only to check the frame", _capture_source(TNT_SCENES))]
+    return [] if path.is_file() else [MissingPiece(path, "only to check the frame", _capture_source(TNT_SCENES))]
 
 
 def _own_pieces(place: Path, names: Mapping[str, str]) -> int:

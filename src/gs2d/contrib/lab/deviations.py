@@ -8,9 +8,9 @@ from gs2d.config.presets import get_recipe
 from gs2d.config.recipe import GradDensify
 from gs2d.config.schedule import scale_schedule
 from gs2d.contrib.lab.aggregate import NOT_YET, Results, surface_metric
-from gs2d.contrib.lab.options import TableOptions
+from gs2d.contrib.lab.lab_options import TableOptions
+from gs2d.contrib.lab.paper_tables import DTU, METRICS, NERF_SYNTHETIC, TNT, PaperTable
 from gs2d.contrib.lab.scenes import FoundScene, missing_scenes, unreadable
-from gs2d.contrib.lab.tables import DTU, METRICS, NERF_SYNTHETIC, TNT, PaperTable
 from gs2d.data.image_files import image_size
 from gs2d.errors import Gs2dError
 from gs2d.io.run_dir import machine, versions

@@ -129,7 +129,7 @@ _TRIANGLES = 200_000  # triangles sampled at a time
 
 
 @dataclass(frozen=True, eq=False)
-class Silhouette:
+class ViewSilhouette:
     """A camera and where the object is in its image, bool [H, W]; the scene's frame."""
 
     camera: Camera
@@ -174,7 +174,7 @@ class DtuScore:
 
 def evaluate_dtu(
     mesh: Mesh,
-    silhouettes: Sequence[Silhouette],
+    silhouettes: Sequence[ViewSilhouette],
     T_metric_scene: np.ndarray,
     truth: DtuTruth,
     *,
@@ -186,7 +186,7 @@ def evaluate_dtu(
 
     Parameters
     ----------
-    silhouettes : sequence of Silhouette
+    silhouettes : sequence of ViewSilhouette
         Of all views; empty: nothing is culled.
     T_metric_scene : ndarray [4, 4]
         scale_mat: from the scene to mm.
@@ -258,7 +258,7 @@ def _score(points: np.ndarray, truth: DtuTruth, culled: float, protocol: DtuSurf
 
 
 def inside_silhouettes(
-    vertices: np.ndarray, silhouettes: Sequence[Silhouette], protocol: DtuSurface = DTU_SURFACE
+    vertices: np.ndarray, silhouettes: Sequence[ViewSilhouette], protocol: DtuSurface = DTU_SURFACE
 ) -> np.ndarray:
     """Which vertices [P, 3] are, in every view, inside the widened silhouette or outside the image; bool [P]."""
     keep = np.ones(len(vertices), bool)

@@ -15,7 +15,7 @@ from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from gs2d.contrib.lab.schedule import Executor, given_up, several_at_once
+from gs2d.contrib.lab.task_order import Executor, given_up, several_at_once
 from gs2d.contrib.lab.tasks import AnyTask, Task, do
 from gs2d.errors import BackendError
 from gs2d.io.run_dir import RunFolder, make_folder

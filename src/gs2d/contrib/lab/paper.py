@@ -12,12 +12,12 @@ from typing import Any
 from gs2d.contrib.lab.aggregate import FIGURES, ClaimResult, Results, Row, check_claims, read_cell
 from gs2d.contrib.lab.deviations import deviations_of
 from gs2d.contrib.lab.execute import execute
-from gs2d.contrib.lab.options import PaperOptions, SweepOptions, TableOptions
-from gs2d.contrib.lab.plan import Plan, commands_of, make_plan, paper_command
+from gs2d.contrib.lab.lab_options import PaperOptions, SweepOptions, TableOptions
+from gs2d.contrib.lab.paper_tables import DTU, TNT, PaperRow, PaperTable
 from gs2d.contrib.lab.render import to_csv, to_latex, to_markdown, write_page
 from gs2d.contrib.lab.scenes import FoundScene
 from gs2d.contrib.lab.surface_protocols import DTU_SURFACE, TNT_SURFACE
-from gs2d.contrib.lab.tables import DTU, TNT, PaperRow, PaperTable
+from gs2d.contrib.lab.table_plan import Plan, commands_of, make_plan, paper_command
 from gs2d.contrib.lab.tasks import failures
 from gs2d.core.atomic_files import atomic_write
 from gs2d.core.json_files import read_json, write_json

@@ -167,7 +167,7 @@ def make_partition(blocks: str, changes: Sequence[str] = ()) -> Partition:
         if not equals or not isinstance(node, dict) or last not in node or isinstance(node[last], dict):
             known = [entry.name for entry in fields(Partition) if entry.name not in ("grid", "coarse")]
             known += [f"coarse.{entry.name}" for entry in fields(CoarseModel)]
-            raise RecipeError(f"--partition must be field=value with {', '.join(known)}; got {change!r}")
+            raise RecipeError(f"--set partition.FIELD=VALUE takes the fields {', '.join(known)}; got {change!r}")
         try:
             node[last] = json.loads(text)
         except json.JSONDecodeError:

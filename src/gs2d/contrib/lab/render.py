@@ -1,6 +1,6 @@
 """A table as a page, Markdown, CSV and LaTeX: what was measured, and the paper's figures beside.
 
-Page and Markdown are templates (``templates/``); what they show of a data set is a :class:`Part`.
+Page and Markdown are templates (``templates/``); what they show of a data set is a :class:`TablePart`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from markupsafe import Markup
 
 from gs2d.config.presets import about_recipe, get_recipe
 from gs2d.contrib.lab.aggregate import FIGURES, Cell, ClaimResult, Results, Row
-from gs2d.contrib.lab.tables import LOWER_IS_BETTER, METRICS, PaperTable, printed
+from gs2d.contrib.lab.paper_tables import LOWER_IS_BETTER, METRICS, PaperTable, printed
 from gs2d.core.atomic_files import atomic_write
 from gs2d.data.image_files import read_image
 from gs2d.errors import Gs2dError
@@ -88,7 +88,7 @@ class ShownRow:
 
 
 @dataclass(frozen=True)
-class Part:
+class TablePart:
     """The part of a table that a data set has: what was measured, or the paper's figures alone.
 
     Attributes
@@ -120,13 +120,13 @@ class Part:
         return [[row.name, *(figure.paper or "-" for figure in row.figures)] for row in self.rows]
 
 
-def parts_of(table: PaperTable, results: Results) -> list[Part]:
+def parts_of(table: PaperTable, results: Results) -> list[TablePart]:
     """Return a part for each data set that was trained, then one for each other one of the paper's."""
     untrained = [data_set for data_set in table.columns if data_set not in results.data_sets]
     return [_part(table, results, data_set) for data_set in (*results.data_sets, *untrained)]
 
 
-def _part(table: PaperTable, results: Results, data_set: str) -> Part:
+def _part(table: PaperTable, results: Results, data_set: str) -> TablePart:
     columns, trained = list(table.columns.get(data_set, ())), data_set in results.data_sets
     means = {row.name: results.mean(row, data_set) for row in results.rows}
     if trained:  # what else was measured
@@ -148,7 +148,7 @@ def _part(table: PaperTable, results: Results, data_set: str) -> Part:
             figures.append(Figure(text, around, quoted, best=is_measured and text == tops[metric]))
         about = "; ".join(filter(None, (row.note, about_row(row))))
         rows.append(ShownRow(row.name, row.recipe is None, about, tuple(figures)))
-    return Part(data_set, trained, tuple(columns), tuple(rows), results.scenes("psnr", data_set))
+    return TablePart(data_set, trained, tuple(columns), tuple(rows), results.scenes("psnr", data_set))
 
 
 def _best(metric: str, means: Sequence[float | None]) -> str:

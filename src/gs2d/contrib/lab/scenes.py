@@ -17,7 +17,7 @@ from gs2d.contrib.lab.dataset_folders import (
     subfolders,
 )
 from gs2d.contrib.lab.datasets import DATASETS, DataSet, SceneFacts
-from gs2d.contrib.lab.tables import DTU, NERF_SYNTHETIC, TNT
+from gs2d.contrib.lab.paper_tables import DTU, NERF_SYNTHETIC, TNT
 from gs2d.data import detect_format
 from gs2d.errors import DataError
 
@@ -90,7 +90,7 @@ def find_scenes(
             f"--data must be a folder of captures, got {'a file' if data.exists() else 'nothing'} at {data}"
         )
     if truths is not None and not truths.is_dir():
-        raise DataError(f"--truth must be a folder of true surfaces, found none at {truths}")
+        raise DataError(f"--ground-truth must be a folder of true surfaces, found none at {truths}")
     captures = dict(sorted(_captures(data, DEPTH).items()))
     broken = unreadable(data)
     if not captures:

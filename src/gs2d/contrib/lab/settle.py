@@ -19,7 +19,7 @@ from gs2d.config.serialize import to_json
 from gs2d.contrib.lab.cells import spread_of
 from gs2d.contrib.lab.partition import Partition, grid_for
 from gs2d.contrib.lab.partition import to_json as partition_json
-from gs2d.contrib.lab.split import Block
+from gs2d.contrib.lab.split import BlockOfSplit
 from gs2d.core.memory_limit import memory_budget
 from gs2d.core.missing import instead
 from gs2d.core.text import name_bytes
@@ -86,12 +86,12 @@ def settle(options: TrainOptions, on_event: OnEvent) -> Settled:
     if recipe.learns("poses"):
         raise RecipeError(
             "blocks need cameras that stay where they are, got a recipe that refines poses; refine them in a run of "
-            "its own, or leave --refine-poses out"
+            "its own, or leave poses out of --learn"
         )
     if recipe.learns("vignetting", "response"):
         raise RecipeError(
-            "blocks need cameras whose light is known, got a recipe that learns vignetting or response; leave "
-            "--vignetting and --response out"
+            "blocks need cameras whose light is known, got a recipe that learns vignetting or response; leave both out "
+            "of --learn"
         )
     protocol = replace(resolved.protocol, near=resolved.protocol.near_for(opened.scene.extent))
     return Settled(opened.scene, recipe, protocol, opened.backend, capture_digest(opened.scene))
@@ -203,7 +203,7 @@ def coarse_downscale(scene: Scene, partition: Partition, downscale: int) -> int:
     return downscale * max(1, round(longer / partition.coarse.side))
 
 
-def block_recipe(recipe: Recipe, partition: Partition, block: Block) -> Recipe:
+def block_recipe(recipe: Recipe, partition: Partition, block: BlockOfSplit) -> Recipe:
     """Return the recipe of a block: from splats whose colours have all degrees, in exposures that are settled.
 
     Its budget is its share of that of everything, by how much of all that is seen lies in it.

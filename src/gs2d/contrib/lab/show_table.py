@@ -5,23 +5,23 @@ from __future__ import annotations
 import json
 
 from gs2d.cli.console import Console
-from gs2d.cli.tables import show_run
+from gs2d.cli.results import show_run
 from gs2d.contrib.lab.blocks import blocks
-from gs2d.contrib.lab.commands import Blocks, Paper, Sweep
+from gs2d.contrib.lab.lab_commands import BlocksCommand, PaperCommand, SweepCommand
 from gs2d.contrib.lab.paper import PaperResult
 from gs2d.contrib.lab.paper import paper as run_paper
 from gs2d.contrib.lab.render import TITLES, claim_text, parts_of
 from gs2d.errors import RunError
 
 
-def show_blocks(command: Blocks, console: Console) -> None:
+def show_blocks(command: BlocksCommand, console: Console) -> None:
     """Run ``gs2d blocks``."""
     run = blocks(command, console.on_event)
     console.close()
     show_run(run.path, run.metrics(), console)
 
 
-def show_table(command: Paper | Sweep, console: Console) -> None:
+def show_table(command: PaperCommand | SweepCommand, console: Console) -> None:
     """Run the command; what failed is an error at the end, when everything else is done and written.
 
     Raises

@@ -31,7 +31,7 @@ FORMAT = 1
 
 
 @dataclass(frozen=True)
-class Block:
+class BlockOfSplit:
     """One part of the scene.
 
     Attributes
@@ -68,7 +68,7 @@ class Split:
     """Cells and their blocks, in one order."""
 
     cells: Cells
-    blocks: tuple[Block, ...]
+    blocks: tuple[BlockOfSplit, ...]
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values."""
@@ -80,7 +80,7 @@ class Split:
         try:
             if data["format"] != FORMAT:
                 raise ValueError(f"format {data['format']!r}, expected {FORMAT}")
-            blocks = tuple(Block(**{**entry, "views": tuple(entry["views"])}) for entry in data["blocks"])
+            blocks = tuple(BlockOfSplit(**{**entry, "views": tuple(entry["views"])}) for entry in data["blocks"])
             return cls(Cells.from_json(data["cells"]), blocks)
         except (LookupError, TypeError, ValueError, OverflowError) as error:
             raise RunError(f"{CELLS} of a partition is damaged ({type(error).__name__}: {error})") from error
@@ -153,7 +153,7 @@ def split_model(
         extent = camera_extent([scene.train[i].camera for i in chosen]) if len(chosen) > 1 else scene.extent
         counts = {"floor": len(floor), "own": int(own.sum()), "frozen": int(frozen.sum()), "core": core}
         weight = float(total[near[cell]].sum() / total.sum())
-        blocks.append(Block(name, () if why else views, weight=weight, extent=extent, skipped=why, **counts))
+        blocks.append(BlockOfSplit(name, () if why else views, weight=weight, extent=extent, skipped=why, **counts))
     found = Split(cells, tuple(blocks))
     write_json(folder / CELLS, found.to_json())
     return found

@@ -12,7 +12,7 @@ import numpy as np
 from gs2d.contrib.lab.dataset_folders import find_truth, published_log, recognise
 from gs2d.contrib.lab.datasets import SceneFacts
 from gs2d.contrib.lab.dtu_reader import dtu_silhouettes
-from gs2d.contrib.lab.evaluate_dtu import Silhouette, evaluate_dtu, read_dtu_truth
+from gs2d.contrib.lab.evaluate_dtu import ViewSilhouette, evaluate_dtu, read_dtu_truth
 from gs2d.contrib.lab.evaluate_tnt import Alignment, evaluate_tnt, read_tnt_truth, read_trajectory
 from gs2d.contrib.lab.surface_protocols import DTU_SURFACE, TNT_SURFACE
 from gs2d.core.mesh import Mesh
@@ -144,13 +144,13 @@ class TanksAndTemplesEvaluator:
         }
 
 
-def _silhouettes(scene: Scene) -> list[Silhouette]:
+def _silhouettes(scene: Scene) -> list[ViewSilhouette]:
     """Return the mask files at their full size; where there are none, the views' own silhouettes."""
     found = dtu_silhouettes(scene.root) if scene.root is not None else ()
     if found:
-        return [Silhouette(view.camera, read_mask(view.path)) for view in found]
+        return [ViewSilhouette(view.camera, read_mask(view.path)) for view in found]
     own = [(view.camera, view.object_mask()) for view in scene.train]
-    return [Silhouette(camera, mask) for camera, mask in own if mask is not None]
+    return [ViewSilhouette(camera, mask) for camera, mask in own if mask is not None]
 
 
 def _alignment(alignment: Alignment) -> dict[str, Any]:

@@ -102,7 +102,7 @@ def locate(points: Sequence[ControlPoint], views: Sequence[View], held_out: Sequ
     """
     if unknown := [name for name in held_out if name not in {point.name for point in points}]:
         raise DataError(
-            f"--check-points must name control points, got {unknown[0]}; known are "
+            f"check_points must name control points, got {unknown[0]}; known are "
             f"{', '.join(point.name for point in points[:8])}"
         )
     by_name = {view.name: view for view in views}

@@ -1,4 +1,4 @@
-"""``gs2d georeference --out``: splats or a mesh of a run in world coordinates.
+"""``gs2d survey --out``: splats or a mesh of a run in world coordinates.
 
 Files are in local metres with z up. Their offset and coordinate system are written beside them::
 

@@ -1,4 +1,4 @@
-"""``gs2d georeference``: finds scale, orientation and position of a run from one source, and checks the result."""
+"""``gs2d survey``: finds scale, orientation and position of a run from one source, and checks the result."""
 
 from __future__ import annotations
 
@@ -90,11 +90,11 @@ def _check(options: GeoreferenceOptions, chosen: Sequence[str]) -> None:
     for name, sources in needs.items():
         if _is_set(getattr(options, name)) and not set(sources) & set(chosen):
             of = " or ".join(f"--{source.replace('_', '-')}" for source in sources)
-            raise RunError(f"--{name.replace('_', '-')} needs {of}")
+            raise RunError(f"{name} needs {of}")
     if options.enu and options.epsg is not None:
         raise RunError("--enu and --epsg exclude each other; leave one out")
     if options.up is not None and not (np.isfinite(options.up).all() and np.linalg.norm(options.up) > _ON_LINE):
-        raise RunError(f"--up must be a direction of three finite numbers, got {options.up}")
+        raise RunError(f"up must be a direction of three finite numbers, got {options.up}")
 
 
 def _is_set(value: object) -> bool:
@@ -161,7 +161,7 @@ def _of_markers(
         why = f"; {left[0]}" if left else ""
         raise DataError(
             f"no {dictionary} marker is usable: {count} detections in {len(views)} photographs{why}; check "
-            "--marker-dictionary, and that markers are at least 20 px wide in two photographs"
+            "marker_dictionary, and that markers are at least 20 px wide in two photographs"
         )
     sides = np.array([marker.side for marker in markers])
     scale = float(metres * sides.sum() / np.square(sides).sum())

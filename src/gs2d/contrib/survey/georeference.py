@@ -222,7 +222,7 @@ def read_georeference(run: Path) -> Georeference | None:
         return Georeference.from_json(read_json(path))
     except DataError as error:
         raise DataError(
-            f"{path} is damaged ({error}); remove it with `gs2d georeference {run} --remove`, then run it again"
+            f"{path} is damaged ({error}); remove it with `gs2d survey {run} --remove`, then run it again"
         ) from error
 
 
@@ -232,8 +232,8 @@ def required_georeference(run: Path) -> Georeference:
     if place is None:
         quoted = shlex.quote(str(run))
         raise RunError(
-            f"{run} has no georeference; find it with `gs2d georeference {quoted} --gps` if the photographs have GPS "
-            f"positions, else with `gs2d georeference {quoted} --known-distance X0 Y0 Z0 X1 Y1 Z1 METRES`, "
+            f"{run} has no georeference; find it with `gs2d survey {quoted} --gps` if the photographs have GPS "
+            f"positions, else with `gs2d survey {quoted} --known-distance X0 Y0 Z0 X1 Y1 Z1 METRES`, "
             "from two points of the mesh"
         )
     return place

@@ -53,7 +53,7 @@ def detector(dictionary: str) -> Any:
     """Return OpenCV's detector of a dictionary."""
     cv2 = required_cv2()
     if dictionary not in DICTIONARIES:
-        raise DataError(f"--marker-dictionary must be one of {', '.join(DICTIONARIES)}, got {dictionary}")
+        raise DataError(f"marker_dictionary must be one of {', '.join(DICTIONARIES)}, got {dictionary}")
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARIES[dictionary]))

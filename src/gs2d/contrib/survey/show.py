@@ -1,47 +1,60 @@
-"""Output of the commands georeference and orthophoto."""
+"""What ``gs2d survey`` does and prints."""
 
 from __future__ import annotations
 
-import shlex
+from typing import Any
 
 from gs2d.cli.console import Console
 from gs2d.contrib.survey.export_world import export_world
-from gs2d.contrib.survey.find_georeference import georeference_run
+from gs2d.contrib.survey.find_georeference import SOURCES, georeference_run
 from gs2d.contrib.survey.orthophoto import orthophoto_run
-from gs2d.contrib.survey.survey_commands import GeoreferenceCommand, Orthophoto
+from gs2d.contrib.survey.survey_commands import SurveyCommand
+from gs2d.errors import RunError
+from gs2d.io.run_dir import PAGE, open_run
+from gs2d.pipeline.finish.run_report import report_again
+from gs2d.pipeline.look.page import page_run
 
 
-def show_georeference(command: GeoreferenceCommand, console: Console) -> None:
-    """``gs2d georeference``."""
-    found = georeference_run(command.run, command, console.on_event)
-    written = None if command.out is None else export_world(command.run, command.out, command.part)
+def survey(command: SurveyCommand, console: Console) -> None:
+    """Run ``gs2d survey``; a run that changes gets its report and its page again."""
+    if command.resolution is not None and not command.orthophoto:
+        raise RunError("--resolution belongs to --orthophoto, which was not given")
+    georeference = georeference_run(command.run, command, console.on_event)
+    if command.remove or any(getattr(command, source) not in (None, False) for source in SOURCES):
+        run = open_run(command.run)
+        if run.file(PAGE).exists():
+            page_run(run.path, on_event=console.on_event)
+        report_again(run, console.on_event)
+    result: dict[str, Any] = {"run": str(command.run), "georeference": georeference and georeference.to_json()}
+    if command.orthophoto:
+        options = (command.run, command.out, command, console.on_event)
+        result["orthophoto"] = orthophoto_run(*options, threads=command.threads)
+    elif command.out is not None:
+        result["export"] = export_world(command.run, command.out, command.part)
     console.close()
-    if found is None:
-        console.say("no georeference; --gps, --positions, --control, --known-distance or --markers finds one")
-    else:
-        for line in found.lines():
-            console.say(line)
-        run = shlex.quote(str(command.run))
-        console.say(f"to show it in report and page: gs2d report {run}; gs2d page {run}")
-    if written is not None:
-        for note in written["notes"]:
-            console.say(note)
-        offset = " ".join(f"{value:.10g}" for value in written["offset"])
-        console.say(f"{written['file']}: metres in {written['frame']}, relative to the offset {offset}")
-        console.say(f"beside it: {', '.join(written['beside'])}")
-    georeference = None if found is None else found.to_json()
-    console.result({"run": str(command.run), "georeference": georeference, "export": written})
+    none = "no georeference; --gps, --positions, --control, --known-distance or --markers finds one"
+    for line in [none] if georeference is None else georeference.lines():
+        console.say(line)
+    if "export" in result:
+        _show_export(result["export"], console)
+    if "orthophoto" in result:
+        _show_orthophoto(result["orthophoto"], console)
+    console.result(result)
 
 
-def show_orthophoto(command: Orthophoto, console: Console) -> None:
-    """``gs2d orthophoto``."""
-    result = orthophoto_run(command.run, command.out, command, console.on_event, threads=command.threads)
-    console.close()
-    for file in result["files"]:
+def _show_export(written: dict[str, Any], console: Console) -> None:
+    for note in written["notes"]:
+        console.say(note)
+    offset = " ".join(f"{value:.10g}" for value in written["offset"])
+    console.say(f"{written['file']}: metres in {written['frame']}, relative to the offset {offset}")
+    console.say(f"beside it: {', '.join(written['beside'])}")
+
+
+def _show_orthophoto(written: dict[str, Any], console: Console) -> None:
+    for file in written["files"]:
         console.say(file)
-    unseen = result["cells_unseen"] / result["cells"]
+    unseen = written["cells_unseen"] / written["cells"]
     console.say(
-        f"{result['rows']:,} x {result['columns']:,} cells of {result['resolution']:g} m, {result['frame']}; "
+        f"{written['rows']:,} x {written['columns']:,} cells of {written['resolution']:g} m, {written['frame']}; "
         f"{unseen:.0%} of the surface is not visible in any photograph and has the colours of the mesh"
     )
-    console.result(result)

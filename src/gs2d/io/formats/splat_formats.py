@@ -91,7 +91,7 @@ def register_format(
     Parameters
     ----------
     name : str
-        Name of the layout, for ``layout=`` and ``--layout``; must not be taken.
+        Name of the layout, for ``layout=`` and ``gs2d export --format``; must not be taken.
     ending : str
         Ending of the file names, with its dot; one that begins with / is a whole file name.
     size : callable, optional

@@ -84,7 +84,7 @@ def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, *, version: in
     farthest = float(np.abs(g.means).max()) if len(g) else 0.0
     bits = _fractional_bits(g, farthest)
     if farthest > _LARGEST:
-        raise DataError(f"SPZ holds positions up to {_LARGEST} units, got {farthest:.4g}; use --layout 3dgs")
+        raise DataError(f"SPZ holds positions up to {_LARGEST} units, got {farthest:.4g}; use --format 3dgs")
     streams = [array.tobytes() for array in _streams(g, bits)]
     parts = _parts_4(g, bits, streams) if version == 4 else _parts_3(g, bits, streams)
     with atomic_write(path) as file:

@@ -54,10 +54,10 @@ def evaluate_run(
         chosen = ScoreOptions(lpips=lpips, **how)
         return score_views(splats, views, *drawing, name=name, on_event=on_event, options=chosen)
 
-    if options.match_exposure:
+    if "exposure" in options.matched:
         scores = scores_of(loaded.scene.test, "scoring test views, colours matched", match=True)
         result |= split_metrics(scores, "test_matched", "test")
-    if options.match_poses:
+    if "poses" in options.matched:
         best = tuple(aligned(splats, loaded.scene.test, *drawing, loaded.scene.extent, on_event))
         result |= split_metrics(scores_of(best, "scoring test views, cameras aligned"), "test_aligned", "test")
     scene, collected = with_predicted(loaded.scene, metered(splats, *drawing)), Collector(loaded.scene)

@@ -300,7 +300,7 @@ def check_frames(options: RenderOptions) -> tuple[str, Path | None]:
         raise RunError(f"--orbit {orbit} and --flight {flight} exclude each other; use one")
     if video is None:
         if options.fps != RenderOptions.fps:
-            raise RunError(f"--fps {options.fps:g} needs --video")
+            raise RunError(f"fps={options.fps:g} needs --video")
     else:
         if not (orbit or flight):
             raise RunError("--video needs --orbit N or --flight N, N >= 2")

@@ -208,7 +208,7 @@ def check_mesh_options(options: MeshOptions) -> None:
     if options.bbox is not None:
         checked_box(options.bbox, "--bbox")
     if options.keep_components is not None and options.keep_components < 0:
-        raise ProtocolError(f"--keep-components must be a whole number >= 0 (0 = all), got {options.keep_components}")
+        raise ProtocolError(f"keep_components must be a whole number >= 0 (0 = all), got {options.keep_components}")
 
 
 def _extract(
@@ -350,7 +350,7 @@ def mesh_run(
             run.file(TEXTURED).unlink()
             on_event(Notice(f"removed {TEXTURED}, which belonged to the previous mesh"))
     if run.file(PAGE).exists():  # it shows the mesh
-        with attempted(PAGE, again("page", run.path), on_event):
+        with attempted(PAGE, again("export", run.path, "--format", "html"), on_event):
             page_run(run.path, on_event=on_event, loaded=loaded)
     report_again(run, on_event)
     return result

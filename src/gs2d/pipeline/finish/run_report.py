@@ -17,7 +17,7 @@ def report_run(path: Path, on_event: OnEvent = ignore) -> Path:
 
     run = open_run(Path(path))
     run.sweep()
-    command = again("report", run.path)
+    command = again("evaluate", run.path)
 
     def failed(section: str, error: Exception) -> None:
         on_event(NotMade(f"{section} in {REPORT}", reason_of(error), command, error))
@@ -31,5 +31,5 @@ def report_run(path: Path, on_event: OnEvent = ignore) -> Path:
 
 def report_again(run: RunFolder, on_event: OnEvent) -> None:
     """Write the report again after a change; report failures as events."""
-    with attempted(REPORT, again("report", run.path), on_event):
+    with attempted(REPORT, again("evaluate", run.path), on_event):
         report_run(run.path, on_event)

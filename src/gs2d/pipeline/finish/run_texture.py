@@ -103,9 +103,7 @@ def textured_mesh(loaded: LoadedRun, mesh: Mesh, options: TextureOptions, on_eve
     on_event(Phase("cutting the surface into charts", 0))
     views, small = _views(loaded, options, on_event), simplified(mesh, options.faces)
     if len(small.faces) > options.faces:
-        on_event(
-            Notice(f"simplified to {len(small.faces):,} triangles, the closest possible to --faces {options.faces}")
-        )
+        on_event(Notice(f"simplified to {len(small.faces):,} triangles, the closest possible to faces={options.faces}"))
     size = options.texture_size or texture_size(small, [view.camera for view in views])
     images = partial(photographs, loaded, views, on_event)
     return bake(unwrap(small, size), images, size, threads=torch.get_num_threads())
@@ -114,11 +112,11 @@ def textured_mesh(loaded: LoadedRun, mesh: Mesh, options: TextureOptions, on_eve
 def check_texture_options(options: TextureOptions) -> None:
     """Raise for invalid options."""
     if options.faces < 4:
-        raise ProtocolError(f"--faces must be a whole number >= 4, got {options.faces}")
+        raise ProtocolError(f"faces must be a whole number >= 4, got {options.faces}")
     if options.texture_downscale is not None and options.texture_downscale < 1:
-        raise ProtocolError(f"--texture-downscale must be a whole number >= 1, got {options.texture_downscale}")
+        raise ProtocolError(f"texture_downscale must be a whole number >= 1, got {options.texture_downscale}")
     if options.texture_size is not None and not MIN_SIZE <= options.texture_size <= MAX_SIZE:
-        raise ProtocolError(f"--texture-size must be {MIN_SIZE} to {MAX_SIZE} texels, got {options.texture_size}")
+        raise ProtocolError(f"texture_size must be {MIN_SIZE} to {MAX_SIZE} texels, got {options.texture_size}")
 
 
 def _mesh(run: RunFolder, loaded: LoadedRun, splats: Splats, options: MeshOptions, on_event: OnEvent) -> Mesh:

@@ -1,4 +1,4 @@
-"""``gs2d page``: the splats of a run or a file as one HTML file."""
+"""``gs2d export --format html``: the splats of a run or a file as one HTML file."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def page_run(
     if out.suffix.lower() not in SUFFIXES:
         raise RunError(f"--out must name an .html file, got {out}")
     if not 0 <= sh_degree <= 3:
-        raise RunError(f"--sh-degree must be 0, 1, 2 or 3, got {sh_degree}")
+        raise RunError(f"sh_degree must be 0, 1, 2 or 3, got {sh_degree}")
     content = page_content(path, on_event, loaded)
     if content.run is not None:
         content.run.sweep()
@@ -87,7 +87,7 @@ def page_run(
         photographs=photographs,
     )
     if written["bytes"] > LARGE:
-        on_event(Notice(f"the page is large ({written['bytes'] / 1e6:.0f} MB): --sh-degree 1 or 0 makes it smaller"))
+        on_event(Notice(f"the page is large ({written['bytes'] / 1e6:.0f} MB): --set sh_degree=1 makes it smaller"))
     return {"file": str(out), "views": len(content.scene.views), **written}
 
 

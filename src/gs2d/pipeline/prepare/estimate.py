@@ -29,7 +29,7 @@ from gs2d.errors import DataError
 from gs2d.pipeline.prepare.limits import DECODING_BYTES, ITERATION_BYTES, use_memory, use_threads
 from gs2d.pipeline.prepare.loaded import read_init
 from gs2d.pipeline.prepare.open_capture import open_capture
-from gs2d.pipeline.prepare.options import PlanOptions
+from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.prepare.photographs import fits
 from gs2d.pipeline.prepare.resolve import check_options, resolve, schedule_scale_of
 from gs2d.render.api import rasterize
@@ -133,13 +133,13 @@ class Estimate:
         ]
 
 
-def plan(options: PlanOptions, on_event: OnEvent = ignore) -> Estimate:
+def plan(options: TrainOptions, on_event: OnEvent = ignore) -> Estimate:
     """Estimate the training that ``gs2d train`` would run with these options; nothing is trained or written.
 
     Raises
     ------
     Gs2dError
-        If the capture cannot be read, or the training does not fit into memory or on disk.
+        If the capture cannot be read, or the training does not fit into memory.
     """
     if is_archive(options.scene):
         with unpacked_for_a_moment(options.scene) as folder:
@@ -151,15 +151,9 @@ def plan(options: PlanOptions, on_event: OnEvent = ignore) -> Estimate:
     capture = open_capture(options, on_event)
     scale = schedule_scale_of(options, capture)
     recipe, capture = resolve(options, capture, on_event, seed=options.seed, schedule_scale=scale)
-    found = estimate(
+    return estimate(
         capture.scene, recipe, capture.backend, downscale=capture.downscale, prepare=options.prepare, start=start
     )
-    if options.disk is not None and found.disk > options.disk * 2**30:
-        raise DataError(
-            f"{found.photographs:,} photographs need about {found.disk / 2**30:.2g} GiB of disk, --disk allows "
-            f"{options.disk:g} GiB; use a larger --downscale or allow more"
-        )
-    return found
 
 
 def estimate(

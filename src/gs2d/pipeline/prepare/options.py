@@ -10,12 +10,14 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from gs2d.config.arguments import PYTHON_ONLY, Arg
+from gs2d.config.arguments import PYTHON_ONLY, SETTING, Arg
 from gs2d.config.presets import DEFAULT_RECIPE
 from gs2d.config.protocols import Protocol
+from gs2d.config.quantities import QUANTITIES
 from gs2d.config.recipe import Recipe
 from gs2d.errors import RecipeError
 
+MATCHED = ("exposure", "poses")  # of EvaluateOptions
 Robust = Literal["auto", "on", "off"]
 Quality = Literal["auto", "draft", "normal", "full"]
 LensModel = Literal[
@@ -24,6 +26,7 @@ LensModel = Literal[
 Box = tuple[float, float, float, float, float, float]  # x0 y0 z0 x1 y1 z1, world units
 BoxOption = Annotated[Box | None, Arg(metavar="X0 Y0 Z0 X1 Y1 Z1")]
 Overrides = Annotated[tuple[str, ...], Arg(name="set", metavar="STAGE.FIELD=VALUE", repeated=True)]
+ViewerOption = Annotated[int | None, Arg(metavar="[PORT]", bare="0")]  # 0: the first free port
 Photos = Annotated[Path, Arg(metavar="PHOTOS", positional=True)]
 
 
@@ -37,6 +40,23 @@ def paths_of(options: object, *names: str) -> None:
 def values(kind: type[Any], options: Any) -> dict[str, Any]:
     """Return the values of ``options`` for the fields of a class of options, by name."""
     return {entry.name: getattr(options, entry.name) for entry in fields(kind)}
+
+
+def learned_names(learn: str | tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names in a value of ``--learn``; "none" is ().
+
+    Raises
+    ------
+    RecipeError
+        If no quantity has one of the names.
+    """
+    names = tuple(learn.split(",")) if isinstance(learn, str) else learn
+    if names == ("none",):
+        return ()
+    for name in names:
+        if name not in ("auto", *QUANTITIES.builtin):
+            raise RecipeError(f"--learn: {QUANTITIES.unknown(name, also=('auto', 'none'))}")
+    return names
 
 
 # -- shared by several commands ----------------------------------------------------------------------------------------
@@ -62,9 +82,7 @@ class Resources:
 
     memory: Annotated[float | None, Arg(metavar="GIB")] = None
     """Memory limit in GiB (default: half of the memory of this machine or container)."""
-    disk: Annotated[float | None, Arg(metavar="GIB")] = None
-    """Disk limit in GiB, mostly for prepared photographs (default: the free space)."""
-    prepare: Literal["auto", "always", "never"] = "auto"
+    prepare: Annotated[Literal["auto", "always", "never"], SETTING] = "auto"
     """Keep undistorted, shrunk photographs on disk instead of in memory, with the same result. auto: if they do not fit
     into memory."""
 
@@ -93,10 +111,9 @@ class CommonTraining:
     """Settings that depend on the data set: background, depth, near plane, fusion limits."""
     robust: Robust = "auto"
     """Robust training for real captures: dense start, removal of floaters. auto: except for known data sets."""
-    exposure: bool = False
-    """Learn exposure and white balance of each photograph (default: if photographs differ, in robust training)."""
-    no_exposure: bool = False
-    """Assume the same exposure for all photographs."""
+    learn: Annotated[str | tuple[str, ...], Arg(metavar="NAMES")] = "auto"
+    """Learn also exposure, poses, intrinsics, vignetting or response, separated by commas; none; or auto: exposure if
+    photographs differ, in robust training. auto,poses adds poses to that."""
     test_every: int | None = None
     """Hold out every N-th view (sorted by name) for testing; 0 trains on all (default: 8, or by
     protocol; 0 for captures of `gs2d poses` with fewer than 24 photographs)."""
@@ -106,10 +123,8 @@ class CommonTraining:
     """Train with known normals, from maps in normals/."""
     overrides: Overrides = ()
     """Change the recipe, e.g. --set surface.iterations=2000; may be repeated."""
-    checkpoint_every: int = 10_000
-    """Iterations between checkpoints."""
-    checkpoint_seconds: float = 120.0
-    """Seconds between checkpoints, whichever comes first."""
+    checkpoint_every: Annotated[str | int, Arg(metavar="N|TIME")] = "2m"
+    """Iterations (500) or time (90s, 10m) between checkpoints."""
     page: bool = True
     """Do not write scene.html, the splats as a page for any browser."""
     subject_box: BoxOption = None
@@ -119,50 +134,32 @@ class CommonTraining:
     masked: Literal["ignore", "empty", "off"] | None = None
     """Meaning of black mask pixels: ignore (not used), empty (transparent), or off (masks are not used) (default:
     ignore, or by protocol)."""
-    stage2_cache_mb: int = 1024
+    stage2_cache_mb: Annotated[int, SETTING] = 1024
     """Cache for views of stage 2 in MiB, about 5 MiB per view of 400x400 px; 0 disables it."""
 
     @property
-    def learns_exposure(self) -> bool | None:
-        """Whether exposures are learned; None: in robust training, if the photographs differ.
-
-        Raises
-        ------
-        RecipeError
-            If both options are set.
-        """
-        if self.exposure and self.no_exposure:
-            raise RecipeError("--exposure and --no-exposure contradict each other, got both; leave one out")
-        return True if self.exposure else False if self.no_exposure else None
+    def learned(self) -> tuple[str, ...]:
+        """Return the names in ``learn``, of which "auto" stands for exposure if the photographs differ."""
+        return learned_names(self.learn)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Training(CommonTraining):
     """Options of the commands that train a scene in one piece: `gs2d train` and `gs2d reconstruct`."""
 
-    vignetting: bool = False
-    """Learn the vignetting of each camera."""
-    response: bool = False
-    """Learn how the response curves of several cameras differ."""
-    refine_poses: bool = False
-    """Refine the pose of each photograph during training."""
-    refine_cameras: bool = False
-    """Refine poses, and focal length and lens of each camera."""
     start_from: Annotated[Path | None, Arg(name="from", metavar="RUN")] = None
     """Reuse finished stages of another run that this recipe shares."""
     cache: Annotated[Path | None, Arg(metavar="DIR")] = None
     """Folder that keeps finished stages for reuse by runs with the same scene and settings."""
-    viewer: bool = False
-    """Show the training in the browser while it runs."""
-    viewer_port: int | None = None
-    """With --viewer: port of the page (default: the first free port from 8080)."""
+    viewer: ViewerOption = None
+    """Show the training in the browser while it runs. PORT: of the page (default: the first free port from 8080)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PoseEstimation:
     """How the cameras of photographs are estimated: options of `gs2d poses` and `gs2d reconstruct`."""
 
-    cameras: Literal["auto", "one", "each"] = "auto"
+    cameras: Annotated[Literal["auto", "one", "each"], SETTING] = "auto"
     """Photographs that share a camera: those with equal folder, size, camera, lens and focal length (auto), all, or
     none."""
     camera_model: LensModel = "auto"
@@ -170,26 +167,26 @@ class PoseEstimation:
     matching: Literal["auto", "exhaustive", "sequential", "similar", "spatial"] = "auto"
     """Image pairs to match: all (exhaustive), consecutive, similar, or spatially near ones. auto: all up to 150
     photographs, else spatial if most have positions, else similar."""
-    overlap: int = 10
+    overlap: Annotated[int, SETTING] = 10
     """Consecutive photographs that each one is matched with, unless all pairs are matched."""
-    neighbours: int = 40
+    neighbours: Annotated[int, SETTING] = 40
     """Similar photographs that each one is matched with, unless all pairs are matched."""
     positions: Annotated[Path | None, Arg(metavar="FILE")] = None
     """Positions of photographs, for choosing pairs: CSV (name,lat,lon,height or name,x,y,z) or OpenDroneMap's geo.txt
     (default: GPS in EXIF or XMP)."""
-    mapper: Literal["auto", "incremental", "global"] = "auto"
+    mapper: Annotated[Literal["auto", "incremental", "global"], SETTING] = "auto"
     """Estimate cameras one by one (incremental) or all at once (global). auto: global from 500 photographs."""
-    max_size: int | None = None
+    max_size: Annotated[int | None, SETTING] = None
     """Shrink the copies to this longer side, px (default: full size)."""
-    feature_size: int = 1600
+    feature_size: Annotated[int, SETTING] = 1600
     """Longer side for feature detection, px. Larger is slower and slightly more accurate."""
     masks: Annotated[Path | None, Arg(metavar="DIR")] = None
     """Folder of masks of the photographs, white = keep (default: where COLMAP, nerfstudio and Metashape put them)."""
-    match_masked: bool = False
+    match_masked: Annotated[bool, SETTING] = False
     """Also use features in masked pixels, for an object that did not move relative to its background."""
     frames: int = 100
     """Number of frames to take from a video; each is the sharpest of its interval (needs ffmpeg)."""
-    link: bool = False
+    link: Annotated[bool, SETTING] = False
     """Hard-link the photographs instead of copying them."""
 
 
@@ -212,14 +209,7 @@ class TrainOptions(Training, Effort, Resources, HowItRuns):
 
     def __post_init__(self) -> None:
         paths_of(self, "scene", "out", "masks", "init", "start_from", "cache")
-
-
-@dataclass(frozen=True, kw_only=True)
-class PlanOptions(TrainOptions):
-    """Options of the estimate of a training: those of `gs2d train`."""
-
-    out: Annotated[Path, Arg(metavar="RUN")] = Path("RUN")
-    """Run folder of the training; nothing is written."""
+        object.__setattr__(self, "checkpoint_every", str(self.checkpoint_every))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,20 +260,16 @@ class DemoOptions(HowItRuns):
     """Recipe. `gs2d recipes` lists them."""
     schedule_scale: float | None = None
     """Fraction of the iterations of the recipe (default: 0.15, two minutes on two cores)."""
-    vary_exposure: bool = False
+    learn: Annotated[str | tuple[str, ...], PYTHON_ONLY] = "none"
+    """As in `gs2d train`."""
+    vary_exposure: Annotated[bool, PYTHON_ONLY] = False
     """Vary exposure and white balance of the training images."""
-    exposure: bool = False
-    """Learn exposure and white balance of each photograph."""
-    vary_poses: bool = False
+    vary_poses: Annotated[bool, PYTHON_ONLY] = False
     """Disturb the poses of the training images by half a degree and half a percent."""
-    refine_poses: bool = False
-    """Refine the pose of each photograph during training."""
     page: bool = True
     """Do not write scene.html, the splats as a page for any browser."""
-    viewer: bool = False
-    """Show the training in the browser while it runs."""
-    viewer_port: int | None = None
-    """With --viewer: port of the page (default: the first free port from 8080)."""
+    viewer: ViewerOption = None
+    """Show the training in the browser while it runs. PORT: of the page (default: the first free port from 8080)."""
     train_views: Annotated[int, PYTHON_ONLY] = 40
     test_views: Annotated[int, PYTHON_ONLY] = 8
     size: Annotated[int, PYTHON_ONLY] = 256
@@ -300,9 +286,9 @@ class MeshOptions:
 
     voxel: float | None = None
     """Voxel size in world units (default: from the scene)."""
-    truncation: float | None = None
+    truncation: Annotated[float | None, SETTING] = None
     """Truncation distance in world units (default: from the voxel size)."""
-    depth_limit: float | None = None
+    depth_limit: Annotated[float | None, SETTING] = None
     """Ignore depth beyond this, in world units (default: from the scene)."""
     bbox: BoxOption = None
     """Mesh this box instead of the subject. With --unbounded: the box of the finest voxels."""
@@ -312,11 +298,11 @@ class MeshOptions:
     """Mesh everything, not only the subject."""
     unbounded: bool = False
     """Mesh distant things too, in voxels that grow with distance."""
-    max_gib: float | None = None
+    max_gib: Annotated[float | None, SETTING] = None
     """Limit of the volume in GiB (default: by --memory). The error for a larger one names a voxel size that fits."""
-    depth: Literal["mean", "median", "transmittance"] | None = None
+    depth: Annotated[Literal["mean", "median", "transmittance"] | None, SETTING] = None
     """Depth maps to fuse (default: by protocol)."""
-    keep_components: int | None = None
+    keep_components: Annotated[int | None, SETTING] = None
     """Keep only the N largest connected components (default: drop small ones)."""
 
 
@@ -324,11 +310,11 @@ class MeshOptions:
 class TextureOptions:
     """How the mesh is textured."""
 
-    faces: int = 50_000
+    faces: Annotated[int, SETTING] = 50_000
     """With --texture: simplify a larger mesh to this number of triangles."""
-    texture_size: int | None = None
+    texture_size: Annotated[int | None, SETTING] = None
     """With --texture: side of the texture in texels (default: two per image pixel, at most 4096)."""
-    texture_downscale: int | None = None
+    texture_downscale: Annotated[int | None, SETTING] = None
     """With --texture: shrink the photographs by this integer factor (default: as in training)."""
 
 
@@ -346,7 +332,7 @@ class RenderOptions:
     """Image width; the height follows (default: as in training)."""
     video: Annotated[Path | None, Arg(metavar="FILE")] = None
     """With --orbit or --flight: also write a video, .mp4 (H.264, needs ffmpeg) or .webp."""
-    fps: float = 30.0
+    fps: Annotated[float, SETTING] = 30.0
     """Frames per second of the video."""
 
     def __post_init__(self) -> None:
@@ -363,10 +349,16 @@ class EvaluateOptions:
     """Thresholds for precision and recall, world units (default: 0.25, 0.5 and 1 % of the size of the true surface)."""
     lpips_weights: Path | None = None
     """VGG-16 and LPIPS weights; without them LPIPS is not computed."""
-    match_exposure: bool = False
-    """Also score test views after matching the colours of each rendering to its photograph."""
-    match_poses: bool = False
-    """Also score test views after aligning each camera to its photograph."""
+    match: Annotated[str | tuple[str, ...], Arg(metavar="NAMES")] = ()
+    """Also score test views after matching exposure, poses, or exposure,poses to the photographs."""
+
+    @property
+    def matched(self) -> tuple[str, ...]:
+        """Return the names in ``match``, checked."""
+        names = tuple(self.match.split(",")) if isinstance(self.match, str) else self.match
+        if set(names) - set(MATCHED):
+            raise RecipeError(f"--match must name {' or '.join(MATCHED)}, got {','.join(names)}")
+        return names
 
     def __post_init__(self) -> None:
         paths_of(self, "ground_truth", "lpips_weights")

@@ -43,11 +43,11 @@ def with_prepared(scene: Scene, run: Path, execution: Execution, on_event: OnEve
     folder = run / PREPARED
     prepared = prepared_scene(scene, folder)
     missing = missing_views(prepared)
-    check_disk(run, missing, execution.disk_bytes)
+    check_disk(run, missing)
     on_event(
         Notice(
             f"{decoded_bytes(scene) / 2**30:.2g} GiB of photographs do not fit into memory: prepared in {folder}, at "
-            f"most {packed_bytes(scene.views) / 2**30:.2g} GiB (--prepare never reads the files instead)"
+            f"most {packed_bytes(scene.views) / 2**30:.2g} GiB (--set prepare=never reads the files instead)"
         )
     )
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 from gs2d.config.presets import (
@@ -70,10 +71,11 @@ def build_recipe(
     """
     value = recipe_of(training.recipe)
     value = with_exposure(value) if exposure else value
-    if training.vignetting or training.response:
-        value = with_photometry(value, vignetting=training.vignetting, response=training.response)
-    value = with_poses(value) if training.refine_poses else value
-    value = with_intrinsics(value) if training.refine_cameras else value
+    learned = training.learned
+    if "vignetting" in learned or "response" in learned:
+        value = with_photometry(value, vignetting="vignetting" in learned, response="response" in learned)
+    value = with_poses(value) if "poses" in learned else value
+    value = with_intrinsics(value) if "intrinsics" in learned else value
     value = with_depth_prior(value, training.depth_prior) if training.depth_prior is not None else value
     value = with_normal_prior(value) if training.normal_prior else value
     value = with_robustness(value) if robust else value
@@ -103,7 +105,7 @@ def check_options(options: TrainOptions) -> None:
         raise RecipeError(f"--robust must be one of {', '.join(ROBUST)}, got {options.robust}")
     check_quality(options.quality)
     scale = 1.0 if options.schedule_scale is None else options.schedule_scale
-    robust, exposure = options.robust != "off", bool(options.learns_exposure)
+    robust, exposure = options.robust != "off", "exposure" in options.learned
     build_recipe(options, seed=options.seed, schedule_scale=scale, robust=robust, exposure=exposure)
     check_execution(options)
     if options.test_every is not None and options.test_every not in (0, *range(2, MAX_VIEWS)):
@@ -118,17 +120,27 @@ def check_execution(options: TrainOptions) -> None:
         raise RecipeError("--init and --from exclude each other: both set the start of training; leave one out")
     if options.downscale is not None and options.downscale < 1:
         raise RecipeError(f"--downscale must be a whole number >= 1, got {options.downscale}")
-    if options.checkpoint_every < 1:
-        raise RecipeError(f"--checkpoint-every must be a whole number >= 1, got {options.checkpoint_every}")
-    if not options.checkpoint_seconds > 0:
-        raise RecipeError(f"--checkpoint-seconds must be a positive number, got {options.checkpoint_seconds}")
+    checkpoint_interval(options.checkpoint_every)
     if options.stage2_cache_mb < 0:
-        raise RecipeError(f"--stage2-cache-mb must be a whole number >= 0, got {options.stage2_cache_mb}")
+        raise RecipeError(f"stage2_cache_mb must be a whole number >= 0, got {options.stage2_cache_mb}")
     if options.prepare not in PREPARE:
-        raise RecipeError(f"--prepare must be one of {', '.join(PREPARE)}, got {options.prepare}")
-    if options.disk is not None and not options.disk > 0:
-        raise RecipeError(f"--disk must be a positive number of GiB, got {options.disk}")
+        raise RecipeError(f"prepare must be one of {', '.join(PREPARE)}, got {options.prepare}")
     check_subject_box(options.subject_box, {"--scene": options.whole_scene})
+
+
+def checkpoint_interval(every: str | int) -> tuple[int | None, float | None]:
+    """Return the iterations and the seconds between checkpoints, one of them None, of ``--checkpoint-every``.
+
+    Raises
+    ------
+    RecipeError
+        If it is neither a whole number of iterations nor a time such as 90s or 10m.
+    """
+    text = str(every)
+    number = int(text[:-1] if text[-1:] in ("s", "m") else text) if re.fullmatch(r"[0-9]{1,12}[sm]?", text) else 0
+    if number < 1:
+        raise RecipeError(f"--checkpoint-every must be iterations (500) or a time (90s, 10m), got {text}")
+    return (number, None) if text.isdecimal() else (None, number * (60.0 if text.endswith("m") else 1.0))
 
 
 def schedule_scale_of(options: TrainOptions, capture: OpenCapture) -> float:
@@ -174,7 +186,7 @@ def robust_and_exposure(training: Training, scene: Scene, protocol: Protocol, on
     """Return whether this capture is trained robustly, and whether exposures are learned.
 
     ``training.robust`` "auto" is robust if the protocol is and the capture has sparse points with the views that
-    observe them. ``training.learns_exposure`` None learns exposures if the colours of those points vary.
+    observe them. "auto" in ``training.learn`` learns exposures if the colours of those points vary.
     """
     robust = training.robust == "on" or (training.robust == "auto" and protocol.robust)
     lacks = scene.unobserved() if robust else ""
@@ -183,11 +195,12 @@ def robust_and_exposure(training: Training, scene: Scene, protocol: Protocol, on
     elif lacks and training.robust == "auto":
         robust = False
         on_event(Notice(f"training is not robust: {lacks}"))
-    exposure = bool(training.learns_exposure)
-    if robust and training.learns_exposure is None and (found := point_gains(scene)) is not None:
+    learned = training.learned
+    exposure = "exposure" in learned
+    if robust and not exposure and "auto" in learned and (found := point_gains(scene)) is not None:
         exposure = found.spread >= DIFFERS
         least, most = found.gains.mean(axis=1).min(), found.gains.mean(axis=1).max()
-        decision = "one is learned for each" if exposure else "treated as equal (--exposure learns them)"
+        decision = "one is learned for each" if exposure else "treated as equal (--learn exposure learns them)"
         on_event(
             Notice(f"exposures of the photographs: {least:.2f} to {most:.2f} times the mean; {decision}", detail=True)
         )

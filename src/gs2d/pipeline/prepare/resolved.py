@@ -74,22 +74,14 @@ class Execution:
 
     threads: int | None = None
     memory: float | None = None
-    disk: float | None = None
     prepare: str = "auto"
-    checkpoint_every: int = 10_000
-    checkpoint_seconds: float = 120.0
+    checkpoint_every: str = "2m"
     start_from: Path | None = None
     cache: Path | None = None
     page: bool = True
     subject_box: Box | None = None
     whole_scene: bool = False
-    viewer: bool = False
-    viewer_port: int | None = None
-
-    @property
-    def disk_bytes(self) -> int | None:
-        """Disk limit in bytes."""
-        return None if self.disk is None else int(self.disk * 2**30)
+    viewer: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -59,7 +59,7 @@ class Live:
             "splats": self._answer_splats,
             "photograph": photographs_route(views, loaded.settings.background),
         }
-        self._server = PageServer(loaded.resolved.execution.viewer_port, routes, option="--viewer-port")
+        self._server = PageServer(loaded.resolved.execution.viewer or None, routes, option="--viewer")
         on_event(Notice(f"watch it at {self._server.url}"))
 
     # -- the training thread -------------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.finish.scoring import PeakGpuMemory, PeakMemory, Visitor
 from gs2d.pipeline.prepare.limits import release_buffers
 from gs2d.pipeline.prepare.loaded import LoadedRun
+from gs2d.pipeline.prepare.resolve import checkpoint_interval
 from gs2d.pipeline.train.attribute_changes import Snapshot, mean_changes, take_snapshot
 from gs2d.pipeline.train.interruption import HeldSignals
 from gs2d.pipeline.train.resume import ResumePoint
@@ -83,6 +84,7 @@ class RunLogger:
         self._run, self._loaded, self._trainer, self._on_event = run, loaded, trainer, on_event
         self._results = StageResults(run, loaded, trainer, on_event, visitors)
         self._progress_every = progress_every(loaded)
+        self._checkpoint_interval = checkpoint_interval(loaded.resolved.execution.checkpoint_every)
         self._memory, self._gpu_memory = PeakMemory(), PeakGpuMemory(loaded.backend)
         self._clock, self._peak, self._at_entry = StageClock(start.seconds), start.peak_memory, dict(start.at_entry)
         self._saved_at, self._saved_iteration = time.perf_counter(), 0
@@ -186,9 +188,9 @@ class RunLogger:
             f"{event.stage} {event.iteration:,}/{event.iterations:,}  {event.splats:,} splats  loss {event.loss:.4f}"
         )
         self._on_event(Step(total, detail))
-        execution = self._loaded.resolved.execution
-        due = event.iteration - self._saved_iteration >= execution.checkpoint_every
-        late = time.perf_counter() - self._saved_at >= execution.checkpoint_seconds
+        iterations, seconds = self._checkpoint_interval
+        due = iterations is not None and event.iteration - self._saved_iteration >= iterations
+        late = seconds is not None and time.perf_counter() - self._saved_at >= seconds
         if (due or late) and not last:
             with self._clock.paused():
                 self._save(event.index, event.iteration)
@@ -269,7 +271,7 @@ class RunLogger:
 def progress_every(loaded: LoadedRun) -> int:
     """Return the iterations between progress events."""
     every = REPORT_EVERY if loaded.backend.on_host else REPORT_EVERY_ON_GPU
-    return max(1, min(every, loaded.resolved.execution.checkpoint_every))
+    return min(every, checkpoint_interval(loaded.resolved.execution.checkpoint_every)[0] or every)
 
 
 def _storable(value: Any) -> bool:

@@ -12,7 +12,7 @@ from gs2d.core.memory import hold
 from gs2d.core.splats import Splats
 from gs2d.data.archive import is_archive, named_by, unpack
 from gs2d.data.scene import Scene
-from gs2d.errors import RecipeError, RunError
+from gs2d.errors import RunError
 from gs2d.io.run_dir import (
     MESH,
     PAGE,
@@ -180,7 +180,7 @@ def _unpacked(options: TrainOptions, allowed: tuple[str, ...], on_event: OnEvent
 @contextmanager
 def watched(loaded: LoadedRun, on_event: OnEvent) -> Iterator[Live | None]:
     """Serve the page of a training while it runs, with ``--viewer``."""
-    if not loaded.resolved.execution.viewer:
+    if loaded.resolved.execution.viewer is None:
         yield None
         return
     live = Live(loaded, on_event)
@@ -192,10 +192,8 @@ def watched(loaded: LoadedRun, on_event: OnEvent) -> Iterator[Live | None]:
 
 def check_viewer(options: TrainOptions) -> None:
     """Raise if the page of ``--viewer`` cannot be served."""
-    if options.viewer:
-        free_port(options.viewer_port, option="--viewer-port")
-    elif options.viewer_port is not None:
-        raise RecipeError("--viewer-port needs --viewer")
+    if options.viewer is not None:
+        free_port(options.viewer or None, option="--viewer")
 
 
 @contextmanager
@@ -313,10 +311,10 @@ def finish(
         if not (run.file(MESH).exists() and "mesh" in run.metrics()):  # a kill may come between the two
             keep_facts(run, extract_mesh(loaded, splats, mesh, run.file(MESH), on_event, subject=subject, seen=frames))
     if execution.page and not run.file(PAGE).exists():
-        with attempted(PAGE, again("page", run.path), on_event):
+        with attempted(PAGE, again("export", run.path, "--format", "html"), on_event):
             page_run(run.path, on_event=on_event, loaded=loaded)
     with attempted(VERDICT, again("evaluate", run.path), on_event):
         write_verdict(run, loaded, collected)
     on_event(Phase("writing the report", 0))  # last: it links to the others
-    with attempted(REPORT, again("report", run.path), on_event):
+    with attempted(REPORT, again("evaluate", run.path), on_event):
         report_run(run.path, on_event)

@@ -100,7 +100,7 @@ function setMeasuring(on = ruler.on) {
   $("aside").textContent = isComplete ? distanceText(a, b).long : "";
   $("scalepanel").hidden = !isComplete;
   const metres = $("metres").valueAsNumber;
-  $("scalecommand").value = isComplete && metres > 0 ? `gs2d georeference RUN --known-distance ${pointText(a)} ${pointText(b)} ${metres}` : "";
+  $("scalecommand").value = isComplete && metres > 0 ? `gs2d survey RUN --known-distance ${pointText(a)} ${pointText(b)} ${metres}` : "";
   drawRuler();
 }
 

@@ -6,9 +6,9 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from gs2d.cli.command_registry import MEASURE, STEPS, register_command
 from gs2d.cli.commands import Common
-from gs2d.cli.registry import MEASURE, STEPS, register_command
-from gs2d.contrib.lab.options import BlocksOptions, PaperOptions, SweepOptions, TableOptions
+from gs2d.contrib.lab.lab_options import BlocksOptions, PaperOptions, SweepOptions, TableOptions
 
 _ACTIONS = "gs2d.contrib.lab.show_table"
 
@@ -24,7 +24,7 @@ def _going_on(options: TableOptions, words: Sequence[str]) -> str:
     first=("scene", "out", "blocks", "recipe", "schedule_scale", "downscale", "memory", "slots"),
 )
 @dataclass(frozen=True, kw_only=True)
-class Blocks(BlocksOptions, Common):
+class BlocksCommand(BlocksOptions, Common):
     """Train a large capture in blocks and merge them."""
 
 
@@ -35,7 +35,7 @@ class Blocks(BlocksOptions, Common):
     first=("recipes", "data", "out", "seeds", "schedule_scale", "train"),
 )
 @dataclass(frozen=True, kw_only=True)
-class Sweep(SweepOptions, Common):
+class SweepCommand(SweepOptions, Common):
     """Compare recipes on scenes and seeds, as a table."""
 
     def after_interrupt(self, words: Sequence[str]) -> str:
@@ -50,7 +50,7 @@ class Sweep(SweepOptions, Common):
     first=("table", "data", "out", "scenes", "schedule_scale", "train"),
 )
 @dataclass(frozen=True, kw_only=True)
-class Paper(PaperOptions, Common):
+class PaperCommand(PaperOptions, Common):
     """Reproduce a table of the paper."""
 
     def after_interrupt(self, words: Sequence[str]) -> str:

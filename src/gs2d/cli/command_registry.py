@@ -12,9 +12,8 @@ from gs2d.config.registry import Register, Registry
 BEGIN = "To begin with"
 STEPS = "Step by step"
 LOOK = "Look, keep and share"
-WORLD = "Real-world coordinates"
 MEASURE = "Measure and compare"
-GROUPS = (BEGIN, STEPS, LOOK, WORLD, MEASURE)  # the order of the help; other groups follow
+GROUPS = (BEGIN, STEPS, LOOK, MEASURE)  # the order of the help; other groups follow
 
 
 @dataclass(frozen=True)
@@ -47,10 +46,8 @@ class Command:
         getattr(importlib.import_module(module), function)(options, console)
 
 
-_CORE = (
-    "doctor", "demo", "reconstruct", "view", "completion", "poses", "plan", "train", "mesh", "info", "render", "page",
-    "export", "report", "evaluate", "recipes",
-)  # fmt: skip
+_CORE = ("doctor", "demo", "reconstruct", "view", "poses", "train", "mesh", "info", "render", "export")
+_CORE += ("evaluate", "recipes")
 COMMANDS: Registry[Command] = Registry("command", "gs2d.commands", builtin=dict.fromkeys(_CORE, "gs2d.cli.commands"))
 
 

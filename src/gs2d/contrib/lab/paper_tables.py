@@ -16,7 +16,7 @@ from typing import Any
 
 from gs2d.config.presets import TABLES
 from gs2d.config.recipe_files import short_name
-from gs2d.contrib.lab.options import SWEEP
+from gs2d.contrib.lab.lab_options import SWEEP
 from gs2d.errors import RecipeError
 
 TNT, NERF_SYNTHETIC, DTU = "TnT", "NeRF-Synthetic", "DTU"  # the data sets, as they are called in every result

@@ -18,9 +18,9 @@ from gs2d.config.recipe_files import short_name
 from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import apply_overrides, to_json
 from gs2d.contrib.lab.jobs import Job, stage_keys
-from gs2d.contrib.lab.options import PaperOptions, SweepOptions, TableOptions
+from gs2d.contrib.lab.lab_options import PaperOptions, SweepOptions, TableOptions
+from gs2d.contrib.lab.paper_tables import PAPER_TABLES, PaperTable, recipe_table
 from gs2d.contrib.lab.scenes import FoundScene, find_scenes
-from gs2d.contrib.lab.tables import PAPER_TABLES, PaperTable, recipe_table
 from gs2d.errors import RecipeError
 from gs2d.io.run_dir import versions
 from gs2d.pipeline.prepare.options import EvaluateOptions, TrainOptions
@@ -52,7 +52,7 @@ def make_plan(options: PaperOptions | SweepOptions) -> Plan:
         value = getattr(options, name)
         if value is not None and value < 1:
             raise RecipeError(f"--{name} must be a whole number >= 1, got {value}")
-    scenes = find_scenes(options.data, options.scenes, protocol=options.protocol, truths=options.truth)
+    scenes = find_scenes(options.data, options.scenes, protocol=options.protocol, truths=options.ground_truth)
     recipes = {row.recipe: trained_recipe(row.recipe, options) for row in table.rows if row.recipe is not None}
     _check_overrides(options.overrides, [get_recipe(name) for name in recipes])
     cells = {

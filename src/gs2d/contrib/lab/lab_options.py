@@ -11,6 +11,7 @@ from gs2d.config.arguments import Arg
 from gs2d.errors import RecipeError
 from gs2d.pipeline.prepare.options import CommonTraining, Overrides, Resources, paths_of
 
+_PARTITION = "partition."  # what changes of the partition begin with, among those of --set
 SWEEP = "sweep"  # the name of a table of chosen recipes
 
 
@@ -34,7 +35,7 @@ class TableOptions:
     """Seeds, such as 0,1,2, or a count: 3 means 0,1,2."""
     backend: str = "auto"
     """Rasterizer."""
-    slots: Annotated[int | None, Arg(alias="--jobs")] = None
+    slots: int | None = None
     """Number of parallel runs (default: one per GPU, else one)."""
     cluster: Annotated[str | None, Arg(metavar="ADDRESS")] = None
     """Run on a Ray cluster that shares the disk of --out: HOST:PORT, or auto for the cluster of this machine."""
@@ -42,7 +43,7 @@ class TableOptions:
     """CPU threads per run (default: the cores divided by the number of parallel runs)."""
     cache: Annotated[Path | None, Arg(metavar="DIR")] = None
     """Folder that keeps finished stages (default: in --out). Tables that share it train common stages once."""
-    truth: Annotated[Path | None, Arg(metavar="DIR")] = None
+    ground_truth: Annotated[Path | None, Arg(metavar="DIR")] = None
     """Folder of true surfaces, NAME.ply, for captures without mesh_gt.ply."""
     lpips_weights: Path | None = None
     """VGG-16 and LPIPS weights; without them LPIPS is not computed."""
@@ -52,7 +53,7 @@ class TableOptions:
     """Only write the table of finished runs."""
 
     def __post_init__(self) -> None:
-        paths_of(self, "data", "out", "cache", "truth", "lpips_weights")
+        paths_of(self, "data", "out", "cache", "ground_truth", "lpips_weights")
         object.__setattr__(self, "scenes", _split(self.scenes))
         object.__setattr__(self, "seeds", parse_seeds(self.seeds))
 
@@ -115,9 +116,10 @@ class BlocksOptions(CommonTraining, Resources):
     """Run folder of the merged scene. The same command continues an interrupted one."""
     blocks: str = "auto"
     """Blocks on the ground, such as 3x3, or in space, such as 2x2x2 (auto: as many as --memory requires)."""
-    partition: Annotated[tuple[str, ...], Arg(metavar="FIELD=VALUE", repeated=True)] = ()
-    """Change the partition, e.g. --partition margin=0.3; may be repeated."""
-    slots: Annotated[int | None, Arg(alias="--jobs")] = None
+    overrides: Overrides = ()
+    """Change the recipe, e.g. --set surface.iterations=2000, or the partition, e.g. --set partition.margin=0.3; may be
+    repeated."""
+    slots: int | None = None
     """Number of parallel runs (default: one per GPU, else one)."""
     cluster: Annotated[str | None, Arg(metavar="ADDRESS")] = None
     """Run on a Ray cluster that shares the disk of --out: HOST:PORT, or auto for the cluster of this machine."""
@@ -138,3 +140,13 @@ class BlocksOptions(CommonTraining, Resources):
 
     def __post_init__(self) -> None:
         paths_of(self, "scene", "out", "masks")
+
+    @property
+    def partition_changes(self) -> tuple[str, ...]:
+        """Return the changes of the partition, ``field=value``."""
+        return tuple(text.removeprefix(_PARTITION) for text in self.overrides if text.startswith(_PARTITION))
+
+    @property
+    def recipe_changes(self) -> tuple[str, ...]:
+        """Return the changes of the recipe."""
+        return tuple(text for text in self.overrides if not text.startswith(_PARTITION))

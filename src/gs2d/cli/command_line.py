@@ -1,4 +1,4 @@
-"""The options of each command, read from its dataclass: for the parser, the help, the completion and the reference."""
+"""The options of each command, read from its dataclass: for the parser, the help and the reference page."""
 
 from __future__ import annotations
 
@@ -14,36 +14,36 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from gs2d.cli.registry import COMMANDS
+from gs2d.cli.command_registry import COMMANDS
 from gs2d.config.arguments import Arg
 
 NAMES: dict[str, type] = {name: command.options for name, command in COMMANDS.working()}
 _METAVARS = {int: "N", float: "NUMBER", Path: "PATH", str: "NAME"}
+_SWITCH = {"true": True, "false": False}
 _MANY = 24  # columns; longer lists of choices are in the text of the option
 
 
 @dataclass(frozen=True)
 class Option:
-    """An option or a positional argument of a command.
+    """An option, a setting or a positional argument of a command.
 
     Attributes
     ----------
     field : str
         Name of the dataclass field.
     flags : tuple of str
-        Names on the command line, ``--out``; empty for a positional argument.
+        Names on the command line, ``--out``; empty for a setting and a positional argument.
+    mark : Arg
     kind : type
         bool for a switch, else the type of each value.
     choices : tuple of str
         The valid values; empty: any.
     count : int or None
         Number of values; None: one or more.
-    repeated : bool
-        One value for each time the option is given.
     metavar : str
         Word for a value in help.
-    required : bool
     default : object
+        ``dataclasses.MISSING`` if a value is required.
     about : str
         Docstring of the field, in one line.
     owner : type
@@ -52,27 +52,39 @@ class Option:
 
     field: str
     flags: tuple[str, ...]
+    mark: Arg
     kind: type
     choices: tuple[str, ...]
     count: int | None
-    repeated: bool
     metavar: str
-    required: bool
     default: Any
     about: str
     owner: type
 
     @property
+    def required(self) -> bool:
+        """Return whether the command needs a value."""
+        return self.default is dataclasses.MISSING
+
+    @property
+    def positional(self) -> bool:
+        """Return whether the value is written without a name."""
+        return self.mark.positional
+
+    @property
     def name(self) -> str:
         """Return the name for messages."""
-        return self.flags[0] if self.flags else self.metavar
+        return self.flags[0] if self.flags else f"--set {self.field}" if self.mark.setting else self.metavar
 
     @property
     def usage(self) -> str:
         """Return the option with its value, as it is written."""
         value = f"{self.count} {self.metavar}S" if (self.count or 0) > 1 and " " not in self.metavar else self.metavar
         value += " ..." if self.count is None and "..." not in value else ""
-        return " ".join(word for word in (self.name if self.flags else "", "" if self.kind is bool else value) if word)
+        if self.mark.setting:
+            return f"{self.name}={value}"
+        value = "" if self.kind is bool else value
+        return " ".join(word for word in ("" if self.positional else self.name, value) if word)
 
     def add_to(self, parser: argparse._ActionsContainer, text: str = "") -> None:
         """Add the option to a parser with its help text. The caller reports missing options after misspelt ones."""
@@ -82,18 +94,35 @@ class Option:
             parser.add_argument(*self.flags, dest=self.field, action=action, help=text)
             return
         nargs: int | str | None = "+" if self.count is None else self.count if self.count > 1 else None
-        if not self.flags:
+        if self.positional:
             nargs = "*" if self.count is None else "?"
         parser.add_argument(
             *(self.flags or (self.field,)),
             **({"dest": self.field} if self.flags else {"default": None}),
-            action="append" if self.repeated else "store",
+            action="append" if self.mark.repeated else "store",
             nargs=nargs,
             type=self.kind,
             choices=self.choices or None,
             help=text,
             metavar=tuple(self.metavar.split()) if isinstance(nargs, int) else self.metavar,
         )
+
+    def read(self, text: str) -> Any:
+        """Return the value of a setting.
+
+        Raises
+        ------
+        ValueError
+            If the text is no valid value; says what is expected.
+        """
+        words = text.split(",") if self.count != 1 else [text]
+        try:
+            values = tuple(_SWITCH[word] if self.kind is bool else self.kind(word) for word in words)
+        except (KeyError, ValueError):
+            values = ()
+        if len(values) != (self.count or len(words)) or not set(values) <= set(self.choices or values):
+            raise ValueError(f"{self.usage} expected, got {text!r}")
+        return values if self.count != 1 else values[0]
 
 
 def about(kind: type) -> str:
@@ -103,48 +132,46 @@ def about(kind: type) -> str:
 
 @functools.cache
 def options_of(kind: type) -> tuple[Option, ...]:
-    """Return the options of a command, those of nested dataclasses included, in the order of the fields."""
-    found: list[Option] = []
+    """Return the options of a command, with those of nested dataclasses, in the order of the fields."""
+    options: list[Option] = []
     for field, hint, mark in fields_of(kind):
         if dataclasses.is_dataclass(hint):
-            found += options_of(hint)
+            options += options_of(hint)
         elif not mark.python_only:
-            found.append(_option(kind, field, hint, mark))
-    return tuple(found)
+            options.append(_option(kind, field, hint, mark))
+    return tuple(options)
 
 
 @functools.cache
 def fields_of(kind: type) -> tuple[tuple[dataclasses.Field[Any], type, Arg], ...]:
     """Return the fields of a dataclass, each with its type and its mark."""
     hints = get_type_hints(kind, include_extras=True)
-    found = []
+    entries = []
     for field in dataclasses.fields(kind):
         hint, mark = hints[field.name], Arg()
         if get_origin(hint) is Annotated:
             hint, mark = get_args(hint)
-        found.append((field, hint, mark))
-    return tuple(found)
+        entries.append((field, hint, mark))
+    return tuple(entries)
 
 
 def _option(kind: type, field: dataclasses.Field[Any], hint: Any, mark: Arg) -> Option:
     value, choices, count = _value(hint)
     name = mark.name or field.name
     switched_off = "no-" if value is bool and field.default is True else ""
-    flags = ("--" + switched_off + name.replace("_", "-"), *([mark.alias] if mark.alias else ()))
-    listed = "|".join(choices)
-    if choices and (mark.positional or len(listed) > _MANY):
+    listed = "true|false" if value is bool else "|".join(choices)
+    if choices and not mark.setting and (mark.positional or len(listed) > _MANY):
         listed = name.split("_")[-1].upper()
     owner = next(base for base in kind.__mro__ if field.name in vars(base).get("__annotations__", {}))
     return Option(
         field=field.name,
-        flags=() if mark.positional else flags,
+        flags=() if mark.positional or mark.setting else ("--" + switched_off + name.replace("_", "-"),),
+        mark=mark,
         kind=mark.kind or value,
         choices=choices,
         count=1 if mark.repeated else count,
-        repeated=mark.repeated,
         metavar=mark.metavar or listed or _METAVARS.get(value, "VALUE"),
-        required=field.default is dataclasses.MISSING,
-        default=None if field.default is dataclasses.MISSING else field.default,
+        default=field.default,
         about=_docstrings(owner).get(field.name, ""),
         owner=owner,
     )
@@ -165,12 +192,12 @@ def _value(hint: Any) -> tuple[type, tuple[str, ...], int | None]:
 @functools.cache
 def _docstrings(kind: type) -> dict[str, str]:
     """Return the strings below the fields of a dataclass, each in one line."""
-    found = {}
+    texts = {}
     body = _classes(kind.__module__)[kind.__name__].body
     for field, text in itertools.pairwise(body):
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr):
-            found[field.target.id] = " ".join(str(ast.literal_eval(text.value)).split())
-    return found
+            texts[field.target.id] = " ".join(str(ast.literal_eval(text.value)).split())
+    return texts
 
 
 @functools.cache
