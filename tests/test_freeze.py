@@ -26,7 +26,7 @@ def counted() -> dict[str, int]:
     options = [(name, option) for name, command in NAMES.items() for option in options_of(command)]
     return {
         "commands": len(NAMES),
-        "options of all commands": 297len(options),
+        "options of all commands": len(options),
         "options by name": len({option.name for _, option in options if option.flags}),
         "settings by name": len({option.name for _, option in options if option.mark.setting}),
         "recipes": len(gs2d.list_recipes()),
