@@ -18,7 +18,7 @@ from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Event, NotMade
 
-LATER = {  # of a training, with what is missing then
+LATER = {  # steps after training, with the result that is missing if they fail
     "train.stage_results.write_poses": "refined cameras and exposures",
     "train.stage_results.write_appearance": "refined cameras and exposures",
     "train.stage_results.score_views": "scores of train views, stage refine",
@@ -47,7 +47,7 @@ def failing(error: Exception) -> Callable[..., Any]:
 
 @pytest.fixture
 def trained(undisturbed: RunFolder, tmp_path: Path) -> Path:
-    """A run that was killed when its last iteration was done: the checkpoints are all that it has of its last stage."""
+    """A run killed after its last iteration: its last stage has checkpoints only."""
     copy = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
     for name in ("splats.ply", "mesh.ply", "scene.html", "verdict.json", "report.html", "subject.json"):
         copy.file(name).unlink()

@@ -39,7 +39,7 @@ def job(capture: Path) -> LoadedRun:
 
 
 def resumed(run: RunFolder, job: LoadedRun, capture: Path, payload: dict[str, Any]) -> tuple[ResumePoint, list[str]]:
-    """Where training goes on when the last checkpoint holds ``payload``, and what is said."""
+    """Return the checkpoint that training resumes from if the last one holds ``payload``, and the notices."""
     save_tensors(run.checkpoints()[-1].path, payload)
     heard: list[Event] = []
     start = choose_start(run, job, heard.append)

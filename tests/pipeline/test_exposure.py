@@ -54,7 +54,7 @@ def run(varied: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 def test_the_gains_of_the_demo_have_mean_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn = np.random.default_rng(0).integers(0, 256, (16, 16, 4)).astype(np.uint8)
-    monkeypatch.setattr(toy, "bake", lambda *_, **__: None)  # a picture that takes no rays
+    monkeypatch.setattr(toy, "bake", lambda *_, **__: None)  # images without ray casting
     monkeypatch.setattr(toy, "render_image", lambda *_: toy.SyntheticImage(drawn, np.zeros(1, bool)))
     for name, vary in (("plain", False), ("varied", True)):
         toy.write_demo_capture(tmp_path / name, train_views=3, test_views=1, size=16, vary=["exposure"] * vary)

@@ -72,7 +72,7 @@ def test_views_with_similar_names_have_different_files() -> None:
     views = [View.from_arrays(name, ball_cameras(1, 2)[0], np.zeros((2, 2, 3), np.uint8)) for name in wanted]
     names = file_names(views)
     assert len({name.lower() for name in names}) == len(wanted)
-    assert names[-1] == "z"  # nobody else's
+    assert names[-1] == "z"  # its name is unique
     assert names[0].startswith("x-")
     assert file_names(views) == names
 

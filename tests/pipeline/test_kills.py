@@ -32,7 +32,7 @@ def layer(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def tried(layer: Path, work: Path, commands: str, actions: str, *more: str) -> list[dict[str, Any]]:
-    """What ``kill_runs`` says of each command and action, none of which did any harm."""
+    """Return the results of ``kill_runs`` for each command and action, after checking that none did harm."""
     environment = {
         **os.environ,
         "LD_PRELOAD": str(layer),
@@ -66,7 +66,7 @@ def test_the_recorded_states_are_those_after_a_kill_a_torn_write_and_a_full_disk
 
 
 def test_the_harness_detects_a_file_that_is_written_in_place(layer: Path, tmp_path: Path) -> None:
-    """A stand-in for an export that writes in place: killed half-way it leaves half a file, which must be found."""
+    """An export that writes in place: killed half-way it leaves half a file, which must be detected."""
     code = (
         "import kill_commands, kill_runs, sys\n"
         "def write(run, out):\n"

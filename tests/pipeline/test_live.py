@@ -39,7 +39,7 @@ def fetch(url: str, path: str) -> tuple[Any, bytes]:
 def test_the_viewer_does_not_change_the_bytes(
     undisturbed: RunFolder, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every progress report is fetched by a page, with images beside it."""
+    """Every progress event is fetched by a page, with photographs."""
     monkeypatch.setattr(module, "MIN_SECONDS", 0.0)
     monkeypatch.setattr(module, "MAX_FRACTION", 1e9)
     seen: list[dict[str, Any]] = []
@@ -119,7 +119,7 @@ def test_the_page_shows_a_copy_of_the_splats(live: Live, splats: Splats) -> None
     live.on_training_event(StageEntering("surface", 0, len(splats)), state_of(splats), None)  # not trained yet
     assert version_of(live) == 0
     live.on_training_event(progress(), state_of(splats), None)
-    splats.means += 100.0  # training goes on at once
+    splats.means += 100.0  # training continues at once
     assert version_of(live) == 1
     answer = live._answer_splats({})
     count = json.loads(answer.headers["X-Splats"])["splats"]

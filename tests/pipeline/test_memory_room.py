@@ -45,7 +45,7 @@ def test_photographs_that_do_not_fit_into_memory_are_an_error_with_a_remedy(monk
     assert downscale > 1
     check_memory(scene(5888 // downscale, 3926 // downscale), downscale, on_host=True)  # as the line says
     needed = 5888 * 3926 * (module.ITERATION_BYTES / downscale**2 + module.DECODING_BYTES)
-    assert needed < 0.6 * 0.95 * GB  # caches have room beside it
+    assert needed < 0.6 * 0.95 * GB  # leaves memory for caches
 
 
 def test_photographs_shrink_to_fit_into_memory_by_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Event, Step
 
-WIDE = (  # for few cameras, far apart, and pictures of a few pixels
+WIDE = (  # for few cameras, far apart, and images of a few pixels
     *("multiview.max_angle=80", "multiview.max_baseline=2", "multiview.radius=1", "multiview.occluded=50"),
     *("multiview.opacity=0.05", "multiview.texture=0.001", "multiview.patches=50"),
 )

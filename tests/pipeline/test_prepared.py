@@ -31,7 +31,7 @@ from gs2d.training.events import Event, Notice, Phase
 from gs2d.training.trainer import Trainer
 
 FLIGHT = Flight(12, width=64, height=48, points=6000, seed=1)
-COARSE = replace(GENERIC, fusion=replace(GENERIC.fusion, voxel=3.0, truncation=15.0))  # m; fusion is not what is tried
+COARSE = replace(GENERIC, fusion=replace(GENERIC.fusion, voxel=3.0, truncation=15.0))  # m; fusion is not tested
 
 
 @pytest.fixture(autouse=True)
@@ -90,7 +90,7 @@ def test_later_commands_use_prepared_photographs(capture: Path, tmp_path: Path) 
     again = mesh_run(run.path, MeshOptions(whole_scene=True, keep_components=0), out=tmp_path / "again.ply")
     assert again["voxel"] == 3.0
     assert report_run(run.path).exists()
-    for file in (run.path / PREPARED).iterdir():  # whoever wants the room takes it
+    for file in (run.path / PREPARED).iterdir():  # deleted to free space
         file.unlink()
     (run.path / PREPARED).rmdir()
     _, job, _ = open_finished(run.path, None, lambda event: None)

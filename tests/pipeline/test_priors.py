@@ -117,7 +117,7 @@ def test_a_broken_map_is_an_error_before_training_and_leaves_nothing(valid: Path
     with pytest.raises(DataError, match="r_4"):
         train(knowing(broken, tmp_path / "run"))
     assert not (tmp_path / "run").exists()
-    train(options(broken, tmp_path / "plain"))  # nobody asks for them
+    train(options(broken, tmp_path / "plain"))  # not used
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere names of files are text")

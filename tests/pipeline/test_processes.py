@@ -107,7 +107,7 @@ def test_process_0_reports_differences(
 
 @pytest.mark.slow
 def test_prepared_photographs_of_an_archive_give_the_same_bytes(capture: Path, whole: Path, tmp_path: Path) -> None:
-    """Process 0 unpacks and prepares; the other one reads what is there."""
+    """Process 0 unpacks and prepares; the other one reads the result."""
     archive = Path(shutil.make_archive(str(tmp_path / "ball"), "zip", capture))
     command = words(archive, tmp_path / "run", "--set", "prepare=always")
     assert in_processes(2, command) == [(0, ""), (0, "")]

@@ -49,7 +49,7 @@ def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 
 def test_the_demo_disturbs_cameras_and_writes_the_true_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(toy, "bake", lambda *_, **__: None)  # a picture that takes no rays
+    monkeypatch.setattr(toy, "bake", lambda *_, **__: None)  # images without ray casting
     image = toy.SyntheticImage(np.full((16, 16, 4), 200, np.uint8), np.zeros(1, bool))
     monkeypatch.setattr(toy, "render_image", lambda *_: image)
     for name, vary in (("plain", False), ("varied", True)):
@@ -94,8 +94,8 @@ def test_later_commands_use_the_refined_cameras(run: RunFolder, capture: Path, t
     psnr = run.metrics()["stages"][-1]["train"]["psnr"]
     own = mean_metrics(list(score_views(splats, job.scene.train, **drawing).values()))  # type: ignore[arg-type]
     assert own.to_json()["psnr"] == psnr
-    as_given = mean_metrics(list(score_views(splats, given.train, **drawing).values()))  # type: ignore[arg-type]
-    assert as_given.to_json()["psnr"] != psnr
+    original_scores = mean_metrics(list(score_views(splats, given.train, **drawing).values()))  # type: ignore[arg-type]
+    assert original_scores.to_json()["psnr"] != psnr
     assert evaluate_run(run.path)["train"]["psnr"] == psnr
     render_run(run.path, RenderOptions(split="train"), out=tmp_path)
     assert len(list(tmp_path.glob("*.png"))) == 6
@@ -136,7 +136,7 @@ def test_an_interrupted_run_resumes_to_the_same_splats_and_poses(run: RunFolder,
     assert not (tmp_path / "run" / POSES).exists()
     stopped = RunFolder(tmp_path / "run")
     given = load_scene(capture).train[0].camera.T_cam_world
-    assert np.array_equal(reload_run(stopped, ignore).scene.train[0].camera.T_cam_world, given)  # not found yet
+    assert np.array_equal(reload_run(stopped, ignore).scene.train[0].camera.T_cam_world, given)  # not refined yet
     resumed = train(learning(capture, tmp_path / "run", resume=True))
     assert comparable(resumed)[0] == comparable(run)[0]
     assert resumed.file(POSES).read_bytes() == run.file(POSES).read_bytes()

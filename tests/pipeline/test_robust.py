@@ -109,7 +109,7 @@ def test_training_is_robust_where_protocol_and_capture_allow_it(
     assert (recipe.stages[0].lr.sh0 > LearningRates().sh0) == robust  # a tenth of the schedule: longer steps
 
 
-# -- the exposure of a view that nobody photographed ----------------------------------------------------------------
+# -- predicted exposures ----------------------------------------------------------------
 def predicted(gains: np.ndarray) -> float:
     """The gain that the last view of the ring would have, by those of the others."""
     scene = ring(gains, test=1)

@@ -161,7 +161,7 @@ def test_the_demo_trains_scores_the_surface_and_reports(tmp_path: Path) -> None:
     assert (out / "capture" / "transforms_train.json").exists()
     assert "gs2d demo: " in (out / "report.html").read_text()
     before = run.file("splats.ply").read_bytes()
-    again = demo(replace(small, resume=True))  # the capture is taken as it is
+    again = demo(replace(small, resume=True))  # the capture is reused
     assert again.file("splats.ply").read_bytes() == before
     assert again.metrics()["surface"] is not None
 

@@ -20,7 +20,7 @@ from tiny import write_ball_mesh
 
 @pytest.fixture
 def beside(undisturbed: RunFolder, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
-    """A copy of the run whose capture has a true mesh beside its photographs; and that capture."""
+    """A copy of the run whose capture has a true mesh; and that capture."""
     monkeypatch.setattr("gs2d.evaluation.evaluators.evaluate_surface", partial(evaluate_surface, samples=2000))
     run, folder = tmp_path / "run", tmp_path / "ball"
     shutil.copytree(undisturbed.path, run)

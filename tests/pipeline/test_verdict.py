@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gs2d.report.record import RunRecord
-from gs2d.report.sections.verdict import verdict_section
 
 from gs2d.config import grades
 from gs2d.core.json_files import write_json
 from gs2d.errors import DataError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.finish.run_verdict import Finding, Measures, ViewMeasures, judge
+from gs2d.report.run_record import RunRecord
+from gs2d.report.sections.verdict_section import verdict_section
 
 
 def views(train: float = 29.0, test: float = 27.0, **changes: Any) -> tuple[ViewMeasures, ...]:

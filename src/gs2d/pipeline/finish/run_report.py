@@ -13,7 +13,7 @@ from gs2d.training.events import NotMade, OnEvent, ignore
 
 def report_run(path: Path, on_event: OnEvent = ignore) -> Path:
     """Write the report of a run; a section that fails is replaced by the reason, with a ``NotMade`` event."""
-    from gs2d.report.write import write_report
+    from gs2d.report.report_page import write_report
 
     run = open_run(Path(path))
     run.sweep()
