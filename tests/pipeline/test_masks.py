@@ -24,7 +24,7 @@ from gs2d.pipeline.finish.run_subject import sights
 from gs2d.pipeline.in_memory import Trained, evaluate, extract_mesh, train
 from gs2d.pipeline.prepare.loaded import reload_run, scene_digest
 from gs2d.pipeline.prepare.open_capture import without_masked_points
-from gs2d.pipeline.prepare.options import MeshOptions
+from gs2d.pipeline.prepare.options import MeshOptions, Training
 from gs2d.render.backends import get_backend
 from gs2d.training.events import Notice
 from gs2d.training.trainer import raster_settings
@@ -55,7 +55,9 @@ def write_ball(root: Path, noise: int) -> Path:
 
 def everything(root: Path, **options: Any) -> tuple[Splats, dict[str, Any], np.ndarray, np.ndarray]:
     recipe = Recipe("plain", (Stage("surface", 12, losses=(LossTerm("l1", 1.0),)),))
-    trained = train(load_scene(root, test_every=4, **options), recipe, learn="exposure", robust="off", backend="cpu")
+    trained = train(
+        load_scene(root, test_every=4, **options), recipe, backend="cpu", options=Training(learn="exposure", robust="off")
+    )
     solid = replace(trained.splats, opacity_logits=trained.splats.opacity_logits + 9)
     mesh = extract_mesh(replace(trained, splats=solid), options=MeshOptions(whole_scene=True, voxel=0.1))
     votes = sights(trained, trained.splats)

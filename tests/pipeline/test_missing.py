@@ -120,7 +120,7 @@ def test_a_failing_section_does_not_affect_others(
     report_run(copy, heard.append)
     whats = [event.what for event in heard if isinstance(event, NotMade)]
     assert whats == [
-        "cameras of the pictures in report.html",
+        "cameras of the images in report.html",
         "comparison with a photograph in report.html",
         "section views in report.html",
         "section training in report.html",

@@ -47,7 +47,7 @@ def test_a_subject_box_becomes_the_subject_and_limits_the_mesh(undisturbed: RunF
     assert json.loads((run.path / "subject.json").read_text())["min"] == list(BOX[:3])
     assert said == [
         Notice(
-            "subject: 1 x 1.2 x 1.4 world units, box -0.5 -0.6 -0.7 0.5 0.6 0.7 (the box was given); "
+            "subject: 1 x 1.2 x 1.4 world units, box -0.5 -0.6 -0.7 0.5 0.6 0.7 (set with --subject-box); "
             "--scene meshes everything"
         )
     ]

@@ -119,14 +119,9 @@ def extract_mesh(
     result = fused(loaded, splats, options, on_event, subject=subject, seen=seen)
     release_buffers()
     write_mesh(out, result.mesh)
-    cleaned: dict[str, Any] = {}
-    if result.cleaned is not None:
-        cleaned = {
-            "pixels": round(result.cleaned.pixels),
-            "faces_per_pixel": len(result.mesh.faces) / max(result.cleaned.pixels, 1.0),
-            "area_unsupported": result.cleaned.unsupported,
-            "area_apart": result.cleaned.small,
-        }
+    pixels: dict[str, Any] = {}
+    if result.pixels is not None:
+        pixels = {"pixels": round(result.pixels), "faces_per_pixel": len(result.mesh.faces) / max(result.pixels, 1.0)}
     return {
         "file": str(out),
         "vertices": len(result.mesh.vertices),
@@ -136,11 +131,8 @@ def extract_mesh(
         "levels": result.levels,
         "fused_by": result.backend,
         **asdict(result.limits),
-        "blocks": result.blocks,
         "volume_bytes": result.volume_bytes,
-        "components": result.components,
-        "faces_removed": result.faces_removed,
-        **cleaned,
+        **pixels,
     }
 
 
