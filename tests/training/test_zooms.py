@@ -307,4 +307,3 @@ def test_targets_are_undistorted_by_the_learned_lens() -> None:
     assert mask is not None
     assert np.array_equal(mask, reached)
     assert np.array_equal(wide.at(camera.T_cam_world).image(), wide.image())  # once, however often it is moved
-    assert there.downscaled(2).image().shape == (15, 20, 3)

@@ -103,18 +103,6 @@ class View:
         """Return a changed view whose image stays in the cache of this view."""
         return replace(self, decode=self._image, cache=ImageCache(0), **changes)
 
-    def downscaled(self, factor: int) -> View:
-        """Return the view at 1 / ``factor`` of its size, with camera, masks and maps.
-
-        The image is downscaled on each access, so that nothing is stored twice.
-        """
-        if factor == 1:
-            return self
-        camera = self.camera.downscaled(factor)
-        maps = None if self.maps is None else replace(self.maps, camera=camera)
-        small = self._sharing(camera=camera, maps=maps)
-        return replace(small, decode=lambda: self._image().downscaled(factor))
-
     def file_intrinsics(self) -> Intrinsics:
         """Return the intrinsics of the image file, including its lens."""
         c = self.camera
@@ -308,10 +296,6 @@ class Scene:
             return tuple(view.with_appearance(found[view.name]) if view.name in found else view for view in views)
 
         return replace(self, train=seen(self.train), test=seen(self.test))
-
-    def downscaled(self, factor: int) -> Scene:
-        """Return the scene with training images at 1 / ``factor`` of their size; test views are unchanged."""
-        return self if factor == 1 else replace(self, train=tuple(view.downscaled(factor) for view in self.train))
 
     @property
     def views(self) -> tuple[View, ...]:
