@@ -3,62 +3,21 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 
 from gs2d.core.memory_limit import cache_bytes as room_for_cache
 from gs2d.core.missing import instead, where_it_ends
-from gs2d.data.build import Capture, build_scene
+from gs2d.data.build import build_scene
 from gs2d.data.file_names import IMAGES, in_any_case
 from gs2d.data.known_captures import missing_lines
 from gs2d.data.masks import Masks, without_masks
-from gs2d.data.readers.capture_readers import READERS, Reader, register_reader
-from gs2d.data.readers.colmap import MODEL_FOLDERS, model_folder, read_colmap
-from gs2d.data.readers.json_captures import CAMERAS, TRAIN, read_blender, read_nerfstudio
+from gs2d.data.readers.capture_readers import READERS, Reader
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
 
 FORMATS = READERS.builtin
 
-
-@dataclass(frozen=True)
-class _BuiltinReader:
-    """A built-in reader."""
-
-    holds: Callable[[Path], object]
-    make: Callable[[Path], Capture]
-    looks_for: str
-
-    def detect(self, path: Path) -> bool:
-        return bool(self.holds(path))
-
-    def read(self, path: Path, *, downscale: int) -> Capture:
-        return self.make(path)
-
-
-class _Colmap:
-    """COLMAP models; ``images_N`` has downscaled images."""
-
-    looks_for = f"cameras.bin and images.bin (or .txt) in {', '.join(MODEL_FOLDERS)} (COLMAP)"
-
-    def detect(self, path: Path) -> bool:
-        return model_folder(path) is not None
-
-    def read(self, path: Path, *, downscale: int) -> Capture:
-        return read_colmap(path, downscale)
-
-
-def _register(name: str, holds: Callable[[Path], object], make: Callable[[Path], Capture], looks_for: str) -> None:
-    made: Callable[[], _BuiltinReader] = partial(_BuiltinReader, holds, make, looks_for)
-    made.__module__ = __name__
-    register_reader(name)(made)
-
-
-_register("blender", lambda root: in_any_case(root, TRAIN).is_file(), read_blender, f"{TRAIN} (Blender)")
-_register("nerfstudio", lambda root: in_any_case(root, CAMERAS).is_file(), read_nerfstudio, f"{CAMERAS} (nerfstudio)")
-register_reader("colmap")(_Colmap)
 
 _PROJECTS = {  # project files of other tools, which must be exported first
     ".psx": "in Metashape, use File > Export > Export Cameras as Agisoft XML (cameras.xml)",

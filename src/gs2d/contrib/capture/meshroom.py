@@ -17,12 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from gs2d.contrib.capture.camera_files import entries, points_beside, real, reals, required, whole
 from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world, skipping
 from gs2d.data.camera_models import Lens
 from gs2d.data.file_names import files_ending, in_any_case
 from gs2d.data.readers.capture_readers import register_reader
-from gs2d.data.readers.common import entries, find_photographs, head, points_beside, real, reals, required, whole
+from gs2d.data.readers.common import find_photographs, head
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError

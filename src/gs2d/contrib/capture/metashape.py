@@ -24,12 +24,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from gs2d.contrib.capture.camera_files import points_beside, real, reals, whole
 from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world, skipping
 from gs2d.data.camera_models import Lens
 from gs2d.data.faces import panorama
 from gs2d.data.file_names import files_ending, in_any_case
 from gs2d.data.readers.capture_readers import register_reader
-from gs2d.data.readers.common import find_photographs, head, points_beside, real, reals, whole
+from gs2d.data.readers.common import find_photographs, head
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
 
@@ -61,7 +62,7 @@ def read_metashape(root: Path) -> Capture:
     """Read the cameras of Metashape; unaligned and disabled cameras and those of other components are skipped.
 
     Images are found by their labels in ``images`` or elsewhere below the folder, sparse points in a PLY file beside the
-    cameras (``common.points_beside``).
+    cameras (``camera_files.points_beside``).
 
     Raises
     ------

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gs2d.contrib.capture.camera_files import entries, real, reals, required, whole
 from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage, skipping
 from gs2d.data.camera_models import Lens
@@ -22,7 +23,7 @@ from gs2d.data.faces import panorama
 from gs2d.data.file_names import in_any_case
 from gs2d.data.image_files import image_size
 from gs2d.data.readers.capture_readers import register_reader
-from gs2d.data.readers.common import entries, find_photographs, real, reals, required, whole
+from gs2d.data.readers.common import find_photographs
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError

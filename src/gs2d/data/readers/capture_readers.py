@@ -13,7 +13,8 @@ from gs2d.errors import DataError
 
 __all__ = ["READERS", "Reader", "register_reader"]
 
-_CORE = ("blender", "nerfstudio", "colmap")
+_JSON = "gs2d.data.readers.json_captures"
+_CORE = {"blender": _JSON, "nerfstudio": _JSON, "colmap": "gs2d.data.readers.colmap"}
 
 
 class Reader(Protocol):
@@ -35,9 +36,7 @@ class Reader(Protocol):
         """
 
 
-READERS: Registry[Callable[[], Reader]] = Registry(
-    "format", "gs2d.readers", builtin=dict.fromkeys(_CORE, "gs2d.data.load"), error=DataError
-)
+READERS: Registry[Callable[[], Reader]] = Registry("format", "gs2d.readers", builtin=_CORE, error=DataError)
 """Readers by name of the format, in the order of detection."""
 
 

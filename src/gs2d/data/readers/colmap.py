@@ -22,6 +22,7 @@ from gs2d.data.faces import panorama
 from gs2d.data.file_names import in_any_case
 from gs2d.data.image_files import image_size
 from gs2d.data.prior_maps import ObservedPoints
+from gs2d.data.readers.capture_readers import register_reader
 from gs2d.data.readers.common import ImageFile, find_photographs, parsed
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, colmap_intrinsics
@@ -472,6 +473,21 @@ def read_colmap(root: Path, downscale: int) -> Capture:
         home=home,
         observe=partial(observed_points, folder, kind, {name: photo.name for name, photo in photographs.items()}),
     )
+
+
+@register_reader("colmap")
+class Colmap:
+    """Reader of COLMAP captures; ``images_N`` has downscaled images."""
+
+    looks_for = f"cameras.bin and images.bin (or .txt) in {', '.join(MODEL_FOLDERS)} (COLMAP)"
+
+    def detect(self, path: Path) -> bool:
+        """Whether the folder has a model."""
+        return model_folder(path) is not None
+
+    def read(self, path: Path, *, downscale: int) -> Capture:
+        """Read a capture."""
+        return read_colmap(path, downscale)
 
 
 def observed_points(folder: Path, kind: str, names: Mapping[str, str] | None = None) -> ObservedPoints:

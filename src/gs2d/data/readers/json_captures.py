@@ -19,6 +19,7 @@ from gs2d.data.file_names import Files, in_any_case
 from gs2d.data.image_files import image_size
 from gs2d.data.masks import FOLDER
 from gs2d.data.prior_maps import DEPTHS, NORMALS, MapFiles
+from gs2d.data.readers.capture_readers import register_reader
 from gs2d.data.readers.common import ImageFile, find_photographs
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics
@@ -82,6 +83,36 @@ def read_nerfstudio(root: Path) -> Capture:
         else:
             notes.append(f"ply_file_path {meta['ply_file_path']} does not exist: the scene has no sparse points")
     return Capture("nerfstudio", tuple(frames), points, skipped=tuple(skipped + unlisted), notes=tuple(notes))
+
+
+@register_reader("blender")
+class Blender:
+    """Reader of NeRF-Synthetic captures."""
+
+    looks_for = f"{TRAIN} (Blender)"
+
+    def detect(self, path: Path) -> bool:
+        """Whether the folder has ``transforms_train.json``."""
+        return in_any_case(path, TRAIN).is_file()
+
+    def read(self, path: Path, *, downscale: int) -> Capture:
+        """Read a capture."""
+        return read_blender(path)
+
+
+@register_reader("nerfstudio")
+class Nerfstudio:
+    """Reader of captures of nerfstudio and instant-ngp."""
+
+    looks_for = f"{CAMERAS} (nerfstudio)"
+
+    def detect(self, path: Path) -> bool:
+        """Whether the folder has ``transforms.json``."""
+        return in_any_case(path, CAMERAS).is_file()
+
+    def read(self, path: Path, *, downscale: int) -> Capture:
+        """Read a capture."""
+        return read_nerfstudio(path)
 
 
 def _read_meta(path: Path) -> dict[str, Any]:
