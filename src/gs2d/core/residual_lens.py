@@ -16,12 +16,12 @@ from gs2d.core.camera import Camera
 _NEWTON = 10  # iterations from x to y; convergence is quadratic
 
 
-def through_lens(picture: Tensor, camera: Camera, lens: Tensor) -> tuple[Tensor, Tensor]:
+def through_lens(image: Tensor, camera: Camera, lens: Tensor) -> tuple[Tensor, Tensor]:
     """Distort a pinhole image with a residual lens.
 
     Parameters
     ----------
-    picture : Tensor [H, W, C]
+    image : Tensor [H, W, C]
         Rendering of ``camera``.
     camera : Camera
         A tensor ``intrinsics`` receives gradients.
@@ -35,23 +35,23 @@ def through_lens(picture: Tensor, camera: Camera, lens: Tensor) -> tuple[Tensor,
     inside : Tensor [H, W] bool
         Pixels inside the rendering; outside, its border is repeated.
     """
-    focal, center = _numbers(camera, picture)
-    pixels = _centres(camera, picture)
+    focal, center = _numbers(camera, image)
+    pixels = _centres(camera, image)
     y = (pixels - center) / focal
-    k1, k2 = lens.to(picture).unbind()
+    k1, k2 = lens.to(image).unbind()
     square = y.square().sum(dim=2, keepdim=True)
-    places = pixels + (pixels - center) * square * (k1 + k2 * square)
-    return sampled(picture, places), _within(places, camera)
+    positions = pixels + (pixels - center) * square * (k1 + k2 * square)
+    return sampled(image, positions), _within(positions, camera)
 
 
 @torch.no_grad()
-def straightened(picture: Tensor, camera: Camera, lens: tuple[float, float]) -> tuple[Tensor, Tensor]:
+def straightened(image: Tensor, camera: Camera, lens: tuple[float, float]) -> tuple[Tensor, Tensor]:
     """Return the pinhole image of a photograph [H, W, C] with a residual lens, and its valid pixels [H, W].
 
     The inverse of :func:`through_lens`, up to resampling.
     """
-    places, inside = seen_at(camera, picture, lens)
-    return sampled(picture, places), inside
+    positions, inside = seen_at(camera, image, lens)
+    return sampled(image, positions), inside
 
 
 @torch.no_grad()
@@ -60,7 +60,7 @@ def seen_at(camera: Camera, like: Tensor, lens: tuple[float, float]) -> tuple[Te
 
     Returns
     -------
-    places : Tensor [H, W, 2] px
+    positions : Tensor [H, W, 2] px
         With dtype and device of ``like``.
     inside : Tensor [H, W] bool
     """
@@ -75,8 +75,8 @@ def seen_at(camera: Camera, like: Tensor, lens: tuple[float, float]) -> tuple[Te
         slope = (1 + square * (3 * k1 + 5 * k2 * square)).clamp_min(0.1)  # the lens folds only outside the image
         near = (near - value / slope).clamp_min(0)
     y = x * torch.where(far > 0, near / far.clamp_min(1e-12), torch.ones_like(far))
-    places = (y * focal + center).to(like.dtype)
-    return places, _within(places, camera)
+    positions = (y * focal + center).to(like.dtype)
+    return positions, _within(positions, camera)
 
 
 def _numbers(camera: Camera, like: Tensor) -> tuple[Tensor, Tensor]:
@@ -93,18 +93,18 @@ def _centres(camera: Camera, like: Tensor) -> Tensor:
     return torch.stack([columns, rows], dim=2)
 
 
-def sampled(picture: Tensor, places: Tensor) -> Tensor:
-    """Sample an image [H, W, C] bicubically at ``places`` [H, W, 2] px; its border extends outwards.
+def sampled(image: Tensor, positions: Tensor) -> Tensor:
+    """Sample an image [H, W, C] bicubically at ``positions`` [H, W, 2] px; its border extends outwards.
 
     Bilinear sampling blurs the image, and training would compensate by sharper splats.
     """
-    height, width, _ = picture.shape
-    grid = places * (2.0 / places.new_tensor([width, height])) - 1.0  # -1 and 1 are the outer edges
-    planes = picture.permute(2, 0, 1)[None]
+    height, width, _ = image.shape
+    grid = positions * (2.0 / positions.new_tensor([width, height])) - 1.0  # -1 and 1 are the outer edges
+    planes = image.permute(2, 0, 1)[None]
     found = F.grid_sample(planes, grid[None], mode="bicubic", padding_mode="border", align_corners=False)
     return found[0].permute(1, 2, 0)
 
 
-def _within(places: Tensor, camera: Camera) -> Tensor:
-    column, row = places.detach().unbind(dim=2)
+def _within(positions: Tensor, camera: Camera) -> Tensor:
+    column, row = positions.detach().unbind(dim=2)
     return (column >= 0) & (column <= camera.width) & (row >= 0) & (row <= camera.height)

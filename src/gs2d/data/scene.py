@@ -18,7 +18,7 @@ from gs2d.core.memory import trim
 from gs2d.data.cache import DecodedImage, ImageCache
 from gs2d.data.masks import Masks
 from gs2d.data.prior_maps import UNOBSERVED, ObservedPoints, PriorMaps
-from gs2d.data.straighten import straightened_picture
+from gs2d.data.straighten import straightened_image
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
 
@@ -78,8 +78,8 @@ class View:
         """Make a view from arrays: image uint8 [H, W, 3 or 4], masks bool [H, W]."""
         if valid is not None:
             mask = valid if mask is None else mask & valid
-        picture = DecodedImage(image, mask, object_mask, valid)
-        return cls(name, camera, lambda: picture)
+        decoded = DecodedImage(image, mask, object_mask, valid)
+        return cls(name, camera, lambda: decoded)
 
     def at(self, T_cam_world: np.ndarray, zoom: Zoom | None = None) -> View:
         """Return the view with another pose; its image stays in the cache of this view.
@@ -93,7 +93,7 @@ class View:
         seen = self._sharing(camera=now, zoom=zoom)
         if lens is None:
             return seen
-        return replace(seen, decode=lambda: straightened_picture(self._image(), now, lens))
+        return replace(seen, decode=lambda: straightened_image(self._image(), now, lens))
 
     def with_appearance(self, found: Appearance) -> View:
         """Return the view with further appearance parameters."""

@@ -96,8 +96,8 @@ def read_metashape(root: Path) -> Capture:
             k = _intrinsics(sensors[key], f"{path}: sensor {key}")
             T = pose_from_camera_to_world(M, f"{where}: transform", opengl=False)
             frames.append(PosedImage(photo.name, photo.path, k, T))
-    points, said = points_beside(root, frames)
-    return Capture("metashape", tuple(frames), points, skipped=tuple(lost), notes=(*notes, *moved, *said))
+    points, point_notes = points_beside(root, frames)
+    return Capture("metashape", tuple(frames), points, skipped=tuple(lost), notes=(*notes, *moved, *point_notes))
 
 
 @register_reader("metashape")
