@@ -140,7 +140,7 @@ def test_a_kill_in_the_middle_leaves_the_old_file_and_the_next_write_nothing_els
     assert names(tmp_path) == ["out"]
 
 
-def test_sweeping_takes_what_the_killed_left_and_nothing_of_those_who_write_or_of_others(tmp_path: Path) -> None:
+def test_sweeping_removes_only_temporary_files_of_killed_processes(tmp_path: Path) -> None:
     for name in ("a", "b" * 250, "ü" * 120, "c\nd"):
         kill_while_writing(tmp_path / name)
     others = [".mine.tmp", "x.gs2d.tmp"]
@@ -155,7 +155,7 @@ def test_sweeping_takes_what_the_killed_left_and_nothing_of_those_who_write_or_o
     assert sweep(tmp_path / "nowhere") == 0
 
 
-def test_a_link_in_the_place_of_the_temporary_file_is_not_followed(tmp_path: Path) -> None:
+def test_a_link_with_the_name_of_the_temporary_file_is_not_followed(tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("mine")
     (tmp_path / ".out.gs2d.tmp").symlink_to(tmp_path / "mine")
     with atomic_write(tmp_path / "out") as file:
@@ -173,13 +173,13 @@ def test_a_link_in_the_place_of_the_temporary_file_is_not_followed(tmp_path: Pat
         (b"[" * 200000, r"a\.json"),
     ],
 )
-def test_a_file_that_is_no_json_is_one_line(tmp_path: Path, content: bytes, message: str) -> None:
+def test_invalid_json_is_one_line(tmp_path: Path, content: bytes, message: str) -> None:
     (tmp_path / "a.json").write_bytes(content)
     with pytest.raises(DataError, match=message):
         read_json(tmp_path / "a.json")
 
 
-def test_a_file_name_that_is_no_utf_8_survives_json(tmp_path: Path) -> None:
+def test_a_file_name_that_is_not_utf_8_survives_json(tmp_path: Path) -> None:
     name = os.fsdecode(b"caf\xe9")  # Latin-1
     write_json(tmp_path / "x.json", {"path": name})
     assert read_json(tmp_path / "x.json") == {"path": name}

@@ -63,12 +63,12 @@ def test_downscaling_cuts_leftover_pixels_and_keeps_rays() -> None:
         ({"fx": -1.0}, "positive"),
     ],
 )
-def test_impossible_cameras_are_refused(change: dict[str, object], message: str) -> None:
+def test_invalid_cameras_are_errors(change: dict[str, object], message: str) -> None:
     with pytest.raises(ShapeError, match=message):
         replace(Camera(4, 4, 5.0, 5.0, 2.0, 2.0, EYE4), **change)  # type: ignore[arg-type]
 
 
-def test_a_pose_that_learns_is_kept_as_the_tensor_it_is() -> None:
+def test_a_pose_that_requires_a_gradient_is_kept_as_its_tensor() -> None:
     T = torch.eye(4, requires_grad=True)
     camera = Camera(20, 10, 8.0, 10.0, 5.0, 3.0, T)
     assert camera.pose is T
@@ -79,7 +79,7 @@ def test_a_pose_that_learns_is_kept_as_the_tensor_it_is() -> None:
     assert replace(camera, pose=None).pose is None
 
 
-def test_a_pose_that_is_not_that_of_the_camera_is_refused() -> None:
+def test_a_pose_that_differs_from_the_camera_is_an_error() -> None:
     camera = Camera(20, 10, 8.0, 10.0, 5.0, 3.0, torch.eye(4, requires_grad=True))
     with pytest.raises(ShapeError, match="T_cam_world"):
         replace(camera, T_cam_world=EYE4 + np.eye(4, k=3))

@@ -66,14 +66,14 @@ def test_composite_worked_by_hand() -> None:
         composite(image, (0.5, 0.5))
 
 
-def test_names_are_in_the_order_in_which_people_count() -> None:
+def test_names_are_sorted_in_numeric_order() -> None:
     names = ["r_10.png", "r_2.png", "a.png", "r_2b.png", "r_002.png", "3.png", "12.png"]
     counted = ["3.png", "12.png", "a.png", "r_002.png", "r_2.png", "r_2b.png", "r_10.png"]
     assert sorted(names, key=natural_key) == counted
 
 
 @pytest.mark.parametrize("channels", [3, 4])
-def test_a_picture_is_shrunk_in_bands_as_in_one_piece(channels: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_downscaling_in_bands_equals_downscaling_at_once(channels: int, monkeypatch: pytest.MonkeyPatch) -> None:
     picture = np.random.default_rng(0).integers(0, 256, (47, 31, channels), dtype=np.uint8)
     whole = area_downscale(picture, 4)
     assert whole.shape == (11, 7, channels)

@@ -1,4 +1,4 @@
-"""What limits are read, and what a cache may take of them."""
+"""Memory limits and cache sizes."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def machine(root: Path, groups: str, files: dict[str, str], total: int = 16 << 3
         ("nonsense\n", {"sys/fs/cgroup/memory.max": "nonsense"}, 16 * 1024, "machine"),
     ],
 )
-def test_the_limit_in_force_is_the_least(
+def test_the_smallest_limit_is_used(
     tmp_path: Path, groups: str, files: dict[str, str], expected: int, word: str
 ) -> None:
     limit = memory_limit(machine(tmp_path, groups, files))
@@ -62,7 +62,7 @@ def test_the_limit_in_force_is_the_least(
     assert word in limit.source
 
 
-def test_too_little_address_space_to_load_the_libraries_in_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_little_address_space_for_the_libraries_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "5")
     for allowed, fits in ((1300 * MB, False), (1400 * MB, True), (resource.RLIM_INFINITY, True)):
         monkeypatch.setattr(resource, "getrlimit", lambda _which, allowed=allowed: (allowed, allowed))
@@ -74,7 +74,7 @@ def test_too_little_address_space_to_load_the_libraries_in_is_refused(monkeypatc
 
 
 @pytest.mark.parametrize("allowed", [100, 400, 700, 1000])
-def test_a_command_in_too_little_address_space_ends_with_a_line(tmp_path: Path, allowed: int) -> None:
+def test_a_command_with_too_little_address_space_ends_with_one_line(tmp_path: Path, allowed: int) -> None:
     """At 700 MB the libraries alone would ask for memory for ever, at 400 MB C++ would end the process."""
     code = f"import resource; resource.setrlimit(resource.RLIMIT_AS, ({allowed} << 20, {allowed} << 20))\n"
     code += "from gs2d.cli import main; main()"
@@ -86,7 +86,7 @@ def test_a_command_in_too_little_address_space_ends_with_a_line(tmp_path: Path, 
     assert not (tmp_path / "run").exists()
 
 
-def test_a_real_limit_is_seen() -> None:
+def test_a_real_limit_is_detected() -> None:
     code = (
         "import resource; resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30))\n"
         "from gs2d.core.memory_limit import memory_limit, cache_bytes\n"

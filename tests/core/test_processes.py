@@ -1,4 +1,4 @@
-"""Which process this is, as the environment says."""
+"""The rank of this process."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SAID = {"RANK": "3", "WORLD_SIZE": "4", "LOCAL_RANK": "1", "LOCAL_WORLD_SIZE": "
 WHERE = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500"}
 
 
-def test_torchrun_says_which_process_this_is() -> None:
+def test_the_rank_is_read_from_the_environment_of_torchrun() -> None:
     place = here({**SAID, **WHERE})
     assert place == Place(3, 4, 1, 2)
     assert not place.leads
@@ -19,7 +19,7 @@ def test_torchrun_says_which_process_this_is() -> None:
 
 
 @pytest.mark.parametrize("lacking", ["RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"])
-def test_who_cannot_meet_others_is_alone(lacking: str) -> None:
+def test_an_incomplete_environment_means_a_single_process(lacking: str) -> None:
     """Schedulers of clusters set some of these names too."""
     environment = {**SAID, **WHERE}
     del environment[lacking]
@@ -31,6 +31,6 @@ def test_who_cannot_meet_others_is_alone(lacking: str) -> None:
     "wrong",
     [{"RANK": "4"}, {"RANK": "-1"}, {"WORLD_SIZE": "two"}, {"LOCAL_RANK": "2"}, {"LOCAL_WORLD_SIZE": "5"}],
 )
-def test_what_cannot_be_is_one_line(wrong: dict[str, str]) -> None:
+def test_an_invalid_rank_is_one_line(wrong: dict[str, str]) -> None:
     with pytest.raises(BackendError, match="WORLD_SIZE"):
         here({**SAID, **WHERE, **wrong})

@@ -1,4 +1,4 @@
-"""What is left of a lens: the formula, its inverse, its gradients, its border."""
+"""Residual distortion: formula, inverse, gradients, border."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def smooth_picture(camera: Camera = CAMERA) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("lens", [(0.1, 0.0), (-0.1, 0.02), (-0.05, -0.03)])
-def test_the_place_that_is_found_for_a_pixel_is_bent_to_it(lens: tuple[float, float]) -> None:
+def test_the_inverse_of_the_residual_lens_is_exact(lens: tuple[float, float]) -> None:
     places, _ = seen_at(CAMERA, torch.zeros(1, dtype=torch.float64), lens)
     focal, center = torch.tensor([CAMERA.fx, CAMERA.fy]), torch.tensor([CAMERA.cx, CAMERA.cy])
     y = (places - center) / focal
@@ -34,7 +34,7 @@ def test_the_place_that_is_found_for_a_pixel_is_bent_to_it(lens: tuple[float, fl
     np.testing.assert_allclose(ideal.numpy(), np.stack([columns, rows], axis=2), atol=1e-9)
 
 
-def test_gradients_are_those_of_lens_picture_and_intrinsics() -> None:
+def test_gradients_of_lens_image_and_intrinsics_are_exact() -> None:
     camera = Camera(9, 7, 8.0, 9.0, 4.2, 3.4, np.eye(4))
     weights = torch.rand(7, 9, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 

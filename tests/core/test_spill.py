@@ -1,4 +1,4 @@
-"""A sequence that is partly on the disk: the same values, whatever is in memory."""
+"""A sequence that is partly on disk."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_values_come_back_bit_for_bit_in_any_order(limit: int) -> None:
         kept[len(given)]
 
 
-def test_a_disk_that_is_full_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def full() -> None:
         raise OSError(28, "No space left on device")
 

@@ -1,4 +1,4 @@
-"""Names of files in texts: as bytes again, and harmless on a terminal."""
+"""Text with file names: conversion to bytes, and escaping for the terminal."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gs2d.errors import DataError, DiskError
 
 
 @pytest.mark.parametrize("name", ["plain.png", "é.png", "日本", os.fsdecode(b"caf\xe9"), os.fsdecode(b"\xff\x1b[2J")])
-def test_a_name_is_its_bytes_again(name: str) -> None:
+def test_a_file_name_is_converted_back_to_its_bytes(name: str) -> None:
     assert name_bytes(name) == os.fsencode(name)
 
 
@@ -27,12 +27,12 @@ def test_a_name_is_its_bytes_again(name: str) -> None:
         ("\ud83d", "\\ud83d"),
     ],
 )
-def test_what_would_steer_a_terminal_is_spelled_out(text: str, shown: str) -> None:
+def test_control_characters_are_escaped(text: str, shown: str) -> None:
     assert printable(text) == shown
     assert printable(shown) == shown
 
 
-def test_an_error_is_one_line_whatever_it_quotes() -> None:
+def test_an_error_that_quotes_a_file_name_is_one_line() -> None:
     assert str(DataError("intrinsics must hold a\nb\r\nc\u2028d")) == "intrinsics must hold a b c d"
     assert str(DiskError("a\nb", 28)) == "a b"
     assert DiskError("a", 28).errno == 28

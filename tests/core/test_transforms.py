@@ -1,4 +1,4 @@
-"""Rotations, neighbour distances, and what cameras say about a scene's size."""
+"""Rotations, neighbour distances, and scale from cameras."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_quaternions_are_wxyz_rotations_of_any_length() -> None:
     np.testing.assert_allclose(quats_to_matrices(-7 * q).numpy(), expected, atol=1e-12)
 
 
-def test_a_rigid_motion_turns_by_its_vector_and_moves_along_its_arc() -> None:
+def test_a_rigid_motion_rotates_by_its_vector_and_moves_along_its_arc() -> None:
     # A quarter turn about z at speed 2 along x: a quarter of a circle of radius 2 / (pi / 2), to (r, r, 0).
     quarter, r = math.pi / 2, 2 / (math.pi / 2)
     T = se3_exp(torch.tensor([0, 0, quarter, 2, 0, 0], dtype=torch.float64))
@@ -48,7 +48,7 @@ def test_a_rigid_motion_is_differentiable_everywhere(size: float) -> None:
     assert torch.equal(se3_exp(torch.zeros(6)), torch.eye(4))
 
 
-def test_a_moved_camera_turns_about_its_own_centre_and_moves_along_its_own_axes() -> None:
+def test_a_moved_camera_rotates_about_its_centre_and_moves_along_its_axes() -> None:
     camera = look_at(np.array([1.0, 2.0, 3.0]), np.zeros(3), UP, width=6, height=4, fx=5)
     turned = perturb_pose(camera, torch.tensor([0.1, 0.2, 0.3, 0, 0, 0], dtype=torch.float64))
     np.testing.assert_allclose(turned.center, camera.center, atol=1e-14)
@@ -114,7 +114,7 @@ def test_a_camera_far_beyond_all_others_is_an_outlier_and_does_not_set_the_exten
     [(1,) * 8 + (30,), (1,) * 6 + (100,) * 4, (1, 1, 1000), (1e-12,) * 7 + (1,)],
     ids=["thirty times", "two scales", "three cameras", "most at one place"],
 )
-def test_cameras_that_may_be_right_are_no_outliers_and_set_the_extent(distances: tuple[float, ...]) -> None:
+def test_plausible_cameras_are_not_outliers_and_set_the_extent(distances: tuple[float, ...]) -> None:
     cameras = on_a_ring(*distances)
     centers = np.stack([camera.center for camera in cameras])
     assert camera_outliers(cameras) == {}

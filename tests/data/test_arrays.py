@@ -1,4 +1,4 @@
-"""NumPy arrays from other programs: numbers are read, everything else is one line."""
+"""NumPy files from other programs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def plain(shape: str = "(2,)", descr: str = "'<f4'") -> str:
 
 @pytest.mark.parametrize("dtype", ["bool", "u1", ">u2", "<i8", "f2", ">f4", "f8"])
 @pytest.mark.parametrize("order", ["C", "F"])
-def test_what_numpy_writes_comes_back(tmp_path: Path, dtype: str, order: str) -> None:
+def test_numpy_files_are_read(tmp_path: Path, dtype: str, order: str) -> None:
     array = np.asarray(np.random.default_rng(0).uniform(0, 200, (3, 4, 5)).astype(dtype), order=order)  # type: ignore[call-overload]
     np.save(tmp_path / "a.npy", array)
     got = read_npy(tmp_path / "a.npy", "map")
@@ -76,7 +76,7 @@ def zeros(megabytes: int) -> bytes:
     return buffer.getvalue()
 
 
-def test_an_archive_that_would_explode_is_not_unpacked(tmp_path: Path) -> None:
+def test_a_zip_bomb_is_not_unpacked(tmp_path: Path) -> None:
     data = zeros(200)
     with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         archive.writestr("a.npy", data)

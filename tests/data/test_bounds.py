@@ -20,7 +20,7 @@ def moved(cameras: list[Camera], offset: np.ndarray, scale: float = 1.0) -> list
     return out
 
 
-def test_points_give_their_percentiles_whatever_the_outliers() -> None:
+def test_the_box_of_points_ignores_outliers() -> None:
     points = np.random.default_rng(0).uniform((-1, -2, -3), (1, 2, 3), (5000, 3))
     points[:20] = 1e4
     bounds, notes = scene_bounds(ring(6), PointCloud(points))
@@ -49,7 +49,7 @@ def test_without_points_the_box_is_what_the_cameras_see() -> None:
         (ring(8, radius=400.0), False),  # other units: the box would be a dot
     ],
 )
-def test_the_customary_blender_box_is_used_only_if_the_cameras_agree(cameras: list[Camera], customary: bool) -> None:
+def test_the_box_of_nerf_synthetic_is_used_only_if_the_cameras_agree(cameras: list[Camera], customary: bool) -> None:
     bounds, _ = scene_bounds(cameras, None, is_synthetic=True)
     assert np.array_equal(bounds, [[-1.3] * 3, [1.3] * 3]) == customary
     assert not np.array_equal(scene_bounds(cameras, None)[0], [[-1.3] * 3, [1.3] * 3])

@@ -1,4 +1,4 @@
-"""What photographs say of how they were taken: EXIF, XMP as drones write it, damaged and missing blocks."""
+"""EXIF and XMP metadata, including damaged blocks."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def gps(latitude: float, longitude: float, *, height: float | None = None) -> di
     ],
     ids=["dji", "dji's own spelling", "dji, older", "sensefly", "standard"],
 )
-def test_a_place_is_read_from_xmp_where_exif_has_none(
+def test_the_position_is_read_from_xmp_if_exif_has_none(
     tmp_path: Path, xmp: str, expected: tuple[float, float, float]
 ) -> None:
     place = read_taken(write(tmp_path / "a.jpg", xmp=xmp)).place
@@ -77,11 +77,11 @@ def test_a_place_is_read_from_xmp_where_exif_has_none(
     ],
     ids=["none", "no XML", "one alone", "a word", "no latitude", "no fix"],
 )
-def test_what_is_no_place_is_none(tmp_path: Path, xmp: str) -> None:
+def test_an_invalid_position_is_ignored(tmp_path: Path, xmp: str) -> None:
     assert read_taken(write(tmp_path / "a.jpg", xmp=xmp)).place is None
     assert read_place(tmp_path / "a.jpg") is None
 
 
 @pytest.mark.parametrize("time", ["0000:00:00 00:00:00", "yesterday", "2026:13:01 10:00:59"])
-def test_a_clock_that_was_not_set_tells_no_time(tmp_path: Path, time: str) -> None:
+def test_the_time_of_an_unset_clock_is_ignored(tmp_path: Path, time: str) -> None:
     assert read_taken(write(tmp_path / "a.jpg", time=time)) == Taken()

@@ -1,4 +1,4 @@
-"""OpenEXR files: linear light as display values, depths as they are, headers that announce too much."""
+"""OpenEXR files: conversion to sRGB, depth maps, and damaged files."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def colors(*values: float, alpha: float | None = None) -> dict[str, np.ndarray]:
     return found if alpha is None else {**found, "A": np.full_like(row, alpha)}
 
 
-def test_linear_light_becomes_srgb_values_and_what_is_brighter_than_white_is_white(tmp_path: Path) -> None:
+def test_linear_light_becomes_srgb_and_is_clipped_at_white(tmp_path: Path) -> None:
     # sRGB: 0.18 -> 0.4614, 0.002 -> 12.92 * 0.002 = 0.0258, 1 -> 1; below 0 and no number: black.
     path = write(tmp_path / "a.exr", colors(0.18, 0.002, 1.0, 7.5, -1.0, np.nan))
     image = read_image(path)
@@ -41,14 +41,14 @@ def test_linear_light_becomes_srgb_values_and_what_is_brighter_than_white_is_whi
     assert image_size(path) == (6, 1)
 
 
-def test_alpha_is_taken_out_of_the_colours(tmp_path: Path) -> None:
+def test_premultiplied_alpha_becomes_straight(tmp_path: Path) -> None:
     path = write(tmp_path / "a.exr", colors(0.09, 0.0, alpha=0.5))
     assert read_image(path)[0].tolist() == [[118, 118, 118, 128], [0, 0, 0, 128]]
     empty = write(tmp_path / "b.exr", colors(0.0, alpha=0.0))
     assert read_image(empty)[0, 0].tolist() == [0, 0, 0, 0]
 
 
-def test_depths_are_what_they_are(tmp_path: Path) -> None:
+def test_depths_are_not_converted(tmp_path: Path) -> None:
     depth = np.array([[1.5, 0.0], [250.25, 3.0]], dtype=np.float32)
     for channels in ({"Z": depth}, {"V": depth}, {"Z": depth, "A": np.ones_like(depth)}):
         values = read_depth(write(tmp_path / "d.exr", channels))
@@ -59,7 +59,7 @@ def test_depths_are_what_they_are(tmp_path: Path) -> None:
         read_depth(write(tmp_path / "n.exr", {"Z": np.zeros((2, 2), np.float32)}))
 
 
-def test_a_capture_may_have_photographs_of_floats(tmp_path: Path) -> None:
+def test_a_capture_may_have_float_images(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for index in range(3):
         light = rng.uniform(0, 1, (12, 16, 3)).astype(np.float32)
@@ -87,7 +87,7 @@ def test_a_header_that_announces_more_than_its_file_can_hold_is_refused_before_d
             reader(path)
 
 
-def test_damage_anywhere_gives_a_picture_or_a_plain_error(tmp_path: Path) -> None:
+def test_a_damaged_file_gives_an_image_or_a_one_line_error(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     noise = {name: rng.random((16, 16), dtype=np.float32) for name in "RGB"}
     whole = bytearray(write(tmp_path / "a.exr", noise).read_bytes())

@@ -1,4 +1,4 @@
-"""Panoramas and wide fisheyes in faces: what a face shows is what a pinhole camera there sees."""
+"""Pinhole faces of panoramas and wide fisheyes."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def assert_faces_agree(scene: Scene, most: float) -> None:
         assert difference.max() <= most, view.name
 
 
-def test_the_faces_of_a_panorama_are_what_pinhole_cameras_see(tmp_path: Path) -> None:
+def test_the_faces_of_a_panorama_equal_pinhole_images(tmp_path: Path) -> None:
     cameras = panoramas(tmp_path)
     scene = load_scene(tmp_path)
     assert len(scene.views) == 54
@@ -99,7 +99,7 @@ def test_faces_of_one_panorama_are_all_test_views_or_none(tmp_path: Path) -> Non
     assert len(scene.test) == 18
 
 
-def test_masks_go_along_and_downscaled_faces_agree_too(tmp_path: Path) -> None:
+def test_masks_and_downscaled_faces_agree(tmp_path: Path) -> None:
     panoramas(tmp_path)
     mask = np.full((WIDTH // 2, WIDTH), 255, np.uint8)
     mask[3 * WIDTH // 8 :] = 0  # the tripod: below 45 degrees
@@ -118,7 +118,7 @@ def test_masks_go_along_and_downscaled_faces_agree_too(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["bin", "txt"])
-def test_panoramas_of_a_colmap_model_are_cut_too(tmp_path: Path, kind: str) -> None:
+def test_panoramas_of_a_colmap_model_are_split_into_faces(tmp_path: Path, kind: str) -> None:
     model = ColmapModel(cameras={1: ("EQUIRECTANGULAR", WIDTH, WIDTH // 2, (WIDTH, WIDTH // 2))})
     for index, camera in enumerate(ring(4)):
         write_panorama(tmp_path / "images" / f"{index}.png", camera)
@@ -154,7 +154,7 @@ def write_fisheyes(root: Path, k: Intrinsics, params: tuple[float, ...], model: 
     found.write(root / "sparse/0")
 
 
-def test_a_wide_fisheye_is_cut_and_its_rim_is_kept_and_a_narrow_one_undistorted(tmp_path: Path) -> None:
+def test_a_wide_fisheye_is_split_into_faces_and_a_narrow_one_undistorted(tmp_path: Path) -> None:
     wide = Intrinsics(200, 200, 62.0, 62.0, 100.0, 100.0, Lens("fisheye", FISHEYE))
     assert field_of_view(wide) == pytest.approx(179, abs=4)
     write_fisheyes(tmp_path / "wide", wide, FISHEYE)

@@ -1,4 +1,4 @@
-"""Files by the names of camera files: other machines, other cases, other Unicode forms; in every reader."""
+"""Image files by the names in camera files of every reader."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def matched(root: Path, *names: str, **options: object) -> list[str | None]:
         ("a" * 5000, ["b.png"], None),
     ],
 )
-def test_the_longest_end_of_a_path_that_names_one_file_counts(
+def test_the_longest_common_end_of_a_path_selects_the_file(
     tmp_path: Path, name: str, there: list[str], expected: str | None
 ) -> None:
     files(tmp_path, *there)
@@ -82,7 +82,7 @@ FORMATS = {
 
 @pytest.mark.parametrize("change", CHANGES)
 @pytest.mark.parametrize("format", FORMATS)
-def test_every_reader_finds_photographs_whose_names_changed(tmp_path: Path, format: str, change: str) -> None:
+def test_every_reader_finds_renamed_images(tmp_path: Path, format: str, change: str) -> None:
     write, cameras, written = FORMATS[format]
     write(tmp_path)
     before = load_scene(tmp_path)
@@ -106,7 +106,7 @@ def test_every_reader_finds_photographs_whose_names_changed(tmp_path: Path, form
         assert [view.name for view in scene.views] == [view.name for view in before.views]
 
 
-def test_blender_finds_photographs_of_another_machine_and_takes_none_of_the_other_split(tmp_path: Path) -> None:
+def test_blender_finds_images_of_another_machine_in_the_right_split(tmp_path: Path) -> None:
     small_blender(tmp_path)
     for split in ("train", "test"):
         path = tmp_path / f"transforms_{split}.json"
@@ -152,7 +152,7 @@ def test_a_photograph_is_not_its_own_mask_or_depth_map(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(bool(HEIF), reason="a package for HEIC is installed")
-def test_photographs_in_a_format_that_cannot_be_read_are_left_out_with_the_reason(tmp_path: Path) -> None:
+def test_images_of_unsupported_formats_are_skipped_with_the_reason(tmp_path: Path) -> None:
     small_metashape(tmp_path, labels="{}.HEIC")
     images = sorted((tmp_path / "images").iterdir())
     for path in images[:4]:

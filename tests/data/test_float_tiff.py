@@ -1,4 +1,4 @@
-"""TIFF files of floats: linear light as display values, whatever is packed how; whole numbers and depths stay."""
+"""TIFF files of floats: conversion to sRGB, depth maps, and damaged files."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def colors(values: np.ndarray = LIGHT) -> np.ndarray:
         ("float64", {}),
     ],
 )
-def test_linear_light_becomes_srgb_values(tmp_path: Path, kind: str, options: dict[str, object]) -> None:
+def test_linear_light_becomes_srgb(tmp_path: Path, kind: str, options: dict[str, object]) -> None:
     path, light = tmp_path / "a.tiff", colors().astype(kind)
     if options.get("planarconfig") == "separate":
         light = np.moveaxis(light, -1, 0)
@@ -45,7 +45,7 @@ def test_linear_light_becomes_srgb_values(tmp_path: Path, kind: str, options: di
     np.testing.assert_array_equal(read_image(path), colors(SHOWN))
 
 
-def test_one_channel_is_grey_and_alpha_is_taken_out_where_it_is_in(tmp_path: Path) -> None:
+def test_one_channel_is_grey_and_premultiplied_alpha_becomes_straight(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "grey.tif", LIGHT)
     np.testing.assert_array_equal(read_image(tmp_path / "grey.tif"), colors(SHOWN))
     half = np.full((2, 3, 1), 0.5, np.float32)
@@ -64,7 +64,7 @@ def test_one_channel_is_grey_and_alpha_is_taken_out_where_it_is_in(tmp_path: Pat
         assert (image[..., 3] == 128).all()
 
 
-def test_whole_numbers_of_sixteen_bits_are_display_values_and_depths_are_what_they_are(tmp_path: Path) -> None:
+def test_16_bit_integers_are_srgb_and_depths_are_not_converted(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "a.tif", colors(np.full((4, 5), 40_000, np.uint16)), photometric="rgb")
     assert np.abs(read_image(tmp_path / "a.tif").astype(int) - 156).max() <= 1  # 40000 / 257 = 155.6
     tifffile.imwrite(tmp_path / "depth.tif", np.full((4, 5), 2.5, np.float32))
@@ -72,7 +72,7 @@ def test_whole_numbers_of_sixteen_bits_are_display_values_and_depths_are_what_th
     assert (read_depth(tmp_path / "depth.tif") == 2.5).all()
 
 
-def test_damage_anywhere_gives_a_picture_or_a_plain_error(tmp_path: Path) -> None:
+def test_a_damaged_file_gives_an_image_or_a_one_line_error(tmp_path: Path) -> None:
     path = tmp_path / "a.tif"
     tifffile.imwrite(path, colors(np.full((16, 16), 0.25, np.float32)), photometric="rgb", compression="zlib")
     whole, rng = path.read_bytes(), np.random.default_rng(0)

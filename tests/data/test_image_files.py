@@ -35,7 +35,7 @@ def test_every_kind_of_file_becomes_8_bit_rgb_or_rgba(tmp_path: Path) -> None:
     assert read_image(tmp_path / "cmyk.jpg").shape == (3, 4, 3)
 
 
-def test_a_picture_that_is_missing_broken_or_cut_is_an_error_that_names_it(tmp_path: Path) -> None:
+def test_a_missing_or_damaged_image_is_an_error_that_names_it(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"gone\.png does not exist"):
         read_image(tmp_path / "gone.png")
     with pytest.raises(DataError, match=r"gone\.png does not exist"):
@@ -63,7 +63,7 @@ def test_a_mask_of_zeros_and_ones_is_not_all_black(tmp_path: Path) -> None:
     assert not read_mask(tmp_path / "dark.png").any()
 
 
-def test_a_written_picture_reads_back_as_it_was(tmp_path: Path) -> None:
+def test_a_written_image_reads_back_unchanged(tmp_path: Path) -> None:
     for channels in (3, 4):
         pixels = np.random.default_rng(channels).integers(0, 256, (7, 5, channels)).astype(np.uint8)
         write_image(tmp_path / "a.png", pixels)
@@ -78,7 +78,7 @@ def png_of(path: Path, width: int, height: int, mode: str = "RGB") -> Path:
     return path
 
 
-def test_an_image_that_would_explode_is_not_decoded(tmp_path: Path) -> None:
+def test_a_decompression_bomb_is_not_decoded(tmp_path: Path) -> None:
     """36 megapixels of black: a hundred kilobytes, and half a gigabyte on the way to an array."""
     bomb = png_of(tmp_path / "bomb.png", 6000, 6000)
     assert bomb.stat().st_size < 200_000
@@ -90,7 +90,7 @@ def test_an_image_that_would_explode_is_not_decoded(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("format_", ["DDS", "EPS", "TGA", "ICO", "PCX", "GIF"])
-def test_formats_that_nobody_photographs_in_are_never_tried(tmp_path: Path, format_: str) -> None:
+def test_other_image_formats_are_never_opened(tmp_path: Path, format_: str) -> None:
     """EPS would start Ghostscript; whatever the file is called, Pillow's other parsers do not see it."""
     Image.new("RGB", (32, 32), "red").save(tmp_path / "a", format=format_)
     path = (tmp_path / "a").rename(tmp_path / "a.png")
@@ -99,7 +99,7 @@ def test_formats_that_nobody_photographs_in_are_never_tried(tmp_path: Path, form
             read(path)
 
 
-def test_formats_of_photographs_and_masks_are_read(tmp_path: Path) -> None:
+def test_common_image_formats_are_read(tmp_path: Path) -> None:
     for suffix in ("jpg", "png", "bmp", "tif", "webp", "ppm", "pgm", "jp2"):
         Image.new("L", (20, 10), 255).save(tmp_path / f"a.{suffix}")
         assert read_image(tmp_path / f"a.{suffix}").shape[:2] == (10, 20), suffix

@@ -1,4 +1,4 @@
-"""Pixels beyond the photograph, which undistortion leaves black: nobody learns, scores, fuses or shows them."""
+"""Invalid pixels after undistortion are never trained, scored, fused or shown."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def reached() -> np.ndarray:
     return source_positions(colmap_intrinsics("camera", "SIMPLE_RADIAL", WIDTH, HEIGHT, PINCUSHION))[1]
 
 
-def test_what_the_photograph_does_not_reach_is_unknown_and_also_outside_the_mask(tmp_path: Path) -> None:
+def test_pixels_outside_the_photograph_are_invalid_and_masked(tmp_path: Path) -> None:
     plain, masked = distorted(tmp_path / "a"), distorted(tmp_path / "b", mask=True)
     for view in (plain, masked):
         np.testing.assert_array_equal(view.valid(), reached())
@@ -57,7 +57,7 @@ def test_what_the_photograph_does_not_reach_is_unknown_and_also_outside_the_mask
     np.testing.assert_array_equal(masked.usable(masks=True), masked.mask())
 
 
-def test_a_smaller_picture_knows_what_all_its_pixels_know(tmp_path: Path) -> None:
+def test_a_downscaled_pixel_is_valid_if_its_whole_block_is(tmp_path: Path) -> None:
     distorted(tmp_path)
     view = load_scene(tmp_path, test_every=0, downscale=4).train[0]
     blocks = reached().reshape(HEIGHT // 4, 4, WIDTH // 4, 4).all(axis=(1, 3))
@@ -75,7 +75,7 @@ def images(unknown: int) -> View:
 
 
 @pytest.mark.parametrize("use_masks", [True, False])
-def test_unknown_pixels_are_no_target_of_any_protocol(use_masks: bool) -> None:
+def test_invalid_pixels_are_never_trained_or_scored(use_masks: bool) -> None:
     view = images(0)
     black = (0.0, 0.0, 0.0)
     made: list[Any] = [
@@ -87,7 +87,7 @@ def test_unknown_pixels_are_no_target_of_any_protocol(use_masks: bool) -> None:
 
 
 @pytest.mark.parametrize("use_masks", [True, False])
-def test_the_depth_of_unknown_pixels_is_not_fused(use_masks: bool) -> None:
+def test_the_depth_of_invalid_pixels_is_not_fused(use_masks: bool) -> None:
     view = images(0)
     splat = Splats(
         means=torch.zeros(1, 3),

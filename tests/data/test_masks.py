@@ -1,4 +1,4 @@
-"""Masks of captures: where each tool puts them, and what a black pixel means."""
+"""Masks of captures: folders of common tools, and the meaning of black pixels."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def masked_names(scene: Scene) -> list[str]:
         (small_alicevision, "masks/IMG_1.png", "IMG_1.jpg"),
     ],
 )
-def test_masks_are_found_where_tools_put_them(
+def test_masks_are_found_in_the_folders_of_common_tools(
     tmp_path: Path, make: Callable[[Path], object], mask: str, view: str
 ) -> None:
     make(tmp_path)
@@ -60,7 +60,7 @@ def test_masks_are_found_where_tools_put_them(
 
 
 @pytest.mark.parametrize("masked", ["ignore", "empty", "off"])
-def test_what_masked_cannot_change_is_said(tmp_path: Path, masked: str) -> None:
+def test_an_ineffective_masked_option_is_reported(tmp_path: Path, masked: str) -> None:
     small_dtu(tmp_path / "scan")
     small_colmap(tmp_path / "bare")
     scene, plain = load_scene(tmp_path / "scan", masked=masked), load_scene(tmp_path / "scan")
@@ -110,7 +110,7 @@ def test_masks_of_another_size_are_scaled_and_of_another_shape_refused(tmp_path:
         load_scene(tmp_path)
 
 
-def test_a_folder_without_masks_of_these_photographs_and_a_wrong_word_are_refused(tmp_path: Path) -> None:
+def test_a_folder_without_matching_masks_and_an_invalid_option_are_errors(tmp_path: Path) -> None:
     small_colmap(tmp_path)
     (tmp_path / "none").mkdir()
     with pytest.raises(DataError, match=r"png\.png"):

@@ -1,4 +1,4 @@
-"""Depth and normal maps from files, on the pixels of their photographs; which points a photograph was found to show."""
+"""Depth and normal maps from files, and observations of points."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def view_of(root: Path, index: int = 0, **options: int) -> View:
 
 
 # -- where maps are found -------------------------------------------------------------------------------------------
-def test_depth_maps_lie_in_depths_under_the_names_of_the_photographs(tmp_path: Path) -> None:
+def test_depth_maps_are_found_by_image_name_in_the_folder_depths(tmp_path: Path) -> None:
     small_colmap(tmp_path)
     for name in ("0.png", "1.npy", "2.png.tif"):
         write_depth(tmp_path / "depths" / name, slope())
@@ -53,7 +53,7 @@ def test_transforms_json_names_maps_and_their_unit(tmp_path: Path) -> None:
 
 # -- files ----------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("kind", [np.uint16, np.int32, np.float32, np.uint8])
-def test_depths_of_8_16_and_32_bits_are_read_as_they_are(tmp_path: Path, kind: type) -> None:
+def test_depths_of_8_16_and_32_bits_are_not_scaled(tmp_path: Path, kind: type) -> None:
     values = np.array([[1, 2, 3], [4, 5, 250]]).astype(kind)
     for suffix in (".npy", ".tif"):
         write_depth(tmp_path / f"d{suffix}", values)
@@ -83,7 +83,7 @@ def broken_files(folder: Path) -> dict[str, Path]:
         ("text.png", "must be an image, got"),
     ],
 )
-def test_files_that_hold_no_depths_are_named(tmp_path: Path, name: str, message: str) -> None:
+def test_invalid_depth_files_are_named(tmp_path: Path, name: str, message: str) -> None:
     path = broken_files(tmp_path)[name]
     with pytest.raises(DataError, match=message) as caught:
         read_depth(path)
@@ -91,7 +91,7 @@ def test_files_that_hold_no_depths_are_named(tmp_path: Path, name: str, message:
     assert "\n" not in str(caught.value)
 
 
-def test_a_map_of_another_shape_than_its_photograph_is_refused(tmp_path: Path) -> None:
+def test_a_map_of_another_aspect_ratio_is_an_error(tmp_path: Path) -> None:
     small_colmap(tmp_path)
     write_depth(tmp_path / "depths" / "0.png", slope(40, 30))
     with pytest.raises(DataError, match="aspect ratio of its image"):
@@ -99,7 +99,7 @@ def test_a_map_of_another_shape_than_its_photograph_is_refused(tmp_path: Path) -
 
 
 # -- on the pixels of the photograph --------------------------------------------------------------------------------
-def test_nothing_known_is_zero_however_it_is_said(tmp_path: Path) -> None:
+def test_every_marker_of_unknown_depth_becomes_zero(tmp_path: Path) -> None:
     small_colmap(tmp_path)
     values = slope().astype(np.float32)
     values[0, 0], values[1, 1], values[2, 2], values[3, 3] = 0, -1, np.nan, np.inf
@@ -110,14 +110,14 @@ def test_nothing_known_is_zero_however_it_is_said(tmp_path: Path) -> None:
     assert not found.whole
 
 
-def test_a_block_becomes_the_middle_of_its_known_readings() -> None:
+def test_a_block_becomes_the_median_of_its_known_values() -> None:
     values = np.array([[1, 9, 0, 0], [2, 3, 0, 7]], dtype=np.float32)
     assert (shrink(values, 2) == [[2, 0]]).all()  # of 1 2 3 9 the lower middle; one of four is too few
     assert (shrink(np.array([[5, 0], [9, 0]], np.float32), 2) == [[5]]).all()
     assert shrink(np.ones((5, 7), np.float32), 2).shape == (3, 4)
 
 
-def test_downscaled_maps_fit_downscaled_photographs(tmp_path: Path) -> None:
+def test_downscaled_maps_match_downscaled_images(tmp_path: Path) -> None:
     small_colmap(tmp_path)
     write_depth(tmp_path / "depths" / "0.png", slope())
     view = view_of(tmp_path, downscale=4)
@@ -135,7 +135,7 @@ def test_smaller_maps_are_interpolated_where_neighbours_agree_and_only_there() -
     assert (sample(values, positions, np.zeros((1, 4), dtype=bool)) == 0).all()
 
 
-def test_maps_are_undistorted_with_their_photographs(tmp_path: Path) -> None:
+def test_maps_are_undistorted_with_their_images(tmp_path: Path) -> None:
     bent = {"k1": -0.1, "camera_model": "OPENCV"}
     small_nerfstudio(tmp_path, count=3, meta=bent, frame={"depth_file_path": "d.npy"})
     height, width = 30, 40
@@ -168,7 +168,7 @@ def test_normals_are_decoded_to_unit_vectors_and_black_is_unknown(tmp_path: Path
 
 # -- points ---------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("kind", ["bin", "txt"])
-def test_points_are_known_by_the_photographs_that_were_found_to_show_them(tmp_path: Path, kind: str) -> None:
+def test_points_are_assigned_to_the_images_that_observe_them(tmp_path: Path, kind: str) -> None:
     model = small_colmap(tmp_path, kind=kind)
     ids = [5, 2, 99]
     model.points = [(i, (i, 0.0, 1.0), (1, 2, 3), 0.25 * i, []) for i in ids]

@@ -1,4 +1,4 @@
-"""The real captures: do our cameras explain their pictures?"""
+"""Real captures: sparse points project to their observations."""
 
 from __future__ import annotations
 

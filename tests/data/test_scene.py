@@ -1,4 +1,4 @@
-"""Views, the cache, detection, and what loading never does."""
+"""Views, image cache, and detection of formats."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_missing_folder_a_file_an_empty_folder_and_an_unknown_layout_are_error
         load_scene(tmp_path)
 
 
-def test_pictures_are_decoded_when_asked_for_and_a_broken_one_is_named(tmp_path: Path) -> None:
+def test_images_are_decoded_on_demand_and_a_damaged_one_is_named(tmp_path: Path) -> None:
     small_blender(tmp_path)
     path = tmp_path / "train/r_2.png"
     path.write_bytes(path.read_bytes()[:400])  # the header is whole, the pixels are not
@@ -74,7 +74,7 @@ def test_pictures_are_decoded_when_asked_for_and_a_broken_one_is_named(tmp_path:
         load_scene(tmp_path)
 
 
-def test_a_picture_that_changed_its_size_since_loading_is_an_error(tmp_path: Path) -> None:
+def test_an_image_whose_size_changed_since_loading_is_an_error(tmp_path: Path) -> None:
     small_blender(tmp_path)
     scene = load_scene(tmp_path)
     small_blender(tmp_path, width=80, height=60)
@@ -146,9 +146,7 @@ def move_away(root: Path, index: int, factor: float) -> None:
 
 @pytest.mark.parametrize("index", [4, 8])  # a training view, a test view
 @pytest.mark.parametrize("factor", [1e3, 1e100])
-def test_a_view_whose_camera_stands_far_from_all_others_is_named_and_left_out(
-    tmp_path: Path, index: int, factor: float
-) -> None:
+def test_a_view_with_an_outlying_camera_is_named_and_left_out(tmp_path: Path, index: int, factor: float) -> None:
     small_nerfstudio(tmp_path, count=20)
     name = f"images/f_{index:02d}.png"
     right = load_scene(tmp_path)

@@ -1,4 +1,4 @@
-"""What most cameras look at, on surfaces and cameras whose subject is known."""
+"""The subject of captures with known ground truth."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def sight(seen_from: Camera, *balls: tuple[np.ndarray, float], room: float = 50.
 
 
 @pytest.mark.parametrize("arc", [360.0, 50.0])
-def test_the_subject_is_the_ball_that_the_cameras_stand_around_not_the_room(arc: float) -> None:
+def test_the_subject_is_the_ball_inside_the_ring_of_cameras_not_the_room(arc: float) -> None:
     place = np.array([0.3, -0.2, 0.1])
     subject = find_subject([sight(c, (place, 1.0)) for c in around(12, 5.0, arc=arc)])
     assert subject.kind == "object"
@@ -57,7 +57,7 @@ def test_the_subject_is_the_ball_that_the_cameras_stand_around_not_the_room(arc:
     assert subject.radius < 6.0  # the room's is 87
 
 
-def test_cameras_inside_a_room_have_a_scene_and_say_so() -> None:
+def test_cameras_inside_a_room_have_a_scene() -> None:
     turns = np.radians(np.arange(0, 360, 24))
     inside = [
         camera(0.4 * np.array([np.cos(a), np.sin(a), 0]), np.array([9 * np.cos(a), 9 * np.sin(a), 0])) for a in turns
@@ -83,14 +83,14 @@ def test_a_subject_reads_back_from_the_run_folder(tmp_path: Path) -> None:
     ("name", "value"),
     [("min", [1, 2]), ("max", [-9.0, -9.0, -9.0]), ("kind", "thing"), ("up", ["a", "b", "c"]), ("center", None)],
 )
-def test_a_damaged_subject_is_named_with_what_to_do(tmp_path: Path, name: str, value: object) -> None:
+def test_a_damaged_subject_is_an_error_with_a_remedy(tmp_path: Path, name: str, value: object) -> None:
     good = Subject("object", np.zeros(3), np.ones(3), np.ones(3) / 2, UP, "so").to_json()
     write_json(tmp_path / "subject.json", {**good, name: value})
     with pytest.raises(DataError, match=r"subject\.json"):
         read_subject(tmp_path)
 
 
-def test_a_given_box_is_taken_as_it_is_or_refused() -> None:
+def test_a_box_of_the_user_is_used_unchanged_or_refused() -> None:
     cameras = around(4, 5.0)
     subject = given_subject((-1, -2, -3, 1, 2, 3), cameras)
     assert (subject.kind, subject.low.tolist(), subject.high.tolist()) == ("object", [-1, -2, -3], [1, 2, 3])

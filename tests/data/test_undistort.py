@@ -102,7 +102,7 @@ def test_a_distorted_grid_becomes_straight(tmp_path: Path, model: str) -> None:
     assert np.abs(np.array(near_plane_policy) - 72.0).max() < 0.06
 
 
-def test_pixels_that_the_photograph_did_not_see_are_masked_out_and_empty(tmp_path: Path) -> None:
+def test_pixels_outside_the_photograph_are_invalid_and_black(tmp_path: Path) -> None:
     """Pincushion n1 = +0.3: the ideal corner (0.7, 0.5) is seen at 1.22 times its radius, outside the sensor."""
     k = Intrinsics(140, 100, 100.0, 100.0, 70.0, 50.0, Lens("perspective", (0.3,)))
     positions, valid = source_positions(k)
@@ -119,7 +119,7 @@ def test_pixels_that_the_photograph_did_not_see_are_masked_out_and_empty(tmp_pat
     assert (out[~valid] == 0).all()
 
 
-def test_a_polynomial_that_folds_back_is_cut_where_it_turns() -> None:
+def test_a_folding_polynomial_is_cut_at_its_maximum() -> None:
     """r (1 - 0.2 r^2) grows until 1 - 0.6 r^2 = 0, r = 1.29099; beyond it the picture would repeat."""
     lens = Lens("perspective", (-0.2,))
     turn = 1 / math.sqrt(0.6)
@@ -132,7 +132,7 @@ def test_a_polynomial_that_folds_back_is_cut_where_it_turns() -> None:
     np.testing.assert_array_equal(np.flatnonzero(valid[10])[[0, -1]], [200 - 129, 199 + 129])
 
 
-def test_masks_are_undistorted_with_their_picture(tmp_path: Path) -> None:
+def test_masks_are_undistorted_with_their_image(tmp_path: Path) -> None:
     """A half-plane mask x < 80 px of the photograph becomes the half plane of the ideal position."""
     params = (F, F, 80.0, 60.0, 0.4, 0.0, 0.0, 0.0)
     small_colmap(tmp_path, count=3, cameras={7: ("OPENCV", WIDTH, HEIGHT, params)})

@@ -1,4 +1,4 @@
-"""The demo capture: its ray caster against closed forms, its solids, its pictures against its mesh, its files."""
+"""The demo capture: ray caster, solids, images and files."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(capture: Pa
     assert reports == [(k + 1, TRAIN + TEST) for k in range(TRAIN + TEST)]
 
 
-def test_a_capture_that_failed_is_not_taken_for_a_capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unfinished_capture_is_not_recognised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full_disk(path: Path, image: np.ndarray) -> None:
         raise DiskError(f"cannot write {path}: No space left on device")
 

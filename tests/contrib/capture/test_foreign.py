@@ -70,7 +70,7 @@ def assert_same_scene(scene: Scene, same: Scene, *, atol: float = 1e-9) -> None:
 
 @pytest.mark.parametrize("lens", [OFF_CENTRE, BENT], ids=["off-centre", "bent"])
 @pytest.mark.parametrize("format", WRITERS)
-def test_the_cameras_of_each_tool_are_those_of_the_same_colmap_model(tmp_path: Path, format: str, lens: Lens) -> None:
+def test_the_cameras_of_each_tool_equal_those_of_colmap(tmp_path: Path, format: str, lens: Lens) -> None:
     WRITERS[format](tmp_path / "theirs", lens)
     assert detect_format(tmp_path / "theirs") == format
     scene = load_scene(tmp_path / "theirs")
@@ -174,7 +174,7 @@ def test_affinity_and_skew_of_metashape_by_its_formulas(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("version", [(1, 0, 0), (1, 2, 0), (1, 2, 1), (1, 2, 2), (1, 2, 4), (1, 2, 5), (1, 2, 14)])
-def test_every_version_of_alicevision_s_file_has_its_own_numbers(tmp_path: Path, version: tuple[int, int, int]) -> None:
+def test_every_version_of_alicevision_files_is_read(tmp_path: Path, version: tuple[int, int, int]) -> None:
     lens = BENT if version >= (1, 2, 0) else Lens(35.0, 35.0, 18.5, 16.25, (0.12, -0.05, 0.02))
     small_alicevision(tmp_path / "theirs", lens, version=version, name="sfm.json")
     assert_same_scene(load_scene(tmp_path / "theirs"), load_scene(as_colmap(tmp_path / "colmap", lens)))
@@ -248,7 +248,7 @@ def test_a_camera_of_a_rig_whose_mounting_is_not_in_the_file_is_skipped_with_tha
     assert load_scene(tmp_path).skipped[0] == "ra_0.jpg: not aligned in Metashape"
 
 
-def test_meshroom_s_photographs_are_found_where_the_file_says_they_are(tmp_path: Path) -> None:
+def test_images_of_meshroom_are_found_at_the_paths_in_the_file(tmp_path: Path) -> None:
     write_images(tmp_path / "elsewhere", poses())
     data = alicevision_scene(OFF_CENTRE, (1, 2, 8), structure=False)
     for view in data["views"]:
@@ -260,7 +260,7 @@ def test_meshroom_s_photographs_are_found_where_the_file_says_they_are(tmp_path:
     assert scene.points is None
 
 
-def test_of_photographs_of_one_name_the_folders_decide(tmp_path: Path) -> None:
+def test_folders_distinguish_images_of_equal_name(tmp_path: Path) -> None:
     small_opensfm(tmp_path)
     (tmp_path / "images" / "left").mkdir()
     (tmp_path / "images" / "a_0.jpg").rename(tmp_path / "images" / "left" / "a_0.jpg")

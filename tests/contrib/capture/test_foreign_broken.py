@@ -1,4 +1,4 @@
-"""Files of cameras of other tools that are broken, or of a kind that is not read: one line that names them."""
+"""Invalid and unsupported camera files of other tools."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def test_an_image_whose_pose_is_not_finite_is_skipped_and_named(
         (without_images(small_alicevision), "at least one image with a camera, got none"),
     ],
 )
-def test_a_broken_file_is_one_line_that_names_it(tmp_path: Path, write: Callable[[Path], Any], words: str) -> None:
+def test_an_invalid_file_is_one_line_that_names_it(tmp_path: Path, write: Callable[[Path], Any], words: str) -> None:
     write(tmp_path)
     with pytest.raises(DataError, match=words) as caught:
         load_scene(tmp_path)

@@ -1,4 +1,4 @@
-"""The similarity of places: found again through noise and outliers; up by the cameras where places tell it worse."""
+"""Robust fit of positions, with up from the cameras."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def angle(fit_rotation: np.ndarray) -> float:
     return float(np.degrees(Rotation.from_matrix(fit_rotation @ TURN.T).magnitude()))
 
 
-def test_exact_places_give_the_exact_similarity() -> None:
+def test_exact_positions_give_the_exact_similarity() -> None:
     source, target = places()
     fit = fit_places(source, target, None)
     assert fit.scale == pytest.approx(SCALE, rel=1e-12)
@@ -33,7 +33,7 @@ def test_exact_places_give_the_exact_similarity() -> None:
     assert fit.tilt == "places"
 
 
-def test_outliers_are_left_out_whatever_the_receiver_s_noise_is() -> None:
+def test_outliers_are_left_out_at_any_noise_level() -> None:
     for noise in (0.01, 1.0):
         source, target = places()
         rng = np.random.default_rng(1)
@@ -47,7 +47,7 @@ def test_outliers_are_left_out_whatever_the_receiver_s_noise_is() -> None:
         assert fit.scale_error < 0.01 * max(noise, 0.1)
 
 
-def test_of_a_small_capture_up_is_taken_from_the_cameras() -> None:
+def test_up_of_a_small_capture_comes_from_the_cameras() -> None:
     source, target = places(spread=2.0)
     noisy = target + np.random.default_rng(2).normal(size=target.shape) * (1.0, 1.0, 2.0)
     up = TURN[2]  # of the world, in the run
@@ -58,7 +58,7 @@ def test_of_a_small_capture_up_is_taken_from_the_cameras() -> None:
     assert alone.tilt_error > 5
 
 
-def test_places_on_a_line_and_places_without_heights_need_an_up() -> None:
+def test_positions_on_a_line_or_without_heights_need_an_up() -> None:
     source, target = places()
     line = np.outer(np.linspace(0, 50, 12), (1.0, 0.4, 0.1))
     on_line = (line - (5, 6, 7)) @ TURN / SCALE
@@ -80,7 +80,7 @@ def cameras(up: tuple[float, float, float], roll: float = 0.0) -> list[Camera]:
     return made
 
 
-def test_up_is_an_axis_of_the_run_where_the_cameras_all_but_say_so() -> None:
+def test_up_is_rounded_to_an_axis_if_the_cameras_nearly_agree() -> None:
     assert cameras_up(cameras((0, 0, 1), roll=0.05)) == pytest.approx((0, 0, 1), abs=0)
     tilted = np.array((0.2, 0.0, 1.0)) / np.linalg.norm((0.2, 0.0, 1.0))
     assert cameras_up(cameras(tuple(tilted))) == pytest.approx(tilted, abs=1e-6)

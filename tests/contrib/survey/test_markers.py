@@ -1,4 +1,4 @@
-"""Printed markers: pictures of a plane with markers on it, and their sides found again in the run."""
+"""Printed markers: detection and size."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_markers_have_their_size_in_the_run_to_a_fraction_of_a_percent(tmp_path:
         assert np.abs(marker.corners[:, 2]).max() < 0.01 * SIDE
 
 
-def test_a_marker_in_one_photograph_is_left_out_and_said(tmp_path: Path) -> None:
+def test_a_marker_in_one_photograph_is_left_out_and_reported(tmp_path: Path) -> None:
     found = detector("4x4_50")
     markers, left = in_run((view, detected(found, view)) for view in views(tmp_path)[:1])
     assert markers == []

@@ -47,7 +47,7 @@ def cells(tags: dict[str, Any], shape: tuple[int, ...]) -> tuple[np.ndarray, np.
     return tie[3] + (column - tie[0]) * scale[0], tie[4] - (row - tie[1]) * scale[1]
 
 
-def test_heights_and_colours_lie_where_the_ball_is(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_heights_and_colours_match_the_ball(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert gs2d(["survey", str(run), "--orthophoto", "--resolution", "0.25", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)["orthophoto"]
     assert (told["epsg"], told["resolution"]) == (32632, 0.25)
@@ -97,7 +97,9 @@ def test_bad_input_is_one_line(
     assert not list(run.glob("*.tif"))
 
 
-def test_a_run_that_is_nowhere_or_has_no_mesh_is_told_what_to_do(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_without_georeference_or_mesh_is_an_error_with_a_remedy(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (run / "mesh.ply").unlink()
     assert gs2d(["survey", str(run), "--orthophoto", "--quiet"]) == 2
     assert "write it with `gs2d mesh" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The report about where a run is in the world."""
+"""The report section on world coordinates."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from gs2d.errors import DataError
 from gs2d.report.run_record import RunRecord
 
 
-def test_a_run_without_a_place_has_no_section(tmp_path: Path) -> None:
+def test_a_run_without_georeference_has_no_section(tmp_path: Path) -> None:
     assert georeference_section(RunRecord(tmp_path, {})) is None
 
 
-def test_check_points_stand_first_then_what_was_left_out_then_the_worst(tmp_path: Path) -> None:
+def test_check_points_come_first_then_outliers_then_the_largest_errors(tmp_path: Path) -> None:
     fitted = tuple(Residual(f"{k}.jpg", np.array([0.01 * k, 0, 0]), "fitted") for k in range(SHOWN + 3))
     others = (
         Residual("<gate>", np.array([0, -0.3, 0.4]), "check"),

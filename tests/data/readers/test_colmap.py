@@ -19,7 +19,7 @@ from gs2d.errors import DataError
 
 
 @pytest.mark.parametrize("kind", ["bin", "txt"])
-def test_cameras_points_and_pictures_are_what_the_model_says(tmp_path: Path, kind: str) -> None:
+def test_cameras_points_and_images_match_the_model(tmp_path: Path, kind: str) -> None:
     model = small_colmap(tmp_path, kind=kind)
     scene = load_scene(tmp_path, test_every=0)
     assert scene.format == "colmap"
@@ -85,7 +85,7 @@ def test_images_missing_on_disk_are_skipped_and_reported(tmp_path: Path) -> None
     assert scene.skipped == ("3.png: no such file in images",)
 
 
-def test_downscale_filters_the_picture_and_keeps_rays(tmp_path: Path) -> None:
+def test_downscale_filters_the_image_and_keeps_rays(tmp_path: Path) -> None:
     small_colmap(tmp_path)
     full, half = load_scene(tmp_path, test_every=0), load_scene(tmp_path, test_every=0, downscale=4)
     a, b = full.train[2], half.train[2]
@@ -116,7 +116,7 @@ def test_images_n_of_a_wrong_size_is_an_error(tmp_path: Path) -> None:
         load_scene(tmp_path, downscale=4)
 
 
-def test_a_picture_of_another_size_rescales_the_camera_and_of_another_shape_is_an_error(tmp_path: Path) -> None:
+def test_another_image_size_rescales_the_camera_and_another_aspect_ratio_is_an_error(tmp_path: Path) -> None:
     small_colmap(tmp_path)
     write_image_of(tmp_path / "images/2.png", 80, 60)
     c = load_scene(tmp_path, test_every=0).train[2].camera
@@ -139,7 +139,7 @@ def test_exif_orientation_is_ignored_as_colmap_ignores_it(tmp_path: Path) -> Non
     np.testing.assert_array_equal(view.image(), stored)
 
 
-def test_masks_beside_the_images_say_which_pixels_count(tmp_path: Path) -> None:
+def test_masks_select_the_used_pixels(tmp_path: Path) -> None:
     small_colmap(tmp_path)
     mask = np.zeros((30, 40), np.uint8)
     mask[8:, :] = 255
@@ -157,7 +157,7 @@ def test_masks_beside_the_images_say_which_pixels_count(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_a_binary_file_cut_anywhere_is_an_error_that_names_it_and_its_size(tmp_path: Path, name: str) -> None:
+def test_a_truncated_binary_file_is_an_error_with_name_and_size(tmp_path: Path, name: str) -> None:
     small_colmap(tmp_path, count=3)
     folder = tmp_path / "sparse/0"
     whole = (folder / f"{name}.bin").read_bytes()
@@ -256,7 +256,7 @@ def test_a_model_without_observations_has_its_points_projected_into_the_images(t
     assert scene.observed(guessed=False).seen["8.png"].tolist() == [2]  # type: ignore[union-attr]
 
 
-def test_a_camera_model_that_cannot_be_undistorted_names_camera_model_and_remedy(tmp_path: Path) -> None:
+def test_an_unsupported_camera_model_is_an_error_with_a_remedy(tmp_path: Path) -> None:
     cameras = {7: ("RAD_TAN_THIN_PRISM_FISHEYE", 40, 30, tuple([35.0, 36.0, 20.0, 15.0] + [0.01] * 12))}
     small_colmap(tmp_path, cameras=cameras)
     with pytest.raises(DataError, match="RAD_TAN_THIN_PRISM_FISHEYE"):
@@ -275,7 +275,7 @@ def test_an_image_of_a_camera_that_is_not_listed_is_an_error(tmp_path: Path) -> 
         load_scene(tmp_path)
 
 
-def test_no_photograph_at_all_is_an_error(tmp_path: Path) -> None:
+def test_a_capture_without_images_is_an_error(tmp_path: Path) -> None:
     small_colmap(tmp_path)
     for path in (tmp_path / "images").iterdir():
         path.unlink()
@@ -297,7 +297,7 @@ def test_points_that_are_not_finite_are_left_out_and_reported(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("word", ["nan", "1e300", "-1", "256"])
-def test_colors_of_points_that_are_no_bytes_are_one_line(tmp_path: Path, word: str) -> None:
+def test_invalid_colours_of_points_are_one_line(tmp_path: Path, word: str) -> None:
     path = tmp_path / "points3D.txt"
     path.write_text(f"1 0.5 0.5 0.5 10 {word} 30 0.1 1 1\n")
     with pytest.raises(DataError, match=r"points3D\.txt"):

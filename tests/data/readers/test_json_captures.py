@@ -66,7 +66,7 @@ def test_without_a_test_file_every_eighth_frame_is_test_and_val_is_not_used(tmp_
     assert len(scene.train) == 7
 
 
-def test_a_split_of_the_data_set_wins(tmp_path: Path) -> None:
+def test_the_split_of_the_capture_takes_precedence(tmp_path: Path) -> None:
     small_blender(tmp_path)
     scene = load_scene(tmp_path, test_every=2)
     assert (len(scene.train), len(scene.test)) == (4, 2)
@@ -92,7 +92,9 @@ def test_shared_intrinsics_with_an_off_centre_principal_point(tmp_path: Path) ->
         ({"fl_y": 31.0}, 31.0, 31.0),
     ],
 )
-def test_focal_lengths_in_pixels_win_over_angles(tmp_path: Path, keys: dict[str, float], fx: float, fy: float) -> None:
+def test_focal_lengths_in_pixels_take_precedence_over_angles(
+    tmp_path: Path, keys: dict[str, float], fx: float, fy: float
+) -> None:
     small_nerfstudio(tmp_path)
 
     def change(meta: dict[str, Any]) -> None:
@@ -160,7 +162,7 @@ def test_a_frame_whose_pose_or_camera_is_not_finite_is_skipped_and_named(
     assert re.match(f"images/f_01.png: .*{reason}", scene.skipped[0])
 
 
-def test_transforms_json_and_what_it_names_may_be_written_in_other_cases(tmp_path: Path) -> None:
+def test_letter_case_of_transforms_json_and_its_files_may_differ(tmp_path: Path) -> None:
     small_nerfstudio(tmp_path, meta={"ply_file_path": "points.ply"}, frame={"mask_path": "mask.png"})
     (tmp_path / "transforms.json").rename(tmp_path / "Transforms.JSON")
     (tmp_path / "Points.PLY").write_text(
@@ -222,7 +224,7 @@ def test_two_frames_of_one_file_are_an_error(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
-def test_cameras_that_all_stand_at_one_place_are_an_error(tmp_path: Path) -> None:
+def test_cameras_with_equal_centres_are_an_error(tmp_path: Path) -> None:
     small_nerfstudio(tmp_path)
     same = opengl_camera_to_world(ring(3)[0])
     edit(tmp_path / "transforms.json", lambda m: [f.update(transform_matrix=same) for f in m["frames"]])
