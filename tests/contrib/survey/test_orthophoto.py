@@ -97,7 +97,7 @@ def test_bad_input_is_one_line(
     assert not list(run.glob("*.tif"))
 
 
-def test_a_run_without_georeference_or_mesh_is_an_error_with_a_remedy(
+def test_without_georeference_or_mesh_the_error_has_a_remedy(
     run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (run / "mesh.ply").unlink()

@@ -66,7 +66,7 @@ def test_without_a_test_file_every_eighth_frame_is_test_and_val_is_not_used(tmp_
     assert len(scene.train) == 7
 
 
-def test_the_split_of_the_capture_takes_precedence(tmp_path: Path) -> None:
+def test_the_split_of_a_capture_wins(tmp_path: Path) -> None:
     small_blender(tmp_path)
     scene = load_scene(tmp_path, test_every=2)
     assert (len(scene.train), len(scene.test)) == (4, 2)
