@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from gs2d.errors import Gs2dError
 from gs2d.synthetic import shapes, textures
 from gs2d.synthetic.demo_capture import demo_cameras, write_capture
-from gs2d.synthetic.demo_scene import FLOOR, RADIUS, ScenePart, ToyScene
+from gs2d.synthetic.demo_scene import FLOOR, RADIUS, DemoPart, ToyScene
 
 _Y_UP = Rotation.from_euler("x", 90, degrees=True)  # y up to z up
 
@@ -62,21 +62,21 @@ def build(meshes: Path, seed: int = 0) -> ToyScene:
     upper, rest = shapes.plinth(RADIUS, 0.10)
     cow = np.asarray(Image.open(meshes / "spot" / "spot_texture.png").convert("RGB"))[::-1] / 255.0
     parts = (
-        ScenePart("plinth", upper.moved(offset=(0, 0, FLOOR)), textures.tiles(rng), gloss=0.10),
-        ScenePart("rim", rest.moved(offset=(0, 0, FLOOR)), textures.plinth_side(rng, aspect=2 * np.pi * RADIUS / 0.26)),
-        ScenePart(
+        DemoPart("plinth", upper.moved(offset=(0, 0, FLOOR)), textures.tiles(rng), gloss=0.10),
+        DemoPart("rim", rest.moved(offset=(0, 0, FLOOR)), textures.plinth_side(rng, aspect=2 * np.pi * RADIUS / 0.26)),
+        DemoPart(
             "bust",
             read_patch(meshes / "nefertiti" / "nefertiti.obj", 1.35, (-0.15, 0.3), 0.0, "z"),
             textures.vase(rng, painted=1.0),
             gloss=0.12,
         ),
-        ScenePart(
+        DemoPart(
             "bunny",
             read_patch(meshes / "stanford_bunny" / "stanford-bunny.obj", 0.55, (0.48, -0.3), 0.7, "y"),
             textures.speckled(rng, (0.75, 0.62, 0.5), (0.35, 0.22, 0.16), level=0.8, mottle=0.12),
             gloss=0.05,
         ),
-        ScenePart(
+        DemoPart(
             "cow",
             read_patch(meshes / "spot" / "spot.obj", 0.5, (-0.4, -0.55), 2.4, "y"),
             textures.srgb_to_linear(cow).astype(np.float32),

@@ -14,7 +14,7 @@ RADIUS = 1.08  # world units, of the plinth
 
 
 @dataclass(frozen=True, eq=False)
-class ScenePart:
+class DemoPart:
     """An object of the scene.
 
     Attributes
@@ -38,13 +38,13 @@ class ToyScene:
 
     Attributes
     ----------
-    parts : tuple of ScenePart
+    parts : tuple of DemoPart
     patch : Patch
         The joined parts.
     part_of_face : ndarray [F] int64
     """
 
-    parts: tuple[ScenePart, ...]
+    parts: tuple[DemoPart, ...]
     patch: shapes.Patch
     part_of_face: np.ndarray  # [F]
 
@@ -56,44 +56,42 @@ def build_scene(seed: int) -> ToyScene:
     return ToyScene(parts, shapes.join([part.patch for part in parts]), np.repeat(np.arange(len(parts)), sizes))
 
 
-def _parts(rng: np.random.Generator) -> Iterator[ScenePart]:
+def _parts(rng: np.random.Generator) -> Iterator[DemoPart]:
     upper, rest = shapes.plinth(RADIUS, 0.10)
-    yield ScenePart("plinth", upper.moved(offset=(0, 0, FLOOR)), textures.tiles(rng), gloss=0.10)
-    yield ScenePart(
-        "rim", rest.moved(offset=(0, 0, FLOOR)), textures.plinth_side(rng, aspect=2 * np.pi * RADIUS / 0.26)
-    )
+    yield DemoPart("plinth", upper.moved(offset=(0, 0, FLOOR)), textures.tiles(rng), gloss=0.10)
+    yield DemoPart("rim", rest.moved(offset=(0, 0, FLOOR)), textures.plinth_side(rng, aspect=2 * np.pi * RADIUS / 0.26))
 
     outline = np.array(
         [[0.17, 0.0], [0.20, 0.03], [0.30, 0.22], [0.36, 0.42], [0.31, 0.62], [0.17, 0.76], [0.145, 0.86], [0.20, 0.95]]
     )
     center = np.array([-0.12, 0.22, FLOOR])
-    yield ScenePart("vase", shapes.vase(outline, wall=0.025).moved(offset=center), textures.vase(rng), gloss=0.12)
+    yield DemoPart("vase", shapes.vase(outline, wall=0.025).moved(offset=center), textures.vase(rng), gloss=0.12)
     twigs, blades, buds = _twigs(rng, center + np.array([0, 0, 0.80]))
-    yield ScenePart("twigs", twigs, textures.speckled(rng, (0.36, 0.25, 0.16), (0.55, 0.42, 0.28), level=1.0))
-    yield ScenePart("leaves", blades, textures.foliage(rng))
-    yield ScenePart("buds", buds, textures.speckled(rng, (0.93, 0.50, 0.55), (0.99, 0.85, 0.80), level=1.0), gloss=0.1)
+    yield DemoPart("twigs", twigs, textures.speckled(rng, (0.36, 0.25, 0.16), (0.55, 0.42, 0.28), level=1.0))
+    yield DemoPart("leaves", blades, textures.foliage(rng))
+    yield DemoPart("buds", buds, textures.speckled(rng, (0.93, 0.50, 0.55), (0.99, 0.85, 0.80), level=1.0), gloss=0.1)
 
     knot = shapes.tube(shapes.torus_knot(0.20, 0.088), 0.062, around=16, closed=True)
     knot = shapes.Patch(knot.vertices, knot.normals, knot.uvs * [1, 6] % 1.0001, knot.faces)
-    yield ScenePart(
+    yield DemoPart(
         "knot",
         knot.moved(offset=(-0.55, -0.36, FLOOR + 0.150), turn=0.5),
         textures.speckled(rng, (0.86, 0.24, 0.17), (0.96, 0.70, 0.35), level=2.2, mottle=0.03),
         gloss=0.35,
     )
-    yield ScenePart(
+    yield DemoPart(
         "tin",
         shapes.box((0.34, 0.34, 0.46)).moved(offset=(0.47, -0.02, FLOOR), turn=0.95),
         textures.tin(rng),
         gloss=0.08,
     )
     orange = textures.speckled(rng, (0.93, 0.50, 0.08), (0.85, 0.41, 0.05), level=1.6, mottle=0.03)
-    yield ScenePart("orange", shapes.ball(0.135).moved(offset=(0.02, -0.38, FLOOR + 0.132)), orange, gloss=0.15)
+    yield DemoPart("orange", shapes.ball(0.135).moved(offset=(0.02, -0.38, FLOOR + 0.132)), orange, gloss=0.15)
     lemon = textures.speckled(rng, (0.94, 0.80, 0.18), (0.88, 0.72, 0.12), level=1.6, mottle=0.03)
     lemon_patch = _laid_down(shapes.ball(0.095, stretch=1.3)).moved(offset=(0.19, -0.58, FLOOR + 0.093), turn=0.6)
-    yield ScenePart("lemon", lemon_patch, lemon, gloss=0.15)
+    yield DemoPart("lemon", lemon_patch, lemon, gloss=0.15)
     wire = textures.speckled(rng, (0.16, 0.17, 0.19), (0.30, 0.31, 0.33), level=1.2)
-    yield ScenePart("trellis", _trellis().moved(offset=(0.36, -0.60, FLOOR), turn=0.45), wire, gloss=0.2)
+    yield DemoPart("trellis", _trellis().moved(offset=(0.36, -0.60, FLOOR), turn=0.45), wire, gloss=0.2)
 
 
 def _laid_down(patch: shapes.Patch) -> shapes.Patch:

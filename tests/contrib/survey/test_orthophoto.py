@@ -97,9 +97,7 @@ def test_bad_input_is_one_line(
     assert not list(run.glob("*.tif"))
 
 
-def test_without_georeference_or_mesh_the_error_has_a_remedy(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_georeference_or_mesh_the_error_has_a_remedy(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (run / "mesh.ply").unlink()
     assert gs2d(["survey", str(run), "--orthophoto", "--quiet"]) == 2
     assert "write it with `gs2d mesh" in capsys.readouterr().err
