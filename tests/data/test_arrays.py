@@ -81,6 +81,6 @@ def test_a_zip_bomb_is_not_unpacked(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         archive.writestr("a.npy", data)
     assert (tmp_path / "bomb.npz").stat().st_size < 400_000
-    with pytest.raises(DataError, match="at most 400 times"):
+    with pytest.raises(DataError, match="more than 400 times"):
         read_npz(tmp_path / "bomb.npz", "archive", lambda name: True)
     assert read_npz(tmp_path / "bomb.npz", "archive", lambda name: name == "b") == {}
