@@ -56,7 +56,10 @@ def write_ball(root: Path, noise: int) -> Path:
 def everything(root: Path, **options: Any) -> tuple[Splats, dict[str, Any], np.ndarray, np.ndarray]:
     recipe = Recipe("plain", (Stage("surface", 12, losses=(LossTerm("l1", 1.0),)),))
     trained = train(
-        load_scene(root, test_every=4, **options), recipe, backend="cpu", options=Training(learn="exposure", robust="off")
+        load_scene(root, test_every=4, **options),
+        recipe,
+        backend="cpu",
+        options=Training(learn="exposure", robust="off"),
     )
     solid = replace(trained.splats, opacity_logits=trained.splats.opacity_logits + 9)
     mesh = extract_mesh(replace(trained, splats=solid), options=MeshOptions(whole_scene=True, voxel=0.1))
