@@ -103,8 +103,7 @@ def test_a_plan_limits_the_splats_to_the_memory(capture: Path, monkeypatch: pyte
     assert found.max_splats is not None
     assert found.start < found.max_splats < 1700
     assert found.memory.most <= 2 << 30
-    assert found.budget == (f"surface.densify.max_splats={found.max_splats}",)
-    assert f"only with --set surface.densify.max_splats={found.max_splats}" in found.lines()[1]
+    assert f"use --set STAGE.densify.max_splats={found.max_splats}" in found.lines()[1]
     monkeypatch.setattr(module, "SPLAT_BYTES", 1 << 24)
     with pytest.raises(DataError, match="photographs"):
         plan(options)

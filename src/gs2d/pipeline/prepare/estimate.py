@@ -8,7 +8,6 @@ pixel of a small test scene, forwards and backwards; ``rasterizer_speed`` measur
 from __future__ import annotations
 
 import math
-import shlex
 import time
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -89,8 +88,6 @@ class Estimate:
         Bytes, including temporary files.
     seconds : Range
         Of the whole run.
-    budget : tuple of str
-        Overrides that limit the recipe to ``max_splats``.
     """
 
     photographs: int
@@ -105,7 +102,6 @@ class Estimate:
     prepared: bool
     disk: float
     seconds: Range
-    budget: tuple[str, ...] = ()
 
     def line(self) -> str:
         """Return time and memory in one line."""
@@ -119,13 +115,14 @@ class Estimate:
         shrunk = f" (--downscale {self.downscale})" if self.downscale > 1 else ""
         where = "prepared on disk" if self.prepared else "in memory"
         allowed = "" if self.allowed is None else f" of {self.allowed / 2**30:.3g} GiB allowed"
-        limited = shlex.join(set_words(self.budget)) or "more --memory"  # not every densifier has a limit
-        budget = "" if self.max_splats is None else f"; only with {limited}"
+        limit = ""
+        if self.max_splats is not None:
+            limit = f"; more do not fit: use --set STAGE.densify.max_splats={self.max_splats} or more --memory"
         least, expected, most = (value / 2**30 for value in self.memory)
         return [
             f"photographs: {self.photographs:,} with {self.pixels / 1e6:.3g} megapixels in total{shrunk}, {where}",
             f"splats: {rounded(self.splats.expected):,} ({rounded(self.splats.least):,} to "
-            f"{rounded(self.splats.most):,}), initially {rounded(self.start):,}{budget}",
+            f"{rounded(self.splats.most):,}), initially {rounded(self.start):,}{limit}",
             f"memory: {expected:.2g} GiB ({least:.2g} to {most:.2g}){allowed}",
             f"disk: {self.disk / 2**30:.2g} GiB",
             f"time: {duration(self.seconds.expected)} ({duration(self.seconds.least)} to "
@@ -216,7 +213,6 @@ def estimate(
         prepared=prepared,
         disk=disk + splats.expected * (2 * CHECKPOINT_BYTES + FILE_BYTES),
         seconds=_seconds(scene, recipe, start, splats, rasterizer_speed(backend)),
-        budget=() if budget is None else budget_overrides(recipe, budget),
     )
 
 
@@ -248,20 +244,6 @@ def limit_of(densify: GradDensify | Densify) -> int | None:
     """Return the number of splats beyond which a densifier adds none; None: no limit."""
     limit = densify.max_splats if isinstance(densify, GradDensify) else densify.options.get("max_splats")
     return None if limit is None else int(limit)
-
-
-def budget_overrides(recipe: Recipe, splats: int) -> tuple[str, ...]:
-    """Return the overrides that limit the splats of a recipe, one for each stage whose densifier has a limit."""
-    fields = {stage.name: "max_splats" for stage in recipe.stages if isinstance(stage.densify, GradDensify)}
-    for stage in recipe.stages:
-        if isinstance(stage.densify, Densify) and "max_splats" in stage.densify.options:
-            fields[stage.name] = "options.max_splats"
-    return tuple(f"{stage}.densify.{field}={splats}" for stage, field in fields.items())
-
-
-def set_words(overrides: tuple[str, ...]) -> list[str]:
-    """Return overrides as words of a command line."""
-    return [word for override in overrides for word in ("--set", override)]
 
 
 def rounded(number: float) -> int:
