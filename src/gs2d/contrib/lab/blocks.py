@@ -44,7 +44,7 @@ from gs2d.pipeline.prepare.options import CommonTraining, TrainOptions, values
 from gs2d.pipeline.prepare.resolve import check_options
 from gs2d.pipeline.prepare.resolved import difference
 from gs2d.pipeline.prepare.run_appearance import with_learned_appearance
-from gs2d.pipeline.prepare.scene_part import ScenePart
+from gs2d.pipeline.prepare.scene_part import TrainedPart
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Notice, OnEvent, ignore
 from gs2d.training.trainer import raster_settings
@@ -79,7 +79,7 @@ class BlocksTask(Task):
         protocol: Protocol = decode(settled_of(self.options.out)["protocol"], Protocol, "protocol")
         return protocol
 
-    def train(self, part: ScenePart, out: Path, on_event: OnEvent, *, downscale: int | None = None) -> RunFolder:
+    def train(self, part: TrainedPart, out: Path, on_event: OnEvent, *, downscale: int | None = None) -> RunFolder:
         """Train a part of everything, or go on."""
         self.limit()
         downscale = self.options.downscale if downscale is None else downscale
@@ -114,7 +114,7 @@ class CoarseTask(BlocksTask):
         settled, partition = self.settled(on_event), self.partition()
         downscale = coarse_downscale(settled.scene, partition, self.options.downscale or 1)
         recipe, out = coarse_recipe(settled.recipe, partition), coarse_folder(self.options.out)
-        run = self.train(ScenePart(recipe=recipe, protocol=settled.protocol), out, on_event, downscale=downscale)
+        run = self.train(TrainedPart(recipe=recipe, protocol=settled.protocol), out, on_event, downscale=downscale)
         return {"stages": run.metrics()["stages"]}
 
 
@@ -164,7 +164,7 @@ class BlockTask(BlocksTask):
         recipe = block_recipe(whole, partition, block)
         region = split.cells.region(split.cells.names.index(self.block))
         start = start_file(partition_folder(out), self.block)
-        part = ScenePart(
+        part = TrainedPart(
             recipe=recipe,
             protocol=self.protocol(),
             views=block.views,
@@ -197,7 +197,7 @@ class SeamsTask(BlocksTask):
             start = start_file(partition_folder(out), SEAMS)
             trained = [len(block.views) for block in read_split(partition_folder(out)).blocks if not block.skipped]
             recipe = seam_recipe(settled.recipe, partition, len(views) * len(trained) / max(1, sum(trained)))
-            part = ScenePart(
+            part = TrainedPart(
                 recipe=recipe,
                 protocol=settled.protocol,
                 views=views,

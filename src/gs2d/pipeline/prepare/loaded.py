@@ -31,7 +31,7 @@ from gs2d.pipeline.prepare.resolve import check_execution, check_options, resolv
 from gs2d.pipeline.prepare.resolved import CaptureRecord, Execution, ResolvedRun, read_resolved
 from gs2d.pipeline.prepare.run_appearance import with_learned_appearance
 from gs2d.pipeline.prepare.run_poses import with_refined_poses
-from gs2d.pipeline.prepare.scene_part import PartStart, ScenePart
+from gs2d.pipeline.prepare.scene_part import PartStart, TrainedPart
 from gs2d.pipeline.prepare.view_priors import with_priors
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
@@ -130,7 +130,7 @@ class RenderedScene(typing.Protocol):
 
 # -- before training ---------------------------------------------------------------------------------------------------
 def prepare_run(
-    options: TrainOptions, on_event: OnEvent, *, title: str = "", part: ScenePart | None = None
+    options: TrainOptions, on_event: OnEvent, *, title: str = "", part: TrainedPart | None = None
 ) -> LoadedRun:
     """Check the options, read the capture and resolve the run. Writes only prepared photographs.
 
@@ -140,7 +140,7 @@ def prepare_run(
     on_event : callable
     title : str
         Heading of the report; empty: the name of the capture.
-    part : ScenePart or None
+    part : TrainedPart or None
         Trains a part of the scene, with its recipe and protocol instead of those of the options.
     """
     if part is None:

@@ -41,7 +41,7 @@ class PartStart:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ScenePart:
+class TrainedPart:
     """A part of a scene with its own recipe and protocol; only its splats are written.
 
     Attributes

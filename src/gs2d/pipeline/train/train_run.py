@@ -40,7 +40,7 @@ from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare.photographs import PREPARED
 from gs2d.pipeline.prepare.resolve import check_options
 from gs2d.pipeline.prepare.resolved import check_same_run
-from gs2d.pipeline.prepare.scene_part import ScenePart
+from gs2d.pipeline.prepare.scene_part import TrainedPart
 from gs2d.pipeline.run_parts import TRAINED
 from gs2d.pipeline.train.live import Live
 from gs2d.pipeline.train.process_group import connected, follow, lead, memory_of
@@ -59,7 +59,7 @@ def train(
     *,
     title: str = "",
     allowed: tuple[str, ...] = (),
-    part: ScenePart | None = None,
+    part: TrainedPart | None = None,
 ) -> RunFolder:
     """Train a run and write splats, mesh, metrics, page and report.
 
@@ -75,7 +75,7 @@ def train(
         Heading of the report; empty: the name of the capture.
     allowed : tuple of str
         Names of files that may already be in ``options.out``.
-    part : ScenePart or None
+    part : TrainedPart or None
         Trains a part of the scene and writes its splats only.
 
     Returns
@@ -107,7 +107,7 @@ def _train(
     together: OneProcess,
     title: str,
     allowed: tuple[str, ...],
-    part: ScenePart | None,
+    part: TrainedPart | None,
 ) -> RunFolder:
     """Train in this process, which leads the others if there are any."""
     check_viewer(options)
