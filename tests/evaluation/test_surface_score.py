@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 from gs2d.core.camera import Camera, look_at
@@ -17,8 +18,8 @@ from gs2d.evaluation.surface_score import (
     distances_to_mesh,
     evaluate_surface,
     face_areas,
-    point_triangle_distances,
     sample_surface,
+    triangle_distances,
 )
 from gs2d.evaluation.visibility import visible_counts
 from gs2d.io.meshes import read_mesh
@@ -56,7 +57,7 @@ def test_distances_to_a_triangle_are_to_its_plane_its_edges_or_its_corners() -> 
     # above the inside: 2; beside the edge y = 0: (3, 4) -> 5; at the corner: 5; beyond (4,0,0): 5;
     # beside 3x + 4y = 12: (12 + 12 - 12) / 5 = 2.4; on it: 0
     expected = [2, 5, 5, 5, 2.4, 0]
-    got = point_triangle_distances(points, np.repeat(triangle[None], len(points), axis=0))
+    got = triangle_distances(torch.from_numpy(points), torch.from_numpy(triangle).expand(len(points), 3, 3)).numpy()
     np.testing.assert_allclose(got, expected, atol=1e-12)
 
 
@@ -170,7 +171,7 @@ def test_true_surface_that_too_few_cameras_see_does_not_count() -> None:
     assert score.truth_hidden == pytest.approx(0.5, abs=0.05)  # slanted views see a rim of it past the edge
     everything = evaluate_surface(square(0.0), truth, thresholds=[0.01], samples=4000)
     assert everything.scores[0].recall == pytest.approx(0.5, abs=0.01)
-    with pytest.raises(DataError, match="no part of it is seen"):
+    with pytest.raises(DataError, match="no camera sees any part"):
         evaluate_surface(square(0.0), truth, cameras=cameras[:2], samples=100)
 
 

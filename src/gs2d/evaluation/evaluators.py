@@ -1,4 +1,4 @@
-"""Ground truths of surfaces: found, read, and compared with a mesh by the evaluator that is registered for them."""
+"""Find ground truths of surfaces, and score meshes with registered evaluators."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ SEEN_SUFFIX = "_seen.npy"  # beside FILE.ply: FILE_seen.npy, how many views see 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """A true surface, compared by the visible-surface protocol.
+    """A true surface for the visible-surface protocol.
 
     Attributes
     ----------
     path : Path
     surface : Mesh, or ndarray [P, 3] of points
     seen : ndarray [F] or None
-        How many training views see each face.
+        Number of training views that see each face.
     """
 
     path: Path
@@ -47,37 +47,37 @@ class Truth:
 
 
 class Evaluator(Protocol):
-    """Scores meshes against the ground truth of a data set. A class is registered; it is made without arguments.
+    """Scores meshes against the ground truth of a data set. Registered classes are created without arguments.
 
-    ``has_thresholds`` says whether ``score`` uses the thresholds that a user gives.
+    ``has_thresholds`` states whether ``score`` uses the thresholds of the user.
     """
 
     has_thresholds: bool
 
     def find(self, capture: Path, given: Path | None, tell: Tell) -> Any | None:
-        """Return the ground truth of a capture, or None where this evaluator has none for it.
+        """Return the ground truth of a capture, or None if this evaluator has none for it.
 
-        ``given`` is the file or the folder that the user names; without one, the truth may lie beside the capture.
-        ``tell`` receives a sentence on each file that is missing. A folder that lacks files is a DataError.
+        ``given`` is the file or folder that the user requested; without it, the truth may be beside the capture.
+        ``tell`` receives a message about each missing file. An incomplete folder is a DataError.
         """
 
     def score(
         self, mesh: Mesh, truth: Any, scene: Scene, *, folder: Path, thresholds: tuple[float, ...]
     ) -> dict[str, Any]:
-        """Return the ``surface`` entry of ``metrics.json`` (docs/guides/runs.md); coloured clouds go to ``folder``.
+        """Return the ``surface`` entry of ``metrics.json`` (docs/guides/runs.md); write coloured clouds to ``folder``.
 
-        The sentences of ``self_check["messages"]`` are shown to the user.
+        The messages in ``self_check["messages"]`` are shown to the user.
         """
 
 
 EVALUATORS: Registry[Callable[[], Evaluator]] = Registry(
     "evaluator", "gs2d.evaluators", builtin={VISIBLE: __name__}, error=DataError
 )
-"""Names of evaluators -> their classes."""
+"""Classes of evaluators, by name."""
 
 
 def register_evaluator(name: str) -> Callable[[Register], Register]:
-    """Return a decorator that registers an evaluator of surfaces, which ``gs2d evaluate`` then uses.
+    """Return a decorator that registers an evaluator of surfaces for ``gs2d evaluate``.
 
     Parameters
     ----------
@@ -87,12 +87,12 @@ def register_evaluator(name: str) -> Callable[[Register], Register]:
     Returns
     -------
     callable
-        Decorates a class without constructor arguments that has the attribute and the methods of ``Evaluator``.
+        Decorates a class without constructor arguments that implements ``Evaluator``.
 
     Raises
     ------
     DataError
-        From the decorator: the name is taken.
+        From the decorator, if the name is taken.
     """
     return EVALUATORS.register(name)
 
@@ -107,7 +107,7 @@ class FoundTruth:
         Of the evaluator.
     evaluator : Evaluator
     truth : object
-        As ``evaluator.find`` returned it.
+        From ``evaluator.find``.
     """
 
     name: str
@@ -121,7 +121,7 @@ def read_truth(path: Path) -> Truth:
     if kind == "points":
         return Truth(path, np.asarray(read_points(path).points, np.float64), None)
     if kind != "mesh":
-        raise DataError(f"{path}: a mesh or points were expected, got {kind} splats; give the true surface")
+        raise DataError(f"{path}: expected a mesh or points, got {kind} splats; use the true surface")
     mesh = read_mesh(path)
     counts = path.with_name(path.stem + SEEN_SUFFIX)
     if not counts.exists():
@@ -133,15 +133,15 @@ def read_truth(path: Path) -> Truth:
 
 
 def choose_truth(given: Path | None, capture: Path, tell: Tell) -> FoundTruth | None:
-    """Return the ground truth of a capture: in a file or a folder that is given, or beside the capture.
+    """Return the ground truth of a capture, from the file or folder ``given``, or beside the capture.
 
-    Evaluators of data sets are asked first. Any other capture is compared with the mesh or the points that are given,
-    or with ``mesh_gt.ply``, ``mesh_gt.obj`` or ``points_gt.ply`` beside it.
+    Evaluators of data sets come first. Other captures are compared with the mesh or points in ``given``, or with
+    ``mesh_gt.ply``, ``mesh_gt.obj`` or ``points_gt.ply`` beside the capture.
 
     Raises
     ------
     DataError
-        If ``given`` holds no ground truth of this capture.
+        If ``given`` contains no ground truth of this capture.
     """
     for name, make in sorted(EVALUATORS.working(), key=lambda item: item[0] == VISIBLE):
         evaluator = make()
@@ -152,7 +152,7 @@ def choose_truth(given: Path | None, capture: Path, tell: Tell) -> FoundTruth | 
 
 
 def check_thresholds(thresholds: tuple[float, ...]) -> None:
-    """Raise for a threshold that is no distance, before anything slow happens."""
+    """Raise DataError early for a threshold that is not a positive number."""
     if not all(t > 0 and math.isfinite(t) for t in thresholds):
         raise DataError(f"--thresholds must be positive distances, got {', '.join(map(str, thresholds))}")
 
@@ -160,9 +160,9 @@ def check_thresholds(thresholds: tuple[float, ...]) -> None:
 def score_surface(
     mesh: Mesh, found: FoundTruth, scene: Scene, *, folder: Path, tell: Tell, thresholds: tuple[float, ...] = ()
 ) -> dict[str, Any]:
-    """Return the ``surface`` entry of ``metrics.json`` (docs/guides/runs.md); coloured clouds go to ``folder``."""
+    """Return the ``surface`` entry of ``metrics.json`` (docs/guides/runs.md); write coloured clouds to ``folder``."""
     if thresholds and not found.evaluator.has_thresholds:
-        tell(f"--thresholds are not used: the evaluator {found.name} has its own protocol")
+        tell(f"--thresholds is ignored: the evaluator {found.name} has its own protocol")
     facts = found.evaluator.score(mesh, found.truth, scene, folder=folder, thresholds=thresholds)
     for message in facts["self_check"]["messages"]:
         tell(message)
@@ -171,12 +171,12 @@ def score_surface(
 
 @EVALUATORS.register(VISIBLE)
 class VisibleSurfaceEvaluator:
-    """Chamfer distance, precision, recall and F-score of a mesh, over what the training views see."""
+    """Chamfer distance, precision, recall and F-score of a mesh, over the surface that the training views see."""
 
     has_thresholds = True
 
     def find(self, capture: Path, given: Path | None, tell: Tell) -> Truth | None:
-        """Return a mesh or points: a file that is given, or one of ``MESH_TRUTHS`` in the folder."""
+        """Return a mesh or points: the file ``given``, or one of ``MESH_TRUTHS`` in the folder."""
         folder = given or capture
         path = next((folder / name for name in MESH_TRUTHS if (folder / name).is_file()), None)
         if path is not None:
@@ -185,18 +185,18 @@ class VisibleSurfaceEvaluator:
             path = given
         elif given is not None:
             raise DataError(
-                f"{given} must hold the official ground truth of a scene of DTU or Tanks and Temples, or one of "
-                f"{', '.join(MESH_TRUTHS)}, got neither for the capture {capture.name}; give a PLY or OBJ file"
+                f"{given} must contain the official ground truth of a scene of DTU or Tanks and Temples, or one of "
+                f"{', '.join(MESH_TRUTHS)}, got neither for the capture {capture.name}; use a PLY or OBJ file"
             )
         truth = None if path is None else read_truth(path)
         if truth is not None and truth.seen is not None:
-            tell(f"which true faces count is taken from {truth.path.stem}{SEEN_SUFFIX}")
+            tell(f"view counts of true faces: {truth.path.stem}{SEEN_SUFFIX}")
         return truth
 
     def score(
         self, mesh: Mesh, truth: Truth, scene: Scene, *, folder: Path, thresholds: tuple[float, ...]
     ) -> dict[str, Any]:
-        """Compare by the visible-surface protocol."""
+        """Score a mesh with the visible-surface protocol."""
         score = evaluate_surface(
             mesh,
             truth.surface,
@@ -212,7 +212,7 @@ class VisibleSurfaceEvaluator:
         if score.clouds is not None:
             make_folder(folder)
             files = {what: f"{folder.name}/{name}" for what, name in write_clouds(folder, score.clouds).items()}
-        is_world = np.array_equal(scene.T_metric_scene, np.eye(4))  # else the scale_mat of DTU
+        is_world = np.array_equal(scene.T_metric_scene, np.eye(4))  # otherwise the scale_mat of DTU
         return {
             "unit": "world units" if is_world else "mm",
             "ground_truth": str(truth.path),
@@ -226,10 +226,10 @@ class VisibleSurfaceEvaluator:
 
 
 def _self_check(score: SurfaceScore, truth: Truth) -> dict[str, Any]:
-    """Whether both surfaces lie in one place at all."""
+    """Check that both surfaces overlap."""
     far = score.accuracy_median is not None and score.accuracy_median > APART * score.diagonal
     line = (
-        f"half of the mesh is more than {APART:.0%} of the true size away from {truth.path.name}: "
-        "is it in the capture's frame, and in its units?"
+        f"half of the mesh is more than {APART:.0%} of the size of the truth away from {truth.path.name}: check its "
+        "coordinate system and units"
     )
     return {"ok": not far and score.reason is None, "messages": [line] if far else []}

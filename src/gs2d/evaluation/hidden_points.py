@@ -1,7 +1,7 @@
-"""Fog without ground truth: sparse points that a photograph shows and that the rendering of its view hides.
+"""Detect floaters without ground truth: sparse points that an image shows but its rendering occludes.
 
-A point that structure from motion found in a photograph can be seen from there, so nothing may lie before it. Where the
-rendered median depth ends clearly nearer, the splats put a sheet, a streak or fog between camera and surface.
+A point that structure from motion triangulated from an image is visible in it. If the rendered median depth is clearly
+smaller, the splats form floaters between camera and surface.
 """
 
 from __future__ import annotations
@@ -13,33 +13,33 @@ import numpy as np
 
 from gs2d.data.prior_maps import PointsInView
 
-NEARER = 0.95  # of a point's depth: a surface before that hides it; SfM depths are good to a few percent
+NEARER = 0.95  # of a point's depth: a nearer surface occludes it; SfM depths have errors of a few percent
 
 
 @dataclass(frozen=True)
 class HiddenPoints:
-    """How many points a view shows, and how many of them its rendering hides."""
+    """Number of sparse points in a view, and how many of them its rendering occludes."""
 
     shown: int
     hidden: int
 
     @property
     def fraction(self) -> float | None:
-        """Hidden points as a fraction of those shown; None where no point is shown."""
+        """Fraction of the points that are occluded; None without points."""
         return self.hidden / self.shown if self.shown else None
 
 
 def hidden_points(depth: np.ndarray, points: PointsInView, *, nearer: float = NEARER) -> HiddenPoints:
-    """Count the points of a view that lie behind its rendered surface.
+    """Count the points of a view that are behind its rendered surface.
 
     Parameters
     ----------
     depth : ndarray [H, W] world units
-        Rendered median depth; 0 where nothing was hit, which hides nothing.
+        Rendered median depth; 0 without a surface.
     points : PointsInView
         From :meth:`gs2d.data.prior_maps.ObservedPoints.in_view`.
     nearer : float
-        A point is hidden where the surface is nearer than this fraction of the point's depth.
+        A point is hidden if the surface is nearer than this fraction of its depth.
     """
     columns, rows = np.floor(points.pixels).astype(np.int64).T
     surface = np.asarray(depth)[rows, columns]
@@ -48,5 +48,5 @@ def hidden_points(depth: np.ndarray, points: PointsInView, *, nearer: float = NE
 
 
 def total(views: Sequence[HiddenPoints]) -> HiddenPoints:
-    """Return the counts of several views together."""
+    """Sum the counts of several views."""
     return HiddenPoints(sum(view.shown for view in views), sum(view.hidden for view in views))

@@ -1,8 +1,7 @@
 """PSNR, SSIM and LPIPS of rendered images.
 
-Two numbers of each of PSNR and SSIM, both named: ``psnr`` and ``ssim`` are taken from the 8-bit image, as the official
-2DGS evaluation does (it reads the PNGs it saved), ``psnr_float`` and ``ssim_float`` from the floats clamped to [0, 1].
-Masked-out pixels count nowhere.
+``psnr`` and ``ssim`` use the 8-bit image, as the official 2DGS evaluation does, which reads PNG files. ``psnr_float``
+and ``ssim_float`` use the float image clamped to [0, 1]. Masked pixels are ignored.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from gs2d.render.backends import Backend
 
 @dataclass(frozen=True)
 class Metric:
-    """A number, or None with the reason why there is none."""
+    """A number, or None with a reason."""
 
     value: float | None
     reason: str | None = None
@@ -30,18 +29,18 @@ class Metric:
 
 @dataclass(frozen=True)
 class ImageMetrics:
-    """How close a rendered image is to its photograph.
+    """Similarity of a rendered image and its target.
 
     Attributes
     ----------
     psnr, ssim : Metric
-        dB and [-1, 1], of the image quantised to 8 bit (the official evaluation).
+        In dB, and in [-1, 1], of the image quantised to 8 bits (official evaluation).
     psnr_float, ssim_float : Metric
-        The same of the float image.
+        Of the float image.
     lpips : Metric
-        VGG LPIPS of the 8-bit image fed as [0, 1] (what 3DGS and 2DGS report).
+        VGG LPIPS of the 8-bit image scaled to [0, 1] (as 3DGS and 2DGS report).
     lpips_signed : Metric
-        The same fed as [-1, 1] (the authors' convention).
+        VGG LPIPS of the 8-bit image scaled to [-1, 1] (convention of its authors).
     """
 
     psnr: Metric
@@ -52,7 +51,7 @@ class ImageMetrics:
     lpips_signed: Metric
 
     def to_json(self) -> dict[str, float | str | None]:
-        """Each value by its name, and ``<name>_reason`` beside every one that is null or partial."""
+        """Return each value by name, and ``<name>_reason`` for values that are null or incomplete."""
         row: dict[str, float | str | None] = {}
         for name, metric in asdict(self).items():
             row[name] = metric["value"]
@@ -62,7 +61,7 @@ class ImageMetrics:
 
 
 def quantise(image: Tensor) -> Tensor:
-    """Round a float image in [0, 1] to 8 bit, half up, clamping what is outside; uint8, same shape."""
+    """Clamp a float image to [0, 1] and round it to 8 bits, half up; uint8 of the same shape."""
     return (image * 255 + 0.5).clamp(0, 255).to(torch.uint8)
 
 
@@ -71,7 +70,7 @@ def _as_8bit(image: Tensor) -> Tensor:
 
 
 def psnr_float(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio, dB: -10 log10 of the mean squared error over valid pixels and channels.
+    """Return the PSNR in dB: -10 log10 of the mean squared error over valid pixels and channels.
 
     Parameters
     ----------
@@ -83,12 +82,12 @@ def psnr_float(image: Tensor, target: Tensor, mask: Tensor | None = None) -> flo
     Returns
     -------
     float
-        ``inf`` for equal images, ``nan`` when no pixel is valid.
+        ``inf`` for equal images, ``nan`` if no pixel is valid.
     """
     check_shapes({"target": (target, "H W 3"), "image": (image, "H W 3")})
     squared = image.detach().clamp(0, 1).double()  # [H, W, 3]
     squared -= target.detach()
-    squared.square_()  # in place: a 4K image of doubles is 200 MB
+    squared.square_()  # in place, because a 4K image of doubles has 200 MB
     if mask is not None:
         check_shapes({"target": (target, "H W 3"), "mask": (mask, "H W")})
         squared = squared[mask]
@@ -99,14 +98,14 @@ def psnr_float(image: Tensor, target: Tensor, mask: Tensor | None = None) -> flo
 
 
 def psnr_8bit(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """``psnr_float`` after quantising both images to 8 bit."""
+    """Return ``psnr_float`` of both images quantised to 8 bits."""
     return psnr_float(_as_8bit(image), _as_8bit(target), mask)
 
 
 def ssim_float(image: Tensor, target: Tensor, mask: Tensor | None = None, *, backend: str | Backend) -> float:
-    """Mean SSIM over valid pixels (11x11 Gaussian window, zero padding: the SSIM of the loss); image clamped to [0, 1].
+    """Return the mean SSIM over valid pixels (11x11 Gaussian window, zero padding, as in the loss); ``nan`` if none is.
 
-    ``nan`` when no pixel is valid. ``backend`` has fused operations, or torch does it.
+    The image is clamped to [0, 1]. Uses fused operations of the ``backend`` if it has them, else torch.
     """
     check_shapes({"target": (target, "H W 3"), "image": (image, "H W 3")})
     if target.numel() == 0 or (mask is not None and not bool(mask.any())):
@@ -116,7 +115,7 @@ def ssim_float(image: Tensor, target: Tensor, mask: Tensor | None = None, *, bac
 
 
 def ssim_8bit(image: Tensor, target: Tensor, mask: Tensor | None = None, *, backend: str | Backend) -> float:
-    """``ssim_float`` after quantising both images to 8 bit."""
+    """Return ``ssim_float`` of both images quantised to 8 bits."""
     return ssim_float(_as_8bit(image), _as_8bit(target), mask, backend=backend)
 
 
@@ -148,17 +147,17 @@ def image_metrics(
     backend: str | Backend,
     lpips: Lpips | None = None,
 ) -> ImageMetrics:
-    """Every image metric of one view.
+    """Compute all image metrics of one view.
 
     Parameters
     ----------
     image, target : Tensor [H, W, 3]
         In [0, 1]; the image is clamped to it.
     mask : Tensor [H, W] bool, optional
-        False = ignore this pixel. LPIPS sees the target there and still averages over the whole image.
+        False = ignore this pixel. For LPIPS, the target replaces the image there, and the mean is over all pixels.
     backend : str or Backend
     lpips : Lpips, optional
-        From ``evaluation.lpips.load_lpips``; without it LPIPS is null with the remedy as reason.
+        From ``evaluation.lpips.load_lpips``; without it LPIPS is null, with a remedy as the reason.
     """
     return ImageMetrics(
         psnr=_metric(psnr_8bit(image, target, mask)),
@@ -171,7 +170,7 @@ def image_metrics(
 
 
 def mean_metrics(views: Sequence[ImageMetrics]) -> ImageMetrics:
-    """Mean of each metric over the views that have it; the reason says how many do not, and why."""
+    """Average each metric over the views that have it; the reason states how many do not, and why."""
 
     def mean(name: str) -> Metric:
         metrics = [getattr(view, name) for view in views]

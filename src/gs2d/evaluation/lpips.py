@@ -1,10 +1,10 @@
-"""LPIPS (Zhang et al. 2018) with a VGG-16 and five 1x1 heads, from weight files that the user supplies.
+"""LPIPS (Zhang et al. 2018) with VGG-16 and five 1x1 heads, from weight files of the user.
 
-Two conventions are in use, and their numbers differ: ``"-1..1"`` scales images to [-1, 1] first, as the authors'
-package does; ``"0..1"`` feeds [0, 1], as the evaluation scripts of 3DGS and 2DGS do. A number must say which it is.
+Two conventions with different values are in use: ``"-1..1"`` scales images to [-1, 1], as the package of the authors
+does; ``"0..1"`` uses [0, 1], as the evaluation scripts of 3DGS and 2DGS do.
 
-Nothing is downloaded. The files are torchvision's VGG-16 state dict (keys ``features.0.weight`` ...) and the heads of
-the ``lpips`` package, version 0.1 (keys ``lin0.model.1.weight`` ...).
+Nothing is downloaded. The files are the VGG-16 state dict of torchvision (keys ``features.0.weight`` ...) and the heads
+of the ``lpips`` package, version 0.1 (keys ``lin0.model.1.weight`` ...).
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from gs2d.core.text import first_line
 from gs2d.errors import DataError, ShapeError
 
 CONVENTIONS = ("0..1", "-1..1")
-BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))  # the convolutions among torchvision's `features`
+BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))  # convolutions in torchvision's `features`
 WIDTHS = (64, 128, 256, 512, 512)
-SHIFT = (-0.030, -0.088, -0.188)  # of the LPIPS scaling layer, on [-1, 1]
+SHIFT = (-0.030, -0.088, -0.188)  # of the LPIPS scaling layer, for [-1, 1]
 SCALE = (0.458, 0.448, 0.450)
-MIN_SIZE = 16  # px: four poolings leave one
+MIN_SIZE = 16  # px; four poolings reduce it to one
 REMEDY = (
     "pass --lpips-weights with torchvision's vgg16-397923af.pth and the lpips package's weights/v0.1/vgg.pth, "
     "or the folder that holds both"
@@ -48,7 +48,7 @@ class Lpips:
 
     @property
     def device(self) -> torch.device:
-        """Where the weights are, and images must be."""
+        """Device of the weights, on which images must be."""
         return next(iter(self.weights.values())).device
 
     def to(self, device: str | torch.device) -> Lpips:
@@ -56,12 +56,12 @@ class Lpips:
         return Lpips({name: weight.to(device) for name, weight in self.weights.items()})
 
     def __call__(self, image: Tensor, target: Tensor, *, convention: str = "0..1") -> Tensor:
-        """Distance [] of two images [H, W, 3] with values in [0, 1], in float32 on every device.
+        """Return the distance [] of two images [H, W, 3] with values in [0, 1], in float32 on every device.
 
         Raises
         ------
         ShapeError
-            Images of different or too small sizes, or an unknown convention.
+            If the images have different or too small sizes, or the convention is unknown.
         """
         if convention not in CONVENTIONS:
             raise ShapeError(f"LPIPS convention must be one of {', '.join(CONVENTIONS)}, got {convention!r}")
@@ -79,7 +79,7 @@ class Lpips:
             return self._distance(x)
 
     def _distance(self, x: Tensor) -> Tensor:
-        """Of a pair [2, 3, H, W], normalised."""
+        """Return the distance of a normalised pair [2, 3, H, W]."""
         total = x.new_zeros(())
         for block, layers in enumerate(BLOCKS):
             if block > 0:
@@ -95,9 +95,9 @@ class Lpips:
 
 @contextmanager
 def _full_precision() -> Iterator[None]:
-    """Without it torch convolves on a GPU with 10 bits of mantissa (TF32), and the metric is another than on a CPU."""
+    """Disable TF32, with which convolutions on a GPU have 10 bits of mantissa, and the metric differs from the CPU."""
     cudnn = torch.backends.cudnn
-    # torch 2.9 has a setting for each operation, and asking the old one fails where somebody has used the new
+    # torch 2.9 has a setting per operation; reading the old setting fails after the new one was used
     owner, name, full = (
         (cudnn.conv, "fp32_precision", "ieee") if hasattr(cudnn, "conv") else (cudnn, "allow_tf32", False)
     )
@@ -122,16 +122,16 @@ def _expected() -> dict[str, tuple[int, ...]]:
 
 
 def load_lpips(paths: str | Path | Iterable[str | Path], *, device: str = "cpu") -> Lpips:
-    """Read the weights from a folder (its .pth and .pt files) or from the files themselves.
+    """Read the weights from files, or from a folder with .pth and .pt files.
 
     Raises
     ------
     DataError
-        A path that is missing or not a state dict, or weights that are missing or of another shape.
+        If a file is missing or no state dict, or weights are missing or have another shape.
     """
-    given = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
+    sources = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     files: list[Path] = []
-    for path in given:
+    for path in sources:
         if not path.exists():
             raise DataError(f"LPIPS weights not found: {path}; {REMEDY}")
         files += sorted([*path.glob("*.pth"), *path.glob("*.pt")]) if path.is_dir() else [path]
@@ -141,17 +141,17 @@ def load_lpips(paths: str | Path | Iterable[str | Path], *, device: str = "cpu")
             state = torch.load(file, map_location=device, weights_only=True)
         except MemoryError:
             raise
-        except Exception as error:  # whatever torch's readers of its old and new formats run into
+        except Exception as error:  # torch's readers raise many kinds
             first = first_line(error)
-            first = first.split(".")[0] if isinstance(error, UnpicklingError) else first  # torch's advice is long
+            first = first.split(".")[0] if isinstance(error, UnpicklingError) else first  # without torch's advice
             raise DataError(f"{file} is not a readable PyTorch state dict ({first}); {REMEDY}") from error
         if not isinstance(state, Mapping):
             raise DataError(f"{file} must hold a state dict, got {type(state).__name__}; {REMEDY}")
         weights |= {key: value.float() for key, value in state.items() if key in expected}
     for key, shape in expected.items():
         if key not in weights:
-            where = ", ".join(map(str, files)) or f"no .pth file in {', '.join(map(str, given))}"
-            raise DataError(f"LPIPS weights lack {key} (looked in {where}); {REMEDY}")
+            where = ", ".join(map(str, files)) or f"no .pth file in {', '.join(map(str, sources))}"
+            raise DataError(f"LPIPS weights lack {key} (in {where}); {REMEDY}")
         if tuple(weights[key].shape) != shape:
             raise DataError(f"LPIPS weight {key} must be {list(shape)}, got {list(weights[key].shape)}; {REMEDY}")
     return Lpips(weights)

@@ -13,19 +13,19 @@ from gs2d.errors import DataError
 
 
 class Cloud:
-    """Points among which the nearest are looked for.
+    """A point cloud for nearest-neighbour queries.
 
     Parameters
     ----------
     points : ndarray [P, 3]
-        Kept as float64 in ``points``; may be none.
+        Stored as float64 in ``points``; may be empty.
     workers : int, optional
-        Threads; default: all.
+        Number of threads (default: all cores).
 
     Raises
     ------
     DataError
-        Coordinates that are not finite.
+        If a coordinate is not finite.
     """
 
     def __init__(self, points: np.ndarray, *, workers: int | None = None) -> None:
@@ -44,21 +44,21 @@ class Cloud:
         neighbours : int
             K.
         limit : float
-            Only what is nearer counts.
+            Upper bound of the distances.
 
         Returns
         -------
         distances : ndarray [Q, K] float64
-            Ascending; infinite where there are fewer.
+            Ascending; infinite for missing neighbours.
         index : ndarray [Q, K] int64
-            Rows of ``points``; their number where there are fewer.
+            Rows of ``points``; P for missing neighbours.
 
         Raises
         ------
         DataError
-            Coordinates that are not finite.
+            If a coordinate is not finite.
         """
-        k = range(1, neighbours + 1)  # a list of them: one column for each, even for one
+        k = range(1, neighbours + 1)  # a list gives one column per neighbour, even for one
         queries = _checked(queries, "queries")
         distances, index = self._tree.query(queries, k=k, distance_upper_bound=limit, workers=self._workers)
         return np.asarray(distances), np.asarray(index)
@@ -68,5 +68,5 @@ def _checked(points: np.ndarray, name: str) -> np.ndarray:
     check_shapes({name: (points, "P 3")})
     points = np.ascontiguousarray(points, np.float64)
     if not np.isfinite(points).all():
-        raise DataError(f"finite {name} were expected, got NaN or infinity; check the files of mesh and ground truth")
+        raise DataError(f"expected finite {name}, got NaN or infinity; check the files of mesh and ground truth")
     return points

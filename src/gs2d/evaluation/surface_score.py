@@ -1,14 +1,13 @@
-"""How near a reconstructed mesh is to the truth, over the surface that the cameras can see.
+"""Score a reconstructed mesh against the ground truth, over the surface that the cameras can see.
 
-The protocol (ours; docs/notebook/evaluation.md):
+The protocol of this project (docs/notebook/evaluation.md):
 
-1. Points are spread over both surfaces, area-weighted, from a seed.
-2. Completeness and recall ask of every true point how far the reconstruction is. Only true surface seen by at least
-   ``min_views`` cameras counts: by counts of each face that come with the data, else by our own depth buffers.
-3. Accuracy and precision ask of every reconstructed point how far the truth is, all of it, seen or not. Only
-   reconstructed surface that some camera would see counts, the reconstruction hiding itself: what is inside or below
-   and cannot appear in any picture is neither rewarded nor punished.
-4. Distances are to triangles, not to samples; or to the nearest point where the truth is a point cloud.
+1. Points are sampled on both surfaces, area-weighted and from a seed.
+2. Completeness and recall use the distances from true points to the reconstruction. Only true surface seen by at least
+   ``min_views`` cameras counts, by view counts per face that come with the data, or by depth buffers.
+3. Accuracy and precision use the distances from reconstructed points to the whole true surface. Only reconstructed
+   surface that a camera would see counts: interior surface, which no image shows, does not change the score.
+4. Distances are to triangles, or to the nearest point of a point cloud.
 """
 
 from __future__ import annotations
@@ -34,41 +33,27 @@ from gs2d.evaluation.visible_surface import VISIBLE_SURFACE
 from gs2d.io.ply_format import write_ply
 
 # -- points on surfaces, and exact distances to triangles --------------------------------------------------------------
-_CANDIDATES = 8  # triangles tried for each point
-_CHUNK = 1 << 16  # points and triangles at a time
+_CANDIDATES = 8  # triangles per point
+_CHUNK = 1 << 16  # points per chunk
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSamples:
-    """Points spread evenly over a mesh: ``points`` [n, 3] float64 and the ``faces`` [n] they lie on."""
+    """Points sampled evenly on a mesh: ``points`` [n, 3] float64 and the ``faces`` [n] they lie on."""
 
     points: np.ndarray
     faces: np.ndarray
 
 
 def face_areas(mesh: Mesh) -> np.ndarray:
-    """Area [F] of every face, world units^2."""
+    """Return the area [F] of every face, world units^2."""
     t = mesh.vertices.astype(np.float64)[mesh.faces]
     return np.asarray(0.5 * np.linalg.norm(np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]), axis=1))
 
 
-def sample_surface(mesh: Mesh, count: int, *, seed: int = 0, mask: np.ndarray | None = None) -> SurfaceSamples:
-    """``count`` points, area-weighted and stratified along the order of the faces; the same for the same seed.
-
-    Parameters
-    ----------
-    mask : ndarray [F] bool, optional
-        Only these faces.
-
-    Returns
-    -------
-    SurfaceSamples
-        Empty where there is no area.
-    """
-    areas = face_areas(mesh)
-    if mask is not None:
-        areas = np.where(mask, areas, 0.0)
-    ends = np.cumsum(areas)
+def sample_surface(mesh: Mesh, count: int, *, seed: int = 0) -> SurfaceSamples:
+    """Sample ``count`` points, area-weighted and stratified in the order of the faces; none without area."""
+    ends = np.cumsum(face_areas(mesh))
     if not len(ends) or ends[-1] <= 0:
         return SurfaceSamples(np.zeros((0, 3)), np.zeros(0, np.int64))
     rng = np.random.default_rng(seed)
@@ -81,56 +66,40 @@ def sample_surface(mesh: Mesh, count: int, *, seed: int = 0, mask: np.ndarray | 
     return SurfaceSamples(points, faces)
 
 
-def distances_to_points(queries: np.ndarray, points: np.ndarray, *, workers: int | None = None) -> np.ndarray:
-    """Return the distance [Q] of each query to the nearest of the points [P, 3]."""
-    return Cloud(points, workers=workers).nearest(queries)[0][:, 0]
+def distances_to_mesh(queries: np.ndarray, mesh: Mesh, *, samples: int = 200_000) -> np.ndarray:
+    """Return the distance [Q] of each query [Q, 3] to the surface.
 
-
-def distances_to_mesh(
-    queries: np.ndarray,
-    mesh: Mesh,
-    *,
-    samples: int = 200_000,
-    seed: int = 0,
-    workers: int | None = None,
-) -> np.ndarray:
-    """Distance [Q] of each query [Q, 3] to the surface.
-
-    The least of the exact distances to the faces of the eight nearest among all face centroids and ``samples`` points
-    of the surface. The spacing of the samples does not enter, as it would in a distance to the nearest sample, but for
-    the rare query whose nearest face is large and has no sample near: then the distance is too long by less than it.
+    It is the smallest exact distance to the faces of the eight nearest points among all face centroids and ``samples``
+    points of the surface. In rare cases, the nearest face is large and has no sample nearby; then the distance is too
+    long by less than the spacing of the samples.
     """
     t = mesh.vertices.astype(np.float64)[mesh.faces]
-    spread = sample_surface(mesh, samples, seed=seed)
+    spread = sample_surface(mesh, samples)
     points = np.concatenate([t.mean(axis=1), spread.points])
-    _, index = Cloud(points, workers=workers).nearest(queries, neighbours=_CANDIDATES)
-    owner = np.concatenate([np.arange(len(t)), spread.faces, [0]])  # there may be fewer than eight points: any face
+    _, index = Cloud(points).nearest(queries, neighbours=_CANDIDATES)
+    owner = np.concatenate([np.arange(len(t)), spread.faces, [0]])  # a missing neighbour stands for face 0
     return _min_distances(queries, t, owner[index])
 
 
 def _min_distances(queries: np.ndarray, t: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Least distance [Q] of each query to some of the triangles [F, 3, 3], ``faces`` [Q, K]."""
+    """Return the smallest distance [Q] of each query to its triangles ``faces`` [Q, K] among [F, 3, 3]."""
     corners = _tensor(t)
     best = np.empty(len(queries))
     for start in range(0, len(queries), _CHUNK):
         part = slice(start, start + _CHUNK)
         p, columns = _tensor(queries[part]), _tensor(faces[part], np.int64).unbind(dim=1)
-        found = [_triangle_distances(p, corners[column]) for column in columns]
-        best[part] = torch.stack(found).amin(dim=0).numpy()
+        distances = [triangle_distances(p, corners[column]) for column in columns]
+        best[part] = torch.stack(distances).amin(dim=0).numpy()
     return best
 
 
-def point_triangle_distances(p: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Distance [n] of points [n, 3] to triangles [n, 3, 3]: to the plane where the foot lies inside, else the edges."""
-    return np.asarray(_triangle_distances(_tensor(p), _tensor(t)).numpy())
-
-
 def _tensor(array: np.ndarray, dtype: type = np.float64) -> Tensor:
-    """Return an array as a tensor: the same memory if it has that type and is writable (torch warns of others)."""
+    """Convert an array to a tensor, copied only if its type differs or it is not writable (torch warns about those)."""
     return torch.from_numpy(np.require(array, dtype, ["C", "W"]))
 
 
-def _triangle_distances(p: Tensor, t: Tensor) -> Tensor:
+def triangle_distances(p: Tensor, t: Tensor) -> Tensor:
+    """Return the distance [n] of points [n, 3] to triangles [n, 3, 3]: to the plane, or to the edges if outside."""
     a, b, c = t.unbind(dim=1)
     normal = torch.linalg.cross(b - a, c - a)
     squared = normal.square().sum(dim=1)
@@ -143,7 +112,7 @@ def _triangle_distances(p: Tensor, t: Tensor) -> Tensor:
 
 
 def _segment(p: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """Distance of points to segments."""
+    """Return the distances of points to segments."""
     along = b - a
     length = along.square().sum(dim=1)
     s = (((p - a) * along).sum(dim=1) / length.where(length > 0, 1)).clamp(0, 1)
@@ -159,14 +128,14 @@ _FEW = 50_000  # points
 
 @dataclass(frozen=True, eq=False)
 class ScoredClouds:
-    """Points of both sides with the distance to the other one, in one frame.
+    """Scored points of both surfaces with their distances to the other surface, in one coordinate system.
 
     Attributes
     ----------
     mesh, truth : ndarray [P, 3], [Q, 3]
     mesh_distances, truth_distances : ndarray [P], [Q]
     tau : float
-        The distance that counts as right, in the same units.
+        Threshold, in the same units.
     """
 
     mesh: np.ndarray
@@ -177,7 +146,7 @@ class ScoredClouds:
 
 
 def distance_colors(distances: np.ndarray, tau: float) -> np.ndarray:
-    """Colours [P, 3] uint8: green up to tau, then from yellow to red at 5 tau and beyond; grey where infinite."""
+    """Return colours [P, 3] uint8: green up to tau, then yellow to red at 5 tau and beyond; grey if infinite."""
     t = np.clip((np.where(np.isfinite(distances), distances, 0) / tau - 1) / 4, 0, 1)[:, None]
     colors = (1 - t) * np.array(NEAR) + t * np.array(FAR)
     colors[distances < tau] = GOOD
@@ -202,9 +171,9 @@ def write_clouds(folder: Path, clouds: ScoredClouds) -> dict[str, str]:
 
 
 def draw_clouds(clouds: ScoredClouds) -> np.ndarray:
-    """Both clouds seen along x, y and z, uint8 [2 side, 3 side, 3]: above the reconstruction, below the truth.
+    """Draw both clouds along x, y and z, uint8 [2 side, 3 side, 3]: the reconstruction above the truth.
 
-    The frame is the truth's, a little widened: what floats far away must not shrink the rest to a dot.
+    The frame is the bounding box of the truth with a margin, so that distant outliers do not shrink the rest.
     """
     inside = clouds.truth if len(clouds.truth) else clouds.mesh
     low, high = (inside.min(axis=0), inside.max(axis=0)) if len(inside) else (np.zeros(3), np.ones(3))
@@ -225,7 +194,7 @@ def draw_clouds(clouds: ScoredClouds) -> np.ndarray:
 
 
 def _panel(points: np.ndarray, colors: np.ndarray, axis: int, low: np.ndarray, size: float) -> np.ndarray:
-    """Points as pixels (few points: as 2x2), seen along an axis; where several fall on one pixel, their mean colour."""
+    """Draw points as pixels (few points as 2x2), projected along an axis; points on one pixel are averaged."""
     across, up = [i for i in range(3) if i != axis]
     column, row = (np.floor((points[:, i] - low[i]) / size * _SIDE).astype(np.int64) for i in (across, up))
     dots = [(0, 0), (1, 0), (0, 1), (1, 1)] if len(points) < _FEW else [(0, 0)]
@@ -242,14 +211,12 @@ def _panel(points: np.ndarray, colors: np.ndarray, axis: int, low: np.ndarray, s
 
 
 # -- the score ---------------------------------------------------------------------------------------------------------
-_Counts = Callable[[np.ndarray, Mesh], np.ndarray]  # in how many views points [P, 3] of a mesh are visible
-FRACTIONS = VISIBLE_SURFACE.fractions  # of the truth's bounding-box diagonal
-SEEN_TOLERANCE = VISIBLE_SURFACE.seen_tolerance  # of the same diagonal: how far behind the depth buffer one sees
+_Counts = Callable[[np.ndarray, Mesh], np.ndarray]  # number of views in which points [P, 3] of a mesh are visible
 
 
 @dataclass(frozen=True)
 class ThresholdScore:
-    """Precision, recall and their harmonic mean at one distance (truth's units). None: there was nothing to measure."""
+    """Precision, recall and their harmonic mean at one threshold, in units of the truth; None if undefined."""
 
     threshold: float
     precision: float | None
@@ -259,7 +226,7 @@ class ThresholdScore:
 
 @dataclass(frozen=True)
 class SurfaceScore:
-    """Distances between two surfaces, in the truth's units; None, with ``reason``, where there is nothing to measure.
+    """Distances between two surfaces, in units of the truth; None, with ``reason``, if nothing can be measured.
 
     Attributes
     ----------
@@ -270,14 +237,14 @@ class SurfaceScore:
     accuracy_median, completeness_median : float or None
     scores : tuple of ThresholdScore
     diagonal : float
-        Of the truth's bounding box.
+        Of the bounding box of the truth.
     mesh_points, truth_points : int
-        Points that counted.
+        Number of scored points.
     mesh_hidden, truth_hidden : float
-        Part of the area (of the points, for a cloud) that did not count because cameras do not see it.
+        Fraction of the area (of the points, for a cloud) that the cameras do not see, and that is not scored.
     reason : str or None
     clouds : ScoredClouds or None
-        The points that counted with their distances, in the mesh's frame and units; tau is the first threshold.
+        The scored points with their distances, in the frame and units of the mesh; tau is the first threshold.
     """
 
     accuracy: float | None
@@ -297,7 +264,7 @@ class SurfaceScore:
 
 @dataclass(frozen=True, eq=False)
 class _Side:
-    """Points of one surface that count, and the part that does not."""
+    """Scored points of one surface, and the fraction that is not scored."""
 
     points: np.ndarray
     hidden: float
@@ -313,62 +280,57 @@ def evaluate_surface(
     T_truth_mesh: np.ndarray | None = None,
     thresholds: Sequence[float] | None = None,
     samples: int = VISIBLE_SURFACE.samples,
-    seed: int = 0,
-    workers: int | None = None,
 ) -> SurfaceScore:
     """Score a reconstruction.
 
     Parameters
     ----------
     mesh : Mesh
-        The reconstruction, in the cameras' frame.
+        The reconstruction, in the frame of the cameras.
     truth : Mesh or ndarray [P, 3]
-        Surface or point cloud, in its own frame.
+        True surface or point cloud, in its own frame.
     cameras : sequence of Camera
-        Who looks. Without cameras everything counts (unless ``seen`` is given).
+        Cameras that determine the visible surface. Without them all surface is scored, unless ``seen`` is set.
     seen : ndarray [F], optional
-        Number of views that see each true face, where the data come with it.
+        Number of views that see each true face.
     min_views : int
-        True surface seen by fewer views does not count.
+        True surface seen by fewer views is not scored.
     T_truth_mesh : ndarray [4, 4], optional
-        Similarity that takes the mesh into the truth's frame.
+        Similarity transform from the frame of the mesh to that of the truth.
     thresholds : sequence of float, optional
-        In the truth's units; default 0.25 %, 0.5 % and 1 % of the diagonal of the truth's bounding box.
+        In units of the truth; default 0.25 %, 0.5 % and 1 % of the diagonal of its bounding box.
     samples : int
         Points on each surface.
-    workers : int, optional
-        Threads; default: all.
 
     Raises
     ------
     DataError
-        If the truth is empty, no part of it is seen, or ``seen`` is of another length than its faces.
+        If the truth is empty, no part of it is visible, or the length of ``seen`` differs from its number of faces.
     """
     T = np.eye(4) if T_truth_mesh is None else np.asarray(T_truth_mesh, dtype=np.float64)
     scale = similarity_scale(T, "T_truth_mesh")
     truth_points = np.asarray(truth.vertices[np.unique(truth.faces)] if isinstance(truth, Mesh) else truth, np.float64)
     if not len(truth_points) or not np.isfinite(truth_points).all():
-        raise DataError("a ground truth with finite points was expected, got none; check the file")
+        raise DataError("expected a ground truth with finite points, got none; check the file")
     diagonal = float(np.linalg.norm(np.ptp(truth_points, axis=0)))
-    tau = [f * diagonal for f in FRACTIONS] if thresholds is None else [float(t) for t in thresholds]
+    tau = [f * diagonal for f in VISIBLE_SURFACE.fractions] if thresholds is None else [float(t) for t in thresholds]
 
-    # Everything below happens in the mesh's frame; distances return to the truth's units at the end.
+    # All computations are in the frame of the mesh; distances are converted to units of the truth at the end.
     local = _moved(truth, np.linalg.inv(T))
-    tolerance = SEEN_TOLERANCE * diagonal / scale
-    counts = partial(visible_counts, cameras=cameras, tolerance=tolerance, workers=workers)
-    to_mesh = partial(distances_to_mesh, samples=samples, seed=seed, workers=workers)
-    theirs = _true_side(local, cameras, seen, min_views, samples, seed, counts)
-    ours = _reconstructed_side(mesh, cameras, samples, seed, counts)
+    tolerance = VISIBLE_SURFACE.seen_tolerance * diagonal / scale
+    counts = partial(visible_counts, cameras=cameras, tolerance=tolerance)
+    theirs = _true_side(local, cameras, seen, min_views, samples, counts)
+    ours = _reconstructed_side(mesh, cameras, samples, counts)
     if not len(mesh.faces) or not len(ours.points):
         why = "the mesh is empty" if not len(mesh.faces) else "no camera sees any of the mesh"
         nothing = tuple(ThresholdScore(t, None, 0.0, 0.0) for t in tau)
         n = len(theirs.points)
         return SurfaceScore(None, None, None, None, None, nothing, diagonal, 0, n, ours.hidden, theirs.hidden, why)
     if isinstance(local, Mesh):
-        accuracy = scale * to_mesh(ours.points, local)
+        accuracy = scale * distances_to_mesh(ours.points, local, samples=samples)
     else:
-        accuracy = scale * distances_to_points(ours.points, local, workers=workers)
-    completeness = scale * to_mesh(theirs.points, mesh)
+        accuracy = scale * Cloud(local).nearest(ours.points)[0][:, 0]
+    completeness = scale * distances_to_mesh(theirs.points, mesh, samples=samples)
     return SurfaceScore(
         accuracy=float(accuracy.mean()),
         completeness=float(completeness.mean()),
@@ -386,7 +348,7 @@ def evaluate_surface(
 
 
 def _threshold_score(accuracy: np.ndarray, completeness: np.ndarray, threshold: float) -> ThresholdScore:
-    """Parts of the points nearer than the threshold (Knapitsch et al. 2017)."""
+    """Return the fractions of the points nearer than the threshold (Knapitsch et al. 2017)."""
     precision, recall = float((accuracy < threshold).mean()), float((completeness < threshold).mean())
     both = precision + recall
     return ThresholdScore(threshold, precision, recall, 2 * precision * recall / both if both > 0 else 0.0)
@@ -398,38 +360,36 @@ def _true_side(
     seen: np.ndarray | None,
     min_views: int,
     samples: int,
-    seed: int,
     counts: _Counts,
 ) -> _Side:
     """Return true points that enough cameras see."""
     if not isinstance(truth, Mesh):
         if seen is not None:
-            raise DataError("a true mesh was expected with counts of views of each face, got a point cloud")
+            raise DataError("view counts per face need a true mesh, got a point cloud")
         keep = frustum_counts(truth, cameras) >= min_views if len(cameras) else np.ones(len(truth), bool)
-        return _side(truth, keep, samples, seed)
+        return _side(truth, keep, samples)
+    spread = sample_surface(truth, samples)
     if seen is not None:
         if len(seen) != len(truth.faces):
-            raise DataError(f"one count for each of {len(truth.faces)} true faces was expected, got {len(seen)}")
-        spread = sample_surface(truth, samples, seed=seed)
-        return _side(spread.points, np.asarray(seen)[spread.faces] >= min_views, samples, seed)
-    points = sample_surface(truth, samples, seed=seed).points
+            raise DataError(f"expected one count for each of {len(truth.faces)} true faces, got {len(seen)}")
+        return _side(spread.points, np.asarray(seen)[spread.faces] >= min_views, samples)
     if not len(cameras):
-        return _side(points, np.ones(len(points), bool), samples, seed)
-    return _side(points, counts(points, truth) >= min_views, samples, seed)
+        return _side(spread.points, np.ones(len(spread.points), bool), samples)
+    return _side(spread.points, counts(spread.points, truth) >= min_views, samples)
 
 
-def _side(points: np.ndarray, keep: np.ndarray, samples: int, seed: int) -> _Side:
+def _side(points: np.ndarray, keep: np.ndarray, samples: int) -> _Side:
     if not keep.any():
-        raise DataError("a ground truth that the cameras see was expected, no part of it is seen; check its frame")
+        raise DataError("no camera sees any part of the ground truth; check its coordinate system")
     kept = points[keep]
-    if len(kept) > samples:  # a point cloud: as it comes, thinned
-        kept = kept[np.sort(np.random.default_rng(seed).choice(len(kept), samples, replace=False))]
+    if len(kept) > samples:  # a large point cloud
+        kept = kept[np.sort(np.random.default_rng(0).choice(len(kept), samples, replace=False))]
     return _Side(kept, float(1.0 - keep.mean()))
 
 
-def _reconstructed_side(mesh: Mesh, cameras: Sequence[Camera], samples: int, seed: int, counts: _Counts) -> _Side:
-    """Reconstructed points that some camera would see."""
-    points = sample_surface(mesh, samples, seed=seed + 1).points  # other points than on an equal truth
+def _reconstructed_side(mesh: Mesh, cameras: Sequence[Camera], samples: int, counts: _Counts) -> _Side:
+    """Return reconstructed points that a camera would see."""
+    points = sample_surface(mesh, samples, seed=1).points  # different points even if mesh and truth are equal
     if not len(points) or not len(cameras):
         return _Side(points, 0.0)
     keep = counts(points, mesh) > 0
@@ -437,7 +397,7 @@ def _reconstructed_side(mesh: Mesh, cameras: Sequence[Camera], samples: int, see
 
 
 def _moved(truth: Mesh | np.ndarray, T: np.ndarray) -> Mesh | np.ndarray:
-    """Return the truth under a transform [4, 4]."""
+    """Apply a transform [4, 4] to the truth."""
     if isinstance(truth, Mesh):
         return Mesh(truth.vertices @ T[:3, :3].T + T[:3, 3], truth.faces)
     return np.asarray(truth, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]

@@ -1,4 +1,4 @@
-"""What cameras can see of a triangle mesh: in how many views a point is visible."""
+"""Count the views in which points of a triangle mesh are visible."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
 from gs2d.meshing.raycast import cast_camera
 
-_NEAR = 1e-9  # world units: whatever is before a camera hides, in captures of any unit
+_NEAR = 1e-9  # world units; occluders at any distance count, in captures of any scale
 
 
 def visible_counts(
@@ -23,19 +23,16 @@ def visible_counts(
     *,
     tolerance: float,
     max_side: int = 800,
-    workers: int | None = None,
 ) -> np.ndarray:
-    """Count the views in which each point [P, 3] is visible, the mesh being the only thing that hides it.
+    """Count the views in which each point [P, 3] is visible, with the mesh as the only occluder.
 
-    A point is visible where it lies in the image and no deeper than ``tolerance`` world units behind the deepest of the
-    3x3 pixels around it: the neighbours spare surfaces seen at a slant, whose depth changes within a pixel.
+    A point is visible if it is in the image and at most ``tolerance`` world units behind the deepest of the 3x3 pixels
+    around it, because the depth of slanted surfaces changes within a pixel.
 
     Parameters
     ----------
-    max_side : int
-        Images are drawn at most this large, px.
-    workers : int, optional
-        Images at a time; default: as many as there are threads.
+    max_side : int, px
+        Largest side of the depth maps.
 
     Returns
     -------
@@ -51,14 +48,14 @@ def visible_counts(
         return np.asarray(inside & (z <= deepest[pixel] + tolerance))
 
     counts = np.zeros(len(points), np.int64)
-    with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         for seen in pool.map(visible, cameras):
             counts += seen
     return counts
 
 
 def frustum_counts(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """Count the images in which each point [P, 3] lies, whatever is before it."""
+    """Count the images that contain each point [P, 3], without occlusion."""
     counts = np.zeros(len(points), np.int64)
     for camera in cameras:
         counts += _in_image(points, camera)[0]
@@ -66,7 +63,7 @@ def frustum_counts(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def _in_image(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which points [P] lie in the image, in which pixel (0 where in none), at what depth."""
+    """Return which points [P] are in the image, their flat pixels (0 if outside), and their depths."""
     pixels, z = camera.project(np.asarray(points, np.float64))
     with np.errstate(invalid="ignore"):
         inside = (z > 0) & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)

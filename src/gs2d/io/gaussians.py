@@ -1,4 +1,4 @@
-"""Splats as other tools' files have them: 3D Gaussians with three scales, as arrays."""
+"""3D Gaussians with three scales, as arrays: the form of splats in the files of other tools."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from gs2d.core.transforms import transform_splats
 from gs2d.errors import DataError
 
 Tell = Callable[[str], object]
-"""Receives one sentence about what a reader left out or changed."""
-FLAT_LOG_SCALE = math.log(1e-6)  # world units, the largest thickness that a disk has in files of three scales
-NO_SCALE = -80.0  # the log scale that stands for a scale of 0
-_SHARE = 0.01  # largest thickness of a disk / its smaller scale
-THIN = 0.25  # third scale / larger of the others: of disks that a file of few bits made thicker
+"""Receives a message about content that a reader dropped or changed."""
+FLAT_LOG_SCALE = math.log(1e-6)  # world units; largest thickness of a disk in files with three scales
+NO_SCALE = -80.0  # log scale that represents a scale of 0
+_SHARE = 0.01  # largest ratio of the thickness of a disk to its smaller scale
+THIN = 0.25  # largest ratio of the third scale to the larger of the others for disks, which quantization may thicken
 _OBLIQUE = (0.36, 0.48, 0.8)  # a direction in which no harmonic is 0
-_FLAT = 0.99  # share of the Gaussians that must be disks
+_FLAT = 0.99  # fraction of the Gaussians that must be disks
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Gaussians:
     quats : ndarray [N, 4]
         (w, x, y, z).
     log_scales : ndarray [N, 3]
-        log of the standard deviations along the columns of the rotation.
+        Logarithms of the standard deviations along the columns of the rotation.
     opacity_logits : ndarray [N]
     sh0 : ndarray [N, 3]
     shN : ndarray [N, K-1, 3]
@@ -60,16 +60,16 @@ class Gaussians:
 
     @classmethod
     def of(cls, splats: Splats) -> Gaussians:
-        """Disks as Gaussians whose third scale, along their normals, is that of ``with_thickness``."""
+        """Convert disks to Gaussians; the third scale, along the normal, is from ``with_thickness``."""
         a = {name: tensor.detach().to("cpu", torch.float32).numpy() for name, tensor in splats.items()}
         scales = with_thickness(a["log_scales"])
         return cls(a["means"], a["quats"], scales, a["opacity_logits"], a["sh0"].reshape(-1, 3), a["shN"])
 
     @classmethod
     def joined(cls, parts: Sequence[Gaussians]) -> Gaussians:
-        """All of several; those of lower SH degree have zeros in the higher ones."""
-        places = max(part.shN.shape[1] for part in parts)
-        padded = [np.pad(part.shN, ((0, 0), (0, places - part.shN.shape[1]), (0, 0))) for part in parts]
+        """Concatenate several sets; lower SH degrees are padded with zeros."""
+        count = max(part.shN.shape[1] for part in parts)
+        padded = [np.pad(part.shN, ((0, 0), (0, count - part.shN.shape[1]), (0, 0))) for part in parts]
         others = {
             field.name: np.concatenate([getattr(part, field.name) for part in parts])
             for field in fields(cls)
@@ -78,12 +78,12 @@ class Gaussians:
         return cls(**others, shN=np.concatenate(padded))
 
     def placed(self, matrix: np.ndarray) -> Gaussians:
-        """Return them after a transform [4, 4] of their frame, which may turn, shift and scale alike in all directions.
+        """Apply a similarity transform [4, 4]: rotation, translation, uniform scale.
 
         Raises
         ------
         ValueError
-            It does something else.
+            If it is no similarity.
         """
         linear = matrix[:3, :3]
         with np.errstate(over="ignore", invalid="ignore"):
@@ -91,26 +91,26 @@ class Gaussians:
             rotation = linear / scale if scale > 0 else linear
             turns = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
         if not (turns and np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6)):
-            raise ValueError("a transform that turns, shifts and scales alike in all directions was expected")
+            raise ValueError("expected a rotation, a translation and a uniform scale")
         moved = Gaussians.of(transform_splats(self.disks(), scale, rotation, matrix[:3, 3]))
         thickness = (self.log_scales[:, 2:].astype(np.float64) + math.log(scale)).astype(np.float32)
         return replace(moved, log_scales=np.concatenate([moved.log_scales[:, :2], thickness], axis=1))
 
     def half_turned_about_z(self) -> Gaussians:
-        """Return them after a half turn of their frame about z: signs and places change, and no number."""
+        """Rotate by 180 degrees about z; exact, only signs and the order of components change."""
         w, x, y, z = self.quats.T
         return replace(self.mirrored((-1, -1, 1)), quats=np.stack([-z, -y, x, w], axis=1))
 
     def mirrored(self, signs: tuple[int, int, int]) -> Gaussians:
-        """Return them with axes of their frame reversed, one sign (1 or -1) an axis; exact, no number changes.
+        """Mirror axes, with one sign (1 or -1) per axis; exact, only signs change.
 
-        A rotation R becomes S R S with S = diag(signs), which is a rotation too and gives the mirrored covariance.
+        A rotation R becomes S R S with S = diag(signs), which is a rotation with the mirrored covariance.
         """
         x, y, z = signs
         a, b, c = _OBLIQUE
         at = np.array(harmonics(a, b, c, self.sh_degree))
         there = np.array(harmonics(x * a, y * b, z * c, self.sh_degree))
-        with np.errstate(invalid="ignore"):  # of a NaN that signals: what comes of it is checked
+        with np.errstate(invalid="ignore"):  # signalling NaN; values are checked later
             return replace(
                 self,
                 means=self.means * np.array(signs, np.float32),
@@ -119,43 +119,43 @@ class Gaussians:
             )
 
     def rows(self, index: np.ndarray) -> Gaussians:
-        """Return the rows of an index or a mask."""
+        """Return the Gaussians of an index array or a mask."""
         return Gaussians(*(getattr(self, field.name)[index] for field in fields(self)))
 
     @property
     def is_flat(self) -> bool:
-        """Whether nearly all are disks with their normals along the third axis, as ours are."""
+        """Whether nearly all are disks with their normals along the third axis."""
         thickest = self.log_scales[:, 2] - self.log_scales[:, :2].max(axis=1, initial=-np.inf)
         return bool((thickest <= math.log(THIN)).mean() >= _FLAT) if len(self) else True
 
     def to_surfels(self, path: str | os.PathLike[str]) -> Splats:
-        """Return the disks of a file ``path`` that flat splats were written to.
+        """Convert to disks; ``path`` is the file, for the error.
 
         Raises
         ------
         DataError
-            They are not flat.
+            If they are not flat.
         """
         if not self.is_flat:
             raise DataError(
-                f"{os.fspath(path)}: flat splats were expected, got 3D Gaussians with three scales; give splats of a "
-                "gs2d or 2DGS run"
+                f"{os.fspath(path)}: expected flat splats, got 3D Gaussians with three scales; use splats of a gs2d or "
+                "2DGS run"
             )
         return self.disks()
 
     def disks(self) -> Splats:
-        """Return them without their third scales, whatever these are."""
+        """Convert to disks by dropping the third scales."""
         arrays = (self.means, self.quats, self.log_scales[:, :2], self.opacity_logits, self.sh0[:, None, :], self.shN)
         return Splats(*(torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)) for array in arrays))
 
     def flattened(self) -> Splats:
-        """Return flat splats: each Gaussian loses its smallest scale, along whose axis its normal then points.
+        """Convert to disks by dropping the smallest scale of each Gaussian; its axis becomes the normal.
 
-        The axes are turned in a circle, so that the rotation stays one: with s_0 the smallest (t_u, t_v, n) are
-        columns (1, 2, 0) of the old rotation, with s_1 columns (2, 0, 1).
+        The axes are permuted cyclically, which keeps a rotation: if s_0 is the smallest scale, (t_u, t_v, n) are
+        columns (1, 2, 0) of the old rotation, and with s_1 columns (2, 0, 1).
         """
         smallest = self.log_scales.argmin(axis=1)  # [N]
-        # Right factors that turn the third axis to axis 0, 1, 2: a third of a turn about (1, 1, 1) or none.
+        # Right factors that rotate the third axis to axis 0, 1, 2: by 120 degrees about (1, 1, 1), or not at all.
         turns = np.array([[0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [1.0, 0.0, 0.0, 0.0]])[smallest]
         (w, x, y, z), (a, b, c, d) = unit_quats(self.quats).T, turns.T
         quats = np.stack(
@@ -174,54 +174,54 @@ class Gaussians:
 
 
 def with_thickness(log_scales: np.ndarray) -> np.ndarray:
-    """Return log scales [N, 3] of disks [N, 2] for formats of 3D Gaussians, float32.
+    """Add a third scale to the log scales [N, 2] of disks, for formats of 3D Gaussians; float32 [N, 3].
 
-    The third scale is 1e-6 world units, or a hundredth of the smaller of the two where that is less: disks stay disks
-    in a scene of any units.
+    The third scale is 1e-6 world units, but at most a hundredth of the smaller scale, so that it is negligible in
+    scenes of any size.
     """
     thickness = np.minimum(log_scales.min(axis=1, keepdims=True) + math.log(_SHARE), FLAT_LOG_SCALE)
     return np.concatenate([log_scales, thickness], axis=1).astype(np.float32)
 
 
 def drawn_bands(path: str | os.PathLike[str], shN: np.ndarray, tell: Tell) -> np.ndarray:
-    """Return higher SH coefficients [N, K-1, ...] without the bands above degree 3; ``tell`` hears of those."""
+    """Drop SH bands above degree 3 of coefficients [N, K-1, ...]; ``tell`` receives a message about it."""
     if shN.shape[1] < num_coefficients(MAX_DEGREE):
         return shN
     degree = math.isqrt(1 + shN.shape[1]) - 1
-    tell(f"{Path(path).name}: SH degree {degree} was read without what is above degree {MAX_DEGREE}, the highest here")
+    tell(f"{Path(path).name}: SH degree {degree} was reduced to {MAX_DEGREE}, the highest supported")
     return shN[:, : num_coefficients(MAX_DEGREE) - 1]
 
 
 def unit_quats(quats: np.ndarray) -> np.ndarray:
-    """Quaternions [N, 4] of length 1, float64; zero becomes no rotation."""
+    """Normalise quaternions [N, 4], float64; zero becomes the identity."""
     q = quats.astype(np.float64)
     length = np.linalg.norm(q, axis=1, keepdims=True)
     return np.where(length > 0, q / np.where(length > 0, length, 1.0), (1.0, 0.0, 0.0, 0.0))
 
 
 def sigmoid(x: np.ndarray) -> np.ndarray:
-    """1 / (1 + exp(-x)), float64, without overflow."""
+    """Return 1 / (1 + exp(-x)), float64, without overflow."""
     return 0.5 + 0.5 * np.tanh(0.5 * x.astype(np.float64))
 
 
 def logit(opacities: np.ndarray) -> np.ndarray:
-    """Opacity logits, float32, of float32 opacities; 0 and 1 are a little inside, for their logits are infinite."""
+    """Return the logits, float32, of opacities; 0 and 1 are moved inside, because their logits are infinite."""
     o = np.clip(opacities.astype(np.float64), 1e-30, 1.0 - 2.0**-25)
     return np.asarray(np.log(o) - np.log1p(-o)).astype(np.float32)
 
 
 def log_scales_of(scales: np.ndarray) -> np.ndarray:
-    """Return logarithms, float32, of scales of 0 or more; that of 0 is -80, that of NaN is NaN."""
+    """Return the logarithms, float32, of scales >= 0; -80 for 0, NaN for NaN."""
     with np.errstate(divide="ignore"):
         return np.maximum(np.log(scales.astype(np.float64)), NO_SCALE).astype(np.float32)
 
 
 def logit_of_byte(alpha: np.ndarray) -> np.ndarray:
-    """Opacity logits, float32, of 8 bits; 0 and 255 are half a step inside, for their logits are infinite."""
+    """Return the logits, float32, of 8-bit opacities; 0 and 255 are moved inside by half a step."""
     o = np.clip(alpha.astype(np.float64) / 255.0, 0.5 / 255.0, 254.5 / 255.0)
     return np.asarray(np.log(o / (1.0 - o))).astype(np.float32)
 
 
 def to_byte(x: np.ndarray) -> np.ndarray:
-    """Return the nearest whole number of 0 to 255."""
+    """Round to the nearest integer in 0 to 255."""
     return np.asarray(np.clip(np.floor(x + 0.5), 0, 255)).astype(np.uint8)

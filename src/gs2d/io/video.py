@@ -1,6 +1,6 @@
-"""Images as a video: MP4 with H.264 by the ffmpeg of the machine, or an animated WebP by Pillow.
+"""Write images as a video: MP4 with H.264 by the installed ffmpeg, or an animated WebP by Pillow.
 
-ffmpeg is a program of the user's, not a dependency: its wheels hold code under the GPL.
+ffmpeg is not a dependency, because its wheels contain GPL code.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from gs2d.core.extras import FFMPEG
 from gs2d.errors import BackendError, DataError
 
 SUFFIXES = (".mp4", ".webp")
-QUALITY = 18  # x264's constant rate factor, 0 to 51, small is good: no loss that one sees
-WEBP_QUALITY = 75  # Pillow's, 0 to 100
-# yuv420p, 8 bits, halves both sides of colour: with H.264 what every player has. It needs even sides; sRGB is near
-# enough to BT.709's curve that players show it so, and the matrix is said, since they guess another for small videos.
+QUALITY = 18  # constant rate factor of x264, 0 (best) to 51: no visible loss
+WEBP_QUALITY = 75  # of Pillow, 0 to 100
+# yuv420p with 8 bits is supported by every player. It requires even sides. The transfer function of sRGB is close to
+# BT.709; the matrix is stated, because players assume another one for small videos.
 _FILTERS = "crop=trunc(iw/2)*2:trunc(ih/2)*2,scale=out_color_matrix=bt709:out_range=tv,format=yuv420p"
 _TAGS = ("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709", "-color_range", "tv")
 
 
 def check_video(path: Path, fps: float, frames: int) -> Path:
-    """Return the name of the video, or raise where none can come out, before anything is rendered.
+    """Check early that a video can be written, and return its path.
 
-    A name without an ending gets ``.mp4`` where ffmpeg is on the PATH, else ``.webp``.
+    A name without a suffix gets ``.mp4`` if ffmpeg is on the PATH, else ``.webp``.
 
     Raises
     ------
     DataError
-        Another kind of file, a senseless rate, or too few frames.
+        For another suffix, an invalid frame rate, or too few frames.
     BackendError
-        ``.mp4`` without an ffmpeg that makes H.264.
+        For ``.mp4`` without an ffmpeg that supports H.264.
     """
     if not path.suffix:
         path = path.with_name(path.name + (".webp" if _missing() else ".mp4"))
@@ -48,14 +48,14 @@ def check_video(path: Path, fps: float, frames: int) -> Path:
     if not 0.1 <= fps <= 240:
         raise DataError(f"fps must be 0.1 to 240 frames a second, got {fps:g}")
     if frames < 2:
-        raise DataError(f"--video needs at least 2 frames, got {frames}; ask for more")
+        raise DataError(f"--video needs at least 2 frames, got {frames}; render more")
     if suffix == ".mp4" and (missing := _missing()):
-        raise BackendError(f"{path.name} needs ffmpeg, and {missing}; install it ({FFMPEG}), or name a .webp file")
+        raise BackendError(f"{path.name} needs ffmpeg, but {missing}; install it ({FFMPEG}), or use a .webp file")
     return path
 
 
 def _missing() -> str:
-    """Return why no MP4 can be made here; nothing where it can."""
+    """Return why no MP4 can be written; empty if it can."""
     if shutil.which("ffmpeg") is None:
         return "there is none on the PATH"
     encoders = subprocess.run(["ffmpeg", "-v", "error", "-encoders"], capture_output=True, text=True, errors="replace")
@@ -70,21 +70,21 @@ def write_video(
     threads: int = 1,
     on_frame: Callable[[int], None] = lambda _done: None,
 ) -> None:
-    """Compress images to a video.
+    """Encode images as a video.
 
     Parameters
     ----------
     path : Path
         Ends in ``.mp4`` or ``.webp``; its folder must exist.
     frames : sequence of Path
-        Images of one size, at least 2. For ``.mp4`` one at a time is decoded; of an odd side the last row or column
-        is left out. For ``.webp`` all are in memory.
+        At least 2 images of equal size. For ``.mp4`` they are decoded one at a time, and odd sides lose their last row
+        or column. For ``.webp`` all are in memory.
     fps : float
-        Frames a second.
+        Frames per second.
     threads : int
-        Of ffmpeg.
+        Threads of ffmpeg.
     on_frame : callable
-        Told how many frames were read; what it raises stops the work, and no file is left.
+        Called with the number of finished frames. An exception it raises stops the encoding without leaving a file.
     """
     check_video(path, fps, len(frames))
     if path.suffix.lower() == ".mp4":
@@ -101,45 +101,45 @@ def write_video(
 def _write_mp4(path: Path, frames: Sequence[Path], fps: float, threads: int, on_frame: Callable[[int], None]) -> None:
     with Image.open(frames[0]) as first:
         size = f"{first.width}x{first.height}"
-    given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-framerate", f"{fps:g}", "-i", "-", "-vf", _FILTERS]
-    coded = ["-c:v", "libx264", "-crf", str(QUALITY), *_TAGS, "-threads", str(threads), "-movflags", "+faststart"]
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-framerate", f"{fps:g}", "-i", "-", "-vf", _FILTERS]
+    codec = ["-c:v", "libx264", "-crf", str(QUALITY), *_TAGS, "-threads", str(threads), "-movflags", "+faststart"]
     try:
         with temporary_beside(path) as (temporary, _):
-            whole = ["-f", "mp4", "-y", f"file:{temporary}"]
-            _run(["ffmpeg", "-v", "error", *given, *coded, *whole], _decoded(frames, on_frame), path)
+            target = ["-f", "mp4", "-y", f"file:{temporary}"]
+            _run(["ffmpeg", "-v", "error", *source, *codec, *target], _decoded(frames, on_frame), path)
     except OSError as error:
         raise disk_error(path, error) from error
 
 
 def _run(words: list[str], images: Iterator[Image.Image], path: Path) -> None:
-    """Run ffmpeg on the pixels of images; BackendError or OSError with what it said last where it fails."""
-    with tempfile.TemporaryFile() as said, subprocess.Popen(words, stdin=subprocess.PIPE, stderr=said) as job:
+    """Run ffmpeg on the pixels of images; raises BackendError or OSError with its last message if it fails."""
+    with tempfile.TemporaryFile() as errors, subprocess.Popen(words, stdin=subprocess.PIPE, stderr=errors) as job:
         assert job.stdin is not None
         try:
             for image in images:
                 job.stdin.write(image.tobytes())
             job.stdin.close()
-        except BrokenPipeError:  # it gave up, and says why
+        except BrokenPipeError:  # ffmpeg failed; the reason is in its output
             pass
         except BaseException:
             job.kill()
-            job.wait()  # leaving the block waits a quarter of a second only after Ctrl-C
+            job.wait()  # after Ctrl-C, leaving the block waits for a quarter of a second only
             raise
         if job.wait() != 0:
-            said.seek(0)
-            last = said.read().decode(errors="replace").strip().rpartition("\n")[2]
+            errors.seek(0)
+            last = errors.read().decode(errors="replace").strip().rpartition("\n")[2]
             if os.strerror(errno.ENOSPC) in last:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            raise BackendError(f"ffmpeg did not make {path}: {last or f'exit status {job.returncode}'}")
+            raise BackendError(f"ffmpeg failed to write {path}: {last or f'exit status {job.returncode}'}")
 
 
 def _decoded(frames: Sequence[Path], on_frame: Callable[[int], None]) -> Iterator[Image.Image]:
-    """Yield the frames, all of the first one's size.
+    """Yield the frames as RGB images.
 
     Raises
     ------
     DataError
-        One has another size.
+        If their sizes differ.
     """
     size = None
     for done, path in enumerate(frames, 1):
@@ -147,6 +147,6 @@ def _decoded(frames: Sequence[Path], on_frame: Callable[[int], None]) -> Iterato
             frame = image.convert("RGB")
         size = size or frame.size
         if frame.size != size:
-            raise DataError(f"frames of one size were expected, got {size} and {frame.size} ({path})")
+            raise DataError(f"expected frames of equal size, got {size} and {frame.size} ({path})")
         yield frame
         on_frame(done)

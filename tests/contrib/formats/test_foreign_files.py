@@ -66,7 +66,7 @@ def axes_of(system: int) -> np.ndarray:
 
 @pytest.mark.parametrize("version", [3, 4])
 @pytest.mark.parametrize("system", range(1, 17))
-def test_spz_is_read_in_the_coordinate_system_that_its_record_names(tmp_path: Path, system: int, version: int) -> None:
+def test_spz_records_select_the_coordinate_system(tmp_path: Path, system: int, version: int) -> None:
     """Positions, covariances, and the colour seen along any direction, turn with the axes."""
     if version == 4:
         pytest.importorskip("zstandard")
@@ -93,10 +93,10 @@ def test_spz_is_read_in_the_coordinate_system_that_its_record_names(tmp_path: Pa
 
 
 @pytest.mark.parametrize(("value", "size"), [(17, 4), (6, 3)])
-def test_a_coordinate_system_that_does_not_exist_is_refused(tmp_path: Path, value: int, size: int) -> None:
+def test_an_invalid_coordinate_system_is_an_error(tmp_path: Path, value: int, size: int) -> None:
     write_spz(tmp_path / "a.spz", Gaussians.of(a_scene(3, 0)))
     record = struct.pack("<II", 0xADBE0003, size) + value.to_bytes(size, "little")
-    with pytest.raises(DataError, match=f"by a number of 1 to 16 in 4 bytes, got {value} in {size}; export it again"):
+    with pytest.raises(DataError, match=f"from 1 to 16 in 4 bytes, got {value} in {size}; export it again"):
         read_splat_file(with_records(tmp_path / "a.spz", 3, record))
 
 
@@ -129,7 +129,7 @@ def test_a_scale_of_0_and_infinite_opacities_are_read(tmp_path: Path, layout: st
 
 @pytest.mark.parametrize("layout", ["2dgs", "3dgs", "splat", "gltf", "usd", "sog"])
 @pytest.mark.parametrize("wrong", [math.nan, math.inf])
-def test_a_splat_with_nan_is_left_out_and_counted(tmp_path: Path, layout: str, wrong: float) -> None:
+def test_splats_with_nan_are_dropped_and_counted(tmp_path: Path, layout: str, wrong: float) -> None:
     if layout == "usd":
         pytest.importorskip("pxr", reason="the extra usd is not installed")
     splats = a_scene(6, 1)
@@ -150,7 +150,7 @@ def test_a_splat_with_nan_is_left_out_and_counted(tmp_path: Path, layout: str, w
     file = read_splat_file(path)
     assert len(file.gaussians) == 5
     among = "sh0" if layout == "sog" else "means"
-    assert file.notes == (f"{path.name}: 1 of 6 splats have NaN or infinity ({among}) and were left out",)
+    assert file.notes == (f"{path.name}: 1 of 6 splats have NaN or infinity ({among}) and were dropped",)
     assert describe_file(path)["notes"] == list(file.notes)
     told: list[str] = []
     assert len(read_splats(path, told.append)) == 5
@@ -206,9 +206,9 @@ def degree_4(path: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "a.spz", "a.glb"])
-def test_sh_degree_4_is_read_without_its_highest_band(tmp_path: Path, name: str) -> None:
+def test_sh_degree_4_is_reduced_to_3(tmp_path: Path, name: str) -> None:
     file = read_splat_file(degree_4(tmp_path / name))
-    assert file.notes == (f"{name}: SH degree 4 was read without what is above degree 3, the highest here",)
+    assert file.notes == (f"{name}: SH degree 4 was reduced to 3, the highest supported",)
     assert file.gaussians.sh_degree == 3
     splats = a_scene(8, 2)
     row = np.abs(file.gaussians.means[:, None] - splats.means.numpy()).sum(axis=2).argmin(axis=1)
@@ -224,7 +224,7 @@ def webp(rows: np.ndarray, shape: tuple[int, int]) -> bytes:
     return data.getvalue()
 
 
-def test_sog_of_version_1_has_ranges_in_place_of_codebooks(tmp_path: Path) -> None:
+def test_sog_1_with_ranges_instead_of_codebooks_is_read(tmp_path: Path) -> None:
     files = packed_sog(Gaussians.of(a_scene(6, 1)))
     means = read_sog_means(tmp_path / "2", files)
     scales, colors = (np.random.default_rng(i).integers(0, 256, (6, 3 + i), dtype=np.uint8) for i in (0, 1))

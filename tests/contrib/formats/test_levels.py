@@ -34,7 +34,7 @@ def disks(means: list[list[float]], scale: float = 0.1, alpha: float = 0.5) -> G
     )
 
 
-def test_two_disks_become_one_with_their_area_centre_covariance_and_mean_colour() -> None:
+def test_two_disks_merge_with_area_centre_covariance_and_mean_colour() -> None:
     """Of masses 3 : 1 (scales 0.1 x 0.1 and, turned a quarter, 0.1 x 0.1 of a third of the opacity), 0.2 apart in x."""
     two = disks([[0.0, 0, 1], [0.2, 0, 1]], alpha=0.6)
     two = replace(two, opacity_logits=np.log(np.array([0.6 / 0.4, 0.2 / 0.8], np.float32)))
@@ -57,7 +57,7 @@ def test_two_disks_become_one_with_their_area_centre_covariance_and_mean_colour(
 
 
 @pytest.mark.usefixtures("native")
-def test_a_textured_wall_of_half_the_disks_looks_alike() -> None:
+def test_half_the_disks_of_a_textured_wall_look_similar() -> None:
     """A grid of 60 x 60 disks whose colours change slowly; the same of every second disk alone has holes."""
     side = np.linspace(-1, 1, 60)
     x, y = np.meshgrid(side, side)

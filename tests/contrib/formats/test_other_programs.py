@@ -39,7 +39,7 @@ def validated(path: Path) -> list[dict[str, object]]:
     return [message for message in found if message["code"] != "UNSUPPORTED_EXTENSION"]
 
 
-def test_khronos_validator_finds_nothing_but_names_that_it_does_not_know_yet(tmp_path: Path) -> None:
+def test_khronos_validator_reports_unknown_names_only(tmp_path: Path) -> None:
     for count, degree in ((0, 0), (30, 0), (30, 3)):
         path = tmp_path / f"{count}_{degree}.glb"
         write_layout(path, a_scene(count, degree), "gltf")
@@ -73,7 +73,7 @@ def near(found: Gaussians, splats: Splats, **within: float) -> None:
     assert np.abs(found.shN - same.shN).max() <= within.get("shN", 1e-6)
 
 
-def test_the_field_s_converter_makes_the_same_glb_of_a_ply(tmp_path: Path) -> None:
+def test_splat_transform_writes_the_same_glb(tmp_path: Path) -> None:
     splats = a_scene(200)
     splats.opacity_logits.clamp_(-8, 8)
     write_layout(tmp_path / "a.ply", splats, "3dgs")
@@ -86,7 +86,7 @@ def test_the_field_s_converter_makes_the_same_glb_of_a_ply(tmp_path: Path) -> No
     near(theirs, splats)
 
 
-def test_the_field_s_converter_and_we_read_each_other_s_sog(tmp_path: Path) -> None:
+def test_sog_is_exchanged_with_splat_transform(tmp_path: Path) -> None:
     splats = a_scene(900, 3)
     write_layout(tmp_path / "a.ply", splats, "3dgs")
     splat_transform(tmp_path / "a.ply", tmp_path / "theirs.sog")
@@ -109,7 +109,7 @@ def test_the_field_s_converter_and_we_read_each_other_s_sog(tmp_path: Path) -> N
     assert turned_by(back.quats, ours.quats).max() < 0.05
 
 
-def test_the_field_s_converter_and_we_read_each_other_s_spz_of_version_4(tmp_path: Path) -> None:
+def test_spz_4_is_exchanged_with_splat_transform(tmp_path: Path) -> None:
     pytest.importorskip("zstandard")
     splats = a_scene(300, 2)
     splats.opacity_logits.clamp_(-5, 5)  # of an opaque byte the converter makes an infinite logit
@@ -123,7 +123,7 @@ def test_the_field_s_converter_and_we_read_each_other_s_spz_of_version_4(tmp_pat
     near(read_splat_file(tmp_path / "back.ply").gaussians, splats, **bits, shN=0.05)
 
 
-def test_the_finest_level_of_the_converter_s_stream_is_all_of_the_splats(tmp_path: Path) -> None:
+def test_the_finest_level_of_a_splat_transform_stream_has_all_splats(tmp_path: Path) -> None:
     splats = a_scene(700, 1)
     write_layout(tmp_path / "a.ply", splats, "3dgs")
     (tmp_path / "lods").mkdir()
@@ -133,7 +133,7 @@ def test_the_finest_level_of_the_converter_s_stream_is_all_of_the_splats(tmp_pat
     assert (found.kind, len(found.gaussians)) == ("streamed SOG, its finest level", 700)
 
 
-def test_the_field_s_converter_reads_our_streams_and_writes_the_same_kind_of_index(tmp_path: Path) -> None:
+def test_splat_transform_reads_streams_and_writes_the_same_index(tmp_path: Path) -> None:
     """It reads no index, but every data set that one refers to."""
     splats = a_scene(900, 1)
     path = tmp_path / "ours" / "lod-meta.json"

@@ -80,7 +80,7 @@ def decoded(path: Path) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_sog_holds_what_its_page_says_within_its_bits(tmp_path: Path, degree: int) -> None:
+def test_sog_has_the_documented_values(tmp_path: Path, degree: int) -> None:
     splats = a_scene(300, degree)
     g = Gaussians.of(splats)
     write_sog(tmp_path / "a.sog", g)
@@ -172,7 +172,7 @@ def meta_with(**changes: Any) -> Callable[[dict[str, bytes]], object]:
         (lambda f: f.update({"sh0.webp": webp(np.zeros((9000, 9000, 3)))}), r"a picture \(9000x9000\) would take"),
     ],
 )
-def test_a_file_of_sog_that_cannot_be_is_one_line(
+def test_an_invalid_sog_is_a_one_line_error(
     tmp_path: Path, change: Callable[[dict[str, bytes]], object], words: str
 ) -> None:
     write_sog(tmp_path / "a.sog", Gaussians.of(a_scene(300, 1)))

@@ -34,7 +34,7 @@ def leaves(node: dict[str, Any]) -> Iterator[dict[str, Any]]:
         yield from leaves(child)
 
 
-def test_each_leaf_has_its_part_of_every_level_in_its_box(tmp_path: Path) -> None:
+def test_each_leaf_contains_its_splats_of_every_level(tmp_path: Path) -> None:
     splats = a_scene(1000, 1)
     path = tmp_path / "scene" / "lod-meta.json"
     write_layout(path, splats, "streamed")
@@ -63,7 +63,7 @@ def test_each_leaf_has_its_part_of_every_level_in_its_box(tmp_path: Path) -> Non
     assert written_bytes(path, "streamed") == sum(f.stat().st_size for f in path.parent.rglob("*") if f.is_file())
 
 
-def test_writing_again_removes_what_the_older_index_referred_to_and_nothing_else(tmp_path: Path) -> None:
+def test_writing_again_removes_files_of_the_older_index_only(tmp_path: Path) -> None:
     folder = tmp_path / "scene"
     folder.mkdir()
     (folder / "1_0").mkdir()
@@ -82,7 +82,7 @@ def test_writing_again_removes_what_the_older_index_referred_to_and_nothing_else
     assert names == listed | {"1_0", "0_0-2"}
 
 
-def test_a_failure_leaves_the_older_stream_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failure_keeps_the_older_stream(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "scene" / "lod-meta.json"
     calls = []
 

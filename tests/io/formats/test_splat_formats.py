@@ -27,7 +27,7 @@ C0 = 0.28209479177387814
 
 
 # -- .splat ----------------------------------------------------------------------------------------------------
-def test_a_splat_record_is_32_bytes_of_the_documented_fields(tmp_path: Path) -> None:
+def test_a_splat_record_has_32_bytes_as_documented(tmp_path: Path) -> None:
     splats = a_scene(3, degree=1)
     splats.quats[:] = torch.tensor([[2.0, 0, 0, 0], [0, 0, -3.0, 0], [0.5, 0.5, 0.5, 0.5]])
     splats.log_scales[:] = torch.log(torch.tensor([[0.1, 0.2], [0.5, 0.4], [0.3, 0.3]]))
@@ -47,7 +47,7 @@ def test_a_splat_record_is_32_bytes_of_the_documented_fields(tmp_path: Path) -> 
     assert rotations == [(128, 128, 0, 128), (192, 192, 192, 192), (255, 128, 128, 128)]
 
 
-def test_a_splat_file_comes_back_within_its_bits_and_without_sh(tmp_path: Path) -> None:
+def test_a_splat_file_survives_a_round_trip_without_sh(tmp_path: Path) -> None:
     splats = a_scene()
     write_splat(tmp_path / "a.splat", Gaussians.of(splats))
     back = read_splat(tmp_path / "a.splat")
@@ -96,7 +96,7 @@ def decode_spz(path: Path) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_spz_holds_what_its_documentation_says_within_its_bits(tmp_path: Path, degree: int) -> None:
+def test_spz_has_the_documented_values(tmp_path: Path, degree: int) -> None:
     splats = a_scene(300, degree)
     g = Gaussians.of(splats)
     assert write_spz(tmp_path / "a.spz", g) == ()
@@ -123,7 +123,7 @@ def test_spz_holds_what_its_documentation_says_within_its_bits(tmp_path: Path, d
         assert (np.abs(ours - theirs).max(axis=(1, 2)) <= bound + 1e-6).all()
 
 
-def test_spz_comes_back_in_the_same_coordinates(tmp_path: Path) -> None:
+def test_spz_keeps_coordinates_in_a_round_trip(tmp_path: Path) -> None:
     splats = a_scene()
     g = Gaussians.of(splats)
     write_spz(tmp_path / "a.spz", g)
@@ -139,7 +139,7 @@ def test_spz_comes_back_in_the_same_coordinates(tmp_path: Path) -> None:
     assert (tmp_path / "b.spz").read_bytes() == first  # no time of writing in it
 
 
-def test_spz_says_in_one_line_how_many_splats_it_clipped(tmp_path: Path) -> None:
+def test_spz_reports_clipped_splats(tmp_path: Path) -> None:
     splats = a_scene(10)
     assert write_spz(tmp_path / "a.spz", Gaussians.of(splats)) == ()  # rounding alone is not told
     splats.log_scales[:2] = -12.0
@@ -147,11 +147,11 @@ def test_spz_says_in_one_line_how_many_splats_it_clipped(tmp_path: Path) -> None
     splats.shN[3, 0, 0] = 1.5
     splats.sh0[[0, 4]] = 5.0  # 0.15 * 5 + 0.5 = 1.25: a byte ends at 1; splat 0 counts once
     assert write_spz(tmp_path / "a.spz", Gaussians.of(splats)) == (
-        "5 of 10 splats did not fit into SPZ and were clipped to what it holds: 2 smaller than 4.5e-5 units, 1 larger "
+        "5 of 10 splats exceed the range of SPZ and were clipped: 2 smaller than 4.5e-5 units, 1 larger "
         "than 379 units, 2 colours far beyond black or white, 1 colours that change too much with the view (SH beyond "
         "1)",
-        "2 of 10 disks are less than four times as wide as SPZ makes them thick (4.5e-5 units): other programs show "
-        "balls; choose another format",
+        "2 of 10 disks are less than four times as wide as thick in SPZ (4.5e-5 units), so other programs do not "
+        "show them flat; choose another format",
     )
     back = read_spz(tmp_path / "a.spz")[0]  # those whose colour did change by more than half a step of 1 / 255
     moved = np.abs(0.15 * (back.sh0 - Gaussians.of(splats).sh0)).max(axis=1) > 0.51 / 255
@@ -166,7 +166,7 @@ def test_spz_says_in_one_line_how_many_splats_it_clipped(tmp_path: Path) -> None
 
 
 # -- compressed PLY --------------------------------------------------------------------------------------------
-def test_a_file_of_supersplat_is_read_as_the_plain_one_beside_it(shared: Callable[[str], Path]) -> None:
+def test_a_supersplat_file_equals_its_uncompressed_version(shared: Callable[[str], Path]) -> None:
     name = shared("gaussians_plush_dog") / "point_cloud_29999_clean"
     plain, packed = read_gaussians(f"{name}.ply"), read_compressed_ply(f"{name}.compressed.ply")
     distance, match = cKDTree(plain.means).query(packed.means)
@@ -181,7 +181,7 @@ def test_a_file_of_supersplat_is_read_as_the_plain_one_beside_it(shared: Callabl
     assert (packed.sh_degree, packed.is_flat, plain.is_flat) == (3, False, False)
 
 
-def test_a_compressed_ply_comes_back_within_its_bits(tmp_path: Path) -> None:
+def test_a_compressed_ply_survives_a_round_trip(tmp_path: Path) -> None:
     splats = a_scene(1000)
     g = Gaussians.of(splats)
     write_compressed_ply(tmp_path / "a.compressed.ply", g)
@@ -223,13 +223,13 @@ def test_every_layout_is_read_back_as_flat_splats(tmp_path: Path, layout: str, n
         ("a.obj", None),
     ],
 )
-def test_the_ending_says_the_layout(name: str, layout: str | None) -> None:
+def test_the_suffix_selects_the_layout(name: str, layout: str | None) -> None:
     assert layout_of(Path(name)) == layout
 
 
 @pytest.mark.parametrize("layout", ["compressed", "spz", "splat", "spz4", "usd", "gltf", "sog"])
 @pytest.mark.parametrize("kept", [0, 1, 10, 200, -1])
-def test_a_file_cut_anywhere_is_one_line_that_names_it(tmp_path: Path, layout: str, kept: int) -> None:
+def test_a_truncated_file_is_a_one_line_error(tmp_path: Path, layout: str, kept: int) -> None:
     path = tmp_path / f"cut{LAYOUTS.get(layout).ending}"
     write_layout(path, a_scene(300), layout)
     path.write_bytes(path.read_bytes()[:kept])
@@ -259,7 +259,7 @@ def spz_with(path: Path, **changes: int) -> None:
         ({"count": 4_000_000_000}, "a cloud of splats .* would take"),
     ],
 )
-def test_a_header_of_spz_that_cannot_be_is_refused(tmp_path: Path, changes: dict[str, int], words: str) -> None:
+def test_an_invalid_spz_header_is_an_error(tmp_path: Path, changes: dict[str, int], words: str) -> None:
     spz_with(tmp_path / "a.spz", **changes)
     with pytest.raises(DataError, match=words):
         read_splat_file(tmp_path / "a.spz")
@@ -268,7 +268,7 @@ def test_a_header_of_spz_that_cannot_be_is_refused(tmp_path: Path, changes: dict
 
 
 @pytest.mark.parametrize("degree", [0, 2])
-def test_spz_of_version_4_has_the_streams_of_version_3_each_for_itself(tmp_path: Path, degree: int) -> None:
+def test_spz_4_has_the_streams_of_version_3(tmp_path: Path, degree: int) -> None:
     """By its documentation: a plain header, a table of sizes, streams of zstd."""
     zstandard = pytest.importorskip("zstandard")
     g = Gaussians.of(a_scene(300, degree))
@@ -307,14 +307,18 @@ def spz4(path: Path, at: int, value: bytes) -> None:
         (12, b"\5", "degree 5"),
         (15, b"\2", "2 streams"),
         (8, struct.pack("<I", 4_000_000_000), "a cloud of splats .* would take"),
-        (8, struct.pack("<I", 21), "a stream of 189 bytes has 180"),
-        (8, struct.pack("<I", 19), "a stream of 171 bytes has 172"),  # no more is unpacked than was asked for, but one
-        (16, struct.pack("<I", 10**9), "a stream of 180 bytes has 0|its zstd is broken"),
-        (32, struct.pack("<Q", 5), "a stream of 180 bytes has 0|its zstd is broken"),
+        (8, struct.pack("<I", 21), "an SPZ stream of 189 bytes, got 180"),
+        (
+            8,
+            struct.pack("<I", 19),
+            "an SPZ stream of 171 bytes, got 172",
+        ),  # no more is unpacked than was asked for, but one
+        (16, struct.pack("<I", 10**9), "an SPZ stream of 180 bytes, got 0|its zstd is broken"),
+        (32, struct.pack("<Q", 5), "an SPZ stream of 180 bytes, got 0|its zstd is broken"),
         (112, bytes(4), "its zstd is broken"),
     ],
 )
-def test_spz_of_version_4_that_cannot_be_is_one_line(tmp_path: Path, at: int, value: bytes, words: str) -> None:
+def test_an_invalid_spz_4_is_a_one_line_error(tmp_path: Path, at: int, value: bytes, words: str) -> None:
     pytest.importorskip("zstandard")
     spz4(tmp_path / "a.spz", at, value)
     with pytest.raises(DataError, match=words) as caught:

@@ -1,4 +1,4 @@
-"""Splat files by format: the writers and the readers that are registered, and what a file of splats holds."""
+"""Read and write splat files by format, with registered writers and readers."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class Layout:
     Attributes
     ----------
     ending : str
-        Ending of the file names. One that begins with / is a whole name, of a file with others beside it.
+        Suffix of the file names. If it begins with /, it is the whole name of a file with others beside it.
     write : callable
-        Writes a file and returns a sentence for each thing that the format cannot store.
+        Writes a file and returns a message for each thing that the format cannot store.
     size : callable or None
-        Returns the bytes of all files that belong to a written one; None: it is one file.
+        Returns the size in bytes of all files that belong to a written one; None if it is a single file.
     """
 
     ending: str
@@ -50,14 +50,14 @@ class SplatReader:
     Attributes
     ----------
     endings : tuple of str
-        Endings of the file names; one that begins with / is a whole name.
+        Suffixes of the file names; those that begin with / are whole names.
     read : callable
-        Takes a path and a function that receives notes; returns the Gaussians, and the kind of file in words ("2dgs"
-        for flat splats).
+        Takes a path and a function that receives messages; returns the Gaussians and a description of the kind of file
+        ("2dgs" for flat splats).
     ply_kind : str or None
-        Reads the PLY files that ``splat_ply.ply_kind`` calls so.
+        Kind of PLY files, from ``splat_ply.ply_kind``, that it reads.
     mesh : callable or None
-        Returns the facts of a mesh in a file that holds one instead of splats, or None.
+        Returns the facts of a file that contains a mesh instead of splats, or None.
     """
 
     endings: tuple[str, ...]
@@ -72,12 +72,12 @@ LAYOUTS: Registry[Layout] = Registry(
     builtin=dict.fromkeys(("3dgs", "2dgs", "spz", "spz4"), __name__),
     error=DataError,
 )
-"""Names of formats that splats are written in. Of two with one ending, the first is chosen by a file's name."""
+"""Formats for writing, by name. If two have the same suffix, the first is the default for file names."""
 
 SPLAT_READERS: Registry[SplatReader] = Registry(
     "splat reader", "gs2d.splat_readers", builtin={"spz": __name__}, error=DataError
 )
-"""Names of formats, other than PLY of 2DGS and 3DGS, that splats are read from."""
+"""Formats for reading, by name, in addition to PLY files of 2DGS and 3DGS."""
 
 
 def register_format(
@@ -93,20 +93,20 @@ def register_format(
     name : str
         Name of the layout, for ``layout=`` and ``gs2d export --format``; must not be taken.
     ending : str
-        Ending of the file names, with its dot; one that begins with / is a whole file name.
+        Suffix of the file names, with its dot; if it begins with /, it is the whole file name.
     size : callable, optional
         As in ``Layout``, for formats that consist of several files.
 
     Returns
     -------
     callable
-        Decorates a function ``(path, splats)`` that writes the file. It returns a tuple with one sentence for each
-        thing that the format cannot store, or None.
+        Decorates a function ``(path, splats)`` that writes the file. It returns a tuple with a message for each thing
+        that the format cannot store, or None.
 
     Raises
     ------
     DataError
-        From the decorator: the name is taken.
+        From the decorator, if the name is taken.
 
     Examples
     --------
@@ -138,20 +138,20 @@ def register_splat_reader(
     name : str
         Name of the format; must not be taken by another reader.
     endings : tuple of str
-        Endings of the file names, with their dots; one that begins with / is a whole file name.
+        Suffixes of the file names, with their dots; those that begin with / are whole file names.
     ply_kind, mesh : optional
         As in ``SplatReader``.
 
     Returns
     -------
     callable
-        Decorates a function ``(path, tell)`` that returns ``gs2d.io.gaussians.Gaussians`` and the kind of file in
-        words, and calls ``tell`` with a sentence on each thing that it left out.
+        Decorates a function ``(path, tell)`` that returns ``gs2d.io.gaussians.Gaussians`` and a description of the
+        kind of file, and calls ``tell`` with a message for each thing that it dropped.
 
     Raises
     ------
     DataError
-        From the decorator: the name is taken.
+        From the decorator, if the name is taken.
     """
 
     def registered(read: Reader) -> Reader:
@@ -189,15 +189,15 @@ def _read_spz(path: str | os.PathLike[str], tell: Tell) -> tuple[Gaussians, str]
 
 
 def endings() -> tuple[str, ...]:
-    """Return the endings of file names that gs2d writes splats to, each once."""
+    """Return the suffixes of the built-in formats for writing."""
     return tuple(dict.fromkeys(layout.ending for _, layout in LAYOUTS.working(LAYOUTS.builtin)))
 
 
 @dataclass(frozen=True, eq=False)
 class SplatFile:
-    """What a file of splats holds: the kind of file in words, and its Gaussians (flat where ``surfels`` are there).
+    """Content of a splat file: a description of its kind, the Gaussians, and the disks if they are flat.
 
-    ``notes`` are sentences on what was left out.
+    ``notes`` are messages about dropped content.
     """
 
     kind: str
@@ -207,7 +207,7 @@ class SplatFile:
 
 
 def layout_of(path: Path) -> str | None:
-    """Return the layout that a file is written in by the longest ending that fits its name, gs2d's own first."""
+    """Return the layout with the longest suffix that matches a file name, built-in layouts first; None without any."""
     name = f"/{path.name}".lower()
     for names in (LAYOUTS.builtin, LAYOUTS.guests()):
         fits = [(key, layout.ending) for key, layout in LAYOUTS.working(names) if name.endswith(layout.ending)]
@@ -217,12 +217,12 @@ def layout_of(path: Path) -> str | None:
 
 
 def write_layout(path: Path, splats: Splats, layout: str) -> tuple[str, ...]:
-    """Write splats in a layout of ``LAYOUTS``, atomically; what it could not hold, one sentence each."""
+    """Write splats in a layout of ``LAYOUTS``, atomically; returns messages about what it cannot store."""
     return LAYOUTS.get(layout).write(path, splats) or ()
 
 
 def write_splats(path: str | os.PathLike[str], splats: Splats, *, layout: str | None = "2dgs") -> None:
-    """Write splats to a file, as ``gs2d export`` does: the whole file, or nothing.
+    """Write splats to a file, as ``gs2d export`` does. The file is written completely or not at all.
 
     Parameters
     ----------
@@ -230,14 +230,14 @@ def write_splats(path: str | os.PathLike[str], splats: Splats, *, layout: str | 
     splats : Splats
         On any device.
     layout : str, optional
-        "2dgs" (the PLY of the official code: float32 bit for bit), "3dgs" (the PLY that viewers open), "compressed",
-        "spz", "spz4", "splat", "usd", "gltf", "sog", "streamed", or a registered format. None: by the ending of
-        ``path``, where .ply is "3dgs".
+        "2dgs" (PLY of the official code, exact float32), "3dgs" (PLY for viewers), "compressed", "spz", "spz4",
+        "splat", "usd", "gltf", "sog", "streamed", or a registered format. None selects it by the suffix of ``path``,
+        where .ply is "3dgs".
 
     Raises
     ------
     DataError
-        If no format has this name or ending, or the layout needs another ending.
+        If no format has this name or suffix, or the layout needs another suffix.
     DiskError
         If the file could not be written.
 
@@ -255,19 +255,19 @@ def write_splats(path: str | os.PathLike[str], splats: Splats, *, layout: str | 
     chosen = layout_of(path) if layout is None else layout
     if chosen is None:
         known = ", ".join(endings()).replace("/", "")
-        raise DataError(f"splats are written as {known}, got {path}; choose such a name, or give a layout")
+        raise DataError(f"splats are written as {known}, got {path}; choose such a name, or set the layout")
     ending = LAYOUTS.get(chosen).ending
     if not f"/{path.name}".lower().endswith(ending):
         raise DataError(
-            f"layout {chosen} is a {ending.removeprefix('/')} file, got {path}; choose such a name, or layout=None for "
-            "the format of the ending"
+            f"layout {chosen} needs a {ending.removeprefix('/')} file, got {path}; choose such a name, or use "
+            "layout=None for the format of the suffix"
         )
     for note in write_layout(path, splats, chosen):
         warnings.warn(f"{path.name}: {note}", stacklevel=2)
 
 
 def written_bytes(path: Path, layout: str) -> int:
-    """Return the bytes of what was written, of all files that belong to it."""
+    """Return the size in bytes of a written file, with all files that belong to it."""
     size = LAYOUTS.get(layout).size
     return path.stat().st_size if size is None else size(path)
 
@@ -279,30 +279,30 @@ def _read_ply(path: str | os.PathLike[str], tell: Tell) -> tuple[Gaussians, str]
             return reader.read(path, tell)
     if kind == "3dgs":
         return read_gaussians(path, tell), "3dgs (three scales, for viewers)"
-    return Gaussians.of(splat_ply.read_splats(path, tell)), "2dgs"  # names another kind
+    return Gaussians.of(splat_ply.read_splats(path, tell)), "2dgs"  # raises for other kinds
 
 
 def reader_of(path: str | os.PathLike[str]) -> SplatReader | None:
-    """Return the reader of a file that is no PLY by its name, or None."""
+    """Return the reader for the name of a file, or None; PLY files have none."""
     name = str(Path(path).absolute()).lower().replace(os.sep, "/")
     return next((reader for _, reader in SPLAT_READERS.working() if name.endswith(reader.endings)), None)
 
 
 def is_splat_file(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is one of splats that are no PLY, by its ending."""
+    """Whether the name of a file is that of a splat format other than PLY."""
     return reader_of(path) is not None
 
 
 def read_splat_file(path: str | os.PathLike[str]) -> SplatFile:
-    """Read splats of any format that is written here, and 3DGS.
+    """Read a splat file of any format.
 
-    A log scale of -inf is a scale of 0, an infinite opacity logit an opaque or an empty splat. Splats with any other
-    number that is not finite are left out, which the notes say.
+    A log scale of -inf is a scale of 0; infinite opacity logits are opaque or empty splats. Splats with other
+    non-finite numbers are dropped, with a note.
 
     Raises
     ------
     DataError
-        Missing, broken, or no splats.
+        If the file is missing, broken, or contains no splats.
     """
     notes: list[str] = []
     reader = reader_of(path)
@@ -320,17 +320,17 @@ def read_splats(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> Spl
     path : path
         PLY (2DGS, 3DGS or compressed), .spz, .splat, .usd, .glb or .sog.
     tell : callable
-        Receives a sentence on splats or SH bands that were left out (default: a Python warning).
+        Receives a message if splats or SH bands are dropped (default: a Python warning).
 
     Returns
     -------
     Splats
-        float32 on the CPU; those of a 2DGS PLY are the stored numbers.
+        float32 on the CPU; exact for a 2DGS PLY.
 
     Raises
     ------
     DataError
-        If the file is missing, broken, holds no splats, or holds 3D Gaussians with three scales.
+        If the file is missing or broken, or contains no splats or 3D Gaussians with three scales.
 
     Examples
     --------
@@ -347,37 +347,34 @@ def read_splats(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> Spl
 
 
 def read_surfels(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Splats, str]:
-    """Read the splats of a file to start a training from, and say in words what they were.
+    """Read splats to start a training from, and describe them.
 
-    Flat ones are as they are. 3D Gaussians lose their smallest scale, whose axis becomes the normal
-    (:meth:`gs2d.io.gaussians.Gaussians.flattened`). ``tell`` is that of ``read_splats``.
+    3D Gaussians lose their smallest scale, whose axis becomes the normal
+    (:meth:`gs2d.io.gaussians.Gaussians.flattened`). ``tell`` is as in ``read_splats``.
 
     Raises
     ------
     DataError
-        Missing, broken, or without splats.
+        If the file is missing, broken, or contains no splats.
     """
-    found = {"mesh": "a mesh", "points": "a point cloud"}.get("" if is_splat_file(path) else ply_kind(path))
-    if found is not None:
+    other = {"mesh": "a mesh", "points": "a point cloud"}.get("" if is_splat_file(path) else ply_kind(path))
+    if other is not None:
         raise DataError(
-            f"{os.fspath(path)} must hold splats to start from, of 2DGS or 3DGS, got {found}; give the splats.ply of a "
-            "run, or what `gs2d export` writes"
+            f"{os.fspath(path)} must contain splats of 2DGS or 3DGS, got {other}; use the splats.ply of a run, or a "
+            "file of `gs2d export`"
         )
     file = read_splat_file(path)
     for note in file.notes:
         tell(note)
     if len(file.gaussians) == 0:
-        raise DataError(f"{os.fspath(path)} must hold splats to start from, got none; give a file with some")
+        raise DataError(f"{os.fspath(path)} must contain splats, got an empty file; use another file")
     if file.surfels is not None:
         return file.surfels, "flat splats"
-    return file.gaussians.flattened(), "3D Gaussians without their smallest scales, whose axes are the normals now"
+    return file.gaussians.flattened(), "3D Gaussians, flattened along their smallest scales"
 
 
 def _mended(gaussians: Gaussians) -> Gaussians:
-    """Return Gaussians whose scales of 0, and opaque and empty opacities, have finite logarithms and logits.
-
-    Other programs write these as infinite numbers (SplatTransform: the logits of bytes of 255 and 0).
-    """
+    """Replace infinite log scales and logits, which other programs write for scales of 0 and opacities of 0 and 1."""
     logits, scales = gaussians.opacity_logits, gaussians.log_scales
     ends = logit((logits > 0).astype(np.float32))
     return replace(
@@ -388,7 +385,7 @@ def _mended(gaussians: Gaussians) -> Gaussians:
 
 
 def _finite(gaussians: Gaussians, path: str | os.PathLike[str], tell: Tell) -> Gaussians:
-    """Return the Gaussians without those with NaN or infinity, of which ``tell`` hears."""
+    """Drop Gaussians with NaN or infinity; ``tell`` receives a message about them."""
     finite = {}
     for field in fields(gaussians):
         values = getattr(gaussians, field.name)
@@ -399,6 +396,6 @@ def _finite(gaussians: Gaussians, path: str | os.PathLike[str], tell: Tell) -> G
     count, among = int((~kept).sum()), ", ".join(name for name, rows in finite.items() if not rows.all())
     got = f"{count:,} of {len(gaussians):,} splats have NaN or infinity ({among})"
     if not kept.any():
-        raise DataError(f"{os.fspath(path)}: finite numbers were expected, {got}; export the file again")
-    tell(f"{Path(path).name}: {got} and were left out")
+        raise DataError(f"{os.fspath(path)}: expected finite numbers, but {got}; export the file again")
+    tell(f"{Path(path).name}: {got} and were dropped")
     return gaussians.rows(kept)

@@ -1,13 +1,14 @@
-"""SPZ, Niantic's compressed splats: version 3, gzip over a header and one stream an attribute; 2 is read too; 4, zstd.
+"""Read and write SPZ, Niantic's compressed splats: versions 3 (gzip) and 4 (zstd); version 2 is read only.
 
-From the format's documentation (github.com/nianticlabs/spz, README). All little-endian: magic, version, count (u32
-each), SH degree, fractional bits, flags, reserved (u8 each); then positions (24-bit fixed point), opacities, colours,
-log scales in 16ths above -10, rotations, SH coefficients (coefficient by coefficient, r g b), 8 bits each. Version 4
-(extra ``spz4``) has the same streams, each packed for itself, behind a header that is not packed: the reserved byte is
-the number of streams, u32 where the table of their sizes is (u64 packed, u64 unpacked), 12 bytes of nothing.
-Its coordinates are right, up, back, where PLY's are taken to be right, down, front: y and z change sign on the way.
-With flag 0x2 there are records (u32 type, u32 size, content) behind the header of version 4, or behind the streams of
-older ones. One of them names another coordinate system of the stored numbers.
+From the format's documentation (github.com/nianticlabs/spz, README). All values are little-endian: magic, version,
+count (u32 each), SH degree, fractional bits, flags, reserved (u8 each); then streams of positions (24-bit fixed point),
+opacities, colours, log scales in 16ths above -10, rotations, SH coefficients (by coefficient, then r g b), 8 bits each.
+Versions 2 and 3 compress header and streams together. Version 4 (extra ``spz4``) compresses each stream separately
+after an uncompressed header, whose reserved byte is the number of streams, followed by the offset of the table of their
+sizes (u32; u64 compressed and u64 uncompressed each) and 12 unused bytes.
+The axes are right, up, back; those of PLY are right, down, front, so y and z change sign. With flag 0x2 there are
+records (u32 type, u32 size, content) after the header of version 4, or after the streams of older versions. One type
+states another coordinate system.
 """
 
 from __future__ import annotations
@@ -42,41 +43,38 @@ _MAGIC = 0x5053474E  # "NGSP"
 _HEADER = struct.Struct("<IIIBBBB")
 _HEADER_4 = struct.Struct("<IIIBBBBI12x")
 _SIZES = struct.Struct("<QQ")
-_WINDOW = 1 << 26  # bytes that a stream of zstd may look back
-_LARGEST = (1 << 23) - 1  # of 24 bits with a sign
-_EXTENDED = 0x2  # flag: there are records
-_RECORD, _COORDINATES = struct.Struct("<II"), 0xADBE0003  # head of a record; the type that names a coordinate system
-_RECORDS = 1 << 20  # bytes of records, at most
+_WINDOW = 1 << 26  # bytes; largest window of a zstd stream
+_LARGEST = (1 << 23) - 1  # of a signed 24-bit integer
+_EXTENDED = 0x2  # flag: the file has records
+_RECORD, _COORDINATES = struct.Struct("<II"), 0xADBE0003  # header of a record; type of the coordinate system
+_RECORDS = 1 << 20  # bytes; largest size of all records
 _RUB, _SYSTEMS = 4, 16
-_DEGREES = 4  # the highest that the format has
-_QUARTER = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # a turn by -90 degrees about x
+_DEGREES = 4  # highest SH degree of the format
+_QUARTER = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # rotation by -90 degrees about x
 _FINEST = 20  # fractional bits
-_STEPS = 64  # of a position in the size of a typical splat
-_COLOR = 0.15  # of 255: colours beyond black and white are kept
-_SH1_STEP, _SH_STEP = (
-    2,
-    4,
-)  # of 255: 7 bits for degree 1, 6 for the others; Niantic's library has 5 and 4 (see decisions)
-_ROOT = np.sqrt(0.5)  # no component but the largest exceeds it
+_STEPS = 64  # steps of a position per size of a typical splat
+_COLOR = 0.15  # scale of SH colours; leaves room beyond black and white
+_SH1_STEP, _SH_STEP = 2, 4  # of 255: 7 bits for degree 1, 6 for higher ones; Niantic's library uses 5 and 4
+_ROOT = np.sqrt(0.5)  # bound of all quaternion components but the largest
 _WORDS = (1 << 9) - 1
 
 
 def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, *, version: int = 3) -> tuple[str, ...]:
-    """Write SPZ of version 3 or 4, atomically; the same bytes for the same splats.
+    """Write SPZ of version 3 or 4, atomically and deterministically.
 
-    The step of positions is at most a 64th of the size of the median splat, if the farthest leaves bits for it.
+    The step of positions is at most a 64th of the median splat size, if the farthest position leaves enough bits.
 
     Returns
     -------
     tuple of str
-        How many splats the format could not hold as they are, and in what; nothing where it could.
+        Messages about splats that the format cannot represent.
 
     Raises
     ------
     DataError
-        A position beyond 2^23 units.
+        If a position exceeds 2^23 units.
     BackendError
-        Version 4 without zstandard.
+        For version 4 without zstandard.
     DiskError
         If the file could not be written.
     """
@@ -93,14 +91,14 @@ def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, *, version: in
 
 
 def _parts_3(g: Gaussians, bits: int, streams: list[bytes]) -> Iterator[bytes]:
-    packed = zlib.compressobj(9, zlib.DEFLATED, 16 + zlib.MAX_WBITS)  # gzip with no time of writing
+    packed = zlib.compressobj(9, zlib.DEFLATED, 16 + zlib.MAX_WBITS)  # gzip without a time stamp
     for part in (_HEADER.pack(_MAGIC, 3, len(g), g.sh_degree, bits, 0, 0), *streams):
         yield packed.compress(part)
     yield packed.flush()
 
 
 def _parts_4(g: Gaussians, bits: int, streams: list[bytes]) -> list[bytes]:
-    streams = streams if g.shN.shape[1] else streams[:-1]  # no stream of nothing, as Niantic's library writes none
+    streams = streams if g.shN.shape[1] else streams[:-1]  # no empty stream, like Niantic's library
     compressor = required("spz4", "zstandard", "SPZ of version 4", "use version 3").ZstdCompressor(level=12)
     packed = [compressor.compress(stream) for stream in streams]
     header = _HEADER_4.pack(_MAGIC, 4, len(g), g.sh_degree, bits, 0, len(streams), _HEADER_4.size)
@@ -117,7 +115,7 @@ def _fractional_bits(g: Gaussians, farthest: float) -> int:
 
 
 def _streams(g: Gaussians, bits: int) -> list[np.ndarray]:
-    """Return the attributes in their order, uint8."""
+    """Return the quantized attributes in file order, uint8."""
     fixed = np.rint(g.means.astype(np.float64) * (1 << bits)).astype("<i4")
     positions = fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3]
     sh = np.rint(np.clip(g.shN, -2.0, 2.0) * 128.0).astype(np.int64) + 128
@@ -134,7 +132,7 @@ def _streams(g: Gaussians, bits: int) -> list[np.ndarray]:
 
 
 def _packed_quats(quats: np.ndarray) -> np.ndarray:
-    """32 bits each [N]: the index of the largest of (x, y, z, w), then sign and 9 bits of each of the others."""
+    """Pack into 32 bits each [N]: index of the largest of (x, y, z, w), then sign and 9 bits of each of the others."""
     q = unit_quats(quats)[:, [1, 2, 3, 0]]
     rows, largest = np.arange(len(q)), np.abs(q).argmax(axis=1)
     q *= np.where(q[rows, largest] < 0, -1.0, 1.0)[:, None]
@@ -147,7 +145,7 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
 
 
 def _losses(g: Gaussians) -> tuple[str, ...]:
-    """Return what clamping changed by more than rounding does: one sentence, with the number of splats, or nothing."""
+    """Return messages about splats that clamping changed by more than rounding."""
     thin = (g.log_scales[:, :2] < -10.0 - 1 / 32).any(axis=1)
     wide = (g.log_scales > 255 / 16 - 10.0 + 1 / 32).any(axis=1)
     vivid = (np.abs(_COLOR * g.sh0.astype(np.float64)) > 0.5 + 0.5 / 255).any(axis=1)
@@ -161,34 +159,32 @@ def _losses(g: Gaussians) -> tuple[str, ...]:
     lines = []
     if clipped := int((thin | wide | vivid | steep).sum()):
         parts = ", ".join(f"{int(rows.sum()):,} {text}" for rows, text in every if rows.any())
-        lines.append(
-            f"{clipped:,} of {len(g):,} splats did not fit into SPZ and were clipped to what it holds: {parts}"
-        )
+        lines.append(f"{clipped:,} of {len(g):,} splats exceed the range of SPZ and were clipped: {parts}")
     if thick := int((g.log_scales[:, :2].max(axis=1, initial=-np.inf) + np.log(THIN) < -10.0).sum()):
         lines.append(
-            f"{thick:,} of {len(g):,} disks are less than four times as wide as SPZ makes them thick (4.5e-5 units): "
-            "other programs show balls; choose another format"
+            f"{thick:,} of {len(g):,} disks are less than four times as wide as thick in SPZ (4.5e-5 units), so other "
+            "programs do not show them flat; choose another format"
         )
     return tuple(lines)
 
 
 def read_spz(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Gaussians, int]:
-    """Read SPZ of version 2, 3 or 4: (Gaussians, version).
+    """Read SPZ of version 2, 3 or 4; returns (Gaussians, version).
 
-    A third scale of the smallest that SPZ has, 4.5e-5 units, comes back as the thickness of a disk.
+    The smallest scale of SPZ, 4.5e-5 units, is read as the thickness of a disk if it is the third.
 
     Parameters
     ----------
     path : path
     tell : callable
-        Receives a sentence on SH bands above degree 3, which are left out.
+        Receives a message if SH bands above degree 3 are dropped.
 
     Raises
     ------
     DataError
-        Missing, of another kind or version, or cut short.
+        If the file is missing, of another kind or version, or truncated.
     BackendError
-        Version 4 without zstandard.
+        For version 4 without zstandard.
     """
     try:
         packed = Path(path).read_bytes()
@@ -199,11 +195,11 @@ def read_spz(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[
 
 
 def _in_our_axes(g: Gaussians, system: int) -> Gaussians:
-    """Return splats stored in a coordinate system of the format, 1 to 16, in right, down, front.
+    """Convert splats from a coordinate system of the format, 1 to 16, to right, down, front.
 
-    The bits of the number less 1 say: right (else left), up (else down), front (else back). Those above 8 (LFD to RBU)
-    are the first eight after a quarter turn about x. It comes after the signs, as in the format's own library, which
-    therefore has half a turn about x between LFD, RFD, LBU, RBU and the axes that these letters name.
+    The bits of the number minus 1 mean: right (else left), up (else down), front (else back). Numbers above 8 (LFD to
+    RBU) are the first eight after a rotation by 90 degrees about x. It is applied after the signs, as in the format's
+    library, which therefore differs by 180 degrees about x from the axes that LFD, RFD, LBU and RBU name.
     """
     right, up, front, turned = (system - 1 >> bit & 1 for bit in range(4))
     g = g.mirrored((1 if right else -1, -1 if up else 1, 1 if front else -1))
@@ -211,7 +207,7 @@ def _in_our_axes(g: Gaussians, system: int) -> Gaussians:
 
 
 def _system(path: str | os.PathLike[str], records: bytes) -> int:
-    """Return the coordinate system that records name, else right, up, back; records of other types are passed over."""
+    """Return the coordinate system in the records, or right, up, back; records of other types are ignored."""
     system, at = _RUB, 0
     while at + _RECORD.size <= len(records):
         kind, size = _RECORD.unpack_from(records, at)
@@ -221,14 +217,14 @@ def _system(path: str | os.PathLike[str], records: bytes) -> int:
             system = int.from_bytes(content, "little") or _RUB
             if len(content) != 4 or system > _SYSTEMS:
                 raise DataError(
-                    f"{os.fspath(path)}: SPZ names its coordinate system by a number of 1 to {_SYSTEMS} in 4 bytes, "
-                    f"got {system} in {len(content)}; export it again"
+                    f"{os.fspath(path)}: expected an SPZ coordinate system from 1 to {_SYSTEMS} in 4 bytes, got "
+                    f"{system} in {len(content)}; export it again"
                 )
     return system
 
 
 def _sizes(version: int, degree: int) -> list[int]:
-    """Return bytes a splat of the streams."""
+    """Return the bytes per splat of each stream."""
     return [9, 1, 3, 3, 3 if version == 2 else 4, 3 * ((degree + 1) ** 2 - 1)]
 
 
@@ -239,14 +235,14 @@ def _parts_of_3(path: str | os.PathLike[str], tail: bytes) -> tuple[int, int, in
     magic, version, count, degree, bits, flags, _ = _HEADER.unpack(header)
     if magic != _MAGIC or version not in (2, 3) or degree > _DEGREES or bits > 23:
         raise DataError(
-            f"{os.fspath(path)}: SPZ of version 2 or 3 with SH degree 0 to {_DEGREES} was expected, got version "
-            f"{version}, degree {degree}; convert it to a PLY"
+            f"{os.fspath(path)}: expected SPZ of version 2 or 3 with SH degree 0 to {_DEGREES}, got version {version}, "
+            f"degree {degree}; convert it to PLY"
         )
     sizes = _sizes(version, degree)
     check_growth(path, len(tail), count * sum(sizes), f"a cloud of splats ({count:,} of them)")
     data = _unpacked(path, unpack, unpack.unconsumed_tail, count * sum(sizes))
     size = _RECORDS if flags & _EXTENDED else 1
-    records = _unpacked(path, unpack, unpack.unconsumed_tail, size, or_end=True)  # and gzip's checksum
+    records = _unpacked(path, unpack, unpack.unconsumed_tail, size, or_end=True)  # also verifies gzip's checksum
     parts, at = [], 0
     for size in sizes:
         parts.append(np.frombuffer(data, np.uint8, count * size, at).reshape(count, size))
@@ -261,20 +257,19 @@ def _parts_of_4(path: str | os.PathLike[str], data: bytes) -> tuple[int, int, in
     sizes = _sizes(4, degree)[: 6 if degree else 5]
     if version != 4 or degree > _DEGREES or bits > 23 or streams not in (len(sizes), 6) or len(data) < _HEADER_4.size:
         raise DataError(
-            f"{os.fspath(path)}: SPZ of version 2, 3 or 4 with SH degree 0 to {_DEGREES} was expected, got version "
-            f"{version}, degree {degree}, {streams} streams in {len(data)} bytes; convert it to a PLY"
+            f"{os.fspath(path)}: expected SPZ of version 2, 3 or 4 with SH degree 0 to {_DEGREES}, got version "
+            f"{version}, degree {degree}, {streams} streams in {len(data)} bytes; convert it to PLY"
         )
     check_growth(path, len(data), count * sum(sizes), f"a cloud of splats ({count:,} of them)")
     system = _system(path, data[_HEADER_4.size : at]) if flags & _EXTENDED else _RUB
     begin, parts = at + streams * _SIZES.size, []
     for size in sizes:
-        told = data[at : at + _SIZES.size].ljust(_SIZES.size, b"\0")
-        length, unpacked = _SIZES.unpack(told)
+        length, unpacked = _SIZES.unpack(data[at : at + _SIZES.size].ljust(_SIZES.size, b"\0"))
         stream = _unzstd(path, data[begin : begin + length], count * size)
         if unpacked != count * size or len(stream) != unpacked:
             raise DataError(
-                f"{os.fspath(path)}: SPZ was expected, a stream of {count * size} bytes has {len(stream)}, of "
-                f"{unpacked} that were announced; copy or export it again"
+                f"{os.fspath(path)}: expected an SPZ stream of {count * size} bytes, got {len(stream)} with a stated "
+                f"size of {unpacked}; copy or export it again"
             )
         parts.append(np.frombuffer(stream, np.uint8).reshape(count, size))
         at, begin = at + _SIZES.size, begin + length
@@ -284,17 +279,17 @@ def _parts_of_4(path: str | os.PathLike[str], data: bytes) -> tuple[int, int, in
 
 
 def _unzstd(path: str | os.PathLike[str], packed: bytes, size: int) -> bytes:
-    """Return at most ``size`` bytes and one more of what a stream becomes."""
+    """Decompress at most ``size`` + 1 bytes of a stream."""
     zstandard = required("spz4", "zstandard", "SPZ of version 4", "use version 3")
     try:
         with zstandard.ZstdDecompressor(max_window_size=_WINDOW).stream_reader(packed) as reader:
             return bytes(reader.read(size + 1))
     except zstandard.ZstdError as error:
-        raise DataError(f"{os.fspath(path)}: SPZ was expected, its zstd is broken ({error}); copy it again") from error
+        raise DataError(f"{os.fspath(path)}: expected SPZ, but its zstd is broken ({error}); copy it again") from error
 
 
 def _gaussians(path: str | os.PathLike[str], version: int, bits: int, parts: list[np.ndarray], tell: Tell) -> Gaussians:
-    """Return splats in the coordinates of the file."""
+    """Dequantize splats, in the coordinates of the file."""
     count = len(parts[0])
     positions, alphas, colors, scales, rotations, sh = parts
     low = positions.reshape(count, 3, 3).astype(np.int32)
@@ -315,15 +310,15 @@ def _gaussians(path: str | os.PathLike[str], version: int, bits: int, parts: lis
 
 
 def _unpacked(path: str | os.PathLike[str], unpack: Any, packed: bytes, size: int, *, or_end: bool = False) -> bytes:
-    """Return the next ``size`` bytes, or the file's end where that will do; never more, whatever it would become."""
+    """Decompress the next ``size`` bytes, or fewer at the end of the file with ``or_end``."""
     try:
         data = bytes(unpack.decompress(packed, size)) if size else b""
     except zlib.error as error:
-        raise DataError(f"{os.fspath(path)}: SPZ was expected, its gzip is broken ({error}); copy it again") from error
+        raise DataError(f"{os.fspath(path)}: expected SPZ, but its gzip is broken ({error}); copy it again") from error
     if len(data) < size and not (or_end and unpack.eof):
         raise DataError(
-            f"{os.fspath(path)}: SPZ was expected, the file ends early ({size} more bytes were announced, {len(data)} "
-            "are left); copy or export it again"
+            f"{os.fspath(path)}: expected SPZ, but the file ends early ({size} more bytes expected, {len(data)} left); "
+            "copy or export it again"
         )
     return data
 
@@ -348,6 +343,6 @@ def _old_quats(rotations: np.ndarray) -> np.ndarray:
 
 
 def _completed(q: np.ndarray, left_out: np.ndarray) -> np.ndarray:
-    """(w, x, y, z) of (x, y, z, w) of which one component is 0 and follows from the others."""
+    """Complete (x, y, z, w) whose ``left_out`` component is 0, and return (w, x, y, z)."""
     q[np.arange(len(q)), left_out] = np.sqrt(np.maximum(0.0, 1.0 - np.square(q).sum(axis=1)))
     return q[:, [3, 0, 1, 2]].astype(np.float32)
