@@ -23,10 +23,10 @@ from gs2d.io.splat_ply import ply_kind
 
 Tell = Callable[[str], None]
 
-APART = 0.05  # of the truth's diagonal: farther, and it is hardly the same surface in the same frame
-MESH_TRUTHS = ("mesh_gt.ply", "mesh_gt.obj", "points_gt.ply")  # beside a capture's photographs
-VISIBLE = "visible-surface"  # the evaluator of captures that no other one knows
-SEEN_SUFFIX = "_seen.npy"  # beside FILE.ply: FILE_seen.npy, how many views see each face
+APART = 0.05  # of the diagonal of the truth: a larger median distance suggests a wrong coordinate system
+MESH_TRUTHS = ("mesh_gt.ply", "mesh_gt.obj", "points_gt.ply")  # files beside a capture
+VISIBLE = "visible-surface"  # the default evaluator
+SEEN_SUFFIX = "_seen.npy"  # FILE_seen.npy beside FILE.ply: number of views that see each face
 
 
 @dataclass(frozen=True, eq=False)

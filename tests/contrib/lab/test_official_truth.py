@@ -108,7 +108,7 @@ def test_a_capture_of_nobody_s_data_set_takes_the_mesh_beside_it(tmp_path: Path)
     assert truth is not None
     assert truth.name == VISIBLE
     assert heard == [f"ground truth: {root / 'mesh_gt.ply'}"]
-    with pytest.raises(DataError, match="got neither for the capture Shed; give a PLY or OBJ file"):
+    with pytest.raises(DataError, match="got neither for the capture Shed; use a PLY or OBJ file"):
         choose_truth(tmp_path / "GT", root, ignore)
     assert len(scene.centers) == 60
 

@@ -312,7 +312,7 @@ def spz4(path: Path, at: int, value: bytes) -> None:
             8,
             struct.pack("<I", 19),
             "an SPZ stream of 171 bytes, got 172",
-        ),  # no more is unpacked than was asked for, but one
+        ),  # reads one extra byte
         (16, struct.pack("<I", 10**9), "an SPZ stream of 180 bytes, got 0|its zstd is broken"),
         (32, struct.pack("<Q", 5), "an SPZ stream of 180 bytes, got 0|its zstd is broken"),
         (112, bytes(4), "its zstd is broken"),
