@@ -143,4 +143,4 @@ def test_the_visible_surface_has_its_headline_at_a_quarter_of_a_per_cent_of_the_
     far: list[str] = []
     elsewhere = score_surface(flat(0.5), truth, scene, folder=tmp_path, tell=far.append)
     assert not elsewhere["self_check"]["ok"]
-    assert "is it in the capture's frame" in far[-1]
+    assert "check its coordinate system" in far[-1]
