@@ -25,7 +25,7 @@ from benchmarks.timing import machine, probe
 from benchmarks.workload import camera, room
 from gs2d.core.splats import Splats
 from gs2d.kernels.library import Library, load
-from gs2d.render.cpu_backend import IMAGES, rasterize_with
+from gs2d.render.native_rasterizer import IMAGES, rasterize_with
 from gs2d.render.types import RasterSettings
 
 WORKLOADS = ((20_000, 400), (100_000, 400), (100_000, 800))

@@ -38,7 +38,7 @@ PHASES = (
 )
 _ADDING = ("add", "_add_chunk", "_blend_colors", "_change", "_view_arrays", "_volume_arrays")  # a view to a volume
 PARTS = (
-    Rule("render", (("render/cpu_backend.py", ""), ("render/cpu_cached.py", ""))),
+    Rule("render", (("render/native_rasterizer.py", ""), ("render/cpu_cached.py", ""))),
     Rule(
         "photographs",
         (

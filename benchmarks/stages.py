@@ -21,7 +21,7 @@ from gs2d.core.splats import Splats
 from gs2d.kernels import native_losses as ops
 from gs2d.kernels.library import Library
 from gs2d.render.backends import get_backend
-from gs2d.render.cpu_backend import IMAGES, rasterize_with
+from gs2d.render.native_rasterizer import IMAGES, rasterize_with
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.training.densify.gradient import densify_and_prune
 from gs2d.training.optimizer import adam_step, begin_stage

@@ -80,13 +80,13 @@ INSIDE = {
     },
     "render": {
         "tensor_api": 7,
-        "api": 6,
+        "api cpu_backend cuda_backend reference_backend": 6,
         "backends camera_response": 5,
         "cpu_cached pose_gradient exposure_transform": 4,
-        "cpu_backend cuda_backend cuda_step reference_errors": 3,
-        "cuda_passes photometry_native reference_rasterizer": 2,
+        "native_rasterizer cuda_rasterizer cuda_step reference_errors": 3,
+        "cuda_passes reference_rasterizer": 2,
         "pair_budget whole_step cuda_works reference_projection reference_transmittance": 1,
-        "pose_gradient_native exposure_native": 1,
+        "native_image_ops": 1,
         "types": 0,
     },
     "training": {
@@ -230,9 +230,7 @@ def test_outside_of_render_nothing_asks_which_backend_it_has() -> None:
             return is_name(node.slice)
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "get":
             return any(map(is_name, node.args))
-        return isinstance(node, ast.alias) and node.name.startswith(
-            ("gs2d.render.cuda_backend", "gs2d.render.pair_budget")
-        )
+        return isinstance(node, ast.alias) and node.name.startswith(("gs2d.render.cuda_", "gs2d.render.pair_budget"))
 
     assert asks(ast.parse("job.backend.name == 'cpu'", mode="eval").body)
     outside = [module for module in MODULES if unit(module) != "render"]

@@ -21,7 +21,8 @@ import torch
 from benchmarks.timing import machine
 from gs2d.kernels.cuda import diagnose, launch
 from gs2d.kernels.cuda.launch import Launcher, OneByOne
-from gs2d.render.backends import BACKENDS, Backend, CudaBackend, get_backend
+from gs2d.render.backends import BACKENDS, Backend, get_backend
+from gs2d.render.cuda_backend import CudaBackend
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks" / "results"

@@ -18,7 +18,7 @@ from PIL import Image
 from benchmarks.gpu.bench import Bench
 from benchmarks.workload import room
 from gs2d.core.camera import Camera, look_at
-from gs2d.render import cuda_backend as cuda
+from gs2d.render import cuda_rasterizer as cuda
 from gs2d.render.types import RasterSettings
 
 SYNTHETIC = "synthetic"

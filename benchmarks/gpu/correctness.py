@@ -26,7 +26,7 @@ from gs2d.kernels.cuda import cuda_losses as ops
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.compile import ARCHITECTURES, compile_source, kernel_sources, source_names
 from gs2d.kernels.tsdf import arguments_of, fuse_on_gpu
-from gs2d.render import cuda_backend as cuda
+from gs2d.render import cuda_rasterizer as cuda
 from gs2d.render import reference_rasterizer as reference
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.types import PLAIN_COLORS, TRANSMITTANCE, Features, RasterSettings

@@ -32,7 +32,7 @@ from gs2d.errors import BackendError
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.compile import compile_source
 from gs2d.render import pair_budget
-from gs2d.render.backends import CudaBackend
+from gs2d.render.cuda_backend import CudaBackend
 from gs2d.training import objective, trainer
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer, TrainerOptions

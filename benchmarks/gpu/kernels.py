@@ -22,8 +22,8 @@ from gs2d.config.recipe import Recipe
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene, View
 from gs2d.errors import BackendError
-from gs2d.render import cuda_backend as cuda
 from gs2d.render import cuda_passes
+from gs2d.render import cuda_rasterizer as cuda
 from gs2d.render.types import RasterSettings
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer, TrainerOptions

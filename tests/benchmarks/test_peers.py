@@ -13,7 +13,7 @@ from benchmarks import peers
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.kernels.library import available_variants, load
-from gs2d.render.cpu_backend import rasterize_with
+from gs2d.render.native_rasterizer import rasterize_with
 from gs2d.render.types import RasterSettings
 
 

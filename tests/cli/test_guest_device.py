@@ -10,7 +10,8 @@ from cli_runs import TINY
 from gs2d.cli import run
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.prepare.quality import QUALITIES, quality_level
-from gs2d.render.backends import BACKENDS, ReferenceBackend, get_backend
+from gs2d.render.backends import BACKENDS, get_backend
+from gs2d.render.reference_backend import ReferenceBackend
 
 
 class OnNamedDevice(ReferenceBackend):

@@ -18,7 +18,7 @@ from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.compile import compile_source, cubin, source_names
-from gs2d.render import cuda_backend as cuda
+from gs2d.render import cuda_rasterizer as cuda
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backends import Backend, backend_report, get_backend
 from gs2d.render.types import RasterSettings, RenderOutput

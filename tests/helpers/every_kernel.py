@@ -20,7 +20,7 @@ from gs2d.kernels.cuda import cuda_losses as ops
 from gs2d.kernels.cuda.cuda_adam import AdamUpdate, adam_step
 from gs2d.kernels.cuda.cuda_multiview import compare_views
 from gs2d.kernels.native_losses import NormalOptions
-from gs2d.render import cuda_backend as cuda
+from gs2d.render import cuda_rasterizer as cuda
 from gs2d.render.cuda_step import Stepper
 from gs2d.render.pair_budget import PairBudget, Rendering
 from gs2d.render.types import PLAIN_COLORS, Features, RasterSettings

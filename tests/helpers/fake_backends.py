@@ -7,7 +7,8 @@ from typing import Any
 
 import torch
 
-from gs2d.render.backends import Backend, CudaBackend
+from gs2d.render.backends import Backend
+from gs2d.render.cuda_backend import CudaBackend
 from gs2d.render.pair_budget import PairBudget
 
 

@@ -161,7 +161,8 @@ class _Event:
 def install(guard: str, emulator: Emulator) -> Counter[str]:
     """From here on this process has a GPU; returns the launches by kernel, as they happen."""
     from gs2d.kernels.cuda import launch
-    from gs2d.render.backends import BACKENDS, CudaBackend
+    from gs2d.render.backends import BACKENDS
+    from gs2d.render.cuda_backend import CudaBackend
 
     launched: Counter[str] = Counter()
 
@@ -188,7 +189,7 @@ def install(guard: str, emulator: Emulator) -> Counter[str]:
     Tensor.pin_memory = lambda self: self.clone()  # type: ignore[assignment, method-assign]
     torch.autograd.Function.apply = _noting_tensors(vars(torch.autograd.Function)["apply"])
     launch.launcher_for = launcher_for
-    BACKENDS._things["cuda"] = CudaBackend
+    BACKENDS._things["cuda"] = lambda: CudaBackend()  # without looking for a GPU
     torch._C._set_only_lift_cpu_tensors(True)  # torch.tensor(..., device="cuda") asks the mode below, too
     _Everywhere().__enter__()
     return launched

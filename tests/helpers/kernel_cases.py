@@ -14,9 +14,9 @@ from emulate import Emulator
 from fake_backends import altered
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
-from gs2d.render import cuda_backend as cuda
+from gs2d.render import cuda_rasterizer as cuda
 from gs2d.render.api import rasterize
-from gs2d.render.backends import CudaBackend
+from gs2d.render.cuda_backend import CudaBackend
 from gs2d.render.types import RasterSettings, RenderOutput
 from render_scenes import KINDS, contraction, random_camera, random_splats, requiring_grad
 

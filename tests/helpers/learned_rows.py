@@ -6,7 +6,8 @@ import torch
 
 from gs2d.config.recipe import Recipe
 from gs2d.data.scene import Scene
-from gs2d.render.backends import PLAIN, Backend
+from gs2d.render.backends import Backend
+from gs2d.render.reference_backend import PLAIN
 from gs2d.training.learned.learned_table import LearnedTable
 from gs2d.training.state import TrainState
 

@@ -10,7 +10,7 @@ from benchmarks.workload import room_workload
 from gs2d.core.splats import Splats
 from gs2d.kernels.buffer_pool import LINE, BufferPool
 from gs2d.kernels.library import Library
-from gs2d.render.cpu_backend import IMAGES, rasterize_with
+from gs2d.render.native_rasterizer import IMAGES, rasterize_with
 from gs2d.render.types import RasterSettings
 
 FLOAT = torch.float32

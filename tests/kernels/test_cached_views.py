@@ -10,8 +10,8 @@ from torch import Tensor
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.splats import Splats
 from gs2d.kernels.library import Library
-from gs2d.render.cpu_backend import rasterize_with
 from gs2d.render.cpu_cached import CachedView, cache_view
+from gs2d.render.native_rasterizer import rasterize_with
 from gs2d.render.types import RasterSettings
 
 COUNT, ROOM = 300, 1 << 30

@@ -15,7 +15,7 @@ from torch import Tensor
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.kernels.library import Library
-from gs2d.render import cpu_backend as cpu
+from gs2d.render import native_rasterizer as cpu
 from gs2d.render.types import RasterSettings
 from render_scenes import IMAGES, random_camera, random_splats, requiring_grad
 

@@ -11,7 +11,7 @@ from benchmarks.workload import Workload, room_workload
 from torch import Tensor
 
 from gs2d.kernels.library import Library
-from gs2d.render import cpu_backend as cpu
+from gs2d.render import native_rasterizer as cpu
 from gs2d.render.api import rasterize
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings

@@ -14,7 +14,7 @@ from gs2d.core.camera import Camera, look_at
 from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import BackendError
 from gs2d.kernels.library import Library, available_variants, load
-from gs2d.render import cpu_backend as cpu
+from gs2d.render import native_rasterizer as cpu
 from gs2d.render import reference_errors
 from gs2d.render import reference_rasterizer as reference
 from gs2d.render.types import RasterSettings

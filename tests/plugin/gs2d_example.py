@@ -16,7 +16,7 @@ from gs2d.data.camera_models import CameraModel
 from gs2d.errors import DivergedError
 from gs2d.io.gaussians import Gaussians
 from gs2d.losses.base import LossReport
-from gs2d.render.backends import CpuBackend
+from gs2d.render.cpu_backend import CpuBackend
 from gs2d.training.actions.entry_action import EntryAction
 from gs2d.training.densify.densifier import Densifier
 from gs2d.training.events import Densified

@@ -14,8 +14,9 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda.launch import Launcher
-from gs2d.render import cuda_backend as cuda
-from gs2d.render.backends import Backend, CudaBackend, get_backend
+from gs2d.render import cuda_rasterizer as cuda
+from gs2d.render.backends import Backend, get_backend
+from gs2d.render.cuda_backend import CudaBackend
 from gs2d.render.types import Features, RasterSettings, RenderOutput
 
 

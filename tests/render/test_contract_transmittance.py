@@ -19,7 +19,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.library import load
-from gs2d.render import cpu_backend as cpu
+from gs2d.render import native_rasterizer as cpu
 from gs2d.render import reference_rasterizer as reference
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend

@@ -15,7 +15,8 @@ from gs2d.config.presets import appearance, refine
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe, Stage
 from gs2d.data.scene import Scene, View
-from gs2d.render.backends import PLAIN, Backend
+from gs2d.render.backends import Backend
+from gs2d.render.reference_backend import PLAIN
 from gs2d.training import events
 from gs2d.training.cached_objective import CachedViews, is_cacheable
 from gs2d.training.state import TrainState

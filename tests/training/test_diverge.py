@@ -17,7 +17,8 @@ from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError, DivergedError, RecipeError
 from gs2d.render import reference_rasterizer as reference
-from gs2d.render.backends import PLAIN, Backend
+from gs2d.render.backends import Backend
+from gs2d.render.reference_backend import PLAIN
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer

@@ -15,7 +15,7 @@ from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import LearningRates, Recipe, Stage
 from gs2d.data.scene import Scene
 from gs2d.errors import RecipeError
-from gs2d.render.backends import PLAIN
+from gs2d.render.reference_backend import PLAIN
 from gs2d.training.densify.densifier import Densifier
 from gs2d.training.optimizer import adam_step
 from gs2d.training.parallel import ONE_PROCESS

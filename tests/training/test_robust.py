@@ -21,7 +21,8 @@ from gs2d.core.splats import Splats
 from gs2d.data.scene import PointCloud, View
 from gs2d.errors import DataError
 from gs2d.render.api import rasterize
-from gs2d.render.backends import PLAIN, get_backend
+from gs2d.render.backends import get_backend
+from gs2d.render.reference_backend import PLAIN
 from gs2d.render.types import RasterSettings
 from gs2d.training import events
 from gs2d.training.learned.point_gains import point_gains

@@ -1,7 +1,7 @@
-"""Memory for large tensors that is used again.
+"""A pool of memory for large tensors.
 
-The C library gives blocks above 32 MB back to the system as soon as they are free, and maps new ones for the next
-tensor: a page costs more to get than to fill. Gradients of 300,000 splats would cost 13,000 pages a backward pass.
+The C library returns freed blocks above 32 MB to the system and maps new pages for the next tensor. Mapping a page
+costs more than filling it; gradients of 300,000 splats would map 13,000 pages in each backward pass.
 """
 
 from __future__ import annotations
@@ -18,43 +18,43 @@ from torch import Tensor
 
 __all__ = ["MIN_BYTES", "BufferPool"]
 
-MIN_BYTES = 32 << 20  # what glibc never keeps
+MIN_BYTES = 32 << 20  # glibc returns larger blocks to the system
 LINE = 64  # bytes of a cache line
-PATIENCE = 64  # requests for which a free block is kept; an iteration makes 13 at most
+PATIENCE = 64  # requests after which a free block is dropped; an iteration makes at most 13
 
 
 class BufferPool:
-    """Hands out tensors and takes their memory back when nobody holds them, or a view of them, any more.
+    """Allocates tensors and reuses their memory once neither they nor views of them are referenced.
 
-    A free block serves tensors of three quarters of its size and more. Where none fits, those of about that size are
-    given up: splats were added or removed. Threads may share a pool.
+    A free block serves tensors of at least three quarters of its size. If none fits, free blocks of similar size are
+    dropped, since splats were added or removed. A pool is thread-safe.
     """
 
     def __init__(self, min_bytes: int = MIN_BYTES) -> None:
         self._least, self._requests = min_bytes, 0
-        self._lock = Lock()  # guards all but `_returned`: a block may come back in the middle of anything
-        self._free: list[tuple[int, np.ndarray]] = []  # with the number of the request since when
+        self._lock = Lock()  # guards all but `_returned`: a finalizer may run at any point
+        self._free: list[tuple[int, np.ndarray]] = []  # with the request number at which it became free
         self._returned: deque[np.ndarray] = deque()
 
     def clear(self) -> None:
-        """Give up every block that nobody holds."""
+        """Drop all free blocks."""
         with self._lock:
             self._returned.clear()
             self._free.clear()
 
     def empty(self, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
-        """Like ``torch.empty`` on the CPU: undefined contents, contiguous."""
+        """Return an uninitialised contiguous tensor, like ``torch.empty`` on the CPU."""
         count = math.prod(shape)
         if count * dtype.itemsize < self._least:
             return torch.empty(tuple(shape), dtype=dtype)
         block = self._take(count * dtype.itemsize + LINE)
-        lent = block[:]  # an array of its own: it dies with the tensor's storage
+        lent = block[:]  # a separate array, freed with the tensor's storage
         weakref.finalize(lent, self._returned.append, block).atexit = False
         return torch.frombuffer(lent, dtype=dtype, count=count, offset=-block.ctypes.data % LINE).view(tuple(shape))
 
     @property
     def free_bytes(self) -> int:
-        """Held for the next tensors."""
+        """Bytes of all free blocks."""
         with self._lock:
             self._collect()
             return sum(block.nbytes for _, block in self._free)

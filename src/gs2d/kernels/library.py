@@ -1,6 +1,6 @@
 """Find, load and describe the native CPU library.
 
-There is one library per instruction set (CMakeLists.txt); ``load()`` picks the best one this processor can run.
+There is one library per instruction set (CMakeLists.txt); ``load()`` picks the best one that this processor can run.
 The environment variable ``GS2D_CPU_VARIANT`` (``v4``, ``v3`` or ``portable``) overrides the choice.
 """
 
@@ -16,12 +16,12 @@ from typing import Any
 
 import torch
 
-from gs2d.errors import BackendError
+from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.buffer_pool import BufferPool
 
-ABI_VERSION = 10  # of what the functions take: a library of another one is not called
-RESULTS_VERSION = 9  # of what they compute: a run goes on with the same bits, or not at all
-VARIANTS = {"v4": 4, "v3": 3, "portable": 0}  # name -> processor level it needs, best first
+ABI_VERSION = 10  # version of the function signatures; a library with another version is refused
+RESULTS_VERSION = 9  # version of the computed bits; a run resumes only with the version it started with
+VARIANTS = {"v4": 4, "v3": 3, "portable": 0}  # name -> required processor level, best first
 LANGUAGE = {"v4": "AVX-512 (x86-64-v4)", "v3": "AVX2 (x86-64-v3)", "portable": "portable", "f64": "portable, float64"}
 FOLDER = Path(__file__).parent / "lib"
 REMEDY = (
@@ -38,11 +38,11 @@ class Library:
     variant : str
         ``"v4"``, ``"v3"``, ``"portable"``, or ``"f64"`` (all arithmetic in float64; tests only).
     dtype : torch.dtype
-        Of the arrays its functions take.
+        dtype of the arrays that its functions take.
     lanes : int
         Pixels per vector.
     pool : BufferPool
-        Where large results come from.
+        Allocates large results.
     """
 
     def __init__(self, path: Path, variant: str) -> None:
@@ -62,7 +62,7 @@ class Library:
 
     def function(self, name: str, restype: Any, argtypes: Sequence[Any]) -> Any:
         """Return the exported function ``name`` with its C signature. The GIL is released while it runs."""
-        key = (name, restype, *argtypes)  # each signature has an object of its own: callers cannot disturb each other
+        key = (name, restype, *argtypes)  # one object per signature, so that callers do not share argtypes
         function = self._functions.get(key)
         if function is None:
             function = self._dll[name]
@@ -70,8 +70,24 @@ class Library:
             self._functions[key] = function
         return function
 
+    def arrays(self, **tensors: torch.Tensor | None) -> list[Any]:
+        """Return the tensors, detached and contiguous, in the order of the arguments; None stays None.
+
+        Raises
+        ------
+        ShapeError
+            If a tensor is not on the CPU or has another dtype than the library.
+        """
+        for name, tensor in tensors.items():
+            if tensor is not None and (not tensor.is_cpu or tensor.dtype != self.dtype):
+                raise ShapeError(
+                    f"{name} must be {self.dtype} on the cpu for the native kernels, got {tensor.dtype} on "
+                    f"{tensor.device}; convert it, or use the reference backend"
+                )
+        return [None if tensor is None else tensor.detach().contiguous() for tensor in tensors.values()]
+
     def use_threads(self, n: int) -> None:
-        """Let the following calls use ``n`` threads. Results do not depend on it."""
+        """Use ``n`` threads in the following calls. Results do not depend on it."""
         self._dll.gs2d_set_threads(int(n))
 
     @property
@@ -81,7 +97,7 @@ class Library:
 
     @property
     def instruction_set(self) -> str:
-        """For people."""
+        """Name of the instruction set, for display."""
         return LANGUAGE[self.variant]
 
 
@@ -104,7 +120,7 @@ def _load(variant: str) -> Library:
 
 
 def load(variant: str | None = None) -> Library:
-    """Return the native library: the best variant of this machine, or the one that is named.
+    """Return the native library: the named variant, or the best one for this machine.
 
     Parameters
     ----------
@@ -120,9 +136,9 @@ def load(variant: str | None = None) -> Library:
     return _choose(FOLDER, variant or os.environ.get("GS2D_CPU_VARIANT"))
 
 
-@cache  # an iteration asks three times, and to look at the files again takes 0.2 ms
+@cache  # an iteration calls it three times, and checking the files takes 0.2 ms
 def _choose(folder: Path, wanted: str | None) -> Library:
-    """Return the library of a name in a folder; errors are not remembered."""
+    """Return the library of a variant in a folder; errors are not cached."""
     choices = available_variants()
     if not choices:
         raise BackendError(f"expected the native CPU library in the package's kernels/lib, found none; {REMEDY}")
@@ -134,16 +150,16 @@ def _choose(folder: Path, wanted: str | None) -> Library:
 
 
 def ready_library() -> Library:
-    """``load()``, set to as many threads as torch uses: call it at the start of every native operation."""
+    """Return :func:`load` set to torch's number of threads. Call it at the start of every native operation."""
     library = load()
     library.use_threads(torch.get_num_threads())
     return library
 
 
 def library_for(tensor: torch.Tensor) -> Library | None:
-    """``prepare()`` for a tensor that it can read; None for others, and where no library was built.
+    """Return :func:`ready_library` for a float32 tensor on the CPU; None for other tensors, or without the library.
 
-    For what torch computes too, only slower: without the library the cpu backend is not there, and torch is the other.
+    For operations that also exist in torch.
     """
     if not tensor.is_cpu or tensor.dtype != torch.float32:
         return None
@@ -154,6 +170,6 @@ def library_for(tensor: torch.Tensor) -> Library | None:
 
 
 def describe_library() -> str:
-    """One line for ``gs2d doctor``: instruction set, pixels per vector, threads."""
+    """Return a line for ``gs2d doctor``: instruction set, pixels per vector, threads."""
     library = ready_library()
     return f"{library.instruction_set}, {library.lanes} pixels per vector, {library.threads} threads"

@@ -1,4 +1,4 @@
-"""Adam on the CPU: all attributes in one native call, and what is not trained is not written."""
+"""Adam on the CPU: all attributes in one native call; rows that are not trained are not written."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from torch import Tensor
 from gs2d.errors import ShapeError
 from gs2d.kernels.library import Library, ready_library
 
-__all__ = ["AdamUpdate", "adam_step", "bias_corrections", "bias_corrections_of", "check_update", "first_not_finite"]
+__all__ = ["AdamUpdate", "adam_step", "bias_corrections", "check_update", "first_not_finite"]
 
 
 @dataclass(frozen=True, eq=False)
 class AdamUpdate:
-    """One attribute's part of a step.
+    """The update of one attribute in an Adam step.
 
     Attributes
     ----------
     parameter, mean, square : Tensor [N, ...] float32
         Contiguous; changed in place.
     gradient : Tensor
-        Like the parameter; with ``compact``, of ``rows`` alone and in their order.
+        Same shape as the parameter; with ``compact``, one row for each of ``rows``.
     rate : float
     step : float
-        Of the bias correction, counted from 1 and with this one; not whole where steps were of different lengths.
+        Step number for the bias correction, 1 in the first step; fractional if steps had different lengths.
     trained : Tensor [N] bool, optional
         Rows that are False are not written, and their gradients are not read.
     rows : Tensor [M] int64, optional
-        Only these rows, each once; instead of ``trained``.
+        Updates only these rows, each once; instead of ``trained``.
     compact : bool
     """
 
@@ -48,7 +48,7 @@ class AdamUpdate:
 
 
 def check_update(update: AdamUpdate) -> None:
-    """Raise ShapeError unless the tensors fit each other."""
+    """Raise ShapeError unless the tensors have matching shapes and types."""
     parameter = update.parameter
     for name in ("mean", "square", *(() if update.compact else ("gradient",))):
         if getattr(update, name).shape != parameter.shape:
@@ -58,25 +58,20 @@ def check_update(update: AdamUpdate) -> None:
             raise ShapeError(f"{name} must be contiguous to be changed in place")
     trained, rows = update.trained, update.rows
     if trained is not None and rows is not None:
-        raise ShapeError("an AdamUpdate takes trained or rows, got both")
+        raise ShapeError("an AdamUpdate takes either trained or rows, got both")
     if trained is not None and (trained.dtype != torch.bool or trained.shape != parameter.shape[:1]):
         raise ShapeError(f"trained must be bool [{len(parameter)}], got {trained.dtype} {list(trained.shape)}")
     if rows is not None and (rows.dtype != torch.int64 or rows.dim() != 1):
         raise ShapeError(f"rows must be int64 [M], got {rows.dtype} {list(rows.shape)}")
     if update.compact and rows is None:
-        raise ShapeError("a compact gradient needs rows, one for each of its own")
+        raise ShapeError("a compact gradient needs rows, the parameter row of each gradient row; got none")
     if update.compact and rows is not None and update.gradient.shape != (len(rows), *parameter.shape[1:]):
         raise ShapeError(
             f"a compact gradient must be {[len(rows), *parameter.shape[1:]]}, got {list(update.gradient.shape)}"
         )
 
 
-def bias_corrections(update: AdamUpdate, beta1: float, beta2: float) -> tuple[float, float]:
-    """Return rate / (1 - beta1^t) and sqrt(1 - beta2^t)."""
-    return bias_corrections_of(update.rate, update.step, beta1, beta2)
-
-
-def bias_corrections_of(rate: float, step: float, beta1: float, beta2: float) -> tuple[float, float]:
+def bias_corrections(rate: float, step: float, beta1: float, beta2: float) -> tuple[float, float]:
     """Return rate / (1 - beta1^t) and sqrt(1 - beta2^t) at step t."""
     return rate / (1 - beta1**step), math.sqrt(1 - beta2**step)
 
@@ -95,33 +90,29 @@ class _Attribute(ctypes.Structure):
 def adam_step(
     updates: Sequence[AdamUpdate], *, beta1: float, beta2: float, eps: float, library: Library | None = None
 ) -> None:
-    """One Adam step of some attributes, in place; the arithmetic of torch's fused Adam (to rounding).
+    """Run one Adam step on several attributes, in place; equal to torch's fused Adam to rounding.
 
     Parameters
     ----------
     updates : sequence of AdamUpdate
-        Tensors of the library's dtype on the CPU.
+        Tensors with the library's dtype on the CPU.
     beta1, beta2, eps : float
     library : Library, optional
-        By default this machine's best, on as many threads as torch uses; the bits do not depend on how many.
+        Default: :func:`ready_library`. The bits do not depend on the number of threads.
 
     Raises
     ------
     ShapeError
-        If something has another shape, dtype or device.
+        If a tensor has another shape, dtype or device, or a row index is out of range.
     """
     library = library or ready_library()
     attributes = (_Attribute * len(updates))()
-    alive = []  # what the pointers belong to
+    alive = []  # tensors behind the pointers
     for slot, update in zip(attributes, updates, strict=True):
         check_update(update)
-        gradient = update.gradient.contiguous()
-        for name, tensor in (
-            *((k, getattr(update, k)) for k in ("parameter", "mean", "square")),
-            ("gradient", gradient),
-        ):
-            if not tensor.is_cpu or tensor.dtype != library.dtype:
-                raise ShapeError(f"{name} must be {library.dtype} on the cpu, got {tensor.dtype} on {tensor.device}")
+        named = {name: getattr(update, name) for name in ("parameter", "mean", "square", "gradient")}
+        tensors = library.arrays(**named)
+        for name, tensor in zip(named, tensors, strict=True):
             setattr(slot, name, tensor.data_ptr())
         rows = update.rows if update.trained is None else update.trained.nonzero().squeeze(1)
         if rows is not None:
@@ -132,27 +123,24 @@ def adam_step(
         slot.height, slot.columns = len(update.parameter), max(1, math.prod(update.parameter.shape[1:]))
         slot.count = 0 if update.parameter.numel() == 0 else slot.height if rows is None else len(rows)
         slot.compact = update.compact
-        slot.step_size, slot.root_2 = bias_corrections(update, beta1, beta2)
-        alive += [gradient, rows]
+        slot.step_size, slot.root_2 = bias_corrections(update.rate, update.step, beta1, beta2)
+        alive += [*tensors, rows]
     function = library.function("gs2d_adam", ctypes.c_int, (ctypes.c_void_p, ctypes.c_int, *[ctypes.c_double] * 3))
     if function(attributes, len(updates), beta1, beta2, eps) != 0:
-        raise ShapeError("rows must be those of the parameter, from 0 on, got others")
+        raise ShapeError("rows must be row indices of the parameter, got an index out of range")
     del alive
 
 
 def first_not_finite(tensors: Sequence[Tensor], *, library: Library | None = None) -> int | None:
-    """Return the number of the first tensor that holds a NaN or an infinity, None if all are finite.
+    """Return the index of the first tensor with a NaN or an infinity, None if all are finite.
 
     Raises
     ------
     ShapeError
-        If one is not of the library's dtype on the CPU.
+        If a tensor is not on the CPU or has another dtype than the library.
     """
     library = library or ready_library()
-    plain = [tensor.detach().contiguous() for tensor in tensors]
-    for tensor in plain:
-        if not tensor.is_cpu or tensor.dtype != library.dtype:
-            raise ShapeError(f"tensors must be {library.dtype} on the cpu, got {tensor.dtype} on {tensor.device}")
+    plain = library.arrays(**{f"tensor {number}": tensor for number, tensor in enumerate(tensors)})
     count = len(plain)
     pointers = (ctypes.c_void_p * count)(*(tensor.data_ptr() for tensor in plain))
     sizes = (ctypes.c_int64 * count)(*(tensor.numel() for tensor in plain))

@@ -1,4 +1,4 @@
-"""Splats in the free space of a photograph, natively; ``training/robust/free_space_maps.py`` has the same in torch."""
+"""Native test for splats in free space (``cpu/free_space.cpp``); ``training/robust/free_space_maps.py`` has the same in torch."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gs2d.kernels.library import library_for
 __all__ = ["SeenSpace", "look_at_free_space"]
 
 
-class _Arguments(ctypes.Structure):
+class _FreeSpaceArguments(ctypes.Structure):
     """``FreeSpaceArguments`` of cpu/free_space.cpp, with float32 arrays."""
 
     _fields_ = (
@@ -27,20 +27,20 @@ class _Arguments(ctypes.Structure):
 
 
 class SeenSpace(NamedTuple):
-    """What an image says about the space before it.
+    """Free space and surface depth of one image.
 
     Attributes
     ----------
     project : Tensor [3, 4] float32
-        A place p is at pixel (x, y) and depth z: (x z, y z, z) = project (p, 1).
+        Projects a point p to pixel (x, y) and depth z: (x z, y z, z) = project (p, 1).
     center : Tensor [3] float32
         Camera centre, world units.
     limit, known : Tensor [H, W] float32, world units
-        What is nearer than ``limit`` is free; ``known`` is the depth of the surface in the image, or infinite.
+        Points nearer than ``limit`` are in free space; ``known`` is the depth of the surface, or infinite.
     radius : float
         Radius of the free ball around the camera, world units.
     fraction : float
-        Of the depth, within which a centre lies on the surface.
+        A centre is on the surface if its depth differs by at most this fraction.
     """
 
     project: Tensor
@@ -52,22 +52,22 @@ class SeenSpace(NamedTuple):
 
 
 def look_at_free_space(ends: Tensor, reach: Tensor, seen: SeenSpace, against: Tensor, support: Tensor) -> bool:
-    """Count, for each splat, a photograph that sees through it and one that shows a surface there.
+    """Count for each splat whether an image sees through it, and whether the image shows a surface at its centre.
 
     Parameters
     ----------
     ends : Tensor [P, N, 3] float32, world units
-        Places at which a splat is looked at, its centre first.
+        Sample points of each splat, its centre first.
     reach : Tensor [N] float32, world units
-        No place of a splat is farther from its centre.
+        Largest distance of a sample point from the centre.
     seen : SeenSpace
     against, support : Tensor [N] int32
-        One is added where any place is free, and where the centre lies on the surface.
+        Incremented where any sample point is in free space, and where the centre is on the surface.
 
     Returns
     -------
     bool
-        False without the native library: nothing was done.
+        False without the native library; nothing is done then.
     """
     library = library_for(ends)
     if library is None or library.dtype != torch.float32:
@@ -76,7 +76,7 @@ def look_at_free_space(ends: Tensor, reach: Tensor, seen: SeenSpace, against: Te
     inputs |= {name: getattr(seen, name) for name in ("project", "center", "limit", "known")}
     given = {name: tensor.contiguous() for name, tensor in inputs.items()}
     height, width = seen.limit.shape
-    arguments = _Arguments(
+    arguments = _FreeSpaceArguments(
         count=ends.shape[1],
         places=len(ends),
         height=height,

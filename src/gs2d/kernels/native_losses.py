@@ -1,8 +1,8 @@
 """Native image losses for autograd: fused value and gradient, the same bits for any number of threads.
 
-Each function computes the gradient in its forward pass, for the cotangent that the caller expects (the weights of the
-loss terms), and hands it out in the backward pass. Another cotangent gives the right gradient too, at the price of a
-second pass. The formulas are in ``kernels/core/losses.h``; ``losses.formulas`` has the same in torch.
+Each function computes the gradient in its forward pass, for the expected cotangent (the weight of the loss term), and
+returns it in the backward pass. Another cotangent also gives the correct gradient, at the cost of a second pass. The
+formulas are in ``kernels/core/losses.h``; ``losses.formulas`` has the same in torch.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ SIGNATURES: dict[str, list[Any]] = {
 
 @dataclass(frozen=True)
 class LossOperations:
-    """The fused operations of a backend, with the signatures of this module's.
+    """The fused loss operations of a backend, with the signatures of this module.
 
     Attributes
     ----------
     photometric, normal_consistency, masked_mean : callable
     blur : callable or None
-        Where ``photometric`` takes the local mean of the target, which is then worth keeping.
+        Computes the local mean of the target for ``photometric``; None: caching it does not save time.
     compare_views : callable or None
-        ``kernels.native_multiview.compare_views``; None: the losses of two views are worked out in torch.
+        ``kernels.native_multiview.compare_views``; None: torch computes the losses of two views.
     """
 
     photometric: Callable[..., tuple[Tensor, Tensor, Tensor]]
@@ -52,7 +52,7 @@ class LossOperations:
 
 @dataclass(frozen=True, eq=False)
 class NormalOptions:
-    """What normal consistency compares, and how.
+    """Inputs and options of normal consistency.
 
     Attributes
     ----------
@@ -60,11 +60,11 @@ class NormalOptions:
     mask : Tensor [H, W] bool or None
         False = ignore this pixel.
     weights : Tensor [H, W] or None
-        By which each pixel's part is multiplied; a constant.
+        Constant weight of each pixel.
     at_camera : bool
-        Whether empty pixels lie at the camera's centre: ``edges`` of ``losses.formulas.normals_from_depth``.
+        Whether empty pixels lie at the camera centre: ``edges`` of ``losses.formulas.normals_from_depth``.
     per_splat : bool
-        The paper's form, mean(alpha - <n, N>), instead of the official mean(1 - alpha <n, N>) with alpha detached.
+        Use the paper's form, mean(alpha - <n, N>), instead of the official mean(1 - alpha <n, N>) with alpha detached.
     """
 
     camera: Camera
@@ -74,7 +74,7 @@ class NormalOptions:
     per_splat: bool = False
 
     def check(self, normal: Tensor, depth: Tensor, alpha: Tensor) -> None:
-        """Raise ShapeError for images of other sizes."""
+        """Raise ShapeError if the images do not have the size of the camera."""
         shapes = {"depth": (depth, "H W"), "normal": (normal, "H W 3"), "alpha": (alpha, "H W")}
         shapes |= {} if self.mask is None else {"mask": (self.mask, "H W")}
         sizes = check_shapes(shapes | ({} if self.weights is None else {"weights": (self.weights, "H W")}))
@@ -84,25 +84,14 @@ class NormalOptions:
 
 
 def _call(library: Library, name: str, *arguments: Any) -> None:
-    """Call an exported function; tensors pass their addresses, None passes null."""
+    """Call an exported function with the addresses of tensors; None becomes null."""
     pointers = [x.data_ptr() if isinstance(x, Tensor) else x for x in arguments]
     if library.function(name, INT, SIGNATURES[name])(*pointers) != 0:
         raise MemoryError(f"{name} could not allocate its scratch rows")
 
 
-def _arrays(library: Library, **tensors: Tensor) -> list[Tensor]:
-    """Return the tensors, contiguous; ShapeError if one is on another device or of another dtype than is taken."""
-    for name, tensor in tensors.items():
-        if tensor.dtype != library.dtype or tensor.device.type != "cpu":
-            raise ShapeError(
-                f"{name} must be {library.dtype} on the cpu for the native losses, got {tensor.dtype} on "
-                f"{tensor.device}; convert it, or use the reference backend"
-            )
-    return [tensor.detach().contiguous() for tensor in tensors.values()]
-
-
-def _wanted(*tensors: Tensor) -> bool:
-    """Whether a gradient may be asked for (inside an autograd.Function it is too late to know)."""
+def needs_gradient(*tensors: Tensor) -> bool:
+    """Whether autograd records these tensors (an autograd.Function cannot tell in its forward pass)."""
     return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
 
 
@@ -115,18 +104,13 @@ def _mask_bytes(mask: Tensor | None) -> Tensor | None:
 
 
 def blur(image: Tensor, *, library: Library | None = None) -> Tensor:
-    """Return the SSIM window (11x11 Gaussian, sigma 1.5, zero outside) over an image [H, W, 3]; not differentiable.
+    """Filter an image [H, W, 3] with the SSIM window (11x11 Gaussian, sigma 1.5, zero outside); not differentiable.
 
-    Of a target this is the ``target_mean`` that ``photometric`` takes.
-
-    Raises
-    ------
-    ShapeError
-        Another shape, dtype or device.
+    The result for a target is the ``target_mean`` of ``photometric``.
     """
     library = library or ready_library()
     sizes = check_shapes({"image": (image, "H W 3")})
-    (source,) = _arrays(library, image=image)
+    (source,) = library.arrays(image=image)
     out = torch.empty_like(source)
     _call(library, "gs2d_blur", source, sizes["H"], sizes["W"], out)
     return out
@@ -145,7 +129,7 @@ class _Photometric(torch.autograd.Function):
         library: Library,
     ) -> tuple[Tensor, Tensor, Tensor]:
         ctx.library = library
-        ctx.expected = torch.tensor(expected, dtype=torch.float64).to(rendered.dtype)  # rounded as the cotangents are
+        ctx.expected = torch.tensor(expected, dtype=torch.float64).to(rendered.dtype)  # rounded like the cotangents
         gradient = torch.empty_like(rendered) if wanted else None
         values = _photometric(rendered, target, mask, mean, library, expected, gradient)
         ctx.save_for_backward(gradient, rendered, target, mask, mean)
@@ -187,7 +171,7 @@ def photometric(
     expected: tuple[float, float, float] = (0.8, -0.2, 0.0),
     library: Library | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean L1, SSIM and L2 of an image, all differentiable in ``rendered``, in one fused pass.
+    """Return mean L1, SSIM and L2 of an image, all differentiable in ``rendered``, in one fused pass.
 
     Parameters
     ----------
@@ -196,21 +180,21 @@ def photometric(
     mask : Tensor [H, W] bool, optional
         False = ignore this pixel.
     target_mean : Tensor [H, W, 3], optional
-        ``blur(target)``, if at hand. Changes no bit of the result.
+        ``blur(target)``, to save time. Changes no bit of the result.
     expected : (float, float, float)
-        Cotangents of the values that the backward pass will probably see; any other costs a second pass.
+        Expected cotangents of the three values; others cost a second pass.
     library : Library, optional
-        By default this machine's best, on as many threads as torch uses.
+        Default: :func:`ready_library`.
 
     Returns
     -------
     l1, ssim, l2 : Tensor []
-        Means over valid pixels and channels; 0 when no pixel is valid. L2 is of the squared difference.
+        Means over valid pixels and channels; 0 if no pixel is valid. L2 is the mean squared difference.
 
     Raises
     ------
     ShapeError
-        Shapes that differ, or another dtype or device than the library takes.
+        If shapes differ, or a tensor has another dtype or device than the library.
     """
     library = library or ready_library()
     shapes = {"target": (target, "H W 3"), "rendered": (rendered, "H W 3")}
@@ -219,11 +203,8 @@ def photometric(
     if mask is not None:
         shapes["mask"] = (mask, "H W")
     check_shapes(shapes)
-    _arrays(library, rendered=rendered)
-    (target,) = _arrays(library, target=target)
-    if target_mean is not None:
-        (target_mean,) = _arrays(library, target_mean=target_mean)
-    wanted = _wanted(rendered)
+    _, target, target_mean = library.arrays(rendered=rendered, target=target, target_mean=target_mean)
+    wanted = needs_gradient(rendered)
     arguments = (target, _mask_bytes(mask), target_mean, expected, wanted, library)
     l1, ssim, l2 = _Photometric.apply(rendered.contiguous(), *arguments)
     return l1, ssim, l2
@@ -272,7 +253,7 @@ def normal_consistency(
     expected: float = 0.05,
     library: Library | None = None,
 ) -> Tensor:
-    """Return normal consistency [], the native form of the functions of the same name in ``losses.formulas``.
+    """Return the normal consistency loss [], the native form of the functions in ``losses.formulas``.
 
     Parameters
     ----------
@@ -283,21 +264,20 @@ def normal_consistency(
     alpha : Tensor [H, W]
     how : NormalOptions
     expected : float
-        Cotangent that the backward pass will probably see; another costs a multiplication of the gradients.
+        Expected cotangent; another one costs a multiplication of the gradients.
     library : Library, optional
 
     Raises
     ------
     ShapeError
-        Shapes that differ, or another dtype or device than the library takes.
+        If shapes differ, or a tensor has another dtype or device than the library.
     """
     library = library or ready_library()
     how.check(normal, depth, alpha)
-    _arrays(library, normal=normal, depth=depth, alpha=alpha)
+    *_, weights = library.arrays(normal=normal, depth=depth, alpha=alpha, weights=how.weights)
     images = (normal.contiguous(), depth.contiguous(), alpha.contiguous())
-    weights = None if how.weights is None else _arrays(library, weights=how.weights)[0]
     how = replace(how, mask=_mask_bytes(how.mask), weights=weights)
-    value: Tensor = _NormalConsistency.apply(*images, how, expected, _wanted(normal, depth, alpha), library)
+    value: Tensor = _NormalConsistency.apply(*images, how, expected, needs_gradient(normal, depth, alpha), library)
     return value
 
 
@@ -318,15 +298,12 @@ class _MaskedMean(torch.autograd.Function):
 
 
 def masked_mean(values: Tensor, mask: Tensor | None = None, *, library: Library | None = None) -> Tensor:
-    """Mean [] of a map [H, W] over the pixels where ``mask`` is True, summed in a fixed order; 0 when there are none.
+    """Return the mean [] of a map [H, W] over the pixels where ``mask`` is True, 0 if there are none.
 
-    Raises
-    ------
-    ShapeError
-        Shapes that differ, or another dtype or device than the library takes.
+    The summation order is fixed.
     """
     library = library or ready_library()
     check_shapes({"values": (values, "H W")} | ({"mask": (mask, "H W")} if mask is not None else {}))
-    _arrays(library, values=values)
+    library.arrays(values=values)
     mean: Tensor = _MaskedMean.apply(values.contiguous(), _mask_bytes(mask), library)
     return mean

@@ -1,7 +1,7 @@
-"""Patches of a view beside those of a neighbour, for autograd: values, and gradients made on the way forward.
+"""Native comparison of image patches of two views, for autograd: gradients are computed in the forward pass.
 
-The formulas are in ``kernels/core/multiview.h``; ``losses.view_pair`` has the same in torch. The same bits for any
-number of threads. A backend adds a :data:`Run`, which fills rows of numbers for each pixel; the rest is here.
+The formulas are in ``kernels/core/multiview.h``; ``losses.view_pair`` has the same in torch. The bits do not depend on
+the number of threads. Backends share everything except a :data:`Run`, which fills rows of numbers for each pixel.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gs2d.kernels.library import Library, ready_library
 
 __all__ = ["CompareArguments", "Compared", "compare_on", "compare_views"]
 
-VALUES, GRADIENTS, MOTION, TURN_SHIFT = 2, 5, 21, 12  # rows; those of motion_gradients are the last two, in turn
+VALUES, GRADIENTS, MOTION, TURN_SHIFT = 2, 5, 21, 12  # rows; motion_gradients has MOTION, then TURN_SHIFT
 
 
 class CompareArguments(ctypes.Structure):
@@ -44,21 +44,23 @@ class CompareArguments(ctypes.Structure):
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """Pixels of a view, and the neighbour that they are compared with.
+    """Pixels of a view, and the neighbouring view that they are compared with.
 
     Attributes
     ----------
     index : Tensor [P] int64
-        Into the flat image, none twice where ``chosen``; the patches there are inside it, and its depth is above 0.
+        Indices into the flat image, without duplicates where ``chosen``. Their patches lie inside the image, and their
+        depth is above 0.
     chosen : Tensor [P] bool
+        Pixels to compare.
     reference : Tensor [H, W]
-        Grey of the view.
+        Grey image of the view.
     source : Tensor [h, w]
-        Grey of the neighbour.
+        Grey image of the neighbour.
     clear : Tensor [h, w] bool
         Pixels of the neighbour around which a patch may be compared.
     source_depth : Tensor [h', w'] world units
-        Of the whole image of the neighbour, in any size; 0 where nothing is hit.
+        Depth of the neighbour's whole image, at any resolution; 0 where nothing is hit.
     camera, source_camera : Camera
     settings : MultiView
     """
@@ -75,7 +77,7 @@ class Compared:
 
 
 Run = Callable[[CompareArguments, dict[str, Tensor | None]], Tensor]
-"""Fills the rows "values", "gradients", "motion_gradients" from the rest; returns the sums of the first and last."""
+"""Fills the rows "values", "gradients" and "motion_gradients"; returns the sums of the first and the last."""
 
 
 class _Compare(torch.autograd.Function):
@@ -110,7 +112,7 @@ class _Compare(torch.autograd.Function):
         index, rows, motion = ctx.saved_tensors
         height, width = ctx.shape
         g_depth, g_normal, g_motion = rows.new_zeros(height * width), None, motion.new_zeros(min(len(motion), MOTION))
-        # No pixel is chosen twice, and the rest add 0: the order in which a device adds changes nothing.
+        # No pixel is chosen twice and the others add 0, so the order of a device's additions does not matter.
         if g_photometric is not None:
             by_similarity = g_photometric * rows[:4]
             g_depth.index_add_(0, index, by_similarity[0])
@@ -143,7 +145,7 @@ def _arguments(given: Compared) -> CompareArguments:
 
 
 def compare_on(depth: Tensor, normal: Tensor, motion: Tensor, given: Compared, run: Run) -> tuple[Tensor, Tensor]:
-    """Return what :func:`compare_views` does, by the kernel of a backend; shapes are checked here."""
+    """Check shapes and compare the views with the kernel of a backend, as :func:`compare_views` does."""
     images = {"depth": (depth, "H W"), "normal": (normal, "H W 3"), "reference": (given.reference, "H W")}
     pixels = {"index": (given.index, "P"), "chosen": (given.chosen, "P"), "motion": (motion, str(MOTION))}
     there = {
@@ -168,7 +170,7 @@ def compare_on(depth: Tensor, normal: Tensor, motion: Tensor, given: Compared, r
 def compare_views(
     depth: Tensor, normal: Tensor, motion: Tensor, given: Compared, *, library: Library | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Compare pixels of a view with a neighbour: sums over them, differentiable in the first three.
+    """Compare pixels of a view with a neighbouring view; differentiable in the first three arguments.
 
     Parameters
     ----------
@@ -176,30 +178,25 @@ def compare_views(
     normal : Tensor [H, W, 3]
         World frame, any length.
     motion : Tensor [21]
-        Rotation (by rows) and translation from the view's camera to the neighbour's; rotation from the world to the
-        view's camera.
+        Rotation (row-major) and translation from the view's camera to the neighbour's, then the rotation from the
+        world to the view's camera.
     given : Compared
     library : Library, optional
-        By default this machine's best, on as many threads as torch uses.
+        Default: ``ready_library()``.
 
     Returns
     -------
     photometric, geometric : Tensor []
-        Sums of ``weight (1 - NCC)`` and ``weight error``, px, where they are known.
+        Sums over the valid pixels of ``weight (1 - NCC)`` and ``weight error`` (px).
 
     Raises
     ------
     ShapeError
-        Shapes that differ, or another dtype or device than the library takes.
+        If shapes differ, or a tensor has another dtype or device than the library.
     """
     library = library or ready_library()
-    floats = {"depth": depth, "normal": normal, "motion": motion, "reference": given.reference}
-    for name, tensor in (floats | {"source": given.source, "source_depth": given.source_depth}).items():
-        if tensor.dtype != library.dtype or tensor.device.type != "cpu":
-            raise ShapeError(
-                f"{name} must be {library.dtype} on the cpu for the native losses, got {tensor.dtype} on "
-                f"{tensor.device}; convert it, or use the reference backend"
-            )
+    images = {name: getattr(given, name) for name in ("reference", "source", "source_depth")}
+    library.arrays(depth=depth, normal=normal, motion=motion, **images)
 
     def run(arguments: CompareArguments, tensors: dict[str, Tensor | None]) -> Tensor:
         for name, tensor in tensors.items():

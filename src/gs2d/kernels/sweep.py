@@ -1,4 +1,4 @@
-"""The plane sweep of one image, natively; ``training/start/plane_sweep.py`` has the same in torch."""
+"""Native plane sweep of one image (``cpu/sweep.cpp``); ``training/start/plane_sweep.py`` has the same in torch."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ __all__ = ["BestPlanes", "sweep_planes"]
 
 @dataclass(frozen=True, eq=False)
 class BestPlanes:
-    """What a sweep keeps of each pixel.
+    """Result of a plane sweep.
 
     Attributes
     ----------
     score : Tensor [H, W]
-        Of the best plane: mean of the NCC with the two images that agree best.
+        Score of the best plane: mean NCC with the two images that agree best.
     plane : Tensor [H, W] int64
+        Index of the best plane.
     before, after : Tensor [H, W]
-        Scores of the planes beside it; anything where it is the first or the last.
+        Scores of the adjacent planes; undefined at the first and the last plane.
     """
 
     score: Tensor
@@ -34,7 +35,7 @@ class BestPlanes:
     after: Tensor
 
 
-class _Arguments(ctypes.Structure):
+class _SweepArguments(ctypes.Structure):
     """``SweepArguments`` of cpu/sweep.cpp, with float32 arrays."""
 
     _fields_ = (
@@ -56,22 +57,22 @@ def sweep_planes(
     radius: int,
     noise: float,
 ) -> BestPlanes | None:
-    """Return the best plane of each pixel of a grey image; None without the native library.
+    """Find the best plane of each pixel of a grey image; None without the native library.
 
     Parameters
     ----------
     image : Tensor [H, W] float32
     wanted : Tensor [H, W] bool
-        Nothing is asked of other pixels: their score is -1, or what it would be.
+        Pixels to sweep; the score of other pixels may be -1.
     others : sequence of n Tensor [h, w] float32
-        Each has its own size.
+        Other images, each of its own size.
     turned, moved : Tensor [n, 3, 3], [n, 3] float32
-        A pixel (x, y, 1) at depth z is shown by an other at ``z turned (x, y, 1) + moved``, homogeneous.
+        Another image shows pixel (x, y, 1) at depth z at ``z turned (x, y, 1) + moved``, homogeneous.
     depths : Tensor [D] float32, world units
     radius : int
-        Patches are of 2 radius + 1 pixels a side; images are mirrored at their edges.
+        Patches have 2 radius + 1 pixels per side; images are mirrored at their edges.
     noise : float
-        Variance that is no texture: added to both sides of the NCC.
+        Variance of image noise, added to both variances of the NCC.
     """
     library = library_for(image)
     if library is None or library.dtype != torch.float32:
@@ -86,7 +87,7 @@ def sweep_planes(
     at = dict(zip(("image", "wanted", "turned", "moved", "depths"), (t.data_ptr() for t in inputs), strict=True))
     at |= {"best": best.data_ptr(), "plane": plane.data_ptr(), "before": before.data_ptr(), "after": after.data_ptr()}
     counts = {"height": height, "width": width, "planes": len(depths), "neighbours": len(images), "radius": radius}
-    arguments = _Arguments(**counts, **at, others=addresses.data_ptr(), sizes=sizes.data_ptr(), noise=noise)
+    arguments = _SweepArguments(**counts, **at, others=addresses.data_ptr(), sizes=sizes.data_ptr(), noise=noise)
     if not library.function("gs2d_sweep", ctypes.c_int, [ctypes.c_void_p])(ctypes.byref(arguments)):
         raise MemoryError("no memory for a plane sweep")
     return BestPlanes(best, plane.long(), before, after)

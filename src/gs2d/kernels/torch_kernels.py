@@ -1,4 +1,4 @@
-"""What the kernels do between two renderings, in plain torch: it judges them, and serves where there are none."""
+"""The training kernels besides rendering, in plain torch: the reference for the native ones, and the fallback."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["accumulate", "adam_step", "finite", "first_not_finite"]
 
 @torch.no_grad()
 def adam_step(updates: Sequence[AdamUpdate], *, beta1: float, beta2: float, eps: float) -> None:
-    """One Adam step of some attributes, in place, by torch's fused Adam; rows that are not trained are not written."""
+    """Run one Adam step on several attributes, in place, by torch's fused Adam; untrained rows are not written."""
     for update in updates:
         whole = (update.parameter, update.mean, update.square)
         rows = update.rows if update.trained is None else update.trained.nonzero().squeeze(1)  # [M]
@@ -41,7 +41,7 @@ def _adam(
     beta2: float,
     eps: float,
 ) -> None:
-    """Adam with bias correction, in place."""
+    """Apply Adam with bias correction, in place."""
     step = torch.tensor(float(update.step - 1), device=parameter.device)  # adam() adds one
     adam(
         [parameter],
@@ -63,7 +63,7 @@ def _adam(
 
 @torch.no_grad()
 def accumulate(signed: Tensor, absolute: Tensor, count: Tensor, signal: Tensor, radii: Tensor) -> None:
-    """Add the norms of the signal of the splats that were seen; they are counted (``kernels/densify_stats.py``)."""
+    """Add the norms of the signal of visible splats and count these splats (``kernels/densify_stats.py``)."""
     seen = radii > 0
     zero = torch.zeros_like(signed)
     signed += torch.where(seen, torch.linalg.vector_norm(signal[:, :2], dim=1), zero)
@@ -73,9 +73,9 @@ def accumulate(signed: Tensor, absolute: Tensor, count: Tensor, signal: Tensor, 
 
 
 def finite(tensor: Tensor) -> bool:
-    """Whether all of a tensor is finite: a sum costs one pass, and cannot be finite if a term is not.
+    """Whether all elements of a tensor are finite, judged by their sum: it is not finite if an element is not.
 
-    On the CPU numpy sums: it wakes no threads, which costs more than the sum where cores are busy.
+    On the CPU numpy computes the sum: waking threads would cost more than the sum on a busy machine.
     """
     detached = tensor.detach()
     if detached.device.type != "cpu":
@@ -85,5 +85,5 @@ def finite(tensor: Tensor) -> bool:
 
 
 def first_not_finite(tensors: Sequence[Tensor]) -> int | None:
-    """Return the number of the first tensor that holds a NaN or an infinity, None if all are finite."""
+    """Return the index of the first tensor with a NaN or an infinity, None if all are finite."""
     return next((number for number, tensor in enumerate(tensors) if not finite(tensor)), None)

@@ -30,20 +30,20 @@ __all__ = [
     "mark_on_cpu",
 ]
 
-VOXELS = 512  # of a block
-THREADS = 128  # of a CUDA block, fuse.cu
+VOXELS = 512  # per block
+THREADS = 128  # per CUDA block, fuse.cu
 
 
 @dataclass(frozen=True)
 class FusionOnHost:
-    """Volumes lie in the host's memory, and a native library adds to them."""
+    """Fusion by a native library, into volumes in host memory."""
 
     library: Library
 
 
 @dataclass(frozen=True)
 class FusionOnDevice:
-    """Volumes lie on a device while views are added to them."""
+    """Fusion by CUDA kernels, into volumes in device memory."""
 
     launcher: Launcher
     device: torch.device
@@ -84,19 +84,23 @@ def mark_on_cpu(
     end: np.ndarray,
     marks: np.ndarray,
 ) -> None:
-    """Mark the blocks near samples ``start + (depth + offset) rays`` that lie in the grid.
+    """Mark the blocks of the grid near the samples ``start + (depth + offset) rays``.
+
+    All positions are in halves of a block.
 
     Parameters
     ----------
     library : Library
     rays : ndarray [3, P] float64
-        In halves of a block for a depth of 1 world unit, as all places here are.
+        Ray directions, per world unit of depth.
     depth : ndarray [P] float64 world units
     offsets : ndarray [S] float64 world units
-    start, end : ndarray [3]
-        Of the rays; of the grid, which begins at 0.
+    start : ndarray [3]
+        Origin of the rays.
+    end : ndarray [3]
+        End of the grid, which begins at 0.
     marks : ndarray [X, Y, Z] bool
-        With a border of one block all round; changed.
+        Includes a border of one block on all sides; changed in place.
     """
     rays, depth, offsets = (np.ascontiguousarray(a, np.float64) for a in (rays, depth, offsets))
     arguments = MarkArguments(
@@ -116,12 +120,10 @@ def mark_on_cpu(
 def arguments_of(
     size: tuple[int, int], truncation: float, arrays: dict[str, np.ndarray | None] | dict[str, Tensor | None]
 ) -> FuseArguments:
-    """Arguments for a depth map of ``size`` (height, width); ``arrays`` are named as the fields, and must outlive them.
+    """Return the arguments for a depth map of ``size`` (height, width).
 
-    Raises
-    ------
-    ShapeError
-        Arrays that are not contiguous, or not float32 (``rows``: int64).
+    ``arrays`` has the names of the fields. The arrays must be contiguous float32 (``rows``: int64) and outlive the
+    result.
     """
     rows = arrays["rows"]
     assert rows is not None
@@ -141,12 +143,12 @@ def arguments_of(
 
 
 def fuse_on_cpu(library: Library, arguments: FuseArguments) -> None:
-    """Add the view, on the threads that the library was told to use.
+    """Fuse the depth map, with the library's number of threads.
 
     Raises
     ------
     BackendError
-        The library's arithmetic is in float64: it cannot read the arrays.
+        If the library computes in float64.
     """
     if library.dtype.itemsize != 4:
         raise BackendError(
@@ -156,5 +158,5 @@ def fuse_on_cpu(library: Library, arguments: FuseArguments) -> None:
 
 
 def fuse_on_gpu(launcher: Launcher, arguments: FuseArguments) -> None:
-    """Add the view: one launch on the current stream."""
+    """Fuse the depth map: one launch on the current stream."""
     launcher.launch("fuse_voxels", arguments.blocks * (VOXELS // THREADS), THREADS, arguments)

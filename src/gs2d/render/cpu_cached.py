@@ -1,9 +1,9 @@
-"""Cached views of the native CPU backend: geometry and opacity are frozen, and only some splats' colours learn.
+"""Cached views of the native CPU backend, for training in which only the colours of some splats change.
 
-Then the image is affine in those colours, ``color = frozen + sum_k w_k max(0, c_k)``. A :class:`CachedView` keeps the
-frozen image and every weight w_k > 0 of one view; rendering it and its gradients never blend again. The weights are
-those of the blending, bit for bit; images equal :func:`gs2d.render.api.rasterize` to the rounding of another order of
-sums, and are bit-identical for any number of threads (``docs/math.md``, "Cached views").
+With frozen geometry and opacity the image is affine in those colours, ``color = frozen + sum_k w_k max(0, c_k)``. A
+:class:`CachedView` stores the frozen image and every weight w_k > 0 of one view, so rendering and gradients need no
+blending. The weights have the bits of the blending. Images equal those of :func:`gs2d.render.api.rasterize` up to the
+summation order, and do not depend on the number of threads (``docs/math.md``, "Cached views").
 """
 
 from __future__ import annotations
@@ -20,7 +20,14 @@ from gs2d.core.checks import check_shapes
 from gs2d.core.splats import Splats
 from gs2d.errors import ShapeError
 from gs2d.kernels.library import Library, ready_library
-from gs2d.render.cpu_backend import _address, _check_tensors, _forward, _ParameterGradients, _parameters, _view
+from gs2d.render.native_rasterizer import (
+    ParameterGradients,
+    address_of,
+    check_tensors,
+    parameters_of,
+    render_forward,
+    view_of,
+)
 from gs2d.render.types import RasterSettings
 
 __all__ = ["CachedView", "cache_view"]
@@ -42,12 +49,12 @@ class _CachedView(ctypes.Structure):
 
 
 class CachedView:
-    """One view for splats of which only the colours of some rows change.
+    """One view of splats of which only the colours of some rows change.
 
     Attributes
     ----------
     arrays : dict of name to Tensor
-        What ``struct CachedView`` points to; the layout belongs to the library's instruction set.
+        Arrays of ``struct CachedView``; their layout depends on the library's instruction set.
     height, width : int
     rows : int
         M, the number of splats whose colours change.
@@ -61,7 +68,7 @@ class CachedView:
         self.rows, self.arrays = rows, arrays
         tiles_x = -(-self.width // TILE)
         numbers = (self.width, self.height, tiles_x, len(arrays["tile_entries"]) - 1, rows, degree)
-        self._native = _CachedView(*numbers, *(_address(arrays[name]) for name in ARRAYS))
+        self._native = _CachedView(*numbers, *(address_of(arrays[name]) for name in ARRAYS))
 
     @property
     def nbytes(self) -> int:
@@ -79,20 +86,16 @@ class CachedView:
         Raises
         ------
         ShapeError
-            Another number of rows or of coefficients than the view was made for, or another dtype.
+            If the number of rows or coefficients or the dtype differ from the cached ones.
         """
         check_shapes({"sh0": (sh0, "M 1 3"), "shN": (shN, "M K 3")})
         degree = int(self._native.degree)
         if len(sh0) != self.rows or shN.shape[1] + 1 < (degree + 1) ** 2:
             raise ShapeError(
                 f"the cached view holds {self.rows} rows of degree {degree}, got {len(sh0)} rows with "
-                f"{1 + shN.shape[1]} coefficients; make it anew with cache_view"
+                f"{1 + shN.shape[1]} coefficients; create it again with cache_view"
             )
-        for name, tensor in (("sh0", sh0), ("shN", shN)):
-            if tensor.dtype != self.library.dtype or tensor.device.type != "cpu":
-                raise ShapeError(
-                    f"{name} must be {self.library.dtype} on the CPU, got {tensor.dtype} on {tensor.device}"
-                )
+        self.library.arrays(sh0=sh0, shN=shN)
         image: Tensor = _Render.apply(self, sh0, shN)
         return image
 
@@ -100,20 +103,20 @@ class CachedView:
         """Return the image and the rows' colours [M, 4]."""
         image = torch.empty(self.height, self.width, 3, dtype=sh0.dtype)
         colors = torch.empty(self.rows, 4, dtype=sh0.dtype)
-        splats = _parameters((sh0, sh0, sh0, sh0, sh0, shN))  # only the coefficients are read
+        splats = parameters_of((sh0, sh0, sh0, sh0, sh0, shN))  # only the coefficients are read
         render = self.library.function("gs2d_cached_render", None, [ctypes.c_void_p] * 4)
-        render(ctypes.byref(self._native), ctypes.byref(splats), _address(colors), _address(image))
+        render(ctypes.byref(self._native), ctypes.byref(splats), address_of(colors), address_of(image))
         return image, colors
 
     def _gradients(self, upstream: Tensor, colors: Tensor, shN: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradients of sh0 and shN from that of the image."""
+        """Return the gradients of sh0 and shN from the gradient of the image."""
         sh0_gradient = torch.empty(self.rows, 1, 3, dtype=shN.dtype)
         shN_gradient = torch.empty_like(shN)
         slots = torch.empty(len(self.arrays["entry_row"]), 4, dtype=shN.dtype)
-        out = _ParameterGradients(sh0=_address(sh0_gradient), shN=_address(shN_gradient))
+        out = ParameterGradients(sh0=address_of(sh0_gradient), shN=address_of(shN_gradient))
         types = [*[ctypes.c_void_p] * 3, ctypes.c_int64, *[ctypes.c_void_p] * 2]
         gradients = self.library.function("gs2d_cached_gradients", None, types)
-        given = (_address(upstream), _address(colors), shN.shape[1], _address(slots))
+        given = (address_of(upstream), address_of(colors), shN.shape[1], address_of(slots))
         gradients(ctypes.byref(self._native), *given, ctypes.byref(out))
         return sh0_gradient, shN_gradient
 
@@ -142,7 +145,7 @@ def cache_view(
     limit_bytes: int,
     library: Library | None = None,
 ) -> CachedView | None:
-    """Cache one view for splats of which only the colours of ``rows`` change.
+    """Cache one view of splats of which only the colours of ``rows`` change.
 
     Parameters
     ----------
@@ -154,33 +157,33 @@ def cache_view(
         Rows whose colours change, each once.
     limit_bytes : int
     library : Library, optional
-        By default this machine's best, on as many threads as torch uses.
+        Default: ``ready_library()``.
 
     Returns
     -------
     CachedView or None
-        None where it would take more than ``limit_bytes``, which depends on nothing but the arguments.
+        None if it exceeds ``limit_bytes``; its size depends only on the arguments.
 
     Raises
     ------
     ShapeError, BackendError
-        As for :func:`gs2d.render.cpu_backend.rasterize`.
+        As for :func:`gs2d.render.native_rasterizer.rasterize`.
     """
     library = library or ready_library()
-    _check_tensors(splats, settings, library.dtype)
+    check_tensors(splats, settings, library.dtype)
     if settings.sh_degree < 0:
         raise ShapeError("a cached view needs colours from harmonics, got plain colours (sh_degree -1)")
     height, width, count = camera.height, camera.width, len(rows)
-    view = _view(camera, settings, True)
+    view = view_of(camera, settings, True)
     tensors = [t.detach().contiguous() for _, t in splats.items()]
-    frame = _forward(library, view, tensors)[-1]
+    frame = render_forward(library, view, tensors)[-1]
     row_of = torch.full((len(splats),), -1, dtype=torch.int32)
     row_of[rows] = torch.arange(count, dtype=torch.int32)
 
     tiles = -(-width // TILE) * -(-height // TILE)
     tile_entries, tile_blocks = (torch.empty(tiles + 1, dtype=torch.int64) for _ in range(2))
     measure = library.function("gs2d_cached_measure", None, [ctypes.c_void_p] * 4)
-    measure(frame.pointer, *(_address(t) for t in (row_of, tile_entries, tile_blocks)))
+    measure(frame.pointer, *(address_of(t) for t in (row_of, tile_entries, tile_blocks)))
     entries, blocks = int(tile_entries[-1]), int(tile_blocks[-1])
     sizes: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
         "entry_row": ((entries,), torch.int32),
@@ -199,5 +202,5 @@ def cache_view(
     cached = CachedView(library, (height, width), settings.sh_degree, count, arrays)
     fill = library.function("gs2d_cached_fill", None, [ctypes.c_void_p] * 4)
     learning = [t[rows] for t in tensors]
-    fill(frame.pointer, _address(row_of), ctypes.byref(_parameters(learning)), ctypes.byref(cached._native))
+    fill(frame.pointer, address_of(row_of), ctypes.byref(parameters_of(learning)), ctypes.byref(cached._native))
     return cached

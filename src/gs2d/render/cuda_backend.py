@@ -1,301 +1,191 @@
-"""The cuda backend: the passes of the CUDA kernels as one differentiable torch function of a launcher.
-
-A launcher runs a kernel by name: on a GPU it hands the structure to the driver on torch's current stream; the tests'
-one runs the same sources on the CPU. Everything else (memory, sorts, order) is the same for both.
-"""
+"""The cuda backend: the CUDA kernels on NVIDIA GPUs."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any
+from collections.abc import Callable, Sequence
+from functools import cache, partial
+from typing import Any, Self, TypeVar
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
-from torch.nn.functional import pad
 
 from gs2d.core.camera import Camera
-from gs2d.core.splats import ATTRIBUTES, IMAGES, Splats
-from gs2d.errors import ShapeError
-from gs2d.kernels.cuda import launch
-from gs2d.kernels.cuda.kernel_arguments import View
-from gs2d.kernels.cuda.launch import Launcher
-from gs2d.render.cuda_passes import (
-    CHANNELS,
-    DEPTH,
-    ForwardState,
-    Wanted,
-    backward,
-    blend_features,
-    errors,
-    forward,
-)
-from gs2d.render.cuda_passes import view_of as _view
+from gs2d.core.splats import Splats
+from gs2d.errors import BackendError
+from gs2d.kernels import torch_kernels
+from gs2d.kernels.cuda import cuda_adam, cuda_losses, cuda_multiview, diagnose, launch
+from gs2d.kernels.native_adam import AdamUpdate
+from gs2d.kernels.native_losses import LossOperations
+from gs2d.kernels.tsdf import FusionOnDevice
+from gs2d.render.backends import Backend, BackendStatus, register_backend
+from gs2d.render.cuda_rasterizer import CudaChoices, rasterize_with, splat_errors_with
+from gs2d.render.cuda_step import Stepper
 from gs2d.render.pair_budget import PairBudget
-from gs2d.render.types import PLAIN_COLORS, Features, RasterSettings, RenderOutput
+from gs2d.render.types import Features, RasterSettings, RenderOutput
+from gs2d.render.whole_step import WholeStep
 
-__all__ = ["CudaChoices", "rasterize", "rasterize_with", "splat_errors", "splat_errors_with"]
+__all__ = ["CudaBackend"]
 
-
-def _check_tensors(splats: Splats, settings: RasterSettings) -> None:
-    """Refuse what would make a kernel read beyond its arrays."""
-    for name, tensor in splats.items():
-        if tensor.dtype != torch.float32 or tensor.device != splats.device:
-            raise ShapeError(
-                f"{name} must be float32 on {splats.device} for the cuda backend, got {tensor.dtype} on {tensor.device}"
-            )
-    if not PLAIN_COLORS <= settings.sh_degree <= 3 or (settings.sh_degree + 1) ** 2 > 1 + splats.shN.shape[1]:
-        raise ShapeError(
-            f"sh_degree must be -1 to 3 and within the stored coefficients ({1 + splats.shN.shape[1]}), "
-            f"got {settings.sh_degree}"
-        )
+T = TypeVar("T")
 
 
-@dataclass(frozen=True, eq=False)
-class CudaChoices:
-    """How the CUDA kernels render.
+@register_backend("cuda")
+class CudaBackend(Backend):
+    """The CUDA kernels.
 
-    Attributes
-    ----------
-    exact_masks : bool
-        False turns off culling inside tiles; the image must not change by a bit (tests).
-    deterministic : bool or None
-        The same gradients bit for bit from run to run. Costs one more pass and 320 bytes for each pair of splat and
-        tile, and 16 more bytes for each further channel. None: as torch.use_deterministic_algorithms says.
-    budget : PairBudget or None
-        Instead of waiting for the number of pairs of splat and tile; the caller looks whether it was enough.
-    """
-
-    exact_masks: bool = True
-    deterministic: bool | None = None
-    budget: PairBudget | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class _Options:
-    """What _Rasterize takes besides the tensors that have gradients."""
-
-    launcher: Launcher
-    view: View
-    exact_masks: bool
-    distortion: bool
-    transmittance: bool
-    deterministic: bool
-    learns: Tensor | None
-    budget: PairBudget | None
-    background: Tensor | None  # of further channels
-
-
-def _image_names(transmittance: bool) -> tuple[str, ...]:
-    return (*IMAGES, "depth_transmittance") if transmittance else IMAGES
-
-
-SAVED = tuple(field.name for field in fields(ForwardState) if field.name not in ("view", "images"))
-
-
-class _Rasterize(torch.autograd.Function):
-    """Images and radii from the six parameter tensors.
-
-    With further channels ``values`` [N, F] the colours are [H, W, 3 + F].
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        options: _Options,
-        probe: Tensor | None,
-        intrinsics: Tensor | None,
-        values: Tensor | None,
-        *parameters: Tensor,
-    ) -> tuple[Tensor, ...]:
-        tensors = [p.detach().contiguous() for p in parameters]
-        launcher, view = options.launcher, options.view
-        choices = {
-            "exact": options.exact_masks,
-            "distortion": options.distortion,
-            "transmittance": options.transmittance,
-        }
-        frame = forward(launcher, view, tensors, **choices, budget=options.budget)
-        features, color = None, frame.images["color"]
-        if values is not None and options.background is not None:
-            count = values.shape[1]
-            values = pad(values.detach(), (0, len(options.background) - count))
-            features = blend_features(launcher, frame, values, options.background)
-            color = torch.cat([color, features[:count].permute(1, 2, 0)], dim=2)
-        if any(ctx.needs_input_grad):
-            # The images returned to the user may be changed in place: save_for_backward would notice, a plain
-            # attribute would not. The rest is nobody else's.
-            ctx.options = options
-            ctx.probe_shape = None if probe is None else tuple(probe.shape)
-            ctx.channels = 0 if options.background is None else count
-            ctx.of_intrinsics = None if intrinsics is None else intrinsics.detach()  # for its dtype and device
-            ctx.save_for_backward(
-                values, features, *(getattr(frame, name) for name in SAVED), *frame.images.values(), *tensors
-            )
-            ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(frame.radii)
-        names = _image_names(options.transmittance)
-        return (frame.radii, color, *(frame.images[name] for name in names[1:]))
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
-        options: _Options = ctx.options
-        values, features, *saved = ctx.saved_tensors
-        tensors = saved[-len(ATTRIBUTES) :]
-        images = dict(zip((*IMAGES, "final_T", "moments", *DEPTH), saved[len(SAVED) : -len(ATTRIBUTES)], strict=True))
-        hidden = dict(zip(SAVED, saved[: len(SAVED)], strict=True))
-        frame = ForwardState(view=options.view, images=images, **hidden)
-        given = [None if g is None else g.detach().to(torch.float32).contiguous() for g in upstream[1:]]
-        if not options.distortion:
-            given[IMAGES.index("distortion")] = None  # a constant
-        of_features = None
-        if values is not None and given[0] is not None:
-            filled = (0, values.shape[1] + 3 - given[0].shape[2])
-            of_features = pad(given[0][..., 3:], filled).permute(2, 0, 1).contiguous()
-            given[0] = given[0][..., :3].contiguous()
-        want_probe, want_intrinsics, want_values, *want = ctx.needs_input_grad[1:]
-        gradients = {
-            name: torch.empty_like(t) if w else None for name, t, w in zip(ATTRIBUTES, tensors, want, strict=True)
-        }
-        device = tensors[0].device
-        probe = torch.empty(ctx.probe_shape, dtype=torch.float32, device=device) if want_probe else None
-        each = torch.zeros(len(tensors[0]), 4, dtype=torch.float32, device=device) if want_intrinsics else None
-        wanted = Wanted({**gradients, "probe": probe, "intrinsics": each}, options.learns, options.deterministic)
-        by_name = {"depth_transmittance": None} | dict(zip(_image_names(options.transmittance), given, strict=True))
-        to_values = torch.zeros_like(values) if want_values or of_features is not None else None
-        further: Any = None if of_features is None else (values, options.background, features, of_features, to_values)
-        backward(options.launcher, frame, tensors, by_name, wanted, further)
-        total = None if each is None else each.sum(dim=0, dtype=torch.float64).to(ctx.of_intrinsics)
-        to_values = None if to_values is None else to_values[:, : ctx.channels]
-        return None, probe, total, to_values, *gradients.values()
-
-
-def rasterize_with(
-    launcher: Launcher,
-    splats: Splats,
-    camera: Camera,
-    settings: RasterSettings,
-    screen_probe: Tensor | None = None,
-    gradient_rows: Tensor | None = None,
-    *,
-    features: Features | None = None,
-    choices: CudaChoices = CudaChoices(),
-) -> RenderOutput:
-    """Render one view with the CUDA kernels; the contract is in :mod:`gs2d.render.api`.
-
-    Images are deterministic. Gradients are sums by atomic additions, so that their last digits vary from run to run on
-    a GPU, unless ``deterministic``. Where only ``sh0`` and ``shN`` have gradients a shorter backward pass runs.
+    Training does not wait for the device: instead of reading the number of pairs of splat and tile, a rendering
+    reserves memory for a quarter more than the largest number so far (:class:`PairBudget`). An iteration that needed
+    more changes nothing and is repeated.
 
     Parameters
     ----------
-    launcher : Launcher
-        Runs the kernels; it decides on which device the tensors must be.
-    splats : Splats
-        float32.
-    camera : Camera
-    settings : RasterSettings
-    screen_probe : Tensor [N, 2] or [N, 4], optional
-        Zeros; its gradient is the densification signal.
-    gradient_rows : Tensor [N] bool, optional
-        Gradients are wanted of these splats only; all others get zeros.
-    features : Features, optional
-        Further channels; without ``gradient_rows`` and depth by transmittance.
-    choices : CudaChoices
-
-    Raises
-    ------
-    ShapeError
-        If a tensor is not float32, or sh_degree needs more coefficients than there are.
-    BackendError
-        If there are too many splats or pairs, or a setting is one of the reference backend only.
+    budget : PairBudget, optional
+        None: each rendering waits for its number of pairs.
     """
-    _check_tensors(splats, settings)
-    if gradient_rows is not None:
-        found = (tuple(gradient_rows.shape), gradient_rows.dtype, gradient_rows.device)
-        if found != ((len(splats),), torch.bool, splats.device):
-            raise ShapeError(f"gradient_rows must be bool [{len(splats)}] on {splats.device}, got {found}")
-        gradient_rows = gradient_rows.clone()  # whatever happens to it before the backward pass
-    deterministic = choices.deterministic
-    if deterministic is None:
-        deterministic = torch.are_deterministic_algorithms_enabled()
-    transmittance = settings.with_transmittance_depth
-    chosen = (choices.exact_masks, settings.with_distortion, transmittance, deterministic)
-    values = background = None
-    if features is not None:
-        values, background = features.values, features.background.detach()
-        background = pad(background, (0, -len(background) % CHANNELS))
-    options = _Options(launcher, _view(camera, settings), *chosen, gradient_rows, choices.budget, background)
-    learning = (screen_probe, camera.intrinsics, values)
-    radii, *images = _Rasterize.apply(options, *learning, *(t for _, t in splats.items()))
-    return RenderOutput(**dict(zip(_image_names(transmittance), images, strict=True)), radii=radii)
 
+    name = "cuda"
+    device = "cuda"
 
-def rasterize(
-    splats: Splats,
-    camera: Camera,
-    settings: RasterSettings,
-    screen_probe: Tensor | None = None,
-    gradient_rows: Tensor | None = None,
-    *,
-    budget: PairBudget | None = None,
-    features: Features | None = None,
-) -> RenderOutput:
-    """:func:`rasterize_with` on the device on which the splats lie, on torch's current stream there."""
-    launcher = launch.launcher_for(splats.device)
-    given = (splats, camera, settings, screen_probe, gradient_rows)
-    return rasterize_with(launcher, *given, features=features, choices=CudaChoices(budget=budget))
+    def __init__(self, budget: PairBudget | None = None) -> None:
+        self._budget = budget
+        self._last: tuple[Callable[[], Any], Callable[[], None]] | None = None  # the iteration that may be repeated
+        self._stepper: Stepper | None = None
 
+    @classmethod
+    def ready(cls) -> Self:
+        """Return the backend, or raise BackendError with the first thing that this machine lacks."""
+        return _ready(cls)
 
-def splat_errors_with(
-    launcher: Launcher,
-    splats: Splats,
-    camera: Camera,
-    image: Tensor,
-    settings: RasterSettings,
-    mask: Tensor | None = None,
-    occlusion: bool = False,
-) -> Tensor:
-    """Inner sum of the paper's E_i for one view [N]; rule 17 of the contract. Deterministic.
+    def rasterize(
+        self,
+        splats: Splats,
+        camera: Camera,
+        settings: RasterSettings,
+        screen_probe: Tensor | None = None,
+        gradient_rows: Tensor | None = None,
+    ) -> RenderOutput:
+        """Render one view on the device of the splats."""
+        view = (splats, camera, settings, screen_probe, gradient_rows)
+        return rasterize_with(launch.launcher_for(splats.device), *view, choices=CudaChoices(budget=self._budget))
 
-    Parameters
-    ----------
-    launcher, splats, camera, settings
-        As for :func:`rasterize_with`.
-    image : Tensor [H, W, 3] float32
-    mask : Tensor [H, W] bool, optional
-        False = ignore.
-    occlusion : bool
-        A pixel counts until it has stopped at or before the splat; an error of more than 1e9 in 8x8 pixels counts 1e9.
+    def rasterize_features(
+        self,
+        splats: Splats,
+        camera: Camera,
+        settings: RasterSettings,
+        features: Features,
+        screen_probe: Tensor | None = None,
+    ) -> RenderOutput:
+        """Render one view with further channels."""
+        launcher, choices = launch.launcher_for(splats.device), CudaChoices(budget=self._budget)
+        return rasterize_with(launcher, splats, camera, settings, screen_probe, features=features, choices=choices)
 
-    Raises
-    ------
-    ShapeError, BackendError
-        As for :func:`rasterize_with`; also for an image or a mask of another shape or dtype.
-    """
-    _check_tensors(splats, settings)
-    size = (camera.height, camera.width)
-    if tuple(image.shape) != (*size, 3) or image.dtype != torch.float32 or image.device != splats.device:
-        raise ShapeError(
-            f"image must be {[*size, 3]} float32 on {splats.device}, got {list(image.shape)} {image.dtype} "
-            f"on {image.device}"
+    def splat_errors(
+        self,
+        splats: Splats,
+        camera: Camera,
+        image: Tensor,
+        settings: RasterSettings,
+        mask: Tensor | None = None,
+        occlusion: bool = False,
+    ) -> Tensor:
+        """Return the summed colour error of each splat [N]."""
+        launcher = launch.launcher_for(splats.device)
+        return splat_errors_with(launcher, splats, camera, image, settings, mask, occlusion)
+
+    def loss_operations(self, device: torch.device) -> LossOperations:
+        """Return the fused operations for the losses; caching the local mean of a target would save no time."""
+        launcher = launch.launcher_for(device)
+        return LossOperations(
+            partial(cuda_losses.photometric, launcher=launcher),
+            partial(cuda_losses.normal_consistency, launcher=launcher),
+            partial(cuda_losses.masked_mean, launcher=launcher),
+            compare_views=partial(cuda_multiview.compare_views, launcher=launcher),
         )
-    if mask is not None and (tuple(mask.shape) != size or mask.dtype != torch.bool or mask.device != splats.device):
-        raise ShapeError(
-            f"mask must be {list(size)} bool on {splats.device}, got {list(mask.shape)} {mask.dtype} on {mask.device}"
-        )
-    parameters = [t.detach().contiguous() for _, t in splats.items()]
-    image, mask = image.detach().contiguous(), None if mask is None else mask.contiguous()
-    return errors(launcher, _view(camera, settings), parameters, image, mask, occlusion)
+
+    def fusion(self) -> FusionOnDevice:
+        """Return what fuses depth maps into volumes."""
+        device = torch.device(self.device)
+        return FusionOnDevice(launch.launcher_for(device), device)
+
+    def for_training(self) -> CudaBackend:
+        """Return a backend with a budget; torch's memory segments may grow from now on."""
+        launch.grow_in_place()
+        return type(self)(PairBudget())
+
+    def iterate(self, update: Callable[[], T], *, rollback: Callable[[], None], exact: bool) -> T:
+        """Run an iteration; first repeat the previous one if it lacked pairs."""
+        budget = self._budget
+        if budget is None:
+            return update()
+        if self._last is not None and budget.overflowed():
+            again, undo = self._last
+            undo()
+            budget.exact = True
+            again()
+        budget.exact = exact
+        self._last = update, rollback
+        return update()
+
+    def takes_whole_steps(self) -> bool:
+        """Whether this is an iteration of a training whose results are not read afterwards."""
+        budget = self._budget
+        if budget is None:
+            return False
+        if budget.exact and self._stepper is not None:
+            self._stepper.release()
+        return not budget.exact and not torch.are_deterministic_algorithms_enabled()
+
+    def step(self, step: WholeStep) -> bool:
+        """Run an iteration with kernels alone (:mod:`gs2d.render.cuda_step`)."""
+        if self._budget is None or not self.takes_whole_steps():
+            return False
+        if self._stepper is None:
+            launch.steps()  # refuses an unknown value before anything is done
+            device = step.splats.device
+            self._stepper = Stepper(launch.launcher_for(device), device)
+        return self._stepper.run(step, self._budget)
+
+    def _overflow(self) -> Tensor | None:
+        """Return whether a rendering of this iteration lacks pairs, [] int32 on the device; None: none can."""
+        return None if self._budget is None else self._budget.overflow
+
+    def adam_step(self, updates: Sequence[AdamUpdate], *, beta1: float, beta2: float, eps: float) -> None:
+        """Run one Adam step on several attributes in one launch."""
+        if not updates:
+            return
+        launcher = launch.launcher_for(updates[0].parameter.device)
+        betas = {"beta1": beta1, "beta2": beta2, "eps": eps}
+        cuda_adam.adam_step(updates, **betas, launcher=launcher, skip=self._overflow())
+
+    def accumulate(self, signed: Tensor, absolute: Tensor, count: Tensor, signal: Tensor, radii: Tensor) -> None:
+        """Add a densification signal."""
+        overflow = self._overflow()
+        visible = radii if overflow is None else radii * (1 - overflow)
+        torch_kernels.accumulate(signed, absolute, count, signal, visible)
+
+    def assign(self, target: Tensor, value: Tensor) -> None:
+        """Copy a value into a tensor."""
+        overflow = self._overflow()
+        target.copy_(value if overflow is None else torch.where(overflow != 0, target, value))
+
+    def is_whole(self) -> bool:
+        """Whether the images of this iteration are complete; waits for the device."""
+        overflow = self._overflow()
+        return overflow is None or int(overflow) == 0
+
+    @classmethod
+    def status(cls) -> BackendStatus:
+        """Return the line for ``gs2d doctor``."""
+        lacking, words = diagnose.report()
+        if lacking is None:
+            return BackendStatus(cls.name, True, "", "", words)
+        return BackendStatus(cls.name, False, lacking.reason, lacking.remedy, "")
 
 
-def splat_errors(
-    splats: Splats,
-    camera: Camera,
-    image: Tensor,
-    settings: RasterSettings,
-    mask: Tensor | None = None,
-    occlusion: bool = False,
-) -> Tensor:
-    """:func:`splat_errors_with` on the device on which the splats lie."""
-    return splat_errors_with(launch.launcher_for(splats.device), splats, camera, image, settings, mask, occlusion)
+@cache  # the machine is examined once; an error is not cached
+def _ready(kind: type[Any]) -> Any:
+    lacking, _ = diagnose.report()
+    if lacking is not None:
+        raise BackendError(f"backend 'cuda' cannot run: {lacking.reason}; {lacking.remedy}")
+    return kind()

@@ -29,7 +29,7 @@ from gs2d.kernels.cuda.sort import (
     passes_of,
     pieces_of,
 )
-from gs2d.kernels.native_adam import bias_corrections_of
+from gs2d.kernels.native_adam import bias_corrections
 from gs2d.render.cuda_passes import CAMERA_BYTES, MAX_SPLATS, PROJECTED, view_of
 from gs2d.render.cuda_works import (
     THREADS,
@@ -406,7 +406,7 @@ class _Adam:
         beta1, beta2, _ = step.betas
         for name, slot in self._slots.items():
             one = step.learned[name]
-            slot.step_size, slot.root_2 = bias_corrections_of(one.rate, one.step, beta1, beta2)
+            slot.step_size, slot.root_2 = bias_corrections(one.rate, one.step, beta1, beta2)
 
 
 class _Plan:

@@ -1,10 +1,10 @@
-"""The exposure and white balance of a photograph: an affine transform of colour, 12 numbers.
+"""Exposure and white balance of a photograph: an affine colour transform of 12 numbers.
 
-What a camera on automatic does to the colours c of a scene is taken to be A c + b, A a 3x3 matrix (gains of the
-channels on its diagonal) and b an offset; ``transform`` [3, 4] is [A | b]. Formulas: docs/math.md, "Exposure".
+A camera with automatic exposure maps the scene's colour c to A c + b, with a 3x3 matrix A (channel gains on its
+diagonal) and an offset b. ``transform`` [3, 4] is [A | b]. Formulas: docs/math.md, "Exposure".
 
-A photograph with an alpha channel has no background of its own: the protocol's background is put behind photograph and
-rendering alike, after the camera. There the transform acts on what the photograph shows, and the background stays.
+A photograph with an alpha channel has no background of its own. The protocol's background is composited behind both
+photograph and rendering, after the camera: the transform changes the object's colours and not the background's.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from torch.autograd.function import once_differentiable
 
 from gs2d.core.checks import check_shapes
 from gs2d.kernels.library import library_for
-from gs2d.render import exposure_native as native
+from gs2d.render import native_image_ops as native
 
-RIDGE = 1e-4  # of a fit, per pixel: keeps what a picture says nothing about at the identity
+RIDGE = 1e-4  # per pixel: keeps what the pixels do not determine at the identity
 
 
 def identity(like: Tensor) -> Tensor:
-    """Return the transform [3, 4] that changes nothing, of the type and on the device of ``like``."""
+    """Return the identity transform [3, 4] with the dtype and device of ``like``."""
     return torch.eye(3, 4, dtype=like.dtype, device=like.device)
 
 
@@ -33,20 +33,20 @@ def expose(
     coverage: Tensor | None = None,
     background: Tensor | None = None,
 ) -> Tensor:
-    """Return a rendered picture as a camera with this transform would have taken it.
+    """Apply the transform of a camera to a rendered image.
 
-    With k = ``coverage`` (1 without one) and B = ``background``: A (C - (1 - k) B) + k b + (1 - k) B. On a CPU, in
-    float32, the bits of picture and gradients do not depend on the number of threads.
+    With k = ``coverage`` (default 1) and B = ``background``: A (C - (1 - k) B) + k b + (1 - k) B. On the CPU in float32
+    the bits of the image and its gradients do not depend on the number of threads.
 
     Parameters
     ----------
     color : Tensor [H, W, 3]
-        Over the background; not clamped.
+        Rendered over the background; not clamped.
     transform : Tensor [3, 4]
     coverage : Tensor [H, W], optional
-        Alpha in [0, 1] of what the camera saw; without it the whole picture. Not differentiated.
+        Alpha in [0, 1] of the object; without it, the object covers the image. Not differentiated.
     background : Tensor [3], optional
-        Needed with ``coverage``.
+        Required with ``coverage``.
 
     Returns
     -------
@@ -74,18 +74,18 @@ class _Expose(torch.autograd.Function):
         ctx.library = library_for(color)
         arguments = (color, transform, coverage, background)
         ctx.save_for_backward(*arguments)
-        return _exposed(*arguments) if ctx.library is None else native.exposed(ctx.library, *arguments)
+        return _exposed(*arguments) if ctx.library is None else native.expose(ctx.library, *arguments)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         arguments = (upstream, *ctx.saved_tensors)
-        gradients = _gradients(*arguments) if ctx.library is None else native.gradients(ctx.library, *arguments)
+        gradients = _gradients(*arguments) if ctx.library is None else native.expose_vjp(ctx.library, *arguments)
         return (*gradients, None, None)
 
 
 def _exposed(color: Tensor, transform: Tensor, coverage: Tensor | None, background: Tensor | None) -> Tensor:
-    """Return the image; by torch."""
+    """Return the exposed image, computed by torch."""
     if coverage is None or background is None:
         return _apply(color, transform[:, :3]) + transform[:, 3]
     behind = (1 - coverage[..., None]) * background.to(color.dtype)
@@ -99,7 +99,7 @@ def _gradients(
     coverage: Tensor | None,
     background: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """Those of ``color`` and ``transform``; by torch."""
+    """Return the gradients of ``color`` and ``transform``, computed by torch."""
     light, weight = color, torch.ones_like(color[..., 0])
     if coverage is not None and background is not None:
         light, weight = color - (1 - coverage[..., None]) * background.to(color.dtype), coverage
@@ -108,7 +108,7 @@ def _gradients(
 
 
 def _apply(vectors: Tensor, matrix: Tensor) -> Tensor:
-    """``matrix @ v`` for each v of [H, W, 3]."""
+    """Return ``matrix @ v`` for each v of [H, W, 3]."""
     columns = [vectors[..., k : k + 1] * matrix[:, k] for k in range(3)]
     return columns[0].add_(columns[1]).add_(columns[2])
 
@@ -120,16 +120,16 @@ def fit_exposure(
     coverage: Tensor | None = None,
     background: Tensor | None = None,
 ) -> Tensor:
-    """Fit the transform [3, 4] that takes a rendered image nearest to a photograph (least squares, some pixels).
+    """Fit the transform [3, 4] from a rendered image to a photograph by least squares over some pixels.
 
-    A ridge of ``RIDGE`` a pixel towards the identity decides what the pixels leave open.
+    A ridge of ``RIDGE`` per pixel pulls the transform to the identity where the pixels do not determine it.
 
     Parameters
     ----------
     color, target : Tensor [H, W, 3]
         Rendering and photograph, over the background.
     pixels : Tensor [H, W] bool
-        Those that are looked at; without any the result is the identity.
+        Pixels to fit; without any, the result is the identity.
     coverage, background
         As for :func:`expose`.
     """

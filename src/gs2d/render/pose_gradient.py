@@ -1,8 +1,8 @@
-"""Gradients of a camera's pose, worked out of the gradients of the splats (rule 20; docs/math.md, "Camera").
+"""Gradient of a camera's pose from the gradients of the splats (rule 20; docs/math.md, "Camera").
 
-Moving the camera is moving all splats the other way. What a backend computes for the splats anyway therefore says what
-a rigid motion of the camera does, and no kernel knows of it. Two things are not carried along by such a motion: the
-directions of view dependent colours, and the normal image, which is in the world frame.
+Moving the camera is moving all splats the opposite way, so the gradients of the splats determine the gradient of a
+rigid motion of the camera, and no kernel computes it. Two parts do not move with the splats and are corrected: the
+directions of view-dependent colours, and the normal image, which is in the world frame.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from torch.autograd.function import once_differentiable
 from gs2d.core.sh import C0, num_coefficients, sh_basis
 from gs2d.core.splats import Splats
 from gs2d.kernels.library import library_for
-from gs2d.render import pose_gradient_native as native
+from gs2d.render import native_image_ops as native
 from gs2d.render.types import RenderOutput
 
 __all__ = ["attach_pose_grad", "normals_without_pose_grad", "pose_gradient", "with_world_normals"]
 
 
 def attach_pose_grad(splats: Splats, pose: Tensor, sh_degree: int) -> Splats:
-    """Return the same splats; what reaches their gradients also reaches that of the camera.
+    """Return the same splats; their gradients also reach the camera's pose.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def attach_pose_grad(splats: Splats, pose: Tensor, sh_degree: int) -> Splats:
     pose : Tensor [4, 4]
         T_cam_world, of any floating dtype and on any device.
     sh_degree : int
-        That is evaluated.
+        Evaluated degree.
     """
     moving = {"means": splats.means, "quats": splats.quats} | ({"sh0": splats.sh0} if sh_degree > 0 else {})
     tensors = _Carry.apply(pose, splats.shN.detach(), sh_degree, *moving.values())
@@ -41,21 +41,21 @@ def attach_pose_grad(splats: Splats, pose: Tensor, sh_degree: int) -> Splats:
 
 
 def with_world_normals(output: RenderOutput, pose: Tensor) -> RenderOutput:
-    """Let the camera's gradient know that normals stay in the world where splats would be turned; same images."""
+    """Return the same images; the pose gradient treats the normal image as fixed in the world frame."""
     normal = _TurnNormals.apply(pose, output.normal, -1.0)
     return replace(output, normal=normal, normal_without_pose_grad=output.normal)
 
 
 def normals_without_pose_grad(output: RenderOutput, pose: Tensor) -> Tensor:
-    """:func:`with_world_normals` undone: for a loss that compares them with other normals that turn with them."""
+    """Undo :func:`with_world_normals`, for a loss that compares normals with others that rotate with the camera."""
     before, now = output.normal_without_pose_grad, output.normal
     if before is not None and before.data_ptr() == now.data_ptr():
         return before
-    return _TurnNormals.apply(pose, now, 1.0)  # somebody has changed them since
+    return _TurnNormals.apply(pose, now, 1.0)  # a caller replaced the image
 
 
 class _Carry(torch.autograd.Function):
-    """Tensors of splats, unchanged."""
+    """Identity on tensors of splats, with a gradient for the pose."""
 
     @staticmethod
     def forward(ctx: Any, pose: Tensor, shN: Tensor, degree: int, *tensors: Tensor) -> tuple[Tensor, ...]:
@@ -71,7 +71,7 @@ class _Carry(torch.autograd.Function):
         if ctx.needs_input_grad[0]:
             force, torque = _wrench(pose, means, quats, shN, ctx.degree, gradients)
             if not bool(torch.isfinite(force).all() & torch.isfinite(torque).all()):
-                # What is not finite has zero gradients (rule 16), but NaN times zero is no zero.
+                # Splats that are not finite have zero gradients (rule 16), but NaN times zero is NaN.
                 means, quats, shN = (torch.where(tensor.isfinite(), tensor, 0.0) for tensor in (means, quats, shN))
                 force, torque = _wrench(pose, means, quats, shN, ctx.degree, gradients)
             to_pose = pose_gradient(pose, force, torque)
@@ -80,7 +80,7 @@ class _Carry(torch.autograd.Function):
 
 
 class _TurnNormals(torch.autograd.Function):
-    """The normal image, unchanged; ``sign`` times its torque goes to the camera."""
+    """Identity on the normal image; ``sign`` times its torque is added to the pose gradient."""
 
     @staticmethod
     def forward(ctx: Any, pose: Tensor, normal: Tensor, sign: float) -> Tensor:
@@ -95,7 +95,7 @@ class _TurnNormals(torch.autograd.Function):
         to_pose = None
         if ctx.needs_input_grad[0]:
             torque = ctx.sign * _turned(normal.reshape(-1, 3), gradient.reshape(-1, 3))
-            # without a force: the same about every point
+            # A torque without a force is the same about every point.
             to_pose = pose_gradient(pose, torch.zeros_like(torque), torque)
         return to_pose, gradient if ctx.needs_input_grad[1] else None, None
 
@@ -103,10 +103,7 @@ class _TurnNormals(torch.autograd.Function):
 def _wrench(
     pose: Tensor, means: Tensor, quats: Tensor, shN: Tensor, degree: int, gradients: tuple[Tensor, ...]
 ) -> tuple[Tensor, Tensor]:
-    """Return derivative by a shift [3] and by a turn about the camera's centre [3] of the scene, world axes, float64.
-
-    ``gradients`` are those of the means, of the quaternions and, where ``degree`` > 0, of ``sh0``.
-    """
+    """Return the wrench (``native_image_ops.Wrench``) of the gradients of means, quats and, for ``degree`` > 0, sh0."""
     T = pose.detach().double().cpu()
     center = -T[:3, :3].T @ T[:3, 3]
     library = library_for(means)
@@ -118,7 +115,7 @@ def _wrench(
     products = _products(quats, gradients[1])  # [4, 4]
     turned = (products[0, 1:] - products[1:, 0] + _axial(products[1:, 1:])) / 2
     torque = _turned(to_splats, gradients[0]) + turned
-    if degree > 0:  # a turn of the camera about its centre changes no direction in which a colour is seen
+    if degree > 0:  # rotating the camera about its centre changes no view direction
         weights = (shN[:, : num_coefficients(degree) - 1] * (gradients[2] / C0)).sum(dim=2)  # [N, K-1]
         values = sh_basis(torch.nn.functional.normalize(to_splats, dim=1), degree)[:, 1:]
         torque = torque - torch.einsum("akj,kj->a", turns_of_harmonics(degree), _products(weights, values))
@@ -128,10 +125,10 @@ def _wrench(
 @cache
 @torch.enable_grad()
 def turns_of_harmonics(degree: int) -> Tensor:
-    """L [3, K-1, K-1] float64: how the harmonics of degrees 1 to ``degree`` change where their argument turns.
+    """Return L [3, K-1, K-1] float64, the derivative of the harmonics of degrees 1 to ``degree`` by a rotation.
 
-    Y_k(g + w x g) = Y_k(g) + sum over axes a and harmonics j of w_a L_akj Y_j(g), for small w. The harmonics of one
-    degree turn into each other; the squares of all entries are multiples of 1/4.
+    Y_k(g + w x g) = Y_k(g) + sum over axes a and harmonics j of w_a L_akj Y_j(g), for small w. Harmonics of one degree
+    map to each other. L is fitted and then rounded: the squares of all entries are multiples of 1/4.
     """
     count = num_coefficients(degree) - 1
     generator = torch.Generator().manual_seed(0)
@@ -148,12 +145,11 @@ def turns_of_harmonics(degree: int) -> Tensor:
 
 
 def pose_gradient(pose: Tensor, force: Tensor, torque: Tensor) -> Tensor:
-    """Return the gradient [4, 4] of T_cam_world whose product with each rigid motion of the scene is the wrench's.
+    """Return the gradient [4, 4] of T_cam_world from the derivatives by a translation and a rotation of the scene.
 
-    ``force`` [3] and ``torque`` [3] about the camera's centre are derivatives by a shift and by a turn of the scene.
-
-    A scene that moves by x + w x (x - center) + v is T_cam_world (1 + [w]x, v - w x center): the smallest matrix with
-    the right products is R [torque about the origin]x / 2 beside R force.
+    ``force`` [3] is the derivative by a translation v, ``torque`` [3] by a rotation w about the camera centre. The
+    motion x + w x (x - center) + v changes T_cam_world to T_cam_world (1 + [w]x, v - w x center). The matrix of least
+    norm with the required inner products is R [torque about the origin]x / 2 next to R force.
     """
     T = pose.detach().double().cpu()
     R, t = T[:3, :3], T[:3, 3]
@@ -166,7 +162,7 @@ def pose_gradient(pose: Tensor, force: Tensor, torque: Tensor) -> Tensor:
 
 
 def _turned(vectors: Tensor, gradients: Tensor) -> Tensor:
-    """Return derivative by a turn [3] of vectors [N, 3], float64 on the CPU."""
+    """Return the derivative [3] by a rotation of vectors [N, 3], float64 on the CPU."""
     library = library_for(vectors)
     if library is not None:
         return native.wrench(library, vectors.new_zeros(3), vectors, gradients)[1]
@@ -174,10 +170,10 @@ def _turned(vectors: Tensor, gradients: Tensor) -> Tensor:
 
 
 def _axial(products: Tensor) -> Tensor:
-    """Sum of a x b [3] from the sums of a_i b_j [3, 3]."""
+    """Return the sum of a x b [3] from the sums of a_i b_j [3, 3]."""
     return torch.stack([products[i, j] - products[j, i] for i, j in ((1, 2), (2, 0), (0, 1))])
 
 
 def _products(left: Tensor, right: Tensor) -> Tensor:
-    """Sum over rows of left_i right_j [p, q], float64 on the CPU, of tensors [N, p] and [N, q]."""
+    """Return the sums over rows of left_i right_j [p, q] of tensors [N, p] and [N, q], float64 on the CPU."""
     return (left.T @ right).double().cpu()

@@ -13,7 +13,8 @@ from torch import Tensor
 from gs2d.config.recipe import LearningRates, Stage
 from gs2d.core.splats import ATTRIBUTES
 from gs2d.kernels.native_adam import AdamUpdate
-from gs2d.render.backends import PLAIN, Backend
+from gs2d.render.backends import Backend
+from gs2d.render.reference_backend import PLAIN
 from gs2d.training.state import Moments, TrainState
 
 

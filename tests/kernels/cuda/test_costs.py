@@ -74,7 +74,7 @@ def test_rows_that_begin_in_the_middle_of_sixteen_bytes_have_the_same_gradients(
     """A view of another tensor's rows is contiguous, and begins anywhere."""
     import numpy as np
 
-    from gs2d.render import cuda_backend as cuda
+    from gs2d.render import cuda_rasterizer as cuda
     from gs2d.render.types import RasterSettings
     from render_scenes import contraction, random_camera, random_cotangents, random_splats, requiring_grad
 

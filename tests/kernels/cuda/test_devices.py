@@ -26,9 +26,9 @@ ctypes.CDLL(sys.argv[1])
 sys.path.insert(0, sys.argv[2])
 
 from gs2d.kernels.cuda import cuda_adam as adam, kernel_arguments as arguments, launch, cuda_losses as ops
-from gs2d.render import cuda_backend as cuda, pair_budget as cuda_budget, cuda_passes, cuda_works
+from gs2d.render import cuda_rasterizer as cuda, pair_budget as cuda_budget, cuda_passes, cuda_works
 from fake_backends import altered
-from gs2d.render.backends import CudaBackend
+from gs2d.render.cuda_backend import CudaBackend
 
 launched, pointers = set(), [0]
 

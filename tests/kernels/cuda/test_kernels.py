@@ -15,7 +15,7 @@ import torch
 from emulate import Emulator
 from gs2d.core.splats import Splats
 from gs2d.errors import ShapeError
-from gs2d.render import cuda_backend as cuda
+from gs2d.render import cuda_rasterizer as cuda
 from gs2d.render import reference_rasterizer as reference
 from gs2d.render.api import rasterize
 from kernel_cases import SETTINGS, double, gradients, many_tiles, render

@@ -16,8 +16,8 @@ from torch import Tensor
 from emulate import Emulator
 from gs2d.core.camera import Camera
 from gs2d.core.splats import ATTRIBUTES, Splats
-from gs2d.render import cuda_backend as cuda
 from gs2d.render import cuda_passes
+from gs2d.render import cuda_rasterizer as cuda
 from gs2d.render import reference_rasterizer as reference
 from gs2d.render.types import PLAIN_COLORS, Features
 from kernel_cases import SETTINGS, Case, crossing_tiles, double, many_tiles

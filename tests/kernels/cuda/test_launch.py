@@ -19,8 +19,8 @@ from emulate import Emulator
 from fake_driver import FakeDriver, Result
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.cuda import launch
-from gs2d.render import cuda_backend as cuda
-from gs2d.render.backends import CudaBackend
+from gs2d.render import cuda_rasterizer as cuda
+from gs2d.render.cuda_backend import CudaBackend
 from gs2d.render.types import RasterSettings
 from render_scenes import IMAGES, contraction, random_camera, random_cotangents, random_splats, requiring_grad
 
@@ -88,7 +88,7 @@ def test_an_error_of_the_driver_is_one_line_with_its_name_and_a_remedy(
 def test_tensors_that_are_not_on_a_gpu_are_refused_with_the_way_out() -> None:
     splats = random_splats(np.random.default_rng(0), random_camera(np.random.default_rng(0)), 3)
     with pytest.raises(ShapeError, match="tensors"):
-        cuda.rasterize(
+        CudaBackend().rasterize(
             splats.to(dtype=torch.float32), random_camera(np.random.default_rng(0)), RasterSettings(sh_degree=0)
         )
 

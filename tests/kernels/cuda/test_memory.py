@@ -14,7 +14,7 @@ import train_toys
 from emulate import Emulator
 from fake_backends import cuda_on_host
 from gs2d.kernels.cuda import launch
-from gs2d.render import cuda_backend as cuda
+from gs2d.render import cuda_rasterizer as cuda
 from kernel_cases import SETTINGS, many_tiles
 from render_scenes import IMAGES, contraction, random_cotangents, requiring_grad
 

@@ -1,4 +1,4 @@
-// The rasterizer's exported functions. render/cpu_backend.py calls them; sizes and types are checked there.
+// The rasterizer's exported functions. render/native_rasterizer.py calls them; sizes and types are checked there.
 #include <pthread.h>
 
 #include "cpu/export.h"

@@ -14,7 +14,7 @@ namespace {
 constexpr int64_t PIECE = 2048;  // pixels
 constexpr int SUMS = 12;
 
-// render/exposure_native.py has the same.
+// render/native_image_ops.py has the same.
 struct Picture {
     const real* color;     // [pixels, 3]
     const real* coverage;  // [pixels], or null: 1

@@ -15,7 +15,7 @@ namespace {
 constexpr int64_t PIECE = 2048;  // pixels
 constexpr int SUMS = 4;          // of the falloff's three numbers, and of the shift
 
-// render/photometry_native.py has the same.
+// render/native_image_ops.py has the same.
 struct Shown {
     const real* color;     // [pixels, 3]
     const real* coverage;  // [pixels], or null: 1

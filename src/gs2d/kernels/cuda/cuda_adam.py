@@ -1,4 +1,4 @@
-"""Adam on a GPU: all attributes in one launch, and what is not trained is not written."""
+"""Adam on a GPU: all attributes in one launch; rows that are not trained are not written."""
 
 from __future__ import annotations
 
@@ -33,27 +33,27 @@ def adam_step(
     launcher: Launcher,
     skip: Tensor | None = None,
 ) -> None:
-    """One Adam step of up to six attributes, in place, in one launch; the arithmetic of torch's fused Adam.
+    """Run one Adam step on up to six attributes, in place, in one launch; the arithmetic of torch's fused Adam.
 
     Parameters
     ----------
     updates : sequence of AdamUpdate
     beta1, beta2, eps : float
     launcher : Launcher
-        Of the tensors' device.
+        Launcher of the tensors' device.
     skip : Tensor [] int32, optional
-        On the device: where it is not 0, nothing is changed.
+        On the device; if it is not 0, nothing is changed.
 
     Raises
     ------
     ShapeError
-        If something has another shape, dtype or device.
+        If a tensor has another shape, dtype or device.
     """
     if len(updates) > 6:
         raise ShapeError(f"adam_step takes up to 6 attributes, got {len(updates)}")
     arguments = AdamArguments(weight_1=1 - beta1, beta2=beta2, weight_2=1 - beta2, eps=eps)
     fill(arguments, skip=skip)
-    alive = []  # what the pointers belong to
+    alive = []  # tensors behind the pointers
     blocks = 0
     for update in updates:
         check_update(update)
@@ -68,7 +68,7 @@ def adam_step(
         slot = arguments.attributes[arguments.count]
         fill(slot, **tensors, gradient=gradient, trained=trained, rows=rows)
         slot.elements, slot.first_block, slot.columns, slot.compact = elements, blocks, columns, int(update.compact)
-        slot.step_size, slot.root_2 = bias_corrections(update, beta1, beta2)
+        slot.step_size, slot.root_2 = bias_corrections(update.rate, update.step, beta1, beta2)
         arguments.count += 1
         blocks += -(-elements // BLOCK_ELEMENTS)
         alive += [gradient, trained, rows]

@@ -18,7 +18,8 @@ from gs2d.config.recipe import GradDensify
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.errors import DivergedError
-from gs2d.render.backends import PLAIN, Backend
+from gs2d.render.backends import Backend
+from gs2d.render.reference_backend import PLAIN
 from gs2d.training import events
 from gs2d.training.densify.densifier import Densifier, Surroundings
 from gs2d.training.rows import append_rows

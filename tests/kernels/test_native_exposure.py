@@ -7,13 +7,13 @@ import torch
 from torch import Tensor
 
 from gs2d.kernels.library import Library
-from gs2d.render.exposure_native import exposed, gradients
 from gs2d.render.exposure_transform import _exposed, _gradients
+from gs2d.render.native_image_ops import expose, expose_vjp
 
 
 @pytest.mark.parametrize("cut_out", [False, True])
 @pytest.mark.parametrize("size", [(1, 1), (3, 5), (130, 129)])
-def test_picture_and_gradients_are_torchs(any_native: Library, cut_out: bool, size: tuple[int, int]) -> None:
+def test_image_and_gradients_agree_with_torch(any_native: Library, cut_out: bool, size: tuple[int, int]) -> None:
     """130 x 129 pixels are nine pieces, the last one of 386, which is no multiple of a vector."""
     g = torch.Generator().manual_seed(size[0])
 
@@ -23,10 +23,10 @@ def test_picture_and_gradients_are_torchs(any_native: Library, cut_out: bool, si
     color, transform, upstream = 1.5 * random(*size, 3), random(3, 4), random(*size, 3) - 0.5
     cover = (random(*size), random(3)) if cut_out else (None, None)
     wanted = _exposed(color, transform, *cover)
-    found = exposed(any_native, color, transform, *cover)
+    found = expose(any_native, color, transform, *cover)
     digits = 1e-6 if any_native.dtype == torch.float32 else 1e-14
     assert torch.allclose(found, wanted, rtol=digits, atol=digits)
     by_torch = _gradients(upstream, color, transform, *cover)
-    by_us = gradients(any_native, upstream, color, transform, *cover)
+    by_us = expose_vjp(any_native, upstream, color, transform, *cover)
     for a, b in zip(by_us, by_torch, strict=True):
         assert torch.allclose(a, b, rtol=100 * digits, atol=100 * digits * float(b.abs().max()))
