@@ -1,7 +1,7 @@
 """The passes of the CUDA kernels over torch tensors: projection, sorts, emission, blending, and their gradients.
 
-Written against a launcher, which runs a kernel by name, so that the sequence of passes, not only the kernels, is tested
-without a GPU. Memory is torch's; nothing waits for the device but for the number of pairs.
+They run kernels by name through a launcher, so that the sequence of passes, too, is tested without a GPU. torch
+allocates the memory. The host waits for the device only for the number of pairs.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from gs2d.kernels.cuda.kernel_arguments import (
     DepthArguments,
     ErrorArguments,
     FeatureArguments,
-    Features,
+    FeatureBuffers,
+    KernelView,
     OccludedArguments,
     SlotArguments,
-    View,
     fill,
 )
 from gs2d.kernels.cuda.launch import Launcher, Work
@@ -49,7 +49,7 @@ __all__ = [
     "DEPTH",
     "IMAGES",
     "ForwardState",
-    "Wanted",
+    "RequestedGradients",
     "backward",
     "blend_features",
     "errors",
@@ -58,12 +58,12 @@ __all__ = [
 ]
 
 TILE = 16
-CHANNELS = 8  # pixels.h: further channels come in groups of these
-MAX_SPLATS = 1 << 24  # an entry holds the splat in 24 bits
-MAX_SLOTTED = 1 << 30  # four slots each, counted in 32 bits
+CHANNELS = 8  # pixels.h: further channels are padded to a multiple of this
+MAX_SPLATS = 1 << 24  # an entry stores the splat in 24 bits
+MAX_SLOTTED = 1 << 30  # four slots each, indexed with 32 bits
 ERROR_UNIT = 2.0**-24  # occluded.cu
-CAMERA_BYTES = View.near.offset  # pose and intrinsics: what tells views of a training apart
-DEPTH = ("depth_transmittance", "slope")  # without pixels where that depth was not asked for
+CAMERA_BYTES = KernelView.near.offset  # pose and intrinsics, which identify a view of a training
+DEPTH = ("depth_transmittance", "slope")  # empty unless that depth was requested
 LISTS = ("records", "entries", "ranges", "tiles", "seen")
 PROJECTED = {
     "records": (16, torch.float32),
@@ -73,40 +73,40 @@ PROJECTED = {
     "tile_counts": (1, torch.int32),
     "radii": (1, torch.float32),
 }
-"""Columns and types of what project.cu writes of each splat."""
+"""Columns and dtypes of the outputs of project.cu, one row per splat."""
 
 
 @dataclass(frozen=True, eq=False)
 class ForwardState:
-    """What the forward pass leaves for the backward pass.
+    """State of a forward pass for the backward pass.
 
     Attributes
     ----------
-    view : View
+    view : KernelView
     records : Tensor [N, 16] float32
-        Screen records; rows of splats without tiles hold garbage.
+        Screen records; undefined for splats without tiles.
     tile_counts : Tensor [N] int32
-        Tiles in each splat's rectangle; 0 = not drawn.
+        Number of tiles in each splat's rectangle; 0 = not drawn.
     entries : Tensor [M] int32
         splat << 8 | mask of sub-blocks, tile by tile, front to back.
     ranges : Tensor [tiles + 1, 2] int64
-        Each tile's part of ``entries``.
+        Each tile's range of ``entries``.
     tiles : Tensor [tiles] int32
-        Tiles in the order in which blocks take them: longest first.
+        Tiles in the order of processing: most entries first.
     seen : Tensor [words, 8] int32
-        Who was seen by a live pixel, one bit per entry and sub-block.
+        Whether a live pixel of a sub-block uses an entry, one bit each.
     images : dict of Tensor
-        The outputs, ``final_T`` [H, W], ``moments`` [H, W, 3], ``depth_transmittance`` and its ``slope`` [H, W].
+        The output images, ``final_T`` [H, W], ``moments`` [H, W, 3], ``depth_transmittance`` and ``slope`` [H, W].
     radii : Tensor [N] float32
     order : Tensor [N] int64
         Splats by depth.
     ends : Tensor [N] int64
         Running sum, in that order, of the pairs of splat and tile.
     permutation : Tensor [M] int64
-        The pair that each entry was.
+        Index of each entry's pair before the sort by tile.
     """
 
-    view: View
+    view: KernelView
     records: Tensor
     tile_counts: Tensor
     entries: Tensor
@@ -121,23 +121,17 @@ class ForwardState:
 
     @property
     def lists(self) -> dict[str, Tensor]:
-        """What all kernels that blend take."""
+        """The tensors that all blending kernels take."""
         return {name: getattr(self, name) for name in LISTS}
 
 
-def view_of(camera: Camera, settings: RasterSettings) -> View:
-    """Return the structure that every kernel takes.
-
-    Raises
-    ------
-    BackendError
-        A setting of the reference backend only.
-    """
+def view_of(camera: Camera, settings: RasterSettings) -> KernelView:
+    """Return the view structure of the kernels; BackendError for a setting that only the reference backend supports."""
     if settings.lowpass_depth != "center":
         raise BackendError(
             f"the cuda backend needs lowpass_depth 'center', got {settings.lowpass_depth!r}; use --backend reference"
         )
-    view = View()
+    view = KernelView()
     view.R[:] = np.asarray(camera.rotation).ravel().tolist()
     view.t[:] = np.asarray(camera.T_cam_world[:3, 3]).tolist()
     view.center[:] = np.asarray(camera.center).tolist()
@@ -158,7 +152,7 @@ def view_of(camera: Camera, settings: RasterSettings) -> View:
     return view
 
 
-def _run(launcher: Launcher, view: View, work: Work) -> None:
+def _run(launcher: Launcher, view: KernelView, work: Work) -> None:
     """Run a launch for a view."""
     if takes_view(work):
         see([work], view)
@@ -170,9 +164,9 @@ def _named(parameters: Sequence[Tensor]) -> dict[str, Tensor]:
 
 
 def _project(
-    launcher: Launcher, view: View, parameters: Sequence[Tensor], *, errors: bool, exact: bool = True
+    launcher: Launcher, view: KernelView, parameters: Sequence[Tensor], *, errors: bool, exact: bool = True
 ) -> dict[str, Tensor]:
-    """Return what project.cu writes; records, cull and rects of splats without tiles are garbage."""
+    """Return the outputs of project.cu; records, cull and rects of splats without tiles are undefined."""
     count, device = parameters[0].shape[0], parameters[0].device
     if count >= MAX_SPLATS:
         raise BackendError(f"the cuda backend takes fewer than {MAX_SPLATS} splats, got {count}")
@@ -187,7 +181,7 @@ def _project(
 
 def forward(
     launcher: Launcher,
-    view: View,
+    view: KernelView,
     parameters: Sequence[Tensor],
     *,
     exact: bool = True,
@@ -195,11 +189,11 @@ def forward(
     transmittance: bool = False,
     budget: PairBudget | None = None,
 ) -> ForwardState:
-    """Render one view; ``exact=False`` turns off culling inside tiles, and all of what has no ellipse (tests).
+    """Render one view.
 
-    The parameters are contiguous float32 tensors in the order of ``Splats``, all on the launcher's device. Without
-    ``distortion`` that image is NaN: it is a tenth of the blending, and few recipes want it. The depth by
-    ``transmittance`` has no pixels without it.
+    The parameters are contiguous float32 tensors in the order of ``Splats``, on the launcher's device. Without
+    ``distortion`` that image is NaN, which saves a tenth of the blending. Without ``transmittance`` the depth by
+    transmittance is empty. ``exact=False`` disables culling inside tiles and of splats without an ellipse (tests).
     """
     device = parameters[0].device
 
@@ -228,15 +222,15 @@ def forward(
 
 def _features(
     values: Tensor, background: Tensor, images: Tensor, upstream: Tensor | None = None, gradients: Tensor | None = None
-) -> Features:
-    """Return the structure of further channels, a multiple of ``CHANNELS``; all tensors are contiguous."""
-    features = Features(count=values.shape[1])
+) -> FeatureBuffers:
+    """Return the structure of further channels; their number is a multiple of ``CHANNELS``, tensors are contiguous."""
+    features = FeatureBuffers(count=values.shape[1])
     fill(features, values=values, background=background, images=images, upstream=upstream, gradients=gradients)
     return features
 
 
 def blend_features(launcher: Launcher, frame: ForwardState, values: Tensor, background: Tensor) -> Tensor:
-    """Return images [F, H, W] of further channels [N, F] over a background [F]: those of the view of ``frame``."""
+    """Return the images [F, H, W] of further channels [N, F] over a background [F], for the view of ``frame``."""
     final_T = frame.images["final_T"]
     images = final_T.new_empty(values.shape[1], *final_T.shape)
     arguments = FeatureArguments(features=_features(values, background, images))
@@ -246,9 +240,9 @@ def blend_features(launcher: Launcher, frame: ForwardState, values: Tensor, back
 
 
 def _bin(
-    launcher: Launcher, view: View, projected: dict[str, Tensor], exact: bool, budget: PairBudget | None = None
+    launcher: Launcher, view: KernelView, projected: dict[str, Tensor], exact: bool, budget: PairBudget | None = None
 ) -> dict[str, Tensor]:
-    """Return the splats of each tile: a stable sort by depth, emission of candidates, a stable sort by tile."""
+    """Return the splats of each tile: stable sort by depth, emission of candidate pairs, stable sort by tile."""
     device = projected["records"].device
     tiles = int(view.tiles_x) * int(view.tiles_y)
     order = torch.sort(projected["depth_keys"], stable=True).indices
@@ -279,17 +273,17 @@ def _bin(
 
 
 @dataclass(frozen=True, eq=False)
-class Wanted:
-    """Which gradients a backward pass is to compute.
+class RequestedGradients:
+    """The gradients that a backward pass computes.
 
     Attributes
     ----------
     parameters : dict of Tensor or None
-        To be filled, by name of the parameter, ``probe`` and ``intrinsics`` [N, 4]; None is not computed.
+        Output tensors by name of the parameter, ``probe`` and ``intrinsics`` [N, 4]; None is not computed.
     learns : Tensor [N] bool, optional
-        The splats that have gradients; all others get zeros.
+        Splats with gradients; all others get zeros.
     deterministic : bool
-        Nothing is added up by atomics: 320 bytes for each pair of splat and tile, and one more pass.
+        Sum without atomics: 320 bytes for each pair of splat and tile, and one more pass.
     """
 
     parameters: dict[str, Tensor | None]
@@ -298,7 +292,7 @@ class Wanted:
 
     @property
     def only_colors(self) -> bool:
-        """Whether nothing but colours learns."""
+        """Whether only colours have gradients."""
         return all(tensor is None for name, tensor in self.parameters.items() if name not in ("sh0", "shN"))
 
 
@@ -307,10 +301,10 @@ def backward(
     frame: ForwardState,
     parameters: Sequence[Tensor],
     upstream: dict[str, Tensor | None],
-    wanted: Wanted,
+    wanted: RequestedGradients,
     features: Sequence[Tensor] | None = None,
 ) -> None:
-    """Fill the gradient tensors in ``wanted``.
+    """Compute the gradients in ``wanted``.
 
     ``features`` are the values [N, F], background [F] and images [F, H, W] of further channels, the gradients of these
     images, and zeros [N, F] for the gradients of the values. They exclude ``wanted.learns`` and a gradient of the depth
@@ -346,7 +340,7 @@ def backward(
 
 
 class _Sums:
-    """Where the blending's gradients are added up: rows of the splats, or a slot for each (entry, warp)."""
+    """Sums of the blending's gradients: one row per splat, or one slot per entry and warp for fixed order."""
 
     def __init__(self, frame: ForwardState, deterministic: bool, *, columns: int) -> None:
         if deterministic and len(frame.permutation) >= MAX_SLOTTED:
@@ -357,7 +351,7 @@ class _Sums:
         self.frame = frame
         self.slots = frame.permutation if deterministic else None  # [M] int64
         rows = len(frame.records) if self.slots is None else 4 * len(self.slots)
-        # one piece of memory, which is cleared at once; 64 bytes a row first, so that they begin where lines do
+        # One allocation, cleared at once; the rows of 64 bytes come first, so that they are aligned to lines.
         both = torch.zeros(rows * (columns + 4), dtype=torch.float32, device=frame.records.device)
         self.extras = both[rows * columns :].view(rows, 4)
         self.gradients = both[: rows * columns].view(rows, columns) if columns else None
@@ -372,7 +366,7 @@ class _Sums:
         return slots
 
     def of_splats(self, launcher: Launcher) -> tuple[Tensor | None, Tensor]:
-        """[N, columns] and [N, 4]."""
+        """Return the sums per splat, [N, columns] and [N, 4]."""
         if self.slots is None:
             return self.gradients, self.extras
         count = len(self.frame.records)
@@ -390,13 +384,13 @@ class _Sums:
 
 def errors(
     launcher: Launcher,
-    view: View,
+    view: KernelView,
     parameters: Sequence[Tensor],
     image: Tensor,
     mask: Tensor | None,
     occlusion: bool = False,
 ) -> Tensor:
-    """Splat errors [N] of one view; all tensors contiguous, image float32 [H, W, 3], mask bool [H, W]."""
+    """Return the splat errors [N] of one view; image float32 [H, W, 3] and mask bool [H, W] are contiguous."""
     count = parameters[0].shape[0]
     projected = _project(launcher, view, parameters, errors=True)
     if count == 0:

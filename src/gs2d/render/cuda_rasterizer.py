@@ -17,13 +17,13 @@ from torch.nn.functional import pad
 from gs2d.core.camera import Camera
 from gs2d.core.splats import ATTRIBUTES, IMAGES, Splats
 from gs2d.errors import ShapeError
-from gs2d.kernels.cuda.kernel_arguments import View
+from gs2d.kernels.cuda.kernel_arguments import KernelView
 from gs2d.kernels.cuda.launch import Launcher
 from gs2d.render.cuda_passes import (
     CHANNELS,
     DEPTH,
     ForwardState,
-    Wanted,
+    RequestedGradients,
     backward,
     blend_features,
     errors,
@@ -75,7 +75,7 @@ class _CudaOptions:
     """Arguments of _CudaRasterize without gradients."""
 
     launcher: Launcher
-    view: View
+    view: KernelView
     exact_masks: bool
     distortion: bool
     transmittance: bool
@@ -159,7 +159,9 @@ class _CudaRasterize(torch.autograd.Function):
         device = tensors[0].device
         probe = torch.empty(ctx.probe_shape, dtype=torch.float32, device=device) if want_probe else None
         each = torch.zeros(len(tensors[0]), 4, dtype=torch.float32, device=device) if want_intrinsics else None
-        wanted = Wanted({**gradients, "probe": probe, "intrinsics": each}, options.learns, options.deterministic)
+        wanted = RequestedGradients(
+            {**gradients, "probe": probe, "intrinsics": each}, options.learns, options.deterministic
+        )
         by_name = {"depth_transmittance": None} | dict(zip(_image_names(options.transmittance), given, strict=True))
         to_values = torch.zeros_like(values) if want_values or of_features is not None else None
         further: Any = None if of_features is None else (values, options.background, features, of_features, to_values)

@@ -1,10 +1,9 @@
-"""A whole iteration on a GPU: projection, sorts, blending, losses, gradients, statistics and Adam by our kernels alone.
+"""A whole training iteration on a GPU with our kernels alone, from projection to Adam.
 
-No autograd, no operation of torch, no memory asked for once it runs: what a rendering needs lies in an
-:class:`Arena`, the arguments of every kernel stay filled, and from one iteration to the next only the camera, the
-photograph, the room for pairs and the learning rates are written. So the launches are always the same ones, which a
-launcher may start as a graph. The arithmetic is that of :mod:`gs2d.render.cuda_passes` and the losses of
-:mod:`gs2d.kernels.cuda.cuda_losses`, kernel by kernel; without gradients that are added up by atomics the bits are too.
+It uses no autograd, no torch operations and no allocations. Memory lies in an :class:`Arena`, and the arguments of all
+kernels stay filled; between iterations only the camera, the photograph, the room for pairs and the learning rates are
+written. The launches are therefore always the same, and a launcher may run them as a graph. The kernels are those of
+:mod:`gs2d.render.cuda_passes` and :mod:`gs2d.kernels.cuda.cuda_losses`; results differ only by the order of atomics.
 """
 
 from __future__ import annotations
@@ -49,21 +48,21 @@ from gs2d.render.whole_step import WholeStep
 
 __all__ = ["Arena", "Stepper"]
 
-SPARE = 1.2  # memory in what is needed, so that a few splats or pairs more find room
-ADAM_ELEMENTS = 512  # of a block: adam.cu
+SPARE = 1.2  # allocated memory relative to the need, so that a few more splats or pairs fit
+ADAM_ELEMENTS = 512  # per block, adam.cu
 DEPTH_BITS = 32
-TICKETS = 16  # counters; the passes of both sorts and the running sums take one each
+TICKETS = 16  # counters; each pass of both sorts and the running sums take one
 MOST_VIEWS = 1 << 12
-MOST_PLANS = 8  # sizes of images whose arguments stay filled
+MOST_PLANS = 8  # image sizes whose arguments stay filled
 
 
 class Arena:
-    """Memory that is asked for once: flat tensors by name, which grow and are only let go all together.
+    """Persistent memory: flat tensors by name, which grow and are only freed together.
 
     Attributes
     ----------
     generation : int
-        Counts the times that something moved: addresses of before are no more.
+        Incremented when a tensor moves, which invalidates addresses.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -74,9 +73,9 @@ class Arena:
     def get(
         self, name: str, count: int, dtype: torch.dtype = torch.float32, *, zeros: bool = False, spare: float = SPARE
     ) -> Tensor:
-        """Return at least ``count`` elements, the same memory as before where that is enough, else ``spare`` times it.
+        """Return at least ``count`` elements: the existing memory, or new memory of ``spare`` times this size.
 
-        ``zeros``: they are 0 when they are new; whoever uses them leaves zeros.
+        With ``zeros`` new memory is zero, and users reset it to zero.
         """
         held = self._held.get(name)
         if held is None or len(held) < count:
@@ -86,14 +85,14 @@ class Arena:
         return held
 
     def release(self) -> None:
-        """Let everything go."""
+        """Free all memory."""
         if self._held:
             self._held.clear()
             self.generation += 1
 
 
 class Stepper:
-    """Does iterations of one training.
+    """Runs iterations of one training.
 
     Parameters
     ----------
@@ -106,18 +105,18 @@ class Stepper:
         self._arena = Arena(device)
         self._plans: dict[tuple[object, ...], _Plan] = {}
         self._generation = -1
-        self._views: dict[tuple[int, int], tuple[object, object, structures.View, bytes]] = {}
+        self._views: dict[tuple[int, int], tuple[object, object, structures.KernelView, bytes]] = {}
 
     def release(self) -> None:
-        """Let the memory go: another way of rendering is about to need as much."""
+        """Free the memory, since a rendering outside of whole steps needs as much."""
         self._plans.clear()
         self._arena.release()
 
     def run(self, step: WholeStep, budget: PairBudget) -> bool:
-        """Do an iteration; False: it is not for here, and nothing was done.
+        """Run an iteration; False: it is not supported and nothing was done.
 
-        Where the room that the budget gives is too little, nothing that lasts is changed on the device, and
-        ``budget.overflowed`` will say so.
+        If the budget's room is too small, the iteration changes no persistent tensor, and ``budget.overflowed`` is
+        true.
         """
         count = len(step.splats)
         if not 0 < count < MAX_SPLATS or budget.overflow is not None or not _suits(step):
@@ -135,41 +134,41 @@ class Stepper:
         self._launcher.run(plan.afterwards)
         return True
 
-    def _view_of(self, step: WholeStep) -> tuple[structures.View, bytes]:
-        """Return the structure of a camera, and what it is known by; kept, because they come again."""
+    def _view_of(self, step: WholeStep) -> tuple[structures.KernelView, bytes]:
+        """Return the structure of a camera and its key; cached, since cameras recur."""
         key = id(step.camera), id(step.settings)
         known = self._views.get(key)
         if known is None:
             if len(self._views) >= MOST_VIEWS:
                 self._views.clear()
             view = view_of(step.camera, step.settings)
-            # the objects too, so that their numbers stay theirs
+            # Keep the objects, so that their ids stay valid.
             known = self._views[key] = step.camera, step.settings, view, bytes(view)[:CAMERA_BYTES]
         return known[2], known[3]
 
-    def _plan_of(self, step: WholeStep, view: structures.View, room: int) -> _Plan:
-        """Return the launches of such an iteration, with everything filled that stays."""
+    def _plan_of(self, step: WholeStep, view: structures.KernelView, room: int) -> _Plan:
+        """Return the launches of such an iteration, with all constant arguments filled."""
         key = _key(step)
         plan = self._plans.get(key)
         if plan is not None and self._generation == self._arena.generation and room <= plan.most_room:
             return plan
         plan = _Plan(self._arena, step, view, room)
         if self._generation != self._arena.generation or len(self._plans) >= MOST_PLANS:
-            self._plans.clear()  # their addresses are no more
+            self._plans.clear()  # their addresses are invalid
         self._generation = self._arena.generation
         self._plans[key] = plan
         return plan
 
 
 def _suits(step: WholeStep) -> bool:
-    """Whether kernels can take the tensors as they lie."""
+    """Whether all tensors are contiguous float32."""
     tensors = [tensor for _, tensor in step.splats.items()]
     tensors += [tensor for one in step.learned.values() for tensor in (one.mean, one.square)]
     return all(tensor.dtype == torch.float32 and tensor.is_contiguous() for tensor in tensors)
 
 
 def _key(step: WholeStep) -> tuple[object, ...]:
-    """Return what arguments depend on, but for what :meth:`_Plan.set` writes."""
+    """Return the key of a plan: all that its arguments depend on, except what :meth:`_Plan.set` writes."""
     splats, height, width = step.splats, step.camera.height, step.camera.width
     return (
         height,
@@ -191,31 +190,35 @@ def _key(step: WholeStep) -> tuple[object, ...]:
 
 
 class _Sorting:
-    """The launches that sort splats by depth and pairs by tile, and the memory that is cleared for them.
+    """The launches that sort splats by depth and pairs by tile, and their scratch memory.
 
     Parameters
     ----------
     arena : Arena
     count : int
-        Splats.
+        Number of splats.
     tiles : int
     room : int
-        Pairs of splat and tile; with some to spare, because the next view has more.
+        Pairs of splat and tile to reserve.
 
     Attributes
     ----------
     most_room : int
-        Pairs that there is memory for.
+        Pairs that fit into the allocated memory.
     bits : int
-        Of the keys of tiles.
-    order, ends, keys, payloads, tile_keys, entries : Tensor
-        Splats by depth, the running sum of their pairs, what emission writes, and the same sorted.
+        Bits of the tile keys.
+    order, ends : Tensor
+        Splats by depth, and the running sum of their pairs.
+    keys, payloads : Tensor
+        Pairs as emitted.
+    tile_keys, entries : Tensor
+        Pairs sorted by tile.
     """
 
     def __init__(self, arena: Arena, count: int, tiles: int, room: int) -> None:
         self._arena, self._count, self._tiles = arena, count, tiles
         self.bits = 16 if tiles < 1 << 15 else 32
-        self._passes = passes_of(tiles.bit_length())  # of tiles 0 .. tiles, the last of which is none
+        self._passes = passes_of(tiles.bit_length())  # keys 0 .. tiles; the last one marks unused pairs
         key = torch.int16 if self.bits == 16 else torch.int32
         entries = arena.get("entries", room, torch.int32)
         self.most_room = len(entries)
@@ -229,7 +232,7 @@ class _Sorting:
         self._scratch()
 
     def _scratch(self) -> None:
-        """Lay out what is cleared when an iteration begins: one piece of memory, and where its parts begin."""
+        """Lay out the scratch memory that is cleared at the start of an iteration."""
         pieces = pieces_of(self._count)
         ends = {"tickets": TICKETS, "depth_digits": MOST_PASSES * DIGITS, "tile_digits": MOST_PASSES * DIGITS}
         ends |= {"ranges": 4 * (self._tiles + 1), "running": -(-pieces // 4) * 4}
@@ -238,21 +241,21 @@ class _Sorting:
         for name, words in ends.items():
             self._parts[name] = at
             at += words
-        self._parts["tile_words"] = at  # last: how many follows the room
+        self._parts["tile_words"] = at  # last, since its size depends on the room
         most = at + len(self._passes) * pieces_of(self.most_room) * DIGITS
         self._words = self._arena.get("scratch", most, torch.int32)
 
     def part(self, name: str, words: int = 0) -> int:
-        """Return the address of a part of the scratch memory, so many times 4 bytes on."""
+        """Return the address of a part of the scratch memory, plus ``words`` times 4 bytes."""
         return self._words.data_ptr() + 4 * (self._parts[name] + words)
 
     def clear(self) -> Work:
-        """Fill the scratch memory with zeros."""
+        """Clear the scratch memory."""
         self._clearing = Work("clear_words", 1, SORT_THREADS, structures.ClearArguments(words=self.part("tickets")))
         return self._clearing
 
     def by_depth(self, depth_keys: Tensor) -> list[Work]:
-        """Sort splats by depth; keys go back and forth between two places, and the last pass leaves them out."""
+        """Sort splats by depth; keys alternate between two buffers, and the last pass does not write them."""
         n, arena = self._count, self._arena
         keys = [depth_keys, arena.get("more_depth_keys", n, torch.int32)]
         orders = [arena.get("order", n, torch.int32), arena.get("more_order", n, torch.int32)]
@@ -277,7 +280,7 @@ class _Sorting:
         return works
 
     def running(self, tile_counts: Tensor, overflow: Tensor) -> Work:
-        """Add up pairs by depth: running sums, their number, and whether there is room for them."""
+        """Compute the running sums of pairs in depth order, their total, and whether it exceeds the room."""
         self._counting = structures.RunningArguments(count=self._count)
         structures.fill(self._counting, order=self.order, tile_counts=tile_counts, ends=self.ends, overflow=overflow)
         structures.fill(self._counting, ticket=self.part("tickets", 2 * MOST_PASSES), words=self.part("running"))
@@ -300,7 +303,7 @@ class _Sorting:
         return self._by_tile
 
     def set(self, room: int, pairs: Tensor) -> None:
-        """Write the room for pairs, and where their number goes."""
+        """Write the room for pairs and the address of their count."""
         pieces = pieces_of(room)
         words = self._parts["tile_words"] + len(self._passes) * pieces * DIGITS
         self._clearing.arguments.count, self._clearing.blocks = words // 4, clear_blocks(words // 4)
@@ -313,13 +316,13 @@ class _Sorting:
 
 
 class _Losses:
-    """The launches of the losses: gradients of images; L1, SSIM and L2 without their values.
+    """The launches of the losses, which compute gradients of images but no values.
 
     Parameters
     ----------
     step : WholeStep
     images : mapping of str to Tensor
-        What blending writes, "maps" for the SSIM, and places for gradients: "g_color" and those of ``upstream``.
+        Blended images, "maps" for the SSIM, and the gradient "g_color".
     upstream : mapping of str to Tensor
         Gradients of the images besides colour, by name of the image: "alpha", "normal" and a depth.
     """
@@ -357,8 +360,8 @@ class _Losses:
             self.works.append(Work("silhouette_vjp", blocks_of(height * width), THREADS, silhouette))
             self._silhouette = silhouette
 
-    def set(self, step: WholeStep, view: structures.View) -> None:
-        """Write photograph, mask and weights. Scales are products of float32 numbers, as of autograd."""
+    def set(self, step: WholeStep, view: structures.KernelView) -> None:
+        """Write photograph, mask and weights. Scales are products in float32, as in autograd."""
         mask, photograph = None if step.mask is None else step.mask.data_ptr(), step.photograph.data_ptr()
         for arguments in self._comparing:
             arguments.mask, arguments.photograph.bytes = mask, photograph
@@ -402,7 +405,7 @@ class _Adam:
         self.work = Work("adam_step", blocks, THREADS, arguments)
 
     def set(self, step: WholeStep) -> None:
-        """Write the rates."""
+        """Write the learning rates."""
         beta1, beta2, _ = step.betas
         for name, slot in self._slots.items():
             one = step.learned[name]
@@ -410,9 +413,9 @@ class _Adam:
 
 
 class _Plan:
-    """The launches of an iteration in their order, in two parts: until the number of pairs is known, and afterwards."""
+    """The launches of an iteration in order, in two parts: up to the count of pairs, and after it."""
 
-    def __init__(self, arena: Arena, step: WholeStep, view: structures.View, room: int) -> None:
+    def __init__(self, arena: Arena, step: WholeStep, view: structures.KernelView, room: int) -> None:
         splats, count, tiles = dict(step.splats.items()), len(step.splats), int(view.tiles_x) * int(view.tiles_y)
         self.overflow = arena.get("overflow", 1, torch.int32)[:1].view(())
         self._sorting = sorting = _Sorting(arena, count, tiles, room)
@@ -466,11 +469,11 @@ class _Plan:
 
     @property
     def most_room(self) -> int:
-        """Pairs that there is memory for."""
+        """Pairs that fit into the allocated memory."""
         return self._sorting.most_room
 
-    def set(self, step: WholeStep, view: structures.View, room: int, pairs: Tensor) -> None:
-        """Write what differs: the camera, the photograph, the room, where the number of pairs goes, and the rates."""
+    def set(self, step: WholeStep, view: structures.KernelView, room: int, pairs: Tensor) -> None:
+        """Write what differs between iterations: camera, photograph, room, address of the count, and rates."""
         see(self._seeing, view)
         for work in self._of_room:
             work.arguments.candidates, work.blocks = room, blocks_of(room)
@@ -480,12 +483,12 @@ class _Plan:
 
 
 def _only_colors(step: WholeStep) -> bool:
-    """Whether nothing but colours learns."""
+    """Whether only colours are trained."""
     return not set(step.learned) - {"sh0", "shN"}
 
 
 def _images(arena: Arena, step: WholeStep) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Return images and what else lies by pixel, and the gradients of the images besides colour, by their names."""
+    """Return the images and other pixel buffers, and the gradients of images besides colour, by name."""
     pixels = step.camera.height * step.camera.width
     planes = {"color": 3, "alpha": 1, "normal": 3, "depth_mean": 1, "depth_median": 1, "final_T": 1}
     planes |= {"maps": 9, "g_color": 3}

@@ -1,7 +1,7 @@
-"""The launches of a rendering and of its gradients: which kernel, how many blocks, which arguments.
+"""The launches of a rendering and its gradients: kernel, number of blocks, arguments.
 
-``cuda_passes`` makes them for tensors of torch and runs them at once; ``cuda_step`` makes them for memory that stays
-and runs them in each iteration, one by one or as a graph. The view and the room for pairs may be written afterwards.
+``cuda_passes`` creates them for torch tensors and runs them at once. ``cuda_step`` creates them once for persistent
+memory and runs them in each iteration, one by one or as a graph. View and room for pairs may be written later.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from gs2d.kernels.cuda.kernel_arguments import (
     BlendColorsArguments,
     BlendVjpArguments,
     EmitArguments,
-    Features,
+    FeatureBuffers,
+    KernelView,
     OrderArguments,
     ProjectArguments,
     ProjectColorsArguments,
     ProjectVjpArguments,
     RangeArguments,
-    View,
     fill,
 )
 from gs2d.kernels.cuda.launch import Work
@@ -51,23 +51,23 @@ Pointers: TypeAlias = Mapping[str, Tensor | int | None]
 
 
 def blocks_of(count: int) -> int:
-    """Return the blocks of a kernel with a thread for each of ``count``."""
+    """Return the number of blocks for ``count`` threads."""
     return -(-count // THREADS)
 
 
 def work_of(kernel: str, blocks: int, arguments: ctypes.Structure, *pointers: Pointers) -> Work:
-    """Return a launch whose structure has these pointers: tensors, addresses or None."""
+    """Return a launch with these pointers in its structure: tensors, addresses or None."""
     for named in pointers:
         fill(arguments, **named)
     return Work(kernel, blocks, THREADS, arguments)
 
 
 def takes_view(work: Work) -> bool:
-    """Whether a launch takes a view, or parts of one."""
+    """Whether a launch takes a view or parts of one."""
     return isinstance(work.arguments, EmitArguments) or hasattr(work.arguments, "view")
 
 
-def see(works: Iterable[Work], view: View) -> None:
+def see(works: Iterable[Work], view: KernelView) -> None:
     """Write a view into launches that take one."""
     for work in works:
         if isinstance(work.arguments, EmitArguments):
@@ -80,32 +80,32 @@ def see(works: Iterable[Work], view: View) -> None:
 def project(
     splats: Mapping[str, Tensor], projected: Mapping[str, Tensor], *, errors: bool = False, exact: bool = True
 ) -> Work:
-    """Make records and footprints: those of blending, or with ``errors`` those of rho <= error_cutoff^2."""
+    """Project splats to records and footprints: of blending, or with ``errors`` of rho <= error_cutoff^2."""
     count = len(splats["means"])
     arguments = ProjectArguments(count=count, sh_rest=splats["shN"].shape[1], errors=int(errors), exact=int(exact))
     return work_of("project_splats", blocks_of(count), arguments, splats, projected)
 
 
 def emit(kernel: str, room: int, visible: int, pointers: Pointers, *, exact: bool = True) -> Work:
-    """Pairs of splat and tile."""
+    """Emit the pairs of splat and tile."""
     arguments = EmitArguments(candidates=room, visible=visible, exact=int(exact))
     return work_of(kernel, blocks_of(room), arguments, pointers)
 
 
 def find_ranges(bits: int, room: int, pointers: Pointers) -> Work:
-    """Each tile's part of the sorted pairs, whose keys have ``bits``."""
+    """Find each tile's range in the sorted pairs, whose keys have ``bits`` bits."""
     return work_of(f"find_ranges_{bits}", blocks_of(room), RangeArguments(candidates=room), pointers)
 
 
 def order_tiles(tiles: int, pointers: Pointers) -> Work:
-    """Tiles, those with the most pairs first."""
+    """Order tiles by their number of pairs, largest first."""
     work = work_of("order_tiles", 1, OrderArguments(tiles=tiles), pointers)
     work.threads = ORDER_THREADS
     return work
 
 
 def blend(tiles: int, lists: Pointers, images: Pointers, *, distortion: bool) -> Work:
-    """Images of the lists of all tiles."""
+    """Blend the images from the lists of all tiles."""
     name = f"blend_forward{'_distortion' if distortion else ''}"
     return work_of(name, tiles, BlendArguments(), lists, images)
 
@@ -118,22 +118,22 @@ def blend_gradients(
     sums: Pointers,
     *,
     absolute: bool = False,
-    features: Features | None = None,
+    features: FeatureBuffers | None = None,
 ) -> Work:
-    """Gradients of the blending, added up for each splat.
+    """Compute the gradients of the blending, summed for each splat.
 
     Parameters
     ----------
     tiles : int
     lists, images : mapping
-        Of the forward pass.
+        Lists and images of the forward pass.
     upstream : mapping
         Gradients of the images by name; absent or None: no gradient.
     sums : mapping
-        "gradients", "extras", "slots" and "learns"; without "gradients" those of colours alone.
+        "gradients", "extras", "slots" and "learns"; without "gradients", only colour gradients are computed.
     absolute : bool
-        Whether the absolute densification signal is gathered too.
-    features : Features, optional
+        Whether to gather the absolute densification signal.
+    features : FeatureBuffers, optional
         Further channels.
     """
     if sums.get("gradients") is None:
@@ -162,17 +162,17 @@ def blend_gradients(
 def splat_gradients(
     splats: Mapping[str, Tensor], sums: Pointers, gradients: Mapping[str, Tensor | None], *, clears: bool = False
 ) -> Work:
-    """Gradients of the parameters, of the sums of :func:`blend_gradients`.
+    """Compute the gradients of the parameters from the sums of :func:`blend_gradients`.
 
     Parameters
     ----------
     splats : mapping of attribute to Tensor
     sums : mapping
-        "tile_counts", "learns", "gradients" and "extras"; without "gradients" those of colours alone.
+        "tile_counts", "learns", "gradients" and "extras"; without "gradients", only colour gradients are computed.
     gradients : mapping of name to Tensor or None
-        To be filled, by attribute, "probe" and "intrinsics"; absent or None: not computed.
+        Output tensors by attribute, "probe" and "intrinsics"; absent or None: not computed.
     clears : bool
-        Whether the sums are zeros afterwards.
+        Whether to reset the sums to zero.
     """
     count = len(splats["means"])
     scalars = {"count": count, "sh_rest": splats["shN"].shape[1], "clears": int(clears)}

@@ -1,4 +1,4 @@
-"""Room for the pairs of a view without asking the device for their number."""
+"""Memory for the pairs of splat and tile of a view, without waiting for the device to count them."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from gs2d.kernels.cuda.driver import fault_of
 
 __all__ = ["MAX_PAIRS", "PairBudget", "Rendering", "room_for"]
 
-SLACK = 1.25  # room of a view that was not rendered before, in the largest number of its size
-VIEW_SLACK = 1.1  # of one that was, in its last number
-MAX_VIEWS = 1 << 14  # numbers that are kept: cameras that are learned are new ones each time
+SLACK = 1.25  # room for a new view, relative to the largest count at its image size
+VIEW_SLACK = 1.1  # room for a known view, relative to its last count
+MAX_VIEWS = 1 << 14  # counts to keep; a learned camera is a new view each time
 STEP = 1 << 16  # room is a multiple of it, so that torch's allocator sees few sizes
-FORGET = 1 / 1024  # share of the largest number that goes with each rendering: room that is not used is sorted too
+FORGET = 1 / 1024  # decay of the largest count per rendering: unused room is sorted too
 MAX_PAIRS = (1 << 31) - 1
 
 
 class Rendering(NamedTuple):
-    """What is rendered: tiles of the image, how many splats, and the camera in bytes."""
+    """Key of a rendering: number of tiles, number of splats, and the camera as bytes."""
 
     tiles: int
     splats: int = 1
@@ -28,22 +28,21 @@ class Rendering(NamedTuple):
 
 
 class PairBudget:
-    """How much room the renderings of a training run make for pairs of splat and tile.
+    """Decides how many pairs of splat and tile a rendering of a training run has room for.
 
-    The first rendering of a size waits for the number of pairs; later ones wait for nothing. A view that was rendered
-    before takes VIEW_SLACK times its last number, and more where splats were added since: views of one size differ by
-    a factor of three. Another view takes SLACK times the largest number of its size so far, which is slowly forgotten.
-    If that is too little, the pairs farthest away are left out, which ``overflow`` says on the device at once, and
-    ``overflowed`` on the host afterwards. So an update that reads ``overflow`` does nothing, and the caller renders
-    again with ``exact`` set. Both speak of all renderings since the last ``overflowed``: an iteration may render two
-    views.
+    The first rendering of an image size waits for its count of pairs; later ones do not wait. A known view gets
+    VIEW_SLACK times its last count, scaled up if splats were added; views of one size differ by a factor of three. A
+    new view gets SLACK times the largest count at its size, which decays slowly. If that is too little, the farthest
+    pairs are dropped. ``overflow`` then tells the device at once, so that updates change nothing, and ``overflowed``
+    tells the host later, so that the caller repeats the iteration with ``exact`` set. Both cover all renderings since
+    the last call of ``overflowed``, since an iteration may render two views.
 
     Attributes
     ----------
     exact : bool
-        The next renderings wait for the number.
+        Whether the next renderings wait for their counts.
     overflow : Tensor [] int32 or None
-        On the device: whether a rendering lacks pairs. None where all were exact.
+        Whether a rendering lacks pairs, on the device. None if all renderings were exact.
     """
 
     def __init__(self) -> None:
@@ -51,12 +50,12 @@ class PairBudget:
         self.overflow: Tensor | None = None
         self._largest: dict[int, float] = {}  # by the number of tiles
         self._of_view: dict[bytes, tuple[int, int]] = {}  # pairs, and splats at that time, by camera
-        self._asked: list[tuple[Rendering, int]] = []  # renderings whose numbers are not known, and their room
-        self._host: list[Tensor] = []  # those numbers, as many as were ever asked for at a time
+        self._asked: list[tuple[Rendering, int]] = []  # renderings with unknown counts, and their room
+        self._host: list[Tensor] = []  # host memory for these counts, reused
         self._event: Any = None
 
     def room(self, rendering: Rendering) -> int | None:
-        """Pairs to make room for; None = wait for their number, and ``learn`` it."""
+        """Return the pairs to reserve; None: wait for the count and pass it to ``learn``."""
         largest = self._largest.get(rendering.tiles)
         if self.exact or largest is None:
             return None
@@ -68,7 +67,7 @@ class PairBudget:
         return min(-(-int(wanted) // STEP) * STEP, MAX_PAIRS)
 
     def learn(self, rendering: Rendering, pairs: int) -> None:
-        """Take the number of pairs of a rendering, once it is known."""
+        """Record the count of pairs of a rendering."""
         tiles = rendering.tiles
         self._largest[tiles] = max(pairs, self._largest.get(tiles, 0) * (1 - FORGET))
         if rendering.camera:
@@ -77,16 +76,16 @@ class PairBudget:
             self._of_view[rendering.camera] = pairs, rendering.splats
 
     def ask(self, rendering: Rendering, room: int, pairs: Tensor) -> None:
-        """Keep the number of pairs [] int64 of a rendering with ``room``, to be looked at later."""
+        """Copy the count of pairs [] int64 of a rendering with ``room`` to the host, without waiting."""
         lacks = (pairs > room).to(torch.int32)
         self.overflow = lacks if self.overflow is None else self.overflow | lacks
         self.expect(rendering, room, pairs.device).copy_(pairs, non_blocking=True)
         self.asked(pairs.device)
 
     def expect(self, rendering: Rendering, room: int, device: torch.device) -> Tensor:
-        """Return where the number of pairs of a rendering with ``room`` is to be written, [] int64: the host's memory.
+        """Return the host tensor [] int64 for the count of pairs of a rendering with ``room``.
 
-        What writes it sets ``overflow`` too, and says when it is on its way (:meth:`asked`).
+        The caller writes it, sets ``overflow``, and calls :meth:`asked` after queueing the write.
         """
         if len(self._host) == len(self._asked):
             self._host.append(torch.empty((), dtype=torch.int64, pin_memory=device.type == "cuda"))
@@ -94,18 +93,18 @@ class PairBudget:
         return self._host[len(self._asked) - 1]
 
     def asked(self, device: torch.device) -> None:
-        """Remember the moment, on the current stream, from which the numbers are there."""
+        """Record an event on the current stream, after which the counts are on the host."""
         if device.type == "cuda":
             self._event = self._event or torch.cuda.Event()
             self._event.record(torch.cuda.current_stream(device))
 
     def overflowed(self) -> bool:
-        """Whether a rendering lacked pairs; waits until their numbers are known, not until they are done.
+        """Whether a rendering lacked pairs; waits for the counts, not for the renderings.
 
         Raises
         ------
         BackendError
-            An error that a kernel has left behind: torch meets it first here.
+            If an earlier kernel failed: torch reports it here first.
         """
         asked, self._asked, self.overflow = self._asked, [], None
         if asked and self._event is not None:
@@ -118,11 +117,11 @@ class PairBudget:
 
 
 def room_for(pairs: Tensor, rendering: Rendering, budget: PairBudget | None) -> int:
-    """Room for the pairs of a rendering: their number [] int64, for which the host waits, or what the budget allows."""
+    """Return the room for a rendering with ``pairs`` [] int64: the budget's, or the count, for which the host waits."""
     room = None if budget is None else budget.room(rendering)
     if room is None:
         with fault_of("the number of pairs of splat and tile"):
-            room = int(pairs)  # the one wait of a rendering
+            room = int(pairs)  # the only wait of a rendering
         if budget is not None:
             budget.learn(rendering, room)
     elif budget is not None:

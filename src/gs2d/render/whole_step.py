@@ -1,4 +1,4 @@
-"""A whole iteration of training in one piece: what a backend is told that does it without being asked part by part."""
+"""The description of a whole training iteration, for backends that run one in a single call."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ __all__ = ["Learned", "StepLosses", "StepNormals", "WholeStep"]
 
 
 class Learned(NamedTuple):
-    """How an attribute learns.
+    """State and learning rate of an attribute.
 
     Attributes
     ----------
-    mean, square : Tensor, like the attribute
+    mean, square : Tensor, same shape as the attribute
         Adam's moments, changed in place.
     rate : float
     step : int
-        Of the bias correction, counted from 1 and with this one.
+        Step number for the bias correction, 1 in the first step.
     trained : Tensor [N] bool or None
         Rows that are False are not written.
     """
@@ -43,11 +43,11 @@ class StepNormals(NamedTuple):
     ----------
     weight : float
     depth : "mean" or "median"
-        Depth that the normals come from.
+        Depth from which normals are computed.
     at_camera : bool
-        Whether empty pixels lie at the camera's centre (``losses.formulas.normals_from_depth``).
+        Whether empty pixels lie at the camera centre (``losses.formulas.normals_from_depth``).
     of_object : bool
-        Whether only the object counts: by the image's alpha, else the rendered one.
+        Weight pixels by the alpha of the image, or by the rendered alpha if the image has none.
     """
 
     weight: float
@@ -64,7 +64,7 @@ class StepLosses(NamedTuple):
     l1, ssim, l2 : float
         Weights.
     silhouette : float or None
-        Weight, for images with alpha; None: no such loss.
+        Weight, for images with alpha; None: no silhouette loss.
     normals : StepNormals or None
     """
 
@@ -77,31 +77,32 @@ class StepLosses(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class WholeStep:
-    """An iteration of training; all tensors are on the device of the splats.
+    """A training iteration; all tensors are on the device of the splats.
 
     Attributes
     ----------
     splats : Splats
-        Changed in place, by Adam.
+        Changed in place by Adam.
     camera : Camera
-        That learns nothing.
+        Without learned pose or intrinsics.
     settings : RasterSettings
     photograph : Tensor [H, W, 3 or 4] uint8
-        As it was decoded; alpha over ``background``.
+        Decoded image; a transparent one is composited over ``background``.
     mask : Tensor [H, W] bool or None
         False = ignore this pixel.
     valid : int
-        Pixels that count.
+        Number of valid pixels.
     background : 3 floats
     losses : StepLosses
-        Those that are active.
+        Active losses.
     rows : Tensor [N] bool or None
-        The splats of which anything learns; None: all of them.
+        Splats that are trained; None: all.
     learned : mapping of attribute to Learned
+        Attributes that are trained.
     betas : (float, float, float)
         Adam's beta1, beta2 and epsilon.
     gathered : mapping of str to Tensor [N]
-        Where the densification signal is added: "signed" and "count", and maybe "absolute"; empty: nowhere.
+        Sums of the densification signal: "signed", "count" and optionally "absolute"; empty: not gathered.
     """
 
     splats: Splats

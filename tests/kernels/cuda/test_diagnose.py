@@ -34,13 +34,13 @@ MENDING = (
     ({"torch_cuda": (11, 8)}, "torch is built for CUDA 11.8, CUDA 12 or newer is needed", "for CUDA 12 or 13"),
     (
         {"torch_cuda": (13, 0)},
-        "cuda.bindings is not here (No module named 'cuda')",
+        "cuda.bindings is missing (No module named 'cuda')",
         "pip install 'cuda-bindings>=13,<14' 'nvidia-cuda-nvrtc>=13,<14' (the extra cuda13;",
     ),
-    ({"bindings_error": ""}, "NVRTC is not here (libnvrtc not found)", "'nvidia-cuda-nvrtc>=13,<14'"),
-    ({"nvrtc_error": "", "nvrtc": (13, 0)}, "no NVIDIA driver is here (libcuda not found)", "install NVIDIA's driver"),
-    ({"driver_error": "", "driver": (12, 4)}, "driver supports CUDA 12.4, but torch is of CUDA 13.0", "update"),
-    ({"torch_cuda": (12, 8)}, "driver supports CUDA 12.4, but NVRTC is of CUDA 13.0", "update"),
+    ({"bindings_error": ""}, "NVRTC is missing (libnvrtc not found)", "'nvidia-cuda-nvrtc>=13,<14'"),
+    ({"nvrtc_error": "", "nvrtc": (13, 0)}, "no NVIDIA driver is installed (libcuda not found)", "install NVIDIA's driver"),
+    ({"driver_error": "", "driver": (12, 4)}, "driver supports CUDA 12.4, but torch needs CUDA 13.0", "update"),
+    ({"torch_cuda": (12, 8)}, "driver supports CUDA 12.4, but NVRTC needs CUDA 13.0", "update"),
     ({"nvrtc": (12, 9)}, "torch sees no CUDA device (no NVIDIA driver)", "CUDA_VISIBLE_DEVICES"),
     ({"devices": (H200,)}, "NVIDIA H200: the GPU must have compute capability 7.5", "--backend cpu"),
 )

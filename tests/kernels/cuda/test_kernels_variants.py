@@ -236,7 +236,7 @@ def test_tiles_beyond_32767_are_blended_as_any_other(emulator: Emulator) -> None
         upstream["color"] = torch.zeros(cam.height, cam.width, 3)
         upstream["color"][-16:, -16:] = g_color
         means = torch.empty_like(scene.means)
-        wanted = cuda_passes.Wanted({**dict.fromkeys(ATTRIBUTES), "means": means, "probe": None})
+        wanted = cuda_passes.RequestedGradients({**dict.fromkeys(ATTRIBUTES), "means": means, "probe": None})
         cuda_passes.backward(FewBlocks(emulator), frame, parameters, upstream, wanted)
         found.append((frame.images["color"][-16:, -16:], means))
     (far_color, far_means), (near_color, near_means) = found

@@ -36,7 +36,7 @@ def folder_with(folder: Path, architectures: tuple[str, ...], **changes: object)
 
 
 def no_compiler() -> ModuleType:
-    raise BackendError("the CUDA compiler NVRTC is not here; install it")
+    raise BackendError("the CUDA compiler NVRTC is missing; install it")
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def test_code_of_other_sources_or_of_another_version_is_not_taken(
 ) -> None:
     bring("sm_90", **changes)
     assert nvrtc.shipped_kernels() is None
-    with pytest.raises(BackendError, match="NVRTC is not here"):
+    with pytest.raises(BackendError, match="NVRTC is missing"):
         nvrtc.cubin("cuda/slots.cu", "sm_90", tmp_path)
 
 
@@ -77,7 +77,7 @@ def test_a_warm_cache_needs_no_compiler(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(nvrtc, "shipped_kernels", lambda: None)
     monkeypatch.setattr(nvrtc, "_nvrtc", no_compiler)
     arch = nvrtc.architecture_for((9, 0))
-    with pytest.raises(BackendError, match="NVRTC is not here"):
+    with pytest.raises(BackendError, match="NVRTC is missing"):
         nvrtc.cubin("cuda/slots.cu", arch, tmp_path)
     monkeypatch.setattr(nvrtc, "compile_source", lambda name, arch: nvrtc.Cubin(b"compiled", "log"))
     nvrtc.cubin("cuda/slots.cu", arch, tmp_path)

@@ -1,1 +1,1 @@
-"""The CUDA kernels: sources (``*.cu``, ``*.h``) and how they are compiled. Nothing here is imported without need."""
+"""The CUDA kernels: sources (``*.cu``, ``*.h``) and how they are compiled. Modules are imported only when needed."""

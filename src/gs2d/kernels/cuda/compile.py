@@ -1,10 +1,9 @@
-"""Compile the CUDA kernels with NVRTC and keep the cubins.
+"""Compile the CUDA kernels with NVRTC and cache the cubins.
 
-No toolkit and no host compiler: NVRTC comes as a wheel, with torch or by itself. It is imported only when something
-must be compiled: what the package brings (:mod:`gs2d.kernels.cuda.shipped`) or the cache holds is not. A cubin is
-cached under a key of the package's version, its sources, the options and the architecture, so a changed package cannot
-meet a stale one. It is written under another name and renamed, so that two
-processes or a killed one leave nothing or a whole file; it carries a digest, so that a damaged one is compiled again.
+This needs neither the CUDA toolkit nor a host compiler: NVRTC comes as a wheel, with torch or by itself. It is imported
+only for kernels that are neither shipped (:mod:`gs2d.kernels.cuda.shipped`) nor cached. The cache key covers the
+package version, sources, options and architecture, so a changed package never loads a stale cubin. Cubins are written
+to a temporary name and renamed, so no process sees a partial file, and carry a digest, so damaged ones are recompiled.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ __all__ = [
 ]
 
 ARCHITECTURES = SHIPPED
-# --fmad=false: every fused multiply-add is written out in core/, so that forward, backward and CPU decide alike.
+# --fmad=false: core/ writes out every fused multiply-add, so that forward, backward and CPU take the same branches.
 OPTIONS = ("--std=c++17", "--fmad=false", "--ptxas-options=-v", "--device-as-default-execution-space")
 REMEDY = "pip install nvidia-cuda-nvrtc cuda-bindings (torch's CUDA wheels bring both), or use --backend cpu"
 DIGEST_BYTES = 32
@@ -52,14 +51,14 @@ KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )
 
 @dataclass(frozen=True)
 class KernelUsage:
-    """What ptxas says about one kernel.
+    """Resources of one kernel, as reported by ptxas.
 
     Attributes
     ----------
     registers : int
         Per thread.
     spilled_bytes, stack_bytes : int
-        Local memory per thread, stores and loads of spills together; 0 in a healthy kernel.
+        Local memory per thread, spill stores and loads together; 0 in a good kernel.
     shared_bytes : int
         Per block.
     """
@@ -72,13 +71,13 @@ class KernelUsage:
 
 @dataclass(frozen=True)
 class Cubin:
-    """Machine code for one architecture (PTX for ``compute_XX``), and the compiler's log ("" where it was cached)."""
+    """Machine code for one architecture (PTX for ``compute_XX``), and the compiler's log ("" if it was cached)."""
 
     code: bytes
     log: str
 
     def usage(self) -> dict[str, KernelUsage]:
-        """Return registers, spills, stack and shared memory of each kernel, from the log."""
+        """Return the resources of each kernel, from the log."""
         found: dict[str, KernelUsage] = {}
         for part in self.log.split("Compiling entry function '")[1:]:
             found[part.partition("'")[0]] = KernelUsage(
@@ -100,7 +99,7 @@ def _number(pattern: str, text: str, missing: int | None = None) -> int:
 
 
 def sources() -> dict[str, str]:
-    """All sources by the name under which they include each other (``core/base.h``, ``cuda/project.cu``)."""
+    """Return all sources by their name in includes (``core/base.h``, ``cuda/project.cu``)."""
     root = resources.files("gs2d.kernels")
     found = {}
     for folder in ("core", "cuda"):
@@ -111,7 +110,7 @@ def sources() -> dict[str, str]:
 
 
 def source_names() -> tuple[str, ...]:
-    """Return the files that hold kernels: ``cuda/project.cu`` and so on."""
+    """Return the names of the files with kernels, such as ``cuda/project.cu``."""
     return tuple(name for name in sources() if name.endswith(".cu"))
 
 
@@ -121,7 +120,7 @@ def kernel_sources() -> dict[str, str]:
 
 
 def shipped_kernels() -> Shipped | None:
-    """Return the machine code that this installation brought; None where it has none, or sources were edited."""
+    """Return the shipped machine code; None without any, or if sources were edited."""
     return _shipped(gs2d.__version__, digest_of(sources(), OPTIONS))
 
 
@@ -129,9 +128,9 @@ def _nvrtc() -> Any:
     try:
         from cuda.bindings import nvrtc
 
-        _check(nvrtc, nvrtc.nvrtcVersion()[0], "nvrtcVersion")  # finds the library only now
+        _check(nvrtc, nvrtc.nvrtcVersion()[0], "nvrtcVersion")  # loads the library
     except (ImportError, RuntimeError, OSError) as error:
-        raise BackendError(f"the CUDA compiler NVRTC is not here ({error}); {REMEDY}") from error
+        raise BackendError(f"the CUDA compiler NVRTC is missing ({error}); {REMEDY}") from error
     return nvrtc
 
 
@@ -141,13 +140,7 @@ def _check(nvrtc: Any, status: Any, what: str) -> None:
 
 
 def nvrtc_version() -> tuple[int, int]:
-    """Of the compiler, (major, minor).
-
-    Raises
-    ------
-    BackendError
-        NVRTC is missing.
-    """
+    """Return the version of NVRTC, (major, minor); BackendError if it is missing."""
     nvrtc = _nvrtc()
     status, major, minor = nvrtc.nvrtcVersion()
     _check(nvrtc, status, "nvrtcVersion")
@@ -155,16 +148,17 @@ def nvrtc_version() -> tuple[int, int]:
 
 
 def architecture_for(capability: tuple[int, int]) -> str:
-    """Return what to compile for on a device of this compute capability: ``(9, 0)`` -> ``"sm_90"``.
+    """Return the architecture to compile for on a device of this compute capability: ``(9, 0)`` -> ``"sm_90"``.
 
-    What the package brings comes first, and needs no compiler. A device newer than the compiler runs code for an older
-    one of the same major version. Of a major version that the compiler does not know it gets ``"compute_120"``, PTX of
-    the newest known one, which the driver translates. Without a compiler it is what the cache may hold.
+    A shipped architecture comes first, since it needs no compiler. A device newer than the compiler runs code for an
+    older one of the same major version. For a newer major version the result is PTX of the newest known architecture,
+    such as ``"compute_120"``, which the driver translates. Without a compiler it is an architecture that the cache may
+    hold.
 
     Raises
     ------
     BackendError
-        The device is too old, or between what NVRTC knows.
+        If no architecture fits the device.
     """
     if capability < MIN_CAPABILITY:
         raise BackendError(
@@ -190,7 +184,7 @@ def architecture_for(capability: tuple[int, int]) -> str:
 
 
 def _known_architectures() -> list[int]:
-    """Of the compiler; without one those for which this package is compiled somewhere."""
+    """Return the architectures that the compiler knows; without a compiler, the shipped ones."""
     try:
         nvrtc = _nvrtc()
     except BackendError:
@@ -201,21 +195,21 @@ def _known_architectures() -> list[int]:
 
 
 def compile_source(name: str, arch: str, options: Sequence[str] = OPTIONS) -> Cubin:
-    """Compile one file, always.
+    """Compile one file, without the cache.
 
     Parameters
     ----------
     name : str
         One of :func:`source_names`.
     arch : str
-        ``"sm_90"`` and the like, or ``"compute_90"`` for PTX.
+        Such as ``"sm_90"``, or ``"compute_90"`` for PTX.
     options : sequence of str
         NVRTC options besides the architecture.
 
     Raises
     ------
     BackendError
-        If NVRTC is missing, does not know the architecture, or refuses the source (with its first error).
+        If NVRTC is missing, does not know the architecture, or rejects the source (with its first error).
     """
     files = sources()
     headers = {key: text for key, text in files.items() if key.endswith(".h")}
@@ -225,16 +219,16 @@ def compile_source(name: str, arch: str, options: Sequence[str] = OPTIONS) -> Cu
 def compile_text(
     text: str, name: str, arch: str, *, headers: Mapping[str, str] | None = None, options: Sequence[str] = OPTIONS
 ) -> Cubin:
-    """Compile a source that is not of the package (the benchmarks' probes).
+    """Compile a source that is not part of the package (the benchmarks' probes).
 
     Parameters
     ----------
     text, name : str
-        The source, and what the compiler calls it.
+        The source, and its name in messages.
     arch, options
         As for :func:`compile_source`.
     headers : mapping of str to str
-        What it may include, by name.
+        Files that it may include, by name.
 
     Raises
     ------
@@ -257,7 +251,7 @@ def compile_text(
         log = _bytes(nvrtc, program, "ProgramLog").decode(errors="replace").rstrip("\0")
         if status != nvrtc.nvrtcResult.NVRTC_SUCCESS:
             first = next((line for line in log.splitlines() if "error" in line), status.name)
-            raise BackendError(f"the CUDA compiler refused {name} for {arch}: {first.strip()}")
+            raise BackendError(f"the CUDA compiler rejected {name} for {arch}: {first.strip()}")
         return Cubin(_bytes(nvrtc, program, "PTX" if arch.startswith("compute_") else "CUBIN"), log)
     finally:
         nvrtc.nvrtcDestroyProgram(program)
@@ -273,10 +267,10 @@ def _bytes(nvrtc: Any, program: Any, what: str) -> bytes:
 
 
 def cache_folder() -> Path | None:
-    """``$GS2D_CACHE``, else ``$XDG_CACHE_HOME/gs2d``, else ``~/.cache/gs2d``; it need not exist. None without a home.
+    """Return ``$GS2D_CACHE``, else ``$XDG_CACHE_HOME/gs2d``, else ``~/.cache/gs2d``, existing or not.
 
-    A user without a home (a number without a name, as containers have) compiles at every start: a folder that others
-    may write to is no place for what is executed.
+    None for a user without a home folder, as in some containers: then kernels are compiled at every start, since
+    executable code does not belong into a folder that others can write to.
     """
     named = os.environ.get("GS2D_CACHE")
     if named:
@@ -289,7 +283,7 @@ def cache_folder() -> Path | None:
 
 
 def is_writable(folder: Path | None) -> bool:
-    """Whether cubins can be kept there; nothing is written."""
+    """Whether cubins can be cached in a folder; writes nothing."""
     if folder is None:
         return False
     there = next((part for part in (folder, *folder.parents) if part.exists()), None)
@@ -297,14 +291,14 @@ def is_writable(folder: Path | None) -> bool:
 
 
 def _key(name: str, arch: str) -> str:
-    """Of the package's version and everything else that the machine code depends on but for the compiler's version."""
+    """Return the cache key: all that the machine code depends on except the compiler's version."""
     return digest_of(sources(), (gs2d.__version__, name, arch, *OPTIONS))[:32]
 
 
 def cubin(name: str, arch: str, folder: Path | None = None) -> Cubin:
-    """Machine code of one file for one architecture: the package's own, from the cache, or compiled.
+    """Return the machine code of one file for one architecture: shipped, cached, or compiled.
 
-    A cache that cannot be read or written costs compile time, nothing else: a read-only home must not stop training.
+    A cache that cannot be read or written only costs compile time.
 
     Parameters
     ----------
@@ -335,7 +329,7 @@ def cubin(name: str, arch: str, folder: Path | None = None) -> Cubin:
 
 
 def _read(path: Path) -> bytes | None:
-    """Return the code of a whole file; None where there is none, or not a whole one."""
+    """Return the code in a cached file; None if it is missing or damaged."""
     try:
         data = path.read_bytes()
     except OSError:

@@ -1,8 +1,8 @@
-"""The image losses on a GPU: the functions of ``kernels/native_losses.py`` over a launcher; nothing waits for the host.
+"""The image losses on a GPU: the functions of ``kernels/native_losses.py`` over a launcher, without waiting.
 
-Values are reduced in a fixed order, so they are the same from run to run. Unlike the native ones, gradients wait for
-the backward pass: their cotangents are read on the device, and nothing has to be guessed (``expected`` is accepted and
-not needed). The formulas are in ``kernels/core/losses.h``; ``losses.formulas`` has the same in torch.
+Values are summed in a fixed order, so they are the same from run to run. Unlike in the native losses, gradients are
+computed in the backward pass, with cotangents read on the device; ``expected`` is accepted for the same signature. The
+formulas are in ``kernels/core/losses.h``; ``losses.formulas`` has the same in torch.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from gs2d.kernels.cuda.kernel_arguments import (
     PhotometricVjpArguments,
     fill,
 )
-from gs2d.kernels.native_losses import NormalOptions
+from gs2d.kernels.native_losses import NormalOptions, needs_gradient
 
 if TYPE_CHECKING:
     from gs2d.kernels.cuda.launch import Launcher
@@ -35,13 +35,13 @@ if TYPE_CHECKING:
 __all__ = ["blur", "masked_mean", "normal_consistency", "photometric", "strips"]
 
 THREADS = 128
-STRIP, STRIP_ROWS = 128, 32  # photometric.cu: reals and rows of a block
-MEAN_PIXELS = 1024  # losses.cu: pixels of a block
+STRIP, STRIP_ROWS = 128, 32  # photometric.cu: reals and rows per block
+MEAN_PIXELS = 1024  # losses.cu: pixels per block
 NORMAL_W, NORMAL_H = 32, 8  # losses.cu: tile of the backward pass
 
 
 def ready(**tensors: Tensor) -> list[Tensor]:
-    """Return the tensors, detached and contiguous, or ShapeError unless all are float32 on the first one's device."""
+    """Return the tensors, detached and contiguous; ShapeError unless all are float32 on the device of the first."""
     device = next(iter(tensors.values())).device
     for name, tensor in tensors.items():
         if tensor.dtype != torch.float32 or tensor.device != device:
@@ -60,22 +60,17 @@ def _mask_of(mask: Tensor | None, device: torch.device) -> Tensor | None:
     return mask.contiguous()
 
 
-def _wanted(*tensors: Tensor) -> bool:
-    """Whether a gradient may be asked for (inside an autograd.Function it is too late to know)."""
-    return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-
-
 def _cotangent(given: Tensor | None) -> Tensor | None:
     return None if given is None else given.detach().to(torch.float32).contiguous()
 
 
 def strips(height: int, width: int) -> int:
-    """Return the blocks of photometric.cu."""
+    """Return the number of blocks of photometric.cu."""
     return -(-3 * width // STRIP) * -(-height // STRIP_ROWS)
 
 
 def _finish(launcher: Launcher, partials: Tensor, *, complement: bool = False) -> Tensor:
-    """[1 / count, mean, ...] from each block's [count, sum, ...], a row each."""
+    """Return [1 / count, mean, ...] from the blocks' [count, sum, ...], one row each."""
     means = partials.new_empty(len(partials))
     arguments = FinishArguments(blocks=partials.shape[1], values=len(partials) - 1, complement=int(complement))
     fill(arguments, partials=partials, means=means)
@@ -84,14 +79,9 @@ def _finish(launcher: Launcher, partials: Tensor, *, complement: bool = False) -
 
 
 def blur(image: Tensor, *, launcher: Launcher) -> Tensor:
-    """Return the SSIM window (11x11 Gaussian, sigma 1.5, zero outside) over an image [H, W, 3]; not differentiable.
+    """Filter an image [H, W, 3] with the SSIM window (11x11 Gaussian, sigma 1.5, zero outside); not differentiable.
 
-    Of a target this is the ``target_mean`` that ``photometric`` takes.
-
-    Raises
-    ------
-    ShapeError
-        Another shape or dtype.
+    The result for a target is the ``target_mean`` of ``photometric``.
     """
     sizes = check_shapes({"image": (image, "H W 3")})
     (source,) = ready(image=image)
@@ -154,7 +144,7 @@ def photometric(
     expected: tuple[float, float, float] = (0.8, -0.2, 0.0),
     launcher: Launcher,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean L1, SSIM and L2 of an image, all differentiable in ``rendered``.
+    """Return mean L1, SSIM and L2 of an image, all differentiable in ``rendered``.
 
     Parameters
     ----------
@@ -163,21 +153,21 @@ def photometric(
     mask : Tensor [H, W] bool, optional
         False = ignore this pixel.
     target_mean : Tensor [H, W, 3], optional
-        ``blur(target)``, if at hand. Changes no bit of the result.
+        ``blur(target)``, to save time. Changes no bit of the result.
     expected : (float, float, float)
-        Not needed here; any cotangents cost the same.
+        Unused; any cotangents cost the same.
     launcher : Launcher
-        Of the tensors' device.
+        Launcher of the tensors' device.
 
     Returns
     -------
     l1, ssim, l2 : Tensor []
-        Means over valid pixels and channels; 0 when no pixel is valid. L2 is of the squared difference.
+        Means over valid pixels and channels; 0 if no pixel is valid. L2 is the mean squared difference.
 
     Raises
     ------
     ShapeError
-        Shapes that differ, or another dtype or device.
+        If shapes, dtypes or devices differ.
     """
     del expected
     images = {"rendered": rendered, "target": target}
@@ -188,7 +178,7 @@ def photometric(
     _, target, *known = ready(**images)
     mask = _mask_of(mask, rendered.device)
     mean = known[0] if known else None
-    l1, ssim, l2 = _Photometric.apply(rendered.contiguous(), target, mask, mean, _wanted(rendered), launcher)
+    l1, ssim, l2 = _Photometric.apply(rendered.contiguous(), target, mask, mean, needs_gradient(rendered), launcher)
     return l1, ssim, l2
 
 
@@ -251,7 +241,7 @@ def normal_consistency(
     expected: float = 0.05,
     launcher: Launcher,
 ) -> Tensor:
-    """Return normal consistency [], the form on a GPU of the functions of the same name in ``losses.formulas``.
+    """Return the normal consistency loss [], the CUDA form of the functions in ``losses.formulas``.
 
     Parameters
     ----------
@@ -262,14 +252,14 @@ def normal_consistency(
     alpha : Tensor [H, W] float32
     how : NormalOptions
     expected : float
-        Not needed here.
+        Unused.
     launcher : Launcher
-        Of the tensors' device.
+        Launcher of the tensors' device.
 
     Raises
     ------
     ShapeError
-        Shapes that differ, or another dtype or device.
+        If shapes, dtypes or devices differ.
     """
     del expected
     how.check(normal, depth, alpha)
@@ -304,12 +294,9 @@ class _MaskedMean(torch.autograd.Function):
 
 
 def masked_mean(values: Tensor, mask: Tensor | None = None, *, launcher: Launcher) -> Tensor:
-    """Mean [] of a map [H, W] over the pixels where ``mask`` is True, summed in a fixed order; 0 when there are none.
+    """Return the mean [] of a map [H, W] over the pixels where ``mask`` is True, 0 if there are none.
 
-    Raises
-    ------
-    ShapeError
-        Shapes that differ, or another dtype or device.
+    The summation order is fixed.
     """
     check_shapes({"values": (values, "H W")} | ({} if mask is None else {"mask": (mask, "H W")}))
     ready(values=values)

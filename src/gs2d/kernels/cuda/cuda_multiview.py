@@ -1,4 +1,4 @@
-"""The comparison of two views on a GPU: ``kernels/native_multiview.py`` over a launcher; nothing waits for the host."""
+"""The comparison of two views on a GPU: ``kernels/native_multiview.py`` over a launcher, without waiting."""
 
 from __future__ import annotations
 
@@ -17,19 +17,13 @@ if TYPE_CHECKING:
 __all__ = ["compare_views"]
 
 THREADS = 128
-PATCHES = 4  # multiview.cu: of a block
+PATCHES = 4  # multiview.cu: per block
 
 
 def compare_views(
     depth: Tensor, normal: Tensor, motion: Tensor, given: Compared, *, launcher: Launcher
 ) -> tuple[Tensor, Tensor]:
-    """Compare pixels of a view with a neighbour: the form on a GPU of the function of ``kernels.native_multiview``.
-
-    Raises
-    ------
-    ShapeError
-        Shapes that differ, or another dtype or device.
-    """
+    """Compare pixels of a view with a neighbouring view: the CUDA form of ``native_multiview.compare_views``."""
     ready(depth=depth, normal=normal, motion=motion, reference=given.reference, source=given.source)
     ready(depth=depth, source_depth=given.source_depth)
 

@@ -1,6 +1,6 @@
-"""Whether this machine can run the CUDA kernels, and the first thing that is missing if not.
+"""Diagnosis of a machine for the CUDA kernels: whether it can run them, and if not, what to fix first.
 
-Facts are gathered first and judged afterwards, in the order in which a user would have to mend them.
+Facts are gathered first and checked afterwards, in the order in which a user would fix them.
 """
 
 from __future__ import annotations
@@ -23,38 +23,38 @@ from gs2d.kernels.cuda.driver import (
     own_default_stream,
 )
 
-__all__ = ["Facts", "MissingFile", "describe", "gather", "missing"]
+__all__ = ["Facts", "Obstacle", "describe", "gather", "missing"]
 
 ANYWAY = "or use --backend cpu"
-OLDEST_CUDA = (12, 0)  # the driver's functions that load kernels for every device at once are of that version
+OLDEST_CUDA = (12, 0)  # first version that loads kernels for all devices at once
 
 
 @dataclass(frozen=True)
 class Facts:
-    """What the CUDA backend needs of a machine, as found.
+    """Properties of a machine that matter to the CUDA backend.
 
     Attributes
     ----------
     torch_version : str
     torch_cuda : (int, int) or None
-        The CUDA version that torch was built with; None = built without.
+        CUDA version of the torch build; None: built without CUDA.
     bindings_error, nvrtc_error, driver_error : str
-        Why each cannot be used; "" where it can.
+        Why each cannot be used; "" if it can.
     nvrtc, driver : (int, int) or None
-        CUDA versions of the compiler, and the newest that the driver supports.
+        CUDA version of the compiler, and the newest CUDA version that the driver supports.
     devices : tuple of (str, (int, int))
-        Name and compute capability of every device that torch sees, the current one first.
+        Name and compute capability of each device visible to torch, the current one first.
     torch_error : str
-        What torch said when it was asked for devices.
+        torch's warning if it finds no device.
     architecture_error : str
-        Why nothing can be compiled for the current device; "" where it can.
+        Why nothing can be compiled for the current device; "" if it can.
     cache : Path or None
-        Where machine code is kept; None where there is no home.
+        Folder of cached machine code; None without a home folder.
     cache_writable : bool
-    shipped : (int, int) or None
-        CUDA version of the machine code that the package brought for the current device; None: it has none.
     own_default_stream : bool
-        Whether the bindings were told to take torch's default stream for another one.
+        Whether cuda.bindings uses a default stream of its own instead of torch's.
+    shipped : (int, int) or None
+        CUDA version of the shipped machine code for the current device; None: there is none.
     """
 
     torch_version: str
@@ -74,53 +74,53 @@ class Facts:
 
 
 @dataclass(frozen=True)
-class MissingFile:
-    """The first thing that is missing, and what to do about it."""
+class Obstacle:
+    """Why the backend cannot run, and the remedy."""
 
     reason: str
     remedy: str
 
 
-def missing(facts: Facts) -> MissingFile | None:
-    """Return what keeps the backend from running; None if nothing does."""
+def missing(facts: Facts) -> Obstacle | None:
+    """Return the first obstacle, None if the backend can run."""
     if facts.torch_cuda is None:
-        return MissingFile(
+        return Obstacle(
             f"torch {facts.torch_version} is built without CUDA",
             f"install a CUDA build of torch (on Linux plain `pip install torch` brings one), {ANYWAY}",
         )
     if facts.torch_cuda < OLDEST_CUDA:
-        return MissingFile(
+        return Obstacle(
             f"torch is built for CUDA {dotted(facts.torch_cuda)}, CUDA 12 or newer is needed",
             f"install a torch build for CUDA 12 or 13, {ANYWAY}",
         )
     if facts.bindings_error:
-        return MissingFile(
-            f"the Python package cuda.bindings is not here ({facts.bindings_error})", _install(facts.torch_cuda[0])
+        return Obstacle(
+            f"the Python package cuda.bindings is missing ({facts.bindings_error})", _install(facts.torch_cuda[0])
         )
     if facts.nvrtc_error and facts.shipped is None:
-        return MissingFile(f"the CUDA compiler NVRTC is not here ({facts.nvrtc_error})", _install(facts.torch_cuda[0]))
+        return Obstacle(f"the CUDA compiler NVRTC is missing ({facts.nvrtc_error})", _install(facts.torch_cuda[0]))
     if facts.driver_error or facts.driver is None:
-        return MissingFile(f"no NVIDIA driver is here ({facts.driver_error})", DRIVER_REMEDY)
+        return Obstacle(f"no NVIDIA driver is installed ({facts.driver_error})", DRIVER_REMEDY)
     compiler = facts.nvrtc if facts.shipped is None else facts.shipped
     for name, needs in (("torch", facts.torch_cuda), ("NVRTC" if facts.shipped is None else "gs2d", compiler)):
         if needs is not None and facts.driver[0] < needs[0]:  # within a major version newer code runs on older drivers
-            return MissingFile(
-                f"the driver supports CUDA {dotted(facts.driver)}, but {name} is of CUDA {dotted(needs)}",
+            return Obstacle(
+                f"the driver supports CUDA {dotted(facts.driver)}, but {name} needs CUDA {dotted(needs)}",
                 f"{OLD_DRIVER}, {ANYWAY}",
             )
     if not facts.devices:
         said = f" ({facts.torch_error})" if facts.torch_error else ""
-        return MissingFile(f"torch sees no CUDA device{said}", f"check `nvidia-smi` and CUDA_VISIBLE_DEVICES, {ANYWAY}")
+        return Obstacle(f"torch sees no CUDA device{said}", f"check `nvidia-smi` and CUDA_VISIBLE_DEVICES, {ANYWAY}")
     if facts.own_default_stream:
-        return MissingFile(f"{PER_THREAD} is set: kernels would run beside torch's work, not after it", "unset it")
+        return Obstacle(f"{PER_THREAD} is set: kernels would run beside torch's work, not after it", "unset it")
     if facts.architecture_error:
         reason, _, remedy = facts.architecture_error.partition("; ")
-        return MissingFile(f"{facts.devices[0][0]}: {reason}", remedy)
+        return Obstacle(f"{facts.devices[0][0]}: {reason}", remedy)
     return None
 
 
 def _install(major: int) -> str:
-    """How to get bindings and compiler of the CUDA version of torch: a mixture does not find its libraries."""
+    """Return how to install bindings and compiler with torch's CUDA version; other versions do not find each other."""
     extra = f"cuda{major}"
     if extra not in EXTRAS:
         return f"install the cuda-bindings and the NVRTC of CUDA {major}, {ANYWAY}"
@@ -128,7 +128,7 @@ def _install(major: int) -> str:
 
 
 def describe(facts: Facts) -> str:
-    """One line about a machine that can run the backend."""
+    """Return a line about a machine that can run the backend."""
     names = [f"{name} (sm_{major}{minor})" for name, (major, minor) in facts.devices]
     compiler = f"NVRTC {dotted(facts.nvrtc)}"
     if facts.shipped is not None:
@@ -138,22 +138,22 @@ def describe(facts: Facts) -> str:
 
 
 def cache_words(cache: Path | None, writable: bool) -> str:
-    """Return what to say of a cache that keeps nothing."""
+    """Return a note about a cache that cannot be written, "" if it can."""
     if writable:
         return ""
     where = "there is no home folder (set GS2D_CACHE)" if cache is None else f"{cache} cannot be written"
     return f"; {where}: kernels are compiled at every start"
 
 
-def report() -> tuple[MissingFile | None, str]:
-    """Return what keeps the backend from running here, and a line about the machine where nothing does."""
+def report() -> tuple[Obstacle | None, str]:
+    """Return the first obstacle on this machine, or None with a line about the machine."""
     facts = gather()
     lacking = missing(facts)
     return lacking, "" if lacking is not None else describe(facts)
 
 
 def gather() -> Facts:
-    """Return the facts of this machine; only the first where torch is built without CUDA. Makes no context on a GPU."""
+    """Return the facts of this machine without creating a GPU context; only the first without a CUDA build of torch."""
     cuda = torch.version.cuda
     if cuda is None:
         return Facts(torch.__version__, None)
@@ -201,7 +201,7 @@ def gather() -> Facts:
 
 
 def seen_devices() -> tuple[tuple[tuple[str, tuple[int, int]], ...], str]:
-    """Return devices that torch sees, the current one first, and what it said where it sees none."""
+    """Return the devices visible to torch, the current one first, and torch's warning if there are none."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         usable = torch.cuda.is_available()
@@ -213,17 +213,17 @@ def seen_devices() -> tuple[tuple[tuple[str, tuple[int, int]], ...], str]:
 
 
 def version_of(text: str) -> tuple[int, int]:
-    """Return (6, 2) of "6.2.41133"."""
+    """Parse a version: "6.2.41133" -> (6, 2)."""
     major, _, rest = text.partition(".")
     return int(major), int(rest.partition(".")[0] or 0)
 
 
 def dotted(version: tuple[int, int] | None) -> str:
-    """Return "6.2" of (6, 2)."""
+    """Format a version: (6, 2) -> "6.2"."""
     return "?" if version is None else f"{version[0]}.{version[1]}"
 
 
 def inner(error: BackendError) -> str:
-    """Return what lies between the brackets of an error's message: the library's own words, one line of them."""
+    """Return the first line of the library's own error message."""
     text = str(error.__cause__ if error.__cause__ is not None else error).strip().splitlines()
     return text[0] if text else type(error).__name__

@@ -1,4 +1,4 @@
-"""The CUDA driver through ``cuda.bindings``, imported when first used, and its errors in words."""
+"""The CUDA driver through ``cuda.bindings``, imported at first use, and error messages with remedies."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ REMEDIES = {
     "CUDA_ERROR_UNSUPPORTED_PTX_VERSION": OLD_DRIVER,
     "CUDA_ERROR_SYSTEM_DRIVER_MISMATCH": "driver and kernel module differ: reboot",
     "CUDA_ERROR_SYSTEM_NOT_READY": "the GPU's fabric or service is not up: check `nvidia-smi`",
-    "CUDA_ERROR_NOT_FOUND": "the kernels and the Python package are of different versions: install gs2d again",
+    "CUDA_ERROR_NOT_FOUND": "kernels and Python package have different versions: install gs2d again",
     "CUDA_ERROR_INVALID_HANDLE": "the GPU was reset under this process: start it again",
     "CUDA_ERROR_CONTEXT_IS_DESTROYED": "the GPU was reset under this process: start it again",
     "CUDA_ERROR_LAUNCH_OUT_OF_RESOURCES": "a kernel is too large for this GPU; please report it",
@@ -34,24 +34,18 @@ REMEDIES = {
     "CUDA_ERROR_ECC_UNCORRECTABLE": "the GPU's memory is failing: reset it, or use another one",
 }
 
-# With it cuda.bindings takes stream 0 for one of the calling thread, torch for the one of all threads.
+# If set, stream 0 is a stream per thread for cuda.bindings, but one stream of all threads for torch.
 PER_THREAD = "CUDA_PYTHON_CUDA_PER_THREAD_DEFAULT_STREAM"
 
 
 def own_default_stream() -> bool:
-    """Whether kernels on torch's default stream would run beside torch's own work there, not after it."""
+    """Whether kernels on the default stream would not be ordered with torch's work on it."""
     return os.environ.get(PER_THREAD, "0") not in ("", "0")
 
 
 @contextmanager
 def fault_of(what: str) -> Iterator[None]:
-    """Turn the error that a kernel has left on the device, which torch meets when it waits, into one of ours.
-
-    Raises
-    ------
-    BackendError
-        With torch's first line and what to do.
-    """
+    """Convert a CUDA error that torch reports while waiting into a BackendError with a remedy."""
     try:
         yield
     except RuntimeError as error:  # torch.AcceleratorError is one, since torch 2.8
@@ -63,43 +57,25 @@ def fault_of(what: str) -> Iterator[None]:
 
 
 def load_driver() -> Any:
-    """``cuda.bindings.driver``.
-
-    Raises
-    ------
-    BackendError
-        It is not installed.
-    """
+    """Return the module ``cuda.bindings.driver``; BackendError if it is not installed."""
     try:
         from cuda.bindings import driver
     except (ImportError, RuntimeError, OSError) as error:
-        raise BackendError(f"the Python package cuda.bindings is not here ({error}); {BINDINGS_REMEDY}") from error
+        raise BackendError(f"the Python package cuda.bindings is missing ({error}); {BINDINGS_REMEDY}") from error
     return driver
 
 
 def driver_version(driver: Any) -> tuple[int, int]:
-    """Return the newest CUDA version that the installed driver supports, (major, minor).
-
-    Raises
-    ------
-    BackendError
-        There is no driver.
-    """
+    """Return the newest CUDA version that the driver supports, (major, minor); BackendError without a driver."""
     try:
         number = int(call(driver, "cuDriverGetVersion"))
-    except (ImportError, RuntimeError, OSError) as error:  # the library is looked for only now
-        raise BackendError(f"no NVIDIA driver is here ({one_line(error)}); {DRIVER_REMEDY}") from error
+    except (ImportError, RuntimeError, OSError) as error:  # the bindings load the library at the first call
+        raise BackendError(f"no NVIDIA driver is installed ({one_line(error)}); {DRIVER_REMEDY}") from error
     return number // 1000, number % 1000 // 10
 
 
 def call(driver: Any, name: str, *arguments: Any) -> Any:
-    """Call a function of the driver and return its value (None where it has none).
-
-    Raises
-    ------
-    BackendError
-        It failed: the function, the error's name and what to do.
-    """
+    """Call a function of the driver and return its value, or None; BackendError with a remedy if it fails."""
     status, *values = getattr(driver, name)(*arguments)
     if status != driver.CUresult.CUDA_SUCCESS:
         raise failure(name, status)
@@ -107,13 +83,13 @@ def call(driver: Any, name: str, *arguments: Any) -> Any:
 
 
 def failure(what: str, status: Any) -> BackendError:
-    """Return the error for a status that is not success."""
+    """Return the error for a status other than success."""
     name = str(getattr(status, "name", status))
     remedy = REMEDIES.get(name, "check `nvidia-smi` and the driver, or use --backend cpu")
     return BackendError(f"the CUDA driver failed in {what} ({name}); {remedy}")
 
 
 def one_line(error: BaseException) -> str:
-    """Return the first line of an error's words."""
+    """Return the first line of an error message."""
     words = str(error).strip().splitlines()
     return words[0] if words else type(error).__name__

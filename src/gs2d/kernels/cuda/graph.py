@@ -1,7 +1,6 @@
-"""A chain of launches that the driver starts at once (a CUDA graph), made kernel by kernel instead of by recording.
+"""A sequence of launches as a CUDA graph, built from kernel nodes instead of stream capture.
 
-What differs from one time to the next, cameras, learning rates, the room for pairs, is changed in the graph before it
-is started: only for the launches of which it does differ.
+Before each start, the nodes whose arguments changed (camera, learning rates, room for pairs) are updated.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from gs2d.kernels.cuda.driver import call, driver_version, failure
 
 __all__ = ["OLDEST_DRIVER", "Graph", "Work", "can_replay"]
 
-OLDEST_DRIVER = (12, 0)  # from which a node takes a kernel of a library
+OLDEST_DRIVER = (12, 0)  # first version whose nodes accept a kernel of a library
 NEEDED = (
     "CUDA_KERNEL_NODE_PARAMS",
     "cuGraphCreate",
@@ -27,16 +26,16 @@ NEEDED = (
 
 
 class Work:
-    """A launch that is made again and again, with arguments that stay where they are.
+    """A launch that is repeated with the same argument structure.
 
     Parameters
     ----------
     name : str
-        The kernel.
+        Name of the kernel.
     blocks, threads : int
-        ``blocks`` may change, and be anything but 0.
+        ``blocks`` may change but must not be 0.
     arguments : ctypes.Structure
-        May be filled anew.
+        May be changed between launches.
     """
 
     __slots__ = ("_pointer", "arguments", "blocks", "name", "parameters", "threads")
@@ -44,11 +43,11 @@ class Work:
     def __init__(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure) -> None:
         self.name, self.blocks, self.threads, self.arguments = name, blocks, threads, arguments
         self._pointer = ctypes.c_void_p(ctypes.addressof(arguments))
-        self.parameters = ctypes.addressof(self._pointer)  # what the driver takes: where the pointers lie
+        self.parameters = ctypes.addressof(self._pointer)  # address of the array of pointers for the driver
 
 
 def can_replay(driver: Any) -> bool:
-    """Whether the driver and its bindings know graphs as they are made here."""
+    """Whether the driver and its bindings support these graphs."""
     if not all(hasattr(driver, name) for name in NEEDED):
         return False
     try:
@@ -58,7 +57,7 @@ def can_replay(driver: Any) -> bool:
 
 
 class Graph:
-    """Launches one after another.
+    """A graph of sequential launches.
 
     Parameters
     ----------
@@ -67,19 +66,19 @@ class Graph:
     kernels : sequence
         Handles of loaded kernels, one for each launch.
     works : sequence of Work
-        As they are the first time.
+        With their first arguments.
 
     Raises
     ------
     BackendError
-        The driver does not make it.
+        If the driver cannot create the graph.
     """
 
     def __init__(self, driver: Any, kernels: Sequence[Any], works: Sequence[Work]) -> None:
         self._driver = driver
         graph = call(driver, "cuGraphCreate", 0)
-        self._nodes: list[tuple[Any, Any]] = []  # node, its parameters
-        self._sent: list[tuple[int, bytes]] = []  # what it has: blocks, arguments
+        self._nodes: list[tuple[Any, Any]] = []  # node and its parameters
+        self._sent: list[tuple[int, bytes]] = []  # blocks and arguments of each node
         before: list[Any] = []
         for kernel, work in zip(kernels, works, strict=True):
             parameters = driver.CUDA_KERNEL_NODE_PARAMS()
@@ -95,13 +94,7 @@ class Graph:
         self._executable = call(driver, "cuGraphInstantiate", graph, 0)
 
     def change(self, works: Sequence[Work]) -> None:
-        """Take over what differs from the last time.
-
-        Raises
-        ------
-        BackendError
-            The driver refuses; nothing was started.
-        """
+        """Update the nodes whose launch changed; BackendError if the driver refuses."""
         driver, executable, success = self._driver, self._executable, self._driver.CUresult.CUDA_SUCCESS
         for number, work in enumerate(works):
             now = work.blocks, bytes(work.arguments)
@@ -115,5 +108,5 @@ class Graph:
             self._sent[number] = now
 
     def launch(self, stream: Any) -> Any:
-        """Start it, and return the driver's status at once."""
+        """Start the graph and return the driver's status without waiting."""
         return self._driver.cuGraphLaunch(self._executable, stream)[0]

@@ -1,4 +1,4 @@
-"""The structures that the CUDA kernels take, field for field as in the ``.cu`` files; change both."""
+"""The argument structures of the CUDA kernels, field for field as in the ``.cu`` files; change both."""
 
 from __future__ import annotations
 
@@ -16,19 +16,20 @@ __all__ = [
     "BlendVjpArguments",
     "BlurArguments",
     "ClearArguments",
+    "DecodedTarget",
     "DepthArguments",
     "DigitArguments",
     "EmitArguments",
     "ErrorArguments",
     "FeatureArguments",
-    "Features",
+    "FeatureBuffers",
     "FinishArguments",
-    "Gathered",
+    "GatheredSignal",
+    "KernelView",
     "MeanArguments",
     "NormalArguments",
     "OccludedArguments",
     "OrderArguments",
-    "Photograph",
     "PhotometricArguments",
     "PhotometricVjpArguments",
     "ProjectArguments",
@@ -38,7 +39,6 @@ __all__ = [
     "RunningArguments",
     "SlotArguments",
     "SortArguments",
-    "View",
     "fill",
 ]
 
@@ -46,7 +46,7 @@ _Field = tuple[str, type]
 
 
 def fill(arguments: ctypes.Structure, **pointers: Tensor | int | None) -> None:
-    """Set the structure's pointers: to tensors, to addresses, or null."""
+    """Set pointers of a structure to tensors, addresses or null."""
     for name, pointer in pointers.items():
         setattr(arguments, name, pointer.data_ptr() if isinstance(pointer, Tensor) else pointer)
 
@@ -59,7 +59,7 @@ def _pointers(*names: str) -> tuple[_Field, ...]:
     return _all(ctypes.c_void_p, *names)
 
 
-class View(ctypes.Structure):
+class KernelView(ctypes.Structure):
     """``struct View`` of common.h."""
 
     _fields_ = (
@@ -75,10 +75,10 @@ class View(ctypes.Structure):
 
 
 class ProjectArguments(ctypes.Structure):
-    """Of project.cu."""
+    """Arguments of project.cu."""
 
     _fields_ = (
-        ("view", View),
+        ("view", KernelView),
         *_all(ctypes.c_int64, "count", "sh_rest"),
         *_pointers(*ATTRIBUTES, "records", "cull", "depth_keys", "rects", "tile_counts", "radii"),
         *_all(ctypes.c_int32, "errors", "exact"),
@@ -86,7 +86,7 @@ class ProjectArguments(ctypes.Structure):
 
 
 class EmitArguments(ctypes.Structure):
-    """Of emit.cu."""
+    """Arguments of emit.cu."""
 
     _fields_ = (
         *_all(ctypes.c_int32, "width", "height", "tiles_x", "tiles_y"),
@@ -98,28 +98,28 @@ class EmitArguments(ctypes.Structure):
 
 
 class RangeArguments(ctypes.Structure):
-    """Of emit.cu."""
+    """Arguments of emit.cu."""
 
     _fields_ = (("candidates", ctypes.c_int64), *_pointers("keys", "permutation", "payloads", "entries", "ranges"))
 
 
 class OrderArguments(ctypes.Structure):
-    """Of order.cu."""
+    """Arguments of order.cu."""
 
     _fields_ = (("tiles", ctypes.c_int64), *_pointers("ranges", "order"))
 
 
 class BlendArguments(ctypes.Structure):
-    """Of blend.cu."""
+    """Arguments of blend.cu."""
 
     _fields_ = (
-        ("view", View),
+        ("view", KernelView),
         *_pointers("records", "entries", "ranges", "tiles", *IMAGES, "final_T", "moments", "seen"),
     )
 
 
-class Features(ctypes.Structure):
-    """Of pixels.h."""
+class FeatureBuffers(ctypes.Structure):
+    """``struct Features`` of pixels.h."""
 
     _fields_ = (
         ("count", ctypes.c_int64),
@@ -128,39 +128,39 @@ class Features(ctypes.Structure):
 
 
 class FeatureArguments(ctypes.Structure):
-    """Of features.cu."""
+    """Arguments of features.cu."""
 
     _fields_ = (
-        ("view", View),
+        ("view", KernelView),
         *_pointers("records", "entries", "ranges", "tiles", "seen", "final_T"),
-        ("features", Features),
+        ("features", FeatureBuffers),
     )
 
 
 class BlendVjpArguments(ctypes.Structure):
-    """Of blend_vjp.cu."""
+    """Arguments of blend_vjp.cu."""
 
     _fields_ = (
-        ("view", View),
+        ("view", KernelView),
         *_pointers("records", "entries", "ranges", "tiles", "seen"),
         *_pointers("color", "alpha", "normal", "depth_mean", "distortion", "final_T", "moments"),
         *_pointers(*(f"g_{name}" for name in IMAGES), "learns", "slots", "gradients", "extras"),
         *_pointers("depth_transmittance", "slope", "g_depth_transmittance"),
-        ("features", Features),
+        ("features", FeatureBuffers),
     )
 
 
 class DepthArguments(ctypes.Structure):
-    """Of transmittance.cu."""
+    """Arguments of transmittance.cu."""
 
     _fields_ = (
-        ("view", View),
+        ("view", KernelView),
         *_pointers("records", "entries", "ranges", "tiles", "seen", "alpha", "median", "depth", "slope"),
     )
 
 
 class SlotArguments(ctypes.Structure):
-    """Of slots.cu."""
+    """Arguments of slots.cu."""
 
     _fields_ = (
         *_all(ctypes.c_int64, "count", "candidates"),
@@ -170,19 +170,19 @@ class SlotArguments(ctypes.Structure):
 
 
 class BlendColorsArguments(ctypes.Structure):
-    """Of blend_colors.cu."""
+    """Arguments of blend_colors.cu."""
 
     _fields_ = (
-        ("view", View),
+        ("view", KernelView),
         *_pointers("records", "entries", "ranges", "tiles", "seen", "learns", "g_color", "slots", "gradients"),
     )
 
 
 class ProjectColorsArguments(ctypes.Structure):
-    """Of blend_colors.cu."""
+    """Arguments of blend_colors.cu."""
 
     _fields_ = (
-        ("view", View),
+        ("view", KernelView),
         *_all(ctypes.c_int64, "count", "sh_rest"),
         *_pointers("means", "sh0", "shN", "tile_counts", "learns", "gradients", "g_sh0", "g_shN"),
         ("clears", ctypes.c_int32),
@@ -190,77 +190,77 @@ class ProjectColorsArguments(ctypes.Structure):
 
 
 class OccludedArguments(ctypes.Structure):
-    """Of occluded.cu."""
+    """Arguments of occluded.cu."""
 
-    _fields_ = (("view", View), *_pointers("records", "entries", "ranges", "tiles", "image", "mask", "errors"))
+    _fields_ = (("view", KernelView), *_pointers("records", "entries", "ranges", "tiles", "image", "mask", "errors"))
 
 
-class Gathered(ctypes.Structure):
-    """Of project_vjp.cu: the densification signal where it is added up at once."""
+class GatheredSignal(ctypes.Structure):
+    """``struct Gathered`` of project_vjp.cu: sums of the densification signal, updated by the kernel."""
 
     _fields_ = _pointers("signed_norms", "absolute_norms", "counts", "radii", "skip")
 
 
 class ProjectVjpArguments(ctypes.Structure):
-    """Of project_vjp.cu."""
+    """Arguments of project_vjp.cu."""
 
     _fields_ = (
-        ("view", View),
+        ("view", KernelView),
         *_all(ctypes.c_int64, "count", "sh_rest"),
         *_pointers(*ATTRIBUTES, "tile_counts", "learns", "gradients", "extras"),
         *_pointers(*(f"g_{name}" for name in ATTRIBUTES), "g_probe"),
         ("probe_columns", ctypes.c_int64),
         *_pointers("g_intrinsics"),
-        ("gathered", Gathered),
+        ("gathered", GatheredSignal),
         ("clears", ctypes.c_int32),
     )
 
 
 class ErrorArguments(ctypes.Structure):
-    """Of errors.cu."""
+    """Arguments of errors.cu."""
 
     _fields_ = (
-        ("view", View),
+        ("view", KernelView),
         ("count", ctypes.c_int64),
         *_pointers("records", "cull", "rects", "tile_counts", "image", "mask", "errors"),
     )
 
 
-class Photograph(ctypes.Structure):
-    """Of photometric.cu: a target as it was decoded."""
+class DecodedTarget(ctypes.Structure):
+    """``struct Photograph`` of photometric.cu: a decoded target image."""
 
     _fields_ = (*_pointers("bytes"), ("background", ctypes.c_float * 3))
 
 
 class PhotometricArguments(ctypes.Structure):
-    """Of photometric.cu."""
+    """Arguments of photometric.cu."""
 
     _fields_ = (
         *_all(ctypes.c_int64, "height", "width"),
         *_pointers("rendered", "target", "mask", "target_mean", "maps", "partials"),
-        ("photograph", Photograph),
+        ("photograph", DecodedTarget),
     )
 
 
 class PhotometricVjpArguments(ctypes.Structure):
-    """Of photometric.cu."""
+    """Arguments of photometric.cu."""
 
     _fields_ = (
         *_all(ctypes.c_int64, "height", "width"),
         *_pointers("rendered", "target", "mask", "maps", "means", "g_l1", "g_ssim", "g_l2", "gradient"),
-        ("photograph", Photograph),
+        ("photograph", DecodedTarget),
         *_all(ctypes.c_float, "l1_scale", "ssim_scale", "l2_scale"),
     )
 
 
 class BlurArguments(ctypes.Structure):
-    """Of photometric.cu."""
+    """Arguments of photometric.cu."""
 
     _fields_ = (*_all(ctypes.c_int64, "height", "width"), *_pointers("image", "out"))
 
 
 class NormalArguments(ctypes.Structure):
-    """Of losses.cu."""
+    """Arguments of losses.cu."""
 
     _fields_ = (
         *_all(ctypes.c_int64, "height", "width"),
@@ -275,25 +275,25 @@ class NormalArguments(ctypes.Structure):
 
 
 class SilhouetteArguments(ctypes.Structure):
-    """Of losses.cu."""
+    """Arguments of losses.cu."""
 
     _fields_ = (("pixels", ctypes.c_int64), *_pointers("alpha", "object", "mask", "g_alpha"), ("scale", ctypes.c_float))
 
 
 class ClearArguments(ctypes.Structure):
-    """Of sort.cu."""
+    """Arguments of sort.cu."""
 
     _fields_ = (*_pointers("words"), ("count", ctypes.c_int64))
 
 
 class DigitArguments(ctypes.Structure):
-    """Of sort.cu."""
+    """Arguments of sort.cu."""
 
     _fields_ = (*_pointers("keys"), ("count", ctypes.c_int64), ("passes", ctypes.c_int32), *_pointers("digits"))
 
 
 class SortArguments(ctypes.Structure):
-    """Of sort.cu."""
+    """Arguments of sort.cu."""
 
     _fields_ = (
         *_pointers("keys", "payloads", "sorted_keys", "sorted_payloads"),
@@ -304,7 +304,7 @@ class SortArguments(ctypes.Structure):
 
 
 class RunningArguments(ctypes.Structure):
-    """Of sort.cu."""
+    """Arguments of sort.cu."""
 
     _fields_ = (
         *_pointers("order", "tile_counts"),
@@ -314,13 +314,13 @@ class RunningArguments(ctypes.Structure):
 
 
 class MeanArguments(ctypes.Structure):
-    """Of losses.cu."""
+    """Arguments of losses.cu."""
 
     _fields_ = (*_all(ctypes.c_int64, "height", "width"), *_pointers("values", "mask", "partials"))
 
 
 class FinishArguments(ctypes.Structure):
-    """Of losses.cu."""
+    """Arguments of losses.cu."""
 
     _fields_ = (
         *_pointers("partials"),
@@ -331,7 +331,7 @@ class FinishArguments(ctypes.Structure):
 
 
 class AdamAttribute(ctypes.Structure):
-    """Of adam.cu."""
+    """Arguments of adam.cu."""
 
     _fields_ = (
         *_pointers("parameter", "mean", "square", "gradient", "trained", "rows"),
@@ -342,7 +342,7 @@ class AdamAttribute(ctypes.Structure):
 
 
 class AdamArguments(ctypes.Structure):
-    """Of adam.cu."""
+    """Arguments of adam.cu."""
 
     _fields_ = (
         ("attributes", AdamAttribute * 6),

@@ -1,8 +1,8 @@
-"""Launch the CUDA kernels on a GPU: torch owns memory, streams and contexts, the driver only loads and launches.
+"""Launch the CUDA kernels on a GPU: torch owns memory, streams and contexts, the driver loads and launches kernels.
 
-A kernel runs on the stream that is current in torch for its device, in torch's (the primary) context of that device,
-so launches fit in between torch's own operations, under ``torch.cuda.stream``, on several devices, in the threads of
-the backward pass and, once a kernel has been launched before, in a captured graph. Nothing here waits for the device.
+A kernel runs on torch's current stream of its device, in the primary context, so launches are ordered with torch's own
+operations: under ``torch.cuda.stream``, on several devices, in the threads of the backward pass and, after a kernel's
+first launch, in a captured graph. Nothing here waits for the device.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ __all__ = ["GpuLauncher", "Launcher", "OneByOne", "Work", "grow_in_place", "laun
 
 ALLOCATOR_VARIABLES = ("PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_ALLOC_CONF")
 STEP_VARIABLE, GRAPH, LAUNCHES = "GS2D_CUDA_STEP", "graph", "launches"
-STATIC_SHARED_BYTES = 48 << 10  # what a block may have without asking
-GRAPHS_FROM = 3  # times that the same launches come, from which they are worth a graph
+STATIC_SHARED_BYTES = 48 << 10  # limit per block without an attribute
+GRAPHS_FROM = 3  # repetitions from which a graph pays off
 MAX_GRAPHS = 64
-MAX_STREAMS = 64  # that are known by their objects
+MAX_STREAMS = 64  # cached stream objects
 MAX_BLOCKS = (1 << 31) - 1
 
 
 class Launcher(Protocol):
-    """Runs one kernel; the structure's pointers are those of tensors that outlive the call.
+    """Runs kernels; the tensors behind the structure's pointers must outlive the call.
 
-    ``shared_bytes`` is dynamic shared memory. A launch of no blocks does nothing.
+    ``shared_bytes`` is dynamic shared memory. A launch of 0 blocks does nothing.
     """
 
     def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
         """Queue the kernel ``name`` on the current stream."""
 
     def run(self, works: Sequence[Work]) -> None:
-        """Queue kernels one after another; the same ones may be started as a graph."""
+        """Queue kernels in order; a launcher may run repeated ones as a graph."""
 
 
 class OneByOne:
-    """Of a launcher that has nothing better for many launches."""
+    """Mixin of launchers that run works one by one."""
 
     def run(self, works: Sequence[Work]) -> None:
         """Launch each."""
@@ -64,25 +64,25 @@ def _architecture_of(device: torch.device) -> str:
 
 
 class GpuLauncher:
-    """Launches kernels on one device; a source file is compiled and loaded when one of its kernels is first wanted.
+    """Launches kernels on one device; a source file is compiled and loaded at the first launch of its kernels.
 
     Parameters
     ----------
     device : torch.device
         With an index.
     driver : module, optional
-        ``cuda.bindings.driver``, or the tests' own.
+        Default: ``cuda.bindings.driver``.
     stream_of, architecture_of : callable
-        The current stream's handle, and the architecture (``"sm_90"``), of a device.
+        Return the current stream's handle and the architecture (``"sm_90"``) of a device.
     code_of : callable
-        Machine code of a source file for an architecture.
+        Returns the machine code of a source file for an architecture.
     source_of : mapping of str to str, optional
-        The file of each kernel; by default the package's.
+        The source file of each kernel. Default: the package's.
 
     Raises
     ------
     BackendError
-        The driver or its context of the device is not there, or streams mean something else to it than to torch.
+        If the driver or the device's context is missing, or the default streams of driver and torch differ.
     """
 
     def __init__(
@@ -96,32 +96,32 @@ class GpuLauncher:
         source_of: Mapping[str, str] | None = None,
     ) -> None:
         if own_default_stream():
-            raise BackendError(f"{PER_THREAD} is set: kernels would run beside torch's work, not after it; unset it")
+            raise BackendError(f"{PER_THREAD} is set: kernels would not be ordered with torch's work; unset it")
         self.device = device
         self._driver = load_driver() if driver is None else driver
         self._stream_of, self._code_of = stream_of, code_of
         self.architecture = architecture_of(device)
         call(self._driver, "cuInit", 0)
         self._handle = call(self._driver, "cuDeviceGet", device.index or 0)
-        self._context = call(self._driver, "cuDevicePrimaryCtxRetain", self._handle)  # torch's; for good
+        self._context = call(self._driver, "cuDevicePrimaryCtxRetain", self._handle)  # torch's context; never released
         self._context_number = int(self._context)
         self._streams: dict[int, Any] = {}
         self._source_of = nvrtc.kernel_sources() if source_of is None else source_of
-        self._libraries: dict[str, tuple[Any, bytes]] = {}  # by source; the code stays alive beside its library
+        self._libraries: dict[str, tuple[Any, bytes]] = {}  # by source; the code must outlive its library
         self._functions: dict[str, Any] = {}  # by kernel
-        self._allowed: dict[str, int] = {}  # dynamic shared memory asked for so far, by kernel
-        self._lock = threading.Lock()  # the backward pass runs in a thread of its own
+        self._allowed: dict[str, int] = {}  # largest dynamic shared memory so far, by kernel
+        self._lock = threading.Lock()  # the backward pass runs in another thread
         self._replays = can_replay(self._driver)
-        self._graphs: dict[tuple[str, ...], Graph | int] = {}  # by their kernels; how often these came before
+        self._graphs: dict[tuple[str, ...], Graph | int] = {}  # by kernel names; an int counts repetitions
 
     def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
-        """Start a kernel on the current stream, and return at once.
+        """Start a kernel on the current stream without waiting.
 
         Raises
         ------
         BackendError
-            Too many blocks, a kernel that does not compile or load, or a launch that the driver refuses; also an error
-            that an earlier kernel left behind.
+            If there are too many blocks, the kernel does not compile or load, or the driver refuses the launch, also
+            because an earlier kernel failed.
         """
         if blocks == 0:
             return
@@ -138,15 +138,10 @@ class GpuLauncher:
             raise failure(f"the launch of {name} ({blocks} blocks of {threads})", status)
 
     def run(self, works: Sequence[Work]) -> None:
-        """Start kernels one after another on the current stream, and return at once.
+        """Start kernels in order on the current stream without waiting.
 
-        From the third time on the same kernels are a graph, where the driver knows graphs and makes it: what the
-        launches cost the host, and the pauses between kernels, are then a fraction. Else each is launched.
-
-        Raises
-        ------
-        BackendError
-            As of :meth:`launch`.
+        From the third repetition on they run as a graph, if the driver supports it, which cuts the host's cost and the
+        gaps between kernels. Raises BackendError like :meth:`launch`.
         """
         if int(call(self._driver, "cuCtxGetCurrent")) == self._context_number:
             self._run(works)
@@ -172,7 +167,7 @@ class GpuLauncher:
                 raise failure(f"the launch of {work.name} ({work.blocks} blocks of {work.threads})", status)
 
     def _graph_of(self, works: Sequence[Work]) -> Graph | None:
-        """Return the graph of these launches, as they are now; None: they have not come often enough, or cannot be."""
+        """Return the updated graph of these launches; None if they were not repeated enough or graphs fail."""
         names = tuple([work.name for work in works])
         known = self._graphs.get(names, 0)
         if isinstance(known, int) and known + 1 < GRAPHS_FROM:
@@ -186,14 +181,14 @@ class GpuLauncher:
                 known = self._graphs[names] = Graph(self._driver, kernels, works)
             else:
                 known.change(works)
-        except BackendError:  # an old driver, or no room: slower, no worse
+        except BackendError:  # an old driver or too little memory: launch one by one
             self._replays = False
             self._graphs.clear()
             return None
         return known
 
     def _start(self, name: str, blocks: int, threads: int, argument: ctypes.c_void_p, shared_bytes: int) -> Any:
-        """Launch in the context that is current; the driver copies what the argument points to."""
+        """Launch in the current context; the driver copies the arguments."""
         function = self._functions.get(name) or self._load(name)
         if shared_bytes > STATIC_SHARED_BYTES and shared_bytes > self._allowed.get(name, 0):
             self._allow(name, shared_bytes)
@@ -202,7 +197,7 @@ class GpuLauncher:
 
     @contextmanager
     def _in_context(self) -> Iterator[None]:
-        """Make the device's context current: a thread that has only used torch's cached memory may have none."""
+        """Make the device's context current; a thread that only used torch's cached memory may have none."""
         driver = self._driver
         if int(call(driver, "cuCtxGetCurrent")) == self._context_number:
             yield
@@ -214,7 +209,7 @@ class GpuLauncher:
             call(driver, "cuCtxPopCurrent")
 
     def _stream(self, handle: int) -> Any:
-        """Return the driver's object for a stream; kept, as most launches are on one."""
+        """Return the driver's object for a stream, cached."""
         if handle not in self._streams:
             if len(self._streams) >= MAX_STREAMS:
                 self._streams.clear()
@@ -222,7 +217,7 @@ class GpuLauncher:
         return self._streams[handle]
 
     def _load(self, name: str) -> Any:
-        """Return the handle of a kernel, loading its file if need be."""
+        """Return the handle of a kernel; loads its file if necessary."""
         with self._lock:
             if name in self._functions:
                 return self._functions[name]
@@ -236,7 +231,7 @@ class GpuLauncher:
                 library = call(self._driver, "cuLibraryLoadData", code, [], [], 0, [], [], 0)
                 self._libraries[source] = library, code
             kernel = call(self._driver, "cuLibraryGetKernel", self._libraries[source][0], name.encode())
-            # A kernel's handle may be launched as a function's, in any context.
+            # A kernel handle can be launched like a function handle, in any context.
             self._functions[name] = self._driver.CUfunction(int(kernel))
             return self._functions[name]
 
@@ -248,15 +243,7 @@ class GpuLauncher:
 
 
 def steps() -> str:
-    """Return how the launches of an iteration are started: ``GS2D_CUDA_STEP``, "graph" where it is not set.
-
-    "launches" starts each kernel by itself.
-
-    Raises
-    ------
-    BackendError
-        It is neither.
-    """
+    """Return ``GS2D_CUDA_STEP``: "graph" (default), or "launches" to start the kernels of an iteration one by one."""
     chosen = os.environ.get(STEP_VARIABLE) or GRAPH
     if chosen not in (GRAPH, LAUNCHES):
         raise BackendError(f"{STEP_VARIABLE} must be {GRAPH} or {LAUNCHES}, got {chosen!r}; unset it")
@@ -264,22 +251,22 @@ def steps() -> str:
 
 
 def grow_in_place() -> bool:
-    """Let torch's segments of memory grow, unless the user has told its allocator something.
+    """Enable torch's expandable memory segments, unless the user configured its allocator.
 
-    Each densification makes 18 tensors of new sizes, some 145 times a run: without, each time the pieces of before are
-    too small for the next ones, and the device waits while more memory is got.
+    Each densification creates 18 tensors of new sizes, about 145 times a run. Without expandable segments the freed
+    blocks are too small, and the device waits for new memory each time.
 
     Returns
     -------
     bool
-        Whether torch was told.
+        Whether they were enabled.
     """
     if torch.version.cuda is None or any(os.environ.get(name) for name in ALLOCATOR_VARIABLES):
         return False
-    try:  # under its newer name first: the older one warns
+    try:  # the newer name first, since the older one warns
         setting = getattr(torch._C, "_accelerator_setAllocatorSettings", None)
         (setting or torch.cuda.memory._set_allocator_settings)("expandable_segments:True")
-    except (AttributeError, RuntimeError):  # not of this version or platform: slower, no worse
+    except (AttributeError, RuntimeError):  # not supported by this version or platform
         return False
     return True
 
@@ -290,14 +277,14 @@ def _of_device(index: int) -> GpuLauncher:
 
 
 def launcher_for(device: torch.device) -> Launcher:
-    """Return the launcher of the device on which tensors lie; one for each device of this process.
+    """Return the launcher of a device; one per device and process.
 
     Raises
     ------
     ShapeError
-        The device is no CUDA device.
+        If the device is not a CUDA device.
     BackendError
-        It cannot run kernels here.
+        If the device cannot run the kernels.
     """
     if device.type != "cuda":
         raise ShapeError(

@@ -1,7 +1,7 @@
-"""The machine code that a wheel brings: with it neither a compiler nor its libraries are needed, the driver alone.
+"""The machine code in a wheel, which needs only the driver, no compiler.
 
-``scripts/build_cubins.py`` puts it there; a source checkout has none. It is taken where it was made of these very
-sources for this version of the package: whoever edits a kernel gets what NVRTC makes of it.
+``scripts/build_cubins.py`` creates it; a source checkout has none. It is used only if it was built from the same
+sources for this version of the package, so edited kernels are compiled by NVRTC.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ __all__ = [
 ]
 
 SHIPPED = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
-PTX = "compute_80"  # for GPUs to come and those in one chip with a CPU; the driver translates it
+PTX = "compute_80"  # for newer and integrated GPUs; the driver translates it
 FOLDER, MANIFEST = "cubins", "manifest.json"
-# GPUs in one chip with a CPU (Xavier, Orin, Thor): their code runs on no other GPU of the same major version, nor any
-# other's on them.
+# GPUs integrated with a CPU (Xavier, Orin, Thor): their code and that of other GPUs of the same major version are not
+# compatible.
 INTEGRATED = frozenset({72, 87, 88, 101, 110})
 
 
 @dataclass(frozen=True)
 class Shipped:
-    """What lies beside this file.
+    """Shipped machine code.
 
     Attributes
     ----------
     folder : Path
-        One archive for each architecture.
+        Contains one archive per architecture.
     compiler : (int, int)
-        Version of CUDA's, whose code a driver of that major version or a newer one takes.
+        CUDA version of the compiler; the driver must support its major version or a newer one.
     architectures : tuple of str
     """
 
@@ -54,7 +54,7 @@ class Shipped:
     architectures: tuple[str, ...]
 
     def architecture_for(self, capability: tuple[int, int]) -> str | None:
-        """Return whose code a device of this compute capability runs; None: there is none for it."""
+        """Return the architecture whose code a device of this compute capability runs, None if there is none."""
         wanted = 10 * capability[0] + capability[1]
         known = [int(arch.removeprefix("sm_")) for arch in self.architectures if arch.startswith("sm_")]
         best = fitting(wanted, known)
@@ -64,18 +64,18 @@ class Shipped:
         return next((text for text in texts if int(text.removeprefix("compute_")) <= wanted), None)
 
     def code(self, name: str, arch: str) -> bytes | None:
-        """Return the code of a source file (``cuda/project.cu``) for an architecture; None where it is not here."""
+        """Return the code of a source file (``cuda/project.cu``) for an architecture, None if it is not shipped."""
         if arch not in self.architectures:
             return None
         try:
             with zipfile.ZipFile(self.folder / f"{arch}.zip") as archive:
                 return archive.read(entry_of(name))
-        except (OSError, KeyError, zipfile.BadZipFile):  # damaged: it is compiled
+        except (OSError, KeyError, zipfile.BadZipFile):  # damaged: the kernel is compiled
             return None
 
 
 def fitting(wanted: int, known: list[int]) -> int | None:
-    """Return the newest of some architectures whose code a device (90: capability 9.0) runs; None: of none."""
+    """Return the newest architecture whose code a device (90: capability 9.0) runs, None if there is none."""
     runs = [
         arch
         for arch in known
@@ -86,12 +86,12 @@ def fitting(wanted: int, known: list[int]) -> int | None:
 
 
 def entry_of(name: str) -> str:
-    """``cuda/project.cu`` -> ``project``, the name in an archive."""
+    """Return the name in an archive: ``cuda/project.cu`` -> ``project``."""
     return name.rpartition("/")[2].removesuffix(".cu")
 
 
 def digest_of(sources: Mapping[str, str], options: tuple[str, ...]) -> str:
-    """Return what the sources and options of a build are known by."""
+    """Return the digest of the sources and options of a build."""
     digest = hashlib.sha256()
     for part in (*options, *(text for pair in sorted(sources.items()) for text in pair)):
         data = part.encode()
@@ -106,21 +106,21 @@ def write_archives(
     code_of: Callable[[str, str], bytes],
     facts: Mapping[str, object],
 ) -> int:
-    """Write an archive for each architecture and the manifest, which comes last.
+    """Write an archive per architecture, then the manifest.
 
     Parameters
     ----------
     names : sequence of str
         Source files (``cuda/project.cu``).
     code_of : callable
-        Machine code of a source file for an architecture.
+        Returns the machine code of a source file for an architecture.
     facts : mapping
-        What it says beside the architectures: ``version`` of the package, ``sources``, and the compiler's.
+        Further entries of the manifest: ``version`` of the package, digest of the ``sources``, version of the compiler.
 
     Returns
     -------
     int
-        Bytes of all that was written.
+        Total bytes written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / MANIFEST).unlink(missing_ok=True)
@@ -132,12 +132,12 @@ def write_archives(
                 archive.writestr(zipfile.ZipInfo(entry_of(name)), code_of(name, arch), zipfile.ZIP_DEFLATED, 9)
         size += path.stat().st_size
     text = json.dumps({**facts, "architectures": list(architectures)}, indent=1)
-    return size + (folder / MANIFEST).write_text(text + "\n", encoding="utf-8")  # as many characters as bytes
+    return size + (folder / MANIFEST).write_text(text + "\n", encoding="utf-8")  # ASCII: one byte per character
 
 
 @cache
 def shipped(version: str, digest: str, folder: Path | None = None) -> Shipped | None:
-    """Return what was made of these sources for this version of the package; None where there is no such thing."""
+    """Return the machine code built from these sources for this version of the package, None if there is none."""
     if folder is None:
         folder = Path(str(resources.files("gs2d.kernels.cuda"))) / FOLDER
     try:
