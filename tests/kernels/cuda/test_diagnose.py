@@ -38,7 +38,7 @@ MENDING = (
         "pip install 'cuda-bindings>=13,<14' 'nvidia-cuda-nvrtc>=13,<14' (the extra cuda13;",
     ),
     ({"bindings_error": ""}, "NVRTC is missing (libnvrtc not found)", "'nvidia-cuda-nvrtc>=13,<14'"),
-    ({"nvrtc_error": "", "nvrtc": (13, 0)}, "no NVIDIA driver is installed (libcuda not found)", "install NVIDIA's driver"),
+    ({"nvrtc_error": "", "nvrtc": (13, 0)}, "no NVIDIA driver is installed (libcuda not found)", "NVIDIA's driver"),
     ({"driver_error": "", "driver": (12, 4)}, "driver supports CUDA 12.4, but torch needs CUDA 13.0", "update"),
     ({"torch_cuda": (12, 8)}, "driver supports CUDA 12.4, but NVRTC needs CUDA 13.0", "update"),
     ({"nvrtc": (12, 9)}, "torch sees no CUDA device (no NVIDIA driver)", "CUDA_VISIBLE_DEVICES"),
