@@ -18,6 +18,12 @@ from gs2d.kernels.cuda import compile
 from gs2d.kernels.cuda import kernel_arguments as arguments
 
 KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )?(\w+)\((\w+)(<float>)? ')
+NAMES = {  # of the C++ structures, where they differ
+    "KernelView": "View",
+    "FeatureBuffers": "Features",
+    "GatheredSignal": "Gathered",
+    "DecodedTarget": "Photograph",
+}
 CAMERA = {name: f"camera.{name}" for name in ("R", "t", "center", "fx", "fy", "cx", "cy")}  # of View
 
 
@@ -41,7 +47,8 @@ def assertions(name: str, structure: type[ctypes.Structure]) -> list[str]:
         lines.append(f'static_assert({offset} == {place}, "{bare}.{field}");')
         inner = getattr(kind, "_type_", kind)
         if isinstance(inner, type) and issubclass(inner, ctypes.Structure):
-            lines += assertions(inner.__name__.lstrip("_"), inner)
+            own = inner.__name__.lstrip("_")
+            lines += assertions(NAMES.get(own, own), inner)
     return lines
 
 
