@@ -1,4 +1,4 @@
-"""Native test for splats in free space (``cpu/free_space.cpp``); ``training/robust/free_space_maps.py`` has the same in torch."""
+"""Native test for splats in free space; ``training/robust/free_space_maps.py`` has the same in torch."""
 
 from __future__ import annotations
 

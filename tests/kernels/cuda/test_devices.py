@@ -121,12 +121,12 @@ with FakeTensorMode():
     view = cuda_passes.view_of(camera, RasterSettings())
     rows = torch.ones(9, dtype=torch.bool, device="cuda:0")
     for sure, transmittance in ((False, False), (True, False), (False, True), (True, True)):
-        options = cuda._Options(launcher, view, True, True, transmittance, sure, rows, budget, None)
+        options = cuda._CudaOptions(launcher, view, True, True, transmittance, sure, rows, budget, None)
         for columns in (2, 4):
             intrinsics = torch.rand(4)  # in the host's memory, where cameras are
             needs = (False, True, True, False, *[True] * 6)
-            there_and_back(cuda._Rasterize, needs, options, rand(9, columns), intrinsics, None, *splats)
-        there_and_back(cuda._Rasterize, (*[False] * 8, True, True), options, None, None, None, *splats)
+            there_and_back(cuda._CudaRasterize, needs, options, rand(9, columns), intrinsics, None, *splats)
+        there_and_back(cuda._CudaRasterize, (*[False] * 8, True, True), options, None, None, None, *splats)
     image, plane, mask = rand(24, 40, 3), rand(24, 40), torch.ones(24, 40, dtype=torch.bool, device="cuda:0")
     mean = ops.blur(image, launcher=launcher)
     there_and_back(ops._Photometric, (True,), image, rand(24, 40, 3), mask, mean, True, launcher)
