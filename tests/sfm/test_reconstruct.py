@@ -216,7 +216,7 @@ def test_ctrl_c_among_the_cameras_keeps_what_was_found_and_names_the_command(roo
     out = tmp_path / "run"
     said = interrupt(words_for(room.photos, out), "finding features")
     line = said.splitlines()[-1]
-    assert line.startswith("interrupted; what was found of the cameras is kept; resume with: gs2d reconstruct ")
+    assert line.startswith("interrupted; the search for cameras is kept; resume with: gs2d reconstruct ")
     assert said.splitlines()[-1].endswith(" --resume")
     assert [path.name for path in out.iterdir()] == [".capture.poses"]
     heard: list[Event] = []

@@ -1,7 +1,7 @@
-"""Runs a command line and returns its exit code: 0 done, 1 internal error, 2 user error (one line), 130 interrupted.
+"""Runs a command line and returns its exit code.
 
-3: the result is complete, but a part such as the report could not be written. 141: the reader of a pipe closed it
-(``gs2d recipes | head -1``).
+0: done. 1: internal error. 2: user error (one line). 3: the result is complete, but a part such as the report could
+not be written. 130: interrupted. 141: the reader of a pipe closed it (``gs2d recipes | head -1``).
 """
 
 from __future__ import annotations
@@ -39,25 +39,13 @@ from gs2d.core.processes import here
 from gs2d.core.text import printable
 from gs2d.errors import Gs2dError
 
-OK, EXIT_BUG, EXIT_USAGE, INCOMPLETE, NOBODY_READS = 0, 1, 2, 3, 141
-_MENDABLE = {
-    errno.ENOSPC,
-    errno.EDQUOT,
-    errno.EFBIG,
-    errno.EACCES,
-    errno.EPERM,
-    errno.EROFS,
-    errno.EMFILE,
-    errno.ENOMEM,
-    errno.ENAMETOOLONG,
-    errno.ELOOP,
-    errno.ENOTDIR,
-    errno.EISDIR,
-    errno.EIO,
-}
-_LIGHT = (RecipesCommand,)  # which load no numbers
-_NO_TRAINING = (*_LIGHT, DoctorCommand, InfoCommand)  # which load torch themselves, if at all
-# How torch says it on the CPU and on a GPU, how C++ does, and the loader of shared libraries.
+OK, EXIT_BUG, EXIT_USAGE, INCOMPLETE, PIPE_CLOSED = 0, 1, 2, 3, 141
+_USER_ERRORS = frozenset(
+    getattr(errno, name)
+    for name in ("ENOSPC EDQUOT EFBIG EACCES EPERM EROFS EMFILE ENOMEM ENAMETOOLONG ELOOP ENOTDIR EISDIR EIO".split())
+)
+_WITHOUT_TRAINING = (RecipesCommand, DoctorCommand, InfoCommand)  # import torch themselves, if at all
+# Messages of torch on the CPU and on a GPU, of C++, and of the loader of shared libraries.
 _NO_MEMORY = re.compile(
     "can't allocate memory|out of memory|std::bad_alloc|failed to map segment|cannot allocate memory", re.IGNORECASE
 )
@@ -67,14 +55,14 @@ _NO_THREAD = re.compile("can't start new thread|Resource temporarily unavailable
 def run(argv: Sequence[str]) -> int:
     """Run one command line and return its exit code; prints every error on stderr."""
     try:
-        if (asked := _answer(argv)) is not None:
-            show_help(asked)
+        if (lines := _help_or_version(argv)) is not None:
+            show_help(lines)
             return OK
-        command = _of_this_process(parse(argv))
+        command = _for_this_process(parse(argv))
         check_inputs(command)  # before anything heavy is imported
     except BrokenPipeError:  # `gs2d train --help | head`
         _drop_stdout()
-        return NOBODY_READS
+        return PIPE_CLOSED
     except (UsageError, Gs2dError) as error:
         return _fail(str(error)) if os.environ.get("RANK", "0") == "0" else EXIT_USAGE
     interruptible = Interruptible()
@@ -82,23 +70,23 @@ def run(argv: Sequence[str]) -> int:
         quiet=command.quiet, as_json=command.json, verbose=command.verbose, before_each=interruptible.check
     )
     try:
-        if not isinstance(command, _LIGHT):
+        if not isinstance(command, RecipesCommand):
             check_address_space()
-        if not isinstance(command, _NO_TRAINING):
-            importlib.import_module("gs2d.pipeline.train.train_run")  # torch and all: see `interrupts`
+        if not isinstance(command, _WITHOUT_TRAINING):
+            importlib.import_module("gs2d.pipeline.train.train_run")  # with torch: see `interrupts`
         with interruptible:
             execute(command, console)
             console.flush()
-        return _what_is_missing(console, argv, command)
+        return _report_missing(console, argv, command)
     except KeyboardInterrupt:
         console.close()
         return _interrupted(argv, command) if here().leads else INTERRUPTED
     except BrokenPipeError:  # `gs2d ... | head`
         _drop_stdout()
-        return NOBODY_READS
+        return PIPE_CLOSED
     except Exception as error:
         console.close()
-        if getattr(error, "told", False):  # contact was lost to another process, and another one says why
+        if getattr(error, "told", False):  # contact to another process was lost, and that process reports the reason
             return EXIT_USAGE
         return _report(error, command.debug)
 
@@ -116,26 +104,26 @@ def _name_of(command: Common) -> str:
 
 
 def leave(code: int) -> NoReturn:
-    """End the process; what stdout still holds is written, or silently dropped if nobody reads it."""
+    """End the process, after writing the rest of stdout, or dropping it if the pipe is closed."""
     try:
         if sys.stdout is not None:
             sys.stdout.flush()
     except OSError as error:
         _drop_stdout()
-        code = NOBODY_READS if isinstance(error, BrokenPipeError) else code or _report(error, debug=False)
-    if code and os.environ.get("WORLD_SIZE", "1") != "1":  # threads that still talk to processes that are gone
+        code = PIPE_CLOSED if isinstance(error, BrokenPipeError) else code or _report(error, debug=False)
+    if code and os.environ.get("WORLD_SIZE", "1") != "1":  # threads may still talk to processes that have ended
         os._exit(code)
     sys.exit(code)
 
 
 def _drop_stdout() -> None:
-    """Drop what cannot be written, so that Python does not try again when it shuts down."""
+    """Redirect stdout to nothing, so that Python does not write again at shutdown."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _answer(argv: Sequence[str]) -> list[str] | None:
-    """Return what is printed where nothing is done: help and the version; None where a command is asked for."""
+def _help_or_version(argv: Sequence[str]) -> list[str] | None:
+    """Return the lines of help or version, or None if a command is to run."""
     from gs2d.cli import help as helps
 
     words = list(argv)
@@ -145,24 +133,22 @@ def _answer(argv: Sequence[str]) -> list[str] | None:
         words = [*words[1:], "--help"]
     if "--version" in words or words[0] in ("version", "-V"):
         return [f"gs2d {gs2d.__version__}"]
-    asked = [word for word in words if word in HELP_WORDS]
-    if not asked:
-        return None
-    everything = "--help-all" in asked
-    if words[0] in NAMES:
+    requested = [word for word in words if word in HELP_WORDS]
+    everything = "--help-all" in requested
+    if requested and words[0] in NAMES:
         return helps.command_help(words[0], everything=everything)
-    if words[0] in HELP_WORDS:
+    if requested and words[0] in HELP_WORDS:
         return helps.program_help(everything=everything)
     return None
 
 
-def _of_this_process(command: Common) -> Common:
-    """Return the command as this process of several does it: process 0 alone prints.
+def _for_this_process(command: Common) -> Common:
+    """Return the command for this process of several: only process 0 prints.
 
     Raises
     ------
     UsageError
-        It is for one process.
+        If the command cannot run in several processes.
     """
     place = here()
     if place.size > 1 and not isinstance(command, TrainCommand):
@@ -171,32 +157,32 @@ def _of_this_process(command: Common) -> Common:
 
 
 def _fail(message: str) -> int:
-    _complain(f"error: {' '.join(message.split())}")
+    _print_error(f"error: {' '.join(message.split())}")
     return EXIT_USAGE
 
 
-def _complain(text: str) -> None:
-    """Print a line on stderr; a terminal gets lines that break between words."""
-    screen, text = sys.stderr is not None and sys.stderr.isatty(), printable(text)
-    for line in layout.message(text, layout.terminal_width()) if screen else [text]:
+def _print_error(text: str) -> None:
+    """Print a line on stderr, wrapped between words on a terminal."""
+    is_terminal, text = sys.stderr is not None and sys.stderr.isatty(), printable(text)
+    for line in layout.message(text, layout.terminal_width()) if is_terminal else [text]:
         print(line, file=sys.stderr)
 
 
-def _trace(error: BaseException) -> None:
+def _print_traceback(error: BaseException) -> None:
     print(printable("".join(traceback.format_exception(error)), lines=True), end="", file=sys.stderr)
 
 
 def _report(error: Exception, debug: bool) -> int:
-    """Print an error; the exit code says whose it is."""
+    """Print an error and return its exit code."""
     if debug:
-        _trace(error)
+        _print_traceback(error)
     if isinstance(error, Gs2dError):
         return _fail(str(error))
-    if isinstance(error, OSError) and error.errno in _MENDABLE:
-        return _fail(f"{error.strerror}: {error.filename or 'no file named'}; mend that and run the command again")
-    said = str(error) if isinstance(error, RuntimeError | ImportError | OSError) else ""
-    no_thread = _NO_THREAD.search(said)
-    if isinstance(error, MemoryError) or no_thread or _NO_MEMORY.search(said):
+    if isinstance(error, OSError) and error.errno in _USER_ERRORS:
+        return _fail(f"{error.strerror}: {error.filename or 'no file named'}; fix that and run the command again")
+    message = str(error) if isinstance(error, RuntimeError | ImportError | OSError) else ""
+    no_thread = _NO_THREAD.search(message)
+    if isinstance(error, MemoryError) or no_thread or _NO_MEMORY.search(message):
         if (limit := address_space()) is not None:
             return _fail(f"out of memory: the address space is limited to {limit / 2**30:.2f} GiB; raise ulimit -v")
         if no_thread:
@@ -204,52 +190,54 @@ def _report(error: Exception, debug: bool) -> int:
         return _fail("out of memory; use a larger --downscale, or fewer splats (--set STAGE.densify.max_splats=N)")
     text = " ".join(str(error).split()) or "no message"
     hint = "" if debug else "; run again with --debug and report it with the traceback"
-    _complain(f"fault in gs2d: {type(error).__name__}: {text[:500]}{hint}")
+    _print_error(f"fault in gs2d: {type(error).__name__}: {text[:500]}{hint}")
     return EXIT_BUG
 
 
-def _what_is_missing(console: Console, argv: Sequence[str], command: Common) -> int:
-    """Print what a finished command could not make and how to make it; 0 where that is nothing."""
+def _report_missing(console: Console, argv: Sequence[str], command: Common) -> int:
+    """Print what a finished command could not write and the command that writes it; return the exit code."""
     for event in console.missing:
         if command.debug and event.error is not None:
-            _trace(event.error)
+            _print_traceback(event.error)
         line = f"not made: {event.what}"
-        if console.quiet:  # nobody has read why
+        if console.quiet:  # the reason was not printed
             line += f" ({event.reason})"
         again = _resumed(argv) if event.command is None else event.command
         if again and sys.stderr is not None and sys.stderr.isatty():
-            _complain(f"{line}; again:")
-            print(printable(again), file=sys.stderr)  # whole, to be copied
+            _print_error(f"{line}; again:")
+            print(printable(again), file=sys.stderr)  # unwrapped, to be copied
         else:
-            _complain(f"{line}; again: {again}" if again else line)
+            _print_error(f"{line}; again: {again}" if again else line)
     return INCOMPLETE if console.missing else OK
 
 
 def _resumed(argv: Sequence[str]) -> str:
-    """Return the same command, that goes on."""
+    """Return the command line that continues this one."""
     words = [word for word in argv if word not in ("--resume", "--overwrite")]
     return f"gs2d {shlex.join([*words, '--resume'])}"
 
 
 def _interrupted(argv: Sequence[str], command: Common) -> int:
+    """Print what is kept of an interrupted command and how to continue it."""
     line = "interrupted"
     if isinstance(command, TrainCommand | DemoCommand | ReconstructCommand):
-        trained = any((command.out / "checkpoints").glob("*.pt"))
-        found = isinstance(command, ReconstructCommand) and (command.out / "capture").exists()
-        if trained or isinstance(command, ReconstructCommand):  # which starts where there is nothing yet
-            kept = "the cameras are kept; " if found else _search(command)
-            line += f"; {'' if trained else kept}resume with: {_resumed(argv)}"
+        is_training = any((command.out / "checkpoints").glob("*.pt"))
+        if is_training or isinstance(command, ReconstructCommand):  # which can always resume
+            line += f"; {'' if is_training else _kept_cameras(command)}resume with: {_resumed(argv)}"
         else:
             line += "; nothing was kept, because training had not begun"
     print(printable(line + command.after_interrupt(argv)), file=sys.stderr)
     return INTERRUPTED
 
 
-def _search(command: TrainCommand | DemoCommand | ReconstructCommand) -> str:
-    """Return what a search for cameras that was interrupted leaves, in words."""
+def _kept_cameras(command: TrainCommand | DemoCommand | ReconstructCommand) -> str:
+    """Return what an interrupted ``gs2d reconstruct`` keeps before training, in words."""
     from gs2d.sfm.search import SEARCH
     from gs2d.sfm.workspace import hidden_workspace
 
-    if (hidden_workspace(command.out / "capture") / SEARCH).exists():
-        return "what was found of the cameras is kept; "
+    capture = command.out / "capture"
+    if capture.exists():
+        return "the cameras are kept; "
+    if (hidden_workspace(capture) / SEARCH).exists():
+        return "the search for cameras is kept; "
     return "nothing was kept, as no camera was found; "

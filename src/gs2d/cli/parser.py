@@ -1,4 +1,4 @@
-"""The command line: argparse with the options of the dataclasses, and one line for each mistake."""
+"""Parses command lines with argparse, from the options of the dataclasses; every mistake becomes one line."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import difflib
 import itertools
 import re
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -19,8 +19,7 @@ from gs2d.pipeline.prepare.options import HowItRuns
 
 HELP_WORDS = ("-h", "--help", "--help-all")
 _OVERRIDES = "overrides"  # the field of --set, where a command trains
-_ALIKE = 0.6  # difflib's ratio from which a word is proposed
-_MOST = 3  # proposed words
+_ALIKE, _MOST = 0.6, 3  # smallest difflib ratio, and largest number, of proposed words
 _NUMBER = re.compile(r"-\.?\d")  # a value, not an option
 _CAPTURE = ("", "the input is given without an option")
 _RUN = ("--out", "use --out for what the command writes")
@@ -45,20 +44,19 @@ _EXPECTED = {
 
 
 class UsageError(Exception):
-    """A command line that does not parse; one line."""
+    """An invalid command line; the message is one line."""
 
 
 class _Parser(argparse.ArgumentParser):
     """Parser of one command, without help."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, options: Sequence[Option], trains: bool) -> None:
         super().__init__(usage="", add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS)
-        self._negative_number_matcher = _NUMBER  # as in Python 3.14; before, -1e-3 was an option
-        options = options_of(NAMES[name])
+        self._negative_number_matcher = _NUMBER  # as in Python 3.14; earlier versions read -1e-3 as an option
         for option in options:
             if not option.mark.setting:
                 option.add_to(self)
-        if _has_settings(options) and not _trains(options):
+        if not trains and any(option.mark.setting for option in options):
             self.add_argument("--set", dest=_OVERRIDES, action="append")
 
     def error(self, message: str) -> NoReturn:
@@ -66,18 +64,18 @@ class _Parser(argparse.ArgumentParser):
 
 
 def parse(argv: Sequence[str]) -> Common:
-    """Return the command that the arguments ask for; ``argv`` has at least one word.
+    """Return the command of a command line of at least one word.
 
     Raises
     ------
     UsageError
-        The arguments have a mistake.
+        If the command line is invalid.
     """
     name, *words = argv
     if name not in NAMES:
         raise UsageError(_with_help(_no_command(name, words), "gs2d --help"))
     try:
-        command: Common = _made(NAMES[name], _given(name, _spelled(name, words)))
+        command: Common = _construct(NAMES[name], _field_values(name, words))
     except UsageError as error:
         raise UsageError(_with_help(str(error), f"gs2d {name} --help")) from None
     if isinstance(command, HowItRuns) and command.resume and command.overwrite:
@@ -85,76 +83,68 @@ def parse(argv: Sequence[str]) -> Common:
     return command
 
 
-def _has_settings(options: Sequence[Option]) -> bool:
-    return any(option.mark.setting for option in options)
-
-
-def _trains(options: Sequence[Option]) -> bool:
-    """Whether ``--set`` also changes the recipe."""
-    return any(option.field == _OVERRIDES for option in options)
-
-
-def _given(name: str, words: Sequence[str]) -> dict[str, Any]:
+def _field_values(name: str, words: Sequence[str]) -> dict[str, Any]:
     """Return the values of a command line by field."""
-    parsed, left = _Parser(name).parse_known_intermixed_args(words)
     options = options_of(NAMES[name])
-    if unknown := next((word for word in left if _is_flag(word)), None):
+    trains = any(option.field == _OVERRIDES for option in options)  # then --set also changes the recipe
+    parsed, rest = _Parser(options, trains).parse_known_intermixed_args(_normalised(words, options))
+    if unknown := next((word for word in rest if _is_flag(word)), None):
         raise UsageError(_no_option(name, unknown.partition("=")[0], options))
-    if left:
+    if rest:
         arguments = " ".join(option.usage for option in options if option.positional)
         takes = f"{arguments} and options; a path with spaces needs quotes" if arguments else "options only"
-        raise UsageError(f"unexpected {left[0]!r}: the command takes {takes}")
-    given = {field: value for field, value in vars(parsed).items() if value not in (None, [])}
-    given |= _settings(name, given.pop(_OVERRIDES, ()), options)
-    if given.get("dry_run"):
-        given.setdefault("out", Path("RUN"))  # nothing is written
-    if missing := [option.usage for option in options if option.required and option.field not in given]:
+        raise UsageError(f"unexpected {rest[0]!r}: the command takes {takes}")
+    values = {field: value for field, value in vars(parsed).items() if value not in (None, [])}
+    values |= _settings(values.pop(_OVERRIDES, ()), options, trains)
+    if values.get("dry_run"):
+        values.setdefault("out", Path("RUN"))  # nothing is written
+    if missing := [option.usage for option in options if option.required and option.field not in values]:
         raise UsageError(f"gs2d {name} needs {' and '.join(missing)}")
-    return given
+    return values
 
 
-def _made(kind: type, given: Mapping[str, Any]) -> Any:
-    """Return a dataclass with the given values, which are also those of its nested dataclasses."""
+def _settings(changes: Sequence[str], options: Sequence[Option], trains: bool) -> dict[str, Any]:
+    """Return the values of ``--set`` by field; changes of the recipe stay words."""
+    settings = {option.field: option for option in options if option.mark.setting}
+    values: dict[str, Any] = {}
+    for change in changes:
+        name, _, text = change.partition("=")
+        if name in settings:
+            try:
+                values[name] = settings[name].read(text)
+            except ValueError as error:
+                raise UsageError(str(error)) from None
+        elif trains:
+            values.setdefault(_OVERRIDES, []).append(change)
+        else:
+            known = f"--set NAME=VALUE takes {', '.join(settings)}"
+            raise UsageError(f"{known}; got {change!r}{_meant(name, settings)}")
+    return values
+
+
+def _construct(kind: type, values: Mapping[str, Any]) -> Any:
+    """Return a dataclass with these values, which are also those of its nested dataclasses."""
     chosen = {}
     for field, hint, _ in fields_of(kind):
         if dataclasses.is_dataclass(hint):
-            chosen[field.name] = _made(hint, given)
-        elif field.name in given:
-            value = given[field.name]
+            chosen[field.name] = _construct(hint, values)
+        elif field.name in values:
+            value = values[field.name]
             chosen[field.name] = tuple(value) if isinstance(value, list) else value
     return kind(**chosen)
 
 
-def _settings(name: str, changes: Sequence[str], options: Sequence[Option]) -> dict[str, Any]:
-    """Return the values of ``--set`` by field: settings of the command, and changes of the recipe if it trains."""
-    settings = {option.field: option for option in options if option.mark.setting}
-    given: dict[str, Any] = {}
-    for change in changes:
-        word, _, text = change.partition("=")
-        if word in settings:
-            try:
-                given[word] = settings[word].read(text)
-            except ValueError as error:
-                raise UsageError(str(error)) from None
-        elif _trains(options):
-            given.setdefault(_OVERRIDES, []).append(change)
-        else:
-            known = f"--set NAME=VALUE takes {', '.join(settings)}"
-            raise UsageError(f"{known}; got {change!r}{_meant(word, settings)}")
-    return given
-
-
-def _spelled(name: str, words: Sequence[str]) -> list[str]:
-    """Return the words with dashes for underscores in options (--max_size), and values of options that have none."""
-    spelled = []
-    bare = {option.name: option.mark.bare for option in options_of(NAMES[name]) if option.mark.bare}
+def _normalised(words: Sequence[str], options: Sequence[Option]) -> list[str]:
+    """Return the words with dashes in options (--schedule_scale), and the value of options that may omit it."""
+    normalised = []
+    bare = {option.name: option.mark.bare for option in options if option.mark.bare}
     for word, following in itertools.zip_longest(words, words[1:], fillvalue=""):
         flag, equals, value = word.partition("=")
         flag = flag.replace("_", "-") if word.startswith("--") else flag
         if flag in bare and not equals and not following.isdecimal():
             equals, value = "=", bare[flag]
-        spelled.append(flag + equals + value)
-    return spelled
+        normalised.append(flag + equals + value)
+    return normalised
 
 
 def _is_flag(word: str) -> bool:
@@ -162,32 +152,28 @@ def _is_flag(word: str) -> bool:
 
 
 # -- paths -------------------------------------------------------------------------------------------------------------
-def check_inputs(command: Common) -> None:
+def check_inputs(options: Any) -> None:
     """Raise for an input path that does not exist; cheap, so that a misspelt path is reported at once."""
-    paths = dict(_inputs(command))
-    kind: type = type(command)
-    for option in options_of(kind):
-        if (path := paths.get(option.field)) is None:
-            continue
-        try:
-            path.stat()
-        except (FileNotFoundError, NotADirectoryError):
-            what = _EXPECTED.get(option.metavar, "a file or a folder")
-            what += " or a file of splats" if (option.field, option.metavar) == ("path", "RUN") else ""
-            raise UsageError(f"expected {what} at {path}, found nothing{where_it_ends(path)}") from None
-        except (OSError, ValueError):
-            continue  # reported by whatever reads it
-
-
-def _inputs(options: Any) -> Iterator[tuple[str, Path]]:
-    """Yield the paths that a command reads, by their fields."""
+    by_field = {option.field: option for option in options_of(type(options))}
     for field in dataclasses.fields(options):
         value = getattr(options, field.name)
         if dataclasses.is_dataclass(value):
-            yield from _inputs(value)
-        unneeded = field.name == "photos" and getattr(options, "resume", False)  # their cameras may be known
-        if isinstance(value, Path) and field.name not in _OUTPUTS and not unneeded:
-            yield field.name, value
+            check_inputs(value)
+        elif isinstance(value, Path) and field.name not in _OUTPUTS:
+            if field.name == "photos" and getattr(options, "resume", False):
+                continue  # not needed once the cameras are known
+            _check_exists(value, by_field[field.name])
+
+
+def _check_exists(path: Path, option: Option) -> None:
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        expected = _EXPECTED.get(option.metavar, "a file or a folder")
+        expected += " or a file of splats" if (option.field, option.metavar) == ("path", "RUN") else ""
+        raise UsageError(f"expected {expected} at {path}, found nothing{where_it_ends(path)}") from None
+    except (OSError, ValueError):
+        pass  # reported by the reader of the path
 
 
 # -- messages ----------------------------------------------------------------------------------------------------------
@@ -196,7 +182,7 @@ def _with_help(text: str, command: str) -> str:
 
 
 def _no_command(name: str, words: Sequence[str]) -> str:
-    """Return the message for a first word that is no command."""
+    """Return the message for an unknown command."""
     if name.startswith("-"):
         command = next((word for word in words if word in NAMES), None)
         if command is not None:
