@@ -1,4 +1,4 @@
-"""The command ``gs2d``: the only package that prints. Nothing here imports torch before a command needs it."""
+"""The command ``gs2d``. No other package prints. Torch is imported only when a command needs it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import sys
 import warnings
 
-TYPE_CHECKING = False  # of typing, which is not imported: until `main` runs, Ctrl-C shows Python's own traceback
+TYPE_CHECKING = False  # without importing typing: until `main` runs, Ctrl-C prints a traceback
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from typing import NoReturn
@@ -16,22 +16,22 @@ __all__ = ["main", "run"]
 
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
-    """Entry point of the command; from its first line Ctrl-C is one line and exit code 130."""
+    """Run the program; from here on Ctrl-C prints one line and exits with code 130."""
     from gs2d.cli.interrupts import ignore, leave_at_once
 
     leave_at_once()
-    # Before torch loads: its OpenMP threads would spin at every barrier, which costs 3x where the cores are shared.
+    # Before torch loads: spinning OpenMP threads take three times as long on shared cores.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from gs2d.cli.app import leave
 
-    # What Pillow says of a damaged EXIF block, and NumPy of arrays of Python 2, both of which are read, helps nobody.
+    # Pillow warns about damaged EXIF blocks, NumPy about arrays of Python 2; both are read all the same.
     warnings.filterwarnings("ignore", module=r"PIL\.|numpy\.lib")
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # None if it is closed
-            stream.reconfigure(errors="backslashreplace")  # a terminal that cannot show a name shows its numbers
+            stream.reconfigure(errors="backslashreplace")  # for names that the terminal cannot show
 
     code = run(sys.argv[1:] if argv is None else argv)
-    ignore()  # the result is known; Python only has to shut down
+    ignore()  # only the shutdown of Python is left
     leave(code)
 
 

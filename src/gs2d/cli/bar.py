@@ -12,7 +12,7 @@ from gs2d.cli.whole import Countdown, WholeRun
 from gs2d.core.text import duration, printable
 from gs2d.training.events import Phase
 
-_WIDEST, _LEAST = 32, 6  # columns of a bar; with fewer there is none
+_WIDEST, _LEAST = 32, 6  # columns of a bar; no bar with fewer
 _FULL, _EMPTY = "\u2501", "\u2500"
 
 
@@ -39,12 +39,12 @@ class Bar:
         counts = f"{self.done:,}/{self.phase.total:,}" if self.phase.total else ""
         tail = "  ".join(word for word in (counts, self.left()) if word)
         name = _cut(self.phase.name, max(width - len(tail) - 2, 8))
-        room = min(width - len(name) - len(tail) - 4, _WIDEST)
+        columns = min(width - len(name) - len(tail) - 4, _WIDEST)
         line = Text(name, no_wrap=True, overflow="ellipsis")
-        if self.phase.total and room >= _LEAST:
+        if self.phase.total and columns >= _LEAST:
             full, empty = ("#", "-") if ascii_only else (_FULL, _EMPTY)
-            filled = min(room * self.done // self.phase.total, room)
-            line.append("  ").append(full * filled, "cyan").append(empty * (room - filled), "dim")
+            filled = min(columns * self.done // self.phase.total, columns)
+            line.append("  ").append(full * filled, "cyan").append(empty * (columns - filled), "dim")
         yield line.append("  " + tail)
         if self.detail:
             yield Text(_cut("  " + self.detail, width), no_wrap=True)

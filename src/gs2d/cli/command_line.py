@@ -87,8 +87,11 @@ class Option:
         return " ".join(word for word in ("" if self.positional else self.name, value) if word)
 
     def add_to(self, parser: argparse._ActionsContainer, text: str = "") -> None:
-        """Add the option to a parser with its help text. The caller reports missing options after misspelt ones."""
+        """Add the option to a parser with its help text; no option is required there. Settings are for help only."""
         text = text.replace("%", "%%")
+        if self.mark.setting:
+            parser.add_argument(self.field, metavar=self.usage, help=text)
+            return
         if self.kind is bool:
             action = "store_false" if self.default else "store_true"
             parser.add_argument(*self.flags, dest=self.field, action=action, help=text)

@@ -1,4 +1,4 @@
-"""The commands of ``gs2d`` by name: those of the core, of contrib and of installed packages."""
+"""The commands of ``gs2d`` by name: of the core, of contrib and of installed packages."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Command:
     group : str
         Heading in ``gs2d --help``.
     first : tuple of str
-        Fields that ``gs2d COMMAND --help`` explains; (): all that only this command has.
+        Fields that ``gs2d COMMAND --help`` explains, the most used first; (): all of this command alone.
     """
 
     name: str
@@ -59,14 +59,14 @@ def register_command(
     Parameters
     ----------
     name : str
-        Word of the command line; must not be taken.
+        Name on the command line; must be unused.
     action : str
-        "module:function" that runs the command, called with the options and the console. It is imported when the
-        command runs, so that the help stays fast: the module of the options should import neither torch nor NumPy.
+        "module:function" that runs the command, called with the options and the console. The module is imported when
+        the command runs. The module of the options should import neither torch nor NumPy, so that help stays fast.
     group : str
         Heading in ``gs2d --help``, such as "Measure and compare".
     first : tuple of str
-        Fields that ``gs2d COMMAND --help`` explains; (): all that only this command has.
+        Fields that ``gs2d COMMAND --help`` explains, the most used first; (): all of this command alone.
 
     Returns
     -------
@@ -76,7 +76,7 @@ def register_command(
     Raises
     ------
     Gs2dError
-        From the decorator: the name is taken.
+        From the decorator, if the name is used.
     """
 
     def registered(options: Register) -> Register:

@@ -21,10 +21,13 @@ from gs2d.cli.whole import WholeRun
 from gs2d.core.text import printable
 from gs2d.training.events import Event, Notice, NotMade, Phase, RunPlan, StageScored, Step
 
-LOG_SECONDS, LOG_FRACTION = 60.0, 0.1  # in a log file: a line after so long, if at least so much of the phase was done
-LOG_SILENCE = 300.0  # s, after which there is a line whatever was done; the first one comes after LOG_SECONDS
+LOG_SECONDS, LOG_FRACTION = (
+    60.0,
+    0.1,
+)  # in a log file: a line after this time, if this fraction of the phase was done since
+LOG_SILENCE = 300.0  # s, after which there is a line in any case; the first line needs only LOG_SECONDS
 _ANY_WIDTH = 10_000  # columns
-_NO_SCREENS = ("dumb", "unknown")  # values of TERM: no cursor that goes back
+_NO_SCREENS = ("dumb", "unknown")  # values of TERM without cursor movement
 
 
 class _Screen(RichConsole):
@@ -33,7 +36,7 @@ class _Screen(RichConsole):
         super().print(*(printable(it, lines=True) if isinstance(it, str) else it for it in objects), **how)
 
     def on_broken_pipe(self) -> None:
-        """Raise where rich would end the process."""
+        """Raise BrokenPipeError, where rich would end the process."""
         raise BrokenPipeError
 
 
@@ -52,7 +55,7 @@ def _screen(file: IO[str], **settings: Any) -> _Screen:
 
 
 def _has_cursor(file: IO[str] | None) -> bool:
-    """Whether lines can be overwritten: on a terminal that is not dumb."""
+    """Return whether lines can be overwritten: on a terminal with cursor movement."""
     return file is not None and file.isatty() and os.environ.get("TERM", "") not in _NO_SCREENS
 
 
@@ -75,10 +78,10 @@ class Console:
         self._whole = WholeRun()
         self._live: Live | None = None
         self._bar: Bar | None = None
-        self._named: set[str] = set()  # phases that a log file has heard of
-        self.missing: list[NotMade] = []  # what could not be made, for the end of the command
-        self._logged = (0.0, 0)  # s, steps done: at the last line of a log file
-        self._logs = 0  # lines of a log file about how far the phase is
+        self._named: set[str] = set()  # phases with a line in the log file
+        self.missing: list[NotMade] = []  # reported at the end of the command
+        self._logged = (0.0, 0)  # time in s and finished steps of the last line of a log file
+        self._logs = 0  # lines of a log file about progress in the phase
 
     def on_event(self, event: Event) -> None:
         """Print an event of the pipeline."""
@@ -121,7 +124,7 @@ class Console:
 
     def _begin(self, phase: Phase) -> None:
         self._bar = Bar(phase, self._whole)
-        if not self._interactive:  # a log file: one line a phase, and now and then how far it is
+        if not self._interactive:  # a log file: one line per phase, then occasional progress
             if phase.name not in self._named:
                 name = printable(phase.name)
                 self._err.print(f"{name} ({phase.total})" if phase.total else name, markup=False)
@@ -149,7 +152,7 @@ class Console:
             self._err.print("; ".join(filter(None, words)), markup=False, soft_wrap=True)
 
     def close(self) -> None:
-        """Take the progress bar off the screen."""
+        """Remove the progress bar."""
         if self._live is not None:
             self._live.stop()
             self._live = None
@@ -180,18 +183,18 @@ class Console:
             return
         table, needed = self._table(title, columns, rows, frame=box.SIMPLE)
         if self._out.width < needed:
-            table, needed = self._table(title, columns, rows, frame=None)  # needs less room
+            table, needed = self._table(title, columns, rows, frame=None)  # narrower
         if self._out.width < needed and (self._out.is_terminal or "COLUMNS" in os.environ):
             for line in records(columns, rows):
                 self._out.print(line, markup=False)
-        else:  # a pipe or a file has room for every table
+        else:  # pipes and files have any width
             screen = self._out if needed <= self._out.width else _screen(sys.stdout, width=needed)
             screen.print(table, soft_wrap=False)
 
     def _table(
         self, title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, frame: box.Box | None
     ) -> tuple[Table, int]:
-        """Return a table, and how many columns of the terminal it needs."""
+        """Return a table and its width in columns."""
         head, gap = escape(title) or None, "" if frame else " "
         table = Table(title=head, title_justify="left", box=frame, padding=(0, 1 if frame else 0), pad_edge=False)
         for i, column in enumerate(columns):

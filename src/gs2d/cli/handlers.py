@@ -1,4 +1,4 @@
-"""What each command does: call the pipeline, show the result. Imported only when a command runs (it loads torch)."""
+"""Actions of the commands: call the pipeline, show the result. Imported when a command runs."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def train(command: c.TrainCommand, console: Console) -> None:
 
     run = run_training(command, console.on_event)
     console.close()
-    if here().leads:  # another process of the same training tells
+    if here().leads:  # one process of several prints
         show_run(run.path, run.metrics(), console)
 
 
 def _estimate(command: c.TrainCommand, console: Console) -> None:
-    """Show what a training would take."""
+    """Show the estimate of a training."""
     from gs2d.pipeline.prepare.estimate import plan
 
     estimate = plan(command, console.on_event)
@@ -86,7 +86,7 @@ def _textured_mesh(command: c.MeshCommand, mesh_options: Any, console: Console) 
     from gs2d.pipeline.finish.run_texture import texture_run
 
     if command.splats is not None:
-        raise ProtocolError("--splats has no texture, which is of the run's own mesh; leave --texture out")
+        raise ProtocolError("--texture needs the mesh of the run; leave out --splats or --texture")
     result = texture_run(
         command.run,
         command,
@@ -105,7 +105,7 @@ def _textured_mesh(command: c.MeshCommand, mesh_options: Any, console: Console) 
 
 
 def _refuse_texture_options(command: c.MeshCommand) -> None:
-    """Refuse an option that would do nothing."""
+    """Raise for a setting of textures without --texture."""
     for name, default in values(TextureOptions, TextureOptions()).items():
         if getattr(command, name) != default:
             raise ProtocolError(f"--set {name} needs --texture; give both")
@@ -132,7 +132,7 @@ def render(command: c.RenderCommand, console: Console) -> None:
 
 
 def view(command: c.ViewCommand, console: Console) -> None:
-    """``gs2d view``: until Ctrl-C."""
+    """Run ``gs2d view`` until Ctrl-C."""
     from gs2d.pipeline.look.view import open_viewer, serve
 
     server, shown = open_viewer(command.path, command.port, console.on_event)

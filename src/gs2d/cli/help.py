@@ -1,4 +1,4 @@
-"""``--help``: what one needs first; ``--help-all``: everything. It loads no torch, so that it is instant."""
+"""``--help`` prints the most used options, ``--help-all`` all. Neither imports torch, so both are instant."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ TITLES = {  # headings of shared options, in order
 
 
 def groups() -> dict[str, list[str]]:
-    """Return the names of all commands by the heading of their group."""
-    found: dict[str, list[str]] = {title: [] for title in GROUPS}
+    """Return the names of all commands by heading."""
+    by_title: dict[str, list[str]] = {title: [] for title in GROUPS}
     for name in NAMES:
-        found.setdefault(COMMANDS[name].group, []).append(name)
-    return {title: names for title, names in found.items() if names}
+        by_title.setdefault(COMMANDS[name].group, []).append(name)
+    return {title: names for title, names in by_title.items() if names}
 
 
 def first_day() -> list[str]:
@@ -71,10 +71,7 @@ def command_help(name: str, *, everything: bool = False) -> list[str]:
         if everything or not title:
             shown = parser.add_argument_group(title or None)
             for option in group:
-                if option.mark.setting:
-                    shown.add_argument(option.field, metavar=option.usage, help=option_text(option).replace("%", "%%"))
-                else:
-                    option.add_to(shown, option_text(option))
+                option.add_to(shown, option_text(option))
     return parser.format_help().splitlines()
 
 
@@ -88,7 +85,7 @@ def _parser(prog: str, usage: str, description: str, epilog: str) -> argparse.Ar
 
 
 def _groups(name: str, options: Sequence[Option]) -> dict[str, list[Option]]:
-    """Return all options by heading: the most used ones under "", then those of the command, then shared ones."""
+    """Return all options by heading: the most used under "", then those of the command, then shared options."""
     by_field = {option.field: option for option in options}
     own = sorted((o for o in options if o.owner is not Common), key=lambda o: (not o.positional, not o.required))
     first = [by_field[field] for field in COMMANDS[name].first] or own
@@ -97,7 +94,7 @@ def _groups(name: str, options: Sequence[Option]) -> dict[str, list[Option]]:
     for option in options:
         if option not in first:
             groups[TITLES.get(option.owner, _OWN)].append(option)
-    return {title: group for title, group in groups.items() if group}
+    return {title: sorted(group, key=lambda o: o.mark.setting) for title, group in groups.items() if group}
 
 
 def option_text(option: Option) -> str:

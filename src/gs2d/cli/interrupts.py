@@ -1,8 +1,8 @@
-"""Ctrl-C and SIGTERM at any moment: one line, exit code 130, and a run is kept or deleted as it was designed.
+"""Ctrl-C and SIGTERM: one line and exit code 130.
 
-While modules load nothing has begun, and code that catches every exception (there is some in torch) would swallow a
-KeyboardInterrupt: there the process leaves at once. While a command works the signal becomes a KeyboardInterrupt, so
-that what was begun is undone; one that was swallowed all the same is raised again at the next event.
+While modules are imported, the process exits at once: nothing has begun, and torch contains code that catches every
+exception. While a command runs, the signal becomes a KeyboardInterrupt, so that unfinished files are removed; if that
+exception is caught, it is raised again at the next event.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ import signal
 import sys
 import time
 
-TYPE_CHECKING = False  # of typing, which takes its time to load
+TYPE_CHECKING = False  # without importing typing, which takes time
 if TYPE_CHECKING:
     from types import FrameType, TracebackType
     from typing import Any
 
 INTERRUPTED = 130
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)  # the second: a scheduler, `timeout`
-_SAME = 1.0  # s; a second signal so soon is an impatient finger, or the first one sent to the whole group
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)  # SIGTERM: schedulers, `timeout`
+_SAME = 1.0  # s; a second signal within this time is ignored
 
 
 def leave_at_once() -> None:
-    """From now on a signal ends the process: nothing has begun that must be undone."""
+    """Exit at once on a signal, from now on."""
     _set(_leave)
 
 
 def ignore() -> None:
-    """From now on signals do nothing."""
+    """Ignore signals from now on."""
     _set(signal.SIG_IGN)
 
 
@@ -43,18 +43,15 @@ def _set(handler: Any) -> None:
 
 
 class Interruptible:
-    """While it is entered, signals raise KeyboardInterrupt in the main thread.
-
-    Entered in another thread it does nothing: whoever runs gs2d there has the signals.
-    """
+    """Context in which signals raise KeyboardInterrupt in the main thread. In other threads it does nothing."""
 
     def __init__(self) -> None:
         self._previous: dict[int, Any] = {}
-        self._heard: float | None = None  # s, when the last signal came
+        self._heard: float | None = None  # s, time of the last signal
         self._unraisable = sys.unraisablehook
 
     def check(self) -> None:
-        """Raise the KeyboardInterrupt that somebody swallowed."""
+        """Raise KeyboardInterrupt again if it was caught."""
         if self._heard is not None:
             raise KeyboardInterrupt
 
@@ -80,5 +77,5 @@ class Interruptible:
             raise KeyboardInterrupt
 
     def _hook(self, unraisable: sys.UnraisableHookArgs) -> None:
-        if unraisable.exc_type is not KeyboardInterrupt:  # that one will be raised by `check`
+        if unraisable.exc_type is not KeyboardInterrupt:  # `check` raises it
             self._unraisable(unraisable)

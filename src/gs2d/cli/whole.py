@@ -9,12 +9,12 @@ from collections.abc import Callable
 from gs2d.core.text import duration
 from gs2d.training.events import Phase, RunPart, RunPlan
 
-GREW = (2.0, 60.0)  # an estimate of more than so many times what is shown, and so many seconds: the work grew
+GREW = (2.0, 60.0)  # factor and seconds by which an estimate must exceed the shown time for the work to have grown
 _TRAINING = "training"
 
 
 class Countdown:
-    """Time left as it is shown: it rises only if the work grew."""
+    """The shown time left, which increases only if the work grew."""
 
     def __init__(self) -> None:
         self._shown = math.inf
@@ -43,11 +43,11 @@ class WholeRun:
         self._phase: Phase | None = None  # the first one of the part
         self._training: float | None = None  # seconds of training, by its progress
         self._left: float | None = None  # seconds of training
-        self._own = False  # whether the phase that runs is the part's own
+        self._own = False  # whether the running phase belongs to the part
         self._shown = Countdown()
 
     def on_phase(self, phase: Phase) -> None:
-        """Go to the part that a phase begins, if it begins one."""
+        """Move to the part that begins with a phase, if one does."""
         for index in range(max(self._now, 0), len(self._parts)):
             if phase.name.startswith(self._parts[index].begins):
                 if index != self._now:
@@ -65,7 +65,7 @@ class WholeRun:
         self._left = self._phase.seconds_left(done, elapsed)
 
     def line(self) -> str:
-        """Return "part 5 of 7: training; whole run: about 14 min left", or nothing where there is no plan."""
+        """Return "part 5 of 7: training; whole run: about 14 min left"; without a plan ""."""
         if self._now < 0 or len(self._parts) < 2:
             return ""
         text = f"part {self._now + 1} of {len(self._parts)}: {self._parts[self._now].name}"
@@ -73,15 +73,15 @@ class WholeRun:
         return text if left is None else f"{text}; whole run: about {duration(left)} left"
 
     def left(self) -> float | None:
-        """Return the seconds until the run ends, which do not rise; None where it is too early to tell.
+        """Return the seconds until the run ends, or None if there is no estimate yet.
 
-        Parts after training are shares of its time.
+        The time of later parts is estimated as a fraction of the time of training.
         """
         if self._training is None:
             return None
         part, spent = self._parts[self._now], self._clock() - self._began
         left = self._left if part.name == _TRAINING else (part.of_training or 0.0) * self._training - spent
-        if left is None or left < 0:  # it takes longer than expected
+        if left is None or left < 0:  # longer than expected
             return None
         later = sum(part.of_training or 0.0 for part in self._parts[self._now + 1 :])
         return self._shown.show(left + later * self._training)
