@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,8 +11,9 @@ import pytest
 from scipy.io import savemat
 
 from capture_writers import ColmapModel, small_blender, small_colmap, small_dtu, write_image_of
-from gs2d.contrib.lab.dataset_folders import describe, find_scenes, missing_lines, protocol_of, recognise
-from gs2d.contrib.lab.datasets import get_dataset
+from gs2d.contrib.lab.dataset_folders import find_truth, missing_lines, protocol_of, recognise
+from gs2d.contrib.lab.datasets import DATASETS
+from gs2d.contrib.lab.scenes import find_scenes
 from gs2d.data import detect_format, load_scene
 
 
@@ -63,11 +63,6 @@ def write_tnt(data: Path) -> Path:
 def write_nerf_synthetic(data: Path) -> Path:
     root = data / "nerf_synthetic/lego"
     small_blender(root, train=3, test=2)
-    frames = json.loads((root / "transforms_test.json").read_text())
-    for frame in frames["frames"]:
-        frame["file_path"] = frame["file_path"].replace("test", "val")
-    (root / "transforms_val.json").write_text(json.dumps(frames))
-    shutil.copytree(root / "test", root / "val")
     (root / "mesh_gt.ply").write_text("ply\n")
     return root
 
@@ -94,15 +89,11 @@ LAYOUTS: dict[str, tuple[str, str, Callable[[Path], Path]]] = {
 def test_a_whole_data_set_has_its_scene_and_nothing_missing(tmp_path: Path, layout: str) -> None:
     dataset, name, write = LAYOUTS[layout]
     root = write(tmp_path)
-    (scene,) = find_scenes(tmp_path, dataset)
-    assert (scene.dataset.name, scene.facts.name, scene.root) == (dataset, name, root)
-    assert scene.lines() == ()
-    assert scene.can_train
-    assert scene.can_score == (dataset != "mip-nerf-360")  # which has no true surface
-    assert recognise(root) == (scene.dataset, scene.facts)
-    # the folder itself, one above it, and by name
-    assert [s.root for s in find_scenes(root, dataset)] == [root]
-    assert [s.root for s in find_scenes(root.parent, dataset, [name.upper()])] == [root]
+    (scene,) = find_scenes(tmp_path)
+    assert (scene.scene, scene.path) == (name, root)
+    assert scene.missing == ()
+    assert scene.scored == (dataset != "mip-nerf-360")  # which has no true surface
+    assert recognise(root) == (DATASETS[dataset], DATASETS[dataset].scene(name))
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -122,7 +113,6 @@ def files_of(layout: str) -> list[str]:
         root, official = "DTU/scan24", "Official_DTU_Dataset"
         truth = ["Points/stl/stl024_total.ply", "ObsMask/ObsMask24_10.mat", "ObsMask/Plane24.mat"]
         capture = [f"images/{p}" for p in images] + [f"mask/{m}" for m in masks] + model
-        capture += ["cameras.npz", "cameras_sphere.npz"]
         return [f"{root}/{f}" for f in capture] + [f"{official}/{f}" for f in truth]
     if layout == "dtu-neus":
         capture = [f"image/{p}" for p in images] + [f"mask/{m}" for m in masks] + ["cameras_sphere.npz"]
@@ -133,11 +123,11 @@ def files_of(layout: str) -> list[str]:
         capture = [f"images/{i}.png" for i in range(4)] + model + ["Barn_COLMAP_SfM.log"]
         return [f"TNT_GOF/TrainingSet/Barn/{f}" for f in capture] + [f"TNT_GT/Barn/{n}" for n in names]
     if layout == "nerf-synthetic":
-        splits = {"train": 3, "test": 2, "val": 2}
+        splits = {"train": 3, "test": 2}
         lists = [f"transforms_{split}.json" for split in splits]
         capture = [f"{split}/r_{i}.png" for split, count in splits.items() for i in range(count)]
         return [f"nerf_synthetic/lego/{f}" for f in (*lists, *capture, "mesh_gt.ply")]
-    capture = [f"{folder}/{i}.png" for folder in ("images", "images_4") for i in range(3)]
+    capture = [f"images_4/{i}.png" for i in range(3)]
     return [f"360_v2/garden/{f}" for f in (*model, *capture)]
 
 
@@ -146,26 +136,19 @@ def test_a_file_that_is_taken_away_is_named_in_one_line(tmp_path: Path, layout: 
     dataset, name, write = LAYOUTS[layout]
     root = write(tmp_path)
     (tmp_path / file).unlink()
-    facts = get_dataset(dataset).scene(name)
-    if file.startswith(("Official", "TNT_GT", "Points", "SampleSet")) or "mesh_gt" in file:  # the ground truth
-        purpose = "to score the surface"
-    elif file.endswith("val.json") or "/val/" in file or (layout == "dtu-2dgs" and file.endswith(".npz")):
-        purpose = "distributed, but not read by gs2d"
+    if file.startswith(("Official", "TNT_GT", "Points", "SampleSet")) or "mesh_gt" in file:
+        pieces = find_truth(DATASETS[dataset], DATASETS[dataset].scene(name), root)[1]
+        lines = tuple(piece.line() for piece in pieces)
+        assert all("to score the surface" in line for line in lines)
+        assert missing_lines(root) == ()
     else:
-        purpose = ""
-    (line,) = [line for line in describe(get_dataset(dataset), facts, root).lines() if _names(line, Path(file).name)]
+        lines = missing_lines(root)
+    (line,) = [line for line in lines if _names(line, Path(file).name)]
     assert line.count("\n") == 0
     assert " is missing (" in line
-    assert purpose in line
     assert "get it from" in line or "export the object" in line
-    lines = describe(get_dataset(dataset), facts, root).lines()
-    lists = file.endswith((".json", ".npz", "images.bin"))  # without a list, what it lists is not looked for
+    lists = file.endswith((".json", ".npz", "images.bin"))  # without a list, its files are not checked
     assert len(lines) == 1 or lists
-    (scene,) = find_scenes(tmp_path, dataset) or (None,)
-    assert scene is None or scene.lines() == lines
-    told = [line for line in missing_lines(root) if _names(line, Path(file).name)]  # what `gs2d train` says of it
-    unread = purpose or (layout == "mip-nerf-360" and "/images/" in file)
-    assert told == ([] if unread else [line])
 
 
 def _names(line: str, name: str) -> bool:

@@ -9,7 +9,6 @@ from gs2d.contrib.lab.datasets import (
     MIP_NERF_360_SCENES,
     NERF_SYNTHETIC_SCENES,
     TNT_SCENES,
-    get_dataset,
 )
 
 
@@ -44,7 +43,6 @@ def test_nerf_synthetic_is_eight_scenes_at_full_size_and_360_has_its_image_folde
 
 def test_every_scene_names_a_protocol_that_exists() -> None:
     for dataset in DATASETS.values():
-        assert get_dataset(dataset.name) is dataset
         for scene in dataset.scenes:
             assert scene.protocol in PROTOCOLS
             assert (scene.tau is not None) == (dataset is TNT_SCENES)

@@ -1,4 +1,4 @@
-"""The data sets of the paper's tables: their scenes, and what each scene adds to its protocol.
+"""The data sets of the paper's tables and their scenes.
 
 Sources: [s] the official 2DGS scripts (dtu_eval, tnt_eval, nerf_eval, m360_eval), [tnt] the evaluation toolbox of
 Tanks and Temples, [m360] the Mip-NeRF 360 paper's split into outdoor and indoor scenes as m360_eval has it,
@@ -21,15 +21,15 @@ class SceneFacts:
     Attributes
     ----------
     name : str
-        As the data set's folders spell it.
+        Name of the folder in the data set.
     protocol : str
-        Name of its protocol (with its fusion limits).
+        Name of the protocol.
     downscale : int
-        What the image size is divided by.
+        Factor by which images are shrunk.
     images : str
-        Folder of the photographs.
+        Folder of the images.
     tau : float or None
-        m, Tanks and Temples: the distance of precision and recall.
+        m, Tanks and Temples: threshold of precision and recall.
     scan : int or None
         DTU: the number of the scan.
     """
@@ -52,7 +52,7 @@ class DataSet:
     scenes : tuple of SceneFacts
         In the order of the paper's tables.
     evaluator : str
-        Of surfaces: "dtu", "tnt", "visible-surface", or "" where there is no ground truth.
+        Of surfaces: "dtu", "tnt", "visible-surface", or "" without ground truth.
     """
 
     name: str
@@ -61,13 +61,7 @@ class DataSet:
     evaluator: str
 
     def scene(self, name: str) -> SceneFacts:
-        """Return the scene of a name, upper and lower case alike.
-
-        Raises
-        ------
-        ProtocolError
-            Unknown; says which exist.
-        """
+        """Return the scene of a name, ignoring case, or raise ProtocolError."""
         for scene in self.scenes:
             if scene.name.lower() == name.lower():
                 return scene
@@ -116,16 +110,3 @@ MIP_NERF_360_SCENES = DataSet(
 DATASETS: Mapping[str, DataSet] = MappingProxyType(
     {d.name: d for d in (DTU_SCENES, TNT_SCENES, NERF_SYNTHETIC_SCENES, MIP_NERF_360_SCENES)}
 )
-
-
-def get_dataset(name: str) -> DataSet:
-    """Return the data set of a name.
-
-    Raises
-    ------
-    ProtocolError
-        Unknown name; says which exist.
-    """
-    if name not in DATASETS:
-        raise ProtocolError(f"no data set {name!r}; there is {', '.join(DATASETS)}")
-    return DATASETS[name]
