@@ -25,11 +25,11 @@ from typing import Any
 
 from gs2d.config.presets import ABSGS_DEFAULT
 from gs2d.contrib.lab.aggregate import Cell, read_cell
-from gs2d.contrib.lab.execute import execute
-from gs2d.contrib.lab.jobs import Job
+from gs2d.contrib.lab.execute import Workers, execute
 from gs2d.contrib.lab.lab_options import PaperOptions
 from gs2d.contrib.lab.scenes import FoundScene, find_scenes
-from gs2d.contrib.lab.table_plan import make_job, trained_recipe
+from gs2d.contrib.lab.table_plan import make_task, trained_recipe
+from gs2d.contrib.lab.training_task import TrainingTask
 from gs2d.core.atomic_files import atomic_write
 from gs2d.core.json_files import write_json
 from gs2d.errors import Gs2dError
@@ -71,12 +71,12 @@ class Candidate:
 CANDIDATES = tuple(Candidate(g, s) for g, s in itertools.product(FACTORS, FACTORS))
 
 
-def make_jobs(options: PaperOptions, scenes: Sequence[FoundScene]) -> dict[tuple[Candidate, str, int], Job]:
+def make_jobs(options: PaperOptions, scenes: Sequence[FoundScene]) -> dict[tuple[Candidate, str, int], TrainingTask]:
     """The run of every candidate, scene and seed."""
     jobs = {}
     for candidate, scene, seed in itertools.product(CANDIDATES, scenes, options.seeds):
         changed = replace(options, overrides=(*options.overrides, *candidate.overrides))
-        job = make_job(changed, scene, RECIPE, trained_recipe(RECIPE, changed), seed)
+        job = make_task(changed, scene, RECIPE, trained_recipe(RECIPE, changed), seed)
         name = f"{scene.name}-{candidate.name}-s{seed}"
         run = replace(job.train, out=options.out / "runs" / name)
         record = job.record.with_name(f"{name}.json")
@@ -143,7 +143,7 @@ def sweep(options: PaperOptions) -> Candidate | None:
     scenes = find_scenes(options.data, options.scenes, truths=options.ground_truth)
     jobs = make_jobs(options, scenes)
     todo = tuple(jobs.values())
-    execute(todo, options.out, say, slots=options.slots, threads=options.threads, backend=options.backend)
+    execute(todo, options.out, say, workers=Workers(options.slots, options.threads, options.backend))
     cells: dict[Candidate, list[Cell]] = {candidate: [] for candidate in CANDIDATES}
     for (candidate, name, seed), job in jobs.items():
         scene = next(scene for scene in scenes if scene.name == name)

@@ -116,7 +116,7 @@ def test_the_printed_commands_are_the_ones_that_were_run(tmp_path: Path) -> None
         threads=1,
         overrides=("surface.densify.max_splats=7",),
     )
-    jobs = make_plan(options).jobs
+    jobs = make_plan(options).tasks
     assert len(jobs) == 5
     for job in jobs:
         words = shlex.split(commands_of(job)[0])

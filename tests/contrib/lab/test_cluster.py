@@ -14,13 +14,13 @@ import pytest
 import gs2d
 from fake_ray import FakeQueue, FakeRay
 from gs2d.cli import run
-from gs2d.contrib.lab import jobs as jobs_module
+from gs2d.contrib.lab import training_task as task_module
 from gs2d.contrib.lab.cluster import Shares, shares
 from gs2d.contrib.lab.cluster_task import token_file
 from gs2d.contrib.lab.cluster_worker import do_on_worker
-from gs2d.contrib.lab.execute import execute
-from gs2d.contrib.lab.jobs import Job
+from gs2d.contrib.lab.execute import Workers, execute
 from gs2d.contrib.lab.tasks import failures
+from gs2d.contrib.lab.training_task import TrainingTask
 from gs2d.errors import DataError
 from gs2d.training.events import Notice, OnEvent, Phase, Step
 from sweep_jobs import make_jobs
@@ -28,11 +28,11 @@ from tiny import write_capture
 
 
 @pytest.fixture
-def trained(monkeypatch: pytest.MonkeyPatch) -> list[Job]:
+def trained(monkeypatch: pytest.MonkeyPatch) -> list[TrainingTask]:
     """Training that takes no time; returns what was trained."""
-    found: list[Job] = []
+    found: list[TrainingTask] = []
 
-    def train(job: Job, on_event: OnEvent) -> dict[str, str]:
+    def train(job: TrainingTask, on_event: OnEvent) -> dict[str, str]:
         if job.name == "bad":
             raise DataError("expected a photograph, got none")
         on_event(Phase("surface", 10))
@@ -41,24 +41,25 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[Job]:
         found.append(job)
         return {}
 
-    monkeypatch.setattr(jobs_module, "train_and_evaluate", train)
+    monkeypatch.setattr(task_module, "train_and_evaluate", train)
     return found
 
 
-def heard_of(jobs: tuple[Job, ...], folder: Path, **options: Any) -> list[str]:
+def heard_of(jobs: tuple[TrainingTask, ...], folder: Path, **options: Any) -> list[str]:
     heard: list[str] = []
     execute(
         jobs,
         folder,
         lambda event: heard.append(event.text) if isinstance(event, Notice) else None,
-        cluster="auto",
-        **options,
+        workers=Workers(cluster="auto", **options),
     )
     return heard
 
 
 # -- what is asked of Ray ----------------------------------------------------------------------------------------------
-def test_each_task_asks_for_what_it_takes_of_a_machine(ray: FakeRay, tmp_path: Path, trained: list[Job]) -> None:
+def test_each_task_asks_for_what_it_takes_of_a_machine(
+    ray: FakeRay, tmp_path: Path, trained: list[TrainingTask]
+) -> None:
     a, b = make_jobs(tmp_path, {"a": ("1",), "b": ("2",)})
     heard_of((replace(a, memory=2.0), replace(b, retries=5)), tmp_path, threads=3, backend="cpu")
     assert ray.asked["a"]["num_cpus"] == 3
@@ -89,7 +90,7 @@ def test_a_task_takes_a_gpu_where_the_backend_uses_one_and_its_part_of_the_cores
 
 
 # -- what becomes of it ------------------------------------------------------------------------------------------------
-def test_what_a_task_tells_comes_back_with_its_name(ray: FakeRay, tmp_path: Path, trained: list[Job]) -> None:
+def test_what_a_task_tells_comes_back_with_its_name(ray: FakeRay, tmp_path: Path, trained: list[TrainingTask]) -> None:
     jobs = make_jobs(tmp_path, {"a": ("1",), "bad": ("2",)})
     heard = heard_of(jobs, tmp_path)
     assert any(text.startswith("a begins on ") for text in heard)
@@ -101,7 +102,7 @@ def test_what_a_task_tells_comes_back_with_its_name(ray: FakeRay, tmp_path: Path
 
 
 def test_a_task_whose_machines_are_lost_fails_and_the_others_go_on(
-    ray: FakeRay, tmp_path: Path, trained: list[Job]
+    ray: FakeRay, tmp_path: Path, trained: list[TrainingTask]
 ) -> None:
     ray.lost.add("a")
     jobs = make_jobs(tmp_path, {"a": ("1",), "b": ("2",)})
@@ -120,7 +121,7 @@ def test_an_interrupt_cancels_what_runs_first_gently(ray: FakeRay, tmp_path: Pat
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        execute(jobs, tmp_path, interrupt, cluster="auto", threads=1)
+        execute(jobs, tmp_path, interrupt, workers=Workers(cluster="auto", threads=1))
     assert ray.cancelled == [False, False, True, True]
     assert not list((tmp_path / "jobs").glob("*.token"))
     assert failures(jobs) == {}  # the next command begins them again
@@ -179,7 +180,7 @@ def test_without_the_option_ray_is_never_imported() -> None:
         "import sys; sys.modules['ray'] = None\n"
         "from pathlib import Path; import tempfile\n"
         "from gs2d.contrib.lab import blocks, paper\n"
-        "from gs2d.contrib.lab.execute import execute\n"
+        "from gs2d.contrib.lab.execute import Workers, execute\n"
         "from sweep_jobs import make_jobs\n"
         "folder = Path(tempfile.mkdtemp())\n"
         "jobs = make_jobs(folder, {'a': ()})\n"

@@ -51,7 +51,7 @@ def test_nodes_are_lost_in_the_middle_and_no_byte_changes(
     assert process.returncode == 0, said
     assert "was lost; it goes on on" in said
     for line in said.splitlines():  # nothing of Ray's own
-        assert line.startswith(("jobs (9)", "jobs: ", "note ")), said
+        assert line.startswith(("tasks (9)", "tasks: ", "note ")), said
     for name in ("splats.ply", "mesh.ply"):
         assert digest(tmp_path / "job" / name) == digest(straight / name)
 

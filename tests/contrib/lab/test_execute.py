@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 
 from gs2d.contrib.lab import execute as execute_module
-from gs2d.contrib.lab import jobs as jobs_module
-from gs2d.contrib.lab.execute import execute
-from gs2d.contrib.lab.jobs import Job
+from gs2d.contrib.lab import training_task as task_module
+from gs2d.contrib.lab.execute import Workers, execute
 from gs2d.contrib.lab.tasks import failures
+from gs2d.contrib.lab.training_task import TrainingTask
 from gs2d.errors import DataError, RunError
 from gs2d.training.events import Notice, OnEvent
 from sweep_jobs import fail_or_die, make_jobs
@@ -33,13 +33,13 @@ def test_a_job_that_fails_does_not_stop_the_rest_and_is_tried_again_by_the_next_
     done: list[str] = []
     broken = {"b"}
 
-    def train(job: Job, _on_event: OnEvent) -> dict[str, str]:
+    def train(job: TrainingTask, _on_event: OnEvent) -> dict[str, str]:
         if job.name in broken:
             raise DataError("expected a photograph, got none")
         done.append(job.name)
         return {}
 
-    monkeypatch.setattr(jobs_module, "train_and_evaluate", train)
+    monkeypatch.setattr(task_module, "train_and_evaluate", train)
     jobs = make_jobs(tmp_path, {"a": ("1",), "b": ("2",), "c": ("3",)})
     execute(jobs, tmp_path)
     assert done == ["a", "c"]
@@ -55,7 +55,7 @@ def test_a_finished_job_is_scored_again_when_more_is_wanted_and_done_again_when_
 ) -> None:
     done: list[str] = []
 
-    def train(job: Job, _on_event: OnEvent) -> dict[str, str]:
+    def train(job: TrainingTask, _on_event: OnEvent) -> dict[str, str]:
         done.append(job.name)
         job.train.out.mkdir(parents=True, exist_ok=True)
         (job.train.out / "splats.ply").touch()
@@ -64,7 +64,7 @@ def test_a_finished_job_is_scored_again_when_more_is_wanted_and_done_again_when_
     def run_that_wants(*wanted: str) -> None:
         execute([replace(job, wanted=wanted) for job in make_jobs(tmp_path, {"a": ("1",)})], tmp_path)
 
-    monkeypatch.setattr(jobs_module, "train_and_evaluate", train)
+    monkeypatch.setattr(task_module, "train_and_evaluate", train)
     run_that_wants("surface: x")
     run_that_wants("surface: x")
     run_that_wants()  # less is wanted: what is there stays
@@ -81,7 +81,7 @@ KILLED = """
 import sys, time
 from pathlib import Path
 from gs2d.contrib.lab import execute as module
-from gs2d.contrib.lab import jobs
+from gs2d.contrib.lab import training_task
 sys.path.insert(0, sys.argv[2])
 from sweep_jobs import fail_or_die, make_jobs
 def train(job, on_event):
@@ -89,7 +89,7 @@ def train(job, on_event):
         print("at b", flush=True)
         time.sleep(60)
     return {}
-jobs.train_and_evaluate = train
+training_task.train_and_evaluate = train
 module.execute(make_jobs(Path(sys.argv[1]), {"a": ("s",), "b": ("s", "t"), "c": ("s", "t")}), Path(sys.argv[1]))
 """
 
@@ -98,7 +98,7 @@ def test_a_folder_that_another_command_works_in_is_refused_and_taken_over_when_i
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done: list[str] = []
-    monkeypatch.setattr(jobs_module, "train_and_evaluate", lambda job, _on_event: done.append(job.name) or {})
+    monkeypatch.setattr(task_module, "train_and_evaluate", lambda job, _on_event: done.append(job.name) or {})
     jobs = make_jobs(tmp_path, {"a": ("s",), "b": ("s", "t"), "c": ("s", "t")})
     with subprocess.Popen(
         [sys.executable, "-c", KILLED, str(tmp_path), HELPERS], stdout=subprocess.PIPE, text=True
@@ -132,8 +132,8 @@ def test_several_at_once_report_what_failed_and_whose_process_died(
         jobs,
         tmp_path,
         lambda event: heard.append(event.text) if isinstance(event, Notice) else None,
-        slots=2,
-        after_job=lambda job: ended.append(job.name),
+        workers=Workers(slots=2),
+        after_task=lambda job: ended.append(job.name),
     )
     assert sorted(ended) == ["a", "b", "c"]
     assert failures(jobs) == {

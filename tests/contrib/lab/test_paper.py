@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from gs2d.cli import run
-from gs2d.contrib.lab import jobs as jobs_module
+from gs2d.contrib.lab import training_task as task_module
 from gs2d.contrib.lab.aggregate import FIGURES, Results, Row, check_claim
 from gs2d.contrib.lab.lab_options import PaperOptions
 from gs2d.contrib.lab.paper import paper
@@ -51,7 +51,7 @@ def test_scenes_are_found_with_their_data_set_and_ground_truth(captures: Path) -
 # -- plans ---------------------------------------------------------------------------------------------------------
 def test_rows_share_stages_that_train_the_same(captures: Path) -> None:
     plan = make_plan(PaperOptions(table="modules", data=captures, out=captures / "out", scenes=("ball",), seeds=(0, 1)))
-    by_name = {job.name: job for job in plan.jobs}
+    by_name = {job.name: job for job in plan.tasks}
     assert list(by_name)[:4] == [
         "ball-2dgs-s0",
         "ball-2dgs-r-module-ii-s0",
@@ -176,11 +176,11 @@ def test_what_is_done_is_not_done_again(
     out, words = finished
     tried: list[str] = []
 
-    def train(job: jobs_module.Job, _on_event: object) -> dict[str, str]:
+    def train(job: task_module.TrainingTask, _on_event: object) -> dict[str, str]:
         tried.append(job.name)
         raise DataError("still broken")
 
-    monkeypatch.setattr(jobs_module, "train_and_evaluate", train)
+    monkeypatch.setattr(task_module, "train_and_evaluate", train)
     before = (out / "runs" / "ball-2dgs-s0" / "splats.ply").stat().st_mtime_ns
     assert run([*words, "--json"]) == 2
     assert len(tried) == 4

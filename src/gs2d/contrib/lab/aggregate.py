@@ -196,7 +196,7 @@ def read_cell(
     test_on : str
         "test" or "train": the views whose image metrics count.
     record : dict
-        What the sweep wrote about the job.
+        What the sweep wrote about the task.
     conventions : MetricConventions
         The protocol's: which of the image metrics count, and which figure of the surface is the headline.
     """

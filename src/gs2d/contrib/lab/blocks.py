@@ -15,7 +15,7 @@ from gs2d.config.protocols import Protocol
 from gs2d.config.serialize import decode
 from gs2d.config.serialize import from_json as recipe_from_json
 from gs2d.contrib.lab.block_start import load_start
-from gs2d.contrib.lab.execute import execute
+from gs2d.contrib.lab.execute import Workers, execute
 from gs2d.contrib.lab.lab_options import BlocksOptions
 from gs2d.contrib.lab.merged import MERGED, SEAM_VIEWS, finish_merged, read_seam_views, write_merged, write_result
 from gs2d.contrib.lab.partition import Partition, from_json, make_partition
@@ -298,10 +298,7 @@ def blocks(options: BlocksOptions, on_event: OnEvent = ignore) -> RunFolder:
         tasks,
         options.out,
         on_event,
-        slots=options.slots,
-        threads=options.threads,
-        backend=options.backend,
-        cluster=options.cluster,
+        workers=Workers(**values(Workers, options)),
         before=write,
     )
     _check_all_done(tasks)

@@ -317,8 +317,6 @@ def evaluate_tnt(
     *,
     published: np.ndarray | None = None,
     protocol: TntSurface = TNT_SURFACE,
-    seed: int = 0,
-    workers: int | None = None,
 ) -> TntScore:
     """Score a mesh.
 
@@ -335,30 +333,28 @@ def evaluate_tnt(
         m.
     published : ndarray [m, 4, 4], optional
         The log that came with the photographs: checked against the cameras, never used.
-    workers : int, optional
-        Threads that look for nearest points; default: all.
 
     Raises
     ------
     DataError
-        The cameras cannot be matched with the log.
+        If the cameras do not match the log.
     """
     source = point_set(mesh)
-    fit, frame_notes = _camera_fit(names, centers, truth, published, protocol, seed)
+    fit, frame_notes = _camera_fit(names, centers, truth, published, protocol)
     target = truth.crop.apply(truth.points).astype(np.float64)
-    start = T = fit.T_target_source
+    T = fit.T_target_source
     reports: list[StageReport] = []
     for stage in protocol.stages:
-        step, report = _stage(source, target, T, truth, stage, tau, protocol, workers)
+        step, report = _stage(source, target, T, truth, stage, tau, protocol)
         T = step.T_target_source @ T
         reports.append(report)
     moved = truth.crop.apply(apply(T, source))
-    alignment = _check(fit, start, T, moved, truth, tau, tuple(reports), frame_notes, protocol)
-    return _score(moved, target, tau, alignment, protocol, workers)
+    alignment = _check(fit, T, moved, truth, tau, tuple(reports), frame_notes, protocol)
+    return _score(moved, target, tau, alignment, protocol)
 
 
 def point_set(mesh: Mesh) -> np.ndarray:
-    """Vertices and face centroids [P + F, 3]: what the official script compares."""
+    """Return vertices and face centroids [P + F, 3], which the official script compares."""
     vertices = mesh.vertices.astype(np.float64)
     return np.concatenate([vertices, vertices[mesh.faces].mean(axis=1)]) if len(mesh.faces) else vertices
 
@@ -369,14 +365,13 @@ def _camera_fit(
     truth: TntTruth,
     published: np.ndarray | None,
     protocol: TntSurface,
-    seed: int,
 ) -> tuple[RobustFit, list[str]]:
-    """From the capture to the scan by camera centres; what is odd about the frames."""
+    """Return the fit from capture to scan by camera centres, and notes on the frames."""
     ours, entries = match_cameras(names, len(truth.trajectory), f"{truth.scene}_COLMAP_SfM.log")
     targets = apply(truth.T_truth_log, truth.trajectory[entries, :3, 3])
     try:
         fit = ransac_similarity(
-            centers[ours], targets, threshold=protocol.camera_threshold, sample=protocol.camera_sample, seed=seed
+            centers[ours], targets, threshold=protocol.camera_threshold, sample=protocol.camera_sample, seed=0
         )
     except DataError as error:
         raise DataError(f"{truth.scene}_COLMAP_SfM.log does not fit the capture's cameras: {error}") from error
@@ -392,7 +387,7 @@ def _camera_fit(
 
 
 def _frame_gap(names: Sequence[str], centers: np.ndarray, published: np.ndarray) -> float:
-    """Median distance of cameras from those of a log, in the order of text (as logs are written) or of numbers."""
+    """Return the median distance of cameras from those of a log, in text order (of logs) or number order."""
     orders = [sorted(range(len(names)), key=key) for key in (lambda i: names[i], lambda i: natural_key(names[i]))]
     return min(float(np.median(np.linalg.norm(published[:, :3, 3] - centers[order], axis=1))) for order in orders)
 
@@ -405,7 +400,6 @@ def _stage(
     stage: IcpStage,
     tau: float,
     protocol: TntSurface,
-    workers: int | None,
 ) -> tuple[IcpResult, StageReport]:
     """One stage on the cropped and thinned clouds."""
     moved = truth.crop.apply(apply(T, source))
@@ -422,7 +416,6 @@ def _stage(
         iterations=stage.iterations,
         fraction_change=protocol.fraction_change,
         rms_change=protocol.rms_change,
-        workers=workers,
     )
     report = StageReport(
         None if stage.voxel is None else stage.voxel * tau,
@@ -439,7 +432,6 @@ def _stage(
 
 def _check(
     fit: RobustFit,
-    start: np.ndarray,
     T: np.ndarray,
     moved: np.ndarray,
     truth: TntTruth,
@@ -448,8 +440,8 @@ def _check(
     messages: list[str],
     protocol: TntSurface,
 ) -> Alignment:
-    """Whether the alignment can be believed, and why not."""
-    change = T @ np.linalg.inv(start)
+    """Return the alignment with the result of its self-check."""
+    change = T @ np.linalg.inv(fit.T_target_source)
     shift = _rms_between(moved, np.linalg.inv(change), tau)  # where they are now against where they were
     alone = _rms_between(moved, truth.T_truth_log @ np.linalg.inv(T), tau)
     scale = similarity_scale(change)
@@ -495,7 +487,7 @@ def _check(
 
 
 def _rms_between(points: np.ndarray, T: np.ndarray, unit: float) -> float | None:
-    """How far a transform moves points, rms, in units; None without points."""
+    """Return the rms distance by which a transform moves points, in units; None without points."""
     if not len(points):
         return None
     few = uniform_downsample(points, 100_000)
@@ -508,7 +500,6 @@ def _score(
     tau: float,
     alignment: Alignment,
     protocol: TntSurface,
-    workers: int | None,
 ) -> TntScore:
     """Precision, recall and F of the cropped clouds."""
     ours = voxel_downsample(moved, protocol.score_voxel * tau)
@@ -519,8 +510,8 @@ def _score(
         clouds = ScoredClouds(ours, np.zeros(0), theirs, np.full(len(theirs), np.inf), tau)
         why = "no part of the mesh lies inside the crop volume"
         return TntScore(tau, None, 0.0, 0.0, None, None, None, 0, len(theirs), alignment, clouds, why)
-    accuracy, _ = Cloud(theirs, workers=workers).nearest(ours)
-    completeness, _ = Cloud(ours, workers=workers).nearest(theirs)
+    accuracy, _ = Cloud(theirs).nearest(ours)
+    completeness, _ = Cloud(ours).nearest(theirs)
     accuracy, completeness = accuracy[:, 0], completeness[:, 0]
     precision, recall = float((accuracy < tau).mean()), float((completeness < tau).mean())
     return TntScore(

@@ -1,7 +1,6 @@
-"""Many tasks from one list: one after another, several at once, or on a cluster, and restarted at any point.
+"""Runs tasks one after another, in parallel processes, or on a cluster. Interrupted tasks continue when run again.
 
-The folder of the list is locked while somebody works in it.
-Never imports torch at the top: a process of its own chooses its GPU before torch loads.
+Imports torch only in functions, because a process selects its GPU before torch loads.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ import multiprocessing
 import os
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -24,47 +24,61 @@ from gs2d.training.events import Notice, OnEvent, ignore
 POLL_SECONDS = 0.5
 
 
+@dataclass(frozen=True)
+class Workers:
+    """Where and with which resources tasks run; the fields are options of `gs2d sweep`, `paper` and `blocks`.
+
+    Attributes
+    ----------
+    slots : int or None
+        Number of parallel tasks; None: one per GPU if the backend is CUDA, else one, in this process; on a cluster, as
+        many as fit.
+    threads : int or None
+        CPU threads of each parallel task; None: the cores divided by the number of tasks.
+    backend : str
+    cluster : str or None
+        Address of a Ray cluster, ``HOST:PORT`` or ``auto`` for the cluster of this machine; None: this machine.
+    """
+
+    slots: int | None = None
+    threads: int | None = None
+    backend: str = "auto"
+    cluster: str | None = None
+
+
 def execute(
     tasks: Sequence[AnyTask],
     folder: Path,
     on_event: OnEvent = ignore,
     *,
-    slots: int | None = None,
-    threads: int | None = None,
-    backend: str = "auto",
-    cluster: str | None = None,
+    workers: Workers = Workers(),
     before: Callable[[], None] = lambda: None,
-    after_job: Callable[[AnyTask], object] = lambda _task: None,
+    after_task: Callable[[AnyTask], object] = lambda _task: None,
 ) -> None:
-    """Do the tasks of a list that are not done; one that fails is written down, and the others go on.
+    """Run all unfinished tasks; a failure is recorded, and the other tasks continue.
 
     Parameters
     ----------
     tasks : sequence of Task
-        Each behind those that must be done before it.
+        Each after the tasks that it needs.
     folder : Path
-        Of the list; locked meanwhile. The system gives the lock of a killed process back.
+        Output folder of the tasks, locked while they run. The operating system releases the lock of a killed process.
     on_event : callable
-        Gets what a task says (one at a time), or how many tasks are done (several).
-    slots : int or None
-        Tasks at the same time; None = one a GPU where the backend is CUDA, else one, in this process; on a cluster as
-        many as it has room for.
-    threads : int or None
-        CPU threads of each of several tasks; None = the cores divided among them.
-    cluster : str or None
-        Address of a Ray cluster that does the tasks: ``HOST:PORT``, or ``auto``, the one that this machine is of.
+        Receives the events of a single task, or the progress of several tasks.
+    workers : Workers
     before : callable
         Called when the folder is locked.
-    after_job : callable
-        Called whenever a task has ended.
+    after_task : callable
+        Called after each task.
 
     Raises
     ------
     BackendError
-        ``slots`` is no number of tasks; the cluster cannot be had, or not be used.
+        If the number of slots is invalid, or the cluster cannot be used.
     RunError
-        Another process works in the folder.
+        If another process works in the folder.
     """
+    slots, cluster = workers.slots, workers.cluster
     if slots is not None and slots < 1:
         raise BackendError(f"--slots must be a whole number >= 1, got {slots}")
     with contextlib.ExitStack() as held:
@@ -72,8 +86,8 @@ def execute(
         if cluster is not None and (todo := [task for task in tasks if not task.is_done()]):
             from gs2d.contrib.lab.cluster import cluster_executor  # loads Ray
 
-            # A cluster that cannot be had leaves no folder behind.
-            ray = cluster_executor(cluster, folder, todo, slots=slots, threads=threads, backend=backend)
+            # First, so that an unusable cluster leaves no folder behind.
+            ray = cluster_executor(cluster, folder, todo, slots=slots, threads=workers.threads, backend=workers.backend)
             held.callback(ray.stop)
         make_folder(folder / "jobs")
         held.enter_context(RunFolder(folder).locked())
@@ -81,22 +95,22 @@ def execute(
         todo = [task for task in tasks if not task.is_done()]
         if cluster is not None:
             if ray is not None:
-                several_at_once([ray.fitted(task) for task in todo], ray, on_event, after_job)
+                several_at_once([ray.fitted(task) for task in todo], ray, on_event, after_task)
             return
-        gpus = gpu_count(backend)
+        gpus = gpu_count(workers.backend)
         slots = min(slots or max(1, gpus), max(1, len(todo)))
         if slots > 1:
-            fraction = threads or max(1, available_cores() // slots)
-            todo = [task if task.alone else task.with_threads(fraction) for task in todo]
-            several_at_once(todo, Processes(slots, gpus), on_event, after_job)
+            threads = workers.threads or max(1, available_cores() // slots)
+            todo = [task if task.alone else task.with_threads(threads) for task in todo]
+            several_at_once(todo, Processes(slots, gpus), on_event, after_task)
             return
         failed: set[str] = set()
         for number, task in enumerate(todo, 1):
             if not given_up(task, failed, on_event):
-                on_event(Notice(f"job {number} of {len(todo)}: {task.name}"))
+                on_event(Notice(f"task {number} of {len(todo)}: {task.name}"))
                 do(task, on_event)
             failed |= {task.name} if task.outcome()["state"] == "failed" else set()
-            after_job(task)
+            after_task(task)
 
 
 def available_cores() -> int:
@@ -105,7 +119,7 @@ def available_cores() -> int:
 
 
 def gpu_count(backend: str) -> int:
-    """Return the GPUs to spread jobs over; 0 where the backend does not use any."""
+    """Return the number of GPUs for tasks; 0 if the backend uses none."""
     if backend not in ("auto", "cuda"):
         return 0
     from gs2d.render.backends import backend_report  # loads torch
@@ -120,7 +134,7 @@ def gpu_count(backend: str) -> int:
 
 # -- processes of this machine -----------------------------------------------------------------------------------------
 class Processes(Executor[AnyTask]):
-    """A process for each task: what one leaves in memory, or dies of, is its own matter."""
+    """Runs each task in a process, so that its memory is freed and its crash ends nothing else."""
 
     def __init__(self, slots: int, gpus: int) -> None:
         visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
@@ -131,7 +145,7 @@ class Processes(Executor[AnyTask]):
         self._begun: dict[str, int] = {}
 
     def running(self) -> Sequence[AnyTask]:
-        """Return the tasks that have a process."""
+        """Return the tasks with a process."""
         return [task for task, _ in self._running.values()]
 
     def has_room(self) -> bool:
@@ -139,7 +153,7 @@ class Processes(Executor[AnyTask]):
         return len(self._running) < self._slots
 
     def start(self, task: AnyTask) -> None:
-        """Begin a task in the first free slot, on its GPU."""
+        """Start a task in the first free slot, on the GPU of the slot."""
         self._begin(next(slot for slot in range(self._slots) if slot not in self._running), task)
 
     def _begin(self, slot: int, task: AnyTask) -> None:
@@ -150,7 +164,7 @@ class Processes(Executor[AnyTask]):
         self._running[slot] = task, process
 
     def wait(self, on_event: OnEvent) -> list[tuple[AnyTask, bool]]:
-        """Wait for a process to end; one that was killed is begun again, as often as its task says."""
+        """Wait for a process to end; a killed process is restarted, ``Task.retries`` times."""
         wait([process.sentinel for _, process in self._running.values()], POLL_SECONDS)
         ended = []
         for slot, (task, process) in list(self._running.items()):
@@ -158,14 +172,14 @@ class Processes(Executor[AnyTask]):
                 continue
             del self._running[slot]
             if process.exitcode < 0 and self._begun[task.name] <= task.retries and not task.is_done():
-                on_event(Notice(f"{task.name}: its process died ({_how(process.exitcode)}); it goes on"))
+                on_event(Notice(f"{task.name}: its process died ({_how(process.exitcode)}); restarted"))
                 self._begin(slot, task)
                 continue
             ended.append((task, _has_failed(task, process.exitcode, on_event)))
         return ended
 
     def stop(self) -> None:
-        """End the processes."""
+        """End all processes."""
         left = [process for _, process in self._running.values()]
         for process in left:
             process.terminate()
@@ -178,7 +192,7 @@ def _how(code: int) -> str:
 
 
 def _has_failed(task: Task, code: int, on_event: OnEvent) -> bool:
-    """Whether a task whose process has ended failed; then it is said."""
+    """Return whether a task whose process has ended has failed; report the failure."""
     outcome = task.outcome()
     if outcome["state"] not in ("done", "failed"):
         task.write("failed", reason=f"its process died ({_how(code)}; out of memory?)", **task.facts())
@@ -189,18 +203,18 @@ def _has_failed(task: Task, code: int, on_event: OnEvent) -> bool:
 
 
 def _do_here(task: Task, device: str | None) -> None:
-    """Do a task in a process made for it."""
+    """Run a task in its own process."""
     if device is not None:
         os.environ["CUDA_VISIBLE_DEVICES"] = device  # before torch loads
     threading.Thread(target=_leave_with_parent, daemon=True).start()
     try:
         do(task)
-    except KeyboardInterrupt:  # Ctrl-C reaches every process of the terminal; the parent says so
+    except KeyboardInterrupt:  # Ctrl-C reaches all processes; the parent reports it
         os._exit(130)
 
 
 def _leave_with_parent() -> None:
-    """End this process when the one that started it is gone: nobody else would, and its lock is free again."""
+    """Exit when the parent process ends, as its lock on the folder is released."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -158,7 +158,7 @@ class Ranking:
     when: str
 
 
-def rank_run(run: RunFolder, job: LoadedRun, on_event: OnEvent = ignore) -> Ranking:
+def rank_run(run: RunFolder, loaded: LoadedRun, on_event: OnEvent = ignore) -> Ranking:
     """E_i (paper Eq. 8) of the splats that the recipe ranked, summed over all training views.
 
     Raises
@@ -166,26 +166,26 @@ def rank_run(run: RunFolder, job: LoadedRun, on_event: OnEvent = ignore) -> Rank
     RunError
         The run is not finished, or its checkpoint is broken.
     """
-    index, action = _first_ranking(job.recipe)
-    splats, group, when = _ranked(run, job, index, action)
+    index, action = _first_ranking(loaded.recipe)
+    splats, group, when = _ranked(run, loaded, index, action)
     ranking = RankByError(**action.options)
-    splats = splats.to(job.backend.device)
+    splats = splats.to(loaded.backend.device)
     total = torch.zeros(len(splats), dtype=torch.float64, device=splats.device)
-    views = job.scene.train
+    views = loaded.scene.train
     for view in counted(views, "errors of each splat", len(views), on_event):
-        seen, settings = splats, job.settings
+        seen, settings = splats, loaded.settings
         if view.appearance:  # that of the end: after stage 1 it hardly changes
             numbers = numbers_of(view, splats.means)
             seen = shown_splats(splats, view.camera, numbers, settings.sh_degree)
             settings = replace(settings, sh_degree=0)
-        image = torch.from_numpy(view.target(job.settings.background)).to(splats.means)
-        mask = view.usable(masks=job.protocol.use_mask_in_training)
+        image = torch.from_numpy(view.target(loaded.settings.background)).to(splats.means)
+        mask = view.usable(masks=loaded.protocol.use_mask_in_training)
         errors = splat_errors(
             seen,
             view.camera,
             image,
             settings,
-            backend=job.backend,
+            backend=loaded.backend,
             mask=None if mask is None else torch.from_numpy(mask).to(splats.device),
             occlusion=ranking.occlusion,
         )
@@ -196,10 +196,10 @@ def rank_run(run: RunFolder, job: LoadedRun, on_event: OnEvent = ignore) -> Rank
     return Ranking(splats, total, group.to(splats.device), when)
 
 
-def _ranked(run: RunFolder, job: LoadedRun, index: int, action: Action) -> tuple[Splats, Tensor | None, str]:
+def _ranked(run: RunFolder, loaded: LoadedRun, index: int, action: Action) -> tuple[Splats, Tensor | None, str]:
     """Return the splats nearest to those that stage ``index`` ranked, the group it found if known, and when."""
-    stages = job.recipe.stages
-    before = stage_end(run, job, index - 1) if index else None
+    stages = loaded.recipe.stages
+    before = stage_end(run, loaded, index - 1) if index else None
     if before is not None:
         return before.splats, None, f"after {stages[index - 1].name}"
     own = [c.path for c in run.checkpoints() if (c.stage_index, c.iteration) == (index, None)]
@@ -233,9 +233,9 @@ def error_positions(errors: Tensor, limits: tuple[float, float]) -> Tensor:
     return ((errors.clamp(min=1e-300) / low).log() / np.log(high / low)).clamp(0, 1)
 
 
-def map_image(splats: Splats, positions: Tensor, view: View, job: LoadedRun, alpha: np.ndarray) -> np.ndarray:
+def map_image(splats: Splats, positions: Tensor, view: View, loaded: LoadedRun, alpha: np.ndarray) -> np.ndarray:
     """E_i splatted: each pixel has the colour of the mean position of its splats, over white; [H, W, 3]."""
-    weighted = splatted(splats, positions, view, job.settings, job.backend)
+    weighted = splatted(splats, positions, view, loaded.settings, loaded.backend)
     steps = error_scale(256)
     where = np.clip(weighted / np.maximum(alpha, 1e-6), 0, 1)
     cover = np.clip(alpha, 0, 1)[..., None]
@@ -246,26 +246,26 @@ def draw_error_maps(
     run: RunFolder, path: Path, on_event: OnEvent = ignore, *, title: str = "", views: int = 3, backend: str = "auto"
 ) -> None:
     """Write the E_i map of one run as a PNG: a row for each view."""
-    job = reload_run(run, on_event, backend=backend)
-    ranking = rank_run(run, job, on_event)
+    loaded = reload_run(run, on_event, backend=backend)
+    ranking = rank_run(run, loaded, on_event)
     limits = map_limits(ranking.errors)
     positions = error_positions(ranking.errors, limits)
-    shown = choose_views(job.scene, views)
-    fractions = [splatted(ranking.splats, ranking.worst, v, job.settings, job.backend) for _, v in shown]
+    shown = choose_views(loaded.scene, views)
+    fractions = [splatted(ranking.splats, ranking.worst, v, loaded.settings, loaded.backend) for _, v in shown]
     top = max(
         SMALLEST_TOP, *(float(np.percentile(fraction, 99.9)) for fraction in fractions)
     )  # these splats are often faint
     rows: list[tuple[str, list[np.ndarray]]] = []
     for (split, view), fraction in zip(shown, fractions, strict=True):
-        output = render_view(ranking.splats, view, job.settings, job.backend)
-        own = photographed(view, output.color, job.settings.background)
+        output = render_view(ranking.splats, view, loaded.settings, loaded.backend)
+        own = photographed(view, output.color, loaded.settings.background)
         color, alpha = np.clip(own.cpu().numpy(), 0, 1), output.alpha.cpu().numpy()
-        photo = view.target(job.settings.background)
+        photo = view.target(loaded.settings.background)
         images = [
             valid_image(photo, view.valid()),
             color,
             error_image(color, photo, view.mask()),
-            map_image(ranking.splats, positions, view, job, alpha),
+            map_image(ranking.splats, positions, view, loaded, alpha),
             highlight_image(color, np.clip(fraction / top, 0, 1)),
         ]
         rows.append((f"{Path(view.name).stem} ({split})", images))

@@ -11,7 +11,7 @@ from typing import Any
 
 from gs2d.contrib.lab.aggregate import FIGURES, ClaimResult, Results, Row, check_claims, read_cell
 from gs2d.contrib.lab.deviations import deviations_of
-from gs2d.contrib.lab.execute import execute
+from gs2d.contrib.lab.execute import Workers, execute
 from gs2d.contrib.lab.lab_options import PaperOptions, SweepOptions, TableOptions
 from gs2d.contrib.lab.paper_tables import DTU, TNT, PaperRow, PaperTable
 from gs2d.contrib.lab.render import to_csv, to_latex, to_markdown, write_page
@@ -24,6 +24,7 @@ from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import RunError
 from gs2d.evaluation.visible_surface import VISIBLE_SURFACE
 from gs2d.io.run_dir import machine, make_folder, versions
+from gs2d.pipeline.prepare.options import values
 from gs2d.training.events import Notice, OnEvent, ignore
 
 ABOUT = "about.json"
@@ -41,7 +42,7 @@ class PaperResult:
     results : Results
     checked : tuple of ClaimResult
     failures : dict
-        Job -> reason, of runs that failed.
+        Reasons of failed runs by name.
     unfinished : int
         Runs that are not there yet (tabulated without training).
     """
@@ -76,15 +77,12 @@ def paper(options: PaperOptions | SweepOptions, on_event: OnEvent = ignore) -> P
 
             load_lpips(options.lpips_weights)  # a wrong file is said now, not after hours of training
         execute(
-            plan.jobs,
+            plan.tasks,
             options.out,
             on_event,
-            slots=options.slots,
-            threads=options.threads,
-            backend=options.backend,
-            cluster=options.cluster,
+            workers=Workers(**values(Workers, options)),
             before=lambda: write_json(options.out / ABOUT, about(plan, None, ())),
-            after_job=lambda _job: tabulate(plan, images=False),
+            after_task=lambda _task: tabulate(plan, images=False),
         )
     return tabulate(plan, on_event)
 
@@ -134,13 +132,13 @@ def _defining(options: TableOptions) -> dict[str, Any]:
 # -- tabulating ------------------------------------------------------------------------------------------------------
 def tabulate(plan: Plan, on_event: OnEvent = ignore, *, images: bool = True) -> PaperResult:
     """Write table.json, .md, .csv, .tex, about.json and (with ``pictures``) index.html, from the runs as they are."""
-    unfinished = sum(job.outcome()["state"] not in ("done", "failed") for job in plan.jobs)
+    unfinished = sum(task.outcome()["state"] not in ("done", "failed") for task in plan.tasks)
     results = Results(tuple(_row(plan, row) for row in plan.table.rows))
     checked = check_claims(plan.table, results)
     deviations = deviations_of(plan.options, plan.scenes, plan.table, results)
     out, facts = plan.options.out, about(plan, results, checked)
     make_folder(out)
-    commands = [line for job in plan.jobs for line in commands_of(job)]
+    commands = [line for task in plan.tasks for line in commands_of(task)]
     write_json(out / "table.json", [row_json(row, results, deviations) for row in results.rows])
     write_json(out / ABOUT, {**facts, "deviations": deviations})
     texts = {
@@ -154,26 +152,26 @@ def tabulate(plan: Plan, on_event: OnEvent = ignore, *, images: bool = True) -> 
     files = [out / name for name in ("table.json", *texts, ABOUT)]
     if images:
         files.append(write_page(plan.table, results, checked, deviations, commands, facts, out, on_event))
-    return PaperResult(plan.table, tuple(files), results, checked, failures(plan.jobs), unfinished)
+    return PaperResult(plan.table, tuple(files), results, checked, failures(plan.tasks), unfinished)
 
 
 def _row(plan: Plan, row: PaperRow) -> Row:
     cells, commands = [], []
     for scene in plan.scenes if row.recipe is not None else ():
         for seed in plan.options.seeds:
-            job = plan.cells[str(row.recipe), scene.name, seed]
+            task = plan.cells[str(row.recipe), scene.name, seed]
             cells.append(
                 read_cell(
-                    job.train.out,
+                    task.train.out,
                     scene=scene.name,
                     data_set=scene.data_set,
                     seed=seed,
                     test_on=scene.protocol.test_on,
-                    record=job.outcome(),
+                    record=task.outcome(),
                     conventions=scene.protocol.metrics,
                 )
             )
-            commands += commands_of(job)
+            commands += commands_of(task)
     paper_figures = {data_set: dict(figures) for data_set, figures in row.paper.items()}
     return Row(row.name, row.recipe, paper_figures, row.note, tuple(cells), tuple(commands))
 
@@ -210,7 +208,7 @@ def about(plan: Plan, results: Results | None, checked: Sequence[ClaimResult]) -
         "seeds": list(options.seeds),
         "spread": "standard deviation over seeds of the mean over scenes",
         "claims": [claim.to_json() for claim in checked],
-        "failures": failures(plan.jobs) if results is not None else {},
+        "failures": failures(plan.tasks) if results is not None else {},
         "command": paper_command(options),
         "versions": versions(),
         "machine": machine(),

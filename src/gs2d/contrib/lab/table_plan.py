@@ -1,6 +1,6 @@
 """What a table needs before a photograph is read: its scenes, its recipes, and the run of each of them.
 
-`gs2d paper` and `gs2d sweep` are two plans of one machine: recipes x scenes x seeds become jobs, which differ in who
+`gs2d paper` and `gs2d sweep` are two plans of one machine: recipes x scenes x seeds become tasks, which differ in who
 names the recipes.
 """
 
@@ -17,10 +17,10 @@ from gs2d.config.recipe import Recipe, validate
 from gs2d.config.recipe_files import short_name
 from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import apply_overrides, to_json
-from gs2d.contrib.lab.jobs import Job, stage_keys
 from gs2d.contrib.lab.lab_options import PaperOptions, SweepOptions, TableOptions
 from gs2d.contrib.lab.paper_tables import PAPER_TABLES, PaperTable, recipe_table
 from gs2d.contrib.lab.scenes import FoundScene, find_scenes
+from gs2d.contrib.lab.training_task import TrainingTask, stage_keys
 from gs2d.errors import RecipeError
 from gs2d.io.run_dir import versions
 from gs2d.pipeline.prepare.options import EvaluateOptions, TrainOptions
@@ -28,17 +28,17 @@ from gs2d.pipeline.prepare.options import EvaluateOptions, TrainOptions
 
 @dataclass(frozen=True)
 class Plan:
-    """A table's work: its scenes, and the job of every (recipe of a row, scene, seed)."""
+    """A table's work: its scenes, and the task of every (recipe of a row, scene, seed)."""
 
     options: PaperOptions | SweepOptions
     table: PaperTable
     scenes: tuple[FoundScene, ...]
-    cells: Mapping[tuple[str, str, int], Job]
+    cells: Mapping[tuple[str, str, int], TrainingTask]
 
     @property
-    def jobs(self) -> tuple[Job, ...]:
+    def tasks(self) -> tuple[TrainingTask, ...]:
         """Each once: rows whose recipes train the same share theirs."""
-        return tuple({job.name: job for job in self.cells.values()}.values())
+        return tuple({task.name: task for task in self.cells.values()}.values())
 
 
 def make_plan(options: PaperOptions | SweepOptions) -> Plan:
@@ -56,7 +56,7 @@ def make_plan(options: PaperOptions | SweepOptions) -> Plan:
     recipes = {row.recipe: trained_recipe(row.recipe, options) for row in table.rows if row.recipe is not None}
     _check_overrides(options.overrides, [get_recipe(name) for name in recipes])
     cells = {
-        (name, scene.name, seed): make_job(options, scene, name, recipe, seed)
+        (name, scene.name, seed): make_task(options, scene, name, recipe, seed)
         for scene, seed, (name, recipe) in itertools.product(scenes, options.seeds, recipes.items())
     }
     return Plan(options, table, scenes, cells)
@@ -95,7 +95,7 @@ def _check_overrides(overrides: Sequence[str], recipes: Sequence[Recipe]) -> Non
             raise RecipeError(f"--set {text} fits no recipe of the table; their stages are {', '.join(stages)}")
 
 
-def make_job(options: TableOptions, scene: FoundScene, name: str, recipe: Recipe, seed: int) -> Job:
+def make_task(options: TableOptions, scene: FoundScene, name: str, recipe: Recipe, seed: int) -> TrainingTask:
     """Return the run of a recipe (``trained_recipe`` of the name) on a scene."""
     downscale = options.downscale or scene.downscale
     train = TrainOptions(
@@ -119,7 +119,7 @@ def make_job(options: TableOptions, scene: FoundScene, name: str, recipe: Recipe
     if scene.scored or options.lpips_weights is not None:
         evaluate = EvaluateOptions(ground_truth=scene.truth, lpips_weights=options.lpips_weights)
     facts = (str(scene.path.resolve()), scene.protocol, downscale, seed, options.backend, versions()["2dgs-r"])
-    return Job(
+    return TrainingTask(
         name=train.out.name,
         record=options.out / "jobs" / f"{train.out.name}.json",
         train=train,
@@ -145,12 +145,12 @@ def paper_command(options: PaperOptions | SweepOptions) -> str:
     return _command(words, options, said)
 
 
-def commands_of(job: Job) -> list[str]:
-    """Return the `gs2d train` and `gs2d evaluate` lines that do what a job does."""
-    words = ["train", str(job.train.scene), "--out", str(job.train.out), "--recipe", str(job.train.recipe)]
-    lines = [_command(words, job.train, ("scene", "out", "recipe", "resume"))]
-    if job.evaluate is not None:
-        lines.append(_command(["evaluate", str(job.train.out)], job.evaluate, ()))
+def commands_of(task: TrainingTask) -> list[str]:
+    """Return the `gs2d train` and `gs2d evaluate` lines that do what a task does."""
+    words = ["train", str(task.train.scene), "--out", str(task.train.out), "--recipe", str(task.train.recipe)]
+    lines = [_command(words, task.train, ("scene", "out", "recipe", "resume"))]
+    if task.evaluate is not None:
+        lines.append(_command(["evaluate", str(task.train.out)], task.evaluate, ()))
     return lines
 
 

@@ -1,7 +1,7 @@
-"""A task of a list: a value that another process, or another machine, can be handed, and what became of it.
+"""Tasks: values that other processes and machines can run, with a record of their outcome.
 
-What became of it is in ``jobs/NAME.json`` under the folder of the list; a task that is done is not done again.
-Never imports torch at the top: a process of its own chooses its GPU before torch loads.
+The record is ``jobs/NAME.json`` in the output folder; finished tasks are not run again. The module imports torch only
+in functions, because a process selects its GPU before torch loads.
 """
 
 from __future__ import annotations
@@ -25,27 +25,26 @@ _OUTCOME = {"state": str, "reason?": str, "notes?": (dict, None), "wanted?": [st
 
 @dataclass(frozen=True, kw_only=True)
 class Task(ABC):
-    """One piece of work: a frozen value of plain values and paths, so that any process can do it.
+    """A piece of work, as a frozen dataclass of plain values and paths that can be pickled.
 
     Attributes
     ----------
     name : str
-        Unique in the list; a file name.
+        Unique name, valid as a file name.
     record : Path
-        The file that says what became of it.
+        File of the outcome.
     after : tuple of str
-        Tasks of the list that must be done before.
+        Names of tasks that must finish first.
     inputs, outputs : tuple of Path
-        Files that it reads beside the capture, and files that it leaves: it is done only while those are there. Both
-        lie in the folder of the list.
+        Files in the output folder that the task reads and writes. A task is finished only while its outputs exist.
     alone : bool
-        Nothing runs beside it: it has all CPU threads.
+        Whether the task runs alone, with all CPU threads.
     retries : int
-        How often it restarts from its last checkpoint when its process dies.
+        Number of restarts, from the last checkpoint, if its process dies.
     memory : float or None, GiB
-        That it keeps to.
+        Memory limit.
     gpu : bool
-        Whether it uses a GPU, where the backend does.
+        Whether the task uses a GPU, if the backend does.
     """
 
     name: str
@@ -59,51 +58,51 @@ class Task(ABC):
     gpu: bool = True
 
     def outcome(self) -> dict[str, Any]:
-        """Return what became of it: ``state`` (new, running, done, failed), ``reason``, and what it says of itself.
+        """Return the record: ``state`` (new, running, done or failed), ``reason``, and results of the task.
 
         Raises
         ------
         DataError, RunError
-            The record was changed by hand.
+            If the record is damaged.
         """
         if not self.record.exists():
             return {"state": "new"}
         found: dict[str, Any] = read_json(self.record)
-        check_shape(self.record, found, _OUTCOME, f"delete it, and {self.name} is done again")
+        check_shape(self.record, found, _OUTCOME, f"delete it to run {self.name} again")
         return found
 
     def is_done(self) -> bool:
-        """Return whether nothing is left to do."""
+        """Return whether the task is finished."""
         return self.outcome()["state"] == "done" and all(path.exists() for path in self.outputs)
 
     def write(self, state: str, **facts: Any) -> None:
-        """Write what became of it."""
+        """Write the record."""
         write_json(self.record, {"state": state, **facts, "time": time.time(), "at": now()})
 
     def facts(self) -> dict[str, Any]:
-        """Return what is true of it however it ended, for its record."""
+        """Return entries of the record that do not depend on success."""
         return {}
 
     def keys(self) -> set[str]:
-        """Return names of all that it makes for others, beside its outputs."""
+        """Return the keys of results that other tasks share, such as stages in the cache."""
         return set()
 
     def keys_ahead(self) -> set[str]:
-        """Return those that it has not made yet: while it runs, a task with one of these waits."""
+        """Return the keys of results that are not finished; tasks with one of them wait."""
         return set()
 
     @abstractmethod
     def with_threads(self, threads: int) -> Self:
-        """Return the task on so many CPU threads."""
+        """Return the task with another number of CPU threads."""
 
     @abstractmethod
     def work(self, on_event: OnEvent) -> dict[str, Any]:
-        """Do it, or go on with it; returns what is written down of it.
+        """Run the task, or continue it; return entries of its record.
 
         Raises
         ------
         Gs2dError
-            What the user can mend.
+            If the user has to act.
         """
 
 
@@ -111,26 +110,26 @@ AnyTask = TypeVar("AnyTask", bound=Task)
 
 
 def failures(tasks: Sequence[Task]) -> dict[str, str]:
-    """Return the reason by task, of those that failed."""
+    """Return the reasons of failed tasks by name."""
     outcomes = {task.name: task.outcome() for task in tasks}
     return {
-        name: outcome.get("reason", "no reason was written down")
+        name: outcome.get("reason", "no reason was recorded")
         for name, outcome in outcomes.items()
         if outcome["state"] == "failed"
     }
 
 
 def do(task: Task, on_event: OnEvent = ignore) -> None:
-    """Do one task; what goes wrong is written down."""
+    """Run a task and write its record, also if it fails."""
     task.write("running")
     try:
-        found = task.work(on_event)
+        result = task.work(on_event)
     except Exception as error:
-        is_ours = not isinstance(error, Gs2dError)
+        is_fault = not isinstance(error, Gs2dError)
         text = " ".join(str(error).split())
-        reason = f"{type(error).__name__}: {error}" if is_ours else text or type(error).__name__
-        more = {"traceback": traceback.format_exc()} if is_ours else {}
+        reason = f"{type(error).__name__}: {error}" if is_fault else text or type(error).__name__
+        more = {"traceback": traceback.format_exc()} if is_fault else {}
         task.write("failed", reason=reason, **task.facts(), **more)
         on_event(Notice(f"{task.name} failed: {reason}"))
         return
-    task.write("done", **found, **task.facts())
+    task.write("done", **result, **task.facts())

@@ -1,7 +1,4 @@
-"""A training run as a task of a list: trained, then scored; and what became of it.
-
-Never imports torch at the top.
-"""
+"""A task that trains and scores one run. Imports torch only in functions."""
 
 from __future__ import annotations
 
@@ -17,22 +14,22 @@ from gs2d.training.events import Event, NotMade, OnEvent
 
 
 @dataclass(frozen=True, kw_only=True)
-class Job(Task):
-    """One run of a list: trained, then scored.
+class TrainingTask(Task):
+    """Train and score one run.
 
-    Jobs whose recipes begin with the same stages share them through the stage cache: of several at once those wait
-    whose next stage another one is training.
+    Tasks whose recipes begin with the same stages share them through the stage cache. A task waits while another one
+    trains its next stage.
 
     Attributes
     ----------
     train : TrainOptions
-        With ``resume``, and with the stage cache of the list.
+        Options with ``resume`` and the shared stage cache.
     evaluate : EvaluateOptions or None
-        What is scored beyond what training scores.
+        Scores beyond those of training.
     stage_keys : tuple of str
-        One for each stage; jobs with equal keys train the same stage.
+        One key per stage; tasks with equal keys train the same stage.
     wanted : tuple of str
-        What is scored, and with what: a finished job is scored again when it was scored with less.
+        Names of the scores and their inputs. A finished task is scored again if its record lacks one.
     """
 
     train: TrainOptions
@@ -45,13 +42,13 @@ class Job(Task):
         return RunFolder(self.train.out).file(SPLATS).exists()
 
     def is_done(self) -> bool:
-        """Return whether nothing is left to do: trained, scored with all that is wanted, and not deleted since."""
+        """Return whether the run is trained, has all scores, and still exists."""
         outcome = self.outcome()
         is_scored = set(self.wanted) <= set(outcome.get("wanted", self.wanted))
         return outcome["state"] == "done" and is_scored and (self.is_trained() or not outcome.get("trained", False))
 
     def facts(self) -> dict[str, Any]:
-        """Return what is true of it however it ended: where it was trained, its pictures were scored."""
+        """Return whether the run is trained, which includes its image scores."""
         return {"trained": self.is_trained()}
 
     def keys(self) -> set[str]:
@@ -62,8 +59,8 @@ class Job(Task):
         """Return the keys of the stages that its run has not finished."""
         return set(self.stage_keys[len(RunFolder(self.train.out).metrics()["stages"]) :])
 
-    def with_threads(self, threads: int) -> Job:
-        """Return the job on so many CPU threads."""
+    def with_threads(self, threads: int) -> TrainingTask:
+        """Return the task with another number of CPU threads."""
         return replace(self, train=replace(self.train, threads=threads))
 
     def work(self, on_event: OnEvent) -> dict[str, Any]:
@@ -72,22 +69,21 @@ class Job(Task):
 
 
 def stage_keys(facts: Sequence[Any], stages: Sequence[Any]) -> tuple[str, ...]:
-    """Return a key of each stage: a hash of what the runs have in common and of the stages so far (as JSON values).
+    """Return a key of each stage: a hash of common facts of the runs and of all stages up to it, as JSON values.
 
-    Cheaper than ``Job.stage_key`` of the pipeline, which reads the photographs, and only used to decide who waits for
-    whom: a wrong one costs time, never a wrong result.
+    Keys only decide which task waits. A wrong key costs time, but never changes a result.
     """
     texts = (repr((list(facts), list(stages[: i + 1]))) for i in range(len(stages)))
     return tuple(hashlib.sha256(text.encode()).hexdigest()[:32] for text in texts)
 
 
-def train_and_evaluate(job: Job, on_event: OnEvent) -> dict[str, str]:
-    """Train and score one run; returns what could not be had, with reasons (``surface``).
+def train_and_evaluate(task: TrainingTask, on_event: OnEvent) -> dict[str, str]:
+    """Train and score one run; return why the surface has no scores, as ``{"surface": reason}``, else {}.
 
     Raises
     ------
     Gs2dError
-        The run itself failed.
+        If training fails.
     """
     from gs2d.pipeline.finish.evaluate import evaluate_run
     from gs2d.pipeline.train.train_run import train
@@ -98,12 +94,12 @@ def train_and_evaluate(job: Job, on_event: OnEvent) -> dict[str, str]:
         missing.extend([event] if isinstance(event, NotMade) else [])
         on_event(event)
 
-    train(job.train, listen)
+    train(task.train, listen)
     no_mesh = [event.reason for event in missing if event.what == MESH]
-    evaluate = job.evaluate
-    if evaluate is not None and no_mesh:  # nothing to compare with a true surface
+    evaluate = task.evaluate
+    if evaluate is not None and no_mesh:  # no surface to score
         weights = evaluate.lpips_weights
         evaluate = None if weights is None else EvaluateOptions(lpips_weights=weights)
     if evaluate is not None:
-        evaluate_run(job.train.out, evaluate, on_event, threads=job.train.threads)
+        evaluate_run(task.train.out, evaluate, on_event, threads=task.train.threads)
     return {"surface": f"no mesh: {no_mesh[0]}"} if no_mesh else {}
