@@ -151,7 +151,7 @@ def _float16_pairs(columns: torch.Tensor) -> np.ndarray:
 def _are_spikes(splats: Splats, eyes: np.ndarray, alpha_min: float) -> np.ndarray:
     """Return whether the visible radius of each splat is large for its distance from the nearest cameras."""
     nearby = 1 + len(eyes) // 10  # the tenth nearest of 100: one camera may stand close to a wall
-    distance = cKDTree(eyes).query(splats.means.numpy(), k=[nearby])[0][:, 0]
+    distance = np.asarray(cKDTree(eyes).query(splats.means.numpy(), k=[nearby])[0])[:, 0]
     widths = (2 * (splats.opacities / alpha_min).clamp(min=1).log()).sqrt() * splats.scales.amax(dim=1)
     return np.asarray(widths.numpy() > SPIKE * distance)
 
