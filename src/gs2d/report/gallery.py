@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,22 +67,11 @@ def read_gallery(renders: Path) -> Gallery | None:
         If the index is broken.
     """
     data = read_index(renders)
-    if data is None:
-        return None
-    views = tuple(
-        ShownView(
-            view["name"],
-            view.get("file", view["name"]),
-            str(view.get("split", "")),
-            tuple(view["depth_limits"]) if view.get("depth_limits") else None,
-        )
-        for view in data["views"]
-    )
-    return Gallery(renders, views, tuple(data["stages"]))
+    return None if data is None else Gallery(renders, tuple(map(_shown_view, data["views"])), tuple(data["stages"]))
 
 
 def read_index(renders: Path) -> dict[str, Any] | None:
-    """Return ``index.json`` with its checked lists ``views`` and ``stages``, or None where there is none.
+    """Return ``index.json`` with its lists ``views`` and ``stages``, or None where there is none.
 
     Raises
     ------
@@ -94,27 +82,23 @@ def read_index(renders: Path) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     data = read_json(path)
-    if isinstance(data, dict):
-        views, stages = data.get("views", []), data.get("stages", [])
-        if _are(views, _is_view) and _are(stages, lambda stage: isinstance(stage, str)):
-            return {**data, "views": views, "stages": stages}
-    raise DataError(
-        f"{path} must hold the lists views and stages as gs2d writes them, got something else; "
-        "delete it (the report then shows no views), or train again with --overwrite"
-    )
+    try:
+        index = {**data, "views": list(data.get("views", ())), "stages": [str(name) for name in data.get("stages", ())]}
+        for view in index["views"]:
+            _shown_view(view)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise DataError(
+            f"{path} must hold the lists views and stages as gs2d writes them, got something else; "
+            "delete it (the report then shows no views), or train again with --overwrite"
+        ) from error
+    return index
 
 
-def _are(values: Any, holds: Callable[[Any], bool]) -> bool:
-    return isinstance(values, list) and all(map(holds, values))
-
-
-def _is_view(entry: Any) -> bool:
-    if not (isinstance(entry, dict) and isinstance(entry.get("name"), str)):
-        return False
-    limits = entry.get("depth_limits")
-    known = limits is None or (_are(limits, lambda value: isinstance(value, int | float)) and len(limits) == 2)
-    words = all(isinstance(entry.get(name, ""), str) for name in ("file", "split"))
-    return known and words and isinstance(entry.get("camera", {}), dict)
+def _shown_view(entry: dict[str, Any]) -> ShownView:
+    """Return an entry of ``views`` (KeyError, TypeError, ValueError, AttributeError: it is broken)."""
+    name, limits = entry["name"], entry.get("depth_limits")
+    depth_limits = None if limits is None else (float(limits[0]), float(limits[1]))
+    return ShownView(str(name), str(entry.get("file", name)), str(entry.get("split", "")), depth_limits)
 
 
 def compared(gallery: Gallery, view: ShownView, *, width: int = 800) -> Pair | None:

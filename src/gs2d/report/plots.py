@@ -1,8 +1,9 @@
-"""Training curves as SVG: losses, PSNR, splat count, opacity, area; for one run or several side by side."""
+"""Training curves as SVG: losses, PSNR, splat count, opacity and area."""
 
 from __future__ import annotations
 
 import io
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeGuard
@@ -12,7 +13,7 @@ import numpy as np
 INK = "#858b94"  # readable on white and on black
 _COLORS = ("#3f86d6", "#e0893a", "#46a56b", "#c6509f", "#8a74d8", "#b9a02d", "#50a9b8")
 _CHANGES = ("mean", "covariance", "opacity", "sh")
-MOST = 1e30  # largest value that is drawn; the limits of axes overflow at 1e308
+MAX_VALUE = 1e30  # larger values are not drawn; the limits of axes overflow at 1e308
 
 
 @dataclass(frozen=True)
@@ -42,32 +43,22 @@ class History:
 
 def read_history(events: Sequence[Mapping[str, Any]]) -> History:
     """Sort the steps of a log into series. Unknown kinds and figures are ignored."""
-    order: list[str] = []
-    lengths: dict[str, int] = {}
+    lengths: dict[str, int] = {}  # by stage, in order
     for event in events:
         stage = event.get("stage")
-        if not isinstance(stage, str):
-            continue
-        if stage not in lengths:
-            order.append(stage)
-            lengths[stage] = 0
-        declared = event.get("iterations") if event.get("kind") == "stage_started" else None
-        lengths[stage] = max(lengths[stage], _whole(declared), _whole(event.get("iteration")))
-    starts, total = {}, 0
-    for stage in order:
-        starts[stage] = total
-        total += lengths[stage]
+        if isinstance(stage, str):
+            declared = event.get("iterations") if event.get("kind") == "stage_started" else None
+            lengths[stage] = max(lengths.get(stage, 0), _whole(declared), _whole(event.get("iteration")))
+    ends = dict(zip(lengths, itertools.accumulate(lengths.values()), strict=True))
+    spans = {name: StageSpan(name, ends[name] - lengths[name], ends[name]) for name in lengths}
     points: dict[str, list[tuple[float, float]]] = {}
     for event in events:
-        stage = event.get("stage")
-        known = isinstance(stage, str) and stage in starts
-        if event.get("kind") in ("progress", "changes") and known and "iteration" in event:
-            iteration = starts[event["stage"]] + _whole(event["iteration"])
+        span = spans.get(str(event.get("stage")))
+        if event.get("kind") in ("progress", "changes") and span is not None and "iteration" in event:
             for name, value in _figures(event).items():
-                points.setdefault(name, []).append((iteration, value))
+                points.setdefault(name, []).append((span.start + _whole(event["iteration"]), value))
     series = {name: (np.array(rows)[:, 0], np.array(rows)[:, 1]) for name, rows in points.items()}
-    spans = tuple(StageSpan(name, starts[name], starts[name] + lengths[name]) for name in order)
-    return History(spans, series)
+    return History(tuple(spans.values()), series)
 
 
 def _whole(value: Any) -> int:
@@ -75,19 +66,17 @@ def _whole(value: Any) -> int:
 
 
 def _is_number(value: Any) -> TypeGuard[float]:
-    """Whether a value can be drawn."""
-    return isinstance(value, int | float) and abs(value) < MOST  # not NaN
+    """Return whether a value can be drawn."""
+    return isinstance(value, int | float) and abs(value) < MAX_VALUE  # not NaN
 
 
 def _figures(event: Mapping[str, Any]) -> dict[str, float]:
     """Return the finite numbers of a step, or of the changes after it."""
     if event.get("kind") == "changes":
-        changes = {f"change/{name}": event.get(name) for name in _CHANGES}
-        return {name: float(v) for name, v in changes.items() if _is_number(v)}
-    named: dict[str, Any] = {name: event.get(name) for name in ("psnr", "splats", "mean_opacity", "mean_area")}
-    losses = event.get("losses")
-    for term, value in losses.items() if isinstance(losses, Mapping) else ():
-        named[f"loss/{term}"] = value
+        named = {f"change/{name}": event.get(name) for name in _CHANGES}
+    else:
+        named = {name: event.get(name) for name in ("psnr", "splats", "mean_opacity", "mean_area")}
+        named |= {f"loss/{term}": value for term, value in (event.get("losses") or {}).items()}
     return {name: float(value) for name, value in named.items() if _is_number(value)}
 
 

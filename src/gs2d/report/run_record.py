@@ -1,4 +1,4 @@
-"""What a run folder says about itself, read once for all sections of the report."""
+"""The data of a run folder, read once for all sections of the report."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class RunRecord:
 
     @property
     def split(self) -> str:
-        """Return the split that scores are about: "test" where there are test views, else "train"."""
+        """Return the scored split: "test" if there are test views, else "train"."""
         return "test" if any(stage.get("test") for stage in self.stages) else "train"
 
     @property

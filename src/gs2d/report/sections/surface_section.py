@@ -40,14 +40,14 @@ _MEANINGS = {  # of the entries of metrics.json, in the order of the report
     "dropped_mesh": ("Mesh dropped", "share of the mesh that is too far from the scan to count"),
     "dropped_truth": ("Truth dropped", "share of the scan that is too far from the mesh to count"),
     "culled": ("Mesh culled", "share of the mesh outside the silhouette of a photograph"),
-    "reason": ("No score", "why there is none"),
+    "reason": ("No score", "reason"),
 }
 _FRACTIONS = ("mesh_hidden", "truth_hidden", "dropped_mesh", "dropped_truth", "culled")
 
 
 @register_section("surface", title="Surface scores")
 def surface_section(run: RunRecord) -> str | None:
-    """Return scores and distances, or why there are none; None where no true surface was given."""
+    """Return scores and distances, or the reason why there are none; None for runs without a true surface."""
     surface = run.surface
     if not surface:
         return missing(f"The surface was not scored: {run.surface_reason}.") if run.surface_reason else None
@@ -64,21 +64,17 @@ def surface_section(run: RunRecord) -> str | None:
         columns=columns,
         titles=titles_of(columns),
         counted=_COUNTED.get(str(surface.get("evaluator", "visible-surface")), ""),
-        doubts=_doubts(surface.get("self_check")),
+        warnings=_warnings(surface.get("self_check") or {}),
         figures=[_row(name, surface[name]) for name in names if _is_figure(surface[name])],
         pixels=_image(surface.get("files"), run.path),
         clouds=_CLOUDS,
     )
 
 
-def _doubts(check: Any) -> list[str]:
-    """Return the messages of the check whether mesh and truth are aligned."""
-    if not isinstance(check, Mapping):
-        return []
+def _warnings(check: Mapping[str, Any]) -> list[str]:
+    """Return the messages of the alignment check."""
     messages = [str(message) for message in check.get("messages") or ()]
-    if not check.get("ok", True):
-        messages = [f"These scores are not reliable: {'; '.join(messages) or 'the alignment check failed'}."]
-    return messages
+    return messages if check.get("ok", True) else [f"These scores are not reliable: {'; '.join(messages)}."]
 
 
 def _image(files: Any, folder: Path) -> np.ndarray | None:

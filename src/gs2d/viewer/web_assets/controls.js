@@ -170,7 +170,6 @@ function listenToPointers() {
     canvas.setPointerCapture(e.pointerId);
     fingers.set(e.pointerId, { x: e.clientX, y: e.clientY });
     setSpinning(false);
-    $("hint").hidden = true;
   };
   canvas.onpointerup = canvas.onpointercancel = (e) => fingers.delete(e.pointerId);
   canvas.onpointermove = (e) => {
@@ -237,6 +236,7 @@ function listenToButtons() {
 }
 
 function listen() {
+  addEventListener("pointerdown", () => ($("hint").hidden = true), { once: true });
   listenToPointers();
   listenToButtons();
   listenToTaps();
