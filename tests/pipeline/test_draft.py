@@ -61,7 +61,7 @@ def test_train_and_reconstruct_have_the_same_defaults_for_a_capture(tmp_path: Pa
     ours = train_options(ReconstructOptions(photos=tmp_path / "photos", out=tmp_path / "run"))
     theirs = TrainOptions(scene=capture, out=tmp_path / "other")
     for placed, test in ((FEW - 1, 0), (FEW, 2)):
-        (capture / "poses.json").write_text(json.dumps({"placed": placed}))
+        (capture / "poses.json").write_text(json.dumps({"photographs": [], "placed": placed, "count": placed}))
         for chosen in (ours, theirs):
             opened = open_capture(chosen, ignore)
             assert (opened.quality, len(opened.scene.test)) == (QualityLevel(24, 12), test)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from statistics import fmean
 from typing import Any
 
@@ -25,7 +24,7 @@ from gs2d.io.run_dir import VERDICT, RunFolder
 from gs2d.io.run_schema import VERDICT_SHAPE, check_shape
 from gs2d.pipeline.finish.scoring import RenderedPhotograph
 from gs2d.pipeline.prepare.loaded import LoadedRun
-from gs2d.sfm.workspace import POSES_JSON
+from gs2d.pipeline.prepare.open_capture import placed_photographs
 
 FORMAT = 3
 NAMED = 3  # views named in a sentence; verdict.json has all
@@ -115,19 +114,6 @@ class Collector:
         points = self._observed.in_view(view.name, view.camera)
         hidden = hidden_points(seen.output.depth("median").cpu().numpy(), points).hidden
         return replace(measured, points=len(points.depth), hidden=hidden)
-
-
-def placed_images(capture: Path | None) -> tuple[int | None, int | None, tuple[str, ...]]:
-    """Return the number of photographs with a camera, of all photographs, and the names without one, if known."""
-    path = None if capture is None else capture / POSES_JSON
-    if path is None or not path.is_file():
-        return None, None, ()
-    data = read_json(path)
-    try:
-        lost = tuple(str(row["source"]) for row in data["photographs"] if not row["placed"])
-        return int(data["placed"]), int(data["count"]), lost
-    except (KeyError, TypeError, ValueError, OverflowError):
-        return None, None, ()  # a file of this name by another program
 
 
 # -- judging -----------------------------------------------------------------------------------------------------------
@@ -247,7 +233,7 @@ def write_verdict(run: RunFolder, loaded: LoadedRun, collected: Collector) -> di
     if collected.failure is not None:
         raise collected.failure
     measures = (
-        Measures(collected.views, *placed_images(loaded.scene.root)) if collected.views else _measured_before(run)
+        Measures(collected.views, *placed_photographs(loaded.scene.root)) if collected.views else _measured_before(run)
     )
     data = {"format": FORMAT, "verdict": asdict(judge(measures)), "measured": asdict(measures)}
     write_json(run.file(VERDICT), data)

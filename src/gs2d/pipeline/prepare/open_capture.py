@@ -15,7 +15,7 @@ from gs2d.data.known_captures import protocol_of
 from gs2d.data.load import reader_of
 from gs2d.data.masks import EMPTY, Masks
 from gs2d.data.scene import PointCloud, View
-from gs2d.errors import DataError, ProtocolError
+from gs2d.errors import ProtocolError
 from gs2d.io.run_dir import RunFolder, is_run
 from gs2d.pipeline.prepare.limits import check_memory, least_downscale
 from gs2d.pipeline.prepare.options import TrainOptions
@@ -58,8 +58,9 @@ def open_capture(options: TrainOptions, on_event: OnEvent) -> OpenCapture:
     protocol = choose_protocol(options.protocol, options.scene, scene_format, on_event)
     if options.test_every is not None:
         protocol = replace(protocol, test_every=options.test_every)
-    elif options.protocol == "auto" and _has_few_photographs(options.scene):
-        protocol = replace(protocol, test_every=0)
+    elif options.protocol == "auto":
+        placed, _, _ = placed_photographs(options.scene)
+        protocol = protocol if placed is None or placed >= FEW else replace(protocol, test_every=0)
     quality = quality_level(options.quality, is_data_set=not protocol.robust, on_host=backend.on_host)
     downscale, scene = _load_shrunk(options, scene_format, protocol, backend, quality, on_event)
     if options.test_every is not None and scene.own_split:
@@ -156,15 +157,20 @@ def _load_shrunk(
     return downscale, scene
 
 
-def _has_few_photographs(capture: Path) -> bool:
-    """Return whether `gs2d poses` made the capture and placed fewer than ``FEW`` photographs."""
-    path = capture / POSES_JSON
-    if not path.is_file():
-        return False
+def placed_photographs(capture: Path | None) -> tuple[int | None, int | None, tuple[str, ...]]:
+    """Return the number of photographs with a camera, of all photographs, and the names without one.
+
+    Numbers are None if `gs2d poses` did not make the capture.
+    """
+    path = None if capture is None else capture / POSES_JSON
+    if path is None or not path.is_file():
+        return None, None, ()
+    data = read_json(path)
     try:
-        return int(read_json(path)["placed"]) < FEW
-    except (DataError, LookupError, TypeError, ValueError):  # a file of another program
-        return False
+        lost = tuple(str(row["source"]) for row in data["photographs"] if not row["placed"])
+        return int(data["placed"]), int(data["count"]), lost
+    except (LookupError, TypeError, ValueError, OverflowError):
+        return None, None, ()  # a file of this name by another program
 
 
 def _downscale_of_resumed(options: TrainOptions) -> int | None:

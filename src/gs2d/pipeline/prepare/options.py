@@ -78,7 +78,7 @@ class HowItRuns:
 
 @dataclass(frozen=True, kw_only=True)
 class Resources:
-    """Limits of memory and disk."""
+    """Memory limit, and where photographs are kept."""
 
     memory: Annotated[float | None, Arg(metavar="GIB")] = None
     """Memory limit in GiB (default: half of the memory of this machine or container)."""

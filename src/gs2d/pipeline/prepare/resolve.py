@@ -95,7 +95,7 @@ def build_recipe(
     ):
         if wanted and getattr(value, field) is None:
             raise RecipeError(f"{option} and --set {field}=null contradict each other, got both; leave one out")
-    losses_of(validate(value))  # which know their options
+    losses_of(validate(value))  # checks the options of the losses
     return value
 
 
@@ -200,7 +200,7 @@ def robust_and_exposure(training: Training, scene: Scene, protocol: Protocol, on
     if robust and not exposure and "auto" in learned and (found := point_gains(scene)) is not None:
         exposure = found.spread >= DIFFERS
         least, most = found.gains.mean(axis=1).min(), found.gains.mean(axis=1).max()
-        decision = "one is learned for each" if exposure else "treated as equal (--learn exposure learns them)"
+        decision = "learned for each photograph" if exposure else "treated as equal (--learn exposure learns them)"
         on_event(
             Notice(f"exposures of the photographs: {least:.2f} to {most:.2f} times the mean; {decision}", detail=True)
         )
