@@ -86,11 +86,10 @@ def test_best_recipes_are_written_read_and_described(name: str) -> None:
     recipe = get_recipe(name)
     assert from_json(to_json(recipe)) == recipe
     said = "\n".join(describe_recipe(recipe))
-    assert "the mesh is of the transmittance depth" in said
-    fitted = "" if name == "best-surface" else ", its splats fitted to them"
-    assert f"dense start: a sweep over photographs of about 256 px{fitted}, and a sphere of splats" in said
-    assert "around the scene; without where they agree on nothing" in said
-    assert "rates but that of the means fall after iteration" in said
+    assert "mesh: from the transmittance depth" in said
+    fitted = "" if name == "best-surface" else ", fitted splats"
+    assert f"dense start: a plane sweep at about 256 px{fitted}, a sphere of splats around the scene; optional" in said
+    assert "all rates but that of the means fall after iteration" in said
 
 
 def test_robust_training_has_its_own_start_and_no_prune_by_size() -> None:

@@ -1,4 +1,4 @@
-"""A recipe in words. Pure Python; never imports torch."""
+"""Describe recipes in words. Pure Python; never imports torch."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gs2d.config.robust import FEW_VIEWS
 
 
 def describe_recipe(recipe: Recipe) -> Iterator[str]:
-    """Lines that say what is trained."""
+    """Yield lines that describe a recipe."""
     yield f"{recipe.name}: {recipe.iterations:,} iterations, SH degree {recipe.sh_degree}, seed {recipe.seed}"
     yield from _describe_learned(recipe)
     if recipe.multiview is not None:
@@ -21,16 +21,15 @@ def describe_recipe(recipe: Recipe) -> Iterator[str]:
     yield from _describe_priors(recipe)
     if recipe.dense_start is not None:
         start = recipe.dense_start
-        fitted = ", its splats fitted to them" if start.fit else ""
-        otherwise = "" if start.required else "; without where they agree on nothing"
-        around = ", and a sphere of splats around the scene" if start.sphere else ""
-        yield f"dense start: a sweep over photographs of about {start.side} px{fitted}{around}{otherwise}"
+        parts = ["fitted splats"] * start.fit + ["a sphere of splats around the scene"] * start.sphere
+        optional = "" if start.required else "; optional"
+        yield f"dense start: a plane sweep at about {start.side} px{''.join(f', {part}' for part in parts)}{optional}"
     if recipe.removal is not None:
         r = recipe.removal
         yield f"floaters: proposed every {r.every:,} iterations, removed unless the training images miss them"
         yield f"dropout: {r.dropout:g} of the splats each iteration, with at most {FEW_VIEWS} training views"
     if recipe.fused_depth is not None:
-        yield f"the mesh is of the {recipe.fused_depth} depth"
+        yield f"mesh: from the {recipe.fused_depth} depth"
     for number, stage in enumerate(recipe.stages, start=1):
         yield f"{number}. {stage.name}: {stage.iterations:,} iterations"
         for line in _describe_stage(stage):
@@ -55,13 +54,13 @@ def _describe_learned(recipe: Recipe) -> Iterator[str]:
 
 
 def _describe_priors(recipe: Recipe) -> Iterator[str]:
-    falls = "weight falls to {0.final_factor:g} of itself over {0.decay_steps:,} iterations"
+    falls = "weight decays to {0.final_factor:g} of its value over {0.decay_steps:,} iterations"
     if recipe.depth_prior is not None:
         d = recipe.depth_prior
-        fitted = "sparse points" if d.align == "points" else "what is rendered"
+        fitted = "sparse points" if d.align == "points" else "the rendered depth"
         sources = {
-            "auto": "a sensor's maps, relative maps or sparse points, whichever the capture has first",
-            "sparse": f"sparse points of at least {d.min_track} photographs within {d.max_error:g} px",
+            "auto": "sensor maps, relative maps or sparse points, whichever the capture has first",
+            "sparse": f"sparse points in at least {d.min_track} photographs within {d.max_error:g} px",
             "sensor": "maps in units of the capture times a factor",
             "relative": f"maps of unknown scale and shift, fitted to {fitted}",
         }
@@ -82,10 +81,10 @@ def _describe_stage(stage: Stage) -> Iterator[str]:
     official = LearningRates()
     times = stage.lr.shN / stage.lr.sh0 / (official.shN / official.sh0) if stage.lr.sh0 else 1.0
     if "shN" in stage.train and not math.isclose(times, 1.0):
-        yield f"SH beyond degree 0 at {times:g} times their rate in 2DGS, next to degree 0"
+        yield f"SH beyond degree 0 at {times:g} times their rate in 2DGS, relative to degree 0"
     if stage.lr.settle_steps:
-        falls = f"to {stage.lr.settle_factor:g} of themselves over {stage.lr.settle_steps:,} iterations"
-        yield f"rates but that of the means fall after iteration {stage.lr.settle_start:,}, {falls}"
+        falls = f"to {stage.lr.settle_factor:g} of their value over {stage.lr.settle_steps:,} iterations"
+        yield f"all rates but that of the means fall after iteration {stage.lr.settle_start:,}, {falls}"
     frozen = [attribute for attribute in ALL if attribute not in stage.train]
     if frozen:
         yield f"frozen: {', '.join(frozen)}"

@@ -1,7 +1,7 @@
-"""The recipes: the ones for users, and one for each row of the tables of the 2DGS-R paper.
+"""The recipes for users, and one for each row of the tables of the 2DGS-R paper.
 
-Stage 1 is the official 2DGS training (facts: arguments and loop of hbb1/2d-gaussian-splatting), stages 2 and 3 are the
-paper's. Scenes are unknown here: what depends on the data set is the protocol's. Pure Python; never imports torch.
+Stage 1 is the official 2DGS training (hbb1/2d-gaussian-splatting); stages 2 and 3 are those of the paper. Settings that
+depend on the data set belong to the protocol. Pure Python; never imports torch.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ from gs2d.config.schedule import LONGER
 from gs2d.errors import RecipeError
 
 PHOTOMETRIC = (LossTerm("l1", 0.8), LossTerm("ssim", 0.2))  # official: lambda_dssim = 0.2
-SH_PATIENCE = 3  # times as many iterations for each SH degree where exposures are learned
-NC_START, DISTORTION_START = 7_000, 3_000  # official: active when iteration > start
+SH_PATIENCE = 3  # factor of the iterations for each SH degree if exposures are learned
+NC_START, DISTORTION_START = 7_000, 3_000  # official
 MULTIVIEW_WEIGHT = 0.3  # docs/notebook/multiview.md
 DEPTH_WEIGHT, NORMAL_WEIGHT = 0.2, 0.05  # docs/notebook/priors.md
 DEFAULT_RECIPE = "best"  # of `gs2d train`, `reconstruct` and `demo`
-OFFICIAL_ITERATIONS = 30_000  # of 2DGS, for which its rates were chosen
+OFFICIAL_ITERATIONS = 30_000  # of 2DGS, which its rates are chosen for
 BEST_ITERATIONS, FAST_ITERATIONS = 20_000, 6_600
 SILHOUETTE = 0.1  # weight of the silhouette loss: docs/notebook/losses.md
-# Weight of normal consistency in best, and in best where it has no L2: docs/notebook/losses.md
+# Weight of normal consistency in best, and in best without L2: docs/notebook/losses.md
 BEST_NC, NC_WITHOUT_SQUARES = 0.035, 0.02
-SQUARES, SQUARES_START = 10.0, 0.5  # weight of L2 in best, and from which part of its iterations on: the same page
-SH_FASTER = 2.5  # times the official rate of SH beyond degree 0: docs/notebook/training.md
-SETTLING, SETTLED = 0.3, 0.1  # of the iterations, at the end, in which rates fall, and to what: notebook/training.md
+SQUARES, SQUARES_START = 10.0, 0.5  # weight of L2 in best, and the fraction of iterations before it: the same page
+SH_FASTER = 2.5  # factor of the official rate of SH beyond degree 0: docs/notebook/training.md
+SETTLING, SETTLED = 0.3, 0.1  # last fraction of iterations in which rates fall, and final factor: training.md
 DENSE_START = DenseStart(side=256, neighbours=3, fit=True)  # docs/notebook/training.md
 STREET_START = DenseStart(sphere=True)  # docs/notebook/floaters.md
 
@@ -61,13 +61,13 @@ ABSGS_DEFAULT = GradDensify(
     cap_every=500,
     reset_at_start_on_white=False,  # stage 3 starts from a trained scene, not from random points
 )
-# "A": "more sensitive thresholds for size and positional gradient"; the paper gives no numbers. Half of D's for the
-# gradient is what the sweep chose on lego (`python -m benchmarks.absgs`); size decided nothing.
+# "A": "more sensitive thresholds for size and positional gradient", without numbers in the paper. Half of D's gradient
+# thresholds were best in a sweep on lego (`python -m benchmarks.absgs`); the size threshold had no effect.
 ABSGS_ADJUSTED = replace(ABSGS_DEFAULT, grad_threshold=1e-4, abs_threshold=2e-4, percent_dense=0.0005)
 
 
 def surface(nc: float = 0.05, distortion: float | None = 0.0, iterations: int = 30_000) -> Stage:
-    """Stage 1: the official 2DGS training. ``distortion`` None takes the protocol's weight; weight 0 drops a term."""
+    """Return stage 1: the official 2DGS training. ``distortion`` None: weight of the protocol; 0 drops a term."""
     return Stage(
         "surface",
         iterations,
@@ -78,7 +78,7 @@ def surface(nc: float = 0.05, distortion: float | None = 0.0, iterations: int = 
 
 
 def appearance(k: float = 1.0) -> Stage:
-    """Stage 2: rank by E_i; only the SH of the worst ``k`` percent learn."""
+    """Return stage 2: rank by E_i, then train only the SH of the worst ``k`` percent."""
     return Stage(
         "appearance",
         10_000,
@@ -90,9 +90,9 @@ def appearance(k: float = 1.0) -> Stage:
 
 
 def refine(nc: float = 0.05, freeze: tuple[str, ...] = ALPHA, *, densify: GradDensify | None = None) -> Stage:
-    """Stage 3: clone the high-error splats in place, then train everything but ``freeze``, NC from the start.
+    """Return stage 3: clone the high-error splats in place, then train everything but ``freeze``, with NC.
 
-    With ``densify`` nothing is cloned (AbsGS densifies instead).
+    With ``densify``, AbsGS densifies instead of the clone.
     """
     return Stage(
         "refine",
@@ -106,7 +106,7 @@ def refine(nc: float = 0.05, freeze: tuple[str, ...] = ALPHA, *, densify: GradDe
 
 
 def continue_training() -> Stage:
-    """More of the same after stage 1: its last rates, its moments, NC on, no densification."""
+    """Return a stage that continues stage 1 with its last rates and moments, NC, and no densification."""
     return Stage(
         "continue",
         30_000,
@@ -117,24 +117,24 @@ def continue_training() -> Stage:
 
 
 def two_dgs(nc: float = 0.05, distortion: float | None = 0.0, *, name: str = "2dgs") -> Recipe:
-    """Plain 2DGS, 30k iterations."""
+    """Return plain 2DGS, 30k iterations."""
     return Recipe(name, (surface(nc, distortion),))
 
 
 def two_dgs_60k(*, name: str = "2dgs-60k") -> Recipe:
-    """Return the fair control: 2DGS for as many iterations as 2DGS-R in total; its first stage is that of ``2dgs``."""
+    """Return the control of 2DGS-R: 2DGS for as many iterations; its first stage is that of ``2dgs``."""
     return Recipe(name, (surface(), continue_training()))
 
 
 def two_dgs_r(*, name: str = "2dgs-r", stage_2: Stage | None = None, stage_3: Stage | None = None) -> Recipe:
-    """2DGS-R: surface 30k, appearance 10k, refine 20k."""
+    """Return 2DGS-R: surface 30k, appearance 10k, refine 20k."""
     return Recipe(name, (surface(), stage_2 or appearance(), stage_3 or refine()))
 
 
 def without_squares(recipe: Recipe) -> Recipe:
-    """Return ``best`` or a relative without L2, and with the normal consistency that suits that: as it was before L2.
+    """Return ``best`` or a similar recipe without L2, and with the weight of normal consistency for that.
 
-    Weights of another's choice stay.
+    Weights that differ from those of ``best`` do not change.
     """
 
     def lighter(term: LossTerm) -> LossTerm:
@@ -152,10 +152,10 @@ def _is(term: LossTerm, kind: str, weight: float) -> bool:
 
 
 def with_exposure(recipe: Recipe) -> Recipe:
-    """Add a colour transform for each training photograph (``NAME-exposure``) to a recipe without one.
+    """Return the recipe with a colour transform for each training image (``NAME-exposure``); itself if it has one.
 
-    Not in the paper. For photographs of a camera on automatic, whose exposure or white balance changes. View-dependent
-    colour comes three times as late: it can feign exposures (docs/notebook/exposure.md).
+    Not in the paper. For cameras with automatic exposure or white balance. View-dependent colour starts three times as
+    late, because it can imitate exposures (docs/notebook/exposure.md).
     """
     if recipe.learns("exposure"):
         return recipe
@@ -165,9 +165,9 @@ def with_exposure(recipe: Recipe) -> Recipe:
 
 
 def with_photometry(recipe: Recipe, *, vignetting: bool = True, response: bool = True) -> Recipe:
-    """Add what a recipe without it learns of cameras: vignetting, response or both (``NAME-photometry``).
+    """Return the recipe with learned vignetting, response or both (``NAME-photometry``); itself if it has one.
 
-    Not in the paper. For lenses that darken corners, and for several cameras whose curves differ
+    Not in the paper. For lenses that darken corners, and for cameras with different response curves
     (docs/notebook/exposure.md).
     """
     if recipe.learns("vignetting", "response"):
@@ -186,12 +186,10 @@ def with_multiview(
     multiview: MultiView = MultiView(),  # noqa: B008 (frozen)
     name: str | None = None,
 ) -> Recipe:
-    """Add losses of two views to the stages with normal consistency, once nothing is densified any more.
+    """Return the recipe with losses between two views, in stages with normal consistency, after densification.
 
-    In the ``last`` part of a stage's iterations, of which one in ``every`` compares.
-
-    Not in the paper, and not PGSR's weights (0.15 and 0.03 of means over the pixels that count; here means run over all
-    pixels). Why they are these, and why they wait for the end of densification: docs/notebook/multiview.md.
+    They are active in the ``last`` fraction of a stage, in one of ``every`` iterations. Not in the paper. Reasons for
+    the weights, which differ from those of PGSR, and for the start: docs/notebook/multiview.md.
     """
 
     def extended(stage: Stage) -> Stage:
@@ -209,21 +207,21 @@ def with_multiview(
 def with_depth_prior(recipe: Recipe, source: str = "auto", weight: float = DEPTH_WEIGHT) -> Recipe:
     """Return the recipe with a loss on known depths in the stages that train the means of all splats (``NAME-depth``).
 
-    Not in the paper. For indoor rooms, walls without texture and few photographs (docs/guides/priors.md). A recipe that
-    has the loss keeps it, and takes the source where one is asked for.
+    Not in the paper. For indoor rooms, walls without texture and few images (docs/guides/priors.md). A recipe that has
+    the loss keeps it, with the requested source.
     """
     if recipe.depth_prior is not None:
         known = recipe.depth_prior if source == "auto" else replace(recipe.depth_prior, source=source)
         return replace(recipe, depth_prior=known)
-    # The mean depth: its gradient reaches every splat of a pixel, that of the median one alone.
+    # The gradient of the mean depth reaches every splat of a pixel, that of the median depth only one.
     term = LossTerm("depth_prior", weight, depth="mean")
     return replace(_in_stages(recipe, term), name=f"{recipe.name}-depth", depth_prior=DepthPrior(source))
 
 
 def with_normal_prior(recipe: Recipe, weight: float = NORMAL_WEIGHT) -> Recipe:
-    """Add a loss on known normals to the stages that train the means of all splats (``NAME-normals``).
+    """Return the recipe with a loss on known normals in the stages that train all means (``NAME-normals``).
 
-    From where normal consistency begins: before, splats are where colours put them, and turning them does harm.
+    It starts with normal consistency: earlier, rotating splats does harm.
     """
     if recipe.normal_prior is not None:
         return recipe
@@ -234,9 +232,9 @@ def with_normal_prior(recipe: Recipe, weight: float = NORMAL_WEIGHT) -> Recipe:
 def with_robustness(recipe: Recipe) -> Recipe:
     """Return the recipe with a dense start and the removal of floaters, unless it has its own.
 
-    Not in the paper; for captures that say which sparse points their images show (docs/notebook/floaters.md). A dense
-    start that is not required gives way to the one that was tried with the removal. Where no resets delay the prune by
-    size there is none, because it would take sky and ground.
+    Not in the paper; for captures with sparse points and the images that show them (docs/notebook/floaters.md). An
+    optional dense start is replaced by the one that was tuned with the removal. Without opacity resets, splats are not
+    pruned by size, because that would remove sky and ground.
     """
     start = recipe.dense_start or STREET_START
     return replace(
@@ -257,14 +255,13 @@ def _sparing_large_splats(stage: Stage) -> Stage:
 def best(
     iterations: int = BEST_ITERATIONS, nc: float = BEST_NC, squares: float = SQUARES, *, name: str = "best"
 ) -> Recipe:
-    """Return the recipe for the best pictures and surface per minute: 2DGS from a fitted dense start, in one stage.
+    """Return the recipe with the best images and surface for its time: 2DGS from a fitted dense start, in one stage.
 
-    Not in the paper. A scene that begins near its end needs no opacity resets, and half the iterations with rates that
-    make up for it; large splats stay, which are what surroundings are made of; alpha is that of the photographs which
-    have one; squares of differences count from the end of densification on; the mesh is of a depth in which no splat
-    decides alone (docs/notebook/best.md). ``nc`` is the weight of normal consistency, ``squares`` that of L2 (0: it is
-    not there). Colours that depend on direction learn faster than in 2DGS, but where photographs are few
-    (:func:`with_few_views`).
+    Not in the paper. A good start needs no opacity resets and fewer iterations, with larger rates. Large splats stay,
+    because they represent the surroundings. A silhouette loss uses the alpha of the images, L2 is active after
+    densification, and the mesh uses the transmittance depth (docs/notebook/best.md). ``nc`` is the weight of normal
+    consistency, ``squares`` that of L2 (0 leaves it out). View-dependent colours learn faster than in 2DGS, except with
+    few images (:func:`with_few_views`).
     """
     part = iterations / OFFICIAL_ITERATIONS
     consistency = LossTerm("normal_consistency", nc, round(NC_START * part), options={"where": "object"})
@@ -285,7 +282,7 @@ def best(
 
 
 def _best_rates(iterations: int) -> LearningRates:
-    """Return official rates made longer for fewer iterations, which settle at the end; those of SH beyond 0 faster."""
+    """Return official rates, larger for fewer iterations, decaying at the end, and faster for SH beyond degree 0."""
     times = (iterations / OFFICIAL_ITERATIONS) ** -LONGER
     start = round((1 - SETTLING) * iterations)
     official = LearningRates(means_decay_steps=iterations)
@@ -299,10 +296,10 @@ def _best_rates(iterations: int) -> LearningRates:
 
 
 def with_few_views(recipe: Recipe) -> Recipe:
-    """Return the recipe for at most ``FEW_VIEWS`` training photographs: SH beyond degree 0 learn as in 2DGS, no L2.
+    """Return the recipe for at most ``FEW_VIEWS`` training images: SH beyond degree 0 learn as in 2DGS, and no L2.
 
-    Of directions that a photograph or two show alone, faster SH learn those by heart (docs/notebook/training.md), and
-    squares help with it (docs/notebook/losses.md). Rates and weights of another's choice stay.
+    With few images, faster SH and L2 overfit (docs/notebook/training.md, docs/notebook/losses.md). Rates and weights
+    that differ from those of ``best`` do not change.
     """
 
     def slower(stage: Stage) -> Stage:
@@ -316,9 +313,9 @@ def with_few_views(recipe: Recipe) -> Recipe:
 
 
 def best_surface(*, name: str = "best-surface") -> Recipe:
-    """Return ``best`` with neighbouring photographs compared in its last fifth, and a start that is not fitted.
+    """Return ``best`` with multi-view losses in its last fifth, and a start that is not fitted.
 
-    Chamfer before dB: a fitted start has better colours, and more splats that lie a little off
+    It prefers an accurate surface: a fitted start has better colours, but more splats that are slightly off
     (docs/notebook/best.md).
     """
     recipe = best()
@@ -328,7 +325,7 @@ def best_surface(*, name: str = "best-surface") -> Recipe:
 
 
 def _in_stages(recipe: Recipe, term: LossTerm) -> Recipe:
-    """Add a loss to the stages that train the means of all splats; a start is that of the first stage."""
+    """Add a loss to the stages that train the means of all splats; ``start`` applies to the first stage."""
 
     def extended(index: int, stage: Stage) -> Stage:
         added = term if index == 0 else replace(term, start=0)
@@ -346,14 +343,14 @@ def _distortion(weight: float | None, start: int) -> tuple[LossTerm, ...]:
 
 
 def _lr_after_surface() -> LearningRates:
-    """Return the rates at the end of stage 1: the means' final one, the others as they were."""
+    """Return the constant rates at the end of stage 1."""
     return LearningRates().at_end(30_000)
 
 
 def with_poses(recipe: Recipe) -> Recipe:
-    """Return the recipe with a refined pose for each training photograph (``NAME-poses``); itself if it has them.
+    """Return the recipe with a refined pose for each training image (``NAME-poses``); itself if it has them.
 
-    Not in the paper. For cameras that are off by a pixel or more (docs/guides/poses.md).
+    Not in the paper. For cameras with errors of a pixel or more (docs/guides/poses.md).
     """
     if recipe.learns("poses"):
         return recipe
@@ -363,7 +360,7 @@ def with_poses(recipe: Recipe) -> Recipe:
 def with_intrinsics(recipe: Recipe) -> Recipe:
     """Return the recipe with refined poses, focal lengths and lenses (``NAME-cameras``); itself if it has them.
 
-    Not in the paper. For cameras whose focal length is off by a few per mille to per cent (docs/guides/poses.md).
+    Not in the paper. For focal lengths with errors of a few per mille to percent (docs/guides/poses.md).
     """
     if recipe.learns("intrinsics"):
         return recipe
@@ -392,10 +389,10 @@ def _registry() -> dict[str, NamedRecipe]:
 
     add("best", "The default: 2DGS from a fitted dense start; best images and surface for the time", best)
     add("best-fast", "best in a third of its iterations", partial(best, FAST_ITERATIONS))
-    add("best-surface", "best, then compares neighbouring photographs: more accurate surface, lower PSNR", best_surface)
+    add("best-surface", "best with multi-view losses at the end: more accurate surface, lower PSNR", best_surface)
     add("2dgs", "2DGS with normal consistency 0.05: the paper's baseline and its stage 1", two_dgs)
     add("2dgs-no-nc", "2DGS without normal consistency", partial(two_dgs, nc=0.0))
-    add("2dgs-60k", "2DGS for as many iterations as 2DGS-R: the fair control", two_dgs_60k)
+    add("2dgs-60k", "2DGS for as many iterations as 2DGS-R: its control", two_dgs_60k)
     for label, nc in {"distortion": 0.05, "distortion-no-nc": 0.0}.items():
         about = f"Table 1: the protocol's distortion weight (100/10), NC {nc:g}"
         add(f"2dgs-{label}", about, partial(two_dgs, nc, None))
@@ -414,14 +411,14 @@ def _registry() -> dict[str, NamedRecipe]:
         stage_3 = refine(freeze=(), densify=densify)
         about = f"AbsGS-{label.upper()}: stage 3 densifies by absolute gradients instead of the clone; opacity free"
         add(f"2dgs-r-absgs-{label}", about, partial(two_dgs_r, stage_3=stage_3))
-    about = "2dgs with patches of neighbouring photographs compared, for better surfaces of textured things"
+    about = "2dgs with multi-view losses, for better surfaces of textured objects"
     add("2dgs-multiview", about, partial(with_multiview, two_dgs()))
     return entries
 
 
 _OWN = _registry()
 RECIPES: Registry[Any] = Registry("recipe", "gs2d.recipes", builtin=dict.fromkeys(_OWN, __name__), error=RecipeError)
-"""Names of recipes -> NamedRecipe; of guests a Recipe, or a function without arguments that makes one."""
+"""Names of recipes -> NamedRecipe, or for plug-ins a Recipe or a function without arguments that returns one."""
 for _name, _named in _OWN.items():
     RECIPES.register(_name)(_named)
 
@@ -459,7 +456,7 @@ def register_recipe(name: str) -> Callable[[Register], Register]:
 
 
 def about_recipe(name: str) -> str:
-    """Return a line about a recipe: of guests the first line of the docstring, or its stages."""
+    """Return one line about a recipe; for plug-ins the first line of the docstring, or the stages."""
     found = get_recipe(name) if is_recipe_file(name) else RECIPES.get(name)
     if isinstance(found, NamedRecipe):
         return found.about
@@ -468,7 +465,7 @@ def about_recipe(name: str) -> str:
     return (getattr(found, "__doc__", None) or "").strip().partition("\n")[0] or f"a recipe of {RECIPES.source(name)}"
 
 
-# The paper's tables: row label -> recipe. "tab:..." are its LaTeX labels.
+# Tables of the paper: row label -> recipe. "tab:..." are its LaTeX labels.
 TABLES: Mapping[str, Mapping[str, str]] = MappingProxyType(
     {
         "regularisation": {  # tab:alpha_beta
@@ -479,7 +476,7 @@ TABLES: Mapping[str, Mapping[str, str]] = MappingProxyType(
             "alpha=0 beta=0.1": "2dgs-nc-0.1",
             "alpha=0 beta=0.3": "2dgs-nc-0.3",
         },
-        "benchmark": {  # tab:benchmark, and the control it lacks
+        "benchmark": {  # tab:benchmark, and a control
             "2DGS": "2dgs",
             "2DGS (w/o NC)": "2dgs-no-nc",
             "2DGS-R": "2dgs-r",
@@ -515,8 +512,8 @@ def get_recipe(name: str) -> Recipe:
     Parameters
     ----------
     name : str
-        One that is registered, ``file.json`` (what ``gs2d recipes show NAME --json`` prints) or ``file.py:name`` (a
-        Recipe, or a function without arguments that makes one).
+        A registered name, ``file.json`` (from ``gs2d recipes show NAME --json``) or ``file.py:name`` (a Recipe, or a
+        function without arguments that returns one).
 
     Returns
     -------

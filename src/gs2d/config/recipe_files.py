@@ -19,24 +19,24 @@ __all__ = ["is_recipe_file", "made_recipe", "read_recipe_file", "short_name"]
 
 
 def is_recipe_file(name: str) -> bool:
-    """Whether a recipe is named by a file that holds it."""
+    """Return whether a recipe name is a file."""
     return name.endswith((".json", ".py")) or ".py:" in name
 
 
 def short_name(name: str) -> str:
-    """Return what a row or a folder calls a recipe: its name, "mine" of ``dir/mine.json`` and of ``file.py:mine``."""
+    """Return the name of a recipe; "mine" for ``dir/mine.json`` and ``file.py:mine``."""
     if not is_recipe_file(name):
         return name
     return Path(name).stem if name.endswith(".json") else name.rpartition(":")[2]
 
 
 def read_recipe_file(name: str) -> Recipe:
-    """Read ``file.json``, or run ``file.py`` once and take what it calls ``name``.
+    """Read ``file.json``, or run ``file.py`` once and return its recipe ``name``.
 
     Raises
     ------
     RecipeError
-        No such file, a file that cannot be read or run, or no recipe of this name in it.
+        If the file does not exist, cannot be read or run, or has no recipe of this name.
     """
     if name.endswith(".json"):
         return _from_json_file(Path(name))
@@ -63,18 +63,18 @@ def read_recipe_file(name: str) -> Recipe:
 
 
 def made_recipe(found: Any, where: str) -> Recipe:
-    """Return a recipe, or what a function without arguments makes, validated.
+    """Return a recipe, or the result of a function without arguments, validated.
 
     Raises
     ------
     RecipeError
-        It is something else.
+        If the result is no recipe.
     """
     try:
         value = found() if callable(found) else found
     except Gs2dError:
         raise
-    except Exception as error:  # a guest may raise anything
+    except Exception as error:  # a plug-in may raise anything
         raise RecipeError(f"{where} cannot be made: {_line(error)}") from error
     if not isinstance(value, Recipe):
         raise RecipeError(f"{where} must be a gs2d.Recipe, or a function that returns one, got {type(value).__name__}")
@@ -103,7 +103,7 @@ def _from_json_file(path: Path) -> Recipe:
         raise RecipeError(f"{path}: {error}; `gs2d recipes show NAME --json` prints a whole one") from error
 
 
-@cache  # what a file registers is registered once
+@cache  # a file registers its names once
 def _run(path: Path) -> ModuleType:
     name = f"gs2d_recipe_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
@@ -120,7 +120,7 @@ def _run(path: Path) -> ModuleType:
 
 
 def _recipes_in(module: ModuleType) -> list[str]:
-    """Return the names of a file's recipes, and of the functions that are its own."""
+    """Return the names of the recipes and functions that a file defines."""
     return [
         name
         for name, value in vars(module).items()

@@ -1,7 +1,7 @@
-"""Recipes as JSON, there and back without loss, and overrides ``stage.field=value`` from the command line.
+"""Recipes as JSON, and overrides ``stage.field=value`` of the command line.
 
-The reader is strict: an unknown key, a missing one or a value of another type is a :class:`RecipeError` that says
-where. Pure Python; never imports torch.
+The reader is strict: an unknown or missing key, or a value of another type, raises a :class:`RecipeError` with its
+position. Pure Python; never imports torch.
 """
 
 from __future__ import annotations
@@ -29,15 +29,14 @@ def to_json(recipe: Recipe) -> dict[str, Any]:
 
 
 def from_json(data: Mapping[str, Any], *, to_train: bool = True) -> Recipe:
-    """Return the recipe that :func:`to_json` wrote, validated.
+    """Return the recipe of a result of :func:`to_json`, validated.
 
-    Of a run that is there, and is not trained on (``to_train`` False), losses and densifiers may be gone that a file
-    or a package had registered.
+    For a finished run (``to_train`` False), losses and densifiers of plug-ins may be missing.
 
     Raises
     ------
     RecipeError
-        Where a key is unknown or missing, or a value has another type.
+        If a key is unknown or missing, or a value has another type.
     """
     with nullcontext() if to_train else absent_guests():
         recipe = decode(data, Recipe, "recipe")
@@ -52,12 +51,12 @@ def apply_overrides(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
     ----------
     recipe : Recipe
     overrides : sequence of str
-        ``field=value`` for the recipe (``seed=3``) and ``stage.field=value`` for a stage. Deeper fields are reached by
-        more dots: ``surface.densify.grad_threshold=1e-4``, ``refine.lr.sh0=0.001``; losses by their kind,
+        ``field=value`` for the recipe (``seed=3``) and ``stage.field=value`` for a stage. Dots reach deeper fields:
+        ``surface.densify.grad_threshold=1e-4``, ``refine.lr.sh0=0.001``; losses by their kind,
         ``surface.losses.normal_consistency.weight=0.1``, their options by
         ``surface.losses.normal_consistency.options.where=object``; entry actions by their name,
         ``refine.on_enter.clone_in_place.options.opacity=preserve``; ``refine.train.means=null`` freezes an attribute.
-        Values are JSON; what is not JSON is taken as a string.
+        Values are JSON; other text is a string.
 
     Returns
     -------
@@ -67,7 +66,7 @@ def apply_overrides(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
     Raises
     ------
     RecipeError
-        Unknown field (says which exist), or a value of another type.
+        If a field is unknown, or a value has another type.
     """
     data = to_json(recipe)
     for override in overrides:
@@ -106,9 +105,9 @@ def _set(data: dict[str, Any], words: list[str], value: Any, override: str) -> N
         if isinstance(node, list) and not last:
             node = _entry(node, word, override)
         elif isinstance(node, dict) and last and words[max(depth - 1, 0)] == "train" and depth > 0:
-            _set_trained(node, word, value)  # validate() knows the attributes
+            _set_trained(node, word, value)  # validate() checks the attributes
         elif isinstance(node, dict) and last and words[max(depth - 1, 0)] == "options" and depth > 0:
-            node[word] = value  # the loss or the densifier knows its options
+            node[word] = value  # the loss, densifier, action or quantity checks its options
         elif isinstance(node, dict) and word in node:
             if last:
                 node[word] = value
@@ -127,7 +126,7 @@ def _set_trained(train: dict[str, Any], attribute: str, rows: Any) -> None:
 
 
 def _entry(entries: list[Any], word: str, override: str) -> Any:
-    """Return the loss of a kind, or the action or the learned quantity of a name."""
+    """Return the loss of a kind, or the action or learned quantity of a name."""
     known = [entry if isinstance(entry, dict) else {} for entry in entries]
     tags = [str(entry.get("kind", entry.get("name", "?"))) for entry in known]
     if word not in tags:
@@ -136,7 +135,7 @@ def _entry(entries: list[Any], word: str, override: str) -> Any:
 
 
 def encode(value: Any) -> Any:
-    """Return a dataclass, with all it holds, as plain dicts, lists, numbers and strings."""
+    """Return a dataclass as plain dicts, lists, numbers and strings."""
     if is_dataclass(value) and not isinstance(value, type):
         return {entry.name: encode(getattr(value, entry.name)) for entry in fields(value)}
     if isinstance(value, Mapping):
@@ -147,12 +146,12 @@ def encode(value: Any) -> Any:
 
 
 def decode(value: Any, kind: Any, where: str) -> Any:
-    """Return a JSON value as the annotated type, a dataclass for one; ``where`` is what an error calls it.
+    """Return a JSON value as an annotated type; ``where`` is its name in errors.
 
     Raises
     ------
     RecipeError
-        An unknown or missing field, or a value of another type.
+        If a field is unknown or missing, or a value has another type.
     """
     origin = get_origin(kind)
     if origin in (Union, UnionType):
@@ -182,7 +181,7 @@ def _decode_union(value: Any, kinds: tuple[Any, ...], where: str) -> Any:
     return decode(value, only, where)
 
 
-@cache  # looked up in the names of a module each time, by typing: some ms for a recipe
+@cache  # typing evaluates all names each time: some ms for a recipe
 def _hints(kind: type) -> dict[str, Any]:
     return get_type_hints(kind)
 

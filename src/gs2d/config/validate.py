@@ -1,4 +1,4 @@
-"""Checks of the values of a recipe: each raises a RecipeError that says where. Pure Python; never imports torch."""
+"""Checks of recipe values, which raise a RecipeError with their position. Pure Python; never imports torch."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def integer(where: str, value: object, *, low: int) -> None:
 
 
 def number(where: str, value: object, *, low: float) -> float:
-    """Return the finite number of at least ``low`` that is required, as a float."""
+    """Require a finite number of at least ``low``, and return it as a float."""
     ok = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value >= low
     require(ok, f"{where} must be a finite number >= {low:g}, got {value!r}")
     assert isinstance(value, int | float)
@@ -28,11 +28,11 @@ def number(where: str, value: object, *, low: float) -> float:
 
 
 def one_of(where: str, value: str, known: tuple[str, ...]) -> None:
-    """Require one of the known words."""
+    """Require one of the known values."""
     require(value in known, f"{where} must be one of {', '.join(known)}; got {value!r}")
 
 
 def group(where: str, name: str, groups: list[str]) -> None:
-    """Require a row group that was written."""
+    """Require a row group that an earlier action writes."""
     written = f"the groups written so far are {', '.join(groups)}" if groups else "no action has written a group yet"
     require(name in groups, f"{where}: no earlier action writes the row group {name!r}; {written}")

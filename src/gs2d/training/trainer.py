@@ -148,7 +148,7 @@ class Trainer:
         self.views = processes.size  # rendered in the last iteration
         self._pending: list[events.TrainingEvent] = []
         if state is not None and init is not None:
-            raise RunError("training goes on from a state or starts from init, got both; leave one out")
+            raise RunError("training continues from a state or starts from init, got both; pass one of them")
         # A resumed training needs no start, but free space comes from the plane sweep, which is then repeated.
         goes_on = (init is not None and options.within is None) or (state is not None and self.recipe.removal is None)
         begins = replace(self.recipe, dense_start=None) if goes_on else self.recipe

@@ -82,7 +82,7 @@ def _range_of_bounds(scene: Scene) -> SweepRange:
     chosen, inside = places[::step], inside[:, ::step]
     seen = {view.name: np.flatnonzero(inside[index]) for index, view in enumerate(scene.train)}
     track = np.full(len(chosen), TRACK)
-    return SweepRange(ObservedPoints(chosen, np.zeros(len(chosen)), track, seen, "places of the bounds"), limits)
+    return SweepRange(ObservedPoints(chosen, np.zeros(len(chosen)), track, seen, "points in the bounds"), limits)
 
 
 def _shows(view: View, places: np.ndarray, half: float) -> tuple[np.ndarray, np.ndarray]:
