@@ -162,3 +162,11 @@ def _names(line: str, name: str) -> bool:
 def test_auto_takes_the_protocol_of_a_known_scene(tmp_path: Path, layout: str, protocol: str) -> None:
     root = LAYOUTS[layout][2](tmp_path)
     assert protocol_of(root, detect_format(root)).name == protocol
+
+
+def test_an_image_in_another_letter_case_is_not_missing(tmp_path: Path) -> None:
+    root = write_360(tmp_path)
+    assert missing_lines(root) == ()
+    image = min((root / "images_4").iterdir())
+    image.rename(image.with_suffix(image.suffix.upper()))
+    assert missing_lines(root) == ()

@@ -66,7 +66,7 @@ def test_numbered_images_keep_their_camera_when_one_is_missing(tmp_path: Path) -
     assert [v.name for v in scene.train] == ["000000.png", "000001.png", "000003.png", "000004.png"]
     np.testing.assert_allclose(scene.train[2].camera.center, cameras[3].center, atol=1e-9)
     assert scene.train[2].object_mask()[15].sum() == 18  # columns 5 to 22 of view 3
-    assert scene.skipped == ("view 2: no photograph",)
+    assert scene.skipped == ("view 2: no image",)
 
 
 def test_wrong_archives_are_errors(tmp_path: Path) -> None:
@@ -121,7 +121,7 @@ def test_photographs_of_another_size_take_the_cameras_of_their_model(tmp_path: P
         assert (view.camera.cx, view.camera.cy, view.camera.fx) == (17.0, 15.5, 35.0)
         np.testing.assert_allclose(view.camera.center, camera.center, atol=1e-9)
         assert view.object_mask().shape == (28, 38)  # of the alpha channel: the mask files are of the originals
-    assert any("5 of 5 views are those of sparse/0" in note for note in scene.notes)
+    assert any("5 of 5 views come from sparse/0" in note for note in scene.notes)
 
 
 def test_masks_are_given_at_their_own_size_with_the_cameras_of_the_archive(tmp_path: Path) -> None:

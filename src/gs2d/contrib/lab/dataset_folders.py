@@ -21,6 +21,7 @@ from gs2d.contrib.lab.datasets import (
 )
 from gs2d.core.image_arrays import is_number
 from gs2d.core.json_files import read_json
+from gs2d.data.file_names import Files, in_any_case
 from gs2d.data.known_captures import DATA_SETS
 from gs2d.data.readers.colmap import read_images
 from gs2d.errors import DataError
@@ -113,8 +114,17 @@ def _colmap_pieces(root: Path, folder: str, source: str) -> list[MissingPiece]:
     missing = _model_files(model, source)
     kind = "bin" if (model / "images.bin").is_file() else "txt" if (model / "images.txt").is_file() else None
     names = [] if kind is None else sorted(image.name for image in read_images(model, kind))
-    paths = (root / folder / name for name in names)
-    return missing + [MissingPiece(path, TRAINING, source) for path in paths if not path.is_file()]
+    return missing + _missing_images(in_any_case(root, folder), names, TRAINING, source)
+
+
+def _missing_images(folder: Path, names: Sequence[str], purpose: str, source: str) -> list[MissingPiece]:
+    """Return the images without a file, by the rules of the readers: letter case and Unicode form may differ."""
+    matches = Files([folder]).match([[name] for name in names], moved=False)
+    return [
+        MissingPiece(folder / name, purpose, source)
+        for name, match in zip(names, matches, strict=True)
+        if match.path is None
+    ]
 
 
 def _blender_pieces(root: Path, source: str) -> list[MissingPiece]:
@@ -130,10 +140,8 @@ def _blender_pieces(root: Path, source: str) -> list[MissingPiece]:
             names = [str(frame["file_path"]) for frame in data["frames"]]
         except (KeyError, TypeError) as error:
             raise DataError(f"{listing} must hold frames with a file_path each, got another entry ({error})") from error
-        for name in names:
-            path = root / (name if Path(name).suffix.lower() in _IMAGES else f"{name}.png")
-            if not path.is_file():
-                missing.append(MissingPiece(path, purpose, source))
+        files = [name if Path(name).suffix.lower() in _IMAGES else f"{name}.png" for name in names]
+        missing += _missing_images(root, files, purpose, source)
     return missing
 
 

@@ -1,4 +1,4 @@
-"""DTU in the layout of IDR and NeuS: photographs, masks, and one npz of projection matrices."""
+"""DTU in the layout of IDR and NeuS: images, masks, and a .npz file of projection matrices."""
 
 from __future__ import annotations
 
@@ -38,24 +38,24 @@ _IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg"}
 def read_dtu(root: Path) -> Capture:
     """Read a DTU scan.
 
-    View i is the i-th file in the order of their names (2.png before 10.png). P_i = world_mat_i @ scale_mat_i maps the
-    unit-sphere frame, which is the scene's frame, to pixels whose centres are whole numbers; ours are at + 0.5, so 0.5
-    is added to cx and cy.
-    T_metric_scene = scale_mat_0 maps the scene to millimetres. Masks (``mask/NNN.png``) are silhouettes
-    (``View.object_mask``), as is an alpha channel: the background is trained. All views train.
-    Where ``sparse/0`` has cameras that stand where these do, its points are used, and its intrinsics if they are of the
-    photographs' size and these are not: 2DGS undistorted its photographs to another size, and made the model for them.
+    View i is the i-th file in numeric order. P_i = world_mat_i @ scale_mat_i maps the unit-sphere frame, which is the
+    frame of the scene, to pixels with integer centres; 0.5 is added to cx and cy. T_metric_scene = scale_mat_0 maps the
+    scene to millimetres. Masks (``mask/NNN.png``) and alpha channels are silhouettes (``View.object_mask``): the
+    background is trained. All views train.
+
+    If the cameras of ``sparse/0`` have the same centres, its points are used, and its intrinsics if they match the
+    image size: 2DGS undistorted its images to another size.
 
     Raises
     ------
     DataError
-        A missing or broken file, another number of images than cameras, or matrices that are no cameras.
+        If a file is missing or invalid, the numbers of images and cameras differ, or a matrix is not a camera.
     """
     model = _read_model(root)
     path, world, scale = _matrices_of(root, model)
     images = _files(root, ("image", "images"))
     if not images:
-        raise DataError(f"{root} must have its photographs in the folder image or images, got none")
+        raise DataError(f"{root} must have its images in the folder image or images, got none")
     indices = _view_indices(images, sorted(world), path)
     masks = _files(root, ("mask", "masks"))
     mask_of = dict(zip(_view_indices(masks, sorted(world), path), masks, strict=True)) if masks else {}
@@ -78,7 +78,7 @@ def read_dtu(root: Path) -> Capture:
             )
         )
     missing = sorted(set(world) - set(indices))
-    skipped += [f"view {index}: no photograph" for index in missing]
+    skipped += [f"view {index}: no image" for index in missing]
     frames, points, notes = _with_model(frames, model)
     if masks:
         notes += (f"masks: {sum(f.object_mask is not None for f in frames)} of {len(frames)} views have a silhouette",)
@@ -112,7 +112,7 @@ class DtuReader:
 
 
 def _observed(model: _Model, frames: Sequence[PosedImage]) -> ObservedPoints:
-    """Return the model's points by the photographs of the scan, which may have another suffix there."""
+    """Return the observations of the model by image name of the scan, whose suffix may differ."""
     found = observed_points(model.folder, model.kind)
     by_stem = {Path(frame.name).stem: frame.name for frame in frames}
     seen = {by_stem[Path(name).stem]: rows for name, rows in found.seen.items() if Path(name).stem in by_stem}
@@ -120,16 +120,16 @@ def _observed(model: _Model, frames: Sequence[PosedImage]) -> ObservedPoints:
 
 
 def decompose_projection(P: np.ndarray, where: str) -> tuple[float, float, float, float, np.ndarray]:
-    """fx, fy, cx, cy and T_cam_world [4, 4] of a projection matrix [3 or 4, 4] of any scale.
+    """Decompose a projection matrix [3 or 4, 4] of any scale: fx, fy, cx, cy and T_cam_world [4, 4].
 
     P[:, :3] = s K R by RQ decomposition with positive diagonal of K and det R = 1; t = K^-1 P[:, 3] / s.
 
     Raises
     ------
     DataError
-        Not finite, singular, or with a skew that a pinhole camera does not have.
+        If it is not finite, singular, or has skew.
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # by a power of two, which rounds nothing
+    with np.errstate(over="ignore", invalid="ignore"):  # scale by a power of two, without rounding
         P = np.ldexp(P, -int(np.frexp(np.abs(P[:3, :3]).max())[1]))
     M = P[:3, :3]
     if not np.isfinite(P[:3]).all() or not abs(np.linalg.det(M)) > 1e-12 * np.abs(M).max() ** 3:
@@ -137,7 +137,7 @@ def decompose_projection(P: np.ndarray, where: str) -> tuple[float, float, float
             f"{where}: world_mat @ scale_mat must be a finite camera of full rank, got {P[:3].round(4).tolist()}"
         )
     if np.linalg.det(M) < 0:
-        P, M = -P, -M  # a projection matrix has no sign
+        P, M = -P, -M  # the sign of a projection matrix is arbitrary
     K, R = rq(M)
     signs = np.sign(np.diag(K))
     K, R = K * signs, R * signs[:, None]
@@ -152,16 +152,16 @@ def decompose_projection(P: np.ndarray, where: str) -> tuple[float, float, float
 
 @dataclass(frozen=True, eq=False)
 class DtuSilhouette:
-    """A view's camera at the size of its mask, and the mask's file; the scene's frame."""
+    """A mask file and its camera, at the size of the mask and in the frame of the scene."""
 
     camera: Camera
     path: Path
 
 
 def dtu_silhouettes(root: Path) -> tuple[DtuSilhouette, ...]:
-    """Return the mask files of a scan in full size, with the archive's cameras, which were made for that size.
+    """Return the full-size mask files of a scan with their cameras, for the culling of the official evaluation.
 
-    What the official evaluation culls with, whatever the size of the photographs. Empty without mask files.
+    Empty without mask files.
     """
     masks = _files(root, ("mask", "masks"))
     if not masks:
@@ -177,7 +177,7 @@ def dtu_silhouettes(root: Path) -> tuple[DtuSilhouette, ...]:
 
 
 def _matrices_of(root: Path, model: _Model | None) -> tuple[Path, dict[int, np.ndarray], dict[int, np.ndarray]]:
-    """Return the archive, its world_mat and its scale_mat: of two, the one whose frame is that of ``sparse/0``."""
+    """Return the archive, its world_mat and its scale_mat; of two archives, the one in the frame of ``sparse/0``."""
     paths = camera_archives(root)
     if not paths:
         raise DataError(f"{root} must hold {' or '.join(CAMERA_FILES)}, got neither")
@@ -195,12 +195,12 @@ def _matrices_of(root: Path, model: _Model | None) -> tuple[Path, dict[int, np.n
 
 
 def camera_archives(root: Path) -> list[Path]:
-    """Return the files of projection matrices that a folder has, the preferred one first."""
+    """Return the files of projection matrices in a folder, the preferred one first."""
     return [path for name in CAMERA_FILES if (path := in_any_case(root, name)).is_file()]
 
 
 def _read_matrices(path: Path) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
-    """world_mat and scale_mat [4, 4] of each view."""
+    """Read world_mat and scale_mat [4, 4] of each view."""
     arrays = read_npz(
         path,
         "camera archive",
@@ -232,20 +232,20 @@ def _files(root: Path, names: Sequence[str]) -> list[Path]:
 
 
 def _view_indices(files: list[Path], views: list[int], path: Path) -> list[int]:
-    """Index of the view of each file: its position if there are as many as cameras, else the number in its name."""
+    """Return the view index of each file: its position if there is one file per camera, else the number in its name."""
     if len(files) == len(views):
         return views
     if all(is_number(file.stem) for file in files):
         return [int(file.stem) for file in files]
     raise DataError(
-        f"{files[0].parent} must hold as many images as {path.name} has views, {len(views)}, or be numbered; "
+        f"{files[0].parent} must hold one image per view of {path.name}, {len(views)}, or numbered images; "
         f"got {len(files)}"
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """What ``sparse/0`` holds: images by name, cameras by number, points."""
+    """Content of ``sparse/0``: images by name, cameras by id, points."""
 
     folder: Path
     kind: str
@@ -268,7 +268,7 @@ def _center(T: np.ndarray) -> np.ndarray:
 
 
 def _same_places(centers: dict[str, np.ndarray], model: _Model) -> bool:
-    """Whether the model's cameras stand where those of the same name do: within 2 % of their spread."""
+    """Whether the model has the same camera centres, within 2 % of their spread."""
     theirs = {Path(name).stem: _center(image.T_cam_world) for name, image in model.images.items()}
     common = sorted(set(centers) & set(theirs))
     if not common:
@@ -281,16 +281,16 @@ def _same_places(centers: dict[str, np.ndarray], model: _Model) -> bool:
 def _with_model(
     frames: list[PosedImage], model: _Model | None
 ) -> tuple[list[PosedImage], PointCloud | None, tuple[str, ...]]:
-    """Return the frames with the model's cameras where those fit the photographs; its points; what was decided."""
+    """Return the frames with matching cameras of the model, its points, and notes."""
     if model is None or (model.points is None and not model.images):
         return frames, None, ()
     if not _same_places({Path(frame.name).stem: _center(frame.T_cam_world) for frame in frames}, model):
-        return frames, None, ("the points of sparse/0 are in another frame than the cameras and are not used",)
+        return frames, None, ("the points of sparse/0 are in other coordinates than the cameras and are not used",)
     images = {Path(name).stem: image for name, image in model.images.items()}
     fitted = [_of_model(frame, images.get(Path(frame.name).stem), model) for frame in frames]
     changed = sum(new is not old for new, old in zip(fitted, frames, strict=True))
     notes = (
-        (f"cameras of {changed} of {len(frames)} views are those of sparse/0, made for photographs of this size",)
+        (f"cameras of {changed} of {len(frames)} views come from sparse/0, which matches the image size",)
         if changed
         else ()
     )
@@ -298,9 +298,9 @@ def _with_model(
 
 
 def _of_model(frame: PosedImage, image: ColmapImage | None, model: _Model) -> PosedImage:
-    """Return the frame, with the model's camera if that has the photograph's size and another focal length or centre.
+    """Return the frame, with the camera of the model if it has the image size and other intrinsics.
 
-    A mask of another size than such a photograph is of the original one: the photograph's alpha channel replaces it.
+    A mask of another size belongs to the original image and is then replaced by the alpha channel.
     """
     camera = None if image is None else model.cameras.get(image.camera_id)
     ours = frame.intrinsics
