@@ -56,7 +56,7 @@ def test_sparse_points_are_used_only_if_their_cameras_stand_where_the_scene_s_do
     ColmapModel(model.cameras, moved, model.points).write(tmp_path / "sparse/0")
     scene = load_scene(tmp_path)
     assert scene.points is None
-    assert any("another frame" in note for note in scene.notes)
+    assert any("other coordinates" in note for note in scene.notes)
 
 
 def test_numbered_images_keep_their_camera_when_one_is_missing(tmp_path: Path) -> None:
@@ -148,4 +148,4 @@ def test_of_two_archives_the_one_in_the_frame_of_the_model_is_read(tmp_path: Pat
     (tmp_path / "cameras.npz").unlink()
     scene = load_scene(tmp_path)
     np.testing.assert_array_equal(scene.T_metric_scene, SCALE_MAT @ wide)
-    assert any("another frame" in note for note in scene.notes)
+    assert any("other coordinates" in note for note in scene.notes)
