@@ -27,6 +27,8 @@ from gs2d.pipeline.prepare.pose_finding import find_poses
 from gs2d.training.events import Event, Notice, Phase
 from room_photos import FOCAL, SIZE, UP, Room, room_image, textures, write_room
 
+ONE_LENS = ("--camera-model", "SIMPLE_PINHOLE")  # no comparison of lenses, which takes half of the time
+
 
 def poses(photos: Path, out: Path, *words: str) -> int:
     return run(["poses", str(photos), "--out", str(out), "--threads", "2", *words])
@@ -101,7 +103,7 @@ def test_separate_pieces_and_photographs_without_a_place_are_named(
     colmap: None, pieces: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "capture"
-    assert poses(pieces, out) == 0
+    assert poses(pieces, out, *ONE_LENS) == 0
     text = capsys.readouterr()
     assert "5 of 10 photographs placed" in text.out
     assert "no camera: 010.jpg: in a separate model (sparse/1)" in text.out
@@ -114,10 +116,10 @@ def test_separate_pieces_and_photographs_without_a_place_are_named(
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes(colmap: None, pieces: Path, tmp_path: Path) -> None:
     out = tmp_path / "capture"
-    assert poses(pieces, out, "--quiet") == 0
+    assert poses(pieces, out, "--quiet", *ONE_LENS) == 0
     models = {path: path.read_bytes() for path in sorted(out.rglob("*.bin"))}
     assert len(models) == 10  # cameras, images, points3D, rigs, frames, twice
-    assert poses(pieces, out, "--overwrite", "--quiet") == 0
+    assert poses(pieces, out, "--overwrite", "--quiet", *ONE_LENS) == 0
     assert {path: path.read_bytes() for path in sorted(out.rglob("*.bin"))} == models
 
 
@@ -181,7 +183,6 @@ def test_a_camera_that_only_turned_is_doubted(colmap: None, tmp_path: Path, caps
     ("phase", "kept"),
     [
         ("matching pairs", "features of 12 photographs, [0-9]+ pairs"),  # the worker matches on until it is stopped
-        ("placing cameras", "features of 12 photographs, 66 pairs"),
         ("comparing lenses", "features of 12 photographs, 66 pairs, placed cameras"),
     ],
 )
