@@ -18,7 +18,7 @@ from capture_writers import small_blender, small_colmap, small_dtu, small_nerfst
 from cli_runs import one_line
 from foreign_writers import small_alicevision, small_metashape, small_opensfm
 from gs2d.cli import run
-from gs2d.core.missing import holds_photographs, instead
+from gs2d.core.missing import holds_photographs, suggestion
 from gs2d.data import detect_format
 
 NEEDS = {  # what each command reads
@@ -157,7 +157,7 @@ def test_captures_of_every_format_are_told_from_photographs_by_names(tmp_path: P
     write(tmp_path / "some")  # type: ignore[operator]
     assert detect_format(tmp_path / "some")
     assert not holds_photographs(tmp_path / "some")
-    assert instead(tmp_path / "some", "run").startswith("; `gs2d train ")
+    assert suggestion(tmp_path / "some", "run").startswith("; `gs2d train ")
     packed(tmp_path / "some")
     assert not holds_photographs(tmp_path / "some.zip")
 

@@ -14,7 +14,7 @@ from gs2d.data import Scene, View, load_scene
 from gs2d.data.prepared import (
     AHEAD,
     Stored,
-    forget_others,
+    delete_unused,
     missing_views,
     prepare,
     prepared_scene,
@@ -101,7 +101,7 @@ def test_an_interrupted_preparation_continues_and_a_changed_photograph_is_prepar
     again = prepared_scene(loaded(capture), folder)
     missing = missing_views(again)
     assert [view.name for view in missing] == [scene.views[0].name, scene.views[1].name]
-    forget_others(again, folder)
+    delete_unused(again, folder)
     assert not second.exists()
     list(prepare(missing, 1))
     assert {path: path.stat().st_mtime_ns for path in folder.iterdir() if path in times and path != first} == {

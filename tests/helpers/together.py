@@ -26,7 +26,7 @@ from gs2d.config.quantities import EXPOSURE, POSES
 from gs2d.config.recipe import Recipe
 from gs2d.config.robust import DenseStart, Removal
 from gs2d.config.schedule import scale_schedule
-from gs2d.core.processes import Place
+from gs2d.core.processes import ProcessRank
 from gs2d.errors import Gs2dError
 from gs2d.training import events
 from gs2d.training.parallel import OneProcess, Turn
@@ -41,7 +41,7 @@ class Batch(OneProcess):
     """One process that does what several do: renders the views of an iteration one by one, and takes the mean."""
 
     def __init__(self, views: int) -> None:
-        self.place = Place(0, views, 0, 1)
+        self.place = ProcessRank(0, views, 0, 1)
         self.results: list[StepResult] = []
 
     def evaluate(

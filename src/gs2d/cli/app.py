@@ -35,7 +35,7 @@ from gs2d.cli.console import Console, show_help
 from gs2d.cli.interrupts import INTERRUPTED, Interruptible
 from gs2d.cli.parser import HELP_WORDS, UsageError, check_inputs, parse
 from gs2d.core.memory_limit import address_space, check_address_space
-from gs2d.core.processes import here
+from gs2d.core.processes import process_rank
 from gs2d.core.text import printable
 from gs2d.errors import Gs2dError
 
@@ -80,7 +80,7 @@ def run(argv: Sequence[str]) -> int:
         return _report_missing(console, argv, command)
     except KeyboardInterrupt:
         console.close()
-        return _interrupted(argv, command) if here().leads else INTERRUPTED
+        return _interrupted(argv, command) if process_rank().leads else INTERRUPTED
     except BrokenPipeError:  # `gs2d ... | head`
         _drop_stdout()
         return PIPE_CLOSED
@@ -150,7 +150,7 @@ def _for_this_process(command: Common) -> Common:
     UsageError
         If the command cannot run in several processes.
     """
-    place = here()
+    place = process_rank()
     if place.size > 1 and not isinstance(command, TrainCommand):
         raise UsageError(f"gs2d {_name_of(command)} runs in one process, got {place.size}; gs2d train is for torchrun")
     return command if place.leads else replace(command, quiet=True, json=False)

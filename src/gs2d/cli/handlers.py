@@ -10,7 +10,7 @@ from typing import Any
 from gs2d.cli import commands as c
 from gs2d.cli.console import Console
 from gs2d.cli.results import score_rows, show_run, show_surface
-from gs2d.core.processes import here
+from gs2d.core.processes import process_rank
 from gs2d.errors import ProtocolError, RecipeError, RunError
 from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions, values
 
@@ -33,7 +33,7 @@ def train(command: c.TrainCommand, console: Console) -> None:
 
     run = run_training(command, console.on_event)
     console.close()
-    if here().leads:  # one process of several prints
+    if process_rank().leads:  # one process of several prints
         show_run(run.path, run.metrics(), console)
 
 

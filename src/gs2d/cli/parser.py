@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 from gs2d.cli.command_line import NAMES, Option, fields_of, options_of
 from gs2d.cli.commands import Common
-from gs2d.core.missing import where_it_ends
+from gs2d.core.missing import path_hint
 from gs2d.pipeline.prepare.options import HowItRuns
 
 HELP_WORDS = ("-h", "--help", "--help-all")
@@ -171,7 +171,7 @@ def _check_exists(path: Path, option: Option) -> None:
     except (FileNotFoundError, NotADirectoryError):
         expected = _EXPECTED.get(option.metavar, "a file or a folder")
         expected += " or a file of splats" if (option.field, option.metavar) == ("path", "RUN") else ""
-        raise UsageError(f"expected {expected} at {path}, found nothing{where_it_ends(path)}") from None
+        raise UsageError(f"expected {expected} at {path}, found nothing{path_hint(path)}") from None
     except (OSError, ValueError):
         pass  # reported by the reader of the path
 

@@ -1,1 +1,1 @@
-"""What every room uses: cameras, splats, meshes, images, transforms, checked shapes, atomic files."""
+"""Values without files: cameras, splats, meshes, images, transforms; shape checks, atomic files and memory limits."""

@@ -20,7 +20,7 @@ _CAPTURES = (  # files and folders of captures
 )
 
 
-def where_it_ends(path: Path) -> str:
+def path_hint(path: Path) -> str:
     """Return a hint on a missing path: "; did you mean scans/chair?" or "; there is no chair in /home/me/scans".
 
     Parameters
@@ -43,7 +43,7 @@ def where_it_ends(path: Path) -> str:
     return f"; there is no {missing.name} in {missing.parent.resolve()}"
 
 
-def instead(path: Path, needed: str) -> str:
+def suggestion(path: Path, needed: str) -> str:
     """Return a suggestion for an existing path that is not what a command needs; begins with "; ".
 
     Only file names are examined. RUN in a suggested command is a name that the user chooses.

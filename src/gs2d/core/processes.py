@@ -12,7 +12,7 @@ NEEDED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 
 
 @dataclass(frozen=True)
-class Place:
+class ProcessRank:
     """Rank of this process among those that train together.
 
     Attributes
@@ -36,7 +36,7 @@ class Place:
         return self.rank == 0
 
 
-def here(environment: Mapping[str, str] = os.environ) -> Place:
+def process_rank(environment: Mapping[str, str] = os.environ) -> ProcessRank:
     """Return the rank of this process; that of a single process if the environment is not complete.
 
     Raises
@@ -45,14 +45,14 @@ def here(environment: Mapping[str, str] = os.environ) -> Place:
         If the environment is contradictory.
     """
     if not all(environment.get(name) for name in NEEDED):
-        return Place()
+        return ProcessRank()
     variables = {name: environment[name] for name in ("RANK", "WORLD_SIZE")}
     variables["LOCAL_RANK"] = environment.get("LOCAL_RANK") or variables["RANK"]
     variables["LOCAL_WORLD_SIZE"] = environment.get("LOCAL_WORLD_SIZE") or variables["WORLD_SIZE"]
     try:
-        place = Place(*map(int, variables.values()))
+        place = ProcessRank(*map(int, variables.values()))
     except ValueError:
-        place = Place(-1)
+        place = ProcessRank(-1)
     if not (0 <= place.rank < place.size and 0 <= place.local_rank < place.local_size <= place.size):
         shown = ", ".join(f"{name}={value}" for name, value in variables.items())
         raise BackendError(f"the environment has an invalid rank, {shown}; start with torchrun, or unset WORLD_SIZE")

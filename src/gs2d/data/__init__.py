@@ -1,4 +1,4 @@
-"""Posed photographs: readers of every supported layout."""
+"""Captures on disk become scenes: readers of every format, image files, masks and maps."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from gs2d.core.atomic_files import disk_error
 from gs2d.core.growth import check_entries, check_growth
-from gs2d.core.missing import holds_photographs, instead
+from gs2d.core.missing import holds_photographs, suggestion
 from gs2d.data.file_names import IMAGES
 from gs2d.data.load import detect_format
 from gs2d.errors import DataError
@@ -75,12 +75,12 @@ def unpack(path: Path, home: Path) -> Path:
     except DataError as error:
         if not holds_photographs(path):
             raise
-        remedy = instead(path, "capture")
+        remedy = suggestion(path, "capture")
         raise DataError(f"{path} must contain cameras, got images without cameras{remedy}") from error
 
 
 @contextlib.contextmanager
-def unpacked_for_a_moment(path: Path) -> Iterator[Path]:
+def unpacked_temporarily(path: Path) -> Iterator[Path]:
     """Unpack a ZIP file into a temporary folder; errors about its content name the archive.
 
     Raises

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from gs2d.core.memory_limit import cache_bytes as room_for_cache
-from gs2d.core.missing import instead, where_it_ends
+from gs2d.core.missing import path_hint, suggestion
 from gs2d.data.build import build_scene
 from gs2d.data.file_names import IMAGES, in_any_case
 from gs2d.data.known_captures import missing_lines
@@ -46,9 +46,9 @@ def detect_format(path: str | os.PathLike[str]) -> str:
         looked_for.append(getattr(reader, "looks_for", ""))
     held = sorted(entry.name + ("/" if entry.is_dir() else "") for entry in root.iterdir())
     if not held:
-        raise DataError(f"{root} must hold a capture, got an empty folder{instead(root, 'capture')}")
+        raise DataError(f"{root} must hold a capture, got an empty folder{suggestion(root, 'capture')}")
     if "run.json" in held:
-        raise DataError(f"{root} must hold a capture, got a run{instead(root, 'capture')}")
+        raise DataError(f"{root} must hold a capture, got a run{suggestion(root, 'capture')}")
     project = next((name for name in held if os.path.splitext(name)[1].lower() in _PROJECTS), None)
     if project is not None:
         remedy = _PROJECTS[os.path.splitext(project)[1].lower()]
@@ -58,7 +58,7 @@ def detect_format(path: str | os.PathLike[str]) -> str:
     images = next((folder for folder in (root, in_any_case(root, "images")) if _images(folder)), None)
     if images is not None and not lacking:
         raise DataError(
-            f"{root} must contain cameras, got {_images(images)} images without cameras{instead(root, 'capture')}"
+            f"{root} must contain cameras, got {_images(images)} images without cameras{suggestion(root, 'capture')}"
         )
     *others, last = filter(None, looked_for)
     raise DataError(
@@ -78,7 +78,7 @@ def _folder(path: str | os.PathLike[str]) -> Path:
     try:
         os.listdir(root)
     except (FileNotFoundError, NotADirectoryError) as error:
-        got = f"a file{instead(root, 'capture')}" if root.exists() else f"no such folder{where_it_ends(root)}"
+        got = f"a file{suggestion(root, 'capture')}" if root.exists() else f"no such folder{path_hint(root)}"
         raise DataError(f"{root} must be the folder of a capture, got {got}") from error
     except OSError as error:
         raise DataError(f"cannot read the folder {root}: {error.strerror or error}") from error

@@ -205,7 +205,7 @@ def prepare(views: Sequence[View], threads: int) -> Iterator[None]:
             trim()
 
 
-def forget_others(scene: Scene, folder: Path) -> None:
+def delete_unused(scene: Scene, folder: Path) -> None:
     """Delete the files in a folder that belong to no view of a ``prepared_scene``, and unfinished ones."""
     used = {view.decode.file.name for view in scene.views if isinstance(view.decode, Stored)}
     for file in folder.iterdir():

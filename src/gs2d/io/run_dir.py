@@ -41,7 +41,7 @@ from gs2d.core.atomic_files import atomic_write, disk_error, is_temporary, sweep
 from gs2d.core.growth import check_entries
 from gs2d.core.json_files import read_json, write_json
 from gs2d.core.locks import try_lock
-from gs2d.core.missing import instead, where_it_ends
+from gs2d.core.missing import path_hint, suggestion
 from gs2d.core.text import first_line
 from gs2d.errors import DataError, RunError
 from gs2d.io.event_log import EventLog
@@ -241,7 +241,7 @@ def open_run(path: str | Path) -> RunFolder:
     path = Path(path)
     if not is_run(path):
         got = "a folder without run.json" if path.is_dir() else "a file" if path.exists() else "nothing"
-        remedy = instead(path, "run") if path.exists() else where_it_ends(path)
+        remedy = suggestion(path, "run") if path.exists() else path_hint(path)
         raise RunError(f"expected a run folder at {path}, got {got}{remedy}")
     return RunFolder(path)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.core.json_files import read_json
-from gs2d.core.missing import instead
+from gs2d.core.missing import suggestion
 from gs2d.data import detect_format
 from gs2d.data.masks import OFF
 from gs2d.errors import DataError, ProtocolError, RunError
@@ -162,7 +162,7 @@ def _check_photos(options: ReconstructOptions) -> None:
     raise DataError(
         f"{photos} must hold photographs only, got cameras too ({kind}): gs2d train {shlex.quote(str(photos))} --out "
         f"{shlex.quote(str(out))} trains with these; to estimate others"
-        f"{instead(photos, 'photographs').removeprefix(';')}"
+        f"{suggestion(photos, 'photographs').removeprefix(';')}"
     )
 
 

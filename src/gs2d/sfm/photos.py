@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from gs2d.core.image_arrays import is_twice_as_wide, natural_key
-from gs2d.core.missing import belongs_to_run, instead, where_it_ends
+from gs2d.core.missing import belongs_to_run, path_hint, suggestion
 from gs2d.data.exif import Taken, read_taken
 from gs2d.data.image_files import read_image
 from gs2d.data.masks import FOLDER, without_masks
@@ -111,12 +111,12 @@ def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...], str]:
         If ``root`` is no folder, or holds too few photographs.
     """
     if root.is_file():
-        other = instead(root, "photographs")
+        other = suggestion(root, "photographs")
         raise DataError(f"{root} must be a folder of photographs or a video, got another file{other}")
     if not root.is_dir():
-        raise DataError(f"{root} must be a folder of photographs, got no such folder{where_it_ends(root)}")
+        raise DataError(f"{root} must be a folder of photographs, got no such folder{path_hint(root)}")
     if belongs_to_run(root):
-        raise DataError(f"{root} must be a folder of photographs, got files of a run{instead(root, 'photographs')}")
+        raise DataError(f"{root} must be a folder of photographs, got files of a run{suggestion(root, 'photographs')}")
     sorted_out: dict[str, list[Path]] = {"photo": [], "video": [], "unread": [], "mask": [], "other": []}
     for path in _files(root):
         kind = _KINDS.get(path.suffix.lower(), "other")

@@ -1,1 +1,1 @@
-"""The demo's capture: a scene with an exactly known surface, drawn by the ray caster."""
+"""The capture of the demo: a rendered scene with an exactly known surface."""

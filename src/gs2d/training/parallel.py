@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from gs2d.core.processes import Place
+from gs2d.core.processes import ProcessRank
 from gs2d.core.splats import Splats
 from gs2d.errors import RunError
 from gs2d.training.state import TrainState
@@ -54,12 +54,12 @@ class OneProcess:
 
     Attributes
     ----------
-    place : Place
+    place : ProcessRank
     stop_asked : bool
         Whether any process had received a request to stop at the last :meth:`meet`.
     """
 
-    place = Place()
+    place = ProcessRank()
     stop_asked = False
 
     @property
@@ -150,12 +150,12 @@ class ManyProcesses(OneProcess):
 
     Parameters
     ----------
-    place : Place
+    place : ProcessRank
     hears : callable
         Returns whether this process has received a request to stop.
     """
 
-    def __init__(self, place: Place, hears: Callable[[], bool] = lambda: False) -> None:
+    def __init__(self, place: ProcessRank, hears: Callable[[], bool] = lambda: False) -> None:
         import torch.distributed as distributed
 
         self._group = distributed

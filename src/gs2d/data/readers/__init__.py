@@ -1,1 +1,1 @@
-"""One reader for each kind of capture."""
+"""Readers of capture formats."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from gs2d.config.registry import Registry
-from gs2d.core.missing import instead
+from gs2d.core.missing import suggestion
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.io import splat_ply
@@ -339,7 +339,7 @@ def read_splats(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> Spl
     if not is_splat_file(path) and Path(path).is_file():
         with open(path, "rb") as opened:
             if opened.read(3) != b"ply":
-                raise DataError(f"{path} must be a file of splats or a run folder{instead(Path(path), 'run')}")
+                raise DataError(f"{path} must be a file of splats or a run folder{suggestion(Path(path), 'run')}")
     file = read_splat_file(path)
     for note in file.notes:
         tell(note)

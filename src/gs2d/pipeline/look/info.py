@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from gs2d.core.missing import belongs_to_run, instead
+from gs2d.core.missing import belongs_to_run, suggestion
 from gs2d.data import detect_format, load_scene
-from gs2d.data.archive import is_archive, unpacked_for_a_moment
+from gs2d.data.archive import is_archive, unpacked_temporarily
 from gs2d.data.known_captures import missing_lines
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import is_splat_file, read_splat_file, reader_of
@@ -20,7 +20,7 @@ _OF_MODELS = (".ply", *FOREIGN)
 def describe_capture(path: Path) -> dict[str, Any]:
     """Describe a capture: a folder, or a ZIP file, which is unpacked temporarily."""
     if is_archive(path):
-        with unpacked_for_a_moment(path) as folder:
+        with unpacked_temporarily(path) as folder:
             return {**describe_capture(folder), "capture": str(path)}
     scene = load_scene(path, format=detect_format(path))
     sizes = sorted({(view.camera.width, view.camera.height) for view in scene.views})
@@ -52,7 +52,7 @@ def describe_file(path: Path) -> dict[str, Any]:
         If the file is none of these, or is broken.
     """
     if path.suffix.lower() not in _OF_MODELS and not is_splat_file(path):
-        remedy = instead(path, "run" if belongs_to_run(path) else "capture")
+        remedy = suggestion(path, "run" if belongs_to_run(path) else "capture")
         raise DataError(f"{path} is no file of splats, mesh or points{remedy}")
     size = path.stat().st_size
     reader = reader_of(path)

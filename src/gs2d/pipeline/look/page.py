@@ -14,7 +14,7 @@ from PIL import Image
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.json_files import read_json
-from gs2d.core.missing import where_it_ends
+from gs2d.core.missing import path_hint
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import focus_point, up_direction
 from gs2d.data import View
@@ -148,7 +148,7 @@ def page_content(path: Path, on_event: OnEvent = ignore, loaded: LoadedRun | Non
             on_event(Notice(f"without the cameras of the photographs: {error}"))
     else:
         if not path.exists():
-            raise DataError(f"{path} is no run folder or file of splats{where_it_ends(path)}")
+            raise DataError(f"{path} is no run folder or file of splats{path_hint(path)}")
         splats, title = read_splats(path, lambda text: on_event(Notice(text))), path.stem
     photographs = [] if loaded is None else some_views(loaded.scene.train)
     scene = page_scene(

@@ -22,7 +22,7 @@ from gs2d.core.memory_limit import memory_budget
 from gs2d.core.splats import Splats
 from gs2d.core.text import duration
 from gs2d.data import Scene
-from gs2d.data.archive import is_archive, unpacked_for_a_moment
+from gs2d.data.archive import is_archive, unpacked_temporarily
 from gs2d.data.prepared import decoded_bytes, packed_bytes
 from gs2d.errors import DataError
 from gs2d.pipeline.prepare.limits import DECODING_BYTES, ITERATION_BYTES, use_memory, use_threads
@@ -139,7 +139,7 @@ def plan(options: TrainOptions, on_event: OnEvent = ignore) -> Estimate:
         If the capture cannot be read, or the training does not fit into memory.
     """
     if is_archive(options.scene):
-        with unpacked_for_a_moment(options.scene) as folder:
+        with unpacked_temporarily(options.scene) as folder:
             return plan(replace(options, scene=folder), on_event)
     check_options(options)
     use_threads(options.threads)

@@ -11,7 +11,7 @@ from gs2d.data import Scene
 from gs2d.data.prepared import (
     check_disk,
     decoded_bytes,
-    forget_others,
+    delete_unused,
     missing_views,
     packed_bytes,
     prepare,
@@ -53,7 +53,7 @@ def with_prepared(scene: Scene, run: Path, execution: Execution, on_event: OnEve
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not shared:
-            forget_others(prepared, folder)
+            delete_unused(prepared, folder)
     except OSError as error:
         raise disk_error(folder, error) from error
     if missing:

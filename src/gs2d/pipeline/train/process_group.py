@@ -18,7 +18,7 @@ from typing import Any
 import torch
 
 from gs2d.core.memory_limit import memory_limit
-from gs2d.core.processes import Place, here
+from gs2d.core.processes import ProcessRank, process_rank
 from gs2d.errors import BackendError, Gs2dError, RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
@@ -47,7 +47,7 @@ def connected(backend: str) -> Iterator[OneProcess]:
     BackendError
         If a process has no GPU, or torch was built without ``torch.distributed``.
     """
-    place = here()
+    place = process_rank()
     if place.size == 1:
         yield ONE_PROCESS
         return
@@ -66,7 +66,7 @@ def connected(backend: str) -> Iterator[OneProcess]:
     torch.distributed.destroy_process_group()
 
 
-def _connect(place: Place, backend: str) -> ManyProcesses:
+def _connect(place: ProcessRank, backend: str) -> ManyProcesses:
     """Join the group of all processes, on a GPU of its own."""
     if not torch.distributed.is_available():
         raise BackendError("several processes need torch.distributed, which this torch does not have; use one")
@@ -84,7 +84,7 @@ def _connect(place: Place, backend: str) -> ManyProcesses:
     return ManyProcesses(place)
 
 
-def memory_of(place: Place, gib: float | None) -> float | None:
+def memory_of(place: ProcessRank, gib: float | None) -> float | None:
     """Return the memory limit of this process in GiB: an equal part of ``--memory``, or of the machine's memory."""
     if place.local_size == 1:
         return gib
