@@ -82,6 +82,6 @@ def test_of_a_name_that_is_taken_the_first_keeps_it_and_one_line_says_so(folder:
         assert dishes.get("stew") == "of a"
         assert dishes.get("soup") == "hot"
     assert sorted(str(warning.message) for warning in seen) == [
-        "b-guest 1.5 offers the dish 'soup', which gs2d has; it is left out",
-        "b-guest 1.5 offers the dish 'stew', which a-guest 1.5 has; it is left out",
+        "b-guest 1.5 declares the dish 'soup' of gs2d; it is ignored",
+        "b-guest 1.5 declares the dish 'stew' of a-guest 1.5; it is ignored",
     ]

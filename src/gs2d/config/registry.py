@@ -1,8 +1,8 @@
-"""The extension points of gs2d: named objects, registered by gs2d, by programs and by installed packages.
+"""Extension points: named objects that gs2d, programs and installed packages register.
 
-Each kind (loss, reader of captures, command, ...) is one :class:`Registry`. A decorator registers an object; an
-installed package names it as an entry point. ``gs2d.contrib`` is registered by the entry points of gs2d itself. Pure
-Python; never imports torch.
+Each kind (loss, capture reader, command, ...) is one :class:`Registry`. A decorator registers an object; an installed
+package declares an entry point. ``gs2d.contrib`` is registered by the entry points of gs2d itself. Pure Python; never
+imports torch.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _DISTRIBUTION, _CONTRIB = "2dgs-r", "gs2d.contrib."
 
 @contextmanager
 def absent_guests() -> Iterator[None]:
-    """Accept names that nothing has: the recipe of a finished run may name what is no longer installed."""
+    """Accept unknown names, because the recipe of a finished run may name a package that is no longer installed."""
     token = _ABSENT.set(True)
     try:
         yield
@@ -42,21 +42,21 @@ def absent_guests() -> Iterator[None]:
 
 
 class Registry(Generic[T]):
-    """What can be asked for by name: what gs2d has, what programs register, and what installed packages offer.
+    """Objects by name: those of gs2d, of programs and of installed packages.
 
-    Nothing is imported before it is asked for; a package that cannot be imported is told in one line, and stops only
-    those who ask for what it offers.
+    Nothing is imported before it is used. If a package cannot be imported, only the use of its objects fails, with a
+    one-line error.
 
     Parameters
     ----------
     what : str
-        One of the things, in words: "loss".
+        Kind of the objects: "loss".
     group : str
-        Entry points of packages that offer them: "gs2d.losses".
+        Group of entry points: "gs2d.losses".
     builtin : mapping of name to module
-        What gs2d itself has; the module registers it when it is imported.
+        Objects of gs2d, and the modules that register them when they are imported.
     error : type of Gs2dError
-        What a wrong name raises.
+        Error for a wrong name.
     """
 
     def __init__(
@@ -73,13 +73,13 @@ class Registry(Generic[T]):
 
     @cached_property
     def _homes(self) -> dict[str, str]:
-        """Modules of gs2d that register a name when they are imported: those of the core, then those of contrib."""
+        """Modules of gs2d by the names that they register: those of the core, then those of contrib."""
         return self._core | {entry.name: entry.module for entry in contrib_entries() if entry.group == self.group}
 
     def register(self, name: str, *, module: str | None = None) -> Callable[[Register], Register]:
         """Return a decorator that registers an object under a name.
 
-        ``module`` is where the object is defined, if its ``__module__`` does not say so.
+        ``module`` is the module that defines the object, if its ``__module__`` is another one.
 
         Raises
         ------
@@ -90,12 +90,12 @@ class Registry(Generic[T]):
         def registered(thing: Register) -> Register:
             home = module or getattr(thing, "__module__", "")
             if self._homes.get(name, home) != home:
-                raise self._error(f"{self.what} {name!r} is one of gs2d's own; give yours another name")
+                raise self._error(f"{self.what} {name!r} belongs to gs2d; use another name")
             holder = self._things.get(name)
             if holder is not None and holder is not thing:
                 raise self._error(
-                    f"{self.what} {name!r} is registered already, by {getattr(holder, '__module__', 'another')}; give "
-                    "yours another name"
+                    f"{self.what} {name!r} is already registered by {getattr(holder, '__module__', 'another')}; use "
+                    "another name"
                 )
             self._things[name] = thing  # type: ignore[assignment]
             return thing
@@ -103,12 +103,12 @@ class Registry(Generic[T]):
         return registered
 
     def get(self, name: str) -> T:
-        """Return the thing of this name, imported now if it was not before.
+        """Return the object of a name, and import it if necessary.
 
         Raises
         ------
         Gs2dError
-            There is none of this name, or its package cannot be imported.
+            If the name is unknown, or its package cannot be imported.
         """
         if name in self._homes and name not in self._things:
             import_module(self._homes[name])
@@ -122,19 +122,19 @@ class Registry(Generic[T]):
         return self.get(name)
 
     def unknown(self, name: str, *, also: Sequence[str] = ()) -> str:
-        """Return the line about a name that stands for nothing; ``also``: what can be said beside the names."""
+        """Return the error message for an unknown name; ``also``: further valid values."""
         names = (*also, *self.names())
         return f"{self.what} must be one of {', '.join(names)}, got {name!r}{did_you_mean(name, names)}"
 
     def check(self, name: object) -> None:
-        """Raise for a name that a recipe gives and nothing has, unless :func:`absent_guests` allows it.
+        """Raise for an unknown name, unless :func:`absent_guests` allows it.
 
-        Nothing is imported. Names of this program must be registered before a recipe gives them.
+        Nothing is imported. A program must register its names before it builds a recipe with them.
 
         Raises
         ------
         Gs2dError
-            Lists the names, and the nearest of them.
+            Lists the names and suggests the nearest one.
         """
         if name not in self and not _ABSENT.get():
             text = self.unknown(str(name))
@@ -142,19 +142,19 @@ class Registry(Generic[T]):
 
     @property
     def builtin(self) -> tuple[str, ...]:
-        """The names of what gs2d itself has."""
+        """The names of gs2d itself."""
         return tuple(self._homes)
 
     def names(self) -> tuple[str, ...]:
-        """All names: gs2d's own, those of this program, those of packages."""
+        """Return all names: those of gs2d, of this program and of packages."""
         return tuple(dict.fromkeys((*self._homes, *self._things, *self._offered)))
 
     def guests(self) -> tuple[str, ...]:
-        """Return the names that are not gs2d's own."""
+        """Return the names that do not belong to gs2d."""
         return tuple(name for name in self.names() if name not in self._homes)
 
     def working(self, names: Sequence[str] | None = None) -> Iterator[tuple[str, T]]:
-        """Yield names (default: all) with their objects; one that cannot be imported is a PluginWarning instead."""
+        """Yield names (default: all) with their objects; warn (PluginWarning) about those that cannot be imported."""
         for name in self.names() if names is None else names:
             try:
                 yield name, self.get(name)
@@ -164,7 +164,7 @@ class Registry(Generic[T]):
                 warnings.warn(str(error), PluginWarning, stacklevel=2)
 
     def source(self, name: str) -> str:
-        """Where a thing is from, in words: "gs2d", a package with its version, or a module of this program."""
+        """Return the origin of an object: "gs2d", a package with its version, or a module of this program."""
         if name in self._homes:
             return "gs2d"
         if name in self._offered:
@@ -182,7 +182,7 @@ class Registry(Generic[T]):
 
     @cached_property
     def _offered(self) -> dict[str, EntryPoint]:
-        """Entry points of installed packages by name; of a name that is taken the first package keeps it."""
+        """Entry points of installed packages by name; the first package keeps a name."""
         offered: dict[str, EntryPoint] = {}
         guests = [entry for entry in entry_points(group=self.group) if not entry.value.startswith(_CONTRIB)]
         for entry in sorted(guests, key=_package):
@@ -192,7 +192,7 @@ class Registry(Generic[T]):
             if taken is None:
                 offered[entry.name] = entry
             else:
-                text = f"{_package(entry)} offers the {self.what} {entry.name!r}, which {taken} has; it is left out"
+                text = f"{_package(entry)} declares the {self.what} {entry.name!r} of {taken}; it is ignored"
                 warnings.warn(text, PluginWarning, stacklevel=3)
         return offered
 
@@ -200,20 +200,20 @@ class Registry(Generic[T]):
         entry = self._offered[name]
         try:
             thing: Any = entry.load()
-        except Exception as error:  # a guest may raise anything while it is imported
+        except Exception as error:  # a plug-in may raise anything
             reason = str(error).partition("\n")[0]
             raise self._error(
                 f"{self.what} {name!r} of {_package(entry)} cannot be imported from {entry.value}: "
-                f"{type(error).__name__}: {reason}; mend or uninstall that package"
+                f"{type(error).__name__}: {reason}; fix or uninstall that package"
             ) from error
         return self._things.setdefault(name, thing)
 
 
 @functools.cache
 def contrib_entries() -> tuple[EntryPoint, ...]:
-    """Return the entry points of gs2d's own ``contrib``: () where that folder was removed.
+    """Return the entry points of ``gs2d.contrib``; () if that folder was removed.
 
-    They come from the metadata of the installed package. A clone that is not installed has them in pyproject.toml.
+    They come from the metadata of the installed package, or from pyproject.toml in a clone that is not installed.
     """
     if not (_PACKAGE / "contrib").is_dir():
         return ()
@@ -228,7 +228,7 @@ def contrib_entries() -> tuple[EntryPoint, ...]:
 
 
 def did_you_mean(name: str, names: Sequence[str]) -> str:
-    """Return "; did you mean ...?" where a name is nearly one of these, else ""."""
+    """Return "; did you mean ...?" for the nearest of the names, else ""."""
     near = difflib.get_close_matches(name, names, n=1)
     return f"; did you mean {near[0]}?" if near else ""
 
