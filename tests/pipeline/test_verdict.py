@@ -130,7 +130,7 @@ def test_the_report_begins_with_the_verdict(tmp_path: Path) -> None:
     assert '<span class="grade poor">poor</span>' in html
     assert "Take more photographs" in html
     write_json(path, {"verdict": {"grade": "good"}})
-    with pytest.raises(DataError, match=r"verdict\.json must hold a verdict"):
+    with pytest.raises(DataError, match=r"verdict\.json is damaged"):
         verdict_section(run)
 
 

@@ -11,9 +11,9 @@ import numpy as np
 from gs2d.core.image_arrays import composite
 from gs2d.core.json_files import read_json
 from gs2d.data.image_files import read_image
-from gs2d.errors import DataError
 from gs2d.io.run_dir import RENDERS
 from gs2d.report.html_parts import Pair
+from gs2d.report.run_record import reading
 
 PHOTOS = "photos"
 
@@ -81,21 +81,16 @@ def read_index(renders: Path) -> dict[str, Any] | None:
     path = renders / "index.json"
     if not path.is_file():
         return None
-    data = read_json(path)
-    try:
+    with reading(path):
+        data = read_json(path)
         index = {**data, "views": list(data.get("views", ())), "stages": [str(name) for name in data.get("stages", ())]}
         for view in index["views"]:
             _shown_view(view)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise DataError(
-            f"{path} must hold the lists views and stages as gs2d writes them, got something else; "
-            "delete it (the report then shows no views), or train again with --overwrite"
-        ) from error
     return index
 
 
 def _shown_view(entry: dict[str, Any]) -> ShownView:
-    """Return an entry of ``views`` (KeyError, TypeError, ValueError, AttributeError: it is broken)."""
+    """Return an entry of ``views``."""
     name, limits = entry["name"], entry.get("depth_limits")
     depth_limits = None if limits is None else (float(limits[0]), float(limits[1]))
     return ShownView(str(name), str(entry.get("file", name)), str(entry.get("split", "")), depth_limits)

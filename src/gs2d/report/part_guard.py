@@ -1,8 +1,9 @@
-"""Runs the parts of the report one by one, so that a part that fails does not lose the others."""
+"""Makes the parts of the report one by one, so that a part that fails does not lose the others."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TypeVar
 
 from gs2d.core.atomic_files import is_full
@@ -13,17 +14,11 @@ OnFailure = Callable[[str, Exception], None]
 """Receives the name of a part that failed, and its error."""
 
 
+@dataclass(frozen=True)
 class Guard:
-    """Make the parts of a page.
+    """Makes parts of a page; ``on_failure`` receives those that fail."""
 
-    Parameters
-    ----------
-    on_failure : callable or None
-        Receives the name and the error of each part that fails.
-    """
-
-    def __init__(self, on_failure: OnFailure | None) -> None:
-        self._on_failure = on_failure
+    on_failure: OnFailure | None
 
     def __call__(self, name: str, build: Callable[[], T]) -> T | str:
         """Return the result of ``build``, or a sentence if it raises; a full disk is raised."""
@@ -32,9 +27,8 @@ class Guard:
         except Exception as error:
             if is_full(error):
                 raise
-            if self._on_failure is not None:
-                self._on_failure(name, error)
-            why = " ".join(str(error).split()) or type(error).__name__
-            return f"The {name} could not be made: {why}"
+            if self.on_failure is not None:
+                self.on_failure(name, error)
+            return f"The {name} could not be made: {' '.join(str(error).split()) or type(error).__name__}"
         finally:
             trim()  # images and meshes were in memory

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from jinja2 import UndefinedError
+
 from gs2d.core.camera import Camera
+from gs2d.errors import DataError
 from gs2d.io.run_dir import open_run
 
 
@@ -90,6 +94,22 @@ def read_record(folder: Path, cameras: Sequence[Camera] = ()) -> RunRecord:
         events=run.events.read(),
         cameras=cameras,
     )
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn errors about the content of a file into one DataError that names the file.
+
+    Raises
+    ------
+    DataError
+    """
+    try:
+        yield
+    except DataError:
+        raise
+    except (LookupError, TypeError, ValueError, OverflowError, AttributeError, UndefinedError) as error:
+        raise DataError(f"{path} is damaged: {error!r}; the gs2d command that wrote it writes it again") from error
 
 
 def name_of(value: Any) -> str:

@@ -66,5 +66,5 @@ def test_a_picture_that_is_gone_is_said_and_a_broken_file_is_an_error(tmp_path: 
     (folder / "poses.png").unlink()
     assert "poses.png cannot be shown" in str(capture_section(RunRecord(tmp_path, {})))
     (folder / "poses.json").write_text("{}")
-    with pytest.raises(DataError, match=r"poses\.json must be as `gs2d poses` writes it, got another entry"):
+    with pytest.raises(DataError, match=r"poses\.json is damaged"):
         capture_section(RunRecord(tmp_path, {}))

@@ -6,13 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from jinja2 import UndefinedError
 
 from gs2d.core.json_files import read_json
 from gs2d.data.image_files import read_image
 from gs2d.errors import DataError
 from gs2d.report.html_parts import render
-from gs2d.report.run_record import RunRecord
+from gs2d.report.run_record import RunRecord, reading
 from gs2d.report.sections.section_registry import register_section
 
 CAPTURE = "capture"  # in a run of `gs2d reconstruct`
@@ -27,17 +26,13 @@ def capture_section(run: RunRecord) -> str | None:
     folder = next((f for f in (run.path / CAPTURE, stated) if (f / POSES_JSON).is_file()), None)
     if folder is None:
         return None
-    found = read_json(folder / POSES_JSON)
     pixels, unreadable = _image(folder / POSES_PNG)
-    try:
+    with reading(folder / POSES_JSON):
+        found = read_json(folder / POSES_JSON)
         rows = [row for row in found["photographs"] if not row["placed"]]
         lost = [(row["source"], f"{int(row['features']):,}", row["reason"]) for row in rows]
         lens = str((found.get("lens") or {}).get("about", ""))
         return render("capture.html", found=found, lens=lens, lost=lost, pixels=pixels, unreadable=unreadable)
-    except (KeyError, TypeError, ValueError, OverflowError, AttributeError, UndefinedError) as error:
-        raise DataError(
-            f"{folder / POSES_JSON} must be as `gs2d poses` writes it, got another entry ({error})"
-        ) from error
 
 
 def _image(path: Path) -> tuple[np.ndarray | None, str]:

@@ -9,10 +9,9 @@ import numpy as np
 
 from gs2d.core.camera import Zoom
 from gs2d.core.json_files import read_json
-from gs2d.errors import DataError
 from gs2d.io.run_dir import EXPOSURE, PHOTOMETRY, POSES
 from gs2d.report.html_parts import macro
-from gs2d.report.run_record import RunRecord
+from gs2d.report.run_record import RunRecord, reading
 from gs2d.report.sections.section_registry import register_section
 
 GREY = 0.5  # scene colour whose value in each photograph is in exposure.json
@@ -26,10 +25,8 @@ def learned_section(run: RunRecord) -> str | None:
         path = run.path / name
         if not path.is_file():
             continue
-        try:
+        with reading(path):
             paragraphs.append(describe(read_json(path)))
-        except (LookupError, TypeError, ValueError, OverflowError) as error:
-            raise DataError(f"{path} is damaged: {error!r}; train again to write it") from error
     return macro("lists.html", "paragraphs", paragraphs) if paragraphs else None
 
 

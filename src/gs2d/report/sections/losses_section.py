@@ -20,41 +20,27 @@ from gs2d.report.sections.section_registry import register_section
 @register_section("losses", title="Losses by photograph")
 def losses_section(run: RunRecord) -> str | None:
     """Return the report of each loss that has one, after the last stage."""
-    found = run.last.get("losses")
-    entries = [(name, e) for name, e in found.items() if isinstance(e, Mapping)] if isinstance(found, Mapping) else []
-    parts = [_of_loss(run, str(name), entry) for name, entry in entries]
+    entries = run.last.get("losses") or {}
+    parts = [_loss_part(run, name, entry) for name, entry in entries.items()]
     return Markup("\n").join(parts) if parts else None
 
 
-def _of_loss(run: RunRecord, name: str, entry: Mapping[str, Any]) -> Markup:
-    values = _figures(entry.get("by_view"))
+def _loss_part(run: RunRecord, name: str, entry: Mapping[str, Any]) -> Markup:
+    values = np.array(list((entry.get("by_view") or {}).values()), np.float64)
     return render(
         "losses.html",
         title=str(entry.get("title", name)),
         figure=str(entry.get("figure", name)),
-        median=None if values is None else float(np.median(values)),
-        plot=None if values is None else _plot(values),
-        views=_views(run.path / RENDERS / LOSSES, entry.get("shown")),
+        median=float(np.median(values)) if len(values) else None,
+        plot=_plot(values) if len(values) else None,
+        views=[_view(run.path / RENDERS / LOSSES, view) for view in entry.get("shown") or ()],
     )
 
 
-def _figures(by_view: Any) -> np.ndarray | None:
-    """Return the figure of each view, if an entry of metrics.json has them."""
-    if not isinstance(by_view, Mapping) or not all(isinstance(value, int | float) for value in by_view.values()):
-        return None
-    return np.array(list(by_view.values()), dtype=np.float64) if by_view else None
-
-
-def _views(folder: Path, shown: Any) -> list[dict[str, Any]]:
-    """Return the names of views with the titles and pixels of their images."""
-    views = []
-    for view in shown if isinstance(shown, list) else ():
-        paths = view.get("images") if isinstance(view, Mapping) else None
-        named = paths.items() if isinstance(paths, Mapping) else ()
-        images = [(title, read_image(folder / path)) for title, path in named if (folder / path).is_file()]
-        if images:
-            views.append({"name": str(view.get("name")), "images": images})
-    return views
+def _view(folder: Path, view: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the name of a view, and its images that exist, by title."""
+    paths = {title: folder / path for title, path in view["images"].items()}
+    return {"name": view["name"], "images": {title: read_image(p) for title, p in paths.items() if p.is_file()}}
 
 
 def _plot(values: np.ndarray) -> str:
