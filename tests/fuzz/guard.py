@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from gs2d.cli.app import _MENDABLE
+from gs2d.cli.app import _USER_ERRORS
 from gs2d.contrib.formats import usd_process
 from gs2d.errors import Gs2dError
 
@@ -168,7 +168,7 @@ def _judged(error: Exception) -> str | None:
     """Nothing for an error that the command line says in one line and calls the user's to mend."""
     if isinstance(error, Gs2dError):
         return "a message of several lines: " + str(error)[:200] if "\n" in str(error).strip() else None
-    if isinstance(error, OSError) and error.errno in _MENDABLE:
+    if isinstance(error, OSError) and error.errno in _USER_ERRORS:
         return None
     at = error.__traceback__
     where = ""
