@@ -205,7 +205,7 @@ def test_a_block_that_fails_leaves_the_others_and_the_merge_waits(
 
     monkeypatch.setattr(module, "train", failing)
     job = tmp_path / "job"
-    with pytest.raises(Gs2dError, match="block-0-1 failed: the disk is full; what is done is kept"):
+    with pytest.raises(Gs2dError, match="block-0-1 failed: the disk is full; finished tasks are kept"):
         blocks(tiny_blocks(capture, job))
     states = {path.stem: json.loads(path.read_text())["state"] for path in (job / "jobs").glob("*.json")}
     assert states.pop("block-0-1") == "failed"

@@ -46,7 +46,6 @@ def test_fields_are_changed_by_name_and_come_back_from_json() -> None:
         ("margin=1.5", "partition.margin must be at most 1 side of a cell, got 1.5"),
         ("min_share=1", "partition.min_share must be below 1, got 1"),
         ("min_views=0", "partition.min_views must be an integer >= 1, got 0"),
-        ("ownership=nearest", "partition.ownership must be one of center; got 'nearest'"),
         ("extent=all", "partition.extent must be one of scene, block; got 'all'"),
         ("coarse.schedule=0", r"partition.coarse.schedule must be in \(0, 1\], got 0"),
         ("coarse.side=8", "partition.coarse.side must be an integer >= 16, got 8"),

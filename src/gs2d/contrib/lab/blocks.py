@@ -1,7 +1,7 @@
-"""``gs2d blocks``: a coarse model, the blocks that it is cut into, and the merged scene, as a list of tasks.
+"""``gs2d blocks``: trains a coarse model, cuts it into blocks, trains and merges them.
 
-coarse -> partition -> blocks, side by side -> merge -> seams -> finish. Each is a value that any process can do, with
-its state in the job folder; what is done is not done again.
+The tasks are coarse -> partition -> blocks (in parallel) -> merge -> seams -> finish. Their state is in the run folder,
+and finished tasks are not run again.
 """
 
 from __future__ import annotations
@@ -49,54 +49,54 @@ from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Notice, OnEvent, ignore
 from gs2d.training.trainer import raster_settings
 
-BLOCKS_JSON = "blocks.json"  # in the job folder: what was settled
+BLOCKS_JSON = "blocks.json"  # in the run folder: the definition of the blocks
 COARSE, PARTITION, MERGE, FINISH = "coarse", "partition", "merge", "finish"
-RETRIES = 2  # of what is killed: another time it may have the memory
+RETRIES = 2  # of killed tasks, which may have lacked memory
 
 
 # -- tasks -------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, kw_only=True)
 class BlocksTask(Task):
-    """A task of one job folder.
+    """A task of a training in blocks.
 
     Attributes
     ----------
     options : TrainOptions
-        As one training of everything would have it, but for recipe and protocol, which ``blocks.json`` has.
+        Options of one training of the whole scene; recipe and protocol are in ``blocks.json``.
     block : str
-        Name of the block, where it is of one.
+        Name of the block, for tasks of one block.
     """
 
     options: TrainOptions
     block: str = ""
 
     def with_threads(self, threads: int) -> BlocksTask:
-        """Return the task on so many CPU threads."""
+        """Return the task with another number of CPU threads."""
         return replace(self, options=replace(self.options, threads=threads))
 
     def protocol(self) -> Protocol:
-        """Return the settled protocol."""
+        """Return the protocol of all blocks."""
         protocol: Protocol = decode(settled_of(self.options.out)["protocol"], Protocol, "protocol")
         return protocol
 
     def train(self, part: TrainedPart, out: Path, on_event: OnEvent, *, downscale: int | None = None) -> RunFolder:
-        """Train a part of everything, or go on."""
+        """Train a part of the scene, or continue its training."""
         self.limit()
         downscale = self.options.downscale if downscale is None else downscale
         options = replace(self.options, memory=self.memory, out=out, downscale=downscale)
         return train(options, on_event, part=part)
 
     def limit(self) -> None:
-        """Keep to the threads and the memory of the task."""
+        """Limit threads and memory to those of the task."""
         use_threads(self.options.threads)
         use_memory(self.memory)
 
     def partition(self) -> Partition:
-        """Return the partition of the job."""
+        """Return the partition."""
         return from_json(settled_of(self.options.out)["partition"])
 
     def settled(self, on_event: OnEvent) -> Settled:
-        """Return what is settled, with the scene."""
+        """Return what the blocks share, with the scene."""
         self.limit()
         data = settled_of(self.options.out)
         options = replace(self.options, memory=self.memory, protocol=self.protocol(), test_every=None)
@@ -107,10 +107,10 @@ class BlocksTask(Task):
 
 @dataclass(frozen=True, kw_only=True)
 class CoarseTask(BlocksTask):
-    """Train the coarse model of everything."""
+    """Train the coarse model of the whole scene."""
 
     def work(self, on_event: OnEvent) -> dict[str, Any]:
-        """Train, or go on."""
+        """Train, or continue."""
         settled, partition = self.settled(on_event), self.partition()
         downscale = coarse_downscale(settled.scene, partition, self.options.downscale or 1)
         recipe, out = coarse_recipe(settled.recipe, partition), coarse_folder(self.options.out)
@@ -145,13 +145,13 @@ class BlockTask(BlocksTask):
     """Train one block, with the coarse model frozen around it."""
 
     def is_done(self) -> bool:
-        """Return whether it is trained, or was found to need no training."""
+        """Return whether the block is trained, or skipped."""
         done = self.outcome()
         splats = block_folder(self.options.out, self.block) / SPLATS
         return done["state"] == "done" and (bool(done.get("skipped")) or splats.exists())
 
     def work(self, on_event: OnEvent) -> dict[str, Any]:
-        """Train, or go on."""
+        """Train, or continue."""
         out, partition = self.options.out, self.partition()
         split = read_split(partition_folder(out))
         blocks = {block.name: block for block in split.blocks}
@@ -187,10 +187,10 @@ class MergeTask(BlocksTask):
 
 @dataclass(frozen=True, kw_only=True)
 class SeamsTask(BlocksTask):
-    """Let what lies at seams learn once more, with all else frozen, and write the scene."""
+    """Train the splats at seams once more, with all others frozen, and write the scene."""
 
     def work(self, on_event: OnEvent) -> dict[str, Any]:
-        """Train, or go on; write."""
+        """Train, or continue, and write."""
         out, settled, partition = self.options.out, self.settled(on_event), self.partition()
         views = read_seam_views(out)
         if views:
@@ -219,7 +219,7 @@ class FinishTask(BlocksTask):
 
 
 def tasks_of(options: TrainOptions, partition: Partition, memory: float | None) -> list[BlocksTask]:
-    """Return the tasks of a job, each behind what it needs."""
+    """Return all tasks, each after the tasks that it needs."""
     out, jobs = options.out, options.out / "jobs"
 
     def common(name: str, after: Sequence[str] = ()) -> dict[str, Any]:
@@ -251,31 +251,31 @@ def tasks_of(options: TrainOptions, partition: Partition, memory: float | None) 
 
 # -- the command -------------------------------------------------------------------------------------------------------
 def blocks(options: BlocksOptions, on_event: OnEvent = ignore) -> RunFolder:
-    """Train a capture in blocks, as many as are needed; the job folder is the run of the merged scene.
+    """Train a capture in blocks; the folder is the run of the merged scene.
 
-    Given again after an interruption of any kind it goes on, and ends with the same bytes.
+    After an interruption the same call continues, and the result is byte-identical.
 
     Raises
     ------
     Gs2dError
-        Anything that the user can mend; what was done stays.
+        If the user has to act; finished tasks are kept.
     """
     partition = make_partition(options.blocks, options.partition_changes)
     if options.slots is not None and options.slots < 1:
         raise RecipeError(f"--slots must be a whole number >= 1, got {options.slots}")
     training = training_of(options)
     check_options(training)
-    check_job_folder(options.out)
+    check_folder(options.out)
     use_threads(options.threads)
     share = _share(options.memory, None if options.cluster else options.slots)  # on a cluster: of each machine
     use_memory(share)
     begun = (options.out / BLOCKS_JSON).exists()
-    if not begun and is_run(options.out):  # there were no blocks
+    if not begun and is_run(options.out):  # without blocks
         return _one_training(options, training, on_event)
     settled = settle(training, on_event)
     if not partition.grid and begun:
         found = settled_of(options.out)["partition"]
-        partition = replace(from_json(found), **_asked(partition))
+        partition = replace(from_json(found), **_requested(partition))
     elif not partition.grid:
         fitting = fitting_partition(settled, training, partition, on_event)
         if fitting is None:
@@ -286,13 +286,13 @@ def blocks(options: BlocksOptions, on_event: OnEvent = ignore) -> RunFolder:
     use_memory(options.memory)
     definition = settled.definition(training, partition)
     if begun:
-        check_same_job(options.out, definition)
+        check_same_definition(options.out, definition)
     tasks = tasks_of(replace(training, recipe="", overrides=(), resume=True), partition, share)
 
     def write() -> None:
         if not (options.out / BLOCKS_JSON).exists():
             write_json(options.out / BLOCKS_JSON, definition)
-        check_same_job(options.out, definition)
+        check_same_definition(options.out, definition)
 
     execute(
         tasks,
@@ -313,7 +313,7 @@ def _one_training(options: BlocksOptions, training: TrainOptions, on_event: OnEv
 
 
 def training_of(options: BlocksOptions) -> TrainOptions:
-    """Return the options of one training of everything."""
+    """Return the options of one training of the whole scene."""
     return TrainOptions(
         scene=options.scene,
         out=options.out,
@@ -331,35 +331,29 @@ def training_of(options: BlocksOptions) -> TrainOptions:
     )
 
 
-def check_job_folder(out: Path) -> None:
-    """Refuse a folder that holds something else."""
+def check_folder(out: Path) -> None:
+    """Raise if a folder holds something else."""
     if (out / BLOCKS_JSON).exists():
         return
     check_claim(out, resume=True, overwrite=False, allowed=(LOCK, "jobs"))
 
 
 def settled_of(out: Path) -> dict[str, Any]:
-    """Return what ``blocks.json`` of a job folder holds.
+    """Return the content of ``blocks.json``.
 
     Raises
     ------
     DataError, RunError
-        Missing, or changed by hand.
+        If the file is missing or damaged.
     """
-    found = read_json(out / BLOCKS_JSON)
-    if isinstance(found, dict) and found.keys() >= {"recipe", "protocol", "partition"}:
-        return found
+    data = read_json(out / BLOCKS_JSON)
+    if isinstance(data, dict) and data.keys() >= {"recipe", "protocol", "partition"}:
+        return data
     raise RunError(f"{out / BLOCKS_JSON} must hold recipe, protocol and partition, got something else; restore it")
 
 
-def check_same_job(out: Path, definition: dict[str, Any]) -> None:
-    """Refuse to go on with another definition.
-
-    Raises
-    ------
-    RunError
-        Names the first thing that differs.
-    """
+def check_same_definition(out: Path, definition: dict[str, Any]) -> None:
+    """Raise RunError, with the first difference, if the folder was begun with another definition."""
     before = settled_of(out)
     for name, value in definition.items():
         old = before.get(name)
@@ -367,13 +361,13 @@ def check_same_job(out: Path, definition: dict[str, Any]) -> None:
             check_capture(out, before, value["digest"])
         elif old != value:
             raise RunError(
-                f"{out} was begun with another {name}{difference(old, value)}; go on with the same options, or choose "
-                "another --out"
+                f"{out} was begun with another {name}{difference(old, value)}; continue with the same options, or "
+                "choose another --out"
             )
 
 
 def check_capture(out: Path, before: dict[str, Any], digest: str) -> None:
-    """Refuse to go on with another capture than ``blocks.json`` says."""
+    """Raise RunError if the capture is not that of ``blocks.json``."""
     old = before.get("capture")
     if not isinstance(old, dict) or old.get("digest") != digest:
         where = old.get("path") if isinstance(old, dict) else "the capture"
@@ -383,8 +377,8 @@ def check_capture(out: Path, before: dict[str, Any], digest: str) -> None:
         )
 
 
-def _asked(partition: Partition) -> dict[str, Any]:
-    """Return what was asked for of a partition whose grid is open, without what memory decided when it was begun."""
+def _requested(partition: Partition) -> dict[str, Any]:
+    """Return the requested fields of a partition with an open grid, without those that were set by memory."""
     decided = ("grid", "splats", "coarse")
     return {name: value for name, value in vars(partition).items() if name not in decided}
 
@@ -395,11 +389,11 @@ def _share(memory: float | None, slots: int | None) -> float | None:
 
 def _check_all_done(tasks: Sequence[Task]) -> None:
     failed = failures(tasks)
-    own = {name: reason for name, reason in failed.items() if not reason.startswith("not begun: ")} or failed
+    own = {name: reason for name, reason in failed.items() if not reason.startswith("not started: ")} or failed
     if own:
         name, reason = next(iter(own.items()))
         more = f" (and {len(own) - 1} more, in {tasks[0].record.parent})" if len(own) > 1 else ""
-        raise RunError(f"{name} failed: {reason}{more}; what is done is kept: mend that and run the command again")
+        raise RunError(f"{name} failed: {reason}{more}; finished tasks are kept; fix that and run the command again")
 
 
 __all__ = ["BLOCKS_JSON", "blocks", "tasks_of"]

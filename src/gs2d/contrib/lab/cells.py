@@ -1,4 +1,4 @@
-"""Where blocks are cut: axes along which cameras and points spread, and cells with equal shares of what is seen."""
+"""Cells of blocks: axes along which cameras and points spread, and cells of equal visible weight."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ import numpy as np
 
 from gs2d.errors import RunError
 
-TRIMMED = 0.01  # of the weight on either side, beyond which nothing is a measure of a cell's side
-_DIGITS = 12  # to which weights are rounded before they are compared: the last bits are the machine's
+TRIMMED = 0.01  # fraction of the weight at either end that is ignored for the sides of cells
+_DIGITS = 12  # to which weights are rounded, as their last bits depend on the machine
 
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Boxes in a turned frame that leave no place out and share none.
+    """Boxes in a rotated frame that tile space.
 
     Attributes
     ----------
     axes : ndarray [A, 3]
-        Unit, orthogonal; blocks are cut across them, A is 2 or 3.
+        Orthonormal axes of the grid; A is 2 or 3.
     low, high : ndarray [B, A], world units along the axes
-        A place belongs to a cell if ``low <= axes @ place < high``; infinite at the rim.
+        A point is in a cell if ``low <= axes @ point < high``; infinite at the outside.
     margin : float, world units
-        By which a block trains beyond its cell.
+        Distance by which a block trains beyond its cell.
     side : float, world units
-        Mean side of a cell, the outermost 1 % of the weight on either side of everything left out.
+        Mean side of a cell, without the outermost 1 % of the weight.
     names : tuple of str
-        Of the blocks, by their place in the grid: ``1-3``.
+        Names of the blocks: grid indices, ``1-3``.
     """
 
     axes: np.ndarray
@@ -43,7 +43,7 @@ class Cells:
         return len(self.names)
 
     def owners(self, places: np.ndarray) -> np.ndarray:
-        """Return the cell [N] int64 of each place [N, 3]; exactly one."""
+        """Return the cell [N] int64 of each point [N, 3]."""
         along = places.astype(np.float64) @ self.axes.T
         found = np.full(len(places), -1, np.int64)
         for cell in range(len(self)):
@@ -51,24 +51,24 @@ class Cells:
         return found
 
     def near(self, cell: int, places: np.ndarray) -> np.ndarray:
-        """Return which places [N, 3] lie in a cell or within its margin [N] bool."""
+        """Return which points [N, 3] lie in a cell or its margin, [N] bool."""
         along = places.astype(np.float64) @ self.axes.T
         low, high = self.low[cell] - self.margin, self.high[cell] + self.margin
         return np.asarray(((along >= low) & (along < high)).all(axis=1))
 
     def region(self, cell: int) -> tuple[tuple[Any, ...], ...]:
-        """Return a cell with its margin as plain values: axes, lower and upper ends along them."""
+        """Return a cell with its margin as plain values: axes, lower and upper ends."""
         low, high = self.low[cell] - self.margin, self.high[cell] + self.margin
         return tuple(map(tuple, self.axes.tolist())), tuple(low.tolist()), tuple(high.tolist())
 
     def distance_to_seam(self, places: np.ndarray) -> np.ndarray:
-        """Return how far each place [N, 3] is from the nearest side of its cell that another cell touches [N]."""
+        """Return the distance [N] of each point [N, 3] from the nearest side of its cell that borders another cell."""
         along, owner = places.astype(np.float64) @ self.axes.T, self.owners(places)
         sides = np.concatenate([along - self.low[owner], self.high[owner] - along], axis=1)
         return np.asarray(sides.min(axis=1))
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain values; null is infinity."""
+        """Return plain values; null stands for infinity."""
 
         def finite(values: np.ndarray) -> list[list[float | None]]:
             return [[float(value) if np.isfinite(value) else None for value in row] for row in values]
@@ -104,12 +104,12 @@ class Cells:
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """How far cameras and sparse points reach.
+    """Spread of cameras and sparse points.
 
     Attributes
     ----------
     axes : ndarray [3, 3]
-        Unit, orthogonal, the one of the largest spread first; each looks to where its largest component is positive.
+        Orthonormal axes by decreasing spread; the largest component of each is positive.
     sides : ndarray [3], world units
         Standard deviation along each.
     """
@@ -119,11 +119,11 @@ class Spread:
 
 
 def spread_of(centers: np.ndarray, points: np.ndarray | None) -> Spread:
-    """Return the principal axes of camera centres [V, 3] and sparse points [P, 3], which count as much as each other.
+    """Return the principal axes of camera centres [V, 3] and sparse points [P, 3], with equal weight.
 
-    Of points only those within the middle 90 % along each coordinate count: a few are always astray.
+    Only points within the middle 90 % along each coordinate count, to ignore outliers.
     """
-    clouds = [centers.astype(np.float64)]  # apart: cameras fly above what they see, which is no side of the scene
+    clouds = [centers.astype(np.float64)]  # separately: the height of cameras above the ground is no spread
     if points is not None and len(points) >= 10:
         points = points[np.isfinite(points).all(axis=1)].astype(np.float64)
         low, high = np.percentile(points, [5, 95], axis=0)
@@ -143,12 +143,12 @@ def cut(places: np.ndarray, weights: np.ndarray, axes: np.ndarray, grid: Sequenc
     ----------
     places : ndarray [N, 3], world units
     weights : ndarray [N]
-        What is to be shared out; places with weight 0 decide nothing.
+        Weights; points of weight 0 are ignored.
     axes : ndarray [A, 3]
-        As many as the grid has numbers.
+        One axis for each number of the grid.
     grid : A numbers
     margin : float
-        Of the mean side of a cell.
+        Fraction of the mean side of a cell.
     """
     seen = weights > 0
     along, weights = places[seen].astype(np.float64) @ axes.T, np.round(weights[seen] / weights.max(), _DIGITS)
@@ -172,7 +172,7 @@ def cut(places: np.ndarray, weights: np.ndarray, axes: np.ndarray, grid: Sequenc
 
 
 def weighted_quantile(values: np.ndarray, weights: np.ndarray, fraction: float) -> float:
-    """Return the value below which about this fraction of the weight lies; 0 of nothing."""
+    """Return the value below which about this fraction of the weight lies; 0 without values."""
     if not len(values):
         return 0.0
     order = np.argsort(values, kind="stable")

@@ -1,4 +1,4 @@
-"""The merged scene of all blocks as a run of its own: splats, scores, mesh, page and report."""
+"""The merged scene of all blocks as a run: splats, scores, mesh, page and report."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ from gs2d.pipeline.train.train_run import finish
 from gs2d.training.events import OnEvent
 from gs2d.training.trainer import raster_settings
 
-MERGED, SEAM_VIEWS = "merged.ply", "seams.json"  # in the job folder: all blocks, and the photographs of their seams
-STAGE = "blocks"  # the one stage of a merged run in metrics.json
+MERGED, SEAM_VIEWS = "merged.ply", "seams.json"  # in the run folder: merged blocks, photographs of their seams
+STAGE = "blocks"  # the stage of a merged run in metrics.json
 
 
 def merged_splats(out: Path) -> Splats:
@@ -46,7 +46,7 @@ def merged_splats(out: Path) -> Splats:
     Raises
     ------
     RunError
-        A block is not finished.
+        If a block is not finished.
     """
     split = read_split(partition_folder(out))
     coarse = finished_splats(open_run(coarse_folder(out)))
@@ -57,12 +57,12 @@ def merged_splats(out: Path) -> Splats:
 
 
 def write_merged(settled: Settled, options: TrainOptions, partition: Partition, on_event: OnEvent) -> dict[str, Any]:
-    """Write the merged splats, and what of them learns once more: ``MERGED``, ``seams.npz``, ``seams.json``.
+    """Write the merged splats and the start of the seams: ``MERGED``, ``seams.npz``, ``seams.json``.
 
     Returns
     -------
     dict
-        ``splats``, and ``views``: how many photographs show a seam.
+        Number of ``splats``, and of ``views`` that show a seam.
     """
     out, splats, views = options.out, merged_splats(options.out), tuple[str, ...]()
     if partition.seam > 0 and partition.seam_schedule > 0:
@@ -82,12 +82,12 @@ def write_merged(settled: Settled, options: TrainOptions, partition: Partition, 
 
 
 def read_seam_views(out: Path) -> tuple[str, ...]:
-    """Return the views that see the seams of a job's merged scene.
+    """Return the views that show the seams of the merged scene.
 
     Raises
     ------
     DataError, RunError
-        Missing, or changed by hand.
+        If the file is missing or damaged.
     """
     found = read_json(out / SEAM_VIEWS)
     views = found.get("views") if isinstance(found, dict) else None
@@ -97,7 +97,7 @@ def read_seam_views(out: Path) -> tuple[str, ...]:
 
 
 def write_result(settled: Settled, options: TrainOptions, partition: Partition, on_event: OnEvent) -> int:
-    """Write the merged scene as a run, its seams as they have learned; returns its splats."""
+    """Write the merged scene with its trained seams as a run; return the number of splats."""
     run, splats = RunFolder(options.out), read_splats(options.out / MERGED)
     if read_seam_views(options.out):
         rows, _ = read_start(start_file(partition_folder(options.out), SEAMS))
@@ -113,7 +113,7 @@ def write_result(settled: Settled, options: TrainOptions, partition: Partition, 
 
 
 def merged_run(settled: Settled, options: TrainOptions, scene: Scene) -> LoadedRun:
-    """Return the merged scene as other commands find it."""
+    """Return the merged scene as a loaded run."""
     resolved = ResolvedRun(
         recipe=settled.recipe,
         protocol=settled.protocol,
@@ -130,10 +130,10 @@ def merged_run(settled: Settled, options: TrainOptions, scene: Scene) -> LoadedR
 
 
 def finish_merged(settled: Settled, options: TrainOptions, on_event: OnEvent) -> dict[str, Any]:
-    """Score the merged scene, mesh it, write its page, verdict and report; returns its entry of ``metrics.json``."""
+    """Score and mesh the merged scene, write page, verdict and report; return its entry of ``metrics.json``."""
     run, memory = RunFolder(options.out), PeakMemory()
     if not run.file(SPLATS).exists():
-        raise RunError(f"{options.out} must have {SPLATS} by now, got none; run the command again")
+        raise RunError(f"{options.out} must have {SPLATS}, found none; run the command again")
     execution = Execution(**values(Execution, options))
     scene = with_prepared(settled.scene, options.out, execution, on_event, shared=True)
     loaded = merged_run(settled, options, scene)
@@ -156,7 +156,7 @@ def finish_merged(settled: Settled, options: TrainOptions, on_event: OnEvent) ->
             )
             entry |= split_metrics(scores, split)
         shown = choose_views(seen)
-        with attempted(f"pictures of {STAGE}", None, on_event):
+        with attempted(f"images of {STAGE}", None, on_event):
             draw_stage(run, loaded, shown, STAGE, splats, None)
         release(scene)
         entry["peak_memory_bytes"] = max(entry["peak_memory_bytes"], memory.read())
@@ -166,7 +166,7 @@ def finish_merged(settled: Settled, options: TrainOptions, on_event: OnEvent) ->
 
 
 def _spent(out: Path) -> dict[str, Any]:
-    """Return the iterations and seconds of everything that was trained, and the most memory of one training."""
+    """Return iterations and seconds of all trainings together, and the peak memory of one."""
     stages = [stage for run in _trained(out) for stage in run.metrics()["stages"]]
     return {
         "name": STAGE,

@@ -1,7 +1,7 @@
-"""How a capture that is too large for one training is cut into blocks, as data. Pure Python; never imports torch.
+"""Settings of how a large capture is cut into blocks. Pure Python; never imports torch.
 
-A coarse model of everything is trained first; blocks are cut of it, trained one by one or side by side with the coarse
-model frozen around them, and merged by who owns what. Why each value is as it is: docs/notebook/blocks.md.
+A coarse model of the whole scene is trained first and cut into blocks. Blocks are trained with the coarse model frozen
+around them, and merged by cells. The reasons for the defaults are in docs/notebook/blocks.md.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from gs2d.config.validate import integer, number, one_of, require
 from gs2d.errors import RecipeError
 
 MAX_BLOCKS = 10_000
-OWNERSHIP = ("center",)
 EXTENTS = ("scene", "block")
 STARTS = ("dense", "coarse")
 AUTO = "auto"
@@ -27,17 +26,16 @@ AUTO = "auto"
 
 @dataclass(frozen=True)
 class CoarseModel:
-    """The model of everything that blocks begin with, and that stands around each of them.
+    """The coarse model of the whole scene, which is frozen around each block.
 
     Attributes
     ----------
     side : int, px
-        Photographs are shrunk by a whole factor until their longer side is about this: it is to tell what is where,
-        not what it looks like from near.
+        Photographs are shrunk by an integer factor to about this longer side. Position matters here, not detail.
     max_splats : int
-        Its budget. Every block renders those that its photographs show.
+        Limit on splats. Each block renders those that its photographs show.
     schedule : float
-        Fraction of the recipe's iterations. Where surfaces are is found in the first third; blocks do the rest.
+        Fraction of the recipe's iterations. Surfaces are in place after a third.
     """
 
     side: int = 400
@@ -47,42 +45,39 @@ class CoarseModel:
 
 @dataclass(frozen=True)
 class Partition:
-    """Where blocks are cut, what each of them sees, and what they begin with.
+    """Cells, views and start of blocks.
 
     Attributes
     ----------
     grid : tuple of int
-        Blocks along the axes of the largest spread of cameras and sparse points; two numbers (along the ground) or
+        Number of blocks along the axes of the largest spread of cameras and sparse points, two (on the ground) or
         three. ``()``: as many as memory needs.
     coarse : CoarseModel
     margin : float
-        A block trains beyond its cell, on each side, by this fraction of a cell's mean side: what lies at a seam is
-        trained with what is behind it, on both sides. Costs (1 + 2 margin)^2 of the splats while it trains.
+        Fraction of the mean cell side by which a block trains beyond its cell, so that surfaces at a seam are trained
+        with their surroundings. Multiplies the trained splats by (1 + 2 margin)^2.
     min_share : float
-        A photograph belongs to a block when at least this fraction of what it shows (blending weight of the coarse
-        model's splats) is the block's, its margin included.
+        A photograph belongs to a block if at least this fraction of its blending weight in the coarse model is in the
+        block with its margin.
     min_views : int
-        A block has at least so many photographs, those that show most of it: with few, blocks stay untrained.
+        Minimum number of photographs of a block; the ones that show most of it are added.
     splats : int
-        That one block trains at most, its margin included; an open grid has as many blocks as that needs.
+        Limit on trained splats of a block with its margin, which determines the number of blocks of an open grid.
     photographs : int
-        Of one block, about, where the grid is open.
+        Approximate number of photographs of a block of an open grid.
     flat : float
-        A third axis is cut, where the grid is open, if the spread along it is more than this of that along the second:
-        land and streets are cut along the ground, a hall or a tower in space.
+        An open grid is cut along a third axis if its spread exceeds this fraction of the second axis: land and streets
+        are cut on the ground, halls and towers in space.
     seam : float
-        After the merge, splats within this fraction of a cell's mean side of a seam learn once more, with all others
-        frozen: what is left of two blocks at a seam was never drawn together.
+        After the merge, splats within this fraction of the mean cell side from a seam are trained once more, with all
+        others frozen, because the blocks on both sides were never rendered together.
     seam_schedule : float
-        How often a photograph of a seam is looked at for that, in the looks of a block at its own; by a block's last
-        rates, without coming or going, and for no more iterations than a block has. 0: not done.
+        Iterations per photograph of that training, as a fraction of those of a block; 0 disables it.
     start : "dense" or "coarse"
-        What a block begins with: the recipe's dense start, where it has one, of the block's own photographs, or the
-        coarse model's splats. Where photographs are large the coarse model knows a fraction of what they show.
-    ownership : "center"
-        The block keeps the splats whose centre lies in its cell; cells share no point and leave none out.
+        Start of a block: the recipe's dense start from the photographs of the block, if the recipe has one, or the
+        splats of the coarse model, which lack the detail of large photographs.
     extent : "scene" or "block"
-        What sizes and steps are measured by in a block: the extent of all cameras, as without blocks, or of its own.
+        Unit of sizes and steps in a block: the extent of all cameras, or of those of the block.
     """
 
     grid: tuple[int, ...] = ()
@@ -96,29 +91,22 @@ class Partition:
     seam: float = 0.05
     seam_schedule: float = 0.2
     start: str = "dense"
-    ownership: str = "center"
     extent: str = "scene"
 
     @property
     def blocks(self) -> int:
-        """How many, where the grid says it; 0: open."""
+        """Return the number of blocks; 0 for an open grid."""
         return math.prod(self.grid) if self.grid else 0
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the blocks, by their place in the grid: ``1-3``."""
+        """Return the names of the blocks, which are their grid indices: ``1-3``."""
         places = itertools.product(*map(range, self.grid)) if self.grid else ()
         return tuple("-".join(map(str, place)) for place in places)
 
 
 def check_partition(partition: Partition) -> Partition:
-    """Return a partition that can be cut.
-
-    Raises
-    ------
-    RecipeError
-        Names the field.
-    """
+    """Return a valid partition, or raise RecipeError with the invalid field."""
     where, coarse = "partition", partition.coarse
     require(len(partition.grid) in (0, 2, 3), f"{where}.grid must be 2 or 3 numbers, got {list(partition.grid)}")
     for count in partition.grid:
@@ -132,7 +120,6 @@ def check_partition(partition: Partition) -> Partition:
     require(partition.min_share < 1, f"{where}.min_share must be below 1, got {partition.min_share}")
     for name in ("seam", "seam_schedule"):
         require(getattr(partition, name) <= 1, f"{where}.{name} must be at most 1, got {getattr(partition, name)}")
-    one_of(f"{where}.ownership", partition.ownership, OWNERSHIP)
     one_of(f"{where}.start", partition.start, STARTS)
     one_of(f"{where}.extent", partition.extent, EXTENTS)
     integer(f"{where}.coarse.side", coarse.side, low=16)
@@ -143,7 +130,7 @@ def check_partition(partition: Partition) -> Partition:
 
 
 def parse_grid(text: str) -> tuple[int, ...]:
-    """Return the grid that ``--blocks`` says: ``3x3``, ``4x2x2``; () for ``auto``."""
+    """Return the grid of a value of ``--blocks`` (``3x3``, ``4x2x2``); () for ``auto``."""
     if text == AUTO:
         return ()
     parts = re.fullmatch(r"(\d{1,5})x(\d{1,5})(?:x(\d{1,5}))?", text)
@@ -187,7 +174,7 @@ def from_json(data: Any) -> Partition:
 
 
 def grid_for(blocks: int, spread: Sequence[float], flat: float) -> tuple[int, ...]:
-    """Return a grid of at least so many blocks whose cells are about as long as wide.
+    """Return a grid of at least ``blocks`` blocks with cells of about equal sides.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What all blocks have in common, settled before anything is trained: recipe, protocol, capture, grid."""
+"""What all blocks share, resolved before training: recipe, protocol, capture and grid."""
 
 from __future__ import annotations
 
@@ -34,24 +34,24 @@ from gs2d.render.backends import Backend
 from gs2d.training.events import Notice, OnEvent
 
 FORMAT = 1
-SEAM_RATES = 0.3  # of a block's iterations, its last: by their rates seams learn. Full ones undo more than they mend
-COARSE_PART = 3  # of the splats that fit, at least, are the blocks': the coarse model has a third at most
+SEAM_RATES = 0.3  # last fraction of a block's iterations, whose learning rates seams use; higher ones do harm
+COARSE_PART = 3  # the coarse model has at most 1/3 of the splats that fit into memory
 
 
 @dataclass(frozen=True, eq=False)
 class Settled:
-    """What all blocks have in common.
+    """What all blocks share.
 
     Attributes
     ----------
     scene : Scene
     recipe : Recipe
-        As one training of everything would have it.
+        Recipe of one training of the whole scene.
     protocol : Protocol
-        With the near plane and the background of the whole.
+        With near plane and background of the whole scene.
     backend : Backend
     capture : str
-        A hash of cameras, points, and sizes and times of files: whether the capture is still what it was.
+        Hash of cameras, points, and sizes and times of files, to detect changes of the capture.
     """
 
     scene: Scene
@@ -61,7 +61,7 @@ class Settled:
     capture: str
 
     def definition(self, options: TrainOptions, partition: Partition) -> dict[str, Any]:
-        """Return what is written down and compared when the command is given again."""
+        """Return the content of ``blocks.json``, which is compared when a run continues."""
         return {
             "format": FORMAT,
             "capture": {"path": str(options.scene.resolve()), "digest": self.capture, "format": self.scene.format},
@@ -75,7 +75,7 @@ class Settled:
 
 
 def settle(options: TrainOptions, on_event: OnEvent) -> Settled:
-    """Read the headers of a capture and settle what all blocks have in common; nothing is written."""
+    """Read the headers of a capture and resolve what all blocks share; nothing is written."""
     check_options(options)
     if is_archive(options.scene):
         remedy = suggestion(options.scene, "capture")
@@ -85,31 +85,30 @@ def settle(options: TrainOptions, on_event: OnEvent) -> Settled:
     recipe, resolved = resolve(options, opened, on_event, seed=options.seed, schedule_scale=scale)
     if recipe.learns("poses"):
         raise RecipeError(
-            "blocks need cameras that stay where they are, got a recipe that refines poses; refine them in a run of "
-            "its own, or leave poses out of --learn"
+            "blocks need fixed cameras, got a recipe that learns poses; learn them in a run of its own, or leave poses "
+            "out of --learn"
         )
     if recipe.learns("vignetting", "response"):
         raise RecipeError(
-            "blocks need cameras whose light is known, got a recipe that learns vignetting or response; leave both out "
-            "of --learn"
+            "blocks learn neither vignetting nor response, got a recipe that does; leave both out of --learn"
         )
     protocol = replace(resolved.protocol, near=resolved.protocol.near_for(opened.scene.extent))
     return Settled(opened.scene, recipe, protocol, opened.backend, capture_digest(opened.scene))
 
 
 def open_settled(options: TrainOptions, recipe: Recipe, on_event: OnEvent) -> Settled:
-    """Read the headers of a capture for a recipe and a protocol (of the options) that are settled."""
+    """Read the headers of a capture for a resolved recipe, and a resolved protocol in the options."""
     opened = open_capture(replace(options, downscale=options.downscale or 1), on_event)
     return Settled(opened.scene, recipe, opened.protocol, opened.backend, capture_digest(opened.scene))
 
 
 def capture_digest(scene: Scene) -> str:
-    """Return a hash of what a scene is made of: cameras, points, and names, sizes and times of photographs.
+    """Return a hash of cameras, points, and names, sizes and times of photographs.
 
     Raises
     ------
     DataError
-        A photograph is gone.
+        If a photograph is missing.
     """
     digest = hashlib.sha256()
     for split, views in (("train", scene.train), ("test", scene.test)):
@@ -134,7 +133,7 @@ def capture_digest(scene: Scene) -> str:
 def fitting_partition(
     settled: Settled, options: TrainOptions, partition: Partition, on_event: OnEvent
 ) -> Partition | None:
-    """Return the partition with as many blocks as memory needs; None where everything fits into one training."""
+    """Return the partition with as many blocks as memory needs; None if one training fits into memory."""
     found: Estimate | None = None
     recipe = settled.recipe
     try:
@@ -142,9 +141,9 @@ def fitting_partition(
             settled.scene, recipe, settled.backend, downscale=(options.downscale or 1), prepare=options.prepare
         )
     except DataError as error:
-        on_event(Notice(f"not in one training: {error}"))
+        on_event(Notice(f"one training does not fit: {error}"))
     if found is not None and found.max_splats is None:
-        on_event(Notice("one training of everything fits into memory: no blocks (--blocks 3x3 makes some)"))
+        on_event(Notice("one training fits into memory: no blocks (--blocks 3x3 makes some)"))
         return None
     room = partition.splats if found is None or found.max_splats is None else found.max_splats
     coarse = replace(partition.coarse, max_splats=max(2, min(partition.coarse.max_splats, room // COARSE_PART)))
@@ -162,7 +161,7 @@ def fitting_partition(
     on_event(
         Notice(
             f"blocks: {'x'.join(map(str, grid))}, of {trained:,} splats at most in "
-            f"{'the memory there is' if allowed is None else f'{allowed / 2**30:.3g} GiB'}"
+            f"{'the available memory' if allowed is None else f'{allowed / 2**30:.3g} GiB'}"
         )
     )
     return replace(partition, grid=grid, splats=trained, coarse=coarse)
@@ -170,7 +169,7 @@ def fitting_partition(
 
 # -- recipes -----------------------------------------------------------------------------------------------------------
 def with_budget(recipe: Recipe, splats: int) -> Recipe:
-    """Return the recipe with no more than so many splats, where it densifies by numbers that are known."""
+    """Return the recipe with a limit on splats, for densifiers that have one."""
 
     def kept(densify: GradDensify | Densify | None) -> GradDensify | Densify | None:
         if isinstance(densify, GradDensify):
@@ -184,7 +183,7 @@ def with_budget(recipe: Recipe, splats: int) -> Recipe:
 
 
 def budget_of(recipe: Recipe) -> int | None:
-    """Return the splats that a recipe allows everything; None: any number."""
+    """Return the limit on splats of a recipe; None: unlimited."""
     limits = (limit_of(stage.densify) for stage in recipe.stages if stage.densify is not None)
     return next((limit for limit in limits if limit is not None), None)
 
@@ -198,32 +197,30 @@ def coarse_recipe(recipe: Recipe, partition: Partition) -> Recipe:
 
 
 def coarse_downscale(scene: Scene, partition: Partition, downscale: int) -> int:
-    """Return by how much photographs are shrunk for the coarse model, in all."""
+    """Return the factor by which photographs are shrunk for the coarse model."""
     longer = max(max(view.camera.width, view.camera.height) for view in scene.views)
     return downscale * max(1, round(longer / partition.coarse.side))
 
 
 def block_recipe(recipe: Recipe, partition: Partition, block: BlockOfSplit) -> Recipe:
-    """Return the recipe of a block: from splats whose colours have all degrees, in exposures that are settled.
+    """Return the recipe of a block: with all SH degrees from the start, and fixed exposures.
 
-    Its budget is its share of that of everything, by how much of all that is seen lies in it.
+    The limit on splats is the fraction ``block.weight`` of that of the whole scene.
     """
     whole = budget_of(recipe)
     most = partition.splats if whole is None else min(partition.splats, math.ceil(whole * block.weight))
     stages = tuple(replace(stage, sh_interval=0) for stage in recipe.stages)
     dense = recipe.dense_start if partition.start == "dense" else None
-    dense = (
-        None if dense is None else replace(dense, required=False)
-    )  # where it finds nothing there is the coarse model
+    dense = None if dense is None else replace(dense, required=False)  # else the coarse model is the start
     value = replace(_with_given_exposure(recipe), stages=stages, dense_start=dense)
     return validate(with_budget(value, max(2, most)))
 
 
 def seam_recipe(recipe: Recipe, partition: Partition, photographs: float) -> Recipe:
-    """Return the recipe by which splats at seams learn once more: by the last rates of a block; none comes or goes.
+    """Return the recipe of splats at seams: with the last learning rates of a block, without densification.
 
-    ``photographs`` is how many show a seam, in those of a mean block: each is looked at as often, whatever it is, until
-    the seams have as many iterations as a block.
+    ``photographs`` is the number of photographs that show a seam over that of a mean block. Iterations are proportional
+    to it, up to those of a block.
     """
     part = min(1.0, partition.seam_schedule * max(1.0, photographs))
     block, stage = recipe.stages[0], scale_schedule(recipe, part).stages[0]
@@ -242,7 +239,7 @@ def seam_recipe(recipe: Recipe, partition: Partition, photographs: float) -> Rec
 
 
 def _with_given_exposure(recipe: Recipe) -> Recipe:
-    """Return the recipe with exposures that stay as they are given, if it learns any."""
+    """Return the recipe with fixed exposures, if it learns exposures."""
     exposure = recipe.quantities.get("exposure")
     return recipe if exposure is None else recipe.with_learned(exposure.with_options(initial="given"))
 
@@ -258,7 +255,7 @@ def coarse_folder(out: Path) -> Path:
 
 
 def partition_folder(out: Path) -> Path:
-    """Return where cells and beginnings of blocks are."""
+    """Return the folder of the cells and start files of blocks."""
     return out / "partition"
 
 

@@ -1,4 +1,4 @@
-"""A coarse model cut into blocks: cells of equal visible weight, the photographs of each, and what it trains."""
+"""Cuts a coarse model into blocks: cells of equal visible weight, their photographs and their trained splats."""
 
 from __future__ import annotations
 
@@ -23,33 +23,33 @@ from gs2d.render.types import RasterSettings
 from gs2d.training.events import Notice, OnEvent, counted
 from gs2d.training.robust.seen_area import shown_weights, shrunk
 
-SIDE = 200  # px, of the pictures in which is looked at what shows what: fractions do not need more
-LEAST_WEIGHT = 1e-3  # px of a splat in a picture, from which it is shown there
-SEAMS = "seams"  # what is trained once more after the merge
-CELLS = "cells.json"  # in the folder of the partition, last: it is whole then
+SIDE = 200  # px, of the renderings in which visibility is measured
+LEAST_WEIGHT = 1e-3  # px, smallest blending weight of a visible splat
+SEAMS = "seams"  # name of the start file of the seams
+CELLS = "cells.json"  # written last
 FORMAT = 1
 
 
 @dataclass(frozen=True)
 class BlockOfSplit:
-    """One part of the scene.
+    """A block of the scene.
 
     Attributes
     ----------
     name : str
-        By its place in the grid: ``1-3``.
+        Grid indices, ``1-3``.
     views : tuple of str
-        Training photographs, in the scene's order; none where the block is left as the coarse model has it.
+        Training photographs, in the order of the scene; () if the block is not trained.
     floor : int
-        How many of them are there only so that there are enough.
+        Number of photographs that were added to reach ``Partition.min_views``.
     own, frozen, core : int
-        Splats of the coarse model that train, that stay around them, and that lie in the cell.
+        Number of coarse splats that are trained, that are frozen, and that lie in the cell.
     weight : float
-        Fraction of all that is seen that lies in the cell and its margin.
+        Fraction of the visible weight of the scene in the cell and its margin.
     extent : float, world units
-        Of its cameras.
+        Extent of the cameras of the block.
     skipped : str
-        Why it is not trained; empty where it is.
+        Reason if the block is not trained, else empty.
     """
 
     name: str
@@ -65,7 +65,7 @@ class BlockOfSplit:
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Cells and their blocks, in one order."""
+    """Cells and their blocks, in the same order."""
 
     cells: Cells
     blocks: tuple[BlockOfSplit, ...]
@@ -87,7 +87,7 @@ class Split:
 
 
 def start_file(folder: Path, block: str) -> Path:
-    """Return where it is said what a block begins with."""
+    """Return the path of the start file of a block."""
     return folder / f"{block}.npz"
 
 
@@ -105,7 +105,7 @@ def split_model(
     folder: Path,
     on_event: OnEvent,
 ) -> Split:
-    """Cut a coarse model and write what each block trains: ``BLOCK.npz``, and at last ``cells.json``.
+    """Cut a coarse model into blocks; write their start files ``BLOCK.npz``, then ``cells.json``.
 
     Parameters
     ----------
@@ -114,23 +114,22 @@ def split_model(
     partition : Partition
         With a grid.
     raster : RasterSettings
-        Of training.
+        Settings of training.
     backend : Backend
     folder : Path
 
     Raises
     ------
     DataError
-        No photograph shows anything of the model.
-    DiskError
+        If no photograph shows the model.
     """
     looks = Looks(splats, scene.train, raster, backend)
     places = splats.means.detach().cpu().numpy()
     total = np.zeros(len(splats))
-    for weights in counted(looks.all(), "looking at what is seen", len(scene.train), on_event):
+    for weights in counted(looks.all(), "measuring visibility", len(scene.train), on_event):
         total += weights
     if not (total > 0).any():
-        raise DataError("no photograph shows anything of the coarse model; check the cameras with `gs2d info`")
+        raise DataError("no photograph shows the coarse model; check the cameras with `gs2d info`")
     spread = spread_of(np.array([view.camera.center for view in scene.train]), _points(scene))
     cells = cut(places, total, spread.axes[: len(partition.grid)], partition.grid, partition.margin)
     near = np.stack([cells.near(cell, places) for cell in range(len(cells))])  # [B, N]
@@ -144,9 +143,9 @@ def split_model(
         core = int((owner == cell).sum())
         views = tuple(scene.train[i].name for i in chosen)
         own, frozen = near[cell] & seen[cell], ~near[cell] & seen[cell]
-        why = "none of its splats is seen" if not own.any() else "no photograph shows it" if not views else ""
+        why = "none of its splats is visible" if not own.any() else "no photograph shows it" if not views else ""
         if why:
-            on_event(Notice(f"block {name} is not trained: {why}; it stays as the coarse model has it ({core} splats)"))
+            on_event(Notice(f"block {name} is not trained: {why}; its {core} splats are those of the coarse model"))
         rows = FROZEN * frozen.astype(np.uint8) + OWN * own.astype(np.uint8)
         known = _exposures(scene, views)
         write_start(start_file(folder, name), rows, known)
@@ -169,17 +168,17 @@ def split_seams(
     folder: Path,
     on_event: OnEvent,
 ) -> tuple[str, ...]:
-    """Write which splats of a merged scene learn once more, those at seams that are seen; arguments as of a model.
+    """Write the start file of the visible splats at seams of a merged scene; parameters as of ``split_model``.
 
     Returns
     -------
     tuple of str
-        Photographs that show them: at least half as much as a block's photographs show of it. None: nothing to do.
+        Photographs that show these splats with at least half of ``Partition.min_share``; () if there are none.
     """
     places, width = splats.means.detach().cpu().numpy(), partition.seam * split.cells.side
     strip = split.cells.distance_to_seam(places) < width
     looks, shares, seen = Looks(splats, scene.train, raster, backend), [], np.zeros(len(splats), dtype=bool)
-    for weights in counted(looks.all(), "looking at seams", len(looks), on_event):
+    for weights in counted(looks.all(), "measuring seams", len(looks), on_event):
         shares.append(weights[strip].sum() / max(weights.sum(), LEAST_WEIGHT))
         if shares[-1] >= partition.min_share / 2:
             seen |= weights > LEAST_WEIGHT
@@ -192,19 +191,19 @@ def split_seams(
 
 
 def _exposures(scene: Scene, names: Sequence[str]) -> np.ndarray | None:
-    """Return the transforms [V, 3, 4] of some training views; None if none were learned."""
+    """Return the exposure transforms [V, 3, 4] of training views; None if none were learned."""
     known = {view.name: view.appearance["exposure"] for view in scene.train if "exposure" in view.appearance}
     return np.stack([known[name] for name in names]) if known and names else None
 
 
 class Looks:
-    """What each view of a scene shows of each splat: blending weights [N] px float64, view by view."""
+    """Blending weights [N] (px, float64) of all splats in each view of a scene."""
 
     def __init__(self, splats: Splats, views: Sequence[View], raster: RasterSettings, backend: Backend) -> None:
         self._splats, self._views, self._raster, self._backend = splats, views, raster, backend
 
     def at(self, index: int) -> np.ndarray:
-        """Return those of a view."""
+        """Return the weights in a view."""
         camera = shrunk(self._views[index].camera, SIDE)
         found = shown_weights(self._splats, camera, self._raster, self._backend)
         return np.asarray(found.cpu().numpy().astype(np.float64))
@@ -213,14 +212,14 @@ class Looks:
         return len(self._views)
 
     def all(self) -> Iterator[np.ndarray]:
-        """Yield those of each view."""
+        """Yield the weights in each view."""
         return map(self.at, range(len(self)))
 
 
 def _shares(
     looks: Looks, near: np.ndarray, partition: Partition, on_event: OnEvent
 ) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return shares of views [V, B], and which splats [N] the photographs of each block show that show enough of it."""
+    """Return shares of views [V, B], and for each block which splats [N] its photographs show."""
     shares = np.zeros((len(looks), len(near)))
     seen = [np.zeros(near.shape[1], dtype=bool) for _ in near]
     for index, weights in enumerate(counted(looks.all(), "choosing photographs", len(looks), on_event)):
@@ -234,7 +233,7 @@ def _shares(
 
 
 def choose_views(shares: np.ndarray, partition: Partition) -> tuple[np.ndarray, list[int]]:
-    """Return the views of a block by what fraction of each is the block's [V]: all, sorted, and those of the floor."""
+    """Return the views of a block, sorted, and those that were added to reach the minimum, from shares [V]."""
     chosen = np.flatnonzero((shares >= partition.min_share) & (shares > 0))
     lacking = partition.min_views - len(chosen)
     floor: list[int] = []
@@ -249,19 +248,18 @@ def _points(scene: Scene) -> np.ndarray | None:
 
 
 def merge(coarse: Splats, split: Split, trained: dict[str, Splats], rows: dict[str, np.ndarray]) -> Splats:
-    """Return one scene: of each block, in order, the splats whose centre lies in its cell.
+    """Return the merged scene: for each block, the splats whose centre lies in its cell.
 
-    Those that the block trained, and then those of the coarse model in its cell that it did not train: the block has
-    seen nothing of them, or has not been trained at all.
+    These are the trained splats of the block, then coarse splats that it did not train.
 
     Parameters
     ----------
     coarse : Splats
     split : Split
     trained : dict of name to Splats
-        Of the blocks that were trained.
+        Splats of the trained blocks.
     rows : dict of name to ndarray [N]
-        What those began with, of the coarse model.
+        Kinds of the coarse splats, from the start files of these blocks.
     """
     owner = split.cells.owners(coarse.means.detach().cpu().numpy())
     parts = []
