@@ -26,6 +26,7 @@ def write_tiny_flight(folder: Path, photographs: int = 12) -> Path:
 
 
 PARTITION = ("partition.min_views=3", "partition.coarse.schedule=0.5")
+CHANGES = (*WORDS, "surface.densify.max_splats=600", *PARTITION)
 
 
 def tiny_blocks(capture: Path, out: Path, **changes: Any) -> BlocksOptions:
@@ -37,7 +38,7 @@ def tiny_blocks(capture: Path, out: Path, **changes: Any) -> BlocksOptions:
         recipe="2dgs",
         robust="off",
         schedule_scale=0.0006,
-        overrides=(*WORDS, "surface.densify.max_splats=600", *PARTITION),
+        overrides=CHANGES,
         backend="cpu",
         threads=1,
         page=False,

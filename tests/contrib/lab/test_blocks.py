@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from benchmarks.flight import Flight, write_flight
 
-from flown import digest, tiny_blocks, write_tiny_flight
+from flown import CHANGES, PARTITION, digest, tiny_blocks, write_tiny_flight
 from gs2d.contrib.lab import blocks as module
 from gs2d.contrib.lab.block_start import FROZEN, OWN, read_start
 from gs2d.contrib.lab.blocks import blocks
@@ -123,7 +123,7 @@ def test_blocks_of_the_default_recipe_begin_with_a_dense_start_of_their_own_cell
     capture, job = tmp_path / "capture", tmp_path / "job"
     write_flight(capture, Flight(16, width=64, height=48, points=800, side=90.0), threads=1)
     options = tiny_blocks(
-        capture, job, recipe="best", robust="auto", learn="exposure", overrides=(), schedule_scale=0.002
+        capture, job, recipe="best", robust="auto", learn="exposure", overrides=PARTITION, schedule_scale=0.002
     )
     blocks(options)
     split, starts = read_split(job / "partition"), []
@@ -149,7 +149,10 @@ def test_blocks_of_the_default_recipe_begin_with_a_dense_start_of_their_own_cell
     ("changes", "text"),
     [
         ({"blocks": "2x3"}, r"begun with another partition \(grid.1: 2, now 3\)"),
-        ({"partition": ("min_views=4", "coarse.schedule=0.5")}, r"another partition \(min_views: 3, now 4\)"),
+        (
+            {"overrides": tuple(text.replace("min_views=3", "min_views=4") for text in CHANGES)},
+            r"another partition \(min_views: 3, now 4\)",
+        ),
         ({"schedule_scale": 0.001}, "begun with another recipe"),
         ({"seed": 3}, r"begun with another recipe \(seed: 0, now 3\)"),
         ({"downscale": 2}, "begun with another capture"),
@@ -181,7 +184,7 @@ def test_a_capture_that_changed_is_told_and_nothing_is_lost(straight: Path, capt
         ({"blocks": "0x2"}, "--blocks must be auto, or two or three whole numbers of 1 or more"),
         ({"slots": 0}, "--slots must be a whole number >= 1, got 0"),
         ({"recipe": "no-such"}, "no-such"),
-        ({"partition": ("margin=2",)}, "partition.margin must be at most 1"),
+        ({"overrides": ("partition.margin=2",)}, "partition.margin must be at most 1"),
     ],
 )
 def test_what_cannot_be_done_is_one_line_and_leaves_nothing(

@@ -66,7 +66,9 @@ def test_a_block_without_splats_is_told_and_stays_as_the_coarse_model_has_it(tmp
     assert skipped
     assert skipped[0].views == ()
     texts = [event.text for event in told if isinstance(event, Notice)]
-    assert any(text.startswith(f"block {skipped[0].name} is not trained: none of its splats is visible") for text in texts)
+    assert any(
+        text.startswith(f"block {skipped[0].name} is not trained: none of its splats is visible") for text in texts
+    )
     trained = {b.name: splats.rows(torch.zeros(80, dtype=torch.bool)) for b in found.blocks if not b.skipped}
     rows = {name: np.full(80, OWN, np.uint8) for name in trained}
     assert len(merge(splats, found, trained, rows)) == sum(block.core for block in skipped)
