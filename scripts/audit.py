@@ -1,7 +1,7 @@
-"""Look at what gs2d depends on: licences, by their metadata, and known vulnerabilities, by pip-audit. `make audit`.
+"""Check the licences of the dependencies, by metadata, and known vulnerabilities, with pip-audit (`make audit`).
 
-Exit code 0: nothing found. 1: something is. 3: vulnerabilities could not be looked up here (pip-audit is not installed,
-or its database cannot be reached); licences were looked at nevertheless.
+Exit codes: 0 without findings, 1 with findings, 3 if pip-audit is not installed or cannot reach its database; licences
+are checked in any case.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
 #!/bin/sh
-# Builds the container's image, `gs2d`, with docker, podman or buildah, whichever works here, and tries it: with no
-# network, as a user id without a name, with a work folder mounted. Version, doctor, a short demo, and cameras of the
-# demo's photographs by COLMAP. At the end it says how large the image is, and what of it.
+# Build the container image `gs2d` with docker, podman or buildah, and test it without network, as a user id without a
+# name, with a mounted work folder: version, doctor, a short demo, and COLMAP on the images of the demo. Prints the size
+# of the image and of its parts.
 # Usage: scripts/build_container.sh [--debootstrap] [OPTION OF THE BUILDER...]
 #
 #   scripts/build_container.sh --build-arg PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu   # for CPUs only
 #
-# --debootstrap (as root, on Debian) makes the base image of Debian's packages, where no registry of images is at hand.
-# Where a builder may not make namespaces (in a container, in some virtual machines): BUILDAH_ISOLATION=chroot.
+# --debootstrap (as root, on Debian) makes the base image from Debian packages, without an image registry.
+# BUILDAH_ISOLATION=chroot is needed where a builder may not create namespaces (in containers, some virtual machines).
 set -eu
 cd "$(dirname "$0")/.."
 tool=""

@@ -1,13 +1,13 @@
-"""Compile the CUDA kernels for every architecture into the package, for a wheel that needs no compiler where it runs.
+"""Compile the CUDA kernels for every architecture into the package, for a wheel that needs no compiler at run time.
 
 ::
 
     PYTHONPATH=src python scripts/build_cubins.py [FOLDER]
     python -m pip wheel . --no-deps
 
-FOLDER is ``src/gs2d/kernels/cuda/cubins`` by default, which git ignores and a wheel takes in. Build with the oldest
-CUDA that knows all architectures, 12.8 (``pip install cuda-bindings==12.8.* nvidia-cuda-nvrtc-cu12==12.8.*``): a driver
-takes code of its own major version of CUDA and of older ones. Kernels that spill are refused. No GPU is needed.
+FOLDER is ``src/gs2d/kernels/cuda/cubins`` by default, which git ignores and wheels include. Build with the oldest CUDA
+that knows all architectures, 12.8 (``pip install cuda-bindings==12.8.* nvidia-cuda-nvrtc-cu12==12.8.*``): a driver
+accepts code of its own and of older major versions of CUDA. Kernels that spill are refused. No GPU is needed.
 """
 
 from __future__ import annotations

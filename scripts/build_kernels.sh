@@ -1,5 +1,5 @@
 #!/bin/sh
-# Builds the CPU kernels of a source checkout into src/gs2d/kernels/lib/ (git-ignored).
+# Build the CPU kernels of a source checkout into src/gs2d/kernels/lib/ (git-ignored).
 # Usage: scripts/build_kernels.sh [cmake options, e.g. -DCMAKE_CXX_COMPILER=clang++]
 set -eu
 root=$(cd "$(dirname "$0")/.." && pwd)

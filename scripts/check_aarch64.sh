@@ -1,13 +1,12 @@
 #!/bin/sh
-# Installs the wheel of 64-bit Arm with a Python of that processor under QEMU, runs `gs2d doctor` from it, and compares
-# with this machine what it draws, its gradients and a short training (scripts/compare_machines.py).
+# Install the 64-bit Arm wheel with an Arm Python under QEMU, run `gs2d doctor` from it, and compare images, gradients
+# and a short training with this machine (scripts/compare_machines.py).
 # Usage: scripts/check_aarch64.sh WHEEL PYTHON
 #        (Debian, as root, on x86-64: apt install qemu-user-static debootstrap; PYTHON has gs2d of the same sources,
 #        installed or by PYTHONPATH)
 #
-# Nothing of this machine is set for it, and no program of Arm is run but by QEMU by name: Debian's packages are
-# unpacked into a temporary folder, not configured. torch is 2.10.0, whose wheel for Arm on the package index is without
-# CUDA (that of 2.13.0 wants its libraries).
+# No setting of this machine is changed: Debian packages are unpacked into a temporary folder, not configured, and Arm
+# programs are started by QEMU explicitly. torch is 2.10.0, whose Arm wheel needs no CUDA libraries.
 set -eu
 [ $# = 2 ] || { sed -n "s/^# *//; 4,6p" "$0" >&2; exit 2; }
 wheel=$(cd "$(dirname "$1")" && pwd)/$(basename "$1")

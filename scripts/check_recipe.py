@@ -1,9 +1,9 @@
-"""Renders the conda recipe for each platform, as rattler-build would before it builds; no conda channel is asked.
+"""Render the conda recipe for each platform, as rattler-build does before a build, without a conda channel.
 
     python -m venv build/recipe-tools && build/recipe-tools/bin/pip install py-rattler-build==0.73.0
     build/recipe-tools/bin/python scripts/check_recipe.py
 
-A mistake in the recipe or its variants is an error of rattler-build's, and exit code 1.
+A mistake in the recipe or its variants is reported by rattler-build, with exit code 1.
 """
 
 from __future__ import annotations

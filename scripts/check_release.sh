@@ -1,5 +1,5 @@
 #!/bin/sh
-# Installs a wheel into an empty environment, from wheels alone (no compiler), and runs a short demo from it.
+# Install a wheel into an empty environment, from wheels only (no compiler), and run a short demo.
 # Usage: scripts/check_release.sh WHEEL [PYTHON]     (the environment is a temporary folder; torch is downloaded)
 set -eu
 wheel=$(cd "$(dirname "$1")" && pwd)/$(basename "$1")
@@ -7,7 +7,7 @@ work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 "${2:-python3}" -m venv "$work/env"
 pip="$work/env/bin/pip --disable-pip-version-check -q install --only-binary :all:"
-cd "$work"    # nothing of a checkout is importable
+cd "$work"    # outside the checkout, so that it cannot be imported
 unset PYTHONPATH
 started=$(date +%s)
 $pip torch

@@ -1,7 +1,7 @@
-"""What two processors make of the same: images and gradients of random splats, and a training of some iterations.
+"""Compare two processors: images and gradients of random splats, and a short training.
 
-    python scripts/compare_machines.py make OUT.npz --capture FOLDER     # on each; FOLDER is made if it is not there
-    python scripts/compare_machines.py compare A.npz B.npz               # fails where they differ by more than rounding
+    python scripts/compare_machines.py make OUT.npz --capture FOLDER     # on each machine; creates FOLDER
+    python scripts/compare_machines.py compare A.npz B.npz               # fails if they differ by more than rounding
 
 `scripts/check_aarch64.sh` runs it on this machine and under QEMU.
 """

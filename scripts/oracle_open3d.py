@@ -1,13 +1,13 @@
-"""What Open3D 0.19 says of the seeded scenes in ``tests/helpers/oracle_scenes.py``.
+"""Score the seeded scenes of ``tests/helpers/oracle_scenes.py`` with Open3D 0.19.
 
-An independent check of ``gs2d.evaluation``, which never imports Open3D. Run once, in an environment of its own::
+An independent check of ``gs2d.evaluation``, which never imports Open3D. Run once, in a separate environment::
 
-    python -m venv /somewhere/oracle && /somewhere/oracle/bin/pip install open3d-cpu==0.19.0
-    /somewhere/oracle/bin/python scripts/oracle_open3d.py > tests/helpers/oracle_open3d.json
+    python -m venv build/oracle && build/oracle/bin/pip install open3d-cpu==0.19.0
+    build/oracle/bin/python scripts/oracle_open3d.py > tests/helpers/oracle_open3d.json
 
-Tanks and Temples: cropping, thinning, RANSAC over camera centres, ICP with scale and nearest distances are Open3D's, in
-the steps and with the criteria of the official script. DTU: points on every triangle, one triangle at a time, thinned
-one by one in a shuffled order; distances are Open3D's.
+Tanks and Temples: Open3D crops, thins, runs RANSAC over camera centres and ICP with scale, and computes nearest
+distances, in the steps and with the criteria of the official script. DTU: points are sampled on every triangle, one
+triangle at a time, and thinned one by one in a shuffled order; Open3D computes the distances.
 """
 
 from __future__ import annotations

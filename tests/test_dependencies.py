@@ -1,4 +1,4 @@
-"""What gs2d needs: all of it is declared, and all of it may be shipped with gs2d under Apache-2.0."""
+"""Dependencies: every import is declared, and every licence is compatible with Apache-2.0."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text
 EXTRAS = {name: lines for name, lines in PROJECT["optional-dependencies"].items() if name not in ("dev", "docs")}
 DECLARED = [*PROJECT["dependencies"], *(line for lines in EXTRAS.values() for line in lines)]
 UNFREE = re.compile(r"\bA?GPL|(?<!Lesser )General Public License|non-?commercial|proprietary", re.IGNORECASE)
-# Packages whose metadata name such a licence, each looked into.
+# Packages whose metadata name such a licence, each checked by hand.
 ALLOWED = {
     "scipy": "BSD; the text names the run-time library of gfortran in its wheel (GPL 3 with the exception for GCC's "
     "run-time libraries, which lets any program carry it)",
     "matplotlib": "its own; the text names FreeType, in its wheel, under the FTL or the GPL 2: the FTL is taken",
     "nvidia-cuda-nvrtc": "NVIDIA's, of extras only: may be passed on with a program, as torch's wheels do",
 }
-# Imported where a user has installed one of them, never declared: their wheels carry LGPL code (HEIC).
+# Imported if the user has installed one of them, never declared: their wheels contain LGPL code (HEIC).
 USERS_OWN = {"pi_heif", "pillow_heif"}
 
 
 def needed(requirements: Iterable[str], found: set[str]) -> set[str]:
-    """Return the installed packages among requirements, and what they need in turn."""
+    """Return the installed packages among requirements, with their own requirements."""
     for requirement in map(Requirement, requirements):
         name = canonicalize_name(requirement.name)
         if name in found or (requirement.marker and not requirement.marker.evaluate({"extra": ""})):
@@ -41,7 +41,7 @@ def needed(requirements: Iterable[str], found: set[str]) -> set[str]:
         try:
             rest = importlib.metadata.requires(name) or []
         except importlib.metadata.PackageNotFoundError:
-            continue  # of an extra that is not here
+            continue  # belongs to an extra that is not installed
         found.add(name)
         needed(rest, found)
     return found
@@ -95,3 +95,9 @@ def test_whatever_is_imported_is_declared() -> None:
         name for name in foreign if name in packages and not declared & set(map(canonicalize_name, packages[name]))
     }
     assert not unknown, "declare them in pyproject.toml, or use what is declared"
+
+
+def test_the_extras_of_the_container_exist() -> None:
+    text = (Path(__file__).parents[1] / "Dockerfile").read_text(encoding="utf-8")
+    (extras,) = re.findall(r"^ARG EXTRAS=(.*)$", text, re.M)
+    assert set(extras.split(",")) <= set(EXTRAS)
