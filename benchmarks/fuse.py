@@ -30,8 +30,8 @@ from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
 from gs2d.meshing.evidence import gather
 from gs2d.meshing.fusion_bounds import derive_limits, sample_depths, widen_truncation
 from gs2d.meshing.marching_cubes import keep_components, marching_cubes
-from gs2d.meshing.tsdf_volume import Volume, fuse, fusion_backend
-from gs2d.meshing.unbounded import cascade_marching_cubes, derive_cascade, fuse_cascade
+from gs2d.meshing.tsdf_volume import VolumeBlocks, find_blocks, fuse_blocks, fusion_backend
+from gs2d.meshing.unbounded import derive_cascade, find_cascade_blocks, fused_cascade_surface
 
 RADIUS = 0.9
 T = TypeVar("T")
@@ -99,15 +99,19 @@ def run(
     limits = timed("limits", lambda: derive_limits(samples, cameras, resolution=resolution))
     noise = timed("noise", lambda: depth_noise(maps, samples, limits))
     limits = widen_truncation(limits, noise)
-    volumes: Sequence[Volume]
+    levels: tuple[VolumeBlocks, ...]
     if unbounded:
         core = np.array([[-RADIUS] * 3, [RADIUS] * 3]) / 2
         cascade = derive_cascade(samples, cameras, bbox=core, voxel=limits.voxel, truncation=limits.truncation)
-        volumes = timed("fuse", lambda: fuse_cascade(maps, cascade, threads=threads, backend=backend))
-        mesh = timed("marching cubes", lambda: cascade_marching_cubes(volumes, cascade, far_weight=1.0))
+        levels = timed("blocks", lambda: find_cascade_blocks(maps, cascade, threads=threads, backend=backend))
+        mesh = timed(
+            "fuse",
+            lambda: fused_cascade_surface(maps, cascade, levels, far_weight=1.0, threads=threads, backend=backend),
+        )
     else:
-        volumes = [timed("fuse", lambda: fuse(maps, limits, threads=threads, backend=backend))]
-        mesh = timed("marching cubes", lambda: marching_cubes(volumes[0]))
+        levels = timed("blocks", lambda: (find_blocks(maps, limits, threads=threads, backend=backend),))
+        volume = timed("fuse", lambda: fuse_blocks(maps, limits, levels[0], threads=threads, backend=backend))
+        mesh = timed("marching cubes", lambda: marching_cubes(volume))
     mesh = timed("components", lambda: keep_components(mesh))
     timed("evidence", lambda: gather(mesh, maps, limits.truncation))
     error = np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS).max() / limits.voxel
@@ -117,11 +121,11 @@ def run(
         resolution=resolution,
         threads=threads,
         backend=fusion_backend(backend).name,
-        levels=len(volumes),
+        levels=len(levels),
         seconds=wall,
         cpu_seconds=cpu,
-        blocks=sum(len(volume.keys) for volume in volumes),
-        volume_mib=round(sum(volume.nbytes for volume in volumes) / 2**20, 1),
+        blocks=sum(len(level.keys) for level in levels),
+        volume_mib=round(sum(level.nbytes for level in levels) / 2**20, 1),
         vertices=len(mesh.vertices),
         faces=len(mesh.faces),
         worst_radius_error_voxels=round(float(error), 3),

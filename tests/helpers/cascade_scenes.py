@@ -1,16 +1,17 @@
-"""Nests made by hand, fields on them, and an outdoor scene with a sky that is wrong."""
+"""Cascades with analytic fields, and an outdoor scene with wrong depths of the sky."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from gs2d.core.camera import look_at
-from gs2d.meshing.depth_maps import RenderedView
+from gs2d.core.mesh import Mesh
+from gs2d.meshing.depth_maps import DepthMap, RenderedView
 from gs2d.meshing.fusion_bounds import FusionBounds
 from gs2d.meshing.tsdf_volume import BLOCK, VOXELS, Volume
-from gs2d.meshing.unbounded import TsdfCascade
+from gs2d.meshing.unbounded import CascadeSurface, TsdfCascade, find_cascade_blocks, fused_cascade_surface
 from surface_shapes import rays, sphere_depth
 
 GROUND, BALL = -0.6, 0.6  # height of the plane, radius of the ball on it
@@ -43,6 +44,29 @@ def volumes_of(cascade: TsdfCascade, field: Callable[[np.ndarray], np.ndarray]) 
         tsdf = np.clip(field(at.reshape(-1, 3)).reshape(-1, VOXELS) / limits.truncation, -1, 1).astype(np.float32)
         volumes.append(Volume(limits, cascade.dims, keys, tsdf, np.ones_like(tsdf), None, None, 1))
     return volumes
+
+
+def mesh_of(volumes: Sequence[Volume], cascade: TsdfCascade) -> Mesh:
+    """Extract the surface of complete levels."""
+    surface = CascadeSurface(cascade, [len(volume.keys) for volume in volumes], 1.0, 1.0)
+    for level, volume in enumerate(volumes):
+        surface.add(volume, level, 0, len(volume.keys))
+    return surface.mesh()
+
+
+def fused_levels(
+    maps: Sequence[DepthMap],
+    cascade: TsdfCascade,
+    *,
+    threads: int = 1,
+    backend: str = "auto",
+    slab_bytes: int = 1 << 40,
+) -> Mesh:
+    """Fuse depth maps into all levels and extract their surface."""
+    blocks = find_cascade_blocks(maps, cascade, threads=threads, backend=backend)
+    return fused_cascade_surface(
+        maps, cascade, blocks, far_weight=1.0, slab_bytes=slab_bytes, threads=threads, backend=backend
+    )
 
 
 def outdoor_frames(sky: str, *, views: int = 24, size: int = 96, seed: int = 0) -> list[RenderedView]:

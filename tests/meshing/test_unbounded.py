@@ -7,19 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cascade_scenes import BALL, GROUND, cascade_of, outdoor_frames, volumes_of
+from cascade_scenes import BALL, GROUND, cascade_of, fused_levels, mesh_of, outdoor_frames, volumes_of
 from gs2d.core.camera import look_at
 from gs2d.errors import ProtocolError
 from gs2d.meshing.depth_maps import RenderedView, depth_map
 from gs2d.meshing.extract import Extraction, ExtractOptions, extract_unbounded
 from gs2d.meshing.marching_cubes import components
 from gs2d.meshing.tsdf_volume import block_bytes
-from gs2d.meshing.unbounded import (
-    cascade_marching_cubes,
-    find_cascade_blocks,
-    fuse_cascade,
-    fused_cascade_surface,
-)
+from gs2d.meshing.unbounded import find_cascade_blocks
 from surface_shapes import edge_uses, is_closed_manifold, rays, signed_volume
 
 
@@ -28,7 +23,7 @@ from surface_shapes import edge_uses, is_closed_manifold, rays, signed_volume
     ("center", "radius"),
     [((0.3, 0.1, 0.2), 1.3), ((2.0, 1.0, 0.0), 3.1), ((0.0, 0.0, 0.0), 2.3), ((0.5, 0.5, 0.5), 2.2)],
 )
-def test_a_sphere_across_levels_is_one_closed_surface_as_exact_as_each_levels_voxel(
+def test_a_sphere_across_levels_is_one_closed_accurate_surface(
     center: tuple[float, float, float], radius: float
 ) -> None:
     """The second crosses all three joins. Linear interpolation errs by at most h^2 / (8 R): 0.02 voxel of 1/16 at R 1.
@@ -36,9 +31,8 @@ def test_a_sphere_across_levels_is_one_closed_surface_as_exact_as_each_levels_vo
     A join's cells reach three voxels of the finer level, so allow four times as much there.
     """
     cascade = cascade_of(4)
-    mesh = cascade_marching_cubes(
-        volumes_of(cascade, lambda p: np.linalg.norm(p - np.asarray(center), axis=1) - radius), cascade, far_weight=1.0
-    )
+    volumes = volumes_of(cascade, lambda p: np.linalg.norm(p - np.asarray(center), axis=1) - radius)
+    mesh = mesh_of(volumes, cascade)
     assert is_closed_manifold(mesh)
     assert components(mesh).max() == 0
     assert signed_volume(mesh) == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.01)
@@ -48,12 +42,12 @@ def test_a_sphere_across_levels_is_one_closed_surface_as_exact_as_each_levels_vo
     assert (error < 0.03 * cascade.levels[0].voxel * 2.0**level).all()
 
 
-def test_any_field_whatever_gives_a_closed_surface_across_the_joins() -> None:
+def test_random_fields_give_a_closed_surface_across_levels() -> None:
     """Random values at every voxel, outside at the rim of the outermost level: all 256 cases, on all joins."""
     cascade = cascade_of(3)
     rng = np.random.default_rng(3)
     volumes = volumes_of(cascade, lambda p: np.where(np.abs(p).max(axis=1) > 3.6, 1.0, rng.normal(size=len(p))))
-    mesh = cascade_marching_cubes(volumes, cascade, far_weight=1.0)
+    mesh = mesh_of(volumes, cascade)
     _, uses, upward = edge_uses(mesh)
     assert len(mesh.faces) > 50_000
     assert (uses % 2 == 0).all()  # no border
@@ -62,7 +56,7 @@ def test_any_field_whatever_gives_a_closed_surface_across_the_joins() -> None:
 
 
 # -- shapes at several distances ---------------------------------------------------------------------------------------
-def test_spheres_near_and_far_are_exact_to_a_part_of_their_levels_voxel() -> None:
+def test_near_and_far_spheres_are_accurate_to_a_fraction_of_a_voxel() -> None:
     """Radius R at distance R from the centre of cameras inside: shells at 1.5, 5 and 20 around a ring of cameras."""
     cameras = [
         look_at(0.3 * np.array([np.cos(a), np.sin(a), 0.0]), np.array([np.cos(a), np.sin(a), z]) * 10,
@@ -76,8 +70,7 @@ def test_spheres_near_and_far_are_exact_to_a_part_of_their_levels_voxel() -> Non
             origin, step = rays(camera)  # inside the sphere: |o + s d| = R, the farther root
             a, b, c = (step**2).sum(-1), step @ origin, origin @ origin - radius**2
             maps.append(depth_map(RenderedView(camera, (-b + np.sqrt(b * b - a * c)) / a)))
-        volumes = fuse_cascade(maps, cascade, threads=1)
-        mesh = cascade_marching_cubes(volumes, cascade, far_weight=1.0)
+        mesh = fused_levels(maps, cascade)
         distance = np.linalg.norm(mesh.vertices, axis=1)
         voxel = cascade.levels[0].voxel * 2.0 ** cascade.level_of(mesh.vertices.astype(np.float64))
         assert len(mesh.faces) > 500
@@ -85,7 +78,7 @@ def test_spheres_near_and_far_are_exact_to_a_part_of_their_levels_voxel() -> Non
         assert np.mean(np.abs(distance - radius) / voxel) < 0.12
 
 
-def test_a_plane_through_all_levels_has_one_layer_and_no_hole_at_the_joins() -> None:
+def test_a_plane_through_all_levels_has_one_layer_without_holes() -> None:
     """Ground at z = -0.3 under a camera that looks along it: only its rim is open, and every column is crossed once."""
     cascade = cascade_of(5)
     eyes = [(x, y) for x in (-1.0, 1.0) for y in (-1.0, 1.0)]
@@ -95,7 +88,7 @@ def test_a_plane_through_all_levels_has_one_layer_and_no_hole_at_the_joins() -> 
             np.array([x, y, 12.0]), np.array([x, y, 0.0]), np.array([0, 1.0, 0]), width=256, height=256, fx=110
         )
         maps.append(depth_map(RenderedView(camera, np.full((256, 256), 12.3))))
-    mesh = cascade_marching_cubes(fuse_cascade(maps, cascade, threads=1), cascade, far_weight=1.0)
+    mesh = fused_levels(maps, cascade)
     assert np.abs(mesh.vertices[:, 2] + 0.3).max() < 0.02 * cascade.levels[0].voxel
     edges, uses, _ = edge_uses(mesh)
     assert uses.max() == 2
@@ -113,7 +106,7 @@ def outdoors(sky: str, seed: int = 0) -> Extraction:
 
 
 @pytest.mark.parametrize("sky", ["unseen", "thin", "scattered", "cards"])
-def test_a_sky_makes_no_shell_and_the_ground_reaches_far_out(sky: str) -> None:
+def test_sky_creates_no_shell_and_the_ground_extends_far(sky: str) -> None:
     result = outdoors(sky)
     v = result.mesh.vertices.astype(np.float64)
     assert result.levels >= 6
@@ -127,7 +120,7 @@ def test_a_sky_makes_no_shell_and_the_ground_reaches_far_out(sky: str) -> None:
     assert (result.mesh.colors == 128).all()
 
 
-def test_memory_of_all_levels_together_is_bounded_and_the_error_names_a_voxel_that_fits() -> None:
+def test_memory_of_all_levels_is_bounded_and_the_error_suggests_a_voxel() -> None:
     frames = outdoor_frames("unseen", views=8, size=48)
     result = extract_unbounded(frames, ExtractOptions(voxel=0.03), threads=1)
     assert result.volume_bytes % block_bytes(colored=True) == 0
@@ -140,18 +133,14 @@ def test_memory_of_all_levels_together_is_bounded_and_the_error_names_a_voxel_th
 
 @pytest.mark.parametrize("colored", [True, False])
 @pytest.mark.parametrize(("levels", "slab_bytes"), [(4, 1), (4, 300_000), (9, 300_000)])
-def test_slabs_of_any_size_give_the_bytes_of_the_mesh_of_whole_levels(
-    levels: int, slab_bytes: int, colored: bool
-) -> None:
+def test_the_mesh_of_all_levels_does_not_depend_on_slabs(levels: int, slab_bytes: int, colored: bool) -> None:
     maps = [depth_map(f) for f in outdoor_frames("unseen", views=6, size=48)]
     maps = maps if colored else [replace(item, color=None) for item in maps]
     cascade = cascade_of(levels, depth_limit=6.0)  # of nine levels some have no blocks
-    volumes = fuse_cascade(maps, cascade, threads=1)
-    whole = cascade_marching_cubes(volumes, cascade, far_weight=1.0)
+    whole = fused_levels(maps, cascade)
     blocks = find_cascade_blocks(maps, cascade, threads=1)
-    assert [len(part.keys) for part in blocks] == [len(volume.keys) for volume in volumes]
-    assert sum(part.nbytes for part in blocks) > 2 * slab_bytes  # several
-    parts = fused_cascade_surface(maps, cascade, blocks, far_weight=1.0, slab_bytes=slab_bytes, threads=1)
+    assert sum(part.nbytes for part in blocks) > 2 * slab_bytes  # several slabs
+    parts = fused_levels(maps, cascade, slab_bytes=slab_bytes)
     assert len(whole.faces) > 1000
     np.testing.assert_array_equal(parts.vertices, whole.vertices)
     np.testing.assert_array_equal(parts.faces, whole.faces)

@@ -202,42 +202,6 @@ def valid_depth(cameras: Sequence[Camera], band: float) -> float:
 FAR_VIEWS = 5.0  # smallest weight of known voxels outside the innermost level: few views agree on a false sky depth
 
 
-def fuse_cascade(
-    frames: Iterable[DepthMap],
-    cascade: TsdfCascade,
-    *,
-    max_bytes: int = 4 << 30,
-    threads: int | None = None,
-    backend: str | Backend = "auto",
-) -> tuple[Volume, ...]:
-    """Fuse depth maps into all levels.
-
-    Parameters
-    ----------
-    frames : iterable of DepthMap
-        Read twice, one at a time: a sequence or a ``Spool``, not a generator.
-    cascade : TsdfCascade
-    max_bytes : int
-        Limit of all volumes together.
-    threads, backend
-        As for ``fuse``.
-
-    Returns
-    -------
-    tuple of Volume
-        One for each level, finest first; a level may have no blocks.
-
-    Raises
-    ------
-    ProtocolError, BackendError
-        As for ``fuse``.
-    """
-    blocks = find_cascade_blocks(frames, cascade, max_bytes=max_bytes, threads=threads, backend=backend)
-    volumes = tuple(_empty(part, limits) for part, limits in zip(blocks, cascade.levels, strict=True))
-    _fuse_into(volumes, frames, cascade, threads, backend)
-    return volumes
-
-
 def find_cascade_blocks(
     frames: Iterable[DepthMap],
     cascade: TsdfCascade,
@@ -246,7 +210,7 @@ def find_cascade_blocks(
     threads: int | None = None,
     backend: str | Backend = "auto",
 ) -> tuple[VolumeBlocks, ...]:
-    """Find the blocks of each level; parameters and errors as for ``fuse_cascade``."""
+    """Find the blocks of each level; parameters and errors as for ``fuse``, with a common limit of memory."""
     if iter(frames) is frames:
         raise TypeError("frames are read twice: pass a list or a Spool, not an iterator")
     check_truncation(cascade.levels[0])
@@ -375,25 +339,6 @@ class _Nodes:
         return out
 
 
-def cascade_marching_cubes(
-    volumes: Sequence[Volume], cascade: TsdfCascade, *, min_weight: float = 1.0, far_weight: float
-) -> Mesh:
-    """Extract the zero level set of all levels as one mesh, as ``marching_cubes`` does for one volume.
-
-    Parameters
-    ----------
-    volumes : sequence of Volume
-        From ``fuse_cascade``.
-    cascade : TsdfCascade
-    min_weight, far_weight : float
-        Smallest weight of known voxels in the innermost level, and in all others.
-    """
-    surface = _CascadeSurface(cascade, [len(volume.keys) for volume in volumes], min_weight, far_weight)
-    for level, volume in enumerate(volumes):
-        surface.add(volume, level, 0, len(volume.keys))
-    return surface.mesh()
-
-
 def fused_cascade_surface(
     frames: Iterable[DepthMap],
     cascade: TsdfCascade,
@@ -405,10 +350,10 @@ def fused_cascade_surface(
     threads: int | None = None,
     backend: str | Backend = "auto",
 ) -> Mesh:
-    """Return the mesh of ``cascade_marching_cubes(fuse_cascade(...))`` without all volumes in memory, byte-identical.
+    """Fuse depth maps into all levels, and extract the zero level set as one mesh.
 
-    Levels are fused slab by slab (``slabs``), several small slabs at a time. Blocks at the border between two levels
-    stay in memory until both are finished.
+    Levels are fused slab by slab (``slabs``), several small slabs at a time; the mesh does not depend on their size.
+    Blocks at the border between two levels stay in memory until both are finished.
 
     Parameters
     ----------
@@ -418,13 +363,13 @@ def fused_cascade_surface(
     blocks : sequence of VolumeBlocks
         Of each level, from ``find_cascade_blocks``.
     min_weight, far_weight : float
-        See ``cascade_marching_cubes``.
+        Smallest weight of known voxels in the innermost level, and in all others.
     slab_bytes : int
         See ``fused_surface``.
     threads, backend
         As for ``fuse``.
     """
-    surface = _CascadeSurface(cascade, [len(part.keys) for part in blocks], min_weight, far_weight)
+    surface = CascadeSurface(cascade, [len(part.keys) for part in blocks], min_weight, far_weight)
     for level, part in enumerate(blocks):
         if not len(part.keys):
             surface.add(_empty(part, cascade.levels[level]), level, 0, 0)
@@ -454,7 +399,7 @@ def _batches(blocks: Sequence[VolumeBlocks], slab_bytes: int) -> Iterator[list[t
         yield batch
 
 
-class _CascadeSurface:
+class CascadeSurface:
     """Collects the surface of levels that are processed in parts. Nodes are numbered over all levels (``_Nodes``)."""
 
     def __init__(self, cascade: TsdfCascade, counts: Sequence[int], min_weight: float, far_weight: float) -> None:

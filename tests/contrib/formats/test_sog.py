@@ -131,12 +131,12 @@ def test_a_folder_and_the_finest_level_of_a_stream_are_read(tmp_path: Path) -> N
     assert len(file.gaussians) == 30 + 4 + 7
     np.testing.assert_array_equal(file.gaussians.means[:30], g.means[5:35])
     for change, words in (
-        ({"filenames": ["../../etc/passwd", "x"]}, "files in its own folder were expected"),
+        ({"filenames": ["../../etc/passwd", "x"]}, "expected files in its own folder"),
         ({"filenames": ["none/meta.json", "1_0/meta.json"]}, "cannot read .*none"),
-        ({"tree": {"lods": {"0": {"file": 0, "offset": 0, "count": 41}}}}, "splats 0 to 41 of a chunk of 40"),
+        ({"tree": {"lods": {"0": {"file": 0, "offset": 0, "count": 41}}}}, "splats 0 to 41 in a chunk of 40"),
         ({"tree": {"children": [{"lods": part}, {"lods": {"0": {"file": 0, "offset": 5, "count": 1}}}]}}, "level once"),
         ({"tree": {}, "environment": None}, "no chunk of the finest level"),
-        ({"tree": 5}, "does not fit"),
+        ({"tree": 5}, "is invalid"),
     ):
         path.write_text(json.dumps(index | change))
         with pytest.raises(DataError, match=words) as caught:
@@ -154,22 +154,22 @@ def meta_with(**changes: Any) -> Callable[[dict[str, bytes]], object]:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (meta_with(version=3), "SOG of version 1 or 2 was expected, got 3"),
-        (meta_with(count=10**9), "1000000000 pixels in means_l.webp were expected"),
-        (meta_with(count=-1), "a number of splats was expected"),
-        (meta_with(scales={"codebook": [0.0] * 255, "files": ["scales.webp"]}), "256 numbers were expected, got 255"),
-        (meta_with(quats={"files": ["sh0.webp"]}), "rotations whose fourth byte is 252 or more"),
+        (meta_with(version=3), "expected SOG of version 1 or 2, got 3"),
+        (meta_with(count=10**9), "expected 1000000000 pixels in means_l.webp"),
+        (meta_with(count=-1), "expected a number of splats"),
+        (meta_with(scales={"codebook": [0.0] * 255, "files": ["scales.webp"]}), "expected 256 numbers, got 255"),
+        (meta_with(quats={"files": ["sh0.webp"]}), "rotations with a fourth byte of 252 or more"),
         (
             meta_with(sh0={"codebook": [math.nan] * 256, "files": ["sh0.webp"]}),
             r"300 splats have NaN or infinity \(sh0\)",
         ),
         (meta_with(means={"mins": [0] * 3, "maxs": [500] * 3, "files": ["means_l.webp", "means_u.webp"]}), "infinity"),
-        (lambda f: f.pop("quats.webp"), "'quats.webp' is not in it"),
-        (lambda f: f.update({"quats.webp": b"RIFF"}), "a picture was expected as 'quats.webp', it does not decode"),
-        (lambda f: f.update({"meta.json": b"[" * 100_000}), "its JSON does not parse"),
+        (lambda f: f.pop("quats.webp"), "'quats.webp' is missing"),
+        (lambda f: f.update({"quats.webp": b"RIFF"}), "cannot decode the image 'quats.webp'"),
+        (lambda f: f.update({"meta.json": b"[" * 100_000}), "its JSON is invalid"),
         (lambda f: f.update({"shN_labels.webp": webp(np.full((20, 20, 3), 255))}), "labels below"),
         (lambda f: f.update({"shN_centroids.webp": webp(np.zeros((8, 8, 3)))}), "192 columns of centroids"),
-        (lambda f: f.update({"sh0.webp": webp(np.zeros((9000, 9000, 3)))}), r"a picture \(9000x9000\) would take"),
+        (lambda f: f.update({"sh0.webp": webp(np.zeros((9000, 9000, 3)))}), r"an image \(9000x9000\) would take"),
     ],
 )
 def test_an_invalid_sog_is_a_one_line_error(

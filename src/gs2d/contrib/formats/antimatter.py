@@ -1,7 +1,7 @@
-"""``.splat`` files of antimatter15/splat: 32 bytes a splat, without view-dependent colour.
+"""Read and write ``.splat`` files of antimatter15/splat: 32 bytes per splat, without view-dependent colour.
 
-A record is position (3 float32), scales (3 float32, not their logarithms), colour and opacity (4 bytes of 255ths) and
-rotation (4 bytes: 128 w + 128, then x, y, z). Large opaque splats are first: viewers show the file while it loads.
+A record consists of position (3 float32), scales (3 float32, not logarithms), colour and opacity (4 bytes) and rotation
+(4 bytes: 128 w + 128, then x, y, z). Large opaque splats come first, because viewers show the file while it loads.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _RECORD = np.dtype([("position", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1",
 
 
 def write_splat(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Write a ``.splat`` file, atomically: the most important first, colours of degree 0 alone.
+    """Write a ``.splat`` file, atomically, by decreasing importance and with colours of SH degree 0 only.
 
     Raises
     ------
@@ -35,7 +35,7 @@ def write_splat(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     g = gaussians.rows(order)
     rows = np.empty(len(g), dtype=_RECORD)
     rows["position"] = g.means
-    rows["scales"] = np.exp(np.clip(g.log_scales.astype(np.float64), None, 88.0))  # e^88 is a float32
+    rows["scales"] = np.exp(np.clip(g.log_scales.astype(np.float64), None, 88.0))  # avoids overflow of float32
     rows["rgba"][:, :3] = to_byte(255.0 * (0.5 + C0 * g.sh0.astype(np.float64)))
     rows["rgba"][:, 3] = to_byte(255.0 * opacity[order])
     rows["rotation"] = to_byte(128.0 * unit_quats(g.quats) + 128.0)
@@ -44,12 +44,12 @@ def write_splat(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
 
 
 def read_splat(path: str | os.PathLike[str]) -> Gaussians:
-    """Read a ``.splat`` file, which says nothing of itself: its size and its numbers are checked.
+    """Read a ``.splat`` file. It has no header, so its size and values are checked.
 
     Raises
     ------
     DataError
-        Missing, no whole number of records, or numbers that are no splats.
+        If the file is missing, has an incomplete record, or has invalid values.
     """
     try:
         data = Path(path).read_bytes()
@@ -57,12 +57,12 @@ def read_splat(path: str | os.PathLike[str]) -> Gaussians:
         raise DataError(f"cannot read {os.fspath(path)}: {error.strerror or error}") from error
     if len(data) % _RECORD.itemsize:
         raise DataError(
-            f"{os.fspath(path)}: a .splat file of {_RECORD.itemsize} bytes a splat was expected, got {len(data)} bytes "
-            "in all; copy or export the file again"
+            f"{os.fspath(path)}: expected a .splat file with {_RECORD.itemsize} bytes per splat, got {len(data)} in "
+            "total; copy or export the file again"
         )
     rows = np.frombuffer(data, dtype=_RECORD)
     if (rows["scales"] < 0).any():
-        raise DataError(f"{os.fspath(path)}: positive scales were expected; is it a .splat file?")
+        raise DataError(f"{os.fspath(path)}: expected positive scales; is it a .splat file?")
     color = rows["rgba"][:, :3].astype(np.float64) / 255.0
     return Gaussians(
         rows["position"].copy(),

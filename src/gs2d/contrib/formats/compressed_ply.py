@@ -1,9 +1,9 @@
-"""Compressed PLY of PlayCanvas and SuperSplat: 16 bytes a splat, and a byte an SH coefficient.
+"""Read and write the compressed PLY of PlayCanvas and SuperSplat: 16 bytes per splat and one per SH coefficient.
 
-Splats are in chunks of 256 that lie together. A chunk has the smallest and largest position, log scale and colour of
-its splats; a splat has shares of the way between them: position and log scales in 11, 10 and 11 bits, colour and
-opacity in 8 each, its rotation in 32 bits (which component of (w, x, y, z) is the largest, and 10 bits of each other).
-SH coefficients are 256 steps from -4 to 4. After what SplatTransform and SuperSplat (PlayCanvas, MIT) read and write.
+Splats are grouped in chunks of 256 neighbours. A chunk stores the smallest and largest position, log scale and colour
+of its splats; a splat stores fractions between them: position and log scales in 11, 10 and 11 bits, colour and opacity
+in 8 bits each. Its rotation has 32 bits: the index of the largest component of (w, x, y, z), and 10 bits for each of
+the others. SH coefficients have 256 steps from -4 to 4. Follows SplatTransform and SuperSplat (PlayCanvas, MIT).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from gs2d.io.ply_format import PlyElement, PlyFile, read_ply, write_ply
 
 _CHUNK = 256
 _BITS = (11, 10, 11)
-_SMALLEST = -40.0  # log scale, 4e-18 units: the range of a chunk is divided into 1,023 steps
+_SMALLEST = -40.0  # log scale, 4e-18 units; limits the range of a chunk, which has 1,023 steps
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _SPAN = {
     "position": ("x", "y", "z"),
@@ -39,7 +39,7 @@ def write_compressed_ply(path: str | os.PathLike[str], gaussians: Gaussians) -> 
     Returns
     -------
     tuple of str
-        What the format could not hold, one sentence each.
+        Messages about values that the format cannot represent.
 
     Raises
     ------
@@ -76,14 +76,14 @@ def write_compressed_ply(path: str | os.PathLike[str], gaussians: Gaussians) -> 
         elements["sh"] = sh
     write_ply(path, elements, comments=("written by gs2d",))
     steep = int((np.abs(g.shN) > 4.0).any(axis=(1, 2)).sum()) if g.shN.size else 0
-    return (f"{steep} of {n} splats have SH coefficients beyond 4, which is what the format holds",) if steep else ()
+    return (f"{steep} of {n} splats have SH coefficients beyond 4, the limit of the format",) if steep else ()
 
 
 def morton_order(means: np.ndarray) -> np.ndarray:
-    """Return an order in which neighbours in the list are neighbours in space: bits of x, y and z in turn."""
+    """Return the Morton order of points, in which neighbours in the list are near in space."""
     if not len(means):
         return np.zeros(0, dtype=int)
-    if np.abs(means).max() > 1e38:  # the span of float32 numbers may be none
+    if np.abs(means).max() > 1e38:  # the span may exceed float32
         means = means.astype(np.float64)
     low, high = means.min(axis=0), means.max(axis=0)
     cell = ((means - low) / np.maximum(high - low, 1e-30) * ((1 << 21) - 1)).astype(np.uint64)
@@ -95,7 +95,7 @@ def morton_order(means: np.ndarray) -> np.ndarray:
 
 
 def _fractions(values: np.ndarray, chunks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(smallest [C, 3], largest [C, 3], shares of the way [N, 3] in [0, 1])."""
+    """Return the smallest and largest values [C, 3] of chunks, and fractions [N, 3] in [0, 1] between them."""
     starts = np.arange(chunks) * _CHUNK
     if not chunks:
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3))
@@ -108,7 +108,7 @@ def _fractions(values: np.ndarray, chunks: int) -> tuple[np.ndarray, np.ndarray,
 
 
 def _pack(fractions: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
-    """Numbers in [0, 1] in so many bits each, the first highest, in one word [N]."""
+    """Quantize columns in [0, 1] to ``bits`` each, and pack them into one word [N], the first in the highest bits."""
     word = np.zeros(len(fractions), np.uint32)
     for column, count in zip(fractions.T, bits, strict=True):
         most = (1 << count) - 1
@@ -128,12 +128,12 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
 
 
 def read_compressed_ply(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> Gaussians:
-    """Read a compressed PLY, in the order of the file; ``tell`` hears of SH bands that are left out.
+    """Read a compressed PLY, in file order; ``tell`` receives a message if SH bands are dropped.
 
     Raises
     ------
     DataError
-        If the file is no PLY, is broken, or its elements do not fit each other.
+        If the file is broken, no PLY, or has inconsistent elements.
     """
     file = read_ply(path)
     vertex, chunk = _elements(path, file)
@@ -144,7 +144,7 @@ def read_compressed_ply(path: str | os.PathLike[str], tell: Tell = warnings.warn
     scale = _between(path, chunk, "scale", _unpack(packed[2], _BITS), at)
     rgba = _unpack(packed[3], (8, 8, 8, 8))
     color = _between(path, chunk, "color", rgba[:, :3], at) if "min_r" in chunk.properties else rgba[:, :3]
-    with np.errstate(over="ignore"):  # a double beyond float32 is infinite
+    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite
         return Gaussians(
             position.astype(np.float32),
             _quats(packed[1]),
@@ -158,10 +158,10 @@ def read_compressed_ply(path: str | os.PathLike[str], tell: Tell = warnings.warn
 def _elements(path: object, file: PlyFile) -> tuple[PlyElement, PlyElement]:
     vertex, chunk = file.elements.get("vertex"), file.elements.get("chunk")
     if vertex is None or chunk is None:
-        raise DataError(f"{path}: a compressed PLY with chunks and vertices was expected, got {sorted(file.elements)}")
+        raise DataError(f"{path}: expected a compressed PLY with chunks and vertices, got {sorted(file.elements)}")
     if chunk.count != -(-vertex.count // _CHUNK):
         raise DataError(
-            f"{path}: {-(-vertex.count // _CHUNK)} chunks for {vertex.count} splats were expected, got {chunk.count}; "
+            f"{path}: expected {-(-vertex.count // _CHUNK)} chunks for {vertex.count} splats, got {chunk.count}; "
             "export the file again"
         )
     return vertex, chunk
@@ -180,20 +180,20 @@ def _real(path: object, element: PlyElement, name: str) -> np.ndarray:
 
 
 def _words(path: object, vertex: PlyElement, name: str) -> np.ndarray:
-    """Return the packed words of a property, whose type may be another one that holds whole numbers."""
+    """Return the packed words of a property of any integer type."""
     words = _column(path, vertex, name)
     if words.dtype.kind not in "iu":
-        raise DataError(f"{path}: whole numbers as {name} were expected, got {words.dtype}; export the file again")
+        raise DataError(f"{path}: expected integers as {name}, got {words.dtype}; export the file again")
     return words.astype(np.uint32)
 
 
 def _between(path: object, chunk: PlyElement, what: str, fractions: np.ndarray, at: np.ndarray) -> np.ndarray:
-    with np.errstate(over="ignore", invalid="ignore"):  # of NaN and between infinite ends: what comes of it is checked
+    with np.errstate(over="ignore", invalid="ignore"):  # NaN and infinite ends; values are checked later
         low, high = (
             np.stack([_real(path, chunk, f"{end}_{x}") for x in _SPAN[what]], axis=1) for end in ("min", "max")
         )
         between = low[at] * (1.0 - fractions) + high[at] * fractions
-        # The ends themselves: 0 times an infinite one, a scale of 0, is NaN.
+        # At 0 and 1 the ends are used directly, because 0 times infinity (a scale of 0) is NaN.
         return np.where(fractions == 0, low[at], np.where(fractions == 1, high[at], between))
 
 
@@ -219,19 +219,19 @@ def _quats(word: np.ndarray) -> np.ndarray:
 
 
 def _sh(path: object, element: PlyElement | None, n: int) -> np.ndarray:
-    """[N, K-1, 3]: bytes are the middles of their steps, 0 and 255 the ends."""
+    """Dequantize SH coefficients [N, K-1, 3]: bytes are centres of steps, except for the ends 0 and 255."""
     if element is None:
         return np.zeros((n, 0, 3), np.float32)
     count = sum(name.startswith("f_rest_") for name in element.properties)
     if not count or count % 3 or math.isqrt(1 + count // 3) ** 2 != 1 + count // 3 or element.count != n:
         raise DataError(
-            f"{path}: 9, 24 or 45 SH coefficients for {n} splats were expected, got {count} for {element.count}; "
+            f"{path}: expected 9, 24 or 45 SH coefficients for {n} splats, got {count} for {element.count}; "
             "export the file again"
         )
     columns = [_column(path, element, f"f_rest_{i}") for i in range(count)]
     if any(c.dtype.kind not in "iu" or (c.size and (c.min() < 0 or c.max() > 255)) for c in columns):
         raise DataError(
-            f"{path}: expected whole numbers of 0 to 255 (uchar) as f_rest_* of a compressed PLY, got "
+            f"{path}: expected integers from 0 to 255 (uchar) as f_rest_* of a compressed PLY, got "
             f"{columns[0].dtype}; export the file again"
         )
     rest = np.stack(columns, axis=1).astype(np.float64)

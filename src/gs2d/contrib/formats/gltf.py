@@ -1,9 +1,8 @@
-"""glTF 2.0 with ``KHR_gaussian_splatting`` (release candidate of February 2026): 3D Gaussians, ours flat ones.
+"""Read and write glTF 2.0 with ``KHR_gaussian_splatting`` (release candidate of February 2026).
 
-Its one kernel is the projected ellipsoid: a disk is written with a thickness that does not show. Attributes are
-float32 and not raw: unit quaternions, linear scales, linear opacities; spherical harmonics are those of 3DGS. glTF has
-y up. As SplatTransform (PlayCanvas, MIT) does with a PLY, a half turn about z takes our coordinates there, which
-changes signs alone.
+The only kernel is the projected ellipsoid, so a disk gets a negligible thickness. Attributes are float32 after
+activation: unit quaternions, linear scales, linear opacities; spherical harmonics are those of 3DGS. glTF has y up. As
+in SplatTransform (PlayCanvas, MIT), coordinates are rotated by 180 degrees about z, which only changes signs.
 """
 
 from __future__ import annotations
@@ -66,7 +65,7 @@ def write_gltf(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
     }
-    if count:  # glTF has no empty lists
+    if count:  # glTF does not allow empty lists
         indices = {name: i for i, name in enumerate(attributes)}
         primitive = {"attributes": indices, "mode": 0, "extensions": {EXTENSION: splatting}}
         document |= {
@@ -89,9 +88,9 @@ def write_gltf(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
 
 
 def _attributes(gaussians: Gaussians) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
-    """Return arrays as they are written, every row of them aligned to 4 bytes, and what their accessors say."""
+    """Return the arrays to write, with rows aligned to 4 bytes, and the properties of their accessors."""
     g = gaussians.half_turned_about_z()
-    color = np.full((len(g), 4), 65535, "<u2")  # for who draws the points alone
+    color = np.full((len(g), 4), 65535, "<u2")  # for viewers that show points only
     color[:, :3] = LINEAR_U16[to_byte(255.0 * (0.5 + C0 * g.sh0.astype(np.float64)))]
     opacity = sigmoid(g.opacity_logits)
     color[:, 3] = np.rint(65535.0 * opacity)
@@ -114,25 +113,25 @@ def _attributes(gaussians: Gaussians) -> dict[str, tuple[np.ndarray, dict[str, A
 
 
 def _places(degree: int) -> list[tuple[int, int]]:
-    """Degrees and places in them of the harmonics up to a degree, in order."""
+    """Return (degree, index in it) of the harmonics up to a degree, in order."""
     return [(level, place) for level in range(degree + 1) for place in range(2 * level + 1)]
 
 
 def read_gltf(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Gaussians, str]:
-    """Read all splats of a .glb or .gltf file's scene, and say in words what they are.
+    """Read all splats in the scene of a .glb or .gltf file; also returns the kind of file.
 
-    ``tell`` receives a sentence on SH bands above degree 3, which are left out.
+    ``tell`` receives a message if SH bands above degree 3 are dropped.
 
     Raises
     ------
     DataError
-        Missing, no glTF, without splats, or with what splats do not have.
+        If the file is missing, no glTF, or contains no splats or unsupported ones.
     """
     document = read_document(path)
     required = document.json.get("extensionsRequired", [])
     beyond = set(map(str, required)) - _KNOWN if isinstance(required, list) else set()
     if beyond:
-        raise DataError(f"{path}: glTF that needs {EXTENSION} alone was expected, it needs {', '.join(sorted(beyond))}")
+        raise DataError(f"{path}: expected glTF that needs {EXTENSION} only, it needs {', '.join(sorted(beyond))}")
     with document.reading():
         found = list(_primitives(document))
         total = sum(document.bytes_of(index) for _, attributes in found for index in attributes.values())
@@ -146,8 +145,8 @@ def read_gltf(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple
         mesh = gltf_mesh(path)
         got = "glTF without" if mesh is None else f"a mesh of {mesh['triangles']:,} triangles"
         raise DataError(
-            f"{path}: Gaussian splats ({EXTENSION}) were expected, got {got}; give the splats.ply of a run or another "
-            "file of splats"
+            f"{path}: expected Gaussian splats ({EXTENSION}), got {got}; use the splats.ply of a run or another "
+            "splat file"
         )
     return Gaussians.joined(parts), "glTF"
 
@@ -158,7 +157,7 @@ def gltf_mesh(path: str | os.PathLike[str]) -> dict[str, int | str] | None:
     Raises
     ------
     DataError
-        Missing, or no glTF.
+        If the file is missing or no glTF.
     """
     document = read_document(path)
     vertices = triangles = 0
@@ -185,7 +184,7 @@ def _none() -> Gaussians:
 
 
 def _primitives(document: GltfDocument) -> Iterator[tuple[np.ndarray, dict[str, int]]]:
-    """Yield the transform of every splat primitive in the scene, and its accessors by name without the prefix."""
+    """Yield the transform and the accessors (by name without the prefix) of every splat primitive in the scene."""
     for matrix, mesh in node_matrices(document):
         for primitive in document.json["meshes"][mesh]["primitives"]:
             splatting = primitive.get("extensions", {}).get(EXTENSION)
@@ -195,24 +194,23 @@ def _primitives(document: GltfDocument) -> Iterator[tuple[np.ndarray, dict[str, 
             compressed = splatting.get("extensions")
             if not compressed and ("kernel" not in splatting or "ROTATION" not in attributes):
                 raise DataError(
-                    f"{document.path}: splats of {EXTENSION} were expected as its release candidate has them, got an "
-                    "early draft (no kernel, or no attribute ROTATION); export the file again with a newer program, or "
-                    "as PLY"
+                    f"{document.path}: expected the release candidate of {EXTENSION}, got an early draft (no kernel or "
+                    "no ROTATION); export the file again with a newer program, or as PLY"
                 )
             if compressed or splatting["kernel"] != "ellipse":
                 more = ", ".join(sorted(splatting.get("extensions", {}))) or repr(splatting["kernel"])
                 raise DataError(
-                    f"{document.path}: splats with the kernel 'ellipse' and no compression were expected, got {more}; "
-                    "convert the file to a PLY"
+                    f"{document.path}: expected splats with the kernel 'ellipse' and no compression, got {more}; "
+                    "convert the file to PLY"
                 )
             yield matrix, attributes
 
 
 def _gaussians(document: GltfDocument, attributes: dict[str, int], tell: Tell) -> Gaussians:
-    """Return one primitive in its own frame."""
+    """Read one primitive, in its own frame."""
     degree = max((int(name.split("_")[2]) for name in attributes if name.startswith("SH_DEGREE_")), default=0)
     if not 0 <= degree <= 8:
-        raise DataError(f"{document.path}: SH degree 0 to 3 was expected, got {degree}; export it with three bands")
+        raise DataError(f"{document.path}: expected SH degree 0 to 3, got {degree}; export it with three bands")
     means = document.array(attributes["POSITION"], "VEC3")
     quats = document.array(attributes["ROTATION"], "VEC4")
     scales = document.array(attributes["SCALE"], "VEC3")
@@ -221,9 +219,9 @@ def _gaussians(document: GltfDocument, attributes: dict[str, int], tell: Tell) -
         document.array(attributes[f"SH_DEGREE_{level}_COEF_{place}"], "VEC3") for level, place in _places(degree)
     ]
     if len({len(array) for array in (means, quats, scales, opacities, *harmonics)}) != 1:
-        raise DataError(f"{document.path}: as many values in each attribute of splats were expected; export it again")
-    if (scales < 0).any() or (opacities < 0).any() or (opacities > 1).any():  # NaN is left out later
-        raise DataError(f"{document.path}: scales from 0 and opacities of 0 to 1 were expected; export it again")
+        raise DataError(f"{document.path}: expected attributes of equal length; export it again")
+    if (scales < 0).any() or (opacities < 0).any() or (opacities > 1).any():  # NaN is dropped later
+        raise DataError(f"{document.path}: expected scales >= 0 and opacities from 0 to 1; export it again")
     return Gaussians(
         means,
         np.ascontiguousarray(quats[:, [3, 0, 1, 2]]),
@@ -237,7 +235,7 @@ def _gaussians(document: GltfDocument, attributes: dict[str, int], tell: Tell) -
 
 
 def _placed(path: str | os.PathLike[str], g: Gaussians, matrix: np.ndarray) -> Gaussians:
-    """Return splats in our coordinates; the half turn is a matter of signs, and exact."""
+    """Transform splats to the coordinates of PLY files; a rotation by 180 degrees is exact."""
     if np.allclose(matrix, _FROM_GLTF, rtol=0, atol=1e-6):
         return g.half_turned_about_z()
     try:

@@ -1,4 +1,4 @@
-"""A glTF 2.0 file: its JSON, its nodes' transforms, and arrays by accessors. Nothing is larger than what lies there."""
+"""Read glTF 2.0 files: JSON, transforms of nodes, and arrays of accessors. Sizes are limited by those of the files."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from gs2d.errors import DataError
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-_DEEPEST = 100  # nodes below each other
+_DEEPEST = 100  # nesting of nodes
 
 
 @dataclass(frozen=True)
 class GltfDocument:
-    """What a file says, and the bytes of the buffer inside (.glb)."""
+    """The JSON of a file, and the buffer that a .glb contains."""
 
     path: Path
     json: dict[str, Any]
@@ -39,18 +39,18 @@ class GltfDocument:
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[None]:
-        """Make of whatever a wrong document runs into one line."""
+        """Convert errors of an invalid document to a DataError."""
         try:
             yield
         except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
             words = " ".join(str(error).split())[:100]
             raise DataError(
-                f"{self.path}: glTF 2.0 was expected, something in it does not fit ({type(error).__name__}: {words}); "
+                f"{self.path}: expected glTF 2.0, but its content is invalid ({type(error).__name__}: {words}); "
                 "export the file again"
             ) from error
 
     def packed_bytes(self) -> int:
-        """Return how many bytes the file has, with the buffers beside it."""
+        """Return the size of the file with its external buffers, in bytes."""
         beside = [
             index
             for index, buffer in enumerate(self.json.get("buffers", []))
@@ -59,27 +59,28 @@ class GltfDocument:
         return self.size + sum(len(self._buffer(index)) for index in beside)
 
     def extra(self, key: str) -> Any:
-        """Return an entry of the asset's extras, or None."""
+        """Return an entry of the extras of the asset, or None."""
         asset = self.json.get("asset")
         extras = asset.get("extras") if isinstance(asset, dict) else None
         return extras.get(key) if isinstance(extras, dict) else None
 
     def bytes_of(self, index: int) -> int:
-        """Return how many bytes an accessor's float32 values will be."""
+        """Return the size of an accessor as float32, in bytes."""
         accessor = self.json["accessors"][_whole(index)]
         return 4 * _whole(accessor["count"]) * _WIDTHS[accessor["type"]]
 
     def array(self, index: int, kind: str) -> np.ndarray:
-        """Return the values of an accessor of a kind ("VEC3") as float32 [N, width]; whole numbers as their flag says.
+        """Read an accessor of a type ("VEC3") as float32 [N, width]; integers are normalised if flagged.
 
         Raises
         ------
-        DataError, or what ``reading`` makes one of.
+        DataError
+            Or an error that ``reading`` converts to one.
         """
         accessor = self.json["accessors"][_whole(index)]
         if accessor["type"] != kind or "sparse" in accessor or "bufferView" not in accessor:
             raise DataError(
-                f"{self.path}: plain accessors were expected, of the type {kind}, got number {index} of "
+                f"{self.path}: expected plain accessors of the type {kind}, got number {index} of "
                 f"{str(accessor['type'])[:20]!r}; export the file again"
             )
         view = self.json["bufferViews"][_whole(accessor["bufferView"])]
@@ -92,7 +93,7 @@ class GltfDocument:
         needed = start + stride * (count - 1) + dtype.itemsize * width if count else 0
         if begin + length > len(data) or needed > length or stride < dtype.itemsize * width:
             raise DataError(
-                f"{self.path}: {needed} bytes for accessor {index} were expected, got a view of {length} in a buffer "
+                f"{self.path}: expected {needed} bytes for accessor {index}, got a view of {length} in a buffer "
                 f"of {len(data)}; copy or export the file again"
             )
         shape, strides = (count, width), (stride, dtype.itemsize)
@@ -111,22 +112,22 @@ class GltfDocument:
         if uri is None and index == 0 and self.inside is not None:
             return self.inside
         if not isinstance(uri, str):
-            raise DataError(f"{self.path}: a buffer with bytes was expected, number {index} has none; export it again")
+            raise DataError(f"{self.path}: buffer {index} has no data; export it again")
         if uri.startswith("data:"):
             try:
                 return base64.b64decode(uri.partition(",")[2], validate=True)
             except binascii.Error as error:
-                raise DataError(f"{self.path}: buffer {index} in base64 was expected; export the file again") from error
+                raise DataError(f"{self.path}: expected buffer {index} in base64; export the file again") from error
         name = self.path.parent / urllib.parse.unquote(uri)
         home = Path(os.path.realpath(self.path)).parent
         if "\0" in uri or not Path(os.path.realpath(name)).is_relative_to(home):
-            raise DataError(f"{self.path}: buffers in the file's own folder were expected, got {uri[:80]!r}")
+            raise DataError(f"{self.path}: expected buffers in the folder of the file, got {uri[:80]!r}")
         return _bytes(name)
 
 
 def _whole(number: Any) -> int:
     if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < 1 << 53:
-        raise ValueError(f"a whole number was expected, got {number!r:.40}")
+        raise ValueError(f"expected an integer >= 0, got {number!r:.40}")
     return number
 
 
@@ -138,12 +139,12 @@ def _bytes(path: Path) -> bytes:
 
 
 def read_document(path: str | os.PathLike[str]) -> GltfDocument:
-    """Read a .glb or a .gltf file, but not what it refers to.
+    """Read a .glb or .gltf file without its external files.
 
     Raises
     ------
     DataError
-        Missing, or no glTF 2.0.
+        If the file is missing or no glTF 2.0.
     """
     data, inside = _bytes(Path(path)), None
     text = data
@@ -152,15 +153,15 @@ def read_document(path: str | os.PathLike[str]) -> GltfDocument:
     try:
         document = json.loads(text.decode("utf-8"))
         if not isinstance(document, dict) or str(document["asset"]["version"]) != "2.0":
-            raise ValueError("version 2.0 was expected")
+            raise ValueError("expected version 2.0")
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         words = " ".join(str(error).split())[:100]
-        raise DataError(f"{os.fspath(path)}: glTF 2.0 was expected ({words}); copy or export the file again") from error
+        raise DataError(f"{os.fspath(path)}: expected glTF 2.0 ({words}); copy or export the file again") from error
     return GltfDocument(Path(path), document, inside, len(data))
 
 
 def _chunks(path: str | os.PathLike[str], data: bytes) -> tuple[bytes, bytes | None]:
-    """Return the JSON of a .glb file, and the chunk of bytes if there is one."""
+    """Return the JSON and the binary chunk, if there is one, of a .glb file."""
     found: list[tuple[bytes, bytes]] = []
     at = _HEADER.size
     while at + _CHUNK.size <= len(data) and len(found) < 2:
@@ -168,18 +169,18 @@ def _chunks(path: str | os.PathLike[str], data: bytes) -> tuple[bytes, bytes | N
         chunk = data[at + _CHUNK.size : at + _CHUNK.size + length]
         if len(chunk) < length:
             raise DataError(
-                f"{os.fspath(path)}: the file ends early ({length} more bytes were announced, {len(chunk)} are left); "
+                f"{os.fspath(path)}: the file ends early ({length} more bytes expected, {len(chunk)} left); "
                 "copy or export it again"
             )
         found.append((kind, chunk))
         at += _CHUNK.size + length
     if not found or found[0][0] != b"JSON" or _HEADER.unpack_from(data)[1] != 2:
-        raise DataError(f"{os.fspath(path)}: glTF 2.0 was expected, got a file that begins like it; export it again")
+        raise DataError(f"{os.fspath(path)}: expected glTF 2.0, but the chunks are invalid; export it again")
     return found[0][1], found[1][1] if len(found) > 1 and found[1][0] == b"BIN\0" else None
 
 
 def node_matrices(document: GltfDocument) -> Iterator[tuple[np.ndarray, int]]:
-    """Yield the transforms [4, 4] to the scene, and the meshes, of all nodes in the default scene that have one."""
+    """Yield (transform to the scene [4, 4], mesh index) of all nodes with a mesh in the default scene."""
     nodes, scenes = document.json.get("nodes", []), document.json.get("scenes", [])
     roots = scenes[_whole(document.json.get("scene", 0))].get("nodes", []) if scenes else range(len(nodes))
     waiting = [(np.eye(4), _whole(node), 0) for node in roots]
@@ -188,7 +189,7 @@ def node_matrices(document: GltfDocument) -> Iterator[tuple[np.ndarray, int]]:
         above, index, depth = waiting.pop()
         left -= 1
         if left < 0 or depth > _DEEPEST:
-            raise DataError(f"{document.path}: nodes with one parent each were expected; export the file again")
+            raise DataError(f"{document.path}: expected nodes with one parent each; export the file again")
         node = nodes[index]
         matrix = above @ _matrix(node)
         waiting += [(matrix, _whole(child), depth + 1) for child in node.get("children", [])]
@@ -211,5 +212,5 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
 def _numbers(values: Any, count: int) -> np.ndarray:
     numbers = [float(value) for value in values]
     if len(numbers) != count or not all(math.isfinite(number) and abs(number) < 1e30 for number in numbers):
-        raise ValueError(f"{count} finite numbers were expected")
+        raise ValueError(f"expected {count} finite numbers")
     return np.array(numbers)

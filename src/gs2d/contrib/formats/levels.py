@@ -1,9 +1,9 @@
-"""Levels of detail: the same scene in half as many splats, and half again, by merging pairs of neighbours.
+"""Levels of detail: halve the number of splats repeatedly by merging pairs of neighbours.
 
-A level is made of the one before. Of all pairs of near splats those whose merging is seen least are merged: each into
-one disk with the centre, covariance and mean colour of the two, weighed by their masses, that covers as much as both
-blended; where that asks for more than full opacity it is larger. What a pair costs is weighed by its mass (opacity
-times area), so that small and faint splats go first, and large differences of colour, place and orientation last.
+Each level is computed from the previous one. The pairs with the least visible change are merged, each into a disk with
+the mass-weighted centre, covariance and mean colour of both, which covers as much as both blended; if that would need
+more than full opacity, the disk is larger. The cost of a pair is weighted by its mass (opacity times area). Small and
+faint splats are therefore merged first, and pairs that differ in colour, position and orientation last.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from scipy.spatial.transform import Rotation
 from gs2d.io.gaussians import Gaussians, logit, sigmoid, unit_quats, with_thickness
 
 _NEIGHBOURS = 10
-_COLOR = 100.0  # of a squared difference of colours (in [0, 1]), against the logarithm of a volume
-_THICK = 0.01  # of the mean squared scale: what disks of one plane have across it, in logarithms of volumes
+_COLOR = 100.0  # weight of a squared colour difference (in [0, 1]) relative to the logarithm of a volume
+_THICK = 0.01  # of the mean squared scale: thickness of disks in logarithms of volumes
 _OPAQUE = 0.999
-_PASSES = 12  # of merging pairs, in one of which each splat has one partner, until half of them are left
+_PASSES = 12  # of merging disjoint pairs, until half of the splats are left
 
 
 def halved(g: Gaussians, cells: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """Return half as many disks that look alike from afar, and their cells.
+    """Return half as many disks with a similar appearance from a distance, and their cells.
 
     Parameters
     ----------
     g : Gaussians
-        Disks; their third scale is not read.
+        Disks; their third scale is ignored.
     cells : ndarray [N] int
-        Only splats of one cell are merged, so that each cell may be drawn at a level of its own.
+        Only splats in the same cell are merged, so that each cell can be shown at its own level.
 
     Returns
     -------
     Gaussians, ndarray [M] int
-        M is half of N, or more where splats have no neighbours left in their cells.
+        M is half of N, or more if splats have no neighbours in their cells.
     """
     target = (len(g) + 1) // 2
     for _ in range(_PASSES):
@@ -57,7 +57,7 @@ def _mass(g: Gaussians) -> np.ndarray:
 
 
 def _covariances(g: Gaussians) -> np.ndarray:
-    """[N, 3, 3] float64."""
+    """Return covariances [N, 3, 3] float64."""
     axes = Rotation.from_quat(unit_quats(g.quats)[:, [1, 2, 3, 0]]).as_matrix()[:, :, :2]
     axes *= np.exp(g.log_scales[:, None, :2].astype(np.float64))
     return np.asarray(axes @ axes.transpose(0, 2, 1))
@@ -69,7 +69,7 @@ def _log_volume(covariance: np.ndarray) -> np.ndarray:
 
 
 def _joint(mass: np.ndarray, means: np.ndarray, covariance: np.ndarray, pairs: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Share of the first, mean and covariance of pairs, each as one distribution."""
+    """Return the mass fraction of the first splat, and the joint mean and covariance, of pairs."""
     i, j = pairs.T
     first = mass[i] / np.maximum(mass[i] + mass[j], 1e-300)
     apart = means[j] - means[i]
@@ -80,16 +80,16 @@ def _joint(mass: np.ndarray, means: np.ndarray, covariance: np.ndarray, pairs: n
 
 
 def _cheapest(g: Gaussians, cells: np.ndarray, most: int) -> np.ndarray:
-    """Return at most so many pairs [P, 2] of near splats, no splat in two of them, those first that are seen least."""
+    """Return at most ``most`` disjoint pairs [P, 2] of near splats, by increasing cost."""
     k = min(_NEIGHBOURS + 1, len(g))
     near = cKDTree(g.means).query(g.means, k=k, workers=-1)[1].reshape(-1)
     own = np.repeat(np.arange(len(g)), k)
-    key = np.unique(np.minimum(own, near) * len(g) + np.maximum(own, near))  # each pair once
+    key = np.unique(np.minimum(own, near) * len(g) + np.maximum(own, near))  # distinct pairs
     pairs = np.stack([key // len(g), key % len(g)], axis=1)
     pairs = pairs[(pairs[:, 0] != pairs[:, 1]) & (cells[pairs[:, 0]] == cells[pairs[:, 1]])]
     mass, means, covariance = _mass(g), g.means.astype(np.float64), _covariances(g)
     volume = _log_volume(covariance)
-    color = np.concatenate([g.sh0, g.shN.reshape(len(g), -1)], axis=1) / math.sqrt(4 * math.pi)  # the mean over the sky
+    color = np.concatenate([g.sh0, g.shN.reshape(len(g), -1)], axis=1) / math.sqrt(4 * math.pi)  # over all directions
     cost = np.empty(len(pairs))
     for start in range(0, len(pairs), 1 << 18):
         some = pairs[start : start + (1 << 18)]
@@ -103,11 +103,11 @@ def _cheapest(g: Gaussians, cells: np.ndarray, most: int) -> np.ndarray:
 
 
 def _matching(pairs: np.ndarray, cost: np.ndarray, count: int) -> np.ndarray:
-    """Return what taking the cheapest pair with both still free, again and again, takes; the cheapest first."""
+    """Return the greedy matching: repeatedly the cheapest pair of unmatched splats; by increasing cost."""
     order = np.argsort(cost, kind="stable")
     pairs, taken, found = pairs[order], np.zeros(count, bool), []
     while len(pairs):
-        # A pair that is the cheapest of both its splats is one that the greedy way would take.
+        # A pair that is the cheapest for both of its splats is in the greedy matching.
         best = np.full(count, len(pairs))
         rank = np.arange(len(pairs))
         np.minimum.at(best, pairs[:, 0], rank)
@@ -124,20 +124,20 @@ def _matching(pairs: np.ndarray, cost: np.ndarray, count: int) -> np.ndarray:
 
 
 def _overlap(g: Gaussians, pairs: np.ndarray, mass: np.ndarray, plane: np.ndarray) -> np.ndarray:
-    """Return what blending takes of the masses of pairs: the integral of both opacities over a plane [P, 3, 2]."""
+    """Return the mass of pairs that blending removes: the integral of both opacities over a plane [P, 3, 2]."""
     i, j = pairs.T
     covariance = _covariances(g)
     both = plane.transpose(0, 2, 1) @ (covariance[i] + covariance[j]) @ plane
     determinant = np.maximum(both[:, 0, 0] * both[:, 1, 1] - both[:, 0, 1] ** 2, 1e-60)
     x, y = ((g.means[j] - g.means[i]).astype(np.float64)[:, None, :] @ plane)[:, 0].T
     distance = (both[:, 1, 1] * x * x - 2 * both[:, 0, 1] * x * y + both[:, 0, 0] * y * y) / determinant
-    # Of opacities o exp(-d^2 / 2) with areas 2 pi s_u s_v, in units of 2 pi.
+    # For opacities o exp(-d^2 / 2) with areas 2 pi s_u s_v, in units of 2 pi.
     both_areas = mass[i] * mass[j] * np.exp(-0.5 * distance) / np.sqrt(determinant)
     return np.asarray(np.minimum(both_areas, np.minimum(mass[i], mass[j])))
 
 
 def _merged(g: Gaussians, pairs: np.ndarray) -> Gaussians:
-    """Return one disk for each pair."""
+    """Merge each pair into one disk."""
     i, j = pairs.T
     mass = _mass(g)
     first, mean, shared = _joint(mass, g.means.astype(np.float64), _covariances(g), pairs)
@@ -147,7 +147,7 @@ def _merged(g: Gaussians, pairs: np.ndarray) -> Gaussians:
     scales = np.sqrt(np.maximum(values[:, :0:-1], 1e-36))
     covered = mass[i] + mass[j] - _overlap(g, pairs, mass, axes[:, :, :2])
     opacity = covered / scales.prod(axis=1)
-    scales *= np.sqrt(np.maximum(opacity / _OPAQUE, 1.0))[:, None]  # what no opacity can hold is held by area
+    scales *= np.sqrt(np.maximum(opacity / _OPAQUE, 1.0))[:, None]  # larger if opacity would exceed 1
     opacity = np.minimum(opacity, _OPAQUE)
     quats = Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]]
     share = first.astype(np.float32)[:, None]

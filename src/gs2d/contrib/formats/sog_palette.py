@@ -1,4 +1,4 @@
-"""Few values for many: the codebooks and the palette of harmonics in SOG, by k-means, the same for the same values."""
+"""Quantize values for SOG by deterministic k-means: codebooks of numbers, and the palette of harmonics."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import torch
 
 _ROUNDS = 12  # of a codebook
 _PALETTE_ROUNDS = 5
-_LEARNT_FROM = 150_000  # splats, at random, that a palette is made of
+_LEARNT_FROM = 150_000  # random splats from which a palette is computed
 _GROUP = 512  # rows of a palette
-_DISTANCES = 1 << 20  # at once, 4 MB: they stay in the cache
+_DISTANCES = 1 << 20  # per chunk; 4 MB fit in the cache
 
 
 def codebook(values: np.ndarray, count: int = 256) -> np.ndarray:
-    """Return ``count`` sorted numbers near which all values [N] are, float32: k-means on the line."""
+    """Return ``count`` sorted codes, float32, for values [N], by one-dimensional k-means."""
     if not len(values):
         return np.zeros(count, np.float32)
     ordered = np.sort(values.astype(np.float64).reshape(-1))
     distinct = np.unique(ordered)
     if len(distinct) <= count:
         return np.concatenate([distinct, np.full(count - len(distinct), distinct[-1])]).astype(np.float32)
-    # Half of them by rank, half by distance: what is rare has its place too.
+    # Half of the initial codes by rank, half by distance, so that rare values are represented, too.
     by_rank = distinct[np.linspace(0, len(distinct) - 1, count // 2).astype(int)]
     by_distance = np.linspace(distinct[0], distinct[-1], count - count // 2)
     centers = np.sort(np.concatenate([by_rank, by_distance]))
@@ -34,20 +34,20 @@ def codebook(values: np.ndarray, count: int = 256) -> np.ndarray:
 
 
 def nearest_code(values: np.ndarray, codes: np.ndarray) -> np.ndarray:
-    """Return the index of the nearest of sorted numbers, uint8, in the shape of ``values``."""
+    """Return the indices of the nearest sorted codes, uint8, in the shape of ``values``."""
     codes = codes.astype(np.float64)
     return np.searchsorted((codes[1:] + codes[:-1]) / 2, values.astype(np.float64)).astype(np.uint8)
 
 
 def palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows [P, D] and for each of ``rows`` [N, D] the index of a near one: P as PlayCanvas's converter has it.
+    """Return a palette [P, D], and the index of a near palette row for each of ``rows`` [N, D].
 
-    P is 1024 times a power of two, about N / 1024 of them and at most 64; all different rows where they are fewer.
-    k-means in two steps: groups first, then as many rows of the palette in each group as its members' share. A row is
-    looked for in its own group alone, which costs a hundredth of the distances and little nearness.
+    As in PlayCanvas's converter, P is 1024 times the largest power of two up to N / 1024, at most 64; with fewer
+    distinct rows, the palette is exact. k-means runs in two steps: groups first, then palette rows in each group in
+    proportion to its size. Searching in one group needs a hundredth of the distances and is nearly as accurate.
     """
     threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # thousands of small products: threads that wait for each other cost more than they give
+    torch.set_num_threads(1)  # many small products are faster without threads
     try:
         return _palette(rows)
     finally:
@@ -77,7 +77,7 @@ def _palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _shares(sizes: np.ndarray, count: int) -> np.ndarray:
-    """Divide ``count`` among groups by their sizes: one or more to each that has members, and none more than it has."""
+    """Divide ``count`` among groups in proportion to their sizes: at least 1 and at most its size for each group."""
     shares = np.maximum(np.floor(count * sizes / sizes.sum()).astype(int), sizes > 0)
     for group in np.argsort(-sizes, kind="stable").tolist():
         shares[group] = min(max(shares[group] + count - shares.sum(), 1), sizes[group]) if sizes[group] else 0
@@ -85,12 +85,12 @@ def _shares(sizes: np.ndarray, count: int) -> np.ndarray:
 
 
 def _split(label: torch.Tensor, count: int) -> tuple[torch.Tensor, ...]:
-    """Return the places of each label."""
+    """Return the indices of each label."""
     return torch.argsort(label, stable=True).split(torch.bincount(label, minlength=count).tolist())
 
 
 def _means(rows: torch.Tensor, count: int, generator: np.random.Generator) -> torch.Tensor:
-    """Return ``count`` means [count, D] of rows that are all different: k-means from rows at random."""
+    """Return ``count`` means [count, D] of distinct rows, by k-means from random rows."""
     centers = rows[torch.from_numpy(np.sort(generator.permutation(len(rows))[:count]))].clone()
     for _ in range(_PALETTE_ROUNDS):
         label = _nearest(rows, centers)
@@ -103,7 +103,7 @@ def _means(rows: torch.Tensor, count: int, generator: np.random.Generator) -> to
 def _nearest(rows: torch.Tensor, centers: torch.Tensor) -> torch.Tensor:
     half = 0.5 * centers.square().sum(dim=1)
     at_once = max(_DISTANCES // len(centers), 1)
-    room = torch.empty(min(at_once, len(rows)), len(centers))  # taken once: fresh pages cost as much as the products
+    room = torch.empty(min(at_once, len(rows)), len(centers))  # allocated once: new pages are slow
     return torch.cat(
         [
             torch.addmm(half, chunk, centers.T, alpha=-1, out=room[: len(chunk)]).argmin(dim=1)

@@ -1,7 +1,7 @@
-"""The streamed form of SOG, written: levels of detail in chunks of space, which a viewer loads as it needs them.
+"""Write the streamed form of SOG: levels of detail in spatial chunks, which a viewer loads on demand.
 
-``lod-meta.json`` has a tree of boxes. Each leaf says for every level which splats of which data set of SOG are in it
-(file, offset, count); level 0 is the finest. The folders of data sets lie beside it.
+``lod-meta.json`` contains a tree of boxes. Each leaf refers, for every level, to its splats in an SOG data set (file,
+offset, count); level 0 is the finest. The folders of the data sets are beside it.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from gs2d.io.gaussians import Gaussians, unit_quats
 
 INDEX = "lod-meta.json"
 LEVELS = 4  # at least: 1, 1/2, 1/4 and 1/8 of the splats
-_MOST_LEVELS, _COARSEST = 8, 250_000  # more levels until one has no more splats than that
-_LEAF = 16_384  # splats of the finest level in a leaf, at most
-_FILE = 131_072  # splats in a data set, about
-_REACH = 3.0  # standard deviations that a box has room for
+_MOST_LEVELS, _COARSEST = 8, 250_000  # further levels are added until the coarsest has at most this many splats
+_LEAF = 16_384  # largest number of splats of the finest level in a leaf
+_FILE = 131_072  # approximate number of splats in a data set
+_REACH = 3.0  # standard deviations of splats that a box contains
 _PARTS = ("means_l", "means_u", "scales", "quats", "sh0", "shN_centroids", "shN_labels")
 
 
 @dataclass(frozen=True, eq=False)
 class _Level:
-    """One level of detail: its splats by leaf, in each in Morton order, and where each leaf begins."""
+    """One level of detail: its splats by leaf, in Morton order within a leaf, and the start of each leaf."""
 
     gaussians: Gaussians
     ends: np.ndarray  # [L + 1]
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Smallest and largest coordinates [L, 3] of what the splats of each leaf cover; infinite where it has none."""
+        """Return the bounding boxes (low, high) [L, 3] of the splats of each leaf; infinite for empty leaves."""
         g, leaves = self.gaussians, len(self.ends) - 1
         turn = Rotation.from_quat(unit_quats(g.quats)[:, [1, 2, 3, 0]]).as_matrix()
         reach = _REACH * np.sqrt(np.square(turn * np.exp(g.log_scales[:, None].astype(np.float64))).sum(axis=2))
@@ -55,26 +55,27 @@ class _Level:
 
 
 def write_streamed_sog(path: str | os.PathLike[str], gaussians: Gaussians, *, levels: int | None = None) -> None:
-    """Write a ``lod-meta.json`` and the folders of its data sets beside it.
+    """Write a ``lod-meta.json``, and the folders of its data sets beside it.
 
-    The index is written last, atomically: what it refers to is there, whenever it is read. What an older index of the
-    same name referred to is removed after that. Nothing else in the folder is touched.
+    The index is written last, atomically, so it always refers to complete data sets. Then the data sets of an older
+    index of the same name are removed. Other files in the folder are not changed.
 
     Parameters
     ----------
     path : path
-        Its folder is made where it is missing.
+        Its folder is created if it is missing.
     gaussians : Gaussians
         Disks.
     levels : int, optional
-        Each has half of the splats of the one before. By default 4, or as many more (8 at most) as the coarsest needs
-        to have no more than 250,000 splats.
+        Each level has half of the splats of the previous one. Default: 4, or up to 8 so that the coarsest has at most
+        250,000 splats.
 
     Raises
     ------
     ValueError
-        ``levels`` is below 1.
+        If ``levels`` is below 1.
     DiskError
+        If a file cannot be written.
     """
     path = Path(path)
     wanted = _levels_for(len(gaussians)) if levels is None else levels
@@ -95,7 +96,7 @@ def write_streamed_sog(path: str | os.PathLike[str], gaussians: Gaussians, *, le
 
 
 def streamed_bytes(path: Path) -> int:
-    """Return the bytes of a stream: its index, and all data sets that it refers to."""
+    """Return the size of a stream in bytes: its index and all data sets."""
     folders = [path.parent / name for name in _listed(path)]
     return path.stat().st_size + sum(file.stat().st_size for folder in folders for file in folder.iterdir())
 
@@ -105,7 +106,7 @@ def _levels_for(count: int) -> int:
 
 
 def _divided(means: np.ndarray) -> tuple[Any, np.ndarray]:
-    """Return a tree of pairs whose ends are numbers of leaves, and the leaf of each splat [N]: halves, by medians."""
+    """Split space at medians; returns a tree of pairs with leaf indices, and the leaf of each splat [N]."""
     cells, numbers = np.zeros(len(means), int), itertools.count()
 
     def divide(rows: np.ndarray) -> Any:
@@ -113,7 +114,7 @@ def _divided(means: np.ndarray) -> tuple[Any, np.ndarray]:
             cells[rows] = leaf = next(numbers)
             return leaf
         some = means[rows]
-        axis = int(np.argmax(np.quantile(some, 0.95, axis=0) - np.quantile(some, 0.05, axis=0)))  # strays do not count
+        axis = int(np.argmax(np.quantile(some, 0.95, axis=0) - np.quantile(some, 0.05, axis=0)))  # ignores outliers
         order = np.argsort(some[:, axis], kind="stable")
         return divide(rows[order[: len(rows) // 2]]), divide(rows[order[len(rows) // 2 :]])
 
@@ -130,14 +131,14 @@ def _made(g: Gaussians, cells: np.ndarray, leaves: int, levels: int) -> Iterator
 
 
 def _written(home: Path, folder: str, levels: list[_Level]) -> dict[str, Any]:
-    """Write the data sets; return the index, with the places of each leaf by level as ``leaves``."""
+    """Write the data sets; returns the index, with the splats of each leaf by level as ``leaves``."""
     names: list[str] = []
     leaves: list[dict[str, dict[str, int]]] = [{} for _ in levels[0].ends[1:]]
     for number, level in enumerate(levels):
         first = 0
         while first < len(leaves):
             begin = level.ends[first]
-            last = max(first + 1, int(np.searchsorted(level.ends, begin + _FILE)))  # the first leaf that is over it
+            last = max(first + 1, int(np.searchsorted(level.ends, begin + _FILE)))  # the first leaf beyond the size
             last = min(last, len(leaves))
             name = folder.format(level=number, file=len(names))
             _write_set(home / name, level.gaussians.rows(np.arange(begin, level.ends[last])))
@@ -183,7 +184,7 @@ def _node(tree: Any, low: np.ndarray, high: np.ndarray, leaves: list[dict[str, d
 
 @contextlib.contextmanager
 def _new_folders(path: Path) -> Iterator[str]:
-    """Yield a pattern for names of new folders beside ``path``, which go again where the body fails."""
+    """Yield a pattern for names of new folders beside ``path``; they are removed if the body fails."""
     made = False
     try:
         if not path.parent.is_dir():
@@ -207,7 +208,7 @@ def _new_folders(path: Path) -> Iterator[str]:
 
 
 def _numbered(name: str, tail: str) -> bool:
-    """Whether a name is that of a data set with this tail."""
+    """Whether a name is that of a data set with this suffix."""
     if not name.endswith(tail):
         return False
     parts = name[: len(name) - len(tail)].split("_")
@@ -215,7 +216,7 @@ def _numbered(name: str, tail: str) -> bool:
 
 
 def _listed(path: Path) -> list[str]:
-    """Return the folders of data sets that an index beside which they lie refers to; none where it is none."""
+    """Return the folders of data sets that an index refers to; empty if it is missing or invalid."""
     try:
         names = json.loads(path.read_bytes())["filenames"]
         folders = [name.removesuffix("/meta.json") for name in names if name.endswith("/meta.json")]
@@ -225,7 +226,7 @@ def _listed(path: Path) -> list[str]:
 
 
 def _remove(folder: Path) -> None:
-    """Remove the files of a data set, and its folder if nothing else is in it."""
+    """Remove the files of a data set, and its folder if it is empty then."""
     for name in (*(f"{part}.webp" for part in _PARTS), "meta.json"):
         with contextlib.suppress(OSError):
             (folder / name).unlink()

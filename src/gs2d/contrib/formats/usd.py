@@ -1,9 +1,9 @@
-"""OpenUSD: a ParticleField with the kernel of Gaussian surflets, which is the 2D Gaussian itself (extra ``usd``).
+"""Read and write OpenUSD: a ParticleField of Gaussian surflets, which are 2D Gaussians (extra ``usd``).
 
-The schema (UsdVol of OpenUSD 26.03) has centres, rotations, linear scales, linear opacities and spherical harmonics as
-3DGS orders them. Scales and opacities as training has them, logarithms and logits, stand beside them as user
-properties, so that what comes back is the same to the bit; they count where they agree with the schema's. The third
-scale says nothing of a surflet; programs that take all fields for ellipsoids find a thickness there that does not show.
+The schema (UsdVol of OpenUSD 26.03) has centres, rotations, linear scales, linear opacities and spherical harmonics in
+the order of 3DGS. Log scales and logits are stored in addition, as user properties, so that reading is exact; they are
+used if they agree with the schema's values. Surflets ignore the third scale; for programs that read all fields as
+ellipsoids, it is a negligible thickness.
 """
 
 from __future__ import annotations
@@ -44,20 +44,20 @@ _APIS = (
     "SphericalHarmonicsAttribute",
 )  # fmt: skip
 _OWN = "userProperties:gs2d:"
-_ADDRESSES = 3 << 30  # bytes of address space for OpenUSD's libraries and threads
-_RATIO = 20  # bytes of addresses for one of the file, beyond ``_ADDRESSES``
-_SECONDS, _RATE = 10, 1 << 20  # of a processor for any file, and bytes of a larger one a second
-_WAIT = 10  # times that, on a machine that is busy
-_AGREE = 2e-6  # relative: rounding of exp and log is less
+_ADDRESSES = 3 << 30  # bytes; address space for OpenUSD's libraries and threads
+_RATIO = 20  # bytes of address space per byte of the file, beyond ``_ADDRESSES``
+_SECONDS, _RATE = 10, 1 << 20  # s of CPU time for any file; bytes per further second
+_WAIT = 10  # times the CPU time, as wall time on a busy machine
+_AGREE = 2e-6  # tolerance; rounding of exp and log is smaller
 
 
 def required_usd() -> Any:
-    """Return the package pxr, OpenUSD's.
+    """Import OpenUSD's package pxr.
 
     Raises
     ------
     BackendError
-        It is not installed.
+        If it is not installed.
     """
     try:
         for name in ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdVol", "Vt"):
@@ -68,14 +68,14 @@ def required_usd() -> Any:
 
 
 def write_usd(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Write a binary OpenUSD file, atomically; the same bytes for the same splats.
+    """Write a binary OpenUSD file, atomically and deterministically.
 
-    The stage says z-up and metres, which is so of georeferenced splats alone: coordinates are written as they are.
+    The stage states z-up and metres, which is true for georeferenced splats only; coordinates are not changed.
 
     Raises
     ------
     BackendError
-        Without OpenUSD.
+        If OpenUSD is not installed.
     DiskError
         If the file could not be written.
     """
@@ -106,7 +106,7 @@ def _vt(kind: Any, values: np.ndarray) -> Any:
 
 
 def _schema_values(pxr: Any, g: Gaussians) -> dict[str, Any]:
-    """Return the attributes of the schema."""
+    """Return the attributes of the schema, by name."""
     scales = _schema_scales(g.log_scales)
     harmonics = np.concatenate([g.sh0[:, None], g.shN], axis=1).reshape(-1, 3)
     reach = 3.0 * scales.max(axis=1, keepdims=True, initial=0.0)
@@ -133,12 +133,12 @@ def _schema_opacities(logits: np.ndarray) -> np.ndarray:
 
 
 def _schema_quats(quats: np.ndarray) -> np.ndarray:
-    """(x, y, z, w) of length 1, as they lie in the memory of USD's quaternions."""
+    """Return unit quaternions (x, y, z, w), the memory layout of USD."""
     return unit_quats(quats)[:, [1, 2, 3, 0]].astype(np.float32)
 
 
 def _save(pxr: Any, path: Path, layer: Any) -> None:
-    """Write a layer; OpenUSD wants names with its endings and writes by itself, hence the folder."""
+    """Write a layer to a temporary folder, because OpenUSD requires its own suffixes, and copy it atomically."""
     with tempfile.TemporaryDirectory(prefix="gs2d-usd-") as home:
         made = Path(home, "splats.usdc")
         try:
@@ -153,17 +153,16 @@ def _save(pxr: Any, path: Path, layer: Any) -> None:
 
 
 def read_usd(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[Gaussians, str]:
-    """Read all particle fields of an OpenUSD file, in the frame of its stage: Gaussians, and their kernels in words.
+    """Read all particle fields of an OpenUSD file, in the frame of its stage; also returns their kernels.
 
-    Fields of surflets are flat whatever their third scale says. ``tell`` receives a sentence on SH bands above degree
-    3, which are left out.
+    The third scale of surflets is ignored. ``tell`` receives a message if SH bands above degree 3 are dropped.
 
     Raises
     ------
     DataError
-        Missing, no OpenUSD, without such fields, or with a kernel or a transform that splats do not have.
+        If the file is missing, no OpenUSD, or has no such fields, or an unsupported kernel or transform.
     BackendError
-        Without OpenUSD.
+        If OpenUSD is not installed.
     """
     facts, data = _ask(path)
     fields, at = [], 0
@@ -175,13 +174,13 @@ def read_usd(path: str | os.PathLike[str], tell: Tell = warnings.warn) -> tuple[
             at += 4 * size
         fields.append(_gaussians(path, fact, arrays, tell))
     if not fields:
-        raise DataError(f"{os.fspath(path)}: a ParticleField was expected, the stage has none; export splats to it")
+        raise DataError(f"{os.fspath(path)}: expected a ParticleField, but the stage has none; export splats to it")
     kernels = sorted({fact["kernel"] for fact in facts["fields"]})
     return Gaussians.joined(fields), "OpenUSD, " + " and ".join(f"{kernel}s" for kernel in kernels)
 
 
 def _ask(path: str | os.PathLike[str]) -> tuple[dict[str, Any], memoryview]:
-    """Return what a process of its own reads: facts, and the bytes of the arrays."""
+    """Read a file in a separate process; returns facts, and the bytes of the arrays."""
     required_usd()
     try:
         size = os.stat(path).st_size
@@ -194,14 +193,14 @@ def _ask(path: str | os.PathLike[str]) -> tuple[dict[str, Any], memoryview]:
         status, said = _read_apart(os.path.abspath(path), most, seconds)
     except subprocess.TimeoutExpired as error:
         raise DataError(
-            f"{os.fspath(path)}: OpenUSD that is read in {error.timeout:.0f} s was expected; do not trust the file"
+            f"{os.fspath(path)}: reading OpenUSD took more than {error.timeout:.0f} s; do not trust the file"
         ) from error
     line, _, _ = said.partition(b"\n")
     try:
         facts = json.loads(line)
     except ValueError:
         raise DataError(
-            f"{os.fspath(path)}: OpenUSD was expected, its reader broke on it (status {status}); copy or "
+            f"{os.fspath(path)}: expected OpenUSD, but its reader failed (status {status}); copy or "
             "export the file again"
         ) from None
     if "error" in facts:
@@ -211,9 +210,9 @@ def _ask(path: str | os.PathLike[str]) -> tuple[dict[str, Any], memoryview]:
 
 
 def _read_apart(path: str, most: int, seconds: int) -> tuple[int, bytes]:
-    """Return exit status and stdout of ``usd_process`` with so many bytes of addresses and seconds of a processor."""
+    """Run ``usd_process`` with limits of address space (bytes) and CPU time (s); returns exit status and stdout."""
     words = [sys.executable, "-P", usd_process.__file__, path, str(most), str(seconds)]
-    # One thread: each takes addresses, which are counted.
+    # One thread, because each needs address space.
     environment = {**os.environ, "PXR_WORK_THREAD_LIMIT": "1", "MALLOC_ARENA_MAX": "1", "OPENBLAS_NUM_THREADS": "1"}
     done = subprocess.run(words, capture_output=True, timeout=_WAIT * seconds, env=environment)
     return done.returncode, done.stdout
@@ -222,16 +221,16 @@ def _read_apart(path: str, most: int, seconds: int) -> tuple[int, bytes]:
 def _gaussians(
     path: str | os.PathLike[str], fact: dict[str, Any], arrays: dict[str, np.ndarray], tell: Tell
 ) -> Gaussians:
-    """Return one field; what it does not say is as the schema has it."""
+    """Convert one field, with the defaults of the schema."""
     where, count = f"{path}: {fact['path']}", fact["count"]
     if fact["kernel"] not in ("surflet", "ellipsoid"):
-        raise DataError(f"{where}: a kernel of Gaussian surflets or ellipsoids was expected, got {fact['kernel']}")
+        raise DataError(f"{where}: expected a kernel of Gaussian surflets or ellipsoids, got {fact['kernel']}")
     opacities = arrays.get("opacities", np.ones((count, 1), np.float32))
-    if ((opacities < 0) | (opacities > 1)).any():  # NaN is left out later
-        raise DataError(f"{where}: opacities of 0 to 1 were expected; export the file again")
+    if ((opacities < 0) | (opacities > 1)).any():  # NaN is dropped later
+        raise DataError(f"{where}: expected opacities from 0 to 1; export the file again")
     scales = arrays.get("scales", np.ones((count, 3), np.float32))
     if (scales < 0).any():
-        raise DataError(f"{where}: scales of 0 or more were expected; export the file again")
+        raise DataError(f"{where}: expected scales >= 0; export the file again")
     quats = arrays.get("orientations", np.tile(np.array([0, 0, 0, 1], np.float32), (count, 1)))
     harmonics = arrays.get("harmonics", np.zeros((count, 3), np.float32))
     harmonics = harmonics.reshape(count, harmonics.shape[1] // 3, 3)
@@ -253,9 +252,9 @@ def _gaussians(
 def _exact(
     g: Gaussians, scales: np.ndarray, opacities: np.ndarray, quats: np.ndarray, own: dict[str, np.ndarray]
 ) -> Gaussians:
-    """Take what training had where the schema's values say the same, splat for splat: others may have changed them."""
+    """Use the exact values of splats whose schema values agree; other programs may have changed them."""
     log_scales, logits, rotations = g.log_scales, g.opacity_logits, g.quats
-    with np.errstate(over="ignore", invalid="ignore"):  # of numbers that no training had
+    with np.errstate(over="ignore", invalid="ignore"):  # invalid values
         if "logScales" in own:
             same = np.isclose(_schema_scales(own["logScales"]), scales[:, :2], rtol=_AGREE, atol=0)
             log_scales = np.concatenate([np.where(same, own["logScales"], log_scales[:, :2]), log_scales[:, 2:]], 1)
@@ -269,7 +268,7 @@ def _exact(
 
 
 def _placed(where: str, g: Gaussians, matrix: np.ndarray) -> Gaussians:
-    """Return a field in the frame of the stage."""
+    """Transform a field to the frame of the stage."""
     if np.array_equal(matrix, np.eye(4)):
         return g
     try:

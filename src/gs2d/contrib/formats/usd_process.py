@@ -1,9 +1,8 @@
-"""Read the particle fields of an OpenUSD file in a process of its own: ``python usd_process.py FILE BYTES SECONDS``.
+"""Read the particle fields of an OpenUSD file in a separate process: ``python usd_process.py FILE BYTES SECONDS``.
 
-A file that was damaged on purpose ends OpenUSD's parser by a signal or takes all memory, so that it works here, where
-neither hurts: under limits of address space and of a processor's time. On stdout comes a line of JSON, what was found
-or ``{"error": ...}``, then the arrays that it names, float32 one after the other. Nothing of gs2d is imported: starting
-is to be quick.
+A malicious file can crash OpenUSD's parser or exhaust the memory, so it is parsed here, with limits of address space
+and CPU time. The output is a line of JSON with facts or ``{"error": ...}``, followed by the arrays that it names,
+float32. Nothing of gs2d is imported, so that the process starts quickly.
 """
 
 from __future__ import annotations
@@ -21,19 +20,24 @@ _KERNELS = {
     "ParticleFieldKernelGaussianEllipsoidAPI": "ellipsoid",
     "ParticleFieldKernelConstantSurfletAPI": "constant",
 }
-_ARRAYS = {"positions": 3, "orientations": 4, "scales": 3, "opacities": 1}  # and as halves, with an h behind the name
+_ARRAYS = {
+    "positions": 3,
+    "orientations": 4,
+    "scales": 3,
+    "opacities": 1,
+}  # also as halves, with an h appended
 _HARMONICS = "radiance:sphericalHarmonicsCoefficients"
-_OWN = "userProperties:gs2d:"  # what training had, beside what the schema has of it
+_OWN = "userProperties:gs2d:"  # exact values of training
 _OWN_ARRAYS = {"logScales": 2, "opacityLogits": 1, "quaternions": 4}
-_OUTSIDE = "everything in the file itself or in its folder was expected, it refers to {}; flatten it into one file"
+_OUTSIDE = "expected all content in the file or its folder, but it refers to {}; flatten it into one file"
 
 
 class _UnfitError(Exception):
-    """What is wrong with the file, in words."""
+    """A problem of the file, as a message."""
 
 
 def _limit(most: int, seconds: int) -> None:
-    """Let this process have so many bytes of addresses and seconds of a processor, where the system knows limits."""
+    """Limit the address space (bytes) and CPU time (s) of this process, if the system supports it."""
     try:
         import resource
     except ModuleNotFoundError:  # Windows
@@ -44,7 +48,7 @@ def _limit(most: int, seconds: int) -> None:
 
 
 def _check_inside(Sdf: Any, root: Any, home: Path) -> None:
-    """Raise where layers beside those in the file's own folder are referred to; none of them is opened."""
+    """Raise if the file refers to layers outside its own folder; they are not opened."""
     layers, seen = [root], set()
     while layers:
         layer = layers.pop()
@@ -62,7 +66,7 @@ def _check_inside(Sdf: Any, root: Any, home: Path) -> None:
 
 
 def _values(prim: Any, name: str, width: int, when: Any, *, half: bool) -> np.ndarray | None:
-    """Return the array [N, width] of an attribute; None where nothing is said."""
+    """Return the array [N, width] of an attribute; None if it is not set."""
     for full in (name, name + "h") if half else (name,):
         attribute = prim.GetAttribute(full)
         value = attribute.Get(when) if attribute else None
@@ -70,13 +74,13 @@ def _values(prim: Any, name: str, width: int, when: Any, *, half: bool) -> np.nd
             continue
         array = np.asarray(value)
         if array.dtype.kind != "f" or array.size != len(value) * width:
-            raise _UnfitError(f"{width} numbers a splat as {full} were expected, got {attribute.GetTypeName()}")
+            raise _UnfitError(f"expected {width} numbers per splat as {full}, got {attribute.GetTypeName()}")
         return array.reshape(-1, width).astype(np.float32)
     return None
 
 
 def _field(prim: Any, when: Any, cache: Any) -> tuple[dict[str, Any], list[np.ndarray]]:
-    """Return what is said of one particle field, and its arrays. Those too short are left out, as the schema says."""
+    """Return the facts and arrays of one particle field. Arrays that are too short are ignored, as in the schema."""
     applied = prim.GetAppliedSchemas()
     kernels = [kernel for api, kernel in _KERNELS.items() if api in applied]
     arrays = {name: _values(prim, name, width, when, half=True) for name, width in _ARRAYS.items()}
@@ -86,7 +90,7 @@ def _field(prim: Any, when: Any, cache: Any) -> tuple[dict[str, Any], list[np.nd
     degree = degree.Get() if degree else None
     degree = 3 if degree is None else int(degree)
     if not 0 <= degree <= 8:
-        raise _UnfitError(f"SH degree 0 to 3 was expected, got {degree}; export it with three bands")
+        raise _UnfitError(f"expected SH degree 0 to 3, got {degree}; export it with three bands")
     harmonics = _values(prim, _HARMONICS, 3, when, half=True)
     coefficients = (degree + 1) ** 2
     if harmonics is not None and len(harmonics) >= count * coefficients:
@@ -95,7 +99,7 @@ def _field(prim: Any, when: Any, cache: Any) -> tuple[dict[str, Any], list[np.nd
     kept = {name: array[:count] for name, array in arrays.items() if array is not None and len(array) >= count}
     matrix = np.array(cache.GetLocalToWorldTransform(prim), dtype=np.float64)
     if not np.isfinite(matrix).all():
-        raise _UnfitError(f"a transform of finite numbers was expected of {prim.GetPath()}")
+        raise _UnfitError(f"expected a transform of finite numbers for {prim.GetPath()}")
     facts = {
         "path": str(prim.GetPath()),
         "kernel": kernels[-1] if kernels else "none",
@@ -109,22 +113,22 @@ def _field(prim: Any, when: Any, cache: Any) -> tuple[dict[str, Any], list[np.nd
 def _found(path: str) -> tuple[dict[str, Any], list[np.ndarray]]:
     from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils, UsdVol
 
-    delegate = UsdUtils.CoalescingDiagnosticDelegate()  # nothing is said on the terminal
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()  # suppresses terminal output
     try:
         root = Sdf.Layer.FindOrOpen(path)
         if root is None:
-            raise _UnfitError("OpenUSD was expected, its reader does not know it as such; copy or export it again")
+            raise _UnfitError("expected OpenUSD, but its reader does not recognise the file; copy or export it again")
         _check_inside(Sdf, root, Path(os.path.realpath(path)).parent)
         stage = Usd.Stage.Open(root)
         if stage is None:
-            raise _UnfitError("OpenUSD was expected, its stage does not open; copy or export it again")
+            raise _UnfitError("expected OpenUSD, but its stage does not open; copy or export it again")
         when = Usd.TimeCode.EarliestTime()
         cache = UsdGeom.XformCache(when)
         prims = [p for p in stage.Traverse(Usd.TraverseInstanceProxies()) if p.IsA(UsdVol.ParticleField)]
         fields = [_field(prim, when, cache) for prim in prims]
     except Tf.ErrorException as error:
         words = " ".join(str(error).split())[:200]
-        raise _UnfitError(f"OpenUSD was expected, its reader says: {words}; copy or export it again") from error
+        raise _UnfitError(f"expected OpenUSD, but its reader reports: {words}; copy or export it again") from error
     finally:
         delegate.TakeUncoalescedDiagnostics()
     facts = {"fields": [fact for fact, _ in fields]}
@@ -132,7 +136,7 @@ def _found(path: str) -> tuple[dict[str, Any], list[np.ndarray]]:
 
 
 def main(path: str, most: str, seconds: str) -> None:
-    """Write what is found to stdout, and end."""
+    """Write the result to stdout, and exit."""
     _limit(int(most), int(seconds))
     arrays: list[np.ndarray] = []
     try:
@@ -140,12 +144,12 @@ def main(path: str, most: str, seconds: str) -> None:
     except _UnfitError as error:
         facts = {"error": str(error)}
     except MemoryError:
-        facts = {"error": "splats that fit into the memory that a file of this size may take were expected"}
+        facts = {"error": "the splats need more memory than a file of this size may use"}
     sys.stdout.buffer.write(json.dumps(facts).encode() + b"\n")
     for array in arrays:
         sys.stdout.buffer.write(np.ascontiguousarray(array, "<f4").data)
     sys.stdout.buffer.flush()
-    os._exit(0)  # what OpenUSD holds need not be taken down piece by piece
+    os._exit(0)  # skips the slow cleanup of OpenUSD
 
 
 if __name__ == "__main__":
