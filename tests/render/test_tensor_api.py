@@ -268,9 +268,9 @@ def test_the_ends_of_opacity_and_scale_are_drawn_and_learn(backend: Backend) -> 
 
 
 BAD: dict[str, tuple[dict[str, Any], str]] = {
-    "logits": ({"opacities": torch.full((12,), -2.0)}, r"opacities must be in \[0, 1\], got -2; give the sigmoid"),
+    "logits": ({"opacities": torch.full((12,), -2.0)}, r"opacities must be in \[0, 1\], got -2; pass the sigmoid"),
     "above one": ({"opacities": torch.full((12,), 1.5)}, r"opacities must be in \[0, 1\], got 1.5"),
-    "log scales": ({"scales": torch.full((12, 2), -3.0)}, "scales must not be negative, got -3; give exp"),
+    "log scales": ({"scales": torch.full((12, 2), -3.0)}, "scales must not be negative, got -3; pass exp"),
     "one camera": ({"viewmats": torch.eye(4)}, "viewmats"),
     "skew": ({"Ks": torch.ones(2, 3, 3)}, "pinhole cameras without skew"),
     "no camera": ({"viewmats": torch.zeros(0, 4, 4), "Ks": torch.zeros(0, 3, 3)}, "at least one camera"),

@@ -1,4 +1,4 @@
-"""The reference for splat errors: the inner sum of the paper's E_i (rule 17 of the contract; docs/math.md)."""
+"""Reference implementation of splat errors: the inner sum of the paper's E_i (rule 17; docs/math.md)."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def splat_errors(
     mask: Tensor | None = None,
     occlusion: bool = False,
 ) -> Tensor:
-    """Sum of |c_i - image| over each splat's footprint [N]; see :func:`gs2d.render.api.splat_errors`."""
-    # Nearly transparent splats count (the opacity is ignored), but do not blend: rule 6 skips all their pairs.
+    """Return the sum of |c_i - image| over each splat's footprint [N]; see :func:`gs2d.render.api.splat_errors`."""
+    # Nearly transparent splats count, since opacity is ignored, but rule 6 skips all their pairs in blending.
     rows = visible_rows(splats, camera, settings, for_errors=True)
     screen = project(splats, rows, camera, settings)
     reach = torch.full_like(screen.opacity, settings.error_cutoff**2)
-    if occlusion:  # the nearer splats of a pixel count with their whole blending footprint
+    if occlusion:  # nearer splats occlude with their whole blending footprint
         reach = reach.maximum(cutoff_squared(screen.opacity, settings))
     boxes = screen_boxes(screen, reach, camera, settings)
 

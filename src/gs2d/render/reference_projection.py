@@ -1,6 +1,6 @@
-"""First half of the reference rasterizer: from splats to screen (docs/math.md, "Projection" and "Footprint").
+"""Projection of splats for the reference rasterizer (docs/math.md, "Projection" and "Footprint").
 
-Everything here is per splat; :mod:`gs2d.render.reference_rasterizer` is per pair of splat and pixel.
+This module works per splat, :mod:`gs2d.render.reference_rasterizer` per pair of splat and pixel.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ MAX_PAIRS = 1 << 21  # pairs of splat and pixel evaluated at once; bounds the me
 
 @dataclass(frozen=True)
 class ScreenSplats:
-    """M splats that can touch the image, in blending order, as one camera sees them.
+    """M splats that can touch the image of one camera, in blending order.
 
-    The splat-to-pixel map (x z, y z, z) = (Tu, Tv, Tw) (u, v, 1) is stored relative to the projected centre c, so that
-    float32 keeps its digits: Au = Tu - c_x Tw and Av = Tv - c_y Tw, whose third components are 0.
+    The splat-to-pixel map (x z, y z, z) = (Tu, Tv, Tw) (u, v, 1) is stored relative to the projected centre c, for
+    float32 precision: Au = Tu - c_x Tw and Av = Tv - c_y Tw, whose third components are 0.
     """
 
     center: Tensor  # [M, 2] px, c
@@ -39,13 +39,13 @@ class ScreenSplats:
     normal: Tensor  # [M, 3] world, facing the camera
 
     def rows(self, index: Tensor) -> ScreenSplats:
-        """Return the splats picked by an index tensor, in its order."""
+        """Return the splats of an index tensor, in its order."""
         return ScreenSplats(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
 
 @dataclass(frozen=True)
-class Block:
-    """Some pixels and the splats whose boxes reach them."""
+class PixelBlock:
+    """A block of pixels and the splats whose boxes reach it."""
 
     pixels: Tensor  # [P] row-major index into the image
     points: Tensor  # [P, 2] px, pixel centres
@@ -53,7 +53,7 @@ class Block:
 
 
 def visible_rows(splats: Splats, camera: Camera, settings: RasterSettings, *, for_errors: bool) -> Tensor:
-    """Rows that are not culled by rules 5, 6, 16, 19 and 23, by increasing camera depth, ties by index (rule 2).
+    """Return the rows that rules 5, 6, 16, 19 and 23 do not cull, by increasing depth, ties by index (rule 2).
 
     Returns
     -------
@@ -64,7 +64,7 @@ def visible_rows(splats: Splats, camera: Camera, settings: RasterSettings, *, fo
     shN = used.shN[:, : num_coefficients(max(settings.sh_degree, 0)) - 1]
     for tensor in (used.means, used.quats, used.log_scales, used.opacity_logits):
         keep &= tensor.isfinite().flatten(1).all(dim=1) if tensor.dim() > 1 else tensor.isfinite()
-    keep &= (used.sh0.abs().sum(dim=(1, 2)) + shN.abs().sum(dim=(1, 2))) <= MAX_COLOR  # False for NaN, like all here
+    keep &= (used.sh0.abs().sum(dim=(1, 2)) + shN.abs().sum(dim=(1, 2))) <= MAX_COLOR  # comparisons with NaN are False
     keep &= (used.scales <= MAX_SIZE).all(dim=1)
     at = _to_camera(used.means, camera)
     keep &= (at.abs() <= MAX_SIZE).all(dim=1)
@@ -79,14 +79,14 @@ def visible_rows(splats: Splats, camera: Camera, settings: RasterSettings, *, fo
 
 
 def _slant_squared(splats: Splats, camera: Camera) -> Tensor:
-    """(s_u t_u.z)^2 + (s_v t_v.z)^2 in the camera frame [N], squared world units: one sigma's reach in depth."""
+    """Return (s_u t_u.z)^2 + (s_v t_v.z)^2 in the camera frame [N]: the squared depth range of one sigma."""
     tangents = quats_to_matrices(splats.quats)[:, :, :2] * splats.scales[:, None, :]  # [N, 3, 2]
     forward = torch.as_tensor(camera.rotation[2].copy(), dtype=tangents.dtype, device=tangents.device)
     return torch.einsum("j,njk->nk", forward, tangents).square().sum(dim=1)
 
 
 def project(splats: Splats, rows: Tensor, camera: Camera, settings: RasterSettings) -> ScreenSplats:
-    """Splats as the camera sees them; differentiable.
+    """Project splats to a camera; differentiable.
 
     Parameters
     ----------
@@ -110,7 +110,9 @@ def project(splats: Splats, rows: Tensor, camera: Camera, settings: RasterSettin
     focal, principal = intrinsics[:2], intrinsics[2:]
     Au = focal[0] * (H[:, 0] - offset[:, :1] * H[:, 2])
     Av = focal[1] * (H[:, 1] - offset[:, 1:] * H[:, 2])
-    third = torch.tensor([1.0, 1.0, 0.0], dtype=means.dtype, device=means.device)  # 0 but for rounding: say so
+    third = torch.tensor(
+        [1.0, 1.0, 0.0], dtype=means.dtype, device=means.device
+    )  # exact zeros instead of rounding errors
 
     to_splat = means - torch.as_tensor(camera.center, dtype=means.dtype, device=means.device)
     directions = to_splat / to_splat.norm(dim=1, keepdim=True)
@@ -133,7 +135,7 @@ def project(splats: Splats, rows: Tensor, camera: Camera, settings: RasterSettin
 
 
 def screen_boxes(screen: ScreenSplats, cutoff_squared: Tensor, camera: Camera, settings: RasterSettings) -> Tensor:
-    """Screen boxes of rule 14 for the disc rho3d <= k^2, clipped to the image; float64.
+    """Return the screen boxes of rule 14 for the disc rho3d <= k^2, clipped to the image.
 
     Parameters
     ----------
@@ -156,9 +158,9 @@ def screen_boxes(screen: ScreenSplats, cutoff_squared: Tensor, camera: Camera, s
 
 
 def _boxes(screen: ScreenSplats, k2: Tensor, camera: Camera, settings: RasterSettings) -> Tensor:
-    """Rule 14: boxes [M, 4] of the disc rho3d <= k2, clipped to the image; all of it where that reaches the camera."""
+    """Return the boxes [M, 4] of rule 14, clipped to the image; all of it if the disc reaches the camera plane."""
     center, Au, Av, Tw = (t.detach().double() for t in (screen.center, screen.Au, screen.Av, screen.Tw))
-    # The line x = X on the screen is (Au - X Tw) . (u, v, 1) = 0 on the disc's plane. It touches |(u, v)| = k where
+    # The line x = X on the screen is (Au - X Tw) . (u, v, 1) = 0 in the disc's plane. It is tangent to |(u, v)| = k if
     # k^2 |(Au - X Tw).uv|^2 = ((Au - X Tw).1)^2, a quadratic in X: d (X^2 - 2 b X + a) = 0; the same for y.
     d = _dot(k2, Tw, Tw)  # < 0 while the whole disc is in front of the camera
     crosses = d >= 0
@@ -177,15 +179,15 @@ def _boxes(screen: ScreenSplats, k2: Tensor, camera: Camera, settings: RasterSet
 
 
 def _square_boxes(screen: ScreenSplats, k2: Tensor, camera: Camera, settings: RasterSettings) -> Tensor:
-    """Rule 19, "box": the tiles [M, 4] px that the official square touches, clipped to the image; none: max < min."""
+    """Return the tiles [M, 4] px of rule 19, "box", clipped to the image; without tiles max < min."""
     center, Au, Av, Tw = (t.detach().double() for t in (screen.center, screen.Au, screen.Av, screen.Tw))
     d = _dot(k2, Tw, Tw)
     middle = torch.stack([_dot(k2, A, Tw) / d for A in (Au, Av)], dim=1)  # [M, 2]
     squares = middle.square() - torch.stack([_dot(k2, A, A) / d for A in (Au, Av)], dim=1)
     half = squares.amax(dim=1).clamp(min=1e-4).sqrt().maximum(settings.lowpass_px * k2.sqrt())
     middle = middle + center
-    known = middle.abs().sum(dim=1) + half < 1e9  # not where the disc only touches the plane
-    first = torch.where(known[:, None], middle - 0.5 - half.ceil()[:, None], 0.0)  # pixel centres are whole numbers
+    known = middle.abs().sum(dim=1) + half < 1e9  # not if the disc only touches the plane
+    first = torch.where(known[:, None], middle - 0.5 - half.ceil()[:, None], 0.0)  # pixel centres at integers
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64, device=d.device)
     end = torch.where(known, 2 * half.ceil() + TILE - 1, 0.0)[:, None]
     lower, upper = (TILE * (side / TILE).clamp(min=0).floor() for side in (first, first + end))
@@ -199,16 +201,16 @@ def _dot(k2: Tensor, A: Tensor, B: Tensor) -> Tensor:
 
 
 def holds_pixel(boxes: Tensor) -> Tensor:
-    """Whether a clipped box holds a pixel centre [M] bool."""
+    """Whether a clipped box contains a pixel centre [M] bool."""
     first = (boxes[:, :2] - 0.5).ceil() + 0.5
     return (first <= boxes[:, 2:]).all(dim=1)
 
 
-def blocks(boxes: Tensor, camera: Camera, dtype: torch.dtype) -> Iterator[Block]:
-    """Blocks of pixels that together cover every pixel that some box reaches.
+def blocks(boxes: Tensor, camera: Camera, dtype: torch.dtype) -> Iterator[PixelBlock]:
+    """Yield blocks of pixels that together cover every pixel in a box.
 
-    Boxes are widened a little (rounding must not hide a pair that passes the exact tests), and a block holds at most
-    ``MAX_PAIRS`` pairs (at least one pixel).
+    Boxes are widened slightly, so that rounding does not drop a pair that passes the exact tests. A block has at most
+    ``MAX_PAIRS`` pairs, but at least one pixel.
     """
     widened = boxes + torch.tensor([-1e-2, -1e-2, 1e-2, 1e-2], dtype=boxes.dtype, device=boxes.device)
     for y in range(0, camera.height, TILE):
@@ -225,15 +227,15 @@ def blocks(boxes: Tensor, camera: Camera, dtype: torch.dtype) -> Iterator[Block]
             points = torch.stack([pixels % camera.width, pixels // camera.width], dim=1).to(dtype) + 0.5
             step = max(1, MAX_PAIRS // len(ids))
             for start in range(0, len(pixels), step):
-                yield Block(pixels[start : start + step], points[start : start + step], ids)
+                yield PixelBlock(pixels[start : start + step], points[start : start + step], ids)
 
 
 def cutoff_squared(opacity: Tensor, settings: RasterSettings) -> Tensor:
-    """k^2 = 2 ln(o / alpha_min): the rho at which alpha falls to alpha_min."""
+    """Return k^2 = 2 ln(o / alpha_min), the rho at which alpha equals alpha_min."""
     return 2 * (opacity.log() - math.log(settings.alpha_min))
 
 
 def _to_camera(points: Tensor, camera: Camera) -> Tensor:
-    """World points [N, 3] in the camera frame [N, 3] world units."""
+    """Transform world points [N, 3] to the camera frame."""
     T = torch.as_tensor(camera.T_cam_world, dtype=points.dtype, device=points.device)
     return points @ T[:3, :3].T + T[:3, 3]

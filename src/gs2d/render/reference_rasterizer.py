@@ -1,7 +1,7 @@
-"""The reference rasterizer: plain torch, any float dtype and device, gradients by autograd alone; the judge.
+"""The reference rasterizer: plain torch, any float dtype and device, with gradients by autograd.
 
-Read beside docs/math.md. Slow and obvious: for each block of pixels all pairs with the splats that reach it are
-evaluated as dense [n, P] matrices (splats x pixels), front to back along dimension 0.
+It follows docs/math.md and is simple rather than fast: for each block of pixels, all pairs with the splats that reach
+it are evaluated as dense [n, P] matrices (splats x pixels), front to back along dimension 0.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch.utils.checkpoint import checkpoint
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.render.reference_projection import (
-    Block,
+    PixelBlock,
     ScreenSplats,
     blocks,
     cutoff_squared,
@@ -29,7 +29,7 @@ from gs2d.render.types import Features, RasterSettings, RenderOutput
 
 __all__ = ["Pairs", "blend_weights", "evaluate_pairs", "rasterize"]
 
-CHANNELS = 11  # and features: color 3, normal 3, alpha, depth_mean, depth_median, distortion, depth_transmittance
+CHANNELS = 11  # before features: color 3, normal 3, alpha, depth_mean, depth_median, distortion, depth_transmittance
 
 
 def rasterize(
@@ -50,7 +50,7 @@ def rasterize(
 
     values, pixels = [_no_pixels(screen, probe, further, channels)], [rows[:0]]
     for block in blocks(boxes, camera, splats.dtype):
-        # Checkpointing keeps only the inputs of a block for the backward pass, so memory does not grow with the image.
+        # Checkpointing stores only the inputs of a block, so memory does not grow with the image.
         values.append(
             checkpoint(
                 _blend_block,
@@ -98,7 +98,7 @@ class Pairs:
 def evaluate_pairs(
     screen: ScreenSplats, points: Tensor, settings: RasterSettings, shift: Tensor | None = None
 ) -> Pairs:
-    """Intersection, low-pass filter, near (rules 3, 4, 5).
+    """Evaluate intersection, low-pass filter and near test (rules 3, 4, 5).
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def evaluate_pairs(
         n splats.
     points : Tensor [P, 2] px
     shift : Tensor [n, P, 2], optional
-        Added to (Tu.z, Tv.z); zero, there for its gradient (rule 13).
+        Zeros added to (Tu.z, Tv.z), for their gradient (rule 13).
     """
     delta = points[None] - screen.center[:, None]  # [n, P, 2] px, from the projected centre
     h_u = delta[..., 0:1] * screen.Tw[:, None] - screen.Au[:, None]  # [n, P, 3]: the plane through pixel column x
@@ -118,13 +118,13 @@ def evaluate_pairs(
     cross = torch.linalg.cross(h_u, h_v)  # (u, v, 1) up to scale: both planes contain the intersection
 
     rho2d = (delta * delta).sum(dim=2) / settings.lowpass_px**2
-    with torch.no_grad():  # the choice of branch has no gradient; comparisons with NaN are False, as wanted
+    with torch.no_grad():  # branches have no gradient; comparisons with NaN are False, as required
         uv = cross[..., :2] / cross[..., 2:]
         z = (uv * screen.Tw[:, None, :2]).sum(dim=2) + screen.Tw[:, None, 2]
         hit = (cross[..., 2] != 0) & (z > 0) & z.isfinite()
         on_plane = hit & ((uv * uv).sum(dim=2) <= rho2d)
 
-    # Pairs that do not use the plane get (0, 0, 1) = the splat's centre: rho3d 0, depth z_c, and no gradient.
+    # Pairs that do not use the plane get the splat's centre (0, 0, 1): rho3d 0, depth z_c, and no gradient.
     centre = torch.tensor([0.0, 0.0, 1.0], dtype=points.dtype, device=points.device)
     cross = torch.where(on_plane[..., None], cross, centre)
     uv = cross[..., :2] / cross[..., 2:]
@@ -136,7 +136,7 @@ def evaluate_pairs(
 
 
 def blend_weights(alpha: Tensor, settings: RasterSettings) -> tuple[Tensor, Tensor]:
-    """Weights w and incoming transmittance T of each pair (rule 7).
+    """Return weights w and incoming transmittance T of each pair (rule 7).
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def blend_weights(alpha: Tensor, settings: RasterSettings) -> tuple[Tensor, Tens
     Returns
     -------
     w : Tensor [n, P]
-        0 for skipped pairs and from the pair on at which a pixel stops.
+        0 for skipped pairs and after a pixel has stopped.
     T : Tensor [n, P]
     """
     with torch.no_grad():
@@ -158,7 +158,7 @@ def blend_weights(alpha: Tensor, settings: RasterSettings) -> tuple[Tensor, Tens
 
 
 def pair_alpha(opacity: Tensor, pairs: Pairs, settings: RasterSettings) -> Tensor:
-    """Return alpha [n, P] of rule 6: 0 where a pair is skipped; the limit alpha_max passes gradients unchanged."""
+    """Return alpha [n, P] of rule 6: 0 for skipped pairs; gradients pass the limit alpha_max unchanged."""
     alpha = opacity[:, None] * torch.exp(-pairs.rho / 2)
     kept = (alpha.detach() >= settings.alpha_min) & pairs.near_enough
     limited = alpha + (alpha.clamp(max=settings.alpha_max) - alpha).detach()
@@ -167,13 +167,13 @@ def pair_alpha(opacity: Tensor, pairs: Pairs, settings: RasterSettings) -> Tenso
 
 def _blend_block(
     screen: ScreenSplats,
-    block: Block,
+    block: PixelBlock,
     probe: Tensor | None,
     features: Features | None,
     camera: Camera,
     settings: RasterSettings,
 ) -> Tensor:
-    """All channels of the pixels of a block [P, channels]."""
+    """Blend all channels of the pixels of a block [P, channels]."""
     screen = screen.rows(block.splats)
     shift = None if probe is None else _probe_shift(probe[block.splats], screen.Tw[:, 2], len(block.pixels), camera)
     pairs = evaluate_pairs(screen, block.points, settings, shift)
@@ -191,7 +191,7 @@ def _blend_block(
     last = torch.where((w > 0) & (T > 0.5), order, 0).amax(dim=0)  # [P], 0 = none (rule 9)
     depth_median = torch.where(last > 0, pairs.depth.gather(0, (last - 1).clamp(min=0)[None])[0], 0.0)
 
-    # The constant far / (far - near) of the mapped depth cancels in differences, and costs float32 its digits.
+    # The constant far / (far - near) of the mapped depth cancels in differences and would cost float32 precision.
     m = -(settings.far * settings.near / (settings.far - settings.near)) / pairs.depth
     before = [(w * power).cumsum(dim=0) - w * power for power in (torch.ones_like(m), m, m * m)]  # A, M1, M2 so far
     distortion = (w * (m * m * before[0] - 2 * m * before[1] + before[2])).sum(dim=0)  # rule 10
@@ -207,14 +207,14 @@ def _blend_block(
 
 
 def _no_pixels(screen: ScreenSplats, probe: Tensor | None, features: Features | None, channels: int) -> Tensor:
-    """Values of no pixels [0, channels]: a view that no splat reaches still has gradients, all zero."""
+    """Return an empty [0, channels] attached to the graph, so that an empty view has zero gradients."""
     parts = [getattr(screen, f.name) for f in fields(screen)] + ([] if probe is None else [probe])
     parts += [] if features is None else [features.values]
     return torch.cat([part.flatten()[:0] for part in parts]).reshape(0, channels)
 
 
 def _probe_shift(probe: Tensor, z_c: Tensor, pixels: int, camera: Camera) -> Tensor:
-    """Return the zero added to (Tu.z, Tv.z) of each pair [n, P, 2], whose gradient is rule 13."""
+    """Return the zeros added to (Tu.z, Tv.z) of each pair [n, P, 2], whose gradient is that of rule 13."""
     shift = probe[:, None, :2].expand(-1, pixels, -1)
     if probe.shape[1] == 4:
         shift = shift + _PerPixel.apply(probe[:, 2:], pixels)
@@ -223,7 +223,7 @@ def _probe_shift(probe: Tensor, z_c: Tensor, pixels: int, camera: Camera) -> Ten
 
 
 class _PerPixel(torch.autograd.Function):
-    """Copy [n, 2] to every pixel; backward sums *absolute* values (AbsGS): the gradient of no scalar."""
+    """Copy [n, 2] to every pixel; the backward pass sums absolute values (AbsGS), not a true gradient."""
 
     @staticmethod
     def forward(ctx: torch.autograd.function.FunctionCtx, probe: Tensor, pixels: int) -> Tensor:
@@ -235,7 +235,7 @@ class _PerPixel(torch.autograd.Function):
 
 
 def _plane_depth_at(h_u: Tensor, h_v: Tensor, Tw: Tensor, where: Tensor) -> Tensor:
-    """Ray-plane depth of filtered pairs with (u, v) held constant, as the official code differentiates it [n, P]."""
+    """Return the ray-plane depth [n, P] of filtered pairs with constant (u, v), as in the official code."""
     with torch.no_grad():
         cross = torch.linalg.cross(h_u, h_v)
         uv = torch.where(where[..., None], cross[..., :2] / cross[..., 2:], 0.0)

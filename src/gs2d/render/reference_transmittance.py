@@ -1,4 +1,4 @@
-"""Depth by continuous transmittance (rule 22; docs/math.md, "Depth by transmittance"): search and gradient."""
+"""Depth by transmittance (rule 22; docs/math.md, "Depth by transmittance"): search and gradient."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from torch import Tensor
 __all__ = ["MIN_SLOPE", "depth_at_half", "fraction_before", "transmittance_at"]
 
 STEPS = 64  # of bisection: as exact as a double
-MIN_SLOPE = 0.05  # of alpha over one half width: less would let a pixel between two surfaces have any gradient
+MIN_SLOPE = 0.05  # of alpha per half width; bounds the gradient of pixels between two surfaces
 
 
 def fraction_before(x: Tensor) -> Tensor:
-    """Return F(x): how much of a splat's opacity lies before ``x`` half widths behind it.
+    """Return F(x), the fraction of a splat's opacity up to ``x`` half widths behind its depth.
 
     The integral of the Epanechnikov kernel: 0 up to -1, 1 from 1 on, with a continuous slope.
     """
@@ -27,7 +27,7 @@ def transmittance_at(z: Tensor, alpha: Tensor, inverse_depth: Tensor, width: flo
     ----------
     z : Tensor [P] world units
     alpha : Tensor [n, P]
-        0 for pairs that do not count.
+        0 for pairs that are not blended.
     inverse_depth : Tensor [n, P] 1 / world units
     width : float
         Half width as a fraction of the depth.
@@ -36,10 +36,10 @@ def transmittance_at(z: Tensor, alpha: Tensor, inverse_depth: Tensor, width: flo
 
 
 def depth_at_half(alpha: Tensor, inverse_depth: Tensor, total: Tensor, width: float) -> Tensor:
-    """Return the depth [P] where T has fallen by half of ``total``; 0 where nothing was blended.
+    """Return the depth [P] at which T has fallen by half of ``total``; 0 where nothing was blended.
 
-    The value is found by bisection. The gradient is that of the implicit function: one Newton step from there, which
-    changes nothing but carries -(dT - dlevel) / (dT/dz) to every pair.
+    Bisection gives the value. The gradient is that of the implicit function, -(dT - dlevel) / (dT/dz), from one Newton
+    step that does not change the value.
     """
     hit = total.detach() > 0
     with torch.no_grad():

@@ -1,9 +1,9 @@
-"""The rasterizer on bare tensors and batches of cameras, also as the torch operator ``gs2d::rasterize_2dgs``.
+"""The rasterizer for plain tensors and batches of cameras, also as the torch operator ``gs2d::rasterize_2dgs``.
 
-The operator is for what captures graphs (``torch.compile``, ``torch.export``): its autograd formula renders again in
-the backward pass, because a graph can hold tensors but not what the kernels keep. Otherwise :func:`rasterize_2dgs`
-calls :func:`gs2d.render.api.rasterize` a camera at a time, or with more than three channels
-:func:`gs2d.render.api.rasterize_features`.
+The operator is for captured graphs (``torch.compile``, ``torch.export``). Its backward pass renders again, because a
+graph holds tensors but not the state of the kernels. Otherwise :func:`rasterize_2dgs` calls
+:func:`gs2d.render.api.rasterize` for each camera, or :func:`gs2d.render.api.rasterize_features` with more than three
+channels.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from gs2d.render.types import PLAIN_COLORS, Features, RasterSettings, RenderOutp
 __all__ = ["Rasterization", "rasterize_2dgs"]
 
 COLORS = 3  # channels in ``sh0``
-MIN_SCALE = 1e-18  # world units; the kernels' own floor: a disc without extent is drawn by the low-pass filter alone
-MIN_OPACITY, MAX_OPACITY = 1e-30, 1 - 2.0**-20  # the logit is finite; below alpha_min a splat is not drawn anyway
+MIN_SCALE = 1e-18  # world units; limit of the kernels: only the low-pass filter draws a smaller disc
+MIN_OPACITY, MAX_OPACITY = 1e-30, 1 - 2.0**-20  # limits with finite logits; splats below alpha_min are not drawn
 CONSTANTS = ("near", "far", "alpha_min", "alpha_max", "transmittance_min", "error_cutoff", "lowpass_px")
 
 
 class Rasterization(NamedTuple):
-    """Images of C cameras and facts of N splats; what each means is in the contract (``gs2d.render.api``).
+    """Images of C cameras and radii of N splats, as defined in the contract (``gs2d.render.api``).
 
     Attributes
     ----------
@@ -42,13 +42,13 @@ class Rasterization(NamedTuple):
         Blended channels over the background.
     alphas : Tensor [C, H, W, 1]
     normals : Tensor [C, H, W, 3]
-        World frame, each splat's facing the camera, summed by weight and not normalised.
+        World frame, facing the camera, summed by weight and not normalised.
     depth_mean, depth_median : Tensor [C, H, W, 1]
         World units; 0 where nothing was hit. The mean is divided by alpha.
     distortion : Tensor [C, H, W, 1]
         Squared differences of mapped depth.
     radii : Tensor [C, N]
-        px, half the longer side of each splat's box; 0 for splats that touch no pixel. Without gradient.
+        px, half the longer side of each splat's box; 0 for splats that touch no pixel. No gradient.
     """
 
     colors: Tensor
@@ -79,11 +79,11 @@ def rasterize_2dgs(
 ) -> Rasterization:
     """Render 2D Gaussians given as tensors into C cameras, differentiable in every tensor.
 
-    Names, shapes and units are those of gsplat's ``rasterization_2dgs``. What differs: images come as one named tuple,
-    with both depths always; ``near_plane`` and everything else that is constant are fields of ``settings``; splats are
-    low-pass filtered and cut off as in the 2DGS paper's code (``eps2d``, ``radius_clip`` and ``tile_size`` do not
-    exist); the distortion is the squared one; ``Ks`` has gradients; the densification signal is the gradient of
-    ``screen_probe`` instead of an entry of a dictionary. docs/migration.md has the whole table.
+    Names, shapes and units are those of gsplat's ``rasterization_2dgs``, with these differences: images are returned as
+    one named tuple, always with both depths; ``near_plane`` and all other constants are fields of ``settings``; splats
+    are low-pass filtered and cut off as in the 2DGS code (no ``eps2d``, ``radius_clip`` and ``tile_size``); the
+    distortion is the squared one; ``Ks`` has gradients; the densification signal is the gradient of ``screen_probe``.
+    docs/migration.md has the full table.
 
     Each camera is one call of :func:`gs2d.rasterize`, with the same bits. Further channels share one more pass: 64
     channels take up to 7 times as long as 3 (docs/notebook/performance.md). Under ``torch.compile`` and
@@ -92,33 +92,33 @@ def rasterize_2dgs(
     Parameters
     ----------
     means : Tensor [N, 3]
-        Centres, world units. float32, or float64 with the reference backend; what follows has the same dtype.
+        Centres, world units. float32, or float64 with the reference backend; other tensors have the same dtype.
     quats : Tensor [N, 4]
-        Rotations (w, x, y, z), of any length; the splat's normal is the third column of the matrix.
+        Rotations (w, x, y, z) of any length; the splat's normal is the third column of the matrix.
     scales : Tensor [N, 2] or [N, 3]
-        Standard deviations along the first two columns, world units, not their logarithms. A third is not looked at.
+        Standard deviations along the first two columns, world units, not their logarithms. A third is ignored.
     opacities : Tensor [N]
         In [0, 1], not logits.
     colors : Tensor [N, D] or [C, N, D]; with ``sh_degree`` [N, K, 3] or [C, N, K, 3]
-        D features of any sign, blended as they are; or SH coefficients, as in rule 11 (0.5 is added, negative colours
-        are 0), in the order of the official code: degree by degree, red, green, blue.
+        D features of any sign, blended unchanged; or SH coefficients as in rule 11 (0.5 is added, negative colours
+        become 0), in the order of the official code: by degree, then red, green, blue.
     viewmats : Tensor [C, 4, 4]
-        World to camera, OpenCV axes (x right, y down, z forward), of any dtype. The gradient is that of rigid motions
-        (rule 20): of changes of scale and shear it says nothing.
+        World to camera, OpenCV axes (x right, y down, z forward), any dtype. The gradient is defined for rigid motions
+        (rule 20), not for scale and shear.
     Ks : Tensor [C, 3, 3]
         Intrinsics, px, without skew; pixel (0, 0) is centred at (0.5, 0.5). Gradients reach fx, fy, cx and cy.
     width, height : int
         px, of all C images.
     sh_degree : int, optional
-        Degree that is evaluated, at most that of ``colors``; None: ``colors`` are colours.
+        Degree to evaluate, at most that of ``colors``; None: ``colors`` are plain features.
     backgrounds : Tensor [C, D] or [D], optional
-        Behind everything; default 0. With ``sh_degree`` in [0, 1].
+        Background; default 0. In [0, 1] with ``sh_degree``.
     screen_probe : Tensor [C, N, 2] or [C, N, 4], optional
-        Zeros that require a gradient, which is the densification signal of 2DGS, and AbsGS's (rule 13).
+        Zeros that require a gradient, which is the densification signal of 2DGS and AbsGS (rule 13).
     settings : RasterSettings
-        The constants; its ``background`` and ``sh_degree`` are not looked at.
+        The constants; ``background`` and ``sh_degree`` are ignored.
     backend : str or Backend
-        As for :func:`gs2d.rasterize`; "auto" goes by the device of ``means``.
+        As for :func:`gs2d.rasterize`; "auto" uses the device of ``means``.
 
     Returns
     -------
@@ -128,7 +128,7 @@ def rasterize_2dgs(
     Raises
     ------
     ShapeError
-        If a tensor has another shape, dtype or range than stated: the message says which.
+        If a tensor has another shape, dtype or range.
     BackendError
         If the backend cannot run here.
 
@@ -158,7 +158,7 @@ def rasterize_2dgs(
                 check_dense(name, tensor)
     if torch.compiler.is_compiling() or not _is_plain(means):
         if not isinstance(backend, str):
-            raise BackendError(f"a captured graph names its backend: give backend={backend.name!r}")
+            raise BackendError(f"a captured graph needs the name of a backend: use backend={backend.name!r}")
         constants = [float(getattr(settings, name)) for name in CONSTANTS]
         choices = (settings.lowpass_depth, settings.near_plane_policy, settings.with_distortion, backend)
         degree = PLAIN_COLORS if sh_degree is None else sh_degree
@@ -181,12 +181,12 @@ class _Tensors(NamedTuple):
 
 
 class _Numbers(NamedTuple):
-    """What the operator takes besides tensors: its schema has no other types."""
+    """Arguments of the operator besides tensors, in types that its schema supports."""
 
     width: int
     height: int
     sh_degree: int  # PLAIN_COLORS: none
-    constants: Sequence[float]  # those of CONSTANTS
+    constants: Sequence[float]  # in the order of CONSTANTS
     lowpass_depth: str
     near_plane_policy: str
     with_distortion: bool
@@ -206,7 +206,7 @@ class _Numbers(NamedTuple):
 
 
 def _is_plain(tensor: object) -> bool:
-    """Whether it holds numbers: not one of the subclasses by which graphs are captured."""
+    """Whether it is an ordinary tensor, not a subclass that captures graphs."""
     return type(tensor) in (Tensor, torch.nn.Parameter)
 
 
@@ -217,7 +217,7 @@ def _render(
     settings: RasterSettings,
     backend: str | Backend,
 ) -> Rasterization:
-    """Render by :func:`gs2d.render.api.rasterize`, whose autograd functions are all there is."""
+    """Render each camera with :func:`gs2d.render.api.rasterize`."""
     means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, screen_probe = tensors
     cameras = _cameras(viewmats, Ks, *size)
     count, channels = len(cameras), _check(tensors, sh_degree)
@@ -258,7 +258,7 @@ def _images(output: RenderOutput, background: Tensor, channels: int) -> tuple[Te
 
 
 def _coefficients(colors: Tensor, sh_degree: int | None) -> tuple[Tensor, Tensor]:
-    """``sh0`` [N, 1, 3] and ``shN``: coefficients, or the first three features, filled with 0 if there are fewer."""
+    """Return ``sh0`` [N, 1, 3] and ``shN``: coefficients, or the first three features padded with 0."""
     if sh_degree is not None:
         return colors[:, :1], colors[:, 1:]
     first = torch.nn.functional.pad(colors[:, :COLORS], (0, max(COLORS - colors.shape[1], 0)))
@@ -266,7 +266,7 @@ def _coefficients(colors: Tensor, sh_degree: int | None) -> tuple[Tensor, Tensor
 
 
 def _cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> list[Camera]:
-    """Return the cameras, with what of them learns."""
+    """Return the cameras; poses and intrinsics that require gradients are passed as tensors."""
     sizes = check_shapes({"viewmats": (viewmats, "C 4 4"), "Ks": (Ks, "C 3 3")})
     if sizes["C"] < 1:
         raise ShapeError("viewmats must hold at least one camera, got [0, 4, 4]")
@@ -287,7 +287,7 @@ def _cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> list[Came
 
 
 def _check(tensors: _Tensors, sh_degree: int | None) -> int:
-    """Check the splats and return the number of channels; what :func:`rasterize` checks is left to it."""
+    """Check what :func:`rasterize` does not check, and return the number of channels."""
     means, quats, scales, opacities, colors, viewmats, *_ = tensors
     third = 3 if scales.dim() == 2 and scales.shape[1] == 3 else 2
     layout = "N D" if sh_degree is None else "N K 3"
@@ -312,15 +312,15 @@ def _check(tensors: _Tensors, sh_degree: int | None) -> int:
         least = torch.stack([scales.detach()[:, :2].min(), opacities.detach().min(), -opacities.detach().max()])
         smallest, lowest, highest = least.tolist()
         if smallest < 0:
-            raise ShapeError(f"scales must not be negative, got {smallest:.4g}; give exp of logarithms")
+            raise ShapeError(f"scales must not be negative, got {smallest:.4g}; pass exp of logarithms")
         if lowest < 0 or highest < -1:
             got = lowest if lowest < 0 else -highest
-            raise ShapeError(f"opacities must be in [0, 1], got {got:.4g}; give the sigmoid of logits")
+            raise ShapeError(f"opacities must be in [0, 1], got {got:.4g}; pass the sigmoid of logits")
     return channels
 
 
 def _backgrounds(backgrounds: Tensor | None, cameras: int, channels: int, like: Tensor) -> Tensor:
-    """Return what is behind each image [C, D]."""
+    """Return the background of each image [C, D]."""
     if backgrounds is None:
         return like.new_zeros(cameras, channels)
     if backgrounds.dim() == 1:
@@ -333,7 +333,7 @@ def _backgrounds(backgrounds: Tensor | None, cameras: int, channels: int, like: 
 
 
 class _LogScales(torch.autograd.Function):
-    """Logarithms; a splat that is not drawn has no gradient, whatever its scales are."""
+    """Logarithm with a lower limit; a zero gradient stays zero at scale 0."""
 
     @staticmethod
     def forward(ctx: Any, scales: Tensor) -> Tensor:
@@ -349,7 +349,7 @@ class _LogScales(torch.autograd.Function):
 
 
 class _Logits(torch.autograd.Function):
-    """Logits; what is beyond the limits has the gradient that it has at them, so that it finds its way back."""
+    """Logit with limits; values beyond a limit have the gradient at the limit, so that they can return."""
 
     @staticmethod
     def forward(ctx: Any, opacities: Tensor) -> Tensor:
@@ -365,7 +365,7 @@ class _Logits(torch.autograd.Function):
 
 
 class _OverBackground(torch.autograd.Function):
-    """The image, unchanged; its gradient also reaches the background that is in it, weighted by 1 - alpha."""
+    """Identity on the image, with a gradient for the background, weighted by 1 - alpha."""
 
     @staticmethod
     def forward(ctx: Any, color: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
@@ -382,7 +382,7 @@ class _OverBackground(torch.autograd.Function):
 # The operator -----------------------------------------------------------------------------------------------------
 
 _TENSORS = len(_Tensors._fields)
-_ARGUMENTS = (  # written out: what torch reads from annotations differs between its versions
+_ARGUMENTS = (  # explicit, since schemas inferred from annotations differ between torch versions
     "Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor colors, Tensor viewmats, Tensor Ks, "
     "Tensor? backgrounds, Tensor? screen_probe, SymInt width, SymInt height, int sh_degree, float[] constants, "
     "str lowpass_depth, str near_plane_policy, bool with_distortion, str backend"
@@ -409,16 +409,16 @@ def _(*arguments: Any) -> tuple[Tensor, ...]:
 
 @torch.library.custom_op("gs2d::rasterize_2dgs_backward", mutates_args=(), schema=_BACKWARD)
 def _backward_operator(upstream: Sequence[Tensor | None], wanted: Sequence[bool], *arguments: Any) -> list[Tensor]:
-    """Render again and return the gradients of the tensors that are wanted."""
+    """Render again and return the gradients of the tensors marked in ``wanted``."""
     tensors, numbers = arguments[:_TENSORS], _Numbers(*arguments[_TENSORS:])
     means = tensors[0]
     stream = torch.cuda.current_stream(means.device) if means.is_cuda else None
 
     def again() -> list[Tensor]:
-        with torch.cuda.stream(stream):  # of a GPU; None changes nothing
+        with torch.cuda.stream(stream):  # None has no effect
             return _gradients(upstream, wanted, tensors, numbers)
 
-    # Within an operator the dispatcher records nothing, in this thread; another has a dispatcher as it always is.
+    # Within an operator autograd is disabled in this thread, but not in another one.
     with ThreadPoolExecutor(1) as thread:
         return thread.submit(again).result()
 
@@ -429,7 +429,7 @@ def _gradients(
     tensors: Sequence[Tensor | None],
     numbers: _Numbers,
 ) -> list[Tensor]:
-    """Gradients of the tensors that are wanted; those of the images are ``upstream``."""
+    """Return the gradients of the tensors marked in ``wanted``; ``upstream`` are those of the images."""
     leaves: list[Any] = [
         None if tensor is None else tensor.detach().requires_grad_(want)
         for tensor, want in zip(tensors, wanted, strict=True)

@@ -1,4 +1,4 @@
-"""What goes into and comes out of a rasterizer, whatever the backend."""
+"""Inputs and outputs of rasterizers, the same for all backends."""
 
 from __future__ import annotations
 
@@ -10,56 +10,51 @@ from torch import Tensor
 
 from gs2d.core.camera import Camera
 
-TRANSMITTANCE = "transmittance"  # the kind of depth that is rendered only where it is asked for
-PLAIN_COLORS = -1  # of RasterSettings.sh_degree
-NEAR_PLANE_POLICIES = (
-    "draw",
-    "cull",
-    "box",
-)  # the values of RasterSettings.near_plane_policy; the kernels know them by their place
-# Rule 23: splats beyond these are culled, as float32 could not hold what is worked out (core/project.h has the same).
+TRANSMITTANCE = "transmittance"  # the kind of depth that is only rendered on request
+PLAIN_COLORS = -1  # value of RasterSettings.sh_degree
+NEAR_PLANE_POLICIES = ("draw", "cull", "box")  # values of near_plane_policy; the kernels use their index
+# Rule 23: splats beyond these limits are culled, since float32 would overflow (core/project.h has the same).
 MAX_SIZE = 1e9  # world units: coordinates in the camera frame, scales
 MIN_SIZE = 1e-18  # world units: smaller scales count as this
 MAX_COLOR = 1e15  # sum of the absolute coefficients of a colour
-MIN_QUATERNION = 1e-15  # largest component; less is a zero quaternion
+MIN_QUATERNION = 1e-15  # largest component; below, it counts as a zero quaternion
 
 
 @dataclass(frozen=True)
 class RasterSettings:
-    """Every constant the rasterizer uses. The numbers in brackets are rules of the contract (render/api.py).
+    """The constants of the rasterizer. Rules are those of the contract (render/api.py).
 
     Attributes
     ----------
     near : float
-        World units. Splats whose centre is at or before it are culled; pairs with a smaller depth are skipped.
+        World units. Splats whose centre is not beyond it are culled; pairs with a smaller depth are skipped.
     far : float
-        World units. Only maps depth for the distortion.
+        World units. Used only to map depth for the distortion.
     alpha_min, alpha_max : float
         Pairs below alpha_min are skipped, above alpha_max clamped.
     transmittance_min : float
-        A pixel stops before the splat that would bring its transmittance below this.
+        A pixel stops before the splat that would reduce its transmittance below this.
     error_cutoff : float
         Footprint of ``splat_errors``: rho <= error_cutoff^2.
     lowpass_px : float
         px. Standard deviation of the screen-space low-pass filter.
     background : tuple of 3 floats
-        Colour behind everything, in [0, 1]; with ``PLAIN_COLORS`` any finite numbers.
+        Background colour in [0, 1]; with ``PLAIN_COLORS`` any finite numbers.
     sh_degree : int
-        SH degree that is evaluated (coefficients above it are ignored and get zero gradient). ``PLAIN_COLORS`` (-1):
-        ``sh0`` holds the colours, or any three features, as they are (rule 11).
+        SH degree to evaluate; higher coefficients are ignored and get zero gradients. With ``PLAIN_COLORS`` (-1)
+        ``sh0`` holds plain colours or any three features (rule 11).
     lowpass_depth : str
-        Depth of a pair where the low-pass filter wins: "center" (the splat centre's), or "plane" (the ray-plane depth
-        of the current official code; reference backend only).
+        Depth of a pair if the low-pass filter determines rho: "center" (depth of the splat centre) or "plane" (the
+        ray-plane depth of the current official code; reference backend only).
     near_plane_policy : str
-        Splats whose disc of ``error_cutoff`` standard deviations reaches the camera plane: "draw" like any other, or
-        "cull", or "box": only in the tiles of the official rasterizer's box, which has no meaning for them (rule 19).
+        Handling of splats whose disc of ``error_cutoff`` standard deviations reaches the camera plane (rule 19):
+        "draw" like any other, "cull", or "box" (only in the tiles of the official rasterizer's box).
     with_distortion : bool
-        False = nobody looks at that image: a backend may leave it out (NaN) where that saves work.
+        If False, a backend may skip that image and return NaN.
     with_transmittance_depth : bool
-        True = ``depth_transmittance`` is wanted too: one search along the ray of each pixel (rule 22).
+        Render ``depth_transmittance`` too, with one search along the ray of each pixel (rule 22).
     depth_width_px : float
-        px. Half of the depth over which a splat's opacity is spread for it, as seen from the camera: so many times the
-        width of a pixel there.
+        px. Half width of the depth interval of a splat's opacity for it, in pixel widths at that depth.
     """
 
     near: float = 0.2
@@ -78,14 +73,11 @@ class RasterSettings:
     depth_width_px: float = 2.0
 
     def for_depths(self, *kinds: str | None) -> RasterSettings:
-        """Return the settings that render these kinds of depth; None: no particular one."""
+        """Return the settings that render these kinds of depth; None is ignored."""
         return replace(self, with_transmittance_depth=self.with_transmittance_depth or TRANSMITTANCE in kinds)
 
     def facts(self) -> dict[str, Any]:
-        """Return the constants by name, as they are written down.
-
-        Without which depths are rendered, which protocol and losses say.
-        """
+        """Return the constants by name, for files, without ``with_transmittance_depth``, which losses determine."""
         return {f.name: getattr(self, f.name) for f in fields(self) if not f.metadata.get("derived")}
 
     def depth_width(self, camera: Camera) -> float:
@@ -100,9 +92,9 @@ class Features:
     Attributes
     ----------
     values : Tensor [N, F]
-        Of any sign; dtype and device of the splats.
+        Any sign; dtype and device of the splats.
     background : Tensor [F]
-        Behind everything; dtype and device of the splats, without gradient.
+        Background; dtype and device of the splats, without gradient.
     """
 
     values: Tensor
@@ -111,7 +103,7 @@ class Features:
 
 @dataclass(frozen=True, eq=False)
 class RenderOutput:
-    """Images and per-splat facts of one view.
+    """Images of one view, and radii of the splats.
 
     Attributes
     ----------
@@ -130,10 +122,10 @@ class RenderOutput:
     radii : Tensor [N] px
         Half the longer side of each splat's screen box; 0 for splats that touch no pixel.
     depth_transmittance : Tensor [H, W] world units, or None
-        Depth before which half of alpha lies, each splat's opacity spread over a little depth; 0 where nothing was hit.
-        None without ``RasterSettings.with_transmittance_depth``.
+        Depth at which half of alpha is accumulated, with each splat's opacity spread over a depth interval; 0 where
+        nothing was hit. None without ``RasterSettings.with_transmittance_depth``.
     normal_without_pose_grad : Tensor [H, W, 3] or None
-        Where a camera learns: ``normal`` as if the world turned with the camera. For losses that compare normals.
+        ``normal`` without its pose gradient, for losses that compare normals; None if the pose has no gradient.
     """
 
     color: Tensor

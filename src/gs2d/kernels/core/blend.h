@@ -26,16 +26,16 @@ template <class V> GS2D_HD PlaneAt<V> plane_at(const Record<V>& s, V dx, V dy) {
     return {fma(s.au, dx, s.bu * dy), fma(s.av, dx, s.bv * dy), fma(s.ai, dx, fma(s.bi, dy, s.iz))};
 }
 
-// A splat at a pixel. Where the low-pass filter decides, u = v = 0 and the depth is z_c; skipped pairs have alpha = 0.
+// A splat at a pixel. If the low-pass filter determines rho, u = v = 0 and the depth is z_c. Skipped pairs have alpha = 0.
 template <class V> struct Hit {
     V u, v;  // plane coordinates
     V depth, inverse_depth;
     V rho;
     V alpha;        // not yet limited to alpha_max
-    mask_t<V> ray;  // the plane decides
+    mask_t<V> ray;  // the plane determines rho
 };
 
-// All of a hit but its alpha where the plane is known to decide (see `is_plain`).
+// A hit without its alpha, if the plane is known to determine rho (see `is_plain`).
 template <class V> GS2D_HD Hit<V> meet_plane(const PlaneAt<V>& p) {
     Hit<V> h;
     h.inverse_depth = p.I, h.depth = reciprocal(p.I);
@@ -45,7 +45,7 @@ template <class V> GS2D_HD Hit<V> meet_plane(const PlaneAt<V>& p) {
     return h;
 }
 
-// The same wherever it is; nothing in it is NaN or infinite. zc = 1 / iz.
+// The general case; no member is NaN or infinite. zc = 1 / iz.
 template <class V> GS2D_HD Hit<V> meet(const PlaneAt<V>& p, V iz, V zc, V dx, V dy, const BlendLimits<V>& k) {
     Hit<V> h = meet_plane(p);
     const V rho2d = fma(dx, dx, dy * dy) * k.inv_lowpass2;
@@ -56,22 +56,22 @@ template <class V> GS2D_HD Hit<V> meet(const PlaneAt<V>& p, V iz, V zc, V dx, V 
     return h;
 }
 
-// Least 1 / z where the plane decides, whatever the pixel: rho3d = d^T A d z^2 is at most rho2d = d^T d / lowpass_px^2 where
-// the largest eigenvalue of A is at most (1 / z / lowpass_px)^2. A little more, against rounding.
+// Least 1 / z for which the plane determines rho at every pixel: rho3d = d^T A d z^2 is at most rho2d = d^T d / lowpass_px^2 where
+// the largest eigenvalue of A is at most (1 / z / lowpass_px)^2. Slightly increased against rounding.
 template <class V> GS2D_HD V plain_from(const Record<V>& s, V lowpass_px) {
     const V xx = fma(s.au, s.au, s.av * s.av), yy = fma(s.bu, s.bu, s.bv * s.bv), xy = fma(s.au, s.bu, s.av * s.bv);
     const V half = V(0.5), d = half * (xx - yy);
     return V(1.001f) * lowpass_px * sqrt(half * (xx + yy) + sqrt(fma(d, d, xy * xy)));
 }
 
-// Whether neither the low-pass filter nor `near` can decide anything at pixels up to `half_side` in x and y from the one at
+// Whether neither the low-pass filter nor `near` has an effect at pixels up to `half_side` in x and y from the pixel at
 // (dx, dy) from the projected centre. False for NaN.
 template <class V> GS2D_HD mask_t<V> is_plain(V dx, V dy, V ai, V bi, V iz, V plain_from, V near, V half_side) {
     const V middle = fma(ai, dx, fma(bi, dy, iz)), range = half_side * (abs(ai) + abs(bi));
     return (middle - range >= plain_from) & ((middle + range) * near < V(0.9999f));
 }
 
-// The alpha of a hit (not yet limited to alpha_max), 0 where it is skipped, by its logarithm. Of a plain splat all depths are
+// The alpha of a hit (not yet limited to alpha_max) from its logarithm, 0 if it is skipped. All depths of a plain splat are
 // beyond `near`.
 template <class V> GS2D_HD V log2_alpha_of(V log2_opacity, V rho) { return fma(V(-0.5 * LOG2E), rho, log2_opacity); }
 template <class V> GS2D_HD V alpha_of(V log2_alpha, const BlendLimits<V>& k) {
@@ -84,7 +84,7 @@ template <class V> GS2D_HD V log2_alpha_of(V log2_opacity, const Hit<V>& h, cons
     return select(h.depth >= k.near, log2_alpha_of(log2_opacity, h.rho), V(-1e30));
 }
 
-// Both.
+// Plane and alpha.
 template <class V>
 GS2D_HD Hit<V> intersect(const Record<V>& s, const PlaneAt<V>& p, V zc, V dx, V dy, const BlendLimits<V>& k) {
     Hit<V> h = meet(p, s.iz, zc, dx, dy, k);
@@ -95,8 +95,8 @@ template <class V> GS2D_HD Hit<V> intersect(const Record<V>& s, V zc, V dx, V dy
     return intersect(s, plane_at(s, dx, dy), zc, dx, dy, k);
 }
 
-// A pixel on its way from front to back. The distortion works with q = 1/z - 1/z of the first pair: the mapped depth is
-// affine in 1/z, and differences near 0 keep their digits in float32.
+// State of a pixel during blending. The distortion works with q = 1/z - 1/z of the first pair: the mapped depth is
+// affine in 1/z, and differences near 0 keep precision in float32.
 template <class V> struct Pixel {
     V T;  // transmittance
     V alpha, red, green, blue, nx, ny, nz;
@@ -106,14 +106,14 @@ template <class V> struct Pixel {
     mask_t<V> live;
 };
 
-// One splat at the pixel, given what `intersect` found: its weight, and all of the state that it changes but the images
-// of `accumulate`. What a stopped pixel does to alpha and `after` is masked later, so that T does not wait for it.
-// Early: a live pixel may have T > 1/2 or nothing in front; otherwise its first and median pairs are past.
+// Blends one splat with the result of `intersect`: returns its weight and updates all state except the images of
+// `accumulate`. Stopped pixels are masked late, so that T does not wait for it. Early: a live pixel may have T > 1/2 or
+// nothing in front; otherwise its first and median pairs are done.
 template <bool Early, class V>
 GS2D_HD V composite_weight(V raw_alpha, V depth, V inverse_depth, const BlendLimits<V>& k, Pixel<V>& p) {
     const V alpha = min(raw_alpha, k.alpha_max);
     const V after = fnma(alpha, p.T, p.T);
-    // T of a live pixel never is below: only a seen splat can stop it
+    // T of a live pixel is never below: only a blended splat can stop it
     p.live = p.live & (after >= k.transmittance_min);
     const V w = keep(p.live, alpha * p.T);
     if constexpr (Early) {
@@ -129,14 +129,14 @@ GS2D_HD V composite_weight(V raw_alpha, V depth, V inverse_depth, const BlendLim
     return w;
 }
 
-// The images that only sum up weights.
+// The images that are weighted sums.
 template <class V> GS2D_HD void accumulate(const Record<V>& s, V w, V depth, Pixel<V>& p) {
     p.red = fma(w, s.red, p.red), p.green = fma(w, s.green, p.green), p.blue = fma(w, s.blue, p.blue);
     p.nx = fma(w, s.nx, p.nx), p.ny = fma(w, s.ny, p.ny), p.nz = fma(w, s.nz, p.nz);
     p.depth = fma(w, depth, p.depth);
 }
 
-// Both; returns where a live pixel saw the splat (also where that pixel stops).
+// Both steps; returns where a live pixel uses the splat (also where that pixel stops).
 template <class V>
 GS2D_HD mask_t<V> composite(const Record<V>& s, V raw_alpha, V depth, V inverse_depth, const BlendLimits<V>& k,
                             Pixel<V>& p) {
@@ -145,7 +145,7 @@ GS2D_HD mask_t<V> composite(const Record<V>& s, V raw_alpha, V depth, V inverse_
     return seen;
 }
 
-// Upstream gradient of one pixel and the totals it needs. With s = g . (outputs of one splat), the remaining sum
+// Upstream gradient of one pixel and its totals. With s = g . (outputs of one splat), the remaining sum
 // S = sum over later splats of w s gives dL/dalpha = T s - S / (1 - alpha) in a front-to-back pass, without a suffix
 // buffer per channel.
 template <class V> struct PixelGradient {
@@ -161,28 +161,28 @@ template <class V> struct PixelGradient {
     V transmittance, z;  // of the depth by transmittance: the factor of depth_pair_vjp, the depth
 };
 
-// What the distortion adds to the gradient of a pixel: total = sum w.
+// Adds the distortion to the gradient of a pixel; total = sum w.
 template <class V> GS2D_HD void add_distortion(V g, V total, V M1, V M2, PixelGradient<V>& p) {
     p.distortion2 = g * total, p.distortion1 = V(-2) * g * M1;
     p.alpha = fma(g, M2, p.alpha);
 }
 
-// What the depth by transmittance adds to it, `slope` from slope_of; 0 where nothing was hit.
+// Adds the depth by transmittance; `slope` from slope_of; 0 where nothing was hit.
 template <class V> GS2D_HD void add_transmittance(V g, V z, V slope, V total, PixelGradient<V>& p) {
     const V upstream = keep(total > V(0), g / slope), half = V(0.5f);
     p.transmittance = upstream * fnma(half, total, V(1)), p.z = z;
     p.alpha = fma(half, upstream, p.alpha);
 }
 
-// What one splat gathers over its pixels; `finish` turns it into a RecordGradient.
+// Sums of one splat over its pixels; `finish` converts them to a RecordGradient.
 template <class V> struct PairSums {
-    V X, Xx, Xy, Y, Yx, Yy, I, Ix, Iy, iz, ln_alpha;  // I: where the plane decides; iz: where the filter does
+    V X, Xx, Xy, Y, Yx, Yy, I, Ix, Iy, iz, ln_alpha;  // I: the plane determines rho; iz: the filter does
     V red, green, blue, nx, ny, nz;
     V lowpass_x, lowpass_y;
     V abs_x, abs_y;
 };
 
-// What the sums of a splat need of one pixel, besides the hit and the upstream gradient.
+// Inputs of a splat's sums at one pixel, besides the hit and the upstream gradient.
 template <class V> struct PairGradient {
     V w;         // weight of the splat
     V ln_alpha;  // dL/d ln(alpha)
@@ -226,7 +226,7 @@ GS2D_HD PairGradient<V> weigh_vjp(const Record<V>& s, V depth, V inverse_depth, 
     return {w, gl, gI};
 }
 
-// Adds that pair to the sums: first what follows from the weight and from alpha alone, then the geometry.
+// Adds the pair to the sums: first the parts of weight and alpha, then the geometry.
 template <bool Geo, class V>
 GS2D_HD void add_colors(const PixelGradient<V>& g, const PairGradient<V>& p, PairSums<V>& sums) {
     sums.ln_alpha = sums.ln_alpha + p.ln_alpha;
@@ -236,9 +236,9 @@ GS2D_HD void add_colors(const PixelGradient<V>& g, const PairGradient<V>& p, Pai
         sums.nx = fma(p.w, g.nx, sums.nx), sums.ny = fma(p.w, g.ny, sums.ny), sums.nz = fma(p.w, g.nz, sums.nz);
 }
 
-// Abs: the AbsGS signal is wanted. Filtered: the low-pass filter may have decided one of the pairs (if not: the same sums).
+// Abs: compute the AbsGS signal. Filtered: the low-pass filter may apply to a pair (if not, the sums are the same).
 // Column: dx is the same in all calls of these sums; finish_column multiplies by it once instead.
-// tu, tv are -dL/dX, -dL/dY, 0 where the filter decides: rho = (X^2 + Y^2) z^2, z = 1 / I.
+// tu, tv are -dL/dX, -dL/dY, 0 if the filter applies: rho = (X^2 + Y^2) z^2, z = 1 / I.
 template <bool Geo, bool Abs, bool Filtered, bool Column, class V>
 GS2D_HD void add_geometry(const Record<V>& s, V dx, V dy, V t, V tu, V tv, V rho, V inverse_depth, mask_t<V> ray,
                           const PairGradient<V>& p, PairSums<V>& sums) {
@@ -265,7 +265,7 @@ GS2D_HD void add_geometry(const Record<V>& s, V dx, V dy, V t, V tu, V tv, V rho
     }
 }
 
-// All of it; returns the weight.
+// All steps; returns the weight.
 template <bool Geo, bool Dist, bool Abs, bool Trans, bool Filtered, bool Column, bool Feat, class V>
 GS2D_HD V composite_vjp(const Record<V>& s, V dx, V dy, const Hit<V>& h, const BlendLimits<V>& k,
                         const PixelGradient<V>& g, V& T, V& S, PairSums<V>& sums, V features) {
@@ -277,7 +277,7 @@ GS2D_HD V composite_vjp(const Record<V>& s, V dx, V dy, const Hit<V>& h, const B
     return p.w;
 }
 
-// The weight of one splat at one pixel, front to back, as `composite_weight` had it. T is 0 where the pixel has stopped.
+// The weight of one splat at one pixel, front to back, as in `composite_weight`. T is 0 if the pixel has stopped.
 template <class V> GS2D_HD V pass_weight(const Hit<V>& h, const BlendLimits<V>& k, V& T) {
     const V alpha = min(h.alpha, k.alpha_max), after = fnma(alpha, T, T);
     const auto goes_on = after >= k.transmittance_min;
@@ -286,18 +286,18 @@ template <class V> GS2D_HD V pass_weight(const Hit<V>& h, const BlendLimits<V>& 
     return w;
 }
 
-// The part of it that reaches the splat's colour: all that is needed while everything else is frozen.
+// The gradient of the splat's colour, which suffices if everything else is frozen.
 template <class V>
 GS2D_HD void composite_color_vjp(const Hit<V>& h, const BlendLimits<V>& k, Vec3<V> g_color, V& T, Vec3<V>& sum) {
     sum = axpy(pass_weight(h, k, T), g_color, sum);
 }
 
-// For sums of `Column` calls: what they have left out.
+// Completes the sums of `Column` calls.
 template <class V> GS2D_HD void finish_column(V dx, PairSums<V>& a) {
     a.Xx = dx * a.X, a.Yx = dx * a.Y, a.Ix = dx * a.I, a.lowpass_x = dx * a.lowpass_x;
 }
 
-// dL/d(record) from the sums, per lane (the sum over lanes is left to the caller). zc = 1 / iz, where abs_x and abs_y are wanted.
+// dL/d(record) from the sums, per lane (the sum over lanes is left to the caller). zc = 1 / iz, if abs_x and abs_y are computed.
 template <class V>
 GS2D_HD RecordGradient<V> finish(const Record<V>& s, V zc, const PairSums<V>& a, const BlendLimits<V>& k) {
     RecordGradient<V> g;

@@ -5,12 +5,12 @@
 
 namespace gs2d {
 
-// c -> A c + b, of what the camera saw; the background is put behind it afterwards.
+// c -> A c + b on the object; the background is composited behind it afterwards.
 template <class V> struct Exposure {
     V A[3][3], b[3], background[3];
 };
 
-// What the camera saw of a colour that is over the background: `coverage` of it.
+// Removes the background from a colour with this `coverage`.
 template <class V> GS2D_HD void remove_background(const V* color, V coverage, const Exposure<V>& e, V* light) {
     for (int i = 0; i < 3; ++i) light[i] = color[i] - (V(1.0f) - coverage) * e.background[i];
 }
@@ -24,7 +24,7 @@ template <class V> GS2D_HD void expose(const V* color, V coverage, const Exposur
     }
 }
 
-// The gradient of the colour; those of A and b, row by row, are added to `sums`.
+// The gradient of the colour; the gradients of A and b, row by row, are added to `sums`.
 template <class V>
 GS2D_HD void expose_vjp(const V* upstream, const V* color, V coverage, const Exposure<V>& e, V* to_color,
                         V (*sums)[4]) {

@@ -1,4 +1,4 @@
-// What one depth map changes in one voxel of a truncated signed distance field (docs/math.md; meshing/tsdf_volume.py
+// Update of one voxel of a truncated signed distance field by one depth map (docs/math.md; meshing/tsdf_volume.py
 // and meshing/sampling.py have the same in numpy, operation for operation: single precision gives the same bits, so
 // nothing here is a fused multiply-add).
 #pragma once
@@ -7,13 +7,13 @@
 
 namespace gs2d {
 
-constexpr int FUSE_VOXELS = 512;           // of a block of 8^3, z fastest
+constexpr int FUSE_VOXELS = 512;           // per block of 8^3, z fastest
 constexpr double FUSE_WEIGHT_SLOPE = 4.0;  // 1 / (1 - FULL_WEIGHT_BEHIND) of meshing/tsdf_volume.py
-constexpr double FUSE_NO_WEIGHT = 1e-20;   // a sum of weights below this is taken as this
+constexpr double FUSE_NO_WEIGHT = 1e-20;   // lower limit of a sum of weights
 
-// One view over some blocks of a volume, for kernels/tsdf.py. R is the type of the arrays.
+// One view and the blocks of a volume that it may change, for kernels/tsdf.py. R is the type of the arrays.
 template <class R> struct FuseArguments {
-    long long blocks;       // that the view may change
+    long long blocks;       // number of blocks
     const long long* rows;  // [blocks] of the volume
     // [blocks, 3] (x z, y z, z) of each block's first voxel: world units times px, and world units
     const R* bases;
@@ -23,7 +23,7 @@ template <class R> struct FuseArguments {
     const R *depth, *slope_x, *slope_y;
     const R *pixel_weight, *pixel_color;      // [height, width], [height, width, 3]; or null
     R truncation;                             // world units
-    R *tsdf, *weight, *color, *color_weight;  // [M, 512], [M, 512, 3]; the colours null where there are none
+    R *tsdf, *weight, *color, *color_weight;  // [M, 512], [M, 512, 3]; colours may be null
 };
 
 // Rays of one depth map through a grid of blocks, for kernels/tsdf.py: where a depth lies on each, sampled before and
@@ -38,7 +38,7 @@ struct MarkArguments {
     unsigned char* marks;     // [padded]: of the lower of the two nearest blocks along each axis
 };
 
-// The pixel that a voxel is seen through, and the place from its centre, px. Outside of the image it is the border's.
+// The pixel that shows a voxel, and the offset from its centre, px; clamped to the image.
 template <class V> struct FusePixel {
     V column, row, x, y;
 };
@@ -49,17 +49,17 @@ template <class V> GS2D_HD FusePixel<V> fuse_pixel(V xz, V yz, V z, V last_colum
     return {column, row, (x - column) - V(0.5f), (y - row) - V(0.5f)};
 }
 
-// How far the surface lies behind the voxel, in truncations, by the plane through the pixel.
+// Distance of the surface behind the voxel, in truncations, by the plane through the pixel.
 template <class V> GS2D_HD V fuse_distance(const FusePixel<V>& p, V depth, V slope_x, V slope_y, V z, V truncation) {
     return (((depth + p.x * slope_x) + p.y * slope_y) - z) / truncation;
 }
 
-// 1 down to 3/4 of the truncation behind the surface, from there falling to 0 at the truncation.
+// 1 up to 3/4 of the truncation behind the surface, then decreasing to 0 at the truncation.
 template <class V> GS2D_HD V fuse_weight(V distance) {
     return min(max((distance + V(1.f)) * V(float(FUSE_WEIGHT_SLOPE)), V(0.f)), V(1.f));
 }
 
-// A running mean: the sum of weights, and how far the mean moves towards the new value.
+// A running mean: the sum of weights, and the step of the mean towards the new value.
 template <class V> struct FuseStep {
     V total, share;
 };
@@ -73,7 +73,7 @@ template <class V> GS2D_HD V fuse_mean(V old, V value, V share) { return old + (
 
 template <class V> GS2D_HD V fuse_clear(V distance) { return min(distance, V(1.f)); }  // free space is 1
 
-// Of a colour: the nearer the surface, the more; 0 before the band.
+// Weight of a colour: increases towards the surface; 0 before the band.
 template <class V> GS2D_HD V fuse_color_weight(V distance, V weight) {
     return keep(distance < V(1.f), weight * (V(1.f) - abs(distance)));
 }

@@ -1,17 +1,17 @@
-// Two views of one surface: a patch warped by its pixel's plane, and the way of a pixel to the other view and back.
-// Formulas and gradients: docs/math.md, "Two views"; losses/multiview.py has the same in torch.
+// Two views of one surface: a patch warped by its pixel's plane, and the round trip of a pixel to the other view.
+// Formulas and gradients: docs/math.md, "Two views"; losses/view_pair.py has the same in torch.
 //
 // A pixel of a view, with depth d along its ray (z = 1) and a rendered normal q, is a plane. Its point X = d ray lies
-// at R X + t for the neighbour. Places are px from the centre of an image's first pixel; so are cx and cy of a `Lens`.
+// at R X + t for the neighbour. Positions are px from the centre of an image's first pixel; so are cx and cy of a `Lens`.
 #pragma once
 
 #include "core/base.h"
 
 namespace gs2d {
 
-constexpr double MIN_COSINE = 0.1;        // between normal and ray: a plane seen more edge-on is none to warp by
-constexpr double MIN_SCALE = 0.1;         // depth in the neighbour in that here: below, a patch comes too close to it
-constexpr double MIN_NORMAL = 1e-4;       // length of a rendered normal that has a direction
+constexpr double MIN_COSINE = 0.1;        // between normal and ray; below, a plane is too edge-on to warp
+constexpr double MIN_SCALE = 0.1;         // ratio of the depths in neighbour and view; below, a patch is too close to the neighbour
+constexpr double MIN_NORMAL = 1e-4;       // least length of a rendered normal with a direction
 constexpr double ROUND_TRIP_EPS = 1e-12;  // px^2, under the root of a distance: no gradient is infinite
 
 // Rows of CompareArguments. Those of `motion_gradients`: of the similarity by R, t and the world's rotation, then of
@@ -19,7 +19,7 @@ constexpr double ROUND_TRIP_EPS = 1e-12;  // px^2, under the root of a distance:
 constexpr int VALUE_ROWS = 2, GRADIENT_ROWS = 5, MOTION_ROWS = 33;
 constexpr int TURN_ROW = 0, SHIFT_ROW = 9, WORLD_ROW = 12, TRIP_TURN_ROW = 21, TRIP_SHIFT_ROW = 30;
 
-// P pixels of a view beside one neighbour. R is the type of the arrays.
+// P pixels of a view and one neighbour. R is the type of the arrays.
 template <class R> struct CompareArguments {
     long long count, width, height, source_width, source_height, depth_width, depth_height, radius;
     double lens[4], source_lens[4];  // fx, fy, cx, cy, as `Camera` has them
@@ -82,7 +82,7 @@ template <class V> GS2D_HD Sampled<V> between(V a, V b, V c, V d, V x, V y) {
 // A r = R r + t (q . r) / (q . X) for every ray r. The depth of its image is in units of d.
 template <class V> struct PatchPlane {
     Vec3<V> right, down, middle;
-    MaskOf<V> planar;                              // a plane seen from its front, not too edge-on
+    MaskOf<V> planar;                              // facing the camera, not too edge-on
     Vec3<V> normal;                                // q in the view's frame
     V along, inverse, inverse_depth, slope_x, slope_y;  // q . ray; 1 / (q . X); 1 / d; q / (q . X)
 };
@@ -152,7 +152,7 @@ GS2D_HD MotionGrad<V> motion_grad(const PatchPlane<V>& p, const PatchPlaneGrad<V
     return {turn, axpy(p.slope_x, g.right, axpy(p.slope_y, g.down, p.inverse_depth * g_middle))};
 }
 
-// Where the neighbour sees a pixel of the patch: the ray's x and y (z = 1), and 1 / depth, in units of 1 / d.
+// Position of a patch pixel in the neighbour: the ray's x and y (z = 1), and 1 / depth, in units of 1 / d.
 template <class V> struct PatchPlace {
     V x, y, inverse;
 };
@@ -166,7 +166,7 @@ template <class V> GS2D_HD Vec3<V> patch_pull(const PatchPlace<V>& p, const Samp
     return {x, y, -fma(x, p.x, y * p.y)};
 }
 
-// Sums over the pixels of two patches, of what is left of their greys when those of the middle are taken off.
+// Sums over the pixels of two patches, with greys relative to the middle pixel.
 template <class V> struct PatchSums {
     V a, b, aa, bb, ab;
     GS2D_HD void add(V x, V y) {
@@ -190,10 +190,10 @@ template <class V> GS2D_HD PatchNcc<V> patch_ncc(const PatchSums<V>& s, V pixels
     return {value, by_a, value * (inverse_b * inverse_b), mean_a, mean_b, valid};
 }
 
-// The way of a pixel to the neighbour, and from what the neighbour sees there back.
+// The round trip of a pixel to the neighbour's surface and back.
 template <class V> struct RoundTrip {
     V error, by_depth;  // px; its derivative
-    MaskOf<V> back;     // it comes back
+    MaskOf<V> back;     // the round trip succeeds
     Vec3<V> met;        // the point of the neighbour's surface, less t
     Vec3<V> by_seen, by_met, by_returned;  // derivatives by R X + t, by `met`, and by R^T met
 };

@@ -5,7 +5,7 @@
 
 namespace gs2d {
 
-// f(x) = k x / (1 + (k - 1) x) from 0 to 1, straight on beyond. `growth` is k = e^s; its inverse is 1 / k.
+// f(x) = k x / (1 + (k - 1) x) from 0 to 1, linear beyond. `growth` is k = e^s; its inverse is 1 / k.
 template <class V> struct Curve {
     V growth, inverse;
 };
@@ -21,7 +21,7 @@ template <class V> GS2D_HD Bent<V> bend(V x, const Curve<V>& c) {
     return {fma(c.growth * over, inside, outside), slope, fnma(c.inverse, above, turned)};
 }
 
-// What is left of the light at a squared radius u: exp(-(a u + b u^2 + c u^3)).
+// Relative brightness at a squared radius u: exp(-(a u + b u^2 + c u^3)).
 template <class V> GS2D_HD V falloff(V u, const V* a) {
     return exp(V(0.0f) - u * fma(u, fma(u, a[2], a[1]), a[0]));
 }

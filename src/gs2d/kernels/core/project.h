@@ -1,8 +1,8 @@
 // From a splat's parameters to its screen record, and back (docs/math.md, "Projection").
 //
-// With P = [s_u t_u, s_v t_v, p] in the camera frame, a pixel ray r = ((x - cx)/fx, (y - cy)/fy, 1) meets the plane at
-// (u, v, 1) = z P^-1 r. The record holds P^-1 per pixel, centred on the projected splat, so that float32 keeps its
-// digits: with d the pixel's offset from the projected centre,
+// With P = [s_u t_u, s_v t_v, p] in the camera frame, a pixel ray r = ((x - cx)/fx, (y - cy)/fy, 1) intersects the plane at
+// (u, v, 1) = z P^-1 r. The record holds P^-1 per pixel, centred on the projected splat, for float32
+// precision: with d the pixel's offset from the projected centre,
 //     X = au dx + bu dy,  Y = av dx + bv dy,  I = iz + ai dx + bi dy,  z = 1 / I,  u = X z,  v = Y z,  iz = 1 / z_c.
 // The rows of P^-1 are (t_v x p) / (s_u n.p), (p x t_u) / (s_v n.p), n / (n.p), with n = t_u x t_v.
 #pragma once
@@ -14,11 +14,11 @@ namespace gs2d {
 
 template <class V> using mask_t = decltype(V() < V());
 
-// Rule 23: what is beyond these is culled, so that no square below leaves float32 (render/types.py has the same numbers).
+// Rule 23: splats beyond these limits are culled, so that no square overflows float32 (render/types.py has the same).
 constexpr double MAX_SIZE = 1e9;          // world units: coordinates in the camera frame, scales
 constexpr double MIN_SIZE = 1e-18;       // world units: smaller scales count as this
 constexpr double MAX_COLOR = 1e15;        // sum of the absolute coefficients of a colour
-constexpr double MIN_QUATERNION = 1e-15;  // largest component; less is a zero quaternion
+constexpr double MIN_QUATERNION = 1e-15;  // largest component; below, it counts as a zero quaternion
 
 // A pinhole camera; x_cam = R x_world + t. S is a scalar.
 template <class S> struct PinholeCamera {
@@ -54,13 +54,13 @@ template <class V> struct RecordGradient {
 };
 constexpr int GRADIENT = RECORD, GRADIENT_EXTRA = 4;  // the latter: lowpass_cx to abs_y
 
-// What both directions need.
+// Values for both directions.
 template <class V> struct Frame3 {
     V qw, qx, qy, qz, inverse_norm;  // unit quaternion, 1 / |quat|
     Vec3<V> tu, tv, n_world;         // world
     Vec3<V> p, a, b, n;              // camera frame: centre, s_u t_u, s_v t_v, normal
     Vec3<V> row0, row1, row2;        // of P^-1
-    V sign;                          // +1, or -1 where t_w looks away from the camera
+    V sign;                          // +1, or -1 if t_w faces away from the camera
     Vec3<V> to_splat;                // unit, world
     V inverse_distance;
 };
@@ -109,7 +109,7 @@ template <class V, class S> GS2D_HD Frame3<V> frame_of(const SplatParameters<V>&
     f.n = rotate(cam.R, f.n_world);
     const V su = max(exp(s.log_su), tiny), sv = max(exp(s.log_sv), tiny);
     f.a = su * tu, f.b = sv * tv;
-    // Exactly edge-on there is no inverse: keep n.p away from 0, the low-pass filter draws such splats.
+    // Exactly edge-on there is no inverse: n.p is kept away from 0; the low-pass filter draws such splats.
     const V nd = dot(f.n, f.p), floor = V(S(1e-7)) * sqrt(dot(f.p, f.p));
     const V inv = one / select(abs(nd) >= floor, nd, select(nd < V(S(0)), -floor, floor));
     f.row0 = (inv / su) * cross(tv, f.p);
@@ -122,7 +122,7 @@ template <class V, class S> GS2D_HD Frame3<V> frame_of(const SplatParameters<V>&
     return f;
 }
 
-// Rules 16 and 23, but for the colour: every parameter is finite and in the range that float32 can square. False for NaN.
+// Rules 16 and 23, except for the colour: every parameter is finite and in the range that float32 can square. False for NaN.
 template <class V> GS2D_HD mask_t<V> in_range(const SplatParameters<V>& p, const Frame3<V>& f) {
     // an eighth of each, so that finite numbers have a finite sum (gcc 12 folds 0 * x to 0 with -fno-signed-zeros)
     const V part = V(0.125f), limit = V(float(MAX_SIZE));
@@ -132,10 +132,10 @@ template <class V> GS2D_HD mask_t<V> in_range(const SplatParameters<V>& p, const
            (abs(f.p.y) <= limit) & (abs(f.p.z) <= limit) & (exp(p.log_su) <= limit) & (exp(p.log_sv) <= limit);
 }
 
-// The same of the sum of the absolute coefficients of a colour.
+// The same for the sum of the absolute coefficients of a colour.
 template <class V> GS2D_HD mask_t<V> color_in_range(V sum) { return sum <= V(float(MAX_COLOR)); }
 
-// All of the record but the colour.
+// The record without the colour.
 template <class V, class S>
 GS2D_HD Record<V> project(const SplatParameters<V>& s, const Frame3<V>& f, const PinholeCamera<S>& cam) {
     Record<V> r;
@@ -203,7 +203,7 @@ GS2D_HD ParameterGradient<V> project_vjp(const SplatParameters<V>& s, const Fram
     return out;
 }
 
-// What one splat says of the camera's intrinsics (docs/math.md, "Camera").
+// Gradient of the camera's intrinsics from one splat (docs/math.md, "Camera").
 template <class V> struct IntrinsicsGradient {
     V fx, fy, cx, cy;
 };
@@ -217,7 +217,7 @@ GS2D_HD IntrinsicsGradient<V> intrinsics_vjp(const Frame3<V>& f, const Record<V>
     return {fnma(kx, along_x, cx * (f.p.x * r.iz)), fnma(ky, along_y, cy * (f.p.y * r.iz)), cx, cy};
 }
 
-// Where the disc rho3d <= k^2 and the low-pass disc can be seen.
+// The footprint of the disc rho3d <= k^2 and the low-pass disc.
 template <class V> struct Footprint {
     // |pixel - e| in the metric (a, b, c) is at most 1 inside the ellipse; slightly widened against rounding.
     V ex, ey, a, b, c;
@@ -226,10 +226,10 @@ template <class V> struct Footprint {
     V k;                             // radius of the disc on the splat's plane, widened
     V x_min, y_min, x_max, y_max;    // exact box of both, px, not clipped
     mask_t<V> crosses;               // the disc reaches the camera plane: no ellipse, no box
-    mask_t<V> unbounded;             // crosses, or so nearly that the ellipse cannot be trusted
+    mask_t<V> unbounded;             // crosses, or too close to it for a reliable ellipse
 };
 
-// Rule 19: what becomes of a splat whose disc rho3d <= error_cutoff^2 reaches the camera plane.
+// Rule 19: handling of a splat whose disc rho3d <= error_cutoff^2 reaches the camera plane.
 constexpr int NEAR_PLANE_DRAW = 0, NEAR_PLANE_CULL = 1, NEAR_PLANE_BOX = 2;
 
 // The disc rho3d <= k^2 reaches the camera plane.
@@ -249,7 +249,7 @@ template <class V, class S> GS2D_HD ScreenAxes<V> screen_axes(const Frame3<V>& f
 }
 
 // Rule 19, "box": centre and half side, px, of the official square around a disc that reaches the camera plane: the
-// formula of an ellipse's box, for what is a hyperbola. Not finite where the disc only touches the plane.
+// formula of an ellipse's box, applied to a hyperbola. Not finite if the disc only touches the plane.
 template <class V> struct Square {
     V x, y, half;
 };
@@ -278,7 +278,7 @@ GS2D_HD Footprint<V> footprint(const Frame3<V>& f, const Record<V>& r, V k2, S l
     const V ex = -scale * fma(xu, f.a.z, xv * f.b.z), ey = -scale * fma(yu, f.a.z, yv * f.b.z);
     const V sxx = fma(ex, ex, scale * fma(xu, xu, xv * xv)), syy = fma(ey, ey, scale * fma(yu, yu, yv * yv));
     const V sxy = fma(ex, ey, scale * fma(xu, yu, xv * yv));
-    // Also when the sum overflowed, or the ellipse is so large that its tests would lose their digits.
+    // Also when the sum overflowed, or the ellipse is so large that its tests would lose precision.
     o.unbounded = (d > V(S(-0.01)) * zz) | invert(sxx + syy < V(S(1e12)));
     const V hx = sqrt(sxx), hy = sqrt(syy), radius = V(lowpass_px) * sqrt(k2);
     o.x_min = r.cx + min(ex - hx, -radius), o.x_max = r.cx + max(ex + hx, radius);

@@ -6,7 +6,7 @@
 namespace gs2d {
 
 constexpr int SH_MAX = 16;  // coefficients of degree 3
-// Degree -1 is no harmonic but the first coefficient itself: the colour, neither shifted nor clamped (rule 11).
+// Degree -1 is the first coefficient itself: the colour, neither shifted nor clamped (rule 11).
 GS2D_HD int sh_count(int degree) { return degree < 0 ? 1 : (degree + 1) * (degree + 1); }
 
 // The first sh_count(degree) basis functions at the unit vector d.
@@ -46,12 +46,12 @@ template <class V> GS2D_HD Vec3<V> sh_color(const V* sh, const V* basis, int deg
     return c;
 }
 
-// What is drawn of a channel of that colour.
+// The drawn value of a channel of that colour.
 template <class V> GS2D_HD V clamped_color(V c, int degree) { return degree < 0 ? c : max(c, V(0.f)); }
-// What its gradient g is of the colour's.
+// The gradient of that colour from the gradient g of the drawn value.
 template <class V> GS2D_HD V clamped_color_vjp(V c, int degree, V g) { return degree < 0 ? g : keep(c > V(0.f), g); }
 
-// Gradient with respect to d of sum_k g[k] basis[k], d taken as a free vector (its length is dealt with by the caller).
+// Gradient with respect to d of sum_k g[k] basis[k], d taken as a free vector (the caller handles its length).
 template <class V> GS2D_HD Vec3<V> sh_basis_vjp(Vec3<V> d, int degree, const V* g) {
     Vec3<V> r = {V(0.0), V(0.0), V(0.0)};
     if (degree < 1) return r;

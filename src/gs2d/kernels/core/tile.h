@@ -39,8 +39,8 @@ template <class V> struct Chords {
     V cx, cy, disc2;  // low-pass disc
 };
 
-// What a footprint holds of the rows y0 to y1, from left to right; nothing where left > right. Both shapes hold (cx, cy), so
-// that this is one piece but where a far end of the ellipse comes back beside the disc.
+// Interval of a footprint in the rows y0 to y1; empty if left > right. Both shapes contain (cx, cy), so it is one interval
+// unless a far end of the ellipse returns beside the disc.
 template <class V> GS2D_HD void reach_in_rows(const Chords<V>& s, V y0, V y1, V& left, V& right) {
     const V far = V(1e30), a = y0 - s.ey, b = y1 - s.ey;
     const V yr = min(max(s.y_right, a), b), yl = min(max(-s.y_right, a), b);
@@ -48,11 +48,11 @@ template <class V> GS2D_HD void reach_in_rows(const Chords<V>& s, V y0, V y1, V&
     const V dy = min(max(s.cy, y0), y1) - s.cy, d2 = fnma(dy, dy, s.disc2), d = sqrt(d2);
     const auto near = d2 >= V(0);
     right = fma(s.half, sqrt(r2), fma(s.slope, yr, s.ex)), left = fnma(s.half, sqrt(l2), fma(s.slope, yl, s.ex));
-    // NaN where the ellipse does not reach: max and min then take the other one
+    // NaN outside the ellipse: max and min then take the other operand
     right = max(right, select(near, s.cx + d, -far)), left = min(left, select(near, s.cx - d, far));
 }
 
-// What is seen of a disc that reaches the camera plane has no ellipse, but it is convex, and bounded where it is beyond `near`. It lies
+// The visible part of a disc that reaches the camera plane has no ellipse, but is convex and bounded beyond `near`. It lies
 // inside half planes a dx + b dy + c >= 0, dx and dy from the projected centre; and there is the low-pass disc (docs/math.md, "Footprint").
 template <class V> struct HalfPlane {
     V a, b, c;
@@ -89,12 +89,12 @@ GS2D_HD Outline<V> outline_of(V au, V bu, V av, V bv, V ai, V bi, V iz, V cx, V 
     return o;
 }
 
-// What an outline holds of the rows y0 to y1, from left to right, all from the projected centre; nothing where left > right.
+// Interval of an outline in the rows y0 to y1, relative to the projected centre; empty if left > right.
 template <class V> GS2D_HD void reach_in_rows(const Outline<V>& s, V y0, V y1, V& left, V& right) {
     const V far = V(1e30f), zero = V(0);
     left = -far, right = far;
     GS2D_UNROLL
-    for (int i = 0; i < SIDES; ++i) {  // each side where its best row is; NaN and a = 0 take nothing away
+    for (int i = 0; i < SIDES; ++i) {  // each side at its best row; NaN and a = 0 have no effect
         const HalfPlane<V> h = s.sides[i];
         const V x = -(max(h.b * y0, h.b * y1) + h.c) / h.a;
         left = select(h.a > zero, max(x, left), left), right = select(h.a < zero, min(x, right), right);
@@ -148,7 +148,7 @@ GS2D_HD TileRectangle with_row(const TileRectangle& r, int x0, int x1, int y) {
             (unsigned short)(y + 1)};
 }
 
-// Rule 19, "box": the tiles that a square (centre and half side, px) touches; none where it is not finite.
+// Rule 19, "box": the tiles that a square (centre and half side, px) touches; none if it is not finite.
 template <class S> GS2D_HD TileRectangle square_tiles(S x, S y, S half, int tiles_x, int tiles_y) {
     if (!(abs(x) + abs(y) + half < S(1e9))) return {0, 0, 0, 0};
     const S side = ceil(half), left = x - S(0.5) - side, top = y - S(0.5) - side;

@@ -1,12 +1,12 @@
-// Depth by continuous transmittance (rule 22; docs/math.md, "Depth by transmittance"): the profile, the search along the
-// ray of a pixel, and what a pair adds to its gradient.
+// Depth by transmittance (rule 22; docs/math.md, "Depth by transmittance"): the profile, the search along the
+// ray of a pixel, and the contribution of a pair to its gradient.
 #pragma once
 
 #include "core/base.h"
 
 namespace gs2d {
 
-// How much of a splat's opacity lies before depth z, and the slope of that over x = (z / z_i - 1) / width: the integral of
+// The fraction of a splat's opacity before depth z, and its slope over x = (z / z_i - 1) / width: the integral of
 // the Epanechnikov kernel, 0 up to x = -1, 1 from x = 1 on.
 template <class V> struct Fraction {
     V before, slope;
@@ -16,7 +16,7 @@ template <class V> GS2D_HD Fraction<V> fraction_at(V z, V inverse_depth, V inv_w
     return {fma(V(0.25f) * x, V(3) - square, V(0.5f)), fnma(V(0.75f), square, V(0.75f))};
 }
 
-// T(z) and its fall there, pair by pair, in any order. fall: -width dT/dz.
+// T(z) and its decrease there, pair by pair, in any order. fall: -width dT/dz.
 template <class V> struct Transmittance {
     V T, fall;
 };
@@ -27,7 +27,7 @@ template <class V> GS2D_HD void pass_pair(V alpha, V inverse_depth, V z, V inv_w
     t.T = t.T * left;
 }
 
-// Newton's method within a bracket: a step that would leave it, or does not halve the step before, becomes a bisection.
+// Newton's method within a bracket: a step that leaves it or does not halve the previous step becomes a bisection.
 template <class V> struct DepthSearch {
     V z, near, far;  // near < depth <= far
     V step;          // the last one's length
@@ -35,7 +35,7 @@ template <class V> struct DepthSearch {
     mask_t<V> open;  // still moving
 };
 
-constexpr int MAX_SEARCH_STEPS = 64;  // twice what bisection needs in float
+constexpr int MAX_SEARCH_STEPS = 64;  // twice the steps of bisection in float
 // Of a width: the search ends with a step that is shorter, after which Newton's method is off by its square, and T falls as
 // it did before.
 template <class real> constexpr real SEARCH_TOLERANCE = real(sizeof(real) == sizeof(double) ? 1e-8 : 1e-4);
@@ -64,12 +64,12 @@ GS2D_HD void advance(const Transmittance<V>& t, V level, V inv_width, V toleranc
     s.z = select(moves, z, s.z), s.fall = select(moves, t.fall, s.fall), s.step = step;
 }
 
-// -dT/dz as the gradient takes it: a pixel between two surfaces has nearly none, and would have any gradient.
+// -dT/dz for the gradient, bounded below: it is nearly 0 for a pixel between two surfaces.
 template <class V> GS2D_HD V slope_of(V fall, V alpha, V z, V inv_width) {
     return max(fall, V(0.05f) * alpha * reciprocal(z)) * inv_width;
 }
 
-// What a pair adds to the gradients by ln(alpha) and 1 / z_i: factor = g T(z) / slope_of(...), g the upstream gradient. The part
+// Contribution of a pair to the gradients by ln(alpha) and 1 / z_i: factor = g T(z) / slope_of(...), g the upstream gradient. The part
 // of the level 1 - alpha / 2 goes through the alpha image.
 template <class V> struct DepthPairGradient {
     V alpha, inverse_depth;

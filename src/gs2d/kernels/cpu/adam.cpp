@@ -1,4 +1,4 @@
-// Adam over some attributes in one call, and whether their gradients are finite.
+// Adam on several attributes in one call, and the check for non-finite gradients.
 #include "core/adam.h"
 
 #include "cpu/export.h"
@@ -8,18 +8,18 @@
 namespace gs2d {
 namespace {
 
-constexpr int64_t PIECE = 8192;  // elements a thread takes at a time: 160 KB are read and written
+constexpr int64_t PIECE = 8192;  // elements per task: 160 KB read and written
 
 // kernels/native_adam.py has the same.
 struct AdamAttribute {
     real *parameter, *mean, *square;          // [N, columns]
     const real* gradient;                     // [N, columns], or [M, columns] with `compact`
-    const int64_t* rows;                      // [M]: only these; or null
+    const int64_t* rows;                      // [M]: rows to update, or null: all
     int64_t height, count, columns, compact;  // N; M or N
     double step_size, root_2;
 };
 
-// `n` elements in a row.
+// `n` consecutive elements.
 void step(real* parameter, real* mean, real* square, const real* gradient, int64_t n, const AdamConstants<V>& k) {
     for (int64_t i = 0; i < n; i += LANES) {
         const int left = n - i < LANES ? static_cast<int>(n - i) : LANES;
@@ -35,7 +35,7 @@ void step(real* parameter, real* mean, real* square, const real* gradient, int64
     }
 }
 
-// Elements [begin, end) of an attribute; with `rows`, whole ones.
+// Elements [begin, end) of an attribute; with `rows`, whole rows.
 void step_piece(const AdamAttribute& a, int64_t begin, int64_t end, const AdamConstants<V>& k) {
     if (!a.rows) return step(a.parameter + begin, a.mean + begin, a.square + begin, a.gradient + begin, end - begin, k);
     for (int64_t i = begin / a.columns; i < end / a.columns; ++i) {
@@ -44,7 +44,7 @@ void step_piece(const AdamAttribute& a, int64_t begin, int64_t end, const AdamCo
     }
 }
 
-// f(i, begin, end) for the pieces of n arrays, elements(i) long, each a multiple of columns(i).
+// Calls f(i, begin, end) for pieces of n arrays with elements(i) elements; pieces are multiples of columns(i).
 template <class E, class C, class F> void for_pieces(int n, E&& elements, C&& columns, F&& f) {
     const auto piece = [&](int i) { return columns(i) < PIECE ? PIECE / columns(i) * columns(i) : columns(i); };
     const auto pieces = [&](int i) { return (elements(i) + piece(i) - 1) / piece(i); };
@@ -75,8 +75,8 @@ bool all_finite(const real* x, int64_t n) {
 
 using namespace gs2d;
 
-// Changes the attributes in place. No bit depends on the number of threads. Returns 1, with nothing changed, where `rows`
-// names one that is not there.
+// Updates the attributes in place. The bits do not depend on the number of threads. Returns 1, without changes, if an
+// index in `rows` is out of range.
 GS2D_EXPORT int gs2d_adam(const AdamAttribute* attributes, int n, double beta1, double beta2, double eps) {
     for (int i = 0; i < n; ++i)
         for (int64_t k = 0; attributes[i].rows && k < attributes[i].count; ++k)
@@ -92,7 +92,7 @@ GS2D_EXPORT int gs2d_adam(const AdamAttribute* attributes, int n, double beta1, 
     return 0;
 }
 
-// The number of the first of n arrays that holds a NaN or an infinity; n if none does.
+// Returns the index of the first of n arrays with a NaN or an infinity, n if all are finite.
 GS2D_EXPORT int gs2d_first_not_finite(const real* const* arrays, const int64_t* sizes, int n) {
     int first = n;
     for_pieces(

@@ -1,4 +1,4 @@
-// The rasterizer's exported functions. render/native_rasterizer.py calls them; sizes and types are checked there.
+// The rasterizer's exported functions. render/native_rasterizer.py calls them and checks sizes and types.
 #include <pthread.h>
 
 #include "cpu/export.h"
@@ -72,7 +72,7 @@ using namespace gs2d;
 // Status of the functions below.
 enum { OK = 0, NO_MEMORY = 1 };
 
-// Renders one view. `*frame` keeps what the backward pass needs until gs2d_frame_release.
+// Renders one view. `*frame` holds the state for the backward pass until gs2d_frame_release.
 GS2D_EXPORT int gs2d_raster_forward(const View* view, const Parameters* splats, const Images* out, Frame** frame) {
     *frame = take_frame();
     if (!*frame) return NO_MEMORY;
@@ -81,7 +81,7 @@ GS2D_EXPORT int gs2d_raster_forward(const View* view, const Parameters* splats, 
     StageClock clock;
     bool ok = project_splats(f, *splats, Reach::BLEND, out->radii);
     clock.done(PROJECT);
-    ok = ok && bin_splats(f);  // its own clock
+    ok = ok && bin_splats(f);  // measures its own time
     StageClock blending;
     ok = ok && blend_tiles(f, *out);
     blending.done(BLEND_FORWARD);
@@ -91,12 +91,12 @@ GS2D_EXPORT int gs2d_raster_forward(const View* view, const Parameters* splats, 
     return NO_MEMORY;
 }
 
-// Depth by transmittance [H, W] of the view that was just rendered; `images` are its outputs.
+// Depth by transmittance [H, W] of the last rendered view; `images` are its outputs.
 GS2D_EXPORT int gs2d_transmittance_depth(Frame* frame, const Images* images, double width, real* depth) {
     return find_transmittance_depth(*frame, images->alpha, images->depth_median, width, depth) ? OK : NO_MEMORY;
 }
 
-// Further channels of the view that was just rendered.
+// Further channels of the last rendered view.
 GS2D_EXPORT int gs2d_raster_features(Frame* frame, const Features* features) {
     return blend_features(*frame, *features) ? OK : NO_MEMORY;
 }
@@ -140,14 +140,14 @@ GS2D_EXPORT int gs2d_splat_errors(const View* view, const Parameters* splats, co
 
 GS2D_EXPORT void gs2d_frame_release(Frame* frame) { give_back(frame); }
 
-// Bytes of memory that a view holds from its forward to its backward pass.
+// Bytes of memory of a view between forward and backward pass.
 GS2D_EXPORT int64_t gs2d_frame_bytes(Frame* frame) {
     size_t bytes = 0;
     for_each_buffer(*frame, [&](auto& buffer) { bytes += buffer.capacity * sizeof(*buffer.data); });
     return static_cast<int64_t>(bytes);
 }
 
-// Frees the memory that is kept for the next view.
+// Frees the memory reserved for the next view.
 GS2D_EXPORT void gs2d_trim() {
     pthread_mutex_lock(&free_lock);
     Frame* f = free_frames;

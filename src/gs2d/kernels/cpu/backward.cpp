@@ -1,4 +1,4 @@
-// Gradients of the blending: tile by tile, front to back, some splats at a time, the sums over a splat's pixels in registers.
+// Gradients of the blending: tile by tile, front to back, in batches of splats, with a splat's sums in registers.
 // Every (tile, splat) has its own slot of gradients (gradient_sums.h), so nothing depends on the order of the tiles.
 #include "cpu/features.h"
 #include "cpu/frame.h"
@@ -11,7 +11,7 @@
 namespace gs2d {
 namespace {
 
-// Upstream gradients as PixelGradient wants them, and S = the sum over all splats of w s, from the image's totals.
+// Upstream gradients for PixelGradient, and S = the sum over all splats of w s, from the image's totals.
 void start(const Frame& f, const Images& images, const ImageGradients& g, const TileArea& a, Planes s) {
     const View& v = f.view;
     const int W = v.width;
@@ -69,7 +69,7 @@ void start(const Frame& f, const Images& images, const ImageGradients& g, const 
     }
 }
 
-// The part of the depth by transmittance, after `start`, which is as short as without it.
+// The contribution of the depth by transmittance, added after `start`.
 __attribute__((noinline)) void start_transmittance(const Frame& f, const real* upstream, const real* alpha,
                                                    const TileArea& a, Planes s) {
     const int W = f.view.width;
@@ -106,7 +106,7 @@ RowLines images_read(const Frame& f, const Images& images, const ImageGradients&
     return lines;
 }
 
-// Only the colours' gradients: no geometry, no opacity.
+// Gradients of colours only, without geometry and opacity.
 void tile_color_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows, Planes s, const TileArea& area,
                     const BlendLimits<V>& limits, RowsAhead next, TileFeatures) {
     const Centres centres(area);

@@ -6,11 +6,11 @@
 namespace gs2d {
 namespace {
 
-constexpr int64_t CHUNKS = 16;  // pieces of the depth order; fixed, so that lists do not depend on threads
+constexpr int64_t CHUNKS = 16;  // pieces of the depth order; fixed, so that lists do not depend on the number of threads
 
 constexpr int DIGIT = 11, DIGITS = 1 << DIGIT, PASSES = (8 * sizeof(DepthKey) + DIGIT - 1) / DIGIT;
 
-// Stable radix sort, least significant digit first: equal depths stay in index order. Returns where the result is.
+// Stable radix sort, least significant digit first: equal depths stay in index order. Returns the buffer with the result.
 DepthItem* radix_sort(DepthItem* items, DepthItem* other, int64_t n, uint32_t (*counts)[DIGITS]) {
     memset(counts, 0, sizeof(*counts) * PASSES);
     for (int64_t i = 0; i < n; ++i)
@@ -45,7 +45,7 @@ void sort_by_depth(Frame& f) {
     f.visible = n;
     if (n == 0) return;
     f.order = radix_sort(items, items + f.count, n, counts);
-    DepthItem* const spare = f.order == items ? items + f.count : items;  // no longer needed, and large enough
+    DepthItem* const spare = f.order == items ? items + f.count : items;  // no longer needed and large enough
     static_assert(sizeof(DepthItem) >= sizeof(TileRect));
     f.ordered_rects = reinterpret_cast<TileRect*>(spare);
     parallel_ranges(n, 16384, [&](int64_t begin, int64_t end) {

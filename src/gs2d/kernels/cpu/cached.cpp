@@ -1,8 +1,8 @@
-// Views with frozen geometry and opacity: the image is affine in the colours of the splats that still learn,
+// Views with frozen geometry and opacity: the image is affine in the colours of the splats that are trained,
 //     color(pixel) = frozen(pixel) + sum over rows k of w_k(pixel) max(0, c_k),
-// so that a view keeps `frozen` and the weights and is never blended again (docs/math.md, "Cached views"). The weights
-// are those of the blending, bit for bit, and so are the gradients of a given image gradient: same sums, same order.
-// Weights lie by tile, splat (front to back) and block, LANES reals each: read in the order in which they are written.
+// so a view stores `frozen` and the weights and needs no blending (docs/math.md, "Cached views"). Weights and gradients
+// have the bits of the blending: same sums in the same order. Weights are stored by tile, splat (front to back) and
+// block, LANES reals each, and read in that order.
 #include "cpu/export.h"
 #include "cpu/frame.h"
 #include "cpu/planes.h"
@@ -11,7 +11,7 @@
 
 namespace gs2d {
 
-// Mirrored by a ctypes structure in render/cpu_cached.py; change both. `row`: index among the splats that learn.
+// Mirrored by a ctypes structure in render/cpu_cached.py; change both. `row`: index among the trained splats.
 struct CachedView {
     int64_t width, height, tiles_x, tiles, rows, degree;
     int64_t *tile_entries, *tile_blocks;  // [tiles + 1]: first entry and first block of weights of each tile
@@ -36,7 +36,7 @@ TileArea area_of(const CachedView& c, int64_t tile) {
     return a;
 }
 
-// Walks a tile as the backward pass does: frozen splats add their colour, the others leave their weights.
+// Processes a tile like the backward pass: frozen splats add their colour, the others store their weights.
 void fill_tile(const Frame& f, int64_t tile, const int32_t* row_of, const CachedView& c, const BlendLimits<V>& limits) {
     alignas(64) real T[PIXELS];
     const TileArea area = tile_area(f, tile);
@@ -147,7 +147,7 @@ void gather_tile(const CachedView& c, int64_t tile, const real* gradient, real* 
 
 using namespace gs2d;
 
-// After a forward pass: how much a cached view holds. `row_of` [N]: the row of a splat that learns, or -1.
+// After a forward pass: measures the size of a cached view. `row_of` [N]: the row of a trained splat, or -1.
 GS2D_EXPORT void gs2d_cached_measure(const Frame* frame, const int32_t* row_of, int64_t* tile_entries,
                                      int64_t* tile_blocks) {
     const Frame& f = *frame;
@@ -167,7 +167,7 @@ GS2D_EXPORT void gs2d_cached_measure(const Frame* frame, const int32_t* row_of, 
     for (int64_t t = 0; t < f.tiles; ++t) tile_entries[t + 1] += tile_entries[t], tile_blocks[t + 1] += tile_blocks[t];
 }
 
-// Fills a view whose arrays are as large as measured; `splats` are the rows that learn.
+// Fills a view whose arrays have the measured sizes; `splats` are the trained rows.
 GS2D_EXPORT void gs2d_cached_fill(const Frame* frame, const int32_t* row_of, const Parameters* splats,
                                   const CachedView* view) {
     const CachedView& c = *view;
@@ -199,7 +199,7 @@ GS2D_EXPORT void gs2d_cached_render(const CachedView* view, const Parameters* sp
     });
 }
 
-// Gradients of the rows' coefficients from that of the image [H, W, 3]; `slots` [entries, 4] is scratch.
+// Gradients of the rows' coefficients from the gradient of the image [H, W, 3]; `slots` [entries, 4] is scratch.
 GS2D_EXPORT void gs2d_cached_gradients(const CachedView* view, const real* gradient, const real* colors,
                                        int64_t sh_rest, real* slots, const ParameterGradients* out) {
     const CachedView& c = *view;

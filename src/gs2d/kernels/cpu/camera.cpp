@@ -1,5 +1,5 @@
-// What a rigid motion of the camera does, from the gradients of the splats (docs/math.md, "Camera"). Pieces of the same size
-// whatever the number of threads, and their sums in order: so are the bits.
+// The derivative by a rigid motion of the camera, from the gradients of the splats (docs/math.md, "Camera"). Pieces have a
+// fixed size and are summed in order, so the bits do not depend on the number of threads.
 #include "core/sh.h"
 
 #include <cstdlib>
@@ -32,7 +32,7 @@ Vec3<V> load_vector(const real* p, int64_t i, int lanes) {
 Vec3<V> keep(M m, Vec3<V> a) { return {keep(m, a.x), keep(m, a.y), keep(m, a.z)}; }
 M is_finite(Vec3<V> a) { return is_finite(a.x) & is_finite(a.y) & is_finite(a.z); }
 
-// By a small turn of q to dq * q.
+// Derivative by a small rotation of q to dq * q.
 Vec3<V> turn_of_quats(const Moved& s, int64_t i, int lanes) {
     V q[4], g[4];
     load_rows<4>(s.quats + 4 * i, 4, lanes, q);
@@ -42,7 +42,7 @@ Vec3<V> turn_of_quats(const Moved& s, int64_t i, int lanes) {
     return keep(here, V(real(0.5)) * (cross(v, gv) + q[0] * gv - g[0] * v));
 }
 
-// By a turn of the directions in which colours are seen.
+// Derivative by a rotation of the view directions of colours.
 Vec3<V> turn_of_colors(const Moved& s, int64_t i, int lanes, Vec3<V> to_splat) {
     V rest[3 * (SH_MAX - 1)], along[SH_MAX];
     const int64_t stride = 3 * s.sh_rest;
@@ -55,7 +55,7 @@ Vec3<V> turn_of_colors(const Moved& s, int64_t i, int lanes, Vec3<V> to_splat) {
         along[k] = dot(g, {rest[3 * k - 3], rest[3 * k - 2], rest[3 * k - 1]});
     const Vec3<V> d = V(real(1)) / sqrt(dot(to_splat, to_splat)) * to_splat;
     const Vec3<V> turn = cross(d, sh_basis_vjp(d, int(s.degree), along));
-    // Where nothing comes in there is nothing, whatever the coefficients are.
+    // A zero gradient contributes 0, even if the coefficients are not finite.
     const M asked = first(lanes) & ((abs(g.x) + abs(g.y) + abs(g.z)) > V(real(0)));
     return keep(asked, turn);
 }
@@ -65,8 +65,8 @@ Vec3<V> turn_of_colors(const Moved& s, int64_t i, int lanes, Vec3<V> to_splat) {
 
 using namespace gs2d;
 
-// sums: derivative by a shift [3] and by a turn about the centre [3] of the scene. What is not finite has no gradients and
-// counts nothing. Returns 1 where memory is short.
+// sums: derivatives by a translation [3] and by a rotation about the centre [3] of the scene. Rows that are not finite
+// contribute 0. Returns 1 if memory is short.
 GS2D_EXPORT int gs2d_camera_wrench(const Moved* moved, double* sums) {
     const Moved& s = *moved;
     const int64_t pieces = (s.count + PIECE - 1) / PIECE;

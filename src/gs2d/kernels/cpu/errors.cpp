@@ -1,4 +1,4 @@
-// Splat errors: the sum over a splat's footprint of |its colour - the photograph| (rule 17 of the contract).
+// Splat errors: the sum over a splat's footprint of |its colour - image| (rule 17 of the contract).
 #include "cpu/frame.h"
 #include "cpu/threads.h"
 #include "cpu/tile.h"
@@ -8,7 +8,7 @@ namespace {
 
 enum Plane { RED, GREEN, BLUE, COUNTS, PLANES };  // COUNTS: 1 where a pixel counts, else 0
 
-// The photograph in block order, tile after tile.
+// The image in block order, tile after tile.
 bool load_target(Frame& f, const real* image, const uint8_t* mask) {
     if (!f.target.reserve(size_t(f.tiles) * PLANES * PIXELS)) return false;
     parallel_for(f.tiles, [&](int64_t tile) {
@@ -44,7 +44,7 @@ bool list_entries(Frame& f) {
     for (int64_t e = 0; e < entries; ++e) ++begin[f.entries[e].splat() + 2];
     for (int64_t i = 0; i < f.count; ++i) begin[i + 2] += begin[i + 1];
     for (int64_t e = 0; e < entries; ++e) f.splat_slots[begin[f.entries[e].splat() + 1]++] = static_cast<uint32_t>(e);
-    // filling has moved every begin to its end, which is the next one's begin: begin[i] is right again
+    // Filling moved every begin to its end, which is the begin of the next one, so begin[i] is correct again.
     return true;
 }
 

@@ -1,5 +1,5 @@
-// Renderings as a camera with a given exposure would have taken them, and the gradients. Pieces of the same size whatever
-// the number of threads, and their sums in order: so are the bits.
+// Exposure of rendered images, and its gradients. Pieces have a fixed size and are summed in order, so the bits do not
+// depend on the number of threads.
 #include "core/exposure.h"
 
 #include <cstdlib>
@@ -41,7 +41,7 @@ V coverage_at(const Picture& p, int64_t first) {
 
 using namespace gs2d;
 
-// `over` [pixels, 3] is set where `clipped` is and the exposed picture is above 1, which it then is not: both may be null.
+// Where `clipped` [pixels, 3] is set, values above 1 become 1 and set `over`; both may be null.
 GS2D_EXPORT void gs2d_expose(const Picture* picture, const uint8_t* clipped, real* out, uint8_t* over) {
     const Exposure<V> e = exposure_of(*picture);
     parallel_ranges(picture->pixels, PIECE, [&](int64_t begin, int64_t end) {
@@ -60,7 +60,7 @@ GS2D_EXPORT void gs2d_expose(const Picture* picture, const uint8_t* clipped, rea
     });
 }
 
-// sums: those of the transform's gradient [3, 4]. `over` may be null. Returns 1 where memory is short.
+// sums: the gradient of the transform [3, 4]. `over` may be null. Returns 1 if memory is short.
 GS2D_EXPORT int gs2d_expose_vjp(const Picture* picture, const uint8_t* over, const real* upstream, real* to_color,
                                 double* sums) {
     const int64_t pieces = (picture->pixels + PIECE - 1) / PIECE;

@@ -1,4 +1,4 @@
-// Blending of further channels: the entries that the forward pass has left are walked once more for their weights.
+// Blending of further channels: a second pass over the entries of the forward pass recomputes their weights.
 #include "cpu/features.h"
 
 #include "cpu/planes.h"
@@ -7,7 +7,7 @@
 namespace gs2d {
 namespace {
 
-// Adds the splats to the planes, and forgets them.
+// Adds the splats to the planes and clears the batch.
 void blend_pairs(const Features& features, FeaturePairs& pairs, real* planes) {
     for_each_channels(feature_rows(features.count), [&](auto n, int64_t c) {
         constexpr int N = decltype(n)::value;
@@ -26,7 +26,7 @@ void blend_pairs(const Features& features, FeaturePairs& pairs, real* planes) {
 }
 
 void blend_tile(const Frame& f, int64_t tile, const Features& features, real* planes, const BlendLimits<V>& limits) {
-    constexpr int AHEAD = 8;  // records lie far apart: ask for them early
+    constexpr int AHEAD = 8;  // prefetch distance for the scattered records
     const int64_t count = features.count;
     const TileArea area = tile_area(f, tile);
     const Centres centres(area);
@@ -56,7 +56,7 @@ void blend_tile(const Frame& f, int64_t tile, const Features& features, real* pl
         if (pairs.splats == FeaturePairs::SPLATS) blend_pairs(features, pairs, planes);
     }
     blend_pairs(features, pairs, planes);
-    read_planes<1>(&f.saved[0], f.view.width, area, T);  // the last one, also of pixels that have stopped
+    read_planes<1>(&f.saved[0], f.view.width, area, T);  // the final one, also of stopped pixels
     for (int64_t c = 0; c < count; ++c) {
         real* const plane = planes + c * FEATURE_STRIDE;
         const V background = V(features.background[c]);
@@ -123,7 +123,7 @@ void begin_features(TileFeatures& t, const Entry* entries, int count) {
             load_channels<N>(*t.all, pairs.splat[j], c, values);
             for (int i = first; i < end; ++i) {
                 const real* const at = t.upstream + c * FEATURE_STRIDE + pairs.block[i] * LANES;
-                V sums[4] = {load(pairs.of_pair[i]), V(0), V(0), V(0)};  // so that none waits for the one before
+                V sums[4] = {load(pairs.of_pair[i]), V(0), V(0), V(0)};  // independent sums, so that none waits for another
                 for (int k = 0; k < N; ++k) sums[k % 4] = fma(load(at + k * FEATURE_STRIDE), values[k], sums[k % 4]);
                 store(pairs.of_pair[i], (sums[0] + sums[1]) + (sums[2] + sums[3]));
             }

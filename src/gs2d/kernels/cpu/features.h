@@ -1,18 +1,18 @@
-// Channels besides the three of a splat's colour, in the memory of a tile: of each channel the pixels in block order.
+// Channels besides the three of a splat's colour, as planes of a tile: pixels in block order per channel.
 #pragma once
 
 #include "cpu/tile.h"
 
 namespace gs2d {
 
-// Pairs (splat, block) of some splats in a row of a tile. Many splats at a time: then the planes of some channels stay in the
-// first cache while all pairs are worked on.
+// Pairs (splat, block) of consecutive splats of a tile. With many splats per batch, the planes of some channels stay in the
+// first-level cache for all pairs.
 struct FeaturePairs {
     static constexpr int SPLATS = 32;
     alignas(64) real of_pair[SPLATS * BLOCKS][LANES];  // the weight; in the backward pass, before it, the part of dL/dw
     uint8_t block[SPLATS * BLOCKS];
     uint32_t splat[SPLATS];
-    int end[SPLATS];  // of each splat's pairs
+    int end[SPLATS];  // end of each splat's pairs
     int pairs = 0, splats = 0;
     void add(const Entry& entry, const Features& features) {
         const char* const values = reinterpret_cast<const char*>(features.values + entry.splat() * features.count);
@@ -30,7 +30,7 @@ template <int N> struct ChannelCount {
     static constexpr int value = N;
 };
 
-// Calls f(number of channels, first channel) for as many channels at a time as registers hold.
+// Calls f(number of channels, first channel) for groups of channels that fit the registers.
 template <class F> inline void for_each_channels(int64_t rows, F&& f) {
     constexpr int MANY = REGISTERS / 2;
     int64_t c = 0;
@@ -59,10 +59,10 @@ inline void for_each_pixel(const TileArea& area, int image_width, int64_t count,
 // From a channel to the next. Not a power of two: rows of those would share few sets of the first cache.
 constexpr int FEATURE_STRIDE = PIXELS + LANES;
 
-// Rows for so many channels: four at a time are worked on.
+// Rows for a number of channels, which are processed in groups of four.
 inline int64_t feature_rows(int64_t count) { return (count + 3) / 4 * 4; }
 
-// Room for the planes of each thread; false when memory is short.
+// Allocates the planes of each thread; false if memory is short.
 bool reserve_feature_planes(Frame& f, int64_t count);
 inline real* feature_planes(const Frame& f, int64_t count, int64_t piece) {
     return &f.feature_planes[size_t(piece * feature_rows(count)) * FEATURE_STRIDE];

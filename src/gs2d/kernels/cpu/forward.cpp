@@ -6,9 +6,9 @@
 namespace gs2d {
 namespace {
 
-constexpr int CHUNK = 256;  // entries looked at together: what is kept of them stays in the first cache
+constexpr int CHUNK = 256;  // entries per batch, whose state fits the first-level cache
 
-// What Pixel<V> holds, in memory between chunks.
+// The members of Pixel<V>, in memory between chunks.
 enum Plane { RED, GREEN, BLUE, NX, NY, NZ, ALPHA, DEPTH, MEDIAN, DISTORTION, T, M1_TWICE, M2, DEPTH0, PLANES };
 
 struct TileState {
@@ -21,7 +21,7 @@ struct TileState {
 struct Candidate {
     PlanesByBlock planes;
     real record[RECORD];
-    LaneBits seen[BLOCKS];  // live pixels of the block that saw it
+    LaneBits seen[BLOCKS];  // live pixels of the block that use it
     uint8_t filtered;       // not plain
 };
 
@@ -55,13 +55,13 @@ inline void store_pixel(TileState& s, int b, const Pixel<V>& p) {
     s.finished[b] = !any(p.live);
 }
 
-// Splats are first intersected BATCH at a time and then composited: the long chain of an intersection does not depend
-// on the pixel's state, and so many of them overlap; the state stays in registers while it is used.
+// BATCH splats are intersected and then composited: intersections do not depend on the pixel's state, so many of them
+// overlap, and the state stays in registers during compositing.
 constexpr int BATCH = 8;
-// gcc would unroll all 8 rounds: with 16 registers the state goes to memory in each
+// gcc would unroll all 8 rounds, and with 16 registers spill the state in each
 constexpr int UNROLL = REGISTERS >= 32 ? 2 : 1;
 
-// What the intersections leave: one row per splat.
+// Results of the intersections, one row per splat.
 struct Batch {
     alignas(64) real log2_alpha[BATCH][LANES], depth[BATCH][LANES], inverse_depth[BATCH][LANES];
 };
@@ -89,7 +89,7 @@ inline void composite_batch(TileWork& w, const uint32_t* list, int count, int b,
     }
 }
 
-// All of them as if they were plain, which most are; then those that are not once more.
+// All splats are processed as plain, which most are; then those that are not plain again.
 inline void intersect_batch(const TileWork& w, const uint32_t* list, int count, int b, const Centres& centres,
                             Batch& batch, const BlendLimits<V>& limits) {
     uint32_t others = 0;
@@ -128,12 +128,12 @@ void blend_block(TileWork& w, int b, int n, const Centres& centres, const BlendL
     store_pixel(w.state, b, p);
 }
 
-// Entries of the chunk that reach a live block, with their records side by side.
+// Entries of the chunk that reach a live block, with their records in consecutive memory.
 int gather(const Frame& f, TileWork& w, const Entry* entries, int n, const TileArea& area, const Centres& centres) {
     uint32_t wanted = 0;
     for (int b = 0; b < BLOCKS; ++b) wanted |= uint32_t(!w.state.finished[b]) << b;
     int m = 0;
-    constexpr int AHEAD = 16;  // what a splat needs lies far apart: ask for it early
+    constexpr int AHEAD = 16;  // prefetch distance for the scattered data of splats
     const V x0 = V(real(area.x0)), y0 = V(real(area.y0));
     for (int i = 0; i < n; i += LANES) {
         uint32_t splats[LANES], touched[LANES];

@@ -1,4 +1,4 @@
-// Everything one view needs between its forward and its backward pass.
+// The state of one view between forward and backward pass.
 #pragma once
 
 #include <atomic>
@@ -17,12 +17,12 @@ namespace gs2d {
 
 constexpr size_t LINE = 64, HUGE_PAGE = size_t(2) << 20;
 
-// Grow-only memory on cache lines. Kept when a Frame goes back to the free list: fresh pages cost more than the work.
+// Grow-only memory aligned to cache lines. It stays allocated when a Frame is freed, since new pages are expensive.
 template <class T> struct Buffer {
     T* data = nullptr;
     size_t capacity = 0;
-    // Contents are lost. False when there is no memory. A buffer that must grow takes 1/16 more than asked: views differ
-    // a little, and a new one should not mean new memory each time.
+    // Contents are lost. False if memory is short. A buffer that must grow gets 1/16 more than requested, since views
+    // differ slightly.
     bool reserve(size_t n) {
         if (n <= capacity) return true;
         const size_t wanted = (capacity ? n + n / 16 : n) * sizeof(T), bytes = (wanted + LINE - 1) / LINE * LINE;
@@ -32,7 +32,7 @@ template <class T> struct Buffer {
         data = posix_memalign(&memory, alignment, bytes) == 0 ? static_cast<T*>(memory) : nullptr;
         capacity = data ? bytes / sizeof(T) : 0;
 #if defined(MADV_HUGEPAGE)
-        // access is scattered; a wish, not a need
+        // access is scattered; only a hint
         if (data && alignment == HUGE_PAGE) madvise(data, bytes, MADV_HUGEPAGE);
 #endif
         return data != nullptr;
@@ -72,10 +72,10 @@ struct ImageGradients {  // null where there is no gradient
     const real* depth_transmittance;  // after find_transmittance_depth
 };
 
-struct ParameterGradients {  // null where not wanted
+struct ParameterGradients {  // null: not computed
     real *means, *quats, *log_scales, *opacity_logits, *sh0, *shN, *probe;
     int64_t probe_columns;  // 2 or 4
-    const uint8_t* rows;    // [N] 0: this splat's gradients are 0; null: all are wanted
+    const uint8_t* rows;    // [N] 0: this splat's gradients are 0; null: all are computed
 };
 
 // Plain channels besides the three of sh0, blended with the same weights (features.cpp).
@@ -88,7 +88,7 @@ struct Features {
     real* gradients;         // [N, F]
 };
 
-// Whether anything but colours is wanted.
+// Whether gradients besides colours are computed.
 inline bool wants_geometry(const ParameterGradients& g) {
     return g.means || g.quats || g.log_scales || g.opacity_logits || g.probe;
 }

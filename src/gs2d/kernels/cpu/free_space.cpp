@@ -1,6 +1,5 @@
-// Which splats lie in the space that a photograph sees through, and which on the surface that it shows
-// (training/free_space.py has the same in torch, and judges this). Splats share nothing, so the result is the same for
-// any number of threads.
+// Finds splats in the free space of an image and splats on its surface (training/robust/free_space_maps.py has the same
+// in torch). Splats are independent, so the result does not depend on the number of threads.
 #include <cmath>
 #include <cstdint>
 
@@ -13,16 +12,16 @@ namespace gs2d {
 // Arrays are contiguous.
 struct FreeSpaceArguments {
     int64_t count, places, height, width;
-    const real* ends;     // [places, count, 3], world: the centre first
-    const real* reach;    // [count], world units: no end is farther from the centre
+    const real* ends;     // [places, count, 3] sample points, world: the centre first
+    const real* reach;    // [count], world units: largest distance of a sample point from the centre
     const real* project;  // [3, 4]: (x z, y z, z) = project (p, 1), px
     const real* center;   // [3] of the camera, world
-    real radius;          // of a ball around the camera that is free
-    const real* limit;    // [height, width]: what is nearer is free
-    const real* known;    // [height, width]: depth of what is shown, infinite where it is not known
-    real fraction;        // of that depth, within which a centre lies on the surface
-    int32_t* against;     // [count]: one more where any place of a splat is free
-    int32_t* support;     // [count]: one more where its centre lies on the surface
+    real radius;          // of the free ball around the camera
+    const real* limit;    // [height, width]: nearer points are in free space
+    const real* known;    // [height, width]: depth of the surface, infinite if unknown
+    real fraction;        // of that depth: tolerance for a centre on the surface
+    int32_t* against;     // [count]: incremented if a sample point is in free space
+    int32_t* support;     // [count]: incremented if the centre is on the surface
 };
 
 namespace {
@@ -34,7 +33,7 @@ struct Plane {
     real at(const real* p) const { return x * p[0] + y * p[1] + z * p[2] + offset; }
 };
 
-// A border of the picture, on whose inner side is what this row of numbers makes positive.
+// A half space of an image border: points with a positive value are inside.
 Plane plane(real x, real y, real z, real offset) { return {x, y, z, offset, std::sqrt(x * x + y * y + z * z)}; }
 
 struct View {
@@ -53,7 +52,7 @@ struct View {
         borders[3] = opposite(0, a.width), borders[4] = opposite(1, a.height);
     }
 
-    // Nothing within `reach` of a place can be in the picture; a little is left for rounding.
+    // No point within `reach` can be in the image, with a margin for rounding.
     bool misses(const real* p, real reach) const {
         const real size = std::fabs(p[0]) + std::fabs(p[1]) + std::fabs(p[2]);
         for (const Plane& border : borders) {
@@ -63,7 +62,7 @@ struct View {
         return false;
     }
 
-    // Depth of a place and the pixel that shows it; false where none does.
+    // Depth and pixel of a point; false if no pixel shows it.
     bool shows(const real* p, real& z, int64_t& pixel) const {
         z = rows[2].at(p);
         if (!(z > 0)) return false;

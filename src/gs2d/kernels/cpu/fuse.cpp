@@ -1,5 +1,5 @@
-// Fusion of depth maps (core/fuse.h), one view at a time. Blocks share nothing and a view changes a voxel once, so the
-// result is the same for any number of threads. Where no voxel of a vector gets weight, the volume is not touched.
+// Fusion of depth maps (core/fuse.h), one view at a time. Blocks are independent and a view changes
+// a voxel once, so the result does not depend on the number of threads. A vector without weight is not written.
 #include "core/fuse.h"
 
 #include "cpu/export.h"
@@ -9,16 +9,16 @@
 namespace gs2d {
 namespace {
 
-constexpr int64_t GRAIN = 32;  // blocks of a piece
+constexpr int64_t GRAIN = 32;  // blocks per piece
 
-// Reals at LANES places.
+// Reals at LANES positions.
 GS2D_HD V gather(const real* from, const int32_t* at) {
     real values[LANES];
     for (int i = 0; i < LANES; ++i) values[i] = from[at[i]];
     return load(values);
 }
 
-// Colours [LANES, 3] of LANES voxels move by the share of each towards those of their pixels.
+// Moves the colours [LANES, 3] of LANES voxels by their shares towards the colours of their pixels.
 void mix_colors(real* colors, const real* image, const int32_t* pixel, V share) {
     real one[LANES], target[3 * LANES], shares[3 * LANES];
     store(one, share);
@@ -63,9 +63,9 @@ void fuse_block(const FuseArguments<real>& a, int64_t n) {
     }
 }
 
-constexpr int64_t RAYS = 8192;  // of a piece
+constexpr int64_t RAYS = 8192;  // per piece
 
-// Marks what rays [begin, end) meet, in the double precision and the order of operations of meshing/tsdf_volume.py. Many
+// Marks the blocks that rays [begin, end) intersect, in the double precision and the order of operations of meshing/tsdf_volume.py. Many
 // rays set the same mark, and all to the same value.
 void mark_rays(const MarkArguments& a, int64_t begin, int64_t end) {
     const int64_t stride_x = a.padded[1] * a.padded[2], stride_y = a.padded[2];
@@ -92,12 +92,12 @@ void mark_rays(const MarkArguments& a, int64_t begin, int64_t end) {
 
 using namespace gs2d;
 
-// Marks the blocks that the pixels of one depth map see something in.
+// Marks the blocks near the surface of one depth map.
 GS2D_EXPORT void gs2d_mark_blocks(const MarkArguments* arguments) {
     parallel_ranges(arguments->count, RAYS, [&](int64_t begin, int64_t end) { mark_rays(*arguments, begin, end); });
 }
 
-// Adds one view to the blocks that it may change.
+// Fuses one view into the blocks that it may change.
 GS2D_EXPORT void gs2d_fuse(const FuseArguments<real>* arguments) {
     parallel_ranges(arguments->blocks, GRAIN, [&](int64_t begin, int64_t end) {
         for (int64_t n = begin; n < end; ++n) fuse_block(*arguments, n);

@@ -3,10 +3,10 @@
 namespace gs2d {
 namespace {
 
-constexpr int64_t LEAST_SLOTS = 4096;  // of a chunk, where there are as many
-constexpr int BATCH = 256;             // entries looked at before their slots are added
+constexpr int64_t LEAST_SLOTS = 4096;  // minimum of a chunk, if there are as many
+constexpr int BATCH = 256;             // entries per batch of slots to add
 
-// The gradients of the coefficients are written last, and read by nobody else: the sums wait there, side by side.
+// The gradients of the coefficients are written last, so their memory holds the sums until then.
 bool fits_in_coefficients(const ParameterGradients& out, int64_t sh_rest) { return out.shN && 3 * sh_rest >= GRADIENT; }
 
 }  // namespace
@@ -27,7 +27,7 @@ bool GradientSums::prepare() {
     });
     f.slot_begin[0] = 0;
     for (int64_t t = 0; t < f.tiles; ++t) f.slot_begin[t + 1] += f.slot_begin[t];
-    // Two chunks in a row hold more than LEAST_SLOTS.
+    // Two consecutive chunks have more than LEAST_SLOTS slots.
     const int64_t most = f.slot_begin[f.tiles] / (LEAST_SLOTS / 2);
     if (!f.chunks.reserve((most < f.tiles ? most : f.tiles) + 3)) return false;
     cut_into_chunks();
@@ -46,8 +46,8 @@ bool GradientSums::prepare() {
     return f.scratch.reserve(2 * chunk_bytes());
 }
 
-// A chunk takes as many slots as the memory of the forward pass holds twice: large chunks, so that a thread seldom waits
-// for another that was interrupted.
+// A chunk has as many slots as fit twice into the memory of the forward pass. Large chunks avoid waiting for interrupted
+// threads.
 void GradientSums::cut_into_chunks() {
     Frame& f = f_;
     const int64_t room = static_cast<int64_t>(forward_scratch(f.count) / (2 * slot_bytes()));

@@ -1,4 +1,4 @@
-// What this library is, and what this processor could run.
+// Properties of this library, and the level of this processor.
 #include "cpu/export.h"
 #include "cpu/simd.h"
 

@@ -2,7 +2,7 @@
 //
 // Two forms: the official one, mean(1 - alpha <n, N>) with alpha detached, and the paper's per-splat one,
 // mean(alpha - <n, N>) with nothing detached. N comes from the depths of the four neighbours, so a depth's gradient is
-// gathered from the four pixels beside it: no atomics. Depths of the background are 0 in the padded copy; outside the
+// gathered from the four adjacent pixels: no atomics. Depths of the background are 0 in the padded copy; outside the
 // image and at ignored pixels they are `absent`, which makes N undefined beside them. Such a pixel has no gradient.
 #include "core/losses.h"
 #include "cpu/export.h"
@@ -16,14 +16,14 @@ constexpr int64_t HALO = 2;  // rows of depth that the gradient of a row depends
 struct Images {
     const real *normal, *depth, *alpha;
     const uint8_t* mask;
-    const real* weights;       // of the pixels, or null
+    const real* weights;       // per pixel, or null
     const double* intrinsics;  // fx, fy, cx, cy
     const double* rotation;    // world to camera, row-major
     int64_t height, width;
     double scale;  // of the gradients: cotangent / valid pixels
     bool per_splat, at_camera;  // at_camera: see makes_normal
     real *normal_gradient, *depth_gradient, *alpha_gradient;  // all null, or the first two at least
-    double* rows;                                             // the part of each row's sum that is not constant
+    double* rows;                                             // the variable part of each row's sum
 };
 
 // One piece of rows [begin, end).
@@ -64,7 +64,7 @@ class Piece {
     real* plane(int k) const { return scratch.row(depths + 2 * centres + k, stride); }
 
     void read_depth(int64_t y) {
-        if (y < 0 || y >= im.height) return;  // it is absent
+        if (y < 0 || y >= im.height) return;  // outside the image
         const real* from = im.depth + y * im.width;
         real* to = depth_row(y);
         fill_validity(im.mask ? im.mask + y * im.width : nullptr, im.width, 1, to);
@@ -157,7 +157,7 @@ using namespace gs2d;
 // value = mean over valid pixels of 1 - alpha <n, N> (pixels without N count 1), or with per_splat of alpha - <n, N>
 // (pixels without N count 0), each times its weight, if there are `weights` [H, W]; at_camera: see makes_normal. Gradients, each times `cotangent`: of normal [H, W, 3] (world frame) and depth [H, W]
 // (both null, or neither), and of alpha (or null; 0 in the official form, where it must be null).
-// Returns 0, or 1 when there is no memory.
+// Returns 0, or 1 if memory is short.
 GS2D_EXPORT int gs2d_normal_consistency(const real* normal, const real* depth, const real* alpha, const uint8_t* mask,
                                         const real* weights, const double* intrinsics, const double* rotation,
                                         int64_t height, int64_t width, int per_splat, int at_camera, double cotangent, real* normal_gradient, real* depth_gradient,

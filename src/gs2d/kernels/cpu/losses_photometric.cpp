@@ -1,4 +1,4 @@
-// L1, SSIM and L2 of an image [H, W, 3], with the gradient of any weighted sum of them, in one pass over the rows.
+// L1, SSIM and L2 of an image [H, W, 3], with the gradient of a weighted sum of them, in one pass over the rows.
 //
 // A row of W interleaved pixels is 3 W reals; the window's taps are 3 reals apart, so that channels need no planes. Each
 // piece of rows runs down the image with two rings of horizontally blurred rows: of the moments x, x^2 + y^2, x y (and
@@ -23,7 +23,7 @@ template <class F> GS2D_HD V window(F at) {
 }
 
 void blur_row(const real* in, real* out, int64_t length) {
-#if defined(GS2D_OWN_AFTER)  // a load of 64 bytes that are not one cache line takes two cycles
+#if defined(GS2D_OWN_AFTER)  // an unaligned load of 64 bytes takes two cycles
     V before = load(in - LANES), here = load(in);
     for (int64_t i = 0; i < length; i += LANES) {
         const V next = load(in + i + LANES);
@@ -39,8 +39,8 @@ void blur_row(const real* in, real* out, int64_t length) {
 #endif
 }
 
-constexpr int ROWS = 4;                  // finished together
-constexpr int NEEDED = TAPS - 1 + ROWS;  // blurred from so many
+constexpr int ROWS = 4;                  // rows finished together
+constexpr int NEEDED = TAPS - 1 + ROWS;  // rows that they are blurred from
 
 // The horizontally blurred rows around y of `MAPS` maps: row y of map m is row (y mod NEEDED) * MAPS + m.
 struct Ring {
@@ -109,7 +109,7 @@ class Piece {
         blurred = scratch.row(r, stride), r += MOMENTS * ROWS;
         moments = {scratch.data + r * stride, stride, maps}, r += NEEDED * maps;
         pullbacks = {scratch.data + r * stride, stride, DERIVATIVES};
-        const int64_t reach = im.gradient ? RADIUS : 0;  // rows of SSIM beyond the piece that its gradient needs
+        const int64_t reach = im.gradient ? RADIUS : 0;  // rows of SSIM beyond the piece, for its gradient
         const int64_t last = end + reach + RADIUS;
         for (int64_t y = begin - reach - RADIUS; y < last; y += ROWS) {
             const int count = last - y < ROWS ? static_cast<int>(last - y) : ROWS;
@@ -124,7 +124,7 @@ class Piece {
     bool inside(int64_t y) const { return y >= 0 && y < im.height; }
     bool mine(int64_t y) const { return y >= begin && y < end; }
     const uint8_t* mask_row(int64_t y) const { return im.mask ? im.mask + y * im.width : nullptr; }
-    // A row of an image, i < length: zero beyond its end. Nothing behind the image is read.
+    // A row of an image, i < length: zero beyond its end. Nothing beyond the image is read.
     struct Row {
         const real* at;
         int64_t n;
@@ -133,7 +133,7 @@ class Piece {
         }
     };
     Row row_of(const real* image, int64_t y) const { return {image + y * n, n}; }
-    // The rendered row; where pixels are ignored, a copy that holds the target there.
+    // The rendered row, or a copy with the target at ignored pixels.
     Row rendered_row(int64_t y) const {
         const Row given = row_of(im.rendered, y), wanted = row_of(im.target, y);
         if (im.mask == nullptr) return given;
@@ -221,7 +221,7 @@ class Piece {
 
     const Images& im;
     const int64_t begin, end, n, length, stride;
-    const bool known;  // the target's blur is given
+    const bool known;  // the blurred target is given
     const int maps;
     const Scratch scratch;
     real *rendered = nullptr, *validity = nullptr;                         // all 1 without a mask
@@ -243,7 +243,7 @@ using namespace gs2d;
 // values = (mean L1, mean SSIM, mean L2) over valid pixels and channels; gradient (or null) = l1_cotangent dL1/drendered
 // + ssim_cotangent dSSIM/drendered + l2_cotangent dL2/drendered. `mask` (bytes, 0 = ignore) and `target_mean` (of
 // gs2d_blur) may be null.
-// Returns 0, or 1 when there is no memory.
+// Returns 0, or 1 if memory is short.
 GS2D_EXPORT int gs2d_photometric(const real* rendered, const real* target, const uint8_t* mask, const real* target_mean,
                                  int64_t height, int64_t width, double l1_cotangent, double ssim_cotangent,
                                  double l2_cotangent, real* gradient, double* values) {

@@ -1,5 +1,5 @@
-// What benchmarks ask about the rasterizer: time by pass, work counted exactly, memory held. Nothing here is on the
-// path of rendering or training.
+// Measurements of the rasterizer for benchmarks: time by pass, exact amounts of work, memory. Rendering and training do not
+// use this file.
 #include <string.h>
 
 #include "cpu/export.h"
@@ -18,7 +18,7 @@ struct PairCounts {
     int64_t visible, lanes;
 };
 
-// Replays one tile as the backward pass does. A pair is visible where a pixel that has not stopped sees the splat.
+// Replays one tile like the backward pass. A pair is visible if a pixel that has not stopped uses the splat.
 PairCounts count_tile(const Frame& f, int64_t tile, const BlendLimits<V>& limits) {
     alignas(64) real T[BLOCKS][LANES];
     const TileArea area = tile_area(f, tile);

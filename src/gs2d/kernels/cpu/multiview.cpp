@@ -1,4 +1,4 @@
-// Patches of a view beside those of a neighbour, LANES pixels at a time: values and gradients in one pass.
+// Comparison of patches of two views, LANES pixels at a time: values and gradients in one pass.
 #include <cstdlib>
 
 #include "core/multiview.h"
@@ -9,12 +9,12 @@
 namespace gs2d {
 namespace {
 
-constexpr int64_t GROUPS = 8;  // vectors of pixels of a piece of work
+constexpr int64_t GROUPS = 8;  // vectors of pixels per piece
 
-// An image between its pixel centres; beyond those of the border, what they have.
+// An image interpolated between pixel centres; beyond the border, the border's values.
 struct Image {
     const real* pixels;
-    int width, right, below;  // to the next column and row: 0 where there is none
+    int width, right, below;  // offsets of the next column and row, 0 at the border
     V last_x, last_y, before_x, before_y;
     Image(const real* pixels, int64_t width, int64_t height)
         : pixels(pixels),
@@ -38,7 +38,7 @@ struct Image {
     }
 };
 
-// LANES pixels of the view. Lanes that are not chosen have the numbers of one that is.
+// LANES pixels of the view. Lanes that are not chosen repeat a chosen one.
 struct Pixels {
     int64_t first;  // of P
     int count;
@@ -47,7 +47,7 @@ struct Pixels {
     Vec3<V> q, ray;
     LaneInts at;  // in the flat image
 
-    // False where none is chosen.
+    // False if no lane is chosen.
     bool set(const CompareArguments<real>& a, const Lens<V>& lens, int64_t first_patch) {
         first = first_patch, count = static_cast<int>(a.count - first < LANES ? a.count - first : LANES);
         uint32_t which = 0;
@@ -69,7 +69,7 @@ struct Pixels {
     }
 };
 
-// A pixel of the patches: its greys here and there, less those of the middle, and what pulls that there to the plane.
+// A pixel of the patches: its greys in both views relative to the middle pixel, and the derivatives by the plane.
 struct Grey {
     V a, b;
     Vec3<V> pull;
@@ -169,7 +169,7 @@ class Comparison {
         each_of(outer(g.normal, p.q), by_ncc, rows_from(WORLD_ROW, p, valid));
     }
 
-    // A square stays convex: all of the patch is where its corners are.
+    // The image of a square is convex, so the corners bound the patch.
     M is_inside(const PatchPlane<V>& plane) const {
         const V r = V(real(a.radius));
         M inside = plane.planar;
@@ -183,7 +183,7 @@ class Comparison {
         return inside;
     }
 
-    // Sums over the patches; what their gradient needs is left in `greys`.
+    // Sums over the patches; `greys` keeps the inputs of their gradient.
     PatchSums<V> sample(const Pixels& p, const PatchPlane<V>& plane, Grey* greys) const {
         const auto look = [&](int64_t j, int64_t i, Vec3<V> row) {
             const PatchPlace<V> at = patch_place(axpy(V(real(i)), plane.right, row));
@@ -211,7 +211,7 @@ class Comparison {
 using namespace gs2d;
 
 // Fills `values`, `gradients` and `motion_gradients` of the arguments, and the sums [2] and [33] of the first and the
-// last. Returns 0, or 1 when there is no memory.
+// last. Returns 0, or 1 if memory is short.
 GS2D_EXPORT int gs2d_compare_views(const CompareArguments<real>* arguments, double* sums) {
     const CompareArguments<real>& a = *arguments;
     const Comparison comparison(a);

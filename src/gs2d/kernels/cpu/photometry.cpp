@@ -1,5 +1,5 @@
-// Renderings behind a camera's curve and vignetting, and the gradients. Pieces of the same size whatever the number of
-// threads, and their sums in order: so are the bits.
+// Response curve and vignetting of rendered images, and their gradients. Pieces have a fixed size and are summed in
+// order, so the bits do not depend on the number of threads.
 #include "core/photometry.h"
 
 #include <cmath>
@@ -13,7 +13,7 @@ namespace gs2d {
 namespace {
 
 constexpr int64_t PIECE = 2048;  // pixels
-constexpr int SUMS = 4;          // of the falloff's three numbers, and of the shift
+constexpr int SUMS = 4;          // three of the falloff and one of the shift
 
 // render/native_image_ops.py has the same.
 struct Shown {
@@ -70,7 +70,7 @@ GS2D_EXPORT void gs2d_shown(const Shown* shown, real* out) {
     });
 }
 
-// sums [4]: the gradient of the falloff's numbers and of the shift. Returns 1 where memory is short.
+// sums [4]: the gradients of the falloff and of the shift. Returns 1 if memory is short.
 GS2D_EXPORT int gs2d_shown_vjp(const Shown* shown, const real* upstream, real* to_color, double* sums) {
     const int64_t pieces = (shown->pixels + PIECE - 1) / PIECE;
     auto* const of_pieces = static_cast<double*>(std::malloc(static_cast<size_t>(pieces * SUMS + 1) * sizeof(double)));

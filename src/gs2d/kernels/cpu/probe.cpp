@@ -1,4 +1,4 @@
-// What this machine can do at this moment: benchmarks print it beside their times.
+// Current speed of this machine, printed by benchmarks with their times.
 #include <string.h>
 #include <time.h>
 
@@ -39,7 +39,7 @@ GS2D_EXPORT double gs2d_probe_fma() {
     return 2.0 * CHAINS * STEPS * LANES * threads / (now() - start) * 1e-9;
 }
 
-// Bytes read and written per second by a copy of 64 MiB on all threads, in GB/s; negative when memory is short.
+// Bytes read and written per second by a copy of 64 MiB on all threads, in GB/s; negative if memory is short.
 GS2D_EXPORT double gs2d_probe_copy() {
     constexpr size_t SIZE = size_t(64) << 20;
     Buffer<char> from, to;

@@ -6,7 +6,7 @@
 namespace gs2d {
 namespace {
 
-// Reads LANES splats; `alive` is false for those culled by themselves (out of range, behind, transparent).
+// Reads LANES splats; `alive` is false for culled ones (out of range, behind the camera, transparent).
 struct Group {
     SplatParameters<V> parameters;
     Frame3<V> frame;
@@ -24,7 +24,7 @@ inline Group project_group(const Frame& f, const Parameters& s, int64_t i, int l
     return g;
 }
 
-// Evaluates the colour of the living; splats whose coefficients are out of range die.
+// Evaluates the colours of alive splats; culls splats whose coefficients are out of range.
 inline void color_group(const Frame& f, const Parameters& s, int64_t i, int lanes, Group& g) {
     V sh[3 * SH_MAX], basis[SH_MAX];
     const int degree = f.view.sh_degree;
@@ -135,7 +135,7 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
 
 namespace {
 
-// Sums of LANES splats; extras of no densification signal are 0.
+// Sums of LANES splats; without a densification signal the extras are 0.
 inline void load_sums(const Sums& sums, int64_t first, int lanes, V* fields, V* extras) {
     load_rows<GRADIENT>(sums.row(first), GRADIENT, lanes, fields);
     for (int k = 0; k < GRADIENT_EXTRA; ++k) extras[k] = V(0);
@@ -143,7 +143,7 @@ inline void load_sums(const Sums& sums, int64_t first, int lanes, V* fields, V* 
     if (sums.columns == 4) load_rows<4>(sums.extra(first), 4, lanes, extras);
 }
 
-// Whether a sum is not 0 (NaN counts): else no pixel saw the splat, or all of its gradients are 0.
+// Whether a sum is nonzero or NaN; otherwise no pixel uses the splat, or all its gradients are 0.
 inline M not_all_zero(const V* fields, const V* extras) {
     V size = V(0);
     for (int k = 0; k < GRADIENT; ++k) size = size + abs(fields[k]);
@@ -218,9 +218,8 @@ void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradi
 
 }  // namespace
 
-// Where the sums are the beginning of shN's gradient, row i is written over the sums of splats behind i. So the last splats come
-// first, and as many at a time as write over nothing that is still to be read; of at most LANES splats everything is read
-// before anything is written.
+// If the sums share the memory of shN's gradient, row i overwrites the sums of later splats. So splats are processed from the
+// last one, in groups that overwrite nothing still to be read; groups of up to LANES splats are read before writing.
 void project_splats_vjp(Frame& f, const Parameters& s, const ParameterGradients& out, real* intrinsics) {
     for (int64_t end = s.count, first = 0; end > 0; end = first) {
         first = 0;

@@ -1,4 +1,4 @@
-// What densification remembers of a view: the norms of the screen gradients, added to the sums of the splats that were seen.
+// The densification signal of a view: adds the norms of the screen gradients to the sums of visible splats.
 #include "cpu/export.h"
 #include "cpu/simd.h"
 #include "cpu/threads.h"
@@ -30,7 +30,7 @@ template <int COLUMNS> void add_range(const Signal& s, int64_t begin, int64_t en
     int64_t i = begin;
     for (; i + LANES <= end; i += LANES) add_vector<COLUMNS>(s, i);
     if (i == end) return;
-    // The rest, in memory of its own; the same arithmetic, so that a splat's bits do not depend on where it stands.
+    // The remainder, in a buffer, with the same arithmetic, so that bits do not depend on the position of a splat.
     real signal[COLUMNS * LANES] = {}, radii[LANES] = {}, sums[3][LANES] = {};
     for (int64_t k = 0; k < end - i; ++k) {
         for (int c = 0; c < COLUMNS; ++c) signal[k * COLUMNS + c] = s.signal[(i + k) * COLUMNS + c];

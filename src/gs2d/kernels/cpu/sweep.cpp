@@ -1,7 +1,7 @@
-// A plane sweep of one image (training/plane_sweep.py has the same in torch, and judges this): for each pixel and depth,
-// the normalised cross-correlation of its patch with what other images show there, averaged over the two best of them;
-// kept are the best depth, its score and those of the depths beside it. Bands of rows share nothing, so the result is the
-// same for any number of threads.
+// Plane sweep of one image (training/start/plane_sweep.py has the same in torch): for each pixel and depth, the normalised
+// cross-correlation of its patch with those of other images, averaged over the two best images. The result is the best
+// depth, its score and the scores of the adjacent depths. Bands of rows are independent, so it does not depend on the
+// number of threads.
 #include <algorithm>
 #include <atomic>
 #include <cstdint>
@@ -21,7 +21,7 @@ namespace {
 #define GS2D_APART _Pragma("GCC ivdep")
 #endif
 
-constexpr int64_t BAND = 32;  // rows of a piece; each is compared with `radius` more on both sides
+constexpr int64_t BAND = 32;  // rows per piece, plus `radius` rows on both sides
 
 }  // namespace
 
@@ -29,16 +29,16 @@ constexpr int64_t BAND = 32;  // rows of a piece; each is compared with `radius`
 struct SweepArguments {
     int64_t height, width, planes, neighbours, radius;
     const real* image;       // [height, width], grey
-    const uint8_t* wanted;   // [height, width]: 0 = nothing is asked of this pixel
+    const uint8_t* wanted;   // [height, width]: 0 = skip this pixel
     const real* const* others;  // [neighbours] images, each [height + 1, width + 1]: the last row and column twice
     const int64_t* sizes;    // [neighbours, 2]: height, width
     const real* turned;      // [neighbours, 3, 3]: other K R K^-1
     const real* moved;       // [neighbours, 3]: other K t
     const real* depths;      // [planes]
-    real noise;              // variance that is no texture
-    real* best;              // [height, width], -1 where nothing is known
+    real noise;              // variance of image noise
+    real* best;              // [height, width], -1 if unknown
     int32_t* plane;          // [height, width]
-    real* before;            // [height, width]: scores of the planes beside the best one
+    real* before;            // [height, width]: scores of the adjacent planes
     real* after;
 };
 
@@ -50,7 +50,7 @@ int64_t mirrored(int64_t i, int64_t size) {
     return std::clamp<int64_t>(i, 0, size - 1);
 }
 
-// Mirrors a row beyond both ends, for patches that reach there. So far as patches do, the row has been made.
+// Mirrors a row beyond both ends, as far as patches reach.
 void mirror_ends(real* row, int64_t width, int64_t radius) {
     for (int64_t k = 1; k <= radius; ++k) {
         row[-k] = row[mirrored(-k, width)];
@@ -58,7 +58,7 @@ void mirror_ends(real* row, int64_t width, int64_t radius) {
     }
 }
 
-// One row of the image, columns [left, right), as another shows it at a depth; `inside` where it does.
+// One row of the image, columns [left, right), sampled from another image at a depth; `inside`: visible there.
 void fetch(const SweepArguments& a, int64_t n, int64_t y, real depth, int64_t left, int64_t right, real* out,
            real* inside) {
     const real *t = a.turned + 9 * n, *m = a.moved + 3 * n, *other = a.others[n];
@@ -85,8 +85,8 @@ void fetch(const SweepArguments& a, int64_t n, int64_t y, real depth, int64_t le
     }
 }
 
-// Room for a band, its rows with `radius` more columns on both sides: arrays with the rows beside it, and of its own.
-// Vectors reach beyond the last column that is wanted: what is there is anything, and nobody looks.
+// Buffers for a band, with `radius` more columns on both sides: arrays with the adjacent rows, and of its own rows.
+// Vectors reach beyond the last requested column; the values there are not used.
 struct Band {
     Band(int64_t width, int64_t rows, int64_t radius)
         : radius(radius),
@@ -112,7 +112,7 @@ struct Band {
     real* const room;
 };
 
-// Sums over the columns of patches, of a row at `at`: of an image, of its square, and of its product with the own one.
+// Sums over the columns of patches in a row at `at`: of an image, its square, and its product with the swept image.
 void sum_columns(const Band& b, const real* image, int64_t at, int64_t left, int64_t right) {
     const real *row = image + at - b.radius, *own = b.own + at - b.radius;
     for (int64_t x = left; x < right; x += LANES) {
@@ -125,7 +125,7 @@ void sum_columns(const Band& b, const real* image, int64_t at, int64_t left, int
     }
 }
 
-// The mean over the rows of patches that begin at `from`.
+// The mean over the rows of patches starting at `from`.
 GS2D_HD V mean_of_rows(const Band& b, const real* from, V share) {
     V sum = load(from);
     for (int64_t k = 1; k <= 2 * b.radius; ++k) sum = sum + load(from + k * b.stride);
@@ -136,7 +136,7 @@ GS2D_HD V variance_of(V square, V mean, V noise) { return max(square - mean * me
 
 V share_of(const Band& b) { return V(real(1) / real((2 * b.radius + 1) * (2 * b.radius + 1))); }
 
-// The image's own patches of a row of the band.
+// The patches of the swept image in a row of the band.
 void keep_own(const SweepArguments& a, const Band& b, int64_t row, int64_t left, int64_t right) {
     const V share = share_of(b), noise = V(a.noise);
     for (int64_t x = left; x < right; x += LANES) {
@@ -146,7 +146,7 @@ void keep_own(const SweepArguments& a, const Band& b, int64_t row, int64_t left,
     }
 }
 
-// Scores of a row of the band with one image: the best two so far. Patches begin at that row of the sums.
+// Scores of a row of the band with one image, merged into the best two. Patches start at that row of the sums.
 void add_scores(const SweepArguments& a, const Band& b, int64_t row, int64_t left, int64_t right) {
     const V share = share_of(b), noise = V(a.noise), none = V(real(-1));
     const real* inside = b.inside + row + b.radius * b.stride;
@@ -162,7 +162,7 @@ void add_scores(const SweepArguments& a, const Band& b, int64_t row, int64_t lef
     }
 }
 
-// What a plane is worth, and whether that is the best so far; `at` is the row in the arrays of results.
+// Computes the score of a plane and keeps the best one; `at` is the row in the result arrays.
 void keep_best(const SweepArguments& a, const Band& b, int64_t plane, int64_t row, int64_t at, int64_t left, int64_t right) {
     const real *first = b.first + row, *second = a.neighbours > 1 ? b.second + row : first;
     real *last = b.last + row, *best = a.best + at, *before = a.before + at, *after = a.after + at;
@@ -180,10 +180,10 @@ void keep_best(const SweepArguments& a, const Band& b, int64_t plane, int64_t ro
     }
 }
 
-// False where there is no memory for it.
+// False if memory is short.
 bool sweep_band(const SweepArguments& a, int64_t begin, int64_t end) {
     const int64_t W = a.width, H = a.height, r = a.radius, rows = end - begin, tall = rows + 2 * r;
-    int64_t left = W, right = 0;  // columns of which something is wanted
+    int64_t left = W, right = 0;  // range of requested columns
     for (int64_t i = begin * W; i < end * W; ++i) {
         if (!a.wanted[i]) continue;
         left = std::min(left, i % W), right = std::max(right, i % W + 1);
@@ -225,7 +225,7 @@ bool sweep_band(const SweepArguments& a, int64_t begin, int64_t end) {
 
 using namespace gs2d;
 
-// 1 where all was done, 0 where memory was short.
+// Returns 1, or 0 if memory was short.
 GS2D_EXPORT int gs2d_sweep(const SweepArguments* arguments) {
     std::atomic<bool> whole{true};
     parallel_ranges(arguments->height, BAND, [&](int64_t begin, int64_t end) {

@@ -18,7 +18,7 @@ struct Pool {
     // guards everything below; busy and job are also read without it
     pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
     pthread_cond_t wake = PTHREAD_COND_INITIALIZER, done = PTHREAD_COND_INITIALIZER;
-    int wanted = 1;            // threads asked for, the caller included
+    int wanted = 1;            // requested threads, including the caller
     int started = 0;           // pool threads alive
     int seats = 0;             // pool threads that may still join the current job
     std::atomic<int> busy{0};  // pool threads inside it
@@ -33,8 +33,8 @@ Pool pool;
 thread_local bool inside = false;
 thread_local int number = 0;
 
-// A thread sleeps only after it has looked for this long: jobs follow each other within microseconds, and to wake a thread
-// takes tens of them. Not longer: torch's threads want the cores too.
+// Time that a thread spins before it sleeps: jobs follow within microseconds, and waking a thread takes tens of them.
+// Longer spinning would take cores from torch's threads.
 template <class F> void look_for(F&& ready) {
     timespec start, now;
     clock_gettime(CLOCK_MONOTONIC, &start);
@@ -141,7 +141,7 @@ void run_tasks(int64_t n, Task task, void* context) {
     work(task, context, n);
     inside = false;
     pthread_mutex_lock(&pool.lock);
-    pool.seats = 0;  // latecomers find nothing to do
+    pool.seats = 0;  // no thread joins from now on
     pthread_mutex_unlock(&pool.lock);
     look_for([] { return pool.busy.load(std::memory_order_relaxed) == 0; });
     pthread_mutex_lock(&pool.lock);

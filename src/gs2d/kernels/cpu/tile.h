@@ -65,7 +65,7 @@ template <int C> inline void read_planes(const real* image, int image_width, con
     if (!image || a.width < TILE || a.height < TILE) memset(out, 0, sizeof(real) * C * PIXELS);
     if (!image) return;
     const real* from = image + (int64_t(a.y0) * image_width + a.x0) * C;
-    // the bounds known: little code, so that many rows are waited for at once
+    // Constant bounds give little code, so that many rows are loaded at once.
     if (a.width == TILE && a.height == TILE) {
         for (int y = 0; y < TILE; ++y, from += int64_t(image_width) * C)
             for (int x = 0; x < TILE; x += 4) split4<C>(from + x * C, out + block_order(x, y));
@@ -112,11 +112,11 @@ struct RowLines {
     }
 };
 
-// The rows of a tile lie far apart: they are asked for while other work is done, a few lines at each of `times` calls. Of many
-// requests at once a processor drops most. They go to the second cache: the first is full.
+// The rows of a tile are scattered, so they are prefetched during other work, a few lines at each of `times` calls, since
+// a processor drops most of many simultaneous requests. They go to the second-level cache, since the first is full.
 class RowsAhead {
   public:
-    // Nothing is asked for where there is no such tile.
+    // No prefetch beyond the last tile.
     RowsAhead(const Frame& f, const RowLines& row, int64_t tile, int times) : row_(row) {
         if (tile >= f.tiles || times == 0) return;
         const TileArea a = tile_area(f, tile);
@@ -136,7 +136,7 @@ class RowsAhead {
     int left_ = 0, at_ = 0, each_ = 0;
 };
 
-// What decides where splats reach a tile, one splat a lane; and whether each is unbounded.
+// Inputs of the footprint test of LANES splats against a tile, and whether each is unbounded.
 struct Footprints {
     V ex, ey, slope, half, inv_y2, y_right, disc2, plain_from;  // of the cull record
     V cx, cy, au, bu, av, bv, ai, bi, iz;                       // of the record

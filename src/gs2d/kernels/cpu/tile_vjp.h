@@ -1,5 +1,5 @@
-// The walk over the splats of a tile for their gradients: what backward.cpp and features_vjp.cpp make variants of. Two files,
-// because what the compiler inlines depends on how much there is in one.
+// The backward pass over the splats of a tile, instantiated by backward.cpp and features_vjp.cpp. These are two files because
+// the compiler's inlining depends on the amount of code in one.
 #pragma once
 
 #include "cpu/features.h"
@@ -22,9 +22,9 @@ inline PixelGradient<V> load_gradient(const Planes s, int b) {
             at(DEPTH), at(MEDIAN), at(MEDIAN_BELOW), at(DIST2), at(DIST1), at(DEPTH0), at(TRANSMITTANCE), at(Z)};
 }
 
-constexpr int AHEAD = 8;  // records lie far apart: ask for them this many splats early
+constexpr int AHEAD = 8;  // prefetch distance for the scattered records, in splats
 
-// Up to where a block is of interest: behind its last splat that has gradients, nothing needs its pixels any more.
+// End of a block's work: behind its last splat with gradients its pixels are not needed.
 struct Interest {
     uint32_t blocks = ALL_BLOCKS;
     int32_t last[BLOCKS];
@@ -43,7 +43,7 @@ struct Interest {
     }
 };
 
-// A splat without gradients: only T and S move on. The same arithmetic as below, so the splats behind it get the same bits.
+// A splat without gradients updates only T and S, with the same arithmetic as below, so later splats get the same bits.
 template <bool Geo, bool Dist>
 __attribute__((noinline)) void pass_by(const real* record, bool plain, uint32_t blocks, Planes s,
                                        const Centres& centres, const BlendLimits<V>& limits) {
@@ -61,13 +61,12 @@ __attribute__((noinline)) void pass_by(const real* record, bool plain, uint32_t 
     }
 }
 
-constexpr bool COLORS_FIT = REGISTERS >= 32;  // the registers hold them beside what moves T and S on
+constexpr bool COLORS_FIT = REGISTERS >= 32;  // they fit the registers next to the update of T and S
 
-// Pairs (splat, block) of some splats in a row. They are worked on in passes, each with a short chain of operations, so that
-// those of many pairs overlap, and with little enough to remember for the registers: the planes; alphas; what moves T and S
-// on; and the sums, splat by splat.
+// Pairs (splat, block) of consecutive splats, processed in passes with short dependency chains, so that many pairs overlap,
+// and little state, so that it fits the registers: planes, alphas, updates of T and S, and the sums of each splat.
 struct Batch {
-    // as many as a splat may have; more would push the pixels out of the first cache
+    // the most that a splat may have; more would evict the pixels from the first-level cache
     static constexpr int PAIRS = BLOCKS;
     alignas(64) real depth[PAIRS][LANES], inverse_depth[PAIRS][LANES], rho[PAIRS][LANES];
     real alpha[PAIRS][LANES];                              // in the end dL/d ln(alpha)
@@ -84,7 +83,7 @@ struct Batch {
 
     bool has_room(uint32_t blocks) const { return pairs + __builtin_popcount(blocks) <= PAIRS; }
 
-    // No branch depends on `blocks`: none could be foreseen.
+    // No branch depends on `blocks`, since none could be predicted.
     void add(const real* splat_record, bool plain, uint32_t blocks, const Centres& centres) {
         memset(&splat[pairs], splats, BLOCKS);
         for (int first = 0; first < BLOCKS; first += 8) {
@@ -102,7 +101,7 @@ struct Batch {
     }
 };
 
-// All of them as if they were plain, which most are; then those that are not once more.
+// All splats are processed as plain, which most are; then those that are not plain again.
 template <bool WithInverse> inline void find_hits(Batch& w, const Centres& centres, const BlendLimits<V>& limits) {
     const auto put = [&](int i, const Hit<V>& h) {
         store(w.depth[i], h.depth), store(w.rho[i], h.rho);
@@ -127,7 +126,7 @@ template <bool WithInverse> inline void find_hits(Batch& w, const Centres& centr
     }
 }
 
-// One pair: T and S move on; what its sums need is left in the batch.
+// One pair: updates T and S, and stores the inputs of its sums in the batch.
 template <bool Geo, bool Dist, bool Trans, bool Feat>
 inline PairGradient<V> weigh_pair(Batch& w, int i, const Record<V>& splat, const PixelGradient<V>& g, Planes s,
                                   const BlendLimits<V>& limits, V features = V(0)) {
@@ -143,7 +142,7 @@ inline PairGradient<V> weigh_pair(Batch& w, int i, const Record<V>& splat, const
     return p;
 }
 
-// Of one splat, whose pairs these are. Colors: add_colors is left to do, for which the weights are there.
+// Sums of one splat over its pairs. Colors: add_colors follows and uses the stored weights.
 template <bool Geo, bool Abs, bool Filtered, bool Colors>
 inline void sum_pairs(const Batch& w, int j, int first, int end, const Record<V>& splat, const Planes s,
                       const Centres& centres, PairSums<V>& sums) {
@@ -153,7 +152,7 @@ inline void sum_pairs(const Batch& w, int j, int first, int end, const Record<V>
     const auto geometry = [&](int i) {
         const int b = w.block[i];
         const PairGradient<V> p = pair(i);
-        const PlaneAt<V> plane = w.planes[j].at(b);  // again: cheaper than to remember u and v
+        const PlaneAt<V> plane = w.planes[j].at(b);  // recomputed, which is cheaper than storing u and v
         const V depth = load(w.depth[i]), t = p.ln_alpha * depth, tz = t * depth;
         V tu = tz * plane.X, tv = tz * plane.Y;
         M ray;
@@ -171,7 +170,7 @@ template <bool Abs>
 inline void write_slot(const Record<V>& splat, const PairSums<V>& sums, bool filtered, const Slots& to,
                        const BlendLimits<V>& limits) {
     RecordGradient<V> g = finish(splat, Abs ? reciprocal(splat.iz) : V(0), sums, limits);
-    if (!to.extras) g.cx = g.cx + g.lowpass_cx, g.cy = g.cy + g.lowpass_cy;  // nobody asks for them apart
+    if (!to.extras) g.cx = g.cx + g.lowpass_cx, g.cy = g.cy + g.lowpass_cy;  // not needed separately
     const V fields[16] = {g.cx, g.cy,         g.au,  g.bu,    g.av,   g.bv, g.ai, g.bi,
                           g.iz, g.ln_opacity, g.red, g.green, g.blue, g.nx, g.ny, g.nz};
     transpose_reduce<GRADIENT>(fields, to.gradients);

@@ -1,5 +1,5 @@
-// Depth by continuous transmittance, after the blending and only where it is asked for: the pairs of a tile are intersected once
-// more and left in memory, block by block, and every pixel searches along its ray among its own.
+// Depth by transmittance, after the blending and only on request: the pairs of a tile are intersected again and stored by
+// block, and every pixel searches its own pairs along its ray.
 #include "cpu/frame.h"
 #include "cpu/planes.h"
 #include "cpu/threads.h"
@@ -7,7 +7,7 @@
 namespace gs2d {
 namespace {
 
-// alpha and 1 / z of the pairs of a tile, a block's one after the other; alpha is 0 where a pixel did not blend the splat.
+// alpha and 1 / z of the pairs of a tile, by block; alpha is 0 if a pixel did not blend the splat.
 struct Pairs {
     Buffer<real> values;  // [pairs, 2, LANES]
     int64_t begin[BLOCKS + 1];
@@ -15,7 +15,7 @@ struct Pairs {
     real* at(int64_t i) { return values.data + 2 * LANES * i; }
 };
 
-// False when there is no memory.
+// False if memory is short.
 bool gather(const Frame& f, int64_t tile, const TileArea& area, const BlendLimits<V>& limits, Pairs& pairs) {
     const Entry* const entries = &f.entries[f.tile_begin[tile]];
     const int32_t count = f.tile_count[tile];

@@ -1,8 +1,8 @@
 // Blending, front to back: one block of four warps per 16x16 tile, a warp owns 8x8 pixels, a thread two of them.
 //
-// Nothing but the warp's own votes: the warps of a block never wait for each other. Per chunk of 32 entries a lane reads
-// one entry; the masks of sub-blocks say which splats the warp must look at; the lanes of those fetch the records into
-// shared memory, so that one memory latency serves the chunk.
+// Warps only vote among their own lanes and never wait for each other. In a chunk of 32 entries each lane reads one entry;
+// the sub-block masks select the splats for the warp; their lanes fetch the records into shared memory, so that a chunk
+// waits for memory once.
 #include "cuda/pixels.h"
 
 namespace gs2d {
@@ -16,7 +16,7 @@ struct BlendArguments {
     float *color, *alpha, *normal, *depth_mean, *depth_median, *distortion;  // [H, W (, 3)]
     float* final_T;                                                          // [H, W]
     float* moments;  // [H, W, 3]: M1, M2, inverse depth of the first pair; written with the distortion
-    // [words, 8] or null: bit j of a word: some live pixel of the sub-block saw entry j of the chunk
+    // [words, 8] or null: bit j of a word: a live pixel of the sub-block uses entry j of the chunk
     uint* seen;
 };
 
@@ -52,7 +52,7 @@ template <bool DIST> __device__ __forceinline__ void blend(const BlendArguments&
     for (; 32 * chunk < count; ++chunk) {
         const int i = 32 * chunk + at.lane;
         const uint entry = i < count ? a.entries[begin + i] : 0u;
-        uint hits[HALVES];  // of this warp: all its lanes agree
+        uint hits[HALVES];  // uniform over the warp
 #pragma unroll
         for (int h = 0; h < HALVES; ++h) {
             const bool live = __any_sync(FULL_MASK, p[h].live);
@@ -76,13 +76,13 @@ template <bool DIST> __device__ __forceinline__ void blend(const BlendArguments&
             planes_of(s, dx, dy, planes);
 #pragma unroll
             for (int h = 0; h < HALVES; ++h) {
-                if (!(hits[h] & bit)) continue;  // the same for all lanes
+                if (!(hits[h] & bit)) continue;  // uniform over the warp
                 const Hit<float> hit = hit_of<decltype(is_plain)::value>(s, planes[h], dx, dy + float(4 * h), limits);
                 const bool saw = composite(s, hit.alpha, hit.depth, hit.inverse_depth, limits, p[h]);
                 seen[h] |= saw ? bit : 0u;
             }
         });
-        __syncwarp();  // before the records are overwritten
+        __syncwarp();  // the records are overwritten next
         if (a.seen) {
             const int64 words = word_of(begin, at.tile, chunk);
 #pragma unroll
@@ -92,7 +92,7 @@ template <bool DIST> __device__ __forceinline__ void blend(const BlendArguments&
             }
         }
     }
-    if (a.seen)  // nobody saw what comes behind the last live pixel
+    if (a.seen)  // no pixel uses the entries behind the last live one
         for (chunk += at.lane; 32 * chunk < count; chunk += 32)
 #pragma unroll
             for (int h = 0; h < HALVES; ++h) a.seen[word_of(begin, at.tile, chunk) + at.sub_block[h]] = 0u;
@@ -110,7 +110,7 @@ constexpr int BLOCKS = 7;
 constexpr int BLOCKS = 8;
 #endif
 
-// The distortion's three moments cost registers and time; without it `distortion` and `moments` are not touched.
+// The distortion's three moments cost registers and time; without it `distortion` and `moments` are not written.
 extern "C" __global__ void __launch_bounds__(128, BLOCKS) blend_forward(BlendArguments a) {
     __shared__ float4 records[4][4][32];  // warp, quarter of a record, entry
     blend<false>(a, records[threadIdx.x >> 5]);

@@ -1,6 +1,6 @@
-// The gradients of colours alone, of all splats or some, while everything else is frozen (stage 2): the blending walked once more for its
-// weights. No remaining sum, no alpha or geometry; splats that do not learn only change the transmittance, and a warp
-// stops behind the last one that does.
+// Gradients of colours alone, of all or some splats, with everything else frozen (stage 2): a second blending pass for the
+// weights, without remaining sums, alpha or geometry. Splats that are not trained only change the transmittance, and a
+// warp stops behind the last trained one.
 #include "cuda/colors.h"
 #include "cuda/pixels.h"
 #include "cuda/reduce.h"
@@ -17,7 +17,7 @@ struct BlendColorsArguments {
     const uchar* learns;   // [N], 0 = no gradient; or null: all
     const float* g_color;  // [H, W, 3]
     const int64* slots;    // as in blend_vjp.cu
-    float* gradients;      // [N, 4]: of the colours, and nothing; zeros on entry; with slots [4 * candidates, 4]
+    float* gradients;      // [N, 4]: colours and padding; zeros on entry; with slots [4 * candidates, 4]
 };
 
 struct ProjectColorsArguments {
@@ -27,8 +27,8 @@ struct ProjectColorsArguments {
     const int* tile_counts;  // [N]; 0: not drawn
     const uchar* learns;     // or null
     float* gradients;        // [N, 4]
-    float *g_sh0, *g_shN;    // null where not wanted
-    int clears;              // 1: rows of gradients that were read are zeros afterwards
+    float *g_sh0, *g_shN;    // null: not computed
+    int clears;              // 1: reset the rows of gradients to zero
 };
 
 extern "C" __global__ void __launch_bounds__(128, 8) blend_vjp_learning(BlendColorsArguments a) {
@@ -54,14 +54,14 @@ extern "C" __global__ void __launch_bounds__(128, 8) blend_vjp_learning(BlendCol
     const auto wanted_in = [&](int64 i, int h) {
         return uniform(a.seen[word_of(begin, at.tile, (i - begin) >> 5) + at.sub_block[h]], at.lane);
     };
-    int64 last = begin;  // chunks from here on hold nobody who learns
+    int64 last = begin;  // later chunks have no trained splats
     for (int64 i = begin; i < end; i += 32)
         if (learning(i, wanted_in(i, 0) | wanted_in(i, 1))) last = i + 1;
 
     for (int64 i = begin; i < last; i += 32) {
         const uint hits[HALVES] = {wanted_in(i, 0), wanted_in(i, 1)};
         const uint wanted = hits[0] | hits[1];
-        if (wanted == 0u) continue;  // the same for all lanes
+        if (wanted == 0u) continue;  // uniform over the warp
         const uint learn = learning(i, wanted);
         bool mine_is_plain = false;
         if (wanted >> at.lane & 1u) {
@@ -84,12 +84,12 @@ extern "C" __global__ void __launch_bounds__(128, 8) blend_vjp_learning(BlendCol
                 const Hit<float> hit = hit_of<decltype(is_plain)::value>(s, planes[h], dx, dy + float(4 * h), limits);
                 composite_color_vjp(hit, limits, g[h], T[h], sum);
             }
-            if (!(learn & bit)) return;  // the same for all lanes
+            if (!(learn & bit)) return;  // uniform over the warp
             float v[4] = {sum.x, sum.y, sum.z, 0.f};
             const float mine = transpose_reduce<4>(v, at.lane);
             if (!(at.lane & 7)) atomicAdd(a.gradients + 4 * int64(rows[at.warp][j]) + (at.lane >> 3), mine);
         });
-        __syncwarp();  // before the records are overwritten
+        __syncwarp();  // the records are overwritten next
     }
 }
 

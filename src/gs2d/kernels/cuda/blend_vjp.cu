@@ -1,6 +1,6 @@
 // Gradients of the blending, front to back, with the layout of blend.cu: a warp owns 8x8 pixels, a thread two of them.
 //
-// The words of the forward pass say which splats a warp must look at: no culling again. A splat's 16 sums are reduced over
+// The words of the forward pass select the splats of a warp, without culling again. A splat's 16 sums are reduced over
 // the warp by a transposing reduction (16 shuffles), after which 16 lanes hold one sum each and add it to the splat's
 // gradient record: one 64-byte line. The order of those additions varies from run to run, and with it the last digits.
 #include "cuda/pixels.h"
@@ -18,7 +18,7 @@ struct BlendVjpArguments {
     const float *color, *alpha, *normal, *depth_mean, *distortion, *final_T, *moments;         // of the forward pass
     const float *g_color, *g_alpha, *g_normal, *g_depth_mean, *g_depth_median, *g_distortion;  // null: no gradient
     const uchar* learns;  // [N], 0 = no gradient; or null: all
-    const int64* slots;   // [entries]: the candidate that each was, or null
+    const int64* slots;   // [entries]: candidate index of each entry, or null
     float* gradients;     // [N, 16], zeros on entry; with slots [4 * candidates, 16]
     float* extras;        // the same rows of 4: low-pass centre, absolute densification signal
     const float *depth_transmittance, *slope, *g_depth_transmittance;  // of transmittance.cu; TRANS only
@@ -28,7 +28,7 @@ struct BlendVjpArguments {
 // One value of a plane that may be absent.
 __device__ __forceinline__ float at_or_zero(const float* plane, int64 i) { return plane ? plane[i] : 0.f; }
 
-// The upstream gradient as composite_vjp wants it, and S = the sum over all splats of w s, from the image's totals.
+// The upstream gradient for composite_vjp, and S = the sum over all splats of w s, from the image's totals.
 template <bool GEO, bool DIST, bool TRANS, bool FEAT>
 __device__ __forceinline__ PixelGradient<float> upstream_of(const BlendVjpArguments& a, int64 i, float& S) {
     const float* bg = a.view.background;
@@ -67,7 +67,7 @@ __device__ __forceinline__ PixelGradient<float> upstream_of(const BlendVjpArgume
     return g;
 }
 
-// `row` is the splat's, or with slots the one of this entry and warp.
+// `row` is the splat, or with slots the slot of this entry and warp.
 template <bool ABS, bool PLAIN>
 __device__ __forceinline__ void add_gradient(const BlendVjpArguments& a, int64 row, const RecordGradient<float>& g,
                                              int lane) {
@@ -80,14 +80,14 @@ __device__ __forceinline__ void add_gradient(const BlendVjpArguments& a, int64 r
         float extra[4] = {g.lowpass_cx, g.lowpass_cy, g.abs_x, g.abs_y};
         const float mine = transpose_reduce<4>(extra, lane);
         if (!(lane & 7)) atomicAdd(a.extras + 4 * row + (lane >> 3), mine);
-    } else if (__any_sync(FULL_MASK, g.lowpass_cx != 0.f || g.lowpass_cy != 0.f)) {  // the same for all lanes
+    } else if (__any_sync(FULL_MASK, g.lowpass_cx != 0.f || g.lowpass_cy != 0.f)) {  // uniform over the warp
         float extra[2] = {g.lowpass_cx, g.lowpass_cy};
         const float mine = transpose_reduce<2>(extra, lane);
         if (!(lane & 15)) atomicAdd(a.extras + 4 * row + (lane >> 4), mine);
     }
 }
 
-// What the inner loop needs of a pixel's upstream gradient, in shared memory: each thread reads what it wrote itself.
+// The upstream gradients of the inner loop, in shared memory; each thread reads only its own values.
 template <bool GEO, bool TRANS = false> struct Upstream {
     float4 color[HALVES][128];             // red, green, blue, alpha
     float4 normal[HALVES][GEO ? 128 : 1];  // and depth
@@ -112,12 +112,12 @@ template <bool GEO, bool TRANS = false> struct Upstream {
     }
 };
 
-struct Staged {  // of a warp: 32 splats
+struct Staged {  // 32 splats of a warp
     float4 records[4][32];
     uint rows[32];
 };
 
-// Of the pairs of some splats of a chunk, in shared memory: the features' part of dL/dw, and then the weight.
+// For the pairs of PART splats, in shared memory: first the features' part of dL/dw, then the weight.
 constexpr int PART = 16;
 using PairValues = float (*)[HALVES][128];
 __device__ __forceinline__ float& value_of(PairValues values, int j, int h) {
@@ -139,7 +139,7 @@ __device__ __forceinline__ void for_each_channels(const BlendVjpArguments& a, co
     }
 }
 
-// The features' part of dL/dw of each splat that is wanted: each gradient of a pixel is read once for all of them.
+// The features' part of dL/dw of each selected splat; each gradient of a pixel is read once for all splats.
 __device__ __forceinline__ void weigh_features(const BlendVjpArguments& a, const Place& at, const Staged& staged,
                                                uint wanted, PairValues to) {
     for (int j = 0; j < PART; ++j) value_of(to, j, 0) = value_of(to, j, 1) = 0.f;
@@ -176,7 +176,7 @@ __device__ __forceinline__ int64 gradient_row(const BlendVjpArguments& a, const 
 __device__ __forceinline__ void add_features(const BlendVjpArguments& a, const Place& at, const Staged& staged,
                                              int64 chunk, uint wanted, PairValues weights) {
     for_each_channels(a, at, [&](int64 c, const float (&g)[HALVES][CHANNELS]) {
-        for (uint left = wanted; left; left &= left - 1) {  // the same for all lanes
+        for (uint left = wanted; left; left &= left - 1) {  // uniform over the warp
             const int j = __ffs(int(left)) - 1;
             const float first = value_of(weights, j, 0), second = value_of(weights, j, 1);
             float v[CHANNELS];
@@ -194,7 +194,7 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
                                           PairValues pairs = nullptr) {
     const Place at = place_of(a.view, a.tiles);
     const BlendLimits<float> limits = limits_of(a.view);
-    PixelGradient<float> g[HALVES];  // in registers only what is not in `upstream`
+    PixelGradient<float> g[HALVES];  // in registers only members that are not in `upstream`
     float T[HALVES], S[HALVES];
 #pragma unroll
     for (int h = 0; h < HALVES; ++h) {
@@ -214,7 +214,7 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
         const uint* words = a.seen + word_of(begin, at.tile, chunk);
         const uint hits[HALVES] = {uniform(words[at.sub_block[0]], at.lane), uniform(words[at.sub_block[1]], at.lane)};
         const uint wanted = hits[0] | hits[1];
-        if (wanted == 0u) continue;  // the same for all lanes
+        if (wanted == 0u) continue;  // uniform over the warp
         bool learns = true, mine_is_plain = false;
         if (wanted >> at.lane & 1u) {
             const uint splat = a.entries[i + at.lane] >> 8;
@@ -247,7 +247,7 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
                     s, dx, dy, hit, limits, g[h], T[h], S[h], sums, FEAT ? value_of(pairs, j, h) : 0.f);
                 if constexpr (FEAT) value_of(pairs, j, h) = w;
             }
-            if (!(learning & bit)) return;  // the same for all lanes
+            if (!(learning & bit)) return;  // uniform over the warp
             finish_column(dx, sums);
             const int64 row = gradient_row<FEAT>(a, at, staged, i, j);
             add_gradient<ABS, PLAIN>(a, row, finish(s, ABS ? reciprocal(s.iz) : 0.f, sums, limits), at.lane);
@@ -257,17 +257,17 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
         } else {
             for (int first = 0; first < 32; first += PART) {
                 const uint part = wanted & (((1u << PART) - 1u) << first);
-                if (part == 0u) continue;  // the same for all lanes
+                if (part == 0u) continue;  // uniform over the warp
                 weigh_features(a, at, staged, part, pairs);
                 for_each_splat(part, plain, step);
                 add_features(a, at, staged, i, part, pairs);
             }
         }
-        __syncwarp();  // before the records are overwritten
+        __syncwarp();  // the records are overwritten next
     }
 }
 
-// GEO: normal or depth images have gradients (or the distortion has: DIST). ABS: the AbsGS signal is wanted. TRANS: the
+// GEO: normal or depth images have gradients (or the distortion has: DIST). ABS: the AbsGS signal is computed. TRANS: the
 // depth by transmittance has. FEAT: further channels have.
 extern "C" __global__ void __launch_bounds__(128, 7) blend_vjp_color(BlendVjpArguments a) {
     __shared__ Staged staged[4];

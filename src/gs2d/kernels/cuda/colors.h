@@ -9,7 +9,7 @@ namespace gs2d {
 struct Coefficients {
     const float *first, *rest;
 };
-struct CoefficientGradients {  // null: not wanted
+struct CoefficientGradients {  // null: not computed
     float *first, *rest;
 };
 

@@ -1,5 +1,5 @@
-// What the CUDA kernels share. Every kernel takes one struct by value (a ctypes structure on the Python side) and uses
-// only what the compiler has built in: no headers of the toolkit. Warp collectives stand in convergent code, with the
+// Shared code of the CUDA kernels. Every kernel takes one struct by value (a ctypes structure on the Python side) and uses
+// only compiler built-ins, no headers of the toolkit. Warp collectives stand in convergent code, with the
 // full mask: the tests run these sources on the CPU, where anything else is an error (tests/helpers/emulator.h).
 #pragma once
 
@@ -16,7 +16,7 @@ typedef long long int64;
 
 constexpr uint FULL_MASK = 0xffffffffu;
 
-// One view, as the kernels take it.
+// One view.
 struct View {
     PinholeCamera<float> camera;
     float near, lowpass_px, inv_lowpass2, log2_alpha_min, alpha_max, transmittance_min;
@@ -38,7 +38,7 @@ __device__ __forceinline__ BlendLimits<float> limits_of(const View& v) {
 struct Culling {
     BoxTest<float> test;
     bool unbounded;
-    // Relative to the tile's first pixel, so that large coordinates do not cost digits.
+    // Relative to the tile's first pixel, for precision at large coordinates.
     __device__ __forceinline__ Culling(const float* cull, int left, int top) {
         const float4* from = reinterpret_cast<const float4*>(cull);
         const float4 lo = from[0], hi = from[1];

@@ -10,7 +10,7 @@ namespace gs2d {
 struct EmitArguments {
     int width, height, tiles_x, tiles_y;
     float near;
-    int64 candidates;  // ends[visible - 1], or the room for them: then what has none is left out
+    int64 candidates;  // ends[visible - 1], or the room; candidates beyond the room are dropped
     int64 visible;
     const void* order;  // [visible] int64, or uint32 (`emit_sorted`): splats by depth
     const void* ends;   // [visible], the same: running sum of tile_counts in that order
@@ -24,13 +24,13 @@ struct EmitArguments {
 struct RangeArguments {
     int64 candidates;
     const void* keys;          // sorted
-    const int64* permutation;  // of the sort; null where it has moved the entries too
+    const int64* permutation;  // of the sort; null if the sort moved the payloads
     const uint* payloads;
     uint* entries;  // [candidates]: payloads in sorted order
     int64* ranges;  // [tiles + 1, 2]: begin and end of each tile's entries; zeros on entry
 };
 
-// First splat in depth order whose candidates end behind `candidate`.
+// The first splat in depth order whose candidates end behind `candidate`.
 template <class Place>
 __device__ __forceinline__ int64 owner_of(const Place* ends, int64 visible, int64 candidate) {
     int64 low = 0, high = visible - 1;
@@ -48,7 +48,7 @@ template <class Key, class Place> __device__ __forceinline__ void emit(const Emi
     const int64 i = int64(blockIdx.x) * blockDim.x + threadIdx.x;
     if (i >= a.candidates) return;
     const Place *order = static_cast<const Place*>(a.order), *ends = static_cast<const Place*>(a.ends);
-    if (i >= int64(ends[a.visible - 1])) {  // room that is not needed
+    if (i >= int64(ends[a.visible - 1])) {  // unused room
         static_cast<Key*>(a.keys)[i] = Key(a.tiles_x * a.tiles_y), a.payloads[i] = 0u;
         return;
     }
@@ -72,7 +72,7 @@ template <class Key, class Place> __device__ __forceinline__ void emit(const Emi
             for (int b = 0; b < 8; ++b) mask |= uint(culling.reaches_block(b)) << b;
         }
     }
-    if (left + 8 >= a.width) mask &= 0x55u;  // what lies outside the image
+    if (left + 8 >= a.width) mask &= 0x55u;  // outside the image
     for (int b = 2; b < 8; b += 2)
         if (top + 2 * b >= a.height) mask &= (1u << b) - 1u;
     static_cast<Key*>(a.keys)[i] = Key(mask ? tile_y * a.tiles_x + tile_x : a.tiles_x * a.tiles_y);

@@ -1,5 +1,5 @@
-// Blending of channels besides the three of a splat's colour: what the forward pass saw is walked once more for its weights,
-// for some channels at a time, whose sums are in registers.
+// Blending of channels besides the three of a splat's colour: a second pass over the used entries recomputes the weights, for
+// groups of channels whose sums fit the registers.
 #include "cuda/pixels.h"
 
 namespace gs2d {
@@ -35,7 +35,7 @@ extern "C" __global__ void __launch_bounds__(128, 4) features_forward(FeatureArg
             const uint hits[HALVES] = {uniform(words[at.sub_block[0]], at.lane),
                                        uniform(words[at.sub_block[1]], at.lane)};
             const uint wanted = hits[0] | hits[1];
-            if (wanted == 0u) continue;  // the same for all lanes
+            if (wanted == 0u) continue;  // uniform over the warp
             bool mine_is_plain = false;
             if (wanted >> at.lane & 1u) {
                 rows[at.warp][at.lane] = a.entries[begin + 32 * chunk + at.lane] >> 8;
@@ -52,7 +52,7 @@ extern "C" __global__ void __launch_bounds__(128, 4) features_forward(FeatureArg
                 float w[HALVES] = {0.f, 0.f};
 #pragma unroll
                 for (int h = 0; h < HALVES; ++h)
-                    if (hits[h] & bit)  // the same for all lanes
+                    if (hits[h] & bit)  // uniform over the warp
                         w[h] = pass_weight(hit_of<decltype(is_plain)::value>(s, planes[h], dx, dy + float(4 * h), limits),
                                            limits, T[h]);
                 const float* values = a.features.values + int64(rows[at.warp][j]) * a.features.count + first;
@@ -68,7 +68,7 @@ extern "C" __global__ void __launch_bounds__(128, 4) features_forward(FeatureArg
                     }
                 }
             });
-            __syncwarp();  // before the records are overwritten
+            __syncwarp();  // the records are overwritten next
         }
 #pragma unroll
         for (int h = 0; h < HALVES; ++h) {

@@ -1,4 +1,4 @@
-// Fusion of depth maps (core/fuse.h), one view in a launch and one voxel in a thread.
+// Fusion of depth maps (core/fuse.h), one view per launch and one voxel per thread.
 #include "core/fuse.h"
 
 #include "cuda/common.h"

@@ -2,14 +2,14 @@
 //
 // Two forms of normal consistency: the official mean(1 - alpha <n, N>) with alpha detached, and the paper's per-splat
 // mean(alpha - <n, N>) with nothing detached. N comes from the depths of the four neighbours, so a depth's gradient is
-// gathered from the four pixels beside it: no atomics.
+// gathered from the four adjacent pixels: no atomics.
 #include "core/losses.h"
 #include "cuda/means.h"
 
 namespace gs2d {
 
-constexpr int MEAN_PIXELS = 1024;           // of a block; losses.py has the same
-constexpr int NORMAL_W = 32, NORMAL_H = 8;  // tile of a block in the backward pass; losses.py has the same
+constexpr int MEAN_PIXELS = 1024;           // per block; cuda_losses.py has the same
+constexpr int NORMAL_W = 32, NORMAL_H = 8;  // tile of a block in the backward pass; cuda_losses.py has the same
 constexpr int HALO = 2;                     // depths that a depth's gradient depends on, on each side
 
 struct NormalArguments {
@@ -21,8 +21,8 @@ struct NormalArguments {
     const uchar* mask;                    // or null
     const float* weights;                 // of the pixels, or null
     float* partials;                      // [2, blocks]: valid pixels; sum of alpha <n, N>, of alpha - <n, N>, or of weighted terms
-    const float *means, *cotangent;       // backward: means[0] = 1 / valid pixels; null where `scale` says it
-    float *g_normal, *g_depth, *g_alpha;  // null where not wanted
+    const float *means, *cotangent;       // backward: means[0] = 1 / valid pixels; null if `scale` is set
+    float *g_normal, *g_depth, *g_alpha;  // null: not computed
     float scale;                          // cotangent / valid pixels
     const uchar* object;                  // instead of weights: bytes of a photograph [H, W, 4], 1 where its alpha is above 1/2
 };
@@ -146,7 +146,7 @@ extern "C" __global__ void __launch_bounds__(128) normal_consistency_vjp(NormalA
     }
 }
 
-// Of the mean |alpha - the photograph's| over valid pixels; 0 where they are the same.
+// Gradient of the mean |alpha - target alpha| over valid pixels; 0 where they are equal.
 extern "C" __global__ void __launch_bounds__(128) silhouette_vjp(SilhouetteArguments a) {
     const int64 at = int64(blockIdx.x) * MEAN_THREADS + threadIdx.x;
     if (at >= a.pixels) return;

@@ -1,4 +1,4 @@
-// Means in a fixed order: each block leaves partial sums, one more block adds them up (finish_means in losses.cu).
+// Means in a fixed order: each block writes partial sums, and one more block adds them (finish_means in losses.cu).
 #pragma once
 
 #include "cuda/common.h"

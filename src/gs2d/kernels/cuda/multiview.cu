@@ -1,14 +1,14 @@
-// Patches of a view beside those of a neighbour: a warp for each pixel, its lanes the pixels of the patch. All lanes
-// work out the plane and the way there and back, which is a small part of the work; the patch is sampled twice, for the
-// sums and for the gradient. A pixel's numbers are its own: nothing is added up across pixels here.
+// Comparison of patches of two views: one warp per pixel, one lane per pixel of the patch. All lanes compute the plane and
+// the round trip, which is a small part of the work. The patch is sampled twice, for the sums and for the gradient. Pixels
+// have separate results, which are summed elsewhere.
 #include "core/multiview.h"
 #include "cuda/common.h"
 
 namespace gs2d {
 
-constexpr int PATCHES = 4;  // of a block; multiview.py has the same
+constexpr int PATCHES = 4;  // per block; cuda_multiview.py has the same
 
-// An image between its pixel centres; beyond those of the border, what they have.
+// An image interpolated between pixel centres; beyond the border, the border's values.
 struct ImageBetween {
     const float* pixels;
     int64 width, height;
@@ -67,7 +67,7 @@ __device__ __forceinline__ PatchPixel patch_pixel(const CompareArguments<float>&
     return {a.reference[pixel + j * a.width + i], s.value, patch_pull(at, s, there)};
 }
 
-// A square stays convex: all of the patch is where its corners are.
+// The image of a square is convex, so the corners bound the patch.
 __device__ __forceinline__ bool patch_is_inside(const ImageBetween& source, const PatchPlane<float>& plane,
                                                 const Lens<float>& there, int radius) {
     bool inside = true;

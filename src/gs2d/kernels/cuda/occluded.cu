@@ -1,5 +1,5 @@
-// Splat errors with occlusion (rule 17): a pixel counts until it has stopped at or before the splat. The walk is that of the
-// blending, over the lists of the footprint rho <= error_k2. Sums are whole numbers, so their order does not matter.
+// Splat errors with occlusion (rule 17): a pixel counts until it has stopped at or before the splat. It is the pass of the
+// blending over the lists of the footprint rho <= error_k2. Sums are whole numbers, so their order does not matter.
 #include "cuda/pixels.h"
 #include "cuda/reduce.h"
 
@@ -19,7 +19,7 @@ struct OccludedArguments {
 };
 
 constexpr float ERROR_UNIT = 1.f / (1 << 24);  // cuda_passes.py has the same
-constexpr float MOST_ERROR = 1e9f;             // of a splat in the 64 pixels of a warp, against overflow
+constexpr float MOST_ERROR = 1e9f;             // limit for a splat in the 64 pixels of a warp, against overflow
 
 extern "C" __global__ void __launch_bounds__(128) splat_errors_occluded(OccludedArguments a) {
     __shared__ float4 staged[4][4][32];
@@ -77,7 +77,7 @@ extern "C" __global__ void __launch_bounds__(128) splat_errors_occluded(Occluded
             const float sum = min(sum_over_warp(error), MOST_ERROR);
             if (at.lane == 0 && sum > 0.f) atomicAdd(a.errors + splats[at.warp][j], uint64(sum * (1.f / ERROR_UNIT)));
         }
-        __syncwarp();  // before the records are overwritten
+        __syncwarp();  // the records are overwritten next
     }
 }
 

@@ -1,5 +1,5 @@
-// Which tile each block of the blending takes: long lists first, so that no long one begins when the others are done. One
-// block counts tiles by the length of their lists and hands out places; what tiles of one bucket come in, nobody sees.
+// The order in which blocks take tiles: long lists first, so that no long list starts when the others are done. One block
+// counts tiles by the length of their lists and assigns positions; the order within a bucket does not affect results.
 #include "cuda/common.h"
 
 namespace gs2d {
@@ -12,7 +12,7 @@ struct OrderArguments {
     int* order;           // [tiles]
 };
 
-// The longest first; all of BUCKETS * PER_BUCKET entries or more are alike.
+// Longest first; lists of BUCKETS * PER_BUCKET entries or more are equal.
 __device__ __forceinline__ int bucket_of(const OrderArguments& a, int64 tile) {
     const int64 chunks = (a.ranges[2 * tile + 1] - a.ranges[2 * tile] + PER_BUCKET - 1) / PER_BUCKET;
     return BUCKETS - 1 - int(chunks < BUCKETS ? chunks : BUCKETS - 1);
@@ -20,7 +20,7 @@ __device__ __forceinline__ int bucket_of(const OrderArguments& a, int64 tile) {
 
 extern "C" __global__ void __launch_bounds__(512) order_tiles(OrderArguments a) {
     __shared__ int sums[BUCKETS];
-    const int own = threadIdx.x;  // a thread has a bucket of its own
+    const int own = threadIdx.x;  // one bucket per thread
     sums[own] = 0;
     __syncthreads();
     for (int64 tile = own; tile < a.tiles; tile += ORDER_THREADS) atomicAdd(&sums[bucket_of(a, tile)], 1);

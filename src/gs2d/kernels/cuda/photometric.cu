@@ -8,10 +8,10 @@
 
 namespace gs2d {
 
-constexpr int STRIP = MEAN_THREADS, STRIP_ROWS = 32;              // reals and rows of a block; losses.py has the same
+constexpr int STRIP = MEAN_THREADS, STRIP_ROWS = 32;              // reals and rows per block; cuda_losses.py has the same
 constexpr int SIDE = 3 * SSIM_RADIUS, STAGED = STRIP + 2 * SIDE;  // reals of a row that a block reads
 
-// A photograph as it was decoded, instead of `target`, in the variants `rgb` and `rgba`: [H, W, 3 or 4].
+// A decoded image [H, W, 3 or 4] instead of `target`, in the variants `rgb` and `rgba`.
 struct Photograph {
     const uchar* bytes;
     float background[3];  // behind alpha
@@ -31,7 +31,7 @@ struct PhotometricVjpArguments {
     int64 height, width;
     const float *rendered, *target;
     const uchar* mask;
-    const float *maps, *means;   // means[0] = 1 / valid reals; null where the scales below are given
+    const float *maps, *means;   // means[0] = 1 / valid reals; null if the scales below are set
     const float *g_l1, *g_ssim, *g_l2;  // cotangents of the values, or null
     float* gradient;                    // [H, W, 3]
     Photograph photograph;
@@ -44,7 +44,7 @@ struct BlurArguments {
     float* out;
 };
 
-// What a thread owns: one column of reals, STRIP_ROWS rows.
+// The part of a thread: one column of reals, STRIP_ROWS rows.
 struct Strip {
     int64 n, height;  // reals of a row, rows
     int64 first, column, begin, end;
@@ -109,7 +109,7 @@ __device__ __forceinline__ bool is_valid(const uchar* mask, int64 y, int64 width
     return !mask || mask[y * width + column / 3];
 }
 
-// byte / 255, rounded as by a division: a product, and what it lacks.
+// byte / 255, rounded like a division: a product plus its error.
 __device__ __forceinline__ float part_of_255(uchar byte) {
     constexpr float PART = 1.f / 255.f;
     const float x = float(byte), q = x * PART;
@@ -125,7 +125,7 @@ __device__ __forceinline__ float target_of(const Arguments& a, int64 y, int64 co
     const int64 x = column / 3;
     const int channel = int(column - 3 * x);
     const uchar* pixel = from.bytes + 4 * (y * a.width + x);
-    // not by its number: the arguments would be copied to memory of the thread for that
+    // not by index, which would copy the arguments to local memory
     const float behind = channel == 0 ? from.background[0] : channel == 1 ? from.background[1] : from.background[2];
     return (part_of_255(pixel[channel]) - behind) * part_of_255(pixel[3]) + behind;
 }
@@ -146,7 +146,7 @@ template <bool KNOWN, int CHANNELS = 0> __device__ __forceinline__ void photomet
     for (int64 y = s.begin - SSIM_RADIUS; y < s.end + SSIM_RADIUS; ++y) {
         float (*row)[STAGED] = rows[y & 1];
         next.store(row);
-        __syncthreads();  // also: nobody is still at the row before the last one, whose place the next one takes
+        __syncthreads();  // also: the buffer of the next row is free
         next.load(s, y + 1, read(y + 1));
         float m = 0.f, q = 0.f, p = 0.f;
 #pragma unroll
@@ -160,7 +160,7 @@ template <bool KNOWN, int CHANNELS = 0> __device__ __forceinline__ void photomet
         const float u = row[0][threadIdx.x + SIDE], v = row[1][threadIdx.x + SIDE];
         if (s.mine() && y >= s.begin && y < s.end) {
             sums[1] = sums[1] + abs(u - v);
-            if constexpr (CHANNELS == 0) sums[3] = fma(u - v, u - v, sums[3]);  // of bytes nobody asks for it
+            if constexpr (CHANNELS == 0) sums[3] = fma(u - v, u - v, sums[3]);  // not used for bytes
         }
         const int64 out = y - SSIM_RADIUS, at = out * s.n + s.column;
         if (out < s.begin || !s.mine()) continue;

@@ -1,4 +1,4 @@
-// Which pixels a thread owns, and what both directions of the blending do alike.
+// The pixels of a thread, and code shared by both directions of the blending.
 #pragma once
 
 #include "cuda/common.h"
@@ -11,10 +11,10 @@ struct Features {
     const float* values;      // [N, F]
     const float* background;  // [F]
     float* images;            // [F, H, W]
-    const float* upstream;    // [F, H, W]; the backward pass only, as what follows
+    const float* upstream;    // [F, H, W]; the backward pass only, like the next member
     float* gradients;         // [N, F], or a row per slot (blend_vjp.cu); zeros on entry
 };
-constexpr int CHANNELS = 8;  // worked on together
+constexpr int CHANNELS = 8;  // processed together
 
 constexpr int HALVES = 2;  // pixels per thread: the second lies four rows below the first
 
@@ -23,7 +23,7 @@ __device__ __forceinline__ int64 word_of(int64 begin, int tile, int64 chunk) {
     return 8 * ((begin >> 5) + tile + chunk);
 }
 
-// Written out, so that it is unrolled in any loop that it is called from.
+// Without a loop, so that it is unrolled in the caller's loops.
 __device__ __forceinline__ uint or_over_warp(uint bits) {
     bits |= __shfl_xor_sync(FULL_MASK, bits, 16);
     bits |= __shfl_xor_sync(FULL_MASK, bits, 8);
@@ -32,7 +32,7 @@ __device__ __forceinline__ uint or_over_warp(uint bits) {
     return bits | __shfl_xor_sync(FULL_MASK, bits, 1);
 }
 
-// A word that is the same for all lanes, in a form that lets the compiler know it: branches on it are uniform.
+// A word that is the same for all lanes, in a form that the compiler recognises, so that branches on it are uniform.
 __device__ __forceinline__ uint uniform(uint word, int lane) { return __ballot_sync(FULL_MASK, word >> lane & 1u); }
 
 struct Place {  // of a thread
@@ -92,8 +92,8 @@ struct No {
     static constexpr bool value = false;
 };
 
-// Calls step(Yes or No: plain; j, bit j) for the splats of a chunk that are wanted, in order. Runs of plain ones, nearly all, have
-// a loop of their own, without the code for the others.
+// Calls step(Yes or No: plain; j, bit j) for the selected splats of a chunk, in order. Runs of plain splats, nearly all, have
+// a separate loop without the code for the others.
 template <class F> __device__ __forceinline__ void for_each_splat(uint wanted, uint plain, F&& step) {
     while (wanted) {
         const uint others = wanted & ~plain;

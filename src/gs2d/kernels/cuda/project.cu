@@ -9,12 +9,12 @@ struct ProjectArguments {
     const float *means, *quats, *log_scales, *opacity_logits, *sh0, *shN;
     float* records;    // [N, 16]
     float* cull;       // [N, 8], see common.h
-    int* depth_keys;   // [N]; the bits of z_c, which sort as integers; those of infinity where culled
+    int* depth_keys;   // [N]; the bits of z_c, which sort as integers; infinity if culled
     ushort* rects;     // [N, 4]: x0, y0, x1, y1 in tiles
     int* tile_counts;  // [N]: tiles in the rectangle
     float* radii;      // [N]
-    int errors;        // 1: the footprint is rho <= error_k2, whatever the opacity
-    int exact;         // 0: what has no ellipse is in every tile (tests)
+    int errors;        // 1: the footprint is rho <= error_k2, for any opacity
+    int exact;         // 0: splats without an ellipse are in every tile (tests)
 };
 
 // The tiles that an outline reaches.

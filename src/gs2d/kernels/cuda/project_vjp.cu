@@ -1,17 +1,17 @@
 // From gradients of records to gradients of parameters, SH and the densification signal: one thread per splat.
 //
-// Rows of SH and of three floats pass through shared memory (rows.h): of the 464 bytes a splat that this reads and writes
-// they are three quarters. So no lane of a warp leaves before the end.
+// Rows of SH and of three floats pass through shared memory (rows.h): they are three quarters of the 464 bytes per splat
+// that this reads and writes. So no lane of a warp exits early.
 #include "cuda/colors.h"
 #include "cuda/rows.h"
 
 namespace gs2d {
 
-// The densification signal added to what was gathered; splats of radius 0 are left alone. All null: not here.
+// Sums of the densification signal; splats of radius 0 are skipped. All null: not gathered here.
 struct Gathered {
     float *signed_norms, *absolute_norms, *counts;  // [N]; absolute_norms may be null alone
     const float* radii;                             // [N] px
-    const int* skip;                                // not 0 there: nothing is added; or null
+    const int* skip;                                // if not 0, nothing is added; or null
 };
 
 struct ProjectVjpArguments {
@@ -22,14 +22,14 @@ struct ProjectVjpArguments {
     const uchar* learns;     // [N], 0: all gradients are 0; or null
     float* gradients;        // [N, 16]
     float* extras;           // [N, 4]
-    float *g_means, *g_quats, *g_log_scales, *g_opacity_logits, *g_sh0, *g_shN, *g_probe;  // null where not wanted
+    float *g_means, *g_quats, *g_log_scales, *g_opacity_logits, *g_sh0, *g_shN, *g_probe;  // null: not computed
     int64 probe_columns;                                                                   // 2 or 4
-    float* g_intrinsics;  // [N, 4]: what each splat says of fx, fy, cx, cy; or null
+    float* g_intrinsics;  // [N, 4]: gradients of fx, fy, cx, cy by splat; or null
     Gathered gathered;
-    int clears;  // 1: rows of gradients and extras that were read are zeros afterwards
+    int clears;  // 1: reset the rows of gradients and extras to zero
 };
 
-// Rows of tensors that were made for this kernel alone: they begin on a boundary.
+// Rows of tensors allocated for this kernel, which are aligned.
 __device__ __forceinline__ void write_2(float* to, int64 i, float a, float b) {
     reinterpret_cast<float2*>(to)[i] = {a, b};
 }
@@ -61,7 +61,7 @@ __device__ __forceinline__ Vec3<float> learn_colors(const ProjectVjpArguments& a
     return color_vjp(a.view.sh_degree, sh, int(a.sh_rest), g_sh, direction, g_color);
 }
 
-// Blocks that a multiprocessor shall hold: five leave 96 registers, which sm_120 has too few of (8 bytes spilled).
+// Blocks per multiprocessor: five would leave 96 registers, too few for sm_120 (8 bytes spilled).
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 1200
 #define PROJECT_VJP_BLOCKS 4
 #else
@@ -72,7 +72,7 @@ extern "C" __global__ void __launch_bounds__(128, PROJECT_VJP_BLOCKS) project_sp
     __shared__ float4 staged[4][WARP_ROWS * MAX_ROW / 4];
     const int lane = threadIdx.x & 31, length = int(3 * a.sh_rest);
     const int64 begin = int64(blockIdx.x) * blockDim.x + (threadIdx.x & ~31u), i = begin + lane;
-    if (begin >= a.count) return;  // the same for all lanes
+    if (begin >= a.count) return;  // uniform over the warp
     const int count = a.count - begin < WARP_ROWS ? int(a.count - begin) : WARP_ROWS;
     float* rows = reinterpret_cast<float*>(staged[threadIdx.x >> 5]);
     const bool drawn = lane < count && a.tile_counts[i] != 0 && (!a.learns || a.learns[i]);

@@ -1,5 +1,5 @@
-// Rows of the splats of a warp, by way of shared memory: lanes side by side move 16 bytes each, where a lane that walked
-// along its own row would touch a line of memory for every 4.
+// Rows of the splats of a warp through shared memory: adjacent lanes move 16 bytes each, while a lane that reads its own row
+// would touch a line of memory for every 4 bytes.
 #pragma once
 
 #include "cuda/common.h"
@@ -13,13 +13,13 @@ template <class T> __device__ __forceinline__ bool is_aligned(const void* at) {
     return reinterpret_cast<unsigned long long>(at) % sizeof(T) == 0;
 }
 
-// Whether a row is wanted of which four floats are a part: of two rows at most, because a row is of three floats or more.
+// Whether four floats are part of a selected row. They belong to at most two rows, since a row has at least three floats.
 __device__ __forceinline__ bool any_wanted(uint wanted, int first_float, int length) {
     const int first = first_float / length, last = (first_float + 3) / length;
     return (wanted >> first | wanted >> (last < WARP_ROWS ? last : first)) & 1u;
 }
 
-// From memory to `rows` [32 * length] those of 32 rows, from `begin` on, whose bit is set; the others may be left. All lanes
+// From memory to `rows` [32 * length] the rows from `begin` on whose bit is set; others may be skipped. All lanes must
 // call it.
 __device__ __forceinline__ void load_rows(const float* from, int64 begin, int count, int length, uint wanted, int lane,
                                           float* rows) {
@@ -34,7 +34,7 @@ __device__ __forceinline__ void load_rows(const float* from, int64 begin, int co
     __syncwarp();
 }
 
-// And back, all of them.
+// Stores all rows. All lanes must call it.
 __device__ __forceinline__ void store_rows(float* to, int64 begin, int count, int length, int lane,
                                            const float* rows) {
     float* target = to + begin * length;

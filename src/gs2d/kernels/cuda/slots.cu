@@ -1,12 +1,12 @@
-// Gradients that do not vary from run to run: instead of adding to a splat's record, each warp writes to a slot of its own
-// (blend_vjp.cu with `slots`), and the slots of a splat, which lie together, are added up here in a fixed order.
+// Deterministic gradients: instead of adding to a splat's record, each warp writes to its own slot (blend_vjp.cu with
+// `slots`), and the slots of a splat, which are consecutive, are summed here in a fixed order.
 #include "cuda/common.h"
 
 namespace gs2d {
 
 struct SlotArguments {
     int64 count;
-    int64 candidates;    // that there are slots for: pairs beyond were left out for want of room
+    int64 candidates;    // with slots; pairs beyond the room were dropped
     const int64* order;  // [N]: splats by depth
     // [N]: running sum of candidates in that order; four slots each, one for each warp of a tile
     const int64* ends;
@@ -17,7 +17,8 @@ struct SlotArguments {
     int64 channels;
 };
 
-// One warp per splat. A lane adds up slots of the same warps of every tile: tiles that do not see the splat change no bit, in the list or not.
+// One warp per splat. A lane sums the slots of the same warps of all tiles; slots of tiles without the splat are 0 and change
+// no bit.
 extern "C" __global__ void __launch_bounds__(128) sum_slots(SlotArguments a) {
     const int64 place = (int64(blockIdx.x) * blockDim.x + threadIdx.x) >> 5;
     const int lane = threadIdx.x & 31;

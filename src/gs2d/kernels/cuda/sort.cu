@@ -1,11 +1,10 @@
-// A stable sort by radix of keys with what belongs to them, and running sums: what a training iteration needs between its
-// own kernels, so that it asks torch for nothing.
+// A stable radix sort of keys with payloads, and running sums, for training iterations without torch operations.
 //
 // Eight bits a pass; a pass reads each key once ("onesweep": Adinets and Merrill, 2022). One launch counts the digits of all
-// passes. A block then takes the next piece of the keys by a ticket, ranks them, says how many of each digit it has, and
-// adds up what the pieces before it say, walking back until one says the sum of all before it ("decoupled look-back":
-// Merrill and Garland, 2016). A number and what it means are one word, so no order of memory is asked for; a piece only
-// waits for those with earlier tickets, whose blocks are running.
+// passes. A block then takes the next piece of the keys by a ticket, ranks them, publishes its count of each digit, and
+// sums the counts of earlier pieces, going back until one has published the sum of all before it ("decoupled look-back":
+// Merrill and Garland, 2016). A number and its kind are one word, so no memory ordering is required; a piece only waits
+// for earlier tickets, whose blocks are running.
 #include "cuda/common.h"
 
 namespace gs2d {
@@ -29,12 +28,12 @@ struct DigitArguments {
 
 struct SortArguments {
     const void* keys;
-    const uint* payloads;  // or null: the place of the key
-    void* sorted_keys;     // or null where nobody wants them
+    const uint* payloads;  // or null: the index of the key
+    void* sorted_keys;     // or null: not written
     uint* sorted_payloads;
     int64 count;
     int shift, bits;       // of the digit
-    const uint* digits;    // [DIGITS]: how many keys have each
+    const uint* digits;    // [DIGITS]: number of keys with each digit
     uint *ticket, *words;  // [pieces, DIGITS]; zeros on entry, both
 };
 
@@ -44,8 +43,8 @@ struct RunningArguments {
     int64 count, room;        // room: for pairs
     uint* ends;               // [count]: running sum, in that order
     uint *ticket, *words;     // [pieces]; zeros on entry, both
-    int64* pairs;             // [1]: the last sum; the host's memory
-    int* overflow;            // [1]: whether it is more than there is room for
+    int64* pairs;             // [1]: the last sum, in host memory
+    int* overflow;            // [1]: whether it exceeds the room
 };
 
 extern "C" __global__ void __launch_bounds__(256) clear_words(ClearArguments a) {
@@ -56,7 +55,7 @@ extern "C" __global__ void __launch_bounds__(256) clear_words(ClearArguments a) 
 
 __device__ __forceinline__ void publish(uint* word, uint value) { *static_cast<volatile uint*>(word) = value; }
 
-// What a piece says, once it says something.
+// Waits for the word of a piece.
 __device__ __forceinline__ uint said(const uint* word) {
     uint value;
     do value = *static_cast<const volatile uint*>(word);
@@ -64,7 +63,7 @@ __device__ __forceinline__ uint said(const uint* word) {
     return value;
 }
 
-// Sums stay at the largest number: more than there can be room for is all the same.
+// Sums saturate: any number above the largest room is equivalent.
 __device__ __forceinline__ uint saturated(uint a, uint b) {
     const uint sum = a + b;  // of two numbers below 2^30
     return sum < NUMBER ? sum : NUMBER;
@@ -198,13 +197,13 @@ template <class Key> __device__ __forceinline__ void sort_pass(const SortArgumen
     }
 }
 
-// What all pieces before one say, added up by its first warp: 32 of them at a time.
+// The sum of all earlier pieces, computed by the first warp, 32 pieces at a time.
 __device__ __forceinline__ uint sum_before(const uint* words, int64 piece, int lane) {
     uint sum = 0u;
     for (int64 last = piece - 1; last >= 0; last -= 32) {
         const int64 p = last - lane;
         const uint word = p >= 0 ? said(words + p) : SUM;
-        const uint ends = __ballot_sync(FULL_MASK, word >= SUM);  // the nearest of these is as far as to look
+        const uint ends = __ballot_sync(FULL_MASK, word >= SUM);  // the nearest of these ends the search
         const int furthest = ends ? __ffs(int(ends)) - 1 : 31;
         uint number = lane <= furthest ? word & NUMBER : 0u;
         const auto exchange = [&](int step) {
@@ -217,7 +216,7 @@ __device__ __forceinline__ uint sum_before(const uint* words, int64 piece, int l
     return sum;
 }
 
-// Where the pairs of each splat end, in the order of depth; the last piece says how many there are.
+// Where the pairs of each splat end, in the order of depth; the last piece writes their number.
 extern "C" __global__ void __launch_bounds__(256) running_counts(RunningArguments a) {
     __shared__ uint sums[1][SORT_THREADS];
     __shared__ uint of_piece, before_piece;

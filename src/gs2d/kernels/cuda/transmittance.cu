@@ -1,6 +1,6 @@
-// Depth by continuous transmittance, after the blending and only where it is asked for. With the layout of blend.cu: a thread
-// searches for its two pixels at once, and each step of the search is a walk over the pairs of the warp, which the words
-// of the forward pass tell. A warp goes on while one of its pixels does; the warps of a block never wait for each other.
+// Depth by transmittance, after the blending and only on request, with the layout of blend.cu: a thread searches for its two
+// pixels at once, and each step of the search is a pass over the pairs of the warp, selected by the words of the forward
+// pass. A warp continues while one of its pixels does; the warps of a block never wait for each other.
 #include "cuda/pixels.h"
 
 namespace gs2d {
@@ -28,7 +28,7 @@ __device__ __forceinline__ void walk(const DepthArguments& a, const Place& at, c
         const uint* words = a.seen + word_of(begin, at.tile, chunk);
         const uint hits[HALVES] = {uniform(words[at.sub_block[0]], at.lane), uniform(words[at.sub_block[1]], at.lane)};
         const uint wanted = hits[0] | hits[1];
-        if (wanted == 0u) continue;  // the same for all lanes
+        if (wanted == 0u) continue;  // uniform over the warp
         bool mine_is_plain = false;
         if (wanted >> at.lane & 1u) {
             fetch_record(a.records, a.entries[begin + 32 * chunk + at.lane] >> 8, records, at.lane);
@@ -43,7 +43,7 @@ __device__ __forceinline__ void walk(const DepthArguments& a, const Place& at, c
             planes_of(s, dx, dy, planes);
 #pragma unroll
             for (int h = 0; h < HALVES; ++h) {
-                if (!(hits[h] & bit)) continue;  // the same for all lanes
+                if (!(hits[h] & bit)) continue;  // uniform over the warp
                 const Hit<float> hit = hit_of<decltype(is_plain)::value>(s, planes[h], dx, dy + float(4 * h), limits);
                 const float alpha = min(hit.alpha, limits.alpha_max), after = fnma(alpha, T[h], T[h]);
                 const bool goes_on = after >= limits.transmittance_min;
@@ -51,7 +51,7 @@ __device__ __forceinline__ void walk(const DepthArguments& a, const Place& at, c
                 pair(h, keep(goes_on, alpha), hit.inverse_depth);
             }
         });
-        __syncwarp();  // before the records are overwritten
+        __syncwarp();  // the records are overwritten next
     }
 }
 
