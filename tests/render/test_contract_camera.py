@@ -283,6 +283,6 @@ def test_20_a_pose_that_moved_on_without_its_camera_is_refused(cpu: Backend, dra
     with torch.no_grad():
         pose[0, 3] += 0.1  # as an optimizer's step does
     image = [torch.zeros(camera.height, camera.width, 3)] if drawing is splat_errors else []
-    with pytest.raises(ShapeError, match="make a camera of the new one"):
+    with pytest.raises(ShapeError, match="create a camera with the new pose"):
         drawing(splats.to(dtype=torch.float32), lens, *image, backend=cpu)
     drawing(splats.to(dtype=torch.float32), replace(lens, T_cam_world=pose), *image, backend=cpu)
