@@ -93,7 +93,7 @@ def test_a_task_takes_a_gpu_where_the_backend_uses_one_and_its_part_of_the_cores
 def test_what_a_task_tells_comes_back_with_its_name(ray: FakeRay, tmp_path: Path, trained: list[TrainingTask]) -> None:
     jobs = make_jobs(tmp_path, {"a": ("1",), "bad": ("2",)})
     heard = heard_of(jobs, tmp_path)
-    assert any(text.startswith("a begins on ") for text in heard)
+    assert any(text.startswith("a starts on ") for text in heard)
     assert "a: odd" in heard
     assert heard.count("bad failed: expected a photograph, got none") == 1
     assert jobs[0].outcome()["state"] == "done"
@@ -107,7 +107,7 @@ def test_a_task_whose_machines_are_lost_fails_and_the_others_go_on(
     ray.lost.add("a")
     jobs = make_jobs(tmp_path, {"a": ("1",), "b": ("2",)})
     heard_of(jobs, tmp_path)
-    reason = "its process or its machine was lost again and again, or had no memory left (WorkerCrashedError)"
+    reason = "its process or machine was lost repeatedly, or ran out of memory (WorkerCrashedError)"
     assert failures(jobs) == {"a": reason}
     assert jobs[1].outcome()["state"] == "done"
 

@@ -45,11 +45,11 @@ def test_nodes_are_lost_in_the_middle_and_no_byte_changes(
 ) -> None:
     cluster, address = nodes
     with begin(blocks_words(capture, tmp_path / "job", address, SCHEDULE)) as process:
-        said = read_until(process, "block-0-1 begins on")
+        said = read_until(process, "block-0-1 starts on")
         lose(cluster)
         said += process.communicate()[1]
     assert process.returncode == 0, said
-    assert "was lost; it goes on on" in said
+    assert "was lost; it continues on" in said
     for line in said.splitlines():  # nothing of Ray's own
         assert line.startswith(("tasks (9)", "tasks: ", "note ")), said
     for name in ("splats.ply", "mesh.ply"):

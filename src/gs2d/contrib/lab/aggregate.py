@@ -1,4 +1,4 @@
-"""From runs to rows: the figures of each run, means over scenes and seeds, and whether the paper's claims hold."""
+"""Aggregates runs into rows: figures of each run, means over scenes and seeds, and checks of the paper's claims."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NOT_YET = ("not trained yet", "under way or interrupted")
 
 @dataclass(frozen=True)
 class Cell:
-    """What one run came to.
+    """The figures of one run.
 
     Attributes
     ----------
@@ -31,10 +31,10 @@ class Cell:
     figures : dict
         One entry for each of FIGURES; None where there is none.
     reasons : dict
-        Why, for those that are None.
+        Reasons of figures that are None.
     run : Path
     details : dict
-        Other facts: splats, surface thresholds, image metrics of each stage, which views were measured.
+        Further facts: splats, surface thresholds, image metrics of each stage, measured views.
     """
 
     scene: str
@@ -46,14 +46,14 @@ class Cell:
     details: dict[str, Any] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """Flat: the figures beside scene and seed."""
+        """Return scene, seed and figures as one flat object."""
         facts = {"scene": self.scene, "data_set": self.data_set, "seed": self.seed, **self.figures}
         return {**facts, "reasons": self.reasons, "run": str(self.run), **self.details}
 
 
 @dataclass(frozen=True)
 class Row:
-    """A row of a table with what was measured for it."""
+    """A row of a table with its measured cells."""
 
     name: str
     recipe: str | None
@@ -71,20 +71,20 @@ class Row:
 class Results:
     """The rows of a table.
 
-    Means are over the runs (scene, seed) that *every* trained row has: a mean over other scenes than those of the row
-    above would be compared with it all the same. Rows of which nothing is there yet do not count for this. Figures that
-    were measured otherwise have no common mean (:func:`measured_on`); of images, test views count where there are any.
+    Means are over the runs (scene, seed) that *all* trained rows have, so that rows are comparable; rows without runs
+    are ignored. Figures that were measured in different ways have no common mean (:func:`measured_on`). For images,
+    test views count if there are any.
     """
 
     rows: tuple[Row, ...]
 
     @property
     def data_sets(self) -> tuple[str, ...]:
-        """Those that were trained."""
+        """Return the trained data sets."""
         return tuple(dict.fromkeys(cell.data_set for row in self.rows for cell in row.cells))
 
     def counted(self, metric: str, data_set: str | None = None) -> set[tuple[str, int]]:
-        """Return the (scene, seed) that means of a metric are taken over; none where there is no common mean."""
+        """Return the runs (scene, seed) in the means of a metric; empty without a common mean."""
         kinds = self._kinds(metric, data_set)
         one = "test views" if "test views" in kinds else next(iter(kinds), "")
         if len(kinds) > 1 and metric not in IMAGES:
@@ -100,17 +100,17 @@ class Results:
         return set.intersection(*filter(None, have)) if any(have) else set()
 
     def _kinds(self, metric: str, data_set: str | None) -> set[str]:
-        """On what, and how, a metric was measured."""
+        """Return the ways in which a metric was measured."""
         cells = (c for r in self.rows for c in r.of(data_set) if c.figures[metric] is not None)
         return {measured_on(cell, metric) for cell in cells}
 
     def scenes(self, metric: str, data_set: str | None = None) -> list[str]:
-        """Return the scenes that means of a metric are taken over."""
+        """Return the scenes in the means of a metric."""
         counted = {scene for scene, _ in self.counted(metric, data_set)}
         return [s for s in dict.fromkeys(c.scene for r in self.rows for c in r.of(data_set)) if s in counted]
 
     def mean(self, row: Row, data_set: str | None = None) -> dict[str, float | None]:
-        """Mean over scenes of the mean over seeds of each figure; None where there is none."""
+        """Return each figure as the mean over scenes of the mean over seeds; None without values."""
         found: dict[str, float | None] = {}
         for name in FIGURES:
             values = self._values(row, name, data_set)
@@ -119,7 +119,7 @@ class Results:
         return found
 
     def spread(self, row: Row, data_set: str | None = None) -> dict[str, float | None]:
-        """Return the deviation over seeds of the mean over scenes; None with fewer than two seeds that have all."""
+        """Return the deviation over seeds of the mean over scenes; None with fewer than two complete seeds."""
         found: dict[str, float | None] = {}
         for name in FIGURES:
             means = by_seed(self._values(row, name, data_set))
@@ -127,7 +127,7 @@ class Results:
         return found
 
     def _values(self, row: Row, name: str, data_set: str | None) -> dict[str, dict[int, float]]:
-        """Scene -> seed -> value, of those that count."""
+        """Return the values in the mean by scene and seed."""
         counted = self.counted(name, data_set)
         found: dict[str, dict[int, float]] = {}
         for cell in row.of(data_set):
@@ -137,7 +137,7 @@ class Results:
         return found
 
     def reasons(self, row: Row) -> dict[str, str]:
-        """Why a figure has no mean."""
+        """Return the reasons of figures without a mean."""
         if not row.cells:
             why = "not trained here" if row.recipe is None else "not trained yet"
             return dict.fromkeys(FIGURES, why)
@@ -154,7 +154,7 @@ class Results:
 
 
 def measured_on(cell: Cell, metric: str) -> str:
-    """Return what figures must share to have a mean: the split of the views, the protocol and unit of surfaces."""
+    """Return what figures of one mean share: the split of the views, or protocol and unit of surfaces."""
     if metric in IMAGES:
         return f"{cell.details.get('views', 'test')} views"
     if metric not in ("fscore", "chamfer"):
@@ -166,15 +166,12 @@ def measured_on(cell: Cell, metric: str) -> str:
     unit = str(surface.get("unit", "world units"))
     if unit != "world units":
         return f"protocol {protocol}, {unit}"
-    # every capture has world units of its own, but for those that one data set has in common
+    # world units differ by capture, except within a data set
     return f"protocol {protocol}, units of {cell.data_set if cell.data_set in DATA_SETS else cell.scene}"
 
 
 def by_seed(values: dict[str, dict[int, float]]) -> list[float]:
-    """Means over scenes (scene -> seed -> value) at each seed that all of the scenes have, in order of the seeds.
-
-    A seed that lacks a scene would be compared with others over other scenes.
-    """
+    """Return means over scenes, from values by scene and seed, for each seed that all scenes have, by seed."""
     seeds = set.intersection(*(set(of_scene) for of_scene in values.values())) if values else set()
     return [statistics.fmean([of_scene[seed] for of_scene in values.values()]) for seed in sorted(seeds)]
 
@@ -189,16 +186,16 @@ def read_cell(
     record: dict[str, Any],
     conventions: MetricConventions = MetricConventions(),  # noqa: B008 (frozen)
 ) -> Cell:
-    """Return the figures of a run, from its ``metrics.json``; None with a reason where there are none.
+    """Return the figures of a run from its ``metrics.json``; missing ones are None, with a reason.
 
     Parameters
     ----------
     test_on : str
         "test" or "train": the views whose image metrics count.
     record : dict
-        What the sweep wrote about the task.
+        Outcome of the task of the run.
     conventions : MetricConventions
-        The protocol's: which of the image metrics count, and which figure of the surface is the headline.
+        Of the protocol: which image metrics count, and the main figure of the surface.
     """
     figures: dict[str, float | None] = dict.fromkeys(FIGURES)
     place: dict[str, Any] = {"scene": scene, "data_set": data_set, "seed": seed, "run": run}
@@ -239,20 +236,20 @@ def read_cell(
 
 
 def measured_as(conventions: MetricConventions) -> dict[str, str]:
-    """Return the image metrics of a table -> their names in ``metrics.json``."""
+    """Return the names in ``metrics.json`` of the image metrics of a table."""
     suffix = "" if conventions.from_8bit else "_float"
     lpips = "lpips" if conventions.lpips_unit_range else "lpips_signed"
     return {"psnr": f"psnr{suffix}", "ssim": f"ssim{suffix}", "lpips": lpips}
 
 
 def surface_metric(rows: Sequence[Row], data_set: str) -> str:
-    """Return the headline figure of a data set's surfaces: what its protocol says."""
+    """Return the main figure of the surfaces of a data set."""
     named = {c.details["headline"] for row in rows for c in row.of(data_set) if "headline" in c.details}
     return named.pop() if len(named) == 1 else "chamfer" if data_set == DTU else "fscore"
 
 
 def _backend(definition: dict[str, Any]) -> str:
-    """Return the backend that trained a run, by its name."""
+    """Return the name of the backend of a run."""
     return str((definition.get("backend") or {}).get("name", "unknown"))
 
 
@@ -263,7 +260,7 @@ def _scores(stage: dict[str, Any], test_on: str) -> dict[str, Any]:
 
 
 def surface_figures(surface: dict[str, Any] | None, data_set: str) -> dict[str, float | None]:
-    """F-score at the first threshold, and Chamfer distance, from the ``surface`` entry of ``metrics.json``."""
+    """Return F-score at the first threshold, and Chamfer distance, from ``surface`` of ``metrics.json``."""
     if not surface:
         return {"fscore": None, "chamfer": None}
     return {"fscore": surface.get("f_score"), "chamfer": surface.get("chamfer")}
@@ -272,20 +269,20 @@ def surface_figures(surface: dict[str, Any] | None, data_set: str) -> dict[str, 
 # -- claims ----------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class StageStep:
-    """The difference of two neighbouring rows of a claim, in the direction in which the paper has it.
+    """The difference of two neighbouring rows of a claim, in the direction of the paper.
 
     Attributes
     ----------
     lower, upper : str
-        Rows; the paper says that ``upper`` is better (or not worse, or alike).
+        Rows; in the paper ``upper`` is better (or not worse, or equal).
     metric : str
     difference : float
-        Mean over scenes and seeds of better-ness: upper minus lower, the other way round where lower is better.
+        Mean over scenes and seeds of upper minus lower, with inverted sign if lower values are better.
     spread : float or None
-        Standard deviation over seeds of the mean over scenes of the difference, taken seed by seed.
+        Standard deviation over seeds of the mean over scenes of the difference.
     seeds : int
     seeds_with_sign : int
-        At so many of them the order is the paper's.
+        Number of seeds with the order of the paper.
     """
 
     lower: str
@@ -299,9 +296,9 @@ class StageStep:
 
 @dataclass(frozen=True)
 class ClaimResult:
-    """Whether one of the paper's claims holds on one data set.
+    """Result of a claim of the paper on one data set.
 
-    ``holds`` is "yes", "no", "open" (the seeds disagree) or "unknown" (something was not measured: ``reason``).
+    ``holds`` is "yes", "no", "open" (the seeds disagree) or "unknown" (a figure is missing: ``reason``).
     """
 
     text: str
@@ -313,17 +310,17 @@ class ClaimResult:
     reason: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return plain values."""
         return asdict(self)
 
 
 def check_claims(table: PaperTable, results: Results) -> tuple[ClaimResult, ...]:
-    """Every claim of a table, on every data set that was trained."""
+    """Check each claim of a table on each trained data set."""
     return tuple(check_claim(claim, results.rows, d) for d in results.data_sets for claim in table.claims)
 
 
 def check_claim(claim: Claim, rows: Sequence[Row], data_set: str) -> ClaimResult:
-    """One claim on one data set."""
+    """Check a claim on a data set."""
     metric = claim.metric
     if metric == "surface":
         metric = surface_metric(rows, data_set)
@@ -350,7 +347,7 @@ def _pairs(claim: Claim) -> list[tuple[str, str]]:
     rows = claim.rows
     if claim.kind == "best":
         return [(row, rows[-1]) for row in rows[:-1]]
-    if claim.kind == "flat":  # the worst and the best decide, but the reader wants to see who they are
+    if claim.kind == "flat":  # all pairs, so that the worst and best are shown
         return [(a, b) for i, a in enumerate(rows) for b in rows[i + 1 :]]
     return list(itertools.pairwise(rows))
 
@@ -367,7 +364,7 @@ def _step(lower: Row, upper: Row, metric: str, data_set: str, claim: Claim) -> S
     within = claim.within or 0.0
     if claim.kind == "flat":
         right = [abs(d) <= within for d in differences]
-    elif claim.kind == "at least":  # not worse by more than the paper rounds away
+    elif claim.kind == "at least":  # within the rounding of the paper
         right = [d >= -ROUNDING[metric] for d in differences]
     else:
         right = [d > 0 for d in differences]

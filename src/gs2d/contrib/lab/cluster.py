@@ -1,7 +1,7 @@
-"""Tasks of a list on the machines of a Ray cluster, which share a disk.
+"""Runs tasks on the machines of a Ray cluster with a shared disk.
 
-Ray decides where a task is done and does it again where a machine is lost. What tasks read and leave lies on the shared
-disk; through Ray go the task itself, what it tells, and what became of it, a few hundred bytes each.
+Ray selects the machine of a task and repeats tasks of lost machines. Files are on the shared disk; Ray transfers only
+the tasks, their events and their outcomes, a few hundred bytes each.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from gs2d.core.extras import install
 from gs2d.errors import BackendError
 from gs2d.training.events import Event, Notice, NotMade, OnEvent, Phase, StageScored, Step
 
-RETRIES = 2  # of a task whose machine or process is lost, at least
+RETRIES = 2  # least number, of a task whose machine or process is lost
 CONNECT_SECONDS, TCP_SECONDS = 60.0, 5.0
 POLL_SECONDS, GOODBYE_SECONDS = 0.5, 15.0
-# ray.init tries for minutes, and in C++, where nothing ends it but the end of its process.
+# ray.init tries for minutes in C++ and cannot be interrupted, so it is tried in another process first.
 PROBE = """
 import logging, os, sys
 try:
@@ -47,9 +47,9 @@ ray.shutdown()
 """
 
 
-# -- the way to the cluster --------------------------------------------------------------------------------------------
+# -- connection --------------------------------------------------------------------------------------------------------
 def check_address(address: str) -> None:
-    """Refuse what is no address of a cluster, or leads to nobody."""
+    """Raise if an address is invalid, or nothing listens there."""
     if address == "auto":
         return
     host, _, port = address.rpartition(":")
@@ -68,12 +68,12 @@ def check_address(address: str) -> None:
 
 
 def check_cluster(address: str) -> None:
-    """Connect to a cluster in another process, which is ended when it takes too long.
+    """Connect to a cluster in another process, with a time limit.
 
     Raises
     ------
     BackendError
-        No Ray answers, or one of another version.
+        If no Ray answers, or another version of Ray.
     """
     try:
         probe = subprocess.run(
@@ -85,20 +85,20 @@ def check_cluster(address: str) -> None:
             "machine is one of the cluster's (`ray status`)"
         ) from None
     if probe.returncode:
-        said = (probe.stdout.splitlines() or [f"exit code {probe.returncode}"])[-1]
+        output = (probe.stdout.splitlines() or [f"exit code {probe.returncode}"])[-1]
         raise BackendError(
-            f"no Ray cluster can be used at {address}: {said[:300]}; start one with `ray start --head`, join it from "
+            f"no Ray cluster can be used at {address}: {output[:300]}; start one with `ray start --head`, join it from "
             "this machine with `ray start --address HOST:PORT`"
         )
 
 
 def connect(address: str) -> tuple[Any, bool]:
-    """Return the ``ray`` module, connected, and whether the connection is ours to close."""
+    """Return the connected ``ray`` module, and whether this call connected it."""
     try:
         import ray
     except ImportError:
         raise BackendError(f"--cluster needs Ray, which is not installed; {install('cluster')}") from None
-    if ray.is_initialized():  # by a program that calls gs2d
+    if ray.is_initialized():  # by the calling program
         return ray, False
     check_address(address)
     check_cluster(address)
@@ -111,21 +111,21 @@ def connect(address: str) -> tuple[Any, bool]:
         raise BackendError(f"no Ray cluster can be used at {address}: {' '.join(str(error).split())[:300]}") from None
     finally:
         if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, before)  # Ray takes it, and would leave without a word
+            signal.signal(signal.SIGTERM, before)  # Ray replaces the handler
     return ray, True
 
 
-# -- what a task takes -------------------------------------------------------------------------------------------------
+# -- resources ---------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Shares:
-    """What a task takes of a machine.
+    """Resources of a task.
 
     Attributes
     ----------
     cores : int
         CPU threads of a task.
     alone : int
-        CPU threads of a task beside which nothing runs.
+        CPU threads of a task that runs alone.
     gpus : int
         0 or 1.
     """
@@ -135,7 +135,7 @@ class Shares:
     gpus: int
 
     def of(self, task: Task) -> dict[str, Any]:
-        """Return the resources of a task as Ray names them."""
+        """Return the resources of a task by Ray's names."""
         gpus = self.gpus if task.gpu else 0
         found: dict[str, Any] = {"num_cpus": self.alone if task.alone else self.cores, "num_gpus": gpus}
         return found if task.memory is None else {**found, "memory": int(task.memory * 2**30)}
@@ -144,12 +144,12 @@ class Shares:
 def shares(
     nodes: Sequence[Mapping[str, float]], backend: str, slots: int | None, threads: int | None, address: str
 ) -> Shares:
-    """Return what tasks take of machines with such resources (``CPU``, ``GPU``, ``memory``).
+    """Return the resources of tasks on machines with these resources (``CPU``, ``GPU``, ``memory``).
 
     Raises
     ------
     BackendError
-        No machine has a CPU, or the GPU that is needed.
+        If no machine has a CPU, or a GPU that the backend needs.
     """
     gpus = int(backend == "cuda" or (backend == "auto" and any(node.get("GPU", 0) >= 1 for node in nodes)))
     able = [node for node in nodes if node.get("CPU", 0) >= 1 and node.get("GPU", 0) >= gpus]
@@ -173,7 +173,7 @@ def _sum(nodes: Sequence[Mapping[str, float]], name: str) -> float:
 
 
 def check_room(nodes: Sequence[Mapping[str, float]], taken: Mapping[str, Any], name: str) -> None:
-    """Refuse a task that no machine has room for: Ray would wait for ever."""
+    """Raise for a task that fits on no machine, for which Ray would wait forever."""
     asked = {"CPU": taken["num_cpus"], "GPU": taken["num_gpus"], "memory": taken.get("memory", 0)}
     if not any(all(node.get(key, 0) >= value for key, value in asked.items()) for node in nodes):
         memory = f" and {asked['memory'] / 2**30:.3g} GiB" if asked["memory"] else ""
@@ -182,8 +182,8 @@ def check_room(nodes: Sequence[Mapping[str, float]], taken: Mapping[str, Any], n
             for node in nodes
         )
         raise BackendError(
-            f"no machine of the cluster has room for {name}, which takes {asked['CPU']} CPUs, {asked['GPU']} GPUs"
-            f"{memory}: there is {there}; give less --threads or --memory"
+            f"{name} fits on no machine of the cluster: it takes {asked['CPU']} CPUs, {asked['GPU']} GPUs"
+            f"{memory}, the machines have {there}; use fewer --threads or less --memory"
         )
 
 
@@ -191,12 +191,12 @@ def check_room(nodes: Sequence[Mapping[str, float]], taken: Mapping[str, Any], n
 def cluster_executor(
     address: str, folder: Path, tasks: Sequence[Task], *, slots: int | None, threads: int | None, backend: str
 ) -> OnCluster[Any]:
-    """Return the executor that does tasks of a list on a cluster.
+    """Return an executor on a cluster.
 
     Raises
     ------
     BackendError
-        The cluster cannot be had, or has no room.
+        If the cluster cannot be used, or a task fits on no machine.
     """
     ray, owned = connect(address)
     try:
@@ -212,7 +212,7 @@ def cluster_executor(
 
 
 class OnCluster(Executor[AnyTask]):
-    """A Ray task for each task, in a process of its own."""
+    """Runs each task as a Ray task in its own process."""
 
     def __init__(self, ray: Any, folder: Path, taken: Shares, slots: int, leave: Callable[[], None]) -> None:
         from ray.util.queue import Queue
@@ -221,7 +221,7 @@ class OnCluster(Executor[AnyTask]):
         self._ray, self._folder, self._taken, self._slots, self._leave = ray, folder, taken, slots, leave
         ray.cloudpickle.register_pickle_by_value(cluster_worker)
         self._remote = ray.remote(max_calls=1)(cluster_worker.do_on_worker)
-        # Where this command runs: with another machine it would be lost.
+        # On this machine, as other machines can be lost.
         here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
         self._queue = Queue(actor_options={"num_cpus": 0, "scheduling_strategy": here})
         self._running: dict[Any, AnyTask] = {}
@@ -229,15 +229,15 @@ class OnCluster(Executor[AnyTask]):
         self._token, self._stopped = secrets.token_hex(8), False
 
     def fitted(self, task: AnyTask) -> AnyTask:
-        """Return a task on as many CPU threads as it takes of a machine."""
+        """Return a task with the number of CPU threads that it gets."""
         return task.with_threads(self._taken.of(task)["num_cpus"])
 
     def running(self) -> Sequence[AnyTask]:
-        """Return the tasks that Ray has, those that wait for room too."""
+        """Return the tasks that were given to Ray, including waiting ones."""
         return list(self._running.values())
 
     def has_room(self) -> bool:
-        """Return whether Ray may have another task; where there is no room it waits there."""
+        """Return whether another task can be given to Ray, where it may wait."""
         return len(self._running) < self._slots
 
     def start(self, task: AnyTask) -> None:
@@ -260,19 +260,19 @@ class OnCluster(Executor[AnyTask]):
         self._running[remote.remote(order, self._queue)] = task
 
     def wait(self, on_event: OnEvent) -> list[tuple[AnyTask, bool]]:
-        """Wait for a task to end, and pass on what all of them tell.
+        """Wait for a task to end, and pass on events of all tasks.
 
         Raises
         ------
         BackendError
-            A machine cannot do any task, because of what it has or does not see.
+            If a machine cannot run any task.
         """
         refs = list(self._running)
         self._ray.wait(refs, num_returns=1, timeout=POLL_SECONDS)
         ready, _ = self._ray.wait(refs, num_returns=len(refs), timeout=0)
         for name, event in self._told():
             self._pass_on(name, event, on_event)
-        for ref, task in self._running.items():  # Ray begins a task without end that the memory is too small for
+        for ref, task in self._running.items():  # Ray restarts tasks without memory forever
             if ref not in ready and self._progress.get(task.name, TaskProgress()).begun > 1 + _retries(task):
                 self._ray.cancel(ref, force=True)
         ended = []
@@ -284,43 +284,43 @@ class OnCluster(Executor[AnyTask]):
             del self._running[ref]
             self._progress.pop(task.name, None)
             with contextlib.suppress(OSError):
-                os.listdir(task.record.parent)  # NFS looks again for what others wrote
+                os.listdir(task.record.parent)  # refreshes the cache of NFS
             if "reason" in outcome:
                 on_event(Notice(f"{task.name} failed: {outcome['reason']}"))
             ended.append((task, outcome["state"] == "failed"))
         return ended
 
     def _told(self) -> list[tuple[str, Event | Begun]]:
-        """Return what tasks have told since the last time."""
+        """Return the events of tasks since the last call."""
         size = self._queue.size()
         return list(self._queue.get_nowait_batch(size)) if size else []
 
     def _outcome(self, ref: Any, task: AnyTask) -> dict[str, Any]:
-        """Return what became of a task that Ray says has ended."""
+        """Return the outcome of a task that has ended."""
         try:
             return dict(self._ray.get(ref))
-        except Exception as error:  # its last machine is lost, too, or it could not be begun
+        except Exception as error:  # its last machine was lost, or it could not start
             kind = type(error).__name__
-            lost = "its process or its machine was lost again and again, or had no memory left"
+            lost = "its process or machine was lost repeatedly, or ran out of memory"
             words = " ".join(str(error).split())[-200:]
             reason = f"{lost} ({kind})" if kind in LOST else f"{kind}: {words}"
             task.write("failed", reason=reason, **task.facts())
             return task.outcome()
 
     def _pass_on(self, name: str, event: Event | Begun, on_event: OnEvent) -> None:
-        """Pass on what a task tells, with its name."""
+        """Pass on an event of a task, with the name of the task."""
         at = self._progress.setdefault(name, TaskProgress())
         if isinstance(event, Begun):
             if at.host:
-                on_event(Notice(f"{name}: its process or its machine ({at.host}) was lost; it goes on on {event.host}"))
+                on_event(Notice(f"{name}: its process or machine ({at.host}) was lost; it continues on {event.host}"))
             else:
-                on_event(Notice(f"{name} begins on {event.host}"))
+                on_event(Notice(f"{name} starts on {event.host}"))
             at.host, at.begun = event.host, at.begun + 1
         elif isinstance(event, Phase):
             at.phase, at.total, at.done = event.name, event.total, event.done
         elif isinstance(event, Step):
             at.done = event.done
-        elif isinstance(event, Notice) and not event.text.startswith(f"{name} failed: "):  # said when it has ended
+        elif isinstance(event, Notice) and not event.text.startswith(f"{name} failed: "):  # reported at the end
             on_event(Notice(f"{name}: {event.text}", event.detail))
         elif isinstance(event, StageScored):
             on_event(Notice(f"{name}: {event.line()}"))
@@ -328,11 +328,11 @@ class OnCluster(Executor[AnyTask]):
             on_event(event)
 
     def detail(self) -> str:
-        """Return how far each task is that has begun."""
+        """Return the progress of all started tasks."""
         return ", ".join(f"{name}{at.words()}" for name, at in self._progress.items() if at.host)
 
     def stop(self) -> None:
-        """Cancel what is running, first so that it can keep a checkpoint, and leave the cluster; once."""
+        """Cancel running tasks, first gently so that they save a checkpoint, and disconnect; only once."""
         if self._stopped:
             return
         self._stopped = True
@@ -340,7 +340,7 @@ class OnCluster(Executor[AnyTask]):
         try:
             for force in (False, True) if refs else ():
                 for ref in refs:
-                    with contextlib.suppress(Exception):  # one that has just ended
+                    with contextlib.suppress(Exception):  # it has just ended
                         self._ray.cancel(ref, force=force)
                 _, refs = self._ray.wait(refs, num_returns=len(refs), timeout=GOODBYE_SECONDS) if refs else ([], [])
                 if not refs:

@@ -1,4 +1,4 @@
-"""The scenes under a folder, the protocol of each, and the ground truth that lies beside them."""
+"""Captures below a folder, with their protocol and ground truth."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ class FoundScene:
     Attributes
     ----------
     name : str
-        Its folder's name.
+        Name of the folder.
     path : Path
     format : str
     protocol : Protocol
     downscale : int
-        What its protocol divides the image size by.
+        Factor by which the protocol shrinks images.
     data_set : str
-        By the paper's name; "other (PROTOCOL)" for captures that are no scene of a known data set.
+        Name in the paper; "other (PROTOCOL)" for captures that belong to no known data set.
     scene : str
-        The data set's name of it; the folder's for others.
+        Name in the data set, else of the folder.
     truth : Path or None
-        Ground truth to give to the evaluation; None: none, or what it finds itself.
+        Ground truth for the evaluation; None: none, or one that the evaluation finds.
     scored : bool
         Whether there is a ground truth.
     missing : tuple of str
-        One line for each piece of the capture, and of the ground truth, that a scene of a known data set lacks.
+        One line for each missing file of the capture or its ground truth, for known data sets.
     """
 
     name: str
@@ -74,7 +74,7 @@ def find_scenes(
     names : sequence of str
         Only these; "lego" also finds a folder "nerf_synthetic_lego".
     protocol : str
-        A name, or "auto": by data set and format of each capture.
+        Name, or "auto": by data set and format of each capture.
     truths : Path, optional
         Folder of ground truths: ``NAME.ply``, ``NAME.obj``, ``NAME/mesh_gt.ply``, or the official files of DTU and
         Tanks and Temples.
@@ -82,7 +82,7 @@ def find_scenes(
     Raises
     ------
     DataError, ProtocolError
-        No captures, or a name that is not there.
+        If there are no captures, or a name is unknown.
     """
     named = None if protocol == "auto" else get_protocol(protocol)
     if not data.is_dir():
@@ -105,7 +105,7 @@ def find_scenes(
 
 
 def _captures(folder: Path, depth: int) -> dict[str, Path]:
-    """Name -> folder of the captures at or below a folder; a capture's own folders are not searched."""
+    """Return the captures at or below a folder by name, without searching inside captures."""
     if _is_capture(folder):
         return {folder.resolve().name: folder}
     found: dict[str, Path] = {}
@@ -118,7 +118,7 @@ def _captures(folder: Path, depth: int) -> dict[str, Path]:
 
 
 def unreadable(folder: Path, depth: int = DEPTH) -> dict[str, str]:
-    """Name -> what is missing first, of folders that are scenes of known data sets but have no cameras."""
+    """Return the first missing file by name, for scenes of known data sets without cameras."""
     if _is_capture(folder):
         return {}
     lines = missing_lines(folder)
@@ -137,7 +137,7 @@ def _is_capture(folder: Path) -> bool:
 
 
 def _match(want: str, captures: dict[str, Path], data: Path, broken: dict[str, str]) -> str:
-    """Return the capture that a name means."""
+    """Return the name of the capture that a name stands for."""
     close = _named(want, list(captures))
     if len(close) != 1:
         why = "".join(f"; {name}: {broken[name]}" for name in _named(want, list(broken)))
@@ -146,7 +146,7 @@ def _match(want: str, captures: dict[str, Path], data: Path, broken: dict[str, s
 
 
 def _named(want: str, names: Sequence[str]) -> list[str]:
-    """Return the names that are, or else end in, what is wanted."""
+    """Return the names equal to ``want``, else those that end in it."""
     close = [name for name in names if name.lower() == want.lower()]
     return close or [name for name in names if name.lower().endswith(f"_{want.lower()}")]
 
@@ -156,7 +156,7 @@ def _look_at(name: str, path: Path, named: Protocol | None, truths: Path | None)
     protocol = named or protocol_of(path, kind, truths)
     known = recognise(path, truths)
     if known is not None and protocol.name not in {scene.protocol for scene in known[0].scenes}:
-        known = None  # a capture that only happens to have the name of a scene, or is treated as something else
+        known = None  # the name of a scene by coincidence, or another protocol was requested
     if known is None:
         data_set = f"other ({protocol.name})"
         truth = _plain_truth(name, path, truths)
@@ -174,7 +174,7 @@ def _look_at(name: str, path: Path, named: Protocol | None, truths: Path | None)
 def _truth_of(
     dataset: DataSet, facts: SceneFacts, name: str, path: Path, truths: Path | None
 ) -> tuple[Path | None, bool]:
-    """Return what to give to the evaluation of a scene of a known data set, and whether it will find a ground truth."""
+    """Return the ground truth for the evaluation of a scene, and whether there is any."""
     if dataset.evaluator in OFFICIAL:
         files, lacking = find_truth(dataset, facts, path, truths)
         if files and not lacking:
@@ -184,7 +184,7 @@ def _truth_of(
 
 
 def _plain_truth(name: str, capture: Path, folder: Path | None) -> Path | None:
-    """Return a mesh or a cloud of points, in a folder or beside the capture."""
+    """Return a true mesh or point cloud in a folder or beside the capture."""
     candidates = [capture / file for file in MESH_TRUTHS]
     if folder is not None:
         own = [folder / f"{name}.ply", folder / f"{name}.obj", *(folder / name / file for file in MESH_TRUTHS)]
@@ -193,7 +193,7 @@ def _plain_truth(name: str, capture: Path, folder: Path | None) -> Path | None:
 
 
 def missing_scenes(scenes: Sequence[FoundScene]) -> dict[str, tuple[list[str], int]]:
-    """Return data set -> (scenes that were not given, how many it has), for the data sets of which some were given."""
+    """Return the missing scenes and the number of scenes of each data set of which some are present."""
     found: dict[str, tuple[list[str], int]] = {}
     for key, data_set in PAPER_NAMES.items():
         have = {scene.scene for scene in scenes if scene.data_set == data_set}

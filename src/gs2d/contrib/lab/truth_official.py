@@ -1,4 +1,4 @@
-"""Meshes of DTU and Tanks and Temples against their official ground truth: what goes into ``metrics.json``."""
+"""Evaluators of meshes against the official ground truth of DTU and of Tanks and Temples."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class OfficialTruth:
     ----------
     facts : SceneFacts
     files : mapping of str to Path
-        Keys as ``gs2d.contrib.lab.dataset_folders`` names them.
+        By kind, as of ``gs2d.contrib.lab.dataset_folders.find_truth``.
     """
 
     facts: SceneFacts
@@ -45,7 +45,7 @@ def find_official(name: str, capture: Path, given: Path | None, tell: Callable[[
     Raises
     ------
     DataError
-        If the folder ``given`` holds not all files of this scene; names each missing file.
+        If the folder ``given`` lacks files of this scene.
     """
     known = None if given is not None and not given.is_dir() else recognise(capture, given)
     if known is None or known[0].evaluator != name:
@@ -145,7 +145,7 @@ class TanksAndTemplesEvaluator:
 
 
 def _silhouettes(scene: Scene) -> list[ViewSilhouette]:
-    """Return the mask files at their full size; where there are none, the views' own silhouettes."""
+    """Return the mask files at full size, else the silhouettes of the views."""
     found = dtu_silhouettes(scene.root) if scene.root is not None else ()
     if found:
         return [ViewSilhouette(view.camera, read_mask(view.path)) for view in found]
@@ -163,5 +163,5 @@ def _alignment(alignment: Alignment) -> dict[str, Any]:
 
 
 def _written(folder: Path, names: Mapping[str, str]) -> dict[str, str]:
-    """Names relative to the run."""
+    """Return names relative to the run."""
     return {what: f"{folder.name}/{name}" for what, name in names.items()}
