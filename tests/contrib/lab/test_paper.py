@@ -189,7 +189,7 @@ def test_what_is_done_is_not_done_again(
     said = capsys.readouterr()
     assert json.loads(said.out)["rows"][0]["name"] == "(I)"
     assert said.err.splitlines()[-1].startswith(
-        "error: 4 of the runs failed, the table is written without what they lack: broken-2dgs"
+        "error: 4 of the runs failed; the table lacks their figures: broken-2dgs"
     )
 
 

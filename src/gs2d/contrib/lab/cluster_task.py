@@ -1,4 +1,4 @@
-"""One task in a process of a cluster: what it waits for, what it tells, what is returned of it."""
+"""Runs a task in a process of a cluster: waits for files, sends events, returns the outcome."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from gs2d.contrib.lab.tasks import Task, do
 from gs2d.core.locks import try_lock
 from gs2d.training.events import Event, Notice, NotMade, Phase, StageScored, Step
 
-WAIT_SECONDS = 90.0  # a shared disk may show a new file, and give the lock of a dead machine back, a minute late
-STEP_SECONDS = 1.0  # between two steps that are told
+WAIT_SECONDS = 90.0  # a shared disk may show files and release locks a minute late
+STEP_SECONDS = 1.0  # between two step events
 
 
 @dataclass(frozen=True)
 class Begun:
-    """A process on a machine begins a task; a second one of the same task: the first was lost."""
+    """A task starts in a process on a machine; sent again if the first process was lost."""
 
     host: str
 
 
 def token_file(folder: Path, token: str) -> Path:
-    """Return the file by which a machine shows that it sees the folder of the list."""
+    """Return the file by which a machine checks that it sees the output folder."""
     return folder / "jobs" / f"{token}.token"
 
 
 def do_order(order: dict[str, Any], queue: Any, host: str) -> dict[str, Any]:
-    """Do a task; see ``do_on_worker``."""
+    """Run a task; see ``do_on_worker``."""
     folder = Path(order["folder"])
     if not token_file(folder, order["token"]).exists():
         return {
@@ -44,17 +44,17 @@ def do_order(order: dict[str, Any], queue: Any, host: str) -> dict[str, Any]:
     tell.send(Begun(host))
     lock = task.record.with_suffix(".lock")
     with open(lock, "a+b") as file:
-        # Of a machine that is only cut off the process may work for a while yet.
+        # A process of a disconnected machine may still be working.
         if not _within(WAIT_SECONDS, lambda: try_lock(file.fileno())):
             return {"state": "failed", "reason": f"another process of the cluster still works on it (it holds {lock})"}
         _within(WAIT_SECONDS, lambda: all(path.exists() for path in task.inputs))  # what is missing says the task
-        if not task.is_done():  # by a process whose machine was lost before it could say so
+        if not task.is_done():  # recorded by a process whose machine was lost
             do(task, tell)
         return {"state": "done"} | task.outcome()
 
 
 def _within(seconds: float, is_so: Callable[[], bool]) -> bool:
-    """Whether something becomes true in time."""
+    """Return whether a condition becomes true in time."""
     end = time.monotonic() + seconds
     while not is_so():
         if time.monotonic() >= end:
@@ -65,7 +65,7 @@ def _within(seconds: float, is_so: Callable[[], bool]) -> bool:
 
 @dataclass
 class Told:
-    """Listens to a task and passes on what the driver shows: steps once a second, all else at once."""
+    """Passes on the events of a task: steps once a second, others at once."""
 
     name: str
     queue: Any
@@ -83,6 +83,6 @@ class Told:
             self.send(replace(event, error=None))  # which need not survive the way
 
     def send(self, event: Event | Begun) -> None:
-        """Send an event; where nobody listens any more, the task is none the worse."""
+        """Send an event; errors are ignored, so that the task continues."""
         with contextlib.suppress(Exception):
             self.queue.put_nowait((self.name, event))

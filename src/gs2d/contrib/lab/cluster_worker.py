@@ -1,7 +1,7 @@
-"""What a machine of a cluster is sent: a function that does one task there, if it can.
+"""The function that runs a task on a machine of a cluster.
 
-It is sent by value, so that it runs where gs2d is missing or another one, too, and says so. Hence no import of gs2d at
-the top, and no name of this module's that is not in ``do_on_worker``.
+It is sent by value, so that it can report a missing or different gs2d. Therefore the module does not import gs2d at the
+top, and ``do_on_worker`` uses no other name of the module.
 """
 
 from __future__ import annotations
@@ -10,20 +10,20 @@ from typing import Any
 
 
 def do_on_worker(order: dict[str, Any], queue: Any) -> dict[str, Any]:
-    """Do a task in this process of a cluster.
+    """Run a task in this process of a cluster.
 
     Parameters
     ----------
     order : dict
-        ``name``; ``task``, pickled; ``version`` of the driver; ``folder``, ``token`` of its list;
-        ``cwd``, where paths begin.
+        ``name``; ``task``, pickled; ``version`` of the driver; ``folder``, ``token`` of the
+        output; ``cwd``, the base of relative paths.
     queue : ray.util.queue.Queue
         Takes (name, event).
 
     Returns
     -------
     dict
-        ``state`` as in the record of the task, with its ``reason``; or ``refused``, and why: nothing can be done here.
+        ``state`` of the record of the task, with its ``reason``; or "refused" with a reason if no task can run here.
     """
     import contextlib
     import os

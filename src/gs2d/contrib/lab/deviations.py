@@ -1,4 +1,4 @@
-"""In what a table differs from the paper's, or what else to know about its figures, in sentences."""
+"""Sentences on differences between a table and that of the paper, and on its figures."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ OFFICIAL_EVALUATORS = {DTU: "dtu", TNT: "tnt"}  # of the paper's surfaces, by da
 def deviations_of(
     options: TableOptions, scenes: Sequence[FoundScene], table: PaperTable, results: Results
 ) -> list[str]:
-    """Every difference that is known, the most important first."""
+    """Return the known differences, the most important first."""
     found = []
     if options.schedule_scale != 1.0:
         found.append(f"the schedule is {options.schedule_scale:g} of the paper's (30k + 10k + 20k iterations)")
@@ -65,14 +65,14 @@ def deviations_of(
 
 
 def opacity_resets(scale: float) -> int:
-    """How often stage 1 resets opacity at this part of the schedule, over a black background."""
+    """Return the number of opacity resets of stage 1 at a fraction of the schedule, over black."""
     stage = scale_schedule(get_recipe("2dgs"), scale).stages[0]
     assert isinstance(stage.densify, GradDensify)
     return sum(stage.densify.resets(i, white=False) for i in range(1, stage.iterations + 1))
 
 
 def _methods(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
-    """Yield what the paper leaves open in the recipes of a table, and where gs2d knowingly does otherwise."""
+    """Yield details that the paper leaves open, and intended differences of gs2d."""
     yield (
         "the rasterizer is gs2d's own and departs from the official one in pixel centres, footprint, and depth where "
         "the low-pass filter wins: docs/notebook/rasterizer.md"
@@ -106,7 +106,7 @@ def _methods(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
 
 
 def _weights(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
-    """Scenes whose protocol weighs distortion otherwise than the paper's "100/10", in tables with such rows."""
+    """Yield scenes whose protocol has another weight of distortion than the paper's "100/10"."""
     if not any("100/10" in row.name for row in table.rows):
         return
     weighed = [(s.name, s.protocol.loss_weights["distortion"]) for s in scenes if s.data_set != TNT]
@@ -116,9 +116,9 @@ def _weights(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
 
 
 def _surfaces(results: Results) -> Iterator[str]:
-    """Surfaces not scored as the paper's were, what was odd, and scores that their own check does not believe."""
+    """Yield surfaces with another protocol than in the paper, and warnings of their self-checks."""
     doubts: dict[tuple[str, str], list[str]] = {}
-    odd: dict[str, Sequence[str]] = {}  # of each scene once: its rows differ in a digit of it
+    odd: dict[str, Sequence[str]] = {}  # once per scene
     for row in results.rows:
         for cell in row.cells:
             surface = cell.details.get("surface") or {}
@@ -141,7 +141,7 @@ def _surfaces(results: Results) -> Iterator[str]:
 
 
 def _scenes(options: TableOptions, scenes: Sequence[FoundScene], table: PaperTable) -> Iterator[str]:
-    """Other photographs, other scenes, pieces of them that are missing."""
+    """Return differences in images and scenes, and missing files."""
     if table.of_paper:
         yield from _other_scenes(scenes, table)
     for scene in scenes:
@@ -163,7 +163,7 @@ def _scenes(options: TableOptions, scenes: Sequence[FoundScene], table: PaperTab
 
 
 def _other_scenes(scenes: Sequence[FoundScene], table: PaperTable) -> Iterator[str]:
-    """Scenes that are not the paper's, and those of its data sets that are not here."""
+    """Yield scenes that are not in the paper, and missing scenes of its data sets."""
     for data_set in dict.fromkeys(scene.data_set for scene in scenes):
         if data_set not in table.columns:
             names = ", ".join(scene.name for scene in scenes if scene.data_set == data_set)
@@ -182,7 +182,7 @@ def _size(scene: FoundScene) -> tuple[int, int] | None:
 
 
 def _missing_figures(results: Results) -> list[str]:
-    """Return runs that failed or are not there yet, and figures that nothing has."""
+    """Return failed and missing runs, and figures without any value."""
     found: list[str] = []
     waiting, failed = 0, dict[tuple[str, str], list[str]]()
     for row in results.rows:

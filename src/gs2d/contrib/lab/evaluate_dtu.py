@@ -34,7 +34,7 @@ from gs2d.io.meshes import read_points
 # -- files -------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class DtuTruth:
-    """What a mesh of one scan is compared with, in mm.
+    """Ground truth of one scan, in mm.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class DtuTruth:
     plane: np.ndarray
 
     def is_observed(self, points: np.ndarray) -> np.ndarray:
-        """Which points [P, 3] lie in an observed cell, bool [P] (the nearest cell centre, ties to even)."""
+        """Return which points [P, 3] lie in an observed cell, bool [P] (nearest cell centre, ties to even)."""
         cell = np.around((points - self.bounds[0]) / self.resolution).astype(np.int64)
         inside = ((cell >= 0) & (cell < self.observed.shape)).all(axis=1)
         inside[inside] = self.observed[tuple(cell[inside].T)]
@@ -76,7 +76,7 @@ def read_dtu_truth(scan: int, files: Mapping[str, Path]) -> DtuTruth:
     Raises
     ------
     DataError
-        A file is missing or broken; names it.
+        If a file is missing or broken.
     """
     mask = _matrices(files["mask"], ("ObsMask", "BB", "Res"))
     observed, bounds = np.asarray(mask["ObsMask"]), np.asarray(mask["BB"], np.float64)
@@ -130,7 +130,7 @@ _TRIANGLES = 200_000  # triangles sampled at a time
 
 @dataclass(frozen=True, eq=False)
 class ViewSilhouette:
-    """A camera and where the object is in its image, bool [H, W]; the scene's frame."""
+    """A camera in the frame of the scene, and the silhouette of the object, bool [H, W]."""
 
     camera: Camera
     mask: np.ndarray
@@ -138,22 +138,22 @@ class ViewSilhouette:
 
 @dataclass(frozen=True, eq=False)
 class DtuScore:
-    """The score of one scan, mm. None, with ``reason``, where there was nothing to measure.
+    """The score of one scan, mm; None, with ``reason``, if nothing could be measured.
 
     Attributes
     ----------
     accuracy, completeness, chamfer : float or None
         Mean distance from the reconstruction to the scan (d2s), from the scan to the reconstruction (s2d), their mean.
     mesh_points, truth_points : int
-        Points that were compared.
+        Number of compared points.
     dropped_mesh, dropped_truth : float
-        Part of them that was ``max_distance`` away or more.
+        Fraction at ``max_distance`` or more.
     culled : float
-        Part of the mesh's vertices outside some silhouette.
+        Fraction of the vertices outside a silhouette.
     ok : bool
-        The self-check: whether reconstruction and scan lie in one place.
+        Self-check: whether reconstruction and scan coincide.
     messages : tuple of str
-        What is odd, one line each.
+        Warnings, one line each.
     clouds : ScoredClouds
     reason : str or None
     """
@@ -182,16 +182,16 @@ def evaluate_dtu(
     seed: int = 0,
     workers: int | None = None,
 ) -> DtuScore:
-    """Score a mesh in the scene's frame.
+    """Score a mesh in the frame of the scene.
 
     Parameters
     ----------
     silhouettes : sequence of ViewSilhouette
-        Of all views; empty: nothing is culled.
+        Silhouettes of all views; (): nothing is culled.
     T_metric_scene : ndarray [4, 4]
         scale_mat: from the scene to mm.
     workers : int, optional
-        Threads that look for nearest points; default: all.
+        Threads of the search for nearest points; default: all.
     """
     similarity_scale(T_metric_scene, "T_metric_scene")
     keep = inside_silhouettes(mesh.vertices.astype(np.float64), silhouettes, protocol)
@@ -205,14 +205,14 @@ def evaluate_dtu(
 
 
 def _touching(mesh: Mesh, low: np.ndarray, high: np.ndarray) -> Mesh:
-    """Return the faces whose boxes touch a box: what lies wholly outside it would be sampled for nothing."""
+    """Return the faces whose bounding boxes touch a box; the others need no samples."""
     corners = mesh.vertices[mesh.faces]
     touch = (corners.max(axis=1) >= low).all(axis=1) & (corners.min(axis=1) < high).all(axis=1)
     return Mesh(mesh.vertices, mesh.faces[touch])
 
 
 def _score(points: np.ndarray, truth: DtuTruth, culled: float, protocol: DtuSurface, workers: int | None) -> DtuScore:
-    """Distances both ways between the thinned points inside the box, and the scan."""
+    """Return the score of distances between the thinned points inside the box and the scan."""
     observed = points[truth.is_observed(points)]
     above = truth.above_plane()
     limit = protocol.max_distance
@@ -260,7 +260,7 @@ def _score(points: np.ndarray, truth: DtuTruth, culled: float, protocol: DtuSurf
 def inside_silhouettes(
     vertices: np.ndarray, silhouettes: Sequence[ViewSilhouette], protocol: DtuSurface = DTU_SURFACE
 ) -> np.ndarray:
-    """Which vertices [P, 3] are, in every view, inside the widened silhouette or outside the image; bool [P]."""
+    """Return which vertices [P, 3] are inside the widened silhouette, or outside the image, in every view; bool [P]."""
     keep = np.ones(len(vertices), bool)
     for view in silhouettes:
         height, width = view.mask.shape
@@ -278,7 +278,7 @@ def inside_silhouettes(
 
 
 def mesh_points(mesh: Mesh, density: float, *, vertices: np.ndarray | None = None) -> np.ndarray:
-    """Points [P, 3] on a mesh in a skew grid on every triangle, about one in each density^2; and its vertices.
+    """Return points [P, 3] on a mesh: a skew grid on each triangle, about one per density^2, and the vertices.
 
     A triangle with edges of length l1, l2 from its first corner and twice the area a2 gets a grid of floor(l1 / t) by
     floor(l2 / t) steps, t = density sqrt(l1 l2 / a2), of which the points at half steps inside the triangle count.
@@ -304,17 +304,16 @@ def mesh_points(mesh: Mesh, density: float, *, vertices: np.ndarray | None = Non
 
 
 def _half_steps(n1: int, n2: int) -> np.ndarray:
-    """Barycentric (u, v) of the half steps of a grid inside the triangle u + v < 1."""
+    """Return barycentric (u, v) of the half steps of a grid inside the triangle u + v < 1."""
     u, v = np.meshgrid((np.arange(n1 + 1) + 0.5) / max(n1, 1e-7), (np.arange(n2 + 1) + 0.5) / max(n2, 1e-7))
     return np.stack([u, v], axis=-1).reshape(-1, 2)[(u + v < 1).ravel()]
 
 
 def thin(points: np.ndarray, radius: float, *, seed: int = 0, slab_size: int = _SLAB) -> np.ndarray:
-    """Choose points of which no two are within ``radius``, so that each one left out is within it of one that is kept.
+    """Thin points to a minimum distance ``radius``; every dropped point is within it of a kept one.
 
     Points are taken greedily: slab by slab along the longest axis, in an order shuffled from the seed within a slab.
-    Within a slab all points that come before their neighbours are taken at once, again and again: the same set as one
-    by one.
+    Within a slab, all points that precede their neighbours are taken at once, repeatedly, which gives the same set.
     """
     if not len(points):
         return points
@@ -327,7 +326,7 @@ def thin(points: np.ndarray, radius: float, *, seed: int = 0, slab_size: int = _
         reach = slab[0, axis] - radius
         slab = slab[rng.permutation(len(slab))]
         near = [part[part[:, axis] >= reach] for part in kept if part[:, axis].max() >= reach]
-        if near:  # what is taken already, as far as it reaches into this slab
+        if near:  # points of earlier slabs that reach into this one
             gap, _ = cKDTree(np.concatenate(near)).query(slab, distance_upper_bound=np.nextafter(radius, np.inf))
             slab = slab[~(gap <= radius)]
         if len(slab):
@@ -336,7 +335,7 @@ def thin(points: np.ndarray, radius: float, *, seed: int = 0, slab_size: int = _
 
 
 def _first_of_neighbours(points: np.ndarray, radius: float) -> np.ndarray:
-    """Which points a greedy choice in their order takes, bool [P]."""
+    """Return which points a greedy choice in their order takes, bool [P]."""
     taken = np.zeros(len(points), bool)
     if not len(points):
         return taken

@@ -7,7 +7,7 @@
 3. Three stages of iterative closest points with scale, both clouds cut to the crop volume.
 4. Both clouds cut and thinned to tau / 2; precision and recall are the parts nearer than tau.
 
-The self-check says whether the alignment can be believed; a wrong log or transform gives a low score, not an error.
+A self-check tests the alignment: a wrong log or transform gives a low score, not an error.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ from gs2d.evaluation.surface_score import ScoredClouds
 from gs2d.io.meshes import read_points
 
 # -- the crop volume ---------------------------------------------------------------------------------------------------
-_PLANES = {0: (1, 2), 1: (0, 2), 2: (0, 1)}  # the two axes of the polygon, by the axis it is drawn out along
+_PLANES = {0: (1, 2), 1: (0, 2), 2: (0, 1)}  # axes of the polygon, by extrusion axis
 _CHUNK = 1 << 21
 
 
 @dataclass(frozen=True, eq=False)
 class CropVolume:
-    """What counts, in the frame of the ground truth.
+    """The scored volume, in the frame of the ground truth.
 
     Attributes
     ----------
     axis : int
-        0, 1 or 2: the axis that the polygon is drawn out along.
+        0, 1 or 2: the axis along which the polygon is extruded.
     low, high : float
         Range along it, both ends included.
     polygon : ndarray [n, 2]
@@ -64,7 +64,7 @@ class CropVolume:
     polygon: np.ndarray
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Which points [P, 3] lie inside, bool [P]."""
+        """Return which points [P, 3] lie inside, bool [P]."""
         check_shapes({"points": (points, "P 3")})
         u, v = _PLANES[self.axis]
         inside = (points[:, self.axis] >= self.low) & (points[:, self.axis] <= self.high)
@@ -79,7 +79,7 @@ class CropVolume:
         return np.asarray(points[self.contains(points)])
 
     def _in_polygon(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Whether an odd number of edges is crossed on the way from (u, v) to u = -infinity."""
+        """Return whether a ray from (u, v) to u = -infinity crosses an odd number of edges."""
         odd = np.zeros(len(u), bool)
         for (u0, v0), (u1, v1) in zip(self.polygon, np.roll(self.polygon, -1, axis=0), strict=True):
             crosses = (v0 < v) != (v1 < v)
@@ -117,7 +117,7 @@ def read_crop(path: Path) -> CropVolume:
 # -- files -------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class TntTruth:
-    """What a mesh of one scene is compared with.
+    """Ground truth of one scene.
 
     Attributes
     ----------
@@ -145,7 +145,7 @@ def read_tnt_truth(scene: str, files: Mapping[str, Path]) -> TntTruth:
     Raises
     ------
     DataError
-        A file is missing or broken; names it.
+        If a file is missing or broken.
     """
     points = np.asarray(read_points(files["scan"]).points)
     crop = read_crop(files["crop"])
@@ -166,7 +166,7 @@ def read_transform(path: Path) -> np.ndarray:
 
 
 def read_trajectory(path: Path) -> np.ndarray:
-    """Camera-to-world matrices [n, 4, 4] of a ``.log`` file: a line of three whole numbers, then the matrix, each."""
+    """Return the camera-to-world matrices [n, 4, 4] of a ``.log`` file: three integers, then a matrix, each."""
     rows = _number_rows(path)
     if not rows or len(rows) % 5 or any(len(row) != (3 if i % 5 == 0 else 4) for i, row in enumerate(rows)):
         raise DataError(
@@ -190,15 +190,15 @@ def _number_rows(path: Path) -> list[list[float]]:
 
 
 def match_cameras(names: Sequence[str], count: int, where: str = "the log") -> tuple[np.ndarray, np.ndarray]:
-    """Which of the named photographs belong to which of ``count`` entries of a log: indices [m], [m].
+    """Match photographs with the ``count`` entries of a log; return both indices [m], [m].
 
-    As many as entries: in order of their names (``frame_2`` before ``frame_10``). Else by the number in the name, the
-    first photograph being 1 (``000001.jpg``) as Tanks and Temples counts, or 0 if there is a number 0.
+    Equal numbers are matched in natural order of names (``frame_2`` before ``frame_10``); else by the number in the
+    name, starting at 1 (``000001.jpg``) as in Tanks and Temples, or at 0 if that number occurs.
 
     Raises
     ------
     DataError
-        Neither is possible.
+        If neither is possible.
     """
     order = np.array(sorted(range(len(names)), key=lambda i: natural_key(names[i])), np.int64)
     if len(names) == count:
@@ -221,7 +221,7 @@ def match_cameras(names: Sequence[str], count: int, where: str = "the log") -> t
 # -- the score ---------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class StageReport:
-    """One stage of the alignment: distances in m; None where nothing was paired."""
+    """One stage of the alignment: distances in m; None without pairs."""
 
     voxel: float | None
     threshold: float
@@ -240,23 +240,23 @@ class Alignment:
     Attributes
     ----------
     ok : bool
-        Whether the score can be believed.
+        Whether the alignment passed.
     messages : tuple of str
-        What is odd, one line each.
+        Warnings, one line each.
     cameras : int
-        Cameras that were matched with the log.
+        Number of cameras matched with the log.
     camera_fraction : float
-        Part of them that agree within the protocol's threshold.
+        Fraction of these within the threshold of the protocol.
     camera_rms, camera_worst : float
-        m, of those.
+        m, of these.
     scale : float
-        From the capture to the scan, in the end.
+        Final scale from capture to scan.
     shift : float or None
-        How far the stages moved the mesh, rms, in tau.
+        rms distance by which the stages moved the mesh, tau.
     shift_scale, shift_degrees : float
-        By how much they changed its size, and turned it.
+        Change of scale and rotation by the stages.
     transform_alone : float or None
-        tau. How far off the mesh would be (rms) had ``_trans.txt`` alone been used.
+        tau. rms error of the mesh with ``_trans.txt`` alone.
     stages : tuple of StageReport
     T_truth_mesh : ndarray [4, 4]
     """
@@ -278,7 +278,7 @@ class Alignment:
 
 @dataclass(frozen=True, eq=False)
 class TntScore:
-    """The score of one scene; distances in m. None, with ``reason``, where there was nothing to measure.
+    """The score of one scene, in m; None, with ``reason``, if nothing could be measured.
 
     Attributes
     ----------
@@ -287,7 +287,7 @@ class TntScore:
     accuracy, completeness, chamfer : float or None
         Mean distance from the reconstruction to the scan, back, and the mean of the two (not part of the protocol).
     mesh_points, truth_points : int
-        Points that were scored.
+        Number of scored points.
     alignment : Alignment
     clouds : ScoredClouds
         The scored points with their distances.
@@ -325,14 +325,14 @@ def evaluate_tnt(
     mesh : Mesh
         In the capture's frame.
     names : sequence of str
-        Of all photographs of the capture.
+        Names of all photographs of the capture.
     centers : ndarray [n, 3]
         Their camera centres, in the capture's frame.
     truth : TntTruth
     tau : float
         m.
     published : ndarray [m, 4, 4], optional
-        The log that came with the photographs: checked against the cameras, never used.
+        The log beside the photographs, which is only compared with the cameras.
 
     Raises
     ------
@@ -401,7 +401,7 @@ def _stage(
     tau: float,
     protocol: TntSurface,
 ) -> tuple[IcpResult, StageReport]:
-    """One stage on the cropped and thinned clouds."""
+    """Run one stage on the cropped and thinned clouds."""
     moved = truth.crop.apply(apply(T, source))
     if stage.voxel is None:
         thin_source = uniform_downsample(moved, protocol.max_points)
@@ -442,7 +442,7 @@ def _check(
 ) -> Alignment:
     """Return the alignment with the result of its self-check."""
     change = T @ np.linalg.inv(fit.T_target_source)
-    shift = _rms_between(moved, np.linalg.inv(change), tau)  # where they are now against where they were
+    shift = _rms_between(moved, np.linalg.inv(change), tau)  # against the start of the stages
     alone = _rms_between(moved, truth.T_truth_log @ np.linalg.inv(T), tau)
     scale = similarity_scale(change)
     log, transform = f"{truth.scene}_COLMAP_SfM.log", f"{truth.scene}_trans.txt"
@@ -501,7 +501,7 @@ def _score(
     alignment: Alignment,
     protocol: TntSurface,
 ) -> TntScore:
-    """Precision, recall and F of the cropped clouds."""
+    """Return precision, recall and F-score of the cropped clouds."""
     ours = voxel_downsample(moved, protocol.score_voxel * tau)
     theirs = voxel_downsample(target, protocol.score_voxel * tau)
     if not len(theirs):
@@ -530,5 +530,5 @@ def _score(
 
 
 def f_score(precision: float, recall: float) -> float:
-    """Harmonic mean, 0 where both are."""
+    """Return the harmonic mean; 0 if both values are 0."""
     return 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0

@@ -1,4 +1,4 @@
-"""The paper's figures from finished runs: K_a and opacity with and without NC, attribute traces, E_i maps."""
+"""Draws the figures of the paper from finished runs: K_a and opacity, traces of attributes, E_i maps."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ CHANGES = (
     Panel("change/sh", "SHs: change an iteration, norm of all coefficients", log=True, smooth=True),
 )
 MAP_PERCENTILES = (50.0, 99.9)  # of E_i: the ends of the colour scale, which is logarithmic
-SMALLEST_TOP = 0.01  # of a pixel: less than this is not worth a colour
+SMALLEST_TOP = 0.01  # least coverage of a coloured pixel
 DEFAULT_RANK = RANK_BY_ERROR  # of runs whose recipe ranks nothing
 
 
@@ -61,8 +61,8 @@ def write_figures(
 
     ``traces.svg``: mean K_a and mean opacity over the iterations, a line for each run. ``changes.svg``: how much mu,
     Sigma, alpha and SHs change an iteration. ``errors-LABEL.png``: for a few views the photograph, the rendering, its
-    error, E_i splatted, and the high-error splats. A figure that the runs have no data for, or whose capture cannot be
-    read, is left out with a notice.
+    error, E_i splatted, and the high-error splats. A figure without data, or whose capture cannot be
+    read, is omitted with a notice.
 
     Parameters
     ----------
@@ -110,9 +110,9 @@ def write_figures(
 
 
 def coverage(runs: Mapping[str, Path]) -> dict[str, tuple[float, ...]]:
-    """Mean K_a and opacity of each run after its first stage, then both at its end: the numbers of the paper's figure.
+    """Return mean K_a and opacity of each run after its first stage, and both at its end.
 
-    Runs whose log does not hold them are left out.
+    Runs without these numbers in their log are omitted.
     """
     found = {}
     for label, path in runs.items():
@@ -125,7 +125,7 @@ def coverage(runs: Mapping[str, Path]) -> dict[str, tuple[float, ...]]:
 
 
 def _value_at(iterations: np.ndarray, values: np.ndarray, end: int) -> float:
-    """Return the last value that was logged up to an iteration."""
+    """Return the last logged value up to an iteration."""
     return float(values[max(0, int((iterations <= end).sum()) - 1)])
 
 
@@ -142,14 +142,14 @@ class Ranking:
     Attributes
     ----------
     splats : Splats
-        As they were when the recipe ranked them, if that checkpoint is still there (in the run, or where the stage was
-        taken from); else after the stage that they were ranked for; else the final ones.
+        Splats when the recipe ranked them, if that checkpoint exists (in the run, or in the source of the stage); else
+        after the stage for which they were ranked; else the final splats.
     errors : Tensor [N] float64
         E_i over all training views.
     worst : Tensor [N] bool
         The high-error splats.
     when : str
-        Which splats these are, in words.
+        Time of these splats, in words.
     """
 
     splats: Splats
@@ -159,12 +159,12 @@ class Ranking:
 
 
 def rank_run(run: RunFolder, loaded: LoadedRun, on_event: OnEvent = ignore) -> Ranking:
-    """E_i (paper Eq. 8) of the splats that the recipe ranked, summed over all training views.
+    """Return E_i (paper Eq. 8) of the ranked splats, summed over all training views.
 
     Raises
     ------
     RunError
-        The run is not finished, or its checkpoint is broken.
+        If the run is not finished, or its checkpoint is broken.
     """
     index, action = _first_ranking(loaded.recipe)
     splats, group, when = _ranked(run, loaded, index, action)
@@ -174,7 +174,7 @@ def rank_run(run: RunFolder, loaded: LoadedRun, on_event: OnEvent = ignore) -> R
     views = loaded.scene.train
     for view in counted(views, "errors of each splat", len(views), on_event):
         seen, settings = splats, loaded.settings
-        if view.appearance:  # that of the end: after stage 1 it hardly changes
+        if view.appearance:  # at the end, as it hardly changes after stage 1
             numbers = numbers_of(view, splats.means)
             seen = shown_splats(splats, view.camera, numbers, settings.sh_degree)
             settings = replace(settings, sh_degree=0)
@@ -197,20 +197,20 @@ def rank_run(run: RunFolder, loaded: LoadedRun, on_event: OnEvent = ignore) -> R
 
 
 def _ranked(run: RunFolder, loaded: LoadedRun, index: int, action: Action) -> tuple[Splats, Tensor | None, str]:
-    """Return the splats nearest to those that stage ``index`` ranked, the group it found if known, and when."""
+    """Return the splats nearest to those that stage ``index`` ranked, their group if known, and the time."""
     stages = loaded.recipe.stages
     before = stage_end(run, loaded, index - 1) if index else None
     if before is not None:
         return before.splats, None, f"after {stages[index - 1].name}"
     own = [c.path for c in run.checkpoints() if (c.stage_index, c.iteration) == (index, None)]
-    if own and stages[index].on_enter == (action,):  # nothing was cloned since: the same splats in the same places
+    if own and stages[index].on_enter == (action,):  # without clones since: the same rows
         state = TrainState.from_state_dict(load_tensors(own[0])["state"])
         return state.splats, state.groups.get(str(action.writes)), f"after {stages[index].name}"
     return finished_splats(run), None, "final splats"
 
 
 def _first_ranking(recipe: Recipe) -> tuple[int, Action]:
-    """Return the stage that first ranks, and how; (0, default) where none does."""
+    """Return the first stage that ranks, and its action; (0, default) without one."""
     for index, stage in enumerate(recipe.stages):
         for action in stage.on_enter:
             if action.name == "rank_by_error":
@@ -219,7 +219,7 @@ def _first_ranking(recipe: Recipe) -> tuple[int, Action]:
 
 
 def map_limits(errors: Tensor) -> tuple[float, float]:
-    """E_i at the ends of the colour scale: the median and the 99.9th percentile of those above 0."""
+    """Return E_i at the ends of the colour scale: median and 99.9th percentile of values above 0."""
     seen = errors[errors > 0].cpu().numpy()
     if not len(seen):
         return 1.0, 10.0
@@ -228,13 +228,13 @@ def map_limits(errors: Tensor) -> tuple[float, float]:
 
 
 def error_positions(errors: Tensor, limits: tuple[float, float]) -> Tensor:
-    """Where each E_i stands on the logarithmic scale between the limits, [N] in [0, 1]."""
+    """Return the position [N] of each E_i on the logarithmic scale, in [0, 1]."""
     low, high = limits
     return ((errors.clamp(min=1e-300) / low).log() / np.log(high / low)).clamp(0, 1)
 
 
 def map_image(splats: Splats, positions: Tensor, view: View, loaded: LoadedRun, alpha: np.ndarray) -> np.ndarray:
-    """E_i splatted: each pixel has the colour of the mean position of its splats, over white; [H, W, 3]."""
+    """Return an image [H, W, 3] of E_i: the colour of the mean position of the splats of a pixel, over white."""
     weighted = splatted(splats, positions, view, loaded.settings, loaded.backend)
     steps = error_scale(256)
     where = np.clip(weighted / np.maximum(alpha, 1e-6), 0, 1)
@@ -254,7 +254,7 @@ def draw_error_maps(
     fractions = [splatted(ranking.splats, ranking.worst, v, loaded.settings, loaded.backend) for _, v in shown]
     top = max(
         SMALLEST_TOP, *(float(np.percentile(fraction, 99.9)) for fraction in fractions)
-    )  # these splats are often faint
+    )  # as these splats are often faint
     rows: list[tuple[str, list[np.ndarray]]] = []
     for (split, view), fraction in zip(shown, fractions, strict=True):
         output = render_view(ranking.splats, view, loaded.settings, loaded.backend)
@@ -290,7 +290,7 @@ COLUMNS = (
 def _write_grid(
     path: Path, rows: Sequence[tuple[str, Sequence[np.ndarray]]], head: str, limits: tuple[float, float], top: float
 ) -> None:
-    """Pictures in rows under their names, with the scale of E_i; high-error splats have full colour at ``top``."""
+    """Return images in rows under their names, with the scale of E_i."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, LogNorm

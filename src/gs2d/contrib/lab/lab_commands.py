@@ -1,4 +1,4 @@
-"""The commands of the lab: blocks, paper and sweep. No torch: `--help` is instant."""
+"""The commands blocks, paper and sweep. Imports no torch, so that `--help` is instant."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from gs2d.contrib.lab.lab_options import BlocksOptions, PaperOptions, SweepOptio
 _ACTIONS = "gs2d.contrib.lab.show_table"
 
 
-def _going_on(options: TableOptions, words: Sequence[str]) -> str:
-    return f"; go on with: gs2d {shlex.join(words)}" if options.train else ""
+def _continued(options: TableOptions, words: Sequence[str]) -> str:
+    return f"; continue with: gs2d {shlex.join(words)}" if options.train else ""
 
 
 @register_command(
@@ -39,8 +39,8 @@ class SweepCommand(SweepOptions, Common):
     """Compare recipes on scenes and seeds, as a table."""
 
     def after_interrupt(self, words: Sequence[str]) -> str:
-        """Return the command that goes on."""
-        return _going_on(self, words)
+        """Return the command that continues."""
+        return _continued(self, words)
 
 
 @register_command(
@@ -54,5 +54,5 @@ class PaperCommand(PaperOptions, Common):
     """Reproduce a table of the paper."""
 
     def after_interrupt(self, words: Sequence[str]) -> str:
-        """Return the command that goes on."""
-        return _going_on(self, words)
+        """Return the command that continues."""
+        return _continued(self, words)

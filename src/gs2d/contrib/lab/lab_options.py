@@ -11,7 +11,7 @@ from gs2d.config.arguments import Arg
 from gs2d.errors import RecipeError
 from gs2d.pipeline.prepare.options import CommonTraining, Overrides, Resources, paths_of
 
-_PARTITION = "partition."  # what changes of the partition begin with, among those of --set
+_PARTITION = "partition."  # prefix of changes of the partition in --set
 SWEEP = "sweep"  # the name of a table of chosen recipes
 
 
@@ -87,12 +87,12 @@ class SweepOptions(TableOptions):
 
 
 def _split(words: Iterable[str]) -> tuple[str, ...]:
-    """``a,b c`` and ``a b c`` alike."""
+    """Split words at commas."""
     return tuple(part for word in words for part in word.split(",") if part)
 
 
 def parse_seeds(words: Iterable[str | int]) -> tuple[int, ...]:
-    """Return seeds: ``0,1,2`` and ``0 1 2`` are seeds; one word n > 0 alone is a count, the seeds 0 to n - 1."""
+    """Return seeds from ``0,1,2`` or ``0 1 2``; a single number n > 0 stands for seeds 0 to n - 1."""
     given = tuple(words)
     if all(isinstance(seed, int) for seed in given):
         return tuple(map(int, given))

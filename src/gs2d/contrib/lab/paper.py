@@ -1,4 +1,4 @@
-"""One of the paper's tables, or a table of chosen recipes: plan, train and score, aggregate, write table and page."""
+"""Makes a table of the paper, or of chosen recipes: plan, train, score, aggregate, write table and page."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ FIXED = ("table", "protocol", "schedule_scale", "downscale", "backend", "overrid
 
 @dataclass(frozen=True)
 class PaperResult:
-    """What came out.
+    """The result of ``gs2d paper`` or ``gs2d sweep``.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class PaperResult:
     failures : dict
         Reasons of failed runs by name.
     unfinished : int
-        Runs that are not there yet (tabulated without training).
+        Number of runs that are not trained (``--no-train``).
     """
 
     table: PaperTable
@@ -56,14 +56,14 @@ class PaperResult:
 
 
 def paper(options: PaperOptions | SweepOptions, on_event: OnEvent = ignore) -> PaperResult:
-    """Train what a table needs and is not there, and write the table.
+    """Train the missing runs of a table, and write the table.
 
-    A run that fails leaves its cells empty, with the reason; the others go on.
+    Cells of a failed run are empty, with the reason; other runs continue.
 
     Raises
     ------
     Gs2dError
-        The options or the data folder are wrong, or another process works in the folder; nothing is trained then.
+        If options or data are invalid, or another process works in the folder.
     """
     asked = make_plan(options)
     check_folder(asked)
@@ -75,7 +75,7 @@ def paper(options: PaperOptions | SweepOptions, on_event: OnEvent = ignore) -> P
         if options.lpips_weights is not None:
             from gs2d.evaluation.lpips import load_lpips  # loads torch
 
-            load_lpips(options.lpips_weights)  # a wrong file is said now, not after hours of training
+            load_lpips(options.lpips_weights)  # before hours of training
         execute(
             plan.tasks,
             options.out,
@@ -88,7 +88,7 @@ def paper(options: PaperOptions | SweepOptions, on_event: OnEvent = ignore) -> P
 
 
 def with_other_rows(plan: Plan) -> Plan:
-    """Return a sweep's plan with the rows of earlier commands too: none takes them away."""
+    """Return the plan of a sweep with the rows of earlier commands, which stay in the table."""
     options, path = plan.options, plan.options.out / ABOUT
     if not isinstance(options, SweepOptions) or not path.exists():
         return plan
@@ -100,7 +100,7 @@ def with_other_rows(plan: Plan) -> Plan:
 
 
 def check_folder(plan: Plan) -> None:
-    """Refuse a folder whose runs were made for something else."""
+    """Raise if the runs of a folder belong to another table."""
     path = plan.options.out / ABOUT
     if plan.options.out.is_file():
         raise RunError(f"--out must be a folder, {plan.options.out} is a file")
@@ -118,7 +118,7 @@ def check_folder(plan: Plan) -> None:
 
 
 def _about(path: Path) -> dict[str, Any]:
-    """Return what ``about.json`` of a folder holds."""
+    """Return the content of ``about.json``."""
     found = read_json(path)
     if isinstance(found, dict):
         return found
@@ -131,7 +131,7 @@ def _defining(options: TableOptions) -> dict[str, Any]:
 
 # -- tabulating ------------------------------------------------------------------------------------------------------
 def tabulate(plan: Plan, on_event: OnEvent = ignore, *, images: bool = True) -> PaperResult:
-    """Write table.json, .md, .csv, .tex, about.json and (with ``pictures``) index.html, from the runs as they are."""
+    """Write table.json, .md, .csv, .tex, about.json and, with images, index.html from the finished runs."""
     unfinished = sum(task.outcome()["state"] not in ("done", "failed") for task in plan.tasks)
     results = Results(tuple(_row(plan, row) for row in plan.table.rows))
     checked = check_claims(plan.table, results)
@@ -195,7 +195,7 @@ def row_json(row: Row, results: Results, deviations: Sequence[str]) -> dict[str,
 
 
 def about(plan: Plan, results: Results | None, checked: Sequence[ClaimResult]) -> dict[str, Any]:
-    """Return what the whole table was made with."""
+    """Return the settings of the whole table."""
     options = plan.options
     return {
         "table": plan.table.name,
@@ -217,7 +217,7 @@ def about(plan: Plan, results: Results | None, checked: Sequence[ClaimResult]) -
 
 
 def _protocols(plan: Plan) -> dict[str, Any]:
-    """Return the protocols of the scenes, and those that surfaces are scored by."""
+    """Return the protocols of scenes and of surface scores."""
     found: dict[str, Any] = {scene.protocol.name: scene.protocol for scene in plan.scenes}
     surfaces = {DTU: ("surface: dtu", DTU_SURFACE), TNT: ("surface: tnt", TNT_SURFACE)}
     for scene in plan.scenes:
@@ -228,7 +228,7 @@ def _protocols(plan: Plan) -> dict[str, Any]:
 
 
 def numbers_of(protocol: Any, within: str = "") -> dict[str, str]:
-    """Return every number of a protocol in words, by the name of its field, those of its parts with a dot."""
+    """Return the numbers of a protocol as text by field name, with dots for nested fields."""
     found: dict[str, str] = {}
     for field in fields(protocol):
         value, name = getattr(protocol, field.name), within + field.name

@@ -1,7 +1,7 @@
-"""The tables of the 2DGS-R paper as values, read from ``paper_tables.toml``; and tables of recipes that somebody chose.
+"""The tables of the 2DGS-R paper, from ``paper_tables.toml``, and tables of chosen recipes.
 
-Rows without a recipe are quoted: other methods, which this project does not train. What the paper says a table shows
-is here too, as :class:`Claim` values that can be checked against any rows. Pure Python; never imports torch.
+Rows without a recipe are quoted figures of other methods. The statements of the paper on its tables are
+:class:`Claim` values, which are checked against measured rows. Pure Python; never imports torch.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from gs2d.config.recipe_files import short_name
 from gs2d.contrib.lab.lab_options import SWEEP
 from gs2d.errors import RecipeError
 
-TNT, NERF_SYNTHETIC, DTU = "TnT", "NeRF-Synthetic", "DTU"  # the data sets, as they are called in every result
+TNT, NERF_SYNTHETIC, DTU = "TnT", "NeRF-Synthetic", "DTU"  # names of data sets in results
 METRICS: Mapping[str, str] = MappingProxyType(
     {"fscore": "F-score", "chamfer": "Chamfer", "psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS"}
 )
@@ -28,20 +28,19 @@ LOWER_IS_BETTER = frozenset({"chamfer", "lpips", "bytes", "seconds"})
 
 @dataclass(frozen=True)
 class Claim:
-    """Something the paper says a table shows, in a form that rows can be checked against.
+    """A statement of the paper on a table that can be checked.
 
     Attributes
     ----------
     text : str
         The claim in words.
     metric : str
-        A key of METRICS, or "surface": F-score, or the Chamfer distance (smaller is better) where that is the data
-        set's figure.
+        A key of METRICS, or "surface": F-score or Chamfer distance, by data set.
     rows : tuple of str
         Labels: from worst to best ("ascending"), the best last ("best"), or all alike ("flat").
     kind : str
     within : float or None
-        For "flat": largest difference between any two rows. It is a little more than the paper's own.
+        For "flat": largest difference of two rows, slightly above that of the paper.
     """
 
     text: str
@@ -53,7 +52,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class PaperRow:
-    """A row: ``recipe`` None is quoted only; ``paper`` has what the paper prints, data set -> metric -> figure."""
+    """A row; quoted if ``recipe`` is None. ``paper`` has the figures of the paper by data set and metric."""
 
     name: str
     recipe: str | None
@@ -63,7 +62,7 @@ class PaperRow:
 
 @dataclass(frozen=True)
 class PaperTable:
-    """A table; ``label`` is its LaTeX label in the paper, ``columns`` has the paper's metrics by data set."""
+    """A table; ``label`` is its LaTeX label in the paper, ``columns`` its metrics by data set."""
 
     name: str
     title: str
@@ -74,12 +73,12 @@ class PaperTable:
 
     @property
     def trained(self) -> tuple[PaperRow, ...]:
-        """The rows that have a recipe."""
+        """Return the rows with a recipe."""
         return tuple(row for row in self.rows if row.recipe is not None)
 
     @property
     def of_paper(self) -> bool:
-        """Whether it is the paper's; else its rows are compared with each other only."""
+        """Return whether the table is in the paper."""
         return self.name != SWEEP
 
     @property
@@ -89,12 +88,12 @@ class PaperTable:
 
 
 def recipe_table(recipes: Sequence[str]) -> PaperTable:
-    """Return a table with a row for each recipe, by its short name, and nothing of the paper.
+    """Return a table with one row per recipe, named by its short name.
 
     Raises
     ------
     RecipeError
-        Two files have recipes of one short name.
+        If two recipes have the same short name.
     """
     names = list(dict.fromkeys(recipes))
     shown = [short_name(name) for name in names]
@@ -130,6 +129,6 @@ PAPER_TABLES: Mapping[str, PaperTable] = MappingProxyType(
 
 
 def printed(metric: str, data_set: str, figure: float) -> str:
-    """Return a figure of the paper with the digits that it prints."""
+    """Return a figure of the paper with its digits."""
     digits = {"psnr": 2, "chamfer": 2, "fscore": 2 if data_set == TNT else 3}.get(metric, 3)
     return f"{figure:.{digits}f}"

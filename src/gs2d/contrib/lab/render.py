@@ -1,7 +1,4 @@
-"""A table as a page, Markdown, CSV and LaTeX: what was measured, and the paper's figures beside.
-
-Page and Markdown are templates (``templates/``); what they show of a data set is a :class:`TablePart`.
-"""
+"""Writes a table as a page, Markdown, CSV and LaTeX, with measured figures and those of the paper."""
 
 from __future__ import annotations
 
@@ -58,7 +55,7 @@ def shown(metric: str, value: float | None) -> str:
 # -- what is shown of a data set ---------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Figure:
-    """A figure as it is shown: the mean ("" in rows that are quoted), its spread over seeds, the paper's; "": none."""
+    """A figure as text: mean ("" in quoted rows), spread over seeds, figure of the paper; "" if missing."""
 
     text: str
     spread: str
@@ -67,19 +64,19 @@ class Figure:
 
     @property
     def measured(self) -> str:
-        """The mean with its spread."""
+        """Return the mean with its spread."""
         return f"{self.text} ± {self.spread}" if self.spread else self.text
 
     @property
     def markdown(self) -> str:
-        """As a cell in Markdown."""
+        """Return the figure as a cell in Markdown."""
         ours = f"**{self.measured}**" if self.best else self.measured
         return f"{ours} {f'({self.paper})' if self.paper else ''}".strip() or "-"
 
 
 @dataclass(frozen=True)
 class ShownRow:
-    """A row of a part; ``about``: what is trained for it, or whose figures they are."""
+    """A row of a part; ``about`` describes its training, or the source of its figures."""
 
     name: str
     quoted: bool
@@ -89,7 +86,7 @@ class ShownRow:
 
 @dataclass(frozen=True)
 class TablePart:
-    """The part of a table that a data set has: what was measured, or the paper's figures alone.
+    """The part of a table for one data set.
 
     Attributes
     ----------
@@ -99,7 +96,7 @@ class TablePart:
         Metrics.
     rows : tuple of ShownRow
     scenes : list of str
-        Those that the means are taken over.
+        Scenes in the means.
     """
 
     data_set: str
@@ -110,18 +107,18 @@ class TablePart:
 
     @property
     def heads(self) -> list[str]:
-        """The columns as they are called; an arrow says which way is better."""
+        """Return the titles of columns, with an arrow towards better values."""
         arrows = {m: "" if m in COSTS else " ↓" if m in LOWER_IS_BETTER else " ↑" for m in TITLES}
         return [TITLES[metric] + arrows[metric] for metric in self.columns]
 
     @property
     def quoted_cells(self) -> list[list[str]]:
-        """The paper's figures alone, with the names of the rows before them."""
+        """Return the rows with the figures of the paper."""
         return [[row.name, *(figure.paper or "-" for figure in row.figures)] for row in self.rows]
 
 
 def parts_of(table: PaperTable, results: Results) -> list[TablePart]:
-    """Return a part for each data set that was trained, then one for each other one of the paper's."""
+    """Return a part for each trained data set, then for the other data sets of the paper."""
     untrained = [data_set for data_set in table.columns if data_set not in results.data_sets]
     return [_part(table, results, data_set) for data_set in (*results.data_sets, *untrained)]
 
@@ -152,7 +149,7 @@ def _part(table: PaperTable, results: Results, data_set: str) -> TablePart:
 
 
 def _best(metric: str, means: Sequence[float | None]) -> str:
-    """Return the best of several figures as it is shown: rows that look alike are marked alike; "" without one."""
+    """Return the best figure as text, so that rows with equal text are all marked; "" without figures."""
     known = [value for value in means if value is not None]
     if metric in COSTS or len(known) < 2:
         return ""
@@ -160,7 +157,7 @@ def _best(metric: str, means: Sequence[float | None]) -> str:
 
 
 def about_row(row: Row) -> str:
-    """Return what is trained for a row: the name of one of the paper's says what the table is about."""
+    """Return the description of the training of a row."""
     if row.recipe is None:
         return ""
     about = about_recipe(row.recipe)
@@ -168,7 +165,7 @@ def about_row(row: Row) -> str:
 
 
 def claim_text(claim: ClaimResult) -> str:
-    """Return one line about a claim: its steps with differences and spread."""
+    """Return a claim in one line: its steps with differences and spread."""
     if claim.holds == "unknown":
         return claim.reason
     steps = claim.steps
@@ -185,7 +182,7 @@ def claim_text(claim: ClaimResult) -> str:
 
 
 def deviations_title(table: PaperTable) -> str:
-    """Return what stands above the deviations."""
+    """Return the sentence above the deviations."""
     return "How this differs from the paper" if table.of_paper else "What to know about these figures"
 
 
@@ -217,10 +214,7 @@ def to_markdown(
 
 
 def to_csv(results: Results) -> str:
-    """Return one line for each row, data set, scene and seed, and one with the mean of each data set.
-
-    The paper's figures have columns where some row has any.
-    """
+    """Return one line for each row, data set, scene and seed, and for the mean of each data set."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     quoted = METRICS if any(row.paper for row in results.rows) else ()
@@ -231,7 +225,7 @@ def to_csv(results: Results) -> str:
             for cell in row.of(data_set):
                 figures = [cell.figures[name] for name in FIGURES]
                 writer.writerow([*place, cell.scene, cell.seed, *figures, *[None] * len(paper)])
-            if row.of(data_set) or any(paper):  # else another method, of which the paper has nothing here
+            if row.of(data_set) or any(paper):  # else a method without figures in the paper
                 writer.writerow([*place, "mean", None, *results.mean(row, data_set).values(), *paper])
     return out.getvalue()
 
@@ -252,9 +246,9 @@ _TEX = str.maketrans(
 
 
 def to_latex(table: PaperTable, results: Results) -> str:
-    """Return ``booktabs`` tables in one float: the measured figures, the paper's in small print below.
+    """Return ``booktabs`` tables in one float: measured figures, with those of the paper in small print.
 
-    Data sets that nothing was trained on follow with the paper's figures alone.
+    Data sets without runs follow, with the figures of the paper.
     """
     lines = ["% \\usepackage{booktabs}", "\\begin{table}", "  \\centering"]
     for part in parts_of(table, results):
@@ -310,7 +304,7 @@ def write_page(
 
 
 def _run(row: Row, cell: Cell) -> list[str | Markup]:
-    """Return a row of the table of all runs, with the reason where there are no figures."""
+    """Return a row of the table of all runs, with the reason if it has no figures."""
     figures: list[str | Markup] = [shown(metric, cell.figures[metric]) for metric in RUN_METRICS]
     if cell.figures["psnr"] is None:
         figures = [Markup('-<span class="why">{}</span>').format(cell.reasons.get("psnr", "")), *"----"]
@@ -320,7 +314,7 @@ def _run(row: Row, cell: Cell) -> list[str | Markup]:
 
 
 def at_the_clone(cell: Cell) -> str:
-    """Return PSNR just before the clone, just after it, and at the end."""
+    """Return PSNR before cloning, after cloning, and at the end."""
     for before, after in itertools.pairwise(cell.details.get("stages", [])):
         if "psnr_after_clone" in after:
             return " → ".join(shown("psnr", v) for v in (before["psnr"], after["psnr_after_clone"], after["psnr"]))
@@ -328,7 +322,7 @@ def at_the_clone(cell: Cell) -> str:
 
 
 def side_by_side(results: Results) -> list[dict[str, Any]]:
-    """Return one view of each scene, by every trained row: its name, and a list of pictures of each kind."""
+    """Return one view of each scene in every trained row: its name and its images by kind."""
     found: list[dict[str, Any]] = []
     for scene, runs in _runs_by_scene(results).items():
         index = read_index(next(iter(runs.values())) / RENDERS) if runs else {"views": [None]}
@@ -346,7 +340,7 @@ def side_by_side(results: Results) -> list[dict[str, Any]]:
 
 
 def _runs_by_scene(results: Results) -> dict[str, dict[str, Path]]:
-    """Scene -> row -> the run of the first seed that has pictures."""
+    """Return the run with images, of the first seed, by scene and row."""
     found: dict[str, dict[str, Path]] = {}
     for row in results.rows:
         for cell in sorted(row.cells, key=lambda cell: cell.seed):
@@ -357,7 +351,7 @@ def _runs_by_scene(results: Results) -> dict[str, dict[str, Path]]:
 
 
 def _last_image(run: Path, file: str, what: str) -> Path:
-    """Return a picture after the last stage that was drawn."""
+    """Return an image after the last rendered stage."""
     stages = (read_index(run / RENDERS) or {"stages": []})["stages"]
     return run / RENDERS / (stages[-1] if stages else "none") / f"{file}.{what}.png"
 
@@ -374,7 +368,7 @@ def own_figures(results: Results, out: Path, on_event: OnEvent) -> list[dict[str
     found = []
     ranking = {row.name for row in results.rows if row.recipe is not None and _ranks(row.recipe)}
     for scene, runs in _runs_by_scene(results).items():
-        maps = [name for name in runs if name in ranking][-1:]  # they need the photographs: one is enough
+        maps = [name for name in runs if name in ranking][-1:]  # one, as it needs the photographs
         section: dict[str, Any] = {"name": scene, "error": "", "drawings": [], "coverage": []}
         try:
             if runs:
@@ -395,7 +389,7 @@ def coverage_rows(means: Mapping[str, Sequence[float]]) -> list[list[str]]:
 
 
 def _ranks(recipe: str) -> bool:
-    """Whether a recipe ranks splats by their error."""
+    """Return whether a recipe ranks splats by error."""
     return any(stage.name == "appearance" for stage in get_recipe(recipe).stages)
 
 

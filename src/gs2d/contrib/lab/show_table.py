@@ -1,4 +1,4 @@
-"""What the commands blocks, paper and sweep print."""
+"""Actions of the commands blocks, paper and sweep."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def show_blocks(command: BlocksCommand, console: Console) -> None:
 
 
 def show_table(command: PaperCommand | SweepCommand, console: Console) -> None:
-    """Run the command; what failed is an error at the end, when everything else is done and written.
+    """Run ``gs2d paper`` or ``gs2d sweep``.
 
     Raises
     ------
     RunError
-        Some runs failed.
+        At the end, if runs failed.
     """
     result = run_paper(command, console.on_event)
     console.close()
@@ -45,8 +45,8 @@ def show_table(command: PaperCommand | SweepCommand, console: Console) -> None:
             else ""
         )
         raise RunError(
-            f"{len(result.failures)} of the runs failed, the table is written without what they lack: "
-            f"{name}: {reason}{more}; mend that and run the command again"
+            f"{len(result.failures)} of the runs failed; the table lacks their figures: "
+            f"{name}: {reason}{more}; fix that and run the command again"
         )
 
 

@@ -53,8 +53,8 @@ class TntSurface:
 
     camera_threshold: float = 0.2  # [tnt]
     camera_sample: int = 6  # [tnt]
-    # [tnt] states 20 iterations but passes the 20 in the place of the rms criterion, so that Open3D's default of 30 is
-    # what runs, and only the share of paired points decides when to stop: at once where all are paired.
+    # [tnt] states 20 iterations but passes them as the rms criterion. Open3D therefore uses its default, 30 iterations,
+    # and stops by the share of paired points only.
     stages: tuple[IcpStage, ...] = (IcpStage(1.0, 80.0, 30), IcpStage(0.5, 20.0, 30), IcpStage(None, 2.0, 30))  # [tnt]
     max_points: int = 4_000_000  # [tnt]
     fraction_change: float = 1e-6  # [tnt]

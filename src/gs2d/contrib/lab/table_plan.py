@@ -1,8 +1,4 @@
-"""What a table needs before a photograph is read: its scenes, its recipes, and the run of each of them.
-
-`gs2d paper` and `gs2d sweep` are two plans of one machine: recipes x scenes x seeds become tasks, which differ in who
-names the recipes.
-"""
+"""Plans a table of ``gs2d paper`` or ``gs2d sweep``: the tasks of all recipes, scenes and seeds."""
 
 from __future__ import annotations
 
@@ -28,7 +24,7 @@ from gs2d.pipeline.prepare.options import EvaluateOptions, TrainOptions
 
 @dataclass(frozen=True)
 class Plan:
-    """A table's work: its scenes, and the task of every (recipe of a row, scene, seed)."""
+    """The scenes of a table, and its tasks by (recipe, scene, seed)."""
 
     options: PaperOptions | SweepOptions
     table: PaperTable
@@ -37,12 +33,12 @@ class Plan:
 
     @property
     def tasks(self) -> tuple[TrainingTask, ...]:
-        """Each once: rows whose recipes train the same share theirs."""
+        """Return each task once; rows with equal recipes share tasks."""
         return tuple({task.name: task for task in self.cells.values()}.values())
 
 
 def make_plan(options: PaperOptions | SweepOptions) -> Plan:
-    """Decide everything that can be decided, and can be wrong, before a photograph is read."""
+    """Return the plan of a table, and check all options, before any image is read."""
     table = _table(options)
     if not options.seeds or len(set(options.seeds)) != len(options.seeds):
         raise RecipeError(
@@ -63,12 +59,12 @@ def make_plan(options: PaperOptions | SweepOptions) -> Plan:
 
 
 def _table(options: PaperOptions | SweepOptions) -> PaperTable:
-    """Return the rows that are asked for."""
+    """Return the table of the requested rows."""
     if isinstance(options, SweepOptions):
         if not options.recipes:
             raise RecipeError("`gs2d sweep` needs the name of a recipe or more; `gs2d recipes` lists them")
         for name in options.recipes:
-            get_recipe(name)  # a name that is wrong is said before anything is looked for
+            get_recipe(name)  # unknown names raise first
         return recipe_table(options.recipes)
     if options.table not in PAPER_TABLES:
         raise RecipeError(f"no table {options.table!r} in the paper; there is {', '.join(PAPER_TABLES)}")
@@ -76,13 +72,13 @@ def _table(options: PaperOptions | SweepOptions) -> PaperTable:
 
 
 def trained_recipe(name: str, options: TableOptions) -> Recipe:
-    """Return a named recipe at the schedule and with the changes of the options."""
+    """Return a recipe with the schedule and overrides of the options."""
     recipe = scale_schedule(get_recipe(name), options.schedule_scale)
     return validate(apply_overrides(recipe, fitting_overrides(recipe, options.overrides)))
 
 
 def fitting_overrides(recipe: Recipe, overrides: Sequence[str]) -> tuple[str, ...]:
-    """Return the overrides that speak of the recipe itself or of a stage that it has."""
+    """Return the overrides of the recipe itself and of its stages."""
     stages = {stage.name for stage in recipe.stages}
     heads = {text: text.partition("=")[0].split(".") for text in overrides}
     return tuple(text for text in overrides if len(heads[text]) == 1 or heads[text][0] in stages)
@@ -96,14 +92,14 @@ def _check_overrides(overrides: Sequence[str], recipes: Sequence[Recipe]) -> Non
 
 
 def make_task(options: TableOptions, scene: FoundScene, name: str, recipe: Recipe, seed: int) -> TrainingTask:
-    """Return the run of a recipe (``trained_recipe`` of the name) on a scene."""
+    """Return the task that trains a recipe (``trained_recipe`` of ``name``) on a scene."""
     downscale = options.downscale or scene.downscale
     train = TrainOptions(
         scene=scene.path,
         out=options.out / "runs" / f"{scene.name}-{short_name(name)}-s{seed}",
         recipe=name,
         protocol=scene.protocol.name if options.protocol == "auto" else options.protocol,
-        robust="auto" if isinstance(options, SweepOptions) else "off",  # the paper has none of it
+        robust="auto" if isinstance(options, SweepOptions) else "off",  # as in the paper
         backend=options.backend,
         format=scene.format,
         downscale=downscale,
@@ -113,7 +109,7 @@ def make_task(options: TableOptions, scene: FoundScene, name: str, recipe: Recip
         resume=True,
         cache=options.cache or options.out / "cache",
         threads=options.threads,
-        page=False,  # of dozens of runs nobody looks at each, and it is as large as the splats
+        page=False,  # as large as the splats
     )
     evaluate = None
     if scene.scored or options.lpips_weights is not None:
@@ -130,7 +126,7 @@ def make_task(options: TableOptions, scene: FoundScene, name: str, recipe: Recip
 
 
 def _wanted(scene: FoundScene, options: TableOptions) -> Iterator[str]:
-    """Yield what is scored: a run that was scored without it is scored again."""
+    """Yield the inputs of scores; a run that lacks one is scored again."""
     if scene.scored:
         yield f"surface: {scene.truth.resolve() if scene.truth else 'official'}"
     if options.lpips_weights is not None:
@@ -139,14 +135,14 @@ def _wanted(scene: FoundScene, options: TableOptions) -> Iterator[str]:
 
 # -- the commands that do it -------------------------------------------------------------------------------------------
 def paper_command(options: PaperOptions | SweepOptions) -> str:
-    """Return the command that makes a table."""
+    """Return the command line of a table."""
     words = ["sweep", *options.recipes] if isinstance(options, SweepOptions) else ["paper", options.table]
     said = ("table", "recipes", "slots", "threads", "cluster", "train", "quiet", "verbose", "json", "debug")
     return _command(words, options, said)
 
 
 def commands_of(task: TrainingTask) -> list[str]:
-    """Return the `gs2d train` and `gs2d evaluate` lines that do what a task does."""
+    """Return the `gs2d train` and `gs2d evaluate` commands of a task."""
     words = ["train", str(task.train.scene), "--out", str(task.train.out), "--recipe", str(task.train.recipe)]
     lines = [_command(words, task.train, ("scene", "out", "recipe", "resume"))]
     if task.evaluate is not None:
@@ -155,7 +151,7 @@ def commands_of(task: TrainingTask) -> list[str]:
 
 
 def _command(words: Sequence[str], options: Any, said: Sequence[str]) -> str:
-    """Return a command line: its first words, and each option that is not at its default, but for those ``said``."""
+    """Return a command line: its first words, and each option with another value than the default, without ``said``."""
     line = ["gs2d", *words]
     for field in fields(options):
         value = getattr(options, field.name)
@@ -164,7 +160,7 @@ def _command(words: Sequence[str], options: Any, said: Sequence[str]) -> str:
         flag = "--" + field.name.replace("_", "-")
         if field.name == "overrides":
             line += [word for text in value for word in ("--set", text)]
-        elif field.name == "seeds":  # one number alone would be a count
+        elif field.name == "seeds":  # a single number would be a count
             line += [flag, ",".join(map(str, value)) + ("," if len(value) == 1 else "")]
         elif value is False:
             line.append(f"--no-{flag[2:]}")
