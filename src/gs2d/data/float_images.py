@@ -163,7 +163,8 @@ def read_exr_map(path: str | os.PathLike[str]) -> np.ndarray:
         As for :func:`exr_size`, or if there are several channels but neither Z nor Y.
     """
     channels = _exr_channels(path)
-    names = [key for key in ("Z", "Y") if key in channels][:1] or list(channels)
+    of_depth: list[str] = [key for key in ("Z", "Y") if key in channels]
+    names = of_depth[:1] or list(channels)
     if len(names) != 1:
         have = ", ".join(sorted(channels)) or "none"
         raise DataError(f"{os.fspath(path)} must have a channel Z or Y, or a single one, got {have}; export depths")
