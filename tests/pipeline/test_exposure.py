@@ -13,12 +13,13 @@ import pytest
 from ball_runs import SMALL, options
 from gs2d.data.image_files import read_image, write_image
 from gs2d.errors import RunError
-from gs2d.io.run_dir import EXPOSURE, LEARNED, RunFolder
+from gs2d.io.run_dir import LEARNED, RunFolder
 from gs2d.pipeline.demo import demo
 from gs2d.pipeline.finish.evaluate import evaluate_run
 from gs2d.pipeline.finish.scoring import score_views
 from gs2d.pipeline.prepare.loaded import open_finished
 from gs2d.pipeline.prepare.options import DemoOptions, EvaluateOptions, TrainOptions
+from gs2d.pipeline.prepare.run_appearance import exposure_gain
 from gs2d.pipeline.train.train_run import train
 from gs2d.synthetic import demo_capture as toy
 from gs2d.synthetic.perturb_exposure import GAINS, random_gains, with_gains
@@ -48,7 +49,7 @@ def run(varied: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
         notices.extend([event.text] if isinstance(event, Notice) else [])
 
     made = train(learning(varied, tmp_path_factory.mktemp("runs") / "exposure"), listen)
-    assert any(text.startswith("exposures: 0.") and "times the mean: exposure.json" in text for text in notices)
+    assert any(text.startswith("exposures: 0.") and "times the mean: learned.json" in text for text in notices)
     return made
 
 
@@ -74,13 +75,11 @@ def test_the_gains_of_the_demo_have_mean_one(tmp_path: Path, monkeypatch: pytest
 
 
 def test_the_transforms_are_written_and_their_mean_is_the_identity(run: RunFolder) -> None:
-    entries = json.loads(run.file(EXPOSURE).read_text())["photographs"]
-    assert [entry["name"] for entry in entries] == [f"train/r_{i}.png" for i in range(6)]
-    transforms = np.array([entry["transform"] for entry in entries])
+    views = json.loads(run.file(LEARNED).read_text())["views"]
+    assert list(views) == [f"train/r_{i}.png" for i in range(6)]
+    transforms = np.array([found["exposure"] for found in views.values()])
     assert transforms.mean(axis=0) == pytest.approx(np.eye(3, 4), abs=1e-6)
     assert np.abs(transforms - np.eye(3, 4)).max() > 0.02
-    grey = 0.5 * transforms[0, :, :3].sum(axis=1) + transforms[0, :, 3]
-    assert entries[0]["grey"] == pytest.approx(grey, abs=1e-6)
     assert run.definition()["recipe"]["name"] == "2dgs-r-exposure"
 
 
@@ -122,6 +121,6 @@ def test_a_missing_or_damaged_file_of_exposures_is_an_error_with_a_remedy(run: R
 
 def test_the_report_shows_the_exposures(run: RunFolder) -> None:
     page = " ".join(run.file("report.html").read_text().split())
-    entries = json.loads(run.file(EXPOSURE).read_text())["photographs"]
-    darkest = min(entries, key=lambda entry: sum(entry["grey"]))
-    assert f"{darkest['name']} is the darkest" in page
+    views = json.loads(run.file(LEARNED).read_text())["views"]
+    darkest = min(views, key=lambda name: exposure_gain(np.array(views[name]["exposure"])))
+    assert f"{darkest} is the darkest" in page

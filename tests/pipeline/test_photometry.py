@@ -11,7 +11,7 @@ import torch
 
 from ball_runs import SMALL, options
 from gs2d.core.vignetting import reach_of
-from gs2d.io.run_dir import PHOTOMETRY, REPORT, RunFolder
+from gs2d.io.run_dir import LEARNED, REPORT, RunFolder
 from gs2d.pipeline.prepare.loaded import reload_run
 from gs2d.pipeline.prepare.run_appearance import as_scene, photographed
 from gs2d.pipeline.train.train_run import train
@@ -32,12 +32,12 @@ def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
     folder = tmp_path_factory.mktemp("runs") / "photometry"
     made = train(options(capture, folder, learn="vignetting,response", overrides=EARLY), listen)
-    assert any(text.startswith("vignetting leaves ") and text.endswith(PHOTOMETRY) for text in notices)
+    assert any(text.startswith("vignetting leaves ") and text.endswith(LEARNED) for text in notices)
     return made
 
 
 def test_views_have_the_vignetting_of_their_camera_and_the_report_shows_it(run: RunFolder) -> None:
-    (camera,) = json.loads(run.file(PHOTOMETRY).read_text())["cameras"]
+    (camera,) = json.loads(run.file(LEARNED).read_text())["cameras"]
     job = reload_run(run, ignore)
     assert camera["photographs"] == [view.name for view in job.scene.views]
     for view in job.scene.views:

@@ -8,7 +8,7 @@
       checkpoints/   <stage number>-<stage>-<iteration>.pt (the last two), <stage number>-<stage>-end.pt (all)
       metrics.json  splats.ply  mesh.ply  mesh.glb (with --texture)  renders/  report.html
       scene.html     the splats as a web page (`gs2d export`)
-      poses.json  learned.json  exposure.json  photometry.json  learned properties of images and cameras
+      poses.json  learned.json  learned properties of images and cameras
       subject.json   the subject that the cameras look at (data.subject_box)
       georeference.json  position of the run in the world, if known
       .lock          held by the process that trains; the operating system releases it when that process ends
@@ -51,8 +51,7 @@ RUN_JSON, EVENTS, METRICS, LOCK = "run.json", "events.jsonl", "metrics.json", ".
 CHECKPOINTS, RENDERS, SURFACE = "checkpoints", "renders", "surface"
 LOSSES = "losses"  # in RENDERS
 SPLATS, MESH, TEXTURED, REPORT, PAGE = "splats.ply", "mesh.ply", "mesh.glb", "report.html", "scene.html"
-EXPOSURE, POSES, SUBJECT, VERDICT = "exposure.json", "poses.json", "subject.json", "verdict.json"
-PHOTOMETRY, LEARNED = "photometry.json", "learned.json"
+POSES, LEARNED, SUBJECT, VERDICT = "poses.json", "learned.json", "subject.json", "verdict.json"
 GEOREFERENCE = "georeference.json"
 FORMAT = 2
 KEPT_CHECKPOINTS = 2
@@ -202,7 +201,7 @@ class RunFolder:
         for name in (CHECKPOINTS, RENDERS, SURFACE):
             shutil.rmtree(self.file(name), ignore_errors=True)
         results = (SPLATS, SUBJECT, VERDICT, GEOREFERENCE, MESH, TEXTURED, REPORT, PAGE)
-        for name in (EVENTS, METRICS, EXPOSURE, POSES, PHOTOMETRY, LEARNED, *results, RUN_JSON):
+        for name in (EVENTS, METRICS, POSES, LEARNED, *results, RUN_JSON):
             self.file(name).unlink(missing_ok=True)
 
     def discard(self) -> None:

@@ -134,14 +134,12 @@ def test_blocks_of_the_default_recipe_begin_with_a_dense_start_of_their_own_cell
         starts.append(begun["splats"])
         trained = read_splats(run_folder.path / "splats.ply").means.numpy()
         assert split.cells.near(cell, trained).mean() > 0.95  # a few wander
-        found = json.loads((run_folder.path / "exposure.json").read_text())["photographs"]
-        coarse = json.loads((job / "coarse/exposure.json").read_text())["photographs"]
-        known = {entry["name"]: entry["transform"] for entry in coarse}
-        for entry in found:
-            assert np.allclose(entry["transform"], known[entry["name"]], atol=1e-6)
+        coarse = json.loads((job / "coarse/learned.json").read_text())["views"]
+        for name, found in json.loads((run_folder.path / "learned.json").read_text())["views"].items():
+            assert np.allclose(found["exposure"], coarse[name]["exposure"], atol=1e-6)
         assert run_folder.definition()["protocol"] == open_run(job).definition()["protocol"]
     assert min(starts) > 50
-    assert json.loads((job / "exposure.json").read_text())["photographs"] == coarse
+    assert json.loads((job / "learned.json").read_text())["views"] == coarse
 
 
 # -- what differs ------------------------------------------------------------------------------------------------------

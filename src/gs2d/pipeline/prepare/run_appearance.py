@@ -1,7 +1,4 @@
-"""Learned appearance of photographs (exposure, vignetting, response): files of a run, and its effect on images.
-
-Later commands read ``learned.json``. ``exposure.json`` and ``photometry.json`` hold the same in readable form.
-"""
+"""Learned appearance of photographs (exposure, vignetting, response): its file, and its effect on images."""
 
 from __future__ import annotations
 
@@ -18,53 +15,48 @@ from gs2d.config.recipe import Recipe
 from gs2d.core.json_files import read_json, write_json
 from gs2d.core.vignetting import reach_of
 from gs2d.data import Scene, View
-from gs2d.data.scene import Appearance
 from gs2d.errors import DataError, RunError
-from gs2d.io.run_dir import EXPOSURE, LEARNED, PHOTOMETRY, SPLATS, RunFolder
+from gs2d.io.run_dir import LEARNED, SPLATS, RunFolder
 from gs2d.render.exposure_transform import expose, fit_exposure
 from gs2d.training.events import Notice, OnEvent
 from gs2d.training.learned.appearance import numbers_of, shown, unshown
 from gs2d.training.learned.quantity import ImagePoints
 
-ABOUT = "learned quantities of each view, by name (docs/math.md)"
-ABOUT_EXPOSURE = (
-    "color in the photograph = A c + b for color c of the scene (sRGB values in [0, 1]), transform = [A | b]; "
-    "the mean over the photographs is the identity; grey: the transformed (0.5, 0.5, 0.5)"
-)
-ABOUT_PHOTOMETRY = (
-    "at a pixel whose distance from the principal point is r times reach, in focal lengths, a camera receives "
+ABOUT = (
+    "learned quantities of each view, by name (docs/math.md). exposure [A | b]: colour in the photograph = A c + b "
+    "for colour c of the scene, sRGB values in [0, 1]; the mean over the photographs is the identity. cameras: at a "
+    "pixel whose distance from the principal point is r times reach, in focal lengths, a camera receives "
     "exp(-(a r^2 + b r^4 + c r^6)) of the light, falloff = [a, b, c]; corner: this at r = 1. f(x) = k x / (1 + "
-    "(k - 1) x), k = e^s, maps light to values, s = shift; the scene has s = 0, the mean of the photographs"
+    "(k - 1) x), k = e^s, maps light to values, s = shift"
 )
-GREY = 0.5
 
 
 def write_appearance(run: RunFolder, scene: Scene, on_event: OnEvent) -> None:
-    """Write the learned appearance of photographs into the run, and report it."""
+    """Write ``learned.json``, the learned appearance of photographs, and report it."""
     known = {view.name: view.appearance for view in scene.views if view.appearance}
     if not known:
         return
+    cameras = _camera_facts(scene) if any(found.keys() & {"vignetting", "response"} for found in known.values()) else []
     views = {view: {name: numbers.tolist() for name, numbers in found.items()} for view, found in known.items()}
-    write_json(run.file(LEARNED), {"format": 1, "about": ABOUT, "views": views})
+    write_json(run.file(LEARNED), {"format": 2, "about": ABOUT, "views": views, "cameras": cameras})
     exposures = {view.name: view.appearance["exposure"] for view in scene.train if "exposure" in view.appearance}
     if exposures:
-        _write_exposures(run, exposures, on_event)
-    if any(found.keys() & {"vignetting", "response"} for found in known.values()):
-        _write_photometry(run, scene, on_event)
+        gains = {name: exposure_gain(transform) for name, transform in exposures.items()}
+        low, high = min(gains, key=gains.__getitem__), max(gains, key=gains.__getitem__)
+        on_event(Notice(f"exposures: {gains[low]:.2f} ({low}) to {gains[high]:.2f} ({high}) times the mean: {LEARNED}"))
+    if cameras:
+        corners, shifts = (sorted(camera[name] for camera in cameras) for name in ("corner", "shift"))
+        light, shift = _range(corners, ".3f"), _range(shifts, "+.3f")
+        on_event(Notice(f"vignetting leaves {light} of the light in corners, response shift {shift}: {LEARNED}"))
 
 
-def _write_exposures(run: RunFolder, transforms: Appearance, on_event: OnEvent) -> None:
-    images = []
-    for name, transform in transforms.items():
-        grey = GREY * transform[:, :3].sum(axis=1) + transform[:, 3]
-        images.append({"name": name, "transform": transform.tolist(), "grey": grey.tolist()})
-    write_json(run.file(EXPOSURE), {"format": 1, "about": ABOUT_EXPOSURE, "photographs": images})
-    gains = {entry["name"]: sum(entry["grey"]) / (3 * GREY) for entry in images}
-    low, high = min(gains, key=gains.__getitem__), max(gains, key=gains.__getitem__)
-    on_event(Notice(f"exposures: {gains[low]:.2f} ({low}) to {gains[high]:.2f} ({high}) times the mean: {EXPOSURE}"))
+def exposure_gain(transform: np.ndarray) -> float:
+    """Return the mean brightness of medium grey under an exposure [3, 4], relative to the scene."""
+    return float(np.mean(0.5 * transform[:, :3].sum(axis=1) + transform[:, 3]) / 0.5)
 
 
-def _write_photometry(run: RunFolder, scene: Scene, on_event: OnEvent) -> None:
+def _camera_facts(scene: Scene) -> list[dict[str, Any]]:
+    """Return vignetting and response of each camera, with its photographs."""
     of_camera: dict[tuple[float, ...], list[View]] = {}
     for view in scene.views:
         falloff, response = (view.appearance.get(name, np.zeros(3)) for name in ("vignetting", "response"))
@@ -74,15 +66,9 @@ def _write_photometry(run: RunFolder, scene: Scene, on_event: OnEvent) -> None:
     for (a, b, c, shift), views in of_camera.items():
         reach = reach_of([view.camera for view in views])
         numbers = [a * reach**2, b * reach**4, c * reach**6]
-        found = {"falloff": numbers, "reach": reach, "shift": shift, "corner": math.exp(-sum(numbers))}
-        cameras.append({**found, "photographs": [view.name for view in views]})
-    write_json(run.file(PHOTOMETRY), {"format": 1, "about": ABOUT_PHOTOMETRY, "cameras": cameras})
-    corners, shifts = (sorted(camera[name] for camera in cameras) for name in ("corner", "shift"))
-    many = f" ({len(cameras)} cameras)" if len(cameras) > 1 else ""
-    line = (
-        f"vignetting leaves {_range(corners, '.3f')} of the light in corners, response shift {_range(shifts, '+.3f')}"
-    )
-    on_event(Notice(f"{line}{many}: {PHOTOMETRY}"))
+        facts = {"falloff": numbers, "reach": reach, "shift": shift, "corner": math.exp(-sum(numbers))}
+        cameras.append({**facts, "photographs": [view.name for view in views]})
+    return cameras
 
 
 def _range(values: list[float], form: str) -> str:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from gs2d.io.run_dir import (
     EVENTS,
-    EXPOSURE,
     LEARNED,
     MESH,
     METRICS,
     PAGE,
-    PHOTOMETRY,
     POSES,
     RUN_JSON,
     SPLATS,
@@ -27,10 +25,8 @@ FILES = {  # the most useful first
     METRICS: "all scores",
     RUN_JSON: "settings, machine and versions",
     EVENTS: "training log",
-    LEARNED: "learned colours of each photograph, as numbers",
-    EXPOSURE: "exposure of each photograph",
+    LEARNED: "learned exposure, vignetting and response",
     POSES: "refined cameras",
-    PHOTOMETRY: "vignetting and response of each camera",
 }
 
 

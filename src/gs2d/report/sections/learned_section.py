@@ -9,12 +9,10 @@ import numpy as np
 
 from gs2d.core.camera import Zoom
 from gs2d.core.json_files import read_json
-from gs2d.io.run_dir import EXPOSURE, PHOTOMETRY, POSES
+from gs2d.io.run_dir import LEARNED, POSES
 from gs2d.report.html_parts import macro
 from gs2d.report.run_record import RunRecord, reading
 from gs2d.report.sections.section_registry import register_section
-
-GREY = 0.5  # scene colour whose value in each photograph is in exposure.json
 
 
 @register_section("learned", title="Learned exposures and cameras")
@@ -26,27 +24,33 @@ def learned_section(run: RunRecord) -> str | None:
         if not path.is_file():
             continue
         with reading(path):
-            paragraphs.append(describe(read_json(path)))
+            paragraphs += filter(None, [describe(read_json(path))])
     return macro("lists.html", "paragraphs", paragraphs) if paragraphs else None
 
 
-def _exposure(data: Mapping[str, Any]) -> str:
-    gains = {str(entry["name"]): float(np.mean(entry["grey"])) / GREY for entry in data["photographs"]}
-    dark, bright = min(gains, key=gains.__getitem__), max(gains, key=gains.__getitem__)
-    return (
-        f"Exposure: {dark} is the darkest photograph ({gains[dark]:.2f} times the mean brightness), {bright} the "
-        f"brightest ({gains[bright]:.2f} times). Training views are scored in the exposure of their photograph; test "
-        "views, the mesh and new renderings use the mean exposure."
-    )
-
-
-def _photometry(data: Mapping[str, Any]) -> str:
+def _appearance(data: Mapping[str, Any]) -> str:
+    grey = {
+        str(name): np.array([*[0.5] * 3, 1.0]) @ np.array(found["exposure"], np.float64).mean(axis=0)
+        for name, found in data["views"].items()
+        if "exposure" in found
+    }
+    gains = {name: float(value) / 0.5 for name, value in grey.items()}
+    texts = []
+    if gains:
+        dark, bright = min(gains, key=gains.__getitem__), max(gains, key=gains.__getitem__)
+        texts.append(
+            f"Exposure: {dark} is the darkest photograph ({gains[dark]:.2f} times the mean brightness), {bright} the "
+            f"brightest ({gains[bright]:.2f} times). Training views are scored in the exposure of their photograph, "
+            "test views in a predicted one. The mesh and new renderings use the mean exposure."
+        )
     cameras = [
         f"{len(entry['photographs'])} photographs ({entry['photographs'][0]}, ...) with {float(entry['corner']):.3f} "
         f"of the light in the corners and a response that deviates by {float(entry['shift']):+.3f}"
         for entry in data["cameras"]
     ]
-    return f"Vignetting and response: {'; '.join(cameras)}. New renderings and the mesh have no vignetting."
+    if cameras:
+        texts.append(f"Vignetting and response: {'; '.join(cameras)}. New renderings and the mesh have no vignetting.")
+    return " ".join(texts)
 
 
 def _poses(data: Mapping[str, Any]) -> str:
@@ -67,4 +71,4 @@ def _poses(data: Mapping[str, Any]) -> str:
     return text
 
 
-_FILES: dict[str, Callable[[Mapping[str, Any]], str]] = {EXPOSURE: _exposure, PHOTOMETRY: _photometry, POSES: _poses}
+_FILES: dict[str, Callable[[Mapping[str, Any]], str]] = {LEARNED: _appearance, POSES: _poses}
