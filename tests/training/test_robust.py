@@ -29,7 +29,7 @@ from gs2d.training.learned.point_gains import point_gains
 from gs2d.training.robust.backdrop import EVEN, find_backdrop
 from gs2d.training.robust.free_space_maps import FreeSpaceMaps
 from gs2d.training.robust.robustness import Robustness
-from gs2d.training.robust.seen_area import LARGEST, largest_log_scales, mostly_unseen
+from gs2d.training.robust.seen_area import LARGEST, largest_log_scales, votes_against_unseen
 from gs2d.training.robust.trial import Witness, missed
 from gs2d.training.start.initialize import initial_splats
 from gs2d.training.start.plane_sweep import start_points, sweep_views
@@ -280,12 +280,13 @@ def cameras_of_the_wall() -> list[Camera]:
 
 
 def test_large_splats_that_are_barely_visible_are_detected() -> None:
-    beside = (9.0, WALL, 3.0, 3.0, 0.99)  # pictures end at x = 3.2 at the most
+    beside = (9.0, WALL, 0.8, 0.8, 0.99)  # all images end before x = 3.2
     behind = (0.2, 2 * WALL, 1.0, 1.0, 0.99)
     before = (0.2, WALL, 4.0, 4.0, 0.99)
-    splats = walls_of(before, beside, behind)
-    found = mostly_unseen(splats, cameras_of_the_wall(), RASTER, BACKEND)
-    assert found.tolist() == [False, True, False]  # what is behind another hides nothing
+    near = (-1.5, 0.5, 0.3, 0.3, 0.99)
+    splats, cameras = walls_of(before, beside, behind, near), cameras_of_the_wall()
+    votes = votes_against_unseen(splats, cameras, RASTER, BACKEND)
+    assert votes.tolist() == [0, 1, 0, len(cameras)]  # a splat behind another hides nothing
 
 
 def test_barely_visible_splats_are_proposed_at_the_end_of_each_fifth() -> None:

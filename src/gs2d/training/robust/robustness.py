@@ -27,7 +27,7 @@ from gs2d.training.parallel import ONE_PROCESS, OneProcess
 from gs2d.training.robust.backdrop import in_color
 from gs2d.training.robust.free_space_maps import FreeSpaceMaps
 from gs2d.training.robust.opaque import is_opaque
-from gs2d.training.robust.seen_area import largest_log_scales, mostly_unseen
+from gs2d.training.robust.seen_area import largest_log_scales, votes_against_unseen
 from gs2d.training.robust.trial import Witness, missed
 from gs2d.training.rows import keep_rows
 from gs2d.training.start.background_sphere import sphere_points
@@ -215,7 +215,7 @@ class Robustness:
         against = self._free.against(splats)
         if last:
             cameras = [view.camera for view in self._learned.scene_now(state.learned).train]
-            against = against.maximum(mostly_unseen(splats, cameras, self._raster, self._backend).to(against))
+            against = against.maximum(votes_against_unseen(splats, cameras, self._raster, self._backend))
         if self._removal.backdrop:
             against = against.maximum(in_color(splats, self._raster.background).to(against))
         return against

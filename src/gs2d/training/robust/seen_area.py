@@ -24,13 +24,19 @@ PLACES = 7
 LEAST = 0.05  # a splat stays if an image shows this fraction of its weight
 INSIDE = 0.6  # it stays, too, if this fraction of it lies within the union of the images
 LARGE = 0.001  # fraction of an image: smaller splats cannot hide much
+COVERS = 0.5  # fraction of an image: a splat this large would be a veil before a view beside that camera
 LARGEST = 0.12  # largest standard deviation of a splat on a known surface, as a fraction of an image
 PAIRS = 1 << 24  # distances between splats and cameras that are in memory at a time, 64 MB
 SIDE = 200  # px, longer side of the images that are rendered
 
 
-def mostly_unseen(splats: Splats, cameras: Sequence[Camera], raster: RasterSettings, backend: Backend) -> Tensor:
-    """Find large splats of which no image shows more than a small fraction, and which lie mostly outside all images.
+def votes_against_unseen(
+    splats: Splats, cameras: Sequence[Camera], raster: RasterSettings, backend: Backend
+) -> Tensor:
+    """Count the images that speak against large splats that hardly any image shows and that lie mostly outside them.
+
+    A large splat has one vote against it. If it is near cameras and would cover their images, each of these cameras is
+    a vote: one distant image that shows a corner of the splat does not outweigh them.
 
     Parameters
     ----------
@@ -41,19 +47,22 @@ def mostly_unseen(splats: Splats, cameras: Sequence[Camera], raster: RasterSetti
 
     Returns
     -------
-    Tensor [N] bool
+    Tensor [N] int32
+        0 for all other splats.
     """
     most = torch.zeros(len(splats), dtype=splats.dtype, device=splats.device)
     large = torch.zeros(len(splats), dtype=torch.bool, device=splats.device)
+    covered = torch.zeros(len(splats), dtype=torch.int32, device=splats.device)
     for camera in cameras:
         small = shrunk(camera, SIDE)
         whole = whole_weights(splats, small)
         large |= whole > LARGE * small.width * small.height
+        covered += whole > COVERS * small.width * small.height
         most = torch.maximum(most, shown_weights(splats, small, raster, backend) / whole.clamp_min(1e-6))
-    found = large & (most < LEAST)
-    rows = found.nonzero().squeeze(1)
-    found[rows] = inside_fraction(splats.rows(rows), cameras) < INSIDE
-    return found
+    unseen = large & (most < LEAST)
+    rows = unseen.nonzero().squeeze(1)
+    unseen[rows] = inside_fraction(splats.rows(rows), cameras) < INSIDE
+    return torch.where(unseen, covered.clamp_min(1), 0)
 
 
 @torch.no_grad()
