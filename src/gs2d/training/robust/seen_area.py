@@ -30,9 +30,7 @@ PAIRS = 1 << 24  # distances between splats and cameras that are in memory at a 
 SIDE = 200  # px, longer side of the images that are rendered
 
 
-def votes_against_unseen(
-    splats: Splats, cameras: Sequence[Camera], raster: RasterSettings, backend: Backend
-) -> Tensor:
+def votes_against_unseen(splats: Splats, cameras: Sequence[Camera], raster: RasterSettings, backend: Backend) -> Tensor:
     """Count the images that speak against large splats that hardly any image shows and that lie mostly outside them.
 
     A large splat has one vote against it. If it is near cameras and would cover their images, each of these cameras is
