@@ -65,10 +65,10 @@ def observed(scene: Scene, error: float = 0.5, track: int = 4) -> Scene:
     return replace(scene, observe=lambda: found)
 
 
-def eager(recipe: Recipe) -> Recipe:
-    """Priors that ask nearly every pixel."""
-    assert recipe.depth_prior is not None
-    return replace(recipe, depth_prior=replace(recipe.depth_prior, opacity=0.05))
+@pytest.fixture(autouse=True)
+def faint_pixels_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compare depths of faint pixels too: the first splats leave most pixels faint."""
+    monkeypatch.setattr("gs2d.losses.prior_formulas.OPACITY", 0.05)
 
 
 # -- what is read ---------------------------------------------------------------------------------------------------
@@ -224,7 +224,7 @@ def cases(scene: Scene) -> dict[str, tuple[Scene, Recipe]]:
 @pytest.mark.parametrize("source", ["sparse", "sensor", "relative"])
 def test_known_depths_move_means_and_no_colours(scene: Scene, backend: str, source: str) -> None:
     made, recipe = cases(scene)[source]
-    trainer = Trainer(made, eager(recipe), GENERIC, backend=backend)
+    trainer = Trainer(made, recipe, GENERIC, backend=backend)
     trainer.enter(0)
     stage = trainer.recipe.stages[0]
     with_it = trainer._whole.evaluate(trainer.state, stage, 1, 0)
@@ -253,13 +253,13 @@ def test_known_depths_improve_the_surface(scene: Scene) -> None:
             found.append(float((output.depth_mean / truth - 1).abs()[there].mean()))
         return float(np.mean(found))
 
-    assert error(eager(with_depth_prior(plain, "sensor", 2.0))) < 0.85 * error(plain)
+    assert error(with_depth_prior(plain, "sensor", 2.0)) < 0.85 * error(plain)
 
 
 @pytest.mark.parametrize("source", ["sparse", "relative"])
 def test_a_resumed_training_gives_the_same_bytes(scene: Scene, backend: str, source: str) -> None:
     made, recipe = cases(scene)[source]
-    end = resumed_everywhere(made, eager(recipe), backend, every=12)
+    end = resumed_everywhere(made, recipe, backend, every=12)
     assert not same(end, Trainer(scene, short(), GENERIC, backend=backend).run())
 
 
