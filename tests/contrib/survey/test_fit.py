@@ -66,7 +66,7 @@ def test_positions_on_a_line_or_without_heights_need_an_up() -> None:
         fit = fit_places(given, told, TURN[2])
         assert fit.scale == pytest.approx(SCALE, rel=1e-9)
         assert angle(fit.rotation) < 1e-5
-        with pytest.raises(DataError, match="--up"):
+        with pytest.raises(DataError, match="--set up"):
             fit_places(given, told, None)
 
 

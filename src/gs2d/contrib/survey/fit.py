@@ -112,7 +112,7 @@ def fit_places(
     if full is not None and (up is None or full.tilt_error < LEVEL):
         return full
     if up is None:
-        raise DataError(f"up is not determined ({reason}), and the cameras do not agree; set --up X Y Z")
+        raise DataError(f"up is not determined ({reason}), and the cameras do not agree; use --set up=X,Y,Z")
     turn = rotation_to_z(up / np.linalg.norm(up))
     fit = _fit(source @ turn.T, target, _solve_level, 2, tilt, robust)
     T = fit.T.copy()

@@ -27,7 +27,7 @@ Role = Literal["fitted", "left out", "check"]
 FITTED: Role = "fitted"
 LEFT_OUT: Role = "left out"
 CHECK: Role = "check"
-_UP = {"places": "the positions", "cameras": "how the cameras were held", "given": "--up"}
+_UP = {"places": "the positions", "cameras": "how the cameras were held", "given": "--set up"}
 _ROLES: tuple[Role, ...] = (FITTED, LEFT_OUT, CHECK)
 
 
