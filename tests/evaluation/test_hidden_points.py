@@ -12,19 +12,19 @@ from gs2d.evaluation.hidden_points import HiddenPoints, hidden_points, total
 POINTS = PointsInView(np.array([[0.5, 0.5], [1.5, 0.5], [2.5, 0.5], [3.5, 0.5]]), np.full(4, 10.0))
 
 
-def test_a_point_is_hidden_by_a_surface_clearly_nearer_and_by_no_other() -> None:
+def test_a_clearly_nearer_surface_occludes_a_point() -> None:
     depth = np.array([[9.4, 9.6, 0.0, 20.0]])  # nearer than 9.5; about there; nothing hit; behind the point
     assert hidden_points(depth, POINTS) == HiddenPoints(shown=4, hidden=1)
 
 
-def test_views_are_pooled_by_points() -> None:
+def test_counts_of_views_are_summed() -> None:
     assert total([HiddenPoints(10, 1), HiddenPoints(0, 0), HiddenPoints(30, 3)]) == HiddenPoints(40, 4)
 
 
 @pytest.mark.parametrize(
     ("row", "reason"), [(0, "shown"), (1, "too few photographs"), (2, "error"), (3, "outside"), (4, "behind")]
 )
-def test_points_of_a_view_are_the_trusted_ones_inside_the_picture(row: int, reason: str) -> None:
+def test_points_of_a_view_are_reliable_and_inside_the_image(row: int, reason: str) -> None:
     camera = Camera(10, 10, fx=10.0, fy=10.0, cx=5.0, cy=5.0, T_cam_world=np.eye(4))
     xyz = np.array([[0.0, 0, 2], [0, 0, 2], [0, 0, 2], [2.0, 0, 2], [0, 0, -2]])
     error, track = np.array([1.0, 1, 3, 1, 1]), np.array([3, 2, 3, 3, 3])

@@ -43,7 +43,7 @@ def test_psnr_of_a_constant_error_of_a_tenth_is_twenty_decibels() -> None:
     assert psnr_float(target + 0.1, target) == pytest.approx(20.0, abs=1e-4)
 
 
-def test_the_8_bit_psnr_sees_only_what_survives_quantisation() -> None:
+def test_the_8_bit_psnr_ignores_differences_below_quantisation() -> None:
     target = torch.full((3, 3, 3), 100 / 255)
     assert psnr_8bit(target + 0.4 / 255, target) == math.inf
     # 0.6/255 rounds to one level of 255: 20 log10(255)
@@ -51,7 +51,7 @@ def test_the_8_bit_psnr_sees_only_what_survives_quantisation() -> None:
     assert psnr_float(target + 0.6 / 255, target) == pytest.approx(20 * math.log10(255 / 0.6), abs=1e-3)
 
 
-def test_masked_pixels_count_neither_in_psnr_nor_in_ssim() -> None:
+def test_masked_pixels_are_ignored_in_psnr_and_ssim() -> None:
     g = torch.Generator().manual_seed(0)
     target = torch.rand(20, 24, 3, generator=g)
     image = (target + 0.1).clamp(0, 1)
@@ -84,7 +84,7 @@ def test_a_metric_that_cannot_be_computed_is_null_with_its_reason() -> None:
     assert empty.psnr == empty.ssim == Metric(None, "no valid pixel")
 
 
-def test_the_mean_over_views_says_how_many_were_left_out() -> None:
+def test_the_mean_over_views_reports_missing_values() -> None:
     target = torch.full((8, 8, 3), 0.5)
     views = [image_metrics(target + error, target, backend="reference") for error in (0.1, 0.0, 0.01)]
     mean = mean_metrics(views)
@@ -122,7 +122,7 @@ def naive_lpips(state: dict[str, Tensor], image: Tensor, target: Tensor) -> floa
     return total
 
 
-def test_lpips_is_that_of_a_network_built_from_modules_in_both_conventions(network: Lpips) -> None:
+def test_lpips_equals_a_network_of_modules_in_both_conventions(network: Lpips) -> None:
     g = torch.Generator().manual_seed(4)
     image, target = torch.rand(32, 37, 3, generator=g), torch.rand(32, 37, 3, generator=g)
     state = vgg_state() | head_state()
@@ -145,7 +145,7 @@ def test_lpips_is_zero_for_equal_images_and_ignores_masked_pixels(network: Lpips
     assert unmasked.lpips.value > 0
 
 
-def test_wrong_weight_files_are_refused_in_one_line_with_the_remedy(tmp_path: Path, weights: Path) -> None:
+def test_wrong_weight_files_are_one_line_errors(tmp_path: Path, weights: Path) -> None:
     noise = tmp_path / "noise.pth"
     noise.write_bytes(b"not a checkpoint at all")
     tensor = tmp_path / "tensor.pth"

@@ -65,7 +65,7 @@ def pair(seed: int) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("published", [True, False], ids=["published heads", "random heads"])
-def test_lpips_is_that_of_the_package_for_the_same_weights_in_both_conventions(
+def test_lpips_equals_the_package_in_both_conventions(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, vgg_file: Path, published: bool
 ) -> None:
     heads = HEADS / "vgg.pth"
@@ -91,7 +91,7 @@ def test_the_published_heads_load_as_distributed(vgg_file: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "head"), [("alex", 1), ("squeeze", 3)])
-def test_heads_of_another_network_are_refused_in_one_line(vgg_file: Path, name: str, head: int) -> None:
+def test_heads_of_another_network_are_a_one_line_error(vgg_file: Path, name: str, head: int) -> None:
     """Channels: VGG 64 128 256 512 512, AlexNet 64 192 384 256 256, SqueezeNet 64 128 256 384 384 512 512."""
     with pytest.raises(
         DataError, match=rf"LPIPS weight lin{head}\.model\.1\.weight must be .*; pass --lpips"
@@ -100,7 +100,7 @@ def test_heads_of_another_network_are_refused_in_one_line(vgg_file: Path, name: 
     assert "\n" not in str(caught.value)
 
 
-def test_both_lpips_figures_are_of_the_8_bit_image_and_named(vgg_file: Path) -> None:
+def test_both_lpips_values_use_the_8_bit_image(vgg_file: Path) -> None:
     """A change below half a level of 255 vanishes in the 8-bit image, so that LPIPS does not see it."""
     network = load_lpips([vgg_file, HEADS / "vgg.pth"])
     target = torch.full((24, 24, 3), 100 / 255)
@@ -111,7 +111,7 @@ def test_both_lpips_figures_are_of_the_8_bit_image_and_named(vgg_file: Path) -> 
 
 
 @pytest.mark.parametrize("torch_is_old", [False, True])
-def test_convolutions_keep_all_digits_on_a_gpu_and_the_users_setting_comes_back(
+def test_convolutions_use_full_precision_and_restore_the_setting(
     vgg_file: Path, monkeypatch: pytest.MonkeyPatch, torch_is_old: bool
 ) -> None:
     """TF32 is torch's default for convolutions on a GPU. Before 2.9 it had one setting for all of cuDNN."""

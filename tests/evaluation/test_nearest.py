@@ -11,7 +11,7 @@ from gs2d.evaluation.nearest import Cloud
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [3, 0, 0]], np.float32)
 
 
-def test_the_nearest_come_first_and_what_is_missing_is_infinitely_far() -> None:
+def test_neighbours_are_sorted_and_missing_ones_are_infinite() -> None:
     distances, index = Cloud(POINTS).nearest(np.array([[0.9, 0, 0]]), neighbours=4)
     np.testing.assert_allclose(distances, [[0.1, 0.9, 2.1, np.inf]], atol=1e-12)
     assert index.tolist() == [[1, 0, 2, 3]]
@@ -21,7 +21,7 @@ def test_the_nearest_come_first_and_what_is_missing_is_infinitely_far() -> None:
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_what_is_not_finite_is_refused(bad: float) -> None:
+def test_non_finite_coordinates_are_an_error(bad: float) -> None:
     broken = np.array([[0.0, bad, 0]])
     with pytest.raises(DataError, match="finite"):
         Cloud(broken)

@@ -19,13 +19,13 @@ FIGURES = json.loads((Path(__file__).resolve().parents[1] / "helpers" / "oracle_
 NAMES = [f"{i + 1:06d}.jpg" for i in range(60)]
 
 
-def test_the_figures_are_of_the_scenes_that_are_scored_here() -> None:
+def test_reference_values_belong_to_these_scenes() -> None:
     assert FIGURES["open3d"] == "0.19.0"
     assert FIGURES["tau"] == TAU
 
 
 @pytest.mark.parametrize("figures", FIGURES["tnt"], ids=lambda f: f"seed{f['seed']}")
-def test_the_f_score_its_alignment_and_every_stage_are_open3d_s(figures: dict) -> None:
+def test_f_score_and_alignment_equal_open3d(figures: dict) -> None:
     """Same steps, same criteria: shares and transforms to rounding, so not one point falls on another side of tau."""
     scene = tnt_scene(figures["seed"])
     polygon = np.array(scene.crop["bounding_polygon"])[:, :2]
@@ -46,7 +46,7 @@ def test_the_f_score_its_alignment_and_every_stage_are_open3d_s(figures: dict) -
 
 
 @pytest.mark.parametrize("figures", FIGURES["tnt"], ids=lambda f: f"seed{f['seed']}")
-def test_camera_centres_are_aligned_as_open3d_aligns_them(figures: dict) -> None:
+def test_alignment_of_camera_centres_equals_open3d(figures: dict) -> None:
     """All pairs: the same matrix. By RANSAC: Open3D keeps the fit to a random sample of six, so to the log's noise."""
     scene = tnt_scene(figures["seed"])
     targets = moved(scene.T_truth_log, scene.log[:, :3, 3])
@@ -57,7 +57,7 @@ def test_camera_centres_are_aligned_as_open3d_aligns_them(figures: dict) -> None
 
 
 @pytest.mark.parametrize("figures", FIGURES["dtu"], ids=lambda f: f"seed{f['seed']}")
-def test_the_chamfer_distance_is_the_oracle_s_but_for_the_shuffle(figures: dict) -> None:
+def test_the_chamfer_distance_equals_the_reference_except_for_the_shuffle(figures: dict) -> None:
     """The same points on the mesh; the random thinning moves the score of this small scene by 0.6 % (one sigma)."""
     scene = dtu_scene(figures["seed"])
     mesh = Mesh(scene.vertices, scene.faces)

@@ -51,7 +51,7 @@ def from_above(count: int = 3, height: float = 5.0) -> list[Camera]:
 # distances
 
 
-def test_distances_to_a_triangle_are_to_its_plane_its_edges_or_its_corners() -> None:
+def test_distances_to_the_plane_edges_and_corners_of_a_triangle() -> None:
     triangle = np.array([[0.0, 0, 0], [4, 0, 0], [0, 3, 0]])
     points = np.array([[1, 1, 2.0], [2, -3, 4], [-3, -4, 0], [7, 0, 4], [4, 3, 0], [0, 0, 0]])
     # above the inside: 2; beside the edge y = 0: (3, 4) -> 5; at the corner: 5; beyond (4,0,0): 5;
@@ -75,7 +75,7 @@ def test_distances_agree_with_trimesh_on_a_crumpled_mesh() -> None:
 # samples
 
 
-def test_samples_lie_on_the_surface_in_proportion_to_area_and_come_back_for_the_same_seed() -> None:
+def test_samples_are_area_weighted_and_reproducible() -> None:
     mesh = merged(square(0.0, half=1.0), square(1.0, half=2.0))  # areas 4 and 16
     assert face_areas(mesh).tolist() == [2.0, 2.0, 8.0, 8.0]
     one, two = sample_surface(mesh, 10_000, seed=3), sample_surface(mesh, 10_000, seed=3)
@@ -98,7 +98,7 @@ def depths(mesh: Mesh, camera: Camera) -> np.ndarray:
     return cast_camera(mesh.vertices.astype(np.float64), mesh.faces, camera).depth
 
 
-def test_depth_is_that_of_another_ray_caster_on_a_real_mesh(shared: Callable[[str], Path]) -> None:
+def test_depth_equals_another_ray_caster(shared: Callable[[str], Path]) -> None:
     """Against the published depth maps of test views, float16: within 0.002."""
     folder = shared("rendered_bottle")
     mesh = read_mesh(folder / "mesh_gt.ply")
@@ -121,7 +121,7 @@ def test_a_closed_surface_has_no_pinholes() -> None:
     assert (depths(Mesh(mesh.vertices + jitter, mesh.faces), camera) > 0).all()
 
 
-def test_what_hides_does_so_in_captures_of_any_unit() -> None:
+def test_occlusion_does_not_depend_on_units() -> None:
     """A capture in kilometres: all of it is nearer to the cameras than a millimetre is in metres."""
     small = 1e-4
     cameras = [Camera(c.width, c.height, c.fx, c.fy, c.cx, c.cy, scaled(c.T_cam_world, small)) for c in from_above(3)]
@@ -163,7 +163,7 @@ def test_half_of_a_square_has_full_precision_and_half_recall() -> None:
     assert score.completeness == pytest.approx(0.25, abs=0.01)  # half the points, at 0 to 1 from the half square
 
 
-def test_true_surface_that_too_few_cameras_see_does_not_count() -> None:
+def test_true_surface_seen_by_few_cameras_is_not_scored() -> None:
     truth = merged(square(0.0), square(-1.0))  # the lower one is hidden
     cameras = from_above(3)
     score = evaluate_surface(square(0.0), truth, cameras=cameras, thresholds=[0.01], samples=4000)
@@ -175,7 +175,7 @@ def test_true_surface_that_too_few_cameras_see_does_not_count() -> None:
         evaluate_surface(square(0.0), truth, cameras=cameras[:2], samples=100)
 
 
-def test_counts_that_come_with_the_data_are_used() -> None:
+def test_view_counts_of_the_data_are_used() -> None:
     truth = merged(square(0.0), square(-1.0))
     seen = np.array([5, 5, 2, 2])
     score = evaluate_surface(square(0.0), truth, seen=seen, thresholds=[0.01], samples=4000)
@@ -187,7 +187,7 @@ def test_counts_that_come_with_the_data_are_used() -> None:
         evaluate_surface(square(0.0), truth, seen=seen[:3])
 
 
-def test_reconstructed_surface_that_no_camera_sees_is_neither_punished_nor_rewarded() -> None:
+def test_invisible_reconstructed_surface_is_not_scored() -> None:
     inside = merged(square(0.0), square(-0.5, half=0.5))  # a second sheet below, hidden by the first
     score = evaluate_surface(inside, square(0.0), cameras=from_above(3), thresholds=[0.01], samples=4000)
     assert score.scores[0].precision == 1
@@ -198,7 +198,7 @@ def test_reconstructed_surface_that_no_camera_sees_is_neither_punished_nor_rewar
     assert punished.scores[0].precision < 0.85
 
 
-def test_reconstruction_on_true_but_unseen_surface_is_not_wrong() -> None:
+def test_reconstruction_on_unseen_true_surface_is_correct() -> None:
     truth = merged(square(0.0), square(-1.0))
     score = evaluate_surface(square(-1.0), truth, seen=np.array([3, 3, 0, 0]), thresholds=[0.01], samples=1000)
     assert score.scores[0].precision == 1

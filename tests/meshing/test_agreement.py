@@ -55,7 +55,7 @@ def errors(images: list[ColorSource]) -> np.ndarray:
     return np.abs(texture.reshape(-1, 3)[inner] - 255 * stripes(places[inner]))
 
 
-def test_an_obstacle_in_two_of_eight_photographs_is_not_painted_on_the_surface() -> None:
+def test_an_obstacle_in_two_of_eight_images_is_rejected() -> None:
     images = photographs(8)
     clean = errors(images)
     images[2] = with_plate(images[2], 1.0, (210, 190, 40))
@@ -65,14 +65,14 @@ def test_an_obstacle_in_two_of_eight_photographs_is_not_painted_on_the_surface()
     assert found.max() < clean.max() + 6
 
 
-def test_the_nearest_photograph_alone_does_not_decide() -> None:
+def test_the_nearest_image_alone_does_not_determine_the_colour() -> None:
     images = photographs(6)
     near = look_at(np.array([0, 0, 1.9]), np.zeros(3), np.array([0.0, 1, 0]), width=SIZE, height=SIZE, fx=1.25 * SIZE)
     images.append(with_plate(photograph(grid_plane(16), near, stripes), 0.4, (30, 200, 30)))
     assert errors(images).max() < 30
 
 
-def test_a_highlight_that_moves_with_the_camera_vanishes() -> None:
+def test_a_moving_highlight_is_removed() -> None:
     images = []
     for image in photographs(8):
         x, y = image.camera.center[:2] / 2
@@ -85,7 +85,7 @@ def test_a_highlight_that_moves_with_the_camera_vanishes() -> None:
     assert np.quantile(errors(images), 0.999) < 20  # of 150 in one photograph
 
 
-def test_exposures_are_found_from_overlaps_in_a_chain_despite_obstacles() -> None:
+def test_exposures_are_estimated_from_a_chain_of_overlaps() -> None:
     """Each photograph shares points with its neighbours only; the third has an obstacle before a third of them."""
     truth, gains = np.random.default_rng(0).uniform(50, 160, (600, 3)), np.array([0.7, 0.9, 1.2, 1.0, 1.3])
     samples = [np.zeros((600, 4), np.uint8) for _ in gains]
@@ -97,7 +97,7 @@ def test_exposures_are_found_from_overlaps_in_a_chain_despite_obstacles() -> Non
     np.testing.assert_allclose(found / found[0], np.repeat((gains / gains[0])[:, None], 3, axis=1), rtol=0.03)
 
 
-def test_photographs_leave_no_seam_where_they_end() -> None:
+def test_image_borders_leave_no_seam() -> None:
     """Each shows a part of the plane only, in an exposure of its own; a uniform wall shows every step."""
     gains, images = (0.8, 1.2, 0.9, 1.15), []
     wall = photographs(4, gains, lambda places: np.full_like(places, 0.5))

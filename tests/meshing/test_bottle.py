@@ -44,7 +44,7 @@ def ray_cast(mesh: Mesh, camera: Camera) -> np.ndarray:
     return np.where(face >= 0, depth, 0).reshape(SIZE, SIZE)
 
 
-def test_exact_depth_of_the_bottle_scene_gives_its_surface_back(shared: Callable[[str], Path]) -> None:
+def test_exact_depth_of_the_bottle_scene_reproduces_its_surface(shared: Callable[[str], Path]) -> None:
     folder = shared("rendered_bottle")
     truth, seen = read_mesh(folder / "mesh_gt.ply"), np.load(folder / "mesh_gt_seen.npy")
     cameras = cameras_of(folder)

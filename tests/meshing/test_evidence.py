@@ -35,7 +35,7 @@ def off_the_ball(mesh: Mesh) -> float:
     return float(area[np.abs(np.linalg.norm(middle, axis=1) - 1) > 0.15].sum() / area.sum())
 
 
-def test_a_sheet_that_one_view_saw_goes_and_the_ball_stays_whole() -> None:
+def test_a_sheet_seen_by_one_view_is_removed_and_the_ball_is_kept() -> None:
     seen = frames(14, sheets=1)
     before, after = (
         extract(seen, ExtractOptions(bbox=BOX, voxel=0.1, by_evidence=cleans), threads=1) for cleans in (False, True)
@@ -46,7 +46,7 @@ def test_a_sheet_that_one_view_saw_goes_and_the_ball_stays_whole() -> None:
     assert before.pixels is None
 
 
-def test_no_face_reaches_beyond_the_box_though_voxels_do() -> None:
+def test_no_face_extends_beyond_the_box() -> None:
     box = np.array([[-0.73, -2, -2], [0.77, 2, 2]])
     mesh = extract(frames(14), ExtractOptions(bbox=box, voxel=0.1), threads=1).mesh
     assert mesh.vertices[:, 0].min() == pytest.approx(-0.73, abs=0.1)
@@ -54,7 +54,7 @@ def test_no_face_reaches_beyond_the_box_though_voxels_do() -> None:
     assert (np.abs(mesh.vertices[:, 0] - 0.02) <= 0.75).all()
 
 
-def test_faces_are_no_more_than_the_pixels_that_saw_them_carry_and_keep_colour_and_shape() -> None:
+def test_the_number_of_faces_follows_the_pixels() -> None:
     found = extract(frames(14), ExtractOptions(bbox=BOX, voxel=0.06, by_evidence=True), threads=1)
     assert found.pixels is not None
     # a pixel at distance 3 is 3 / 40 wide, and the best view of each part looks nearly straight at it
@@ -65,7 +65,7 @@ def test_faces_are_no_more_than_the_pixels_that_saw_them_carry_and_keep_colour_a
     assert (np.abs(found.mesh.colors.astype(int) - (200, 40, 90)).max(axis=0) <= 1).all()
 
 
-def test_what_views_say_is_said_vertex_by_vertex_whatever_the_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_evidence_does_not_depend_on_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     made = [depth_map(frame) for frame in frames(5, sheets=2)]
     mesh = extract(frames(5), ExtractOptions(bbox=BOX, voxel=0.1), threads=1).mesh
     whole = gather(mesh, made, 0.1)
@@ -112,5 +112,5 @@ def part_of_floor(frames: list[RenderedView]) -> float:
     return float(areas(mesh)[inside].sum()) / 1.4**2
 
 
-def test_a_floor_on_which_depths_are_loose_stays_whole() -> None:
+def test_a_floor_with_noisy_depths_is_kept() -> None:
     assert part_of_floor(views_of_a_floor()) == pytest.approx(1, abs=0.1)

@@ -50,7 +50,7 @@ def test_backprojected_pixels_project_back() -> None:
     np.testing.assert_allclose(z, [1, 2, 3])
 
 
-def test_the_voxel_is_the_robust_box_by_the_resolution() -> None:
+def test_the_voxel_is_the_percentile_box_divided_by_the_resolution() -> None:
     """1000 points from 0 to 100: the 1st to 99th percentile span 98."""
     lim = derive_limits([sample(line(1000, 0, 100), np.full(1000, 5.0))], [CAMERA], resolution=98)
     assert lim.voxel == pytest.approx(1.0)
@@ -103,7 +103,7 @@ def test_a_bbox_is_fused_whole() -> None:
         {"depth_limit": 0.5},  # before everything
     ],
 )
-def test_limits_that_make_no_sense_are_refused_in_one_line(options: dict) -> None:
+def test_invalid_limits_are_one_line_errors(options: dict) -> None:
     with pytest.raises(ProtocolError) as error:
         derive_limits([sample(line(100, 0, 1), np.ones(100))], [CAMERA], **options)
     assert "\n" not in str(error.value)
@@ -137,7 +137,7 @@ def test_disagreement_is_as_large_as_the_error() -> None:
     assert 1.2 * 0.02 < noise < 2.5 * 0.02
 
 
-def test_occlusion_is_no_disagreement() -> None:
+def test_occlusion_is_not_disagreement() -> None:
     """A small box before a wall, seen from several sides: parts of the wall are hidden in some views."""
     eyes = [np.array([x, -4.0, z]) for x in (-1, 0, 1) for z in (0, 1)]
     cameras = [look_at(eye, np.zeros(3), UP, width=96, height=96, fx=80) for eye in eyes]
@@ -151,7 +151,7 @@ def test_occlusion_is_no_disagreement() -> None:
     assert noise < 0.01
 
 
-def test_the_truncation_is_twenty_times_the_noise_within_five_and_twenty_voxels_and_a_40th_of_the_box() -> None:
+def test_the_truncation_follows_the_noise_within_bounds() -> None:
     lim = replace(limits_of(orbit_maps(0.0)), voxel=0.01, truncation=0.05, side=10.0)
     assert widen_truncation(lim, 0.001).truncation == 0.05
     assert widen_truncation(lim, 0.006).truncation == pytest.approx(0.12)
@@ -161,7 +161,7 @@ def test_the_truncation_is_twenty_times_the_noise_within_five_and_twenty_voxels_
     assert widen_truncation(lim, 0.006).depth_noise == 0.006
 
 
-def test_noisy_maps_are_fused_better_with_the_widened_truncation() -> None:
+def test_noisy_maps_are_fused_better_with_a_wider_truncation() -> None:
     frames = [RenderedView(m.camera, m.depth) for m in orbit_maps(0.02)]
     wide = extract(frames, ExtractOptions(voxel=0.007), threads=1)
     narrow = extract(frames, ExtractOptions(voxel=0.007, truncation=0.035), threads=1)

@@ -72,14 +72,14 @@ def test_white_noise_with_every_ambiguous_case_is_closed(seed: int) -> None:
     assert (upward == 1).all()
 
 
-def test_zeros_on_voxels_do_not_open_the_surface_or_make_empty_triangles() -> None:
+def test_zeros_on_voxels_create_no_holes_or_degenerate_triangles() -> None:
     mesh = marching_cubes(volume_of(lambda p: np.rint((np.abs(p).max(1) - 0.5) * 8) / 8, limits(1.0, 2 / 16), 2))
     assert is_closed_manifold(mesh)
     t = mesh.vertices.astype(np.float64)[mesh.faces]
     assert np.linalg.norm(np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]), axis=1).min() > 0
 
 
-def test_blocks_in_any_cut_give_the_same_surface_without_seams() -> None:
+def test_blocks_in_any_partition_give_the_same_surface() -> None:
     """A plane through 4^3 blocks: no edge inside the box has fewer than two faces."""
     lim = limits(1.0, 2 / 32)
     mesh = marching_cubes(volume_of(lambda p: p @ np.array([0.3, 0.5, 0.81]) - 0.111, lim, 4))
@@ -90,7 +90,7 @@ def test_blocks_in_any_cut_give_the_same_surface_without_seams() -> None:
     assert components(mesh).max() == 0
 
 
-def test_unknown_voxels_make_no_surface() -> None:
+def test_unknown_voxels_create_no_surface() -> None:
     lim = limits(1.0, 2 / 32)
     valid = volume_of(sphere(0.7), lim, 4)
     weight = valid.weight.copy()
@@ -118,7 +118,7 @@ def test_missing_blocks_are_unknown_space() -> None:
     assert (z < low).any()
 
 
-def test_vertex_colours_are_interpolated_and_uncoloured_ends_do_not_count() -> None:
+def test_vertex_colours_are_interpolated_without_uncoloured_ends() -> None:
     lim = limits(1.0, 2 / 16)
     plain = volume_of(lambda p: p[:, 2] - 0.05, lim, 2)
     color = np.full((*plain.tsdf.shape, 3), 90.0, np.float32)
@@ -141,7 +141,7 @@ def strips() -> Mesh:
     return Mesh(vertices, faces, np.repeat(np.arange(12, dtype=np.uint8)[:, None], 3, axis=1))
 
 
-def test_small_components_and_unused_vertices_go() -> None:
+def test_small_components_and_unused_vertices_are_removed() -> None:
     kept = keep_components(strips(), min_faces=2)
     assert kept.colors is not None
     assert kept.colors[:, 0].tolist() == [0, 1, 2, 3, 8, 9, 10, 11]

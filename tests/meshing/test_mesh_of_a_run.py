@@ -38,7 +38,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train(options).path
 
 
-def test_a_run_is_meshed_without_bounds_and_its_levels_are_told(run: Path, tmp_path: Path) -> None:
+def test_an_unbounded_mesh_of_a_run_reports_its_levels(run: Path, tmp_path: Path) -> None:
     result = mesh_run(run, MeshOptions(unbounded=True, voxel=0.05), out=tmp_path / "far.ply", threads=1)
     assert result["unbounded"] is True
     assert result["levels"] >= 1
@@ -50,9 +50,7 @@ def test_a_run_is_meshed_without_bounds_and_its_levels_are_told(run: Path, tmp_p
     assert json.dumps(result)
 
 
-def test_voxels_that_nobody_asked_for_are_as_large_as_memory_needs(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_default_voxels_grow_until_the_volume_fits(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fine = mesh_run(run, MeshOptions(), out=tmp_path / "fine.ply", threads=1)
     allowed = fine["volume_bytes"] // 3
     monkeypatch.setattr("gs2d.pipeline.finish.run_mesh.memory_budget", lambda: allowed)
@@ -67,9 +65,7 @@ def test_voxels_that_nobody_asked_for_are_as_large_as_memory_needs(
         mesh_run(run, MeshOptions(voxel=fine["voxel"]), out=tmp_path / "asked.ply", threads=1)
 
 
-def test_a_training_whose_mesh_does_not_fit_has_it_in_larger_voxels_from_the_same_depth_maps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_training_with_little_memory_uses_larger_voxels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Training and mesh in one command: the depth maps that scoring kept were closed after the voxels that failed."""
     monkeypatch.setattr("gs2d.pipeline.finish.run_mesh._volume_bytes", lambda _options: 400 << 10)
     capture, heard = write_capture(tmp_path / "ball", size=32), list[Event]()
@@ -80,9 +76,7 @@ def test_a_training_whose_mesh_does_not_fit_has_it_in_larger_voxels_from_the_sam
     assert run.metrics()["mesh"]["faces"] == len(read_mesh(run.file("mesh.ply")).faces) > 10
 
 
-def test_the_run_fuses_its_protocols_depth_and_one_of_before_that_field_still_resumes(
-    run: Path, tmp_path: Path
-) -> None:
+def test_a_run_fuses_the_depth_of_its_protocol(run: Path, tmp_path: Path) -> None:
     assert mesh_run(run, MeshOptions(voxel=0.05), out=tmp_path / "a.ply", threads=1)["depth"] == "median"
     assert mesh_run(run, MeshOptions(voxel=0.05, depth="mean"), out=tmp_path / "b.ply", threads=1)["depth"] == "mean"
     folder = RunFolder(run)
@@ -104,7 +98,7 @@ def test_the_run_fuses_its_protocols_depth_and_one_of_before_that_field_still_re
 
 
 @pytest.mark.parametrize("unbounded", [False, True])
-def test_a_run_is_fused_by_its_own_backend_and_says_so(
+def test_a_run_is_fused_by_its_backend(
     run: Path, tmp_path: Path, unbounded: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []

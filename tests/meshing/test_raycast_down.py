@@ -17,7 +17,7 @@ def two_floors() -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([low, high]), np.concatenate([HALVES, HALVES + 4])
 
 
-def test_the_highest_surface_is_met_and_interpolated() -> None:
+def test_the_highest_surface_is_hit_and_interpolated() -> None:
     vertices, faces = two_floors()
     hits = cast_down(vertices, faces, (0.0, 4.0), 1.0, (4, 4))
     heights = (vertices[faces[hits.face], 2] * hits.weights).sum(axis=-1)
@@ -29,7 +29,7 @@ def test_the_highest_surface_is_met_and_interpolated() -> None:
     np.testing.assert_allclose(x, np.tile(np.arange(4) + 0.5, (4, 1)), atol=1e-6)
 
 
-def test_beside_the_surface_there_is_none_and_no_ray_slips_between_triangles() -> None:
+def test_rays_miss_beside_the_surface_but_not_between_triangles() -> None:
     vertices, faces = two_floors()
     hits = cast_down(vertices, faces, (-1.0, 5.0), 0.25, (24, 24))
     inside = np.zeros((24, 24), dtype=bool)

@@ -18,7 +18,7 @@ def sheet(n: int = 30) -> tuple[np.ndarray, np.ndarray]:
     return points, np.concatenate(faces).astype(np.int32)
 
 
-def test_a_process_of_its_own_gives_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_separate_process_gives_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
     points, faces = sheet()
     here = simplify.collapse(points, faces, 300)
     monkeypatch.setattr(simplify, "OWN_PROCESS_FACES", 1)
@@ -31,7 +31,7 @@ def test_a_process_of_its_own_gives_the_same_bytes(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("program", ["raise SystemExit(1)", "print('no arrays')"])
-def test_where_the_other_process_fails_the_work_is_done_here(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
+def test_a_failing_process_falls_back_to_this_one(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
     points, faces = sheet()
     expected = simplify.collapse(points, faces, 300)
     monkeypatch.setattr(simplify, "OWN_PROCESS_FACES", 1)

@@ -40,7 +40,7 @@ def wall_points(image: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("sky", [0.9, 0.03])
-def test_a_sky_without_points_is_found_up_to_the_roofs(sky: float) -> None:
+def test_sky_without_points_is_detected_up_to_the_roofs(sky: float) -> None:
     image = castle(sky=sky)
     found = sky_in(image, wall_points(image))
     assert found[: ROOF - 16].all()
@@ -49,7 +49,7 @@ def test_a_sky_without_points_is_found_up_to_the_roofs(sky: float) -> None:
     assert found[ROOF - 10 : ROOF, WIDTH // 2 - 4 : WIDTH // 2 + 4].mean() < 0.1  # the tower
 
 
-def test_smooth_parts_of_a_thing_are_not_sky() -> None:
+def test_smooth_parts_of_objects_are_not_sky() -> None:
     image = castle()
     image[ROOF + 10 : ROOF + 45, 20:100] = 0.9  # a smooth plate within the wall
     image[-12:, :14] = 0.9  # and a small one at the rim

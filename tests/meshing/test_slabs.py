@@ -25,7 +25,7 @@ def maps(*, colored: bool) -> list[DepthMap]:
 
 @pytest.mark.parametrize("colored", [False, True])
 @pytest.mark.parametrize("fraction", [0.0, 0.3, 0.6])
-def test_the_mesh_of_slabs_is_that_of_the_whole_volume(colored: bool, fraction: float) -> None:
+def test_the_mesh_does_not_depend_on_slabs(colored: bool, fraction: float) -> None:
     seen = maps(colored=colored)
     limits = derive_limits([sample_depths(item) for item in seen], [item.camera for item in seen], voxel=0.05)
     blocks = find_blocks(seen, limits, threads=1)
@@ -42,7 +42,7 @@ def test_the_mesh_of_slabs_is_that_of_the_whole_volume(colored: bool, fraction: 
         np.testing.assert_array_equal(parts.colors, whole.colors)
 
 
-def test_no_slab_takes_more_memory_than_it_may_unless_it_is_one_layer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slabs_respect_the_memory_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = maps(colored=False)
     limits = derive_limits([sample_depths(item) for item in seen], [item.camera for item in seen], voxel=0.04)
     blocks = find_blocks(seen, limits, threads=1)

@@ -48,7 +48,7 @@ def middle(texture: np.ndarray) -> list[int]:
     return [int(v) for v in texture[len(texture) // 2, len(texture) // 2]]
 
 
-def test_a_checkered_box_is_drawn_from_its_texture_as_its_photographs_show_it() -> None:
+def test_a_textured_checkered_box_looks_like_its_images() -> None:
     pytest.importorskip("xatlas")
     mesh = box()
     images = [photograph(mesh, camera, checkers) for camera in ring(14)]
@@ -67,7 +67,7 @@ def test_a_checkered_box_is_drawn_from_its_texture_as_its_photographs_show_it() 
 
 
 @pytest.mark.usefixtures("uncorrected")
-def test_a_texel_takes_the_photographs_with_most_pixels_per_area_less_the_first_that_is_left_out() -> None:
+def test_a_texel_is_weighted_by_pixels_per_area() -> None:
     # f = 64; straight above a plane q = f^2 / z^2: 4096, 1024, 256 and 64 at z = 1, 2, 4, 8. The best two, less the
     # third: 3840 and 768, which is 5 to 1.
     heights = ((4, GREEN), (1, RED), (8, GREEN), (2, BLUE))
@@ -76,7 +76,7 @@ def test_a_texel_takes_the_photographs_with_most_pixels_per_area_less_the_first_
 
 
 @pytest.mark.usefixtures("uncorrected")
-def test_what_stands_before_the_surface_does_not_colour_it() -> None:
+def test_occluders_do_not_colour_the_surface() -> None:
     # A plate of half the side hides the middle of the floor from the near camera; the far one comes in from aside.
     floor, plate = grid_plane(16, side=2.0), grid_plane(4, side=1.0, z=0.5)
     both = join([floor, plate])
@@ -103,7 +103,7 @@ def test_pixels_that_are_masked_or_transparent_are_not_used() -> None:
         bake(flat_atlas(grid_plane()), listed([masked]), 64, threads=1)
 
 
-def test_a_gain_between_photographs_leaves_no_step_where_one_of_them_ends() -> None:
+def test_a_gain_between_images_leaves_no_step() -> None:
     # One of two images is a fifth brighter and ends in the middle of the plane.
     mesh = grid_plane(16)
     one = photograph(mesh, above(2.0, 128, 128.0), lambda p: np.full_like(p, 0.5))
@@ -117,7 +117,7 @@ def test_a_gain_between_photographs_leaves_no_step_where_one_of_them_ends() -> N
     assert row[16] == pytest.approx(np.sqrt(128 * 153), abs=2)  # the mean exposure
 
 
-def test_feathering_falls_towards_outlines_but_not_on_slanted_planes() -> None:
+def test_feathering_decreases_towards_outlines_only() -> None:
     focal, columns = 100.0, np.arange(40)
     plane = np.broadcast_to(1 / (0.5 + 0.01 * columns), (30, 40))  # 1 / depth is linear in the image
     shown = np.ones((30, 40), bool)
@@ -133,7 +133,7 @@ def test_feathering_falls_towards_outlines_but_not_on_slanted_planes() -> None:
     np.testing.assert_allclose(border[:4], np.array([1, 2, 3, 4]) / FEATHER)
 
 
-def test_unseen_texels_take_the_colour_of_the_surface_beside_them() -> None:
+def test_unseen_texels_get_the_colour_of_adjacent_surface() -> None:
     # The left half of a plane was seen, green above and red below; another plane lies behind it, far away.
     mesh = join([grid_plane(8), grid_plane(2, z=5.0)])
     texels = texels_of(flat_atlas(grid_plane(8)), 64)
@@ -149,7 +149,7 @@ def test_unseen_texels_take_the_colour_of_the_surface_beside_them() -> None:
     assert picture_[:, :32].reshape(-1, 3).tolist() == [[10, 200, 10]] * 1024 + [[200, 10, 10]] * 1024  # untouched
 
 
-def test_no_texel_of_the_texture_is_without_a_colour_of_its_nearest_chart() -> None:
+def test_texels_outside_charts_get_the_nearest_colour() -> None:
     mesh = Mesh(grid_plane(2).vertices * np.float32(0.5), grid_plane(2).faces)  # the middle half of the texture
     texels = texels_of(flat_atlas(mesh), 64)
     assert len(texels.index) == 32 * 32
@@ -158,7 +158,7 @@ def test_no_texel_of_the_texture_is_without_a_colour_of_its_nearest_chart() -> N
     assert (texture[:, 32:] == (1, 2, 3)).all()
 
 
-def test_a_simplified_mesh_has_so_many_faces_and_the_same_shape() -> None:
+def test_simplification_keeps_the_shape() -> None:
     pytest.importorskip("fast_simplification")
     mesh = box(20)
     assert simplified(mesh, len(mesh.faces)) is mesh
@@ -198,7 +198,7 @@ def test_other_programs_open_the_files_with_their_texture(tmp_path: Path, name: 
     assert (colors[bottom] == (0, 0, 250)).all()
 
 
-def test_an_obj_file_its_material_and_its_texture_are_replaced_all_three_or_not_at_all(
+def test_an_obj_file_is_replaced_with_its_material_and_texture_or_not_at_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:

@@ -57,7 +57,7 @@ def test_an_oblique_plane_is_flat_to_a_small_part_of_a_voxel() -> None:
     assert np.abs(error).max() < 0.02 * lim.voxel
 
 
-def test_depth_is_not_made_up_across_a_depth_edge() -> None:
+def test_no_depth_is_invented_across_a_depth_edge() -> None:
     """Two walls at 2 and 3 that meet at the middle column: no vertex lies between them.
 
     What is known of the near wall's inside ends there: its side is as deep as the full weight and no deeper.
@@ -74,7 +74,7 @@ def test_depth_is_not_made_up_across_a_depth_edge() -> None:
     assert (z > 2.5).any()
 
 
-def test_unseen_space_makes_no_shell() -> None:
+def test_unobserved_space_creates_no_shell() -> None:
     """One camera sees half a sphere: one open sheet, nothing behind it and nothing around the image's edge."""
     camera = look_at(np.array([0, -3.0, 0]), np.zeros(3), np.array([0, 0, 1.0]), width=160, height=160, fx=200)
     depth = sphere_depth(camera, 1.0)
@@ -106,7 +106,7 @@ def test_a_thin_plate_seen_from_both_sides_has_two_faces_and_no_other_layer(thic
     assert area == pytest.approx(2.0, rel=0.05)  # two sheets of 1.0 x 1.0, once each
 
 
-def test_invalid_pixels_and_pixels_without_depth_carry_nothing() -> None:
+def test_invalid_pixels_are_ignored() -> None:
     camera = orbit(1, 3.0)[0]
     depth = sphere_depth(camera, 1.0)
     valid = np.zeros(depth.shape, bool)
@@ -121,7 +121,7 @@ def test_invalid_pixels_and_pixels_without_depth_carry_nothing() -> None:
     assert x[:, 0].max() < 48.5
 
 
-def test_weights_of_pixels_weigh() -> None:
+def test_pixel_weights_are_used() -> None:
     """Two views from one place, of walls at 2.00 and 2.04, weighted 3 to 1: the wall is at 2.01."""
     camera = Camera(64, 64, 80.0, 80.0, 32.0, 32.0, np.eye(4))
     one = np.ones((64, 64))
@@ -178,7 +178,7 @@ def test_memory_is_bounded_and_the_error_names_a_voxel_that_fits() -> None:
     assert 0.3 * max_bytes < volume.nbytes <= max_bytes
 
 
-def test_a_spool_gives_back_what_it_was_given_as_often_as_asked() -> None:
+def test_a_spool_can_be_read_repeatedly() -> None:
     camera = orbit(1, 3.0)[0]
     depth = sphere_depth(camera, 1.0)
     rng = np.random.default_rng(0)

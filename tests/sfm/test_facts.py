@@ -11,7 +11,7 @@ from gs2d.sfm.colmap_process import read_facts
 
 
 @pytest.mark.parametrize("data", [None, b"no database", b""])
-def test_a_database_that_cannot_be_read_is_one_line(tmp_path: Path, data: bytes | None) -> None:
+def test_an_unreadable_database_is_a_one_line_error(tmp_path: Path, data: bytes | None) -> None:
     """On a full disk SQLite cannot open what is in its journal: that was a traceback."""
     if data is not None:
         (tmp_path / "database.db").write_bytes(data)

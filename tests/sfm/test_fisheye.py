@@ -52,7 +52,7 @@ def found(*pictures: np.ndarray) -> Circle | None:
     [(200, 150, 149), (200, 150, 200), (215, 142, 130), (195, 153, 212)],
     ids=["in the height", "in the width", "off the middle", "beyond the width"],
 )
-def test_the_circle_of_round_photographs_is_found(x: float, y: float, radius: float) -> None:
+def test_the_image_circle_is_detected(x: float, y: float, radius: float) -> None:
     circle = found(*(round_picture(x, y, radius, seed=seed) for seed in range(3)))
     assert circle is not None
     assert (circle.x * 400, circle.y * 300, circle.radius * 400) == pytest.approx((x, y, radius), abs=2)
@@ -62,7 +62,7 @@ def test_the_circle_of_round_photographs_is_found(x: float, y: float, radius: fl
     assert inside[np.hypot(u - x, v - y) < 0.95 * radius].all()
 
 
-def test_darkness_of_another_shape_is_no_circle() -> None:
+def test_other_dark_areas_are_no_circle() -> None:
     """A frame, a statue that turns before black velvet, a round plate that is smaller than any fisheye's circle."""
     framed = np.zeros((300, 400, 3), np.uint8)
     framed[40:-40, 60:-60] = mottled()[40:-40, 60:-60]
@@ -84,7 +84,7 @@ def photos_of(root: Path, images: dict[str, np.ndarray]) -> list[Photo]:
     return list(read_photos(find_photos(root)[0], root, threads=1))
 
 
-def test_what_is_beyond_the_circle_is_masked_beside_what_the_user_masks(tmp_path: Path) -> None:
+def test_pixels_outside_the_circle_are_masked(tmp_path: Path) -> None:
     photos = photos_of(tmp_path / "photos", {f"{i}.png": round_picture(200, 150, 149, seed=i) for i in range(3)})
     own = np.full((300, 400), 255, np.uint8)
     own[150:] = 0
@@ -153,7 +153,7 @@ class _Database:
         ("SIMPLE_RADIAL", (330.0, 200, 150, -0.1), None),  # a telephone's
     ],
 )
-def test_matches_tell_a_fisheye_and_its_focal_length(
+def test_matches_determine_a_fisheye_and_its_focal_length(
     pycolmap: Any, model: str, params: tuple[float, ...], focal: float | None
 ) -> None:
     camera = pycolmap.Camera(model="SIMPLE_FISHEYE", width=SIZE[0], height=SIZE[1], params=[F, 200, 150], camera_id=1)
@@ -183,7 +183,7 @@ def test_matches_tell_a_fisheye_and_its_focal_length(
         ("SIMPLE_RADIAL", (90.0, 200, 150, -0.01), 10, 0.6, True),  # 132 degrees
     ],
 )
-def test_a_camera_is_doubted_by_what_its_photographs_made_of_it(
+def test_placed_images_can_raise_doubts_about_a_camera(
     pycolmap: Any, model: str, params: tuple[float, ...], placed: int, error: float, is_doubted: bool
 ) -> None:
     lens = pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=list(params), camera_id=1)
@@ -237,9 +237,7 @@ def test_round_photographs_of_185_degrees_are_placed_masked_and_cut_into_faces(c
 
 @pytest.mark.slow
 @pytest.mark.parametrize("camera_model", ["auto", "OPENCV_FISHEYE"])
-def test_photographs_that_a_fisheye_fills_are_known_by_what_they_show(
-    colmap: None, tmp_path: Path, camera_model: str
-) -> None:
+def test_full_frame_fisheyes_are_detected_by_matches(colmap: None, tmp_path: Path, camera_model: str) -> None:
     truth = write_photographs(tmp_path / "photos", "fisheye", count=8, width=480, angle=150, fits="diagonal")
     made, _ = searched(tmp_path, camera_model=camera_model)
     off = errors(tmp_path / "capture", truth)

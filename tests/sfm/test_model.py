@@ -45,7 +45,7 @@ PIECES = [piece("a", "b", "c"), piece("x", "y", "z")]
         ("lonely", "no matches with any other photograph"),
     ],
 )
-def test_the_reason_for_a_photograph_without_a_place(name: str, expected: str) -> None:
+def test_the_reason_for_an_unplaced_photograph(name: str, expected: str) -> None:
     facts = MatchFacts({**FEATURES, "lonely": 500, "y": 900}, FACTS.matches)
     assert why_not_placed(name, PIECES, facts) == expected
 
@@ -66,7 +66,7 @@ def follow(work: Path, code: str) -> tuple[list[object], Solved]:
     return seen, solved
 
 
-def test_what_the_worker_tells_becomes_phases_and_steps(tmp_path: Path) -> None:
+def test_messages_of_the_worker_become_progress(tmp_path: Path) -> None:
     code = (
         "assert json.load(open(sys.argv[1]))['groups'][0]['camera_model'] == 'OPENCV'\n"
         "say(phase='cameras', total=5); say(done=2); say(done=5); say(models=[{'upright': True}])"
@@ -90,13 +90,13 @@ def test_what_the_worker_tells_becomes_phases_and_steps(tmp_path: Path) -> None:
         ("say(phase='features', total=3)", "ended with code 0 while finding features: no output"),
     ],
 )
-def test_a_worker_that_dies_is_one_line_with_its_last_words(tmp_path: Path, code: str, expected: str) -> None:
+def test_a_failing_worker_is_a_one_line_error(tmp_path: Path, code: str, expected: str) -> None:
     with pytest.raises(DataError, match=expected) as caught:
         follow(tmp_path, code)
     assert "\n" not in str(caught.value)
 
 
-def test_without_pycolmap_the_extra_is_named_before_anything_is_read(
+def test_without_pycolmap_the_error_names_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
@@ -109,7 +109,7 @@ def test_without_pycolmap_the_extra_is_named_before_anything_is_read(
 
 
 # -- where the capture goes --------------------------------------------------------------------------------------------
-def test_the_photographs_folder_and_what_is_in_it_or_above_it_are_no_place_for_the_capture(tmp_path: Path) -> None:
+def test_out_must_not_overlap_the_folder_of_photographs(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()
     for out in (photos, photos / "capture", tmp_path):
@@ -139,7 +139,7 @@ def test_a_folder_with_other_files_is_never_replaced(tmp_path: Path) -> None:
         check_out(tmp_path / "file", tmp_path / "photos", overwrite=True)
 
 
-def test_a_capture_takes_its_place_as_a_whole_and_an_older_one_goes(tmp_path: Path) -> None:
+def test_a_capture_replaces_an_older_one_atomically(tmp_path: Path) -> None:
     out = tmp_path / "room"
     for content in ("first", "second"):
         with workspace(out) as work:
@@ -150,7 +150,7 @@ def test_a_capture_takes_its_place_as_a_whole_and_an_older_one_goes(tmp_path: Pa
         assert [path.name for path in tmp_path.iterdir()] == ["room"]
 
 
-def test_what_a_killed_command_left_is_removed_and_an_older_capture_comes_back(tmp_path: Path) -> None:
+def test_an_older_capture_is_restored_after_a_kill(tmp_path: Path) -> None:
     """Killed between the two renames of put_in_place."""
     left = tmp_path / ".room.poses"
     (left / "old").mkdir(parents=True)
@@ -163,7 +163,7 @@ def test_what_a_killed_command_left_is_removed_and_an_older_capture_comes_back(t
     assert [path.name for path in tmp_path.iterdir()] == ["room"]
 
 
-def test_two_commands_do_not_make_the_same_capture(tmp_path: Path) -> None:
+def test_two_commands_cannot_create_the_same_capture(tmp_path: Path) -> None:
     work = tmp_path / ".room.poses"
     work.mkdir()
     with (

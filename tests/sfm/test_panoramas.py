@@ -58,7 +58,7 @@ def two_circles() -> np.ndarray:
     return np.concatenate([circle, circle[:, ::-1]], axis=1)
 
 
-def test_a_picture_of_a_whole_sphere_meets_itself_and_others_of_its_shape_do_not() -> None:
+def test_the_edges_of_a_full_panorama_fit_together() -> None:
     assert meets_itself(one(panorama_rays(512), (512, 256)))
     assert not meets_itself(one(panorama_rays(512), (512, 256))[:, 40:-40])
     assert not meets_itself(ordinary(512, 256))
@@ -80,7 +80,7 @@ def groups_of(photos: list[Photo], camera_model: str = "auto") -> tuple[list[boo
     return panorama_groups(photos, groups, camera_model)
 
 
-def test_panoramas_are_known_by_their_pictures_or_by_their_xmp(tmp_path: Path) -> None:
+def test_panoramas_are_detected_by_content_or_xmp(tmp_path: Path) -> None:
     flat = np.random.default_rng(0).integers(0, 255, (64, 128, 3)).astype(np.uint8)  # meets itself nowhere
     sphere = one(panorama_rays(512), (512, 256))
     photos = photos_of(
@@ -116,7 +116,7 @@ def panoramas(colmap: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
     return root, truth, said
 
 
-def test_the_places_of_panoramas_are_found_from_photographs_alone(
+def test_poses_of_panoramas_are_estimated(
     panoramas: tuple[Path, dict[str, np.ndarray], list[str]],
 ) -> None:
     """Measured: 0.3 mm of a room of 4 m, 0.02 degrees."""
@@ -131,7 +131,7 @@ def test_the_places_of_panoramas_are_found_from_photographs_alone(
 
 
 @pytest.mark.slow
-def test_panoramas_and_ordinary_photographs_of_one_room_have_one_frame(colmap: None, tmp_path: Path) -> None:
+def test_panoramas_and_photographs_of_a_room_are_placed_together(colmap: None, tmp_path: Path) -> None:
     truth = write_photographs(tmp_path / "photos" / "around", "panorama", count=6, width=WIDTH)
     truth = {f"around/{name}": pose for name, pose in truth.items()}
     patterns = walls()
@@ -154,7 +154,7 @@ def test_panoramas_and_ordinary_photographs_of_one_room_have_one_frame(colmap: N
     assert found["turned_worst_degrees"] < 0.3
 
 
-def test_training_starts_on_the_walls_where_faces_of_different_panoramas_agree(
+def test_training_starts_from_points_on_the_walls(
     panoramas: tuple[Path, dict[str, np.ndarray], list[str]],
 ) -> None:
     root, truth, _ = panoramas

@@ -40,7 +40,7 @@ def folder_of(root: Path, names: tuple[str, ...] = ("a.png", "b.png", "c.png")) 
     "place",
     ["photos/masks/a.png.png", "photos/masks/a.png", "masks/a.png", "photos/a_mask.png", "photos/masks/a_mask.png"],
 )
-def test_masks_are_found_where_tools_put_them_and_are_no_photographs(tmp_path: Path, place: str) -> None:
+def test_masks_of_common_tools_are_found(tmp_path: Path, place: str) -> None:
     root = folder_of(tmp_path / "photos")
     write(tmp_path / place, np.full((16, 24), 255, np.uint8))
     found = photos(root)
@@ -51,7 +51,7 @@ def test_masks_are_found_where_tools_put_them_and_are_no_photographs(tmp_path: P
     assert line.endswith("; the other 2 are whole")
 
 
-def test_masks_are_turned_and_shrunk_with_their_photograph(tmp_path: Path) -> None:
+def test_masks_are_rotated_and_downscaled_with_their_photograph(tmp_path: Path) -> None:
     write_room(tmp_path / "photos", 3)
     turn_file(tmp_path / "photos" / "001.jpg", 6)  # stored turned
     for name in ("000", "001", "002"):
@@ -82,7 +82,7 @@ def features(database: Path) -> np.ndarray:
     return np.concatenate([np.frombuffer(data, np.float32).reshape(-1, cols)[:, :2] for cols, data in rows])
 
 
-def test_no_features_are_found_in_masked_pixels_and_the_capture_keeps_the_masks(colmap: None, tmp_path: Path) -> None:
+def test_masked_pixels_give_no_features(colmap: None, tmp_path: Path) -> None:
     write_room(tmp_path / "photos", 6)
     mask = np.full((200, 200), 255, np.uint8)
     mask[:, :40] = 0

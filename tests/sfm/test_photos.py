@@ -50,7 +50,7 @@ def photos_of(root: Path) -> list[Photo]:
     return list(read_photos(find_photos(root)[0], root, threads=1))
 
 
-def test_photographs_are_found_in_subfolders_and_sorted_as_people_count(tmp_path: Path) -> None:
+def test_photographs_in_subfolders_are_sorted_naturally(tmp_path: Path) -> None:
     for name in ("b/frame_10.jpg", "b/frame_2.jpg", "a 1.JPG", "c.png", ".hidden.jpg", ".git/d.jpg", "__MACOSX/e.jpg"):
         image(tmp_path / name)
     found, notes, warning = find_photos(tmp_path)
@@ -61,7 +61,7 @@ def test_photographs_are_found_in_subfolders_and_sorted_as_people_count(tmp_path
     assert notes == ()
 
 
-def test_names_in_the_capture_have_no_white_space_and_stay_different(tmp_path: Path) -> None:
+def test_names_in_the_capture_are_unique_without_white_space(tmp_path: Path) -> None:
     for name in ("a b.png", "a_b.png", "c.tif", "c.tif.png", "d\udcff.png"):
         image(tmp_path / name)
     names = {photo.label: photo.name for photo in photos_of(tmp_path)}
@@ -75,7 +75,7 @@ def test_names_in_the_capture_have_no_white_space_and_stay_different(tmp_path: P
 
 
 @pytest.mark.skipif(bool(HEIF), reason="a package for HEIC is installed")
-def test_files_that_are_no_photographs_are_named_with_what_to_do(tmp_path: Path) -> None:
+def test_other_files_are_reported_with_a_remedy(tmp_path: Path) -> None:
     for i in range(3):
         image(tmp_path / f"{i}.jpg")
     for name in ("x.HEIC", "y.heic", "z.CR2", "clip.MOV", "notes.txt", "masks/0.jpg.png"):
@@ -103,7 +103,7 @@ def test_files_that_are_no_photographs_are_named_with_what_to_do(tmp_path: Path)
         (("a.mp4",), "video"),
     ],
 )
-def test_a_folder_without_photographs_is_one_line_with_a_remedy(
+def test_a_folder_without_photographs_is_a_one_line_error(
     tmp_path: Path, names: tuple[str, ...], expected: str
 ) -> None:
     for name in names:
@@ -114,7 +114,7 @@ def test_a_folder_without_photographs_is_one_line_with_a_remedy(
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_a_picture_is_turned_as_pillow_turns_it(tmp_path: Path, orientation: int) -> None:
+def test_exif_orientations_match_pillow(tmp_path: Path, orientation: int) -> None:
     image(tmp_path / "a.png", orientation=orientation)
     with Image.open(tmp_path / "a.png") as file:
         expected = np.asarray(ImageOps.exif_transpose(file))
@@ -126,7 +126,7 @@ def stage(root: Path, folder: Path, *, max_size: int | None = None, link: bool =
     return list(copy_images(photos_of(root), folder, max_size=max_size, link=link, threads=1))
 
 
-def test_upright_photographs_are_copied_byte_for_byte_and_theirs_stay_as_they_were(tmp_path: Path) -> None:
+def test_upright_photographs_are_copied_unchanged(tmp_path: Path) -> None:
     root = tmp_path / "photos"
     for name in ("0.jpg", "sub/1.png", "2.jpg"):
         image(root / name)
@@ -137,7 +137,7 @@ def test_upright_photographs_are_copied_byte_for_byte_and_theirs_stay_as_they_we
     assert {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in root.rglob("*.*")} == before
 
 
-def test_a_photograph_that_exif_turns_is_stored_upright_and_keeps_its_focal_length(tmp_path: Path) -> None:
+def test_a_rotated_photograph_is_stored_upright_with_its_focal_length(tmp_path: Path) -> None:
     root = tmp_path / "photos"
     image(root / "0.jpg", size=(64, 48), orientation=6, model="phone", focal=4.25)
     image(root / "1.jpg", size=(64, 48), orientation=3)
@@ -185,7 +185,7 @@ def turned_world(seed: int) -> np.ndarray:
     return np.asarray(q * np.sign(np.linalg.det(q)))
 
 
-def test_up_is_found_from_a_half_ring_of_tilted_cameras() -> None:
+def test_up_is_estimated_from_tilted_cameras() -> None:
     """All look down by 45 degrees from one side: the mean of their up vectors leans by more than 20."""
     angles = np.linspace(0, np.pi, 9)
     eyes = np.stack([2 * np.cos(angles), 2 * np.sin(angles), np.full(9, 2.0)], axis=1)
@@ -199,12 +199,12 @@ def test_up_is_found_from_a_half_ring_of_tilted_cameras() -> None:
 
 
 # -- which pairs are matched -------------------------------------------------------------------------------------------
-def test_each_photograph_is_paired_with_the_next_ones_and_with_far_ones() -> None:
+def test_each_image_is_paired_with_consecutive_and_distant_ones() -> None:
     """Overlap 3: the next 1, 2, 3 and those 2^0, 2^1, 2^2 on, i.e. 1, 2, 3, 4."""
     assert neighbour_pairs(6, 3) == {(i, j) for i in range(6) for j in range(i + 1, 6) if j - i <= 4}
 
 
-def test_similar_photographs_are_paired_and_strangers_are_not() -> None:
+def test_similar_images_are_paired() -> None:
     """Six photographs of one thing and six of another, interleaved: each finds its own kind."""
     rng = np.random.default_rng(0)
     things = rng.integers(0, 255, (2, 200, 128))
@@ -221,7 +221,7 @@ def flight(lines: int, shots: int) -> list[tuple[float, float, float]]:
     return [(x, 30.0 * line, 80.0) for line in range(lines) for x in (along if line % 2 == 0 else along[::-1])]
 
 
-def test_near_photographs_are_on_the_same_line_and_on_the_next_ones() -> None:
+def test_near_images_are_on_the_same_and_adjacent_lines() -> None:
     places = flight(9, 20)
     pairs = near_pairs(places, 12)
     middle = 4 * 20 + 10  # of the fifth line
@@ -231,7 +231,7 @@ def test_near_photographs_are_on_the_same_line_and_on_the_next_ones() -> None:
     assert all(i < j for i, j in pairs)
 
 
-def test_the_order_is_that_of_the_clocks_where_they_all_run(tmp_path: Path) -> None:
+def test_images_are_ordered_by_time_if_all_have_one(tmp_path: Path) -> None:
     """A counter of names that began again at 0001, as cameras do after 9999."""
     for name, second in (("DSC_9998", 1), ("DSC_9999", 2), ("DSC_0001", 3), ("DSC_0002", 4)):
         image(tmp_path / f"{name}.jpg", time=f"2026:05:01 10:00:0{second}")

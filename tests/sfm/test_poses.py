@@ -59,7 +59,7 @@ def poses_of(capture: Path) -> dict[str, np.ndarray]:
     return {image.name: image.T_cam_world for image in read_images(capture / "sparse/0", "bin")}
 
 
-def test_the_cameras_of_a_drawn_room_are_found(room: Room) -> None:
+def test_cameras_of_a_rendered_room_are_estimated(room: Room) -> None:
     """Turned photographs included. Measured: centres 0.06 % of their spread, 0.04 degrees, focal length 0.1 %."""
     truth = {name: camera.T_cam_world for name, camera in room.cameras.items()}
     mine = poses_of(room.capture)
@@ -72,7 +72,7 @@ def test_the_cameras_of_a_drawn_room_are_found(room: Room) -> None:
     assert room.printed["cameras"][0]["focal_px"] == pytest.approx(FOCAL, rel=0.01)
 
 
-def test_the_capture_has_what_training_reads_and_nothing_else(room: Room) -> None:
+def test_the_capture_has_the_files_that_training_reads(room: Room) -> None:
     assert sorted(path.name for path in room.capture.iterdir()) == ["images", "poses.json", "poses.png", "sparse"]
     assert sorted(path.name for path in (room.capture / "sparse").iterdir()) == ["0"]
     assert [path.name for path in room.capture.parent.iterdir()] == ["room"]  # no workplace is left
@@ -86,7 +86,7 @@ def test_the_capture_has_what_training_reads_and_nothing_else(room: Room) -> Non
     assert (np.ptp(image.astype(int), axis=2) > 60).sum() > 500  # red cameras
 
 
-def test_an_existing_capture_is_replaced_only_when_asked(
+def test_an_existing_capture_is_replaced_with_overwrite_only(
     room: Room, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "room"
@@ -99,7 +99,7 @@ def test_an_existing_capture_is_replaced_only_when_asked(
     assert poses_of(out).keys() == room.cameras.keys()
 
 
-def test_separate_pieces_and_photographs_without_a_place_are_named(
+def test_separate_models_and_unplaced_photographs_are_reported(
     colmap: None, pieces: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "capture"
@@ -157,7 +157,7 @@ def strangers(root: Path) -> None:
         (strangers, "must hold photographs that overlap, got 3 without a single matching pair"),
     ],
 )
-def test_photographs_that_give_no_cameras_say_why_and_leave_nothing(
+def test_photographs_without_a_model_are_a_one_line_error(
     colmap: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], write: Callable[[Path], None], expected: str
 ) -> None:
     photos = tmp_path / "photos"
@@ -168,7 +168,9 @@ def test_photographs_that_give_no_cameras_say_why_and_leave_nothing(
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
 
 
-def test_a_camera_that_only_turned_is_doubted(colmap: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_camera_that_only_rotated_gives_a_warning(
+    colmap: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """COLMAP finds a model all the same, of another focal length and 3 degrees between rays; the room's has 40."""
     for i in range(4):
         target = np.array([0.0, 0.9 - 0.25 * i, 0.9])
@@ -207,9 +209,7 @@ def test_an_interrupted_search_continues_and_gives_the_same_bytes(
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL], ids=["term", "kill"])
-def test_an_interrupted_command_leaves_no_process_and_what_the_next_one_goes_on_with(
-    room: Room, tmp_path: Path, number: int
-) -> None:
+def test_an_interrupted_command_leaves_no_process_and_can_continue(room: Room, tmp_path: Path, number: int) -> None:
     """Its worker ends with its stdin."""
     words = [sys.executable, "-m", "gs2d", "poses", str(room.photos), "--out", str(tmp_path / "capture")]
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)

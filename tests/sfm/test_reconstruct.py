@@ -71,9 +71,7 @@ def test_photographs_become_a_run_with_its_capture(
     assert (out / "splats.ply").read_bytes() == finished
 
 
-def test_cameras_that_were_found_are_not_found_again(
-    room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_estimated_cameras_are_reused(room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = started(room, tmp_path)
     monkeypatch.setattr(module, "find_poses", lambda *_: pytest.fail("cameras were looked for again"))
     options = ReconstructOptions(photos=room.photos, out=out, resume=True, training=TRAINING, **SMALL)  # type: ignore[arg-type]
@@ -90,7 +88,7 @@ def test_cameras_that_were_found_are_not_found_again(
         (["--seed", "3"], "made"),
     ],
 )
-def test_a_resume_with_other_options_for_the_cameras_is_refused(
+def test_a_resume_with_other_camera_options_is_an_error(
     room: Room, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
 ) -> None:
     out = started(room, tmp_path)
@@ -98,7 +96,7 @@ def test_a_resume_with_other_options_for_the_cameras_is_refused(
     assert message in one_line(capsys.readouterr().err)
 
 
-def test_a_resume_with_other_photographs_is_refused(
+def test_a_resume_with_other_photographs_is_an_error(
     room: Room, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, photos = started(room, tmp_path), tmp_path / "photos"
@@ -141,7 +139,7 @@ def a_capture(photos: Path) -> None:
         (lambda photos: write_room(photos, 3), ["--set", "max_size=3"], "number"),
     ],
 )
-def test_what_makes_no_run_is_refused_before_anything_is_made(
+def test_bad_input_is_an_error_before_files_are_written(
     colmap: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], fill: Any, words: list[str], message: str
 ) -> None:
     photos = tmp_path / "photos"
@@ -157,7 +155,7 @@ def test_what_makes_no_run_is_refused_before_anything_is_made(
     ("package", "words", "message"),
     [("pycolmap", [], "pip install 'pycolmap>="), ("xatlas", ["--texture"], "pip install 'xatlas>=")],
 )
-def test_an_extra_that_is_missing_is_one_line_before_anything_is_made(
+def test_a_missing_extra_is_an_error_before_files_are_written(
     package: str,
     words: list[str],
     message: str,
@@ -174,7 +172,7 @@ def test_an_extra_that_is_missing_is_one_line_before_anything_is_made(
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
 
 
-def test_overwrite_begins_anew_and_a_failure_keeps_the_old_run(
+def test_overwrite_starts_again_and_a_failure_keeps_the_old_run(
     room: Room, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = started(room, tmp_path)
@@ -212,7 +210,7 @@ def interrupt(words: list[str], until: str) -> str:
     return said
 
 
-def test_ctrl_c_among_the_cameras_keeps_what_was_found_and_names_the_command(room: Room, tmp_path: Path) -> None:
+def test_ctrl_c_during_the_search_keeps_results(room: Room, tmp_path: Path) -> None:
     out = tmp_path / "run"
     said = interrupt(words_for(room.photos, out), "finding features")
     line = said.splitlines()[-1]
@@ -227,7 +225,7 @@ def test_ctrl_c_among_the_cameras_keeps_what_was_found_and_names_the_command(roo
     assert not (out / ".capture.poses").exists()
 
 
-def test_ctrl_c_in_training_keeps_the_cameras(room: Room, tmp_path: Path) -> None:
+def test_ctrl_c_during_training_keeps_the_cameras(room: Room, tmp_path: Path) -> None:
     out = started(room, tmp_path)
     words = [*words_for(room.photos, out, "--resume"), "--schedule-scale", "1.0"]
     said = interrupt(words, "training 2dgs-r")

@@ -43,7 +43,7 @@ def pattern(number: int, size: tuple[int, int] = (96, 64)) -> Image.Image:
 
 
 @real
-def test_the_frames_that_are_written_are_those_that_were_judged_sharpest(tmp_path: Path) -> None:
+def test_the_sharpest_frames_are_written(tmp_path: Path) -> None:
     sharp = {1, 5, 6, 11}
     images = [pattern(i) if i in sharp else pattern(i).filter(ImageFilter.GaussianBlur(2)) for i in range(12)]
     video = look_into(write_video(tmp_path / "50 % of -it.mp4", images))
@@ -59,7 +59,7 @@ def test_the_frames_that_are_written_are_those_that_were_judged_sharpest(tmp_pat
 
 
 @real
-def test_a_video_that_was_filmed_upright_gives_upright_frames(tmp_path: Path) -> None:
+def test_a_portrait_video_gives_upright_frames(tmp_path: Path) -> None:
     flat = write_video(tmp_path / "flat.mp4", [pattern(i) for i in range(4)])
     turned = tmp_path / "turned.mp4"
     words = ["ffmpeg", "-v", "error", "-i", str(flat), "-c", "copy", "-metadata:s:v:0", "rotate=90", str(turned)]
@@ -72,7 +72,7 @@ def test_a_video_that_was_filmed_upright_gives_upright_frames(tmp_path: Path) ->
 
 
 @real
-def test_broken_videos_are_one_line(tmp_path: Path) -> None:
+def test_broken_videos_are_one_line_errors(tmp_path: Path) -> None:
     noise = tmp_path / "noise.mp4"
     noise.write_bytes(np.random.default_rng(0).bytes(4096))
     with pytest.raises(DataError, match="Invalid") as caught:
@@ -87,7 +87,7 @@ def test_broken_videos_are_one_line(tmp_path: Path) -> None:
         take(look_into(whole), [0, 1, 2], tmp_path / "frames")
 
 
-def test_without_ffmpeg_the_line_says_how_to_get_it(
+def test_without_ffmpeg_the_error_names_a_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("pycolmap")
