@@ -1,4 +1,4 @@
-"""``gs2d orthophoto``: orthophoto and elevation model of a georeferenced run as GeoTIFF."""
+"""``gs2d survey --orthophoto``: orthophoto and elevation model of a georeferenced run as GeoTIFF."""
 
 from __future__ import annotations
 
