@@ -82,7 +82,7 @@ def texture_run(
     write_mesh(target, baked.mesh, up=up_direction([view.camera for view in loaded.scene.train]))
     if target.resolve() == run.file(TEXTURED).resolve():
         if run.file(PAGE).exists():  # it shows the textured mesh
-            with attempted(PAGE, again("page", run.path), on_event):
+            with attempted(PAGE, again("export", run.path, "--format", "html"), on_event):
                 page_run(run.path, on_event=on_event, loaded=loaded)
         report_again(run, on_event)
     return {
