@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.core.image_arrays import composite
 from gs2d.core.json_files import read_json
 from gs2d.data.image_files import read_image
 from gs2d.io.run_dir import RENDERS
@@ -104,21 +103,10 @@ def compared(gallery: Gallery, view: ShownView, *, width: int = 800) -> Pair | N
     photo, color = gallery.photo(view), gallery.rendering(stage, view, "color")
     if photo is None or color is None or photo.shape[:2] != color.shape[:2]:
         return None
-    words = [f"{view.name} ({view.kind})" if view.kind else view.name, psnr_text(color, photo)]
     return Pair(
         (photo, color),
         ("photograph", "rendering"),
-        title=", ".join(words),
+        title=f"{view.name} ({view.kind})" if view.kind else view.name,
         full=(gallery.beside(view), gallery.beside(view, stage, "color")),
         width=width,
     )
-
-
-def psnr_text(image: np.ndarray, photo: np.ndarray | None) -> str:
-    """Return the PSNR of two 8-bit images as text; empty where their sizes differ."""
-    if photo is None or image.shape[:2] != photo.shape[:2]:
-        return ""
-    white = (1.0, 1.0, 1.0)
-    difference = composite(image, white).astype(np.float64) - composite(photo, white)
-    squared = float(np.mean(difference**2))
-    return "equal" if squared == 0 else f"{-10 * np.log10(squared):.2f} dB"

@@ -6,7 +6,7 @@ from typing import Any
 
 from gs2d.io.run_dir import RENDERS
 from gs2d.report.color_maps import ERROR_TOP, depth_scale, error_scale
-from gs2d.report.gallery import Gallery, ShownView, compared, psnr_text, read_gallery
+from gs2d.report.gallery import Gallery, ShownView, compared, read_gallery
 from gs2d.report.html_parts import missing, render
 from gs2d.report.run_record import RunRecord
 from gs2d.report.sections.section_registry import register_section
@@ -40,7 +40,6 @@ def views_section(run: RunRecord) -> str | None:
 
 def _shown(gallery: Gallery, view: ShownView) -> dict[str, Any]:
     """Return the images of a view that exist; the first view is compared with its photograph at the top of the page."""
-    photo = gallery.photo(view)
     pair = compared(gallery, view)
     images = []
     for stage in gallery.stages:
@@ -49,11 +48,9 @@ def _shown(gallery: Gallery, view: ShownView) -> dict[str, Any]:
             if pixels is None or (kind == "color" and pair is not None and stage == gallery.stages[-1]):
                 continue
             words = [title] + [f"after {stage}"] * (len(gallery.stages) > 1)
-            if kind == "color":
-                words.append(psnr_text(pixels, photo))
             if kind == "depth" and view.depth_limits is not None:
                 words.append("{:.3g} to {:.3g} world units".format(*view.depth_limits))
-            image = {"kind": kind, "pixels": pixels, "caption": ", ".join(filter(None, words))}
+            image = {"kind": kind, "pixels": pixels, "caption": ", ".join(words)}
             images.append({**image, "full": gallery.beside(view, stage, kind)})
     on_top = pair is not None and view is gallery.views[0]
     return {"name": view.name, "kind": view.kind, "pair": None if on_top else pair, "images": images}

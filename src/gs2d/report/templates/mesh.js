@@ -74,7 +74,7 @@ async function turnable(figure) {
   const up = unit(orbit.up), arm = minus(orbit.eye, orbit.center), distance = Math.hypot(...arm);
   const level = unit(minus(arm, up.map((x) => x * dot(arm, up)))), side = cross(up, level);
   const start = [0, Math.asin(Math.max(-0.99, Math.min(0.99, dot(unit(arm), up))))];
-  const tangent = Math.min(1, Math.max(0.25, (0.85 * orbit.radius) / distance)); // half of the smaller field of view
+  const tangent = Math.min(1, Math.max(0.25, orbit.radius / distance)); // half of the smaller field of view
   let [turn, rise] = start, clay = !isPainted;
 
   function draw() {
