@@ -1,4 +1,4 @@
-"""The thresholds of the verdict on a run, with the reason for each.
+"""Thresholds of the verdict on a run, with reasons.
 
 They are calibrated on real captures; ``tests/pipeline/test_verdict.py`` has the measurements.
 """
@@ -13,7 +13,7 @@ GRADES = (GOOD, USABLE, POOR)
 
 @dataclass(frozen=True)
 class Limits:
-    """The last good and the last usable value of a measure; with ``good`` above ``usable`` more is better."""
+    """Limits of good and usable values of a measure. If ``good`` exceeds ``usable``, higher values are better."""
 
     good: float
     usable: float

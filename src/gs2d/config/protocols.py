@@ -1,4 +1,4 @@
-"""What depends on the data set: depth, background, near, split, masks, fusion limits, metric conventions.
+"""Protocols: settings that depend on the data set (depth, background, near, split, masks, fusion limits, metrics).
 
 Sources, marked at each number: [s] the official 2DGS scripts (dtu_eval, tnt_eval, nerf_eval, m360_eval), [c] the
 official 2DGS code, [2dgs] the 2DGS paper, [r] the 2DGS-R paper, [d] a decision of this project.
@@ -16,12 +16,12 @@ from gs2d.config.registry import Registry
 from gs2d.errors import ProtocolError, RecipeError
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-RELATIVE_NEAR = 0.01  # [d] of the extent, where a protocol names no near
+RELATIVE_NEAR = 0.01  # [d] of the extent, if a protocol has no near
 
 
 @dataclass(frozen=True)
 class FusionLimits:
-    """How depth maps become a mesh; None is derived from the scene.
+    """Settings of the fusion of depth maps into a mesh; None is derived from the scene.
 
     Attributes
     ----------
@@ -30,9 +30,9 @@ class FusionLimits:
     depth_limit : float or None
         World units. Depths beyond it are ignored.
     clusters : int
-        How many of the largest connected components are kept; 0 keeps all.
+        Number of largest connected components to keep; 0 keeps all.
     depth : str or None
-        "mean", "median" or "transmittance": the depth that is fused; None is the one that the losses use.
+        "mean", "median" or "transmittance": the fused depth; None: that of the losses.
     subject : bool
         Mesh what most cameras look at (``data.subject_box``), cleaned and simplified by evidence; False: all that is
         inside the limits, as the scripts of the data sets do.
@@ -48,16 +48,16 @@ class FusionLimits:
 
 @dataclass(frozen=True)
 class MetricConventions:
-    """How image and surface quality are reported.
+    """Conventions of reported image and surface quality.
 
     Attributes
     ----------
     from_8bit : bool
         Image metrics on renders quantised to 8 bits, as the official code measures them from PNG files.
     lpips_unit_range : bool
-        LPIPS fed with [0, 1], as the official code does, instead of the [-1, 1] the network was made for.
+        LPIPS of values in [0, 1], as in the official code, instead of the [-1, 1] of the network.
     surface : str
-        "chamfer" or "f_score": the headline figure against ground truth.
+        "chamfer" or "f_score": the main figure against ground truth.
     """
 
     from_8bit: bool = True  # [c] metrics.py reads PNG files
@@ -67,31 +67,31 @@ class MetricConventions:
 
 @dataclass(frozen=True)
 class Protocol:
-    """The facts of a data set that a recipe leaves open.
+    """Settings that a recipe leaves to the data set.
 
     Attributes
     ----------
     name : str
     depth : str
-        "mean", "median" or "transmittance": depth of surface normals and of fusion, where a loss names none.
+        "mean", "median" or "transmittance": depth of surface normals and of fusion, unless a loss names one.
     loss_weights : mapping of kind to float
-        Weights of losses that name none (Table 1 of the 2DGS-R paper).
+        Weights of losses without a weight of their own (Table 1 of the 2DGS-R paper).
     background : tuple of 3 floats
         Colour behind everything, in [0, 1].
     near : float or None
         World units. None: 1 % of the scene's extent.
     near_plane_policy : str
-        "draw", "cull" or "box": what the rasterizer does with splats that reach the camera plane (``RasterSettings``).
+        "draw", "cull" or "box": treatment of splats that reach the camera plane (``RasterSettings``).
     downscale : int
-        Hint: what the paper divides the image size by.
+        Factor by which the paper shrinks images.
     test_every : int
-        Every so many views (by name) are test views where the format has no split; 0 = all train.
+        Every N-th view (by name) is a test view if the format has no split; 0: all views train.
     test_on : str
-        "test" or "train": the views on which the headline image metrics are measured.
+        "test" or "train": the views of the main image metrics.
     robust : bool
-        Whether recipes are made robust where the capture allows it (``recipes.with_robustness``, ``--robust auto``).
+        Whether ``--robust auto`` makes recipes robust, if the capture allows it.
     use_mask_in_training, use_mask_in_fusion : bool
-        Whether masked-out pixels are ignored by losses and ranking, and by fusion.
+        Whether losses and ranking, and fusion, ignore masked pixels.
     fusion : FusionLimits
     metrics : MetricConventions
     """
@@ -99,7 +99,7 @@ class Protocol:
     name: str
     depth: str
     loss_weights: Mapping[str, float] = field(hash=False)
-    background: tuple[float, float, float] = BLACK  # [c] unless asked for white
+    background: tuple[float, float, float] = BLACK  # [c] unless white is set
     near: float | None = None
     near_plane_policy: str = "draw"
     downscale: int = 1  # [d] full size
@@ -113,20 +113,20 @@ class Protocol:
 
     @property
     def white(self) -> bool:
-        """Whether the background is white (2DGS resets opacity once more on white)."""
+        """Return whether the background is white, for which 2DGS resets opacity once more."""
         return self.background == WHITE
 
     def near_for(self, extent: float) -> float:
-        """Near distance, world units, in a scene of this extent."""
+        """Return the near distance in a scene of this extent, world units."""
         return RELATIVE_NEAR * extent if self.near is None else self.near
 
     @property
     def fused_depth(self) -> str:
-        """Depth that becomes the mesh, "mean", "median" or "transmittance"."""
+        """Return the fused depth: "mean", "median" or "transmittance"."""
         return self.depth if self.fusion.depth is None else self.fusion.depth
 
     def resolve(self, terms: Sequence[LossTerm]) -> tuple[LossTerm, ...]:
-        """Return the terms with the weights and depths that they leave open; terms of weight 0 are dropped.
+        """Return the terms with missing weights and depths filled in, without terms of weight 0.
 
         Raises
         ------
@@ -148,7 +148,7 @@ DTU = Protocol(
     depth="median",  # [s] depth_ratio 1
     loss_weights={"distortion": 1000.0},  # [s] lambda_dist 1000
     near=0.2,  # [c] rasterizer
-    near_plane_policy="cull",  # [d] objects: no splat has business at the camera
+    near_plane_policy="cull",  # [d] objects: splats at the camera are wrong
     downscale=2,  # [s] -r 2, [r]
     test_every=0,  # [s] all views train
     test_on="train",  # [r] "we evaluated PSNR on the training set"
@@ -172,10 +172,10 @@ GENERIC = Protocol(
     "generic",
     depth="mean",  # [d] as 2DGS advises for scenes that are not object-centred
     loss_weights={"distortion": 100.0},  # [2dgs] unbounded scenes
-    near=None,  # [d] 0.2 is meaningless in a frame of unknown size
+    near=None,  # [d] the scale is unknown
     test_every=8,  # [c] --eval
-    fusion=FusionLimits(subject=True),  # [d] people photograph things, and want them without the forest behind
-    robust=True,  # [d] photographs of the street: few, unevenly spread, on automatic
+    fusion=FusionLimits(subject=True),  # [d] photographs of objects, without their surroundings
+    robust=True,  # [d] real captures: few, unevenly spread photographs with automatic exposure
 )
 
 PROTOCOLS: Registry[Protocol] = Registry(
