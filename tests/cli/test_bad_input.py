@@ -226,7 +226,6 @@ def test_a_command_on_what_is_no_run_says_what_it_found(
     [
         # The report is written without its pictures, and says so: 3.
         ("renders/index.json", '"camera"', '"cam"', "evaluate", 3),
-        ("renders/index.json", '"file": "', '"file": 5, "x": "', "evaluate", 3),
         ("renders/index.json", '"stages": [', '"stages": 5, "x": [', "evaluate", 3),
         ("metrics.json", '"iterations": ', '"iterations": "x", "y": ', "info", 2),
         ("metrics.json", '"name": "', '"name": [], "x": "', "evaluate", 2),

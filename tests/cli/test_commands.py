@@ -101,7 +101,7 @@ def test_the_splats_of_a_file_are_drawn_and_meshed_with_the_cameras_of_a_run(
     for words, told in (
         (mesh, "--splats needs --out: files in the run are made from its own splats"),
         ([*mesh, "--out", str(trained / "mesh.ply")], "is the mesh of the run's own splats"),
-        ([*mesh, "--texture"], "--splats has no texture"),
+        ([*mesh, "--texture"], "--texture needs the mesh of the run"),
         (["render", str(trained), "--splats", str(glb)], "--splats needs --out"),
         (["render", str(trained), "--splats", str(trained), "--out", str(tmp_path / "x")], "got the folder"),
     ):
@@ -120,7 +120,7 @@ def test_an_export_whose_layout_and_ending_contradict_each_other_is_refused(
     assert run(["export", str(trained), "--out", str(tmp_path / "a.fbx")]) == 2
     endings = ".ply, .spz, .compressed.ply, .splat, .usd, .glb, .sog, lod-meta.json"
     told = capsys.readouterr().err
-    assert f"splats are written as {endings} files, got --out" in told
+    assert f"--out must end in {endings}, got" in told
     assert "meshes are written by `gs2d mesh RUN`" in told
     assert list(tmp_path.iterdir()) == []
 
