@@ -54,7 +54,7 @@ def test_the_runs_mesh_gets_a_texture_of_what_the_photographs_show(
         (["--texture", "--set", "texture_size=10"], "texels"),
         (["--texture", "--set", "texture_downscale=0"], "number"),
         (["--texture", "--out", "mesh.ply"], "written"),
-        (["--texture", "--out", "no/such/folder/a.glb"], "exists"),
+        (["--texture", "--out", "no/such/folder/a.glb"], "existing folder"),
     ],
 )
 def test_what_makes_no_texture_is_one_line(

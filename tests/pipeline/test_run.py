@@ -195,7 +195,7 @@ def test_two_notes_precede_training_and_the_estimate_does_not_change_the_bytes(
     undisturbed: RunFolder, capture: Path, tmp_path: Path
 ) -> None:
     heard: list[Event] = []
-    run = train(options(capture, tmp_path / "run", quality="full", downscale=1, disk=1000.0), heard.append)
+    run = train(options(capture, tmp_path / "run", quality="full", downscale=1), heard.append)
     assert run.file("splats.ply").read_bytes() == undisturbed.file("splats.ply").read_bytes()
     training = next(i for i, event in enumerate(heard) if isinstance(event, Phase) and event.name == "training 2dgs-r")
     told = [event for event in heard[:training] if isinstance(event, Notice)]
