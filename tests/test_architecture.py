@@ -1,4 +1,4 @@
-"""The house rules that a machine can check: floors, file lengths, public names, what imports without torch."""
+"""Architecture rules: layers, file lengths, public names, and modules that import without torch."""
 
 from __future__ import annotations
 
@@ -148,8 +148,8 @@ def test_imports_only_go_down() -> None:
     assert not wrong
 
 
-def test_contrib_uses_public_names_and_its_parts_are_independent() -> None:
-    """That the core never imports contrib follows from the layers: contrib is the highest."""
+def test_contrib_uses_public_names_and_its_parts_do_not_import_each_other() -> None:
+    """The layers forbid the core to import contrib: contrib is the highest layer."""
     wrong = []
     for module in MODULES:
         if unit(module) != "contrib":
@@ -173,7 +173,7 @@ def module_meant(imported: str) -> str:
 
 
 def import_graph() -> dict[str, set[str]]:
-    """Return what each module imports: at its top, inside functions, and for type checkers only.
+    """Return the imports of each module: at its top, inside functions, and for type checkers only.
 
     A package's ``__init__`` is a module like others: ``from gs2d.data import Scene`` is an edge to it, and it has edges
     to the modules that it exports from; ``from gs2d.data.scene import Scene`` is no edge to it. That of gs2d itself
@@ -183,7 +183,7 @@ def import_graph() -> dict[str, set[str]]:
     return graph | {"gs2d": set()}
 
 
-def test_no_module_imports_itself_by_way_of_others() -> None:
+def test_imports_have_no_cycle() -> None:
     graph = import_graph()
     assert "gs2d.pipeline.train.train_run" in graph["gs2d.contrib.lab.training_task"], (
         "an import inside a function counts too"
@@ -194,12 +194,12 @@ def test_no_module_imports_itself_by_way_of_others() -> None:
         pytest.fail(f"a circle: {' is imported by '.join(error.args[1])}; move what they share into a module below")
 
 
-def test_nothing_lies_loose_on_the_top_level() -> None:
+def test_every_module_belongs_to_a_package() -> None:
     assert {path.name for path in PACKAGE.glob("*.py")} == TOP
 
 
 @pytest.mark.parametrize("room", INSIDE)
-def test_inside_a_room_imports_go_down_too(room: str) -> None:
+def test_imports_within_a_package_go_down(room: str) -> None:
     floors = {name: floor for names, floor in INSIDE[room].items() for name in names.split()}
     assert set(floors) == {
         path.stem for path in (PACKAGE / room).iterdir() if path.suffix == ".py" or path.is_dir()
@@ -219,8 +219,8 @@ def test_inside_a_room_imports_go_down_too(room: str) -> None:
     assert not wrong
 
 
-def test_outside_of_render_nothing_asks_which_backend_it_has() -> None:
-    """What differs between processors is the matter of ``Backend``: no comparison with its name, no table by it."""
+def test_only_render_distinguishes_backends() -> None:
+    """Differences between devices belong into ``Backend``: no comparison with its name, no table by name."""
 
     def is_name(node: ast.AST) -> bool:
         return isinstance(node, ast.Attribute) and node.attr == "name" and "backend" in ast.unparse(node.value).lower()
@@ -239,13 +239,13 @@ def test_outside_of_render_nothing_asks_which_backend_it_has() -> None:
     assert not lines_where(asks, outside)
 
 
-def test_files_have_one_subject_and_no_more_lines_than_that_takes() -> None:
+def test_files_are_not_too_long() -> None:
     lines = {module: len(path.read_text(encoding="utf-8").splitlines()) for module, path in MODULES.items()}
     assert not {module: count for module, count in lines.items() if count > MAX_LINES}
 
 
 def lines_where(is_wrong: Callable[[ast.AST], bool], modules: Iterable[str]) -> list[str]:
-    """Return MODULE:LINE of each node that is wrong."""
+    """Return MODULE:LINE of each violation."""
     return [f"{name}:{getattr(node, 'lineno', 0)}" for name in modules for node in nodes_of(name) if is_wrong(node)]
 
 
@@ -317,8 +317,8 @@ def test_importing_a_module_has_no_side_effect_on_torch() -> None:
     run_python(code)
 
 
-def test_tests_lie_where_their_modules_lie() -> None:
-    """``helpers`` is what they share, ``benchmarks`` and ``fuzz`` test what is beside the package, ``gpu`` a device."""
+def test_tests_mirror_the_package() -> None:
+    """Other folders: ``helpers`` is shared code, ``benchmarks`` and ``fuzz`` test code outside the package."""
     root = Path(__file__).parent
     folders = {path.parent.relative_to(root) for path in root.rglob("test_*.py")} - {
         *map(Path, ("benchmarks", "fuzz", "gpu"))

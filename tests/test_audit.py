@@ -1,4 +1,4 @@
-"""What is said of vulnerabilities: never "none" where nobody could be asked."""
+"""The audit never reports "no vulnerabilities" if it could not check."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def audit() -> ModuleType:
         ('{"dependencies": [{"name": "a", "skip_reason": "not on PyPI"}]}', 3, "not checked: a"),
     ],
 )
-def test_what_could_not_be_asked_is_said(
+def test_a_failed_check_is_reported(
     audit: ModuleType,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -49,7 +49,7 @@ def test_what_could_not_be_asked_is_said(
     assert words in capsys.readouterr().out
 
 
-def test_without_the_tool_nothing_is_claimed(
+def test_without_pip_audit_no_result_is_claimed(
     audit: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)

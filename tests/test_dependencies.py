@@ -48,14 +48,14 @@ def needed(requirements: Iterable[str], found: set[str]) -> set[str]:
 
 
 def unfree(metadata: Iterable[tuple[str, str]]) -> list[str]:
-    """Return what the metadata of a package say of its licence that speaks against it."""
+    """Return the licence texts in the metadata of a package that forbid its use."""
     said = [line for key, text in metadata if key in ("License-Expression", "License") for line in text.splitlines()]
     said += [text for key, text in metadata if key == "Classifier" and text.startswith("License")]
     return [line.strip() for line in said if UNFREE.search(line)]
 
 
 @pytest.mark.parametrize("name", sorted(needed(DECLARED, set())))
-def test_no_dependency_is_under_the_gpl_or_for_non_commercial_use(name: str) -> None:
+def test_no_dependency_has_a_gpl_or_non_commercial_licence(name: str) -> None:
     against = unfree(importlib.metadata.metadata(name).items())  # type: ignore[attr-defined]
     assert bool(against) == (name in ALLOWED), f"{name}: {against[:3]}; look into it, then ALLOWED or another package"
 
@@ -73,7 +73,7 @@ def test_no_dependency_is_under_the_gpl_or_for_non_commercial_use(name: str) -> 
         ("License", "MIT", True),
     ],
 )
-def test_such_a_licence_would_be_found(key: str, text: str, is_free: bool) -> None:
+def test_the_check_detects_such_a_licence(key: str, text: str, is_free: bool) -> None:
     assert (not unfree([(key, text)])) == is_free
 
 
@@ -85,7 +85,7 @@ def imported(path: Path) -> Iterator[str]:
         yield from (name.partition(".")[0] for name in names)
 
 
-def test_whatever_is_imported_is_declared() -> None:
+def test_every_imported_package_is_declared() -> None:
     declared = {canonicalize_name(Requirement(line).name) for line in DECLARED}
     packages = importlib.metadata.packages_distributions()
     modules = {name for path in PACKAGE.rglob("*.py") for name in imported(path)}

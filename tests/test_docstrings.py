@@ -44,7 +44,7 @@ def entries(text: str, section: str) -> Iterator[tuple[str, str]]:
 
 
 def taken(node: ast.AST) -> set[str]:
-    """Return the parameters of a function, or of what makes an object of a class."""
+    """Return the parameters of a function, or of the constructor of a class."""
     if isinstance(node, ast.ClassDef):
         made = [sub for sub in node.body if isinstance(sub, ast.FunctionDef) and sub.name in ("__init__", "__new__")]
         own = {
@@ -68,7 +68,7 @@ def test_sections_name_parameters_fields_and_types_that_exist() -> None:
 
 
 def faults_of(path: Path) -> list[str]:
-    """Return what the docstrings of a module name that does not exist."""
+    """Return the names in the docstrings of a module that do not exist."""
     module, tree = importlib.import_module(module_of(path)), tree_of(path)
     known = set(dir(module)) | words_of(tree) | TYPES
     wrong = []
@@ -92,7 +92,7 @@ PATH = re.compile(r"--set (?!NAME=|partition\.)([\w.{}]+)=?")
 
 
 def printed_paths() -> list[tuple[str, str]]:
-    """Return the ``--set`` paths of all strings in the package, with their module; {} is what a message puts in."""
+    """Return the ``--set`` paths of all strings in the package, with their module; {} stands for a formatted value."""
     found = []
     for path in FILES:
         for node in ast.walk(tree_of(path)):
@@ -106,7 +106,7 @@ def printed_paths() -> list[tuple[str, str]]:
     return sorted({(module, path) for module, path in found if set(path) - set("{}")})
 
 
-def test_every_set_path_that_a_message_prints_exists_in_a_recipe_whose_stages_have_other_names() -> None:
+def test_set_paths_in_messages_exist_in_a_recipe_with_other_stage_names() -> None:
     base = get_recipe("best")
     whole = replace(
         base,

@@ -1,4 +1,4 @@
-"""The guides keep their word: their Python runs, and what they link to is there."""
+"""Pages: their Python runs, and their commands, options, defaults and file names exist."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ROOT = DOCS.parent
 
 
 def run_blocks(page: Path, least: int) -> dict[str, Any]:
-    """Run the blocks of Python of a page as one program, in the current folder."""
+    """Run the Python blocks of a page as one program, in the current folder."""
     blocks = list(re.finditer(r"^```python\n(.*?)^```$", page.read_text(encoding="utf-8"), re.M | re.S))
     assert len(blocks) >= least
     names: dict[str, Any] = {}
@@ -62,7 +62,7 @@ def test_the_loss_of_the_tutorial_reaches_the_splats_and_its_recipe_trains(
     assert not torch.equal(plain.splats.opacity_logits, crisp.splats.opacity_logits)
 
 
-def test_the_program_that_optimises_poses_finds_the_cameras() -> None:
+def test_the_program_of_the_pose_tutorial_recovers_the_cameras() -> None:
     names = run_blocks(DOCS / "tutorials" / "camera-poses.md", 1)
     before, after = names["errors"](names["start"]), names["errors"](names["found"])
     assert before.min() > 0.02
@@ -93,18 +93,18 @@ def test_the_program_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.Monk
     assert len(gs2d.read_splats(tmp_path / "splats.ply")) > 0
 
 
-def test_the_recipes_of_the_concepts_page_are_recipes() -> None:
+def test_the_recipes_of_the_concepts_page_exist() -> None:
     names = run_blocks(DOCS / "concepts.md", 1)
     assert names["two_dgs_r"].stages == RECIPES["2dgs-r"]().stages
 
 
-def test_files_that_the_architecture_names_are_there() -> None:
+def test_files_on_the_architecture_page_exist() -> None:
     named = set(re.findall(r"[\w/]+\.py\b", (DOCS / "architecture.md").read_text(encoding="utf-8")))
     there = [path.as_posix() for folder in ("src", "tests") for path in (ROOT / folder).rglob("*.py")]
     assert {name for name in named if not any(path.endswith("/" + name) for path in there)} == set()
 
 
-def test_citation_and_changelog_are_of_the_version() -> None:
+def test_citation_and_changelog_have_the_current_version() -> None:
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     dated = re.search(r"^version: (\S+)\ndate-released: (\S+)$", citation, re.M)
     assert dated is not None
@@ -115,7 +115,7 @@ def test_citation_and_changelog_are_of_the_version() -> None:
     assert re.findall(r"^## (.*)$", changelog, re.M)[0] == "[Unreleased]"
 
 
-# The pages for users: what they say of options, defaults and files is compared with the program.
+# Options, defaults and files on the user pages are compared with the program.
 NO_USER_PAGES = {"CHANGELOG", "kernels", "math"}
 USER_PAGES = [page for folder in ("..", ".", "guides", "tutorials") for page in sorted((DOCS / folder).glob("*.md"))]
 USER_PAGES = [page for page in USER_PAGES if page.stem not in NO_USER_PAGES]
@@ -133,7 +133,7 @@ def commands_of(text: str) -> list[list[str]]:
 
 
 @pytest.mark.parametrize("page", USER_PAGES, ids=lambda page: page.stem)
-def test_commands_on_a_page_exist_with_their_options(page: Path) -> None:
+def test_commands_and_options_on_a_page_exist(page: Path) -> None:
     wrong = []
     for name, *words in commands_of(page.read_text(encoding="utf-8")):
         if re.fullmatch(r"[a-z]+", name):
@@ -152,7 +152,7 @@ def test_options_between_backticks_exist(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", USER_PAGES, ids=lambda page: page.stem)
-def test_defaults_that_a_page_states_are_those_of_the_program(page: Path) -> None:
+def test_defaults_on_a_page_are_current(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     for flag, value in re.findall(r"`(--set \w+|--[\w-]+)[^`]*`(?:[^`(]*\(|, )default:? ([\d.,]*\d|`[\w-]+`)", text):
         assert str(ALL_OPTIONS[flag].default) in (value.strip("`").replace(",", ""), value + ".0"), flag
@@ -161,7 +161,7 @@ def test_defaults_that_a_page_states_are_those_of_the_program(page: Path) -> Non
             assert ALL_OPTIONS[flag].default in (value, None), flag
 
 
-def test_files_that_the_pages_name_are_there() -> None:
+def test_files_on_the_pages_exist() -> None:
     written = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "src").rglob("*.py"))
     foreign = {"crisp.py", "metrics.py"}  # of a tutorial, of the official code
     missing = []
@@ -185,7 +185,7 @@ def test_files_that_the_pages_name_are_there() -> None:
     assert missing == []
 
 
-def test_fields_that_the_pages_set_are_fields_of_recipes() -> None:
+def test_recipe_fields_on_the_pages_exist() -> None:
     recipes = [RECIPES[name]() for name in ("best", "2dgs-r", "2dgs-multiview")]
     recipes.append(with_robustness(with_intrinsics(with_exposure(with_normal_prior(with_depth_prior(recipes[0]))))))
     wrong = []

@@ -1,4 +1,4 @@
-"""What ``import gs2d`` offers: the names that the README and the guides use, documented, loaded when they are used."""
+"""The public interface of ``import gs2d``: documented names that are loaded lazily."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ FACE = (
 )
 
 
-def test_the_face_is_public() -> None:
+def test_public_names_are_public_in_their_modules() -> None:
     assert set(FACE) <= set(gs2d.__all__)
 
 
 @pytest.mark.parametrize("name", [name for name in gs2d.__all__ if name != "__version__"])
-def test_each_name_says_what_it_is(name: str) -> None:
+def test_each_public_name_has_a_docstring(name: str) -> None:
     found = getattr(gs2d, name)
     text = inspect.getdoc(found) or ""
     first = text.partition("\n")[0]
@@ -51,7 +51,7 @@ def test_each_name_says_what_it_is(name: str) -> None:
 
 
 def documented(text: str) -> dict[str, str]:
-    """Return the names of a docstring's Parameters and Attributes with what is said of them."""
+    """Return the entries of the Parameters and Attributes of a docstring, with their descriptions."""
     found: dict[str, str] = {}
     for section in re.findall(r"^(?:Parameters|Attributes)\n-+\n(.*?)(?=^\w[^\n]*\n-+$|\Z)", text, re.M | re.S):
         names: list[str] = []
@@ -94,7 +94,7 @@ def test_each_parameter_and_field_is_documented_and_each_array_has_a_shape(name:
         assert "Returns\n-------" in (inspect.getdoc(found) or "")
 
 
-def test_importing_gs2d_loads_nothing_else() -> None:
+def test_importing_gs2d_loads_no_other_package() -> None:
     code = "import sys; before = set(sys.modules); import gs2d; print(*sorted(set(sys.modules) - before))"
     environment = os.environ | {"PYTHONPATH": str(Path(gs2d.__file__).parents[1])}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)

@@ -1,4 +1,4 @@
-"""The wheel that is released: from `scripts/build_release.sh`, installed where there is nothing else."""
+"""The released wheel, built by `scripts/build_release.sh` and installed into an empty environment."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_the_wheel_runs_the_demo_in_an_empty_environment_without_a_compiler() ->
     assert f"gs2d {gs2d.__version__}" in done.stdout
 
 
-def test_the_wheel_for_arm_holds_libraries_for_arm_that_need_an_old_glibc_alone() -> None:
+def test_the_arm_wheel_contains_arm_libraries_for_an_old_glibc() -> None:
     wheels = sorted((ROOT / "dist").glob(f"2dgs_r-{gs2d.__version__}-py3-none-manylinux_*_aarch64.whl"))
     if not wheels:
         pytest.skip("no aarch64 wheel in dist/: scripts/build_release.sh --aarch64")
@@ -47,7 +47,7 @@ def test_the_wheel_for_arm_holds_libraries_for_arm_that_need_an_old_glibc_alone(
             assert max(versions) <= (int(told[1]), int(told[2]))
 
 
-def test_the_conda_recipe_needs_what_pyproject_needs() -> None:
+def test_the_conda_recipe_has_the_dependencies_of_pyproject() -> None:
     """Names differ: conda has torch as pytorch, and matplotlib without a window system as matplotlib-base."""
     recipe = (ROOT / "packaging" / "conda" / "recipe.yaml").read_text(encoding="utf-8")
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -59,8 +59,8 @@ def test_the_conda_recipe_needs_what_pyproject_needs() -> None:
     assert f'version: "{gs2d.__version__}"' in recipe
 
 
-def test_what_two_processors_draw_may_differ_by_rounding_and_not_by_more(tmp_path: Path) -> None:
-    """The judge of `scripts/check_aarch64.sh`, on results made up by hand."""
+def test_two_processors_may_differ_by_rounding_only(tmp_path: Path) -> None:
+    """The comparison of `scripts/check_aarch64.sh`, on artificial results."""
     rng = np.random.default_rng(0)
     here = {f"image {name}": rng.random((20, 30, 3), dtype=np.float32) for name in IMAGES}
     here |= {"gradient means": rng.random((50, 3), dtype=np.float32)}

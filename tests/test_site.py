@@ -1,6 +1,6 @@
-"""The documentation as a site: each page is in its navigation, each link leads to a heading, each reference is whole.
+"""The documentation site: navigation and references are complete.
 
-What needs no Sphinx is asked here in seconds; the slow test builds the site, as `make docs` does.
+The slow test builds the site with Sphinx, as `make docs` does.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def test_every_page_is_in_the_navigation() -> None:
 
 def test_each_known_fault_names_tests_that_exist() -> None:
     parts = re.split(r"^## ", (ROOT / "docs" / "known-faults.md").read_text(encoding="utf-8"), flags=re.M)[1:]
-    assert len(parts) == 10  # the list of complaints that this page answers
+    assert len(parts) == 10
     for part in parts:
         named = TEST_NAME.findall(part)
         assert named, part.splitlines()[0]
@@ -62,20 +62,20 @@ def test_the_command_reference_has_every_option_of_every_command() -> None:
     assert set(re.findall(r"\]\(#([^)]+)\)", text)) <= anchors
 
 
-def test_the_python_reference_has_the_public_face() -> None:
+def test_the_python_reference_has_all_public_names() -> None:
     text = module("reference").python()
     for name in set(gs2d.__all__) - {"__version__"}:
         assert f":: gs2d.{name}\n" in text
 
 
 @pytest.mark.parametrize("page", ["docs/reference/commands.md", "docs/reference/python.md"])
-def test_generated_pages_say_where_the_generated_part_goes(page: str) -> None:
+def test_generated_pages_have_one_marker(page: str) -> None:
     assert (ROOT / page).read_text(encoding="utf-8").count("<!-- generated -->") == 1
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The site, as `make docs` builds it: a warning is an error."""
+    """Build the site as `make docs` does; warnings are errors."""
     for name in ("sphinx", "myst_parser", "furo"):
         pytest.importorskip(name, reason="the extra `docs` is not installed: make docs")
     home = tmp_path_factory.mktemp("docs")

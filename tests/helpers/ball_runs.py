@@ -1,4 +1,4 @@
-"""What the tests of the pipeline share: how the tiny ball is trained, and what may not differ between two runs."""
+"""Train the tiny ball, and compare two runs of it."""
 
 from __future__ import annotations
 

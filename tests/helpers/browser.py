@@ -1,4 +1,4 @@
-"""Chromium without a window, driven by its DevTools protocol: pages are opened, touched, and asked what they show."""
+"""Headless Chromium, driven by its DevTools protocol."""
 
 from __future__ import annotations
 

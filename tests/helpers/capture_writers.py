@@ -1,4 +1,4 @@
-"""Small captures in every layout, written by the tests' own code (struct and json, nothing of gs2d but the camera)."""
+"""Write small captures in every layout with struct and json, independently of the readers of gs2d."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the tests of the command line share: tiny runs, and the one line of an error."""
+"""Tiny runs for tests of the command line, and its one-line errors."""
 
 from __future__ import annotations
 

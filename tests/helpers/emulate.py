@@ -1,7 +1,6 @@
 """Compile CUDA sources for the CPU (emulator.h) and call their kernels on tensors in host memory.
 
-Libraries are kept in build/emulated under a digest of all that goes into them, for the other workers and processes of
-the tests and for the next time.
+Compiled libraries are cached in build/emulated under a digest of their inputs.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Every kernel of the package once or more, on sizes that are a multiple of nothing: what comes out, by name.
-
-For the sanitizers, which must be in the process from its start.
-"""
+"""Run every kernel of the package on sizes that are no multiple of a block, for the sanitizers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Backends for tests: one with other functions in the place of its own, one whose images are not whole."""
+"""Backends for tests: one with replaced methods, one with incomplete images."""
 
 from __future__ import annotations
 

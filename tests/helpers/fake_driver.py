@@ -1,4 +1,4 @@
-"""A CUDA driver for the launcher's tests: it records calls, fails when told to, and may run kernels in the emulator."""
+"""A fake CUDA driver: records calls, fails on request, and can run kernels in the emulator."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""A GPU for torch with values but no GPU: tensors on "cuda" whose bytes lie in host memory, for processes of tests.
+"""A fake GPU for torch: tensors on "cuda" whose bytes are in host memory.
 
-As on a GPU, tensors of the host and of the device may not be mixed, numpy cannot see the device's, and "cuda" is not
-"cuda:0". Kernels run in the emulator on the bytes. ``install`` changes torch for the rest of the process: it belongs in
-a process of its own. Streams, real memory and time are not there.
+As on a GPU, host and device tensors cannot be mixed, NumPy cannot read device tensors, and "cuda" is not "cuda:0".
+Kernels run in the emulator. ``install`` changes torch for the rest of the process, so use a separate process. Streams,
+device memory and timing are not modelled.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A module in place of Ray: does at once what it is given, in this process, and remembers what was asked of it."""
+"""A fake Ray module: runs tasks immediately in this process and records them."""
 
 from __future__ import annotations
 

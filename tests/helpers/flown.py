@@ -1,4 +1,4 @@
-"""A tiny flight, and `gs2d blocks` on it in seconds."""
+"""A tiny aerial capture, and options with which `gs2d blocks` takes seconds on it."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Captures of other tools from known cameras and lenses, written from their documentation and nothing of gs2d.
+"""Write captures of other tools from known cameras and lenses, following the documentation of these tools.
 
-Each has the same photographs (40x30, names ``a_0.jpg`` ...) and, for comparison, the same cameras as a COLMAP model.
+All have the same images (40x30, ``a_0.jpg`` ...) and, for comparison, the same cameras as a COLMAP model.
 """
 
 from __future__ import annotations

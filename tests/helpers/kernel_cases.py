@@ -1,4 +1,4 @@
-"""Scenes for the CUDA kernels, and ways to run them by the emulator and by the reference."""
+"""Scenes for the CUDA kernels, and functions that run them in the emulator and the reference."""
 
 from __future__ import annotations
 

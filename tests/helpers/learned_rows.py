@@ -1,4 +1,4 @@
-"""What is learned of images and cameras, for tests: a state with its rows, and one update by hand."""
+"""Learned quantities for tests: a state with its rows, and a single update."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Programs of other people from npm, in named versions, for tests that ask them what they think of our files."""
+"""Pinned npm packages that read our files in tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cells and rows of a table that nothing was trained for; a schedule of seconds, without curves, for one that is."""
+"""Table cells and rows without training, and a schedule of seconds for a trained one."""
 
 from __future__ import annotations
 

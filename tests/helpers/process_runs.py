@@ -1,4 +1,4 @@
-"""Small runs of ``gs2d train`` in several processes, started as a test or torchrun does."""
+"""Small runs of ``gs2d train`` in several processes, started directly or by torchrun."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands of gs2d on the cluster of ``ray_nodes.py``, and what of it can be killed."""
+"""Run commands of gs2d on the cluster of ``ray_nodes.py``, and kill its processes."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""A Ray cluster of several nodes on this machine, as a program: prints its address, and does what it reads.
+"""Start a Ray cluster of several nodes on this machine: prints its address and executes commands from stdin.
 
-``lose``: all nodes with CPUs lose their processes without grace, so that no task is spared, and others come; with
-numbers, those nodes alone. The end of its input is its own end.
+``lose`` kills the processes of all nodes with CPUs (or of the numbered ones) and starts new nodes. The cluster ends
+with its input.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""A third opinion on the contract: one pixel and one splat at a time, in world space, numpy float64, no cleverness.
+"""An independent renderer for the contract tests: one pixel and one splat at a time, in world space, in float64.
 
-It intersects rays with planes directly (no homogeneous map), and says how far every decision was from flipping.
+Intersects rays with planes directly (no homogeneous map), and returns the margin of every threshold decision.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Scenes for the rasterizer's tests: single splats placed by hand, and random scenes with the awkward cases."""
+"""Scenes for the rasterizer tests: single splats, and random scenes with edge cases."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run folder made by hand, small, with every file that a report reads."""
+"""Write a small run folder with every file that a report reads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Photographs of the corner of a room with mottled walls, drawn by a formula, for tests of structure from motion."""
+"""Synthetic images of the corner of a room with textured walls, for tests of structure from motion."""
 
 from __future__ import annotations
 

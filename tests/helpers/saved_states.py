@@ -1,4 +1,4 @@
-"""States of training as checkpoints keep them: bytes, there and back."""
+"""Training states as checkpoint bytes, and back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Splats for the tests of files, and how far rotations lie apart."""
+"""Splats for tests of file formats, and the angle between rotations."""
 
 from __future__ import annotations
 

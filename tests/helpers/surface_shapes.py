@@ -1,4 +1,4 @@
-"""Volumes made from formulas, and meshes taken apart."""
+"""Volumes from formulas, and properties of meshes."""
 
 from __future__ import annotations
 

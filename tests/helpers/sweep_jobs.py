@@ -1,4 +1,4 @@
-"""Jobs that train nothing."""
+"""Sweep jobs without training."""
 
 from __future__ import annotations
 

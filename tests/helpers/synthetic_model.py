@@ -1,4 +1,4 @@
-"""COLMAP models made by hand: cameras on an arc that look at random points, observed through a known lens."""
+"""Synthetic COLMAP models: cameras on an arc observe random points through a known lens."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A command on a pseudo-terminal of a given width, for tests of what a person sees."""
+"""Run a command on a pseudo-terminal of a given width."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shapes whose colour is a formula of the place, and photographs of them by the demo's ray caster."""
+"""Shapes whose colour is a formula of the position, and ray-cast images of them."""
 
 from __future__ import annotations
 

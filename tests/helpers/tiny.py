@@ -1,4 +1,4 @@
-"""Tiny captures for tests of the whole path: a coloured ball, drawn by a formula, in the NeRF-Synthetic layout."""
+"""Tiny captures for end-to-end tests: a coloured ball in the NeRF-Synthetic layout."""
 
 from __future__ import annotations
 

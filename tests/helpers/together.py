@@ -1,7 +1,7 @@
-"""A batch of several views in one process, to compare with; and a program that trains toys in several processes.
+"""A batch of several views in one process for comparison, and a program that trains toys in several processes.
 
-As a program (``python together.py CASE,CASE FOLDER``), each process does the cases in order and writes what came out to
-``FOLDER/CASE.RANK.pt``; the environment says which process it is, as torchrun does.
+As a program (``python together.py CASE,CASE FOLDER``), each process runs the cases in order and writes the results to
+``FOLDER/CASE.RANK.pt``. Ranks are in the environment, as with torchrun.
 """
 
 from __future__ import annotations

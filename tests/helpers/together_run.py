@@ -1,7 +1,7 @@
-"""The command ``gs2d`` in a process that torchrun, or a test, says is one of several; without mesh and report.
+"""The command ``gs2d`` in one of several processes, without mesh and report.
 
-``python together_run.py [signal=RANK:STEP:NUMBER] [seed=RANK:SEED] WORDS...``: a signal that the process of this rank
-sends itself at the beginning of a step, counted over all stages, but not after a restart; another seed in one of them.
+``python together_run.py [signal=RANK:STEP:NUMBER] [seed=RANK:SEED] WORDS...``: the process of this rank sends itself a
+signal at the beginning of a step, counted over all stages, unless it was restarted, or uses another seed.
 """
 
 from __future__ import annotations

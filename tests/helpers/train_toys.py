@@ -1,4 +1,4 @@
-"""Toys for the trainer: random splats, a full state, and a ball of 80 splats seen by six cameras of 24x24 pixels."""
+"""Toys for the trainer: random splats, a full state, and a ball of 80 splats with six cameras of 24x24 px."""
 
 from __future__ import annotations
 

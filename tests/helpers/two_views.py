@@ -1,4 +1,4 @@
-"""A textured plane and what two cameras see of it, with noise: pairs of views for the losses that compare them."""
+"""Noisy pairs of views of a textured plane, for the multi-view losses."""
 
 from __future__ import annotations
 

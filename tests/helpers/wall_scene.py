@@ -1,4 +1,4 @@
-"""Five photographs of a textured wall with a bare part, and the sparse points on it: a scene whose depth is known."""
+"""Five images of a textured wall with a bare part, with sparse points: a scene of known depth."""
 
 from __future__ import annotations
 
