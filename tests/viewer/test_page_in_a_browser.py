@@ -263,7 +263,7 @@ def test_keys_open_help_show_normals_and_depth_and_step_through_photographs(page
     still(page)
 
 
-def test_a_photographed_view_is_drawn_as_the_rasterizer_draws_it_after_turning_and_coming_back(page: Page) -> None:
+def test_the_view_of_a_photograph_matches_the_rasterizer(page: Page) -> None:
     page.drag((320, 160), (380, 170))
     page.size(WIDTH, HEIGHT)
     try:

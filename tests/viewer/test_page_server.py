@@ -118,7 +118,7 @@ def test_idle_connections_are_limited_and_end_in_time(
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_port_that_is_taken_is_refused_if_it_was_asked_for_and_passed_by_if_not() -> None:
+def test_a_requested_port_in_use_is_an_error_and_the_default_skips_it() -> None:
     with socket.socket() as taken:
         taken.bind((HOST, 0))
         taken.listen()

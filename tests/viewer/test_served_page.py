@@ -134,7 +134,7 @@ def test_stages_the_mesh_and_photographs_are_requested_when_they_are_chosen() ->
         assert tab.errors == []
 
 
-def test_a_page_of_a_training_shows_new_splats_until_it_is_held_and_says_when_nobody_answers() -> None:
+def test_a_live_page_shows_new_splats_can_be_paused_and_reports_a_lost_server() -> None:
     training = Training(is_live=True)
     with opened(training) as tab:
         tab.until("$('status').textContent === 'training begins'")
@@ -163,7 +163,7 @@ def test_without_the_token_there_is_nothing() -> None:
         assert not tab.ask("document.querySelector('canvas')")
 
 
-def test_a_page_of_another_site_gets_no_scene_even_with_the_token(tmp_path: Path) -> None:
+def test_another_site_gets_nothing_even_with_the_token(tmp_path: Path) -> None:
     training = Training()
     address = training.server.url.replace("/?", "/state?")
     attack = f"""<script>fetch("{address}").then(() => (document.title = "told"), () => (document.title = "refused"));

@@ -1,7 +1,7 @@
-"""A small web server for the page of splats: one process, the loopback interface, and a secret token.
+"""A small web server for the page: one process, the loopback interface and a secret token.
 
-Requests must carry the token that is in the printed address, and must name this machine as their host; all others get
-status 403. Every connection carries one request.
+Requests must carry the token of the printed address and name this machine as their host; all others get status 403.
+Each connection carries one request.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ HOST = "127.0.0.1"  # from another machine: ssh -L
 DEFAULT_PORT = 8080
 TEXT = "text/plain; charset=utf-8"
 REFUSED = "This page is private: open the address that gs2d printed, with its token.\n"
-_LOCAL_NAMES = ("127.0.0.1", "localhost")  # other host names: DNS rebinding by a page of another site
-_MAX_CONNECTIONS = 16  # at the same time; further ones are closed at once
-_TIMEOUT = 30.0  # s without a byte, after which a connection is closed
+_LOCAL_NAMES = ("127.0.0.1", "localhost")  # other names may be DNS rebinding by another site
+_MAX_CONNECTIONS = 16  # simultaneous; further ones are closed at once
+_TIMEOUT = 30.0  # s; a connection is closed after this time without a byte
 _TRIED_PORTS = 100
 _HEADERS = {
     "Cache-Control": "no-store",
@@ -67,7 +67,7 @@ def free_port(port: int | None, *, option: str = "--port") -> int:
     Raises
     ------
     BackendError
-        The port is out of range, or taken.
+        If the port is out of range or in use.
     """
     tried = [port] if port is not None else list(range(DEFAULT_PORT, DEFAULT_PORT + _TRIED_PORTS))
     reason = ""
@@ -91,7 +91,7 @@ def number_in(arguments: Mapping[str, str], name: str, count: int) -> int:
     Raises
     ------
     DataError
-        It is missing, no number, or out of range.
+        If it is missing, not a number, or out of range.
     """
     text = arguments.get(name, "")
     if not (text.isascii() and text.isdigit() and len(text) < 10 and int(text) < count):
@@ -100,12 +100,12 @@ def number_in(arguments: Mapping[str, str], name: str, count: int) -> int:
 
 
 class PageServer:
-    """Serves routes from threads of its own until it is closed.
+    """Serves routes from its own threads until it is closed.
 
     Parameters
     ----------
     port : int or None
-        None: the first free one from 8080 on.
+        None: the first free port from 8080 on.
     routes : mapping
         Routes by path, without the slash; ``""`` is the page.
 

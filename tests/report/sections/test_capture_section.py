@@ -1,4 +1,4 @@
-"""The report of a run says how the cameras of its photographs were found."""
+"""The section about the cameras from structure from motion."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def capture(folder: Path, found: dict[str, Any]) -> Path:
     return folder
 
 
-def test_photographs_without_a_place_the_lens_and_the_picture_are_in_the_report(tmp_path: Path) -> None:
+def test_the_report_has_unplaced_photographs_lens_and_image(tmp_path: Path) -> None:
     capture(tmp_path / "capture", FOUND)
     html = str(capture_section(RunRecord(tmp_path, {})))
     assert "2 of 3 photographs have a camera. There are 1,234 sparse points" in html
@@ -48,7 +48,7 @@ def test_photographs_without_a_place_the_lens_and_the_picture_are_in_the_report(
     assert "data:image/jpeg;base64," in html
 
 
-def test_a_capture_beside_the_run_is_found_by_its_path_and_all_placed_leaves_no_table(tmp_path: Path) -> None:
+def test_a_capture_outside_the_run_is_read_by_its_path(tmp_path: Path) -> None:
     found = {**FOUND, "placed": 2, "count": 2, "photographs": FOUND["photographs"][:2]}
     there = capture(tmp_path / "elsewhere", found)
     html = str(capture_section(RunRecord(tmp_path / "run", {"scene": {"path": str(there)}})))
@@ -61,7 +61,7 @@ def test_cameras_from_elsewhere_have_no_section(tmp_path: Path) -> None:
     assert capture_section(RunRecord(tmp_path, {})) is None
 
 
-def test_a_picture_that_is_gone_is_said_and_a_broken_file_is_an_error(tmp_path: Path) -> None:
+def test_a_missing_image_is_reported_and_a_broken_file_is_an_error(tmp_path: Path) -> None:
     folder = capture(tmp_path / "capture", FOUND)
     (folder / "poses.png").unlink()
     assert "poses.png cannot be shown" in str(capture_section(RunRecord(tmp_path, {})))
