@@ -44,7 +44,7 @@ def counted(maps: FreeSpaceMaps, splats: Splats, *, reference: bool) -> tuple[Te
     return against, support
 
 
-def test_it_counts_what_torch_counts(maps: FreeSpaceMaps, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_counts_agree_with_torch(maps: FreeSpaceMaps, monkeypatch: pytest.MonkeyPatch) -> None:
     splats = scattered(20_000)
     found, true = (counted(maps, splats, reference=reference) for reference in (False, True))
     assert 0.02 < (true[0] > 1).float().mean() < 0.9

@@ -79,7 +79,7 @@ def assert_as_in_torch(compare: Callable[..., object], masked: bool, learns: boo
         assert int(off.sum()) <= 0.01 * int((e != 0).sum())
 
 
-def test_pixels_at_every_edge_of_what_counts_are_decided_alike(native64: Library) -> None:
+def test_pixels_at_every_validity_limit_agree_with_torch(native64: Library) -> None:
     """Normals edge-on, turned away and of no length, an image that the patch leaves, and a neighbour far too near."""
     case = scenario(dtype=DOUBLE, settings=MultiView(patches=2000, radius=2, texture=0.03, occluded=4.0))
     g = torch.Generator().manual_seed(5)

@@ -230,7 +230,7 @@ def test_the_best_variant_is_chosen_and_the_environment_overrides_it(monkeypatch
         load()
 
 
-def test_a_missing_library_is_said_with_the_remedy(monkeypatch: pytest.MonkeyPatch, tmp_path: object) -> None:
+def test_a_missing_library_is_an_error_with_a_remedy(monkeypatch: pytest.MonkeyPatch, tmp_path: object) -> None:
     monkeypatch.setattr("gs2d.kernels.library.FOLDER", tmp_path)
     assert available_variants() == ()
     with pytest.raises(BackendError, match="--backend"):

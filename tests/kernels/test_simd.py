@@ -71,7 +71,7 @@ def test_transpose_swaps_rows_and_columns(any_native: Library) -> None:
     assert np.array_equal(out, x.T)
 
 
-def test_transposing_reduction_sums_each_vector_into_its_own_place(any_native: Library) -> None:
+def test_transposing_reduction_sums_each_vector_into_its_own_lane(any_native: Library) -> None:
     x = np.random.default_rng(0).integers(-99, 99, size=(20, any_native.lanes)).astype(real(any_native))
     out = np.empty(20, dtype=x.dtype)
     any_native.function("gs2d_selftest_transpose_reduce", None, [ctypes.c_void_p] * 2)(x.ctypes.data, out.ctypes.data)
@@ -121,7 +121,7 @@ def test_bits_are_added_in_the_lanes_of_a_mask_and_move_to_the_left(any_native: 
         assert np.array_equal(out, in_lane[0] * bits[0] << 4 | in_lane[1] * bits[1])
 
 
-def test_numbers_that_are_not_zero_are_found_for_every_block_of_a_tile(any_native: Library) -> None:
+def test_nonzero_masks_are_set_for_every_block_of_a_tile(any_native: Library) -> None:
     n = any_native.lanes
     function = any_native.function("gs2d_selftest_nonzero", ctypes.c_uint32, [ctypes.c_void_p])
     random = np.random.default_rng(0)

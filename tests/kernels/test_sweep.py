@@ -54,7 +54,7 @@ def test_it_finds_the_planes_and_scores_that_torch_finds(
     assert float((depth / WALL - 1).abs().median()) < 0.05
 
 
-def test_images_of_other_sizes_are_compared_and_what_they_do_not_show_is_unknown(views: list[SmallView]) -> None:
+def test_images_of_other_sizes_are_compared_and_pixels_outside_them_are_unknown(views: list[SmallView]) -> None:
     cut = replace(views[3], grey=views[3].grey[:, :, :20, :31].contiguous())
     found, true = best_planes(views[2], [cut], Z, 2), best_planes_reference(views[2], [cut], Z, 2)
     assert_like(found.score, true.score, views[2])

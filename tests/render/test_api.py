@@ -43,7 +43,7 @@ def test_settings_out_of_range_are_refused(change: dict[str, Any], message: str)
         rasterize(splat(), front_camera(), RasterSettings(**change), backend="reference")
 
 
-def test_splats_whose_rows_do_not_agree_are_refused() -> None:
+def test_splats_with_different_numbers_of_rows_are_refused() -> None:
     scene = splat()
     scene.quats = torch.ones(2, 4)  # Splats checks at birth, but its tensors are mutable
     with pytest.raises(ShapeError, match="quats"):

@@ -84,7 +84,7 @@ def test_08_normals_are_in_the_world_frame(backend: Backend) -> None:
     equal(out.normal[4, 4], [0.7, 0.0, 0.0])
 
 
-def test_08_the_side_is_judged_at_the_splats_centre_for_all_its_pixels(backend: Backend) -> None:
+def test_08_the_facing_side_is_determined_at_the_splats_centre_for_all_pixels(backend: Backend) -> None:
     # Centre (1, 0, 2), normal t_w = (cos a, 0, -sin a) with <t_w, p> = cos a - 2 sin a: a = 30 degrees: -0.134 < 0, so
     # t_w stays, in every pixel that the splat touches; with a = 20 degrees +0.256 > 0, and it turns.
     for a, sign in ((30, 1.0), (20, -1.0)):
@@ -166,7 +166,7 @@ def test_11_colour_is_seen_along_the_direction_from_the_camera_centre(backend: B
     equal(color[4, 4] / 0.5, [0.5, 0.5 + C1 * 0.8 * 0.3, 0.5 - C1 * 0.6 * 0.3])
 
 
-def test_11_only_the_asked_degree_is_evaluated(backend: Backend) -> None:
+def test_11_only_the_requested_degree_is_evaluated(backend: Backend) -> None:
     scene = requiring_grad(replace(splat(), shN=torch.full((1, 15, 3), 0.2)))
     out = rasterize(scene, front_camera(), RasterSettings(sh_degree=1), backend=backend)
     # Along z only the coefficient of C1 z contributes.

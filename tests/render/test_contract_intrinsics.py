@@ -51,7 +51,7 @@ def gradient(splats: Splats, camera: Camera, cotangents: dict[str, Tensor], back
 
 
 @pytest.mark.parametrize("image", IMAGES)
-def test_21_the_gradient_is_what_finite_differences_find(image: str) -> None:
+def test_21_the_gradient_agrees_with_finite_differences(image: str) -> None:
     splats, camera, cotangents = scene(3)
     cotangents = {image: cotangents[image]}
     found, step = gradient(splats, camera, cotangents, "reference"), 1e-5
@@ -193,7 +193,7 @@ def test_21_a_camera_of_another_size_learns_the_same_intrinsics(cpu: Backend) ->
         assert_close(intrinsics.grad, factor * of_scaled.grad)
 
 
-def test_a_focal_length_finds_its_way_back_to_a_photograph(cpu: Backend) -> None:
+def test_a_perturbed_focal_length_converges_to_that_of_its_image(cpu: Backend) -> None:
     rng = np.random.default_rng(0)
     camera = replace(random_camera(rng), width=40, height=30, fx=40.0, fy=40.0, cx=20.0, cy=15.0)
     splats = random_splats(rng, camera, 60, ("plain",)).to(torch.float32)

@@ -162,7 +162,7 @@ def test_04_the_ray_plane_depth_is_a_setting_of_the_reference() -> None:
 
 
 # 5 ---------------------------------------------------------------------------------------------------------------
-def test_05_splats_at_or_before_near_are_culled_whole(backend: Backend) -> None:
+def test_05_splats_at_or_before_near_are_culled(backend: Backend) -> None:
     settings = RasterSettings(near=1.0)
     for z, drawn in ((-2.0, False), (0.5, False), (1.0, False), (1.001, True)):
         out = rasterize(splat((0, 0, z)), front_camera(), settings, backend=backend)

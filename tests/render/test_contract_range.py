@@ -64,7 +64,7 @@ def test_23_every_finite_parameter_is_drawn_alike(backend: Backend, name: str, c
             assert_like_reference(backend, altered, camera, (name, column, edge))
 
 
-def test_23_a_far_centre_does_not_draw_over_the_picture(backend: Backend) -> None:
+def test_23_a_far_centre_does_not_cover_the_image(backend: Backend) -> None:
     for far in (1e10, 1e18, 1e20, 1e30, 3e38):
         for mean in ((0.0, far, 0.0), (0.0, 0.0, far), (far, far, far), (0.0, far, 2.0)):
             out = rasterize(splat(mean), edge_camera("turned"), backend=backend)
@@ -107,7 +107,7 @@ def test_23_the_limits_are_where_the_rule_has_them(backend: Backend) -> None:
     assert not seen({"sh0": torch.full((1, 1, 3), 0.34 * MAX_COLOR)})
 
 
-def test_23_what_is_culled_has_no_gradient_and_harms_no_other(backend: Backend) -> None:
+def test_23_culled_splats_have_no_gradient_and_do_not_affect_others(backend: Backend) -> None:
     for name, value in (("means", 1e20), ("log_scales", 60.0), ("sh0", 1e30), ("quats", 1e-30)):
         broken = replace(splat(), **{name: torch.full_like(getattr(splat(), name), value)})
         both = requiring_grad(stack(broken, splat((0, 0, 3.0))))

@@ -199,7 +199,7 @@ def test_17_each_pixel_is_compared_with_its_own_colour(backend: Backend) -> None
     equal(splat_errors(splat(), front_camera(5, 5), image, backend=backend), expected[None])
 
 
-def test_17_hidden_splats_count_unless_occlusion_is_asked_for(backend: Backend) -> None:
+def test_17_hidden_splats_count_without_occlusion(backend: Backend) -> None:
     # T after 0.98, 0.98, 0.98: the pixel stops before the third. The fourth is hidden; scale 9: flat over 5 x 5 px.
     layers = [splat((0, 0, 2 + i), scales=(9, 9), opacity=o) for i, o in enumerate((0.98, 0.98, 0.98, 0.1))]
     camera, image = front_camera(5, 5), torch.zeros(5, 5, 3)

@@ -37,7 +37,7 @@ def test_the_curve_keeps_its_ends_never_turns_and_has_its_inverse_at_the_other_s
         assert torch.allclose(bend(bent, number(-shift)), every)
 
 
-def test_light_is_whole_at_the_principal_point_and_falls_off_to_the_reach() -> None:
+def test_vignetting_is_1_at_the_principal_point_and_decreases_outwards() -> None:
     reach = reach_of([CAMERA])
     assert reach == pytest.approx(0.5)  # hypot(4, 3) / 10
     squares = torch.from_numpy(squared_radii(CAMERA, reach))
@@ -46,7 +46,7 @@ def test_light_is_whole_at_the_principal_point_and_falls_off_to_the_reach() -> N
     assert vignetting(torch.tensor([0.0, 1.0]), a).tolist() == pytest.approx([1.0, math.exp(-0.6)])
 
 
-def test_a_picture_of_half_the_size_has_the_same_light() -> None:
+def test_an_image_of_half_the_size_has_the_same_vignetting() -> None:
     reach = reach_of([CAMERA])
     small = squared_radii(CAMERA.downscaled(2), reach)
     # Four pixels lie half a pixel from their middle along each axis: their mean square is its square and 2 x 0.25 px^2.
@@ -59,7 +59,7 @@ def photograph(color: Tensor, transform: Tensor, numbers: Tensor, squares: Tenso
     return show(expose(show(color, falloff, squares, *cover), transform, *cover), curve, None, *cover)
 
 
-def test_in_the_mean_exposure_and_response_a_picture_keeps_its_colours_at_the_principal_point() -> None:
+def test_mean_exposure_and_response_keep_colours_at_the_principal_point() -> None:
     color, numbers = random(6, 8, 3) * 1.4 - 0.2, torch.tensor([0.4, 0.0, 0.1, 0.0], dtype=torch.float64)
     squares = squares_of(CAMERA, 0.5, color)
     assert torch.allclose(show(color, numbers, torch.zeros_like(squares)), color)

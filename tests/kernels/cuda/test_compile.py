@@ -137,7 +137,7 @@ def test_two_processes_at_once_share_one_cache(tmp_path: Path) -> None:
     assert cubin("cuda/emit.cu", "sm_90", tmp_path).log == ""
 
 
-def test_without_nvrtc_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_nvrtc_the_error_names_the_package_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cuda.bindings", None)
     with pytest.raises(BackendError, match="bindings"):
         compile_source("cuda/emit.cu", "sm_90")

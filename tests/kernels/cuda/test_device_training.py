@@ -222,7 +222,7 @@ def test_without_waiting_for_the_number_of_pairs_training_gives_the_same_bits(
     assert {k: m.steps for k, m in kept.state.moments.items()} == {k: m.steps for k, m in trainer.state.moments.items()}
 
 
-def test_room_that_is_not_needed_holds_nothing_and_too_little_room_is_said(
+def test_unused_room_is_empty_and_too_little_room_sets_overflow(
     emulator: Emulator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The last splat by depth lies at the top: pairs that do not exist would count on, into the tiles below it.
@@ -310,7 +310,7 @@ def image_scene() -> tuple[View, ...]:
     )
 
 
-def test_photographs_wait_as_bytes_and_become_the_targets_of_the_cpu() -> None:
+def test_images_are_stored_as_bytes_and_convert_to_the_targets_of_the_cpu() -> None:
     """72 bytes opaque, 96 with alpha, 96 with a mask: of 170 bytes on the device the first two use 168.
 
     Pinned, the third takes 128 + 32 bytes.
@@ -335,7 +335,7 @@ def test_photographs_wait_as_bytes_and_become_the_targets_of_the_cpu() -> None:
     assert sorted(targets._kept) == [0, 1, 2]
 
 
-def test_a_state_on_a_device_is_saved_in_host_memory_and_moves_whole() -> None:
+def test_a_state_on_a_device_is_saved_in_host_memory_and_moves_completely() -> None:
     state = train_toys.full_state()
     state.move_to("meta")
     tensors = [t for _, t in state.splats.items()] + [m.mean for m in state.moments.values()]

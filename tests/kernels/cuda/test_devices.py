@@ -172,5 +172,5 @@ def test_gradients_and_splat_errors_stay_on_the_device(said: list[str]) -> None:
         assert f"'{kernel}'" in said[1]
 
 
-def test_a_tensor_of_the_host_is_found(said: list[str]) -> None:
+def test_a_tensor_in_host_memory_is_detected(said: list[str]) -> None:
     assert said[2] == "refused: ('ends', device(type='cpu'))"

@@ -48,7 +48,7 @@ def test_a_missing_barrier_gives_wrong_results(cases: emulate.EmulatedKernels) -
     assert all(result != list(range(63, -1, -1)) for result in results)
 
 
-def test_warps_that_run_ahead_show_a_vote_in_the_place_of_a_barrier(cases: emulate.EmulatedKernels) -> None:
+def test_warps_that_run_ahead_expose_a_vote_used_as_a_barrier(cases: emulate.EmulatedKernels) -> None:
     """Where all warps go from collective to collective together it would pass for one; with a barrier all is well."""
     right = [*range(63, -1, -1), *range(127, 63, -1)]
 

@@ -112,7 +112,9 @@ def said(script: str, guard: Path, emulator: emulate.Emulator, folder: Path) -> 
     return done.stdout.splitlines()
 
 
-def test_the_fake_gpu_refuses_what_a_gpu_refuses(guard: Path, emulator: emulate.Emulator, tmp_path: Path) -> None:
+def test_the_fake_gpu_refuses_the_same_operations_as_a_gpu(
+    guard: Path, emulator: emulate.Emulator, tmp_path: Path
+) -> None:
     words, gradient = said(RULES, guard, emulator, tmp_path)
     assert words == "can't convert cuda"
     assert gradient == "[0.0, 2.0, 4.0, 9.0]"

@@ -75,7 +75,7 @@ def test_the_order_of_threads_warps_and_blocks_does_not_change_images(emulator: 
             assert float((a[name] - b[name]).norm()) <= 1e-5 * float(a[name].norm()), name
 
 
-def test_what_would_read_beyond_an_array_is_refused(emulator: Emulator) -> None:
+def test_arguments_that_would_read_beyond_an_array_are_refused(emulator: Emulator) -> None:
     camera, scene = front_camera(), splat()
     with pytest.raises(ShapeError, match="sh_degree"):
         cuda.rasterize_with(emulator, scene, camera, SETTINGS)  # degree 3, but no coefficients beyond the first

@@ -42,7 +42,7 @@ def test_a_launch_passes_the_structure_as_it_is_on_the_current_stream_in_the_dev
     assert done.argument == bytes(numbers())
 
 
-def test_the_stream_is_asked_for_at_each_launch() -> None:
+def test_each_launch_uses_the_current_stream() -> None:
     driver, streams = FakeDriver(), [1, 2, 3]
     launcher = launch.GpuLauncher(
         torch.device("cuda", 0),
@@ -56,7 +56,7 @@ def test_the_stream_is_asked_for_at_each_launch() -> None:
     assert [done.stream for done in driver.launches] == [1, 2, 3]
 
 
-def test_dynamic_shared_memory_beyond_48_kib_is_asked_for_once() -> None:
+def test_dynamic_shared_memory_beyond_48_kib_is_requested_once() -> None:
     driver = FakeDriver()
     launcher = fake_driver.launcher(driver, index=1)
     for size in (48 << 10, 60_000, 60_000, 50_000, 70_000):
@@ -93,7 +93,7 @@ def test_tensors_that_are_not_on_a_gpu_are_refused_with_the_way_out() -> None:
         )
 
 
-def test_a_scene_through_launcher_and_driver_is_what_the_kernels_make_of_it(emulator: Emulator) -> None:
+def test_a_scene_through_launcher_and_driver_equals_the_kernels_result(emulator: Emulator) -> None:
     """The whole path of a GPU, but for torch's memory and the GPU: pointers reach the kernels through the driver."""
     rng = np.random.default_rng(3)
     camera = random_camera(rng)
@@ -178,7 +178,7 @@ def test_the_real_bindings_pass_on_every_launch(calls: Calls) -> None:
     ]
 
 
-def test_the_real_bindings_make_repeated_launches_a_graph_and_change_what_differs(calls: Calls) -> None:
+def test_the_real_bindings_run_repeated_launches_as_a_graph_and_update_changes(calls: Calls) -> None:
     first = {"kernel": "project_splats", "grid": [5, 1, 1], "block": [128, 1, 1], "first": 77}
     second = {"kernel": "project_splats_vjp", "grid": [6, 1, 1], "block": [256, 1, 1]}
     of_launch = {"call": "launch", "shared": 0, "stream": 0x1234, "device": 1}
@@ -209,7 +209,7 @@ NEWER = "_accelerator_setAllocatorSettings"  # of later versions of torch
 
 
 @pytest.mark.parametrize("newer", [True, False])
-def test_torchs_memory_grows_in_place_in_training_unless_the_user_has_said_how(
+def test_training_enables_expandable_segments_unless_the_user_configured_the_allocator(
     monkeypatch: pytest.MonkeyPatch, newer: bool
 ) -> None:
     told: list[str] = []

@@ -45,7 +45,7 @@ def unchanged_by_poison(work: Callable[[], list[Tensor]]) -> int:
 
 
 @pytest.mark.parametrize("deterministic", [False, True])
-def test_no_pass_of_the_rasterizer_reads_what_is_not_written(emulator: Emulator, deterministic: bool) -> None:
+def test_no_pass_of_the_rasterizer_reads_uninitialised_memory(emulator: Emulator, deterministic: bool) -> None:
     case = many_tiles()
     cotangents = random_cotangents(np.random.default_rng(1), case.camera)
     image = torch.rand(case.camera.height, case.camera.width, 3, generator=torch.Generator().manual_seed(0))
@@ -65,7 +65,7 @@ def test_no_pass_of_the_rasterizer_reads_what_is_not_written(emulator: Emulator,
     assert unchanged_by_poison(work) == len(IMAGES) + 7 + 2
 
 
-def test_nothing_in_training_reads_what_is_not_written(emulator: Emulator, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_reads_no_uninitialised_memory(emulator: Emulator, monkeypatch: pytest.MonkeyPatch) -> None:
     """Losses, Adam, densification, ranking, clones and frozen rows of three short stages."""
     monkeypatch.setattr(launch, "launcher_for", lambda device: emulator)
     backend = cuda_on_host()

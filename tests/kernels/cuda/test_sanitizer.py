@@ -67,14 +67,14 @@ def run(script: str, kind: str = "addresses") -> subprocess.CompletedProcess[str
     return subprocess.run(command, env=settings, capture_output=True, text=True, check=False)
 
 
-def test_a_read_beyond_a_tensor_is_found_with_its_line() -> None:
+def test_a_read_beyond_a_tensor_is_reported_with_its_line() -> None:
     done = run(BEYOND)
     assert done.returncode != 0
     assert "heap-buffer-overflow" in done.stderr
     assert "photometric.cu" in done.stderr
 
 
-def test_words_that_do_not_lie_on_their_boundary_are_found_with_their_line() -> None:
+def test_misaligned_words_are_reported_with_their_line() -> None:
     done = run(MISPLACED, "undefined")
     assert done.returncode != 0
     assert "misaligned address" in done.stderr
@@ -82,7 +82,7 @@ def test_words_that_do_not_lie_on_their_boundary_are_found_with_their_line() -> 
 
 
 @pytest.mark.parametrize("kind", list(SANITIZERS))
-def test_no_kernel_reads_or_writes_beyond_a_tensor_or_does_what_is_undefined(kind: str) -> None:
+def test_no_kernel_accesses_memory_beyond_a_tensor_or_has_undefined_behaviour(kind: str) -> None:
     done = run(EVERYTHING, kind)
     assert done.returncode == 0, done.stderr[-3000:]
     assert done.stdout == "all done\n"

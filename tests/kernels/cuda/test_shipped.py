@@ -94,7 +94,7 @@ def script() -> ModuleType:
     return module
 
 
-def test_what_the_script_builds_is_what_the_package_takes(tmp_path: Path) -> None:
+def test_the_package_loads_the_archives_of_the_build_script(tmp_path: Path) -> None:
     try:
         version = nvrtc.nvrtc_version()
     except BackendError as error:

@@ -56,7 +56,7 @@ def test_a_sort_by_radix_is_torchs_stable_sort(emulator: Emulator, count: int, s
 
 
 @pytest.mark.parametrize(("tiles", "width"), [(1, 16), (200, 16), (2500, 16), (40_000, 32), (1 << 17, 32)])
-def test_tiles_are_sorted_with_what_lies_in_them(emulator: Emulator, tiles: int, width: int) -> None:
+def test_pairs_are_sorted_by_tile_with_their_payloads(emulator: Emulator, tiles: int, width: int) -> None:
     count = PIECE + 300
     generator = torch.Generator().manual_seed(tiles)
     keys = torch.randint(0, tiles + 1, (count,), generator=generator, dtype=torch.int32)

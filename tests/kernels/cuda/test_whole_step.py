@@ -151,9 +151,7 @@ VARIANTS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", list(VARIANTS))
-def test_three_stages_have_the_bits_of_those_that_go_through_torch(
-    emulator: Emulator, scene: Scene, variant: str
-) -> None:
+def test_three_stages_have_the_bits_of_training_through_torch(emulator: Emulator, scene: Scene, variant: str) -> None:
     """Densified, reset, ranked and cloned in between; what counts then has been gathered by a kernel."""
     change, recipe, protocol = VARIANTS[variant]
     given = emulator, change(scene), recipe
@@ -166,7 +164,7 @@ def test_three_stages_have_the_bits_of_those_that_go_through_torch(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [5, 11])
-def test_memory_of_before_and_the_order_of_threads_change_nothing(
+def test_reused_memory_and_the_order_of_threads_change_nothing(
     emulator: Emulator, scene: Scene, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All that is not promised to be zeros is NaN or -1 when an iteration begins; the sums are zeros when it ends."""
@@ -194,7 +192,7 @@ def test_memory_of_before_and_the_order_of_threads_change_nothing(
         assert float((a - b).norm()) <= 1e-3 * float(a.norm()), name  # atomics in another order
 
 
-def test_an_iteration_without_room_for_its_pairs_changes_nothing_and_is_done_again(
+def test_an_iteration_without_room_for_its_pairs_changes_nothing_and_is_repeated(
     emulator: Emulator, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recipe = brief()
@@ -212,9 +210,7 @@ def on_gpu(driver: FakeDriver) -> GpuLauncher:
 
 
 @pytest.mark.parametrize("stages", [1, pytest.param(3, marks=pytest.mark.slow)])
-def test_an_iteration_that_comes_again_is_a_graph_with_the_same_bits(
-    emulator: Emulator, scene: Scene, stages: int
-) -> None:
+def test_a_repeated_iteration_is_a_graph_with_the_same_bits(emulator: Emulator, scene: Scene, stages: int) -> None:
     """Rows are added in between and cameras, rates and rooms change: in the graph, where they differ."""
     recipe = brief() if stages == 1 else train_toys.short()
     plain, some = trained(emulator, scene, recipe, "launches")
@@ -238,7 +234,7 @@ def test_a_driver_without_graphs_launches_one_by_one(emulator: Emulator, scene: 
     assert len(driver.replays) <= 2  # both halves once, where the refusal comes afterwards
 
 
-def test_a_way_that_does_not_exist_is_one_line(scene: Scene, emulator: Emulator) -> None:
+def test_an_unknown_step_mode_is_an_error_of_one_line(scene: Scene, emulator: Emulator) -> None:
     with pytest.raises(BackendError, match="GS2D_CUDA_STEP must be graph or launches, got 'fast'; unset it"):
         trained(emulator, scene, brief(), "fast")
 
@@ -253,7 +249,7 @@ class OfItsOwn(GradientDensifier):
         return super().after_backward(state, output, iteration)
 
 
-def test_what_is_learned_of_cameras_and_densifiers_with_steps_of_their_own_go_through_torch(
+def test_learned_cameras_and_custom_densifiers_train_through_torch(
     emulator: Emulator, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recipe = train_toys.short()
@@ -270,7 +266,9 @@ def test_what_is_learned_of_cameras_and_densifiers_with_steps_of_their_own_go_th
 
 
 @pytest.mark.parametrize("case", ["object", "squares", "silhouettes", "compared later", "in the host's memory"])
-def test_an_iteration_by_kernels_has_the_bits_of_one_through_torch(emulator: Emulator, scene: Scene, case: str) -> None:
+def test_an_iteration_by_kernels_has_the_bits_of_an_iteration_through_torch(
+    emulator: Emulator, scene: Scene, case: str
+) -> None:
     """In the host's memory: where the device has no room for the bytes of the photographs."""
     recipe, given, count, options = brief(), scene, 6, {}
     if case == "object":
@@ -289,7 +287,7 @@ def test_an_iteration_by_kernels_has_the_bits_of_one_through_torch(emulator: Emu
     assert same(parts, whole)
 
 
-def test_an_iteration_asks_torch_for_nothing(emulator: Emulator, scene: Scene) -> None:
+def test_an_iteration_uses_no_torch_operations(emulator: Emulator, scene: Scene) -> None:
     """Neither an operation nor memory; only the order of the views is drawn, once in an epoch."""
     recipe = of_object(brief())
     first = replace(recipe.stages[0], iterations=200)
@@ -312,7 +310,7 @@ def test_an_iteration_asks_torch_for_nothing(emulator: Emulator, scene: Scene) -
     assert set(count.names) <= {"randperm", "detach"}, count.names  # detach: the number of pairs, in the host's memory
 
 
-def test_a_byte_is_the_same_number_as_by_a_division(emulator: Emulator) -> None:
+def test_a_byte_converts_to_the_same_number_as_by_division(emulator: Emulator) -> None:
     """All 256: a row of them, against a target of floats, is an L1 of exactly 0."""
     from gs2d.kernels.cuda.cuda_losses import THREADS, strips
     from gs2d.kernels.cuda.kernel_arguments import PhotometricArguments, fill
