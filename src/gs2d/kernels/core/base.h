@@ -58,9 +58,10 @@ GS2D_HD double max(double a, double b) { return a > b ? a : b; }
 GS2D_HD float whole(float a) { return float(int(a)); }  // floor, of what is not negative and fits 31 bits
 GS2D_HD double whole(double a) { return double(int(a)); }
 
-// Functions of the innermost loops. On a GPU their instructions err by 1 or 2 units in the last place, equally in the forward
-// and the backward pass; elsewhere they are as exact as the type.
-// 2^x where x <= 0; for very negative or non-finite x the result must not be used.
+// Functions of the innermost loops. On a GPU their instructions err by 1 or 2 units in the last place, equally in the
+// forward and the backward pass; elsewhere they are as exact as the type.
+
+// 2^x for x <= 0; the result must not be used for very negative or non-finite x.
 template <class V> GS2D_HD V exp2_small(V x) { return exp2(x); }
 template <class V> GS2D_HD V reciprocal(V a) { return V(1) / a; }
 template <class V> GS2D_HD V quotient(V a, V b) { return a / b; }

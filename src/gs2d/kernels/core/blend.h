@@ -26,7 +26,8 @@ template <class V> GS2D_HD PlaneAt<V> plane_at(const Record<V>& s, V dx, V dy) {
     return {fma(s.au, dx, s.bu * dy), fma(s.av, dx, s.bv * dy), fma(s.ai, dx, fma(s.bi, dy, s.iz))};
 }
 
-// A splat at a pixel. If the low-pass filter determines rho, u = v = 0 and the depth is z_c. Skipped pairs have alpha = 0.
+// A splat at a pixel. If the low-pass filter determines rho, u = v = 0 and the depth is z_c. Skipped pairs have
+// alpha = 0.
 template <class V> struct Hit {
     V u, v;  // plane coordinates
     V depth, inverse_depth;
@@ -56,8 +57,9 @@ template <class V> GS2D_HD Hit<V> meet(const PlaneAt<V>& p, V iz, V zc, V dx, V 
     return h;
 }
 
-// Least 1 / z for which the plane determines rho at every pixel: rho3d = d^T A d z^2 is at most rho2d = d^T d / lowpass_px^2 where
-// the largest eigenvalue of A is at most (1 / z / lowpass_px)^2. Slightly increased against rounding.
+// Least 1 / z for which the plane determines rho at every pixel: rho3d = d^T A d z^2 is at most rho2d = d^T d /
+// lowpass_px^2 where the largest eigenvalue of A is at most (1 / z / lowpass_px)^2. Slightly increased against
+// rounding.
 template <class V> GS2D_HD V plain_from(const Record<V>& s, V lowpass_px) {
     const V xx = fma(s.au, s.au, s.av * s.av), yy = fma(s.bu, s.bu, s.bv * s.bv), xy = fma(s.au, s.bu, s.av * s.bv);
     const V half = V(0.5), d = half * (xx - yy);
@@ -71,8 +73,8 @@ template <class V> GS2D_HD mask_t<V> is_plain(V dx, V dy, V ai, V bi, V iz, V pl
     return (middle - range >= plain_from) & ((middle + range) * near < V(0.9999f));
 }
 
-// The alpha of a hit (not yet limited to alpha_max) from its logarithm, 0 if it is skipped. All depths of a plain splat are
-// beyond `near`.
+// The alpha of a hit (not yet limited to alpha_max) from its logarithm, 0 if it is skipped. All depths of a plain splat
+// are beyond `near`.
 template <class V> GS2D_HD V log2_alpha_of(V log2_opacity, V rho) { return fma(V(-0.5 * LOG2E), rho, log2_opacity); }
 template <class V> GS2D_HD V alpha_of(V log2_alpha, const BlendLimits<V>& k) {
     return keep(log2_alpha >= k.log2_alpha_min, exp2_small(log2_alpha));
@@ -297,7 +299,8 @@ template <class V> GS2D_HD void finish_column(V dx, PairSums<V>& a) {
     a.Xx = dx * a.X, a.Yx = dx * a.Y, a.Ix = dx * a.I, a.lowpass_x = dx * a.lowpass_x;
 }
 
-// dL/d(record) from the sums, per lane (the sum over lanes is left to the caller). zc = 1 / iz, if abs_x and abs_y are computed.
+// dL/d(record) from the sums, per lane (the sum over lanes is left to the caller). zc = 1 / iz, if abs_x and abs_y are
+// computed.
 template <class V>
 GS2D_HD RecordGradient<V> finish(const Record<V>& s, V zc, const PairSums<V>& a, const BlendLimits<V>& k) {
     RecordGradient<V> g;

@@ -14,8 +14,9 @@ constexpr double SSIM_WINDOW[SSIM_RADIUS + 1] = {0.2660117248617943,  0.21300553
                                                  0.03600077212843082, 0.007598758135239184, 0.0010283800844791099};
 
 // SSIM of one pixel and channel, and its derivatives by the blurred moments that depend on the rendered image x:
-// a = B(x), s = B(x^2 + y^2), p = B(x y); b = B(y) is the target's. The sum of both second moments is enough, because
-// the variances occur only as a sum. The pullback to the image is  dL/dx = B(d_mean) + 2 x B(d_squares) + y B(d_product).
+//     a = B(x), s = B(x^2 + y^2), p = B(x y); b = B(y) is the target's.
+// The sum of both second moments suffices, since the variances occur only as a sum. The gradient of the image is
+//     dL/dx = B(d_mean) + 2 x B(d_squares) + y B(d_product).
 template <class V> struct SsimPoint {
     V value, d_mean, d_squares, d_product;
 };
@@ -49,8 +50,8 @@ template <class V> GS2D_HD V l2_slope(V x, V y) { return V(2.0f) * (x - y); }
 // The surface normal of a pixel from the z-depths of its four neighbours, not normalised, in the camera frame:
 // (P_down - P_up) x (P_right - P_left) is proportional to
 //     n = (fx gx, fy gy, -(1 + (px - cx) gx + (py - cy) gy)),  gx = (zr - zl)/(zr + zl),  gy = (zd - zu)/(zd + zu)
-// with the positive factor (zr + zl)(zd + zu) / (fx fy). Its product with the pixel's ray is -1 before scaling: it faces
-// the camera and is never 0, so nothing is guarded here but the depths being positive.
+// with the positive factor (zr + zl)(zd + zu) / (fx fy). Its product with the pixel's ray is -1 before scaling: it
+// faces the camera and is never 0, so nothing is guarded here but the depths being positive.
 template <class V> struct DepthNormal {
     Vec3<V> direction;  // unit, camera frame
     V inverse_length;   // 1 / |n|
@@ -71,9 +72,9 @@ GS2D_HD DepthNormal<V> depth_normal(V left, V right, V up, V down, V offset_x, V
 // A neighbour of depth 0 was not hit. NaN counts as a hit: it must reach the loss.
 template <class V> GS2D_HD auto was_hit(V depth) { return invert(depth <= V(0.0f)); }
 
-// Whether four neighbours make a normal: all of them were hit; or with `at_camera`, where those that were not hit lie at
-// the camera's centre, one of each pair. Its gx or gy is then 1 or -1, and depth_normal needs no other formula. Ignored
-// pixels, and those outside the image, make none: there they have a negative depth.
+// Whether four neighbours define a normal: all of them were hit, or with `at_camera` at least one of each pair, and the
+// others lie at the camera centre. gx or gy is then 1 or -1, and depth_normal needs no other formula. Ignored pixels and
+// those outside the image have a negative depth and define no normal.
 template <class V> GS2D_HD auto makes_normal(V left, V right, V up, V down, bool at_camera) {
     if (!at_camera) return was_hit(left) & was_hit(right) & was_hit(up) & was_hit(down);
     const V zero = V(0.0f);

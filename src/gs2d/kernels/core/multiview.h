@@ -2,7 +2,8 @@
 // Formulas and gradients: docs/math.md, "Two views"; losses/view_pair.py has the same in torch.
 //
 // A pixel of a view, with depth d along its ray (z = 1) and a rendered normal q, is a plane. Its point X = d ray lies
-// at R X + t for the neighbour. Positions are px from the centre of an image's first pixel; so are cx and cy of a `Lens`.
+// at R X + t for the neighbour. Positions are px from the centre of an image's first pixel; so are cx and cy of a
+// `Lens`.
 #pragma once
 
 #include "core/base.h"

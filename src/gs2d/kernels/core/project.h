@@ -1,7 +1,7 @@
 // From a splat's parameters to its screen record, and back (docs/math.md, "Projection").
 //
-// With P = [s_u t_u, s_v t_v, p] in the camera frame, a pixel ray r = ((x - cx)/fx, (y - cy)/fy, 1) intersects the plane at
-// (u, v, 1) = z P^-1 r. The record holds P^-1 per pixel, centred on the projected splat, for float32
+// With P = [s_u t_u, s_v t_v, p] in the camera frame, a pixel ray r = ((x - cx)/fx, (y - cy)/fy, 1) intersects the
+// plane at (u, v, 1) = z P^-1 r. The record holds P^-1 per pixel, centred on the projected splat, for float32
 // precision: with d the pixel's offset from the projected centre,
 //     X = au dx + bu dy,  Y = av dx + bv dy,  I = iz + ai dx + bi dy,  z = 1 / I,  u = X z,  v = Y z,  iz = 1 / z_c.
 // The rows of P^-1 are (t_v x p) / (s_u n.p), (p x t_u) / (s_v n.p), n / (n.p), with n = t_u x t_v.
@@ -122,7 +122,8 @@ template <class V, class S> GS2D_HD Frame3<V> frame_of(const SplatParameters<V>&
     return f;
 }
 
-// Rules 16 and 23, except for the colour: every parameter is finite and in the range that float32 can square. False for NaN.
+// Rules 16 and 23, except for the colour: every parameter is finite and in the range that float32 can square. False for
+// NaN.
 template <class V> GS2D_HD mask_t<V> in_range(const SplatParameters<V>& p, const Frame3<V>& f) {
     // an eighth of each, so that finite numbers have a finite sum (gcc 12 folds 0 * x to 0 with -fno-signed-zeros)
     const V part = V(0.125f), limit = V(float(MAX_SIZE));

@@ -20,8 +20,8 @@ template <class V> struct BoxTest {
     V slope_y, slope_x;  // best y for a given x, and the reverse: -b / c, -b / a
 };
 
-// Where the footprint reaches the box, unless it is unbounded. The least value of a convex quadratic over a box that does
-// not hold its minimum is on a side that faces the minimum: two candidates.
+// Where the footprint reaches the box, unless it is unbounded. The least value of a convex quadratic over a box that
+// does not hold its minimum is on a side that faces the minimum: two candidates.
 template <class V> GS2D_HD mask_t<V> reaches(const BoxTest<V>& s, V x0, V y0, V x1, V y1) {
     const V px = min(max(s.ex, x0), x1) - s.ex, py = min(max(s.ey, y0), y1) - s.ey;  // nearest in x, in y
     const V qy = min(max(fma(s.slope_y, px, s.ey), y0), y1) - s.ey;                  // best y on the side x = px
@@ -39,8 +39,8 @@ template <class V> struct Chords {
     V cx, cy, disc2;  // low-pass disc
 };
 
-// Interval of a footprint in the rows y0 to y1; empty if left > right. Both shapes contain (cx, cy), so it is one interval
-// unless a far end of the ellipse returns beside the disc.
+// Interval of a footprint in the rows y0 to y1; empty if left > right. Both shapes contain (cx, cy), so it is one
+// interval unless a far end of the ellipse returns beside the disc.
 template <class V> GS2D_HD void reach_in_rows(const Chords<V>& s, V y0, V y1, V& left, V& right) {
     const V far = V(1e30), a = y0 - s.ey, b = y1 - s.ey;
     const V yr = min(max(s.y_right, a), b), yl = min(max(-s.y_right, a), b);
@@ -52,8 +52,9 @@ template <class V> GS2D_HD void reach_in_rows(const Chords<V>& s, V y0, V y1, V&
     right = max(right, select(near, s.cx + d, -far)), left = min(left, select(near, s.cx - d, far));
 }
 
-// The visible part of a disc that reaches the camera plane has no ellipse, but is convex and bounded beyond `near`. It lies
-// inside half planes a dx + b dy + c >= 0, dx and dy from the projected centre; and there is the low-pass disc (docs/math.md, "Footprint").
+// The visible part of a disc that reaches the camera plane has no ellipse, but is convex and bounded beyond `near`. It
+// lies inside half planes a dx + b dy + c >= 0, dx and dy from the projected centre. The footprint also has the
+// low-pass disc (docs/math.md, "Footprint").
 template <class V> struct HalfPlane {
     V a, b, c;
 };

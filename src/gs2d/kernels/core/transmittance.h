@@ -36,8 +36,8 @@ template <class V> struct DepthSearch {
 };
 
 constexpr int MAX_SEARCH_STEPS = 64;  // twice the steps of bisection in float
-// Of a width: the search ends with a step that is shorter, after which Newton's method is off by its square, and T falls as
-// it did before.
+// Of a width: the search ends with a step that is shorter, after which Newton's method is off by its square, and T
+// falls as it did before.
 template <class real> constexpr real SEARCH_TOLERANCE = real(sizeof(real) == sizeof(double) ? 1e-8 : 1e-4);
 
 // At the depth of one of the pixel's pairs; least, most: 1 / z of its pairs.
@@ -69,8 +69,8 @@ template <class V> GS2D_HD V slope_of(V fall, V alpha, V z, V inv_width) {
     return max(fall, V(0.05f) * alpha * reciprocal(z)) * inv_width;
 }
 
-// Contribution of a pair to the gradients by ln(alpha) and 1 / z_i: factor = g T(z) / slope_of(...), g the upstream gradient. The part
-// of the level 1 - alpha / 2 goes through the alpha image.
+// Contribution of a pair to the gradients by ln(alpha) and 1 / z_i: factor = g T(z) / slope_of(...), g the upstream
+// gradient. The part of the level 1 - alpha / 2 goes through the alpha image.
 template <class V> struct DepthPairGradient {
     V alpha, inverse_depth;
 };

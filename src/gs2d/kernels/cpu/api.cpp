@@ -101,8 +101,8 @@ GS2D_EXPORT int gs2d_raster_features(Frame* frame, const Features* features) {
     return blend_features(*frame, *features) ? OK : NO_MEMORY;
 }
 
-// Gradients of the parameters of the same call's splats; `images` are that call's outputs. `intrinsics` [N, 4], or null: what each
-// splat says of fx, fy, cx and cy. `features`, or null: those of the same view.
+// Gradients of the parameters of the same call's splats; `images` are that call's outputs. `intrinsics` [N, 4], or
+// null: the gradients of fx, fy, cx and cy by splat. `features`, or null: those of the same view.
 GS2D_EXPORT int gs2d_raster_backward_features(Frame* frame, const Parameters* splats, const Images* images,
                                               const ImageGradients* upstream, const ParameterGradients* out,
                                               real* intrinsics, const Features* features) {

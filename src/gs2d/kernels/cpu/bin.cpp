@@ -10,7 +10,8 @@ constexpr int64_t CHUNKS = 16;  // pieces of the depth order; fixed, so that lis
 
 constexpr int DIGIT = 11, DIGITS = 1 << DIGIT, PASSES = (8 * sizeof(DepthKey) + DIGIT - 1) / DIGIT;
 
-// Stable radix sort, least significant digit first: equal depths stay in index order. Returns the buffer with the result.
+// Stable radix sort, least significant digit first: equal depths stay in index order. Returns the buffer with the
+// result.
 DepthItem* radix_sort(DepthItem* items, DepthItem* other, int64_t n, uint32_t (*counts)[DIGITS]) {
     memset(counts, 0, sizeof(*counts) * PASSES);
     for (int64_t i = 0; i < n; ++i)

@@ -1,5 +1,5 @@
-// The derivative by a rigid motion of the camera, from the gradients of the splats (docs/math.md, "Camera"). Pieces have a
-// fixed size and are summed in order, so the bits do not depend on the number of threads.
+// The derivative by a rigid motion of the camera, from the gradients of the splats (docs/math.md, "Camera"). Pieces
+// have a fixed size and are summed in order, so the bits do not depend on the number of threads.
 #include "core/sh.h"
 
 #include <cstdlib>

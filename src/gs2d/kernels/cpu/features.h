@@ -5,8 +5,8 @@
 
 namespace gs2d {
 
-// Pairs (splat, block) of consecutive splats of a tile. With many splats per batch, the planes of some channels stay in the
-// first-level cache for all pairs.
+// Pairs (splat, block) of consecutive splats of a tile. With many splats per batch, the planes of some channels stay in
+// the first-level cache for all pairs.
 struct FeaturePairs {
     static constexpr int SPLATS = 32;
     alignas(64) real of_pair[SPLATS * BLOCKS][LANES];  // the weight; in the backward pass, before it, the part of dL/dw

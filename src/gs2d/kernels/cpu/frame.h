@@ -168,7 +168,8 @@ struct Frame {
     int64_t visible = 0;
     int64_t groups() const { return (tiles + GROUP - 1) / GROUP; }
 
-    // One piece of memory for what a single pass needs: in the forward pass the arrays below, in the backward pass slots.
+    // One piece of memory for what a single pass needs: in the forward pass the arrays below, in the backward pass
+    // slots.
     Buffer<char> scratch;
     CullRecord* cull = nullptr;         // [N]
     TileRect* rects = nullptr;          // [N]

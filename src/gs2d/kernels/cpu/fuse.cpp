@@ -65,8 +65,8 @@ void fuse_block(const FuseArguments<real>& a, int64_t n) {
 
 constexpr int64_t RAYS = 8192;  // per piece
 
-// Marks the blocks that rays [begin, end) intersect, in the double precision and the order of operations of meshing/tsdf_volume.py. Many
-// rays set the same mark, and all to the same value.
+// Marks the blocks that rays [begin, end) intersect, in double precision and with the order of operations of
+// meshing/tsdf_volume.py. Many rays set the same mark, all to the same value.
 void mark_rays(const MarkArguments& a, int64_t begin, int64_t end) {
     const int64_t stride_x = a.padded[1] * a.padded[2], stride_y = a.padded[2];
     for (int64_t step = 0; step < a.steps; ++step) {

@@ -46,8 +46,8 @@ bool GradientSums::prepare() {
     return f.scratch.reserve(2 * chunk_bytes());
 }
 
-// A chunk has as many slots as fit twice into the memory of the forward pass. Large chunks avoid waiting for interrupted
-// threads.
+// A chunk has as many slots as fit twice into the memory of the forward pass. Large chunks avoid waiting for
+// interrupted threads.
 void GradientSums::cut_into_chunks() {
     Frame& f = f_;
     const int64_t room = static_cast<int64_t>(forward_scratch(f.count) / (2 * slot_bytes()));

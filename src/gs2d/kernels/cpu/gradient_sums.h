@@ -30,11 +30,11 @@ class GradientSums {
     // Cuts the tiles into chunks and sets f.sums to 0; false when memory is short.
     bool prepare();
 
-    // Calls blend(tile, next, slots, feature_slots, piece) for each tile with slots, on all threads, and adds the slots to
-    // f.sums and to the features' gradients. `next` is the tile that this thread will probably blend then; there may be none
-    // of that number. `piece` < get_threads() is another one for each call under way.
-    // Every thread goes through the chunks: it blends groups of chunk c until somebody has each, then it adds parts of chunk
-    // c - 1, until somebody has each. It waits only for what somebody is already working on.
+    // Calls blend(tile, next, slots, feature_slots, piece) for each tile with slots, on all threads, and adds the slots
+    // to f.sums and to the features' gradients. `next` is the tile that this thread probably blends next, which may
+    // not exist. `piece` < get_threads() differs between concurrent calls. Every thread processes the chunks in order: it
+    // blends groups of chunk c until all are taken, then adds parts of chunk c - 1 until all are taken. It waits only
+    // for work in progress on another thread.
     template <class F> void for_each_tile(F&& blend) {
         parallel_for(threads_, [&](int64_t piece) {
             for (int64_t c = 0; c <= chunks_; ++c) {

@@ -155,13 +155,14 @@ class Piece {
 using namespace gs2d;
 
 // value = mean over valid pixels of 1 - alpha <n, N> (pixels without N count 1), or with per_splat of alpha - <n, N>
-// (pixels without N count 0), each times its weight, if there are `weights` [H, W]; at_camera: see makes_normal. Gradients, each times `cotangent`: of normal [H, W, 3] (world frame) and depth [H, W]
-// (both null, or neither), and of alpha (or null; 0 in the official form, where it must be null).
-// Returns 0, or 1 if memory is short.
+// (pixels without N count 0), weighted by `weights` [H, W] if not null; at_camera: see makes_normal. Gradients, scaled
+// by `cotangent`: of normal [H, W, 3] (world frame) and depth [H, W] (both null, or neither), and of alpha (null in the
+// official form). Returns 0, or 1 if memory is short.
 GS2D_EXPORT int gs2d_normal_consistency(const real* normal, const real* depth, const real* alpha, const uint8_t* mask,
                                         const real* weights, const double* intrinsics, const double* rotation,
-                                        int64_t height, int64_t width, int per_splat, int at_camera, double cotangent, real* normal_gradient, real* depth_gradient,
-                                        real* alpha_gradient, double* value) {
+                                        int64_t height, int64_t width, int per_splat, int at_camera, double cotangent,
+                                        real* normal_gradient, real* depth_gradient, real* alpha_gradient,
+                                        double* value) {
     *value = 0;
     auto* rows = static_cast<double*>(std::malloc(static_cast<size_t>(height + 1) * sizeof(double)));
     if (rows == nullptr) return 1;

@@ -1,10 +1,10 @@
 // L1, SSIM and L2 of an image [H, W, 3], with the gradient of a weighted sum of them, in one pass over the rows.
 //
-// A row of W interleaved pixels is 3 W reals; the window's taps are 3 reals apart, so that channels need no planes. Each
-// piece of rows runs down the image with two rings of horizontally blurred rows: of the moments x, x^2 + y^2, x y (and
-// y, unless its blur is given), and of SSIM's derivatives by the blurred moments. 5 rows behind the input SSIM is
-// finished, 10 rows behind it the gradient, a few rows at a time: most of the rows above and below that they are blurred
-// from are the same. Everything stays in the second-level cache.
+// A row of W interleaved pixels is 3 W reals; the window's taps are 3 reals apart, so that channels need no planes.
+// Each piece of rows runs down the image with two rings of horizontally blurred rows: of the moments x, x^2 + y^2, x y
+// (and y, unless its blur is given), and of SSIM's derivatives by the blurred moments. 5 rows behind the input SSIM is
+// finished, 10 rows behind it the gradient, a few rows at a time: most of the rows above and below that they are
+// blurred from are the same. Everything stays in the second-level cache.
 #include "core/losses.h"
 #include "cpu/export.h"
 #include "cpu/losses_rows.h"
@@ -240,10 +240,9 @@ double ordered_sum(const double* values, int64_t n) {
 
 using namespace gs2d;
 
-// values = (mean L1, mean SSIM, mean L2) over valid pixels and channels; gradient (or null) = l1_cotangent dL1/drendered
-// + ssim_cotangent dSSIM/drendered + l2_cotangent dL2/drendered. `mask` (bytes, 0 = ignore) and `target_mean` (of
-// gs2d_blur) may be null.
-// Returns 0, or 1 if memory is short.
+// values = (mean L1, mean SSIM, mean L2) over valid pixels and channels; gradient (or null) = l1_cotangent
+// dL1/drendered + ssim_cotangent dSSIM/drendered + l2_cotangent dL2/drendered. `mask` (bytes, 0 = ignore) and
+// `target_mean` (of gs2d_blur) may be null. Returns 0, or 1 if memory is short.
 GS2D_EXPORT int gs2d_photometric(const real* rendered, const real* target, const uint8_t* mask, const real* target_mean,
                                  int64_t height, int64_t width, double l1_cotangent, double ssim_cotangent,
                                  double l2_cotangent, real* gradient, double* values) {

@@ -1,5 +1,5 @@
-// Measurements of the rasterizer for benchmarks: time by pass, exact amounts of work, memory. Rendering and training do not
-// use this file.
+// Measurements of the rasterizer for benchmarks: time by pass, exact amounts of work, memory. Rendering and training do
+// not use this file.
 #include <string.h>
 
 #include "cpu/export.h"
@@ -50,7 +50,8 @@ PairCounts count_tile(const Frame& f, int64_t tile, const BlendLimits<V>& limits
 
 using namespace gs2d;
 
-// Nanoseconds of the last forward and backward pass of the calling thread, in the order of enum Stage; returns how many.
+// Nanoseconds of the last forward and backward pass of the calling thread, in the order of enum Stage; returns how
+// many.
 GS2D_EXPORT int gs2d_stage_times(int64_t* ns) {
     memcpy(ns, stage_ns, sizeof stage_ns);
     return STAGES;

@@ -1,6 +1,6 @@
-// A splat's plane at the pixels of a tile. It is affine in the pixel, so that it is the sum of a part that depends on the lane
-// alone and one that depends on the block alone: three additions for each block. Everything that walks a tile's splats takes
-// the plane from here, so that all of it decides alike.
+// A splat's plane at the pixels of a tile. It is affine in the pixel, so that it is the sum of a part that depends on
+// the lane alone and one that depends on the block alone: three additions for each block. All passes over a
+// tile's splats use this code, so that they take the same branches.
 #pragma once
 
 #include "cpu/tile.h"
@@ -9,8 +9,8 @@ namespace gs2d {
 
 constexpr int BLOCKS_Y = BLOCKS / BLOCKS_X;
 
-// Pixel centres of a tile's blocks: of the lanes, in columns and rows of blocks. First pixels of blocks; of those of a row,
-// each four times; of rows, in all lanes.
+// Pixel centres of a tile's blocks: of the lanes, in columns and rows of blocks. First pixels of blocks; of those of a
+// row, each four times; of rows, in all lanes.
 struct Centres {
     alignas(64) real x[BLOCKS_X][LANES], y[BLOCKS_Y][LANES], first_x[BLOCKS], first_y[BLOCKS];
     alignas(64) real column_x[BLOCKS_X * 4], row_y[BLOCKS_Y][LANES];
@@ -50,8 +50,8 @@ struct SplatPlanes {
     }
 };
 
-// The same numbers for a walk from block to block, with many splats at each: what a block takes is side by side, and the
-// log2 opacity behind it, so that a splat at a block is in few cache lines.
+// The same numbers for passes from block to block with many splats each: the values of a block are consecutive and
+// followed by the log2 opacity, so that a splat at a block is in few cache lines.
 struct PlanesByBlock {
     alignas(LANES * sizeof(real)) real lane[3][LANES], block[BLOCKS][4];
 

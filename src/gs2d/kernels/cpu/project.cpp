@@ -218,8 +218,9 @@ void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradi
 
 }  // namespace
 
-// If the sums share the memory of shN's gradient, row i overwrites the sums of later splats. So splats are processed from the
-// last one, in groups that overwrite nothing still to be read; groups of up to LANES splats are read before writing.
+// If the sums share the memory of shN's gradient, row i overwrites the sums of later splats. So splats are processed
+// from the last one, in groups that overwrite nothing still to be read; groups of up to LANES splats are read before
+// writing.
 void project_splats_vjp(Frame& f, const Parameters& s, const ParameterGradients& out, real* intrinsics) {
     for (int64_t end = s.count, first = 0; end > 0; end = first) {
         first = 0;

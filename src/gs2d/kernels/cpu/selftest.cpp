@@ -89,7 +89,8 @@ GS2D_EXPORT uint32_t gs2d_selftest_nonzero(const uint32_t* in) {
     return nonzero(of);
 }
 
-// in: [11, LANES], what outline_of takes of LANES splats; image: near, width, height. Out: what each holds of the rows y0 to y1.
+// in: [11, LANES], what outline_of takes of LANES splats; image: near, width, height. Out: what each holds of the rows
+// y0 to y1.
 GS2D_EXPORT void gs2d_selftest_outline(const real* in, const real* image, real y0, real y1, real* left, real* right) {
     V v[11], from, to;
     for (int k = 0; k < 11; ++k) v[k] = load(in + k * LANES);

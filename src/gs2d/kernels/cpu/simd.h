@@ -109,7 +109,8 @@ GS2D_HD V whole(V a) {
 }
 
 #if !defined(GS2D_OWN_INDICES)
-// Writes STRIDE times the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.
+// Writes STRIDE times the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple
+// of LANES.
 template <int STRIDE> GS2D_HD int multiples_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
     int count = 0;
     for (int i = 0; i < n; ++i) {

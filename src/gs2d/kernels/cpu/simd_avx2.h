@@ -134,7 +134,8 @@ GS2D_HD void gather_pairs(const float* p, LaneInts i, V& a, V& b) {
 }
 
 #define GS2D_OWN_INDICES
-// Writes STRIDE times the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.
+// Writes STRIDE times the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple
+// of LANES.
 template <int STRIDE> GS2D_HD int multiples_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
     const __m128i shift = _mm_cvtsi32_si128(31 - bit);
     __m256i index = _mm256_setzero_si256();

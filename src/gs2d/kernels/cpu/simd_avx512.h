@@ -33,7 +33,8 @@ GS2D_HD V scale2(V a, V n) { return _mm512_scalef_ps(a.v, n.v); }
 
 #define GS2D_OWN_EXP2
 constexpr Exp2Table<5> EXP2_TABLE;
-// 2^x for x in [-126, 127]; relative error below 2e-7. 32 values of a table, degree 2 minimax on [-1/64, 1/64]: half the products.
+// 2^x for x in [-126, 127]; relative error below 2e-7. 32 values of a table, degree 2 minimax on [-1/64, 1/64]: half
+// the products.
 GS2D_HD V exp2_small(V x) {
     const V t = x + V(EXP2_TABLE.ROUND), f = x - (t - V(EXP2_TABLE.ROUND));
     const __m512i n = _mm512_castps_si512(t.v), *const table = reinterpret_cast<const __m512i*>(EXP2_TABLE.of);
@@ -147,7 +148,8 @@ GS2D_HD void gather_pairs(const float* p, LaneInts i, V& a, V& b) {
 }
 
 #define GS2D_OWN_INDICES
-// Writes STRIDE times the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.
+// Writes STRIDE times the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple
+// of LANES.
 template <int STRIDE> GS2D_HD int multiples_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
     const __m512i wanted = _mm512_set1_epi32(1 << bit), step = _mm512_set1_epi32(16 * STRIDE);
     __m512i index = _mm512_mullo_epi32(_mm512_set1_epi32(STRIDE),

@@ -1,7 +1,7 @@
-// Plane sweep of one image (training/start/plane_sweep.py has the same in torch): for each pixel and depth, the normalised
-// cross-correlation of its patch with those of other images, averaged over the two best images. The result is the best
-// depth, its score and the scores of the adjacent depths. Bands of rows are independent, so it does not depend on the
-// number of threads.
+// Plane sweep of one image (training/start/plane_sweep.py has the same in torch): for each pixel and depth, the
+// normalised cross-correlation of its patch with those of other images, averaged over the two best images. The result
+// is the best depth, its score and the scores of the adjacent depths. Bands of rows are independent, so it does not
+// depend on the number of threads.
 #include <algorithm>
 #include <atomic>
 #include <cstdint>

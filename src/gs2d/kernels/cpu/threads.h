@@ -29,9 +29,10 @@ template <class F> void parallel_ranges(int64_t n, int64_t grain, F&& f) {
     });
 }
 
-// Called on every thread of a parallel_for: shares out the pieces [first, end), whose flags are 0. Piece i goes to thread
-// i % get_threads() as long as that thread keeps up: what a thread has written to memory for a piece in one pass is still
-// near it in the next, where cores do not share a cache. Threads that have finished help the others, from the last piece.
+// Called on every thread of a parallel_for: shares out the pieces [first, end), whose flags are 0. Piece i goes to
+// thread i % get_threads() as long as that thread keeps up: what a thread has written to memory for a piece in one pass
+// is still near it in the next, where cores do not share a cache. Threads that have finished help the others, from the
+// last piece.
 template <class F> void share_out(int64_t first, int64_t end, std::atomic<uint8_t>* taken, F&& f) {
     const int64_t threads = get_threads(), me = thread_number() % threads;
     const auto take = [&](int64_t i) {

@@ -112,8 +112,9 @@ struct RowLines {
     }
 };
 
-// The rows of a tile are scattered, so they are prefetched during other work, a few lines at each of `times` calls, since
-// a processor drops most of many simultaneous requests. They go to the second-level cache, since the first is full.
+// The rows of a tile are scattered, so they are prefetched during other work, a few lines at each of `times` calls,
+// since a processor drops most of many simultaneous requests. They go to the second-level cache, since the first is
+// full.
 class RowsAhead {
   public:
     // No prefetch beyond the last tile.
@@ -180,8 +181,8 @@ __attribute__((noinline)) inline void outlined_blocks(const Frame& f, const Foot
         masks[__builtin_ctz(left)] = found[__builtin_ctz(left)];
 }
 
-// Bit b of masks[i]: the ellipse or the low-pass disc of splat i reaches a pixel centre of block b, or nearly so. A footprint
-// reaches each row of blocks in one interval. tile_x, tile_y: the tile's first pixel.
+// Bit b of masks[i]: the ellipse or the low-pass disc of splat i reaches a pixel centre of block b, or nearly so. A
+// footprint reaches each row of blocks in one interval. tile_x, tile_y: the tile's first pixel.
 inline void blocks_touched(const Frame& f, const Footprints& s, V tile_x, V tile_y, uint32_t* masks) {
     const Chords<V> chords = {s.ex - tile_x, s.ey - tile_y, s.slope,       s.half, s.inv_y2,
                               s.y_right,     s.cx - tile_x, s.cy - tile_y, s.disc2};

@@ -1,5 +1,5 @@
-// The backward pass over the splats of a tile, instantiated by backward.cpp and features_vjp.cpp. These are two files because
-// the compiler's inlining depends on the amount of code in one.
+// The backward pass over the splats of a tile, instantiated by backward.cpp and features_vjp.cpp. These are two files
+// because the compiler's inlining depends on the amount of code in one.
 #pragma once
 
 #include "cpu/features.h"
@@ -63,8 +63,9 @@ __attribute__((noinline)) void pass_by(const real* record, bool plain, uint32_t 
 
 constexpr bool COLORS_FIT = REGISTERS >= 32;  // they fit the registers next to the update of T and S
 
-// Pairs (splat, block) of consecutive splats, processed in passes with short dependency chains, so that many pairs overlap,
-// and little state, so that it fits the registers: planes, alphas, updates of T and S, and the sums of each splat.
+// Pairs (splat, block) of consecutive splats, processed in passes with short dependency chains, so that many pairs
+// overlap, and little state, so that it fits the registers: planes, alphas, updates of T and S, and the sums of each
+// splat.
 struct Batch {
     // the most that a splat may have; more would evict the pixels from the first-level cache
     static constexpr int PAIRS = BLOCKS;

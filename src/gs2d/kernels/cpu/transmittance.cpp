@@ -1,5 +1,5 @@
-// Depth by transmittance, after the blending and only on request: the pairs of a tile are intersected again and stored by
-// block, and every pixel searches its own pairs along its ray.
+// Depth by transmittance, after the blending and only on request: the pairs of a tile are intersected again and stored
+// by block, and every pixel searches its own pairs along its ray.
 #include "cpu/frame.h"
 #include "cpu/planes.h"
 #include "cpu/threads.h"

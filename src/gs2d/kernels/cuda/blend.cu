@@ -1,8 +1,8 @@
 // Blending, front to back: one block of four warps per 16x16 tile, a warp owns 8x8 pixels, a thread two of them.
 //
-// Warps only vote among their own lanes and never wait for each other. In a chunk of 32 entries each lane reads one entry;
-// the sub-block masks select the splats for the warp; their lanes fetch the records into shared memory, so that a chunk
-// waits for memory once.
+// Warps only vote among their own lanes and never wait for each other. In a chunk of 32 entries each lane reads one
+// entry; the sub-block masks select the splats for the warp; their lanes fetch the records into shared memory, so that
+// a chunk waits for memory once.
 #include "cuda/pixels.h"
 
 namespace gs2d {

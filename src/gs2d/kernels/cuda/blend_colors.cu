@@ -1,6 +1,6 @@
-// Gradients of colours alone, of all or some splats, with everything else frozen (stage 2): a second blending pass for the
-// weights, without remaining sums, alpha or geometry. Splats that are not trained only change the transmittance, and a
-// warp stops behind the last trained one.
+// Gradients of colours alone, of all or some splats, with everything else frozen (stage 2): a second blending pass for
+// the weights, without remaining sums, alpha or geometry. Splats that are not trained only change the transmittance,
+// and a warp stops behind the last trained one.
 #include "cuda/colors.h"
 #include "cuda/pixels.h"
 #include "cuda/reduce.h"

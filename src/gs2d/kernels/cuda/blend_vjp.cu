@@ -267,8 +267,8 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
     }
 }
 
-// GEO: normal or depth images have gradients (or the distortion has: DIST). ABS: the AbsGS signal is computed. TRANS: the
-// depth by transmittance has. FEAT: further channels have.
+// GEO: normal or depth images have gradients (or the distortion has: DIST). ABS: the AbsGS signal is computed. TRANS:
+// the depth by transmittance has. FEAT: further channels have.
 extern "C" __global__ void __launch_bounds__(128, 7) blend_vjp_color(BlendVjpArguments a) {
     __shared__ Staged staged[4];
     __shared__ Upstream<false> upstream;

@@ -1,4 +1,5 @@
-// Colours of splats from their SH coefficients, and back. The degree is a template value inside: coefficients stay in registers.
+// Colours of splats from their SH coefficients, and back. The degree is a template value inside: coefficients stay in
+// registers.
 #pragma once
 
 #include "cuda/common.h"
@@ -52,7 +53,8 @@ __device__ __forceinline__ Vec3<float> color_of(int degree, const Coefficients& 
     });
 }
 
-// Writes the gradients of the coefficients, zeros for those beyond the degree; returns that of the unit vector to the splat.
+// Writes the gradients of the coefficients, zeros for those beyond the degree; returns that of the unit vector to the
+// splat.
 __device__ __forceinline__ Vec3<float> color_vjp(int degree, const Coefficients& from, int rest,
                                                  const CoefficientGradients& to, Vec3<float> direction, Vec3<float> g) {
     return with_degree(degree, [&](auto d) {

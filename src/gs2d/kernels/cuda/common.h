@@ -1,6 +1,6 @@
-// Shared code of the CUDA kernels. Every kernel takes one struct by value (a ctypes structure on the Python side) and uses
-// only compiler built-ins, no headers of the toolkit. Warp collectives stand in convergent code, with the
-// full mask: the tests run these sources on the CPU, where anything else is an error (tests/helpers/emulator.h).
+// Shared code of the CUDA kernels. Every kernel takes one struct by value (a ctypes structure on the Python side) and
+// uses only compiler built-ins, no headers of the toolkit. Warp collectives stand in convergent code, with the full
+// mask: the tests run these sources on the CPU, where anything else is an error (tests/helpers/emulator.h).
 #pragma once
 
 #include "core/blend.h"
@@ -33,8 +33,8 @@ __device__ __forceinline__ BlendLimits<float> limits_of(const View& v) {
             v.inv_depth_width};
 }
 
-// A splat against the sub-blocks of a tile: cull record ex, ey, a, b, c, cx, cy, disc2. disc2 < 0: no ellipse but an outline, and ex is
-// its k; then every sub-block is reached as far as this test knows.
+// Test of a splat against the sub-blocks of a tile. Cull record: ex, ey, a, b, c, cx, cy, disc2. If disc2 < 0, the
+// splat has an outline instead of an ellipse, ex is its k, and this test passes for every sub-block.
 struct Culling {
     BoxTest<float> test;
     bool unbounded;

@@ -1,5 +1,5 @@
-// Blending of channels besides the three of a splat's colour: a second pass over the used entries recomputes the weights, for
-// groups of channels whose sums fit the registers.
+// Blending of channels besides the three of a splat's colour: a second pass over the used entries recomputes the
+// weights, for groups of channels whose sums fit the registers.
 #include "cuda/pixels.h"
 
 namespace gs2d {

@@ -47,10 +47,10 @@ struct FinishArguments {
     const float* partials;  // [1 + values, blocks]; the first row counts
     int64 blocks;
     int values, complement;  // complement: the mean of 1 - value
-    float* means;            // [1 + values]: 1 / count, means; a count of 0 is taken as 1
+    float* means;            // [1 + values]: 1 / count, means; a count of 0 counts as 1
 };
 
-// Depth of a pixel; 0 in the background. Outside the image and at ignored pixels it makes no normal: makes_normal.
+// Depth of a pixel; 0 in the background. Outside the image and at ignored pixels there is no normal (makes_normal).
 __device__ __forceinline__ float depth_at(const NormalArguments& a, int64 x, int64 y) {
     const float absent = a.at_camera ? -1.f : 0.f;
     if (x < 0 || y < 0 || x >= a.width || y >= a.height) return absent;

@@ -1,6 +1,6 @@
-// Comparison of patches of two views: one warp per pixel, one lane per pixel of the patch. All lanes compute the plane and
-// the round trip, which is a small part of the work. The patch is sampled twice, for the sums and for the gradient. Pixels
-// have separate results, which are summed elsewhere.
+// Comparison of patches of two views: one warp per pixel, one lane per pixel of the patch. All lanes compute the plane
+// and the round trip, which is a small part of the work. The patch is sampled twice, for the sums and for the gradient.
+// Pixels have separate results, which are summed elsewhere.
 #include "core/multiview.h"
 #include "cuda/common.h"
 

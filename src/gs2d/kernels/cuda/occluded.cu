@@ -1,5 +1,5 @@
-// Splat errors with occlusion (rule 17): a pixel counts until it has stopped at or before the splat. It is the pass of the
-// blending over the lists of the footprint rho <= error_k2. Sums are whole numbers, so their order does not matter.
+// Splat errors with occlusion (rule 17): a pixel counts until it has stopped at or before the splat. It is the pass of
+// the blending over the lists of the footprint rho <= error_k2. Sums are whole numbers, so their order does not matter.
 #include "cuda/pixels.h"
 #include "cuda/reduce.h"
 

@@ -1,5 +1,6 @@
-// The order in which blocks take tiles: long lists first, so that no long list starts when the others are done. One block
-// counts tiles by the length of their lists and assigns positions; the order within a bucket does not affect results.
+// The order in which blocks take tiles: long lists first, so that no long list starts when the others are done. One
+// block counts tiles by the length of their lists and assigns positions; the order within a bucket does not affect
+// results.
 #include "cuda/common.h"
 
 namespace gs2d {

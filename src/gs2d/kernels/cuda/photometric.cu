@@ -2,7 +2,8 @@
 //
 // A row of W interleaved pixels is 3 W reals, and the window's taps are 3 reals apart: channels need no planes. A block
 // runs down a strip of 128 reals; each row passes through shared memory once, is blurred horizontally, and enters 11
-// running sums in registers, so that the vertical blur reads no memory at all. 5 rows behind the input a row is finished.
+// running sums in registers, so that the vertical blur reads no memory at all. 5 rows behind the input a row is
+// finished.
 #include "core/losses.h"
 #include "cuda/means.h"
 

@@ -92,8 +92,8 @@ struct No {
     static constexpr bool value = false;
 };
 
-// Calls step(Yes or No: plain; j, bit j) for the selected splats of a chunk, in order. Runs of plain splats, nearly all, have
-// a separate loop without the code for the others.
+// Calls step(Yes or No: plain; j, bit j) for the selected splats of a chunk, in order. Runs of plain splats, nearly
+// all, have a separate loop without the code for the others.
 template <class F> __device__ __forceinline__ void for_each_splat(uint wanted, uint plain, F&& step) {
     while (wanted) {
         const uint others = wanted & ~plain;

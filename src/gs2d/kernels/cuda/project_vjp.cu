@@ -1,7 +1,7 @@
 // From gradients of records to gradients of parameters, SH and the densification signal: one thread per splat.
 //
-// Rows of SH and of three floats pass through shared memory (rows.h): they are three quarters of the 464 bytes per splat
-// that this reads and writes. So no lane of a warp exits early.
+// Rows of SH and of three floats pass through shared memory (rows.h): they are three quarters of the 464 bytes per
+// splat that this reads and writes. So no lane of a warp exits early.
 #include "cuda/colors.h"
 #include "cuda/rows.h"
 
@@ -51,7 +51,8 @@ __device__ __forceinline__ Vec3<float> mean_of(const ProjectVjpArguments& a, int
     return {m[0], m[1], m[2]};
 }
 
-// Gradients of the coefficients: of the first one to `first`, of the others over their row. Returns that of the direction.
+// Gradients of the coefficients: of the first one to `first`, of the others over their row. Returns that of the
+// direction.
 __device__ __forceinline__ Vec3<float> learn_colors(const ProjectVjpArguments& a, int64 i, Vec3<float> g_color,
                                                     float* row, float* first) {
     const Coefficients sh = {a.sh0 + 3 * i, row};

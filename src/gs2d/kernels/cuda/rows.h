@@ -1,5 +1,5 @@
-// Rows of the splats of a warp through shared memory: adjacent lanes move 16 bytes each, while a lane that reads its own row
-// would touch a line of memory for every 4 bytes.
+// Rows of the splats of a warp through shared memory: adjacent lanes move 16 bytes each, while a lane that reads its
+// own row would touch a line of memory for every 4 bytes.
 #pragma once
 
 #include "cuda/common.h"
@@ -13,7 +13,8 @@ template <class T> __device__ __forceinline__ bool is_aligned(const void* at) {
     return reinterpret_cast<unsigned long long>(at) % sizeof(T) == 0;
 }
 
-// Whether four floats are part of a selected row. They belong to at most two rows, since a row has at least three floats.
+// Whether four floats are part of a selected row. They belong to at most two rows, since a row has at least three
+// floats.
 __device__ __forceinline__ bool any_wanted(uint wanted, int first_float, int length) {
     const int first = first_float / length, last = (first_float + 3) / length;
     return (wanted >> first | wanted >> (last < WARP_ROWS ? last : first)) & 1u;

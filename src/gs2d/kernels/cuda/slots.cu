@@ -17,8 +17,8 @@ struct SlotArguments {
     int64 channels;
 };
 
-// One warp per splat. A lane sums the slots of the same warps of all tiles; slots of tiles without the splat are 0 and change
-// no bit.
+// One warp per splat. A lane sums the slots of the same warps of all tiles; slots of tiles without the splat are 0 and
+// change no bit.
 extern "C" __global__ void __launch_bounds__(128) sum_slots(SlotArguments a) {
     const int64 place = (int64(blockIdx.x) * blockDim.x + threadIdx.x) >> 5;
     const int lane = threadIdx.x & 31;

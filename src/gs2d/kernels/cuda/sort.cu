@@ -1,10 +1,10 @@
 // A stable radix sort of keys with payloads, and running sums, for training iterations without torch operations.
 //
-// Eight bits a pass; a pass reads each key once ("onesweep": Adinets and Merrill, 2022). One launch counts the digits of all
-// passes. A block then takes the next piece of the keys by a ticket, ranks them, publishes its count of each digit, and
-// sums the counts of earlier pieces, going back until one has published the sum of all before it ("decoupled look-back":
-// Merrill and Garland, 2016). A number and its kind are one word, so no memory ordering is required; a piece only waits
-// for earlier tickets, whose blocks are running.
+// Eight bits a pass; a pass reads each key once ("onesweep": Adinets and Merrill, 2022). One launch counts the digits
+// of all passes. A block then takes the next piece of the keys by a ticket, ranks them, publishes its count of each
+// digit, and sums the counts of earlier pieces, going back until one has published the sum of all before it ("decoupled
+// look-back": Merrill and Garland, 2016). A number and its kind are one word, so no memory ordering is required; a
+// piece only waits for earlier tickets, whose blocks are running.
 #include "cuda/common.h"
 
 namespace gs2d {

@@ -1,6 +1,6 @@
-// Depth by transmittance, after the blending and only on request, with the layout of blend.cu: a thread searches for its two
-// pixels at once, and each step of the search is a pass over the pairs of the warp, selected by the words of the forward
-// pass. A warp continues while one of its pixels does; the warps of a block never wait for each other.
+// Depth by transmittance, after the blending and only on request, with the layout of blend.cu: a thread searches for
+// its two pixels at once, and each step of the search is a pass over the pairs of the warp, selected by the words of
+// the forward pass. A warp continues while one of its pixels does; the warps of a block never wait for each other.
 #include "cuda/pixels.h"
 
 namespace gs2d {
