@@ -46,8 +46,10 @@ class Command:
         getattr(importlib.import_module(module), function)(options, console)
 
 
-_CORE = ("doctor", "demo", "reconstruct", "view", "poses", "train", "mesh", "info", "render", "export")
-_CORE += ("evaluate", "recipes")
+_CORE = (
+    *("doctor", "demo", "reconstruct", "view", "poses", "train", "mesh"),
+    *("info", "render", "export", "evaluate", "recipes"),
+)
 COMMANDS: Registry[Command] = Registry("command", "gs2d.commands", builtin=dict.fromkeys(_CORE, "gs2d.cli.commands"))
 
 

@@ -154,7 +154,8 @@ def _is_flag(word: str) -> bool:
 # -- paths -------------------------------------------------------------------------------------------------------------
 def check_inputs(options: Any) -> None:
     """Raise for an input path that does not exist; cheap, so that a misspelt path is reported at once."""
-    by_field = {option.field: option for option in options_of(type(options))}
+    kind: type = type(options)
+    by_field = {option.field: option for option in options_of(kind)}
     for field in dataclasses.fields(options):
         value = getattr(options, field.name)
         if dataclasses.is_dataclass(value):
