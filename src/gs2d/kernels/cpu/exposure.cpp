@@ -41,8 +41,8 @@ V coverage_at(const Picture& p, int64_t first) {
 
 using namespace gs2d;
 
-// Where `clipped` [pixels, 3] is set, values above 1 become 1 and set `over`; both may be null.
-GS2D_EXPORT void gs2d_expose(const Picture* picture, const uint8_t* clipped, real* out, uint8_t* over) {
+// Unnamed parameters of the exported functions are reserved and null.
+GS2D_EXPORT void gs2d_expose(const Picture* picture, const void*, real* out, void*) {
     const Exposure<V> e = exposure_of(*picture);
     parallel_ranges(picture->pixels, PIECE, [&](int64_t begin, int64_t end) {
         for (int64_t i = begin; i < end; i += LANES) {
@@ -51,17 +51,11 @@ GS2D_EXPORT void gs2d_expose(const Picture* picture, const uint8_t* clipped, rea
             expose(color, coverage_at(*picture, i), e, seen);
             store_pixels(out, i, picture->pixels, seen);
         }
-        if (!clipped) return;
-        for (int64_t k = 3 * begin; k < 3 * end; ++k) {
-            const bool cut = clipped[k] && out[k] > real(1);
-            over[k] = cut;
-            out[k] = cut ? real(1) : out[k];
-        }
     });
 }
 
-// sums: the gradient of the transform [3, 4]. `over` may be null. Returns 1 if memory is short.
-GS2D_EXPORT int gs2d_expose_vjp(const Picture* picture, const uint8_t* over, const real* upstream, real* to_color,
+// sums: the gradient of the transform [3, 4]. Returns 1 if memory is short.
+GS2D_EXPORT int gs2d_expose_vjp(const Picture* picture, const void*, const real* upstream, real* to_color,
                                 double* sums) {
     const int64_t pieces = (picture->pixels + PIECE - 1) / PIECE;
     auto* const of_pieces = static_cast<double*>(std::malloc(static_cast<size_t>(pieces * SUMS + 1) * sizeof(double)));
@@ -74,14 +68,7 @@ GS2D_EXPORT int gs2d_expose_vjp(const Picture* picture, const uint8_t* over, con
         for (int64_t i = begin; i < end; i += LANES) {
             V color[3], given[3], gradient[3];
             load_pixels(picture->color, i, picture->pixels, color);
-            if (over) {
-                real kept[3 * LANES];
-                const int64_t n = 3 * (picture->pixels - i < LANES ? picture->pixels - i : LANES);
-                for (int64_t k = 0; k < n; ++k) kept[k] = over[3 * i + k] ? real(0) : upstream[3 * i + k];
-                load_pixels(kept, 0, n / 3, given);
-            } else {
-                load_pixels(upstream, i, picture->pixels, given);
-            }
+            load_pixels(upstream, i, picture->pixels, given);
             expose_vjp(given, color, coverage_at(*picture, i), e, gradient, totals);
             store_pixels(to_color, i, picture->pixels, gradient);
         }
