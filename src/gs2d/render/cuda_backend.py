@@ -54,7 +54,8 @@ class CudaBackend(Backend):
     @classmethod
     def ready(cls) -> Self:
         """Return the backend, or raise BackendError with the first thing that this machine lacks."""
-        return _ready(cls)
+        _check_machine()
+        return cls()
 
     def rasterize(
         self,
@@ -184,8 +185,7 @@ class CudaBackend(Backend):
 
 
 @cache  # the machine is examined once; an error is not cached
-def _ready(kind: type[Any]) -> Any:
+def _check_machine() -> None:
     lacking, _ = diagnose.report()
     if lacking is not None:
         raise BackendError(f"backend 'cuda' cannot run: {lacking.reason}; {lacking.remedy}")
-    return kind()

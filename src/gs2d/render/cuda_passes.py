@@ -322,8 +322,8 @@ def backward(
     sums = _Sums(frame, wanted.deterministic, columns=0 if only_colors else 16)
     further = None
     if features is not None:
-        *inputs, to_values = features
-        further = _features(*inputs, sums.of_features(to_values))
+        values, background, blended_values, gradients_of_images, to_values = features
+        further = _features(values, background, blended_values, gradients_of_images, sums.of_features(to_values))
     blended = blend_gradients(
         len(frame.tiles),
         frame.lists,
