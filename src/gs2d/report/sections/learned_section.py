@@ -18,7 +18,7 @@ from gs2d.report.sections.section_registry import register_section
 @register_section("learned", title="Learned exposures and cameras")
 def learned_section(run: RunRecord) -> str | None:
     """Return a paragraph for each file of learned properties; None if the run has none."""
-    paragraphs = []
+    paragraphs: list[str] = []
     for name, describe in _FILES.items():
         path = run.path / name
         if not path.is_file():
