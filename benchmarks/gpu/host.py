@@ -33,7 +33,7 @@ from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.compile import compile_source
 from gs2d.render import pair_budget
 from gs2d.render.cuda_backend import CudaBackend
-from gs2d.training import objective, trainer
+from gs2d.training import objective, targets, trainer
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer, TrainerOptions
 
@@ -135,6 +135,7 @@ def nothing_runs() -> Iterator[NullDriver]:
         (launch, "launcher_for", lambda device: launcher),
         (trainer, "is_async", lambda device: True),
         (objective, "is_async", lambda device: True),
+        (targets, "is_async", lambda device: True),
         (trainer, "validate", lambda recipe: recipe),  # the row group that stage 2 learns is made, not ranked
         (budget, "room", lambda self, rendering: 1 << 10),
         (budget, "overflowed", _nothing_overflowed),

@@ -19,7 +19,7 @@ from gs2d.render.cuda_step import Stepper
 from gs2d.render.pair_budget import PairBudget, Rendering
 from gs2d.render.types import RasterSettings
 from gs2d.render.whole_step import Learned, StepLosses, StepNormals, WholeStep
-from gs2d.training import objective, trainer
+from gs2d.training import objective, targets, trainer
 
 ROOM = 1 << 20  # pairs
 
@@ -70,7 +70,7 @@ def _step(bench: Bench, splats: Splats, camera: Camera, channels: int) -> None:
 def _way(chosen: str, dry: bool) -> Iterator[None]:
     """Iterations done in one way; with ``dry`` as on a device that nobody waits for."""
     asked = objective.is_async
-    places: tuple[Any, ...] = (trainer, objective)
+    places: tuple[Any, ...] = (trainer, objective, targets)
     for place in places if dry else ():
         place.is_async = lambda device: True
     try:

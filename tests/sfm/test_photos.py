@@ -99,7 +99,7 @@ def test_other_files_are_reported_with_a_remedy(tmp_path: Path) -> None:
         ((), "photographs"),
         (("0.jpg", "1.jpg"), "photographs"),
         pytest.param(("a.HEIC",), "pi-heif", marks=pytest.mark.skipif(bool(HEIF), reason="a package for HEIC is here")),
-        (("a.CR2",), "developed"),
+        (("a.CR2",), "raw files"),
         (("a.mp4",), "video"),
     ],
 )

@@ -111,7 +111,7 @@ def test_a_video_becomes_a_capture_with_its_frames(tmp_path: Path, monkeypatch: 
     said: list[Event] = []
     options = PosesOptions(photos=video, out=tmp_path / "capture", frames=len(photos), threads=2)
     result = find_poses(replace(options, camera_model="SIMPLE_PINHOLE"), said.append)
-    assert (result["count"], result["asked"]["frames"]) == (len(photos), len(photos))
+    assert (result["count"], result["requested"]["frames"]) == (len(photos), len(photos))
     assert result["placed"] == len(photos)
     assert len(result["cameras"]) == 1
     names = [row["name"] for row in result["photographs"]]

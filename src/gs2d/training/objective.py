@@ -29,7 +29,7 @@ from gs2d.training.robust.dropout import dropout_rate, dropped_out, kept_splats
 from gs2d.training.robust.opaque import another_background
 from gs2d.training.state import TrainState
 from gs2d.training.step_result import StepResult
-from gs2d.training.targets import Target, TargetSource
+from gs2d.training.targets import Target, TargetSource, is_async
 
 
 def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> RasterSettings:
@@ -310,11 +310,6 @@ def clipped_pixels(target: Target) -> Tensor:
     """Return where an image is clipped [H, W, 3], except in the background of images with an alpha channel."""
     clipped = target.image >= 1
     return clipped if target.silhouette is None else clipped & (target.silhouette[..., None] > 0)
-
-
-def is_async(device: torch.device) -> bool:
-    """Return whether reading a tensor on this device makes the host wait."""
-    return device.type != "cpu"
 
 
 def check_losses(stage: Stage, iteration: int, losses: Mapping[str, float | Tensor]) -> dict[str, float]:

@@ -85,6 +85,11 @@ class TargetSource(Protocol):
         """Return the bytes of an image on the device of training; None if targets are kept as floats."""
 
 
+def is_async(device: torch.device) -> bool:
+    """Return whether reading a tensor on this device makes the host wait."""
+    return device.type != "cpu"
+
+
 def make_targets(
     scene: Scene,
     protocol: config.Protocol,
@@ -96,7 +101,7 @@ def make_targets(
     """Return the targets of the training views of a scene, on the device of the splats."""
     views, background, device = scene.train, protocol.background, splats.device
     use_masks = protocol.use_mask_in_training
-    if device.type != "cpu":
+    if is_async(device):
         limit = 1 << 31 if limit_bytes is None else limit_bytes
         pinned = 0 if scene.ahead else cache_bytes(PINNED_BYTES)
         options = {"dtype": splats.dtype, "limit_bytes": limit, "pinned_bytes": pinned}

@@ -36,7 +36,6 @@ from gs2d.training.objective import (
     check_losses,
     diverged,
     first_not_finite,
-    is_async,
     no_view,
     raster_settings,
     visible_mask,
@@ -49,7 +48,7 @@ from gs2d.training.robust.robustness import Robustness
 from gs2d.training.rows import keep_rows
 from gs2d.training.state import TrainState
 from gs2d.training.step_result import StepResult
-from gs2d.training.targets import TargetSource, make_targets
+from gs2d.training.targets import TargetSource, is_async, make_targets
 from gs2d.training.whole_steps import WholeSteps
 
 __all__ = ["OnEvent", "Trainer", "TrainerOptions", "raster_settings"]

@@ -32,7 +32,7 @@ from gs2d.render import pair_budget as cuda_budget
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.pair_budget import Rendering
 from gs2d.render.types import RasterSettings
-from gs2d.training import events
+from gs2d.training import events, targets
 from gs2d.training import objective as views
 from gs2d.training import trainer as loop
 from gs2d.training.targets import DeviceTargets, Targets
@@ -167,6 +167,7 @@ def test_an_iteration_waits_for_nothing_once_it_knows_how_many_pairs_to_expect(
     recipe = quiet(VARIANTS[variant]) if stage == 0 else VARIANTS[variant]
     monkeypatch.setattr(loop, "is_async", lambda device: True)
     monkeypatch.setattr(views, "is_async", lambda device: True)
+    monkeypatch.setattr(targets, "is_async", lambda device: True)
     trainer = Trainer(
         scene, recipe, GENERIC, backend=emulated, options=TrainerOptions(progress_every=1000, target_bytes=1 << 20)
     )
@@ -192,6 +193,7 @@ def test_a_loss_that_is_not_finite_stops_training_at_the_next_report(
 
     monkeypatch.setattr(loop, "is_async", lambda device: True)
     monkeypatch.setattr(views, "is_async", lambda device: True)
+    monkeypatch.setattr(targets, "is_async", lambda device: True)
     trainer = Trainer(scene, train_toys.short(), GENERIC, backend=emulated, options=TrainerOptions(progress_every=2))
     trainer.enter(0)
     trainer.step()
