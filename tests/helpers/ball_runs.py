@@ -1,4 +1,4 @@
-"""Train the tiny ball, and compare two runs of it."""
+"""Train the tiny ball, and compare two runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SCALE = 0.001  # 30 + 10 + 20 iterations
 
 
 def options(capture: Path, out: Path, **changes: Any) -> TrainOptions:
-    """Options of a run through all three stages of 2DGS-R."""
+    """Return options for a run through all three stages of 2DGS-R."""
     plain = TrainOptions(
         scene=capture, out=out, recipe="2dgs-r", schedule_scale=SCALE, overrides=SMALL, threads=1, checkpoint_every=4
     )
@@ -25,17 +25,17 @@ def options(capture: Path, out: Path, **changes: Any) -> TrainOptions:
 
 
 def comparable(run: RunFolder) -> tuple[bytes, list[dict[str, Any]], list[dict[str, Any]]]:
-    """All of a run that may not depend on how it got there: splats, log without notices, metrics without times."""
+    """Return the reproducible part of a run: splats, log events without notices, metrics without times."""
     stages = [
         {k: v for k, v in stage.items() if k not in ("seconds", "peak_memory_bytes", "reused_from")}
         for stage in run.metrics()["stages"]
     ]
-    log = [event for event in run.events.read() if event["kind"] != "notice"]  # they name memory and GPU of the machine
+    log = [event for event in run.events.read() if event["kind"] != "notice"]  # they report memory and GPU
     return run.file("splats.ply").read_bytes(), log, stages
 
 
 class Stop(Exception):
-    """Stands for a kill."""
+    """Simulates a kill."""
 
 
 def spawn(capture: Path, out: Path, *more: str) -> subprocess.Popen[bytes]:

@@ -1,4 +1,4 @@
-"""Headless Chromium, driven by its DevTools protocol."""
+"""Drive headless Chromium through the DevTools protocol."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from PIL import Image
 
 CHROMIUM = next((found for name in ("chromium", "google-chrome", "chrome") if (found := shutil.which(name))), None)
 FLAGS = ("--headless=new", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-PATIENCE = 300.0  # s: machines of tests are busy, and draw without a GPU
+PATIENCE = 300.0  # s: test machines are busy and render without a GPU
 
 
 def require_browser() -> None:
-    """Skip where no browser, or nothing to talk to it with, is there."""
+    """Skip if there is no browser or no WebSocket client."""
     if CHROMIUM is None:
         pytest.skip("there is no Chromium on this machine")
     pytest.importorskip("websockets.sync.client", reason="websockets drives the browser")
 
 
 class Page:
-    """One tab: commands go out, answers come back, in order; what the page complained about is kept in ``errors``."""
+    """A tab: sends commands and reads replies in order; page errors are collected in ``errors``."""
 
     def __init__(self, socket: Any) -> None:
         self.socket, self.errors = socket, []  # type: ignore[var-annotated]
         self._numbers = itertools.count(1)
 
     def send(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """Send a command of the protocol and return its answer."""
+        """Send a protocol command and return its reply."""
         number = next(self._numbers)
         self.socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
         while True:
@@ -58,27 +58,27 @@ class Page:
         self.until("document.readyState === 'complete' && location.href !== 'about:blank'")
 
     def ask(self, expression: str) -> Any:
-        """Return the value of a JavaScript expression."""
+        """Evaluate a JavaScript expression and return its value."""
         answer = self.send("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
     def until(self, expression: str, patience: float = PATIENCE) -> None:
-        """Wait until an expression is true, so many seconds."""
+        """Wait up to ``patience`` seconds until an expression is true."""
         end = time.monotonic() + patience
         while not self.ask(f"Boolean({expression})"):
             assert time.monotonic() < end, f"never true: {expression}; {self.errors}"
             time.sleep(0.05)
 
     def size(self, width: int, height: int, *, phone: bool = False, scale: float = 1.0) -> None:
-        """Give the window a size in CSS px; a phone has fingers."""
+        """Set the window size in CSS px; ``phone`` enables touch input."""
         self.send(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=phone
         )
         self.send("Emulation.setTouchEmulationEnabled", enabled=phone, maxTouchPoints=5)
 
     def middle(self, selector: str) -> tuple[float, float]:
-        """Return where the middle of an element is, px; it is scrolled to."""
+        """Scroll to an element and return its centre in px."""
         box = self.ask(
             f"(() => {{ const e = document.querySelector({json.dumps(selector)}); "
             "e.scrollIntoView({block: 'center'}); const b = e.getBoundingClientRect(); "
@@ -93,19 +93,19 @@ class Page:
         self.mouse("mouseReleased", x, y)
 
     def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
-        """Send one event of the mouse, its left button."""
+        """Send a mouse event with the left button."""
         pressed = {"button": "left", "buttons": 1, "clickCount": 1} if kind != "mouseWheel" else {}
         self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, **{**pressed, **more})
 
     def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 6) -> None:
-        """Press, move in steps, release."""
+        """Drag the mouse from start to end in ``steps`` steps."""
         self.mouse("mousePressed", *start)
         for t in np.linspace(0, 1, steps + 1)[1:]:
             self.mouse("mouseMoved", *(a + t * (b - a) for a, b in zip(start, end, strict=True)))
         self.mouse("mouseReleased", *end)
 
     def fingers(self, *ways: tuple[tuple[float, float], tuple[float, float]], steps: int = 6) -> None:
-        """Touch with one finger a way, move all of them from start to end, lift them."""
+        """Touch with one finger per (start, end) pair, move all fingers along their paths, then lift them."""
         for i, t in enumerate(np.linspace(0, 1, steps + 1)):
             points = [
                 {"x": a[0] + t * (b[0] - a[0]), "y": a[1] + t * (b[1] - a[1]), "id": k} for k, (a, b) in enumerate(ways)
@@ -122,7 +122,7 @@ class Page:
         self.send("Input.dispatchKeyEvent", type="keyUp", key=key, **code, **more)
 
     def image(self, path: Path | None = None, *, whole: bool = False) -> np.ndarray:
-        """Return the window (or the whole document) as [H, W, 3] in [0, 1]; write it where a path is given."""
+        """Return the window (or the whole document) as [H, W, 3] in [0, 1]; also write it to ``path`` if it is set."""
         data = base64.b64decode(self.send("Page.captureScreenshot", format="png", captureBeyondViewport=whole)["data"])
         if path is not None:
             path.write_bytes(data)
@@ -132,7 +132,7 @@ class Page:
 
 @contextmanager
 def browser(*flags: str) -> Iterator[Page]:
-    """Start Chromium with an empty profile and yield a tab; both end with the block."""
+    """Start Chromium with an empty profile and yield a tab; both are closed on exit."""
     from websockets.sync.client import connect
 
     assert CHROMIUM is not None
@@ -151,7 +151,7 @@ def browser(*flags: str) -> Iterator[Page]:
 
 
 def _address(profile: Path, process: subprocess.Popen[bytes]) -> str:
-    """Where the first tab listens."""
+    """Return the debugger address of the first tab."""
     import urllib.request
 
     end = time.monotonic() + PATIENCE

@@ -24,7 +24,7 @@ MODEL_IDS = {
 
 
 def ring(count: int, *, width: int = 40, height: int = 30, f: float = 35.0, radius: float = 4.0) -> list[Camera]:
-    """Cameras on a circle that look at the origin, z up."""
+    """Return cameras on a circle that look at the origin, z up."""
     angles = np.arange(count) * 2 * math.pi / count
     eyes = [radius * np.array([math.cos(a), math.sin(a), 0.3]) for a in angles]
     up = np.array([0.0, 0.0, 1.0])
@@ -32,7 +32,7 @@ def ring(count: int, *, width: int = 40, height: int = 30, f: float = 35.0, radi
 
 
 def write_image_of(path: Path, width: int = 40, height: int = 30, *, seed: int = 0, alpha: bool = False) -> np.ndarray:
-    """A random PNG or JPEG; returns its pixels as they were before encoding."""
+    """Write a random PNG or JPEG and return its pixels before encoding."""
     pixels = np.random.default_rng(seed).integers(0, 256, (height, width, 4 if alpha else 3)).astype(np.uint8)
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels).save(path)
@@ -41,7 +41,7 @@ def write_image_of(path: Path, width: int = 40, height: int = 30, *, seed: int =
 
 @dataclass
 class ColmapModel:
-    """What goes into a COLMAP model's files."""
+    """Contents of a COLMAP model."""
 
     cameras: dict[int, tuple] = field(default_factory=dict)  # id -> (model, width, height, params)
     images: list[tuple] = field(default_factory=list)  # (id, T_cam_world, camera id, name, [(x, y, point id)])
@@ -89,7 +89,7 @@ class ColmapModel:
 
 
 def quaternion(T: np.ndarray) -> tuple[float, ...]:
-    """(w, x, y, z) of the rotation of T, by scipy."""
+    """Return (w, x, y, z) of the rotation of T, computed by SciPy."""
     x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
     return float(w), float(x), float(y), float(z)
 
@@ -97,10 +97,10 @@ def quaternion(T: np.ndarray) -> tuple[float, ...]:
 def small_colmap(
     root: Path, *, count: int = 9, where: str = "sparse/0", kind: str = "bin", **model_args: Any
 ) -> ColmapModel:
-    """A ring of PINHOLE cameras with an off-centre principal point; images 0.png, 1.png ... of 40x30."""
+    """Write a ring of PINHOLE cameras with an off-centre principal point; images 0.png, 1.png ... of 40x30."""
     model = ColmapModel(cameras={7: ("PINHOLE", 40, 30, (35.0, 36.0, 18.5, 16.25))})
     for index, camera in enumerate(ring(count)):
-        # Written in reverse, with ids that are no indices: order must come from the names.
+        # Written in reverse, with ids that are not indices: readers must sort by name.
         name = f"{count - 1 - index}.png"
         model.images.append((100 + index, camera.T_cam_world, 7, name, [(1.5, 2.5, -1)] * (index % 3)))
         write_image_of(root / "images" / name, seed=index)
@@ -115,14 +115,14 @@ def small_colmap(
 
 
 def opengl_camera_to_world(camera: Camera) -> list[list[float]]:
-    """The matrix that Blender would write for this camera."""
+    """Return the matrix that Blender would write for this camera."""
     M = np.linalg.inv(camera.T_cam_world)
     M[:3, 1:3] *= -1
     return M.tolist()
 
 
 def small_blender(root: Path, *, train: int = 4, test: int = 2, width: int = 40, height: int = 30) -> list[Camera]:
-    """RGBA pictures of a ring; camera_angle_x only; file_path without extension."""
+    """Write RGBA images of a ring, with only camera_angle_x and file_path values without extension."""
     cameras = ring(train + test, width=width, height=height)
     for split, chosen in (("train", cameras[:train]), ("test", cameras[train:])):
         frames = []
@@ -138,7 +138,7 @@ def small_blender(root: Path, *, train: int = 4, test: int = 2, width: int = 40,
 def small_nerfstudio(
     root: Path, *, count: int = 9, meta: dict | None = None, frame: dict | None = None
 ) -> list[Camera]:
-    """One transforms.json with shared intrinsics, off-centre; ``meta`` and ``frame`` add keys to all of each kind."""
+    """Write a transforms.json with shared off-centre intrinsics; ``meta`` and ``frame`` add keys to it and its frames."""
     cameras = ring(count)
     frames = []
     for index, camera in enumerate(cameras):
@@ -156,7 +156,7 @@ SCALE_MAT = np.array([[200.0, 0, 0, -30], [0, 200, 0, 10], [0, 0, 200, 640], [0,
 def small_dtu(
     root: Path, *, count: int = 5, digits: int = 3, images: str = "image", archive: str = "cameras_sphere.npz"
 ) -> Any:
-    """world_mat and scale_mat of a ring, with pixel centres at whole numbers as DTU has them."""
+    """Write world_mat and scale_mat of a ring, with pixel centres at integers as in DTU."""
     cameras = ring(count)
     arrays = {}
     for index, camera in enumerate(cameras):
@@ -177,7 +177,7 @@ def small_dtu(
 
 
 def tree_hash(root: Path) -> dict[str, str]:
-    """Names, contents and times of change of all files and folders below ``root``."""
+    """Return names, contents and modification times of all files and folders below ``root``."""
     out = {}
     for path in sorted(root.rglob("*")):
         content = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "folder"

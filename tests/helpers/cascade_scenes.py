@@ -1,4 +1,4 @@
-"""Cascades with analytic fields, and an outdoor scene with wrong depths of the sky."""
+"""Cascades filled from analytic fields, and an outdoor scene with wrong sky depths."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ GROUND, BALL = -0.6, 0.6  # height of the plane, radius of the ball on it
 def cascade_of(
     count: int, *, voxels: int = 32, half: float = 1.0, truncation: float | None = None, depth_limit: float = 1e9
 ) -> TsdfCascade:
-    """``count`` levels around the origin."""
+    """Return a cascade of ``count`` levels around the origin."""
     size = 2 * half / voxels
     levels = []
     for k in range(count):
@@ -32,7 +32,7 @@ def cascade_of(
 
 
 def volumes_of(cascade: TsdfCascade, field: Callable[[np.ndarray], np.ndarray]) -> list[Volume]:
-    """Every level full of a field of points [P, 3] -> signed distance [P], all known."""
+    """Fill every level with a field of points [P, 3] -> signed distance [P]; all voxels are observed."""
     volumes = []
     local = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK,) * 3), axis=1)
     for k, limits in enumerate(cascade.levels):
@@ -70,10 +70,10 @@ def fused_levels(
 
 
 def outdoor_frames(sky: str, *, views: int = 24, size: int = 96, seed: int = 0) -> list[RenderedView]:
-    """A ball on a plane to the horizon, seen by a ring of cameras. What the sky's pixels say:
+    """Render a ball on a plane that reaches the horizon, from a ring of cameras. ``sky`` sets the depth of sky pixels:
 
-    "unseen": nothing; "thin": a depth of 30, but alpha 0.3; "scattered": a random depth from 15 to 80 at every pixel;
-    "cards": one random depth for each view.
+    "unseen": none; "thin": a depth of 30 with alpha 0.3; "scattered": a random depth from 15 to 80 at every pixel;
+    "cards": one random depth per view.
     """
     rng = np.random.default_rng(seed)
     frames = []

@@ -1,7 +1,7 @@
-"""A process that runs commands of gs2d one after another, so that its imports are paid once.
+"""Run gs2d commands one after another in one process, which imports everything only once.
 
-As a program (``python cli_process.py``) it reads a JSON object per line (``words``, ``cwd``) and writes one (``code``,
-``out``, ``err``).
+Run as a program (``python cli_process.py``), it reads one JSON object per line (``words``, ``cwd``) and writes one
+(``code``, ``out``, ``err``).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Result(NamedTuple):
 
 
 class CliProcess:
-    """Runs commands in a process with these folders at the start of its import path."""
+    """Runs commands in a process whose import path starts with the configured folders."""
 
     def __init__(self, *folders: Path) -> None:
         path = os.pathsep.join(map(str, folders))
@@ -35,7 +35,7 @@ class CliProcess:
         )
 
     def __call__(self, *words: object, code: int = 0, cwd: Path | None = None) -> Result:
-        """Run ``gs2d WORDS``, which must exit with ``code``."""
+        """Run ``gs2d WORDS`` and check that it exits with ``code``."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(json.dumps({"words": list(map(str, words)), "cwd": str(cwd or Path.cwd())}) + "\n")
@@ -46,12 +46,12 @@ class CliProcess:
         return result
 
     def close(self) -> None:
-        """End the process."""
+        """Stop the process."""
         self._process.communicate(timeout=60)
 
 
 def serve() -> None:
-    """Run the commands on stdin until it ends."""
+    """Run commands from stdin until it closes."""
     from gs2d.cli import run
 
     answers = sys.stdout

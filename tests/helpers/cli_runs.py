@@ -1,18 +1,18 @@
-"""Tiny runs for tests of the command line, and its one-line errors."""
+"""Tiny runs for command-line tests, and a check of one-line errors."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
 
-TINY = [  # all three stages, in a second
+TINY = [  # all three stages, within a second
     *("--recipe", "2dgs-r", "--schedule-scale", "0.0005"),
     *("--set", "init_points=100", "--set", "surface.densify.max_splats=150"),
 ]
 
 
 def one_line(text: str) -> str:
-    """The only line of a stderr, which must be an error."""
+    """Return the single line of a stderr output, which must be an error."""
     lines = text.splitlines()
     assert len(lines) == 1, text
     assert lines[0].startswith("error: ")

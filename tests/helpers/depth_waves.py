@@ -1,4 +1,4 @@
-"""Depth maps of a wavy wall, for fusion on every device."""
+"""Depth maps of a wavy wall, for fusion tests on every device."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
 
 
 def waves(count: int, *, colored: bool) -> list[DepthMap]:
-    """A wavy wall with holes from several places: weights in every other view, no colours in the third."""
+    """Return depth maps of a wavy wall with holes; every other view has weights, every third has no colours."""
     rng = np.random.default_rng(0)
     found = []
     for k in range(count):

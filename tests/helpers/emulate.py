@@ -26,26 +26,26 @@ from gs2d.kernels.cuda.launch import OneByOne
 HERE = Path(__file__).parent
 KERNELS = Path(gs2d.kernels.__file__).parent
 KEPT = HERE.parents[1] / "build" / "emulated"
-# As the GPU build: no contraction, and every fused multiply-add written out. -march only makes fmaf fast.
+# As in the GPU build: no contraction; every fused multiply-add is explicit. -march only makes fmaf fast.
 FLAGS = (
     "-std=c++17",
     "-O1",
     "-fPIC",
     "-shared",
-    "-fno-gnu-unique",  # no shared memory in common with another library
+    "-fno-gnu-unique",  # do not share static variables with other libraries
     "-ffp-contract=off",
     "-fno-math-errno",
     "-Wall",
     "-Wno-unknown-pragmas",
 )
 ADDRESSES = ("-fsanitize=address", "-fno-omit-frame-pointer", "-g")  # needs the run-time library in the process
-# -fsanitize=alignment of float4 included: a misaligned one is an error on a GPU.
+# Includes -fsanitize=alignment for float4: misaligned access is an error on a GPU.
 UNDEFINED = ("-fsanitize=undefined", "-fno-sanitize-recover=all", "-g")
 KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )?(\w+)\(')
 
 
 class EmulatedKernels:
-    """The kernels of some CUDA sources, as functions that run on the CPU."""
+    """Kernels of some CUDA sources as functions that run on the CPU."""
 
     def __init__(self, library: Path) -> None:
         self._dll = ctypes.CDLL(str(library))
@@ -60,9 +60,9 @@ class EmulatedKernels:
         descending: bool = False,
         seed: int = 0,
     ) -> None:
-        """Run a whole grid; RuntimeError with the emulator's words if threads do not meet at a collective.
+        """Run a whole grid; raise RuntimeError with the emulator's message if threads diverge at a collective.
 
-        With ``seed`` > 0 threads, warps and blocks run in an order of their own.
+        With ``seed`` > 0, threads, warps and blocks run in a random order.
         """
         function = self._dll[f"launch_{name}"]
         function.restype = ctypes.c_char_p
@@ -80,10 +80,10 @@ def build(
     addresses: bool = False,
     undefined: bool = False,
 ) -> EmulatedKernels:
-    """Compile, unless that was done. Skips without g++.
+    """Compile the sources unless a cached library exists. Skip without g++.
 
-    ``approximate``: with the largest errors of the approximate instructions. ``addresses``: with AddressSanitizer;
-    ``undefined``: undefined behaviour ends the process.
+    ``approximate``: apply the largest errors of the approximate instructions. ``addresses``: use AddressSanitizer;
+    ``undefined``: undefined behaviour aborts the process.
     """
     if shutil.which("g++") is None:
         pytest.skip("no g++ here, which runs the CUDA kernels on the CPU; install one")
@@ -98,7 +98,7 @@ def build(
     library = KEPT / f"{sources[0].stem}-{digest.hexdigest()[:24]}.so"
     KEPT.mkdir(parents=True, exist_ok=True)
     with library.with_suffix(".lock").open("w") as lock:
-        while not try_lock(lock.fileno()):  # another worker is at it
+        while not try_lock(lock.fileno()):  # another worker is compiling
             time.sleep(0.2)
         if not library.exists():
             compile_into(library, command, wrapper)
@@ -108,9 +108,9 @@ def build(
 
 
 def wrapper_of(sources: Sequence[Path]) -> str:
-    """Return the source of a library: the sources, and a function for each of their kernels."""
+    """Return the source of a library: the CUDA sources plus one function per kernel."""
     lines = [f'#include "{HERE / "emulator.h"}"']
-    lines.append("namespace gs2d {}\nusing namespace gs2d;")  # where our kernels live
+    lines.append("namespace gs2d {}\nusing namespace gs2d;")  # the namespace of our kernels
     lines += [f'#include "{path}"' for path in sources]
     signature = "(unsigned x, unsigned y, unsigned block, int order, const void* a)"
     for kernel in [kernel for source in sources for kernel in KERNEL.findall(source.read_text())]:
@@ -121,12 +121,12 @@ def wrapper_of(sources: Sequence[Path]) -> str:
 
 @functools.cache
 def compiler() -> str:
-    """Return which g++ this is."""
+    """Return the version of g++."""
     return subprocess.run(["g++", "--version"], capture_output=True, text=True, check=True).stdout
 
 
 def compile_into(library: Path, command: Sequence[str], wrapper: str) -> None:
-    """Compile; the library has its name when it is whole."""
+    """Compile to a temporary file, then rename it, so that the library is always complete."""
     source, made = library.with_suffix(".cpp"), library.with_suffix(".tmp")
     source.write_text(wrapper)
     words = [*command, str(source), "-o", str(made)]
@@ -137,7 +137,7 @@ def compile_into(library: Path, command: Sequence[str], wrapper: str) -> None:
 
 
 def forget_old() -> None:
-    """Remove what no test has wanted for a week: each change of a header makes all of them anew."""
+    """Remove libraries unused for a week: every header change creates new ones."""
     for path in KEPT.iterdir():
         if time.time() - path.stat().st_mtime > 7 * 24 * 3600 and path.suffix == ".so":
             for suffix in (".so", ".cpp", ".lock"):
@@ -148,7 +148,7 @@ def forget_old() -> None:
 class Emulator(OneByOne):
     """A launcher (``gs2d.kernels.cuda.launch``) that runs the package's kernels on tensors in host memory.
 
-    A source file is compiled when one of its kernels is first wanted.
+    Each source file is compiled when one of its kernels is first launched.
     """
 
     descending: bool = False

@@ -1,4 +1,4 @@
-"""Run every kernel of the package on sizes that are no multiple of a block, for the sanitizers."""
+"""Run every kernel of the package on sizes that are not multiples of a block, for the sanitizers."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ROOM = 1 << 12
 
 
 def rendering(emulator: Emulator, case: Case) -> dict[str, Tensor]:
-    """Images, all gradients in both ways of adding them up, and errors."""
+    """Return images, splat errors, and all gradients from both accumulation methods."""
     cotangents, found = random_cotangents(np.random.default_rng(1), case.camera), {}
 
     def render(name: str, trained: tuple[str, ...], settings: RasterSettings = SETTINGS, **options: object) -> None:
@@ -76,7 +76,7 @@ def rendering(emulator: Emulator, case: Case) -> dict[str, Tensor]:
 
 
 def losses(emulator: Emulator, case: Case) -> dict[str, Tensor]:
-    """Values and gradients of all losses."""
+    """Return values and gradients of all losses."""
     g, found = _numbers(), {}
     for size in ((37, 44), (1, 1), (12, 43)):
         x, y, m = torch.rand(*size, 3, generator=g), torch.rand(*size, 3, generator=g), torch.rand(*size, generator=g)
@@ -109,7 +109,7 @@ def losses(emulator: Emulator, case: Case) -> dict[str, Tensor]:
 
 
 def steps(emulator: Emulator) -> dict[str, Tensor]:
-    """Adam alone, on all rows, on some, and on a gradient of these alone."""
+    """Run Adam on all rows, on selected rows, and with a compact gradient for selected rows."""
     g, found = _numbers(), {}
     trained = torch.arange(57) % 2 == 0
     index = trained.nonzero().squeeze(1)
@@ -125,7 +125,7 @@ def steps(emulator: Emulator) -> dict[str, Tensor]:
 
 
 def whole_steps(emulator: Emulator, case: Case) -> dict[str, Tensor]:
-    """Iterations in one piece: photographs with and without alpha, all that learns and colours alone."""
+    """Run fused iterations: targets with and without alpha, training all parameters or only colours."""
     g, found = _numbers(), {}
     height, width, count = case.camera.height, case.camera.width, len(case.splats)
     stepper = Stepper(emulator, torch.device("cpu"))
@@ -161,7 +161,7 @@ def whole_steps(emulator: Emulator, case: Case) -> dict[str, Tensor]:
 
 
 def everything(emulator: Emulator) -> dict[str, Tensor]:
-    """What all kernels make of the same numbers; finite, all of it."""
+    """Return the results of all kernels for fixed inputs; all must be finite."""
     case = many_tiles()  # 70 x 45 px
     found = rendering(emulator, case) | losses(emulator, case) | steps(emulator) | whole_steps(emulator, case)
     assert all(bool(tensor.isfinite().all()) for tensor in found.values())

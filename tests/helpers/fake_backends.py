@@ -1,4 +1,4 @@
-"""Backends for tests: one with replaced methods, one with incomplete images."""
+"""Backends for tests: with replaced methods, or with incomplete images."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gs2d.render.pair_budget import PairBudget
 
 
 def altered(backend: Backend, **changes: Any) -> Backend:
-    """A copy in which these functions and values stand instead; functions get no ``self``."""
+    """Return a copy with replaced attributes; replacement functions get no ``self``."""
     changed = copy(backend)
     for name, value in changes.items():
         assert hasattr(backend, name), name
@@ -22,7 +22,7 @@ def altered(backend: Backend, **changes: Any) -> Backend:
 
 
 def cuda_on_host() -> Backend:
-    """The cuda backend for tensors in host memory, where an emulator is the launcher."""
+    """Return the cuda backend for tensors in host memory, with an emulator as launcher."""
 
     def for_training() -> Backend:
         return altered(CudaBackend(PairBudget()), device="cpu")
@@ -31,7 +31,7 @@ def cuda_on_host() -> Backend:
 
 
 def lacking(pairs: int) -> Backend:
-    """The cuda backend in an iteration that lacks so many pairs."""
+    """Return the cuda backend in an iteration that is short of ``pairs`` pairs."""
     budget = PairBudget()
     budget.overflow = torch.tensor(min(pairs, 1), dtype=torch.int32)
     return altered(CudaBackend(budget), device="cpu")

@@ -25,7 +25,7 @@ class Result(IntEnum):
     CUDA_ERROR_SOMETHING_NEW = 9999
 
 
-ARGUMENT_BYTES = 1024  # more than any structure has
+ARGUMENT_BYTES = 1024  # larger than any argument structure
 
 
 class Attribute(IntEnum):
@@ -34,7 +34,7 @@ class Attribute(IntEnum):
 
 @dataclass(frozen=True)
 class Launch:
-    """One launch as the driver saw it."""
+    """One launch as received by the driver."""
 
     kernel: str
     grid: tuple[int, int, int]
@@ -56,7 +56,7 @@ class NodeParameters:
 
 @dataclass
 class Node:
-    """A kernel of a graph, with a copy of its argument."""
+    """A kernel node of a graph, with a copy of its argument."""
 
     kernel: int
     after: list[int]
@@ -75,18 +75,18 @@ class Node:
 class FakeDriver:
     """The functions of ``cuda.bindings.driver`` that the launcher calls."""
 
-    emulator: Emulator | None = None  # runs what is launched, if given
-    argument_bytes: int = 0  # how many bytes of the argument to keep
+    emulator: Emulator | None = None  # if set, executes the launches
+    argument_bytes: int = 0  # number of argument bytes to record
     failing: dict[str, Result] = field(default_factory=dict)
-    current: list[int] = field(default_factory=lambda: [0])  # stack of contexts of the calling thread
+    current: list[int] = field(default_factory=lambda: [0])  # context stack of the calling thread
     loaded: list[bytes] = field(default_factory=list)
     launches: list[Launch] = field(default_factory=list)
     attributes: list[tuple[int, int, int, int]] = field(default_factory=list)
-    names: list[str] = field(default_factory=list)  # by handle - 1
+    names: list[str] = field(default_factory=list)  # index: handle - 1
     version: int = 12080
-    graphs: list[list[Node]] = field(default_factory=list)  # by handle - 1
-    replays: list[int] = field(default_factory=list)  # graphs that were started
-    changes: int = 0  # of nodes
+    graphs: list[list[Node]] = field(default_factory=list)  # index: handle - 1
+    replays: list[int] = field(default_factory=list)  # launched graphs
+    changes: int = 0  # number of node updates
 
     CUresult = Result
     CUfunction_attribute = Attribute
@@ -175,7 +175,7 @@ class FakeDriver:
 
 
 def launcher(driver: FakeDriver, index: int = 0, stream: int = 0, code: bytes = b"\x7fELF") -> GpuLauncher:
-    """The real launcher over a fake driver."""
+    """Return the real launcher on top of a fake driver."""
     return GpuLauncher(
         torch.device("cuda", index),
         driver=driver,

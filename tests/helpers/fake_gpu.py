@@ -21,9 +21,9 @@ from torch.utils._pytree import tree_flatten, tree_map_only
 from emulate import Emulator
 
 GPU = torch.device("cuda:0")
-CROSSES = {"aten::copy_", "aten::_to_copy"}  # what takes tensors of both
+CROSSES = {"aten::copy_", "aten::_to_copy"}  # operations that accept tensors of both devices
 
-# What torch needs to know of devices of this type, where it is built without them.
+# Device information that torch needs where it is built without CUDA.
 GUARD = """
 #include <c10/core/impl/DeviceGuardImplInterface.h>
 static c10::impl::DeviceGuardImplRegistrar registrar(
@@ -32,7 +32,7 @@ static c10::impl::DeviceGuardImplRegistrar registrar(
 
 
 class GpuTensor(Tensor):
-    """A tensor on the device; ``inner`` has its values."""
+    """A tensor on the device; ``inner`` holds its values."""
 
     inner: Tensor
 
@@ -63,7 +63,7 @@ class GpuTensor(Tensor):
 
 
 def run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
-    """One operation, on the values, its result where a GPU would have it."""
+    """Run one operation on the inner values and return its result on the device that a GPU would use."""
     tensors = [t for t in tree_flatten((args, kwargs))[0] if isinstance(t, Tensor)]
     there = any(isinstance(t, GpuTensor) for t in tensors)
     here = [t for t in tensors if not isinstance(t, GpuTensor) and t.dim() > 0]
@@ -84,14 +84,14 @@ def run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
 
 
 class _Everywhere(TorchDispatchMode):
-    """Also what makes tensors from none."""
+    """Mode that also intercepts functions creating tensors without tensor arguments."""
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         return run(func, args, kwargs or {})
 
 
 def backward(self: Tensor, gradient: Tensor | None = None) -> None:
-    """``Tensor.backward`` without torch's engine, which wants a real device: the graph in topological order."""
+    """``Tensor.backward`` without torch's engine, which needs a real device: visits the graph in topological order."""
     root: Any = self.grad_fn
     waiting: Counter[Any] = Counter()
     seen, todo = {root}, [root]
@@ -113,7 +113,7 @@ def backward(self: Tensor, gradient: Tensor | None = None) -> None:
                 if after is None:
                     continue
                 if gradient_of is not None:
-                    gradient_of = gradient_of.sum_to_size(after._input_metadata[number].shape)  # of what was expanded
+                    gradient_of = gradient_of.sum_to_size(after._input_metadata[number].shape)  # undo broadcasting
                     sums = given.setdefault(after, {})
                     sums[number] = sums[number] + gradient_of if number in sums else gradient_of
                 waiting[after] -= 1
@@ -131,12 +131,12 @@ def _applied(node: Any, inputs: dict[int, Tensor]) -> tuple[Tensor | None, ...]:
         return (None,) * len(node.next_functions)
     outputs = (getattr(node, "apply", None) or node)(*(inputs.get(i) for i in range(len(node._input_metadata))))
     outputs = outputs if isinstance(outputs, tuple) else (outputs,)
-    takes = getattr(node, "takes_tensors", None)  # of our own functions: what is no tensor has no edge in the graph
+    takes = getattr(node, "takes_tensors", None)  # gs2d's own functions: arguments that are not tensors have no edge
     return outputs if takes is None else tuple(g for g, is_tensor in zip(outputs, takes, strict=True) if is_tensor)
 
 
 def _noting_tensors(apply: Callable[..., Any]) -> Any:
-    """``Function.apply`` that leaves a note which arguments were tensors."""
+    """Wrap ``Function.apply`` to record which arguments were tensors."""
 
     def noting(cls: Any, *args: Any) -> Any:
         outputs = apply.__get__(None, cls)(*args)
@@ -149,7 +149,7 @@ def _noting_tensors(apply: Callable[..., Any]) -> Any:
 
 
 class _Event:
-    """Of a device that has always finished."""
+    """An event of a device that has always finished."""
 
     def __init__(self, **_: Any) -> None: ...
 
@@ -159,7 +159,7 @@ class _Event:
 
 
 def install(guard: str, emulator: Emulator) -> Counter[str]:
-    """From here on this process has a GPU; returns the launches by kernel, as they happen."""
+    """Install the fake GPU in this process; return the launches by kernel, updated as they happen."""
     from gs2d.kernels.cuda import launch
     from gs2d.render.backends import BACKENDS
     from gs2d.render.cuda_backend import CudaBackend
@@ -189,7 +189,7 @@ def install(guard: str, emulator: Emulator) -> Counter[str]:
     Tensor.pin_memory = lambda self: self.clone()  # type: ignore[assignment, method-assign]
     torch.autograd.Function.apply = _noting_tensors(vars(torch.autograd.Function)["apply"])
     launch.launcher_for = launcher_for
-    BACKENDS._things["cuda"] = lambda: CudaBackend()  # without looking for a GPU
-    torch._C._set_only_lift_cpu_tensors(True)  # torch.tensor(..., device="cuda") asks the mode below, too
+    BACKENDS._things["cuda"] = lambda: CudaBackend()  # skips GPU detection
+    torch._C._set_only_lift_cpu_tensors(True)  # the mode also intercepts torch.tensor(..., device="cuda")
     _Everywhere().__enter__()
     return launched

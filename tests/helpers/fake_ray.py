@@ -9,15 +9,15 @@ from typing import Any
 
 
 class WorkerCrashedError(Exception):
-    """As Ray's, by its name."""
+    """Has the name of Ray's exception."""
 
 
 class TaskCancelledError(Exception):
-    """As Ray's, by its name."""
+    """Has the name of Ray's exception."""
 
 
 class Remote:
-    """A remote function: done at once, in this process, where ``FakeRay.lost`` does not say that it is lost."""
+    """A remote function: runs immediately in this process unless ``FakeRay.lost`` lists it as lost."""
 
     def __init__(self, ray: FakeRay, function: Callable[..., Any], options: dict[str, Any]) -> None:
         self.ray, self.function, self.taken = ray, function, options
@@ -36,7 +36,7 @@ class Remote:
 
 
 class FakeRay(ModuleType):
-    """What gs2d uses of Ray."""
+    """The part of Ray's API that gs2d uses."""
 
     def __init__(self) -> None:
         super().__init__("ray")
@@ -84,7 +84,7 @@ class FakeRay(ModuleType):
 
 
 class FakeQueue:
-    """As ray.util.queue.Queue."""
+    """Behaves like ray.util.queue.Queue."""
 
     def __init__(self, actor_options: dict[str, Any]) -> None:
         assert actor_options["num_cpus"] == 0

@@ -1,4 +1,4 @@
-"""A tiny aerial capture, and options with which `gs2d blocks` takes seconds on it."""
+"""A tiny aerial capture, and options that make `gs2d blocks` take seconds on it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WORDS = (
 
 
 def write_tiny_flight(folder: Path, photographs: int = 12) -> Path:
-    """Write photographs of 32x24 over 120 m of land."""
+    """Write 32x24 images that cover 120 m of land."""
     write_flight(folder, Flight(photographs, width=32, height=24, points=400, side=120.0), threads=1)
     return folder
 
@@ -30,7 +30,7 @@ CHANGES = (*WORDS, "surface.densify.max_splats=600", *PARTITION)
 
 
 def tiny_blocks(capture: Path, out: Path, **changes: Any) -> BlocksOptions:
-    """Return options of 2x2 blocks of 18 iterations each."""
+    """Return options for 2x2 blocks of 18 iterations each."""
     options = BlocksOptions(
         scene=capture,
         out=out,
@@ -48,5 +48,5 @@ def tiny_blocks(capture: Path, out: Path, **changes: Any) -> BlocksOptions:
 
 
 def digest(path: Path) -> str:
-    """Return a hash of a file."""
+    """Return the hash of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()

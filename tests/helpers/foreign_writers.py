@@ -1,6 +1,6 @@
 """Write captures of other tools from known cameras and lenses, following the documentation of these tools.
 
-All have the same images (40x30, ``a_0.jpg`` ...) and, for comparison, the same cameras as a COLMAP model.
+All use the same images (40x30, ``a_0.jpg`` ...); the same cameras as a COLMAP model serve for comparison.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ WIDTH, HEIGHT = 40, 30
 
 @dataclass(frozen=True)
 class Lens:
-    """fx, fy, cx, cy in pixels from the corner; k of a polynomial; p1 and p2 of OpenCV."""
+    """fx, fy, cx, cy in pixels from the corner; polynomial coefficients k; OpenCV's p1 and p2."""
 
     fx: float = 35.0
     fy: float = 35.0
@@ -40,7 +40,7 @@ BENT = Lens(35.0, 36.0, 18.5, 16.25, (0.12, -0.05, 0.02), (0.004, -0.003))
 
 
 def poses(count: int = 9) -> dict[str, np.ndarray]:
-    """T_cam_world by name."""
+    """Return T_cam_world by name."""
     return {f"a_{i}.jpg": camera.T_cam_world for i, camera in enumerate(ring(count))}
 
 
@@ -57,7 +57,7 @@ def points(count: int = 30) -> tuple[np.ndarray, np.ndarray]:
 
 
 def as_colmap(root: Path, lens: Lens, count: int = 9) -> Path:
-    """The same capture as a COLMAP model."""
+    """Write the same capture as a COLMAP model."""
     model = ColmapModel(cameras={1: lens.colmap()})
     for index, (name, T) in enumerate(poses(count).items()):
         model.images.append((index + 1, T, 1, name, []))
@@ -69,7 +69,7 @@ def as_colmap(root: Path, lens: Lens, count: int = 9) -> Path:
 
 
 def opensfm_camera(lens: Lens) -> dict[str, Any]:
-    """Normalised by the larger side, from the middle of the image."""
+    """Return the camera normalised by the larger side, with its origin at the image centre."""
     k1, k2, k3 = (*lens.k, 0.0, 0.0, 0.0)[:3]
     return {
         "projection_type": "brown",
@@ -116,12 +116,12 @@ def small_opensfm(
     (root / where / "reconstruction.json").write_text(json.dumps(value))
 
 
-#: Where the chunk of the Metashape captures is: x_world = scale R x_chunk + t
+#: Pose of the chunk in Metashape captures: x_world = scale R x_chunk + t
 CHUNK = (2.5, Rotation.from_euler("zyx", [30, -20, 50], degrees=True).as_matrix(), np.array([1.0, -2.0, 3.0]))
 
 
 def metashape_transform(T_cam_world: np.ndarray, chunk: tuple[float, np.ndarray, np.ndarray] = CHUNK) -> str:
-    """The camera-to-chunk matrix as text, such that the chunk's similarity puts the camera where it is."""
+    """Return the camera-to-chunk matrix as text; the chunk's similarity maps it to ``T_cam_world``."""
     scale, R, t = chunk
     M = np.linalg.inv(T_cam_world)
     inside = np.eye(4)
@@ -140,7 +140,7 @@ def metashape_similarity(chunk: tuple[float, np.ndarray, np.ndarray] = CHUNK) ->
 
 
 def metashape_calibration(lens: Lens, extra: str = "", kind: str = "frame") -> str:
-    """Focal length fy, b1 = fx - fy; the tangential coefficients are OpenCV's the other way round."""
+    """Return a calibration with focal length fy, b1 = fx - fy, and OpenCV's tangential coefficients swapped."""
     k = "".join(f"<k{i + 1}>{value!r}</k{i + 1}>" for i, value in enumerate(lens.k))
     return (
         f"<calibration type='{kind}' class='adjusted'><resolution width='{WIDTH}' height='{HEIGHT}'/>"
@@ -165,7 +165,7 @@ def metashape_document(
 def small_metashape(
     root: Path, lens: Lens = OFF_CENTRE, *, more: str = "", labels: str = "{}", extra: str = "", kind: str = "frame"
 ) -> None:
-    """``labels``: how a photograph's name without its ending becomes a label; ``more``: cameras besides."""
+    """Write a Metashape capture. ``labels`` maps a file stem to a label; ``more`` adds cameras."""
     write_images(root / "images", poses())
     cameras = "".join(
         f"<camera id='{i}' sensor_id='0' label='{labels.format(name[:-4])}'><transform>{metashape_transform(T)}"
@@ -177,7 +177,7 @@ def small_metashape(
 
 
 def write_points(path: Path, offset: float = 0.0) -> None:
-    """An ASCII PLY of the points, as tools export them."""
+    """Write the points as an ASCII PLY, as tools export them."""
     xyz, rgb = points()
     rows = "".join(
         f"{float(x[0] + offset)!r} {float(x[1])!r} {float(x[2])!r} {c[0]} {c[1]} {c[2]}\n"
@@ -190,7 +190,7 @@ def write_points(path: Path, offset: float = 0.0) -> None:
 
 
 def alicevision_intrinsic(lens: Lens, version: tuple[int, int, int]) -> dict[str, Any]:
-    """As the version of the file has it."""
+    """Return the intrinsics in the layout of a file format version."""
     entry: dict[str, Any] = {
         "intrinsicId": "12",
         "width": str(WIDTH),

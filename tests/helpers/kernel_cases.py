@@ -30,18 +30,18 @@ def render(
     settings: RasterSettings,
     probe: Tensor | None = None,
 ) -> RenderOutput:
-    """Through the public function, as a backend."""
+    """Render through the public function, as a backend does."""
 
     def run(s: Splats, c: Camera, r: RasterSettings, p: Tensor | None = None) -> RenderOutput:
         return cuda.rasterize_with(launcher, s, c, r, p)
 
-    backend = altered(CudaBackend(), rasterize=run)  # errors are not asked for here
+    backend = altered(CudaBackend(), rasterize=run)  # splat errors are not requested here
     return rasterize(splats, camera, settings, backend=backend, screen_probe=probe)
 
 
 @dataclass(frozen=True)
 class Case:
-    """One random scene, float32."""
+    """A random scene, float32."""
 
     seed: int
     splats: Splats
@@ -49,7 +49,7 @@ class Case:
 
 
 def cases(count: int, kinds: tuple[str, ...] = KINDS) -> Iterator[Case]:
-    """Every third seed has small splats, every third large ones and many layers."""
+    """Return random cases: every third seed has small splats, every third large splats in many layers."""
     for seed in range(count):
         rng = np.random.default_rng(seed)
         camera = random_camera(rng)
@@ -63,12 +63,12 @@ def double(splats: Splats) -> Splats:
 
 
 def quantile(values: Tensor, q: float) -> float:
-    """Without torch's limit on the size."""
+    """Compute a quantile without torch's size limit."""
     return float(np.quantile(values.numpy(), q))
 
 
 def cases_with_margins(count: int = 60) -> list[Case]:
-    """Small scenes in which no decision is within 1e-4 of its threshold (ties of depth excluded)."""
+    """Return small scenes in which no decision is within 1e-4 of its threshold (depth ties excluded)."""
     clear = []
     for case in cases(count, tuple(kind for kind in KINDS if kind != "twins")):
         camera = case.camera.resized(min(case.camera.width, 8), min(case.camera.height, 8))
@@ -82,7 +82,7 @@ def cases_with_margins(count: int = 60) -> list[Case]:
 def gradients(
     run: Callable[..., RenderOutput], splats: Splats, camera: Camera, cotangents: dict[str, Tensor], columns: int
 ) -> dict[str, Tensor]:
-    """Vector-Jacobian products of all parameters and the probe."""
+    """Return vector-Jacobian products of all parameters and the probe."""
     scene = requiring_grad(splats)
     probe = torch.zeros(len(splats), columns, dtype=splats.dtype, requires_grad=True)
     contraction(run(scene, camera, SETTINGS, probe), cotangents).backward()
@@ -96,13 +96,13 @@ def gradients(
 
 def many_tiles() -> Case:
     rng = np.random.default_rng(5)
-    camera = random_camera(rng).resized(70, 45)  # no multiple of 16, 8 or 4
+    camera = random_camera(rng).resized(70, 45)  # not a multiple of 16, 8 or 4
     splats = random_splats(rng, camera, 150)
     return Case(5, replace(splats, log_scales=splats.log_scales - 0.7).to(dtype=torch.float32), camera)
 
 
 def crossing_tiles(seed: int) -> Case:
-    """Some of everything, most of it across the camera plane, in many tiles."""
+    """Return a scene with all kinds of splats, most of them crossing the camera plane, in many tiles."""
     rng = np.random.default_rng(seed)
     camera = random_camera(rng).resized(90, 70)
     splats = random_splats(rng, camera, 60, ("crossing", "crossing", "near_plane", "huge", "edge_on", "plain"))

@@ -1,9 +1,9 @@
-"""The commands that ``kill_runs`` ends at each of their calls: on what, how they are gone on with, what they leave.
+"""The commands that ``kill_runs`` interrupts at each file operation: inputs, how they resume, and their results.
 
-Everything is small, and each run is a fork of a process that has imported all that the command imports. Curves are
-drawn for the command ``report`` alone: they are made in memory and take most of the time of a training of 12
-iterations. For ``reconstruct`` a real search for the cameras is made once, and what COLMAP's process made is laid where
-it would make it again, file by file.
+Inputs are small, and each run is a fork of a process that has already imported every module the command needs.
+Curves are drawn only for the command ``report``: drawing happens in memory and takes most of the time of a training
+with 12 iterations. For ``reconstruct``, a real pose search runs once; later runs copy the files of COLMAP's process one
+by one.
 """
 
 from __future__ import annotations
@@ -39,23 +39,23 @@ from gs2d.pipeline.train.train_run import train
 from room_photos import write_room
 from tiny import write_capture
 
-DONE, REFUSED, FAULT = 0, 2, 1  # exit codes, as of gs2d
+DONE, REFUSED, FAULT = 0, 2, 1  # exit codes of gs2d
 FEW = ("init_points=40", "surface.densify.max_splats=60")
-SHORT = {  # the three stages on few views: as many kinds of files as in a long run
+SHORT = {  # all three stages with few views: the same kinds of files as in a long run
     "schedule_scale": 0.0002,
     "overrides": FEW,
     "checkpoint_every": 2,
     "page": True,
 }
 DATED = {"report.html", "run.json", "metrics.json", "verdict.json", "events.jsonl", ".lock", "poses.json"} | {
-    "about.json",  # times, names of folders
+    "about.json",  # times, folder names
     "index.html",
-    *("table.csv", "table.md", "table.tex"),  # what table.json says, seconds among it
+    *("table.csv", "table.md", "table.tex"),  # contents of table.json, including seconds
 }
 
 
 def started(work: Callable[[], object]) -> int:
-    """Do something in a child; its process."""
+    """Start ``work`` in a child and return its process id."""
     child = os.fork()
     if not child:
         code = FAULT
@@ -73,17 +73,17 @@ def started(work: Callable[[], object]) -> int:
 
 
 def ended(child: int) -> int:
-    """Wait for a child; its exit code, or minus the signal that ended it."""
+    """Wait for a child; return its exit code, or minus the signal that ended it."""
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
 def forked(work: Callable[[], object]) -> int:
-    """Do something in a child and wait for it."""
+    """Run ``work`` in a child and wait for it."""
     return ended(started(work))
 
 
 def draw_little() -> None:
-    """Replace every figure by one dot and the view of the mesh by a text, which takes no time."""
+    """Replace every figure by a dot and the mesh view by a text, which takes no time."""
     import matplotlib.figure
     from PIL import Image
 
@@ -101,7 +101,7 @@ def draw_little() -> None:
 
 
 def import_all(names: list[str]) -> None:
-    """Import what a child had imported at its end, so that no later child takes time for it; warm what is cached."""
+    """Import the modules that a child had imported at its end and warm caches, which speeds up later children."""
     from gs2d.report.html_parts import environment
 
     for name in names:
@@ -116,21 +116,21 @@ def import_all(names: list[str]) -> None:
 
 
 def undated(path: Path) -> Any:
-    """What a file holds, without times; None where it holds nothing that must be the same."""
+    """Return the contents of a file without times, or None if no content must be reproducible."""
     if path.name in DATED or path.suffix == ".pt" or path.parent.name == "jobs":
         return None
     return without_seconds(json.loads(path.read_text())) if path.name == "table.json" else path.read_bytes()
 
 
 def without_seconds(value: Any) -> Any:
-    """A document without the entries that are called so."""
+    """Return a document without entries named "seconds"."""
     if isinstance(value, dict):
         return {key: without_seconds(inner) for key, inner in value.items() if key != "seconds"}
     return [without_seconds(inner) for inner in value] if isinstance(value, list) else value
 
 
 class Command(ABC):
-    """One command: how it is begun on a fresh folder, gone on with after a kill, and what it leaves."""
+    """A command: how to start it in a fresh folder, how to resume it after a kill, and its results."""
 
     name = ""
     draws = False
@@ -142,24 +142,24 @@ class Command(ABC):
         self.arrange()
 
     def arrange(self) -> None:  # noqa: B027 (most commands begin with nothing)
-        """Make once what all runs of it begin with."""
+        """Create the inputs shared by all runs of the command."""
 
     def prepare(self, folder: Path) -> None:
-        """Make the folder as it is before the command."""
+        """Set up the folder as it is before the command."""
         folder.mkdir()
 
     def run(self, folder: Path) -> None:
-        """Do it, or go on with it, in a process of its own."""
+        """Run or resume the command in its own process."""
         if not self.draws:
             draw_little()
         self.act(folder)
 
     @abstractmethod
     def act(self, folder: Path) -> None:
-        """Do it."""
+        """Execute the command."""
 
     def leaves(self, folder: Path) -> dict[str, Any]:
-        """Return what may not depend on how often the command was killed: all names, and bytes without times."""
+        """Return the results that must not depend on interruptions: all names, and contents without times."""
         files = {str(path.relative_to(folder)): path for path in sorted(folder.rglob("*")) if path.is_file()}
         found = {name: undated(path) for name, path in files.items()}
         for path in [path.parent for path in files.values() if path.name == "run.json"]:
@@ -178,21 +178,21 @@ class Train(Command):
     name = "train"
 
     def act(self, folder: Path) -> None:
-        """From what is there."""
+        """Train, resuming from existing files."""
         train(options(self.capture, folder / "run", resume=True, **SHORT))
 
 
 class OfRun(Command):
-    """A command on a run that is trained."""
+    """A command on a trained run."""
 
     def arrange(self) -> None:
-        """Train it."""
+        """Train the run."""
         finished = self.work / "finished"
         if not finished.exists() and forked(lambda: train(options(self.capture, finished, **SHORT))) != DONE:
             raise SystemExit("the training before the command failed")
 
     def prepare(self, folder: Path) -> None:
-        """A copy of the run."""
+        """Copy the run."""
         shutil.copytree(self.work / "finished", folder / "run")
 
 
@@ -202,7 +202,7 @@ class Mesh(OfRun):
     name = "mesh"
 
     def act(self, folder: Path) -> None:
-        """Its mesh."""
+        """Mesh the run."""
         mesh_run(folder / "run")
 
 
@@ -212,7 +212,7 @@ class Export(OfRun):
     name = "export"
 
     def act(self, folder: Path) -> None:
-        """Its splats in two layouts."""
+        """Export the splats in two layouts."""
         export_run(folder / "run", folder / "out.spz")
         export_run(folder / "run", folder / "out.splat")
 
@@ -223,7 +223,7 @@ class Page(OfRun):
     name = "page"
 
     def act(self, folder: Path) -> None:
-        """Its page."""
+        """Export the page."""
         page_run(folder / "run")
 
 
@@ -233,18 +233,20 @@ class Report(OfRun):
     name, draws = "report", True
 
     def act(self, folder: Path) -> None:
-        """Its report."""
+        """Write the report."""
         report_run(folder / "run")
 
 
 class Sweep(Command):
-    """``gs2d sweep`` of two recipes of which the second goes on from a stage of the first; ``gs2d paper`` is the same
-    function with another list of recipes."""
+    """``gs2d sweep`` of two recipes; the second continues from a stage of the first.
+
+    ``gs2d paper`` calls the same function with other recipes.
+    """
 
     name = "sweep"
 
     def act(self, folder: Path) -> None:
-        """The table."""
+        """Compute the table."""
         result = paper(
             SweepOptions(
                 recipes=("2dgs", "2dgs-r"),
@@ -261,12 +263,12 @@ class Sweep(Command):
 
 
 class Reconstruct(Command):
-    """``gs2d reconstruct``, its COLMAP as it ended once."""
+    """``gs2d reconstruct`` with the recorded output of one COLMAP run."""
 
     name = "reconstruct"
 
     def arrange(self) -> None:
-        """Six photographs and one search for their cameras."""
+        """Write six images and estimate their poses once."""
         self.photos, self.searched = self.work / "photos", self.work / "searched"
         if not self.searched.exists():
             write_room(self.photos, 6)
@@ -308,14 +310,14 @@ class Reconstruct(Command):
         )
 
     def act(self, folder: Path) -> None:
-        """The capture and the run."""
+        """Write the capture and the run."""
         from gs2d.pipeline.prepare import pose_finding as sfm
 
         def again(request: Any, *_: Any) -> Any:
             try:
                 shutil.copyfile(self.searched / "database.db", request.database)
                 shutil.copytree(self.searched / "models", request.output, dirs_exist_ok=True)
-            except OSError as error:  # the process that stands in for COLMAP's ends: that is what is said of it
+            except OSError as error:  # the process that replaces COLMAP's fails: report it as COLMAP's failure
                 raise DataError("COLMAP ended") from error
             return pickle.loads((self.searched / "solved").read_bytes())
 

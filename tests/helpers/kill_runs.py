@@ -1,8 +1,8 @@
-"""Runs commands of gs2d once for each call that changes a file, and ends them, or fills the disk, at that call.
+"""Run gs2d commands once per file-changing call, and kill them, or fill the disk, at that call.
 
-A program of its own: ``failing_files.c`` must be loaded before Python is (LD_PRELOAD), and everything is imported once,
-each run is a fork. It prints a JSON object for each command and action: how many calls there are, by name, how many
-were tried, and what went wrong. By hand (docs/notebook/reliability.md)::
+This is a separate program: ``failing_files.c`` must be loaded before Python (LD_PRELOAD). Modules are imported once and
+each run is a fork. For each command and action it prints a JSON object: the number of calls by name, the number tried,
+and the failures. To run it by hand (docs/notebook/reliability.md)::
 
     cc -shared -fPIC -o /tmp/failing.so tests/helpers/failing_files.c -ldl
     LD_PRELOAD=/tmp/failing.so GS2D_FAILING_FILES=/tmp/failing.so PYTHONPATH=src:tests/helpers OMP_NUM_THREADS=1 \
@@ -35,30 +35,30 @@ from gs2d.io.run_dir import load_tensors
 from kill_commands import COMMANDS, DATED, DONE, REFUSED, Command, ended, forked, import_all, started
 from kill_states import States, gone_on_from, tree_of, watched
 
-AT_EACH_CALL = {"kill": -1, "tear": -2, "full": errno.ENOSPC}  # tear: half a write, or right after another call
+AT_EACH_CALL = {"kill": -1, "tear": -2, "full": errno.ENOSPC}  # tear: after half a write, or right after another call
 
 
 class Layer:
-    """The calls below a folder, counted and disturbed."""
+    """Counts and disturbs the file operations below a folder."""
 
     def __init__(self) -> None:
         self._library = ctypes.CDLL(os.environ["GS2D_FAILING_FILES"])
 
     def arm(self, folder: Path, number: int = -1, action: int = 0, record: int = -1) -> None:
-        """Count from now on in this process; do ``action`` at call ``number``."""
+        """Start counting in this process; apply ``action`` at call ``number``."""
         self._library.failing_arm(os.fsencode(folder), ctypes.c_long(number), action, record)
 
     def watch(self, folder: Path, told: int, answered: int) -> None:
-        """Tell each call from now on, and wait for an answer (``kill_states``)."""
+        """Report each call from now on and wait for a reply (``kill_states``)."""
         self._library.failing_watch(os.fsencode(folder), told, answered)
 
     def turn_back_the_clock(self) -> None:
-        """Let the wall clock of this process run backwards."""
+        """Make the wall clock of this process run backwards."""
         self._library.failing_clock()
 
 
 def half_written(folder: Path, whole: set[bytes] | None = None) -> list[str]:
-    """Return the files under their own names that are not whole; ``whole``: what was looked at before, and was."""
+    """Return incomplete files that have their final names; ``whole`` caches contents already checked as complete."""
     broken = []
     for path in folder.rglob("*"):
         if not path.is_file() or path.name.endswith(".tmp"):
@@ -85,7 +85,7 @@ def half_written(folder: Path, whole: set[bytes] | None = None) -> list[str]:
 
 @contextlib.contextmanager
 def scratch(work: Path) -> Iterator[Path]:
-    """A folder that is removed at the end."""
+    """Yield a temporary folder."""
     folder = work / "try"
     shutil.rmtree(folder, ignore_errors=True)
     yield folder
@@ -93,7 +93,7 @@ def scratch(work: Path) -> Iterator[Path]:
 
 
 def differing(found: dict[str, Any], expected: dict[str, Any]) -> list[str]:
-    """Return what differs, by name."""
+    """Return the names whose contents differ."""
     names = sorted(expected.keys() | found.keys())
     return [
         f"{name} " + ("is missing" if name not in found else "is left over" if name not in expected else "differs")
@@ -103,14 +103,14 @@ def differing(found: dict[str, Any], expected: dict[str, Any]) -> list[str]:
 
 
 def gone_on(command: Command, folder: Path, expected: dict[str, Any]) -> list[str]:
-    """Do the command again, and return what is then not as it should be."""
+    """Run the command again and return the differences from the expected result."""
     if forked(lambda: command.run(folder)) != DONE:
         return ["cannot be gone on with"]
     return differing(command.leaves(folder), expected)
 
 
 def disturbed_at(command: Command, layer: Layer, folder: Path, number: int, action: str) -> int:
-    """Do the command in a new folder, disturbed at one call; its exit code."""
+    """Run the command in a new folder with one call disturbed; return its exit code."""
     command.prepare(folder)
 
     def disturbed() -> None:
@@ -121,7 +121,7 @@ def disturbed_at(command: Command, layer: Layer, folder: Path, number: int, acti
 
 
 def at_call(command: Command, layer: Layer, number: int, action: str, expected: dict[str, Any]) -> list[str]:
-    """Disturb the command at one call, do it again, and return what is not as it should be."""
+    """Disturb the command at one call, run it again, and return the differences from the expected result."""
     with scratch(command.work) as folder:
         code = disturbed_at(command, layer, folder, number, action)
         allowed = (-signal.SIGKILL,) if action != "full" else (REFUSED, DONE)
@@ -133,7 +133,7 @@ def at_call(command: Command, layer: Layer, number: int, action: str, expected: 
 
 
 def at_every_call(command: Command, layer: Layer, given: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Look at all that is left by each action at each call, go on from it; the lines that are printed."""
+    """Check and resume from every state that each action leaves at each call; return the result lines."""
     actions = [action for action in given.actions.split(",") if action in AT_EACH_CALL]
     _, expected, _ = undisturbed(command, layer)
     with scratch(command.work) as folder:
@@ -161,7 +161,7 @@ def at_every_call(command: Command, layer: Layer, given: argparse.Namespace) -> 
 
 
 def check_states(command: Command, layer: Layer, folder: Path, states: States, given: argparse.Namespace) -> None:
-    """Disturb the command for real: what it leaves must be what was looked at, but for times."""
+    """Disturb the command for real and check that it leaves the recorded state, except for times."""
     for state in states.found.values():
         for action, numbers in state.left_by.items():
             for number in numbers:
@@ -176,7 +176,7 @@ def check_states(command: Command, layer: Layer, folder: Path, states: States, g
 
 
 def steady(name: str, data: bytes | None) -> bytes | bool:
-    """What a file holds, or half of it under a temporary name; whether it is one, where times are in it."""
+    """Return the contents of a file that must be reproducible; a temporary file counts only as present or absent."""
     whole = Path(name).name.removeprefix(".").removesuffix(".gs2d.tmp")
     dated = whole in DATED or f".{whole}" in DATED or whole.endswith((".pt", "table.json"))
     return data is not None if data is None or dated or "/jobs/" in name else data
@@ -185,7 +185,7 @@ def steady(name: str, data: bytes | None) -> bytes | bool:
 def at_random(
     command: Command, chance: random.Random, seconds: float, expected: dict[str, Any]
 ) -> tuple[list[str], int]:
-    """Kill the command at a time by chance, three times in turn; what is wrong then, and how many kills it felt."""
+    """Kill the command at random times, three times in a row; return the failures and the number of effective kills."""
     with scratch(command.work) as folder:
         command.prepare(folder)
         codes = []
@@ -194,12 +194,12 @@ def at_random(
             time.sleep(chance.uniform(0, seconds))
             os.kill(child, signal.SIGKILL)
             codes.append(ended(child))
-        kills = codes.count(-signal.SIGKILL)  # the others were through before
+        kills = codes.count(-signal.SIGKILL)  # the other runs had already finished
         return half_written(folder) + gone_on(command, folder, expected), kills
 
 
 def stopped_and_continued(command: Command, chance: random.Random, expected: dict[str, Any]) -> list[str]:
-    """Stop the command and let it go on, again and again."""
+    """Repeatedly stop and continue the command (SIGSTOP, SIGCONT)."""
     with scratch(command.work) as folder:
         command.prepare(folder)
         child = started(lambda: command.run(folder))
@@ -212,7 +212,7 @@ def stopped_and_continued(command: Command, chance: random.Random, expected: dic
 
 
 def with_the_clock_going_back(command: Command, layer: Layer, expected: dict[str, Any]) -> list[str]:
-    """Do the command while the clock on the wall runs backwards."""
+    """Run the command while the wall clock runs backwards."""
     with scratch(command.work) as folder:
         command.prepare(folder)
 
@@ -225,7 +225,7 @@ def with_the_clock_going_back(command: Command, layer: Layer, expected: dict[str
 
 
 def twice_at_once(command: Command, chance: random.Random, expected: dict[str, Any]) -> list[str]:
-    """Do the command twice in one folder, the second a little later: one at least is through, and the other refused."""
+    """Run the command twice in one folder, slightly offset: at least one must succeed, and the other may be refused."""
     with scratch(command.work) as folder:
         command.prepare(folder)
         first = started(lambda: command.run(folder))
@@ -237,7 +237,7 @@ def twice_at_once(command: Command, chance: random.Random, expected: dict[str, A
 
 
 def with_another_photograph(command: Command, layer: Layer, calls: int, expected: dict[str, Any]) -> list[str]:
-    """Kill the training half-way, change a photograph: it is refused, and goes on when the photograph is back."""
+    """Kill the training half-way and change an image: resuming is refused until the image is restored."""
     photograph = command.capture / "train" / "r_0.png"
     before = photograph.read_bytes()
     with scratch(command.work) as folder:
@@ -258,7 +258,7 @@ def with_another_photograph(command: Command, layer: Layer, calls: int, expected
 
 
 def undisturbed(command: Command, layer: Layer) -> tuple[list[str], dict[str, Any], float]:
-    """Return the calls of the command, one line each, what it leaves, and the seconds that it took."""
+    """Return the command's calls (one per line), its result, and its duration in seconds."""
     with scratch(command.work) as folder:
         command.prepare(folder)
         record, imported = command.work / "calls.txt", command.work / "imported.txt"
@@ -275,15 +275,15 @@ def undisturbed(command: Command, layer: Layer) -> tuple[list[str], dict[str, An
         seconds = time.monotonic() - began
         os.close(descriptor)
         import_all(imported.read_text().split())
-        gc.freeze()  # what is loaded is not looked through by each child
+        gc.freeze()  # children do not scan objects that are already loaded
         return record.read_text().splitlines(), command.leaves(folder), seconds
 
 
 def tries(command: Command, layer: Layer, action: str, given: argparse.Namespace) -> dict[str, Any]:
-    """Do all of one action to one command; the line that is printed."""
+    """Try one action on one command; return the result line."""
     calls, expected, seconds = undisturbed(command, layer)
     if action == "random":
-        seconds = undisturbed(command, layer)[2]  # all is imported now
+        seconds = undisturbed(command, layer)[2]  # all modules are imported by this point
     wrong: list[str] = []
     tried, kills, began, chance = 0, 0, time.monotonic(), random.Random(given.seed)
     numbers = range(given.first, len(calls), given.every) if action in AT_EACH_CALL else range(given.times)
@@ -311,7 +311,7 @@ def tries(command: Command, layer: Layer, action: str, given: argparse.Namespace
 
 
 def main() -> None:
-    """Disturb commands as the options say."""
+    """Disturb commands as selected by the options."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--commands", default=",".join(COMMANDS))
     parser.add_argument("--actions", default=",".join(AT_EACH_CALL), help="and random, stop, clock, twice, photograph")

@@ -1,13 +1,13 @@
-"""What a command leaves when it ends at any of its calls that change files: every such state, and each gone on from.
+"""Record every state that a command may leave when it ends at a file-changing call, and resume from each.
 
-The command runs once. It stands still before each call, and after half of each write, while its folder is looked at:
-that is what SIGKILL leaves there, for what a killed process wrote stays, and its locks go with it. Before each call
-that needs room a copy of the process (fork) goes on alone, with a full disk, until it ends; then the folder is as
-before and the first goes on. Many states are the same (fsync changes none, and who finds the disk full removes what it
-began): each is gone on from once, and judged for all calls that leave it.
+The command runs once. It pauses before each call, and after half of each write, while its folder is recorded. SIGKILL
+would leave exactly this state, because written data stays and locks are released. Before each call that needs disk
+space, a forked copy of the process continues with a full disk until it ends; then the folder is restored and the
+original continues. Many states are equal (fsync changes nothing; a process with a full disk removes its partial
+output). Each distinct state is resumed once, and the result applies to all calls that leave it.
 
-A copy has the thread alone that made the call: of a command that has others (``reconstruct``: those of its libraries)
-it may wait for ever. Such a one is run with a full disk from the start, call by call.
+A fork contains only the calling thread, so forks of multi-threaded commands (``reconstruct`` uses libraries with
+threads) may hang. Such commands are run with a full disk from the start, once per call.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from typing import Any
 
 from kill_commands import DONE, REFUSED, Command, ended, started
 
-Tree = dict[str, bytes | None]  # by name below the folder: what a file holds; None of a folder
+Tree = dict[str, bytes | None]  # by path below the folder: file contents; None for a folder
 
 
 def tree_of(folder: Path) -> Tree:
-    """Return all that is in a folder, in the order of names."""
+    """Return all contents of a folder, sorted by name."""
     found: Tree = {}
     for path in sorted(folder.rglob("*")):
         found[str(path.relative_to(folder))] = None if path.is_dir() else path.read_bytes()
@@ -35,7 +35,7 @@ def tree_of(folder: Path) -> Tree:
 
 
 def lay(tree: Tree, folder: Path) -> None:
-    """Make a folder hold this and nothing else."""
+    """Make a folder contain exactly this tree."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     for name, data in tree.items():
@@ -48,7 +48,7 @@ def lay(tree: Tree, folder: Path) -> None:
 
 @dataclass
 class State:
-    """What a folder held, and of which actions at which calls: ``{"kill": [3, 4], "tear": [3]}``."""
+    """Contents of a folder, and the calls that leave it, by action: ``{"kill": [3, 4], "tear": [3]}``."""
 
     tree: Tree
     left_by: dict[str, list[int]] = field(default_factory=dict)
@@ -62,10 +62,10 @@ class States:
 
     calls: list[str] = field(default_factory=list)  # "write /run/x"
     found: dict[bytes, State] = field(default_factory=dict)
-    ended_wrong: list[str] = field(default_factory=list)  # of copies with a full disk
+    ended_wrong: list[str] = field(default_factory=list)  # copies with a full disk that failed
 
     def note(self, tree: Tree, action: str, number: int) -> State:
-        """Add what an action at a call leaves."""
+        """Add the state that an action leaves at a call."""
         digest = sha256()
         for name, data in tree.items():
             digest.update(repr((name, data is None, len(data or b""))).encode() + (data or b""))
@@ -75,7 +75,7 @@ class States:
 
 
 class _Kept:
-    """A folder as it was before another process went on in it: the same files (inodes: some are open)."""
+    """Snapshot of a folder, restored after another process changed it; inodes are kept because some files are open."""
 
     def __init__(self, folder: Path, tree: Tree) -> None:
         self.folder, self.tree, self.links = folder, tree, folder.with_name(folder.name + "-kept")
@@ -105,15 +105,15 @@ class _Kept:
 
 
 class Look:
-    """One run of a command that is looked at: what the layer tells, and what is noted of it."""
+    """One observed run of a command: reads the layer's messages and records states."""
 
     def __init__(self, folder: Path, actions: list[str]) -> None:
         self.folder, self.actions, self.states = folder, actions, States()
-        self.torn = True  # whether the last call has its state for "tear"
+        self.torn = True  # whether the last call has its "tear" state
         self.kept: _Kept | None = None
 
     def hear(self, line: str) -> bytes:
-        """Note what the folder holds now; what is answered: "c" to go on, "f" for a copy with a full disk."""
+        """Record the folder; return the reply: "c" to continue, "f" to fork a copy with a full disk."""
         kind, _, rest = line.partition(" ")
         tree, calls = tree_of(self.folder), self.states.calls
         if kind == "B":
@@ -135,13 +135,13 @@ class Look:
         return b"c"
 
     def after(self, tree: Tree) -> None:
-        """What is here after half of the last call, if that was a write, else after it: torn there, it leaves this."""
+        """Record the state after half of the last call if it was a write, or after the call: its "tear" state."""
         if not self.torn:
             self.states.note(tree, "tear", len(self.states.calls) - 1)
         self.torn = True
 
     def on_full_disk(self, tree: Tree, code: int) -> None:
-        """A copy with a full disk has ended."""
+        """Record the result of a copy with a full disk."""
         number = len(self.states.calls) - 1
         state = self.states.note(tree, "full", number)
         if code not in (REFUSED, DONE):
@@ -151,16 +151,16 @@ class Look:
 
 
 def watched(command: Command, layer: Any, folder: Path, actions: list[str]) -> States:
-    """Run the command once, in the end undisturbed, and return what the actions at each of its calls leave.
+    """Run the command once, undisturbed in the end, and return the states that the actions leave at each call.
 
     Parameters
     ----------
     layer
         The layer of ``kill_runs``.
     folder
-        Where the command works; it is there afterwards, as the command left it.
+        The command's working folder; afterwards it contains the command's result.
     actions
-        Of kill, tear and full.
+        A subset of kill, tear and full.
     """
     told, answered = os.pipe(), os.pipe()
 
@@ -172,7 +172,7 @@ def watched(command: Command, layer: Any, folder: Path, actions: list[str]) -> S
     child = started(looked_at)
     os.close(told[1]), os.close(answered[0])
     look = Look(folder, actions)
-    while line := os.read(told[0], 1 << 16):  # the process waits after each: one line at a time
+    while line := os.read(told[0], 1 << 16):  # the process waits after each line, so one line arrives at a time
         os.write(answered[1], look.hear(line.decode(errors="surrogateescape").rstrip("\n")))
     os.close(told[0]), os.close(answered[1])
     if (code := ended(child)) != DONE:
@@ -182,7 +182,7 @@ def watched(command: Command, layer: Any, folder: Path, actions: list[str]) -> S
 
 
 def gone_on_from(states: States, folder: Path, judge: Callable[[Path], list[str]], seconds: float) -> int:
-    """Lay each state into the folder, add what ``judge`` says of it; the number that there was time for."""
+    """Restore each state and collect the failures that ``judge`` returns; return the number of states checked in time."""
     began, done = time.monotonic(), 0
     for state in states.found.values():
         if time.monotonic() - began > seconds:

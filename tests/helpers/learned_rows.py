@@ -1,4 +1,4 @@
-"""Learned quantities for tests: a state with its rows, and a single update."""
+"""Learned quantities for tests: a training state with its rows, and single updates."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from gs2d.training.state import TrainState
 
 
 def begun(state: TrainState, recipe: Recipe, scene: Scene) -> TrainState:
-    """Return the state with the rows that training of a recipe starts from."""
+    """Return the state at the start of training, including learned rows."""
     state.learned = LearnedTable(recipe, scene).start(state.splats.means, {})
     return state
 
 
 class Learner:
-    """The table of a recipe and its rows, float32 where they lie beside the splats."""
+    """The table of a recipe's learned quantities and their rows; rows are float32 when stored beside the splats."""
 
     def __init__(self, recipe: Recipe, scene: Scene) -> None:
         self.table = LearnedTable(recipe, scene)
@@ -33,5 +33,5 @@ class Learner:
         self.table.update(self.rows, index, {name: shaped}, {name: rate}, backend)
 
     def numbers(self, name: str, index: int) -> torch.Tensor:
-        """Return the numbers of a view."""
+        """Return the values of a view."""
         return self.table.quantities[name].numbers(self.rows[name].values, index)

@@ -1,4 +1,4 @@
-"""Cameras, rendered images and depths for the tests of the losses."""
+"""Cameras, rendered images and depths for loss tests."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gs2d.render.types import RenderOutput
 
 
 def make_camera(width: int, height: int) -> Camera:
-    """A camera with nothing symmetric about it."""
+    """Return a camera without symmetries."""
     T = look_at(
         np.array([1.0, -2.0, 0.7]), np.zeros(3), np.array([0.1, 0.2, 1.0]), width=width, height=height, fx=1.0
     ).T_cam_world
@@ -19,7 +19,7 @@ def make_camera(width: int, height: int) -> Camera:
 
 
 def make_output(height: int, width: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> RenderOutput:
-    """Random images that could come from a rasterizer, all requiring gradients."""
+    """Return random images like those of a rasterizer; all require gradients."""
     g = torch.Generator().manual_seed(seed)
 
     def rand(*shape: int) -> Tensor:
@@ -37,7 +37,7 @@ def make_output(height: int, width: int, seed: int = 0, dtype: torch.dtype = tor
 
 
 def plane_depth(camera: Camera, normal_world: np.ndarray, offset: float) -> Tensor:
-    """Exact z-depth [H, W] of the plane {X: normal . X = offset}."""
+    """Return the exact z-depth [H, W] of the plane {X: normal . X = offset}."""
     i, j = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = np.stack([(i - camera.cx) / camera.fx, (j - camera.cy) / camera.fy, np.ones_like(i)], axis=-1)
     rays_world = rays @ camera.rotation  # z = 1 along each ray

@@ -1,4 +1,4 @@
-"""Seeded weights of LPIPS's networks, in the keys of the published files."""
+"""Seeded weights for LPIPS's networks, under the keys of the published files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gs2d.evaluation.lpips import BLOCKS, WIDTHS
 
 
 def vgg_state(seed: int = 0) -> dict[str, Tensor]:
-    """Random weights under the keys of torchvision's VGG-16, small layers scaled to keep activations alive."""
+    """Return random weights under the keys of torchvision's VGG-16, scaled to keep small layers active."""
     g = torch.Generator().manual_seed(seed)
     state, width_in = {}, 3
     for layers, width in zip(BLOCKS, WIDTHS, strict=True):
@@ -22,6 +22,6 @@ def vgg_state(seed: int = 0) -> dict[str, Tensor]:
 
 
 def head_state(seed: int = 1) -> dict[str, Tensor]:
-    """Random non-negative heads under the keys of the lpips package."""
+    """Return random non-negative heads under the keys of the lpips package."""
     g = torch.Generator().manual_seed(seed)
     return {f"lin{b}.model.1.weight": torch.rand(1, width, 1, 1, generator=g) for b, width in enumerate(WIDTHS)}

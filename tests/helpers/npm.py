@@ -1,4 +1,4 @@
-"""Pinned npm packages that read our files in tests."""
+"""Pinned npm packages that read gs2d's files in tests."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ VERSIONS = {"gltf-validator": "2.0.0-dev.3.10", "@playcanvas/splat-transform": "
 
 
 def package(name: str) -> Path:
-    """Return the folder of a package, installed for this run of the tests; skip where npm cannot."""
+    """Return the folder of a package, installed for this test run; skip if npm cannot install it."""
     if shutil.which("npm") is None or shutil.which("node") is None:
         pytest.skip("there is no npm on this machine")
     failure = _installed(name)
@@ -32,7 +32,7 @@ def _home() -> Path:
 
 @cache
 def _installed(name: str) -> str:
-    """Return why a package could not be installed; "" where it was."""
+    """Return why a package could not be installed, or "" on success."""
     words = ["npm", "install", "--ignore-scripts", "--no-audit", "--no-fund", f"{name}@{VERSIONS[name]}"]
     try:
         done = subprocess.run(words, cwd=_home(), capture_output=True, text=True, timeout=240)
@@ -42,7 +42,7 @@ def _installed(name: str) -> str:
 
 
 def forget() -> None:
-    """Remove what was installed."""
+    """Remove the installed packages."""
     if _home.cache_info().currsize:
         shutil.rmtree(_home(), ignore_errors=True)
     _home.cache_clear()
@@ -50,14 +50,14 @@ def forget() -> None:
 
 
 def node(script: str, *words: str) -> str:
-    """Run JavaScript in the folder of the packages and return what it prints."""
+    """Run JavaScript in the packages' folder and return its output."""
     done = subprocess.run(["node", "-e", script, *words], cwd=_home(), capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout
 
 
 def splat_transform(*words: str | Path) -> None:
-    """Convert splats by the field's converter, on the CPU."""
+    """Convert splats with splat-transform on the CPU."""
     program = package("@playcanvas/splat-transform") / "bin" / "cli.mjs"
     done = subprocess.run(
         ["node", str(program), "-q", "-w", "-g", "cpu", *map(str, words)], capture_output=True, text=True, timeout=240

@@ -1,4 +1,4 @@
-"""Captures of DTU and Tanks and Temples with their official files on disk, from the seeded scenes."""
+"""Write DTU and Tanks and Temples captures with their official files, from the seeded scenes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gs2d.core.camera import look_at
 from gs2d.io.ply_format import write_ply
 from oracle_scenes import DtuScene, TntScene, dtu_scene, moved, similarity, tnt_scene
 
-T_MM = similarity(12.0, np.eye(3), (5, -3, 0))  # the scene's unit is 12 mm
+T_MM = similarity(12.0, np.eye(3), (5, -3, 0))  # one scene unit is 12 mm
 
 
 def write_points(path: Path, points: np.ndarray) -> None:
@@ -25,7 +25,7 @@ def write_points(path: Path, points: np.ndarray) -> None:
 
 
 def write_tnt_capture(folder: Path, name: str = "Truck") -> tuple[Path, Path, TntScene]:
-    """``TrainingSet/Truck`` with a text model, and ``GT/Truck``; returns capture, ground truth and scene."""
+    """Write ``TrainingSet/Truck`` with a text model, and ``GT/Truck``; return capture, ground truth and scene."""
     scene = tnt_scene(0)
     root, truth = folder / "TrainingSet" / name, folder / "GT" / name
     (root / "images").mkdir(parents=True)
@@ -60,7 +60,7 @@ def write_log(path: Path, poses: np.ndarray) -> None:
 
 
 def write_dtu_capture(folder: Path) -> tuple[Path, Path, DtuScene]:
-    """``DTU/scan24`` in the frame of T_MM, all of it silhouette, and ``Official`` beside it."""
+    """Write ``DTU/scan24`` in the frame of T_MM, with full silhouettes, and ``Official`` beside it."""
     scene = dtu_scene(0)
     root, official = folder / "DTU/scan24", folder / "Official"
     (root / "image").mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""Seeded scenes that ``scripts/oracle_open3d.py`` and the tests score: numpy only, the same bits for both."""
+"""Seeded scenes scored by ``scripts/oracle_open3d.py`` and the tests; NumPy only, so that both get the same bits."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def moved(T: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def hills(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Height over [-1, 1]^2: no symmetry, slopes up to about 1."""
+    """Return heights over [-1, 1]^2 without symmetry, with slopes up to about 1."""
     bump = np.exp(-8 * ((x - 0.3) ** 2 + (y + 0.2) ** 2))
     return 0.25 * np.sin(3 * x + 0.4) * np.cos(2 * y - 0.7) + 0.2 * bump + 0.1 * x * y
 
 
 def grid_mesh(cells: int, half: float, height: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of a height field over [-half, half]^2."""
+    """Return vertices and faces of a height field over [-half, half]^2."""
     line = np.linspace(-half, half, cells + 1)
     x, y = (a.ravel() for a in np.meshgrid(line, line))
     i = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
@@ -50,7 +50,7 @@ def grid_mesh(cells: int, half: float, height: Any) -> tuple[np.ndarray, np.ndar
 class TntScene:
     """A capture, and the official files of its scene as arrays.
 
-    ``vertices``, ``faces``, ``centers`` are in the capture's frame; ``T_truth_capture`` is what alignment should find.
+    ``vertices``, ``faces`` and ``centers`` are in the capture's frame; ``T_truth_capture`` is the expected alignment.
     """
 
     vertices: np.ndarray
@@ -65,9 +65,9 @@ class TntScene:
 
 
 def tnt_scene(seed: int = 0, *, T_log_capture: np.ndarray | None = None) -> TntScene:
-    """Hills, scanned with 2 mm of noise, reconstructed with 60 mm of waves and a hole.
+    """Return hills scanned with 2 mm of noise, and their reconstruction with 60 mm waves and a hole.
 
-    The log of the 60 cameras is 1 % too large, some centimetres aside, and has 5 mm of noise.
+    The log of the 60 cameras is 1 % too large, shifted by a few centimetres, and has 5 mm of noise.
     """
     rng = np.random.default_rng(seed)
     xy = rng.uniform(-1.1, 1.1, (12_000, 2))
@@ -111,7 +111,7 @@ class DtuScene:
 
 
 def dtu_scene(seed: int = 0) -> DtuScene:
-    """Hills of 24 mm, scanned every 0.3 mm or so; the mesh is 0.4 mm too high, has waves, and a piece in the air."""
+    """Return hills of 24 mm, scanned about every 0.3 mm; the mesh is 0.4 mm too high, has waves and a floating piece."""
     rng = np.random.default_rng(seed)
     xy = rng.uniform(-12, 12, (7000, 2))
     scan = np.column_stack([xy, 12 * hills(*(xy / 12).T)])
@@ -121,7 +121,7 @@ def dtu_scene(seed: int = 0) -> DtuScene:
     faces = np.concatenate([faces, more + len(vertices)]).astype(np.int32)
     bounds = np.array([[-14.0, -14, -10], [14, 14, 20]])
     observed = np.ones((15, 15, 16), np.uint8)
-    observed[:3] = 0  # x below -8.9 or so is not observed
+    observed[:3] = 0  # x below about -8.9 is not observed
     return DtuScene(
         np.concatenate([vertices, piece]), faces, np.concatenate([scan, table]), observed, bounds,
         np.array([0.0, 0, 1, 6]),

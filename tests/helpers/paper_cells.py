@@ -1,4 +1,4 @@
-"""Table cells and rows without training, and a schedule of seconds for a trained one."""
+"""Table cells and rows without training, and a short schedule for trained ones."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def make_row(name: str, *cells: Cell, paper: Mapping[str, Any] | None = None) ->
 
 
 def draw_nothing(patch: pytest.MonkeyPatch) -> None:
-    """No reports and figures, which draw curves for seconds and have tests of their own."""
+    """Disable reports and figures: drawing takes seconds and is tested elsewhere."""
     for module in ("train.train_run", "finish.run_report"):
         patch.setattr(f"gs2d.pipeline.{module}.report_run", lambda path, *_: path)
     patch.setattr("gs2d.contrib.lab.figures.write_figures", _draw_labels)
 
 
 def _draw_labels(runs: Mapping[str, Path], out: Path, *_: object, maps: Sequence[str]) -> tuple[Path, ...]:
-    """In place of ``write_figures``: a drawing that says what was to be drawn."""
+    """Replace ``write_figures``: write an image that only lists the requested figures."""
     out.mkdir(parents=True, exist_ok=True)
     (out / "traces.svg").write_text(f"{sorted(runs)} {sorted(maps)}")
     return (out / "traces.svg",)

@@ -1,4 +1,4 @@
-"""Run commands of gs2d on the cluster of ``ray_nodes.py``, and kill its processes."""
+"""Run gs2d commands on the cluster of ``ray_nodes.py``, and kill its processes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NODES = Path(__file__).with_name("ray_nodes.py")
 
 @contextlib.contextmanager
 def cluster_of(count: int) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Start a head without CPUs and so many nodes with one each; yields the program, and the address."""
+    """Start a head without CPUs and ``count`` nodes with one CPU each; yield the process and the address."""
     with subprocess.Popen(
         [sys.executable, str(NODES), str(count)],
         stdin=subprocess.PIPE,
@@ -33,7 +33,7 @@ def cluster_of(count: int) -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 
 def lose(cluster: subprocess.Popen[str], *which: int) -> None:
-    """Let nodes lose their processes (all, where none is named), and wait until others are there."""
+    """Kill the processes of nodes (all by default), and wait until new nodes have joined."""
     assert cluster.stdin is not None
     assert cluster.stdout is not None
     cluster.stdin.write(" ".join(["lose", *map(str, which)]) + "\n")
@@ -42,7 +42,7 @@ def lose(cluster: subprocess.Popen[str], *which: int) -> None:
 
 
 def blocks_words(capture: Path, job: Path, address: str, schedule: float) -> list[str]:
-    """Return the words that do what ``tiny_blocks`` does, on a cluster."""
+    """Return command-line words equivalent to ``tiny_blocks``, on a cluster."""
     words = ["blocks", str(capture), "--out", str(job), "--blocks", "2x2", "--recipe", "2dgs", "--robust", "off"]
     words += [
         "--set",
@@ -58,7 +58,7 @@ def blocks_words(capture: Path, job: Path, address: str, schedule: float) -> lis
 
 
 def begin(words: list[str], code: str = "", stderr: int | IO[str] = subprocess.PIPE) -> subprocess.Popen[str]:
-    """Begin a command of gs2d, after some code."""
+    """Start a gs2d command after running ``code``."""
     program = f"import sys, gs2d; {code}\nfrom gs2d.cli import main; main()"
     environment = {name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"}
     return subprocess.Popen(
@@ -71,7 +71,7 @@ def begin(words: list[str], code: str = "", stderr: int | IO[str] = subprocess.P
 
 
 def read_until(process: subprocess.Popen[str], words: str) -> str:
-    """Read what a command says until these words; all of it so far."""
+    """Read a command's output until ``words`` appear; return everything read so far."""
     assert process.stderr is not None
     found = ""
     for line in process.stderr:
@@ -82,7 +82,7 @@ def read_until(process: subprocess.Popen[str], words: str) -> str:
 
 
 def below(process: int) -> Iterator[int]:
-    """Yield the processes below one (Linux)."""
+    """Yield the descendants of a process (Linux)."""
     with contextlib.suppress(OSError):
         for thread in Path(f"/proc/{process}/task").iterdir():
             for child in (thread / "children").read_text().split():
@@ -91,7 +91,7 @@ def below(process: int) -> Iterator[int]:
 
 
 def workers(cluster: int, names: tuple[str, ...]) -> list[int]:
-    """Return the processes of a cluster that do a task with such a name."""
+    """Return the cluster processes that run a task with one of these names."""
     found = []
     for process in below(cluster):
         with contextlib.suppress(OSError):

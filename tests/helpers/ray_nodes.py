@@ -1,7 +1,7 @@
-"""Start a Ray cluster of several nodes on this machine: prints its address and executes commands from stdin.
+"""Start a Ray cluster of several nodes on this machine; print its address and execute commands from stdin.
 
-``lose`` kills the processes of all nodes with CPUs (or of the numbered ones) and starts new nodes. The cluster ends
-with its input.
+``lose`` kills the processes of all nodes with CPUs (or of the numbered nodes) and starts new nodes. The cluster stops
+when stdin closes.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from typing import Any
 from ray.cluster_utils import Cluster
 
 SMALL = {"object_store_memory": 80_000_000}
-TRIES = 5  # of a node to come, on a machine with other work
+TRIES = 5  # attempts to start a node on a busy machine
 
 
 def another_node(cluster: Cluster) -> Any:
-    """Return a node that has come to the cluster; Ray gives up waiting for it early."""
+    """Add a node to the cluster and return it; retries because Ray's timeout is short."""
     for left in reversed(range(TRIES)):
         try:
             return cluster.add_node(num_cpus=1, num_gpus=0, **SMALL)

@@ -1,6 +1,6 @@
-"""An independent renderer for the contract tests: one pixel and one splat at a time, in world space, in float64.
+"""Independent renderer for the contract tests: one pixel and one splat at a time, in world space, in float64.
 
-Intersects rays with planes directly (no homogeneous map), and returns the margin of every threshold decision.
+Intersects rays with planes directly (no homogeneous transform), and returns the margin of every threshold decision.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ class Oracle:
     margin: float = np.inf
 
     def decide(self, value: float, threshold: float) -> bool:
-        """value >= threshold, noting how close it was."""
+        """Return value >= threshold, and record the margin."""
         self.margin = min(self.margin, abs(value - threshold) / max(abs(value), abs(threshold), 1e-12))
         return value >= threshold
 
 
 def render(splats: Splats, camera: Camera, s: RasterSettings) -> Oracle:
-    """Rules 1 to 11 for finite splats."""
+    """Render finite splats by rules 1 to 11."""
     H, W = camera.height, camera.width
     out = Oracle(
         {k: np.zeros((H, W)) for k in ("alpha", "depth_mean", "depth_median", "distortion")}

@@ -1,4 +1,4 @@
-"""Scenes for the rasterizer tests: single splats, and random scenes with edge cases."""
+"""Scenes for rasterizer tests: single splats, and random scenes with edge cases."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from gs2d.render.types import RenderOutput
 
 IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
 RED, GREEN, BLUE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
-Y_AXIS = (0.0, 1.0, 0.0)  # a turn by d degrees about y: t_u = (cos d, 0, -sin d), t_w = (sin d, 0, cos d)
+Y_AXIS = (0.0, 1.0, 0.0)  # a rotation by d degrees about y: t_u = (cos d, 0, -sin d), t_w = (sin d, 0, cos d)
 C0 = 0.5 / math.sqrt(math.pi)  # value of the degree-0 spherical harmonic
 
 
 def equal(actual: Tensor | float | list[float], expected: Tensor | float | list[float] | list[list[float]]) -> None:
-    """Equal up to float32 rounding."""
+    """Assert equality up to float32 rounding."""
     actual, expected = torch.as_tensor(actual).detach().double(), torch.as_tensor(expected).double()
     assert_close(actual, expected, rtol=2e-5, atol=2e-6)
 
 
 @contextmanager
 def repeatable(backend: Backend) -> Iterator[None]:
-    """Renderings have gradients of the same bits each time: on a GPU only by torch's switch, sums are atomics'."""
+    """Make gradients bit-identical between runs: on a GPU this needs torch's switch, because sums use atomics."""
     torch.use_deterministic_algorithms(backend.name == "cuda")
     try:
         yield
@@ -40,7 +40,7 @@ def repeatable(backend: Backend) -> Iterator[None]:
 
 
 def front_camera(width: int = 9, height: int = 9, focal: float = 10.0, **change: float) -> Camera:
-    """At the origin, looking along +z; principal point at the image's middle (a pixel centre where sizes are odd)."""
+    """Return a camera at the origin along +z, principal point at the image centre (a pixel centre for odd sizes)."""
     values = {"fx": focal, "fy": focal, "cx": width / 2, "cy": height / 2} | change
     return Camera(width, height, values["fx"], values["fy"], values["cx"], values["cy"], np.eye(4))
 
@@ -54,7 +54,7 @@ def splat(
     degrees: float = 0.0,
     dtype: torch.dtype = torch.float32,
 ) -> Splats:
-    """One splat, rotated by ``degrees`` about ``axis``; unrotated it lies in the plane z = const, normal +z."""
+    """Return one splat, rotated by ``degrees`` about ``axis``; unrotated, it lies in the plane z = const, normal +z."""
     half = math.radians(degrees) / 2
     n = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
     quat = [math.cos(half), *(math.sin(half) * n)]
@@ -70,17 +70,17 @@ def splat(
 
 
 def stack(*parts: Splats) -> Splats:
-    """Several scenes as one, rows in order."""
+    """Concatenate scenes; rows keep their order."""
     return Splats(**{f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Splats)})
 
 
 def requiring_grad(splats: Splats) -> Splats:
-    """A copy whose tensors are leaves with ``requires_grad``."""
+    """Return a copy whose tensors are leaves with ``requires_grad``."""
     return Splats(**{name: t.detach().clone().requires_grad_() for name, t in splats.items()})
 
 
 def random_camera(rng: np.random.Generator) -> Camera:
-    """A small image, unequal focal lengths, a principal point off the middle, a random pose near the origin."""
+    """Return a camera with a small image, unequal focal lengths, off-centre principal point, and pose near the origin."""
     width, height = (int(rng.integers(5, 40)) for _ in range(2))
     rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     rotation *= np.sign(np.linalg.det(rotation))
@@ -95,7 +95,7 @@ KINDS = ("plain", "edge_on", "huge", "tiny", "transparent", "opaque", "behind", 
 
 
 def random_splats(rng: np.random.Generator, camera: Camera, count: int, kinds: tuple[str, ...] = KINDS) -> Splats:
-    """Random splats in front of a camera, each of one of the kinds; float64."""
+    """Return random splats in front of a camera, each of a random kind; float64."""
     W, H = camera.width, camera.height
     pixel = np.stack([rng.uniform(-0.1 * W, 1.1 * W, count), rng.uniform(-0.1 * H, 1.1 * H, count)], axis=1)
     z = rng.uniform(1.0, 6.0, count)
@@ -117,7 +117,7 @@ def random_splats(rng: np.random.Generator, camera: Camera, count: int, kinds: t
         quats[i] = _edge_on_quat(means[i] - camera.center, rng)
     means_t = torch.tensor(means)
     for i in np.flatnonzero(kind == "twins"):
-        if i > 0:  # an exact copy of the row before: equal depth, order by index
+        if i > 0:  # an exact copy of the previous row: equal depths are ordered by index
             means_t[i] = means_t[i - 1]
             quats[i], scales[i], opacity[i] = quats[i - 1], scales[i - 1], opacity[i - 1]
     return Splats(
@@ -131,14 +131,14 @@ def random_splats(rng: np.random.Generator, camera: Camera, count: int, kinds: t
 
 
 def _edge_on_quat(view: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A rotation whose third column is across ``view`` up to 1e-3 rad."""
+    """Return a rotation whose third column is perpendicular to ``view`` up to 1e-3 rad."""
     normal = np.cross(view, rng.normal(size=3))
     normal = normal / np.linalg.norm(normal) + rng.normal(size=3) * 1e-3
     normal /= np.linalg.norm(normal)
     first = np.cross(normal, rng.normal(size=3))
     first /= np.linalg.norm(first)
     m = np.stack([first, np.cross(normal, first), normal], axis=1)
-    # Quaternion of a rotation matrix by the eigenvector form (no branches): the top eigenvector of Bar-Itzhack's K.
+    # Quaternion of a rotation matrix without branches: the top eigenvector of Bar-Itzhack's K.
     K = np.array(
         [
             [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
@@ -151,7 +151,7 @@ def _edge_on_quat(view: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def contraction(output: RenderOutput, cotangents: dict[str, Tensor]) -> Tensor:
-    """Sum over images of <image, cotangent>: its gradient is a vector-Jacobian product."""
+    """Sum <image, cotangent> over all images: its gradient is a vector-Jacobian product."""
     total = output.color.new_zeros(())
     for name, cotangent in cotangents.items():
         total = total + (getattr(output, name) * cotangent.to(output.color.dtype)).sum()
@@ -159,6 +159,6 @@ def contraction(output: RenderOutput, cotangents: dict[str, Tensor]) -> Tensor:
 
 
 def random_cotangents(rng: np.random.Generator, camera: Camera) -> dict[str, Tensor]:
-    """A standard normal cotangent for every image; float64."""
+    """Return a standard normal cotangent for every image; float64."""
     shape = {name: (camera.height, camera.width, 3) for name in ("color", "normal")}
     return {name: torch.tensor(rng.normal(size=shape.get(name, (camera.height, camera.width)))) for name in IMAGES}

@@ -1,4 +1,4 @@
-"""Write a small run folder with every file that a report reads."""
+"""Write a small run folder that contains every file a report reads."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def write_renders(folder: Path, width: int, height: int) -> None:
 
 
 def fabricate(folder: Path, *, size: int = 48, height: int | None = None) -> Path:
-    """A whole run; photographs are square without a height."""
+    """Write a complete run; images are square unless ``height`` is set."""
     folder.mkdir(parents=True)
     write_json(folder / "run.json", definition())
     surface = {

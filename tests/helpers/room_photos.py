@@ -1,4 +1,4 @@
-"""Synthetic images of the corner of a room with textured walls, for tests of structure from motion."""
+"""Synthetic images of a room corner with textured walls, for structure-from-motion tests."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ STORED = {
     3: Image.Transpose.ROTATE_180,
     6: Image.Transpose.ROTATE_90,
     8: Image.Transpose.ROTATE_270,
-}  # EXIF -> to store
-_CELLS = 512  # of a texture, over 4 world units
+}  # EXIF orientation -> transposition to store
+_CELLS = 512  # cells per texture, over 4 world units
 
 
 def textures(seed: int = 0) -> np.ndarray:
-    """Noise of several scales [3, _CELLS, _CELLS, 3] in [0, 255]: corners wherever one looks, none like another."""
+    """Return multi-scale noise [3, _CELLS, _CELLS, 3] in [0, 255], with unique corner features everywhere."""
     rng = np.random.default_rng(seed)
     out = np.zeros((3, _CELLS, _CELLS, 3))
     for cells, weight in ((16, 1.0), (32, 1.2), (64, 1.0)):
@@ -36,8 +36,8 @@ def textures(seed: int = 0) -> np.ndarray:
 
 
 def room_image(camera: Camera, walls: np.ndarray) -> np.ndarray:
-    """uint8 [H, W, 3]: floor z = 0 and walls x = 0, y = 0 of the octant x, y, z > 0, each with its own texture."""
-    samples = 2  # along each side of a pixel
+    """Render the octant x, y, z > 0 as uint8 [H, W, 3]: floor z = 0, walls x = 0 and y = 0, each with its own texture."""
+    samples = 2  # per pixel side
     rows, columns = (np.mgrid[: camera.height * samples, : camera.width * samples] + 0.5) / samples
     rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], axis=-1)
     rays = rays @ camera.rotation
@@ -56,7 +56,7 @@ def room_image(camera: Camera, walls: np.ndarray) -> np.ndarray:
 
 
 def room_cameras(count: int, *, width: int = SIZE, height: int = SIZE, focal: float = FOCAL) -> list[Camera]:
-    """Cameras on an arc before the corner, level, at changing heights and distances, that look at it."""
+    """Return level cameras on an arc in front of the corner, at varying heights and distances, that look at it."""
     cameras = []
     for i, angle in enumerate(np.radians(np.linspace(15, 75, count))):
         radius, rise = 3.0 + 0.35 * np.sin(2.1 * i), 1.2 + 0.45 * np.sin(1.3 * i)
@@ -67,7 +67,7 @@ def room_cameras(count: int, *, width: int = SIZE, height: int = SIZE, focal: fl
 
 
 def write_room(folder: Path, count: int = 12, *, seed: int = 0, suffix: str = ".jpg", start: int = 0) -> list[Camera]:
-    """Write the photographs ``000.jpg`` ...; returns their true cameras."""
+    """Write the images ``000.jpg`` ...; return their true cameras."""
     folder.mkdir(parents=True, exist_ok=True)
     cameras, walls = room_cameras(count), textures(seed)
     for i, camera in enumerate(cameras):
@@ -76,7 +76,7 @@ def write_room(folder: Path, count: int = 12, *, seed: int = 0, suffix: str = ".
 
 
 def write_walk(folder: Path, count: int = 8) -> None:
-    """Write photographs of someone who walks along a wall and looks ahead: no two from places side by side."""
+    """Write the images of a walk along a wall, looking ahead: no two cameras are side by side."""
     folder.mkdir(parents=True, exist_ok=True)
     walls = textures()
     for i, far in enumerate(np.linspace(3.9, 3.0, count)):
@@ -86,7 +86,7 @@ def write_walk(folder: Path, count: int = 8) -> None:
 
 
 def turn_file(path: Path, orientation: int) -> None:
-    """Store a picture as a camera held otherwise stores it: turned, with the EXIF orientation that turns it back."""
+    """Store an image as a rotated camera stores it: rotated, with the EXIF orientation that rotates it back."""
     with Image.open(path) as file:
         stored = file.transpose(STORED[orientation])
     exif = Image.Exif()
@@ -96,7 +96,7 @@ def turn_file(path: Path, orientation: int) -> None:
 
 @dataclass(frozen=True)
 class Room:
-    """Photographs, the capture made of them, what the command printed, and the true cameras by name."""
+    """Images, the capture made of them, the command's output, and the true cameras by name."""
 
     photos: Path
     capture: Path
@@ -105,12 +105,12 @@ class Room:
 
 
 def found_room(root: Path) -> Room:
-    """Return twelve photographs, three stored turned, beside a file that is none, with what `gs2d poses` finds."""
+    """Run `gs2d poses` on twelve images, three stored rotated, and one file that is not an image."""
     cameras = write_room(root / "photos", 12)
     for i, orientation in ((2, 6), (5, 8), (9, 3)):
         turn_file(root / "photos" / f"{i:03}.jpg", orientation)
     (root / "photos" / "notes.txt").write_text("corner, noon")
-    out = root / "captures" / "room"  # its folder is made too
+    out = root / "captures" / "room"  # the command also creates the parent folder
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         assert run(["poses", str(root / "photos"), "--out", str(out), "--json", "--threads", "2"]) == 0
     names = {f"{i:03}.jpg": camera for i, camera in enumerate(cameras)}

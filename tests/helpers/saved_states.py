@@ -1,4 +1,4 @@
-"""Training states as checkpoint bytes, and back."""
+"""Convert training states to checkpoint bytes and back."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def saved(trainer: Trainer) -> bytes:
 
 
 def resumed_everywhere(scene: Scene, recipe: Recipe, backend: str, every: int = 5) -> Splats:
-    """Train, resume from the state at each ``every``-th event, and return what all of them end with."""
+    """Train, resume from the state at each ``every``-th event, and return all final states."""
     saves: list[bytes] = []
     trainer = Trainer(
         scene,

@@ -1,4 +1,4 @@
-"""Splats for tests of file formats, and the angle between rotations."""
+"""Splats for file format tests, and the angle between rotations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gs2d.io.gaussians import unit_quats
 
 
 def a_scene(n: int = 700, degree: int = 3, seed: int = 1) -> Splats:
-    """Splats as training makes them: small disks in a box of 4 units."""
+    """Return splats like those of training: small discs in a box of 4 units."""
     g = torch.Generator().manual_seed(seed)
     k = (degree + 1) ** 2 - 1
     return Splats(
@@ -24,6 +24,6 @@ def a_scene(n: int = 700, degree: int = 3, seed: int = 1) -> Splats:
 
 
 def turned_by(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Degrees between rotations."""
+    """Return the angle between rotations in degrees."""
     dot = np.abs((unit_quats(a) * unit_quats(b)).sum(axis=1))
     return np.degrees(2 * np.arccos(np.clip(dot, 0, 1)))

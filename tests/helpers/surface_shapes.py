@@ -1,4 +1,4 @@
-"""Volumes from formulas, and properties of meshes."""
+"""Volumes defined by formulas, and mesh properties."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from gs2d.meshing.tsdf_volume import BLOCK, VOXELS, Volume
 
 
 def limits(half: float, voxel: float, truncation: float | None = None, depth_limit: float = 100.0) -> FusionBounds:
-    """A cube of half side ``half`` around the origin."""
+    """Return a cube of half side ``half`` around the origin."""
     trunc = truncation if truncation is not None else 5 * voxel
     low, high = (-half, -half, -half), (half, half, half)
     return FusionBounds(low, high, 2 * half, voxel, trunc, depth_limit, 1.0, 1.0, voxel, 0.0)
 
 
 def volume_of(field: Callable[[np.ndarray], np.ndarray], lim: FusionBounds, blocks: int) -> Volume:
-    """A volume of blocks^3 blocks, all known, that holds a field of points [P, 3] -> [P]."""
+    """Return a volume of blocks^3 observed blocks filled from a field of points [P, 3] -> [P]."""
     dims = (blocks, blocks, blocks)
     corner = np.stack(np.unravel_index(np.arange(blocks**3), dims), axis=1) * BLOCK
     local = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK,) * 3), axis=1)
@@ -31,14 +31,14 @@ def volume_of(field: Callable[[np.ndarray], np.ndarray], lim: FusionBounds, bloc
 
 
 def dense(volume: Volume) -> np.ndarray:
-    """The field of ``volume_of`` as one array [n, n, n]."""
+    """Return the field of ``volume_of`` as one array [n, n, n]."""
     b = volume.dims[0]
     cubes = volume.tsdf.reshape(b, b, b, BLOCK, BLOCK, BLOCK)
     return cubes.transpose(0, 3, 1, 4, 2, 5).reshape(b * BLOCK, b * BLOCK, b * BLOCK)
 
 
 def edge_uses(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Every undirected edge [E, 2], how many faces use it [E], and how many of those walk it upwards [E]."""
+    """Return undirected edges [E, 2], their face counts [E], and how many faces traverse them in ascending order [E]."""
     f = mesh.faces.astype(np.int64)
     directed = np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]])
     edges, inverse, uses = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True)
@@ -47,7 +47,7 @@ def edge_uses(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def is_closed_manifold(mesh: Mesh) -> bool:
-    """Every edge has exactly two faces, which walk it in opposite directions."""
+    """Check that every edge has exactly two faces, which traverse it in opposite directions."""
     _, uses, upward = edge_uses(mesh)
     return bool((uses == 2).all() and (upward == 1).all())
 
@@ -58,20 +58,20 @@ def area(mesh: Mesh) -> float:
 
 
 def signed_volume(mesh: Mesh) -> float:
-    """Enclosed volume, positive when faces look outward."""
+    """Return the enclosed volume, positive if faces point outward."""
     t = mesh.vertices.astype(np.float64)[mesh.faces]
     return float(np.einsum("fi,fi->f", t[:, 0], np.cross(t[:, 1], t[:, 2])).sum() / 6)
 
 
 def rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Camera centre [3] and, for each pixel centre, the world step [H, W, 3] that goes one unit deep."""
+    """Return the camera centre [3] and, per pixel centre, the world-space step of unit depth [H, W, 3]."""
     v, u = np.mgrid[0 : camera.height, 0 : camera.width]
     local = np.stack([(u + 0.5 - camera.cx) / camera.fx, (v + 0.5 - camera.cy) / camera.fy, np.ones(u.shape)], -1)
     return camera.center, local @ camera.rotation
 
 
 def sphere_depth(camera: Camera, radius: float, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
-    """z-depth of a sphere at pixel centres: |o + s d - c| = r, the nearer root; 0 where it is missed."""
+    """Return the z-depth of a sphere at pixel centres: the nearer root of |o + s d - c| = r, or 0 if missed."""
     o, d = rays(camera)
     oc = o - np.asarray(center)
     a, b, c = (d * d).sum(-1), d @ oc, oc @ oc - radius**2
@@ -80,7 +80,7 @@ def sphere_depth(camera: Camera, radius: float, center: tuple[float, float, floa
 
 
 def box_depth(camera: Camera, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """z-depth of an axis-aligned box at pixel centres (slab method); 0 where it is missed."""
+    """Return the z-depth of an axis-aligned box at pixel centres (slab method); 0 if missed."""
     o, d = rays(camera)
     d = np.where(np.abs(d) < 1e-12, 1e-12, d)
     s = np.stack([(lower - o) / d, (upper - o) / d])
@@ -89,7 +89,7 @@ def box_depth(camera: Camera, lower: np.ndarray, upper: np.ndarray) -> np.ndarra
 
 
 def orbit(count: int, distance: float, size: int = 96, focal: float = 120.0) -> list[Camera]:
-    """Cameras all round the origin, at golden-angle steps."""
+    """Return cameras all around the origin, at golden-angle steps."""
     k = np.arange(count)
     z = 1 - 2 * (k + 0.5) / count
     angle = k * np.pi * (3 - np.sqrt(5))

@@ -11,7 +11,7 @@ from gs2d.pipeline.prepare.options import TrainOptions
 
 
 def make_jobs(folder: Path, keys: dict[str, tuple[str, ...]]) -> tuple[TrainingTask, ...]:
-    """Jobs by name with the keys of their stages; their capture is an empty folder, so that training fails at once."""
+    """Return jobs by name with the keys of their stages; the capture is an empty folder, so training fails at once."""
     return tuple(
         TrainingTask(
             name=name,
@@ -24,7 +24,7 @@ def make_jobs(folder: Path, keys: dict[str, tuple[str, ...]]) -> tuple[TrainingT
 
 
 def fail_or_die(job: TrainingTask, _device: str | None) -> None:
-    """What a process of its own does in place of training: that of "b" is killed, the others fail."""
+    """Replace training in a child process: the job "b" is killed, the others fail."""
     if job.name == "b":
         os.kill(os.getpid(), signal.SIGKILL)
     job.write("failed", reason="no photographs")

@@ -14,12 +14,12 @@ WIDTH, HEIGHT = 640, 480
 def synthetic_model(
     pycolmap: Any, model: str, params: tuple[float, ...], *, count: int = 12, points: int = 400, noise: float = 0.3
 ) -> Any:
-    """A model whose observations are exact but for ``noise`` px (Gaussian), through a lens of these parameters."""
+    """Return a model with observations through a lens of these parameters, with Gaussian ``noise`` in px."""
     rng = np.random.default_rng(0)
     piece = pycolmap.Reconstruction()
     lens = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=list(params), camera_id=1)
     piece.add_camera_with_trivial_rig(lens)
-    xyz = rng.uniform(-1.6, 1.6, (points, 3))  # to the corners of the pictures
+    xyz = rng.uniform(-1.6, 1.6, (points, 3))  # reaches the image corners
     numbers = [piece.add_point3D(p, pycolmap.Track(), np.zeros(3, np.uint8)) for p in xyz]
     for i, angle in enumerate(np.linspace(0, 2.5, count)):
         eye = np.array([4 * np.cos(angle), 4 * np.sin(angle), 1 + 0.8 * np.sin(3 * angle)])

@@ -16,7 +16,7 @@ ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
 def raw_screen_of(words: list[str], *, columns: int, env: dict[str, str] | None = None, command: str = "gs2d") -> str:
-    """Return what `python -m COMMAND WORDS` writes to a terminal, escapes and all, stdout and stderr together."""
+    """Return what `python -m COMMAND WORDS` writes to a terminal (stdout and stderr), including escape sequences."""
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
     plain = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES", "NO_COLOR")}
@@ -26,7 +26,7 @@ def raw_screen_of(words: list[str], *, columns: int, env: dict[str, str] | None 
         while True:
             try:
                 chunk = os.read(ours, 1 << 16)
-            except OSError:  # how Linux tells that the other end is closed
+            except OSError:  # on Linux: the other end is closed
                 return
             if not chunk:
                 return

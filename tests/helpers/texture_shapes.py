@@ -1,4 +1,4 @@
-"""Shapes whose colour is a formula of the position, and ray-cast images of them."""
+"""Shapes whose colour is a function of position, and ray-cast images of them."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from gs2d.core.mesh import Mesh
 from gs2d.meshing.raycast import cast_camera
 from gs2d.meshing.texture import Atlas, ColorSource, ColorSources
 
-Paint = Callable[[np.ndarray], np.ndarray]  # places [n, 3] to colours [n, 3] in [0, 1]
+Paint = Callable[[np.ndarray], np.ndarray]  # points [n, 3] to colours [n, 3] in [0, 1]
 
 
 def grid_plane(n: int = 8, side: float = 2.0, z: float = 0.0) -> Mesh:
-    """A square of 2 n^2 triangles across the z axis, seen from +z counter-clockwise."""
+    """Return a square of 2 n^2 triangles perpendicular to z, counter-clockwise as seen from +z."""
     ticks = np.linspace(-side / 2, side / 2, n + 1)
     x, y = np.meshgrid(ticks, ticks, indexing="xy")
     vertices = np.stack([x, y, np.full_like(x, z)], axis=-1).reshape(-1, 3)
@@ -26,7 +26,7 @@ def grid_plane(n: int = 8, side: float = 2.0, z: float = 0.0) -> Mesh:
 
 
 def box(n: int = 6) -> Mesh:
-    """The cube [-1, 1]^3 of 12 n^2 triangles, outwards."""
+    """Return the cube [-1, 1]^3 of 12 n^2 triangles that face outwards."""
     side = grid_plane(n, z=1.0)
     turns = [np.eye(3), np.diag([1.0, -1.0, -1.0])]
     turns += [np.array([[0, 0, s], [0, 1, 0], [-s, 0, 0]], float) for s in (1, -1)]
@@ -35,26 +35,26 @@ def box(n: int = 6) -> Mesh:
 
 
 def join(meshes: list[Mesh]) -> Mesh:
-    """One mesh of several pieces."""
+    """Concatenate meshes into one."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     vertices = np.concatenate([mesh.vertices for mesh in meshes])
     return Mesh(vertices, np.concatenate([m.faces + int(s) for m, s in zip(meshes, starts, strict=False)]))
 
 
 def flat_atlas(mesh: Mesh) -> Atlas:
-    """The atlas of a mesh in [-1, 1]^2: its x and y are the texture's, y upwards; pieces behind others are not cut."""
+    """Return an atlas that maps x and y in [-1, 1]^2 to the texture, y up; overlapping pieces are not separated."""
     uv = (0.5 + 0.5 * mesh.vertices[:, :2] * (1, -1)).astype(np.float32)
     return Atlas(mesh, np.arange(len(mesh.vertices)), mesh.faces, uv, charts=1)
 
 
 def checkers(places: np.ndarray) -> np.ndarray:
-    """Squares of a third, rounded at the edges to two hundredths, in colours that follow the place."""
+    """Return squares of side 1/3 with edges blurred over 0.02, in colours that depend on the position."""
     wave = np.prod(np.tanh(np.sin(3 * np.pi * (places + 0.1)) * 8), axis=1)[:, None]
     return np.asarray(0.5 + 0.2 * places * (1, -1, 1) + 0.25 * wave * (1.0, 0.6, -0.4))
 
 
 def photograph(mesh: Mesh, camera: Camera, paint: Paint, gain: float = 1.0, samples: int = 3) -> ColorSource:
-    """What the camera sees, unlit, RGBA with straight alpha."""
+    """Render the unlit mesh as RGBA with straight alpha."""
     hits = cast_camera(mesh.vertices.astype(np.float64), mesh.faces, camera, samples=samples)
     hit = hits.face >= 0
     places = np.einsum("hk,hkc->hc", hits.weights[hit], mesh.vertices[mesh.faces[hits.face[hit]]])
@@ -66,7 +66,7 @@ def photograph(mesh: Mesh, camera: Camera, paint: Paint, gain: float = 1.0, samp
 
 
 def ring(count: int, distance: float = 4.0, size: int = 96, turn: float = 0.0) -> list[Camera]:
-    """Cameras around the z axis, in turn from above and from below."""
+    """Return cameras around the z axis, alternating between above and below."""
     cameras = []
     for i in range(count):
         angle, rise = 2 * np.pi * i / count + turn, (0.75, -0.65)[i % 2]
@@ -76,11 +76,11 @@ def ring(count: int, distance: float = 4.0, size: int = 96, turn: float = 0.0) -
 
 
 def above(height: float, size: int = 64, focal: float = 64.0) -> Camera:
-    """A camera on the z axis that looks down; its image's x is the world's x."""
+    """Return a camera on the z axis that looks down; image x is world x."""
     down = np.array([0.0, 0, height])
     return look_at(down, np.zeros(3), np.array([0.0, 1, 0]), width=size, height=size, fx=focal)
 
 
 def listed(images: list[ColorSource]) -> ColorSources:
-    """Images in memory, read as often as they are needed."""
+    """Return images held in memory, readable any number of times."""
     return lambda factor: (image.shrunk(factor) for image in images)

@@ -12,11 +12,11 @@ from gs2d.core.camera import Camera, look_at
 
 SIZE = 24
 ANGLE = 0.7  # radians, field of view
-RADIUS = 0.8  # of the ball, world units
+RADIUS = 0.8  # ball radius, world units
 
 
 def ball_image(camera: Camera) -> np.ndarray:
-    """RGBA uint8 [H, W, 4] of the ball at the origin: red, green and blue follow x, y, z; mottled."""
+    """Render the ball at the origin as RGBA uint8 [H, W, 4]; red, green and blue follow x, y, z, with mottling."""
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
     rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], axis=-1)
     rays = rays @ camera.rotation
@@ -30,7 +30,7 @@ def ball_image(camera: Camera) -> np.ndarray:
 
 
 def ball_cameras(count: int, size: int = SIZE, phase: float = 0.0) -> list[Camera]:
-    """Cameras on a rising spiral around the ball."""
+    """Return cameras on a rising spiral around the ball."""
     focal = 0.5 * size / np.tan(ANGLE / 2)
     cameras = []
     for i in range(count):
@@ -54,7 +54,7 @@ def write_capture(folder: Path, *, train: int = 6, test: int = 2, size: int = SI
 
 
 def write_ball_mesh(path: Path, rings: int = 24) -> None:
-    """The ball's surface as a PLY mesh."""
+    """Write the ball's surface as a PLY mesh."""
     from gs2d.core.mesh import Mesh
     from gs2d.io.meshes import write_mesh
 

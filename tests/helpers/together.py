@@ -1,7 +1,7 @@
-"""A batch of several views in one process for comparison, and a program that trains toys in several processes.
+"""Single-process batches of several views for comparison, and a program that trains toys in several processes.
 
-As a program (``python together.py CASE,CASE FOLDER``), each process runs the cases in order and writes the results to
-``FOLDER/CASE.RANK.pt``. Ranks are in the environment, as with torchrun.
+Run as a program (``python together.py CASE,CASE FOLDER``), each process runs the cases in order and writes the results
+to ``FOLDER/CASE.RANK.pt``. Ranks come from the environment, as with torchrun.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from wall_scene import wall
 
 
 class Batch(OneProcess):
-    """One process that does what several do: renders the views of an iteration one by one, and takes the mean."""
+    """Emulates several processes in one: renders the views of an iteration one by one and averages the gradients."""
 
     def __init__(self, views: int) -> None:
         self.place = ProcessRank(0, views, 0, 1)
@@ -77,7 +77,7 @@ class Batch(OneProcess):
 
 
 def _own_signal(result: StepResult) -> StepResult:
-    """Return a result whose signal no later view adds to: they have one probe."""
+    """Return a result with its own copy of the signal: all views share one probe, which accumulates."""
     if result.signal is None:
         return result
     signal = result.signal.clone()
@@ -86,30 +86,30 @@ def _own_signal(result: StepResult) -> StepResult:
 
 
 def learning() -> Recipe:
-    """``short`` with exposures and poses learned from the third iteration on."""
+    """Return ``short`` with exposures and poses learned from the third iteration on."""
     return short().with_learned(*(replace(quantity, start=2, decay_steps=20) for quantity in (EXPOSURE, POSES)))
 
 
 def cached() -> Recipe:
-    """Stage 2 is long enough for cached views; ``ROOM`` is for four of the six."""
+    """Return a recipe whose stage 2 is long enough for cached views; ``ROOM`` holds four of the six."""
     first, second, _ = short().stages
     return Recipe("cached", (replace(first, iterations=3), replace(second, iterations=25)))
 
 
 def dropping() -> Recipe:
-    """Splats are left out of iterations, and views compared with their neighbours."""
+    """Return a recipe with splat dropout and multi-view losses."""
     return replace(compared(), removal=Removal(decay=0.0, dropout=0.3))
 
 
 def robust() -> Recipe:
-    """15 iterations on a wall: a dense start, and floaters removed."""
+    """Return 15 iterations on a wall, with a dense start and floater removal."""
     made = scale_schedule(with_robustness(two_dgs()), 0.0005)
     start = DenseStart(side=48, min_angle=1.0)
     made = replace(made, dense_start=start, removal=Removal(every=5, decay=0.1))
     return replace(made, stages=(replace(made.stages[0], densify=None),), sh_degree=1)
 
 
-ROOM = 90_000  # bytes of each process for cached views
+ROOM = 90_000  # bytes per process for cached views
 RECIPES: dict[str, Callable[[], Recipe]] = {
     "cached": cached,
     "robust": robust,
@@ -124,7 +124,7 @@ RECIPES: dict[str, Callable[[], Recipe]] = {
 def trained(
     recipe: Recipe, together: OneProcess, state: dict[str, Any] | None = None, **options: Any
 ) -> tuple[TrainState, dict[str, Any]]:
-    """Train to the end; the state, and what was heard: losses, and the states that could be gone on from."""
+    """Train to the end; return the state, and the recorded losses and resumable states."""
     heard: dict[str, Any] = {"losses": [], "states": []}
 
     def on_event(event: events.TrainingEvent) -> None:
@@ -143,14 +143,14 @@ def trained(
 
 
 def flat(value: Any, at: str = "") -> dict[str, Tensor]:
-    """Every tensor and number of a state, by where it is."""
+    """Flatten all tensors and numbers of a state, keyed by path."""
     if isinstance(value, dict):
         return {k: v for name, inner in value.items() for k, v in flat(inner, f"{at}/{name}").items()}
     return {at: value if isinstance(value, Tensor) else torch.as_tensor(value)} if value is not None else {}
 
 
 def free_port() -> int:
-    """A port that nothing listens at: none that connections are given (from 32768 on), or other workers look at."""
+    """Return an unused port below 32768, the start of the ephemeral range, and unlikely to clash between test workers."""
     first = 15_000 + os.getpid() * 37 % 15_000 + next(_PORTS)
     for port in range(first, 32_768):
         with socket.socket() as probe, contextlib.suppress(OSError):
@@ -163,14 +163,14 @@ _PORTS = itertools.count()
 
 
 def environment(rank: int, size: int, port: int) -> dict[str, str]:
-    """What torchrun says to a process."""
+    """Return the environment that torchrun sets for a process."""
     said = {"RANK": rank, "WORLD_SIZE": size, "LOCAL_RANK": rank, "LOCAL_WORLD_SIZE": size, "MASTER_PORT": port}
     own = {"MASTER_ADDR": "127.0.0.1", "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
     return {**os.environ, **own, **{name: str(value) for name, value in said.items()}}
 
 
 def launch(size: int, words: Sequence[str]) -> list[subprocess.Popen[str]]:
-    """Start a program of Python in so many processes that find each other."""
+    """Start a Python program in ``size`` processes that connect to each other."""
     port = free_port()
     return [
         subprocess.Popen(
@@ -185,13 +185,13 @@ def launch(size: int, words: Sequence[str]) -> list[subprocess.Popen[str]]:
 
 
 def ended(processes: Sequence[subprocess.Popen[str]], seconds: float = 600) -> list[tuple[int, str]]:
-    """Wait for processes; exit code and stderr of each."""
+    """Wait for processes; return exit code and stderr of each."""
     said = [process.communicate(timeout=seconds)[1] for process in processes]
     return [(process.returncode, text) for process, text in zip(processes, said, strict=True)]
 
 
 def together_in(size: int, cases: Sequence[str], folder: Path) -> dict[str, list[Any]]:
-    """Do cases in so many processes; what each found, by case."""
+    """Run cases in ``size`` processes; return each process's results by case."""
     for code, text in ended(launch(size, [__file__, ",".join(cases), str(folder)])):
         assert code == 0, text
     found = {case: [folder / f"{case}.{rank}.pt" for rank in range(size)] for case in cases}
@@ -199,11 +199,11 @@ def together_in(size: int, cases: Sequence[str], folder: Path) -> dict[str, list
 
 
 def do(case: str, many: Any) -> Any:
-    """Do one case in this process of several."""
+    """Run one case in this process."""
     if case in RECIPES:
         state, heard = trained(RECIPES[case](), many)
         return {"state": state.state_dict(), "losses": heard["losses"]}
-    if case == "resumed":  # in the middle of a stage: the state of process 0 counts, the others have none
+    if case == "resumed":  # in mid-stage: only process 0 passes a state
         whole, heard = trained(short(), many)
         kept = many.tell(heard["states"][3]) if many.leads else many.tell(None)
         state, _ = trained(short(), many, kept if many.leads else None)
@@ -227,7 +227,7 @@ def do(case: str, many: Any) -> Any:
 
 
 def main() -> None:
-    """Do the cases of the command line."""
+    """Run the cases named on the command line."""
     from gs2d.pipeline.train.process_group import connected
 
     torch.set_num_threads(1)

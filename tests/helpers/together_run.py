@@ -1,7 +1,7 @@
-"""The command ``gs2d`` in one of several processes, without mesh and report.
+"""Run ``gs2d`` in one of several processes, without mesh and report.
 
-``python together_run.py [signal=RANK:STEP:NUMBER] [seed=RANK:SEED] WORDS...``: the process of this rank sends itself a
-signal at the beginning of a step, counted over all stages, unless it was restarted, or uses another seed.
+``python together_run.py [signal=RANK:STEP:NUMBER] [seed=RANK:SEED] WORDS...``: the process of this rank uses another
+seed, or sends itself a signal at the start of a step (counted over all stages) unless it was restarted.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from gs2d.training.trainer import Trainer
 
 
 def main() -> None:
-    """Run the command, with its exit code."""
+    """Run the command and exit with its code."""
     rank, words = int(os.environ.get("RANK", "0")), sys.argv[1:]
     while "=" in words[0]:
         name, _, value = words.pop(0).partition("=")

@@ -1,4 +1,4 @@
-"""Toys for the trainer: random splats, a full state, and a ball of 80 splats with six cameras of 24x24 px."""
+"""Toys for trainer tests: random splats, a full state, and a ball of 80 splats with six cameras of 24x24 px."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ VIEWS, SIZE, POINTS = 6, 24, 60
 
 
 def random_splats(count: int, seed: int = 0, degree: int = 3, dtype: torch.dtype = torch.float32) -> Splats:
-    """Splats in the unit ball with every attribute random."""
+    """Return splats in the unit ball with random attributes."""
     g = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> torch.Tensor:
@@ -45,7 +45,7 @@ def random_splats(count: int, seed: int = 0, degree: int = 3, dtype: torch.dtype
 
 
 def full_state(count: int = 10, seed: int = 0) -> TrainState:
-    """A state in which everything that has rows is there, and different in every row."""
+    """Return a state that has all per-row data, different in every row."""
     splats = random_splats(count, seed)
     state = TrainState(splats, torch.Generator().manual_seed(seed))
     state.moments = {
@@ -58,7 +58,7 @@ def full_state(count: int = 10, seed: int = 0) -> TrainState:
 
 
 def make_scene() -> Scene:
-    """Six views of random splats, rendered by the reference, with noisy points to start from."""
+    """Render six views of random splats with the reference; the initial points are noisy."""
     truth = random_splats(80, seed=3)
     cameras = [
         look_at(
@@ -91,7 +91,7 @@ def make_scene() -> Scene:
 
 
 def short(absgs: bool = False) -> Recipe:
-    """2DGS-R in 10 + 4 + 5 iterations: densified at 3, 6 and 9, reset after 5, normal consistency after 4."""
+    """Return 2DGS-R in 10 + 4 + 5 iterations: densified at 3, 6 and 9, reset after 5, normal consistency after 4."""
     densify = GradDensify(
         every=3, start=1, stop=10, reset_every=5, scale_cull_start=0, opacity_cull=0.005, max_splats=75, absolute=absgs
     )
@@ -119,7 +119,7 @@ WIDE = MultiView(
 
 
 def compared() -> Recipe:
-    """``short`` with both losses of two views, in stage 1 after the last densification but one."""
+    """Return ``short`` with both multi-view losses, active in stage 1 after its second-last densification."""
     recipe = with_multiview(short(), 0.15, 0.03)
     first = recipe.stages[0]
     losses = tuple(replace(t, start=6) if t.kind.startswith("multiview") else t for t in first.losses)
@@ -135,7 +135,7 @@ def backends() -> list[str]:
 
 
 class RunLogger:
-    """Keeps the events, and a copy of the splats at each."""
+    """Records the events, and a copy of the splats at each."""
 
     def __init__(self) -> None:
         self.events: list[events.TrainingEvent] = []
@@ -148,7 +148,7 @@ class RunLogger:
         self.splats.append(self.trainer.splats.clone())
 
     def at(self, kind: type, stage: str) -> Splats:
-        """The splats at the first event of a kind in a stage."""
+        """Return the splats at the first event of a kind in a stage."""
         for event, splats in zip(self.events, self.splats, strict=True):
             if isinstance(event, kind) and event.stage == stage:  # type: ignore[attr-defined]
                 return splats
@@ -156,7 +156,7 @@ class RunLogger:
 
 
 def grouped(given: dict[str, Any]) -> dict[str, Any]:
-    """Return arguments of a trainer with those of its options in their place."""
+    """Return trainer arguments with option fields grouped into their option objects."""
     names = {entry.name for entry in fields(TrainerOptions)} & given.keys()
     rest = {name: value for name, value in given.items() if name not in names}
     return rest | {"options": TrainerOptions(**{name: given[name] for name in names})}
@@ -173,5 +173,5 @@ def train(scene: Scene, recipe: Recipe, **options: object) -> tuple[Trainer, Run
 
 
 def same(a: Splats, b: Splats) -> bool:
-    """Whether all bytes are the same."""
+    """Return whether all bytes are equal."""
     return all(torch.equal(x, y) for (_, x), (_, y) in zip(a.items(), b.items(), strict=True))

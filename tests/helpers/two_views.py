@@ -17,7 +17,7 @@ NORMAL = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
 
 
 def camera_at(width: int, height: int, *eye: float) -> Camera:
-    """Return a camera that looks at the origin, its principal point off the centre."""
+    """Return a camera that looks at the origin, with an off-centre principal point."""
     focal = 1.1 * width
     made = look_at(
         np.array(eye), np.zeros(3), np.array([0.0, 1.0, 0.0]), width=width, height=height, fx=focal, fy=0.95 * focal
@@ -26,7 +26,7 @@ def camera_at(width: int, height: int, *eye: float) -> Camera:
 
 
 def plane_depth(camera: Camera) -> Tensor:
-    """Depth [H, W] of the plane through the origin, float64."""
+    """Return the depth [H, W] of the plane through the origin, float64."""
     j, i = np.mgrid[: camera.height, : camera.width] + 0.5
     rays = np.stack([(i - camera.cx) / camera.fx, (j - camera.cy) / camera.fy, np.ones_like(i)], axis=-1)
     return torch.as_tensor(-(camera.center @ NORMAL) / (rays @ camera.rotation @ NORMAL))
@@ -34,7 +34,7 @@ def plane_depth(camera: Camera) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """Inputs of the losses; ``views`` joins them."""
+    """Inputs of the multi-view losses; ``views`` combines them."""
 
     depth: Tensor
     normal: Tensor
@@ -44,12 +44,12 @@ class Scenario:
     mask: Tensor | None = None
 
     def views(self, depth: Tensor, normal: Tensor, motion: Tensor | None = None) -> ViewPair:
-        """Return the pair for other leaves; ``motion`` [6] moves the camera, and learns."""
+        """Return the pair for other leaves; ``motion`` [6] moves the camera and requires a gradient."""
         camera = self.camera if motion is None else perturb_pose(self.camera, motion)
         return ViewPair(depth, normal, self.candidates, camera, self.neighbour, self.mask)
 
     def double(self) -> Scenario:
-        """Return the very same numbers in float64."""
+        """Return the same values in float64."""
         images = (replace(p, grey=p.grey.double()) for p in (self.neighbour.reference, self.neighbour.source))
         reference, source = images
         neighbour = replace(self.neighbour, reference=reference, source=source, depth=self.neighbour.depth.double())
@@ -60,9 +60,9 @@ def scenario(
     size: tuple[int, int] = (61, 47), *, seed: int = 0, dtype: torch.dtype = torch.float32, masked: bool = False,
     settings: MultiView | None = None, depth_size: tuple[int, int] | None = None,
 ) -> Scenario:  # fmt: skip
-    """Return noisy photographs and depths; some pixels are unclear, some hit nothing, some normals are edge-on.
+    """Return noisy images and depths with masked pixels, pixels without depth, and edge-on normals.
 
-    ``depth_size`` is that of the neighbour's depth, by default its photograph's.
+    ``depth_size`` is the resolution of the neighbour's depth map, by default that of its image.
     """
     settings = settings or MultiView(patches=300, radius=2, texture=0.03, occluded=4.0)
     g = torch.Generator().manual_seed(seed)
@@ -95,5 +95,5 @@ def scenario(
 
 
 def in_torch(views: ViewPair) -> tuple[Tensor, Tensor]:
-    """Return both losses by the formulas in torch."""
+    """Compute both losses with the torch formulas."""
     return photometric(views), geometric(views)

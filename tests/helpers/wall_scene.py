@@ -1,4 +1,4 @@
-"""Five images of a textured wall with a bare part, with sparse points: a scene of known depth."""
+"""Five images of a textured wall with a textureless part, with sparse points: a scene of known depth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WIDTH, HEIGHT, FOCAL = 48, 36, 40.0
 
 
 def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Colours [..., 3] in [0.1, 0.9] of a wall without a repeating pattern."""
+    """Return non-repeating wall colours [..., 3] in [0.1, 0.9]."""
     rng = np.random.default_rng(5)
     waves = rng.normal(size=(24, 2)) * 6
     phases = rng.uniform(0, 2 * np.pi, size=(24, 3))
@@ -24,7 +24,7 @@ def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def image(camera: Camera, gain: float = 1.0) -> np.ndarray:
-    """The wall as a camera at z = 0 sees it, uint8; its left third is bare."""
+    """Render the wall from a camera at z = 0, uint8; its left third has no texture."""
     x = (np.arange(WIDTH) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(HEIGHT) + 0.5 - camera.cy) / camera.fy
     rays = np.stack([*np.meshgrid(x, y), np.ones((HEIGHT, WIDTH))], axis=-1) @ camera.rotation
@@ -36,7 +36,7 @@ def image(camera: Camera, gain: float = 1.0) -> np.ndarray:
 
 @cache
 def wall(gains: tuple[float, ...] = (1.0,) * 5) -> Scene:
-    """Five photographs of a wall, with sparse points on its textured part."""
+    """Return five images of a wall, with sparse points on its textured part."""
     cameras = [
         look_at(np.array([x, 0.1 * i, 0.0]), np.array([x * 0.5, 0, WALL]), np.array([0.0, -1.0, 0.0]),
                 width=WIDTH, height=HEIGHT, fx=FOCAL)
