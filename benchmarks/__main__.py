@@ -1,10 +1,11 @@
-"""The benchmark suite.
+"""Run the benchmark suite or compare two results.
 
 ::
 
-    python -m benchmarks --out FILE.json [--quick] [--threads 2] [--only 20k 100k-800] [--variant v3]
-                         [--splats RUN_OR_PLY --capture FOLDER [--downscale N]] [--runs RUN [RUN ...]]
-    python -m benchmarks compare A.json B.json
+The first form times every workload stage by stage. ``--quick`` is a smoke test that takes a few seconds. ``--splats``
+adds a workload of trained splats, viewed by the cameras of their capture. ``--runs`` adds the splats of finished runs;
+captures are located through the run folders, and missing ones are skipped with a message. The second form exits with 1
+if B is slower than A by more than noise (rule: benchmarks/compare.py), and with 2 if the files cannot be compared.
 
 The first form times every workload stage by stage; ``--quick`` takes a few seconds and only shows that everything
 works. ``--splats`` adds splats trained on photographs, seen by the cameras of their capture; ``--runs`` those of
@@ -23,7 +24,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before torch loads
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # set before torch loads, as in the command line
 
 from benchmarks.compare import NotComparable, compare
 from benchmarks.suite import run_suite
@@ -40,7 +41,7 @@ from benchmarks.workload import (
 
 
 def report(path: Path, name: str, document: dict[str, Any]) -> None:
-    """A few figures of a workload as soon as it is done; the file holds all that is done."""
+    """Print a short summary of a finished workload; the result file has every figure."""
     result = document["workloads"][name]
     ms, iteration = result["best_ms"], result["iteration_ms"]
     executed, useful = result["fma_fraction_executed"], result["fma_fraction"]
@@ -56,7 +57,7 @@ def report(path: Path, name: str, document: dict[str, Any]) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the suite, or compare two results; returns the exit status."""
+    """Run the suite or compare two results; return the exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words[:1] == ["compare"]:
         return compare_files(words[1:])
@@ -66,19 +67,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--seconds", type=float, default=6.0, help="for each group of steps")
-    parser.add_argument("--only", nargs="+", help="workloads whose name contains one of these")
-    parser.add_argument("--crossing", action="store_true", help="0.3 %% more splats, across the camera plane, unseen")
-    parser.add_argument("--variant", help="instruction set: v4, v3 or portable (default: the best)")
-    parser.add_argument("--splats", type=Path, help="a run folder or a PLY of trained splats")
-    parser.add_argument("--capture", type=Path, help="the photographs they were trained on")
+    parser.add_argument("--seconds", type=float, default=6.0, help="minimum time per group of steps")
+    parser.add_argument("--only", nargs="+", help="run only workloads whose name contains one of these words")
+    parser.add_argument(
+        "--crossing", action="store_true", help="add 0.3 %% more splats that cross the camera plane and are not visible"
+    )
+    parser.add_argument("--variant", help="instruction set: v4, v3 or portable (default: best supported)")
+    parser.add_argument("--splats", type=Path, help="run folder or PLY of trained splats")
+    parser.add_argument("--capture", type=Path, help="capture that the splats were trained on")
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--runs", type=Path, nargs="+", default=[], help="folders of finished runs")
     args = parser.parse_args(words)
     if (args.splats is None) != (args.capture is None):
         parser.error("--splats and --capture belong together")
     if args.variant:
-        os.environ["GS2D_CPU_VARIANT"] = args.variant  # losses and training take it from here
+        os.environ["GS2D_CPU_VARIANT"] = args.variant  # losses and training read the number of threads from torch
     sizes = [s for s in (QUICK if args.quick else FULL) if not args.only or any(o in name_of(*s) for o in args.only)]
     workloads = [partial(room_workload, *size, crossing=args.crossing) for size in sizes]
     if args.splats is not None:
@@ -99,7 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def runs_there(runs: Sequence[Path]) -> list[Callable[[], Workload]]:
-    """The workloads of the runs that are on this machine; the others are named, with what is missing."""
+    """Return the workloads of the runs that exist on this machine; print the others with the reason."""
     found: list[Callable[[], Workload]] = []
     for run in runs:
         try:
@@ -112,7 +115,7 @@ def runs_there(runs: Sequence[Path]) -> list[Callable[[], Workload]]:
 
 
 def compare_files(words: Sequence[str]) -> int:
-    """0: no regression; 1: regression; 2: not comparable."""
+    """Compare two result files: return 0 without a regression, 1 with one, 2 if they are not comparable."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks compare")
     parser.add_argument("before", type=Path)
     parser.add_argument("after", type=Path)

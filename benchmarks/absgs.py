@@ -1,8 +1,12 @@
-"""The sweep that chooses the thresholds of AbsGS-A, the row of the paper's table that comes without numbers.
+"""Choose the thresholds of AbsGS-A, for which the paper gives no values, by a parameter sweep.
 
 ::
 
-    python -m benchmarks.absgs --data CAPTURES --out runs/absgs [--scenes lego scan24] [--schedule-scale 0.1]
+The paper only says "more sensitive thresholds for size and positional gradient". The sweep therefore divides the
+thresholds of AbsGS-D: both gradient thresholds by one factor, the size threshold (``percent_dense``) by another. Every
+candidate trains stage 3 only; stages 1 and 2 are shared through ``--cache``, also with `gs2d paper`. A is the candidate
+more sensitive than D with the highest mean PSNR, because the paper tuned for rendering quality. The PSNR is measured on
+the reported test views, so row A is optimistic. An interrupted sweep can be restarted.
 
 "More sensitive thresholds for size and positional gradient" is all the paper says. So AbsGS-D's thresholds are divided:
 both of the gradient by one factor, that of the size (``percent_dense``) by another. Every candidate trains stage 3 only
@@ -37,20 +41,20 @@ from gs2d.io.run_dir import machine, versions
 from gs2d.training.events import Event, Notice
 
 RECIPE = "2dgs-r-absgs-d"
-FACTORS = (1, 2, 4)  # what the thresholds of D are divided by
+FACTORS = (1, 2, 4)  # divisors of the thresholds of D
 HEADS = ("gradient /", "size /", "clone", "split", "percent_dense", "splats", "PSNR", "surface", "seconds", "runs")
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """Thresholds: D's, those of the gradient and that of the size divided by a factor each."""
+    """Thresholds of D with the gradient and size thresholds divided by one factor each."""
 
     gradient: int
     size: int
 
     @property
     def thresholds(self) -> dict[str, float]:
-        """Fields of ``GradDensify``."""
+        """Return the overrides of ``GradDensify`` fields."""
         return {
             "grad_threshold": ABSGS_DEFAULT.grad_threshold / self.gradient,
             "abs_threshold": ABSGS_DEFAULT.abs_threshold / self.gradient,
@@ -59,12 +63,12 @@ class Candidate:
 
     @property
     def overrides(self) -> tuple[str, ...]:
-        """What `gs2d train --recipe 2dgs-r-absgs-d` takes after --set."""
+        """Return the ``--set`` arguments for `gs2d train --recipe 2dgs-r-absgs-d`."""
         return tuple(f"refine.densify.{name}={value:g}" for name, value in self.thresholds.items())
 
     @property
     def name(self) -> str:
-        """For files."""
+        """Return a name for files."""
         return f"g{self.gradient}-s{self.size}"
 
 
@@ -72,7 +76,7 @@ CANDIDATES = tuple(Candidate(g, s) for g, s in itertools.product(FACTORS, FACTOR
 
 
 def make_jobs(options: PaperOptions, scenes: Sequence[FoundScene]) -> dict[tuple[Candidate, str, int], TrainingTask]:
-    """The run of every candidate, scene and seed."""
+    """Return one run per candidate, scene and seed."""
     jobs = {}
     for candidate, scene, seed in itertools.product(CANDIDATES, scenes, options.seeds):
         changed = replace(options, overrides=(*options.overrides, *candidate.overrides))
@@ -85,7 +89,9 @@ def make_jobs(options: PaperOptions, scenes: Sequence[FoundScene]) -> dict[tuple
 
 
 def choose(cells: Mapping[Candidate, Sequence[Cell]]) -> Candidate | None:
-    """The best mean PSNR among the candidates more sensitive than D that have as many runs as any; None if none has."""
+    """Return the candidate more sensitive than D with the highest mean PSNR, or None; incomplete candidates are
+    ignored.
+    """
     scores = {
         candidate: [psnr for cell in found if (psnr := cell.figures["psnr"]) is not None]
         for candidate, found in cells.items()
@@ -97,7 +103,7 @@ def choose(cells: Mapping[Candidate, Sequence[Cell]]) -> Candidate | None:
 
 
 def rows_of(cells: Mapping[Candidate, Sequence[Cell]]) -> list[list[str]]:
-    """A row for each candidate: thresholds, and means over scenes and seeds."""
+    """Return a row per candidate: thresholds, and means over scenes and seeds."""
     rows = []
     for candidate, found in cells.items():
         done = [cell for cell in found if cell.figures["psnr"] is not None]
@@ -117,13 +123,13 @@ def rows_of(cells: Mapping[Candidate, Sequence[Cell]]) -> list[list[str]]:
 
 
 def mean(values: Sequence[float | None]) -> float | None:
-    """Mean of those that are there."""
+    """Return the mean of the values that are not missing."""
     known = [value for value in values if value is not None]
     return statistics.fmean(known) if known else None
 
 
 def markdown(cells: Mapping[Candidate, Sequence[Cell]], chosen: Candidate | None, command: str) -> str:
-    """The table and what was chosen."""
+    """Return the table and the chosen candidate in Markdown."""
     lines = ["| " + " | ".join(HEADS) + " |", "|---" * len(HEADS) + "|"]
     lines += ["| " + " | ".join(row) + " |" for row in rows_of(cells)]
     said = "Nothing can be chosen: no run is finished."
@@ -134,12 +140,12 @@ def markdown(cells: Mapping[Candidate, Sequence[Cell]], chosen: Candidate | None
 
 
 def lost(cell: Cell) -> bool:
-    """Whether a run came to nothing."""
+    """Return True if a run failed."""
     return cell.figures["psnr"] is None and "psnr" in cell.reasons
 
 
 def sweep(options: PaperOptions) -> Candidate | None:
-    """Train all candidates, and write ``absgs.json`` and ``absgs.md``."""
+    """Train all candidates and write ``absgs.json`` and ``absgs.md``."""
     scenes = find_scenes(options.data, options.scenes, truths=options.ground_truth)
     jobs = make_jobs(options, scenes)
     todo = tuple(jobs.values())
@@ -166,13 +172,13 @@ def sweep(options: PaperOptions) -> Candidate | None:
 
 
 def say(event: Event) -> None:
-    """Notices on the screen."""
+    """Print a notice."""
     if isinstance(event, Notice):
         print(event.text, flush=True)
 
 
 def main() -> None:
-    """Parse the arguments and sweep."""
+    """Parse the arguments and run the sweep."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.absgs", description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)

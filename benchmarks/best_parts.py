@@ -1,9 +1,9 @@
-"""What every part of the recipe ``best`` is worth: the recipe with each part left out, and with what is not in it.
+"""Ablate the recipe ``best``: variants that leave out one part or add one.
 
 ::
 
-    python -m benchmarks.time_to_quality demo ../shared/data/nerf_synthetic_lego:2 --scales 0.1
-        --recipes best $(python -m benchmarks.best_parts)
+As a program, the module prints the variants in the form that ``gs2d train --recipe`` accepts
+(``benchmarks/best_parts.py:median``). Results are in docs/notebook/best.md.
 
 Run as a program it prints the variants as ``gs2d train --recipe`` takes them (``benchmarks/best_parts.py:median``).
 The figures are in docs/notebook/best.md.
@@ -34,12 +34,12 @@ def _densify(**changes: Any) -> Recipe:
 
 
 def _rates(stage: Stage) -> Stage:
-    """Official rates, whatever the length."""
+    """Use the official learning rates, independent of the schedule length."""
     return replace(stage, lr=LearningRates(means_decay_steps=stage.iterations))
 
 
 def _term(kind: str, **changes: Any) -> Recipe:
-    """A loss with other values."""
+    """Replace the settings of a loss."""
 
     def changed(stage: Stage) -> Stage:
         return replace(stage, losses=tuple(replace(t, **changes) if t.kind == kind else t for t in stage.losses))
@@ -56,7 +56,7 @@ def _sh_as_2dgs(stage: Stage) -> Stage:
 
 
 def _without_start() -> Recipe:
-    """The official start of random or sparse points, and its resets."""
+    """Use the official initialisation from random or sparse points, with opacity resets."""
     changed = _densify(reset_every=3_000)
     return replace(changed, dense_start=None)
 
@@ -75,7 +75,7 @@ def _unfitted() -> Recipe:
 
 
 VARIANTS: dict[str, Recipe] = {
-    # Left out, one at a time.
+    # One part left out.
     "no_dense_start": _without_start(),
     "start_not_fitted": _unfitted(),
     "official_rates": _stage(_rates),
@@ -87,7 +87,7 @@ VARIANTS: dict[str, Recipe] = {
     "no_silhouette": _without("silhouette"),
     "no_squares": _without("l2"),
     "median": replace(best(), fused_depth="median"),
-    # Tried, and not in it.
+    # Parts that were tried and are not in the recipe.
     "squares_twice": _term("l2", weight=2 * SQUARES),
     "squares_always": _term("l2", start=0),
     "silhouette_thrice": _term("silhouette", weight=3 * SILHOUETTE),

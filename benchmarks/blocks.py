@@ -1,8 +1,16 @@
-"""Blocks against one training of everything, of the same budget of splats and the same iterations in all.
+"""Compare training in blocks with one training of the whole capture, at equal splat budget and equal iterations.
 
 ::
 
-    python -m benchmarks.blocks FOLDER [--photographs 100] [--size 96] [--grid 2x2] [--iterations 4000] [--splats 40000]
+A flown capture (``benchmarks.flown_capture``) is trained as a whole and by ``gs2d blocks``. The coarse model and all
+blocks together have as many iterations as the single training; ``--block-iterations`` sets the iterations per block
+instead. Both runs are scored on the test views (mean PSNR, and PSNR of the pixels that show land within ``--near`` of a
+seam) and against the true surface (F-score at ``--within``, overall and near seams). Times are training time in
+seconds. Images of the views with the longest seams are written to ``FOLDER/JOB-seam-*.png``: photograph, whole, blocks,
+and the seam drawn on the photograph. The table is printed; figures are written to ``FOLDER/JOB-figures.json``. A second
+table lists PSNR by distance from a seam, for the single training and for the blocks before and after the seams are
+refined. JOB is ``blocks``, or ``blocks-N`` with ``--block-iterations N``, so that both can share a folder and one whole
+training; ``--job`` sets another name, for instance for another ``--partition FIELD=VALUE``.
 
 A flown capture (``benchmarks.flown_capture``) is trained on whole and by ``gs2d blocks``; the coarse model and all
 blocks together have as many iterations as the one training, or each block has ``--block-iterations``. Both are scored
@@ -53,18 +61,18 @@ from gs2d.render.api import rasterize
 from gs2d.training.events import Notice
 
 ALL_OF = {"2dgs": 30_000, "best": 20_000}  # iterations of the recipes
-ZOOM = 6  # of the pictures of seams
-FROM = (0, 1, 2, 4, 8, 16, 32, 64)  # m from a seam
+ZOOM = 6  # number of seam images
+FROM = (0, 1, 2, 4, 8, 16, 32, 64)  # m, distance from a seam
 
 
 def job_folder(folder: Path, args: argparse.Namespace) -> Path:
-    """Return where the blocks are: another job for another number of iterations."""
+    """Return the job folder; it depends on the number of iterations."""
     own = "blocks" if args.block_iterations is None else f"blocks-{args.block_iterations}"
     return folder / (args.job or own)
 
 
 def train_both(folder: Path, args: argparse.Namespace) -> None:
-    """Make the capture, train whole and in blocks; what is finished stays."""
+    """Make the capture and train it whole and in blocks; skip finished parts."""
     capture = folder / "capture"
     if not (capture / "sparse/0/cameras.bin").exists():
         flight = Flight(args.photographs, args.size, args.size * 3 // 4, side=args.side, points=args.points)
@@ -105,7 +113,7 @@ def train_both(folder: Path, args: argparse.Namespace) -> None:
 
 
 def seam_distances(camera: Camera, truth: Mesh, cells: Cells) -> np.ndarray:
-    """Return how far what each pixel shows is from a seam [H, W], world units; infinite where it shows nothing."""
+    """Return the distance of each pixel's surface point from a seam [H, W], world units; infinite for background."""
     hits = cast_camera(truth.vertices, truth.faces, camera)
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
     rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], axis=-1)
@@ -115,19 +123,19 @@ def seam_distances(camera: Camera, truth: Mesh, cells: Cells) -> np.ndarray:
 
 
 def psnr(squares: list[np.ndarray]) -> float:
-    """Return the PSNR of all pixels together, dB."""
+    """Return the PSNR over all pixels, dB."""
     return -10 * math.log10(float(np.concatenate(squares).mean()))
 
 
 def shown(job: LoadedRun, splats: Splats, view: View) -> tuple[np.ndarray, np.ndarray]:
-    """Return a rendering of a view [H, W, 3] in [0, 1], and its mean squared error in each pixel [H, W]."""
+    """Return a rendering of a view [H, W, 3] in [0, 1], and its squared error per pixel [H, W]."""
     with torch.no_grad():
         color = rasterize(splats, view.camera, job.settings, backend=job.backend).color.clamp(0, 1).numpy()
     return color, ((color - view.target(job.settings.background)) ** 2).mean(axis=2)
 
 
 def by_distance(folder: Path, args: argparse.Namespace) -> str:
-    """Return the PSNR of what lies how far from a seam, of one training and of blocks before and after their seams."""
+    """Return PSNR by distance from a seam: the whole training, and blocks before and after the seams are refined."""
     job_of_blocks = job_folder(folder, args)
     cells, truth = read_split(job_of_blocks / "partition").cells, read_mesh(folder / "capture/mesh_gt.ply")
     _, job, whole = open_finished(folder / "whole", args.threads, lambda _event: None)
@@ -145,7 +153,7 @@ def by_distance(folder: Path, args: argparse.Namespace) -> str:
 
 
 def measured(folder: Path, args: argparse.Namespace) -> dict[str, dict[str, float]]:
-    """Score both runs, overall and near seams, and draw the views with the most seam."""
+    """Score both runs, overall and near seams, and draw the views with the longest seams."""
     job_of_blocks = job_folder(folder, args)
     cells, truth = read_split(job_of_blocks / "partition").cells, read_mesh(folder / "capture/mesh_gt.ply")
     folders = {"whole": folder / "whole", "blocks": job_of_blocks}
@@ -186,7 +194,7 @@ def measured(folder: Path, args: argparse.Namespace) -> dict[str, dict[str, floa
 
 
 def draw(path: Path, view: View, colors: dict[str, np.ndarray], distances: np.ndarray, near: float) -> None:
-    """Write photograph, whole, blocks, and the photograph with what is near a seam in red."""
+    """Write photograph, whole, blocks, and the photograph with pixels near a seam in red."""
     photograph = view.target((0.0, 0.0, 0.0))
     red = photograph.copy()
     red[distances < near / 8] = (1.0, 0.0, 0.0)
@@ -197,7 +205,7 @@ def draw(path: Path, view: View, colors: dict[str, np.ndarray], distances: np.nd
 
 
 def table(found: dict[str, dict[str, float]]) -> str:
-    """Return the figures in Markdown."""
+    """Return the figures as Markdown."""
     lines = ["| | splats | iterations | seconds | PSNR | near seams | F | near seams |", "|---" * 8 + "|"]
     for name, of in found.items():
         lines.append(
@@ -208,29 +216,35 @@ def table(found: dict[str, dict[str, float]]) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Measure; 2 for what the user can mend."""
+    """Run the benchmark; return 2 for user errors."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.blocks", description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--photographs", type=int, default=100)
-    parser.add_argument("--size", type=int, default=96, help="px, of the longer side")
-    parser.add_argument("--side", type=float, help="m of land, about")
-    parser.add_argument("--points", type=int, help="sparse points")
+    parser.add_argument("--size", type=int, default=96, help="longer image side, px")
+    parser.add_argument("--side", type=float, help="approximate side of the land, m")
+    parser.add_argument("--points", type=int, help="number of sparse points")
     parser.add_argument("--grid", default="2x2")
     parser.add_argument("--recipe", choices=ALL_OF, default="best")
     parser.add_argument("--robust", choices=("auto", "on", "off"), default="off")
-    parser.add_argument("--iterations", type=int, default=4000, help="in all, of either")
-    parser.add_argument("--block-iterations", type=int, help="of each block (default: --iterations in all)")
-    parser.add_argument("--splats", type=int, default=40_000, help="budget in all, of either")
+    parser.add_argument("--iterations", type=int, default=4000, help="total iterations of each method")
+    parser.add_argument("--block-iterations", type=int, help="iterations per block (default: --iterations in total)")
+    parser.add_argument("--splats", type=int, default=40_000, help="total splat budget of each method")
     parser.add_argument("--coarse-splats", type=int, default=15_000)
     parser.add_argument("--coarse-side", type=int, default=48, help="px")
     parser.add_argument("--coarse-schedule", type=float, default=0.5)
-    parser.add_argument("--partition", nargs="*", default=[], metavar="FIELD=VALUE", help="changes beside these")
+    parser.add_argument(
+        "--partition",
+        nargs="*",
+        default=[],
+        metavar="FIELD=VALUE",
+        help="partition settings that differ from the defaults",
+    )
     parser.add_argument("--job", help="name of the job folder")
     parser.add_argument("--min-views", type=int, default=20)
     parser.add_argument("--margin", type=float, default=0.2)
     parser.add_argument("--extent", choices=("scene", "block"), default="scene")
-    parser.add_argument("--near", type=float, default=8.0, help="m from a seam that is near")
-    parser.add_argument("--within", type=float, default=1.0, help="m, of F")
+    parser.add_argument("--near", type=float, default=8.0, help="distance from a seam that counts as near, m")
+    parser.add_argument("--within", type=float, default=1.0, help="distance threshold of the F-score, m")
     parser.add_argument("--slots", type=int, default=1)
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args(arguments)

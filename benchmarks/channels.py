@@ -1,8 +1,9 @@
-"""What further channels, learning cameras and captured graphs cost ``gs2d.rasterize_2dgs``, as ratios of CPU time.
+"""Measure the cost of extra channels, camera gradients and captured graphs in ``gs2d.rasterize_2dgs``.
 
 ::
 
-    python -m benchmarks.channels [--splats 20000] [--size 400] [--repeats 10] [--backend cpu]
+Runs forward and backward passes of one view of the synthetic room on one thread. Each variant is timed next to
+``gs2d.rasterize`` with three plain channels in the same round. Prints the median and quartiles of the CPU time ratio.
 
 Forward and backward passes of one view of the synthetic room on one thread. Each variant is timed next to
 ``gs2d.rasterize`` with three plain channels in the same round. Prints the median ratio of all rounds and its quartiles.
@@ -31,7 +32,7 @@ Row = tuple[str, float, float, float]
 
 
 def ways(splats: Splats, size: int, backend: str) -> dict[str, Callable[[], object]]:
-    """Forward and backward passes by name; the first is what the others are compared with."""
+    """Return forward and backward passes by name; the first is the baseline."""
     view = camera(size)
     generator = torch.Generator().manual_seed(0)
     colors = torch.rand(len(splats), max(CHANNELS), generator=generator)
@@ -64,7 +65,7 @@ def ways(splats: Splats, size: int, backend: str) -> dict[str, Callable[[], obje
 
 
 def measure(splats: int, size: int, repeats: int, backend: str = "cpu") -> list[Row]:
-    """Ratios of CPU time, a row for each way."""
+    """Return CPU time ratios, a row per variant."""
     torch.set_num_threads(1)
     torch._dynamo.reset()
     found = ways(room(splats), size, backend)
@@ -81,10 +82,10 @@ def measure(splats: int, size: int, repeats: int, backend: str = "cpu") -> list[
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the table."""
+    """Run the benchmark and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--splats", type=int, default=20_000)
-    parser.add_argument("--size", type=int, default=400, help="px, of both sides")
+    parser.add_argument("--size", type=int, default=400, help="image width and height, px")
     parser.add_argument("--repeats", type=int, default=10)
     parser.add_argument("--backend", default="cpu", help="cpu or reference")
     options = parser.parse_args(arguments)

@@ -1,14 +1,14 @@
-"""Whether one results file is slower than another by more than noise.
+"""Decide whether one results file is slower than another by more than noise.
 
 A step regresses when both its median and its best time, in units of the machine, grow by more than the limit:
 
     growth = (time_B x probe_B) / (time_A x probe_A)        probe: the rate measured in the same run
     limit  = 1 + max(0.10, 2 x (spread_A / median_A + spread_B / median_B))
 
-with the copy rate for the steps that move memory (``MEMORY_STEPS``) and the multiply-add rate for the others. Asking
-both figures keeps an interruption (which moves medians) and a lucky sample (which moves minima) from deciding alone.
-Steps below 0.2 ms in both files are not judged. Memory per splat has no noise: more than 1 % is a regression. Files of
-different instruction sets or numbers of threads, or with no workload in common, are not compared.
+The probe is the copy rate for memory-bound steps (``MEMORY_STEPS``) and the multiply-add rate for the others. Both
+times must grow, so that neither an interruption (which moves medians) nor a lucky sample (which moves minima) decides
+alone. Steps below 0.2 ms in both files are ignored. Memory per splat has no noise: an increase of more than 1 % is a
+regression. Files with different instruction sets or thread counts, or without a common workload, cannot be compared.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ MEMORY_GROWTH = 0.01
 
 
 class NotComparable(Exception):
-    """The two files do not measure the same thing."""
+    """Raised if the two files do not measure the same thing."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """One figure in both files, in units of each machine."""
+    """One figure of both files, in machine units."""
 
     workload: str
     step: str
-    growth: float  # of the lesser of median and best
+    growth: float  # the smaller growth of median and best
     limit: float
 
     @property
     def regressed(self) -> bool:
-        """Whether it grew beyond noise."""
+        """Return True if the growth exceeds noise."""
         return self.growth > self.limit
 
     def __str__(self) -> str:
@@ -46,7 +46,7 @@ class Change:
 
 
 def _steps(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[tuple[str, str, float, float]]:
-    """Step, prefix of its fields, and the probes in both files."""
+    """Yield each step with its field prefix and the probes of both files."""
     for step in a["ms"]:
         key = "copy_gb_s" if step in MEMORY_STEPS else "fma_gflops"
         if step in b["ms"]:
@@ -69,12 +69,12 @@ def _judge(name: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[Ch
 
 
 def compare(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[Change]:
-    """Changes from file A to file B, workload by workload.
+    """Return the changes from file A to file B, workload by workload.
 
     Raises
     ------
     NotComparable
-        Other format, instruction set or number of threads, or no common workload.
+        If the format, instruction set or number of threads differ, or there is no common workload.
     """
     for key, one, two in (
         ("format", a.get("format"), b.get("format")),

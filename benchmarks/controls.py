@@ -1,4 +1,4 @@
-"""Recipes that separate causes: each changes one thing of a named recipe.
+"""Recipes for controlled experiments: each changes one setting of a registered recipe.
 
 ::
 
@@ -24,7 +24,7 @@ CONTROLS = {
 
 
 def spec(name: str) -> str:
-    """Return what ``--recipe`` takes for a control or a registered recipe."""
+    """Return the ``--recipe`` argument of a control or a registered recipe."""
     return f"{__file__}:{CONTROLS[name]}" if name in CONTROLS else name
 
 
@@ -34,27 +34,27 @@ def _last_stage(name: str, title: str, **changes: Any) -> Recipe:
 
 
 def restart_2dgs_60k() -> Recipe:
-    """2dgs-60k, where the means' rate falls once more from 1.6e-4 to 1.6e-6 in the last 30,000 iterations."""
+    """2dgs-60k with the means' learning rate restarted: 1.6e-4 to 1.6e-6 again over the last 30,000 iterations."""
     return _last_stage("2dgs-60k", "2dgs-60k-restart", lr=LearningRates(means_decay_steps=30_000))
 
 
 def restart_2dgs_r() -> Recipe:
-    """2dgs-r, where the means' rate falls once more from 1.6e-4 to 1.6e-6 in stage 3."""
+    """2dgs-r with the means' learning rate restarted: 1.6e-4 to 1.6e-6 again in stage 3."""
     return _last_stage("2dgs-r", "2dgs-r-restart", lr=LearningRates(means_decay_steps=20_000))
 
 
 def no_clone() -> Recipe:
-    """2dgs-r without the clone in stage 3."""
+    """2dgs-r without cloning in stage 3."""
     return _last_stage("2dgs-r", "2dgs-r-no-clone", on_enter=())
 
 
 def no_nc_late() -> Recipe:
-    """2dgs-60k without normal consistency in the last 30,000 iterations: module row III without its stages."""
+    """2dgs-60k without normal consistency in the last 30,000 iterations: module row III without stages."""
     return _last_stage("2dgs-60k", "2dgs-60k-no-nc-late", losses=PHOTOMETRIC)
 
 
 def edges_camera() -> Recipe:
-    """2dgs-60k in the official code's reading of normals beside empty pixels."""
+    """2dgs-60k with the official code's treatment of normals next to empty pixels."""
 
     def changed(term: LossTerm) -> LossTerm:
         return replace(term, options={"edges": "camera"}) if term.kind == "normal_consistency" else term
@@ -65,12 +65,12 @@ def edges_camera() -> Recipe:
 
 
 def dense() -> Recipe:
-    """2dgs from a dense start that is fitted to the photographs, without opacity resets."""
+    """2dgs from a dense initialisation fitted to the photographs, without opacity resets."""
     return _dense("2dgs-dense", GradDensify(reset_every=0))
 
 
 def dense_still() -> Recipe:
-    """2dgs from a dense start that is fitted to the photographs, never densified."""
+    """2dgs from a dense initialisation fitted to the photographs, without densification."""
     return _dense("2dgs-dense-still", None)
 
 

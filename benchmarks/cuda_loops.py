@@ -1,9 +1,10 @@
-"""What a GPU would execute, counted without one: registers, shared memory and the inner loops of the CUDA kernels.
+"""Count registers, shared memory and inner-loop instructions of the compiled CUDA kernels, without a GPU.
 
 ::
 
-    python -m benchmarks.cuda_loops            compare with results/cuda_loops.json (exit status 1 if it differs)
-    python -m benchmarks.cuda_loops --update   write that file, after a change that is meant
+Every kernel is compiled for sm_90 and disassembled with nvdisasm (``pip install nvidia-cuda-nvdisasm``). For blend
+kernels, the innermost loop with the most arithmetic is counted: one iteration processes one splat at the 8x8 pixels of
+a warp. Both halves and all branches are counted. Figures of different compilers are not compared.
 
 Every kernel is compiled for sm_90 and disassembled with nvdisasm (``pip install nvidia-cuda-nvdisasm``). Of the blend
 kernels the innermost loop with the most arithmetic is what matters: one round of it is one splat at the 8x8 pixels of a
@@ -45,7 +46,7 @@ Counts = dict[str, int]
 
 
 class Unavailable(Exception):
-    """A tool that the count needs is missing; says which, and how to get it."""
+    """Raised if a required tool is missing; the message says how to install it."""
 
 
 def _disassembler() -> str:
@@ -57,7 +58,7 @@ def _disassembler() -> str:
 
 
 def compiler_version() -> str:
-    """For instance "NVRTC 13.0"."""
+    """Return the compiler name and version, for instance "NVRTC 13.0"."""
     try:
         return "NVRTC {}.{}".format(*nvrtc_version())
     except BackendError as error:
@@ -65,7 +66,7 @@ def compiler_version() -> str:
 
 
 def innermost_loops(listing: str) -> dict[str, list[list[str]]]:
-    """Of each kernel in nvdisasm's listing: the instructions of each loop that holds no other, and more than a jump."""
+    """Return the instructions of each kernel's innermost loops; loops that are only a jump are skipped."""
     loops: dict[str, list[list[str]]] = {}
     for part in re.split(r"\.section\s+\.text\.", listing)[1:]:
         name = re.match(r"\w+", part)
@@ -90,7 +91,7 @@ def innermost_loops(listing: str) -> dict[str, list[list[str]]]:
 
 
 def mix(instructions: Sequence[str]) -> Counts:
-    """How many of each class, and in all; the rest is integer work and moves."""
+    """Return instruction counts by class and in total; the rest is integer work and moves."""
     found: Counter[str] = Counter(total=len(instructions))
     for text in instructions:
         operation = re.sub(r"^@!?\w+\s+", "", text).split()[0].split(".")[0]
@@ -100,7 +101,7 @@ def mix(instructions: Sequence[str]) -> Counts:
 
 
 def count() -> dict[str, dict[str, Any]]:
-    """By kernel: registers and shared memory, spilled bytes, and of the blend kernels the innermost loop."""
+    """Return registers, shared memory and spilled bytes by kernel, and the innermost loop of blend kernels."""
     tool = _disassembler()
     kernels: dict[str, dict[str, Any]] = {}
     for source in source_names():
@@ -125,7 +126,7 @@ def count() -> dict[str, dict[str, Any]]:
 
 
 def differences(measured: dict[str, dict[str, Any]], committed: dict[str, dict[str, Any]]) -> list[str]:
-    """One line for each figure that left its tolerance, in either direction: a gain must be committed too."""
+    """Return one line per figure outside its tolerance, in either direction: gains must be committed too."""
     if measured.keys() != committed.keys():
         return [f"kernels that only one side has: {', '.join(sorted(measured.keys() ^ committed.keys()))}"]
     lines = []
@@ -141,7 +142,7 @@ def differences(measured: dict[str, dict[str, Any]], committed: dict[str, dict[s
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Compare, or write the committed file."""
+    """Compare with the committed file, or write it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--update", action="store_true")
     args = parser.parse_args(arguments)

@@ -1,8 +1,11 @@
-"""Training iterations of two source trees in turn, so that a shared machine treats both alike.
+"""Time training iterations of two source trees alternately, so that machine load affects both equally.
 
 ::
 
-    python -m benchmarks.duel BEFORE AFTER [--splats 20000] [--size 400] [--threads 2] [--stage 0] [--rounds 40]
+BEFORE and AFTER are checkouts with built kernels (``scripts/build_kernels.sh``). Each runs its own code in its own
+process, on the workload of ``benchmarks.iteration``. The processes take turns of a few iterations; one waits while the
+other works. The first iteration of each turn is not counted, because the caches hold the other process's data.
+``--splats 200 --size 16`` measures the overhead outside the kernels.
 
 BEFORE and AFTER are checkouts with their kernels built (``scripts/build_kernels.sh``); each runs its own code in a
 process of its own, on the workload of ``benchmarks.iteration``, some iterations at a time, one waiting while the other
@@ -24,8 +27,8 @@ from pathlib import Path
 
 
 def serve(splats: int, size: int, threads: int, stage: int) -> None:
-    """Answer each number of iterations on stdin with their seconds on stdout."""
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before torch loads
+    """Read iteration counts from stdin and write the measured seconds to stdout."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # set before torch loads, as in the command line
     import torch
 
     from benchmarks.iteration import make_scene, steady
@@ -44,9 +47,9 @@ def serve(splats: int, size: int, threads: int, stage: int) -> None:
     recipe = Recipe("bench", tuple(steady(stage) for stage in two_dgs_r().stages))
     scene, state = make_scene(workload.splats, workload.cameras), TrainState(start, generator)
     trainer = Trainer(scene, recipe, GENERIC, backend="cpu", state=state)
-    for index in range(stage + 1):  # a stage needs the row groups of those before
+    for index in range(stage + 1):  # a stage needs the row groups of earlier stages
         trainer.enter(index)
-    for _ in range(2 * len(scene.train)):  # every view twice: caches are full
+    for _ in range(2 * len(scene.train)):  # render every view twice to fill the caches
         trainer.step()
     print("ready", flush=True)
     for line in sys.stdin:
@@ -59,9 +62,11 @@ def serve(splats: int, size: int, threads: int, stage: int) -> None:
 
 
 def start_side(checkout: Path, arguments: Sequence[str]) -> subprocess.Popen[str]:
-    """A process that serves iterations of a checkout; its own benchmarks are used where it has this one."""
+    """Start a process that serves iterations of a checkout, with that checkout's benchmarks if they include this
+    module.
+    """
     here = Path(__file__).resolve().parents[1]
-    paths = [checkout / "src", checkout, here]  # before this file was there, the workload is that of `here`
+    paths = [checkout / "src", checkout, here]  # older checkouts lack this module and use the workload of `here`
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(str(path.resolve()) for path in paths)}
     command = [sys.executable, str(Path(__file__).resolve()), "--serve", *arguments]
     side = subprocess.Popen(
@@ -74,7 +79,7 @@ def start_side(checkout: Path, arguments: Sequence[str]) -> subprocess.Popen[str
 
 
 def take_turns(sides: Sequence[subprocess.Popen[str]], rounds: int, each: int) -> list[list[float]]:
-    """Milliseconds of the iterations of each side."""
+    """Return the milliseconds of each side's iterations."""
     times: list[list[float]] = [[] for _ in sides]
     for _ in range(rounds):
         for side, found in zip(sides, times, strict=True):
@@ -87,7 +92,7 @@ def take_turns(sides: Sequence[subprocess.Popen[str]], rounds: int, each: int) -
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run and print."""
+    """Run the benchmark and print the result."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkouts", type=Path, nargs="*", metavar="BEFORE AFTER")
     parser.add_argument("--splats", type=int, default=20_000)
@@ -95,7 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--stage", type=int, default=0, choices=(0, 1, 2), help="surface, appearance or refine")
     parser.add_argument("--rounds", type=int, default=40)
-    parser.add_argument("--each", type=int, default=8, help="iterations of a turn")
+    parser.add_argument("--each", type=int, default=8, help="iterations per turn")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args(arguments)

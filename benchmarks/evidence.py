@@ -1,9 +1,12 @@
-"""What the paper has no rows for, by runs that share their stages: method or implementation? (docs/notebook/results.md)
+"""Run experiments that separate effects of the method from effects of the implementation (docs/notebook/results.md).
 
 ::
 
-    python -m benchmarks.evidence DATA FOLDER [--scale 1] [--seed 0] [--captures lego bottle] [--recipes 2dgs ...]
-        [--results FILE]
+DATA holds the captures. Runs use ``gs2d train ... --cache``, so the first 30,000 iterations are trained once. Finished
+runs are skipped and interrupted runs are resumed. Times are wall time in seconds, summed over all stages of a recipe,
+including cached ones. Figures are written to ``FOLDER/evidence.json`` and a table is printed. ``--results`` merges the
+rows into FILE, which can collect rows of several days. Each row records its commit and machine; check out the same
+commit before continuing.
 
 DATA holds the captures. Runs are those of ``gs2d train ... --cache``, so that the first 30,000 iterations are trained
 once; a run that is finished is not done again, one that was cut off goes on. Seconds are of the clock, summed over a
@@ -42,7 +45,7 @@ KEY = ("capture", "recipe", "seed", "scale")  # of a row
 
 
 def row_of(case: Case, recipe: str, args: argparse.Namespace) -> dict[str, Any]:
-    """Train and score one run unless it is done, and return its figures."""
+    """Train and score one run unless it is finished, and return its figures."""
     metrics = run_case(case, Method(recipe, recipe, spec(recipe)), str(args.data), args.folder, args.scale, args.seed)
     run = RunFolder(args.folder / f"{case.name}-{recipe}-s{args.seed}")
     stages, surface = metrics["stages"], metrics.get("surface")
@@ -62,7 +65,7 @@ def row_of(case: Case, recipe: str, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def made_by(definition: dict[str, Any]) -> dict[str, Any]:
-    """Return what a run is of: its own date, machine and versions, and the commit and the kernels that score it."""
+    """Return the provenance of a run: date, machine and versions, and the commit and kernels that score it."""
     words = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
     commit = subprocess.run(words, capture_output=True, text=True).stdout.strip()
     facts = {name: definition[key] for name, key in (("date", "created"), ("machine", "machine"))}
@@ -70,7 +73,7 @@ def made_by(definition: dict[str, Any]) -> dict[str, Any]:
 
 
 def merge_row(file: Path, row: dict[str, Any]) -> None:
-    """Put a row into a file of rows, in place of the one with the same capture, recipe, seed and scale."""
+    """Merge a row into a results file, replacing the row with the same capture, recipe, seed and scale."""
     kept = json.loads(file.read_text())["rows"] if file.exists() else []
     found = {tuple(other[name] for name in KEY): other for other in kept}
     found[tuple(row[name] for name in KEY)] = row
@@ -78,7 +81,7 @@ def merge_row(file: Path, row: dict[str, Any]) -> None:
 
 
 def line_of(row: dict[str, Any]) -> str:
-    """Return a row of the table."""
+    """Return a table row."""
     fine = f"{row['f_scores'][0]:.3f} | {row['chamfer']:.5f}" if row["f_scores"] else " | "
     images = row["images"]
     return (
@@ -89,7 +92,7 @@ def line_of(row: dict[str, Any]) -> str:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run what is missing and print the table."""
+    """Run missing experiments and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("folder", type=Path)
@@ -97,7 +100,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--captures", nargs="+", choices=list(CASES), default=list(CASES))
     parser.add_argument("--recipes", nargs="+", default=list(RECIPES))
-    parser.add_argument("--results", type=Path, help="file of rows of several days, to put these into")
+    parser.add_argument("--results", type=Path, help="results file that collects the rows of several days")
     args = parser.parse_args(arguments)
     args.folder.mkdir(parents=True, exist_ok=True)
     names = ("scene", "recipe", "iterations", "PSNR", "worst view", "training views", "F 0.25 %", "Chamfer", "splats")

@@ -1,4 +1,4 @@
-"""The pictures of the README and docs/notebook/results.md: one strip a run (photograph, colour, normal, depth, mesh).
+"""Draw the image strips of the README and docs/notebook/results.md (photograph, colour, normal, depth, mesh).
 
 ::
 
@@ -22,12 +22,12 @@ from gs2d.io.meshes import read_mesh
 
 
 def views_of(run: Path) -> int:
-    """How many views a run drew."""
+    """Return the number of views that a run rendered."""
     return len(json.loads((run / "renders" / "index.json").read_text())["views"])
 
 
 def images_of(run: Path, view: int, stage: str | None, kinds: Sequence[str]) -> list[np.ndarray]:
-    """Photograph, renderings of some kinds and mesh of one view of a run, uint8 [H, W, 3] each."""
+    """Return photograph, renderings and mesh image of one view of a run, uint8 [H, W, 3] each."""
     shown = json.loads((run / "renders" / "index.json").read_text())["views"][view]
     stages = [entry["name"] for entry in json.loads((run / "metrics.json").read_text())["stages"]]
     folder = run / "renders" / (stage or stages[-1])
@@ -41,7 +41,7 @@ def images_of(run: Path, view: int, stage: str | None, kinds: Sequence[str]) -> 
 
 
 def strip(run: Path, view: int, stage: str | None, size: int) -> list[np.ndarray]:
-    """Return the images of one view of a run, ``size`` px high: uint8 [size, W, 3] each."""
+    """Return the images of one view of a run as a strip, uint8 [size, W, 3]."""
     images = images_of(run, view, stage, ("color", "normal", "depth"))
     shapes = [(round(size * image.shape[1] / image.shape[0]), size) for image in images]
     pairs = zip(images, shapes, strict=True)
@@ -49,7 +49,7 @@ def strip(run: Path, view: int, stage: str | None, size: int) -> list[np.ndarray
 
 
 def main() -> None:
-    """Write the strips of some runs under one another."""
+    """Write the strips of several runs, stacked vertically."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("runs", type=Path, nargs="+")
@@ -59,7 +59,7 @@ def main() -> None:
     args = parser.parse_args()
     rows = [np.concatenate(strip(run, args.view, args.stage, args.size), axis=1) for run in args.runs]
     image = np.concatenate(rows, axis=0)
-    used = np.flatnonzero((image != 255).any(axis=(1, 2)))  # white margins above and below say nothing
+    used = np.flatnonzero((image != 255).any(axis=(1, 2)))  # crop white margins above and below
     write_image(args.out, image[used[0] : used[-1] + 1])
 
 

@@ -1,4 +1,4 @@
-"""A capture as a drone brings it home: any number of photographs in lines over land whose surface is known."""
+"""Render synthetic drone captures: photographs in flight lines over land with a known surface."""
 
 from __future__ import annotations
 
@@ -21,37 +21,38 @@ from gs2d.io.meshes import write_mesh
 from gs2d.meshing.raycast import Hits, cast_camera
 from gs2d.synthetic.textures import linear_to_srgb
 
-HEIGHT = 80.0  # m, of the flight above the mean of the ground
+HEIGHT = 80.0  # m, flight altitude above the mean ground height
 ANGLE = np.radians(60.0)  # horizontal field of view
-FORWARD, SIDE = 0.8, 0.7  # of a photograph that the next one, and the next line, show too
-TILT = np.radians(15.0)  # of the camera from straight down, ahead and back on every other line: walls are seen
-LEAST_TRACK = 3  # photographs that must see a sparse point
-OBSERVATIONS = 200  # sparse points that a photograph has at most
-PIXEL_NOISE = 0.3  # px, standard deviation of where a point is seen
+FORWARD, SIDE = 0.8, 0.7  # overlap of consecutive photographs, and of neighbouring lines
+TILT = np.radians(15.0)  # camera tilt from nadir, forward and backward on alternating lines: shows walls
+LEAST_TRACK = 3  # minimum number of photographs per sparse point
+OBSERVATIONS = 200  # maximum number of sparse points per photograph
+PIXEL_NOISE = 0.3  # px, standard deviation of point observations
 _SAMPLES = 2  # rays per pixel along each axis
 
 
 @dataclass(frozen=True)
 class Flight:
-    """What is flown.
+    """Parameters of a synthetic flight.
 
     Attributes
     ----------
     photographs : int
     width, height : int, px
     points : int or None
-        Sparse points, before those that fewer than three photographs see are left out; None: 40 a photograph.
+        Number of sparse points before points visible in fewer than three photographs are removed; None: 40 per
+        photograph.
     side : float or None, m
-        Of what is flown over, about; None: it grows with the photographs, which overlap by 80 % ahead and
-        70 % to the side.
+        Approximate side of the area flown over. None: it grows with the number of photographs, with 80 % forward and
+        70 % side overlap.
     land : float or None, m
-        Side of the land, at least; None: it reaches beyond what the photographs show. Land smaller than what is flown
-        over is shown whole by any number of photographs.
+        Minimum side of the land. None: the land extends beyond the visible area. Land smaller than the area flown
+        over is visible as a whole for any number of photographs.
     seed : int
     latitude, longitude, altitude : float
-        Degrees and m, of the origin.
+        Origin, degrees and m.
     gps_noise : float, m
-        Standard deviation of the positions in EXIF, along each axis.
+        Standard deviation of the EXIF positions along each axis.
     """
 
     photographs: int
@@ -68,18 +69,18 @@ class Flight:
 
     @property
     def focal(self) -> float:
-        """Focal length, px."""
+        """Return the focal length, px."""
         return self.width / 2 / float(np.tan(ANGLE / 2))
 
     @property
     def pixel(self) -> float:
-        """Width of a pixel on the ground, m."""
+        """Return the width of a pixel on the ground, m."""
         return HEIGHT / self.focal
 
 
 @dataclass(frozen=True, eq=False)
 class _Photograph:
-    """What a photograph leaves: which sparse points it shows [n], where [n, 2] px, in which colours [n, 3]."""
+    """Sparse points of a photograph: point indices [n], pixel positions [n, 2] and colours [n, 3]."""
 
     points: np.ndarray
     pixels: np.ndarray
@@ -93,28 +94,29 @@ def write_flight(
     on_progress: Callable[[int, int], None] | None = None,
     threads: int | None = None,
 ) -> None:
-    """Write photographs with GPS positions, their true cameras and sparse points as COLMAP has them, and the surface.
+    """Write photographs with GPS positions, ground-truth cameras, COLMAP sparse points and the true surface.
 
-    ``images/*.jpg``, ``mesh_gt.ply`` and ``sparse/0/*.bin`` (last: an unfinished capture is not mistaken for one). The
-    frame is metres east, north and up of the flight's origin. Lines are as many as make the land about square; it
-    grows with the photographs. The same arguments give the same bytes, for any number of threads.
+    Writes ``images/*.jpg``, ``mesh_gt.ply`` and ``sparse/0/*.bin``; the model is written last, so that an unfinished
+    capture is not mistaken for a complete one. The frame is east-north-up in metres from the flight's origin. The
+    number of lines makes the land approximately square; its area grows with the number of photographs. Output depends
+    only on the arguments, not on the number of threads.
 
     Parameters
     ----------
     folder : path
-        Made where it does not exist; files of an earlier capture are replaced.
+        Created if missing; files of an earlier capture are replaced.
     flight : Flight
     on_progress : callable, optional
-        Called with (photographs done, photographs in all) now and then, from the calling thread.
+        Called occasionally with (finished photographs, all photographs), from the calling thread.
     threads : int, optional
-        Default: the cores of this machine, at most 8.
+        Default: the number of cores, at most 8.
 
     Raises
     ------
     DataError
-        Fewer than two photographs, or smaller than 16 px.
+        If there are fewer than two photographs, or they are smaller than 16 px.
     DiskError
-        A file could not be written.
+        If a file cannot be written.
     """
     if flight.photographs < 2 or min(flight.width, flight.height) < 16:
         raise DataError(
@@ -143,12 +145,12 @@ def write_flight(
 
 
 def image_name(number: int) -> str:
-    """Return the name of a photograph by its place in the flight."""
+    """Return the file name of the photograph with this index."""
     return f"{number:06d}.jpg"
 
 
 def flown_cameras(flight: Flight) -> list[Camera]:
-    """Return cameras in lines to and fro along x, with a little unrest; the camera looks ahead and back in turn."""
+    """Return cameras in alternating lines along x, with small random motion; every other line looks backward."""
     across = HEIGHT * 2 * np.tan(ANGLE / 2)
     along = across * flight.height / flight.width
     step, gap = along * (1 - FORWARD), across * (1 - SIDE)
@@ -172,13 +174,13 @@ def flown_cameras(flight: Flight) -> list[Camera]:
 
 
 def _side(cameras: list[Camera]) -> float:
-    """Side of the land, m, that all photographs show nothing beyond."""
+    """Return a land side, m, beyond which no photograph shows anything."""
     reach = HEIGHT * 1.3 * np.tan(ANGLE / 2 + TILT) + TILE
     return float(2 * (np.abs([camera.center[:2] for camera in cameras]).max() + reach))
 
 
 def sparse_points(land: Land, cameras: list[Camera], flight: Flight) -> np.ndarray:
-    """Return points [P, 3] on the surface, by its area below the flight, sorted by tiles."""
+    """Sample points [P, 3] on the surface below the flight, uniform by area, sorted by tiles."""
     rng = np.random.default_rng([flight.seed, 2])
     count = 40 * flight.photographs if flight.points is None else flight.points
     flown = np.abs([camera.center[:2] for camera in cameras]).max(axis=0) + HEIGHT * np.tan(ANGLE / 2)
@@ -205,7 +207,7 @@ def _photograph(
     order = np.argsort(number, kind="stable")
     rank = np.random.default_rng([flight.seed, 5]).permutation(len(points))
     index = _PointIndex(points[order], order, number[order], rank, land)
-    _ = land.normals, land.heights  # before threads ask for them
+    _ = land.normals, land.heights  # compute before threads use them
 
     def shoot(number: int) -> _Photograph:
         camera = cameras[number]
@@ -227,7 +229,7 @@ def _photograph(
 
 
 def footprint(land: Land, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners [2], [2] of the rectangle of the ground that holds all a camera sees of it, m."""
+    """Return two corners [2], [2] of the ground rectangle that contains a camera's visible area, m."""
     u, v = (np.array([0.0, size]) for size in (camera.width, camera.height))
     rays = np.array([[(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0] for x in u for y in v])
     world = rays @ camera.rotation
@@ -239,7 +241,7 @@ def footprint(land: Land, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def picture(land: Land, chosen: np.ndarray, hits: Hits, flight: Flight) -> np.ndarray:
-    """Return the photograph uint8 [H, W, 3]: the mean of linear colours over the rays of a pixel, as sRGB."""
+    """Render a photograph, uint8 [H, W, 3]: the mean linear colour over the rays of each pixel, as sRGB."""
     there = hits.face >= 0
     face = hits.face[there]
     weights, corners = hits.weights[there], land.corners[chosen[face]]
@@ -262,7 +264,7 @@ def _write_photograph(path: Path, pixels: np.ndarray, flight: Flight, camera: Ca
 
 @dataclass(frozen=True, eq=False)
 class _PointIndex:
-    """Sparse points [P, 3] by the tile that they lie in, with their numbers, tiles and ranks in being found [P]."""
+    """Sparse points [P, 3] grouped by tile, with their indices, tiles and detection ranks [P]."""
 
     places: np.ndarray
     numbers: np.ndarray
@@ -279,7 +281,7 @@ class _PointIndex:
         pixels: np.ndarray,
         rng: np.random.Generator,
     ) -> _Photograph:
-        """Return what a camera sees of the points: those that lie on the surface its rays hit, some of them."""
+        """Return a subset of the points that are visible to a camera, that is, on the surface hit by its rays."""
         land = self.land
         first = np.clip(((low - land.low) // TILE).astype(int), 0, land.tiles - 1)
         last = np.clip(((high - land.low) // TILE).astype(int), 0, land.tiles - 1)
@@ -293,7 +295,7 @@ class _PointIndex:
         visible = np.abs(hits.depth[row, column] - z) < max(0.3, 2 * HEIGHT / camera.fx)
         near, at = near[visible], at[visible]
         if len(near) > OBSERVATIONS:
-            kept = np.sort(np.argsort(self.rank[near])[:OBSERVATIONS])  # neighbours choose the same
+            kept = np.sort(np.argsort(self.rank[near])[:OBSERVATIONS])  # neighbouring images choose the same points
             near, at = near[kept], at[kept]
         column, row = at.astype(int).T
         colors = pixels[row, column]

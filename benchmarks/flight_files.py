@@ -1,4 +1,4 @@
-"""Files of a flown capture: EXIF of its photographs, and a COLMAP model with tracks."""
+"""Write files of a synthetic flight: EXIF metadata and a COLMAP model with tracks."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from scipy.spatial.transform import Rotation
 from gs2d.core.atomic_files import atomic_write
 from gs2d.core.camera import Camera
 
-_AXIS, _FLATTENING = 6_378_137.0, 1 / 298.257223563  # of WGS 84: m, and none
-_PINHOLE = 1  # COLMAP's number of the camera model
+_AXIS, _FLATTENING = 6_378_137.0, 1 / 298.257223563  # WGS 84: semi-major axis in m, and flattening
+_PINHOLE = 1  # COLMAP's camera model id
 _BEGIN = datetime.datetime(2026, 5, 4, 10, 0, 0)
 _SECONDS = 2  # between photographs
 
 
 def flight_exif(place: np.ndarray, origin: tuple[float, float, float], number: int, angle: float) -> Image.Exif:
-    """Return EXIF with a GPS position, the time and the focal length.
+    """Return EXIF data with GPS position, time and focal length.
 
     Parameters
     ----------
     place : ndarray [3], m
-        East, north and up of the origin.
+        East, north and up from the origin.
     origin : latitude, longitude (degrees, WGS 84), height (m)
     number : int
-        Of the photograph, which tells its time.
+        Index of the photograph; sets its time.
     angle : float, radians
         Horizontal field of view.
     """
@@ -54,9 +54,9 @@ def flight_exif(place: np.ndarray, origin: tuple[float, float, float], number: i
 
 
 def geodetic(place: np.ndarray, origin: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return latitude, longitude (degrees) and height (m) of metres east, north and up [3] of an origin.
+    """Convert east, north and up [3] in metres from an origin to latitude, longitude (degrees) and height (m).
 
-    By the radii of the ellipsoid at the origin: centimetres off within a kilometre, and the ground is taken as flat.
+    Uses the ellipsoid radii at the origin and a flat ground: accurate to centimetres within a kilometre.
     """
     phi = math.radians(origin[0])
     e2 = _FLATTENING * (2 - _FLATTENING)
@@ -68,7 +68,7 @@ def geodetic(place: np.ndarray, origin: tuple[float, float, float]) -> tuple[flo
 
 
 def _sexagesimal(degrees: float) -> tuple[IFDRational, IFDRational, IFDRational]:
-    """Degrees, minutes, seconds; seconds in steps of 10^-5, a third of a millimetre."""
+    """Return degrees, minutes and seconds; seconds in steps of 10^-5, about a third of a millimetre."""
     ticks = round(degrees * 3600e5)
     whole, rest = divmod(ticks, 3600 * 10**5)
     minutes, seconds = divmod(rest, 60 * 10**5)
@@ -85,20 +85,20 @@ def write_model(
     *,
     least: int,
 ) -> None:
-    """Write a binary COLMAP model of pinhole cameras that share one camera; ``cameras.bin`` comes last.
+    """Write a binary COLMAP model with one shared pinhole camera; ``cameras.bin`` is written last.
 
     Parameters
     ----------
     folder : path
     cameras, names
-        Of the photographs.
+        One per photograph.
     points : ndarray [P, 3], colors : ndarray uint8 [P, 3]
-    tracks : for each photograph (numbers [n] of the points that it shows, where they are [n, 2] px)
+    tracks : one per photograph: (indices [n] of visible points, pixel positions [n, 2])
     least : int
-        Photographs that must see a point; the others are left out, here and in the photographs.
+        Minimum number of photographs per point; other points are removed from the model and the photographs.
     """
     counts = np.bincount(np.concatenate([numbers for numbers, _ in tracks]), minlength=len(points))
-    identity = np.where(counts >= least, np.cumsum(counts >= least), 0)  # COLMAP's numbers, from 1; 0 = left out
+    identity = np.where(counts >= least, np.cumsum(counts >= least), 0)  # COLMAP ids start at 1; 0 = removed
     track_of, place_of = [], []
     with atomic_write(folder / "images.bin") as file:
         file.write(struct.pack("<Q", len(cameras)))

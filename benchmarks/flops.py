@@ -1,15 +1,15 @@
 """Floating-point operations of one splat at one pixel, counted by hand.
 
-Two counts. ``EXECUTED`` is what the loops execute, from ``kernels/core/blend.h``; its share of peak is the headline:
-it says how well the machine is used. ``USEFUL`` stands beside it: what the formulas of docs/math.md take when each
-pixel is worked out by itself. A loop that leaves work out does not get slower by it: then the second share grows where
-the first does not. Forward, 67: offsets 2, the plane from its six coefficients 10, 1 / I 1, u and v 2, rho3d 3, the
-low-pass filter 4, log2 alpha 2, a polynomial of degree 5 for 2^x 13, compositing 30 as below. Backward, 119. (The
-forward count was 69 before; results of then say so in ``flops_per_visible_pair``.)
+There are two counts. ``EXECUTED`` counts the operations of the loops in ``kernels/core/blend.h``; its share of peak
+measures how well the machine is used. ``USEFUL`` counts the operations of the formulas in docs/math.md when each pixel
+is computed on its own. An optimisation that skips work lowers only the first count. Forward, 67: offsets 2, the plane
+from its six coefficients 10, 1 / I 1, u and v 2, rho3d 3, the low-pass filter 4, log2 alpha 2, a polynomial of degree 5
+for 2^x 13, compositing 30 as below. Backward: 119.
 
-A fused multiply-add counts 2, any other addition, subtraction, multiplication, division or rounding 1; comparisons,
-selects, minima, maxima, loads and the exponent's integer arithmetic count nothing. Executed, with AVX-512, for a pair
-whose splat is plain (``is_plain``), as nearly all are (with AVX2 2^x has one term more: 2 operations):
+A fused multiply-add counts 2; any other addition, subtraction, multiplication, division or rounding counts 1.
+Comparisons, selects, minima, maxima, loads and integer arithmetic of the exponent are not counted. Executed operations
+with AVX-512, for a pair with a plain splat (``is_plain``, nearly all pairs; with AVX2 2^x has one more term, 2
+operations):
 
     meet, alpha                            composite                 weigh_vjp, add_colors, add_geometry
       X, Y, I: lane + block      3           T after, w        3       T after, w                         3
@@ -31,9 +31,9 @@ whose splat is plain (``is_plain``), as nearly all are (with AVX2 2^x has one te
 from __future__ import annotations
 
 USEFUL = {"forward": 67, "backward": 119}
-EXECUTED = {"forward": 19 + 30, "backward": 19 + 76}  # the backward pass computes the intersection again
+EXECUTED = {"forward": 19 + 30, "backward": 19 + 76}  # the backward pass recomputes the intersection
 
 
 def fraction(flops_per_pair: int, pairs: int, milliseconds: float, fma_gflops: float) -> float:
-    """Share of the peak multiply-add rate that the visible pairs alone account for."""
+    """Return the share of the peak multiply-add rate that the visible pairs account for."""
     return flops_per_pair * pairs / (1e6 * milliseconds * fma_gflops)

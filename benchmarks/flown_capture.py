@@ -1,8 +1,10 @@
-"""A capture of any number of photographs, flown in lines over land with houses whose surface is known.
+"""Make a synthetic drone capture with any number of photographs over land with houses and a known surface.
 
 ::
 
-    python -m benchmarks.flown_capture FOLDER --photographs 6400 [--size 96] [--points 20000] [--gps-noise 1.5]
+The capture has COLMAP's layout with ground-truth cameras, so training needs no structure from motion. The photographs'
+EXIF data has GPS positions, and the true surface is ``mesh_gt.ply``. The land grows with the number of photographs,
+with 80 % forward and 70 % side overlap. On two cores, 6,400 photographs of 96x72 or 100 of 1600x1200 take two minutes.
 
 COLMAP's layout with true cameras, so that training needs no structure from motion; GPS positions in the photographs'
 EXIF for those who want to try it; the true surface is ``mesh_gt.ply``. Land grows with the photographs, which overlap
@@ -20,15 +22,19 @@ from gs2d.errors import Gs2dError
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Write the capture; 2 for what the user can mend."""
+    """Write the capture; return 2 for user errors."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.flown_capture", description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--photographs", type=int, default=400)
     parser.add_argument("--size", type=int, default=320, help="width, px; the height is three quarters of it")
-    parser.add_argument("--points", type=int, help="sparse points, about (default: 40 a photograph)")
-    parser.add_argument("--side", type=float, help="m flown over, about (default: it grows with the photographs)")
-    parser.add_argument("--land", type=float, help="side of the land, m (default: it reaches beyond all pictures)")
-    parser.add_argument("--gps-noise", type=float, default=1.5, help="m, along each axis")
+    parser.add_argument("--points", type=int, help="approximate number of sparse points (default: 40 per photograph)")
+    parser.add_argument(
+        "--side", type=float, help="approximate side of the area flown over, m (default: grows with the photographs)"
+    )
+    parser.add_argument("--land", type=float, help="side of the land, m (default: extends beyond all images)")
+    parser.add_argument(
+        "--gps-noise", type=float, default=1.5, help="standard deviation of GPS positions along each axis, m"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int)
     args = parser.parse_args(arguments)

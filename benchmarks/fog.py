@@ -1,8 +1,13 @@
-"""Fog in new views of real captures, and what each part of robust training does against it: docs/notebook/floaters.md.
+"""Measure floaters in test views of real captures, for several variants of robust training (docs/notebook/floaters.md).
 
 ::
 
-    python -m benchmarks.fog CAPTURE[:DOWNSCALE] ... [--variants off robust ...] [--scale 0.05] [--out FILE.json]
+Trains each capture, which must have COLMAP sparse points with tracks, once per variant. Every 8th view is held out.
+Reports PSNR and SSIM of test views, the worst test view, PSNR after an affine colour fit (which removes exposure
+differences), PSNR of training views, the share of sparse points hidden in test views (mean and worst view), the share
+of blending weight of all training views that lies clearly closer to a camera than 99 % of the sparse points, the share
+of training pixels with alpha below 0.9, the number of splats, and CPU time. Runs on one thread; on a shared machine,
+CPU times are only roughly comparable, and only within one run.
 
 Trains each capture (with the sparse points that its photographs show: COLMAP's) once for each variant, every 8th view
 held out, and measures: PSNR and SSIM of test views, the worst one, PSNR after an affine fit of colour (what exposure
@@ -42,16 +47,16 @@ from gs2d.render.exposure_transform import fit_exposure
 from gs2d.render.types import RasterSettings
 from gs2d.training.trainer import Trainer
 
-NEAR_PERCENTILE, NEARER = 1.0, 0.9  # of the depths of sparse points in the photographs that show them; a margin
-TRAINING_VIEWS = 12  # that are scored, evenly chosen
-OPAQUE = 0.9  # alpha below which a pixel of a training view is counted as transparent
+NEAR_PERCENTILE, NEARER = 1.0, 0.9  # quantile of sparse point depths in the photographs that show them; margin
+TRAINING_VIEWS = 12  # number of scored views, evenly spaced
+OPAQUE = 0.9  # alpha below which a training pixel counts as transparent
 
 
 def _without(field: str) -> Callable[[Recipe], Recipe]:
     return lambda recipe: replace(recipe, **{field: None})  # type: ignore[arg-type]
 
 
-VARIANTS: Mapping[str, tuple[dict[str, Any], Callable[[Recipe], Recipe]]] = {  # options, and a change of the recipe
+VARIANTS: Mapping[str, tuple[dict[str, Any], Callable[[Recipe], Recipe]]] = {  # options, and a recipe change
     "off": ({"robust": "off"}, lambda recipe: recipe),
     "robust": ({}, lambda recipe: recipe),
     "no dense start": ({}, _without("dense_start")),
@@ -65,7 +70,7 @@ VARIANTS: Mapping[str, tuple[dict[str, Any], Callable[[Recipe], Recipe]]] = {  #
 
 
 def train_variant(scene: Scene, name: str, recipe: str, scale: float, seed: int) -> tuple[Trainer, float]:
-    """Train a scene with a variant; the trainer, and CPU seconds."""
+    """Train a scene with a variant; return the trainer and the CPU seconds."""
     asked, change = VARIANTS[name]
     training = Training(recipe=recipe, **asked)
     start = time.process_time()
@@ -81,7 +86,7 @@ def train_variant(scene: Scene, name: str, recipe: str, scale: float, seed: int)
 
 @torch.no_grad()
 def measure(scene: Scene, trainer: Trainer) -> dict[str, Any]:
-    """The figures of a trained scene."""
+    """Return the figures of a trained scene."""
     settings, splats = trainer.settings, trainer.splats
     brightness = metered(splats, settings, trainer.backend)
     seen = with_predicted(trainer.scene_now(), brightness)
@@ -125,7 +130,7 @@ def _score(scene: Scene, view: View, splats: Splats, settings: RasterSettings) -
 
 
 def near_weight(scene: Scene, splats: Splats, settings: RasterSettings) -> float:
-    """Share of the blending weight of all training views by splats nearer to its camera than nearly all points are.
+    """Return the share of blending weight, over all training views, of splats closer than nearly all sparse points.
 
     The weight of a splat in a view is the derivative of the sum of all pixels with respect to its colour.
     """
@@ -149,7 +154,7 @@ def near_weight(scene: Scene, splats: Splats, settings: RasterSettings) -> float
 
 
 def show(rows: Sequence[dict[str, Any]]) -> str:
-    """The figures as a Markdown table."""
+    """Return the figures as a Markdown table."""
     lines = [
         "| capture | variant | test | worst | SSIM | colour fitted | training | hidden | worst | near | transparent "
         "| splats | CPU |",
@@ -166,7 +171,7 @@ def show(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Parse the arguments, and train."""
+    """Parse the arguments, train and measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", nargs="+", metavar="CAPTURE[:DOWNSCALE]")
     parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=["off", "robust"])

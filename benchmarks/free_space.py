@@ -1,8 +1,9 @@
-"""A look at free space, which robust training takes every 50 iterations: natively, and in torch.
+"""Time the free-space check of robust training, native and in torch; training runs it every 50 iterations.
 
 ::
 
-    python -m benchmarks.free_space CAPTURE[:DOWNSCALE] ... [--repeat 3]
+For each capture with sparse points, the initial splats are checked in all photographs. Reports CPU seconds per check
+(minimum of the repetitions) and the number of splats on which both implementations disagree. Runs on one thread.
 
 Of each capture (whose sparse points are known) the splats that training starts from are looked at in all photographs.
 Told are seconds of the processor of a look, the least of the repetitions, and of how many splats the two do not agree.
@@ -28,7 +29,7 @@ from gs2d.training.trainer import Trainer
 
 
 def look(scene: Scene, repeat: int) -> tuple[int, list[float], int]:
-    """Return the splats, seconds natively and in torch, and how many splats the two do not agree on."""
+    """Return the number of splats, native and torch seconds, and the number of splats with different results."""
     trainer = Trainer(scene, with_robustness(get_recipe("best")), GENERIC, backend="cpu")
     maps, splats = trainer._robust._free, trainer.splats
     assert maps is not None
@@ -50,7 +51,7 @@ def look(scene: Scene, repeat: int) -> tuple[int, list[float], int]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print a table; 2 for a capture that cannot be read."""
+    """Run the benchmark and print a table; return 2 for a capture that cannot be read."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.free_space",
         description=__doc__,

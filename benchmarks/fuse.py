@@ -1,9 +1,11 @@
-"""Fusion and marching cubes on seeded depth maps: seconds of the clock and of the processor, and memory.
+"""Measure fusion and marching cubes on seeded depth maps: wall time, CPU time and memory.
 
 ::
 
-    python -m benchmarks.fuse [--views 60] [--size 400] [--resolution 512] [--threads 2] [--unbounded]
-                              [--backend auto] [--json FILE]
+The scene is a sphere of radius 0.9 with coloured waves, viewed from all sides; its surface is about as large as that of
+``rendered_bottle``. With ``--unbounded`` the same frames are fused into nested levels; the innermost level has half the
+side of the sphere and the voxel size of the bounded run. ``--backend reference`` fuses in numpy, ``cpu`` natively,
+``cuda`` on a GPU. Compare CPU times on a shared machine.
 
 The scene is a sphere of radius 0.9 with coloured waves, seen from all round: as much surface as ``rendered_bottle``.
 With ``--unbounded`` the same frames go into a nest of levels; the innermost has half the side of the sphere, and the
@@ -39,7 +41,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Result:
-    """What one run took and gave."""
+    """Cost and output size of one run."""
 
     views: int
     size: int
@@ -57,7 +59,7 @@ class Result:
 
 
 def sphere_map(camera: Camera) -> DepthMap:
-    """Depth and colour of the sphere at pixel centres."""
+    """Return depth and colour of the sphere at pixel centres."""
     v, u = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5
     local = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], -1)
     step = local @ camera.rotation  # one unit deep
@@ -69,7 +71,7 @@ def sphere_map(camera: Camera) -> DepthMap:
 
 
 def orbit(count: int, size: int) -> list[Camera]:
-    """Cameras all round at distance 4, as far as those of ``rendered_bottle``."""
+    """Return cameras on all sides at distance 4, as for ``rendered_bottle``."""
     k = np.arange(count)
     z = 1 - 2 * (k + 0.5) / count
     angle = k * np.pi * (3 - 5**0.5)
@@ -133,7 +135,7 @@ def run(
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the result, and write it where ``--json`` says."""
+    """Print the result, and write it to ``--json`` if requested."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--views", type=int, default=60)
     parser.add_argument("--size", type=int, default=400)

@@ -1,16 +1,17 @@
-"""How well a run's scale and place are known from noisy positions and control points, against the truth.
+"""Measure the accuracy of a run's scale and position from noisy GPS positions and control points.
 
 ::
 
-    python -m benchmarks.georeference FOLDER [--photographs 60] [--size 400] [--seeds 10] [--results FILE.json]
+A flown capture (``benchmarks/flown_capture.py``) is rendered; ``gs2d poses`` estimates cameras from its photographs
+alone, and ``gs2d train`` makes a short run. For each seed, `gs2d survey` then gets
 
-A flown capture (``benchmarks/flown_capture.py``) is rendered; ``gs2d poses`` finds cameras from its photographs alone,
-and ``gs2d train`` makes a run of a few iterations of them. Then `gs2d survey` is given, for each seed,
+- noisy photograph positions, some with outliers of 50 m: a corrected receiver (0.02 m), a drone (0.5 m) and a
+  phone (2 m and 5 m), along each axis;
+- control points: points of the true surface, marked in the photographs with a noise of half a pixel and measured to
+  0.01 m; every third is held out as a check point.
 
-- positions of the photographs with noise, of which some are outliers by 50 m: a receiver with corrections (0.02 m), a
-  drone's (0.5 m), a phone's (2 m and 5 m, along each axis);
-- control points: places of the true surface, marked in the photographs to half a pixel, measured to 0.01 m; every
-  third is held out as a check point.
+The table lists the scale error (relative to a fit of all cameras to the ground truth) and the command's estimate of
+that error, the distance of the cameras from their true positions, and the check point residuals beside the true errors.
 
 Reported are the error of the scale (against that of a fit of all cameras to the truth) and what the command says of it,
 how far the cameras come to lie from their true places, and the residuals of the check points, beside the true errors.
@@ -40,23 +41,23 @@ from gs2d.io.run_dir import open_run
 from gs2d.pipeline.prepare.loaded import reload_run
 
 NOISES = (0.0, 0.02, 0.5, 2.0, 5.0)  # m, along each axis
-OUTLIERS, FAR = 0.05, 50.0  # share of the positions, and how far off they are, m
+OUTLIERS, FAR = 0.05, 50.0  # share of outlier positions, and their error, m
 CONTROL, MARK_NOISE, SURVEY_NOISE = 9, 0.5, 0.01  # points; px; m
-SEEN_BY = 4  # photographs that must show a control point
-EPSG, WORLD = 32632, np.array([500_000.0, 5_200_000.0, 0.0])  # m, where the flight's origin is
-EDGE = 5.0  # px from the rim, at which nothing is marked
+SEEN_BY = 4  # minimum photographs per control point
+EPSG, WORLD = 32632, np.array([500_000.0, 5_200_000.0, 0.0])  # origin of the flight, m
+EDGE = 5.0  # px, image border without marks
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """True cameras by name, and the true surface's points [P, 3], m."""
+    """True cameras by name, and the true surface points [P, 3], m."""
 
     cameras: dict[str, Camera]
     surface: np.ndarray
 
 
 def prepared(folder: Path, photographs: int, size: int) -> tuple[Path, Truth]:
-    """Return the run, made where it is missing, and the truth."""
+    """Return the run, which is made if missing, and the ground truth."""
     flown, capture, run = folder / "flown", folder / "capture", folder / "run"
     if not (flown / "sparse" / "0" / "images.bin").exists():
         write_flight(flown, Flight(photographs, width=size, height=size * 3 // 4, gps_noise=0.0))
@@ -74,13 +75,13 @@ def prepared(folder: Path, photographs: int, size: int) -> tuple[Path, Truth]:
 
 
 def views_of(run: Path) -> list[View]:
-    """Return all photographs of the run."""
+    """Return all views of the run."""
     scene = reload_run(open_run(run), lambda _: None).scene
     return [*scene.train, *scene.test]
 
 
 def write_positions(path: Path, places: dict[str, np.ndarray], noise: float, rng: np.random.Generator) -> int:
-    """Write noisy positions of photographs and return how many of them are outliers."""
+    """Write noisy photograph positions and return the number of outliers."""
     names = list(places)
     wrong = set(rng.permutation(len(names))[: round(OUTLIERS * len(names))].tolist()) if noise else set()
     lines = [f"# EPSG:{EPSG}", "name,x,y,z"]
@@ -95,7 +96,7 @@ def write_positions(path: Path, places: dict[str, np.ndarray], noise: float, rng
 
 
 def write_control(path: Path, truth: Truth, names: list[str], rng: np.random.Generator) -> int:
-    """Write control points with their marks, every third a check point, and return how many there are."""
+    """Write control points with their marks, every third a check point; return their number."""
     lines, count = [f"# EPSG:{EPSG}", "name,x,y,z,photo,u,v,check"], 0
     for place in truth.surface[rng.permutation(len(truth.surface))]:
         marks = {name: pixel for name in names if (pixel := seen_at(truth.cameras[name], place)) is not None}
@@ -111,7 +112,7 @@ def write_control(path: Path, truth: Truth, names: list[str], rng: np.random.Gen
 
 
 def seen_at(camera: Camera, place: np.ndarray) -> np.ndarray | None:
-    """Return the pixel [2] at which a camera has a place in its picture, or None. What hides it is not looked at."""
+    """Return the pixel [2] at which a camera sees a point, or None if it is out of frame; occlusion is ignored."""
     x, y, z = camera.rotation @ place + camera.T_cam_world[:3, 3]
     u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
     inside = z > 0 and EDGE < u < camera.width - EDGE and EDGE < v < camera.height - EDGE
@@ -119,7 +120,7 @@ def seen_at(camera: Camera, place: np.ndarray) -> np.ndarray | None:
 
 
 def judged(found: Georeference, centers: np.ndarray, true: np.ndarray, scale: float) -> dict[str, Any]:
-    """Return the true errors of a georeference beside what it says of itself; cameras [V, 3] of the run, and true."""
+    """Return the true errors and the reported errors of a georeference; cameras are [V, 3], of the run and true."""
     off = np.linalg.norm(found.to_world(centers) - WORLD - true, axis=1)
     told = found.facts.get("scale_error")
     return {
@@ -134,7 +135,7 @@ def judged(found: Georeference, centers: np.ndarray, true: np.ndarray, scale: fl
 
 
 def measured(folder: Path, photographs: int, size: int, seeds: int) -> list[dict[str, Any]]:
-    """Return a row for each source, the mean and the worst over the seeds."""
+    """Return a row per source: the mean and the worst value over the seeds."""
     run, truth = prepared(folder, photographs, size)
     views = views_of(run)
     names = [view.name for view in views]
@@ -163,14 +164,14 @@ def measured(folder: Path, photographs: int, size: int, seeds: int) -> list[dict
 
 
 def over_seeds(tries: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return means, and the worst error of the scale."""
+    """Return means and the worst scale error."""
     names = [name for name in tries[0] if tries[0][name] is not None]
     means = {name: float(np.mean([entry[name] for entry in tries])) for name in names}
     return {**means, "worst_scale_error": max(entry["scale_error"] for entry in tries), "seeds": len(tries)}
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Return the rows in Markdown."""
+    """Return the rows as Markdown."""
     heads = ("scale off, mean", "worst", "told", "cameras off", "left out of outliers", "rms", "check points")
     lines = ["| source | " + " | ".join(heads) + " |", "|---" * (len(heads) + 1) + "|"]
     for row in rows:
@@ -187,7 +188,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Measure and print the table; 2 for what the user can mend."""
+    """Run the benchmark and print the table; return 2 for user errors."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.georeference", description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--photographs", type=int, default=60)
