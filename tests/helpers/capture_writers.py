@@ -138,7 +138,7 @@ def small_blender(root: Path, *, train: int = 4, test: int = 2, width: int = 40,
 def small_nerfstudio(
     root: Path, *, count: int = 9, meta: dict | None = None, frame: dict | None = None
 ) -> list[Camera]:
-    """Write a transforms.json with shared off-centre intrinsics; ``meta`` and ``frame`` add keys to it and its frames."""
+    """Write a transforms.json with shared off-centre intrinsics; ``meta`` and ``frame`` extend it and its frames."""
     cameras = ring(count)
     frames = []
     for index, camera in enumerate(cameras):

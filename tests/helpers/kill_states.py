@@ -182,7 +182,7 @@ def watched(command: Command, layer: Any, folder: Path, actions: list[str]) -> S
 
 
 def gone_on_from(states: States, folder: Path, judge: Callable[[Path], list[str]], seconds: float) -> int:
-    """Restore each state and collect the failures that ``judge`` returns; return the number of states checked in time."""
+    """Restore each state and collect the failures that ``judge`` returns; return the number of checked states."""
     began, done = time.monotonic(), 0
     for state in states.found.values():
         if time.monotonic() - began > seconds:

@@ -111,7 +111,7 @@ class DtuScene:
 
 
 def dtu_scene(seed: int = 0) -> DtuScene:
-    """Return hills of 24 mm, scanned about every 0.3 mm; the mesh is 0.4 mm too high, has waves and a floating piece."""
+    """Return hills of 24 mm, scanned every 0.3 mm or so; a mesh 0.4 mm too high, with waves and a floating piece."""
     rng = np.random.default_rng(seed)
     xy = rng.uniform(-12, 12, (7000, 2))
     scan = np.column_stack([xy, 12 * hills(*(xy / 12).T)])

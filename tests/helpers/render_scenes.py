@@ -80,7 +80,7 @@ def requiring_grad(splats: Splats) -> Splats:
 
 
 def random_camera(rng: np.random.Generator) -> Camera:
-    """Return a camera with a small image, unequal focal lengths, off-centre principal point, and pose near the origin."""
+    """Return a camera near the origin with a small image, unequal focal lengths and an off-centre principal point."""
     width, height = (int(rng.integers(5, 40)) for _ in range(2))
     rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     rotation *= np.sign(np.linalg.det(rotation))

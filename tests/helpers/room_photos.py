@@ -36,7 +36,7 @@ def textures(seed: int = 0) -> np.ndarray:
 
 
 def room_image(camera: Camera, walls: np.ndarray) -> np.ndarray:
-    """Render the octant x, y, z > 0 as uint8 [H, W, 3]: floor z = 0, walls x = 0 and y = 0, each with its own texture."""
+    """Render the octant x, y, z > 0 as uint8 [H, W, 3]: floor z = 0, walls x = 0 and y = 0, each with a texture."""
     samples = 2  # per pixel side
     rows, columns = (np.mgrid[: camera.height * samples, : camera.width * samples] + 0.5) / samples
     rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], axis=-1)

@@ -38,7 +38,7 @@ def dense(volume: Volume) -> np.ndarray:
 
 
 def edge_uses(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return undirected edges [E, 2], their face counts [E], and how many faces traverse them in ascending order [E]."""
+    """Return undirected edges [E, 2], their face counts [E], and how many of those traverse them upwards [E]."""
     f = mesh.faces.astype(np.int64)
     directed = np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]])
     edges, inverse, uses = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True)

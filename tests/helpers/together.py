@@ -150,7 +150,7 @@ def flat(value: Any, at: str = "") -> dict[str, Tensor]:
 
 
 def free_port() -> int:
-    """Return an unused port below 32768, the start of the ephemeral range, and unlikely to clash between test workers."""
+    """Return an unused port below 32768, the start of the ephemeral range, unlikely to clash between test workers."""
     first = 15_000 + os.getpid() * 37 % 15_000 + next(_PORTS)
     for port in range(first, 32_768):
         with socket.socket() as probe, contextlib.suppress(OSError):

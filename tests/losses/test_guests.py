@@ -1,4 +1,4 @@
-"""Losses from elsewhere: a function with options, a class with data of its own."""
+"""Plug-in losses: a function with options, and a class with its own data."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ from loss_images import make_camera, make_output
 
 @pytest.fixture(autouse=True)
 def guests() -> Iterator[None]:
-    before = {name: LOSSES.get(name) for name in LOSSES.builtin}  # modules register once
+    before = {name: LOSSES.get(name) for name in LOSSES.builtin}  # modules register only once
     yield
     LOSSES._things.clear()
     LOSSES._things.update(before)
 
 
 def blackness(output: RenderOutput, view: LossView, power: float = 1.0) -> Tensor:
-    """How bright a picture is."""
+    """Return the brightness of the image."""
     return output.color.clamp_min(1e-6).pow(power).mean()
 
 
 class Mean(Loss):
-    """The mean colour of each photograph, found once."""
+    """Mean colour of each image, computed once."""
 
     def __init__(self, only: int) -> None:
         self._only = only
@@ -101,7 +101,7 @@ def test_options_that_a_loss_does_not_take_stop_before_training() -> None:
 
 
 def transparent(scene: Scene) -> Scene:
-    """Return the scene with an alpha channel in its photographs."""
+    """Add an alpha channel to the images of a scene."""
     views = []
     for view in scene.train:
         alpha = np.full((*view.image().shape[:2], 1), 255, np.uint8)
@@ -111,7 +111,7 @@ def transparent(scene: Scene) -> Scene:
 
 
 def with_guest(recipe: Recipe, *, needs: Sequence[str]) -> tuple[Recipe, list[tuple[RenderOutput, LossView]]]:
-    """Return a recipe with a loss that has these needs in its first stage, and the list of its arguments."""
+    """Return a recipe whose first stage has a loss with these needs, and a list that records its arguments."""
     given: list[tuple[RenderOutput, LossView]] = []
 
     def kept(output: RenderOutput, view: LossView) -> Tensor:
@@ -169,7 +169,7 @@ def test_a_class_must_be_a_loss() -> None:
 
 
 class Fused(Loss):
-    """The mean colour, with forms for a backend with fused operations and for an iteration in one piece."""
+    """Mean colour, with implementations for fused backends and for fused iterations."""
 
     only_color = True
 

@@ -1,4 +1,4 @@
-"""Losses of two views: a plane whose depth and normal are known, seen by two cameras."""
+"""Two-view losses on a plane of known depth and normal."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PLANE_NORMAL = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
 
 
 def camera_at(*eye: float, **changes: float) -> Camera:
-    """48 x 40 px, principal point off the centre, looking at the origin."""
+    """Return a camera of 48 x 40 px that looks at the origin, with an off-centre principal point."""
     made = look_at(np.array(eye), np.zeros(3), np.array([0.0, 1.0, 0.0]), width=48, height=40, fx=50.0, fy=47.0)
     return replace(made, **({"cx": 22.5, "cy": 21.0} | changes))
 
@@ -35,14 +35,14 @@ HERE, THERE = camera_at(0.0, 0.1, 2.0), camera_at(0.5, 0.2, 1.9, cx=26.0, cy=18.
 
 
 def plane_depth(camera: Camera) -> Tensor:
-    """Depth [H, W] of the plane through the origin."""
+    """Return the depth [H, W] of the plane through the origin."""
     j, i = np.mgrid[: camera.height, : camera.width] + 0.5
     rays = np.stack([(i - camera.cx) / camera.fx, (j - camera.cy) / camera.fy, np.ones_like(i)], axis=-1)
     return torch.as_tensor(-(camera.center @ PLANE_NORMAL) / (rays @ camera.rotation @ PLANE_NORMAL))
 
 
 def plane_image(camera: Camera) -> Tensor:
-    """A smooth texture on the plane, as the camera sees it [H, W, 3]."""
+    """Return a smooth texture on the plane as seen by the camera [H, W, 3]."""
     j, i = np.mgrid[: camera.height, : camera.width] + 0.5
     z = plane_depth(camera).numpy()
     points = np.stack([(i - camera.cx) / camera.fx * z, (j - camera.cy) / camera.fy * z, z], axis=-1)
@@ -53,7 +53,7 @@ def plane_image(camera: Camera) -> Tensor:
 
 @dataclass(frozen=True)
 class Case:
-    """The plane's images for the first view, and its neighbour."""
+    """The plane's images for the first view, and the neighbour."""
 
     depth: Tensor
     normal: Tensor
@@ -79,7 +79,7 @@ def test_at_the_true_plane_patches_and_round_trips_agree(case: Case) -> None:
     ncc, valid = views.similarity
     error, back = views.round_trip
     assert valid.sum() > 25
-    assert float(ncc[valid].min()) > 0.99  # what is missing is bilinear sampling of a curved texture
+    assert float(ncc[valid].min()) > 0.99  # the rest is bilinear sampling of a curved texture
     assert float(error[back].max()) < 1e-2  # and of a depth that is not linear in the pixel
     assert float(photometric(views)) < 0.003
     assert float(geometric(views)) < 0.003
@@ -92,12 +92,12 @@ def test_the_gradient_points_to_the_true_depth(case: Case, offset: float) -> Non
         loss(case.views(depth)).backward()
         assert depth.grad is not None
         touched = depth.grad[depth.grad != 0]
-        right = (touched.sign() == np.sign(offset)).double().mean()  # a step against the gradient goes back
+        right = (touched.sign() == np.sign(offset)).double().mean()  # gradient descent moves towards the plane
         assert float(right) > 0.9, (loss.__name__, float(right))
 
 
 def test_the_gradient_points_to_the_true_normal(case: Case) -> None:
-    tilt = torch.tensor([0.5, 0.3, 0.0], dtype=torch.float64)  # a small one hardly moves a patch of 5 px
+    tilt = torch.tensor([0.5, 0.3, 0.0], dtype=torch.float64)  # a small tilt hardly moves a patch of 5 px
     normal = (case.normal + tilt).clone().requires_grad_()
     photometric(case.views(normal=normal)).backward()
     assert normal.grad is not None
@@ -121,7 +121,7 @@ def test_gradients_are_those_of_finite_differences(case: Case) -> None:
         views.__dict__["weights"] = weights
         return photometric(views), geometric(views)
 
-    weights = torch.rand(len(index), generator=g, dtype=torch.float64)  # they have no gradient: any constant
+    weights = torch.rand(len(index), generator=g, dtype=torch.float64)  # weights are constants: they have no gradient
     assert torch.autograd.gradcheck(values, (d.requires_grad_(), n.requires_grad_()), eps=1e-7, atol=1e-6)
 
 
@@ -134,7 +134,7 @@ def test_the_mean_does_not_depend_on_the_number_of_patches(case: Case) -> None:
     assert whole.item() == pytest.approx(((1 - ncc) * views.weights)[valid].sum().item() / count)
     half = torch.arange(count).view(depth.shape) % 2 == 0
     masked = ViewPair(depth, case.normal, everything.reference.textured & half, HERE, everything, half)
-    assert photometric(masked).item() == pytest.approx(whole.item(), rel=0.05)  # half of the sum, half of the pixels
+    assert photometric(masked).item() == pytest.approx(whole.item(), rel=0.05)  # half of the sum and half of the pixels
     g = torch.Generator().manual_seed(0)
     few = [replace(everything, draws=torch.rand(60, generator=g, dtype=torch.float64)) for _ in range(20)]
     sampled = [photometric(ViewPair(depth, case.normal, everything.reference.textured, HERE, n)).item() for n in few]

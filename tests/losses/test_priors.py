@@ -1,4 +1,4 @@
-"""Losses on known depths and normals: values worked by hand, gradients, fits of relative maps."""
+"""Depth and normal prior losses: hand-computed values, gradients, fits of relative maps."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ HIT = torch.ones(4, 5, dtype=torch.float64)
 
 
 def valid(depth: Tensor) -> MetricDepth:
-    """A map that knows the depths above 0."""
+    """Return a map in which depths above 0 are valid."""
     return MetricDepth(1 / torch.where(depth > 0, depth, 1), depth > 0)
 
 
 def directed(normals: Tensor) -> NormalTarget:
-    """Normals that are known where they are not 0."""
+    """Return normals that are valid where they are not 0."""
     return NormalTarget(normals, (normals != 0).any(dim=2).to(normals))
 
 
@@ -47,7 +47,7 @@ def no_noise(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("no_noise")
 def test_the_loss_of_a_map_is_the_mean_relative_error() -> None:
     depth, truth = torch.full((4, 5), 2.0).double(), torch.zeros(4, 5).double()
-    truth[0, 0], truth[1, 2], truth[3, 4] = 1.0, 2.0, 4.0  # errors 1, 0, 1/2; 17 pixels unknown
+    truth[0, 0], truth[1, 2], truth[3, 4] = 1.0, 2.0, 4.0  # errors 1, 0, 1/2; 17 pixels are invalid
     loss = depth_prior(valid(truth), depth, HIT)
     assert loss.item() == pytest.approx(1.5 / 20)
 
@@ -55,14 +55,14 @@ def test_the_loss_of_a_map_is_the_mean_relative_error() -> None:
 @pytest.mark.usefixtures("no_noise")
 def test_pixels_that_are_hardly_covered_do_not_count() -> None:
     depth, alpha = torch.full((4, 5), 2.0).double(), HIT.clone()
-    alpha[0, 0], depth[1, 1] = 0.4, 0.0  # too thin, nothing hit
+    alpha[0, 0], depth[1, 1] = 0.4, 0.0  # too faint; no surface
     loss = depth_prior(valid(torch.ones(4, 5).double()), depth, alpha)
     assert loss.item() == pytest.approx(18 / 20)
 
 
 @pytest.mark.usefixtures("no_noise")
 def test_a_point_between_pixels_is_compared_with_the_plane_through_them() -> None:
-    # On a plane disparity is linear: 1/2 and 1/4 at the pixels, 3/8 in the middle, so z = 8/3.
+    # On a plane, disparity is linear: 1/2 and 1/4 at the pixels, 3/8 at the midpoint, so z = 8/3.
     depth = torch.full((2, 2), 2.0).double()
     depth[:, 1] = 4.0
     middle = points([[0, 1, 2, 3]], [[0.25] * 4], [2.0])
@@ -84,7 +84,7 @@ def test_normals_cost_one_minus_their_cosine_by_blending_weight() -> None:
     normal[0, 0], truth[0, 0] = torch.tensor([0, 0, 1.0]), torch.tensor([0, 0, 1.0])  # 0
     normal[0, 1], truth[0, 1] = torch.tensor([0.8, 0, 0]), torch.tensor([0, 1.0, 0])  # 0.8 (1 - 0)
     normal[1, 0], truth[1, 0] = torch.tensor([0, 0, -0.5]), torch.tensor([0, 0, 1.0])  # 0.5 (1 + 1)
-    normal[1, 1] = torch.tensor([1.0, 0, 0])  # unknown
+    normal[1, 1] = torch.tensor([1.0, 0, 0])  # invalid
     assert normal_prior(directed(truth), normal, alpha).item() == pytest.approx((0.8 + 1.0) / 4)
 
 

@@ -1,4 +1,4 @@
-"""The losses: definitions by hand-worked numbers."""
+"""Loss definitions, checked against hand-computed values."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_ssim_of_two_flat_images_far_from_the_border_is_the_luminance_term() -> 
 
 
 def test_ssim_pads_with_zeros() -> None:
-    # A single pixel: only the centre weight g of the window meets the image, so mu = g v and E[v v'] = g v v'.
+    # Single pixel: only the window's centre weight g overlaps the image, so mu = g v and E[v v'] = g v v'.
     g = reference.gaussian_window()[5].item() ** 2
     x, y = 0.4, 0.9
     mu_x, mu_y, var_x, var_y, cov = g * x, g * y, g * x * x, g * y * y, g * x * y
@@ -47,7 +47,7 @@ def test_ssim_agrees_with_torchmetrics_where_the_window_is_inside_the_image() ->
     y = (x + 0.2 * torch.randn(40, 33, 3, generator=g, dtype=torch.float64)).clamp(0, 1)
     _, theirs = structural_similarity_index_measure(
         x.permute(2, 0, 1)[None], y.permute(2, 0, 1)[None], sigma=1.5, data_range=1.0, return_full_image=True
-    )  # it reflects at the border where we pad with zeros: compare where the window is inside
+    )  # skimage reflects at the border, gs2d pads with zeros: compare only where the window is inside
     ours = reference.ssim_map(x, y)
     torch.testing.assert_close(ours[5:-5, 5:-5], theirs[0].permute(1, 2, 0)[5:-5, 5:-5], rtol=1e-9, atol=0)
     assert (ours - theirs[0].permute(1, 2, 0)).abs().max() > 1e-3
@@ -86,7 +86,7 @@ def test_with_camera_edges_an_empty_neighbour_lies_at_the_cameras_centre() -> No
     depth = torch.where(torch.rand(9, 11, generator=generator) < 0.4, 0.0, depth)
     i, j = np.meshgrid(np.arange(11) + 0.5, np.arange(9) + 0.5)
     rays = np.stack([(i - camera.cx) / camera.fx, (j - camera.cy) / camera.fy, np.ones_like(i)], axis=-1)
-    points = camera.center + depth.numpy()[..., None] * (rays @ camera.rotation)  # world; the centre where empty
+    points = camera.center + depth.numpy()[..., None] * (rays @ camera.rotation)  # the camera centre where empty
     down, right = points[2:, 1:-1] - points[:-2, 1:-1], points[1:-1, 2:] - points[1:-1, :-2]
     product = np.cross(down, right)
     length = np.linalg.norm(product, axis=-1, keepdims=True)
@@ -94,14 +94,14 @@ def test_with_camera_edges_an_empty_neighbour_lies_at_the_cameras_centre() -> No
     found = normals_from_depth(depth, camera, edges="camera")
     assert ((length == 0).any(), (length > 0).mean() > 0.5) == (True, True)
     np.testing.assert_allclose(found[1:-1, 1:-1].numpy(), expected, atol=1e-12)
-    beside = normals_from_depth(depth, camera).norm(dim=-1) == 0  # the border too
+    beside = normals_from_depth(depth, camera).norm(dim=-1) == 0  # includes the border
     assert (found[beside].norm(dim=-1) > 0.5).sum() > 20
     torch.testing.assert_close(found[~beside], normals_from_depth(depth, camera)[~beside])
 
 
 def test_with_camera_edges_normals_beside_the_background_are_across_the_rays() -> None:
-    # Half of a plane in front of the camera, the right half empty. At the last hit column but one all is as ever; at
-    # the next two pixels P_right is the centre: N is across P_left, and so are all planes through the centre.
+    # The right half of the image is empty. Normals change only in the last column of the plane and the first
+    # empty one: there P_right is the camera centre, so N is perpendicular to P_left.
     camera = make_camera(8, 5)
     depth = torch.full((5, 8), 2.0, dtype=torch.float64)
     depth[:, 4:] = 0
@@ -110,8 +110,8 @@ def test_with_camera_edges_normals_beside_the_background_are_across_the_rays() -
     assert normals[2, 3].numpy() @ ray == pytest.approx(0, abs=1e-12)  # its left neighbour is column 2
     assert normals[2, 3].norm().item() == pytest.approx(1)
     assert normals[2, 2].numpy() @ camera.forward == pytest.approx(-1)
-    assert (normals[:, 5:] == 0).all()  # left and right empty
-    assert (normals[2, 4] == 0).all()  # above and below it empty
+    assert (normals[:, 5:] == 0).all()  # left and right are empty
+    assert (normals[2, 4] == 0).all()  # above and below are empty
 
 
 @pytest.mark.parametrize("mask_one", [(2, 3), (1, 2)])
@@ -124,7 +124,7 @@ def test_with_camera_edges_an_ignored_neighbour_still_leaves_no_normal(mask_one:
     row, column = mask_one
     for away in [(0, 0), (0, 1), (0, -1), (1, 0), (-1, 0)]:
         assert (normals[row + away[0], column + away[1]] == 0).all()
-    assert normals[4, 3].norm() > 0.5  # above it is empty, not ignored
+    assert normals[4, 3].norm() > 0.5  # the pixel above is empty, not ignored
 
 
 @pytest.mark.parametrize("loss", [reference.normal_consistency, reference.normal_consistency_per_splat])
@@ -153,7 +153,7 @@ def test_weights_multiply_the_part_of_each_pixel_and_the_count_stays() -> None:
     mask = torch.rand(8, 9, generator=torch.Generator().manual_seed(0)) < 0.9
     for loss in (reference.normal_consistency, reference.normal_consistency_per_splat):
         parts = torch.zeros((), dtype=torch.float64)
-        for row in range(2):  # the upper and the lower half, by weights of 0 and 1
+        for row in range(2):  # upper and lower half, selected by weights of 0 and 1
             half = torch.zeros(8, 9, dtype=torch.float64)
             half[4 * row : 4 * row + 4] = 1
             parts = parts + (row + 2) * loss(*images, mask, weights=half)
@@ -216,7 +216,7 @@ def test_the_silhouette_loss_sees_a_splat_that_has_the_colour_of_the_background(
     value = reference.silhouette(alpha, wanted)
     assert value.item() == 0.125
     assert torch.autograd.grad(value, alpha)[0].tolist() == [[0.25, 0.0], [0.0, 0.0]]
-    # Ignoring that pixel leaves nothing wrong among the other three.
+    # Without that pixel the other three have no error.
     assert reference.silhouette(alpha, wanted, torch.tensor([[False, True], [True, True]])).item() == 0.0
 
 

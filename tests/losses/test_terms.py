@@ -1,4 +1,4 @@
-"""The losses of a recipe: masks, gradients, terms, both implementations."""
+"""Losses of a recipe: masks, gradients, terms, both implementations."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def one_loss(
     depth: str = "mean",
     backend: str = "reference",
 ) -> Tensor:
-    """A loss of weight 1; silhouette: the first channel of the target; second view: the target, a step aside."""
+    """Return a loss of weight 1; the silhouette is the target's first channel, the second view a shifted target."""
     terms, neighbour = [LossTerm(kind, 1.0)], one_neighbour(target, mask, camera)
     view = LossView(target, camera, mask, index=0, depth_kind=depth, silhouette=target[..., 0], neighbour=neighbour)
     losses = Losses(terms)
@@ -53,7 +53,7 @@ def one_loss(
 
 
 class OnePrior:
-    """Depths and normals made of the colours of a target, with the face of ``Priors``."""
+    """Depths and normals computed from a target's colours, with the interface of ``Priors``."""
 
     def __init__(self, target: Tensor) -> None:
         valid, directions = torch.ones_like(target[..., 0]), torch.nn.functional.normalize(target, dim=2)
@@ -64,7 +64,7 @@ class OnePrior:
 
 
 def one_neighbour(target: Tensor, mask: Tensor | None, camera: Camera) -> Neighbour:
-    """The same photograph from a little to the right, every patch of 3 px asked, nothing hidden."""
+    """Return the same image from a camera shifted to the right, with all patches of 3 px sampled and no occlusion."""
     settings = MultiView(patches=target.shape[0] * target.shape[1], radius=1, texture=1e-3, opacity=0.01, occluded=1e3)
     image, aside = prepare_image(target, mask, settings), camera.T_cam_world.copy()
     aside[0, 3] -= 0.1
@@ -131,7 +131,7 @@ def test_every_reference_loss_passes_a_float64_gradient_check(kind: str, masked:
     target = torch.rand(height, width, 3, generator=g, dtype=torch.float64)
     mask = torch.rand(height, width, generator=g) < 0.85 if masked else None
     images = {name: image for name, image in vars(output).items() if name not in ("radii", "normal_without_pose_grad")}
-    if kind in ("normal_consistency", *PRIORS):  # alpha is detached there, which finite differences cannot know
+    if kind in ("normal_consistency", *PRIORS):  # alpha is detached, which finite differences cannot reproduce
         images["alpha"] = images["alpha"].detach()
 
     def loss(*values: Tensor) -> Tensor:
@@ -197,7 +197,7 @@ def test_object_weights_give_no_gradient_to_the_background(backend: str, request
         view = LossView(target, camera, silhouette=alpha)
         value = compute_losses(output, view, terms, backend=backend)["normal_consistency"]
         (gradients[where],) = torch.autograd.grad(value, output.normal)
-    empty = alpha[1:-1, 1:-1] == 0  # of those with a normal
+    empty = alpha[1:-1, 1:-1] == 0  # among pixels with a normal
     inner = {where: gradient[1:-1, 1:-1] for where, gradient in gradients.items()}
     assert (inner["image"][empty] != 0).all()
     assert (inner["object"][empty] == 0).all()

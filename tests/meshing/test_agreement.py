@@ -1,4 +1,4 @@
-"""Consensus of photographs in a texture: obstacles, highlights, exposures, and the memory for them."""
+"""Consensus of images in a texture: obstacles, highlights, exposures, and memory use."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ SIZE = 128
 
 
 def stripes(places: np.ndarray) -> np.ndarray:
-    """Fine waves on colours that change slowly."""
+    """Return fine waves on slowly changing colours."""
     wave = np.sin(12 * places[:, :1]) * np.sin(10 * places[:, 1:2])
     return np.asarray(0.45 + 0.12 * places * (1, -1, 0) + 0.15 * wave * (1.0, 0.8, 0.4))
 
 
 def cameras(count: int) -> list[Camera]:
-    """Cameras in a ring above the plane."""
+    """Return cameras in a ring above the plane."""
     found = []
     for k in range(count):
         angle = 2 * np.pi * k / count
@@ -30,13 +30,13 @@ def cameras(count: int) -> list[Camera]:
 
 
 def photographs(count: int, gains: tuple[float, ...] = (), paint: Paint = stripes) -> list[ColorSource]:
-    """The plane from each camera."""
+    """Render the plane from each camera."""
     plane, seen = grid_plane(16), cameras(count)
     return [photograph(plane, camera, paint, gain) for camera, gain in zip(seen, gains or (1.0,) * count, strict=True)]
 
 
 def with_plate(image: ColorSource, height: float, color: tuple[int, int, int]) -> ColorSource:
-    """The same photograph with a plate before the plane that is not part of the mesh."""
+    """Add a plate in front of the plane that is not part of the mesh."""
     plate = join([grid_plane(2, side=0.9)])
     plate = type(plate)(plate.vertices + np.float32([0.2, 0.1, height]), plate.faces)
     hidden = cast_camera(plate.vertices.astype(np.float64), plate.faces, image.camera).face >= 0
@@ -47,7 +47,7 @@ def with_plate(image: ColorSource, height: float, color: tuple[int, int, int]) -
 
 
 def errors(images: list[ColorSource]) -> np.ndarray:
-    """Absolute errors [t, 3] of the texels, of 255, up to the rim of the plane."""
+    """Return absolute texel errors [t, 3] on a scale of 255, without the plane's border."""
     texture = bake(flat_atlas(grid_plane(16)), listed(images), SIZE, threads=1).mesh.texture
     row, column = np.indices((SIZE, SIZE)).reshape(2, -1)
     places = np.stack([(column + 0.5) / SIZE * 2 - 1, 1 - (row + 0.5) / SIZE * 2, np.zeros(SIZE * SIZE)], axis=1)
@@ -82,11 +82,11 @@ def test_a_moving_highlight_is_removed() -> None:
             return stripes(places) + 0.6 * spot
 
         images.append(photograph(grid_plane(16), image.camera, shiny))
-    assert np.quantile(errors(images), 0.999) < 20  # of 150 in one photograph
+    assert np.quantile(errors(images), 0.999) < 20  # one image is off by 150
 
 
 def test_exposures_are_estimated_from_a_chain_of_overlaps() -> None:
-    """Each photograph shares points with its neighbours only; the third has an obstacle before a third of them."""
+    """Images share points only with their neighbours; in the third image an obstacle covers a third of them."""
     truth, gains = np.random.default_rng(0).uniform(50, 160, (600, 3)), np.array([0.7, 0.9, 1.2, 1.0, 1.3])
     samples = [np.zeros((600, 4), np.uint8) for _ in gains]
     for k, (table, gain) in enumerate(zip(samples, gains, strict=True)):
@@ -98,7 +98,7 @@ def test_exposures_are_estimated_from_a_chain_of_overlaps() -> None:
 
 
 def test_image_borders_leave_no_seam() -> None:
-    """Each shows a part of the plane only, in an exposure of its own; a uniform wall shows every step."""
+    """Each image shows only part of the plane, at its own exposure; the uniform wall would reveal any step."""
     gains, images = (0.8, 1.2, 0.9, 1.15), []
     wall = photographs(4, gains, lambda places: np.full_like(places, 0.5))
     for k, image in enumerate(wall):
@@ -106,5 +106,5 @@ def test_image_borders_leave_no_seam() -> None:
         (valid if k % 2 else valid.T)[:, : SIZE // 2 + 8 * k - 12] = False
         images.append(ColorSource(image.camera, image.image, valid))
     texture = bake(flat_atlas(grid_plane(16)), listed(images), SIZE, threads=1).mesh.texture[8:-8, 8:-8].astype(int)
-    assert max(np.abs(np.diff(texture, axis=k)).max() for k in (0, 1)) <= 2  # of 50 between photographs
+    assert max(np.abs(np.diff(texture, axis=k)).max() for k in (0, 1)) <= 2  # exposures differ by 50
     assert np.ptp(texture) <= 8

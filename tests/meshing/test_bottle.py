@@ -1,4 +1,4 @@
-"""The ceiling: exact depth maps of a real scanned scene, ray-cast by Embree, give its surface back."""
+"""Upper bound of mesh quality: fusing exact depth maps of a scanned object (ray-cast by Embree) restores its surface."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SIZE = 200
 
 
 def cameras_of(folder: Path) -> list[Camera]:
-    """Every second training camera of the NeRF-Synthetic file, at half size."""
+    """Return every second training camera of the NeRF-Synthetic file, at half resolution."""
     info = json.loads((folder / "transforms_train.json").read_text())
     focal = 0.5 * SIZE / np.tan(0.5 * info["camera_angle_x"])
     flip = np.diag([1.0, -1, -1, 1])  # OpenGL axes to OpenCV axes
@@ -30,12 +30,12 @@ def cameras_of(folder: Path) -> list[Camera]:
 
 
 def ray_cast(mesh: Mesh, camera: Camera) -> np.ndarray:
-    """z-depth [H, W] by trimesh and Embree; 0 where nothing is hit."""
+    """Return z-depth [H, W] computed by trimesh and Embree; 0 where the ray hits nothing."""
     pyembree = pytest.importorskip("trimesh.ray.ray_pyembree")
     caster = pyembree.RayMeshIntersector(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
     v, u = np.mgrid[0:SIZE, 0:SIZE] + 0.5
     local = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], -1).reshape(-1, 3)
-    step = local @ camera.rotation  # one unit deep
+    step = local @ camera.rotation  # unit depth
     face = caster.intersects_first(np.broadcast_to(camera.center, step.shape), step)
     a, b, c = np.moveaxis(mesh.vertices.astype(np.float64)[mesh.faces[face]], 1, 0)
     normal = np.cross(b - a, c - a)

@@ -1,4 +1,4 @@
-"""A mesh holds what its views saw: sheets that few saw go, faces are as many as pixels, borders and colours stay."""
+"""Mesh cleaning keeps observed surface: removes sheets seen by few views, limits faces, keeps borders and colours."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BOX = np.array([[-2.0, -2, -2], [2, 2, 2]])
 
 
 def frames(count: int, *, sheets: int = 0) -> list[RenderedView]:
-    """A coloured ball from all round; the first views have a sheet before it, in a corner of their pictures."""
+    """Render a coloured ball from all around; the first views have a sheet in front of it in an image corner."""
     made = []
     for number, camera in enumerate(orbit(count, 4.0, size=32, focal=40.0)):
         depth = sphere_depth(camera, 1.0)
@@ -29,7 +29,7 @@ def frames(count: int, *, sheets: int = 0) -> list[RenderedView]:
 
 
 def off_the_ball(mesh: Mesh) -> float:
-    """The part of the area that lies away from the ball."""
+    """Return the fraction of the area that lies away from the ball."""
     middle = mesh.vertices[mesh.faces].mean(axis=1)
     area = areas(mesh)
     return float(area[np.abs(np.linalg.norm(middle, axis=1) - 1) > 0.15].sum() / area.sum())
@@ -40,7 +40,7 @@ def test_a_sheet_seen_by_one_view_is_removed_and_the_ball_is_kept() -> None:
     before, after = (
         extract(seen, ExtractOptions(bbox=BOX, voxel=0.1, by_evidence=cleans), threads=1) for cleans in (False, True)
     )
-    assert off_the_ball(before.mesh) > 0.01  # there was a sheet
+    assert off_the_ball(before.mesh) > 0.01  # the sheet exists
     assert off_the_ball(after.mesh) == 0.0
     assert areas(after.mesh).sum() == pytest.approx(4 * np.pi, rel=0.1)
     assert before.pixels is None
@@ -57,7 +57,7 @@ def test_no_face_extends_beyond_the_box() -> None:
 def test_the_number_of_faces_follows_the_pixels() -> None:
     found = extract(frames(14), ExtractOptions(bbox=BOX, voxel=0.06, by_evidence=True), threads=1)
     assert found.pixels is not None
-    # a pixel at distance 3 is 3 / 40 wide, and the best view of each part looks nearly straight at it
+    # a pixel at distance 3 is 3 / 40 wide, and the best view of each part is nearly perpendicular to it
     assert found.pixels == pytest.approx(4 * np.pi * (40 / 3) ** 2, rel=0.3)
     assert len(found.mesh.faces) <= 1.05 * FACES_A_PIXEL * found.pixels
     assert np.abs(np.linalg.norm(found.mesh.vertices, axis=1) - 1).max() < 0.1
@@ -73,24 +73,24 @@ def test_evidence_does_not_depend_on_chunks(monkeypatch: pytest.MonkeyPatch) -> 
     parts = gather(mesh, made, 0.1)
     for name in ("views", "support", "against", "density"):
         np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
-    for at in range(0, len(mesh.vertices), 29):  # one by one, in double precision
+    for at in range(0, len(mesh.vertices), 29):  # one vertex at a time, in double precision
         support, against, least = 0, 0, np.inf
         for item in made:
             x, y, z = item.camera.rotation @ mesh.vertices[at] + item.camera.T_cam_world[:3, 3]
             column, row = item.camera.fx * x / z + item.camera.cx, item.camera.fy * y / z + item.camera.cy
             seen = item.depth[int(row), int(column)]
-            normal = mesh.vertices[at] / np.linalg.norm(mesh.vertices[at])  # of a ball, nearly
+            normal = mesh.vertices[at] / np.linalg.norm(mesh.vertices[at])  # approximate: exact for a ball
             arm = item.camera.center - mesh.vertices[at]
             facing = normal @ arm / np.linalg.norm(arm)
             least = min(least, abs(abs(seen - z) - 0.1), abs(facing - 0.1) / 3)
             support += bool(seen > 0 and abs(seen - z) <= 0.1 and facing > 0.1)
             against += bool(seen > z + 0.1)
-        if least > 0.02:  # neither nearly beyond the tolerance nor nearly grazing
+        if least > 0.02:  # skip vertices close to the tolerance or to grazing angles
             assert (whole.support[at], whole.against[at]) == (support, against)
 
 
 def views_of_a_floor(count: int = 12) -> list[RenderedView]:
-    """Cameras look down at the plane z = 0, whose depth is loose and weighs little, as that of a plain floor."""
+    """Render the plane z = 0 from cameras looking down; its depth is noisy with low weight, as for a textureless floor."""
     made = []
     for number in range(count):
         angle = 2 * np.pi * number / count
@@ -104,7 +104,7 @@ def views_of_a_floor(count: int = 12) -> list[RenderedView]:
 
 
 def part_of_floor(frames: list[RenderedView]) -> float:
-    """The part of the square |x|, |y| < 0.7 that is covered by a mesh of the frames, and what lies above it."""
+    """Return the part of the square |x|, |y| < 0.7 covered by the fused mesh, and the part of the mesh above it."""
     mesh = extract(
         frames, ExtractOptions(bbox=BOX, voxel=0.06, truncation=0.3, min_weight=0.25, by_evidence=True), threads=1
     ).mesh

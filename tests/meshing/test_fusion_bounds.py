@@ -1,4 +1,4 @@
-"""Limits come from what all views saw, and disagreement between views widens the truncation."""
+"""Fusion bounds follow the observations of all views; disagreement between views widens the truncation."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def sample(points: np.ndarray, depths: np.ndarray, footprint: float = 1e-4) -> D
 
 
 def line(count: int, low: float, high: float) -> np.ndarray:
-    """Points on the x axis; y and z within a tenth."""
+    """Return points on the x axis; y and z stay within 0.1."""
     t = np.linspace(0, 1, count)
     return np.stack([low + (high - low) * t, 0.1 * np.cos(9 * t), 0.1 * np.sin(9 * t)], axis=1)
 
@@ -51,7 +51,7 @@ def test_backprojected_pixels_project_back() -> None:
 
 
 def test_the_voxel_is_the_percentile_box_divided_by_the_resolution() -> None:
-    """1000 points from 0 to 100: the 1st to 99th percentile span 98."""
+    """For 1000 points from 0 to 100, the 1st to 99th percentile span 98."""
     lim = derive_limits([sample(line(1000, 0, 100), np.full(1000, 5.0))], [CAMERA], resolution=98)
     assert lim.voxel == pytest.approx(1.0)
     assert lim.truncation == pytest.approx(5.0)
@@ -67,7 +67,7 @@ def test_the_voxel_is_not_finer_than_half_a_pixel() -> None:
 
 
 def test_a_far_background_is_left_out_and_reported() -> None:
-    """A fifth of the pixels see mountains at 200 times the depth of the rest: box and voxel follow the rest."""
+    """A fifth of the pixels show mountains at 200 times the depth of the rest: box and voxel follow the rest."""
     near, far = sample(line(800, 0, 1), np.full(800, 5.0)), sample(line(200, -900, 900), np.full(200, 1000.0))
     lim = derive_limits([near, far], [CAMERA], resolution=98)
     assert lim.depth_limit == 20.0  # 4 times the median
@@ -86,7 +86,7 @@ def test_a_bbox_is_fused_whole() -> None:
     lim = derive_limits([sample(line(100, 0, 1), np.full(100, 1.0))], [CAMERA], bbox=box, resolution=100)
     assert (lim.lower, lim.upper) == ((-1, -1, -1), (1, 3, 1))
     assert lim.voxel == pytest.approx(0.04)
-    assert lim.depth_limit == pytest.approx(8.0)  # the camera at y = -5 looks along y: the far face is 8 deep
+    assert lim.depth_limit == pytest.approx(8.0)  # the camera at y = -5 looks along y: the far face is at depth 8
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,7 @@ def test_a_bbox_is_fused_whole() -> None:
         {"bbox": np.zeros((2, 3))},
         {"bbox": np.zeros((3, 2))},
         {"bbox": np.array([[-1, -9, -1], [1, -8, 1]])},  # behind the camera
-        {"depth_limit": 0.5},  # before everything
+        {"depth_limit": 0.5},  # in front of everything
     ],
 )
 def test_invalid_limits_are_one_line_errors(options: dict) -> None:
@@ -113,7 +113,7 @@ def test_invalid_limits_are_one_line_errors(options: dict) -> None:
 
 
 def orbit_maps(error: float, seed: int = 0) -> list[DepthMap]:
-    """A unit sphere seen from all round; each map wrong by its own smooth waves of standard deviation ``error``."""
+    """Return depth maps of a unit sphere from all around, each with smooth waves of standard deviation ``error``."""
     rng = np.random.default_rng(seed)
     maps = []
     for camera in orbit(24, 3.0, size=96, focal=120.0):
@@ -130,15 +130,17 @@ def noise_of(maps: list[DepthMap]) -> float | None:
 
 
 def test_disagreement_is_as_large_as_the_error() -> None:
-    """The difference of two errors of sigma has standard deviation sqrt(2) sigma; 75 % of its positive half lie below
-    1.15 times that, 1.63 sigma. Slanted surface adds to it."""
+    """The difference of two errors of sigma has standard deviation sqrt(2) sigma.
+
+    75 % of its positive half lie below 1.15 times that, 1.63 sigma. Slanted surfaces add to it.
+    """
     noise = noise_of(orbit_maps(0.02))
     assert noise is not None
     assert 1.2 * 0.02 < noise < 2.5 * 0.02
 
 
 def test_occlusion_is_not_disagreement() -> None:
-    """A small box before a wall, seen from several sides: parts of the wall are hidden in some views."""
+    """A small box in front of a wall, from several sides: some views do not see parts of the wall."""
     eyes = [np.array([x, -4.0, z]) for x in (-1, 0, 1) for z in (0, 1)]
     cameras = [look_at(eye, np.zeros(3), UP, width=96, height=96, fx=80) for eye in eyes]
     maps = []

@@ -1,4 +1,4 @@
-"""Adding views natively: numpy is the reference, and single precision leaves no room between the two."""
+"""Native integration of views agrees with the numpy reference to single precision."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ native = pytest.mark.skipif(not available_variants(), reason="the native library
 
 
 def views(count: int = 6) -> list[DepthMap]:
-    """A sphere with noise and holes, near enough to be cut by the images; weights and colours in some of the views."""
+    """Return a sphere with noise and holes, cut by the image borders; some of the views have weights and colours."""
     rng = np.random.default_rng(3)
     found = []
     for k, camera in enumerate(orbit(count, 2.2, size=64, focal=80.0)):
@@ -75,7 +75,7 @@ def test_the_native_mesh_of_all_levels_equals_numpy() -> None:
 
 
 def wall(depth: float) -> tuple[Volume, DepthMap, Camera]:
-    """One block of 8^3 voxels of 0.25 from (-1, -1, 1) on, before a camera at the origin that sees a wall."""
+    """Return one block of 8^3 voxels of 0.25 from (-1, -1, 1) on, and a view from the origin of a wall."""
     camera = Camera(64, 64, 16.0, 16.0, 32.0, 32.0, np.eye(4))
     lim = replace(LIMITS, lower=(-1.0, -1.0, 1.0), upper=(0.5, 0.5, 2.5), voxel=0.25, truncation=1.0, depth_limit=9.0)
     color = np.full((64, 64, 3), 200, np.uint8)
@@ -87,9 +87,9 @@ def wall(depth: float) -> tuple[Volume, DepthMap, Camera]:
 def test_a_voxel_changes_as_computed_by_hand(backend: str) -> None:
     """Voxels at z = 1, 1.25, ... 2.75, a truncation of 1, walls at 1.5 and then at 1.75.
 
-    First wall: distances 0.5, 0.25, 0, -0.25, -0.5, -0.75, -1, -1.25: weight 1 to -0.75, then 0. Second: 0.75, 0.5,
-    0.25, 0, -0.25, -0.5, -0.75, -1: their means, and at z = 2.5 the second alone. The colour of the voxel at z = 1 has
-    the weight (1 - 0.5) + (1 - 0.75).
+    The first wall has distances 0.5, 0.25, 0, -0.25, -0.5, -0.75, -1, -1.25, with weight 1 down to -0.75, then 0. The
+    second has 0.75, 0.5, 0.25, 0, -0.25, -0.5, -0.75, -1. The result is the mean of both; at z = 2.5 only the second
+    counts. The colour of the voxel at z = 1 has the weight (1 - 0.5) + (1 - 0.75).
     """
     volume, first, camera = wall(1.5)
     second = depth_map(RenderedView(camera, np.full((64, 64), 1.75), np.full((64, 64, 3), 100, np.uint8)))

@@ -1,4 +1,4 @@
-"""Captures whose meshes other implementations lose: a room seen from inside, and a surface that shines.
+"""Captures whose meshes other implementations break: a room seen from inside, and a specular surface.
 
 docs/known-faults.md names these tests.
 """
@@ -14,19 +14,19 @@ from gs2d.meshing.depth_maps import RenderedView
 from gs2d.meshing.extract import ExtractOptions, extract, extract_unbounded
 from surface_shapes import rays
 
-ROOM = np.array([3.0, 2.0, 1.3])  # half its sides; the cameras stand in it
+ROOM = np.array([3.0, 2.0, 1.3])  # half side lengths; the cameras are inside
 UP = np.array([0, 0, 1.0])
 
 
 def room_depth(camera: Camera) -> np.ndarray:
-    """z-depth of the walls, floor and ceiling at pixel centres: where a ray leaves the box it begins in."""
+    """Return the z-depth of walls, floor and ceiling at pixel centres: where a ray leaves the box."""
     eye, steps = rays(camera)
     steps = np.where(np.abs(steps) < 1e-12, 1e-12, steps)
     return np.asarray(((np.sign(steps) * ROOM - eye) / steps).min(axis=-1))
 
 
 def room_views() -> list[RenderedView]:
-    """A walk through the room, looking outwards all the time: what an orbit's bounding sphere knows nothing of."""
+    """Return views from a path through the room that look outwards, unlike an orbit around an object."""
     views = []
     for k in range(30):
         along = 2 * np.pi * k / 30
@@ -38,7 +38,7 @@ def room_views() -> list[RenderedView]:
 
 
 def covered(mesh: Mesh, axis: int, side: float, cell: float = 0.2) -> float:
-    """Return the part of a wall of the room, in cells, that has a vertex in its plane."""
+    """Return the fraction of a room wall's cells that have a vertex in its plane."""
     v = mesh.vertices.astype(np.float64)
     v = v[np.abs(v[:, axis] - side * ROOM[axis]) < 0.05]
     across = [k for k in range(3) if k != axis]
@@ -57,7 +57,7 @@ def test_a_room_seen_from_inside_has_all_its_walls(bounded: bool) -> None:
 
 
 def shining_wall(through: int, views: int = 12) -> list[RenderedView]:
-    """A wall at y = 0; in the first views a highlight, which moves with the camera, is explained 1 unit behind it."""
+    """Return views of a wall at y = 0; the first ``through`` have a moving highlight with depth 1 unit behind the wall."""
     frames = []
     for k in range(views):
         x = -0.6 + 1.2 * k / (views - 1)
@@ -71,7 +71,7 @@ def shining_wall(through: int, views: int = 12) -> list[RenderedView]:
 
 
 def cells_without(mesh: Mesh, cell: float = 0.1) -> int:
-    """Return how many cells of the wall's middle, where the highlights are, have no vertex near its plane."""
+    """Return how many cells in the middle of the wall, where the highlights are, have no vertex near its plane."""
     v = mesh.vertices.astype(np.float64)
     v = v[np.abs(v[:, 1]) < 0.2]
     found = {tuple(row) for row in np.floor(v[:, [0, 2]] / cell).astype(int).tolist()}
@@ -83,5 +83,5 @@ def test_a_highlight_that_some_views_see_through_leaves_no_hole() -> None:
 
 
 def test_what_all_views_see_through_is_a_hole() -> None:
-    """A mirror is not mended by fusion: what every photograph explains behind it is meshed behind it."""
+    """Fusion does not repair a mirror: if all images agree on a depth behind it, the mesh lies there."""
     assert cells_without(extract(shining_wall(12), ExtractOptions(resolution=96), threads=1).mesh) > 10

@@ -1,4 +1,4 @@
-"""Marching cubes: closed, oriented, seam-free; only known space makes surface."""
+"""Marching cubes gives closed, oriented surfaces without seams, and only in observed space."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def sphere(radius: float) -> object:
 
 
 def smooth_noise(seed: int, n: int) -> object:
-    """Random waves, positive at the border of the cube of side 2, so that every surface is closed."""
+    """Return random waves, positive at the border of the cube of side 2, so that every surface is closed."""
     rng = np.random.default_rng(seed)
     k, phase = rng.normal(size=(n, 3)) * 4, rng.uniform(0, 2 * np.pi, n)
 
@@ -31,7 +31,7 @@ def smooth_noise(seed: int, n: int) -> object:
 
 
 def white_noise(seed: int) -> object:
-    """Independent signs at every voxel, positive at the border: every one of the 256 cases, every ambiguous face."""
+    """Return independent signs at every voxel, positive at the border: all 256 cases and all ambiguous faces."""
 
     def field(p: np.ndarray) -> np.ndarray:
         values = np.random.default_rng(seed).normal(size=len(p))
@@ -94,7 +94,7 @@ def test_unknown_voxels_create_no_surface() -> None:
     lim = limits(1.0, 2 / 32)
     valid = volume_of(sphere(0.7), lim, 4)
     weight = valid.weight.copy()
-    weight[valid.blocks[:, 0] >= 2] = 0.5  # half of space below the least weight
+    weight[valid.blocks[:, 0] >= 2] = 0.5  # half of space is below the minimum weight
     half = Volume(lim, valid.dims, valid.keys, valid.tsdf, weight, None, None, 1)
     mesh = marching_cubes(half, min_weight=1.0)
     boundary = lim.lower[0] + 2 * BLOCK * lim.voxel
@@ -135,7 +135,7 @@ def test_vertex_colours_are_interpolated_without_uncoloured_ends() -> None:
 
 
 def strips() -> Mesh:
-    """Three pieces: 2 faces, 1 face, 2 faces, with a vertex that no face uses and colours that name the vertex."""
+    """Return three pieces of 2, 1 and 2 faces, an unused vertex, and colours that encode the vertex index."""
     faces = np.array([[0, 1, 2], [5, 6, 7], [1, 3, 2], [8, 9, 10], [9, 11, 10]], np.int32)
     vertices = np.arange(36, dtype=np.float32).reshape(12, 3)
     return Mesh(vertices, faces, np.repeat(np.arange(12, dtype=np.uint8)[:, None], 3, axis=1))

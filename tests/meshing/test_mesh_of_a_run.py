@@ -1,4 +1,4 @@
-"""``gs2d mesh RUN --unbounded``: a tiny run meshed without bounds, and what the user is told."""
+"""``gs2d mesh RUN --unbounded``: a tiny run meshed without bounds, and the messages."""
 
 from __future__ import annotations
 
@@ -44,9 +44,7 @@ def test_an_unbounded_mesh_of_a_run_reports_its_levels(run: Path, tmp_path: Path
     assert result["levels"] >= 1
     mesh = read_mesh(tmp_path / "far.ply")
     assert len(mesh.faces) == result["faces"] > 100
-    assert np.median(np.linalg.norm(mesh.vertices, axis=1)) == pytest.approx(
-        RADIUS, rel=0.4
-    )  # trained for a moment only
+    assert np.median(np.linalg.norm(mesh.vertices, axis=1)) == pytest.approx(RADIUS, rel=0.4)  # barely trained
     assert json.dumps(result)
 
 
@@ -66,7 +64,7 @@ def test_default_voxels_grow_until_the_volume_fits(run: Path, tmp_path: Path, mo
 
 
 def test_training_with_little_memory_uses_larger_voxels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Training and mesh in one command: the depth maps that scoring kept were closed after the voxels that failed."""
+    """Training and meshing in one command: the depth maps kept by scoring are closed once the smaller voxels failed."""
     monkeypatch.setattr("gs2d.pipeline.finish.run_mesh._volume_bytes", lambda _options: 400 << 10)
     capture, heard = write_capture(tmp_path / "ball", size=32), list[Event]()
     overrides = ("init_points=400", "surface.iterations=40", "surface.densify.max_splats=400")
@@ -83,7 +81,7 @@ def test_a_run_fuses_the_depth_of_its_protocol(run: Path, tmp_path: Path) -> Non
     job = reload_run(folder, lambda _event: None)
     of_recipe = with_fused_depth(job.protocol, replace(job.recipe, fused_depth="transmittance"))
     assert (of_recipe.fused_depth, job.protocol.fused_depth) == ("transmittance", "median")
-    assert with_fused_depth(of_recipe, job.recipe) is of_recipe  # a recipe that says nothing changes nothing
+    assert with_fused_depth(of_recipe, job.recipe) is of_recipe  # a recipe without the setting changes nothing
     definition = json.loads((run / "run.json").read_text())
     del definition["protocol"]["fusion"]["depth"]
     old = RunFolder(tmp_path)

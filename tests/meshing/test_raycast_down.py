@@ -1,4 +1,4 @@
-"""Rays straight down: which triangle of several is met, where, and how far below."""
+"""Rays straight down: which of several triangles is hit, where, and at what depth."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ HALVES = np.array([[0, 1, 2], [0, 2, 3]])
 
 
 def two_floors() -> tuple[np.ndarray, np.ndarray]:
-    """A floor at height 1, and above its east half one that rises from 2 to 3 towards the north."""
+    """Return a floor at height 1, and a second one above its east half that rises from 2 to 3 towards the north."""
     low = np.concatenate([SQUARE, np.full((4, 1), 1.0)], axis=1)
     high = np.concatenate([SQUARE * (0.5, 1) + (2, 0), (2 + SQUARE[:, 1:] / 4)], axis=1)
     return np.concatenate([low, high]), np.concatenate([HALVES, HALVES + 4])
@@ -21,10 +21,10 @@ def test_the_highest_surface_is_hit_and_interpolated() -> None:
     vertices, faces = two_floors()
     hits = cast_down(vertices, faces, (0.0, 4.0), 1.0, (4, 4))
     heights = (vertices[faces[hits.face], 2] * hits.weights).sum(axis=-1)
-    north = np.array([3.5, 2.5, 1.5, 0.5])  # of the rows: the first is the northernmost
+    north = np.array([3.5, 2.5, 1.5, 0.5])  # per row; the first row is the northernmost
     np.testing.assert_allclose(heights[:, :2], 1.0, atol=1e-6)
     np.testing.assert_allclose(heights[:, 2:], np.repeat((2 + north / 4)[:, None], 2, axis=1), atol=1e-6)
-    np.testing.assert_allclose(hits.depth, 4.0 - heights, atol=1e-5)  # one more than below the highest vertex, 3
+    np.testing.assert_allclose(hits.depth, 4.0 - heights, atol=1e-5)  # rays start at 4, one above the highest vertex
     x = (vertices[faces[hits.face], 0] * hits.weights).sum(axis=-1)
     np.testing.assert_allclose(x, np.tile(np.arange(4) + 0.5, (4, 1)), atol=1e-6)
 

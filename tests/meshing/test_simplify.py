@@ -1,4 +1,4 @@
-"""Edge collapse in a process of its own: the bytes of one here, and an answer where there is no other process."""
+"""Edge collapse in a separate process gives the same bytes as in-process, and also works where no process can start."""
 
 from __future__ import annotations
 

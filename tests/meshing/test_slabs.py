@@ -1,4 +1,4 @@
-"""The surface is made slab by slab: the same mesh, byte for byte, with a part of the volume in memory."""
+"""Slab-wise surface extraction gives a byte-identical mesh while only part of the volume is in memory."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from surface_shapes import orbit, sphere_depth
 
 
 def maps(*, colored: bool) -> list[DepthMap]:
-    """A ball from all round, with colours that differ from pixel to pixel."""
+    """Render a ball from all around, with colours that differ from pixel to pixel."""
     random = np.random.default_rng(0)
     found = []
     for camera in orbit(6, 4.0, size=32, focal=40.0):
@@ -58,6 +58,6 @@ def test_slabs_respect_the_memory_limit(monkeypatch: pytest.MonkeyPatch) -> None
     fused_surface(seen, limits, blocks, slab_bytes=most, threads=1)
     assert len(held) > 1
     assert max(held) <= most
-    rows = list(slabs(blocks, block_bytes(False)))  # no layer fits: each is a slab, with the next one
+    rows = list(slabs(blocks, block_bytes(False)))  # no layer fits: each is a slab, together with the next one
     assert [start for start, _, _ in rows[1:]] == [own for _, own, _ in rows[:-1]]
     assert (rows[0][0], rows[-1][1]) == (0, len(blocks.keys))

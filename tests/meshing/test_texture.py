@@ -1,4 +1,4 @@
-"""Texture baking: which photographs colour a texel and how much, what is filled, and the files."""
+"""Texture baking: which images colour a texel and with what weight, filling of unseen texels, and files."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ RED, GREEN, BLUE = (np.array(c, float) for c in ((1, 0, 0), (0, 1, 0), (0, 0, 1)
 
 
 def plain(camera_height: float, color: np.ndarray, size: int = 64) -> ColorSource:
-    """A picture of one colour, from above."""
+    """Return an image of one colour, from above."""
     image = np.broadcast_to(np.rint(255 * color).astype(np.uint8), (size, size, 3))
     return ColorSource(above(camera_height, size), np.ascontiguousarray(image))
 
 
 @pytest.fixture
 def uncorrected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Photographs as they are: what differs between them stays different."""
+    """Disable exposure correction, so that differences between images remain."""
     monkeypatch.setattr(atlas_module, "corrected", lambda image, *_: (image, np.ones(image.shape[:2], np.float32)))
 
 
@@ -56,20 +56,20 @@ def test_a_textured_checkered_box_looks_like_its_images() -> None:
     assert baked.unseen < 10  # of 60 000: at the corners
     colors = np.rint(255 * np.clip(checkers(mesh.vertices), 0, 1)).astype(np.uint8)
     by_vertex, by_texture = [], []
-    for camera in ring(3, turn=0.4):  # none of those
+    for camera in ring(3, turn=0.4):  # cameras that were not used for baking
         truth = photograph(mesh, camera, checkers)
         target = np.where(truth.image[..., 3:] > 0, truth.image[..., :3] / 255, 1.0)
         inside = truth.image[..., 3] == 255
         by_texture.append(psnr(image(baked.mesh, camera)[0][inside], target[inside]))
         by_vertex.append(psnr(image(Mesh(mesh.vertices, mesh.faces, colors), camera)[0][inside], target[inside]))
     assert min(by_texture) > 31
-    assert max(by_vertex) < 20  # six squares of colours for three of checkers
+    assert max(by_vertex) < 20  # vertex colours: six squares for three of the checkerboard
 
 
 @pytest.mark.usefixtures("uncorrected")
 def test_a_texel_is_weighted_by_pixels_per_area() -> None:
-    # f = 64; straight above a plane q = f^2 / z^2: 4096, 1024, 256 and 64 at z = 1, 2, 4, 8. The best two, less the
-    # third: 3840 and 768, which is 5 to 1.
+    # f = 64; straight above a plane q = f^2 / z^2: 4096, 1024, 256 and 64 at z = 1, 2, 4, 8. The best two, minus
+    # the third: 3840 and 768, a ratio of 5 to 1.
     heights = ((4, GREEN), (1, RED), (8, GREEN), (2, BLUE))
     baked = bake(flat_atlas(grid_plane()), listed([plain(z, c, 256) for z, c in heights]), 64, best=2, threads=1)
     assert middle(baked.mesh.texture) == pytest.approx([255 * 5 / 6, 0, 255 / 6], abs=1)
@@ -77,7 +77,7 @@ def test_a_texel_is_weighted_by_pixels_per_area() -> None:
 
 @pytest.mark.usefixtures("uncorrected")
 def test_occluders_do_not_colour_the_surface() -> None:
-    # A plate of half the side hides the middle of the floor from the near camera; the far one comes in from aside.
+    # A plate of half the side length hides the middle of the floor from the near camera; the far one looks obliquely.
     floor, plate = grid_plane(16, side=2.0), grid_plane(4, side=1.0, z=0.5)
     both = join([floor, plate])
     uv = np.concatenate([0.25 + 0.25 * floor.vertices[:, :2], 0.75 + 0.2 * plate.vertices[:, :2]]).astype(np.float32)
@@ -85,7 +85,7 @@ def test_occluders_do_not_colour_the_surface() -> None:
     image = np.zeros((200, 200, 3), np.uint8)
     images = [ColorSource(above(4.0, 200, 300.0), image + np.uint8([255, 0, 0]))]
     baked = bake(sheet, listed(images), 128, best=1, threads=1)
-    # seen from 4 above, a plate of half the side 0.5 above the floor hides (0.5 * 4 / 3.5)^2 of it (world units)
+    # seen from height 4, a plate of half the side at height 0.5 hides (0.5 * 4 / 3.5)^2 of the floor (world units)
     floor_texels = (128 * 0.5) ** 2
     assert baked.unseen == pytest.approx(floor_texels * (4 / 3.5) ** 2 / 4, rel=0.15)
     aside = [ColorSource(camera, image + np.uint8([0, 0, 255])) for camera in ring(8, 4.0, 200)[::2]]
@@ -113,7 +113,7 @@ def test_a_gain_between_images_leaves_no_step() -> None:
     valid[:, :64] = True
     images = listed([one, ColorSource(one.camera, image, valid)])
     row = bake(flat_atlas(mesh), images, 128, best=2, threads=1).mesh.texture[64, :, 0].astype(int)
-    assert np.ptp(row) <= 2  # not 12, half of the difference
+    assert np.ptp(row) <= 2  # without blending: 12, half of the difference
     assert row[16] == pytest.approx(np.sqrt(128 * 153), abs=2)  # the mean exposure
 
 
@@ -134,7 +134,7 @@ def test_feathering_decreases_towards_outlines_only() -> None:
 
 
 def test_unseen_texels_get_the_colour_of_adjacent_surface() -> None:
-    # The left half of a plane was seen, green above and red below; another plane lies behind it, far away.
+    # The left half of a plane is visible, green above and red below; another plane lies far behind it.
     mesh = join([grid_plane(8), grid_plane(2, z=5.0)])
     texels = texels_of(flat_atlas(grid_plane(8)), 64)
     colors, seen = np.zeros((len(texels.index), 3), np.uint8), texels.index % 64 < 32
@@ -144,9 +144,9 @@ def test_unseen_texels_get_the_colour_of_adjacent_surface() -> None:
     picture_ = np.zeros((64 * 64, 3), np.uint8)
     picture_[texels.index] = colors
     picture_ = picture_.reshape(64, 64, 3)
-    assert picture_[60, 60, 0] > 160  # what is between the two mixes them
+    assert picture_[60, 60, 0] > 160  # filled texels between both colours mix them
     assert picture_[4, 60, 1] > 160
-    assert picture_[:, :32].reshape(-1, 3).tolist() == [[10, 200, 10]] * 1024 + [[200, 10, 10]] * 1024  # untouched
+    assert picture_[:, :32].reshape(-1, 3).tolist() == [[10, 200, 10]] * 1024 + [[200, 10, 10]] * 1024  # unchanged
 
 
 def test_texels_outside_charts_get_the_nearest_colour() -> None:
@@ -162,7 +162,7 @@ def test_simplification_keeps_the_shape() -> None:
     pytest.importorskip("fast_simplification")
     mesh = box(20)
     assert simplified(mesh, len(mesh.faces)) is mesh
-    far = Mesh((mesh.vertices.astype(np.float64) + 1e6), mesh.faces)  # 32 bits hold these to 1/16 only
+    far = Mesh((mesh.vertices.astype(np.float64) + 1e6), mesh.faces)  # float32 has a resolution of only 1/16 here
     small = simplified(far, 400)
     assert 300 <= len(small.faces) <= 400
     np.testing.assert_allclose(np.abs(small.vertices - 1e6).max(axis=1), 1, atol=1e-3)
@@ -172,7 +172,7 @@ def test_simplification_keeps_the_shape() -> None:
 
 # -- files -------------------------------------------------------------------------------------------------------------
 def textured() -> TexturedMesh:
-    """The unit square in four triangles around its middle, red above and blue below."""
+    """Return the unit square as four triangles around its centre, red above and blue below."""
     mesh = grid_plane(2)
     texture = np.zeros((16, 16, 3), np.uint8)
     texture[:8], texture[8:] = (250, 0, 0), (0, 0, 250)

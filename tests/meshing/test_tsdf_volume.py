@@ -1,4 +1,4 @@
-"""Fusion: known shapes come out where they are, closed, in one layer, in bounded memory."""
+"""Fusion reproduces known shapes: closed, in one layer, at the right position, in bounded memory."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_a_sphere_seen_from_all_round_is_closed_and_has_its_radius() -> None:
 def test_an_oblique_plane_is_flat_to_a_small_part_of_a_voxel() -> None:
     """Plane z = 4 + 0.8 x before the camera at the origin: depth 4 / (1 - 0.8 x') at the pixel ray (x', y', 1).
 
-    Read at the nearest pixel, it would be wrong by up to half a pixel of 0.02 world units times 0.8: 0.4 voxel along z.
+    Nearest-pixel depth would be wrong by up to half a pixel of 0.02 world units times 0.8: 0.4 voxel along z.
     """
     camera = Camera(160, 120, 200.0, 200.0, 80.0, 60.0, np.eye(4))
     slope = (np.arange(160) + 0.5 - 80) / 200
@@ -58,9 +58,9 @@ def test_an_oblique_plane_is_flat_to_a_small_part_of_a_voxel() -> None:
 
 
 def test_no_depth_is_invented_across_a_depth_edge() -> None:
-    """Two walls at 2 and 3 that meet at the middle column: no vertex lies between them.
+    """Two walls at 2 and 3 meet at the middle column: no vertex lies between them.
 
-    What is known of the near wall's inside ends there: its side is as deep as the full weight and no deeper.
+    Observed space behind the near wall ends at this column; its side face is only as deep as the full weight.
     """
     camera = Camera(64, 64, 80.0, 80.0, 32.0, 32.0, np.eye(4))
     depth = np.where(np.arange(64) < 32, 2.0, 3.0) * np.ones((64, 1))
@@ -75,12 +75,12 @@ def test_no_depth_is_invented_across_a_depth_edge() -> None:
 
 
 def test_unobserved_space_creates_no_shell() -> None:
-    """One camera sees half a sphere: one open sheet, nothing behind it and nothing around the image's edge."""
+    """One camera sees half a sphere: the mesh is one open sheet, with nothing behind it or around the image border."""
     camera = look_at(np.array([0, -3.0, 0]), np.zeros(3), np.array([0, 0, 1.0]), width=160, height=160, fx=200)
     depth = sphere_depth(camera, 1.0)
     mesh = marching_cubes(fuse([depth_map(RenderedView(camera, depth))], limits(1.3, 0.02), threads=1))
     assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1).max() < 0.02
-    assert mesh.vertices[:, 1].max() < -1 / 3 + 0.05  # the outline seen from 3 away is at y = -1/3
+    assert mesh.vertices[:, 1].max() < -1 / 3 + 0.05  # the silhouette seen from distance 3 is at y = -1/3
     _, uses, _ = edge_uses(mesh)
     assert uses.max() == 2
     assert (uses == 1).any()
@@ -122,7 +122,7 @@ def test_invalid_pixels_are_ignored() -> None:
 
 
 def test_pixel_weights_are_used() -> None:
-    """Two views from one place, of walls at 2.00 and 2.04, weighted 3 to 1: the wall is at 2.01."""
+    """Two views from the same position, of walls at 2.00 and 2.04, weighted 3 to 1: the wall is at 2.01."""
     camera = Camera(64, 64, 80.0, 80.0, 32.0, 32.0, np.eye(4))
     one = np.ones((64, 64))
     frames = [RenderedView(camera, 2.00 * one, valid=3 * one), RenderedView(camera, 2.04 * one, valid=1 * one)]
@@ -135,8 +135,8 @@ def test_free_space_clears_a_phantom_that_other_views_look_through() -> None:
     cameras = orbit(60, 3.0, size=64, focal=80.0)
     frames = sphere_frames(cameras, 0.9)
     phantom = np.asarray(frames[0].depth).copy()
-    phantom[28:36, 28:36] = 1.95  # 0.15 before the surface
-    for position in (0, 30):  # wherever it comes in the order
+    phantom[28:36, 28:36] = 1.95  # 0.15 in front of the surface
+    for position in (0, 30):  # at any position in the order
         order = [*frames[1 : 1 + position], RenderedView(cameras[0], phantom), *frames[1 + position :]]
         mesh = marching_cubes(fuse(maps(order), LIMITS, threads=1))
         assert np.linalg.norm(mesh.vertices, axis=1).max() < 0.92
@@ -199,7 +199,7 @@ def test_a_spool_can_be_read_repeatedly() -> None:
 
 
 def test_an_orbit_at_uneven_distances_keeps_the_whole_scene() -> None:
-    """One camera close to the wall, the others far: the first cause of circular holes in other implementations."""
+    """One camera close to the wall, the others far: a cause of circular holes in other implementations."""
     wall = np.array([-2.0, 0.0, -2.0]), np.array([2.0, 0.2, 2.0])
     eyes = [np.array([x, -y, 0.0]) for x, y in ((0.0, 0.4), (-1.0, 4.0), (1.0, 4.0), (0.0, 5.0))]
     up = np.array([0, 0, 1.0])

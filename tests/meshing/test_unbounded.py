@@ -1,4 +1,4 @@
-"""Unbounded scenes: one closed mesh over levels of different voxels, ground far out, and no shell around the scene."""
+"""Unbounded scenes: one closed mesh across levels of different voxels, with far ground and no shell around the scene."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ from surface_shapes import edge_uses, is_closed_manifold, rays, signed_volume
 def test_a_sphere_across_levels_is_one_closed_accurate_surface(
     center: tuple[float, float, float], radius: float
 ) -> None:
-    """The second crosses all three joins. Linear interpolation errs by at most h^2 / (8 R): 0.02 voxel of 1/16 at R 1.
+    """The second sphere crosses all three joins.
 
-    A join's cells reach three voxels of the finer level, so allow four times as much there.
+    Linear interpolation errs by at most h^2 / (8 R): 0.02 voxel of 1/16 at R = 1. Cells at a join reach three voxels of
+    the finer level, so the tolerance is four times as large there.
     """
     cascade = cascade_of(4)
     volumes = volumes_of(cascade, lambda p: np.linalg.norm(p - np.asarray(center), axis=1) - radius)
@@ -43,7 +44,7 @@ def test_a_sphere_across_levels_is_one_closed_accurate_surface(
 
 
 def test_random_fields_give_a_closed_surface_across_levels() -> None:
-    """Random values at every voxel, outside at the rim of the outermost level: all 256 cases, on all joins."""
+    """Random values at every voxel, positive at the border of the outermost level: all 256 cases, on all joins."""
     cascade = cascade_of(3)
     rng = np.random.default_rng(3)
     volumes = volumes_of(cascade, lambda p: np.where(np.abs(p).max(axis=1) > 3.6, 1.0, rng.normal(size=len(p))))
@@ -51,13 +52,13 @@ def test_random_fields_give_a_closed_surface_across_levels() -> None:
     _, uses, upward = edge_uses(mesh)
     assert len(mesh.faces) > 50_000
     assert (uses % 2 == 0).all()  # no border
-    assert (2 * upward == uses).all()  # as often one way as the other
+    assert (2 * upward == uses).all()  # both directions equally often
     assert (uses == 2).mean() > 0.999
 
 
 # -- shapes at several distances ---------------------------------------------------------------------------------------
 def test_near_and_far_spheres_are_accurate_to_a_fraction_of_a_voxel() -> None:
-    """Radius R at distance R from the centre of cameras inside: shells at 1.5, 5 and 20 around a ring of cameras."""
+    """Spheres of radius R = 1.5, 5 and 20 around a ring of cameras, so that the distance equals the radius."""
     cameras = [
         look_at(0.3 * np.array([np.cos(a), np.sin(a), 0.0]), np.array([np.cos(a), np.sin(a), z]) * 10,
                 np.array([0, 0, 1.0]), width=64, height=64, fx=28.0)
@@ -79,7 +80,7 @@ def test_near_and_far_spheres_are_accurate_to_a_fraction_of_a_voxel() -> None:
 
 
 def test_a_plane_through_all_levels_has_one_layer_without_holes() -> None:
-    """Ground at z = -0.3 under a camera that looks along it: only its rim is open, and every column is crossed once."""
+    """Ground at z = -0.3 under a camera that looks along it: only its border is open; every column is crossed once."""
     cascade = cascade_of(5)
     eyes = [(x, y) for x in (-1.0, 1.0) for y in (-1.0, 1.0)]
     maps = []
@@ -93,7 +94,7 @@ def test_a_plane_through_all_levels_has_one_layer_without_holes() -> None:
     edges, uses, _ = edge_uses(mesh)
     assert uses.max() == 2
     rim = mesh.vertices[edges[uses == 1]].reshape(-1, 3)
-    assert np.abs(rim[:, :2]).max(axis=1).min() > 12.0  # across the joins at 1, 2, 4 and 8 nothing is open
+    assert np.abs(rim[:, :2]).max(axis=1).min() > 12.0  # no open edge at the joins at 1, 2, 4 and 8
     t = mesh.vertices[mesh.faces].astype(np.float64)
     area = 0.5 * np.abs(np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0])[:, 2]).sum()
     x, y = np.abs(rim[:, 0]).max(), np.abs(rim[:, 1]).max()
@@ -112,7 +113,7 @@ def test_sky_creates_no_shell_and_the_ground_extends_far(sky: str) -> None:
     assert result.levels >= 6
     assert not (v[:, 2] > BALL + 0.2).any()
     ground = v[np.abs(v[:, 2] - GROUND) < 0.3]
-    assert np.linalg.norm(ground[:, :2], axis=1).max() > 15  # five times as far as the cameras stand
+    assert np.linalg.norm(ground[:, :2], axis=1).max() > 15  # five times the distance of the cameras
     away = np.minimum(np.abs(np.linalg.norm(v, axis=1) - BALL), np.abs(v[:, 2] - GROUND))
     distance = np.abs(v).max(axis=1)
     assert (away < 0.6 * result.limits.voxel * np.maximum(1, 2 * distance / (result.limits.side / 2))).all()
@@ -136,7 +137,7 @@ def test_memory_of_all_levels_is_bounded_and_the_error_suggests_a_voxel() -> Non
 def test_the_mesh_of_all_levels_does_not_depend_on_slabs(levels: int, slab_bytes: int, colored: bool) -> None:
     maps = [depth_map(f) for f in outdoor_frames("unseen", views=6, size=48)]
     maps = maps if colored else [replace(item, color=None) for item in maps]
-    cascade = cascade_of(levels, depth_limit=6.0)  # of nine levels some have no blocks
+    cascade = cascade_of(levels, depth_limit=6.0)  # some of the nine levels have no blocks
     whole = fused_levels(maps, cascade)
     blocks = find_cascade_blocks(maps, cascade, threads=1)
     assert sum(part.nbytes for part in blocks) > 2 * slab_bytes  # several slabs

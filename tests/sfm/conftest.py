@@ -1,4 +1,4 @@
-"""Structure from motion of a drawn room, run once for all tests; they never change it."""
+"""Structure from motion of a rendered room, run once; tests must not modify the results."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def colmap() -> None:
 
 @pytest.fixture(scope="session")
 def room(colmap: None, tmp_path_factory: pytest.TempPathFactory) -> Room:
-    """Twelve photographs, of which three are stored turned; one file is no photograph."""
+    """Return twelve images, three of them stored rotated; one file is not an image."""
     return found_room(tmp_path_factory.mktemp("sfm"))
 
 
 @pytest.fixture(scope="session")
 def pieces(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Five photographs of one room, four of another, and one of nothing."""
+    """Return five images of one room, four of another, and one of nothing."""
     root = tmp_path_factory.mktemp("pieces") / "photos"
     write_room(root, 5)
     write_room(root, 4, seed=1, start=10)

@@ -1,4 +1,4 @@
-"""What is read of COLMAP's database when its process has ended."""
+"""Reading COLMAP's database after its process has ended."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gs2d.sfm.colmap_process import read_facts
 
 @pytest.mark.parametrize("data", [None, b"no database", b""])
 def test_an_unreadable_database_is_a_one_line_error(tmp_path: Path, data: bytes | None) -> None:
-    """On a full disk SQLite cannot open what is in its journal: that was a traceback."""
+    """On a full disk, SQLite cannot recover from its journal."""
     if data is not None:
         (tmp_path / "database.db").write_bytes(data)
     with pytest.raises(DataError, match=r"database\.db"):

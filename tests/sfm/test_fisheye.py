@@ -1,4 +1,4 @@
-"""Fisheyes of unknown lens: which photographs are some, by their circle, by names, and by what their matches tell."""
+"""Fisheye images with unknown lens: detection by image circle, by names, and by matches."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ F = 150.0
 
 # -- the circle --------------------------------------------------------------------------------------------------------
 def mottled(size: tuple[int, int] = SIZE, seed: int = 0) -> np.ndarray:
-    """A photograph without darkness, uint8 [H, W, 3]."""
+    """Return an image without dark areas, uint8 [H, W, 3]."""
     return np.random.default_rng(seed).integers(40, 255, (size[1], size[0], 3)).astype(np.uint8)
 
 
 def round_picture(x: float, y: float, radius: float, size: tuple[int, int] = SIZE, seed: int = 0) -> np.ndarray:
-    """A photograph of a fisheye: noise within a circle, px, and what stray light leaves beyond it."""
+    """Return a fisheye image: noise inside a circle (px), and traces of stray light outside."""
     v, u = np.mgrid[: size[1], : size[0]] + 0.5
     light = np.clip(radius - np.hypot(u - x, v - y) + 0.5, 0, 1)[..., None]
     stray = np.random.default_rng(seed + 1).integers(0, 8, (size[1], size[0], 3))
@@ -63,7 +63,7 @@ def test_the_image_circle_is_detected(x: float, y: float, radius: float) -> None
 
 
 def test_other_dark_areas_are_no_circle() -> None:
-    """A frame, a statue that turns before black velvet, a round plate that is smaller than any fisheye's circle."""
+    """A frame, a statue rotating before black velvet, and a round plate smaller than any fisheye's circle."""
     framed = np.zeros((300, 400, 3), np.uint8)
     framed[40:-40, 60:-60] = mottled()[40:-40, 60:-60]
     statues = []
@@ -108,7 +108,7 @@ def pycolmap(colmap: None) -> Any:
 
 
 class _Database:
-    """Matches of photographs of random points through a lens, 0.3 px off, and every tenth of them wrong."""
+    """Matches between images of random points through a lens, with 0.3 px noise and a tenth of outliers."""
 
     def __init__(self, pycolmap: Any, model: str, params: tuple[float, ...], *, count: int = 4) -> None:
         rng = np.random.default_rng(0)
@@ -150,7 +150,7 @@ class _Database:
         ("SIMPLE_RADIAL_FISHEYE", (F, 200, 150, 0.02), F),  # 153 degrees from left to right
         ("SIMPLE_FISHEYE", (240.0, 200, 150), 240.0),  # 119 degrees from corner to corner
         ("SIMPLE_PINHOLE", (300.0, 200, 150), None),
-        ("SIMPLE_RADIAL", (330.0, 200, 150, -0.1), None),  # a telephone's
+        ("SIMPLE_RADIAL", (330.0, 200, 150, -0.1), None),  # a phone
     ],
 )
 def test_matches_determine_a_fisheye_and_its_focal_length(
@@ -175,11 +175,11 @@ def test_matches_determine_a_fisheye_and_its_focal_length(
             10,
             0.6,
             False,
-        ),  # an ordinary camera: nothing is asked, no time lost
+        ),  # an ordinary camera: no test needed, no time lost
         ("SIMPLE_RADIAL", (330.0, 200, 150, 0.1), 5, 0.6, False),
         ("SIMPLE_RADIAL", (330.0, 200, 150, -0.05), 4, 0.6, True),
         ("SIMPLE_RADIAL", (330.0, 200, 150, -0.05), 10, 1.1, True),
-        ("SIMPLE_RADIAL", (330.0, 200, 150, -0.2), 10, 0.6, True),  # the corner is moved by 11 %
+        ("SIMPLE_RADIAL", (330.0, 200, 150, -0.2), 10, 0.6, True),  # the lens moves the corner by 11 %
         ("SIMPLE_RADIAL", (90.0, 200, 150, -0.01), 10, 0.6, True),  # 132 degrees
     ],
 )
@@ -211,7 +211,7 @@ def searched(root: Path, **options: Any) -> tuple[dict[str, Any], list[str]]:
 
 @pytest.mark.slow
 def test_round_photographs_of_185_degrees_are_placed_masked_and_cut_into_faces(colmap: None, tmp_path: Path) -> None:
-    """Measured with 16 of 800 px: 0.4 mm of a room of 4 m; before, 27 cm and no doubt was said."""
+    """Measured at 16 of 800 px: an error of 0.4 mm in a room of 4 m."""
     truth = write_photographs(tmp_path / "photos", "fisheye", count=8, width=480, angle=185, fits="height", off=(8, -6))
     made, said = searched(tmp_path)
     off = errors(tmp_path / "capture", truth)
@@ -222,7 +222,7 @@ def test_round_photographs_of_185_degrees_are_placed_masked_and_cut_into_faces(c
     assert made["lens"]["fisheyes"][0]["why"] == "circle"
     assert read_json(tmp_path / "capture/poses.json")["lens"] == made["lens"]
     assert any("(round images)" in line for line in said)
-    assert made["masks"] == 8  # which this command may replace
+    assert made["masks"] == 8  # the command may overwrite these
     assert searched(tmp_path, overwrite=True)[0]["lens"] == made["lens"]
     (camera,) = read_cameras(tmp_path / "capture/sparse/0", "bin").values()
     assert camera.params[1:3] == pytest.approx((248, 174), abs=1.5)

@@ -63,7 +63,7 @@ def trial(model: str, error: float, *doubted: str) -> Trial:
     ],
 )
 def test_the_true_lens_is_chosen(pycolmap: Any, model: str, params: tuple[float, ...]) -> None:
-    """The model was placed with SIMPLE_RADIAL."""
+    """The model was estimated with SIMPLE_RADIAL."""
     piece = synthetic_model(pycolmap, model, params)
     steps: list[int] = []
     apply(pycolmap, piece, Trial("SIMPLE_RADIAL", 0, (), {1: [F, CX, CY, 0.0]}, {1: "SIMPLE_RADIAL"}), threads=1)
@@ -71,7 +71,7 @@ def test_the_true_lens_is_chosen(pycolmap: Any, model: str, params: tuple[float,
     best = choose(trials)
     assert best.model == model
     assert steps == [1, 2, 3, 4]
-    assert best.error < 0.6  # noise of 0.3 px along each axis: 0.38 in the mean, plus that of the points
+    assert best.error < 0.6  # noise of 0.3 px per axis: 0.38 on average, plus the error of the points
     apply(pycolmap, piece, best, threads=1)
     camera = piece.camera(1)
     assert camera.model.name == model
@@ -87,7 +87,7 @@ def test_the_true_lens_is_chosen(pycolmap: Any, model: str, params: tuple[float,
     ],
 )
 def test_the_true_fisheye_is_chosen(pycolmap: Any, model: str, params: tuple[float, ...]) -> None:
-    """The model was placed with SIMPLE_RADIAL_FISHEYE: fisheyes are compared with each other."""
+    """The model was estimated with SIMPLE_RADIAL_FISHEYE: only fisheye models are compared."""
     piece = synthetic_model(pycolmap, model, params)
     first = [280.0, CX, CY, 0.0]
     apply(pycolmap, piece, Trial("SIMPLE_RADIAL_FISHEYE", 0, (), {1: first}, {1: "SIMPLE_RADIAL_FISHEYE"}), threads=1)
@@ -97,7 +97,7 @@ def test_the_true_fisheye_is_chosen(pycolmap: Any, model: str, params: tuple[flo
     assert best.model == model
     assert not best.doubts
     assert best.error < 0.6
-    apply(pycolmap, piece, trials[-1], threads=1)  # OPENCV_FISHEYE keeps one focal length
+    apply(pycolmap, piece, trials[-1], threads=1)  # OPENCV_FISHEYE keeps fx = fy
     camera = piece.camera(1)
     assert camera.model.name == "OPENCV_FISHEYE"
     assert camera.focal_length_x == camera.focal_length_y == pytest.approx(280, rel=0.02)

@@ -1,4 +1,4 @@
-"""What is said about photographs without a camera, a worker that dies, folders that are taken. No COLMAP."""
+"""Messages about images without a pose, a worker that crashes, and output folders in use. Runs without COLMAP."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def request(work: Path) -> Request:
 
 
 def follow(work: Path, code: str) -> tuple[list[object], Solved]:
-    """Run a worker of these lines of Python, in which ``say(...)`` sends a message."""
+    """Run a worker with this Python code, in which ``say(...)`` sends a message."""
     program = "import json, os, sys\ndef say(**m): print(json.dumps(m), flush=True)\n" + code
     seen: list[object] = []
     solved = solve(request(work), lambda *step: seen.append(step), command=(sys.executable, "-c", program))
@@ -131,7 +131,7 @@ def test_a_folder_with_other_files_is_never_replaced(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"holds other files \(thesis.tex\)"):
         check_out(out, tmp_path / "photos", overwrite=True)
     (out / "thesis.tex").unlink()
-    (out / "poses.json").rmdir()  # images and sparse of somebody else
+    (out / "poses.json").rmdir()  # images and sparse belong to another tool
     with pytest.raises(RunError, match=r"holds other files \(images\)"):
         check_out(out, tmp_path / "photos", overwrite=True)
     (tmp_path / "file").touch()
@@ -172,4 +172,4 @@ def test_two_commands_cannot_create_the_same_capture(tmp_path: Path) -> None:
         workspace(tmp_path / "room"),
     ):
         raise AssertionError("both have it")
-    assert work.is_dir()  # theirs
+    assert work.is_dir()  # belongs to the other search

@@ -1,4 +1,4 @@
-"""360-degree panoramas without cameras: which photographs are some, their places, and what training makes of them."""
+"""360-degree panoramas without poses: detection, pose estimation, and training."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def ordinary(width: int, height: int) -> np.ndarray:
 
 
 def two_circles() -> np.ndarray:
-    """What cameras with two fisheyes store before it is stitched."""
+    """Return a dual-fisheye image, as such cameras store it before stitching."""
     circle = one(fisheye_rays(256, 256, 190), (256, 256))
     return np.concatenate([circle, circle[:, ::-1]], axis=1)
 
@@ -64,7 +64,7 @@ def test_the_edges_of_a_full_panorama_fit_together() -> None:
     assert not meets_itself(ordinary(512, 256))
     assert not meets_itself(two_circles())
     sky = ordinary(512, 256)
-    sky[:60] = (120, 160, 220)  # a top row of one colour is no sphere yet
+    sky[:60] = (120, 160, 220)  # a uniform top row alone does not make a panorama
     assert not meets_itself(sky)
 
 
@@ -81,7 +81,7 @@ def groups_of(photos: list[Photo], camera_model: str = "auto") -> tuple[list[boo
 
 
 def test_panoramas_are_detected_by_content_or_xmp(tmp_path: Path) -> None:
-    flat = np.random.default_rng(0).integers(0, 255, (64, 128, 3)).astype(np.uint8)  # meets itself nowhere
+    flat = np.random.default_rng(0).integers(0, 255, (64, 128, 3)).astype(np.uint8)  # left and right edges do not match
     sphere = one(panorama_rays(512), (512, 256))
     photos = photos_of(
         tmp_path,
@@ -99,12 +99,12 @@ def test_panoramas_are_detected_by_content_or_xmp(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def panoramas(colmap: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.ndarray], list[str]]:
-    """A capture of seven panoramas, their true poses, and what was said."""
+    """Return a capture of seven panoramas, their true poses, and the command's output."""
     root = tmp_path_factory.mktemp("panoramas")
     truth = write_photographs(root / "photos", "panorama", count=7, width=WIDTH)
     (root / "photos" / "masks").mkdir()
     mask = np.full((WIDTH // 2, WIDTH), 255, np.uint8)
-    mask[-60:] = 0  # who holds the camera
+    mask[-60:] = 0  # the person holding the camera
     for name in truth:
         Image.fromarray(mask).save(root / "photos" / "masks" / f"{name}.png")
     said: list[str] = []
@@ -119,7 +119,7 @@ def panoramas(colmap: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
 def test_poses_of_panoramas_are_estimated(
     panoramas: tuple[Path, dict[str, np.ndarray], list[str]],
 ) -> None:
-    """Measured: 0.3 mm of a room of 4 m, 0.02 degrees."""
+    """Measured: 0.3 mm in a room of 4 m, 0.02 degrees."""
     root, truth, said = panoramas
     assert "7 photographs are 360-degree panoramas: each has one pose, and is trained as several faces" in said
     found = errors(root / "capture", truth)
@@ -146,7 +146,7 @@ def test_panoramas_and_photographs_of_a_room_are_placed_together(colmap: None, t
         Image.fromarray(photograph(patterns, pose, rays, (400, 300))).save(tmp_path / "photos" / name, quality=95)
         truth[name] = pose
     made = find_poses(PosesOptions(photos=tmp_path / "photos", out=tmp_path / "capture", threads=2))
-    assert made["lens"]["trials"]  # of the ordinary ones
+    assert made["lens"]["trials"]  # for the ordinary images
     assert {camera["model"] == "EQUIRECTANGULAR" for camera in made["cameras"]} == {True, False}
     found = errors(tmp_path / "capture", truth)
     assert found["placed"] == 12

@@ -1,4 +1,4 @@
-"""Masks of photographs without cameras: found, turned with them, and passed on to COLMAP."""
+"""Masks of images without poses: found, rotated with the images, and passed to COLMAP."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ def test_masks_of_common_tools_are_found(tmp_path: Path, place: str) -> None:
 
 def test_masks_are_rotated_and_downscaled_with_their_photograph(tmp_path: Path) -> None:
     write_room(tmp_path / "photos", 3)
-    turn_file(tmp_path / "photos" / "001.jpg", 6)  # stored turned
+    turn_file(tmp_path / "photos" / "001.jpg", 6)  # stored rotated
     for name in ("000", "001", "002"):
         with Image.open(tmp_path / "photos" / f"{name}.jpg") as image:
-            pixels = np.asarray(image.resize((150, 200)))  # no square: which way round it is can be told
+            pixels = np.asarray(image.resize((150, 200)))  # not square, so that the orientation is detectable
             exif = image.getexif()
         Image.fromarray(pixels).save(tmp_path / "photos" / f"{name}.jpg", exif=exif)
         mask = np.zeros((200, 150), np.uint8)
@@ -76,7 +76,7 @@ def test_masks_are_rotated_and_downscaled_with_their_photograph(tmp_path: Path) 
 
 
 def features(database: Path) -> np.ndarray:
-    """All places of features, px; read as the product does, so that COLMAP, which opens the file now, can."""
+    """Return all feature positions in px, read as gs2d reads them, so that COLMAP can still open the file."""
     with contextlib.closing(sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True)) as connection:
         rows = connection.execute("SELECT cols, data FROM keypoints WHERE rows > 0").fetchall()
     return np.concatenate([np.frombuffer(data, np.float32).reshape(-1, cols)[:, :2] for cols, data in rows])
@@ -99,7 +99,7 @@ def test_masked_pixels_give_no_features(colmap: None, tmp_path: Path) -> None:
             lines.append(event.text)
 
     options = {"photos": tmp_path / "photos", "out": tmp_path / "capture", "masks": tmp_path / "masks", "threads": 1}
-    options["camera_model"] = "SIMPLE_PINHOLE"  # no comparison of lenses
+    options["camera_model"] = "SIMPLE_PINHOLE"  # skips the lens comparison
     found = find_poses(PosesOptions(**options), watch)  # type: ignore[arg-type]
     assert found["placed"] == 6
     assert found["masks"] == 6

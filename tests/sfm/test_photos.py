@@ -1,4 +1,4 @@
-"""Which files of a folder are photographs, how they get into the capture, and what shares a camera. No COLMAP."""
+"""Which files of a folder are images, how they are copied into the capture, and which share a camera. No COLMAP."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def image(
     focal: float = 0,
     time: str = "",
 ) -> None:
-    """A JPEG or PNG whose left half is red and whose top is bright, with EXIF."""
+    """Write a JPEG or PNG with EXIF; its left half is red and its top is bright."""
     width, height = size
     pixels = np.zeros((height, width, 3), np.uint8)
     pixels[:, : width // 2, 0] = 200
@@ -149,7 +149,7 @@ def test_a_rotated_photograph_is_stored_upright_with_its_focal_length(tmp_path: 
             assert ExifTags.Base.Orientation not in ours.getexif()
             assert ours.info.get("icc_profile") == theirs.info.get("icc_profile")
             upright = np.asarray(ImageOps.exif_transpose(theirs), float)
-            assert np.abs(np.asarray(ours, float) - upright).mean() < 1.0  # JPEG once more, quality 95
+            assert np.abs(np.asarray(ours, float) - upright).mean() < 1.0  # one more JPEG compression, at quality 95
             if name == "0.jpg":
                 assert ours.getexif()[ExifTags.Base.Model] == "phone"
                 assert float(ours.getexif().get_ifd(DETAILS)[ExifTags.Base.FocalLength]) == 4.25
@@ -160,7 +160,7 @@ def test_photographs_of_one_folder_size_camera_and_focal_length_share_a_camera(t
     image(tmp_path / "1.jpg", model="A", focal=5)
     image(tmp_path / "2.jpg", model="A", focal=9)  # zoomed
     image(tmp_path / "3.jpg", model="B", focal=5)
-    image(tmp_path / "4.jpg", size=(16, 24), model="A", focal=5, orientation=6)  # upright it is 24 x 16 as the first
+    image(tmp_path / "4.jpg", size=(16, 24), model="A", focal=5, orientation=6)  # upright it is 24 x 16, like the first
     image(tmp_path / "5.jpg", size=(16, 24), model="A", focal=5)
     image(tmp_path / "sub/6.jpg", model="A", focal=5)
     photos = photos_of(tmp_path)
@@ -174,7 +174,7 @@ def test_photographs_of_one_folder_size_camera_and_focal_length_share_a_camera(t
 
 # -- which way is up ---------------------------------------------------------------------------------------------------
 def rotations(eyes: np.ndarray, target: np.ndarray, world: np.ndarray) -> np.ndarray:
-    """Level cameras at ``eyes`` that look at ``target``, in a world turned by ``world`` [3, 3]."""
+    """Return level cameras at ``eyes`` that look at ``target``, in a world rotated by ``world`` [3, 3]."""
     up = np.array([0.0, 0.0, 1.0])
     cameras = [look_at(eye, target, up, width=9, height=9, fx=9) for eye in eyes]
     return np.stack([camera.rotation @ world.T for camera in cameras])
@@ -186,7 +186,7 @@ def turned_world(seed: int) -> np.ndarray:
 
 
 def test_up_is_estimated_from_tilted_cameras() -> None:
-    """All look down by 45 degrees from one side: the mean of their up vectors leans by more than 20."""
+    """All cameras look down by 45 degrees from one side: the mean of their up vectors leans by more than 20."""
     angles = np.linspace(0, np.pi, 9)
     eyes = np.stack([2 * np.cos(angles), 2 * np.sin(angles), np.full(9, 2.0)], axis=1)
     world = turned_world(1)
@@ -200,12 +200,12 @@ def test_up_is_estimated_from_tilted_cameras() -> None:
 
 # -- which pairs are matched -------------------------------------------------------------------------------------------
 def test_each_image_is_paired_with_consecutive_and_distant_ones() -> None:
-    """Overlap 3: the next 1, 2, 3 and those 2^0, 2^1, 2^2 on, i.e. 1, 2, 3, 4."""
+    """Overlap 3: offsets 1, 2, 3 and 2^0, 2^1, 2^2, i.e. 1, 2, 3, 4."""
     assert neighbour_pairs(6, 3) == {(i, j) for i in range(6) for j in range(i + 1, 6) if j - i <= 4}
 
 
 def test_similar_images_are_paired() -> None:
-    """Six photographs of one thing and six of another, interleaved: each finds its own kind."""
+    """Six images of one object and six of another, interleaved: images are paired within each group."""
     rng = np.random.default_rng(0)
     things = rng.integers(0, 255, (2, 200, 128))
     images = [np.clip(things[i % 2] + rng.normal(0, 9, (200, 128)), 0, 255).astype(np.uint8) for i in range(12)]
@@ -216,7 +216,7 @@ def test_similar_images_are_paired() -> None:
 
 
 def flight(lines: int, shots: int) -> list[tuple[float, float, float]]:
-    """Places of a drone: lines 30 m apart, flown to and fro, a photograph every 12 m, at 80 m."""
+    """Return drone positions: lines 30 m apart, flown back and forth, an image every 12 m, at a height of 80 m."""
     along = [12.0 * k for k in range(shots)]
     return [(x, 30.0 * line, 80.0) for line in range(lines) for x in (along if line % 2 == 0 else along[::-1])]
 
@@ -224,7 +224,7 @@ def flight(lines: int, shots: int) -> list[tuple[float, float, float]]:
 def test_near_images_are_on_the_same_and_adjacent_lines() -> None:
     places = flight(9, 20)
     pairs = near_pairs(places, 12)
-    middle = 4 * 20 + 10  # of the fifth line
+    middle = 4 * 20 + 10  # on the fifth line
     others = {i if j == middle else j for i, j in pairs if middle in (i, j)}
     assert {other // 20 for other in others} == {3, 4, 5}
     assert max(np.linalg.norm(np.subtract(places[middle], places[other])) for other in others) < 45
@@ -232,7 +232,7 @@ def test_near_images_are_on_the_same_and_adjacent_lines() -> None:
 
 
 def test_images_are_ordered_by_time_if_all_have_one(tmp_path: Path) -> None:
-    """A counter of names that began again at 0001, as cameras do after 9999."""
+    """The counter in the names restarted at 0001, as in cameras after 9999."""
     for name, second in (("DSC_9998", 1), ("DSC_9999", 2), ("DSC_0001", 3), ("DSC_0002", 4)):
         image(tmp_path / f"{name}.jpg", time=f"2026:05:01 10:00:0{second}")
     photos = photos_of(tmp_path)

@@ -1,4 +1,4 @@
-"""``gs2d poses`` from photographs to a capture: by COLMAP on a drawn room whose cameras are known, and on castles."""
+"""``gs2d poses`` from images to a capture: COLMAP on a rendered room with known cameras, and on real castles."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from gs2d.pipeline.prepare.pose_finding import find_poses
 from gs2d.training.events import Event, Notice, Phase
 from room_photos import FOCAL, SIZE, UP, Room, room_image, textures, write_room
 
-ONE_LENS = ("--camera-model", "SIMPLE_PINHOLE")  # no comparison of lenses, which takes half of the time
+ONE_LENS = ("--camera-model", "SIMPLE_PINHOLE")  # skips the lens comparison, half of the run time
 
 
 def poses(photos: Path, out: Path, *words: str) -> int:
@@ -35,7 +35,7 @@ def poses(photos: Path, out: Path, *words: str) -> int:
 
 
 def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """scale, rotation, translation that take points [P, 3] to others with the least squares (Umeyama 1991)."""
+    """Return scale, rotation and translation that map ``source`` to ``target`` by least squares (Umeyama 1991)."""
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)
     u, s, vt = np.linalg.svd(b.T @ a)
     d = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
@@ -45,7 +45,7 @@ def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarra
 
 
 def pose_errors(mine: dict[str, np.ndarray], truth: dict[str, np.ndarray]) -> tuple[float, float, np.ndarray]:
-    """Of name -> T_cam_world: rms of centre distances over their spread; largest angle, degrees; rotation [3, 3]."""
+    """Return the rms centre error relative to the spread, the largest angle in degrees, and the rotation [3, 3]."""
     names = sorted(mine.keys() & truth.keys())
     centers, targets = (np.stack([-T[n][:3, :3].T @ T[n][:3, 3] for n in names]) for T in (mine, truth))
     scale, R, t = similarity(centers, targets)
@@ -60,7 +60,7 @@ def poses_of(capture: Path) -> dict[str, np.ndarray]:
 
 
 def test_cameras_of_a_rendered_room_are_estimated(room: Room) -> None:
-    """Turned photographs included. Measured: centres 0.06 % of their spread, 0.04 degrees, focal length 0.1 %."""
+    """Includes rotated images. Measured: centres 0.06 % of their spread, 0.04 degrees, focal length 0.1 %."""
     truth = {name: camera.T_cam_world for name, camera in room.cameras.items()}
     mine = poses_of(room.capture)
     assert mine.keys() == truth.keys()
@@ -75,12 +75,12 @@ def test_cameras_of_a_rendered_room_are_estimated(room: Room) -> None:
 def test_the_capture_has_the_files_that_training_reads(room: Room) -> None:
     assert sorted(path.name for path in room.capture.iterdir()) == ["images", "poses.json", "poses.png", "sparse"]
     assert sorted(path.name for path in (room.capture / "sparse").iterdir()) == ["0"]
-    assert [path.name for path in room.capture.parent.iterdir()] == ["room"]  # no workplace is left
+    assert [path.name for path in room.capture.parent.iterdir()] == ["room"]  # no working folder remains
     scene = load_scene(room.capture)
     assert (scene.format, len(scene.train), len(scene.test)) == ("colmap", 10, 2)
     assert scene.points is not None
     assert len(scene.points) == room.printed["points"] > 500
-    assert not any("undistorted on load" in note for note in scene.details)  # drawn by a pinhole: no lens was needed
+    assert not any("undistorted on load" in note for note in scene.details)  # rendered by a pinhole: no lens was needed
     image = read_image(room.capture / "poses.png")
     assert image.shape[0] > 300
     assert (np.ptp(image.astype(int), axis=2) > 60).sum() > 500  # red cameras
@@ -171,7 +171,7 @@ def test_photographs_without_a_model_are_a_one_line_error(
 def test_a_camera_that_only_rotated_gives_a_warning(
     colmap: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """COLMAP finds a model all the same, of another focal length and 3 degrees between rays; the room's has 40."""
+    """COLMAP finds a model, but with a wrong focal length and 3 degrees between rays; the room has 40."""
     for i in range(4):
         target = np.array([0.0, 0.9 - 0.25 * i, 0.9])
         camera = look_at(np.array([2.5, 2.0, 1.2]), target, UP, width=SIZE, height=SIZE, fx=FOCAL)
@@ -184,7 +184,7 @@ def test_a_camera_that_only_rotated_gives_a_warning(
 @pytest.mark.parametrize(
     ("phase", "kept"),
     [
-        ("matching pairs", "features of 12 photographs, [0-9]+ pairs"),  # the worker matches on until it is stopped
+        ("matching pairs", "features of 12 photographs, [0-9]+ pairs"),  # the worker goes on matching until stopped
         ("comparing lenses", "features of 12 photographs, 66 pairs, placed cameras"),
     ],
 )
@@ -210,7 +210,7 @@ def test_an_interrupted_search_continues_and_gives_the_same_bytes(
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL], ids=["term", "kill"])
 def test_an_interrupted_command_leaves_no_process_and_can_continue(room: Room, tmp_path: Path, number: int) -> None:
-    """Its worker ends with its stdin."""
+    """The worker ends when its stdin closes."""
     words = [sys.executable, "-m", "gs2d", "poses", str(room.photos), "--out", str(tmp_path / "capture")]
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     work = tmp_path / ".capture.poses"
@@ -231,7 +231,7 @@ def test_an_interrupted_command_leaves_no_process_and_can_continue(room: Room, t
 
 
 def workers_of(work: Path) -> list[int]:
-    """Processes whose command line names a file of the workplace (Linux; elsewhere none is seen)."""
+    """Return processes whose command line names a file of the working folder (Linux; empty elsewhere)."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         try:
@@ -254,7 +254,7 @@ def test_the_cameras_of_a_castle_agree_with_a_known_model(
     most_centers: float,
     most_degrees: float,
 ) -> None:
-    """11 photographs with EXIF. The known model has a SIMPLE_RADIAL lens; measured 0.16 %, 0.18 degrees for OPENCV."""
+    """11 images with EXIF. The known model has a SIMPLE_RADIAL lens; measured 0.16 %, 0.18 degrees for OPENCV."""
     root = shared("sceaux_castle")
     assert poses(root / "images", tmp_path / "capture", "--quiet", *words) == 0
     known = {image.name: image.T_cam_world for image in read_images(root / "sparse/0", "bin")}

@@ -1,4 +1,4 @@
-"""``gs2d reconstruct``: from photographs to a run; what is refused, kept and not done twice."""
+"""``gs2d reconstruct``: from images to a run; refused input, kept results, and resuming without repeated work."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def words_for(photos: Path, out: Path, *words: str) -> list[str]:
 
 
 def started(room: Room, tmp_path: Path) -> Path:
-    """A run folder in which the cameras were found before."""
+    """Return a run folder whose poses are already estimated."""
     out = tmp_path / "run"
     shutil.copytree(room.capture, out / "capture")
     return out
@@ -61,9 +61,9 @@ def test_photographs_become_a_run_with_its_capture(
     assert sorted(path.name for path in (out / "capture").iterdir()) == ["images", "poses.json", "poses.png", "sparse"]
     definition = open_run(out).definition()
     assert definition["scene"]["path"] == str((out / "capture").resolve())
-    assert (definition["scene"]["train"], definition["scene"]["test"]) == (12, 0)  # so few are all needed
+    assert (definition["scene"]["train"], definition["scene"]["test"]) == (12, 0)  # few views: all are for training
     assert run(["render", str(out), "--split", "train", "--quiet"]) == 0  # later commands find the capture
-    # what is done is not done again, and the folder of the photographs is not needed any more
+    # completed work is not repeated, and the image folder is no longer needed
     finished = (out / "splats.ply").read_bytes()
     assert run([*words_for(room.photos, out, "--resume", "--json", "--quiet")]) == 0
     printed = json.loads(capsys.readouterr().out)
@@ -194,7 +194,7 @@ def test_overwrite_starts_again_and_a_failure_keeps_the_old_run(
 
 
 def interrupt(words: list[str], until: str) -> str:
-    """Ctrl-C when a phase is named; what was said on stderr."""
+    """Send Ctrl-C when a phase is reported; return stderr."""
     with subprocess.Popen([sys.executable, "-m", "gs2d", *words], stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         said = ""
@@ -234,7 +234,7 @@ def test_ctrl_c_during_training_keeps_the_cameras(room: Room, tmp_path: Path) ->
 
 
 def test_every_option_of_train_is_one_of_reconstruct() -> None:
-    """But those that it decides itself; a new option of `Training` is there by itself."""
+    """Except those that `reconstruct` sets itself; new options of `Training` are added automatically."""
     words = [
         "--recipe",
         "2dgs",

@@ -1,4 +1,4 @@
-"""Which layers of an interrupted search are kept, and a search that is killed several times."""
+"""Which stages of an interrupted search are kept, and a search that is killed several times."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LAYERS = {"photographs": [1], "features": [2], "pairs": [3], "mapping": [4]}
     [
         ("", {"capture", "database.db", "pairs.txt", "mapping"}),
         ("mapping", {"capture", "database.db", "pairs.txt"}),
-        ("pairs", {"capture"}),  # the database is unreadable here, and is removed
+        ("pairs", {"capture"}),  # the unreadable database is removed
         ("features", {"capture"}),
         ("photographs", set()),
     ],

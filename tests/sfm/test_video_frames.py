@@ -1,4 +1,4 @@
-"""Frames of a video as photographs: which are chosen, by what ffmpeg writes, and what is said where there is none."""
+"""Video frames as images: frame selection, ffmpeg's output, and messages if there are none."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ real = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="there is no ff
 
 
 def write_video(path: Path, images: list[Image.Image], *options: str) -> Path:
-    """A video of these pictures, at odd times: phones have no fixed rate."""
+    """Write a video with irregular timestamps: phones have no fixed frame rate."""
     folder = path.with_suffix(".pictures")
     folder.mkdir(parents=True)
     for i, image in enumerate(images):
@@ -37,7 +37,7 @@ def write_video(path: Path, images: list[Image.Image], *options: str) -> Path:
 
 
 def pattern(number: int, size: tuple[int, int] = (96, 64)) -> Image.Image:
-    """Noise under a grey level that tells the number."""
+    """Return noise around a grey level that encodes the number."""
     noise = np.random.default_rng(number).integers(-20, 20, (size[1], size[0], 1))
     return Image.fromarray(np.clip(20 + 9 * number + noise, 0, 255).astype(np.uint8).repeat(3, axis=2))
 

@@ -1,4 +1,4 @@
-"""Initial pairs of a walk straight ahead, which need looser thresholds."""
+"""Initial pairs for forward motion, which need looser thresholds."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_a_walk_straight_ahead_is_placed(colmap: None, tmp_path: Path, capsys: p
     images = sorted(read_images(out / "sparse" / "0", "bin"), key=lambda image: image.name)
     centers = np.stack([-image.T_cam_world[:3, :3].T @ image.T_cam_world[:3, 3] for image in images])
     steps = np.diff(centers, axis=0)
-    ahead = np.stack([image.T_cam_world[2, :3] for image in images])  # where each camera looks
+    ahead = np.stack([image.T_cam_world[2, :3] for image in images])  # viewing directions
     assert np.linalg.norm(steps, axis=1) == pytest.approx(np.linalg.norm(steps, axis=1).mean(), rel=0.15)
     assert (ahead[:-1] * steps / np.linalg.norm(steps, axis=1, keepdims=True)).sum(axis=1) == pytest.approx(1, abs=0.02)
     assert "cameras" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Adam: torch's arithmetic, row groups, and rows that are not trained."""
+"""Adam: agreement with torch, row groups, and frozen rows."""
 
 from __future__ import annotations
 

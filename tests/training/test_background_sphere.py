@@ -1,4 +1,4 @@
-"""Splats around everything at the start: where they stand, in what colour, and what training makes of them."""
+"""Background sphere: initial positions and colours of its splats, and the result of training."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_splats_are_placed_where_images_show_pixels_of_unknown_depth(monkeypatch
     places, colors, normals, sizes = sphere_points(scene, sweep_views(scene, SMALL))
     center = np.mean([view.camera.center for view in scene.train], axis=0)
     assert scene.points is not None
-    reach = np.linalg.norm(scene.points.points - center, axis=1).max()  # swept places lie beside the points
+    reach = np.linalg.norm(scene.points.points - center, axis=1).max()  # swept points lie next to the points
     radius = np.linalg.norm(places - center, axis=1)
     np.testing.assert_allclose(radius, radius[0])
     assert 1.9 * reach < radius[0] < 2.3 * reach
@@ -34,7 +34,7 @@ def test_splats_are_placed_where_images_show_pixels_of_unknown_depth(monkeypatch
         x, z = view.camera.project(places)
         inside |= (z > 0) & (x[:, 0] >= 0) & (x[:, 0] < WIDTH)
     assert inside.all()
-    bare = np.abs(colors - 0.5).max(axis=1) < 0.02  # the bare third of the wall is grey
+    bare = np.abs(colors - 0.5).max(axis=1) < 0.02  # the textureless third of the wall is grey
     assert bare.mean() > 0.5
     to_the_left = places[:, 0] / places[:, 2] * WALL < -1.2
     assert bare[to_the_left].mean() > 0.9

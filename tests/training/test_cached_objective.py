@@ -1,4 +1,4 @@
-"""Stage 2 from cached views: the same training to rounding, the same bytes for any threads and after any resume."""
+"""Stage 2 from cached views: equals normal training up to rounding, independently of thread count and resuming."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def threads() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def masked(scene: Scene) -> Scene:
-    """The toy, with a corner of every other view to be ignored."""
+    """Return the toy scene; every other view masks out a corner."""
     views = []
     for i, view in enumerate(scene.train):
         mask = np.ones((SIZE, SIZE), bool)
@@ -46,7 +46,7 @@ def masked(scene: Scene) -> Scene:
 
 
 def recipe(iterations: int = 3 * VIEWS, k: float = 20.0) -> Recipe:
-    """Stage 2 alone, then a little of stage 3."""
+    """Return a recipe with mainly stage 2, and a short stage 3."""
     return Recipe("colors", (replace(appearance(k=k), iterations=iterations), replace(refine(), iterations=2)))
 
 
@@ -82,7 +82,7 @@ def test_cached_views_have_the_losses_and_gradients_of_full_renderings(masked: S
             plain = b.gradients[name][cached.rows]
             assert a.gradients[name].shape == plain.shape
             error = (a.gradients[name] - plain).abs().max() / plain.abs().max()
-            assert error <= 3e-6, (index, name)  # the SSIM amplifies the rounding of the image
+            assert error <= 3e-6, (index, name)  # SSIM amplifies rounding errors of the image
             assert plain.abs().max() > 0
 
 
@@ -134,7 +134,7 @@ def test_which_stages_use_cached_views() -> None:
     assert cacheable(plain)
     assert cacheable(replace(plain, train={"sh0": "high_error"}))
     assert not cacheable(plain, PLAIN)
-    assert not cacheable(plain, views=51)  # two visits of each view pay for filling
+    assert not cacheable(plain, views=51)  # caching pays off from two visits per view
     assert not cacheable(replace(plain, train=dict.fromkeys(("sh0", "shN"), "all")))
     assert not cacheable(replace(plain, train={"sh0": "high_error", "shN": "clones"}))
     assert not cacheable(replace(plain, train={**plain.train, "opacity_logits": "high_error"}))

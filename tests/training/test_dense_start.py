@@ -1,4 +1,4 @@
-"""A dense start of photographs without sparse points: where is swept, what is found, how splats are fitted to it."""
+"""Dense initialisation of images without sparse points: sweep range, resulting points, and splat fitting."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from tiny import RADIUS, ball_image
 from wall_scene import WALL, wall
 
 BALL = DenseStart(side=64, neighbours=3, cell=2.0)
-PIXEL = 3.0 / 80  # world units at the middle of the ball
+PIXEL = 3.0 / 80  # world units at the centre of the ball
 BOUNDS = np.array([[-1.2, -1.2, -1.2], [1.3, 1.2, 1.2]])
 
 
 @cache
 def ball() -> Scene:
-    """A mottled ball with an alpha channel, photographed from a ring of cameras 12 degrees apart; no points."""
+    """Return a mottled ball with an alpha channel, from a ring of cameras 12 degrees apart, without points."""
     views = []
     for i, turn in enumerate(np.radians(np.arange(0, 360, 12))):
         eye = 3.0 * np.array([np.cos(turn), np.sin(turn), 0.1])
@@ -54,7 +54,7 @@ def pointless_wall() -> Scene:
     return replace(wall(), observe=None, points=None, bounds=np.array([[-1.5, -1.2, 3.0], [1.5, 1.2, 5.0]]))
 
 
-# -- where is swept -------------------------------------------------------------------------------------------------
+# -- sweep range -----------------------------------------------------------------------------------------------------
 def test_without_points_the_visual_hull_limits_the_sweep() -> None:
     found = sweep_range(ball())
     cell = float(np.linalg.norm(BOUNDS[1] - BOUNDS[0])) / 48
@@ -62,7 +62,7 @@ def test_without_points_the_visual_hull_limits_the_sweep() -> None:
         distance = float(np.linalg.norm(view.camera.center))
         near, far = found.limits[view.name]
         assert distance - RADIUS - 4 * cell < near < distance - RADIUS
-        assert distance + RADIUS < far < distance + 1.25 * RADIUS + 4 * cell  # the hull of a ring has poles
+        assert distance + RADIUS < far < distance + 1.25 * RADIUS + 4 * cell  # the hull extends at the poles
     assert np.linalg.norm(found.observed.points, axis=1).max() < 1.3 * RADIUS + 2 * cell
     assert len(found.observed.points) <= 2 * 2000
 
@@ -74,7 +74,7 @@ def test_a_wall_is_swept_without_sparse_points() -> None:
     assert np.median(np.abs(depth[depth > 0] / WALL - 1)) < 0.02
 
 
-# -- what is found --------------------------------------------------------------------------------------------------
+# -- points ----------------------------------------------------------------------------------------------------------
 def test_swept_points_lie_on_the_ball() -> None:
     cloud = start_points(ball(), swept_ball(), BALL)
     off = np.abs(np.linalg.norm(cloud.points, axis=1) - RADIUS)
@@ -90,7 +90,7 @@ def test_swept_points_lie_on_the_ball() -> None:
         assert not (depth > 0)[alpha < 0.5].any()
 
 
-# -- how splats are fitted ------------------------------------------------------------------------------------------
+# -- splat fitting ---------------------------------------------------------------------------------------------------
 def recipe(settings: DenseStart, iterations: int = 6) -> Recipe:
     made = scale_schedule(two_dgs(), iterations / 30_000)
     stage = replace(made.stages[0], densify=None, sh_interval=0)
@@ -119,7 +119,7 @@ def test_a_fitted_splat_has_the_colour_of_the_images_and_a_bounded_size(monkeypa
     assert torch.equal(fitted.quats, plain.quats)
     torch.testing.assert_close(fitted.opacities, torch.full_like(fitted.opacities, 0.7))
     assert (fitted.scales <= 1.5 * 1.1 * PIXEL).all()
-    small = plain.scales * 0.5 < 1.5 * 0.6 * PIXEL  # the nearest camera is 1 - 1.1 x 0.8 / 3 of the distance away
+    small = plain.scales * 0.5 < 1.5 * 0.6 * PIXEL  # the nearest camera is at 1 - 1.1 x 0.8 / 3 of the distance
     assert small.float().mean() > 0.5
     torch.testing.assert_close(fitted.scales[small], 0.5 * plain.scales[small])
     shown = sh_to_rgb(fitted.sh0, fitted.shN, torch.nn.functional.normalize(-fitted.means, dim=1), 1)  # from outside
@@ -142,9 +142,9 @@ def test_a_resumed_training_does_not_sweep_again(monkeypatch: pytest.MonkeyPatch
     assert all(torch.equal(a, b) for (_, a), (_, b) in zip(whole.items(), again.items(), strict=True))
 
 
-# -- a start that is wished for, not required -----------------------------------------------------------------------
+# -- optional dense start --------------------------------------------------------------------------------------------
 def unlike_anything() -> Scene:
-    """Photographs of noise: no two agree on anything."""
+    """Return images of noise, in which no two views agree."""
     noise = np.random.default_rng(0)
     views = [
         View.from_arrays(view.name, view.camera, noise.integers(0, 255, (64, 64, 3), dtype=np.uint8))

@@ -1,4 +1,4 @@
-"""Densifiers as objects: one from elsewhere, what a recipe says of it, and that the loop asks nobody else."""
+"""Densifiers as plug-in objects: a registered one, its recipe entry, and the training loop's use of it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gs2d.training.trainer import Trainer
 
 
 class Twins(Densifier):
-    """At one iteration the splats that were seen most often get a twin each."""
+    """At iteration ``at``, duplicates the splats that were visible most often."""
 
     def __init__(self, surroundings: Surroundings, at: int, count: int = 2) -> None:
         super().__init__(surroundings)
@@ -68,7 +68,7 @@ def test_a_registered_densifier_adds_splats_and_statistics() -> None:
     assert len(trainer.splats) == before + 3
     statistics = trainer.state.statistics
     assert statistics is not None
-    assert statistics["seen"][-3:].tolist() == [1.0, 1.0, 1.0]  # of the fifth iteration alone
+    assert statistics["seen"][-3:].tolist() == [1.0, 1.0, 1.0]  # in the fifth iteration only
     again = TrainState.from_state_dict(trainer.state.state_dict())
     assert again.statistics is not None
     assert torch.equal(again.statistics["seen"], statistics["seen"])

@@ -1,4 +1,4 @@
-"""Densification, worked by hand: statistics, clone, split, prune, resets."""
+"""Densification, computed by hand: statistics, clone, split, prune, resets."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def logit(opacity: float) -> float:
 def state_of(
     scales: list[tuple[float, float]], opacities: list[float], signed: list[float], count: list[float]
 ) -> TrainState:
-    """Splats of given size, opacity and statistics; everything else differs from row to row."""
+    """Return splats with these sizes, opacities and statistics; all other attributes differ between rows."""
     n = len(scales)
     splats = random_splats(n, seed=1)
     splats.log_scales = torch.tensor(scales).log()
@@ -63,7 +63,7 @@ def test_statistics_add_norms_of_visible_splats() -> None:
 
 def test_small_splats_are_cloned_and_large_ones_split_from_the_threshold_on() -> None:
     # extent 1: up to 0.01 is small. Row 0: mean exactly 2e-4, size exactly at most 0.01 -> clone. Row 1: just below.
-    # Row 2: large, mean 3e-4 -> split. Row 3: large, never seen.
+    # Row 2: large, mean 3e-4 -> split. Row 3: large, never visible.
     state = state_of(
         [(0.005, 0.009), (0.005, 0.009), (0.02, 0.005), (0.02, 0.02)],
         [0.5, 0.5, 0.5, 0.5],
@@ -78,14 +78,14 @@ def test_small_splats_are_cloned_and_large_ones_split_from_the_threshold_on() ->
     assert len(after) == 6
     for name, tensor in after.items():
         assert torch.equal(tensor[:3], dict(before.items())[name][[0, 1, 3]]), name
-        assert torch.equal(tensor[3], dict(before.items())[name][0]), name  # an exact copy, in the same place
+        assert torch.equal(tensor[3], dict(before.items())[name][0]), name  # an exact copy in the same position
     for child in (4, 5):
         for name in ("quats", "opacity_logits", "sh0", "shN"):
             assert torch.equal(dict(after.items())[name][child], dict(before.items())[name][2]), name
         torch.testing.assert_close(after.log_scales[child].exp(), torch.tensor([0.02, 0.005]) / 1.6)
         assert not torch.equal(after.means[child], before.means[2])
     assert not torch.equal(after.means[4], after.means[5])
-    # clones and children belong to the groups of their origins (0 and 2 are in g), and have no memory
+    # clones and children inherit the groups of their origins (0 and 2 are in g); their moments start at zero
     assert state.groups["g"].tolist() == [True, False, False, True, True, True]
     for moments in state.moments.values():
         assert moments.mean[:3].all()
@@ -105,13 +105,13 @@ def test_children_lie_in_the_plane_of_their_parent_and_spread_like_its_gaussian(
     local = state.splats.means @ frame  # [2n, 3] along t_u, t_v, t_w
     assert len(local) == 2 * n
     assert local[:, 2].abs().max() < 1e-6
-    # 8000 draws: the standard deviation is known to 0.8 %, the mean to 0.0022 and 0.0006
+    # 8000 draws: standard error 0.8 % for the standard deviation, 0.0022 and 0.0006 for the mean
     assert local[:, :2].std(dim=0).tolist() == pytest.approx([0.2, 0.05], rel=0.04)
     assert local[:, :2].mean(dim=0).abs().max() < 0.01
 
 
 def test_splats_below_the_opacity_cull_are_pruned_clones_and_children_included() -> None:
-    # row 0 is faint and cloned: both go. Row 1 is faint and split: its children go. Row 2 is exactly bright enough.
+    # Row 0 is faint and cloned: both are pruned. Row 1 is faint and split: so are its children. Row 2 is bright enough.
     state = state_of(
         [(0.005, 0.005), (0.02, 0.02), (0.02, 0.02)], [0.04, 0.04, 0.0501], [1.0, 1.0, 0.0], [1.0, 1.0, 1.0]
     )
@@ -147,7 +147,7 @@ def test_absgs_splits_by_the_absolute_gradient_and_clones_by_the_signed_one() ->
     assert state.statistics is not None
     state.statistics["absolute"] = torch.tensor([0.0, 9e-4, 3e-4, 4e-4])
     assert run(state, densify) == DensifyCounts(cloned=1, split=1, pruned_by_opacity=0, pruned_large=0)
-    # rows 0, 1, 2 stay, then the clone of 0, then the children of 3
+    # rows 0, 1, 2 remain, then the clone of 0, then the children of 3
     torch.testing.assert_close(state.splats.scales[4:], torch.full((2, 2), 0.02 / 1.6))
 
 
@@ -162,8 +162,8 @@ def test_max_splats_prefers_the_largest_gradients() -> None:
 
 
 def test_max_splats_counts_splats_after_pruning() -> None:
-    # five splats, of which the first is too faint: it takes no room, and wins none with its gradient. Four stay, the
-    # budget of six lets two of the other three grow, of which one splits (a parent goes, two children come).
+    # The first of five splats is too faint: it uses no budget, and its gradient does not count. Four remain. The
+    # budget of six lets two of the other three grow, one of them by a split (a parent is replaced by two children).
     sizes = [(0.005, 0.005), (0.005, 0.005), (0.02, 0.02), (0.005, 0.005), (0.005, 0.005)]
     state = state_of(sizes, [0.01, 0.5, 0.5, 0.5, 0.5], [9e-3, 3e-4, 9e-4, 5e-4, 0.0], [1.0] * 5)
     assert run(state, GradDensify(max_splats=6)) == DensifyCounts(
@@ -201,7 +201,7 @@ def test_limiting_opacity_zeroes_its_moments_but_not_the_step_count() -> None:
 
 
 def test_screen_size_never_prunes() -> None:
-    """The official screen-size prune is dead code; a splat that fills the screen but not the world stays."""
+    """The official screen-size prune is dead code: splats that are large only on screen are kept."""
     state = state_of([(0.09, 0.09)], [0.5], [0.0], [1.0])
     assert run(state, iteration=14_900) == DensifyCounts(0, 0, 0, 0)
     assert isinstance(state.splats, Splats)

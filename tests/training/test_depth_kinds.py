@@ -1,4 +1,4 @@
-"""Training by the depth of continuous transmittance: rendered where a loss asks for it, and nowhere else."""
+"""Training with continuous-transmittance depth: rendered only where a loss requests it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from train_toys import short
 
 
 def by_depth(recipe: Recipe, kind: str, *kinds_of_loss: str) -> Recipe:
-    """The recipe with losses of these kinds by that depth."""
+    """Return the recipe in which losses of these kinds use that depth."""
 
     def changed(term: LossTerm) -> LossTerm:
         return replace(term, depth=kind) if term.kind in kinds_of_loss else term
@@ -27,7 +27,7 @@ def by_depth(recipe: Recipe, kind: str, *kinds_of_loss: str) -> Recipe:
 
 def test_transmittance_depth_is_rendered_only_if_a_loss_uses_it(scene: Scene) -> None:
     trainer = Trainer(scene, by_depth(short(), "transmittance", "normal_consistency"), GENERIC, backend="reference")
-    stages = trainer.recipe.stages  # normal consistency begins after 4 iterations, and is not in the second stage
+    stages = trainer.recipe.stages  # normal consistency starts after 4 iterations, and is not in the second stage
     asked = [trainer._whole.settings(stages[0], iteration).with_transmittance_depth for iteration in (4, 5)]
     assert asked == [False, True]
     assert not trainer._whole.settings(stages[1], 4).with_transmittance_depth
@@ -44,7 +44,7 @@ def test_transmittance_and_median_depth_have_different_gradients(scene: Scene, b
         assert np.isfinite(float(result.losses["normal_consistency"]))
         found[kind] = result.gradients
     moved = {kind: (gradients["means"] != 0).any(dim=1) for kind, gradients in found.items()}
-    assert torch.equal(found["median"]["sh0"], found["transmittance"]["sh0"])  # colours are not asked
+    assert torch.equal(found["median"]["sh0"], found["transmittance"]["sh0"])  # colours do not depend on depth
     assert not torch.equal(found["median"]["means"], found["transmittance"]["means"])
     assert bool((moved["transmittance"] >= moved["median"]).all())
 

@@ -1,4 +1,4 @@
-"""Training that cannot go on stops, and says where and why."""
+"""Diverging training stops with a message that names the place and the cause."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_bad_recipes_and_empty_scenes_are_refused_before_training(scene: Scene) 
 
 
 def spoiled(spoil: Callable[[Splats, RenderOutput], RenderOutput], calls: int) -> Backend:
-    """The reference, whose render number ``calls`` is spoiled."""
+    """Return the reference backend with the output of one render call replaced."""
     count = [0]
 
     def rasterize(

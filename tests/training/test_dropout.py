@@ -1,4 +1,4 @@
-"""Splats that an iteration leaves out at random where photographs are few."""
+"""Random splat dropout for captures with few images."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ def test_worst_takes_the_largest_errors_and_the_lower_index_of_ties() -> None:
     errors = torch.tensor([1.0, 5.0, 5.0, 2.0, 5.0])
     assert worst(errors, 40).tolist() == [1, 2]
     assert worst(errors, 100).tolist() == [1, 2, 4, 3, 0]
-    assert worst(torch.ones(5000), 10).tolist() == list(range(500))  # many: an unstable sort would mix them
+    assert worst(torch.ones(5000), 10).tolist() == list(range(500))  # many ties: an unstable sort would shuffle them
 
 
 def test_ranking_sums_over_views_and_writes_the_group() -> None:

@@ -1,4 +1,4 @@
-"""Exposures that are learned: updates by hand, the whole loss, what they are worth on a scene that needs them."""
+"""Learned exposures: single updates, the complete loss, and the gain on a scene with varying exposure."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_the_mean_of_all_transforms_is_the_identity(scene: Scene) -> None:
 
 
 class Looks(TorchDispatchMode):
-    """Counts the operations for which a host would wait for its device."""
+    """Counts operations that make the host wait for a device."""
 
     count = 0
 
@@ -72,7 +72,7 @@ def test_on_a_device_transform_and_update_do_not_wait(scene: Scene) -> None:
         _, gradient = _gradients(image, color, transform, coverage, white)
         made.table.update(made.rows, 1, {"exposure": gradient}, {"exposure": 0.1}, backend)
         assert looks.count == 0
-        backend.is_whole()  # this is one
+        backend.is_whole()  # one such operation
     assert looks.count == 1
 
 
@@ -88,7 +88,7 @@ def test_the_gradient_of_a_transform_is_that_of_the_whole_loss(scene: Scene) -> 
 
     def loss(change: torch.Tensor) -> float:
         kept = rows.values.clone()
-        rows.values[2] += change * VIEWS / (VIEWS - 1)  # the mean takes its share back
+        rows.values[2] += change * VIEWS / (VIEWS - 1)  # keeping the mean fixed removes this share
         total = sum(float(value) for value in trainer._whole.evaluate(state, stage, 1, 2).losses.values())
         rows.values = kept
         return total
@@ -116,7 +116,7 @@ def test_constant_exposures_change_no_bit_of_the_splats(
 
 
 def test_exposure_does_not_change_the_white_background(scene: Scene, backend: str) -> None:
-    # The photograph is empty and so is the rendering: both are white, whatever the transform, and the loss is 0.
+    # Image and rendering are both empty, therefore white for any transform, and the loss is 0.
     empty = View.from_arrays("empty", scene.train[0].camera, np.zeros((SIZE, SIZE, 4), np.uint8))
     splats = random_splats(5)
     splats.opacity_logits.fill_(-20.0)
@@ -139,7 +139,7 @@ def test_clipped_pixels_exclude_the_white_background() -> None:
 
 def test_a_clipped_pixel_allows_brighter_colours(scene: Scene) -> None:
     rendered = torch.tensor([[[1.3, 1.3, 0.7]]], requires_grad=True)
-    clipped = torch.tensor([[[True, False, True]]])  # red is no error, green and blue are
+    clipped = torch.tensor([[[True, False, True]]])  # clipped red counts as no error; green and blue do count
     at = ImagePoints(scene.train[0].camera)
     seen = shown(rendered, {"exposure": torch.eye(3, 4)}, at, clipped)
     assert seen.flatten().tolist() == pytest.approx([1.0, 1.3, 0.7])
@@ -176,7 +176,7 @@ def test_cached_views_have_the_losses_and_gradients_of_full_renderings(scene: Sc
         assert torch.allclose(a.gradients["sh0"], b.gradients["sh0"][cached.rows], rtol=1e-4, atol=1e-8)
 
 
-# -- what it is worth ---------------------------------------------------------------------------------------------
+# -- gain ---------------------------------------------------------------------------------------------------------
 TRAIN, TEST = 16, 4
 
 
@@ -188,10 +188,10 @@ def image(truth: Splats, camera: Camera, gain: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def varied() -> tuple[Scene, Splats, np.ndarray]:
-    """Matt splats in 16 photographs of random gains, whose mean is 1, and 4 test photographs of gain 1; the gains."""
+    """Return matt splats with 16 images of random gains (mean 1) and 4 test images of gain 1, and the gains."""
     truth = random_splats(80, seed=3)
     truth.shN.zero_()
-    truth.sh0.mul_(0.5)  # nothing near white, where photographs clip
+    truth.sh0.mul_(0.5)  # nothing near white, where images clip
     angles = 2.4 * np.arange(TRAIN + TEST)
     cameras = [
         look_at(
@@ -233,15 +233,15 @@ def test_exposure_gains_are_recovered_and_improve_new_views(varied: tuple[Scene,
         scores.append(held_out_psnr(scene, trainer))
         if recipe.learned:
             transforms = np.stack([view.appearance["exposure"] for view in trainer.scene_now().train])
-            grey = (0.5 * transforms[:, :, :3].sum(axis=2) + transforms[:, :, 3]) / 0.5  # what a middle grey becomes
-    errors = np.abs(grey / gains - 1)  # the gains are 13 % from 1 in the mean
+            grey = (0.5 * transforms[:, :, :3].sum(axis=2) + transforms[:, :, 3]) / 0.5  # mapped middle grey
+    errors = np.abs(grey / gains - 1)  # the gains differ from 1 by 13 % on average
     assert scores[1] > scores[0] + 8  # measured: 36.4 and 50.1 dB
     assert errors.mean() < 0.012  # measured: 0.006
     assert errors.max() < 0.04  # measured: 0.022
 
 
 def held_out_psnr(scene: Scene, trainer: Trainer) -> float:
-    """PSNR of the test photographs as they are: nothing is fitted to them."""
+    """Return the PSNR of the unmodified test images: nothing is fitted to them."""
     splats, errors = trainer.run(), []
     for view in scene.test:
         with torch.no_grad():
@@ -262,5 +262,5 @@ def test_the_events_name_the_prior_among_the_losses(scene: Scene) -> None:
     Trainer(
         scene, recipe, GENERIC, backend="reference", on_event=listen, options=TrainerOptions(progress_every=1)
     ).run()
-    assert [event.losses["exposure"] > 0 for event in seen] == [False, True]  # identities first
+    assert [event.losses["exposure"] > 0 for event in seen] == [False, True]  # the first transforms are identities
     assert seen[1].loss == pytest.approx(sum(seen[1].losses.values()))

@@ -1,4 +1,4 @@
-"""Splats that are rendered with those in training and never change, and exposures that are given."""
+"""Frozen splats rendered together with those in training, and fixed exposures."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_trained_splats_get_the_same_gradients_beside_frozen_ones(backend: str) 
     )
     for trainer in (apart, together):
         trainer.enter(0)
-        trainer.state.step = 7  # the losses of two views have begun
+        trainer.state.step = 7  # halfway to the start of the multi-view losses
     stage, found = compared().stages[0], []
     for trainer in (apart, together):
         probe = torch.zeros(len(trainer.splats), 2, requires_grad=True)
@@ -72,7 +72,7 @@ def test_frozen_splats_never_change(backend: str) -> None:
     assert len(trainer.drawn) == len(splats) + 15
     assert same(trainer.drawn.rows(torch.arange(len(splats), len(splats) + 15)), before)
     assert len(splats) != 45  # densified and cloned
-    assert not same(splats, trainer_of(short(), own, None, backend).run())  # what is around matters
+    assert not same(splats, trainer_of(short(), own, None, backend).run())  # the surroundings matter
 
 
 def test_a_run_with_frozen_splats_resumes_to_the_same_bytes() -> None:
@@ -97,7 +97,7 @@ def test_a_part_without_a_dense_start_begins_with_init() -> None:
 
     trainer = trainer_of(short(), own, frozen, backends()[-1], within=within)
     assert same(trainer.splats, own)
-    assert asked == []  # only a dense start is of places
+    assert asked == []  # only a dense start has points
 
 
 # -- exposures ---------------------------------------------------------------------------------------------------------
@@ -105,7 +105,7 @@ GIVEN = short().with_learned(replace(EXPOSURE, start=0, decay_steps=10).with_opt
 
 
 def transforms() -> torch.Tensor:
-    """Six, whose mean is not the identity."""
+    """Return six transforms whose mean is not the identity."""
     gains = torch.linspace(0.5, 0.9, 6)
     return torch.cat([torch.eye(3) * gains[:, None, None], torch.zeros(6, 3, 1)], dim=2)
 

@@ -1,4 +1,4 @@
-"""A training that starts from splats: flat ones as they are, 3D Gaussians without their smallest scale."""
+"""Training initialised from splats: 2D splats unchanged, 3D Gaussians without their smallest scale."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_training_starts_from_a_copy_of_init() -> None:
 
 
 def test_init_gets_the_sh_degree_of_the_recipe() -> None:
-    """What the recipe's degree lacks is left out; what the splats lack begins at 0."""
+    """Higher degrees are dropped; missing degrees start at 0."""
     degree = train_toys.short().sh_degree
     wanted = (degree + 1) ** 2 - 1
     given = train_toys.random_splats(5)
@@ -60,7 +60,7 @@ def test_empty_or_broken_init_and_init_with_a_state_are_refused() -> None:
 
 
 def test_a_3d_gaussian_loses_its_smallest_scale_and_its_normal_points_there() -> None:
-    """Three Gaussians with their smallest scale along each axis: in-plane axes and scales stay what they were."""
+    """Three Gaussians, each with its smallest scale along another axis: in-plane axes and scales are kept."""
     rng = np.random.default_rng(0)
     quats = rng.normal(size=(3, 4)).astype(np.float32)
     log_scales = np.log(np.array([[0.1, 0.5, 0.9], [0.7, 0.2, 0.4], [0.8, 0.6, 0.3]], np.float32))

@@ -1,4 +1,4 @@
-"""The first splats."""
+"""Initial splats."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_points_give_places_colours_opacity_and_scales(scene: Scene) -> None:
     assert (initial.source, initial.dropped, len(splats)) == ("points", 0, 4)
     torch.testing.assert_close(splats.means[:, 0], torch.tensor([0.0, 0.1, 0.2, 0.3]))
     torch.testing.assert_close(splats.opacities, torch.full((4,), 0.1))
-    # the three others: squared distances 1 + 4 + 9 and 1 + 1 + 4 (in units of 0.01)
+    # the three other points: squared distances 1 + 4 + 9 and 1 + 1 + 4 (in units of 0.01)
     outer, inner = 0.1 * math.sqrt(14 / 3), 0.1 * math.sqrt(2)
     expected = torch.tensor([outer, inner, inner, outer])
     torch.testing.assert_close(splats.scales, expected[:, None].repeat(1, 2))
@@ -57,7 +57,7 @@ def test_without_points_splats_are_random_in_the_bounds_and_grey(scene: Scene) -
     assert (initial.source, len(splats)) == ("random", 500)
     assert (splats.means.amin(dim=0) >= torch.tensor([-0.5, -0.2, 0.0])).all()
     assert (splats.means.amax(dim=0) <= torch.tensor([0.5, 0.2, 0.1])).all()
-    # the mean of 500 uniform numbers is within 0.06 of the middle of an interval of length 1 (4.6 sigma)
+    # the mean of 500 uniform numbers is within 0.06 of the centre of an interval of length 1 (4.6 sigma)
     assert splats.means.mean(dim=0).sub(torch.tensor([0.0, 0.0, 0.05])).abs().max() < 0.06
     assert not splats.sh0.any()
     assert torch.equal(start(bare).splats.means, splats.means)

@@ -1,4 +1,4 @@
-"""What all learned quantities have in common: one Adam, one schedule, cancelled updates, resuming, refusals."""
+"""Common behaviour of learned quantities: Adam, schedule, cancelled updates, resuming, error messages."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NAMES = ("intrinsics", "poses", "vignetting", "exposure", "response")
 
 
 def everything(**changes: float) -> Recipe:
-    """``short`` with all quantities from its third iteration on."""
+    """Return ``short`` with all quantities active from the third iteration on."""
     given = {"start": 2, "decay_steps": 10, "rate": 1e-2, "rate_final": 1e-3, **changes}
     quantities = EXPOSURE, POSES, INTRINSICS.with_options(distortion=True), RESPONSE, VIGNETTING
     return short().with_learned(*(replace(quantity, **given) for quantity in quantities))  # type: ignore[arg-type]
@@ -53,7 +53,7 @@ def test_the_first_step_of_a_row_is_the_rate_and_the_second_is_adam_s(scene: Sce
 
 def test_rates_decay_over_the_whole_run_after_the_start() -> None:
     settings = replace(POSES, rate=0.1, rate_final=0.001, decay_steps=100, start=5)
-    assert settings.rate_at(50) == pytest.approx(0.01)  # the geometric mean, half way
+    assert settings.rate_at(50) == pytest.approx(0.01)  # the geometric mean, at half of the schedule
     assert settings.rate_at(100) == settings.rate_at(500) == pytest.approx(0.001)
     assert settings.rate_at(5) == 0 < settings.rate_at(6)
 
@@ -98,7 +98,7 @@ def test_resuming_from_any_event_gives_the_same_splats_and_rows(scene: Scene) ->
     )
     end = trainer.run()
     found = trainer.state.learned
-    assert all(rows.values.abs().max() > 1e-4 for name, rows in found.items() if name != "response")  # of one camera
+    assert all(rows.values.abs().max() > 1e-4 for name, rows in found.items() if name != "response")  # per camera
     for data in kept[:: 3 if backend == "cpu" else 9]:
         resumed = Trainer(scene, recipe, GENERIC, backend=backend, state=TrainState.from_state_dict(data))
         assert same(resumed.run(), end)
@@ -148,7 +148,7 @@ def test_learned_numbers_that_are_not_finite_stop_training(scene: Scene, monkeyp
         trainer._check_parameters(trainer.recipe.stages[0], ())
 
 
-# -- what a recipe says --------------------------------------------------------------------------------------------
+# -- recipe settings -----------------------------------------------------------------------------------------------
 def test_a_recipe_names_registered_quantities_once() -> None:
     recipe = Recipe("one", (surface(),))
     with pytest.raises(RecipeError, match=r"quantity must be one of intrinsics, poses.*got 'warmth'"):
@@ -157,7 +157,7 @@ def test_a_recipe_names_registered_quantities_once() -> None:
     with pytest.raises(RecipeError, match="learned 'exposure' is there twice"):
         from_json(to_json(twice))
     learning = recipe.with_learned(EXPOSURE, INTRINSICS, POSES)
-    assert list(learning.quantities) == ["intrinsics", "poses", "exposure"]  # as they are applied
+    assert list(learning.quantities) == ["intrinsics", "poses", "exposure"]  # in the order of application
     changed = apply_overrides(learning, ["learned.exposure.start=7", "learned.intrinsics.options.distortion=true"])
     assert changed.quantities["exposure"] == replace(EXPOSURE, start=7)
     assert changed.quantities["intrinsics"].options == {"distortion": True}

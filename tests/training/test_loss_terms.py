@@ -1,4 +1,4 @@
-"""Which iterations have a term of the loss, what the others save, and where in the image a term is asked."""
+"""Schedules of loss terms: active iterations, skipped work, and restriction to image regions."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from train_toys import WIDE, compared, same, short
 
 
 def with_terms(recipe: Recipe, **changes: Any) -> Recipe:
-    """Change fields of the terms of a kind (of all stages): ``normal_consistency={"every": 2}``."""
+    """Change fields of all terms of a kind, in all stages: ``normal_consistency={"every": 2}``."""
 
     def changed(stage: Stage) -> Stage:
         return replace(stage, losses=tuple(replace(t, **changes.get(t.kind, {})) for t in stage.losses))
@@ -31,7 +31,7 @@ def with_terms(recipe: Recipe, **changes: Any) -> Recipe:
 
 
 def cut_out(scene: Scene) -> Scene:
-    """The same photographs with an alpha channel: empty where they are black."""
+    """Return the same images with an alpha channel that is empty where they are black."""
 
     def with_alpha(view: View) -> View:
         image = view.image()
@@ -60,7 +60,7 @@ def test_an_inactive_term_changes_nothing(scene: Scene, backend: str) -> None:
     without = replace(stage, losses=tuple(t for t in stage.losses if t.kind != "normal_consistency"))
     for iteration, other in ((7, without), (8, without), (9, stage)):
         found, expected = (trainer._whole.evaluate(trainer.state, s, iteration, 0) for s in (rare, other))
-        assert found.losses == expected.losses  # the weight is as written
+        assert found.losses == expected.losses  # the weight is not rescaled
         assert all(torch.equal(found.gradients[name], expected.gradients[name]) for name in expected.gradients)
     assert set(trainer._whole.evaluate(trainer.state, rare, 9, 0).losses) == {"l1", "ssim", "normal_consistency"}
 
@@ -84,7 +84,7 @@ def test_inputs_of_an_inactive_term_are_not_rendered(scene: Scene, monkeypatch: 
         rendered.clear()
         trainer._whole.evaluate(trainer.state, recipe.stages[0], iteration, 0)
         counts.append((len(rendered), rendered[0].with_distortion))
-    assert counts == [(1, False), (2, True)]  # the second view, and the map of distortion
+    assert counts == [(1, False), (2, True)]  # the second view, and the distortion map
 
 
 def test_a_training_with_options_resumes_to_the_same_bytes(scene: Scene, backend: str) -> None:

@@ -1,4 +1,4 @@
-"""Training that compares views: who is compared with whom, what is drawn, resume to the same bytes."""
+"""Multi-view training: neighbours, sampling, and byte-identical resuming."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from train_toys import WIDE, compared, same, short
 
 
 def ring(angles: list[float], distance: float = 3.0) -> Scene:
-    """Cameras around the origin, at these angles in degrees, without points."""
+    """Return cameras around the origin at these angles in degrees, without points."""
     views = []
     for k, a in enumerate(np.radians(angles)):
         eye, up = distance * np.array([np.cos(a), np.sin(a), 0.0]), np.array([0.0, 0.0, 1.0])
@@ -35,11 +35,11 @@ def ring(angles: list[float], distance: float = 3.0) -> Scene:
 
 # -- neighbours ---------------------------------------------------------------------------------------------------
 def test_neighbours_are_the_nearest_views_within_the_angle_and_the_baselines() -> None:
-    # From 0 degrees: 1 is too near (baseline 2 sin(0.5) = 0.017 of the distance), 60 looks another way.
+    # From 0 degrees: 1 is too close (baseline 2 sin(0.5) = 0.017 of the distance), 60 has another viewing direction.
     settings = MultiView(neighbours=3, max_angle=45.0, min_baseline=0.05, max_baseline=1.0)
     found = find_neighbours(ring([0, 1, 30, 10, 60, 20]), settings)
     assert found[0] == (3, 5, 2)
-    assert found[4] == (2, 5)  # 30 degrees away and 40; 50 is too many
+    assert found[4] == (2, 5)  # 30 and 40 degrees away; 50 is too far
     assert find_neighbours(ring([0, 1, 30, 10, 60, 20]), replace(settings, neighbours=1))[0] == (3,)
     assert find_neighbours(ring([0, 1, 30, 10]), replace(settings, max_baseline=0.3))[0] == (3,)  # 30: 0.52
 
@@ -49,7 +49,7 @@ def test_a_scene_without_neighbours_is_refused_before_anything_is_trained(scene:
         Trainer(scene, with_multiview(short()), GENERIC, backend="reference")
 
 
-# -- draws --------------------------------------------------------------------------------------------------------
+# -- sampling -----------------------------------------------------------------------------------------------------
 def test_an_iteration_draws_from_the_seed_the_stage_and_the_iteration_alone() -> None:
     recipe, neighbours = compared(), (3, 5, 7)
 
@@ -65,10 +65,10 @@ def test_an_iteration_draws_from_the_seed_the_stage_and_the_iteration_alone() ->
         assert not torch.equal(first[1], drawn(*other)[1]), other
     assert {drawn(0, 0, i)[0] for i in range(40)} == set(neighbours)
     assert draw_turn(recipe, 0, 9, (), WIDE) is None
-    assert drawn(2**63 - 1, 2, 10**6)[1].shape == (WIDE.patches,)  # the largest seed there is
+    assert drawn(2**63 - 1, 2, 10**6)[1].shape == (WIDE.patches,)  # the largest possible seed
 
 
-# -- photographs --------------------------------------------------------------------------------------------------
+# -- images -------------------------------------------------------------------------------------------------------
 def test_patches_with_masked_or_transparent_pixels_are_not_compared() -> None:
     rng = np.random.default_rng(0)
     camera = ring([0]).train[0].camera
@@ -97,7 +97,7 @@ def test_both_multiview_losses_change_depths_after_their_start(scene: Scene, bac
     assert set(after.losses) - set(before.losses) == {"multiview_photometric", "multiview_geometric"}
     assert after.losses["multiview_photometric"] > 0
     assert after.losses["multiview_geometric"] > 0
-    # The neighbour's depth may be a smaller image: nearly the same values, from a quarter of the pixels.
+    # A lower resolution of the neighbour's depth gives nearly the same values from a quarter of the pixels.
     assert trainer.recipe.multiview is not None
     coarse = replace(trainer.recipe, multiview=replace(trainer.recipe.multiview, depth_downscale=2))
     small = Trainer(scene, coarse, GENERIC, backend=backend, state=trainer.state)._whole
@@ -109,7 +109,7 @@ def test_both_multiview_losses_change_depths_after_their_start(scene: Scene, bac
     only = replace(stage, losses=tuple(t for t in stage.losses if not t.kind.startswith("multiview")))
     plain = whole.evaluate(trainer.state, only, 7, 0)
     assert not torch.equal(after.gradients["means"], plain.gradients["means"])
-    assert torch.equal(after.gradients["sh0"], plain.gradients["sh0"])  # colours are not asked
+    assert torch.equal(after.gradients["sh0"], plain.gradients["sh0"])  # the losses do not affect colours
 
 
 def test_a_resumed_training_gives_the_same_bytes(scene: Scene, backend: str) -> None:

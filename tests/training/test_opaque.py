@@ -1,4 +1,4 @@
-"""Photographs without an alpha channel are opaque, and what is trained on them becomes so."""
+"""Images without an alpha channel are opaque, and training on them makes the scene opaque."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_the_background_changes_at_the_end_of_stages_that_train_opacity() -> Non
 
 
 def opacity_gradient(iterations: range, *, channels: int) -> float:
-    """Of all opacities together, over iterations of which photograph, splats and background have one colour."""
+    """Return the summed opacity gradient over iterations in which image, splats and background have the same colour."""
     scene, state = make_scene(), full_state(20)
     stage = replace(robust().stages[0], losses=(LossTerm("l2", 1.0),))
     recipe = replace(robust(dropout=0.0), stages=(stage,))
@@ -57,6 +57,6 @@ def opacity_gradient(iterations: range, *, channels: int) -> float:
 def test_holes_are_filled_in_opaque_images_only() -> None:
     last = robust().stages[0].iterations
     late = range(last - len(BACKGROUNDS) + 1, last + 1)
-    assert opacity_gradient(late, channels=3) < -1e-3  # a step against it raises opacity
+    assert opacity_gradient(late, channels=3) < -1e-3  # gradient descent raises opacity
     assert opacity_gradient(late, channels=4) == pytest.approx(0, abs=1e-6)
     assert opacity_gradient(range(1, len(BACKGROUNDS) + 1), channels=3) == pytest.approx(0, abs=1e-6)

@@ -1,4 +1,4 @@
-"""Several processes train one scene: gradients of the batch, the same state everywhere, resuming, what is refused."""
+"""Training one scene in several processes: batch gradients, identical states, resuming, error messages."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CASES = [*RECIPES, "resumed", "differing"]
 
 
 def differing(a: Any, b: Any) -> list[str]:
-    """Where two states are not the same, to the bit."""
+    """Return the paths at which two states are not bit-identical."""
     first, second = flat(a), flat(b)
     assert first.keys() == second.keys()
     return [name for name in first if not torch.equal(first[name], second[name])]
@@ -36,7 +36,7 @@ def differing(a: Any, b: Any) -> list[str]:
 
 @pytest.fixture(scope="module")
 def two(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
-    """All cases, done by two processes."""
+    """Run all cases in two processes."""
     return together_in(2, CASES, tmp_path_factory.mktemp("two"))
 
 
@@ -48,7 +48,7 @@ def test_two_processes_have_identical_states(case: str, two: dict[str, list[Any]
 
 @pytest.mark.parametrize("case", RECIPES)
 def test_two_processes_equal_one_with_batches_of_two(case: str, two: dict[str, list[Any]]) -> None:
-    """To the bit: the sum of two numbers has no order. What sums up all views (E_i, errors) does, to rounding."""
+    """Bit-identical, because a sum of two numbers has no order. Sums over all views (E_i, errors) agree up to rounding."""
     state, heard = trained(RECIPES[case](), Batch(2))
     found = two[case][0]
     assert differing(state.state_dict(), found["state"]) == []
@@ -73,7 +73,7 @@ def test_processes_whose_states_differ_stop_with_one_line(two: dict[str, list[An
 
 @pytest.mark.slow
 def test_four_processes_equal_one_with_batches_of_four(tmp_path: Path) -> None:
-    """To rounding: sums of four numbers have an order. Iterations of fewer views leave processes idle."""
+    """Equal up to rounding, because sums of four numbers depend on the order. Smaller batches leave processes idle."""
     cases = ["short", "learning", "relocating", "cached"]
     for case, found in together_in(4, cases, tmp_path).items():
         state, _ = trained(RECIPES[case](), Batch(4))
@@ -89,12 +89,12 @@ def test_four_processes_equal_one_with_batches_of_four(tmp_path: Path) -> None:
 
 
 def test_each_view_of_an_iteration_updates_its_learned_rows(two: dict[str, list[Any]]) -> None:
-    """19 iterations of six views, in pairs and alone: none is left out, none counted twice."""
+    """19 iterations over six views, in pairs and alone: each view counts exactly once."""
     state = two["learning"][0]["state"]
     assert state["processes"] == [[0, 0, 2]]
-    assert sum(state["learned"]["exposure"]["steps"]) == 17  # from the third on
+    assert sum(state["learned"]["exposure"]["steps"]) == 17  # starting with the third
     assert sum(state["learned"]["poses"]["steps"]) >= 8
-    assert state["moments"]["means"]["steps"] <= 5  # views of the last stage: of five that count as five
+    assert state["moments"]["means"]["steps"] <= 5  # last stage: a batch of five counts as five steps
 
 
 def test_rates_for_several_views_follow_grendel() -> None:
@@ -108,7 +108,7 @@ def test_rates_for_several_views_follow_grendel() -> None:
 
 
 def test_a_step_of_four_views_keeps_the_memory_of_four_steps() -> None:
-    """By the formulas, in float64, after steps of one view and of four: the bias correction counts views."""
+    """Compared with the formulas in float64, after steps of one and of four views: bias correction counts views."""
     stage = Stage("s", 9, train={"opacity_logits": "all"})
     state = TrainState(random_splats(5, dtype=torch.float64), torch.Generator())
     state.moments["opacity_logits"] = Moments.zeros_like(state.splats.opacity_logits)
@@ -129,7 +129,7 @@ def test_a_step_of_four_views_keeps_the_memory_of_four_steps() -> None:
 
 
 def test_a_run_resumes_with_another_number_of_processes(scene: Scene) -> None:
-    """2, then 1, then 2: the schedule is one of views, and each of them is in it once."""
+    """With 2, then 1, then 2 processes: the schedule counts views, and each view occurs once."""
     _, heard = trained(short(), Batch(2))
     state, heard = trained(short(), ONE_PROCESS, heard["states"][1])
     assert heard["losses"][0][:2] == ("surface", 5)
@@ -140,14 +140,14 @@ def test_a_run_resumes_with_another_number_of_processes(scene: Scene) -> None:
 
 
 class Guest(Densifier):
-    """Of a package that knows of one view an iteration."""
+    """A third-party loss that assumes one view per iteration."""
 
     def changes(self, iteration: int) -> bool:
         return False
 
 
 class Restless(Densifier):
-    """May change splats in each iteration."""
+    """A densifier that may change splats in every iteration."""
 
     shares_views = True
 

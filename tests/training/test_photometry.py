@@ -1,4 +1,4 @@
-"""Vignetting and response that are learned: updates by hand, the whole loss, resuming, what they are worth."""
+"""Learned vignetting and response: single updates, the complete loss, resuming, and the gain."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ needs_cpu = pytest.mark.skipif("cpu" not in backends(), reason="the native libra
 
 
 def quick() -> Recipe:
-    """``short`` with everything of photographs and cameras from its third iteration on."""
+    """Return ``short`` with all photometric and camera quantities active from the third iteration on."""
     light = (replace(quantity, start=2, decay_steps=10, rate=0.02) for quantity in (VIGNETTING, RESPONSE))
     return short().with_learned(replace(EXPOSURE, start=2, decay_steps=10), *light)
 
 
 def seen_through(views: tuple[View, ...], cameras: int) -> list[View]:
-    """Views whose files have one of so many intrinsics, by turns."""
+    """Assign ``cameras`` different intrinsics to the views, in rotation."""
     known = [Intrinsics(64, 64, 60.0 + i, 60.0, 32.0, 32.0, Lens("fov", (0.9,))) for i in range(cameras)]
     return [replace(view, intrinsics=known[index % cameras]) for index, view in enumerate(views)]
 
@@ -57,7 +57,7 @@ def test_images_of_one_camera_share_vignetting_and_response(scene: Scene) -> Non
     powers = reach_of([scene.train[0].camera]) ** np.array([2.0, 4.0, 6.0])
     for index in (0, 2, 4):
         assert seen[index]["vignetting"] * powers == pytest.approx([-0.01, 0.01, -0.01])
-        assert seen[index]["response"] == pytest.approx(0.005)  # half of the photographs are its own
+        assert seen[index]["response"] == pytest.approx(0.005)  # each camera takes half of the images
     assert not seen[1]["vignetting"].any()
     assert seen[1]["response"] == pytest.approx(-0.005)
     only = short().with_learned(VIGNETTING)
@@ -109,7 +109,7 @@ def test_constant_photometry_leaves_splats_unchanged_up_to_rounding(scene: Scene
 
 
 def test_ranking_uses_the_vignetting_of_the_image(scene: Scene) -> None:
-    # A falloff that is even over the whole picture is a gain.
+    # A falloff that is uniform over the whole image is a gain.
     splats, view = random_splats(40, seed=1), scene.train[0]
     image, settings = torch.from_numpy(view.target((0.0, 0.0, 0.0))), RasterSettings()
     plain = splat_errors(splats, view.camera, image, settings, backend="reference")
@@ -131,13 +131,13 @@ def test_unshown_inverts_shown(scene: Scene) -> None:
     assert torch.allclose(unshown(shown(color, known, at), known, at), color)
 
 
-# -- what it is worth ---------------------------------------------------------------------------------------------
+# -- gain ---------------------------------------------------------------------------------------------------------
 TRAIN, TEST = 24, 4
 FALLOFF = (0.35, 0.15, 0.0)
 
 
 def taken(lights: tuple[dict[str, torch.Tensor], ...], gains: np.ndarray) -> tuple[Scene, Splats]:
-    """Matt splats in photographs of these gains, by cameras of these lights by turns, whose intrinsics differ."""
+    """Render matt splats with these gains, alternating between cameras with these photometric models."""
     truth = random_splats(120, seed=3)
     truth.shN.zero_()
     truth.sh0.mul_(0.5)
@@ -145,7 +145,7 @@ def taken(lights: tuple[dict[str, torch.Tensor], ...], gains: np.ndarray) -> tup
     heights = np.linspace(-1.5, 1.5, TRAIN + TEST)[np.argsort(np.sin(7 * angles))]
     up, views = np.array([0.0, 0.0, 1.0]), []
     for i, (a, z) in enumerate(zip(angles, heights, strict=True)):
-        aside = 0.4 * np.array([np.sin(3 * a), np.cos(5 * a), np.sin(11 * a)])  # so that a splat wanders in the picture
+        aside = 0.4 * np.array([np.sin(3 * a), np.cos(5 * a), np.sin(11 * a)])  # varies the image positions of splats
         place, number = np.array([3 * np.cos(a), 3 * np.sin(a), z]), i % len(lights)
         camera = look_at(place, aside, up, width=SIZE, height=SIZE, fx=30.0)
         with torch.no_grad():
@@ -167,7 +167,7 @@ def taken(lights: tuple[dict[str, torch.Tensor], ...], gains: np.ndarray) -> tup
 
 
 def learned(scene: Scene, truth: Splats, recipe: Recipe) -> tuple[float, list[Appearance]]:
-    """PSNR of the test photographs after a training from the true splats, and what was found of the cameras."""
+    """Train from the true splats; return the PSNR of the test images, and the estimated camera models."""
     state = begun(TrainState(truth.clone(), torch.Generator().manual_seed(0)), recipe, scene)
     trainer = Trainer(scene, recipe, GENERIC, backend="cpu", state=state)
     trainer.run()
@@ -207,7 +207,7 @@ def test_response_curves_are_recovered_and_improve_new_views() -> None:
 
 
 def held_out_psnr(scene: Scene, trainer: Trainer) -> float:
-    """PSNR of the test photographs, in the mean exposure and as their camera shows the scene."""
+    """Return the PSNR of the test images, at the mean exposure and with their camera's photometric model."""
     errors = []
     for view in scene.test:
         with torch.no_grad():

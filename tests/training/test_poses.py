@@ -1,4 +1,4 @@
-"""Poses that are learned: updates by hand, the gauge, what stands still, resuming, what they are worth."""
+"""Learned poses: single updates, the gauge, fixed quantities, resuming, and the gain."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def scene() -> Scene:
 
 
 def quick() -> Recipe:
-    """``short`` with poses from its third iteration on."""
+    """Return ``short`` with poses active from the third iteration on."""
     return short().with_learned(replace(POSES, rate=1e-2, rate_final=1e-3, start=2, decay_steps=10))
 
 
@@ -58,7 +58,7 @@ def test_a_similarity_of_the_scene_is_no_camera_motion(scene: Scene) -> None:
 
 @pytest.mark.parametrize("k", range(7))
 def test_similarity_motions_keep_the_images(scene: Scene, k: int) -> None:
-    # The scene moves, and each camera with it: x_cam stays (scaled, where the scene grows).
+    # The scene moves together with each camera: x_cam is unchanged (or scaled with the scene).
     given, step, extent = CameraPose(POSES, scene).given, 1e-6, 2.0
     middle = np.mean([view.camera.center for view in scene.train], axis=0)
     w, v, grow = np.eye(7)[k, :3] * step, np.eye(7)[k, 3:6] * step * extent, 1 + step * (k == 6)
@@ -102,7 +102,7 @@ def test_the_pose_gradient_is_that_of_the_loss(scene: Scene) -> None:
             assert slope == pytest.approx(float(found[backend][k]), rel=1e-3, abs=1e-5)
 
 
-# -- where they learn ---------------------------------------------------------------------------------------------
+# -- training -----------------------------------------------------------------------------------------------------
 def test_cameras_are_constant_while_only_colours_learn(scene: Scene) -> None:
     trainer = Trainer(scene, quick(), GENERIC, backend=backends()[-1])
     kept = {}
@@ -159,7 +159,7 @@ def test_a_view_at_another_pose_keeps_its_image(scene: Scene) -> None:
     assert scene.with_poses({"not there": np.eye(4)}).train == scene.train
 
 
-# -- what they are worth ------------------------------------------------------------------------------------------
+# -- gain ---------------------------------------------------------------------------------------------------------
 @needs_cpu
 def test_poses_are_recovered_and_improve_new_views() -> None:
     truth, angles = random_splats(80, seed=3), 2.4 * np.arange(20)

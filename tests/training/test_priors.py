@@ -1,4 +1,4 @@
-"""Training with what is known of the views: what is read, how maps are fitted, that depths move, resume."""
+"""Training with depth and normal priors: reading, fitting relative maps, effect on depths, resuming."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from train_toys import SIZE, random_splats, same, short
 
 @dataclass(frozen=True)
 class Maps:
-    """Maps in memory, with the face of ``PriorMaps``."""
+    """In-memory maps with the interface of ``PriorMaps``."""
 
     values: np.ndarray
     files: MapFiles
@@ -46,7 +46,7 @@ class Maps:
 def mapped(
     scene: Scene, make: Callable[[int, np.ndarray], np.ndarray], *, whole: bool = False, **files: object
 ) -> Scene:
-    """The scene with a depth map of each training view, made of the depths that its points were rendered at."""
+    """Add a depth map to each training view, computed from the depths of the scene's points."""
     truth, views = random_splats(80, seed=3), []
     for index, view in enumerate(scene.train):
         with torch.no_grad():
@@ -57,7 +57,7 @@ def mapped(
 
 
 def observed(scene: Scene, error: float = 0.5, track: int = 4) -> Scene:
-    """The scene with all its points seen by every view."""
+    """Return the scene with all its points observed by every view."""
     assert scene.points is not None
     count = len(scene.points)
     seen = {view.name: np.arange(count) for view in scene.train}
@@ -67,11 +67,11 @@ def observed(scene: Scene, error: float = 0.5, track: int = 4) -> Scene:
 
 @pytest.fixture(autouse=True)
 def faint_pixels_count(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compare depths of faint pixels too: the first splats leave most pixels faint."""
+    """Compare depths of faint pixels too, because the initial splats leave most pixels faint."""
     monkeypatch.setattr("gs2d.losses.prior_formulas.OPACITY", 0.05)
 
 
-# -- what is read ---------------------------------------------------------------------------------------------------
+# -- reading --------------------------------------------------------------------------------------------------------
 def test_auto_prefers_sensor_maps_then_relative_maps_then_points(scene: Scene) -> None:
     def keep(_: int, depth: np.ndarray) -> np.ndarray:
         return depth
@@ -130,7 +130,7 @@ def test_relative_maps_are_fitted_to_the_points_in_the_better_space(scene: Scene
     exact = mapped(scene, lambda _, depth: depth)
     views = {}
     rows, xyz = 0, []
-    for view in exact.train:  # points on the very surface of each view's map
+    for view in exact.train:  # points exactly on the surface of each view's map
         depth = view.maps.values  # type: ignore[union-attr]
         y, x = np.nonzero(depth)
         chosen = rng.choice(len(x), 60, replace=False)
@@ -158,7 +158,7 @@ def test_relative_maps_are_fitted_to_the_points_in_the_better_space(scene: Scene
 
 # -- normals --------------------------------------------------------------------------------------------------------
 def facing(scene: Scene, flip: tuple[int, int, int]) -> Scene:
-    """Normals that look straight at the camera, in other axes."""
+    """Return normals that point at the camera, in flipped axes."""
     towards = -np.array(flip) * np.array([0.0, 0.0, 1.0])
     views = [
         replace(view, maps=Maps(np.tile(towards, (SIZE, SIZE, 1)), MapFiles(normal="known")))  # type: ignore[arg-type]
@@ -167,7 +167,7 @@ def facing(scene: Scene, flip: tuple[int, int, int]) -> Scene:
     return replace(scene, train=tuple(views))
 
 
-# -- the start ------------------------------------------------------------------------------------------------------
+# -- initialisation -------------------------------------------------------------------------------------------------
 def test_training_starts_from_points_on_depth_maps(scene: Scene) -> None:
     made = mapped(scene, lambda _, depth: np.where(depth > 0, 3.0, 0))  # planes in front of the cameras
     recipe = replace(with_depth_prior(short(), "sensor"), init_points=120)
@@ -185,7 +185,7 @@ def test_training_starts_from_points_on_depth_maps(scene: Scene) -> None:
         )  # type: ignore[index]
         pixels, depth = view.camera.project(points)
         assert np.allclose(depth, 3.0)
-        assert np.allclose(pixels % 1, 0.5)  # at pixel centres, in their colours
+        assert np.allclose(pixels % 1, 0.5)  # at pixel centres, with the pixel colours
         columns, rows = np.floor(pixels).astype(int).T
         assert (colors == view.image()[rows, columns]).all()
     again = with_known_points(made, recipe).points

@@ -1,4 +1,4 @@
-"""Resuming is exact: after any event, after a kill, from a shared stage; states of another run are refused."""
+"""Resuming is exact: after any event, after a kill, and from a shared stage; foreign states are rejected."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_resuming_from_any_event_gives_the_same_bytes(scene: Scene, absgs: bool)
         options=TrainerOptions(progress_every=1),
     )
     end = trainer.run()
-    robust = {events.FloatersRemoved}  # of robust recipes alone: test_robust
+    robust = {events.FloatersRemoved}  # only in robust recipes, see test_robust
     assert {type(event) for event, _ in kept} == set(events.TrainingEvent.__args__) - robust  # type: ignore[attr-defined]
     for event, data in kept[:: 1 if backend == "cpu" else 5]:
         resumed = Trainer(scene, short(absgs), GENERIC, backend=backend, state=reload(data))

@@ -1,4 +1,4 @@
-"""What keeps fog out: depths by a plane sweep, space that photographs show to be empty, opacity that decays."""
+"""Prevention of floaters: plane sweep depths, free space in the images, opacity decay."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def swept_wall() -> object:
 
 
 def splat_at(*places: tuple[float, float, float], scale: float = 0.02) -> Splats:
-    """Splats at places, facing the cameras."""
+    """Return splats at these positions that face the cameras."""
     splats = random_splats(len(places))
     splats.means[:] = torch.tensor(places)
     splats.quats[:] = torch.tensor([1.0, 0, 0, 0])  # t_u = x, t_v = y
@@ -124,15 +124,15 @@ def test_the_images_that_see_through_a_splat_are_counted(monkeypatch: pytest.Mon
 
 def test_a_surface_at_an_end_of_a_splat_counts(maps: FreeSpaceMaps) -> None:
     splats = splat_at((0.5, 0, WALL), (0.5, 0, 2.0), (0.5, 60.0, WALL), (0.5, 60.0, WALL))
-    splats.log_scales[3, 1] = np.log(60.0)  # from outside of all images down to the middle of the wall
+    splats.log_scales[3, 1] = np.log(60.0)  # from outside of all images to the centre of the wall
     images = len(wall().train)
     assert maps.showing(splats).tolist() == [images, 0, 0, images]
     assert maps.showing(splats.rows(torch.tensor([], dtype=torch.int64))).tolist() == []
 
 
-# -- the trial ------------------------------------------------------------------------------------------------------
+# -- removal trial --------------------------------------------------------------------------------------------------
 def wall_of_splats() -> tuple[Splats, list[Witness]]:
-    """A grid of grey splats on a wall of their colour, which five cameras see, and the images that show it."""
+    """Return a grid of grey splats on a wall of the same colour, five cameras, and their images."""
     x, y = torch.meshgrid(torch.linspace(-2, 2, 9), torch.linspace(-1.5, 1.5, 7), indexing="ij")
     places = [(float(a), float(b), WALL) for a, b in zip(x.flatten(), y.flatten(), strict=True)]
     splats = splat_at(*places, scale=0.35)
@@ -147,7 +147,7 @@ def wall_of_splats() -> tuple[Splats, list[Witness]]:
 
 
 def with_fog(splats: Splats, place: tuple[float, float, float]) -> Splats:
-    """The splats, and in the last row a dark one before a camera."""
+    """Append a dark splat in front of a camera as the last row."""
     fog = splat_at(place, scale=0.1)
     fog.opacity_logits[:] = 2.0
     fog.sh0[:] = rgb_to_sh0(torch.tensor([[0.1, 0.1, 0.1]]))
@@ -156,7 +156,7 @@ def with_fog(splats: Splats, place: tuple[float, float, float]) -> Splats:
 
 
 def test_splats_that_the_images_miss_are_kept() -> None:
-    """A mirror: one of five depth maps sees through the middle of the wall, and all five images show it."""
+    """A mirror: one of five depth maps sees through the centre of the wall, but all five images show the wall."""
     splats, witnesses = wall_of_splats()
     middle = (splats.means[:, :2].norm(dim=1) < 0.6).to(torch.int32)
     assert missed(splats, middle, witnesses, RASTER, BACKEND).tolist() == (middle > 0).tolist()
@@ -169,7 +169,7 @@ def test_floaters_that_overfit_one_image_are_removed() -> None:
     foggy = with_fog(splats, place)  # type: ignore[arg-type]
     color = rasterize(foggy, witnesses[0].camera, RASTER, backend=BACKEND).color.detach()
     assert not torch.allclose(color, witnesses[0].color, atol=0.1)
-    learned = [replace(witnesses[0], color=color), *witnesses[1:]]  # that image shows the fog, no other
+    learned = [replace(witnesses[0], color=color), *witnesses[1:]]  # only that image shows the floater
     against = torch.zeros(len(foggy), dtype=torch.int32)
     against[-1] = 1
     assert not missed(foggy, against, learned, RASTER, BACKEND).any()
@@ -194,7 +194,7 @@ def test_removed_floaters_are_reported_as_events() -> None:
     trainer.state.splats.means[:7] = torch.tensor([0.5, 0.0, 1.8])
     trainer.state.splats.sh0[:7] = -3.0  # black
     before = len(trainer.splats)
-    trainer.step()  # a fifth of 15 iterations ends
+    trainer.step()  # the iteration at one fifth of the 15
     (removed,) = [event for event in happened if isinstance(event, events.FloatersRemoved)]
     assert removed.iteration == 3
     assert removed.removed >= 7
@@ -204,11 +204,11 @@ def test_removed_floaters_are_reported_as_events() -> None:
 
 @pytest.mark.parametrize("behind", [True, False])
 def test_trials_render_frozen_splats(behind: bool) -> None:
-    """Dark fog is missed over black, which is darker, and not where the wall behind it is drawn."""
+    """Removing a dark floater is noticed only if the frozen wall behind it is rendered, not over black."""
     frozen = wall_of_splats()[0] if behind else None
     state = full_state(20)
     splats = state.splats
-    splats.means[:] = torch.tensor([0.5, 0.0, WALL])  # nothing speaks against these
+    splats.means[:] = torch.tensor([0.5, 0.0, WALL])  # no depth map contradicts these
     splats.means[:5] = torch.tensor([0.5, 0.0, 1.8])
     splats.quats[:] = torch.tensor([1.0, 0, 0, 0])
     splats.log_scales[:] = float(np.log(0.1))
@@ -241,7 +241,7 @@ def test_large_splats_shrink_only_on_known_surfaces() -> None:
     splats.log_scales[:] = torch.tensor([0.1, WALL]).log()
     robust = Robustness(wall(), short(), RASTER, BACKEND)
     kept = splats.log_scales.clone()
-    robust.remove(state, replace(stage, iterations=10), 10)  # the last iteration: nothing learns what shrinking leaves
+    robust.remove(state, replace(stage, iterations=10), 10)  # too late to train after shrinking
     assert torch.equal(state.splats.log_scales, kept[: len(state.splats)])
     robust.remove(state, replace(stage, iterations=100), 10)
     short_axis, long_axis = state.splats.scales[:10].T
@@ -266,9 +266,9 @@ def test_a_capture_without_observations_is_refused_in_one_line() -> None:
         Trainer(make_scene(), short(), GENERIC, backend="auto")
 
 
-# -- how much of a splat is photographed ------------------------------------------------------------------------------
+# -- visible fraction of a splat --------------------------------------------------------------------------------------
 def walls_of(*rows: tuple[float, float, float, float, float]) -> Splats:
-    """Opaque splats that face the cameras: x, z, both scales, opacity."""
+    """Return opaque splats that face the cameras; each row has x, z, two scales and opacity."""
     splats = splat_at(*((x, 0.0, z) for x, z, *_ in rows))
     splats.log_scales[:] = torch.tensor([[u, v] for *_, u, v, _ in rows]).log()
     splats.opacity_logits[:] = torch.logit(torch.tensor([row[4] for row in rows]))
@@ -286,7 +286,7 @@ def test_large_splats_that_are_barely_visible_are_detected() -> None:
     near = (-1.5, 0.5, 0.3, 0.3, 0.99)
     splats, cameras = walls_of(before, beside, behind, near), cameras_of_the_wall()
     votes = votes_against_unseen(splats, cameras, RASTER, BACKEND)
-    assert votes.tolist() == [0, 1, 0, len(cameras)]  # a splat behind another hides nothing
+    assert votes.tolist() == [0, 1, 0, len(cameras)]  # a splat occludes nothing that is in front of it
 
 
 def test_barely_visible_splats_are_proposed_at_the_end_of_each_fifth() -> None:
@@ -310,7 +310,7 @@ def test_opacity_decays_by_its_rate_every_ten_iterations_and_not_below_the_least
     recipe = short(dense_start=None, removal=Removal(decay=0.1))
     robust, state = Robustness(wall(), recipe, RASTER, BACKEND), full_state(4)
     state.splats.opacity_logits[:] = torch.logit(torch.tensor([0.9, 0.5, 0.0051, 0.001]))
-    state.splats.sh0[:] = 1.0  # not in the colour of the background
+    state.splats.sh0[:] = 1.0  # different from the background colour
     robust.decay(state, recipe.stages[0], 9, PLAIN)
     assert state.splats.opacities == pytest.approx(torch.tensor([0.9, 0.5, 0.0051, 0.001]), abs=1e-6)
     robust.decay(state, recipe.stages[0], 10, lacking(1))
@@ -320,18 +320,18 @@ def test_opacity_decays_by_its_rate_every_ten_iterations_and_not_below_the_least
 
 
 def test_splats_in_the_colour_of_the_background_do_not_decay() -> None:
-    """No image would ask for it again: a white floor before a white background would become transparent."""
+    """No image would raise their opacity again: a white floor before a white background would become transparent."""
     recipe = short(dense_start=None, removal=Removal(decay=0.1))
     raster = RasterSettings(background=(0.2, 0.6, 1.0))
     robust, state = Robustness(wall(), recipe, raster, BACKEND), full_state(3)
     state.splats.opacity_logits[:] = torch.logit(torch.tensor([0.8]))
-    colours = [[0.2, 0.6, 1.0], [0.25, 0.55, 1.05], [0.2, 0.6, 1.07]]  # one channel too far is another colour
+    colours = [[0.2, 0.6, 1.0], [0.25, 0.55, 1.05], [0.2, 0.6, 1.07]]  # 1.07 is too far in one channel
     state.splats.sh0[:] = rgb_to_sh0(torch.tensor(colours))
     robust.decay(state, recipe.stages[0], 10, PLAIN)
     assert state.splats.opacities == pytest.approx(torch.tensor([0.8, 0.8, 0.72]), abs=1e-6)
 
 
-# -- exposures by points --------------------------------------------------------------------------------------------
+# -- exposures from points ------------------------------------------------------------------------------------------
 def test_gains_follow_from_the_colours_of_points() -> None:
     gains = (0.7, 0.85, 1.0, 0.9, 0.8)
     found = point_gains(wall(gains))
@@ -344,7 +344,7 @@ def test_gains_follow_from_the_colours_of_points() -> None:
     assert same.spread < 0.01
 
 
-# -- the colour behind everything ------------------------------------------------------------------------------------
+# -- background colour ------------------------------------------------------------------------------------------------
 def test_the_backdrop_is_the_colour_of_pixels_without_sparse_points() -> None:
     found = find_backdrop(wall())
     assert found is not None

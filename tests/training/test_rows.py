@@ -1,4 +1,4 @@
-"""keep_rows and append_rows move parameters, moments, statistics and groups together; a state saves and loads whole."""
+"""keep_rows and append_rows move parameters, moments, statistics and groups together; states round-trip completely."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from train_toys import full_state, random_splats
 
 
 def row_tensors(state: TrainState) -> dict[str, torch.Tensor]:
-    """Everything in a state that has rows."""
+    """Return all tensors of a state that have one row per splat."""
     tensors = dict(state.splats.items())
     for name, moments in state.moments.items():
         tensors |= {f"mean of {name}": moments.mean, f"square of {name}": moments.square}

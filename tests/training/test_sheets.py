@@ -1,4 +1,4 @@
-"""Sheets of white: splats of the background's colour that normal consistency pays for, and what keeps them away."""
+"""White sheets: splats of the background's colour that normal consistency rewards, and their prevention."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from gs2d.training.trainer import Trainer
 from tiny import RADIUS, write_capture
 from train_toys import backends
 
-SCHEDULE, WEIGHT = 0.05, 0.5  # 1500 iterations, NC from 350: enough for sheets at ten times the weight of the paper
+SCHEDULE, WEIGHT = 0.05, 0.5  # 1500 iterations, NC from 350: enough for sheets at ten times the paper's weight
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """``longest`` splat in world units, mean alpha of the empty background, PSNR of training views in dB."""
+    """Length of the longest splat in world units, mean alpha of the background, PSNR of training views in dB."""
 
     longest: float
     covered: float
@@ -55,7 +55,7 @@ def outcome(scene: Scene, recipe: Recipe) -> Outcome:
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    """Twelve photographs of a ball before white, with alpha."""
+    """Return twelve images of a ball before white, with alpha."""
     return load_scene(write_capture(tmp_path_factory.mktemp("ball") / "capture", train=12, test=1, size=32))
 
 
@@ -67,8 +67,8 @@ def with_sheets(scene: Scene) -> Outcome:
 
 
 def test_normal_consistency_of_the_whole_image_makes_sheets(with_sheets: Outcome) -> None:
-    """The other tests say something only where there are any."""
-    assert with_sheets.longest > 2 * RADIUS  # longer than the ball is wide
+    """Confirms that sheets appear without prevention; otherwise the other tests prove nothing."""
+    assert with_sheets.longest > 2 * RADIUS  # longer than the ball's diameter
     assert with_sheets.covered > 0.2
 
 

@@ -1,4 +1,4 @@
-"""No schedule scale kills the scene: N never falls below half of what it was before an opacity reset."""
+"""At every schedule scale the splat count stays above half of its value before an opacity reset."""
 
 from __future__ import annotations
 
@@ -42,6 +42,6 @@ def test_a_real_short_run_keeps_its_splats_and_learns(scene: Scene, factor: floa
     for protocol in (BLACK, WHITE) if backend.name == "cpu" else (BLACK,):
         Trainer(scene, recipe, protocol, backend=backend, on_event=on_event).run()
         assert min(counts) >= 30
-        assert len(counts) >= 11  # the start, and ten densifications
+        assert len(counts) >= 11  # the initial count, and ten densifications
         assert sum(losses[-3:]) < 0.7 * sum(losses[:3])
         counts, losses = [60], []

@@ -1,4 +1,4 @@
-"""The trainer: order of an iteration, frozen rows, determinism, what a protocol decides."""
+"""The trainer: order of an iteration, frozen rows, determinism, and effects of the protocol."""
 
 from __future__ import annotations
 
@@ -81,9 +81,9 @@ def test_frozen_rows_and_attributes_do_not_change(scene: Scene, backend: str) ->
 def test_invisible_splats_are_dropped_at_the_end_of_a_stage(
     scene: Scene, backend: str, near_plane_policy: str, unseen: int
 ) -> None:
-    # A needle of 50 along x: no camera of the ring (3 away, at 0, 60, ... degrees) has x in its image plane, so
-    # its disc reaches every camera plane. These pictures are smaller than a tile: its box holds them. And a small splat
-    # far above, which is never in sight; where crossing splats are drawn, it stays as by the official training.
+    # A needle of length 50 along x: no camera of the ring (distance 3, at 0, 60, ... degrees) has x in its image plane,
+    # so its disc reaches every camera plane. The images are smaller than a tile, so its box covers them. A small splat
+    # far above is never visible; if crossing splats are drawn, it is kept as in the official training.
     splats = random_splats(12, seed=1)
     sheet = splats.rows(torch.tensor([0])).clone()
     sheet.means.zero_(), sheet.quats.copy_(torch.tensor([[1.0, 0, 0, 0]])), sheet.opacity_logits.fill_(3.0)
@@ -112,7 +112,7 @@ def test_invisible_splats_are_dropped_at_the_end_of_a_stage(
 
 
 def test_a_densification_updates_nothing_and_a_reset_everything_but_opacity(scene: Scene) -> None:
-    # thresholds that nothing reaches: densification at 3 and 6 changes no row
+    # no row reaches the thresholds: densification at 3 and 6 changes nothing
     densify = GradDensify(
         grad_threshold=1e9,
         opacity_cull=0.0,
@@ -175,7 +175,7 @@ def test_a_stage_of_no_iterations_runs_its_actions(scene: Scene) -> None:
 
 
 def test_a_view_without_visible_splats_is_skipped(scene: Scene) -> None:
-    """The picture is background, no gradient flows, and training goes on."""
+    """The image is background, gradients are zero, and training continues."""
     away = replace(scene.train[0].camera, T_cam_world=np.diag([1.0, 1.0, 1.0, 1.0]) + np.eye(4, k=3) * 1e3)
     view = View.from_arrays("away.png", away, scene.train[0].image())
     trainer, _ = train(replace(scene, train=(*scene.train, view)), short())

@@ -1,4 +1,4 @@
-"""Focal lengths and lenses that are learned: gradients, sharing, updates by hand, resuming, what they are worth."""
+"""Learned focal lengths and lenses: gradients, sharing, single updates, resuming, and the gain."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def scene() -> Scene:
 
 
 def quick(**changes: Any) -> Recipe:
-    """``short`` with poses and focal lengths from its third iteration on."""
+    """Return ``short`` with poses and focal lengths active from the third iteration on."""
     learned = {"rate": 1e-2, "rate_final": 1e-3, "start": 2, "decay_steps": 10}
     intrinsics = replace(INTRINSICS, **learned, options=changes)  # type: ignore[arg-type]
     return short().with_learned(replace(POSES, **learned), intrinsics)  # type: ignore[arg-type]
@@ -66,7 +66,7 @@ def test_gradients_of_the_intrinsics_are_those_of_the_loss(scene: Scene, kind: s
             largest = float(found["reference"].abs().max())
             torch.testing.assert_close(found[backend], found["reference"], rtol=2e-3, atol=2e-3 * largest)
             continue
-        if kind == "normal_consistency":  # its alpha is held by definition, which differences do not do
+        if kind == "normal_consistency":  # alpha is detached by definition, which finite differences cannot reproduce
             continue
         step, whole = 1e-6, trainer._whole
         for k in range(5):
@@ -155,9 +155,9 @@ def test_test_views_of_the_same_camera_get_its_focal_length(scene: Scene) -> Non
 
 
 def seen_with_a_wrong_focal_length(factor: float) -> tuple[Splats, Scene]:
-    """Splats before, around and behind cameras that say a focal length that is off, and their photographs."""
+    """Return splats all around cameras whose focal length is off by a factor, and their images."""
     truth, angles = random_splats(160, seed=3), 2.4 * np.arange(20)
-    truth = replace(truth, means=truth.means * 2, log_scales=truth.log_scales + 0.3)  # far and near: it shows
+    truth = replace(truth, means=truth.means * 2, log_scales=truth.log_scales + 0.3)  # a large depth range
     heights, near = np.linspace(-1.5, 1.5, 20)[np.argsort(np.sin(7 * angles))], 3.0 + 0.8 * np.sin(5 * angles)
     base, views = make_scene(), []
     for k, (a, z, r) in enumerate(zip(angles, heights, near, strict=True)):
@@ -210,7 +210,7 @@ LENS = (-0.12, -0.04)
 
 
 def seen_through_a_lens() -> tuple[Splats, Scene]:
-    """Splats and photographs of them by cameras of which something of the lens is left, and nobody says so."""
+    """Return splats and their images from cameras with unmodelled residual lens distortion."""
     truth, scene = seen_with_a_wrong_focal_length(1.0)
     views = []
     for view in scene.views:
@@ -242,17 +242,17 @@ def test_the_lens_of_a_known_scene_is_recovered(monkeypatch: pytest.MonkeyPatch)
         rates = {"intrinsics": trainer.learned.learning(0, iteration)["intrinsics"]}
         trainer.learned.update(state.learned, index, found.learned, rates, trainer.backend)
     found_lens, corner = quantity.zoom(rows.values, 0), quantity.corners[0]
-    for square in (0.1, 0.2, corner):  # what it does to the picture, rather than its two numbers, is told apart well
+    for square in (0.1, 0.2, corner):  # the distortion is well determined, its two coefficients individually are not
         wanted = 1 + LENS[0] * square + LENS[1] * square**2
         got = (1 + found_lens.k1 * square + found_lens.k2 * square**2) * found_lens.scale
         assert got == pytest.approx(wanted, abs=2e-3)
-    # The ranking of splats and E_i look at photographs that were straightened.
+    # Splat ranking and E_i use undistorted images.
     assert residual_of(trainer, state) < before / 3
 
 
 @torch.no_grad()
 def residual_of(trainer: Trainer, state: TrainState) -> float:
-    """Return the mean difference of all renderings from their images, without the residual lens."""
+    """Return the mean difference between renderings and images, without the residual lens."""
     errors = []
     for k in range(16):
         camera, target = trainer._whole._seen(state, k)
@@ -295,9 +295,9 @@ def test_targets_are_undistorted_by_the_learned_lens() -> None:
     view = View.from_arrays("a.png", camera, picture)
     there = view.at(camera.T_cam_world, Zoom(1.0, 0.0, 0.0, 0.08, 0.0))
     straight, valid = there.image(), there.valid()
-    assert np.array_equal(straight[14:16, 5:35], picture[14:16, 5:35])  # the middle lines stay
-    assert straight[3, 20].max() < 255 or straight[3, 3].max() < 255  # others bend
-    assert valid is None  # the photograph shows more than a pinhole of this size
+    assert np.array_equal(straight[14:16, 5:35], picture[14:16, 5:35])  # the centre lines are unchanged
+    assert straight[3, 20].max() < 255 or straight[3, 3].max() < 255  # other lines bend
+    assert valid is None  # the image covers more than a pinhole of this size
     wide = view.at(camera.T_cam_world, Zoom(1.0, 0.0, 0.0, -0.08, 0.0))
     reached = wide.valid()
     assert reached is not None
@@ -306,4 +306,4 @@ def test_targets_are_undistorted_by_the_learned_lens() -> None:
     mask = wide.mask()
     assert mask is not None
     assert np.array_equal(mask, reached)
-    assert np.array_equal(wide.at(camera.T_cam_world).image(), wide.image())  # once, however often it is moved
+    assert np.array_equal(wide.at(camera.T_cam_world).image(), wide.image())  # resampled only once
