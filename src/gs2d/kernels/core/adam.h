@@ -1,4 +1,4 @@
-// One element's step of Adam, with the arithmetic of torch's fused kernels.
+// Adam step of one element, with the arithmetic of torch's fused kernels.
 #pragma once
 
 #include "core/base.h"

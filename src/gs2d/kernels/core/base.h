@@ -1,9 +1,9 @@
-// The vocabulary of core/: arithmetic on a value type V.
+// Basic arithmetic of core/ on a value type V.
 //
-// core/ holds every formula of the rasterizer once, as header-only templates on V. V is float or double here (and float
-// in a CUDA thread), or a vector of pixels or splats on the CPU (cpu/simd.h overloads the same names). Rules: no branch
-// on a V (use select), no std::, every fused multiply-add written out as fma, so that forward and backward of every
-// backend round alike.
+// core/ contains every formula of the rasterizer once, as header-only templates on V. V is float or double (float in a
+// CUDA thread), or on the CPU a vector of pixels or splats, for which cpu/simd.h overloads the same names. Rules: no
+// branches on a V (use select), no std::, and every fused multiply-add is written as fma, so that the forward and
+// backward passes of all backends round alike.
 #pragma once
 
 #if defined(__CUDACC__) || defined(__CUDACC_RTC__) || defined(__AMDGCN__)
@@ -55,11 +55,11 @@ GS2D_HD float min(float a, float b) { return a < b ? a : b; }
 GS2D_HD float max(float a, float b) { return a > b ? a : b; }
 GS2D_HD double min(double a, double b) { return a < b ? a : b; }
 GS2D_HD double max(double a, double b) { return a > b ? a : b; }
-GS2D_HD float whole(float a) { return float(int(a)); }  // floor, of what is not negative and fits 31 bits
+GS2D_HD float whole(float a) { return float(int(a)); }  // floor for non-negative values that fit in 31 bits
 GS2D_HD double whole(double a) { return double(int(a)); }
 
-// Functions of the innermost loops. On a GPU their instructions err by 1 or 2 units in the last place, equally in the
-// forward and the backward pass; elsewhere they are as exact as the type.
+// Functions for the innermost loops. On a GPU their instructions have errors of 1 or 2 units in the last place, the
+// same in the forward and the backward pass; elsewhere they have the precision of the type.
 
 // 2^x for x <= 0; the result must not be used for very negative or non-finite x.
 template <class V> GS2D_HD V exp2_small(V x) { return exp2(x); }
@@ -78,7 +78,7 @@ GS2D_HD float reciprocal(float a) {
 }
 GS2D_HD float quotient(float a, float b) { return a * reciprocal(b); }
 #elif defined(__AMDGCN__)
-#if __has_builtin(__builtin_amdgcn_exp2f)  // older compilers make the same instruction of exp2
+#if __has_builtin(__builtin_amdgcn_exp2f)  // older compilers generate the same instruction for exp2
 GS2D_HD float exp2_small(float x) { return __builtin_amdgcn_exp2f(x); }
 #endif
 GS2D_HD float reciprocal(float a) { return __builtin_amdgcn_rcpf(a); }

@@ -13,15 +13,15 @@ template <class V> struct BlendLimits {
     V near;
     V log2_alpha_min;
     V alpha_max, transmittance_min;
-    V inv_depth_width = V(0);  // of rule 22, where that depth has a gradient
+    V inv_depth_width = V(0);  // for rule 22, if that depth has a gradient
 };
 
-// A splat's plane at a pixel: u / z, v / z and 1 / z, affine in the pixel.
+// A splat plane at a pixel: u / z, v / z and 1 / z, affine in the pixel position.
 template <class V> struct PlaneAt {
     V X, Y, I;
 };
 
-// dx, dy: pixel centre - projected splat centre, px.
+// dx, dy: pixel centre minus projected splat centre, in px.
 template <class V> GS2D_HD PlaneAt<V> plane_at(const Record<V>& s, V dx, V dy) {
     return {fma(s.au, dx, s.bu * dy), fma(s.av, dx, s.bv * dy), fma(s.ai, dx, fma(s.bi, dy, s.iz))};
 }
@@ -36,7 +36,7 @@ template <class V> struct Hit {
     mask_t<V> ray;  // the plane determines rho
 };
 
-// A hit without its alpha, if the plane is known to determine rho (see `is_plain`).
+// Intersects a splat whose plane is known to determine rho (see `is_plain`); does not set alpha.
 template <class V> GS2D_HD Hit<V> meet_plane(const PlaneAt<V>& p) {
     Hit<V> h;
     h.inverse_depth = p.I, h.depth = reciprocal(p.I);
@@ -46,7 +46,7 @@ template <class V> GS2D_HD Hit<V> meet_plane(const PlaneAt<V>& p) {
     return h;
 }
 
-// The general case; no member is NaN or infinite. zc = 1 / iz.
+// Intersects any splat; no member is NaN or infinite. zc = 1 / iz.
 template <class V> GS2D_HD Hit<V> meet(const PlaneAt<V>& p, V iz, V zc, V dx, V dy, const BlendLimits<V>& k) {
     Hit<V> h = meet_plane(p);
     const V rho2d = fma(dx, dx, dy * dy) * k.inv_lowpass2;
@@ -57,24 +57,24 @@ template <class V> GS2D_HD Hit<V> meet(const PlaneAt<V>& p, V iz, V zc, V dx, V 
     return h;
 }
 
-// Least 1 / z for which the plane determines rho at every pixel: rho3d = d^T A d z^2 is at most rho2d = d^T d /
-// lowpass_px^2 where the largest eigenvalue of A is at most (1 / z / lowpass_px)^2. Slightly increased against
-// rounding.
+// Returns the least 1 / z for which the plane determines rho at every pixel: rho3d = d^T A d z^2 is at most
+// rho2d = d^T d / lowpass_px^2 if the largest eigenvalue of A is at most (1 / z / lowpass_px)^2. Slightly increased to
+// allow for rounding.
 template <class V> GS2D_HD V plain_from(const Record<V>& s, V lowpass_px) {
     const V xx = fma(s.au, s.au, s.av * s.av), yy = fma(s.bu, s.bu, s.bv * s.bv), xy = fma(s.au, s.bu, s.av * s.bv);
     const V half = V(0.5), d = half * (xx - yy);
     return V(1.001f) * lowpass_px * sqrt(half * (xx + yy) + sqrt(fma(d, d, xy * xy)));
 }
 
-// Whether neither the low-pass filter nor `near` has an effect at pixels up to `half_side` in x and y from the pixel at
-// (dx, dy) from the projected centre. False for NaN.
+// Returns whether neither the low-pass filter nor `near` has an effect at pixels up to `half_side` in x and y from the
+// pixel at (dx, dy) from the projected centre. False for NaN.
 template <class V> GS2D_HD mask_t<V> is_plain(V dx, V dy, V ai, V bi, V iz, V plain_from, V near, V half_side) {
     const V middle = fma(ai, dx, fma(bi, dy, iz)), range = half_side * (abs(ai) + abs(bi));
     return (middle - range >= plain_from) & ((middle + range) * near < V(0.9999f));
 }
 
-// The alpha of a hit (not yet limited to alpha_max) from its logarithm, 0 if it is skipped. All depths of a plain splat
-// are beyond `near`.
+// Alpha of a hit (not yet limited to alpha_max) and its logarithm. Alpha is 0 for skipped pairs. All depths of a plain
+// splat are beyond `near`, so the plain variants do not test the depth.
 template <class V> GS2D_HD V log2_alpha_of(V log2_opacity, V rho) { return fma(V(-0.5 * LOG2E), rho, log2_opacity); }
 template <class V> GS2D_HD V alpha_of(V log2_alpha, const BlendLimits<V>& k) {
     return keep(log2_alpha >= k.log2_alpha_min, exp2_small(log2_alpha));
@@ -86,7 +86,7 @@ template <class V> GS2D_HD V log2_alpha_of(V log2_opacity, const Hit<V>& h, cons
     return select(h.depth >= k.near, log2_alpha_of(log2_opacity, h.rho), V(-1e30));
 }
 
-// Plane and alpha.
+// Evaluates the plane and alpha.
 template <class V>
 GS2D_HD Hit<V> intersect(const Record<V>& s, const PlaneAt<V>& p, V zc, V dx, V dy, const BlendLimits<V>& k) {
     Hit<V> h = meet(p, s.iz, zc, dx, dy, k);
@@ -109,36 +109,36 @@ template <class V> struct Pixel {
 };
 
 // Blends one splat with the result of `intersect`: returns its weight and updates all state except the images of
-// `accumulate`. Stopped pixels are masked late, so that T does not wait for it. Early: a live pixel may have T > 1/2 or
-// nothing in front; otherwise its first and median pairs are done.
+// `accumulate`. Stopped pixels are masked late, so that T does not wait for the mask. `Early`: a live pixel may have
+// T > 1/2 or nothing in front; otherwise its first and median pairs are already processed.
 template <bool Early, class V>
 GS2D_HD V composite_weight(V raw_alpha, V depth, V inverse_depth, const BlendLimits<V>& k, Pixel<V>& p) {
     const V alpha = min(raw_alpha, k.alpha_max);
     const V after = fnma(alpha, p.T, p.T);
-    // T of a live pixel is never below: only a blended splat can stop it
+    // T of a live pixel is never below this value: only a blended splat can stop it
     p.live = p.live & (after >= k.transmittance_min);
     const V w = keep(p.live, alpha * p.T);
     if constexpr (Early) {
         p.inverse_depth0 = select(p.alpha <= V(0), inverse_depth, p.inverse_depth0);
         p.median = select((w > V(0)) & (p.T > V(0.5)), depth, p.median);
     }
-    const V q = p.inverse_depth0 - inverse_depth, wq = w * q;  // -q, so that the one in memory is subtracted
+    const V q = p.inverse_depth0 - inverse_depth, wq = w * q;  // -q, so that the value in memory is the subtrahend
     p.distortion = fma(wq, fma(q, p.alpha, p.M1_twice), fma(w, p.M2, p.distortion));
-    p.M1_twice = p.M1_twice - (wq + wq);  // exact: additions instead of a product
+    p.M1_twice = p.M1_twice - (wq + wq);  // exact: additions replace a product
     p.M2 = fma(wq, q, p.M2);
     p.T = select(p.live, after, p.T);
     p.alpha = p.alpha + w;
     return w;
 }
 
-// The images that are weighted sums.
+// Updates the images that are weighted sums.
 template <class V> GS2D_HD void accumulate(const Record<V>& s, V w, V depth, Pixel<V>& p) {
     p.red = fma(w, s.red, p.red), p.green = fma(w, s.green, p.green), p.blue = fma(w, s.blue, p.blue);
     p.nx = fma(w, s.nx, p.nx), p.ny = fma(w, s.ny, p.ny), p.nz = fma(w, s.nz, p.nz);
     p.depth = fma(w, depth, p.depth);
 }
 
-// Both steps; returns where a live pixel uses the splat (also where that pixel stops).
+// Runs both steps; returns where a live pixel uses the splat (including pixels that stop at it).
 template <class V>
 GS2D_HD mask_t<V> composite(const Record<V>& s, V raw_alpha, V depth, V inverse_depth, const BlendLimits<V>& k,
                             Pixel<V>& p) {
@@ -147,20 +147,20 @@ GS2D_HD mask_t<V> composite(const Record<V>& s, V raw_alpha, V depth, V inverse_
     return seen;
 }
 
-// Upstream gradient of one pixel and its totals. With s = g . (outputs of one splat), the remaining sum
-// S = sum over later splats of w s gives dL/dalpha = T s - S / (1 - alpha) in a front-to-back pass, without a suffix
-// buffer per channel.
+// Upstream gradient of one pixel and its totals. With s = g . (outputs of one splat), the remaining sum S = sum over
+// later splats of w s gives dL/dalpha = T s - S / (1 - alpha) in a front-to-back pass, without a suffix buffer per
+// channel.
 template <class V> struct PixelGradient {
     V red, green, blue;
-    V alpha;  // of sum w; background and the quotient of depth_mean are folded in
+    V alpha;  // of sum w; includes background and the quotient of depth_mean
     V nx, ny, nz;
     V depth;  // of sum w z
     V median;
-    V median_below;  // the median pair is the one that brings T from above 1/2 to this: max(1/2, T_final)
-    // The distortion's part of s: g (q^2 sum w - 2 q M1 + M2) with g its gradient. The last term is folded into alpha.
+    V median_below;  // the median pair reduces T from above 1/2 to this value: max(1/2, T_final)
+    // Distortion term of s: g (q^2 sum w - 2 q M1 + M2) with g its gradient. Its last summand is included in alpha.
     V distortion2, distortion1;  // g sum w, -2 g M1
     V inverse_depth0;
-    V transmittance, z;  // of the depth by transmittance: the factor of depth_pair_vjp, the depth
+    V transmittance, z;  // for the depth by transmittance: factor of depth_pair_vjp; depth
 };
 
 // Adds the distortion to the gradient of a pixel; total = sum w.
@@ -169,7 +169,7 @@ template <class V> GS2D_HD void add_distortion(V g, V total, V M1, V M2, PixelGr
     p.alpha = fma(g, M2, p.alpha);
 }
 
-// Adds the depth by transmittance; `slope` from slope_of; 0 where nothing was hit.
+// Adds the depth by transmittance; `slope` is the result of slope_of, 0 if nothing was hit.
 template <class V> GS2D_HD void add_transmittance(V g, V z, V slope, V total, PixelGradient<V>& p) {
     const V upstream = keep(total > V(0), g / slope), half = V(0.5f);
     p.transmittance = upstream * fnma(half, total, V(1)), p.z = z;
@@ -184,16 +184,16 @@ template <class V> struct PairSums {
     V abs_x, abs_y;
 };
 
-// Inputs of a splat's sums at one pixel, besides the hit and the upstream gradient.
+// Inputs of the sums of a splat at one pixel, in addition to the hit and the upstream gradient.
 template <class V> struct PairGradient {
     V w;         // weight of the splat
     V ln_alpha;  // dL/d ln(alpha)
-    V I;         // dL/d(1 / depth), alpha held
+    V I;         // dL/d(1 / depth) at constant alpha
 };
 
-// One splat at one pixel, front to back. T is 0 where the pixel has stopped (or does not exist).
-// Geo: normal or depth images have gradients. Dist: the distortion has. Trans: the depth by transmittance has.
-// Feat: further channels have, and `features` is their part of dL/dw.
+// Processes one splat at one pixel, front to back. T is 0 if the pixel has stopped (or does not exist).
+// Template flags say which outputs have gradients. Geo: normal or depth images; Dist: distortion; Trans: depth by
+// transmittance; Feat: further channels, and `features` is their part of dL/dw.
 template <bool Geo, bool Dist, bool Trans, bool Feat = false, class V>
 GS2D_HD PairGradient<V> weigh_vjp(const Record<V>& s, V depth, V inverse_depth, V raw_alpha, const BlendLimits<V>& k,
                                   const PixelGradient<V>& g, V& T, V& S, V features = V(0)) {
@@ -201,13 +201,13 @@ GS2D_HD PairGradient<V> weigh_vjp(const Record<V>& s, V depth, V inverse_depth, 
     const V after = fnma(alpha, T, T);
     const auto goes_on = after >= k.transmittance_min;
     const V w = keep(goes_on, alpha * T);
-    // s = dL/dw, transmittance held
+    // s = dL/dw at constant transmittance
     V along = fma(s.red, g.red, fma(s.green, g.green, fma(s.blue, g.blue, g.alpha)));
     if constexpr (Feat) along = along + features;
     V gI = V(0);
     if constexpr (Geo) {
         along = along + fma(s.nx, g.nx, fma(s.ny, g.ny, fma(s.nz, g.nz, depth * g.depth)));
-        // T is above median_below exactly before the median pair, and w > 0 where it falls
+        // T exceeds median_below exactly before the median pair, and w > 0 where T falls
         const V gz = fma(w, g.depth, keep(goes_on & (T > g.median_below) & (after <= g.median_below), g.median));
         gI = -(gz * (depth * depth));
     }
@@ -222,13 +222,13 @@ GS2D_HD PairGradient<V> weigh_vjp(const Record<V>& s, V depth, V inverse_depth, 
         const DepthPairGradient<V> d = depth_pair_vjp(alpha, inverse_depth, g.z, k.inv_depth_width, g.transmittance);
         of_alpha = of_alpha + d.alpha, gI = gI + keep(goes_on, d.inverse_depth);
     }
-    // d alpha / d ln(alpha) = the unclamped alpha: the ceiling passes gradients
+    // d alpha / d ln(alpha) = the unclamped alpha: gradients pass through the upper limit
     const V gl = keep(goes_on, of_alpha * raw_alpha);
     T = keep(goes_on, after);
     return {w, gl, gI};
 }
 
-// Adds the pair to the sums: first the parts of weight and alpha, then the geometry.
+// Adds the pair to the sums: first the terms of weight and alpha, then the geometry.
 template <bool Geo, class V>
 GS2D_HD void add_colors(const PixelGradient<V>& g, const PairGradient<V>& p, PairSums<V>& sums) {
     sums.ln_alpha = sums.ln_alpha + p.ln_alpha;
@@ -238,7 +238,7 @@ GS2D_HD void add_colors(const PixelGradient<V>& g, const PairGradient<V>& p, Pai
         sums.nx = fma(p.w, g.nx, sums.nx), sums.ny = fma(p.w, g.ny, sums.ny), sums.nz = fma(p.w, g.nz, sums.nz);
 }
 
-// Abs: compute the AbsGS signal. Filtered: the low-pass filter may apply to a pair (if not, the sums are the same).
+// Abs: compute the AbsGS signal. Filtered: the low-pass filter may apply to a pair (otherwise the sums are the same).
 // Column: dx is the same in all calls of these sums; finish_column multiplies by it once instead.
 // tu, tv are -dL/dX, -dL/dY, 0 if the filter applies: rho = (X^2 + Y^2) z^2, z = 1 / I.
 template <bool Geo, bool Abs, bool Filtered, bool Column, class V>
@@ -267,7 +267,7 @@ GS2D_HD void add_geometry(const Record<V>& s, V dx, V dy, V t, V tu, V tv, V rho
     }
 }
 
-// All steps; returns the weight.
+// Runs all steps; returns the weight.
 template <bool Geo, bool Dist, bool Abs, bool Trans, bool Filtered, bool Column, bool Feat, class V>
 GS2D_HD V composite_vjp(const Record<V>& s, V dx, V dy, const Hit<V>& h, const BlendLimits<V>& k,
                         const PixelGradient<V>& g, V& T, V& S, PairSums<V>& sums, V features) {
@@ -279,7 +279,7 @@ GS2D_HD V composite_vjp(const Record<V>& s, V dx, V dy, const Hit<V>& h, const B
     return p.w;
 }
 
-// The weight of one splat at one pixel, front to back, as in `composite_weight`. T is 0 if the pixel has stopped.
+// Returns the weight of one splat at one pixel, front to back, as in `composite_weight`. T is 0 for stopped pixels.
 template <class V> GS2D_HD V pass_weight(const Hit<V>& h, const BlendLimits<V>& k, V& T) {
     const V alpha = min(h.alpha, k.alpha_max), after = fnma(alpha, T, T);
     const auto goes_on = after >= k.transmittance_min;
@@ -288,7 +288,7 @@ template <class V> GS2D_HD V pass_weight(const Hit<V>& h, const BlendLimits<V>& 
     return w;
 }
 
-// The gradient of the splat's colour, which suffices if everything else is frozen.
+// Returns the gradient of the splat colour, sufficient if everything else is frozen.
 template <class V>
 GS2D_HD void composite_color_vjp(const Hit<V>& h, const BlendLimits<V>& k, Vec3<V> g_color, V& T, Vec3<V>& sum) {
     sum = axpy(pass_weight(h, k, T), g_color, sum);
@@ -299,8 +299,8 @@ template <class V> GS2D_HD void finish_column(V dx, PairSums<V>& a) {
     a.Xx = dx * a.X, a.Yx = dx * a.Y, a.Ix = dx * a.I, a.lowpass_x = dx * a.lowpass_x;
 }
 
-// dL/d(record) from the sums, per lane (the sum over lanes is left to the caller). zc = 1 / iz, if abs_x and abs_y are
-// computed.
+// Returns dL/d(record) from the sums, per lane; the caller sums over lanes. zc = 1 / iz; needed only if abs_x and abs_y
+// are computed.
 template <class V>
 GS2D_HD RecordGradient<V> finish(const Record<V>& s, V zc, const PairSums<V>& a, const BlendLimits<V>& k) {
     RecordGradient<V> g;

@@ -1,11 +1,11 @@
-// The exposure and white balance of a photograph at one pixel (docs/math.md, "Exposure").
+// Exposure and white balance of a photo at one pixel (docs/math.md, "Exposure").
 #pragma once
 
 #include "core/base.h"
 
 namespace gs2d {
 
-// c -> A c + b on the object; the background is composited behind it afterwards.
+// Applies c -> A c + b to the object colour; the background is composited behind the object afterwards.
 template <class V> struct Exposure {
     V A[3][3], b[3], background[3];
 };
@@ -24,7 +24,7 @@ template <class V> GS2D_HD void expose(const V* color, V coverage, const Exposur
     }
 }
 
-// The gradient of the colour; the gradients of A and b, row by row, are added to `sums`.
+// Returns the gradient of the colour; adds the gradients of A and b to `sums`, row by row.
 template <class V>
 GS2D_HD void expose_vjp(const V* upstream, const V* color, V coverage, const Exposure<V>& e, V* to_color,
                         V (*sums)[4]) {

@@ -1,4 +1,4 @@
-// The losses of one pixel, and their vector-Jacobian products (docs/math.md has the same formulas in words).
+// Losses of one pixel and their vector-Jacobian products (formulas: docs/math.md).
 #pragma once
 
 #include "core/base.h"
@@ -8,14 +8,14 @@ namespace gs2d {
 constexpr double SSIM_C1 = 0.01 * 0.01;
 constexpr double SSIM_C2 = 0.03 * 0.03;
 
-// The window: exp(-k^2 / 4.5), k = 0..5, divided by the sum over k = -5..5.
+// SSIM window: exp(-k^2 / 4.5), k = 0..5, divided by the sum over k = -5..5.
 constexpr int SSIM_RADIUS = 5, SSIM_TAPS = 2 * SSIM_RADIUS + 1;
 constexpr double SSIM_WINDOW[SSIM_RADIUS + 1] = {0.2660117248617943,  0.21300553771125366,  0.1093606895097,
                                                  0.03600077212843082, 0.007598758135239184, 0.0010283800844791099};
 
-// SSIM of one pixel and channel, and its derivatives by the blurred moments that depend on the rendered image x:
-//     a = B(x), s = B(x^2 + y^2), p = B(x y); b = B(y) is the target's.
-// The sum of both second moments suffices, since the variances occur only as a sum. The gradient of the image is
+// SSIM of one pixel and channel, and its derivatives with respect to the blurred moments of the rendered image x:
+//     a = B(x), s = B(x^2 + y^2), p = B(x y); b = B(y) belongs to the target y.
+// The sum of both second moments suffices, because the variances occur only as a sum. The image gradient is
 //     dL/dx = B(d_mean) + 2 x B(d_squares) + y B(d_product).
 template <class V> struct SsimPoint {
     V value, d_mean, d_squares, d_product;
@@ -38,7 +38,7 @@ template <class V> GS2D_HD SsimPoint<V> ssim_point(V a, V b, V s, V p) {
     return {value, d_mean, d_squares, d_product};
 }
 
-// d|x - y| / dx, 0 where they are equal.
+// d|x - y| / dx, 0 where x = y.
 template <class V> GS2D_HD V l1_sign(V x, V y) {
     const V zero = V(0.0f), one = V(1.0f);
     return select(x > y, one, select(x < y, -one, zero));
@@ -47,11 +47,11 @@ template <class V> GS2D_HD V l1_sign(V x, V y) {
 // d(x - y)^2 / dx.
 template <class V> GS2D_HD V l2_slope(V x, V y) { return V(2.0f) * (x - y); }
 
-// The surface normal of a pixel from the z-depths of its four neighbours, not normalised, in the camera frame:
-// (P_down - P_up) x (P_right - P_left) is proportional to
+// Computes the surface normal of a pixel from the z-depths of its four neighbours, not normalised, in camera
+// coordinates: (P_down - P_up) x (P_right - P_left) is proportional to
 //     n = (fx gx, fy gy, -(1 + (px - cx) gx + (py - cy) gy)),  gx = (zr - zl)/(zr + zl),  gy = (zd - zu)/(zd + zu)
-// with the positive factor (zr + zl)(zd + zu) / (fx fy). Its product with the pixel's ray is -1 before scaling: it
-// faces the camera and is never 0, so nothing is guarded here but the depths being positive.
+// with the positive factor (zr + zl)(zd + zu) / (fx fy). The dot product of n with the pixel ray is -1, so n faces the
+// camera and is never 0. The only precondition is that the depths are positive.
 template <class V> struct DepthNormal {
     Vec3<V> direction;  // unit, camera frame
     V inverse_length;   // 1 / |n|
@@ -69,12 +69,12 @@ GS2D_HD DepthNormal<V> depth_normal(V left, V right, V up, V down, V offset_x, V
     return {inverse_length * n, inverse_length, two * inverse_x * inverse_x, two * inverse_y * inverse_y};
 }
 
-// A neighbour of depth 0 was not hit. NaN counts as a hit: it must reach the loss.
+// True if a neighbour was hit (depth above 0). NaN counts as a hit, so that it propagates to the loss.
 template <class V> GS2D_HD auto was_hit(V depth) { return invert(depth <= V(0.0f)); }
 
-// Whether four neighbours define a normal: all of them were hit, or with `at_camera` at least one of each pair, and the
-// others lie at the camera centre. gx or gy is then 1 or -1, and depth_normal needs no other formula. Ignored pixels and
-// those outside the image have a negative depth and define no normal.
+// Returns whether four neighbours define a normal. All must be hit; with `at_camera` one hit per pair is enough, and
+// missed neighbours are taken to lie at the camera centre. Then gx or gy is 1 or -1, and depth_normal needs no other
+// formula. Ignored pixels and pixels outside the image have a negative depth and define no normal.
 template <class V> GS2D_HD auto makes_normal(V left, V right, V up, V down, bool at_camera) {
     if (!at_camera) return was_hit(left) & was_hit(right) & was_hit(up) & was_hit(down);
     const V zero = V(0.0f);
@@ -82,8 +82,8 @@ template <class V> GS2D_HD auto makes_normal(V left, V right, V up, V down, bool
     return invert(absent) & was_hit(left + right) & was_hit(up + down);
 }
 
-// The pullback of a cotangent of the unit normal to gx and gy, times slope_x and slope_y: the depth of the right
-// neighbour gets x * left, the left one -x * right, the lower one y * up, the upper one -y * down.
+// The pullback of a cotangent of the unit normal to gx and gy, times slope_x and slope_y. Depth gradients of the
+// neighbours: right x * left, left -x * right, lower y * up, upper -y * down.
 template <class V> struct DepthNormalGrad {
     V x, y;
 };

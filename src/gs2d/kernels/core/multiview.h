@@ -1,40 +1,40 @@
 // Two views of one surface: a patch warped by its pixel's plane, and the round trip of a pixel to the other view.
-// Formulas and gradients: docs/math.md, "Two views"; losses/view_pair.py has the same in torch.
+// Formulas and gradients: docs/math.md, "Two views"; torch version: losses/view_pair.py.
 //
-// A pixel of a view, with depth d along its ray (z = 1) and a rendered normal q, is a plane. Its point X = d ray lies
-// at R X + t for the neighbour. Positions are px from the centre of an image's first pixel; so are cx and cy of a
-// `Lens`.
+// A pixel with depth d along its ray (z = 1) and a rendered normal q defines a plane. Its point X = d ray has the
+// coordinates R X + t in the neighbour. Positions are in px from the centre of the first pixel of an image; so are cx
+// and cy of a `Lens`.
 #pragma once
 
 #include "core/base.h"
 
 namespace gs2d {
 
-constexpr double MIN_COSINE = 0.1;        // between normal and ray; below, a plane is too edge-on to warp
-constexpr double MIN_SCALE = 0.1;         // ratio of the depths in neighbour and view; below, a patch is too close to the neighbour
-constexpr double MIN_NORMAL = 1e-4;       // least length of a rendered normal with a direction
-constexpr double ROUND_TRIP_EPS = 1e-12;  // px^2, under the root of a distance: no gradient is infinite
+constexpr double MIN_COSINE = 0.1;        // between normal and ray; planes below are too edge-on to warp
+constexpr double MIN_SCALE = 0.1;         // depth in the neighbour / depth in the view; patches below are too close
+constexpr double MIN_NORMAL = 1e-4;       // minimum length of a rendered normal
+constexpr double ROUND_TRIP_EPS = 1e-12;  // px^2, added under the square root of a distance to keep gradients finite
 
-// Rows of CompareArguments. Those of `motion_gradients`: of the similarity by R, t and the world's rotation, then of
-// the round trip by R and t.
+// Numbers of rows in CompareArguments, and first rows in `motion_gradients`: the similarity with respect to R, t and
+// the world rotation, then the round trip with respect to R and t.
 constexpr int VALUE_ROWS = 2, GRADIENT_ROWS = 5, MOTION_ROWS = 33;
 constexpr int TURN_ROW = 0, SHIFT_ROW = 9, WORLD_ROW = 12, TRIP_TURN_ROW = 21, TRIP_SHIFT_ROW = 30;
 
-// P pixels of a view and one neighbour. R is the type of the arrays.
+// P pixels of a view and one neighbour. R is the array type.
 template <class R> struct CompareArguments {
     long long count, width, height, source_width, source_height, depth_width, depth_height, radius;
-    double lens[4], source_lens[4];  // fx, fy, cx, cy, as `Camera` has them
-    double texture, occluded;        // of `MultiView`
+    double lens[4], source_lens[4];  // fx, fy, cx, cy, as in `Camera`
+    double texture, occluded;        // as in `MultiView`
     const R *depth, *normal;         // [H, W] world units, [H, W, 3] world frame
-    const R* motion;                 // [21]: R and t from view to neighbour, and the rotation from world to view
-    const long long* index;          // [P] into the flat image
-    const unsigned char* chosen;     // [P]: there the patch is inside the image, and d > 0
+    const R* motion;                 // [21]: R and t from view to neighbour, then the rotation from world to view
+    const long long* index;          // [P] index into the flattened image
+    const unsigned char* chosen;     // [P]: 1 if the patch is inside the image and d > 0
     const R *reference, *source;     // [H, W], [h, w] grey
     const unsigned char* clear;      // [h, w]
-    const R* source_depth;           // [depth_height, depth_width] of the whole image, world units; 0: nothing is hit
-    R* values;                       // [2, P]: weight (1 - NCC), weight error
-    R* gradients;                    // [5, P] of the first by depth and normal, of the second by depth; or null
-    R* motion_gradients;             // [33, P] of the first by `motion`, of the second by its R and t; or null
+    const R* source_depth;           // [depth_height, depth_width] of the whole image, world units; 0: no hit
+    R* values;                       // [2, P]: weight * (1 - NCC), weight * error
+    R* gradients;                    // [5, P]: row 0 of `values` by depth and normal, row 1 by depth; or null
+    R* motion_gradients;             // [33, P]: row 0 of `values` by `motion`, row 1 by its R and t; or null
 };
 
 template <class V> using MaskOf = decltype(V(0.f) < V(0.f));
@@ -42,7 +42,7 @@ template <class V> using MaskOf = decltype(V(0.f) < V(0.f));
 template <class V> struct Lens {
     V fx, fy, cx, cy;
 };
-// Of an image, or of the same one in another size.
+// Converts the intrinsics of an image, or of a resized copy of it.
 template <class V, class R> GS2D_HD Lens<V> lens_of(const double* lens, double by_x = 1., double by_y = 1.) {
     return {V(R(lens[0] * by_x)), V(R(lens[1] * by_y)), V(R(lens[2] * by_x - 0.5)), V(R(lens[3] * by_y - 0.5))};
 }
@@ -58,9 +58,9 @@ template <class V> GS2D_HD Vec3<V> transposed_times(const Rows3<V>& m, Vec3<V> v
 }
 
 template <class V> struct Motion {
-    Rows3<V> turn;   // from view to neighbour
-    Vec3<V> shift;   // world units
-    Rows3<V> world;  // from the world to the view
+    Rows3<V> turn;   // rotation from view to neighbour
+    Vec3<V> shift;   // translation, world units
+    Rows3<V> world;  // rotation from world to view
 };
 template <class V, class R> GS2D_HD Motion<V> motion_of(const R* m) {
     return {{{V(m[0]), V(m[1]), V(m[2])}, {V(m[3]), V(m[4]), V(m[5])}, {V(m[6]), V(m[7]), V(m[8])}},
@@ -68,23 +68,24 @@ template <class V, class R> GS2D_HD Motion<V> motion_of(const R* m) {
             {{V(m[12]), V(m[13]), V(m[14])}, {V(m[15]), V(m[16]), V(m[17])}, {V(m[18]), V(m[19]), V(m[20])}}};
 }
 
-// An image between pixel centres, and its derivatives.
+// An image interpolated between pixel centres, and its derivatives.
 template <class V> struct Sampled {
     V value, by_x, by_y;
 };
-// Bilinear: a b over c d, at (x, y) in the unit square.
+// Bilinear interpolation at (x, y) in the unit square; a b is the upper row, c d the lower row.
 template <class V> GS2D_HD Sampled<V> between(V a, V b, V c, V d, V x, V y) {
     const V right = b - a, bend = (d - c) - right;
     const V by_x = fma(bend, y, right), by_y = fma(bend, x, c - a);
     return {fma(y, by_y, fma(x, right, a)), by_x, by_y};
 }
 
-// The plane of a pixel as a map A: of one px to the right, one down, and the pixel's ray, to rays of the neighbour.
-// A r = R r + t (q . r) / (q . X) for every ray r. The depth of its image is in units of d.
+// The plane of a pixel as a linear map A from rays of the view to rays of the neighbour,
+// A r = R r + t (q . r) / (q . X). A maps one px to the right, one px down and the pixel ray to `right`, `down` and
+// `middle`. Depths are in units of d.
 template <class V> struct PatchPlane {
     Vec3<V> right, down, middle;
-    MaskOf<V> planar;                              // facing the camera, not too edge-on
-    Vec3<V> normal;                                // q in the view's frame
+    MaskOf<V> planar;                              // faces the camera and is not too edge-on
+    Vec3<V> normal;                                // q in the camera frame of the view
     V along, inverse, inverse_depth, slope_x, slope_y;  // q . ray; 1 / (q . X); 1 / d; q / (q . X)
 };
 
@@ -108,7 +109,7 @@ GS2D_HD PatchPlane<V> patch_plane(V depth, Vec3<V> q, Vec3<V> ray, const Motion<
     return p;
 }
 
-// Of a scalar by R and t.
+// Gradient of a scalar with respect to R and t.
 template <class V> struct MotionGrad {
     Rows3<V> turn;
     Vec3<V> shift;
@@ -117,7 +118,7 @@ template <class V> GS2D_HD Rows3<V> outer(Vec3<V> a, Vec3<V> b) { return {a.x * 
 template <class V> GS2D_HD Rows3<V> operator+(const Rows3<V>& a, const Rows3<V>& b) {
     return {a.x + b.x, a.y + b.y, a.z + b.z};
 }
-// Calls leave(k, weight * number k), row by row.
+// Calls leave(k, weight * element k), row by row.
 template <class V, class Leave> GS2D_HD void each_of(const Rows3<V>& m, V weight, Leave leave) {
     leave(0, weight * m.x.x), leave(1, weight * m.x.y), leave(2, weight * m.x.z);
     leave(3, weight * m.y.x), leave(4, weight * m.y.y), leave(5, weight * m.y.z);
@@ -127,10 +128,10 @@ template <class V, class Leave> GS2D_HD void each_of(const Vec3<V>& v, V weight,
     leave(0, weight * v.x), leave(1, weight * v.y), leave(2, weight * v.z);
 }
 
-// The pullback of cotangents of `right`, `down` and `middle`.
+// Gradients computed from the cotangents of `right`, `down` and `middle`.
 template <class V> struct PatchPlaneGrad {
     V depth;
-    Vec3<V> normal, right, down;  // of q in the view's frame; per unit of a ray
+    Vec3<V> normal, right, down;  // for q in the view's frame; per unit of a ray
 };
 
 template <class V>
@@ -138,7 +139,7 @@ GS2D_HD PatchPlaneGrad<V> patch_plane_vjp(const PatchPlane<V>& p, Vec3<V> g_righ
                                           V depth, Vec3<V> ray, const Motion<V>& m, const Lens<V>& lens) {
     const Vec3<V> right = (V(1.f) / lens.fx) * g_right, down = (V(1.f) / lens.fy) * g_down;
     const V g_x = dot(right, m.shift), g_y = dot(down, m.shift);
-    const V g_offset = -(p.inverse * fma(g_x, p.slope_x, g_y * p.slope_y));  // of q . X
+    const V g_offset = -(p.inverse * fma(g_x, p.slope_x, g_y * p.slope_y));  // with respect to q . X
     const V by_ray = g_offset * depth;
     const Vec3<V> normal = {fma(g_x, p.inverse, by_ray * ray.x), fma(g_y, p.inverse, by_ray * ray.y), by_ray};
     const V by_shift = p.inverse_depth * p.inverse_depth * dot(g_middle, m.shift);
@@ -153,7 +154,7 @@ GS2D_HD MotionGrad<V> motion_grad(const PatchPlane<V>& p, const PatchPlaneGrad<V
     return {turn, axpy(p.slope_x, g.right, axpy(p.slope_y, g.down, p.inverse_depth * g_middle))};
 }
 
-// Position of a patch pixel in the neighbour: the ray's x and y (z = 1), and 1 / depth, in units of 1 / d.
+// Position of a patch pixel in the neighbour: x and y of the ray (z = 1), and 1 / depth in units of 1 / d.
 template <class V> struct PatchPlace {
     V x, y, inverse;
 };
@@ -161,13 +162,13 @@ template <class V> GS2D_HD PatchPlace<V> patch_place(Vec3<V> h) {
     const V inverse = V(1.f) / max(h.z, V(float(MIN_SCALE)));
     return {h.x * inverse, h.y * inverse, inverse};
 }
-// d grey / d h, by the derivatives of the sample.
+// Returns d grey / d h from the derivatives of the sample.
 template <class V> GS2D_HD Vec3<V> patch_pull(const PatchPlace<V>& p, const Sampled<V>& s, const Lens<V>& there) {
     const V x = (s.by_x * there.fx) * p.inverse, y = (s.by_y * there.fy) * p.inverse;
     return {x, y, -fma(x, p.x, y * p.y)};
 }
 
-// Sums over the pixels of two patches, with greys relative to the middle pixel.
+// Sums over the pixels of two patches; grey values are relative to the centre pixel.
 template <class V> struct PatchSums {
     V a, b, aa, bb, ab;
     GS2D_HD void add(V x, V y) {
@@ -175,10 +176,10 @@ template <class V> struct PatchSums {
     }
 };
 
-// d NCC / d b_i = by_a (a_i - mean_a) - by_b (b_i - mean_b), means as the sums have them.
+// d NCC / d b_i = by_a (a_i - mean_a) - by_b (b_i - mean_b); the means have the same reference as the sums.
 template <class V> struct PatchNcc {
     V value, by_a, by_b, mean_a, mean_b;
-    MaskOf<V> valid;  // both vary; that there by half of `texture`
+    MaskOf<V> valid;  // both patches have texture: at least `texture`, in the neighbour half of it
 };
 
 template <class V> GS2D_HD PatchNcc<V> patch_ncc(const PatchSums<V>& s, V pixels, V texture) {
@@ -193,14 +194,14 @@ template <class V> GS2D_HD PatchNcc<V> patch_ncc(const PatchSums<V>& s, V pixels
 
 // The round trip of a pixel to the neighbour's surface and back.
 template <class V> struct RoundTrip {
-    V error, by_depth;  // px; its derivative
+    V error, by_depth;  // px; derivative with respect to the depth
     MaskOf<V> back;     // the round trip succeeds
-    Vec3<V> met;        // the point of the neighbour's surface, less t
-    Vec3<V> by_seen, by_met, by_returned;  // derivatives by R X + t, by `met`, and by R^T met
+    Vec3<V> met;        // intersection with the neighbour's surface, minus t
+    Vec3<V> by_seen, by_met, by_returned;  // derivatives with respect to R X + t, `met`, and R^T met
 };
 
-// `there` is the lens of the neighbour's depths, which `read` samples at a place. `is_clear` says whether a patch
-// around what a ray of the neighbour (z = 1) meets may be compared.
+// `there` is the lens of the neighbour's depth map, which `read` samples. `is_clear` returns whether a patch may be
+// compared around the point that a neighbour ray (z = 1) hits.
 template <class V, class Read, class Clear>
 GS2D_HD RoundTrip<V> round_trip(V depth, Vec3<V> ray, const Motion<V>& m, const Lens<V>& here, const Lens<V>& there,
                                 V last_x, V last_y, Read read, Clear is_clear) {

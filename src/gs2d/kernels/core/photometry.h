@@ -1,4 +1,4 @@
-// Vignetting and response of a camera at one pixel (docs/math.md, "Vignetting and response").
+// Vignetting and response curve of a camera at one pixel (docs/math.md, "Vignetting and response").
 #pragma once
 
 #include "core/base.h"
@@ -21,7 +21,7 @@ template <class V> GS2D_HD Bent<V> bend(V x, const Curve<V>& c) {
     return {fma(c.growth * over, inside, outside), slope, fnma(c.inverse, above, turned)};
 }
 
-// Relative brightness at a squared radius u: exp(-(a u + b u^2 + c u^3)).
+// Returns the relative brightness at a squared radius u: exp(-(a u + b u^2 + c u^3)).
 template <class V> GS2D_HD V falloff(V u, const V* a) {
     return exp(V(0.0f) - u * fma(u, fma(u, a[2], a[1]), a[0]));
 }

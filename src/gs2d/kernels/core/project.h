@@ -1,4 +1,4 @@
-// From a splat's parameters to its screen record, and back (docs/math.md, "Projection").
+// Conversion of splat parameters to a screen record, and its gradient (docs/math.md, "Projection").
 //
 // With P = [s_u t_u, s_v t_v, p] in the camera frame, a pixel ray r = ((x - cx)/fx, (y - cy)/fy, 1) intersects the
 // plane at (u, v, 1) = z P^-1 r. The record holds P^-1 per pixel, centred on the projected splat, for float32
@@ -14,11 +14,11 @@ namespace gs2d {
 
 template <class V> using mask_t = decltype(V() < V());
 
-// Rule 23: splats beyond these limits are culled, so that no square overflows float32 (render/types.py has the same).
+// Rule 23: splats beyond these limits are culled, so that no square overflows float32 (same limits: render/types.py).
 constexpr double MAX_SIZE = 1e9;          // world units: coordinates in the camera frame, scales
-constexpr double MIN_SIZE = 1e-18;       // world units: smaller scales count as this
+constexpr double MIN_SIZE = 1e-18;       // world units: smaller scales are set to this value
 constexpr double MAX_COLOR = 1e15;        // sum of the absolute coefficients of a colour
-constexpr double MIN_QUATERNION = 1e-15;  // largest component; below, it counts as a zero quaternion
+constexpr double MIN_QUATERNION = 1e-15;  // largest component; smaller quaternions count as zero
 
 // A pinhole camera; x_cam = R x_world + t. S is a scalar.
 template <class S> struct PinholeCamera {
@@ -38,23 +38,23 @@ template <class V> struct Record {
     V cx, cy, au, bu, av, bv, ai, bi, iz;
     V log2_opacity;
     V red, green, blue;
-    V nx, ny, nz;  // world, facing the camera
+    V nx, ny, nz;  // world frame, facing the camera
 };
 constexpr int RECORD = 16;
 
-// Gradients of a record, summed over pixels. `center` counts pairs that hit the plane, `lowpass` the filtered ones:
-// the densification signal excludes the latter.
+// Gradients of a record, summed over pixels. `cx` and `cy` sum the pairs that hit the plane; `lowpass_cx` and
+// `lowpass_cy` sum the filtered pairs, which the densification signal excludes.
 template <class V> struct RecordGradient {
     V cx, cy, au, bu, av, bv, ai, bi, iz;
     V ln_opacity;
     V red, green, blue;
     V nx, ny, nz;
     V lowpass_cx, lowpass_cy;
-    V abs_x, abs_y;  // sums of absolute values of the densification signal, per px
+    V abs_x, abs_y;  // sums of absolute values for the densification signal, per px
 };
-constexpr int GRADIENT = RECORD, GRADIENT_EXTRA = 4;  // the latter: lowpass_cx to abs_y
+constexpr int GRADIENT = RECORD, GRADIENT_EXTRA = 4;  // lowpass_cx to abs_y are extra
 
-// Values for both directions.
+// Intermediate values of both passes.
 template <class V> struct Frame3 {
     V qw, qx, qy, qz, inverse_norm;  // unit quaternion, 1 / |quat|
     Vec3<V> tu, tv, n_world;         // world
@@ -78,13 +78,13 @@ template <class V, class S> GS2D_HD Vec3<V> center_of(const PinholeCamera<S>& ca
     return {V(cam.center[0]), V(cam.center[1]), V(cam.center[2])};
 }
 
-// The unit vector along d, and 1 / |d|.
+// Returns the unit vector along d, and 1 / |d|.
 template <class V> GS2D_HD Vec3<V> direction_of(Vec3<V> d, V& inverse_length) {
     inverse_length = V(1.0f) / sqrt(dot(d, d));
     return inverse_length * d;
 }
 
-// The largest component of the quaternion.
+// Returns the largest absolute component of the quaternion.
 template <class V> GS2D_HD V longest_of(const SplatParameters<V>& s) {
     return max(max(abs(s.qw), abs(s.qx)), max(abs(s.qy), abs(s.qz)));
 }
@@ -92,7 +92,7 @@ template <class V> GS2D_HD V longest_of(const SplatParameters<V>& s) {
 template <class V, class S> GS2D_HD Frame3<V> frame_of(const SplatParameters<V>& s, const PinholeCamera<S>& cam) {
     Frame3<V> f;
     const V one = V(S(1)), two = V(S(2)), tiny = V(S(MIN_SIZE));
-    // 2^-80 keeps the square of the largest quaternion; all others are multiplied by 1, which changes no bit.
+    // The factor 2^-80 prevents overflow of squares of large quaternions; others are multiplied by 1, which is exact.
     const V shrink = select(longest_of(s) > V(S(1e15)), V(S(8.271806125530277e-25)), one);
     const V qw = s.qw * shrink, qx = s.qx * shrink, qy = s.qy * shrink, qz = s.qz * shrink;
     const V inverse = one / sqrt(fma(qw, qw, fma(qx, qx, fma(qy, qy, qz * qz))));
@@ -109,7 +109,7 @@ template <class V, class S> GS2D_HD Frame3<V> frame_of(const SplatParameters<V>&
     f.n = rotate(cam.R, f.n_world);
     const V su = max(exp(s.log_su), tiny), sv = max(exp(s.log_sv), tiny);
     f.a = su * tu, f.b = sv * tv;
-    // Exactly edge-on there is no inverse: n.p is kept away from 0; the low-pass filter draws such splats.
+    // A splat that is exactly edge-on has no inverse, so n.p is kept away from 0; the low-pass filter draws it.
     const V nd = dot(f.n, f.p), floor = V(S(1e-7)) * sqrt(dot(f.p, f.p));
     const V inv = one / select(abs(nd) >= floor, nd, select(nd < V(S(0)), -floor, floor));
     f.row0 = (inv / su) * cross(tv, f.p);
@@ -122,10 +122,10 @@ template <class V, class S> GS2D_HD Frame3<V> frame_of(const SplatParameters<V>&
     return f;
 }
 
-// Rules 16 and 23, except for the colour: every parameter is finite and in the range that float32 can square. False for
-// NaN.
+// Rules 16 and 23, except for the colour: returns whether all parameters are finite and their squares fit in float32.
+// False for NaN.
 template <class V> GS2D_HD mask_t<V> in_range(const SplatParameters<V>& p, const Frame3<V>& f) {
-    // an eighth of each, so that finite numbers have a finite sum (gcc 12 folds 0 * x to 0 with -fno-signed-zeros)
+    // an eighth of each value, so that finite values have a finite sum (gcc 12 folds 0 * x to 0 with -fno-signed-zeros)
     const V part = V(0.125f), limit = V(float(MAX_SIZE));
     const V size = part * abs(p.logit) + part * abs(p.qw) + part * abs(p.qx) + part * abs(p.qy) + part * abs(p.qz) +
                    part * abs(p.log_su) + part * abs(p.log_sv);
@@ -133,10 +133,10 @@ template <class V> GS2D_HD mask_t<V> in_range(const SplatParameters<V>& p, const
            (abs(f.p.y) <= limit) & (abs(f.p.z) <= limit) & (exp(p.log_su) <= limit) & (exp(p.log_sv) <= limit);
 }
 
-// The same for the sum of the absolute coefficients of a colour.
+// The same test for the sum of the absolute coefficients of a colour.
 template <class V> GS2D_HD mask_t<V> color_in_range(V sum) { return sum <= V(float(MAX_COLOR)); }
 
-// The record without the colour.
+// Computes the record without the colour.
 template <class V, class S>
 GS2D_HD Record<V> project(const SplatParameters<V>& s, const Frame3<V>& f, const PinholeCamera<S>& cam) {
     Record<V> r;
@@ -158,7 +158,7 @@ template <class V> struct ParameterGradient {
     V probe_x, probe_y;  // z_c dL/d(Tu.z), z_c dL/d(Tv.z), per px; without the low-pass branch
 };
 
-// Vector-Jacobian product of `project` (the colour's part, `g_direction` with respect to f.to_splat, comes from sh.h).
+// Vector-Jacobian product of `project`. `g_direction`, the gradient with respect to f.to_splat, comes from sh.h.
 template <class V, class S>
 GS2D_HD ParameterGradient<V> project_vjp(const SplatParameters<V>& s, const Frame3<V>& f, const Record<V>& r,
                                          const RecordGradient<V>& g, Vec3<V> g_direction, const PinholeCamera<S>& cam) {
@@ -166,7 +166,7 @@ GS2D_HD ParameterGradient<V> project_vjp(const SplatParameters<V>& s, const Fram
     const V two = V(S(2)), kx = V(S(1) / cam.fx), ky = V(S(1) / cam.fy);
     // dL/dP = -R^T G R^T with R = P^-1, G = dL/dR (its third column is 0).
     const V g00 = kx * g.au, g01 = ky * g.bu, g10 = kx * g.av, g11 = ky * g.bv, g20 = kx * g.ai, g21 = ky * g.bi;
-    const auto column = [&](Vec3<V> row) {  // of dL/dP, for the column that belongs to this row of R
+    const auto column = [&](Vec3<V> row) {  // column of dL/dP that belongs to this row of R
         const V x0 = fma(g00, row.x, g01 * row.y), x1 = fma(g10, row.x, g11 * row.y), x2 = fma(g20, row.x, g21 * row.y);
         return -x0 * f.row0 + -x1 * f.row1 + -x2 * f.row2;
     };
@@ -185,7 +185,7 @@ GS2D_HD ParameterGradient<V> project_vjp(const SplatParameters<V>& s, const Fram
     out.log_su = dot(ga, f.a);
     out.log_sv = dot(gb, f.b);
     const V su = sqrt(dot(f.a, f.a)), sv = sqrt(dot(f.b, f.b));
-    const Vec3<V> gu = rotate_back(cam.R, su * ga), gv = rotate_back(cam.R, sv * gb);  // of t_u, t_v
+    const Vec3<V> gu = rotate_back(cam.R, su * ga), gv = rotate_back(cam.R, sv * gb);  // gradients of t_u, t_v
     const Vec3<V> gn = f.sign * Vec3<V>{g.nx, g.ny, g.nz};
     const V w = f.qw, x = f.qx, y = f.qy, z = f.qz;
     const V d21 = gv.z - gn.y, d02 = gn.x - gu.z, d10 = gu.y - gv.x;  // antisymmetric and symmetric parts
@@ -204,7 +204,7 @@ GS2D_HD ParameterGradient<V> project_vjp(const SplatParameters<V>& s, const Fram
     return out;
 }
 
-// Gradient of the camera's intrinsics from one splat (docs/math.md, "Camera").
+// Computes the gradient of the camera intrinsics for one splat (docs/math.md, "Camera").
 template <class V> struct IntrinsicsGradient {
     V fx, fy, cx, cy;
 };
@@ -220,20 +220,20 @@ GS2D_HD IntrinsicsGradient<V> intrinsics_vjp(const Frame3<V>& f, const Record<V>
 
 // The footprint of the disc rho3d <= k^2 and the low-pass disc.
 template <class V> struct Footprint {
-    // |pixel - e| in the metric (a, b, c) is at most 1 inside the ellipse; slightly widened against rounding.
+    // |pixel - e| in the metric (a, b, c) is at most 1 inside the ellipse; slightly widened to allow for rounding.
     V ex, ey, a, b, c;
     V slope, half, inv_y2, y_right;  // the same ellipse by rows: see Chords in tile.h
     V disc2;                         // low-pass disc: radius^2, widened
     V k;                             // radius of the disc on the splat's plane, widened
     V x_min, y_min, x_max, y_max;    // exact box of both, px, not clipped
-    mask_t<V> crosses;               // the disc reaches the camera plane: no ellipse, no box
+    mask_t<V> crosses;               // the disc reaches the camera plane, so it has neither ellipse nor box
     mask_t<V> unbounded;             // crosses, or too close to it for a reliable ellipse
 };
 
 // Rule 19: handling of a splat whose disc rho3d <= error_cutoff^2 reaches the camera plane.
 constexpr int NEAR_PLANE_DRAW = 0, NEAR_PLANE_CULL = 1, NEAR_PLANE_BOX = 2;
 
-// The disc rho3d <= k^2 reaches the camera plane.
+// Returns whether the disc rho3d <= k^2 reaches the camera plane.
 template <class V> GS2D_HD mask_t<V> reaches_camera_plane(const Frame3<V>& f, V k2) {
     return invert(k2 * fma(f.a.z, f.a.z, f.b.z * f.b.z) < f.p.z * f.p.z);
 }
@@ -249,8 +249,8 @@ template <class V, class S> GS2D_HD ScreenAxes<V> screen_axes(const Frame3<V>& f
             V(cam.fy) * fnma(ry, f.b.z, f.b.y)};
 }
 
-// Rule 19, "box": centre and half side, px, of the official square around a disc that reaches the camera plane: the
-// formula of an ellipse's box, applied to a hyperbola. Not finite if the disc only touches the plane.
+// Rule 19, "box": centre and half side, in px, of the official square around a disc that reaches the camera plane. The
+// formula is that of an ellipse's box, applied to a hyperbola. Not finite if the disc only touches the plane.
 template <class V> struct Square {
     V x, y, half;
 };
@@ -279,12 +279,12 @@ GS2D_HD Footprint<V> footprint(const Frame3<V>& f, const Record<V>& r, V k2, S l
     const V ex = -scale * fma(xu, f.a.z, xv * f.b.z), ey = -scale * fma(yu, f.a.z, yv * f.b.z);
     const V sxx = fma(ex, ex, scale * fma(xu, xu, xv * xv)), syy = fma(ey, ey, scale * fma(yu, yu, yv * yv));
     const V sxy = fma(ex, ey, scale * fma(xu, yu, xv * yv));
-    // Also when the sum overflowed, or the ellipse is so large that its tests would lose precision.
+    // Also if the sum overflowed, or if the ellipse is so large that its tests would lose precision.
     o.unbounded = (d > V(S(-0.01)) * zz) | invert(sxx + syy < V(S(1e12)));
     const V hx = sqrt(sxx), hy = sqrt(syy), radius = V(lowpass_px) * sqrt(k2);
     o.x_min = r.cx + min(ex - hx, -radius), o.x_max = r.cx + max(ex + hx, radius);
     o.y_min = r.cy + min(ey - hy, -radius), o.y_max = r.cy + max(ey + hy, radius);
-    // Widen by 0.03 px and 0.3 % of the longer side, which bounds the rounding of the inverse below.
+    // Widen by 0.03 px and 0.3 % of the longer side, which exceeds the rounding error of the inverse below.
     const V wide = fma(V(S(1e-5)), sxx + syy, V(S(1e-3)));
     const V wxx = sxx + wide, wyy = syy + wide, det = fnma(sxy, sxy, wxx * wyy);
     const V inv = one / (det * V(S(1.004)));

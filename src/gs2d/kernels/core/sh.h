@@ -1,4 +1,4 @@
-// Real spherical harmonics up to degree 3 and the derivative of a colour along them (docs/math.md, "Colour").
+// Real spherical harmonics up to degree 3 and their derivatives by direction (docs/math.md, "Colour").
 #pragma once
 
 #include "core/base.h"
@@ -6,10 +6,10 @@
 namespace gs2d {
 
 constexpr int SH_MAX = 16;  // coefficients of degree 3
-// Degree -1 is the first coefficient itself: the colour, neither shifted nor clamped (rule 11).
+// In degree -1, the first coefficient is the colour, neither shifted nor clamped (rule 11).
 GS2D_HD int sh_count(int degree) { return degree < 0 ? 1 : (degree + 1) * (degree + 1); }
 
-// The first sh_count(degree) basis functions at the unit vector d.
+// Evaluates the first sh_count(degree) basis functions at the unit vector d.
 template <class V> GS2D_HD void sh_basis(Vec3<V> d, int degree, V* basis) {
     const V x = d.x, y = d.y, z = d.z;
     basis[0] = degree < 0 ? V(1.0) : V(0.28209479177387814);
@@ -38,7 +38,7 @@ template <class V> GS2D_HD void sh_basis(Vec3<V> d, int degree, V* basis) {
     basis[15] = -(a3 * x * (xx - three * yy));
 }
 
-// Colour + 1/2, not clamped, from the coefficients sh[3 * k + channel].
+// Computes colour + 1/2, not clamped, from the coefficients sh[3 * k + channel].
 template <class V> GS2D_HD Vec3<V> sh_color(const V* sh, const V* basis, int degree) {
     const V half = degree < 0 ? V(0.f) : V(0.5f);
     Vec3<V> c = {half, half, half};
@@ -46,12 +46,12 @@ template <class V> GS2D_HD Vec3<V> sh_color(const V* sh, const V* basis, int deg
     return c;
 }
 
-// The drawn value of a channel of that colour.
+// Returns the displayed value of a colour channel.
 template <class V> GS2D_HD V clamped_color(V c, int degree) { return degree < 0 ? c : max(c, V(0.f)); }
-// The gradient of that colour from the gradient g of the drawn value.
+// Returns the gradient of a colour channel from the gradient g of its displayed value.
 template <class V> GS2D_HD V clamped_color_vjp(V c, int degree, V g) { return degree < 0 ? g : keep(c > V(0.f), g); }
 
-// Gradient with respect to d of sum_k g[k] basis[k], d taken as a free vector (the caller handles its length).
+// Computes the gradient of sum_k g[k] basis[k] with respect to d, as a free vector (the caller handles normalisation).
 template <class V> GS2D_HD Vec3<V> sh_basis_vjp(Vec3<V> d, int degree, const V* g) {
     Vec3<V> r = {V(0.0), V(0.0), V(0.0)};
     if (degree < 1) return r;

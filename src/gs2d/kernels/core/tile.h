@@ -1,4 +1,4 @@
-// Footprints against tiles. V may be a vector of boxes, S is a scalar.
+// Tests of footprints against tiles. V may be a vector of boxes, S is a scalar.
 #pragma once
 
 #include "core/base.h"
@@ -8,20 +8,20 @@ namespace gs2d {
 
 constexpr int TILE_PX = 16;  // side of a tile
 
-// Tiles, half open; empty for culled splats.
+// Half-open range of tiles; empty for culled splats.
 struct TileRectangle {
     unsigned short x0, y0, x1, y1;
 };
 
-// A footprint in the pixel-centre metric of Footprint <= 1, and its low-pass disc.
+// A footprint, where the pixel-centre metric of Footprint is <= 1, and its low-pass disc.
 template <class V> struct BoxTest {
-    V ex, ey, a, b, c;   // conic
+    V ex, ey, a, b, c;   // ellipse
     V cx, cy, disc2;     // low-pass disc
-    V slope_y, slope_x;  // best y for a given x, and the reverse: -b / c, -b / a
+    V slope_y, slope_x;  // best y for a given x, and vice versa: -b / c, -b / a
 };
 
-// Where the footprint reaches the box, unless it is unbounded. The least value of a convex quadratic over a box that
-// does not hold its minimum is on a side that faces the minimum: two candidates.
+// Returns where the footprint reaches the box, unless it is unbounded. The minimum of a convex quadratic over a box
+// that does not contain the unconstrained minimum is on a side facing it: two candidates.
 template <class V> GS2D_HD mask_t<V> reaches(const BoxTest<V>& s, V x0, V y0, V x1, V y1) {
     const V px = min(max(s.ex, x0), x1) - s.ex, py = min(max(s.ey, y0), y1) - s.ey;  // nearest in x, in y
     const V qy = min(max(fma(s.slope_y, px, s.ey), y0), y1) - s.ey;                  // best y on the side x = px
@@ -32,15 +32,15 @@ template <class V> GS2D_HD mask_t<V> reaches(const BoxTest<V>& s, V x0, V y0, V 
     return (f1 <= V(1)) | (f2 <= V(1)) | (fma(dx, dx, dy * dy) <= s.disc2);
 }
 
-// A footprint by rows: its ellipse holds x = ex + slope dy +- half sqrt(1 - inv_y2 dy^2) at the height ey + dy, and is
-// farthest to the right at dy = y_right, to the left at -y_right.
+// A footprint by rows: at height ey + dy its ellipse covers x = ex + slope dy +- half sqrt(1 - inv_y2 dy^2). Its
+// rightmost point is at dy = y_right, its leftmost point at -y_right.
 template <class V> struct Chords {
     V ex, ey, slope, half, inv_y2, y_right;
     V cx, cy, disc2;  // low-pass disc
 };
 
-// Interval of a footprint in the rows y0 to y1; empty if left > right. Both shapes contain (cx, cy), so it is one
-// interval unless a far end of the ellipse returns beside the disc.
+// Computes the interval of a footprint in rows y0 to y1; empty if left > right. Both shapes contain (cx, cy), so it is
+// one interval unless a far end of the ellipse extends beyond the disc.
 template <class V> GS2D_HD void reach_in_rows(const Chords<V>& s, V y0, V y1, V& left, V& right) {
     const V far = V(1e30), a = y0 - s.ey, b = y1 - s.ey;
     const V yr = min(max(s.y_right, a), b), yl = min(max(-s.y_right, a), b);
@@ -48,26 +48,26 @@ template <class V> GS2D_HD void reach_in_rows(const Chords<V>& s, V y0, V y1, V&
     const V dy = min(max(s.cy, y0), y1) - s.cy, d2 = fnma(dy, dy, s.disc2), d = sqrt(d2);
     const auto near = d2 >= V(0);
     right = fma(s.half, sqrt(r2), fma(s.slope, yr, s.ex)), left = fnma(s.half, sqrt(l2), fma(s.slope, yl, s.ex));
-    // NaN outside the ellipse: max and min then take the other operand
+    // NaN outside the ellipse: max and min then return the other operand
     right = max(right, select(near, s.cx + d, -far)), left = min(left, select(near, s.cx - d, far));
 }
 
-// The visible part of a disc that reaches the camera plane has no ellipse, but is convex and bounded beyond `near`. It
-// lies inside half planes a dx + b dy + c >= 0, dx and dy from the projected centre. The footprint also has the
-// low-pass disc (docs/math.md, "Footprint").
+// The visible part of a disc that reaches the camera plane has no ellipse, but it is convex and bounded beyond `near`.
+// It lies inside half planes a dx + b dy + c >= 0, with dx and dy relative to the projected centre. The footprint also
+// contains the low-pass disc (docs/math.md, "Footprint").
 template <class V> struct HalfPlane {
     V a, b, c;
 };
 constexpr int DIRECTIONS = 8, SIDES = DIRECTIONS + 1;
-// of the sum of the absolute terms: the kernels' X, Y and I are off by some 1e-6 of it
+// relative to the sum of absolute terms; the relative error of the kernels' X, Y and I is about 1e-6
 constexpr double OUTLINE_SLACK = 1e-5;
 template <class V> struct Outline {
     HalfPlane<V> sides[SIDES];
     V disc2;
-    mask_t<V> unknown;  // not finite: covers everything
+    mask_t<V> unknown;  // not finite: covers all pixels
 };
 
-// Of the planes X, Y, I of a record where (X^2 + Y^2) / I^2 <= k^2 and 0 < I <= 1 / near, in an image of that size.
+// Bounds the region with (X^2 + Y^2) / I^2 <= k^2 and 0 < I <= 1 / near, for planes X, Y, I of a record.
 template <class V>
 GS2D_HD Outline<V> outline_of(V au, V bu, V av, V bv, V ai, V bi, V iz, V cx, V cy, V k, V disc2, V near, V width,
                               V height) {
@@ -90,7 +90,7 @@ GS2D_HD Outline<V> outline_of(V au, V bu, V av, V bv, V ai, V bi, V iz, V cx, V 
     return o;
 }
 
-// Interval of an outline in the rows y0 to y1, relative to the projected centre; empty if left > right.
+// Computes the interval of an outline in rows y0 to y1, relative to the projected centre; empty if left > right.
 template <class V> GS2D_HD void reach_in_rows(const Outline<V>& s, V y0, V y1, V& left, V& right) {
     const V far = V(1e30f), zero = V(0);
     left = -far, right = far;
@@ -108,18 +108,18 @@ template <class V> GS2D_HD void reach_in_rows(const Outline<V>& s, V y0, V y1, V
     left = select(s.unknown, -far, left), right = select(s.unknown, far, right);
 }
 
-// The exact box of a footprint, px, not clipped.
+// The exact box of a footprint in px, not clipped.
 template <class S> struct PixelBox {
     S x_min, y_min, x_max, y_max;
 };
 
-// first tile that reaches px; px may be anything but NaN
+// first tile that reaches px, which must not be NaN
 template <class S> GS2D_HD int tile_floor(S px, int tiles) {
     const S t = px * S(1.0 / TILE_PX);
     return t <= S(0) ? 0 : t >= S(tiles) ? tiles : static_cast<int>(t);
 }
 
-// Tiles whose pixel centres the widened box of a footprint can reach.
+// Returns the tiles whose pixel centres the widened box of a footprint can reach.
 template <class S>
 GS2D_HD TileRectangle tile_rectangle(const PixelBox<S>& o, bool unbounded, int width, int height, int tiles_x,
                                      int tiles_y) {
@@ -133,7 +133,7 @@ GS2D_HD TileRectangle tile_rectangle(const PixelBox<S>& o, bool unbounded, int w
             (unsigned short)(ty1 < tiles_y ? ty1 + 1 : tiles_y)};
 }
 
-// Tiles x0 to x1 of a row whose pixel centres may be between left and right, px.
+// Returns the tiles x0 to x1 of a row whose pixel centres may be between left and right, in px.
 template <class S> GS2D_HD bool tiles_between(S left, S right, int width, int tiles_x, int& x0, int& x1) {
     const S margin = S(0.05), half = S(0.5), from = left - margin, to = right + margin;
     if (!(from <= S(width) - half && to >= half && from <= to)) return false;
@@ -142,14 +142,14 @@ template <class S> GS2D_HD bool tiles_between(S left, S right, int width, int ti
     return true;
 }
 
-// The rectangle that holds all of the rows so far and tiles x0 to x1 of row y; start with {0, 0, 0, 0}.
+// Extends the bounding rectangle by the tiles x0 to x1 of row y; start with {0, 0, 0, 0}.
 GS2D_HD TileRectangle with_row(const TileRectangle& r, int x0, int x1, int y) {
     if (r.x1 <= r.x0) return {(unsigned short)x0, (unsigned short)y, (unsigned short)x1, (unsigned short)(y + 1)};
     return {(unsigned short)(x0 < r.x0 ? x0 : r.x0), r.y0, (unsigned short)(x1 > r.x1 ? x1 : r.x1),
             (unsigned short)(y + 1)};
 }
 
-// Rule 19, "box": the tiles that a square (centre and half side, px) touches; none if it is not finite.
+// Rule 19, "box": returns the tiles that a square (centre and half side, px) touches; none if it is not finite.
 template <class S> GS2D_HD TileRectangle square_tiles(S x, S y, S half, int tiles_x, int tiles_y) {
     if (!(abs(x) + abs(y) + half < S(1e9))) return {0, 0, 0, 0};
     const S side = ceil(half), left = x - S(0.5) - side, top = y - S(0.5) - side;
@@ -158,7 +158,7 @@ template <class S> GS2D_HD TileRectangle square_tiles(S x, S y, S half, int tile
             (unsigned short)tile_floor(left + end, tiles_x), (unsigned short)tile_floor(top + end, tiles_y)};
 }
 
-// Half the longer side of some tiles, clipped to the image; 0 for none.
+// Returns half the longer side of a tile rectangle, clipped to the image; 0 if empty.
 template <class S> GS2D_HD S tiles_radius(const TileRectangle& t, int width, int height) {
     if (t.x1 <= t.x0 || t.y1 <= t.y0) return S(0);
     const int right = t.x1 * TILE_PX < width ? t.x1 * TILE_PX : width,
@@ -167,7 +167,7 @@ template <class S> GS2D_HD S tiles_radius(const TileRectangle& t, int width, int
     return S(w > h ? w : h) / S(2);
 }
 
-// Rule 14. crosses: the splat's disc reaches the camera plane.
+// Rule 14. `crosses`: the splat disc reaches the camera plane.
 template <class S> GS2D_HD S clipped_radius(const PixelBox<S>& o, bool crosses, int width, int height) {
     const S w = S(width), h = S(height), half = S(0.5), zero = S(0);
     if (crosses) return (w > h ? w : h) / S(2);

@@ -1,13 +1,13 @@
-// Depth by transmittance (rule 22; docs/math.md, "Depth by transmittance"): the profile, the search along the
-// ray of a pixel, and the contribution of a pair to its gradient.
+// Depth by transmittance (rule 22; docs/math.md, "Depth by transmittance"): the profile, the search along a pixel ray,
+// and the contribution of a pair to the gradient.
 #pragma once
 
 #include "core/base.h"
 
 namespace gs2d {
 
-// The fraction of a splat's opacity before depth z, and its slope over x = (z / z_i - 1) / width: the integral of
-// the Epanechnikov kernel, 0 up to x = -1, 1 from x = 1 on.
+// The fraction of a splat's opacity in front of depth z, and its slope over x = (z / z_i - 1) / width. The fraction is
+// the integral of the Epanechnikov kernel: 0 up to x = -1, and 1 from x = 1.
 template <class V> struct Fraction {
     V before, slope;
 };
@@ -16,7 +16,7 @@ template <class V> GS2D_HD Fraction<V> fraction_at(V z, V inverse_depth, V inv_w
     return {fma(V(0.25f) * x, V(3) - square, V(0.5f)), fnma(V(0.75f), square, V(0.75f))};
 }
 
-// T(z) and its decrease there, pair by pair, in any order. fall: -width dT/dz.
+// T(z) and its decrease, accumulated over pairs in any order. fall: -width dT/dz.
 template <class V> struct Transmittance {
     V T, fall;
 };
@@ -27,20 +27,20 @@ template <class V> GS2D_HD void pass_pair(V alpha, V inverse_depth, V z, V inv_w
     t.T = t.T * left;
 }
 
-// Newton's method within a bracket: a step that leaves it or does not halve the previous step becomes a bisection.
+// Newton's method within a bracket. A step that leaves it or does not halve the previous step becomes a bisection.
 template <class V> struct DepthSearch {
     V z, near, far;  // near < depth <= far
-    V step;          // the last one's length
-    V fall;          // of T where it began
-    mask_t<V> open;  // still moving
+    V step;          // length of the last step
+    V fall;          // decrease of T where the last step began
+    mask_t<V> open;  // not converged
 };
 
-constexpr int MAX_SEARCH_STEPS = 64;  // twice the steps of bisection in float
-// Of a width: the search ends with a step that is shorter, after which Newton's method is off by its square, and T
-// falls as it did before.
+constexpr int MAX_SEARCH_STEPS = 64;  // twice the number of bisection steps in float
+// Relative to the width. The search ends with a shorter step; the remaining error of Newton's method is then the square
+// of that step, and the decrease of T is practically unchanged.
 template <class real> constexpr real SEARCH_TOLERANCE = real(sizeof(real) == sizeof(double) ? 1e-8 : 1e-4);
 
-// At the depth of one of the pixel's pairs; least, most: 1 / z of its pairs.
+// Starts at the depth of a pair of the pixel; least, most: bounds of 1 / z of its pairs.
 template <class V>
 GS2D_HD DepthSearch<V> begin_search(V z, V least, V most, V inv_width, mask_t<V> hit) {
     const V width = reciprocal(inv_width);
@@ -49,14 +49,14 @@ GS2D_HD DepthSearch<V> begin_search(V z, V least, V most, V inv_width, mask_t<V>
     return {z, near, far, far - near, V(0), hit};
 }
 
-// One step, given T at z.
+// Takes one step, given T at z.
 template <class V>
 GS2D_HD void advance(const Transmittance<V>& t, V level, V inv_width, V tolerance, DepthSearch<V>& s) {
     const V excess = t.T - level;
     const auto before = excess > V(0);
     s.near = select(before, s.z, s.near), s.far = select(before, s.far, s.z);
     const V newton = quotient(excess, t.fall * inv_width), half = V(0.5f) * (s.far - s.near), next = s.z + newton;
-    // false for NaN and infinities: bisection
+    // false for NaN and infinities, which select bisection
     const auto good = (next >= s.near) & (next <= s.far) & (abs(newton) <= V(0.5f) * s.step);
     const V z = select(good, next, s.near + half), step = select(good, abs(newton), half);
     const auto moves = s.open;
@@ -64,13 +64,13 @@ GS2D_HD void advance(const Transmittance<V>& t, V level, V inv_width, V toleranc
     s.z = select(moves, z, s.z), s.fall = select(moves, t.fall, s.fall), s.step = step;
 }
 
-// -dT/dz for the gradient, bounded below: it is nearly 0 for a pixel between two surfaces.
+// Returns -dT/dz for the gradient, bounded below because it is nearly 0 for a pixel between two surfaces.
 template <class V> GS2D_HD V slope_of(V fall, V alpha, V z, V inv_width) {
     return max(fall, V(0.05f) * alpha * reciprocal(z)) * inv_width;
 }
 
-// Contribution of a pair to the gradients by ln(alpha) and 1 / z_i: factor = g T(z) / slope_of(...), g the upstream
-// gradient. The part of the level 1 - alpha / 2 goes through the alpha image.
+// Contribution of a pair to the gradients of ln(alpha) and 1 / z_i. factor = g T(z) / slope_of(...), with g the
+// upstream gradient. The dependence of the level 1 - alpha / 2 is handled by the alpha image.
 template <class V> struct DepthPairGradient {
     V alpha, inverse_depth;
 };

@@ -10,7 +10,7 @@ namespace {
 
 constexpr int64_t PIECE = 8192;  // elements per task: 160 KB read and written
 
-// kernels/native_adam.py has the same.
+// Layout mirrored in kernels/native_adam.py.
 struct AdamAttribute {
     real *parameter, *mean, *square;          // [N, columns]
     const real* gradient;                     // [N, columns], or [M, columns] with `compact`
@@ -19,7 +19,7 @@ struct AdamAttribute {
     double step_size, root_2;
 };
 
-// `n` consecutive elements.
+// Updates `n` consecutive elements.
 void step(real* parameter, real* mean, real* square, const real* gradient, int64_t n, const AdamConstants<V>& k) {
     for (int64_t i = 0; i < n; i += LANES) {
         const int left = n - i < LANES ? static_cast<int>(n - i) : LANES;
@@ -35,7 +35,7 @@ void step(real* parameter, real* mean, real* square, const real* gradient, int64
     }
 }
 
-// Elements [begin, end) of an attribute; with `rows`, whole rows.
+// Updates elements [begin, end) of an attribute; with `rows`, whole rows.
 void step_piece(const AdamAttribute& a, int64_t begin, int64_t end, const AdamConstants<V>& k) {
     if (!a.rows) return step(a.parameter + begin, a.mean + begin, a.square + begin, a.gradient + begin, end - begin, k);
     for (int64_t i = begin / a.columns; i < end / a.columns; ++i) {
@@ -75,8 +75,8 @@ bool all_finite(const real* x, int64_t n) {
 
 using namespace gs2d;
 
-// Updates the attributes in place. The bits do not depend on the number of threads. Returns 1, without changes, if an
-// index in `rows` is out of range.
+// Updates the attributes in place. The result is bit-identical for any number of threads. Returns 1, without changes,
+// if an index in `rows` is out of range.
 GS2D_EXPORT int gs2d_adam(const AdamAttribute* attributes, int n, double beta1, double beta2, double eps) {
     for (int i = 0; i < n; ++i)
         for (int64_t k = 0; attributes[i].rows && k < attributes[i].count; ++k)
@@ -92,7 +92,7 @@ GS2D_EXPORT int gs2d_adam(const AdamAttribute* attributes, int n, double beta1, 
     return 0;
 }
 
-// Returns the index of the first of n arrays with a NaN or an infinity, n if all are finite.
+// Returns the index of the first array that contains a NaN or an infinity, or n if all are finite.
 GS2D_EXPORT int gs2d_first_not_finite(const real* const* arrays, const int64_t* sizes, int n) {
     int first = n;
     for_pieces(

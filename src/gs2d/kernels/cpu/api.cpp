@@ -11,7 +11,7 @@ namespace {
 pthread_mutex_t free_lock = PTHREAD_MUTEX_INITIALIZER;
 Frame* free_frames = nullptr;
 int free_count = 0;
-constexpr int KEEP = 2;  // frames whose memory is kept for the next view
+constexpr int KEEP = 2;  // frames whose memory is kept for the next views
 
 template <class F> void for_each_buffer(Frame& f, F&& visit) {
     visit(f.records), visit(f.tile_begin), visit(f.entries), visit(f.tile_count), visit(f.taken), visit(f.saved),
@@ -69,7 +69,7 @@ void give_back(Frame* f) {
 
 using namespace gs2d;
 
-// Status of the functions below.
+// Status codes of the functions below.
 enum { OK = 0, NO_MEMORY = 1 };
 
 // Renders one view. `*frame` holds the state for the backward pass until gs2d_frame_release.
@@ -91,18 +91,18 @@ GS2D_EXPORT int gs2d_raster_forward(const View* view, const Parameters* splats, 
     return NO_MEMORY;
 }
 
-// Depth by transmittance [H, W] of the last rendered view; `images` are its outputs.
+// Computes the depth by transmittance [H, W] of the last rendered view; `images` are its outputs.
 GS2D_EXPORT int gs2d_transmittance_depth(Frame* frame, const Images* images, double width, real* depth) {
     return find_transmittance_depth(*frame, images->alpha, images->depth_median, width, depth) ? OK : NO_MEMORY;
 }
 
-// Further channels of the last rendered view.
+// Renders further channels of the last rendered view.
 GS2D_EXPORT int gs2d_raster_features(Frame* frame, const Features* features) {
     return blend_features(*frame, *features) ? OK : NO_MEMORY;
 }
 
-// Gradients of the parameters of the same call's splats; `images` are that call's outputs. `intrinsics` [N, 4], or
-// null: the gradients of fx, fy, cx and cy by splat. `features`, or null: those of the same view.
+// Computes the gradients of the splat parameters; `images` are the outputs of the same view. `intrinsics`: per-splat
+// gradients [N, 4] of fx, fy, cx and cy, or null. `features`: further channels of the same view, or null.
 GS2D_EXPORT int gs2d_raster_backward_features(Frame* frame, const Parameters* splats, const Images* images,
                                               const ImageGradients* upstream, const ParameterGradients* out,
                                               real* intrinsics, const Features* features) {
@@ -125,7 +125,7 @@ GS2D_EXPORT int gs2d_raster_backward(Frame* frame, const Parameters* splats, con
     return gs2d_raster_backward_features(frame, splats, images, upstream, out, nullptr, nullptr);
 }
 
-// The inner sum of E_i: `image` [H, W, 3], `mask` [H, W] bytes or null, `errors` [N].
+// Computes the inner sum of E_i: `image` [H, W, 3], `mask` [H, W] bytes or null, `errors` [N].
 GS2D_EXPORT int gs2d_splat_errors(const View* view, const Parameters* splats, const real* image, const uint8_t* mask,
                                   int occlusion, real* errors) {
     Frame* f = take_frame();
@@ -140,7 +140,7 @@ GS2D_EXPORT int gs2d_splat_errors(const View* view, const Parameters* splats, co
 
 GS2D_EXPORT void gs2d_frame_release(Frame* frame) { give_back(frame); }
 
-// Bytes of memory of a view between forward and backward pass.
+// Returns the bytes that a view occupies between forward and backward pass.
 GS2D_EXPORT int64_t gs2d_frame_bytes(Frame* frame) {
     size_t bytes = 0;
     for_each_buffer(*frame, [&](auto& buffer) { bytes += buffer.capacity * sizeof(*buffer.data); });

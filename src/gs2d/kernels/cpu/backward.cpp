@@ -1,5 +1,6 @@
-// Gradients of the blending: tile by tile, front to back, in batches of splats, with a splat's sums in registers.
-// Every (tile, splat) has its own slot of gradients (gradient_sums.h), so nothing depends on the order of the tiles.
+// Gradients of the blending: tile by tile, front to back, in batches of splats; the sums of a splat stay in registers.
+// Each (tile, splat) pair has its own gradient slot (gradient_sums.h), so the order of the tiles does not affect the
+// result.
 #include "cpu/features.h"
 #include "cpu/frame.h"
 #include "cpu/gradient_sums.h"
@@ -11,7 +12,7 @@
 namespace gs2d {
 namespace {
 
-// Upstream gradients for PixelGradient, and S = the sum over all splats of w s, from the image's totals.
+// Upstream gradients for PixelGradient, and S = the sum of w s over all splats, computed from the image totals.
 void start(const Frame& f, const Images& images, const ImageGradients& g, const TileArea& a, Planes s) {
     const View& v = f.view;
     const int W = v.width;
@@ -54,7 +55,7 @@ void start(const Frame& f, const Images& images, const ImageGradients& g, const 
         put(s[DEPTH], gd);
         if (g.distortion) {
             const V gx = at(dist[0]);
-            sum = fma(V(2) * gx, at(dist[1]), sum);  // each pair counts for both of its splats
+            sum = fma(V(2) * gx, at(dist[1]), sum);  // a pair contributes to both of its splats
             PixelGradient<V> p;
             p.alpha = ga;
             add_distortion(gx * V(real(lever * lever)), alpha, at(dist[2]), at(dist[3]), p);
@@ -69,7 +70,7 @@ void start(const Frame& f, const Images& images, const ImageGradients& g, const 
     }
 }
 
-// The contribution of the depth by transmittance, added after `start`.
+// Adds the contribution of the depth by transmittance; called after `start`.
 __attribute__((noinline)) void start_transmittance(const Frame& f, const real* upstream, const real* alpha,
                                                    const TileArea& a, Planes s) {
     const int W = f.view.width;
@@ -106,7 +107,7 @@ RowLines images_read(const Frame& f, const Images& images, const ImageGradients&
     return lines;
 }
 
-// Gradients of colours only, without geometry and opacity.
+// Computes gradients of the colours only, not of geometry and opacity.
 void tile_color_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows, Planes s, const TileArea& area,
                     const BlendLimits<V>& limits, RowsAhead next, TileFeatures) {
     const Centres centres(area);

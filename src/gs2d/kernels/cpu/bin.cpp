@@ -1,4 +1,4 @@
-// Depth order, then lists of splats per tile: a counting sort in depth order needs no key per entry.
+// Sorts splats by depth, then builds the splat lists of the tiles by a counting sort, which needs no key per entry.
 #include "cpu/frame.h"
 #include "cpu/stages.h"
 #include "cpu/threads.h"
@@ -6,12 +6,12 @@
 namespace gs2d {
 namespace {
 
-constexpr int64_t CHUNKS = 16;  // pieces of the depth order; fixed, so that lists do not depend on the number of threads
+constexpr int64_t CHUNKS = 16;  // pieces of the depth order; fixed, so that the lists do not depend on the thread count
 
 constexpr int DIGIT = 11, DIGITS = 1 << DIGIT, PASSES = (8 * sizeof(DepthKey) + DIGIT - 1) / DIGIT;
 
-// Stable radix sort, least significant digit first: equal depths stay in index order. Returns the buffer with the
-// result.
+// Stable radix sort, least significant digit first, so equal depths stay in index order. Returns the buffer that
+// contains the result.
 DepthItem* radix_sort(DepthItem* items, DepthItem* other, int64_t n, uint32_t (*counts)[DIGITS]) {
     memset(counts, 0, sizeof(*counts) * PASSES);
     for (int64_t i = 0; i < n; ++i)
@@ -19,7 +19,7 @@ DepthItem* radix_sort(DepthItem* items, DepthItem* other, int64_t n, uint32_t (*
     for (int p = 0; p < PASSES; ++p) {
         uint32_t* c = counts[p];
         const int shift = DIGIT * p;
-        if (c[(items[0].key >> shift) & (DIGITS - 1)] == n) continue;  // the same digit everywhere
+        if (c[(items[0].key >> shift) & (DIGITS - 1)] == n) continue;  // all items have the same digit
         uint32_t at = 0;
         for (int d = 0; d < DIGITS; ++d) {
             const uint32_t here = c[d];
@@ -46,7 +46,7 @@ void sort_by_depth(Frame& f) {
     f.visible = n;
     if (n == 0) return;
     f.order = radix_sort(items, items + f.count, n, counts);
-    DepthItem* const spare = f.order == items ? items + f.count : items;  // no longer needed and large enough
+    DepthItem* const spare = f.order == items ? items + f.count : items;  // `items` is free by then and large enough
     static_assert(sizeof(DepthItem) >= sizeof(TileRect));
     f.ordered_rects = reinterpret_cast<TileRect*>(spare);
     parallel_ranges(n, 16384, [&](int64_t begin, int64_t end) {
@@ -75,7 +75,7 @@ bool bin_splats(Frame& f) {
     int64_t at = 0;
     for (int64_t t = 0; t < tiles; ++t) {
         f.tile_begin[t] = at;
-        uint32_t in_tile = 0;  // from here on the histogram holds positions within the tile
+        uint32_t in_tile = 0;  // from here on, the histogram holds positions within the tile
         for (int64_t c = 0; c < CHUNKS; ++c) {
             const uint32_t here = f.histogram[c * tiles + t];
             f.histogram[c * tiles + t] = in_tile;

@@ -1,8 +1,8 @@
-// Views with frozen geometry and opacity: the image is affine in the colours of the splats that are trained,
+// Views with frozen geometry and opacity. The image is affine in the colours of the trained splats,
 //     color(pixel) = frozen(pixel) + sum over rows k of w_k(pixel) max(0, c_k),
-// so a view stores `frozen` and the weights and needs no blending (docs/math.md, "Cached views"). Weights and gradients
-// have the bits of the blending: same sums in the same order. Weights are stored by tile, splat (front to back) and
-// block, LANES reals each, and read in that order.
+// so a view stores `frozen` and the weights and needs no blending (docs/math.md, "Cached views"). Images and gradients
+// are bit-identical to those of the blending, because the sums have the same order. Weights are stored by tile, splat
+// (front to back) and block, LANES reals each, and read in that order.
 #include "cpu/export.h"
 #include "cpu/frame.h"
 #include "cpu/planes.h"
@@ -14,9 +14,9 @@ namespace gs2d {
 // Mirrored by a ctypes structure in render/cpu_cached.py; change both. `row`: index among the trained splats.
 struct CachedView {
     int64_t width, height, tiles_x, tiles, rows, degree;
-    int64_t *tile_entries, *tile_blocks;  // [tiles + 1]: first entry and first block of weights of each tile
+    int64_t *tile_entries, *tile_blocks;  // [tiles + 1]: first entry and first weight block of each tile
     int32_t* entry_row;                   // [entries]
-    int32_t* entry_blocks;                // [entries]: bit b: there are weights for block b
+    int32_t* entry_blocks;                // [entries]: bit b is set if block b has weights
     int64_t* row_begin;                   // [rows + 1]
     int32_t* row_entries;                 // [entries]: entries of each row, in tile order
     real* weights;                        // [blocks, LANES]
@@ -36,7 +36,7 @@ TileArea area_of(const CachedView& c, int64_t tile) {
     return a;
 }
 
-// Processes a tile like the backward pass: frozen splats add their colour, the others store their weights.
+// Processes a tile like the backward pass: frozen splats add their colour, trained splats store their weights.
 void fill_tile(const Frame& f, int64_t tile, const int32_t* row_of, const CachedView& c, const BlendLimits<V>& limits) {
     alignas(64) real T[PIXELS];
     const TileArea area = tile_area(f, tile);
@@ -123,7 +123,7 @@ void render_tile(const CachedView& c, int64_t tile, const real* colors, real* im
     write_planes<3>(planes, image, static_cast<int>(c.width), area_of(c, tile));
 }
 
-// One slot of colour gradients per entry.
+// Writes one slot of colour gradients per entry.
 void gather_tile(const CachedView& c, int64_t tile, const real* gradient, real* slots) {
     const int64_t first = c.tile_entries[tile], last = c.tile_entries[tile + 1];
     if (first == last) return;
@@ -147,7 +147,7 @@ void gather_tile(const CachedView& c, int64_t tile, const real* gradient, real* 
 
 using namespace gs2d;
 
-// After a forward pass: measures the size of a cached view. `row_of` [N]: the row of a trained splat, or -1.
+// Measures the size of a cached view after a forward pass. `row_of` [N]: the row of a trained splat, or -1.
 GS2D_EXPORT void gs2d_cached_measure(const Frame* frame, const int32_t* row_of, int64_t* tile_entries,
                                      int64_t* tile_blocks) {
     const Frame& f = *frame;
@@ -183,7 +183,7 @@ GS2D_EXPORT void gs2d_cached_fill(const Frame* frame, const int32_t* row_of, con
     });
 }
 
-// The image [H, W, 3], and the rows' colours [rows, 4] for the backward pass.
+// Renders the image [H, W, 3], and stores the row colours [rows, 4] for the backward pass.
 GS2D_EXPORT void gs2d_cached_render(const CachedView* view, const Parameters* splats, real* colors, real* image) {
     const CachedView& c = *view;
     for_each_group(c, [&](int64_t i, int lanes) {
@@ -199,7 +199,7 @@ GS2D_EXPORT void gs2d_cached_render(const CachedView* view, const Parameters* sp
     });
 }
 
-// Gradients of the rows' coefficients from the gradient of the image [H, W, 3]; `slots` [entries, 4] is scratch.
+// Computes the gradients of the row coefficients from the image gradient [H, W, 3]; `slots` [entries, 4] is scratch.
 GS2D_EXPORT void gs2d_cached_gradients(const CachedView* view, const real* gradient, const real* colors,
                                        int64_t sh_rest, real* slots, const ParameterGradients* out) {
     const CachedView& c = *view;

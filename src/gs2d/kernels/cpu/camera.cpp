@@ -1,5 +1,5 @@
-// The derivative by a rigid motion of the camera, from the gradients of the splats (docs/math.md, "Camera"). Pieces
-// have a fixed size and are summed in order, so the bits do not depend on the number of threads.
+// Computes the derivative with respect to a rigid camera motion from the splat gradients (docs/math.md, "Camera").
+// Pieces have a fixed size and are summed in order, so the result is bit-identical for any number of threads.
 #include "core/sh.h"
 
 #include <cstdlib>
@@ -14,7 +14,7 @@ namespace {
 constexpr int64_t PIECE = 1024;  // rows
 constexpr int SUMS = 6;          // force, torque
 
-// render/native_image_ops.py has the same.
+// Layout mirrored in render/native_image_ops.py.
 struct Moved {
     int64_t count;
     const real *points, *to_points;  // [N, 3] and their gradients
@@ -32,7 +32,7 @@ Vec3<V> load_vector(const real* p, int64_t i, int lanes) {
 Vec3<V> keep(M m, Vec3<V> a) { return {keep(m, a.x), keep(m, a.y), keep(m, a.z)}; }
 M is_finite(Vec3<V> a) { return is_finite(a.x) & is_finite(a.y) & is_finite(a.z); }
 
-// Derivative by a small rotation of q to dq * q.
+// Adds the derivative with respect to a small rotation of q to dq * q.
 Vec3<V> turn_of_quats(const Moved& s, int64_t i, int lanes) {
     V q[4], g[4];
     load_rows<4>(s.quats + 4 * i, 4, lanes, q);
@@ -42,7 +42,7 @@ Vec3<V> turn_of_quats(const Moved& s, int64_t i, int lanes) {
     return keep(here, V(real(0.5)) * (cross(v, gv) + q[0] * gv - g[0] * v));
 }
 
-// Derivative by a rotation of the view directions of colours.
+// Adds the derivative with respect to a rotation of the view directions of the colours.
 Vec3<V> turn_of_colors(const Moved& s, int64_t i, int lanes, Vec3<V> to_splat) {
     V rest[3 * (SH_MAX - 1)], along[SH_MAX];
     const int64_t stride = 3 * s.sh_rest;
@@ -65,8 +65,8 @@ Vec3<V> turn_of_colors(const Moved& s, int64_t i, int lanes, Vec3<V> to_splat) {
 
 using namespace gs2d;
 
-// sums: derivatives by a translation [3] and by a rotation about the centre [3] of the scene. Rows that are not finite
-// contribute 0. Returns 1 if memory is short.
+// sums: derivatives with respect to a translation [3] and a rotation [3] of the scene about the centre. Non-finite rows
+// contribute 0. Returns 1 if out of memory.
 GS2D_EXPORT int gs2d_camera_wrench(const Moved* moved, double* sums) {
     const Moved& s = *moved;
     const int64_t pieces = (s.count + PIECE - 1) / PIECE;

@@ -6,9 +6,9 @@
 namespace gs2d {
 namespace {
 
-enum Plane { RED, GREEN, BLUE, COUNTS, PLANES };  // COUNTS: 1 where a pixel counts, else 0
+enum Plane { RED, GREEN, BLUE, COUNTS, PLANES };  // COUNTS is 1 for pixels that count, else 0
 
-// The image in block order, tile after tile.
+// Copies the image in block order, tile after tile.
 bool load_target(Frame& f, const real* image, const uint8_t* mask) {
     if (!f.target.reserve(size_t(f.tiles) * PLANES * PIXELS)) return false;
     parallel_for(f.tiles, [&](int64_t tile) {
@@ -30,12 +30,12 @@ inline V difference(const Record<V>& s, const real* target, int b) {
     return (abs(s.red - at(RED)) + abs(s.green - at(GREEN)) + abs(s.blue - at(BLUE)));
 }
 
-// Pixels of block b that count for the splat.
+// Returns the pixels of block b that count for the splat.
 inline M counts(const Hit<V>& h, const BlendLimits<V>& limits, V cutoff2, const real* target, int b) {
     return (h.rho <= cutoff2) & (h.depth >= limits.near) & (load(target + COUNTS * PIXELS + b * LANES) > V(0));
 }
 
-// Entries of every splat, in tile order.
+// Lists the entries of each splat in tile order.
 bool list_entries(Frame& f) {
     const int64_t entries = f.tile_begin[f.tiles];
     if (!f.splat_slots.reserve(entries) || !f.splat_begin.reserve(f.count + 2)) return false;
@@ -44,7 +44,7 @@ bool list_entries(Frame& f) {
     for (int64_t e = 0; e < entries; ++e) ++begin[f.entries[e].splat() + 2];
     for (int64_t i = 0; i < f.count; ++i) begin[i + 2] += begin[i + 1];
     for (int64_t e = 0; e < entries; ++e) f.splat_slots[begin[f.entries[e].splat() + 1]++] = static_cast<uint32_t>(e);
-    // Filling moved every begin to its end, which is the begin of the next one, so begin[i] is correct again.
+    // Filling moved each begin to its end, which is the next begin, so begin[i] is correct again.
     return true;
 }
 

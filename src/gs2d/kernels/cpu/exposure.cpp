@@ -1,5 +1,5 @@
-// Exposure of rendered images, and its gradients. Pieces have a fixed size and are summed in order, so the bits do not
-// depend on the number of threads.
+// Exposure of rendered images, and its gradients. Pieces have a fixed size and are summed in order, so the result is
+// bit-identical for any number of threads.
 #include "core/exposure.h"
 
 #include <cstdlib>
@@ -14,7 +14,7 @@ namespace {
 constexpr int64_t PIECE = 2048;  // pixels
 constexpr int SUMS = 12;
 
-// render/native_image_ops.py has the same.
+// Layout mirrored in render/native_image_ops.py.
 struct Picture {
     const real* color;     // [pixels, 3]
     const real* coverage;  // [pixels], or null: 1
@@ -54,7 +54,7 @@ GS2D_EXPORT void gs2d_expose(const Picture* picture, const void*, real* out, voi
     });
 }
 
-// sums: the gradient of the transform [3, 4]. Returns 1 if memory is short.
+// sums: the gradient of the transform [3, 4]. Returns 1 if out of memory.
 GS2D_EXPORT int gs2d_expose_vjp(const Picture* picture, const void*, const real* upstream, real* to_color,
                                 double* sums) {
     const int64_t pieces = (picture->pixels + PIECE - 1) / PIECE;

@@ -56,7 +56,7 @@ void blend_tile(const Frame& f, int64_t tile, const Features& features, real* pl
         if (pairs.splats == FeaturePairs::SPLATS) blend_pairs(features, pairs, planes);
     }
     blend_pairs(features, pairs, planes);
-    read_planes<1>(&f.saved[0], f.view.width, area, T);  // the final one, also of stopped pixels
+    read_planes<1>(&f.saved[0], f.view.width, area, T);  // final transmittance, also for stopped pixels
     for (int64_t c = 0; c < count; ++c) {
         real* const plane = planes + c * FEATURE_STRIDE;
         const V background = V(features.background[c]);
@@ -97,7 +97,7 @@ void start_features(const Frame& f, const Features& features, const real* alpha_
     memset(planes, 0, sizeof(real) * feature_rows(count) * FEATURE_STRIDE);
     for_each_pixel(area, W, count, features.upstream, [&](int i, const real* g) {
         for (int64_t c = 0; c < count; ++c) planes[c * FEATURE_STRIDE + i] = g[c];
-        V parts[4] = {V(0), V(0), V(0), V(0)};  // along the image; along the background
+        V parts[4] = {V(0), V(0), V(0), V(0)};  // products with the image; products with the background
         for (int64_t c = 0; c < count; c += LANES) {
             const int n = count - c < LANES ? int(count - c) : LANES;
             const V some = load_first(g + c, n);
@@ -106,7 +106,7 @@ void start_features(const Frame& f, const Features& features, const real* alpha_
         }
         real along[4];
         transpose_reduce<4>(parts, along);
-        S[i] += along[0] - (final_T[i] + alpha[i]) * along[1];  // what is blended is the image without the background
+        S[i] += along[0] - (final_T[i] + alpha[i]) * along[1];  // the blended image excludes the background
         g_alpha[i] -= along[1];
     });
 }
@@ -123,7 +123,7 @@ void begin_features(TileFeatures& t, const Entry* entries, int count) {
             load_channels<N>(*t.all, pairs.splat[j], c, values);
             for (int i = first; i < end; ++i) {
                 const real* const at = t.upstream + c * FEATURE_STRIDE + pairs.block[i] * LANES;
-                V sums[4] = {load(pairs.of_pair[i]), V(0), V(0), V(0)};  // independent sums, so that none waits for another
+                V sums[4] = {load(pairs.of_pair[i]), V(0), V(0), V(0)};  // independent sums: shorter dependency chains
                 for (int k = 0; k < N; ++k) sums[k % 4] = fma(load(at + k * FEATURE_STRIDE), values[k], sums[k % 4]);
                 store(pairs.of_pair[i], (sums[0] + sums[1]) + (sums[2] + sums[3]));
             }

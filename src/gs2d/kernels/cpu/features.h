@@ -1,15 +1,15 @@
-// Channels besides the three of a splat's colour, as planes of a tile: pixels in block order per channel.
+// Channels other than the splat colour, stored as planes of a tile: pixels in block order per channel.
 #pragma once
 
 #include "cpu/tile.h"
 
 namespace gs2d {
 
-// Pairs (splat, block) of consecutive splats of a tile. With many splats per batch, the planes of some channels stay in
-// the first-level cache for all pairs.
+// (splat, block) pairs of consecutive splats of a tile. Large batches keep the planes of a few channels in the L1 cache
+// for all pairs.
 struct FeaturePairs {
     static constexpr int SPLATS = 32;
-    alignas(64) real of_pair[SPLATS * BLOCKS][LANES];  // the weight; in the backward pass, before it, the part of dL/dw
+    alignas(64) real of_pair[SPLATS * BLOCKS][LANES];  // weight; in the backward pass first the part of dL/dw
     uint8_t block[SPLATS * BLOCKS];
     uint32_t splat[SPLATS];
     int end[SPLATS];  // end of each splat's pairs
@@ -30,7 +30,7 @@ template <int N> struct ChannelCount {
     static constexpr int value = N;
 };
 
-// Calls f(number of channels, first channel) for groups of channels that fit the registers.
+// Calls f(number of channels, first channel) for groups of channels that fit in registers.
 template <class F> inline void for_each_channels(int64_t rows, F&& f) {
     constexpr int MANY = REGISTERS / 2;
     int64_t c = 0;
@@ -38,7 +38,7 @@ template <class F> inline void for_each_channels(int64_t rows, F&& f) {
     for (; c < rows; c += 4) f(ChannelCount<4>(), c);
 }
 
-// Some channels of a splat in all lanes; 0 beyond the last one.
+// Broadcasts some channels of a splat to all lanes; channels beyond the last one are 0.
 template <int N> inline void load_channels(const Features& features, uint32_t splat, int64_t c, V (&values)[N]) {
     const real* const from = features.values + splat * features.count + c;
     if (c + N <= features.count) {
@@ -48,7 +48,7 @@ template <int N> inline void load_channels(const Features& features, uint32_t sp
     }
 }
 
-// Calls f(pixel of a tile in block order, where its further channels are in an image [H, W, 3 + F]) for those inside.
+// Calls f(pixel index in block order, pointer to its channels in an image [H, W, 3 + F]) for each pixel in the image.
 template <class Image, class F>
 inline void for_each_pixel(const TileArea& area, int image_width, int64_t count, Image* image, F&& f) {
     for (int y = 0; y < area.height; ++y)
@@ -56,36 +56,36 @@ inline void for_each_pixel(const TileArea& area, int image_width, int64_t count,
             f(block_order(x, y), image + (int64_t(area.y0 + y) * image_width + area.x0 + x) * (3 + count) + 3);
 }
 
-// From a channel to the next. Not a power of two: rows of those would share few sets of the first cache.
+// Stride between channels. A power of two would map the rows to only a few L1 cache sets.
 constexpr int FEATURE_STRIDE = PIXELS + LANES;
 
-// Rows for a number of channels, which are processed in groups of four.
+// Number of rows for `count` channels, which are processed in groups of four.
 inline int64_t feature_rows(int64_t count) { return (count + 3) / 4 * 4; }
 
-// Allocates the planes of each thread; false if memory is short.
+// Allocates the planes of each thread; returns false if out of memory.
 bool reserve_feature_planes(Frame& f, int64_t count);
 inline real* feature_planes(const Frame& f, int64_t count, int64_t piece) {
     return &f.feature_planes[size_t(piece * feature_rows(count)) * FEATURE_STRIDE];
 }
 
-// Reads the upstream gradients of a tile into `planes`, and adds what follows from the totals of the channels to the
-// gradient of alpha and to S, both in block order (backward.cpp).
+// Reads the upstream gradients of a tile into `planes`. Adds the contribution of the channel totals to the gradient of
+// alpha and to S, both in block order (backward.cpp).
 void start_features(const Frame& f, const Features& features, const real* alpha_image, const TileArea& area, real* planes,
                     real* g_alpha, real* S);
 
-// Further channels of a tile, or nothing.
+// Further channels of a tile; empty if `all` is null.
 struct TileFeatures {
     const Features* all = nullptr;
     const real* upstream = nullptr;  // [rows, FEATURE_STRIDE]
-    real* slots = nullptr;           // [slots, rows], from the next splat's on
+    real* slots = nullptr;           // [slots, rows], beginning with the next splat
     FeaturePairs* pairs = nullptr;
-    int done = 0;  // of `pairs`: those that have their weight
+    int done = 0;  // number of `pairs` whose weight is stored
 };
 
-// Takes the splats of so many entries: their part of dL/dw.
+// Takes the splats of `count` entries and computes their part of dL/dw.
 void begin_features(TileFeatures& t, const Entry* entries, int count);
 
-// Writes the slots of those splats, from the weights.
+// Writes the slots of the pending splats from the weights.
 void finish_features(TileFeatures& t);
 
 }  // namespace gs2d

@@ -1,4 +1,4 @@
-// The variants of the backward pass for further channels.
+// Backward pass variants for further channels.
 #include "cpu/tile_vjp.h"
 
 namespace gs2d {

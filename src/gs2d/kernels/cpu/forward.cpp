@@ -1,4 +1,4 @@
-// Blending, front to back, one tile per task: block by block, with the pixels' state in registers.
+// Blending, front to back, one tile per task: block by block, with the pixel state in registers.
 #include "cpu/frame.h"
 #include "cpu/planes.h"
 #include "cpu/threads.h"
@@ -6,9 +6,9 @@
 namespace gs2d {
 namespace {
 
-constexpr int CHUNK = 256;  // entries per batch, whose state fits the first-level cache
+constexpr int CHUNK = 256;  // entries per batch; their state fits in the L1 cache
 
-// The members of Pixel<V>, in memory between chunks.
+// Members of Pixel<V>, stored in memory between chunks.
 enum Plane { RED, GREEN, BLUE, NX, NY, NZ, ALPHA, DEPTH, MEDIAN, DISTORTION, T, M1_TWICE, M2, DEPTH0, PLANES };
 
 struct TileState {
@@ -21,8 +21,8 @@ struct TileState {
 struct Candidate {
     PlanesByBlock planes;
     real record[RECORD];
-    LaneBits seen[BLOCKS];  // live pixels of the block that use it
-    uint8_t filtered;       // not plain
+    LaneBits seen[BLOCKS];  // live pixels of the block that use the splat
+    uint8_t filtered;       // nonzero if the splat is not plain
 };
 
 struct TileWork {
@@ -32,7 +32,7 @@ struct TileWork {
     uint32_t touched[CHUNK + LANES], list[CHUNK + LANES];  // read and written a vector at a time
     TileState state;
 
-    // The lists of blocks hold bytes from the first one, so that nothing is left to work out.
+    // Block lists contain byte offsets from the first candidate, so no multiplication is needed.
     Candidate& at(uint32_t offset) {
         return *reinterpret_cast<Candidate*>(reinterpret_cast<char*>(candidates) + offset);
     }
@@ -55,10 +55,10 @@ inline void store_pixel(TileState& s, int b, const Pixel<V>& p) {
     s.finished[b] = !any(p.live);
 }
 
-// BATCH splats are intersected and then composited: intersections do not depend on the pixel's state, so many of them
+// BATCH splats are intersected and then composited. Intersections do not depend on the pixel state, so many of them
 // overlap, and the state stays in registers during compositing.
 constexpr int BATCH = 8;
-// gcc would unroll all 8 rounds, and with 16 registers spill the state in each
+// gcc would unroll all 8 rounds and, with 16 registers, spill the state in each round
 constexpr int UNROLL = REGISTERS >= 32 ? 2 : 1;
 
 // Results of the intersections, one row per splat.
@@ -81,7 +81,7 @@ inline void composite_batch(TileWork& w, const uint32_t* list, int count, int b,
     if constexpr (REGISTERS >= 32) {
 #pragma GCC unroll UNROLL
         for (int i = 0; i < count; ++i) add(i, weigh(i));
-    } else {  // the state of a pixel does not fit: first one half of it, then the other
+    } else {  // the pixel state does not fit in registers: process it in two halves
 #pragma GCC unroll UNROLL
         for (int i = 0; i < count; ++i) store(batch.log2_alpha[i], weigh(i));
 #pragma GCC unroll UNROLL
@@ -89,7 +89,7 @@ inline void composite_batch(TileWork& w, const uint32_t* list, int count, int b,
     }
 }
 
-// All splats are processed as plain, which most are; then those that are not plain again.
+// Process all splats as plain, since most are, then repeat those that are not.
 inline void intersect_batch(const TileWork& w, const uint32_t* list, int count, int b, const Centres& centres,
                             Batch& batch, const BlendLimits<V>& limits) {
     uint32_t others = 0;
@@ -128,7 +128,7 @@ void blend_block(TileWork& w, int b, int n, const Centres& centres, const BlendL
     store_pixel(w.state, b, p);
 }
 
-// Entries of the chunk that reach a live block, with their records in consecutive memory.
+// Collects the chunk entries that reach a live block, with their records in consecutive memory.
 int gather(const Frame& f, TileWork& w, const Entry* entries, int n, const TileArea& area, const Centres& centres) {
     uint32_t wanted = 0;
     for (int b = 0; b < BLOCKS; ++b) wanted |= uint32_t(!w.state.finished[b]) << b;

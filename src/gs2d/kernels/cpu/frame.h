@@ -1,4 +1,4 @@
-// The state of one view between forward and backward pass.
+// State of one view between forward and backward pass.
 #pragma once
 
 #include <atomic>
@@ -21,8 +21,8 @@ constexpr size_t LINE = 64, HUGE_PAGE = size_t(2) << 20;
 template <class T> struct Buffer {
     T* data = nullptr;
     size_t capacity = 0;
-    // Contents are lost. False if memory is short. A buffer that must grow gets 1/16 more than requested, since views
-    // differ slightly.
+    // Discards the contents. Returns false if out of memory. A buffer that must grow gets 1/16 more than requested,
+    // since views differ slightly.
     bool reserve(size_t n) {
         if (n <= capacity) return true;
         const size_t wanted = (capacity ? n + n / 16 : n) * sizeof(T), bytes = (wanted + LINE - 1) / LINE * LINE;
@@ -32,7 +32,7 @@ template <class T> struct Buffer {
         data = posix_memalign(&memory, alignment, bytes) == 0 ? static_cast<T*>(memory) : nullptr;
         capacity = data ? bytes / sizeof(T) : 0;
 #if defined(MADV_HUGEPAGE)
-        // access is scattered; only a hint
+        // a hint only: access is scattered
         if (data && alignment == HUGE_PAGE) madvise(data, bytes, MADV_HUGEPAGE);
 #endif
         return data != nullptr;
@@ -51,7 +51,7 @@ struct View {
     double fx, fy, cx, cy;
     double near, far, alpha_min, alpha_max, transmittance_min, error_cutoff, lowpass_px;
     double background[3];
-    // exact_masks = 0: no culling inside tiles, none of what has no ellipse (tests)
+    // exact_masks = 0 disables culling inside tiles, including splats without an ellipse (tests)
     int32_t width, height, sh_degree, exact_masks;
     int32_t near_plane_policy;  // rule 19: NEAR_PLANE_*
 };
@@ -67,36 +67,36 @@ struct Images {
     real* radii;  // [N]
 };
 
-struct ImageGradients {  // null where there is no gradient
+struct ImageGradients {  // null: no gradient
     const real *color, *alpha, *normal, *depth_mean, *depth_median, *distortion;
     const real* depth_transmittance;  // after find_transmittance_depth
 };
 
 struct ParameterGradients {  // null: not computed
     real *means, *quats, *log_scales, *opacity_logits, *sh0, *shN, *probe;
-    int64_t probe_columns;  // 2 or 4
-    const uint8_t* rows;    // [N] 0: this splat's gradients are 0; null: all are computed
+    int64_t probe_columns;  // columns of the screen probe: 2 or 4
+    const uint8_t* rows;    // [N] 0: gradients of this splat are 0; null: all are computed
 };
 
-// Plain channels besides the three of sh0, blended with the same weights (features.cpp).
+// Plain channels in addition to the three of sh0, blended with the same weights (features.cpp).
 struct Features {
     int64_t count;           // F
     const real* values;      // [N, F]
     const real* background;  // [F]
-    real* color;             // [H, W, 3 + F], whose first three are not touched
-    const real* upstream;    // of `color`; the backward pass only, as what follows
+    real* color;             // [H, W, 3 + F]; the first three channels are not written
+    const real* upstream;    // gradient of `color`; like the next member, backward pass only
     real* gradients;         // [N, F]
 };
 
-// Whether gradients besides colours are computed.
+// True if gradients of anything but colours are computed.
 inline bool wants_geometry(const ParameterGradients& g) {
     return g.means || g.quats || g.log_scales || g.opacity_logits || g.probe;
 }
 
-// Box tests per (tile, splat), in pixels: see Footprint.
+// Box tests per (tile, splat) in pixels; see Footprint.
 struct CullRecord {
     real ex, ey, slope, half;
-    // disc2 < 0: no ellipse but an outline, and ex is its k; plain_from: see is_plain
+    // disc2 < 0: the splat has an outline instead of an ellipse, and ex is its k; plain_from: see is_plain
     real inv_y2, y_right, disc2, plain_from;
 };
 
@@ -106,9 +106,9 @@ constexpr uint32_t ALL_BLOCKS = BLOCKS == 32 ? 0xffffffffu : (1u << (BLOCKS % 32
 
 // One splat in one tile.
 struct Entry {
-    // the splat; the highest bit, after the forward pass: it is plain there (is_plain in core/blend.h)
+    // splat index; after the forward pass the highest bit is set if the splat is plain here (is_plain in core/blend.h)
     uint32_t word;
-    uint32_t blocks;  // bit b: some live pixel of block b saw the splat (before the forward pass: undefined)
+    uint32_t blocks;  // bit b: a live pixel of block b uses the splat (undefined before the forward pass)
     uint32_t splat() const { return word & 0x7fffffffu; }
     bool plain() const { return word >> 31; }
 };
@@ -123,31 +123,31 @@ struct DepthItem {
     uint32_t splat;
 };
 
-// Consecutive tiles whose gradients are in memory at the same time.
+// Consecutive tiles whose gradients are in memory simultaneously.
 struct GradientChunk {
     int64_t first_tile;
     int64_t first_slot;
-    std::atomic<int64_t> groups_left, sums_left;  // groups of tiles to blend; parts of its slots to add to the sums
-    std::atomic<int64_t> next_part;               // of the latter, that nobody adds yet
+    std::atomic<int64_t> groups_left, sums_left;  // groups of tiles left to blend; parts left to add to the sums
+    std::atomic<int64_t> next_part;               // next part to add to the sums
 };
 
-// Sums of the gradients of each splat's record over the tiles.
+// Gradients of each splat record, summed over the tiles.
 struct Sums {
     real* data;  // [N, GRADIENT]
-    // [N, columns]: those of GRADIENT_EXTRA that the densification signal wants, where its gradient will be
+    // [N, columns]: values of GRADIENT_EXTRA for the densification signal, stored in the memory of its gradient
     real* extras;
     int columns;              // 0, 2 or 4
-    int64_t coefficient_row;  // 0, or `data` is the beginning of shN's gradient, whose rows have this many reals
+    int64_t coefficient_row;  // row length of the gradient of shN if `data` shares its memory, else 0
     real* row(int64_t splat) const { return data + splat * GRADIENT; }
     real* extra(int64_t splat) const { return extras + splat * columns; }
 };
 
-// Bytes of the arrays of a forward pass over n splats.
+// Returns the bytes of the arrays of a forward pass over n splats.
 inline size_t forward_scratch(int64_t n) {
     return static_cast<size_t>(n) * (sizeof(CullRecord) + sizeof(TileRect) + 2 * sizeof(DepthItem));
 }
 
-constexpr int64_t GROUP = 4;  // tiles that one thread blends in a row
+constexpr int64_t GROUP = 4;  // consecutive tiles that one thread blends
 
 struct Frame {
     View view;
@@ -156,24 +156,24 @@ struct Frame {
     int32_t tiles_x = 0, tiles_y = 0;
     int64_t tiles = 0;
 
-    // Kept from the forward to the backward pass.
+    // Kept between forward and backward pass.
     Buffer<real> records;        // [N, RECORD]
     Buffer<int64_t> tile_begin;  // [tiles + 1]
     Buffer<Entry> entries;
-    Buffer<std::atomic<uint8_t>> taken;  // [groups]: whether somebody blends these tiles (share_out)
-    Buffer<int32_t> tile_count;  // entries that survive the forward pass; they are moved to the front of their tile
+    Buffer<std::atomic<uint8_t>> taken;  // [groups]: nonzero if a thread has taken these tiles (share_out)
+    Buffer<int32_t> tile_count;  // [tiles] entries that survive the forward pass, moved to the front of their tile
     Buffer<real> saved;          // [4, H W]: T_final, M1, M2, inverse_depth0
-    Buffer<real> depth_slope;    // [2, H W]: depth by transmittance, -dT/dz there
+    Buffer<real> depth_slope;    // [2, H W]: depth by transmittance, and -dT/dz at that depth
     real inv_depth_width = 0;
     int64_t visible = 0;
     int64_t groups() const { return (tiles + GROUP - 1) / GROUP; }
 
-    // One piece of memory for what a single pass needs: in the forward pass the arrays below, in the backward pass
-    // slots.
+    // One allocation for data that only a single pass needs: the arrays below in the forward pass, slots in the
+    // backward pass.
     Buffer<char> scratch;
     CullRecord* cull = nullptr;         // [N]
     TileRect* rects = nullptr;          // [N]
-    DepthItem* order = nullptr;         // [visible], by depth; projection leaves the keys of all
+    DepthItem* order = nullptr;         // [visible], sorted by depth; projection stores the keys of all splats
     TileRect* ordered_rects = nullptr;  // [visible], like order
     Buffer<uint32_t> histogram;         // [chunks, tiles]
 
@@ -181,14 +181,14 @@ struct Frame {
     Buffer<int64_t> slot_begin;    // [tiles + 1]
     Buffer<GradientChunk> chunks;  // [tiles + 1] at most
     int64_t largest_chunk = 0;     // slots
-    Buffer<real> own_sums;         // where no parameter's gradient has room for the sums
-    Buffer<real> feature_planes;   // of either pass: [threads, rows of channels, FEATURE_STRIDE]
+    Buffer<real> own_sums;         // used if no parameter gradient has room for the sums
+    Buffer<real> feature_planes;   // both passes: [threads, rows of channels, FEATURE_STRIDE]
     Sums sums = {};
 
     // Splat errors.
     Buffer<real> target;           // [tiles, 4, PIXELS]
     Buffer<int64_t> splat_begin;   // [N + 2]
-    Buffer<uint32_t> splat_slots;  // entries of each splat, in tile order
+    Buffer<uint32_t> splat_slots;  // entry indices of each splat, in tile order
 
     Frame* next_free = nullptr;
 };
@@ -217,30 +217,30 @@ inline V lane_y(int y) {
     for (int i = 0; i < LANES; ++i) v[i] = real(y + i / BLOCK_W) + real(0.5);
     return load(v);
 }
-// Lanes of that block inside the image.
+// Mask of the lanes of that block that are inside the image.
 inline M lanes_inside(int x, int y, int width, int height) {
     uint32_t b = 0;
     for (int i = 0; i < LANES; ++i) b |= uint32_t(x + i % BLOCK_W < width && y + i / BLOCK_W < height) << i;
     return mask_of(b);
 }
 
-// Which pixels a splat's footprint must hold.
+// Which pixels a splat footprint must contain.
 enum class Reach {
     BLEND,           // alpha >= alpha_min; more transparent splats are culled
     ERRORS,          // rho <= error_cutoff^2
-    ERRORS_OCCLUDED  // either
+    ERRORS_OCCLUDED  // union of both
 };
 
-// The passes, in order. Those that return bool return false when memory is short.
+// The passes, in order. Functions that return bool return false if out of memory.
 bool project_splats(Frame& frame, const Parameters& splats, Reach reach, real* radii);
 bool bin_splats(Frame& frame);
 bool blend_tiles(Frame& frame, const Images& images);
-// After blend_tiles.
+// Call after blend_tiles.
 bool blend_features(Frame& frame, const Features& features);
-// `features` may be null; with them the gradients of the geometry are computed too, and out.rows must be null.
+// `features` may be null. With features, geometry gradients are computed too, and out.rows must be null.
 bool blend_tiles_vjp(Frame& frame, const Images& images, const ImageGradients& gradients, int64_t sh_rest,
                      const ParameterGradients& out, bool geometry, const Features* features);
-// Rule 22, after blend_tiles: `alpha` and `median` are its images, `width` the half width as a fraction of the depth.
+// Rule 22; call after blend_tiles. `alpha` and `median` are its images; `width`: half width relative to the depth.
 bool find_transmittance_depth(Frame& frame, const real* alpha, const real* median, double width, real* depth);
 bool splat_errors(Frame& frame, const real* image, const uint8_t* mask, real* errors);
 bool occluded_splat_errors(Frame& frame, const real* image, const uint8_t* mask, real* errors);

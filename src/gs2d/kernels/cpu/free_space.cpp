@@ -1,5 +1,5 @@
-// Finds splats in the free space of an image and splats on its surface (training/robust/free_space_maps.py has the same
-// in torch). Splats are independent, so the result does not depend on the number of threads.
+// Counts splats in the free space of an image and splats on its surface (torch version:
+// training/robust/free_space_maps.py). Splats are independent, so the result does not depend on the number of threads.
 #include <cmath>
 #include <cstdint>
 
@@ -12,14 +12,14 @@ namespace gs2d {
 // Arrays are contiguous.
 struct FreeSpaceArguments {
     int64_t count, places, height, width;
-    const real* ends;     // [places, count, 3] sample points, world: the centre first
+    const real* ends;     // [places, count, 3] sample points in world coordinates; the first is the centre
     const real* reach;    // [count], world units: largest distance of a sample point from the centre
     const real* project;  // [3, 4]: (x z, y z, z) = project (p, 1), px
-    const real* center;   // [3] of the camera, world
-    real radius;          // of the free ball around the camera
-    const real* limit;    // [height, width]: nearer points are in free space
+    const real* center;   // [3] camera centre, world
+    real radius;          // radius of the ball around the camera that is free space
+    const real* limit;    // [height, width]: points closer than this are in free space
     const real* known;    // [height, width]: depth of the surface, infinite if unknown
-    real fraction;        // of that depth: tolerance for a centre on the surface
+    real fraction;        // tolerance for a centre on the surface, relative to that depth
     int32_t* against;     // [count]: incremented if a sample point is in free space
     int32_t* support;     // [count]: incremented if the centre is on the surface
 };
@@ -33,7 +33,7 @@ struct Plane {
     real at(const real* p) const { return x * p[0] + y * p[1] + z * p[2] + offset; }
 };
 
-// A half space of an image border: points with a positive value are inside.
+// Half space of an image border: points with a positive value are inside.
 Plane plane(real x, real y, real z, real offset) { return {x, y, z, offset, std::sqrt(x * x + y * y + z * z)}; }
 
 struct View {
@@ -52,7 +52,7 @@ struct View {
         borders[3] = opposite(0, a.width), borders[4] = opposite(1, a.height);
     }
 
-    // No point within `reach` can be in the image, with a margin for rounding.
+    // True if no point within `reach` can be in the image, with a margin for rounding.
     bool misses(const real* p, real reach) const {
         const real size = std::fabs(p[0]) + std::fabs(p[1]) + std::fabs(p[2]);
         for (const Plane& border : borders) {
@@ -62,7 +62,7 @@ struct View {
         return false;
     }
 
-    // Depth and pixel of a point; false if no pixel shows it.
+    // Computes the depth and pixel of a point; returns false if no pixel shows it.
     bool shows(const real* p, real& z, int64_t& pixel) const {
         z = rows[2].at(p);
         if (!(z > 0)) return false;

@@ -1,5 +1,5 @@
-// Fusion of depth maps (core/fuse.h), one view at a time. Blocks are independent and a view changes
-// a voxel once, so the result does not depend on the number of threads. A vector without weight is not written.
+// Fusion of depth maps (core/fuse.h), one view at a time. Blocks are independent and a view updates a voxel once, so
+// the result does not depend on the number of threads. Vectors with zero weight are not written.
 #include "core/fuse.h"
 
 #include "cpu/export.h"
@@ -11,14 +11,14 @@ namespace {
 
 constexpr int64_t GRAIN = 32;  // blocks per piece
 
-// Reals at LANES positions.
+// Reals at LANES positions of an array.
 GS2D_HD V gather(const real* from, const int32_t* at) {
     real values[LANES];
     for (int i = 0; i < LANES; ++i) values[i] = from[at[i]];
     return load(values);
 }
 
-// Moves the colours [LANES, 3] of LANES voxels by their shares towards the colours of their pixels.
+// Moves the colours [LANES, 3] of LANES voxels towards the colours of their pixels, each by its own share.
 void mix_colors(real* colors, const real* image, const int32_t* pixel, V share) {
     real one[LANES], target[3 * LANES], shares[3 * LANES];
     store(one, share);
@@ -66,7 +66,7 @@ void fuse_block(const FuseArguments<real>& a, int64_t n) {
 constexpr int64_t RAYS = 8192;  // per piece
 
 // Marks the blocks that rays [begin, end) intersect, in double precision and with the order of operations of
-// meshing/tsdf_volume.py. Many rays set the same mark, all to the same value.
+// meshing/tsdf_volume.py. Concurrent writes to a mark all store the same value.
 void mark_rays(const MarkArguments& a, int64_t begin, int64_t end) {
     const int64_t stride_x = a.padded[1] * a.padded[2], stride_y = a.padded[2];
     for (int64_t step = 0; step < a.steps; ++step) {
@@ -80,7 +80,7 @@ void mark_rays(const MarkArguments& a, int64_t begin, int64_t end) {
             const int64_t block_x = (int64_t(x) + 1) >> 1, block_y = (int64_t(y) + 1) >> 1,
                           block_z = (int64_t(z) + 1) >> 1;
             const int64_t flat = block_x * stride_x + block_y * stride_y + block_z;
-            if (flat == last) continue;  // neighbours mostly share a block
+            if (flat == last) continue;  // consecutive samples usually share a block
             last = flat;
             __atomic_store_n(&a.marks[flat], 1, __ATOMIC_RELAXED);
         }
@@ -92,12 +92,12 @@ void mark_rays(const MarkArguments& a, int64_t begin, int64_t end) {
 
 using namespace gs2d;
 
-// Marks the blocks near the surface of one depth map.
+// Marks the blocks near the surface of a depth map.
 GS2D_EXPORT void gs2d_mark_blocks(const MarkArguments* arguments) {
     parallel_ranges(arguments->count, RAYS, [&](int64_t begin, int64_t end) { mark_rays(*arguments, begin, end); });
 }
 
-// Fuses one view into the blocks that it may change.
+// Fuses one view into the blocks that it may update.
 GS2D_EXPORT void gs2d_fuse(const FuseArguments<real>* arguments) {
     parallel_ranges(arguments->blocks, GRAIN, [&](int64_t begin, int64_t end) {
         for (int64_t n = begin; n < end; ++n) fuse_block(*arguments, n);

@@ -3,10 +3,10 @@
 namespace gs2d {
 namespace {
 
-constexpr int64_t LEAST_SLOTS = 4096;  // minimum of a chunk, if there are as many
+constexpr int64_t LEAST_SLOTS = 4096;  // minimum of a chunk, if the view has as many
 constexpr int BATCH = 256;             // entries per batch of slots to add
 
-// The gradients of the coefficients are written last, so their memory holds the sums until then.
+// The coefficient gradients are written last, so their memory holds the sums until then.
 bool fits_in_coefficients(const ParameterGradients& out, int64_t sh_rest) { return out.shN && 3 * sh_rest >= GRADIENT; }
 
 }  // namespace
@@ -46,7 +46,7 @@ bool GradientSums::prepare() {
     return f.scratch.reserve(2 * chunk_bytes());
 }
 
-// A chunk has as many slots as fit twice into the memory of the forward pass. Large chunks avoid waiting for
+// A chunk has as many slots as fit twice into the memory of the forward pass. Large chunks reduce waiting for
 // interrupted threads.
 void GradientSums::cut_into_chunks() {
     Frame& f = f_;

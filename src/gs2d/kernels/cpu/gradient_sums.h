@@ -1,6 +1,6 @@
-// Gradients of records: each (tile, splat) writes its own slot, and the slots of a splat are added in the order of the
-// tiles. Only the slots of two chunks of tiles are in memory: while one is blended, those of the one before are added.
-// Neither the cut into chunks nor the number of threads changes the order in which a splat's slots are added.
+// Gradients of splat records. Each (tile, splat) pair writes its own slot, and the slots of a splat are added in tile
+// order. Only the slots of two chunks of tiles are in memory: while one chunk is blended, the slots of the previous
+// chunk are added. The order of these additions depends neither on the chunk size nor on the number of threads.
 #pragma once
 
 #include <sched.h>
@@ -11,7 +11,7 @@
 
 namespace gs2d {
 
-// Consecutive slots. `extras` and `has_extra` are null where no densification signal is wanted: its parts are added in.
+// Consecutive slots. `extras` and `has_extra` are null without a densification signal; its parts are then added in.
 struct Slots {
     real* gradients;     // [slots, GRADIENT]
     real* extras;        // [slots, GRADIENT_EXTRA], only where has_extra
@@ -27,12 +27,12 @@ class GradientSums {
     GradientSums(Frame& frame, int64_t sh_rest, const ParameterGradients& out, const Features* features)
         : f_(frame), out_(out), features_(features), sh_rest_(sh_rest) {}
 
-    // Cuts the tiles into chunks and sets f.sums to 0; false when memory is short.
+    // Splits the tiles into chunks and sets f.sums to 0; returns false if out of memory.
     bool prepare();
 
     // Calls blend(tile, next, slots, feature_slots, piece) for each tile with slots, on all threads, and adds the slots
-    // to f.sums and to the features' gradients. `next` is the tile that this thread probably blends next, which may
-    // not exist. `piece` < get_threads() differs between concurrent calls. Every thread processes the chunks in order: it
+    // to f.sums and to the feature gradients. `next` is the tile that this thread probably blends next; it may not
+    // exist. `piece` < get_threads() differs between concurrent calls. Every thread processes the chunks in order: it
     // blends groups of chunk c until all are taken, then adds parts of chunk c - 1 until all are taken. It waits only
     // for work in progress on another thread.
     template <class F> void for_each_tile(F&& blend) {
@@ -52,9 +52,9 @@ class GradientSums {
     const Features* const features_;  // or null
     const int64_t sh_rest_;
     int64_t chunks_ = 0, threads_ = 1;
-    uint32_t parts_ = 1;  // pieces in which a chunk is added, each some of the splats; a power of two
+    uint32_t parts_ = 1;  // number of parts in which a chunk is added, each for a subset of the splats; a power of two
 
-    // chunks hold whole groups
+    // chunks contain whole groups
     int64_t first_group(int64_t c) const { return (f_.chunks[c].first_tile + GROUP - 1) / GROUP; }
     int64_t tile_slots(int64_t tile) const { return f_.slot_begin[tile + 1] - f_.slot_begin[tile]; }
     void cut_into_chunks();
@@ -70,7 +70,7 @@ class GradientSums {
     void add(int64_t c, uint32_t part) const;
 
     template <class F> void blend_group(int64_t c, int64_t group, int64_t piece, F&& blend) {
-        if (c >= 2) wait_for(f_.chunks[c - 2].sums_left);  // its slots' memory is used again
+        if (c >= 2) wait_for(f_.chunks[c - 2].sums_left);  // the memory of its slots is reused
         const int64_t first = group * GROUP, last = first + GROUP - 1;
         for (int64_t tile = first; tile <= last && tile < f_.tiles; ++tile) {
             const int64_t next = tile == last ? tile + 1 + (threads_ - 1) * GROUP : tile + 1;
@@ -85,7 +85,7 @@ class GradientSums {
         GradientChunk& chunk = f_.chunks[c];
         for (int64_t part; (part = chunk.next_part.fetch_add(1, std::memory_order_relaxed)) < parts_;) {
             wait_for(chunk.groups_left);
-            if (c >= 1) wait_for(f_.chunks[c - 1].sums_left);  // a splat's slots are added in order
+            if (c >= 1) wait_for(f_.chunks[c - 1].sums_left);  // the slots of a splat are added in order
             add(c, static_cast<uint32_t>(part));
             chunk.sums_left.fetch_sub(1, std::memory_order_release);
         }

@@ -1,8 +1,8 @@
-// Properties of this library, and the level of this processor.
+// Properties of this library, and the instruction set level of this CPU.
 #include "cpu/export.h"
 #include "cpu/simd.h"
 
-// 4: x86-64-v4, 3: x86-64-v3, 0: neither. Meaningful in the portable library, which every processor can load.
+// 4: x86-64-v4, 3: x86-64-v3, 0: neither. Meaningful in the portable library, which any CPU can load.
 GS2D_EXPORT int gs2d_cpu_level() {
 #if defined(__x86_64__)
     __builtin_cpu_init();

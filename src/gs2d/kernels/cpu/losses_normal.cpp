@@ -1,9 +1,9 @@
 // Normal consistency of a rendered normal image with the normals of a depth image: value and gradients in one pass.
 //
-// Two forms: the official one, mean(1 - alpha <n, N>) with alpha detached, and the paper's per-splat one,
-// mean(alpha - <n, N>) with nothing detached. N comes from the depths of the four neighbours, so a depth's gradient is
-// gathered from the four adjacent pixels: no atomics. Depths of the background are 0 in the padded copy; outside the
-// image and at ignored pixels they are `absent`, which makes N undefined beside them. Such a pixel has no gradient.
+// Two forms: the official mean(1 - alpha <n, N>) with alpha detached, and the paper's per-splat mean(alpha - <n, N>)
+// with nothing detached. N depends on the depths of the four neighbours, so the depth gradient is gathered from the
+// four adjacent pixels, without atomics. In the padded copy, background depths are 0; outside the image and at ignored
+// pixels they are `absent`, which makes N undefined for adjacent pixels. Pixels without N have no gradient.
 #include "core/losses.h"
 #include "cpu/export.h"
 #include "cpu/losses_rows.h"
@@ -20,13 +20,13 @@ struct Images {
     const double* intrinsics;  // fx, fy, cx, cy
     const double* rotation;    // world to camera, row-major
     int64_t height, width;
-    double scale;  // of the gradients: cotangent / valid pixels
+    double scale;  // factor of the gradients: cotangent / valid pixels
     bool per_splat, at_camera;  // at_camera: see makes_normal
-    real *normal_gradient, *depth_gradient, *alpha_gradient;  // all null, or the first two at least
-    double* rows;                                             // the variable part of each row's sum
+    real *normal_gradient, *depth_gradient, *alpha_gradient;  // all null, or at least the first two set
+    double* rows;                                             // the variable part of the sum of each row
 };
 
-// One piece of rows [begin, end).
+// Processes one piece of rows [begin, end).
 class Piece {
   public:
     Piece(const Images& images, int64_t begin, int64_t end)
@@ -57,7 +57,7 @@ class Piece {
     }
 
   private:
-    // Padded rows by image row: depth, and the pullbacks to the horizontal and vertical differences.
+    // Padded rows by image row: depth, and the pullbacks with respect to the horizontal and vertical differences.
     real* depth_row(int64_t y) const { return scratch.row(y - begin + HALO, stride); }
     real* pull_x(int64_t y) const { return scratch.row(depths + y - begin + 1, stride); }
     real* pull_y(int64_t y) const { return scratch.row(depths + centres + y - begin + 1, stride); }
@@ -77,7 +77,7 @@ class Piece {
         return static_cast<int>(im.width - i < 0 ? 0 : im.width - i < LANES ? im.width - i : LANES);
     }
 
-    // Values, and the gradients that stay at their pixel, of row y; pullbacks for its neighbours.
+    // Computes the values of row y, the gradients of its own pixels, and pullbacks for the neighbours.
     void centre_row(int64_t y) {
         const real *z = depth_row(y), *above = depth_row(y - 1), *below = depth_row(y + 1);
         real *qx = plane(0), *qy = plane(1), *qz = plane(2), *a = plane(3), *validity = plane(4), *w = plane(5);
@@ -111,7 +111,7 @@ class Piece {
             const DepthNormalGrad<V> g = depth_normal_vjp<V>(f, weight * camera, offset_x, offset_y, fx, fy);
             store(pull_x(y) + i, keep(defined, g.x));
             store(pull_y(y) + i, keep(defined, g.y));
-            const Vec3<V> n = weight * f.direction;  // of the camera-frame normal; R^T takes it to the world
+            const Vec3<V> n = weight * f.direction;  // camera frame; R^T transforms it to the world frame
             store(qx + i, keep(defined, dot({rotation[0], rotation[3], rotation[6]}, n)));
             store(qy + i, keep(defined, dot({rotation[1], rotation[4], rotation[7]}, n)));
             store(qz + i, keep(defined, dot({rotation[2], rotation[5], rotation[8]}, n)));
@@ -144,7 +144,7 @@ class Piece {
     const Images& im;
     const int64_t begin, end, length, stride, depths, centres;
     const Scratch scratch;
-    const real absent;  // the depth outside the image and at ignored pixels
+    const real absent;  // depth outside the image and at ignored pixels
     const V fx, fy;
     V rotation[9];
 };
@@ -154,10 +154,10 @@ class Piece {
 
 using namespace gs2d;
 
-// value = mean over valid pixels of 1 - alpha <n, N> (pixels without N count 1), or with per_splat of alpha - <n, N>
-// (pixels without N count 0), weighted by `weights` [H, W] if not null; at_camera: see makes_normal. Gradients, scaled
-// by `cotangent`: of normal [H, W, 3] (world frame) and depth [H, W] (both null, or neither), and of alpha (null in the
-// official form). Returns 0, or 1 if memory is short.
+// value = mean over valid pixels of 1 - alpha <n, N> (1 for pixels without N), or with per_splat of alpha - <n, N> (0
+// for pixels without N). Terms are weighted by `weights` [H, W] if not null; at_camera: see makes_normal. Gradients are
+// scaled by `cotangent`: normal [H, W, 3] (world frame) and depth [H, W], both null or neither, and alpha (null in the
+// official form). Returns 0, or 1 if out of memory.
 GS2D_EXPORT int gs2d_normal_consistency(const real* normal, const real* depth, const real* alpha, const uint8_t* mask,
                                         const real* weights, const double* intrinsics, const double* rotation,
                                         int64_t height, int64_t width, int per_splat, int at_camera, double cotangent,

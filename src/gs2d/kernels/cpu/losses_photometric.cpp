@@ -1,10 +1,10 @@
-// L1, SSIM and L2 of an image [H, W, 3], with the gradient of a weighted sum of them, in one pass over the rows.
+// L1, SSIM and L2 of an image [H, W, 3], and the gradient of their weighted sum, in one pass over the rows.
 //
-// A row of W interleaved pixels is 3 W reals; the window's taps are 3 reals apart, so that channels need no planes.
-// Each piece of rows runs down the image with two rings of horizontally blurred rows: of the moments x, x^2 + y^2, x y
-// (and y, unless its blur is given), and of SSIM's derivatives by the blurred moments. 5 rows behind the input SSIM is
-// finished, 10 rows behind it the gradient, a few rows at a time: most of the rows above and below that they are
-// blurred from are the same. Everything stays in the second-level cache.
+// A row of W interleaved pixels has 3 W reals; the window taps are 3 reals apart, so channels need no planes. Each
+// piece of rows moves down the image with two ring buffers of horizontally blurred rows: the moments x, x^2 + y^2, x y
+// (and y, unless its blur is passed in), and the derivatives of SSIM with respect to the blurred moments. SSIM is
+// computed 5 rows behind the input and the gradient 10 rows behind, ROWS rows at a time to share most of their input
+// rows. All buffers fit in the L2 cache.
 #include "core/losses.h"
 #include "cpu/export.h"
 #include "cpu/losses_rows.h"
@@ -14,7 +14,7 @@ namespace {
 
 constexpr int RADIUS = SSIM_RADIUS, TAPS = SSIM_TAPS;
 
-// The window over 11 values `at(k)`, k = -5..5.
+// Applies the window to 11 values `at(k)`, k = -5..5.
 template <class F> GS2D_HD V window(F at) {
     V sum = V(real(SSIM_WINDOW[0])) * at(0);
 #pragma GCC unroll 8
@@ -39,10 +39,10 @@ void blur_row(const real* in, real* out, int64_t length) {
 #endif
 }
 
-constexpr int ROWS = 4;                  // rows finished together
-constexpr int NEEDED = TAPS - 1 + ROWS;  // rows that they are blurred from
+constexpr int ROWS = 4;                  // rows computed together
+constexpr int NEEDED = TAPS - 1 + ROWS;  // input rows that their blur needs
 
-// The horizontally blurred rows around y of `MAPS` maps: row y of map m is row (y mod NEEDED) * MAPS + m.
+// Horizontally blurred rows around y of `MAPS` maps: row y of map m is row (y mod NEEDED) * MAPS + m.
 struct Ring {
     real* data;
     int64_t stride;
@@ -52,7 +52,7 @@ struct Ring {
     void clear(int64_t y, int64_t length) const {
         for (int map = 0; map < maps; ++map) std::memset(row(y, map), 0, static_cast<size_t>(length) * sizeof(real));
     }
-    // The window down the columns of rows y .. y + count - 1 of a map: of row r to out + r * stride.
+    // Applies the vertical window to rows y .. y + count - 1 of a map; row r is written to out + r * stride.
     void blur(int64_t y, int count, int map, int64_t length, real* out) const {
         const real* rows[NEEDED];
         for (int k = 0; k < NEEDED; ++k) rows[k] = row(y + k - RADIUS, map);
@@ -76,7 +76,7 @@ struct Images {
     const real *rendered, *target, *target_mean;
     const uint8_t* mask;
     int64_t height, width;
-    double l1_scale, ssim_scale, l2_scale;  // of the gradient: cotangent / (valid pixels * 3)
+    double l1_scale, ssim_scale, l2_scale;  // gradient factors: cotangent / (valid pixels * 3)
     real* gradient;
     double *l1_rows, *ssim_rows, *l2_rows;  // sums of each row
 };
@@ -84,7 +84,7 @@ struct Images {
 enum Moment { MEAN, SQUARES, PRODUCT, TARGET_MEAN, MOMENTS };
 enum Derivative { D_MEAN, D_SQUARES, D_PRODUCT, DERIVATIVES };
 
-// One piece of rows [begin, end).
+// Processes one piece of rows [begin, end).
 class Piece {
   public:
     Piece(const Images& images, int64_t begin, int64_t end)
@@ -109,7 +109,7 @@ class Piece {
         blurred = scratch.row(r, stride), r += MOMENTS * ROWS;
         moments = {scratch.data + r * stride, stride, maps}, r += NEEDED * maps;
         pullbacks = {scratch.data + r * stride, stride, DERIVATIVES};
-        const int64_t reach = im.gradient ? RADIUS : 0;  // rows of SSIM beyond the piece, for its gradient
+        const int64_t reach = im.gradient ? RADIUS : 0;  // SSIM rows beyond the piece that its gradient needs
         const int64_t last = end + reach + RADIUS;
         for (int64_t y = begin - reach - RADIUS; y < last; y += ROWS) {
             const int count = last - y < ROWS ? static_cast<int>(last - y) : ROWS;
@@ -124,7 +124,7 @@ class Piece {
     bool inside(int64_t y) const { return y >= 0 && y < im.height; }
     bool mine(int64_t y) const { return y >= begin && y < end; }
     const uint8_t* mask_row(int64_t y) const { return im.mask ? im.mask + y * im.width : nullptr; }
-    // A row of an image, i < length: zero beyond its end. Nothing beyond the image is read.
+    // A row of an image, i < length. Values beyond its end are 0; nothing beyond the image is read.
     struct Row {
         const real* at;
         int64_t n;
@@ -133,7 +133,7 @@ class Piece {
         }
     };
     Row row_of(const real* image, int64_t y) const { return {image + y * n, n}; }
-    // The rendered row, or a copy with the target at ignored pixels.
+    // Returns the rendered row, or a copy with the target at ignored pixels.
     Row rendered_row(int64_t y) const {
         const Row given = row_of(im.rendered, y), wanted = row_of(im.target, y);
         if (im.mask == nullptr) return given;
@@ -160,7 +160,7 @@ class Piece {
         for (int m = 0; m < maps; ++m) blur_row(products + m * stride, moments.row(y, m), length);
     }
 
-    // f for those of `count` rows from y on that are not above `least`.
+    // Calls f for those of `count` rows, starting at y, that are not above `least`.
     template <class F> static void from(int64_t least, int64_t y, int count, F f) {
         const int64_t above = least > y ? least - y : 0;
         if (above < count) f(y + above, static_cast<int>(count - above));
@@ -168,7 +168,7 @@ class Piece {
     real* derivative(int d, int r) const { return derivatives + (d * ROWS + r) * stride; }
     V blurred_at(int map, int r, int64_t i) const { return load(blurred + (map * ROWS + r) * stride + i); }
 
-    // SSIM of rows y .. y + count - 1 and its derivatives, blurred along the rows.
+    // Computes SSIM of rows y .. y + count - 1 and its derivatives, blurred horizontally.
     void ssim_rows(int64_t y, int count) {
         for (int m = 0; m < maps; ++m) moments.blur(y, count, m, length, blurred + m * ROWS * stride);
         for (int r = 0; r < count; ++r) ssim_row(y + r, r);
@@ -221,7 +221,7 @@ class Piece {
 
     const Images& im;
     const int64_t begin, end, n, length, stride;
-    const bool known;  // the blurred target is given
+    const bool known;  // the blurred target is passed in
     const int maps;
     const Scratch scratch;
     real *rendered = nullptr, *validity = nullptr;                         // all 1 without a mask
@@ -242,7 +242,7 @@ using namespace gs2d;
 
 // values = (mean L1, mean SSIM, mean L2) over valid pixels and channels; gradient (or null) = l1_cotangent
 // dL1/drendered + ssim_cotangent dSSIM/drendered + l2_cotangent dL2/drendered. `mask` (bytes, 0 = ignore) and
-// `target_mean` (of gs2d_blur) may be null. Returns 0, or 1 if memory is short.
+// `target_mean` (of gs2d_blur) may be null. Returns 0, or 1 if out of memory.
 GS2D_EXPORT int gs2d_photometric(const real* rendered, const real* target, const uint8_t* mask, const real* target_mean,
                                  int64_t height, int64_t width, double l1_cotangent, double ssim_cotangent,
                                  double l2_cotangent, real* gradient, double* values) {
@@ -277,7 +277,7 @@ GS2D_EXPORT int gs2d_photometric(const real* rendered, const real* target, const
     return failed;
 }
 
-// The window over an image [H, W, 3], zero outside: bit for bit what gs2d_photometric computes for its target.
+// Applies the window to an image [H, W, 3], zero outside; bit-identical to the target blur of gs2d_photometric.
 GS2D_EXPORT int gs2d_blur(const real* image, int64_t height, int64_t width, real* out) {
     int failed = 0;
     const int64_t n = 3 * width, length = row_length(n), stride = row_stride(n);
@@ -301,7 +301,7 @@ GS2D_EXPORT int gs2d_blur(const real* image, int64_t height, int64_t width, real
     return failed;
 }
 
-// Mean over valid pixels of one map [H, W].
+// Computes the mean of a map [H, W] over valid pixels.
 GS2D_EXPORT int gs2d_masked_mean(const real* map, const uint8_t* mask, int64_t height, int64_t width, double* value) {
     *value = 0;
     const int64_t valid = count_valid(mask, height * width), length = row_length(width);

@@ -1,5 +1,5 @@
-// Scratch rows for the image losses: padded with zeros on both sides, so that a window may reach over the edge and a
-// vector over the end of a row.
+// Scratch rows for the image losses, padded with zeros on both sides, so that windows and vectors may extend beyond the
+// ends of a row.
 #pragma once
 
 #include <cstdlib>
@@ -10,14 +10,14 @@
 
 namespace gs2d {
 
-constexpr int64_t MARGIN = 16;  // reals on either side of a row: 5 pixels of 3 channels, and whole cache lines
+constexpr int64_t MARGIN = 16;  // reals on either side of a row: at least 5 pixels of 3 channels, in whole cache lines
 
 // Length of a row of n reals, rounded up to whole vectors of every instruction set.
 GS2D_HD int64_t row_length(int64_t n) { return (n + 31) / 32 * 32; }
-// Distance of two rows.
+// Stride between rows.
 GS2D_HD int64_t row_stride(int64_t n) { return row_length(n) + 2 * MARGIN; }
 
-// Zeroed memory for rows, aligned to a cache line. Null inside when the machine has none left.
+// Zeroed memory for rows, aligned to a cache line. The pointer is null if out of memory.
 struct Scratch {
     void* block;
     real* data;
@@ -28,11 +28,11 @@ struct Scratch {
     Scratch(const Scratch&) = delete;
     Scratch& operator=(const Scratch&) = delete;
     bool failed() const { return block == nullptr; }
-    // The first real of the r-th row of stride `stride`, after its left margin.
+    // Returns the first real after the left margin of row r, for rows of stride `stride`.
     real* row(int64_t r, int64_t stride) const { return data + r * stride + MARGIN; }
 };
 
-// 1 at valid pixels, 0 at ignored ones, each `channels` times; all 1 without a mask. The rest of the row stays 0.
+// Fills a row with 1 at valid and 0 at ignored pixels, each `channels` times; all 1 without a mask. Padding stays 0.
 inline void fill_validity(const uint8_t* mask, int64_t width, int channels, real* validity) {
     if (mask == nullptr) {
         for (int64_t i = 0; i < width * channels; ++i) validity[i] = real(1);
@@ -46,7 +46,7 @@ inline void fill_validity(const uint8_t* mask, int64_t width, int channels, real
     }
 }
 
-// Number of valid pixels.
+// Counts valid pixels.
 inline int64_t count_valid(const uint8_t* mask, int64_t pixels) {
     if (mask == nullptr) return pixels;
     int64_t count = 0;
@@ -54,8 +54,8 @@ inline int64_t count_valid(const uint8_t* mask, int64_t pixels) {
     return count;
 }
 
-// Rows of each of the pieces that a pool should work on when a piece costs `overlap` rows more than its own. Results
-// never depend on it: every row is computed alike wherever the image is cut.
+// Returns the rows per piece for the thread pool if a piece computes `overlap` additional rows. The result of a loss
+// does not depend on it, since each row is computed the same way wherever the image is split.
 inline int64_t rows_per_piece(int64_t height, int64_t overlap) {
     const int64_t wanted = (height + 2 * get_threads() - 1) / (2 * get_threads());
     return get_threads() == 1 ? height : wanted < 4 * overlap ? 4 * overlap : wanted;

@@ -1,5 +1,5 @@
-// Measurements of the rasterizer for benchmarks: time by pass, exact amounts of work, memory. Rendering and training do
-// not use this file.
+// Measurements of the rasterizer for benchmarks: time per pass, exact amounts of work, memory. Rendering and training
+// do not use this file.
 #include <string.h>
 
 #include "cpu/export.h"
@@ -50,16 +50,16 @@ PairCounts count_tile(const Frame& f, int64_t tile, const BlendLimits<V>& limits
 
 using namespace gs2d;
 
-// Nanoseconds of the last forward and backward pass of the calling thread, in the order of enum Stage; returns how
-// many.
+// Writes the nanoseconds of the last forward and backward pass of the calling thread, in the order of enum Stage.
+// Returns the number of stages.
 GS2D_EXPORT int gs2d_stage_times(int64_t* ns) {
     memcpy(ns, stage_ns, sizeof stage_ns);
     return STAGES;
 }
 
-// Work in the view of a forward pass: visible pairs (pixel, splat); lane pairs that the backward pass computes;
-// entries (tile, splat) before and after the forward pass; splats in the view; slots of the largest chunk of the last
-// backward pass.
+// Counts the work of the view of a forward pass: visible (pixel, splat) pairs; lane pairs that the backward pass
+// computes; (tile, splat) entries before and after the forward pass; splats in the view; slots of the largest chunk of
+// the last backward pass.
 GS2D_EXPORT int gs2d_frame_counts(Frame* frame, int64_t counts[6]) {
     const Frame& f = *frame;
     const BlendLimits<V> limits = limits_of(f.view);

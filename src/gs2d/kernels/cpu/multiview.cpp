@@ -11,7 +11,7 @@ namespace {
 
 constexpr int64_t GROUPS = 8;  // vectors of pixels per piece
 
-// An image interpolated between pixel centres; beyond the border, the border's values.
+// An image interpolated between pixel centres; border values extend beyond the border.
 struct Image {
     const real* pixels;
     int width, right, below;  // offsets of the next column and row, 0 at the border
@@ -38,16 +38,16 @@ struct Image {
     }
 };
 
-// LANES pixels of the view. Lanes that are not chosen repeat a chosen one.
+// LANES pixels of the view. Lanes that are not chosen repeat a chosen pixel.
 struct Pixels {
-    int64_t first;  // of P
+    int64_t first;  // index of the first of P pixels
     int count;
     M chosen;
     V depth;
     Vec3<V> q, ray;
-    LaneInts at;  // in the flat image
+    LaneInts at;  // index into the flattened image
 
-    // False if no lane is chosen.
+    // Returns false if no lane is chosen.
     bool set(const CompareArguments<real>& a, const Lens<V>& lens, int64_t first_patch) {
         first = first_patch, count = static_cast<int>(a.count - first < LANES ? a.count - first : LANES);
         uint32_t which = 0;
@@ -69,14 +69,14 @@ struct Pixels {
     }
 };
 
-// A pixel of the patches: its greys in both views relative to the middle pixel, and the derivatives by the plane.
+// A patch pixel: its grey values in both views relative to the centre pixel, and derivatives with respect to the plane.
 struct Grey {
     V a, b;
     Vec3<V> pull;
 };
 
 class Comparison {
-    // Leaves the k-th number of each lane that counts in row + k of the motion's gradients.
+    // Stores the k-th value of each valid lane in row + k of the motion gradients.
     auto rows_from(int row, const Pixels& p, M counts) const {
         return [this, row, &p, counts](int k, V v) { leave(a.motion_gradients, row + k, p, keep(counts, v)); };
     }
@@ -169,7 +169,7 @@ class Comparison {
         each_of(outer(g.normal, p.q), by_ncc, rows_from(WORLD_ROW, p, valid));
     }
 
-    // The image of a square is convex, so the corners bound the patch.
+    // The warped square is convex, so its corners bound the patch.
     M is_inside(const PatchPlane<V>& plane) const {
         const V r = V(real(a.radius));
         M inside = plane.planar;
@@ -183,7 +183,7 @@ class Comparison {
         return inside;
     }
 
-    // Sums over the patches; `greys` keeps the inputs of their gradient.
+    // Sums over the patches; `greys` keeps the inputs of the gradient.
     PatchSums<V> sample(const Pixels& p, const PatchPlane<V>& plane, Grey* greys) const {
         const auto look = [&](int64_t j, int64_t i, Vec3<V> row) {
             const PatchPlace<V> at = patch_place(axpy(V(real(i)), plane.right, row));
@@ -210,8 +210,8 @@ class Comparison {
 
 using namespace gs2d;
 
-// Fills `values`, `gradients` and `motion_gradients` of the arguments, and the sums [2] and [33] of the first and the
-// last. Returns 0, or 1 if memory is short.
+// Fills `values`, `gradients` and `motion_gradients`. Writes the pixel sums of the first [2] and of the last [33] to
+// `sums`. Returns 0, or 1 if out of memory.
 GS2D_EXPORT int gs2d_compare_views(const CompareArguments<real>* arguments, double* sums) {
     const CompareArguments<real>& a = *arguments;
     const Comparison comparison(a);

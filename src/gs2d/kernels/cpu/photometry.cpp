@@ -1,5 +1,5 @@
 // Response curve and vignetting of rendered images, and their gradients. Pieces have a fixed size and are summed in
-// order, so the bits do not depend on the number of threads.
+// order, so the result is bit-identical for any number of threads.
 #include "core/photometry.h"
 
 #include <cmath>
@@ -13,9 +13,9 @@ namespace gs2d {
 namespace {
 
 constexpr int64_t PIECE = 2048;  // pixels
-constexpr int SUMS = 4;          // three of the falloff and one of the shift
+constexpr int SUMS = 4;          // three of the falloff, one of the shift
 
-// render/native_image_ops.py has the same.
+// Layout mirrored in render/native_image_ops.py.
 struct Shown {
     const real* color;     // [pixels, 3]
     const real* coverage;  // [pixels], or null: 1
@@ -70,7 +70,7 @@ GS2D_EXPORT void gs2d_shown(const Shown* shown, real* out) {
     });
 }
 
-// sums [4]: the gradients of the falloff and of the shift. Returns 1 if memory is short.
+// sums [4]: the gradients of the falloff and of the shift. Returns 1 if out of memory.
 GS2D_EXPORT int gs2d_shown_vjp(const Shown* shown, const real* upstream, real* to_color, double* sums) {
     const int64_t pieces = (shown->pixels + PIECE - 1) / PIECE;
     auto* const of_pieces = static_cast<double*>(std::malloc(static_cast<size_t>(pieces * SUMS + 1) * sizeof(double)));

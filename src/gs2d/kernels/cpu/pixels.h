@@ -1,4 +1,4 @@
-// LANES pixels of a picture, or those that are left of it, as vectors: zeros behind the last one.
+// Loads and stores up to LANES pixels of an image as vectors; lanes beyond the last pixel are 0.
 #pragma once
 
 #include <cstring>

@@ -1,6 +1,6 @@
-// A splat's plane at the pixels of a tile. It is affine in the pixel, so that it is the sum of a part that depends on
-// the lane alone and one that depends on the block alone: three additions for each block. All passes over a
-// tile's splats use this code, so that they take the same branches.
+// A splat plane at the pixels of a tile. The plane is affine in the pixel position, so it is the sum of a per-lane part
+// and a per-block part: three additions per block. All passes over the splats of a tile use this code, so they take the
+// same branches.
 #pragma once
 
 #include "cpu/tile.h"
@@ -9,8 +9,9 @@ namespace gs2d {
 
 constexpr int BLOCKS_Y = BLOCKS / BLOCKS_X;
 
-// Pixel centres of a tile's blocks: of the lanes, in columns and rows of blocks. First pixels of blocks; of those of a
-// row, each four times; of rows, in all lanes.
+// Pixel centres of a tile. `x` and `y`: lane positions per column and row of blocks. `first_x` and `first_y`: first
+// pixel of each block. `column_x`: the same for one row of blocks, each value four times. `row_y`: first row of each
+// row of blocks, in all lanes.
 struct Centres {
     alignas(64) real x[BLOCKS_X][LANES], y[BLOCKS_Y][LANES], first_x[BLOCKS], first_y[BLOCKS];
     alignas(64) real column_x[BLOCKS_X * 4], row_y[BLOCKS_Y][LANES];
@@ -25,13 +26,13 @@ struct Centres {
     V at_y(int b) const { return load(y[b / BLOCKS_X]); }
 };
 
-// The lanes' parts of X, Y, I.
+// Computes the per-lane parts of X, Y and I.
 inline __attribute__((always_inline)) void set_lanes(const real* record, real (&lane)[3][LANES]) {
     for (int k = 0; k < 3; ++k) store(lane[k], fma(V(record[2 + 2 * k]), lane_x(0), V(record[3 + 2 * k]) * lane_y(0)));
 }
 
 struct SplatPlanes {
-    // Aligned to a vector, not more: many of them a power of two apart would share few sets of the first cache.
+    // Aligned to a vector only: a power-of-two stride would map many splats to a few sets of the L1 cache.
     alignas(LANES * sizeof(real)) real lane[3][LANES], block[3][BLOCKS];
 
     inline __attribute__((always_inline)) void set(const real* record, const Centres& centres) {
@@ -50,13 +51,13 @@ struct SplatPlanes {
     }
 };
 
-// The same numbers for passes from block to block with many splats each: the values of a block are consecutive and
-// followed by the log2 opacity, so that a splat at a block is in few cache lines.
+// The same values for passes that visit block after block with many splats each. The values of a block are consecutive
+// and followed by the log2 opacity, so a splat at a block touches few cache lines.
 struct PlanesByBlock {
     alignas(LANES * sizeof(real)) real lane[3][LANES], block[BLOCKS][4];
 
     inline __attribute__((always_inline)) void set(const real* record, const Centres& centres) {
-        constexpr int PARTS = BLOCKS_X * 4 / LANES;  // vectors for a row of blocks
+        constexpr int PARTS = BLOCKS_X * 4 / LANES;  // vectors per row of blocks
         set_lanes(record, lane);
         V a, b, constant, dx[PARTS];
         unzip_planes(record + 2, a, b, constant);
@@ -73,14 +74,14 @@ struct PlanesByBlock {
     V log2_opacity(int b) const { return V(block[b][3]); }
 };
 
-// Whether each splat is plain all over a tile.
+// Returns which splats are plain over the whole tile.
 inline M plain_over_tile(const Frame& f, const Footprints& s, V tile_x, V tile_y) {
-    const V half = V(real(TILE / 2));  // half a pixel to spare
+    const V half = V(real(TILE / 2));  // includes a margin of half a pixel
     return is_plain(tile_x + half - s.cx, tile_y + half - s.cy, s.ai, s.bi, s.iz, s.plain_from, V(real(f.view.near)),
                     half);
 }
 
-// A splat at block b, where its plane is `plane`. Plain: as `Entry` says.
+// Evaluates a splat at block b, where its plane is `plane`. `plain`: see `Entry`.
 inline Hit<V> hit_at(const Record<V>& s, V zc, const PlaneAt<V>& plane, bool plain, const Centres& centres, int b,
                      const BlendLimits<V>& k) {
     if (!plain) return intersect(s, plane, zc, centres.at_x(b) - s.cx, centres.at_y(b) - s.cy, k);

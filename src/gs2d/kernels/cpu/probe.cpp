@@ -1,4 +1,4 @@
-// Current speed of this machine, printed by benchmarks with their times.
+// Measures the current speed of this machine; benchmarks print it with their times.
 #include <string.h>
 #include <time.h>
 
@@ -20,7 +20,7 @@ double now() {
 
 using namespace gs2d;
 
-// Fused multiply-adds per second on all threads, in GFLOP/s (2 per multiply-add and lane); takes about 10 ms.
+// Returns fused multiply-adds per second on all threads, in GFLOP/s (2 per multiply-add and lane). Takes about 10 ms.
 GS2D_EXPORT double gs2d_probe_fma() {
     constexpr int CHAINS = 12, STEPS = 1 << 19;
     const int threads = get_threads();
@@ -39,7 +39,7 @@ GS2D_EXPORT double gs2d_probe_fma() {
     return 2.0 * CHAINS * STEPS * LANES * threads / (now() - start) * 1e-9;
 }
 
-// Bytes read and written per second by a copy of 64 MiB on all threads, in GB/s; negative if memory is short.
+// Returns bytes read and written per second by a 64 MiB copy on all threads, in GB/s; negative if out of memory.
 GS2D_EXPORT double gs2d_probe_copy() {
     constexpr size_t SIZE = size_t(64) << 20;
     Buffer<char> from, to;

@@ -6,7 +6,7 @@
 namespace gs2d {
 namespace {
 
-// Reads LANES splats; `alive` is false for culled ones (out of range, behind the camera, transparent).
+// Reads LANES splats; clears `alive` for culled splats (out of range, behind the camera, transparent).
 struct Group {
     SplatParameters<V> parameters;
     Frame3<V> frame;
@@ -38,7 +38,7 @@ inline void color_group(const Frame& f, const Parameters& s, int64_t i, int lane
     g.record.blue = clamped_color(c.z, degree);
 }
 
-// Rectangles and radii of the splats `boxed` (a bit each) of a group: rule 19, "box".
+// Computes the rectangles and radii of the splats in the bit mask `boxed` of a group: rule 19, "box".
 void box_group(Frame& f, const Group& g, int64_t i, uint32_t boxed, V k2, real* radii) {
     const Square<V> s = official_square(g.frame, g.record, k2, real(f.view.lowpass_px), f.camera);
     alignas(64) real x[LANES], y[LANES], half[LANES];
@@ -51,7 +51,7 @@ void box_group(Frame& f, const Group& g, int64_t i, uint32_t boxed, V k2, real* 
     }
 }
 
-// The tiles that the outline of a splat reaches, LANES rows of tiles at a time.
+// Finds the tiles that a splat outline reaches, LANES rows of tiles at a time.
 TileRect outlined_rectangle(const Frame& f, int64_t splat) {
     const real* const r = &f.records[splat * RECORD];
     const View& v = f.view;
@@ -135,7 +135,7 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
 
 namespace {
 
-// Sums of LANES splats; without a densification signal the extras are 0.
+// Loads the sums of LANES splats; without a densification signal the extras are 0.
 inline void load_sums(const Sums& sums, int64_t first, int lanes, V* fields, V* extras) {
     load_rows<GRADIENT>(sums.row(first), GRADIENT, lanes, fields);
     for (int k = 0; k < GRADIENT_EXTRA; ++k) extras[k] = V(0);
@@ -143,7 +143,7 @@ inline void load_sums(const Sums& sums, int64_t first, int lanes, V* fields, V* 
     if (sums.columns == 4) load_rows<4>(sums.extra(first), 4, lanes, extras);
 }
 
-// Whether a sum is nonzero or NaN; otherwise no pixel uses the splat, or all its gradients are 0.
+// Returns where a sum is nonzero or NaN. Elsewhere no pixel uses the splat, or all its gradients are 0.
 inline M not_all_zero(const V* fields, const V* extras) {
     V size = V(0);
     for (int k = 0; k < GRADIENT; ++k) size = size + abs(fields[k]);
@@ -160,7 +160,7 @@ void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradi
             if (out.shN) ask_for(out.shN + (i + LANES) * 3 * s.sh_rest, LANES * 3 * s.sh_rest);
         }
         V g[GRADIENT], e[GRADIENT_EXTRA];
-        load_sums(f.sums, i, lanes, g, e);  // before anything is written: they may lie in the rows of out.shN
+        load_sums(f.sums, i, lanes, g, e);  // before any write: the sums may share memory with rows of out.shN
         const M seen = not_all_zero(g, e) & first(lanes);
         if (!any(seen)) {
             zero_rows(out.means, i, 3, lanes), zero_rows(out.quats, i, 4, lanes),
@@ -218,9 +218,9 @@ void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradi
 
 }  // namespace
 
-// If the sums share the memory of shN's gradient, row i overwrites the sums of later splats. So splats are processed
-// from the last one, in groups that overwrite nothing still to be read; groups of up to LANES splats are read before
-// writing.
+// If the sums share memory with the gradient of shN, row i overwrites the sums of later splats. Splats are therefore
+// processed from last to first, in groups that overwrite only sums already read. Groups of up to LANES splats are read
+// before they are written.
 void project_splats_vjp(Frame& f, const Parameters& s, const ParameterGradients& out, real* intrinsics) {
     for (int64_t end = s.count, first = 0; end > 0; end = first) {
         first = 0;

@@ -1,4 +1,4 @@
-// The densification signal of a view: adds the norms of the screen gradients to the sums of visible splats.
+// Densification signal of a view: adds the norms of the screen gradients to the sums of visible splats.
 #include "cpu/export.h"
 #include "cpu/simd.h"
 #include "cpu/threads.h"
@@ -10,7 +10,7 @@ constexpr int64_t PIECE = 8192;  // splats
 
 struct Signal {
     const real *signal, *radii;       // [N, columns], [N]
-    real *signed_sum, *absolute_sum;  // [N]; absolute_sum: with four columns
+    real *signed_sum, *absolute_sum;  // [N]; absolute_sum: only with four columns
     real* count;                      // [N]
 };
 
@@ -30,7 +30,7 @@ template <int COLUMNS> void add_range(const Signal& s, int64_t begin, int64_t en
     int64_t i = begin;
     for (; i + LANES <= end; i += LANES) add_vector<COLUMNS>(s, i);
     if (i == end) return;
-    // The remainder, in a buffer, with the same arithmetic, so that bits do not depend on the position of a splat.
+    // Process the remainder in a buffer with the same arithmetic, so the result does not depend on the position.
     real signal[COLUMNS * LANES] = {}, radii[LANES] = {}, sums[3][LANES] = {};
     for (int64_t k = 0; k < end - i; ++k) {
         for (int c = 0; c < COLUMNS; ++c) signal[k * COLUMNS + c] = s.signal[(i + k) * COLUMNS + c];

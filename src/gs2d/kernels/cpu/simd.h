@@ -1,6 +1,6 @@
-// A vector of LANES reals (V) and a mask of LANES bits (M): the only place that knows the instruction set.
+// A vector of LANES reals (V) and a mask of LANES bits (M). Only this header depends on the instruction set.
 //
-// Each library is one instruction set (CMakeLists.txt), so `V` is one type per library:
+// Each library is compiled for one instruction set (CMakeLists.txt), so `V` is one type per library:
 //
 //   library    real     LANES   file
 //   v4         float    16      simd_avx512.h
@@ -8,7 +8,7 @@
 //   portable   float    8       simd_portable.h (GCC vector extensions; any processor)
 //   f64        double   8       simd_portable.h (tests only)
 //
-// Offered, besides + - * / on V and < <= > >= on V giving M, and & | ~ on M:
+// Operations, in addition to + - * / on V, < <= > >= on V returning M, and & | ~ on M:
 //   V(real)                   broadcast               load(p), store(p, v)        unaligned, LANES reals
 //   load_first(p, n)          first n lanes, rest 0   store_first(p, v, n)        n in 0..LANES
 //   fma(a,b,c), fnma(a,b,c)   a*b+c, c-a*b            min, max, abs, sqrt, round  min(a,b) is b where a is NaN
@@ -16,15 +16,15 @@
 //   whole(a)                  floor, |a| < 2^22
 //   keep(m, a)                m ? a : 0               any(m), all(m), bits(m), mask_of(bits), first(n)
 //   iota()                    0, 1, 2, ...            sum(v)                      fixed order
-//   REGISTERS                 how many vectors the processor holds
+//   REGISTERS                 number of vector registers of the CPU
 //   transpose(v)              in place, LANES vectors
 //   transpose_reduce<K>(v, p) p[k] = sum(v[k]), K = 16 or 4, fixed order
-//   columns_of_8(rows, v)     LANES rows of 8 reals to 8 vectors
-//   unzip_planes(p, a, b, c)  the slopes in x and in y and the constants of a splat's planes, repeated
-//   with_bits(i, m, bits)     the LaneInts i, with more bits where m; shifted<N>(i) to the left; store(p, i): LANES of them
-//   ints_of(v)                LaneInts of what is whole and fits 31 bits; row_major(j, width, i): j width + i
-//   gather(p, i)              p[i] of each lane; gather_pairs(p, i, a, b): p[i] and p[i + 1]
-//   load_packed<K>(p, v)      LANES rows of K reals to K vectors, and store_packed<K> back
+//   columns_of_8(rows, v)     converts LANES rows of 8 reals to 8 vectors
+//   unzip_planes(p, a, b, c)  slopes in x, slopes in y and constants of a splat's planes, repeated
+//   with_bits(i, m, bits)     i | bits in the lanes of m (LaneInts); shifted<N>(i): i << N; store(p, i): LANES integers
+//   ints_of(v)                LaneInts of whole numbers that fit in 31 bits; row_major(j, width, i): j width + i
+//   gather(p, i)              p[i] per lane; gather_pairs(p, i, a, b): p[i] and p[i + 1]
+//   load_packed<K>(p, v)      converts LANES rows of K reals to K vectors; store_packed<K> is the inverse
 #pragma once
 
 #include <cstddef>
@@ -36,7 +36,7 @@
 
 namespace gs2d {
 
-// For each 8-bit mask the numbers of its bits, one after the other.
+// For each 8-bit mask, the indices of its set bits in ascending order.
 struct BitNumbers {
     uint8_t of[256][8] = {};
     constexpr BitNumbers() {
@@ -47,7 +47,7 @@ struct BitNumbers {
 };
 constexpr BitNumbers BIT_NUMBERS;
 
-// The same times STRIDE.
+// The same indices times STRIDE.
 template <int STRIDE> struct BitMultiples {
     static_assert(7 * STRIDE < 1 << 16);
     alignas(16) uint16_t of[256][8] = {};
@@ -58,15 +58,15 @@ template <int STRIDE> struct BitMultiples {
 };
 template <int STRIDE> constexpr BitMultiples<STRIDE> BIT_MULTIPLES;
 
-// For 2^x = 2^(n + k / N) 2^f: the bits of 2^(k / N), less those that shifting the whole number N n + k to the exponent
-// leaves in the mantissa. Adding `ROUND` to x leaves that number in the lowest bits.
+// Table for 2^x = 2^(n + k / N) 2^f. Entries are the bits of 2^(k / N), minus k << SHIFT: shifting the integer N n + k
+// to the exponent leaves those bits in the mantissa. Adding `ROUND` to x leaves N n + k in the lowest bits.
 template <int LOG_N> struct Exp2Table {
     static constexpr int N = 1 << LOG_N, SHIFT = 23 - LOG_N;
     static constexpr float ROUND = 1.5f * float(1 << SHIFT);
     alignas(64) uint32_t of[N] = {};
     constexpr Exp2Table() {
         double root = 2, power = 1;
-        for (int i = 0; i < LOG_N; ++i) {  // root = sqrt(root), by Newton
+        for (int i = 0; i < LOG_N; ++i) {  // root = sqrt(root), by Newton's method
             double r = root;
             for (int n = 0; n < 40; ++n) r = 0.5 * (r + root / r);
             root = r;
@@ -90,13 +90,13 @@ template <int LOG_N> struct Exp2Table {
 
 namespace gs2d {
 
-// One pass over one vector of pixels: 4 wide and LANES / 4 high.
+// A block is the pixels of one vector: 4 wide and LANES / 4 high.
 constexpr int BLOCK_W = 4;
 constexpr int BLOCK_H = LANES / BLOCK_W;
 constexpr int TILE = 16;
 constexpr int BLOCKS = TILE * TILE / LANES;
 constexpr int BLOCKS_X = TILE / BLOCK_W;
-using LaneBits = std::conditional_t<LANES == 16, uint16_t, uint8_t>;  // what bits(m) fits
+using LaneBits = std::conditional_t<LANES == 16, uint16_t, uint8_t>;  // integer type for bits(m)
 
 GS2D_HD M invert(M a) { return ~a; }
 GS2D_HD V operator-(V a) { return V(real(0)) - a; }
@@ -109,8 +109,8 @@ GS2D_HD V whole(V a) {
 }
 
 #if !defined(GS2D_OWN_INDICES)
-// Writes STRIDE times the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple
-// of LANES.
+// Writes STRIDE * i for each i < n whose masks[i] has the bit set; both arrays are padded to a multiple of LANES.
+// Returns the number of values written.
 template <int STRIDE> GS2D_HD int multiples_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
     int count = 0;
     for (int i = 0; i < n; ++i) {
@@ -121,7 +121,7 @@ template <int STRIDE> GS2D_HD int multiples_with_bit(const uint32_t* masks, int 
 }
 #endif
 #if !defined(GS2D_OWN_NONZERO)
-// Bit b: p[b] is not 0, of BLOCKS numbers.
+// Returns a mask whose bit b is set if p[b] is not 0, b < BLOCKS.
 GS2D_HD uint32_t nonzero(const LaneBits* p) {
     uint32_t all = 0;
     for (int b = 0; b < BLOCKS; ++b) all |= uint32_t(p[b] != 0) << b;
@@ -129,8 +129,8 @@ GS2D_HD uint32_t nonzero(const LaneBits* p) {
 }
 #endif
 
-// Rows of K < LANES reals, one after the other, to K vectors and back, LANES rows at a time: K - 1 shuffles a vector.
-// element of (what there is so far, vector S) for vector I
+// Conversion between LANES consecutive rows of K < LANES reals and K vectors, with K - 1 shuffles per vector.
+// packed_source and packed_target return the source element for a lane of vector I when vector S is merged into the result so far.
 template <int K, int I, int S> constexpr int packed_source(int lane) {
     const int e = lane * K + I, vector = e / LANES, at = e % LANES;
     return vector == S ? LANES + at : S > 1 ? lane : vector == 0 ? at : 0;
@@ -169,7 +169,7 @@ template <int K> GS2D_HD void store_packed(real* p, const V* v) {
 }
 
 #if !defined(GS2D_OWN_UNZIP)
-// Of p = a0 b0 a1 b1 a2 b2 c2 c3: a = a0 a1 a2 0, b = b0 b1 b2 0, c = 0 0 c2 c3, again and again.
+// Splits p = a0 b0 a1 b1 a2 b2 c2 c3 into repetitions of a = a0 a1 a2 0, b = b0 b1 b2 0, c = 0 0 c2 c3.
 GS2D_HD void unzip_planes(const real* p, V& a, V& b, V& c) {
     typedef real Four __attribute__((vector_size(4 * sizeof(real))));
     struct Row {
@@ -189,7 +189,7 @@ GS2D_HD void unzip_planes(const real* p, V& a, V& b, V& c) {
 }
 #endif
 #if !defined(GS2D_OWN_COLUMNS)
-// v[k] lane i = rows[i][k], k < 8.
+// Sets lane i of v[k] to rows[i][k], k < 8.
 GS2D_HD void columns_of_8(const real* const* rows, V* v) {
     static_assert(LANES == 8);
     for (int i = 0; i < 8; ++i) v[i] = load(rows[i]);
@@ -198,7 +198,7 @@ GS2D_HD void columns_of_8(const real* const* rows, V* v) {
 #endif
 
 #if !defined(GS2D_DOUBLE)
-// 2^x for x in [-126, 127]; relative error below 2e-7. Degree 5, minimax on [-1/2, 1/2].
+// Computes 2^x for x in [-126, 127]; relative error below 2e-7. Degree 5, minimax on [-1/2, 1/2].
 #if !defined(GS2D_OWN_EXP2)
 GS2D_HD V exp2_small(V x) {
     const V n = round(x), f = x - n;
@@ -210,7 +210,7 @@ GS2D_HD V exp2_small(V x) {
 #endif
 GS2D_HD V exp2(V x) { return exp2_small(min(max(x, V(-126.f)), V(127.f))); }
 
-// e^x, relative error below 4e-7 where the result is a normal number; saturates outside.
+// Computes e^x; relative error below 4e-7 where the result is a normal number; saturates outside.
 GS2D_HD V exp(V x) {
     const V n = round(min(max(x * V(float(LOG2E)), V(-126.f)), V(127.f)));
     V f = fnma(n, V(0.693359375f), x);
@@ -225,7 +225,7 @@ GS2D_HD V exp(V x) {
     return select(x > V(88.02f), V(__builtin_inff()), select(x < V(-87.3f), V(0.f), y));
 }
 
-// log2(x) for normal x > 0: x = 2^e m with m in [sqrt(1/2), sqrt 2], series of atanh((m - 1) / (m + 1)).
+// Computes log2(x) for normal x > 0: x = 2^e m with m in [sqrt(1/2), sqrt 2], series of atanh((m - 1) / (m + 1)).
 GS2D_HD V log2(V x) {
     V e;
     const V m = split2(x, e);

@@ -36,7 +36,7 @@ GS2D_HD V scale2(V a, V n) {
 
 #define GS2D_OWN_EXP2
 constexpr Exp2Table<3> EXP2_TABLE;
-// 2^x for x in [-126, 127]; relative error below 2e-7. 8 values of a table, degree 3 minimax on [-1/16, 1/16].
+// Computes 2^x for x in [-126, 127]; relative error below 2e-7. Table of 8 values, degree 3 minimax on [-1/16, 1/16].
 GS2D_HD V exp2_small(V x) {
     const V t = x + V(EXP2_TABLE.ROUND), f = x - (t - V(EXP2_TABLE.ROUND));
     const __m256i n = _mm256_castps_si256(t.v);
@@ -63,7 +63,7 @@ GS2D_HD M operator~(M a) { return {_mm256_xor_ps(a.m, _mm256_castsi256_ps(_mm256
 GS2D_HD uint32_t bits(M m) { return static_cast<uint32_t>(_mm256_movemask_ps(m.m)); }
 GS2D_HD bool any(M m) { return bits(m) != 0; }
 #define GS2D_OWN_NONZERO
-GS2D_HD uint32_t nonzero(const uint8_t* p) {  // of 32
+GS2D_HD uint32_t nonzero(const uint8_t* p) {  // of 32 values
     const __m256i v = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(p));
     return ~static_cast<uint32_t>(_mm256_movemask_epi8(_mm256_cmpeq_epi8(v, _mm256_setzero_si256())));
 }
@@ -77,7 +77,7 @@ GS2D_HD M first(int n) {
     return {_mm256_castsi256_ps(_mm256_cmpgt_epi32(_mm256_set1_epi32(n), _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7)))};
 }
 GS2D_HD V select(M m, V a, V b) {
-    __m256 r;  // not the intrinsic: gcc 12 compares the mask with 0 first
+    __m256 r;  // assembly, because with the intrinsic gcc 12 first compares the mask with 0
     asm("vblendvps %3, %2, %1, %0" : "=x"(r) : "x"(b.v), "x"(a.v), "x"(m.m));
     return r;
 }
@@ -94,7 +94,7 @@ GS2D_HD float sum(V a) {
     return _mm_cvtss_f32(_mm_add_ss(h, _mm_movehdup_ps(h)));
 }
 
-// In place, LANES x LANES.
+// Transposes LANES x LANES values in place.
 GS2D_HD void transpose(V* v) {
     __m256 t[8], r[8];
     for (int i = 0; i < 8; i += 2) {
@@ -126,7 +126,7 @@ GS2D_HD void gather_pairs(const float* p, LaneInts i, V& a, V& b) {
     const double* pairs = reinterpret_cast<const double*>(p);
     const __m256 low = _mm256_castpd_ps(_mm256_i32gather_pd(pairs, _mm256_castsi256_si128(i), 4));
     const __m256 high = _mm256_castpd_ps(_mm256_i32gather_pd(pairs, _mm256_extracti128_si256(i, 1), 4));
-    const auto in_order = [](__m256 x) {  // of 0, 1, 4, 5 and 2, 3, 6, 7
+    const auto in_order = [](__m256 x) {  // from order 0, 1, 4, 5 and 2, 3, 6, 7
         return _mm256_castpd_ps(_mm256_permute4x64_pd(_mm256_castps_pd(x), 0xd8));
     };
     a = in_order(_mm256_shuffle_ps(low, high, 0x88));
@@ -134,8 +134,8 @@ GS2D_HD void gather_pairs(const float* p, LaneInts i, V& a, V& b) {
 }
 
 #define GS2D_OWN_INDICES
-// Writes STRIDE times the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple
-// of LANES.
+// Writes STRIDE * i for each i < n whose masks[i] has the bit set; both arrays are padded to a multiple of LANES.
+// Returns the number of values written.
 template <int STRIDE> GS2D_HD int multiples_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
     const __m128i shift = _mm_cvtsi32_si128(31 - bit);
     __m256i index = _mm256_setzero_si256();

@@ -33,8 +33,8 @@ GS2D_HD V scale2(V a, V n) { return _mm512_scalef_ps(a.v, n.v); }
 
 #define GS2D_OWN_EXP2
 constexpr Exp2Table<5> EXP2_TABLE;
-// 2^x for x in [-126, 127]; relative error below 2e-7. 32 values of a table, degree 2 minimax on [-1/64, 1/64]: half
-// the products.
+// Computes 2^x for x in [-126, 127]; relative error below 2e-7. The table of 32 values needs only a degree 2 minimax
+// polynomial on [-1/64, 1/64], which halves the number of multiplications.
 GS2D_HD V exp2_small(V x) {
     const V t = x + V(EXP2_TABLE.ROUND), f = x - (t - V(EXP2_TABLE.ROUND));
     const __m512i n = _mm512_castps_si512(t.v), *const table = reinterpret_cast<const __m512i*>(EXP2_TABLE.of);
@@ -59,7 +59,7 @@ GS2D_HD M operator~(M a) { return {_knot_mask16(a.k)}; }
 GS2D_HD M and_not(M a, M b) { return {_kandn_mask16(b.k, a.k)}; }  // a & ~b
 GS2D_HD bool any(M m) { return !_kortestz_mask16_u8(m.k, m.k); }
 #define GS2D_OWN_NONZERO
-GS2D_HD uint32_t nonzero(const uint16_t* p) {  // of 16
+GS2D_HD uint32_t nonzero(const uint16_t* p) {  // of 16 values
     const __m256i v = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(p));
     return _mm256_test_epi16_mask(v, v);
 }
@@ -78,12 +78,12 @@ GS2D_HD V iota() { return _mm512_setr_ps(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 1
 GS2D_HD float sum(V a) { return _mm512_reduce_add_ps(a.v); }
 
 #define GS2D_OWN_AFTER
-// Lanes K .. K + LANES - 1 of a and b, one after the other.
+// Returns elements K .. K + LANES - 1 of the concatenation of a and b.
 template <int K> GS2D_HD V after(V a, V b) {
     return _mm512_castsi512_ps(_mm512_alignr_epi32(_mm512_castps_si512(b.v), _mm512_castps_si512(a.v), K));
 }
 
-// In place, LANES x LANES.
+// Transposes LANES x LANES values in place.
 GS2D_HD void transpose(V* v) {
     __m512 t[16], r[16];
     for (int i = 0; i < 16; i += 2) {
@@ -107,16 +107,16 @@ GS2D_HD void transpose(V* v) {
 }
 
 #define GS2D_OWN_COLUMNS
-// v[k] lane i = rows[i][k], k < 8.
+// Sets lane i of v[k] to rows[i][k], k < 8.
 GS2D_HD void columns_of_8(const float* const* rows, V* v) {
     __m512 r[8];
-    for (int i = 0; i < 8; ++i) {  // 4 rows and the 4 that follow, two times
+    for (int i = 0; i < 8; ++i) {  // rows `first` to `first + 3` of the low half, the next 4 in the high half
         const int first = i % 4 + i / 4 * 8;
         r[i] = _mm512_insertf32x8(_mm512_castps256_ps512(_mm256_loadu_ps(rows[first])),
                                   _mm256_loadu_ps(rows[first + 4]), 1);
     }
     __m512 q[8];
-    for (int i = 0; i < 8; i += 4) {  // q[i + j]: columns j and 4 + j of 4 rows, of the 4 that follow
+    for (int i = 0; i < 8; i += 4) {  // q[i + j]: columns j and 4 + j of the rows in r[i .. i + 3]
         const __m512 a = _mm512_unpacklo_ps(r[i], r[i + 1]), b = _mm512_unpackhi_ps(r[i], r[i + 1]);
         const __m512 c = _mm512_unpacklo_ps(r[i + 2], r[i + 3]), d = _mm512_unpackhi_ps(r[i + 2], r[i + 3]);
         q[i] = _mm512_shuffle_ps(a, c, 0x44), q[i + 1] = _mm512_shuffle_ps(a, c, 0xee);
@@ -148,8 +148,8 @@ GS2D_HD void gather_pairs(const float* p, LaneInts i, V& a, V& b) {
 }
 
 #define GS2D_OWN_INDICES
-// Writes STRIDE times the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple
-// of LANES.
+// Writes STRIDE * i for each i < n whose masks[i] has the bit set; both arrays are padded to a multiple of LANES.
+// Returns the number of values written.
 template <int STRIDE> GS2D_HD int multiples_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
     const __m512i wanted = _mm512_set1_epi32(1 << bit), step = _mm512_set1_epi32(16 * STRIDE);
     __m512i index = _mm512_mullo_epi32(_mm512_set1_epi32(STRIDE),
@@ -176,7 +176,7 @@ template <int K> GS2D_HD void transpose_reduce(const V* v, float* p) {
     static_assert(K == 16 || K == 4);
     __m512 q[K / 4];
     for (int i = 0; i < K / 4; ++i) {
-        // 4 vectors -> 1: within each 128-bit part, lane k holds the part's sum of vector k
+        // 4 vectors -> 1: within each 128-bit part, lane k holds the partial sum of vector k
         const __m512 a = v[4 * i].v, b = v[4 * i + 1].v, c = v[4 * i + 2].v, d = v[4 * i + 3].v;
         const __m512 ab = _mm512_add_ps(_mm512_unpacklo_ps(a, b), _mm512_unpackhi_ps(a, b));
         const __m512 cd = _mm512_add_ps(_mm512_unpacklo_ps(c, d), _mm512_unpackhi_ps(c, d));

@@ -1,4 +1,4 @@
-// simd.h for any processor, by GCC's and clang's vector extensions: 8 floats, or 8 doubles for the tests.
+// simd.h for any CPU, using GCC and clang vector extensions: 8 floats, or 8 doubles for the tests.
 #pragma once
 
 #define GS2D_IN_PARTS
@@ -14,7 +14,7 @@ using lane_int = int32_t;
 #endif
 constexpr int LANES = 8, REGISTERS = 16;
 
-// A vector is as many parts as it takes of what every processor has, 16 bytes: g++ compares wider ones lane by lane.
+// A vector consists of 16-byte parts, which any CPU supports: g++ compares wider vectors lane by lane.
 constexpr int WIDE = 16 / sizeof(real), PARTS = LANES / WIDE;
 typedef real Part __attribute__((vector_size(16)));
 typedef lane_int PartMask __attribute__((vector_size(16)));
@@ -29,7 +29,7 @@ struct V {
     GS2D_HD real operator[](int i) const { return of[i / WIDE][i % WIDE]; }
 };
 
-// The results of f(k) for each part k. Written out, not a loop: a loop's arrays stay in memory.
+// Combines the results of f(k) for each part k. Unrolled by hand: a loop would keep its arrays in memory.
 template <class T, class F> GS2D_HD T per_part(F f) {
     T r;
     r.of[0] = f(0), r.of[1] = f(1);
@@ -59,8 +59,8 @@ GS2D_HD V operator*(V a, V b) {
 GS2D_HD V operator/(V a, V b) {
     return per_part<V>([&](int k) { return a.of[k] / b.of[k]; });
 }
-// Without a fused instruction a call per lane would cost ten times the rest: round twice there. The double library
-// always rounds twice: it is compared with finite differences, not bit for bit.
+// Rounds twice if the CPU has no fused instruction, where a library call per lane would be about ten times slower. The
+// double library always rounds twice: it is compared with finite differences, not bit for bit.
 GS2D_HD V fma(V a, V b, V c) {
 #if (defined(__FP_FAST_FMAF) || defined(__ARM_FEATURE_FMA)) && !defined(GS2D_DOUBLE)
     return per_lane([&](int i) { return __builtin_fmaf(a[i], b[i], c[i]); });
@@ -123,7 +123,7 @@ GS2D_HD V sqrt(V a) {
     return per_lane([&](int i) { return __builtin_sqrtf(a[i]); });
 }
 GS2D_HD V round(V a) { return (a + V(12582912.f)) - V(12582912.f); }  // |a| < 2^22; needs value-safe floating point
-// Bits of numbers in arithmetic that wraps around: lanes that a mask leaves out later may hold any number here.
+// Unsigned arithmetic, which wraps around: lanes that are masked out later may hold any value here.
 typedef uint32_t PartBits __attribute__((vector_size(16)));
 GS2D_HD V scale2(V a, V n) {
     return per_part<V>(
@@ -136,7 +136,7 @@ GS2D_HD V split2(V x, V& e) {
 }
 #endif
 
-// Bit i of lane i.
+// Sets bit i in lane i.
 GS2D_HD M own_bits() {
     return per_part<M>([](int k) {
         PartMask r{};
@@ -209,7 +209,7 @@ GS2D_HD real sum(V a) {  // ((0 + 4) + (2 + 6)) + ((1 + 5) + (3 + 7)), here and 
     const Part p = (a.of[0] + a.of[2]) + (a.of[1] + a.of[3]);
     return p[0] + p[1];
 }
-// In place, LANES x LANES.
+// Transposes LANES x LANES values in place.
 GS2D_HD void transpose(V* v) {
     real t[LANES][LANES];
     for (int i = 0; i < LANES; ++i) store(t[i], v[i]);
@@ -223,7 +223,7 @@ GS2D_HD real sum(V a) {
     const Part p = a.of[0] + a.of[1];
     return (p[0] + p[2]) + (p[1] + p[3]);
 }
-// 4 x 4, in place; one part of each of four vectors.
+// Transposes 4 x 4 values in place: one part of each of four vectors.
 GS2D_HD void transpose(Part& a, Part& b, Part& c, Part& d) {
     const Part ab = __builtin_shufflevector(a, b, 0, 4, 1, 5), cd = __builtin_shufflevector(c, d, 0, 4, 1, 5);
     const Part ab2 = __builtin_shufflevector(a, b, 2, 6, 3, 7), cd2 = __builtin_shufflevector(c, d, 2, 6, 3, 7);

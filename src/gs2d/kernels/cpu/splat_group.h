@@ -1,15 +1,15 @@
-// LANES splats at a time: rows of parameters to vectors and back.
+// Converts rows of parameters of LANES splats to vectors and back.
 #pragma once
 
 #include "cpu/frame.h"
 
 namespace gs2d {
 
-// v[k] lane i = p[i * stride + k] for i < lanes; missing lanes repeat the last row, so that no lane holds garbage.
+// Sets lane i of v[k] to p[i * stride + k] for i < lanes; missing lanes repeat the last row, so no lane holds garbage.
 template <int K> inline void load_rows(const real* p, int64_t stride, int lanes, V* v) {
     if constexpr (K >= LANES) {
         for (int k = 0; k < K; k += LANES) {
-            const int from = k + LANES <= K ? k : K - LANES;  // the last part may overlap the one before
+            const int from = k + LANES <= K ? k : K - LANES;  // the last part may overlap the previous one
             V part[LANES];
             for (int i = 0; i < LANES; ++i) part[i] = load(p + int64_t(i < lanes ? i : lanes - 1) * stride + from);
             transpose(part);
@@ -55,7 +55,7 @@ inline SplatParameters<V> load_parameters(const Parameters& s, int64_t first, in
     return {{m[0], m[1], m[2]}, q[0], q[1], q[2], q[3], l[0], l[1], o[0]};
 }
 
-// Coefficients of LANES splats: sh[3 * k + channel].
+// Loads the coefficients of LANES splats: sh[3 * k + channel].
 inline void load_sh(const Parameters& s, int64_t first, int lanes, int degree, V* sh) {
     load_rows<3>(s.sh0 + 3 * first, 3, lanes, sh);
     const int64_t stride = 3 * s.sh_rest;
@@ -65,7 +65,7 @@ inline void load_sh(const Parameters& s, int64_t first, int lanes, int degree, V
     if (degree == 3) load_rows<45>(rest, stride, lanes, sh + 3);
 }
 
-// The cache lines of `count` reals from p on: asked for while other work is done.
+// Prefetches the cache lines of `count` reals starting at p.
 inline __attribute__((always_inline)) void ask_for(const real* p, int64_t count) {
     for (int64_t i = 0; i < count; i += LINE / sizeof(real)) __builtin_prefetch(p + i, 0, 3);
 }
@@ -76,7 +76,7 @@ inline void zero_rows(real* p, int64_t first, int64_t stride, int lanes) {
     if (p) memset(p + first * stride, 0, size_t(lanes * stride) * sizeof(real));
 }
 
-// Gradients of the coefficients of LANES splats from those of their colours.
+// Computes the coefficient gradients of LANES splats from their colour gradients.
 inline void write_sh(int degree, int64_t sh_rest, const ParameterGradients& out, int64_t i, int lanes,
                      const Vec3<V>& g_color, const V* basis) {
     V g[3 * SH_MAX];

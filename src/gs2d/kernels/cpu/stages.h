@@ -1,4 +1,4 @@
-// Nanoseconds of each pass of this thread's last calls, for benchmarks: a clock read per pass and view.
+// Nanoseconds of each pass of this thread's last calls, for benchmarks. Costs one clock read per pass and view.
 #pragma once
 
 #include <cstdint>
@@ -13,7 +13,7 @@ extern __thread int64_t stage_ns[STAGES];  // a forward or backward pass overwri
 class StageClock {
   public:
     StageClock() { clock_gettime(CLOCK_MONOTONIC, &last_); }
-    // The time since the last call (or construction) was spent in `stage`.
+    // Adds the time since the last call (or construction) to `stage`.
     void done(Stage stage) {
         timespec now;
         clock_gettime(CLOCK_MONOTONIC, &now);

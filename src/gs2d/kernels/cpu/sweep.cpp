@@ -1,7 +1,7 @@
-// Plane sweep of one image (training/start/plane_sweep.py has the same in torch): for each pixel and depth, the
-// normalised cross-correlation of its patch with those of other images, averaged over the two best images. The result
-// is the best depth, its score and the scores of the adjacent depths. Bands of rows are independent, so it does not
-// depend on the number of threads.
+// Plane sweep of one image (torch version: training/start/plane_sweep.py). For each pixel and depth, computes the
+// normalised cross-correlation of its patch with patches of other images, averaged over the two best images. The result
+// is the best depth, its score and the scores of the adjacent depths. Bands of rows are independent, so the result does
+// not depend on the number of threads.
 #include <algorithm>
 #include <atomic>
 #include <cstdint>
@@ -14,7 +14,7 @@
 namespace gs2d {
 namespace {
 
-// The arrays of a loop do not overlap.
+// Pointers in a loop do not alias.
 #if defined(__clang__)
 #define GS2D_APART _Pragma("clang loop vectorize(assume_safety)")
 #else
@@ -25,15 +25,15 @@ constexpr int64_t BAND = 32;  // rows per piece, plus `radius` rows on both side
 
 }  // namespace
 
-// Arrays are contiguous. Depths go from one end of the sweep to the other.
+// Arrays are contiguous. Depths are monotonic.
 struct SweepArguments {
     int64_t height, width, planes, neighbours, radius;
     const real* image;       // [height, width], grey
     const uint8_t* wanted;   // [height, width]: 0 = skip this pixel
-    const real* const* others;  // [neighbours] images, each [height + 1, width + 1]: the last row and column twice
+    const real* const* others;  // [neighbours] images, each [height + 1, width + 1]; last row and column repeated
     const int64_t* sizes;    // [neighbours, 2]: height, width
-    const real* turned;      // [neighbours, 3, 3]: other K R K^-1
-    const real* moved;       // [neighbours, 3]: other K t
+    const real* turned;      // [neighbours, 3, 3]: K_n R K^-1, with K_n of the neighbour
+    const real* moved;       // [neighbours, 3]: K_n t
     const real* depths;      // [planes]
     real noise;              // variance of image noise
     real* best;              // [height, width], -1 if unknown
@@ -50,7 +50,7 @@ int64_t mirrored(int64_t i, int64_t size) {
     return std::clamp<int64_t>(i, 0, size - 1);
 }
 
-// Mirrors a row beyond both ends, as far as patches reach.
+// Mirrors a row at both ends, as far as patches reach.
 void mirror_ends(real* row, int64_t width, int64_t radius) {
     for (int64_t k = 1; k <= radius; ++k) {
         row[-k] = row[mirrored(-k, width)];
@@ -58,7 +58,7 @@ void mirror_ends(real* row, int64_t width, int64_t radius) {
     }
 }
 
-// One row of the image, columns [left, right), sampled from another image at a depth; `inside`: visible there.
+// Samples columns [left, right) of an image row from another image at a depth; `inside`: visible in that image.
 void fetch(const SweepArguments& a, int64_t n, int64_t y, real depth, int64_t left, int64_t right, real* out,
            real* inside) {
     const real *t = a.turned + 9 * n, *m = a.moved + 3 * n, *other = a.others[n];
@@ -85,8 +85,8 @@ void fetch(const SweepArguments& a, int64_t n, int64_t y, real depth, int64_t le
     }
 }
 
-// Buffers for a band, with `radius` more columns on both sides: arrays with the adjacent rows, and of its own rows.
-// Vectors reach beyond the last requested column; the values there are not used.
+// Buffers for a band, with `radius` more columns on both sides. Some also contain the adjacent rows, the others only
+// the rows of the band. Vectors extend beyond the last requested column; the values there are not used.
 struct Band {
     Band(int64_t width, int64_t rows, int64_t radius)
         : radius(radius),
@@ -102,8 +102,8 @@ struct Band {
     Band(const Band&) = delete;
 
     const int64_t radius, stride;
-    real *fetched, *inside, *own;       // of column 0
-    real *means, *squares, *products;  // sums over the columns of patches
+    real *fetched, *inside, *own;       // pointers to column 0
+    real *means, *squares, *products;  // sums over patch columns
     real *own_mean, *variance, *first, *second, *last;
 
     bool failed() const { return room == nullptr; }
@@ -112,7 +112,7 @@ struct Band {
     real* const room;
 };
 
-// Sums over the columns of patches in a row at `at`: of an image, its square, and its product with the swept image.
+// Sums over the patch columns in a row at `at`: an image, its square, and its product with the swept image.
 void sum_columns(const Band& b, const real* image, int64_t at, int64_t left, int64_t right) {
     const real *row = image + at - b.radius, *own = b.own + at - b.radius;
     for (int64_t x = left; x < right; x += LANES) {
@@ -125,7 +125,7 @@ void sum_columns(const Band& b, const real* image, int64_t at, int64_t left, int
     }
 }
 
-// The mean over the rows of patches starting at `from`.
+// Returns the mean over the patch rows starting at `from`.
 GS2D_HD V mean_of_rows(const Band& b, const real* from, V share) {
     V sum = load(from);
     for (int64_t k = 1; k <= 2 * b.radius; ++k) sum = sum + load(from + k * b.stride);
@@ -136,7 +136,7 @@ GS2D_HD V variance_of(V square, V mean, V noise) { return max(square - mean * me
 
 V share_of(const Band& b) { return V(real(1) / real((2 * b.radius + 1) * (2 * b.radius + 1))); }
 
-// The patches of the swept image in a row of the band.
+// Computes the patch statistics of the swept image in a row of the band.
 void keep_own(const SweepArguments& a, const Band& b, int64_t row, int64_t left, int64_t right) {
     const V share = share_of(b), noise = V(a.noise);
     for (int64_t x = left; x < right; x += LANES) {
@@ -146,7 +146,7 @@ void keep_own(const SweepArguments& a, const Band& b, int64_t row, int64_t left,
     }
 }
 
-// Scores of a row of the band with one image, merged into the best two. Patches start at that row of the sums.
+// Merges the scores of a band row with one image into the best two. Patches start at that row of the sums.
 void add_scores(const SweepArguments& a, const Band& b, int64_t row, int64_t left, int64_t right) {
     const V share = share_of(b), noise = V(a.noise), none = V(real(-1));
     const real* inside = b.inside + row + b.radius * b.stride;
@@ -180,7 +180,7 @@ void keep_best(const SweepArguments& a, const Band& b, int64_t plane, int64_t ro
     }
 }
 
-// False if memory is short.
+// Processes a band; returns false if out of memory.
 bool sweep_band(const SweepArguments& a, int64_t begin, int64_t end) {
     const int64_t W = a.width, H = a.height, r = a.radius, rows = end - begin, tall = rows + 2 * r;
     int64_t left = W, right = 0;  // range of requested columns
@@ -225,7 +225,7 @@ bool sweep_band(const SweepArguments& a, int64_t begin, int64_t end) {
 
 using namespace gs2d;
 
-// Returns 1, or 0 if memory was short.
+// Returns 1, or 0 if out of memory.
 GS2D_EXPORT int gs2d_sweep(const SweepArguments* arguments) {
     std::atomic<bool> whole{true};
     parallel_ranges(arguments->height, BAND, [&](int64_t begin, int64_t end) {

@@ -21,7 +21,7 @@ struct Pool {
     int wanted = 1;            // requested threads, including the caller
     int started = 0;           // pool threads alive
     int seats = 0;             // pool threads that may still join the current job
-    std::atomic<int> busy{0};  // pool threads inside it
+    std::atomic<int> busy{0};  // pool threads inside the job
     std::atomic<uint64_t> job{0};
     Task task = nullptr;
     void* context = nullptr;
@@ -33,8 +33,8 @@ Pool pool;
 thread_local bool inside = false;
 thread_local int number = 0;
 
-// Time that a thread spins before it sleeps: jobs follow within microseconds, and waking a thread takes tens of them.
-// Longer spinning would take cores from torch's threads.
+// How long a thread spins before it sleeps. Jobs follow within microseconds, and waking a thread takes tens of
+// microseconds. Longer spinning would take cores from torch's threads.
 template <class F> void look_for(F&& ready) {
     timespec start, now;
     clock_gettime(CLOCK_MONOTONIC, &start);
@@ -77,7 +77,7 @@ void* thread_main(void* started) {
     return nullptr;
 }
 
-// A forked child has only the forking thread: it starts with an empty pool and fresh locks.
+// A forked child has only the forking thread, so it starts with an empty pool and fresh locks.
 void after_fork() {
     pthread_mutex_init(&pool.run_lock, nullptr);
     pthread_mutex_init(&pool.lock, nullptr);
@@ -89,7 +89,7 @@ void after_fork() {
     number = 0;
 }
 
-void start_missing(int needed) {  // with pool.lock held
+void start_missing(int needed) {  // call with pool.lock held
     if (pool.started == 0) {
         static bool registered = false;
         if (!registered) pthread_atfork(nullptr, nullptr, after_fork);
@@ -122,7 +122,7 @@ int thread_number() { return number; }
 
 void run_tasks(int64_t n, Task task, void* context) {
     const int helpers = static_cast<int>(n - 1 < get_threads() - 1 ? n - 1 : get_threads() - 1);
-    if (helpers <= 0 || inside) {  // also a parallel_for inside a task: run it here
+    if (helpers <= 0 || inside) {  // a nested parallel_for runs on the calling thread
         for (int64_t i = 0; i < n; ++i) task(context, i);
         return;
     }

@@ -1,8 +1,8 @@
-// A pool of sleeping threads. OpenMP is not used, since its threads spin and torch has a pool in the same process.
+// A pool of sleeping threads. OpenMP is not used: its threads spin, and torch has its own pool in the process.
 //
 // parallel_for(n, f) calls f(i) once for each i in [0, n), on the calling thread and the pool, in no fixed order. For
-// results that do not depend on the number of threads, cut the work into a number of pieces that does not depend on it
-// either, let piece i write only what belongs to i, and reduce in order afterwards.
+// results that do not depend on the number of threads, use a fixed number of pieces, let piece i write only its own
+// output, and reduce in order afterwards.
 #pragma once
 
 #include <atomic>
@@ -12,7 +12,7 @@ namespace gs2d {
 
 void set_threads(int n);  // at least 1; the calling thread is one of them
 int get_threads();
-int thread_number();  // of the calling thread, as long as it lives: 1, 2, ... in the pool, 0 for all others
+int thread_number();  // of the calling thread, constant while it lives: 1, 2, ... in the pool, 0 for all other threads
 
 using Task = void (*)(void* context, int64_t i);
 void run_tasks(int64_t n, Task task, void* context);
@@ -21,7 +21,7 @@ template <class F> void parallel_for(int64_t n, F&& f) {
     run_tasks(n, [](void* context, int64_t i) { (*static_cast<F*>(context))(i); }, &f);
 }
 
-// Cuts [0, n) into pieces of at most `grain` and calls f(begin, end) for each.
+// Splits [0, n) into pieces of at most `grain` and calls f(begin, end) for each.
 template <class F> void parallel_ranges(int64_t n, int64_t grain, F&& f) {
     parallel_for((n + grain - 1) / grain, [&](int64_t i) {
         const int64_t begin = i * grain, end = begin + grain < n ? begin + grain : n;
@@ -29,10 +29,10 @@ template <class F> void parallel_ranges(int64_t n, int64_t grain, F&& f) {
     });
 }
 
-// Called on every thread of a parallel_for: shares out the pieces [first, end), whose flags are 0. Piece i goes to
-// thread i % get_threads() as long as that thread keeps up: what a thread has written to memory for a piece in one pass
-// is still near it in the next, where cores do not share a cache. Threads that have finished help the others, from the
-// last piece.
+// Called on every thread of a parallel_for: distributes the pieces [first, end), whose flags are 0. Piece i goes to
+// thread i % get_threads() as long as that thread keeps up. On CPUs whose cores do not share a cache, data that a
+// thread wrote for a piece in one pass is then in its cache in the next pass. Threads that have finished help the
+// others, starting with the last piece.
 template <class F> void share_out(int64_t first, int64_t end, std::atomic<uint8_t>* taken, F&& f) {
     const int64_t threads = get_threads(), me = thread_number() % threads;
     const auto take = [&](int64_t i) {

@@ -1,4 +1,4 @@
-// Pixels of one tile in block order, and the exact footprint test of one splat against all blocks of a tile.
+// Pixels of one tile in block order, and the exact footprint test of a splat against all blocks of a tile.
 #pragma once
 
 #include "cpu/frame.h"
@@ -7,12 +7,12 @@ namespace gs2d {
 
 constexpr int PIXELS = TILE * TILE;
 
-// First pixel of block b within its tile.
+// First pixel of block b, relative to the tile.
 inline int block_x(int b) { return b % BLOCKS_X * BLOCK_W; }
 inline int block_y(int b) { return b / BLOCKS_X * BLOCK_H; }
 
 struct TileArea {
-    int x0, y0, width, height;  // first pixel; pixels inside the image
+    int x0, y0, width, height;  // first pixel; number of pixels inside the image
 };
 inline TileArea tile_area(const Frame& f, int64_t tile) {
     TileArea a;
@@ -23,12 +23,12 @@ inline TileArea tile_area(const Frame& f, int64_t tile) {
     return a;
 }
 
-// Position of a tile's pixel in block order.
+// Returns the index in block order of a pixel of a tile.
 inline int block_order(int x, int y) {
     return ((y / BLOCK_H) * BLOCKS_X + x / BLOCK_W) * LANES + (y % BLOCK_H) * BLOCK_W + x % BLOCK_W;
 }
 
-// Four pixels of a row: the unit in which images are rearranged.
+// Four pixels of a row, the unit in which images are rearranged.
 typedef real Four __attribute__((vector_size(4 * sizeof(real))));
 inline Four load4(const real* p) {
     Four v;
@@ -60,12 +60,12 @@ template <int C> inline void join4(const real* from, real* to) {
     }
 }
 
-// An interleaved image -> C planes in block order, one after the other; 0 outside the image, and where it is null.
+// Converts an interleaved image to C consecutive planes in block order; 0 outside the image, and if the image is null.
 template <int C> inline void read_planes(const real* image, int image_width, const TileArea& a, real* out) {
     if (!image || a.width < TILE || a.height < TILE) memset(out, 0, sizeof(real) * C * PIXELS);
     if (!image) return;
     const real* from = image + (int64_t(a.y0) * image_width + a.x0) * C;
-    // Constant bounds give little code, so that many rows are loaded at once.
+    // Constant bounds give compact code, so many rows are loaded at once.
     if (a.width == TILE && a.height == TILE) {
         for (int y = 0; y < TILE; ++y, from += int64_t(image_width) * C)
             for (int x = 0; x < TILE; x += 4) split4<C>(from + x * C, out + block_order(x, y));
@@ -94,7 +94,7 @@ template <int C> inline void write_planes(const real* values, real* image, int i
     }
 }
 
-// The cache lines that a row of a tile takes of some images: where each is for the first row of the first tile.
+// Cache lines of one tile row in several images; `at` is the address for the first row of the first tile.
 struct RowLines {
     struct Line {
         const real* at;
@@ -112,19 +112,18 @@ struct RowLines {
     }
 };
 
-// The rows of a tile are scattered, so they are prefetched during other work, a few lines at each of `times` calls,
-// since a processor drops most of many simultaneous requests. They go to the second-level cache, since the first is
-// full.
+// Prefetches the scattered rows of a tile during other work, a few lines in each of `times` calls, because a CPU drops
+// most of many simultaneous requests. The lines go to the L2 cache, because the L1 cache is full.
 class RowsAhead {
   public:
-    // No prefetch beyond the last tile.
+    // Does not prefetch beyond the last tile.
     RowsAhead(const Frame& f, const RowLines& row, int64_t tile, int times) : row_(row) {
         if (tile >= f.tiles || times == 0) return;
         const TileArea a = tile_area(f, tile);
         first_ = int64_t(a.y0) * row.width + a.x0, left_ = a.height * row.count;
         each_ = (left_ + times - 1) / times;
     }
-    inline __attribute__((always_inline)) void ask() {  // inlined: gcc drops calls of functions that only prefetch
+    inline __attribute__((always_inline)) void ask() {  // inlined: gcc drops calls to functions that only prefetch
         for (int n = each_ < left_ ? each_ : left_; n > 0; --n, --left_) {
             __builtin_prefetch(row_.lines[at_].at + first_ * row_.lines[at_].channels, 0, 2);
             if (++at_ == row_.count) at_ = 0, first_ += row_.width;
@@ -133,16 +132,16 @@ class RowsAhead {
 
   private:
     const RowLines& row_;
-    int64_t first_ = 0;  // pixel of the row
+    int64_t first_ = 0;  // first pixel of the row
     int left_ = 0, at_ = 0, each_ = 0;
 };
 
-// Inputs of the footprint test of LANES splats against a tile, and whether each is unbounded.
+// Inputs of the footprint test of LANES splats against a tile, and which splats are unbounded.
 struct Footprints {
-    V ex, ey, slope, half, inv_y2, y_right, disc2, plain_from;  // of the cull record
-    V cx, cy, au, bu, av, bv, ai, bi, iz;                       // of the record
+    V ex, ey, slope, half, inv_y2, y_right, disc2, plain_from;  // from the cull record
+    V cx, cy, au, bu, av, bv, ai, bi, iz;                       // from the record
 
-    // Of splats[0 .. LANES).
+    // Loads splats[0 .. LANES).
     Footprints(const Frame& f, const uint32_t* splats) {
         const real *rows[LANES], *records[LANES];
         for (int i = 0; i < LANES; ++i)
@@ -158,7 +157,7 @@ struct Footprints {
     }
 };
 
-// As blocks_touched, for the splats without an ellipse: only their masks are written.
+// Like blocks_touched for splats without an ellipse: writes only their masks.
 __attribute__((noinline)) inline void outlined_blocks(const Frame& f, const Footprints& s, V tile_x, V tile_y,
                                                       uint32_t* masks) {
     const View& v = f.view;
@@ -181,13 +180,13 @@ __attribute__((noinline)) inline void outlined_blocks(const Frame& f, const Foot
         masks[__builtin_ctz(left)] = found[__builtin_ctz(left)];
 }
 
-// Bit b of masks[i]: the ellipse or the low-pass disc of splat i reaches a pixel centre of block b, or nearly so. A
-// footprint reaches each row of blocks in one interval. tile_x, tile_y: the tile's first pixel.
+// Sets bit b of masks[i] if the ellipse or low-pass disc of splat i reaches a pixel centre of block b, or nearly so. A
+// footprint reaches each row of blocks in one interval. tile_x, tile_y: first pixel of the tile.
 inline void blocks_touched(const Frame& f, const Footprints& s, V tile_x, V tile_y, uint32_t* masks) {
     const Chords<V> chords = {s.ex - tile_x, s.ey - tile_y, s.slope,       s.half, s.inv_y2,
                               s.y_right,     s.cx - tile_x, s.cy - tile_y, s.disc2};
     LaneInts touched = {};
-    V last = V(real(TILE) - real(0.5));  // pixel centres of a row of blocks
+    V last = V(real(TILE) - real(0.5));  // last pixel centre of a row of blocks
 #pragma GCC unroll 1
     for (int y = BLOCKS / BLOCKS_X; y > 0; --y, last = last - V(real(BLOCK_H))) {
         V left, right;

@@ -1,5 +1,5 @@
-// The backward pass over the splats of a tile, instantiated by backward.cpp and features_vjp.cpp. These are two files
-// because the compiler's inlining depends on the amount of code in one.
+// Backward pass over the splats of a tile, instantiated in backward.cpp and features_vjp.cpp. There are two files
+// because compiler inlining depends on the amount of code in a file.
 #pragma once
 
 #include "cpu/features.h"
@@ -10,7 +10,7 @@
 namespace gs2d {
 namespace {
 
-// Per pixel of the tile, in block order: state, then what PixelGradient<V> holds.
+// Per pixel of the tile, in block order: state, then the members of PixelGradient<V>.
 enum Plane {
     T, S, RED, GREEN, BLUE, ALPHA, NX, NY, NZ, DEPTH, MEDIAN, MEDIAN_BELOW, DIST2, DIST1, DEPTH0, TRANSMITTANCE, Z, PLANES
 };
@@ -24,7 +24,7 @@ inline PixelGradient<V> load_gradient(const Planes s, int b) {
 
 constexpr int AHEAD = 8;  // prefetch distance for the scattered records, in splats
 
-// End of a block's work: behind its last splat with gradients its pixels are not needed.
+// Marks the end of a block: the pixels behind its last splat with gradients are not needed.
 struct Interest {
     uint32_t blocks = ALL_BLOCKS;
     int32_t last[BLOCKS];
@@ -43,7 +43,7 @@ struct Interest {
     }
 };
 
-// A splat without gradients updates only T and S, with the same arithmetic as below, so later splats get the same bits.
+// A splat without gradients updates only T and S, with the same arithmetic as below, so later splats keep their bits.
 template <bool Geo, bool Dist>
 __attribute__((noinline)) void pass_by(const real* record, bool plain, uint32_t blocks, Planes s,
                                        const Centres& centres, const BlendLimits<V>& limits) {
@@ -61,37 +61,36 @@ __attribute__((noinline)) void pass_by(const real* record, bool plain, uint32_t 
     }
 }
 
-constexpr bool COLORS_FIT = REGISTERS >= 32;  // they fit the registers next to the update of T and S
+constexpr bool COLORS_FIT = REGISTERS >= 32;  // true if colours fit in registers during the update of T and S
 
-// Pairs (splat, block) of consecutive splats, processed in passes with short dependency chains, so that many pairs
-// overlap, and little state, so that it fits the registers: planes, alphas, updates of T and S, and the sums of each
-// splat.
+// (splat, block) pairs of consecutive splats, processed in passes: planes, alphas, updates of T and S, and the sums of
+// each splat. Short dependency chains let many pairs overlap, and the small state of each pass fits in registers.
 struct Batch {
-    // the most that a splat may have; more would evict the pixels from the first-level cache
+    // maximum of one splat; a larger batch would evict the pixels from the L1 cache
     static constexpr int PAIRS = BLOCKS;
     alignas(64) real depth[PAIRS][LANES], inverse_depth[PAIRS][LANES], rho[PAIRS][LANES];
-    real alpha[PAIRS][LANES];                              // in the end dL/d ln(alpha)
+    real alpha[PAIRS][LANES];                              // finally dL/d ln(alpha)
     real I[PAIRS][LANES];                                  // dL/d(1 / z)
-    real w[PAIRS][LANES];                                  // weight, where colours come after it
-    M ray[PAIRS];                                          // of splats that are not plain
+    real w[PAIRS][LANES];                                  // weight, if colours are processed afterwards
+    M ray[PAIRS];                                          // set for splats that are not plain
     uint8_t block[PAIRS + BLOCKS], splat[PAIRS + BLOCKS];  // `splat` counts within the batch
-    // Of each splat. Its pairs are those before `end`; filtered: the low-pass filter decided one of them.
+    // Per splat. Its pairs end at `end`; filtered: the low-pass filter determined rho for at least one of them.
     SplatPlanes planes[PAIRS];
     const real* record[PAIRS];
     uint8_t end[PAIRS], filtered[PAIRS];
-    uint32_t others = 0;  // a bit for each splat that is not plain
+    uint32_t others = 0;  // bit mask of splats that are not plain
     int pairs = 0, splats = 0;
 
     bool has_room(uint32_t blocks) const { return pairs + __builtin_popcount(blocks) <= PAIRS; }
 
-    // No branch depends on `blocks`, since none could be predicted.
+    // Does not branch on `blocks`, since such branches are unpredictable.
     void add(const real* splat_record, bool plain, uint32_t blocks, const Centres& centres) {
         memset(&splat[pairs], splats, BLOCKS);
         for (int first = 0; first < BLOCKS; first += 8) {
             const uint32_t byte = blocks >> first & 255u;
             uint64_t numbers;
             memcpy(&numbers, BIT_NUMBERS.of[byte], sizeof numbers);
-            numbers += 0x0101010101010101u * uint64_t(first);  // to each byte
+            numbers += 0x0101010101010101u * uint64_t(first);  // added to each byte
             memcpy(&block[pairs], &numbers, sizeof numbers);
             pairs += __builtin_popcount(byte);
         }
@@ -102,7 +101,7 @@ struct Batch {
     }
 };
 
-// All splats are processed as plain, which most are; then those that are not plain again.
+// Processes all splats as plain, since most are, then repeats those that are not.
 template <bool WithInverse> inline void find_hits(Batch& w, const Centres& centres, const BlendLimits<V>& limits) {
     const auto put = [&](int i, const Hit<V>& h) {
         store(w.depth[i], h.depth), store(w.rho[i], h.rho);
@@ -127,7 +126,7 @@ template <bool WithInverse> inline void find_hits(Batch& w, const Centres& centr
     }
 }
 
-// One pair: updates T and S, and stores the inputs of its sums in the batch.
+// Processes one pair: updates T and S, and stores the inputs of its sums in the batch.
 template <bool Geo, bool Dist, bool Trans, bool Feat>
 inline PairGradient<V> weigh_pair(Batch& w, int i, const Record<V>& splat, const PixelGradient<V>& g, Planes s,
                                   const BlendLimits<V>& limits, V features = V(0)) {
@@ -143,7 +142,7 @@ inline PairGradient<V> weigh_pair(Batch& w, int i, const Record<V>& splat, const
     return p;
 }
 
-// Sums of one splat over its pairs. Colors: add_colors follows and uses the stored weights.
+// Sums the pairs of one splat. Colors: add_colors follows and uses the stored weights.
 template <bool Geo, bool Abs, bool Filtered, bool Colors>
 inline void sum_pairs(const Batch& w, int j, int first, int end, const Record<V>& splat, const Planes s,
                       const Centres& centres, PairSums<V>& sums) {
@@ -181,7 +180,7 @@ inline void write_slot(const Record<V>& splat, const PairSums<V>& sums, bool fil
     if (Abs || filtered) transpose_reduce<GRADIENT_EXTRA>(extra, to.extras);
 }
 
-// Empties the batch; returns where the next splat's slot is.
+// Empties the batch; returns the slot of the next splat.
 template <bool Geo, bool Dist, bool Abs, bool Trans, bool Feat>
 __attribute__((noinline)) Slots finish_batch(Batch& w, Slots to, Planes s, const Centres& centres,
                                              const BlendLimits<V>& limits, TileFeatures& features) {
@@ -258,7 +257,7 @@ void tile_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows, Plane
 using TileVjp = void (*)(const Frame&, int64_t, Slots, const uint8_t*, Planes, const TileArea&, const BlendLimits<V>&,
                          RowsAhead, TileFeatures);
 
-// With gradients of further channels.
+// Instantiations with gradients of further channels.
 TileVjp feature_variant(bool dist, bool abs);
 
 }  // namespace gs2d

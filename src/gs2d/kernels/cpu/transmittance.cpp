@@ -1,5 +1,5 @@
-// Depth by transmittance, after the blending and only on request: the pairs of a tile are intersected again and stored
-// by block, and every pixel searches its own pairs along its ray.
+// Depth by transmittance, computed after the blending and only on request. The pairs of a tile are intersected again
+// and stored by block; then each pixel searches its own pairs along its ray.
 #include "cpu/frame.h"
 #include "cpu/planes.h"
 #include "cpu/threads.h"
@@ -7,7 +7,7 @@
 namespace gs2d {
 namespace {
 
-// alpha and 1 / z of the pairs of a tile, by block; alpha is 0 if a pixel did not blend the splat.
+// alpha and 1 / z of the pairs of a tile, by block; alpha is 0 for pixels that did not blend the splat.
 struct Pairs {
     Buffer<real> values;  // [pairs, 2, LANES]
     int64_t begin[BLOCKS + 1];
@@ -15,7 +15,7 @@ struct Pairs {
     real* at(int64_t i) { return values.data + 2 * LANES * i; }
 };
 
-// False if memory is short.
+// Stores the pairs of a tile; returns false if out of memory.
 bool gather(const Frame& f, int64_t tile, const TileArea& area, const BlendLimits<V>& limits, Pairs& pairs) {
     const Entry* const entries = &f.entries[f.tile_begin[tile]];
     const int32_t count = f.tile_count[tile];
@@ -49,7 +49,7 @@ bool gather(const Frame& f, int64_t tile, const TileArea& area, const BlendLimit
     return true;
 }
 
-// The pixels of a block; `depth` holds a first guess.
+// Searches the pixels of a block; `depth` holds the initial guess.
 void search(Pairs& pairs, int b, V alpha, V inv_width, real* depth, real* slope) {
     const int64_t begin = pairs.begin[b], end = pairs.begin[b + 1];
     const M hit = alpha > V(0);

@@ -1,17 +1,17 @@
-// Adam over all attributes in one launch, with the arithmetic of torch's fused kernels. Rows that
-// are not trained are not written.
+// Adam over all attributes in one launch, with the arithmetic of torch's fused kernels. Rows that are not trained are
+// not written.
 #include "core/adam.h"
 #include "cuda/common.h"
 
 namespace gs2d {
 
-constexpr int ATTRIBUTES = 6, ADAM_THREADS = 128, ADAM_PER_THREAD = 4;  // elements; cuda_adam.py has the same
+constexpr int ATTRIBUTES = 6, ADAM_THREADS = 128, ADAM_PER_THREAD = 4;  // elements; same values in cuda_adam.py
 
 struct AdamAttribute {
     float *parameter, *mean, *square;  // [N, columns]
     const float* gradient;             // [N, columns], or [M, columns] with `compact`
-    const uchar* trained;              // [N], 0 = not trained; or null: all
-    const int64* rows;                 // [M]: rows to update; or null: all
+    const uchar* trained;              // [N], 0: not trained; null: all are trained
+    const int64* rows;                 // [M]: rows to update; null: all
     int64 elements;                    // columns * (M or N)
     int64 first_block;
     int columns, compact;
@@ -22,7 +22,7 @@ struct AdamArguments {
     AdamAttribute attributes[ATTRIBUTES];
     int count;                             // attributes in use
     float weight_1, beta2, weight_2, eps;  // weight_k = 1 - beta_k
-    const int* skip;                       // if not 0, do nothing; or null
+    const int* skip;                       // does nothing if nonzero; may be null
 };
 
 __device__ __forceinline__ void update(const AdamAttribute& p, const AdamArguments& a, int64 at, float g) {

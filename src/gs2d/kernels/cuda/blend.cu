@@ -1,8 +1,8 @@
-// Blending, front to back: one block of four warps per 16x16 tile, a warp owns 8x8 pixels, a thread two of them.
+// Blending, front to back: one block of four warps per 16x16 tile; a warp has 8x8 pixels, a thread two of them.
 //
-// Warps only vote among their own lanes and never wait for each other. In a chunk of 32 entries each lane reads one
-// entry; the sub-block masks select the splats for the warp; their lanes fetch the records into shared memory, so that
-// a chunk waits for memory once.
+// Warps vote only among their own lanes and never wait for each other. In a chunk of 32 entries, each lane reads one
+// entry, the sub-block masks select the splats for the warp, and the selected lanes fetch the records into shared
+// memory. A chunk therefore waits for memory only once.
 #include "cuda/pixels.h"
 
 namespace gs2d {
@@ -12,11 +12,11 @@ struct BlendArguments {
     const float* records;  // [N, 16]
     const uint* entries;   // splat << 8 | mask of sub-blocks
     const int64* ranges;   // [tiles + 1, 2]
-    const int* tiles;      // [tiles]: which tile a block takes, or null
+    const int* tiles;      // [tiles]: tile of each block, or null
     float *color, *alpha, *normal, *depth_mean, *depth_median, *distortion;  // [H, W (, 3)]
     float* final_T;                                                          // [H, W]
     float* moments;  // [H, W, 3]: M1, M2, inverse depth of the first pair; written with the distortion
-    // [words, 8] or null: bit j of a word: a live pixel of the sub-block uses entry j of the chunk
+    // [words, 8] or null: bit j of a word is set if a live pixel of the sub-block uses entry j of the chunk
     uint* seen;
 };
 
@@ -82,7 +82,7 @@ template <bool DIST> __device__ __forceinline__ void blend(const BlendArguments&
                 seen[h] |= saw ? bit : 0u;
             }
         });
-        __syncwarp();  // the records are overwritten next
+        __syncwarp();  // the records are overwritten in the next iteration
         if (a.seen) {
             const int64 words = word_of(begin, at.tile, chunk);
 #pragma unroll
@@ -92,7 +92,7 @@ template <bool DIST> __device__ __forceinline__ void blend(const BlendArguments&
             }
         }
     }
-    if (a.seen)  // no pixel uses the entries behind the last live one
+    if (a.seen)  // no pixel uses entries behind the last live one
         for (chunk += at.lane; 32 * chunk < count; chunk += 32)
 #pragma unroll
             for (int h = 0; h < HALVES; ++h) a.seen[word_of(begin, at.tile, chunk) + at.sub_block[h]] = 0u;
@@ -101,7 +101,7 @@ template <bool DIST> __device__ __forceinline__ void blend(const BlendArguments&
         if (at.inside[h]) write_pixel<DIST>(a, at.x, at.y + 4 * h, p[h]);
 }
 
-// Blocks per multiprocessor to compile for: 8 leave 64 registers a thread, with which sm_75 and sm_80 would spill.
+// Minimum blocks per multiprocessor: 8 would leave 64 registers per thread, with which sm_75 and sm_80 spill.
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ < 800
 constexpr int BLOCKS = 6;
 #elif defined(__CUDA_ARCH__) && __CUDA_ARCH__ == 800

@@ -1,6 +1,6 @@
-// Gradients of colours alone, of all or some splats, with everything else frozen (stage 2): a second blending pass for
-// the weights, without remaining sums, alpha or geometry. Splats that are not trained only change the transmittance,
-// and a warp stops behind the last trained one.
+// Gradients of colours only, for all or some splats, with everything else frozen (stage 2). A second blending pass
+// recomputes the weights, without remaining sums, alpha or geometry. Splats that are not trained only affect the
+// transmittance, and a warp stops after the last trained splat.
 #include "cuda/colors.h"
 #include "cuda/pixels.h"
 #include "cuda/reduce.h"
@@ -14,7 +14,7 @@ struct BlendColorsArguments {
     const int64* ranges;
     const int* tiles;
     const uint* seen;
-    const uchar* learns;   // [N], 0 = no gradient; or null: all
+    const uchar* learns;   // [N], 0: no gradient; null: all have gradients
     const float* g_color;  // [H, W, 3]
     const int64* slots;    // as in blend_vjp.cu
     float* gradients;      // [N, 4]: colours and padding; zeros on entry; with slots [4 * candidates, 4]
@@ -25,7 +25,7 @@ struct ProjectColorsArguments {
     int64 count, sh_rest;
     const float *means, *sh0, *shN;
     const int* tile_counts;  // [N]; 0: not drawn
-    const uchar* learns;     // or null
+    const uchar* learns;     // [N], 0: no gradient; or null
     float* gradients;        // [N, 4]
     float *g_sh0, *g_shN;    // null: not computed
     int clears;              // 1: reset the rows of gradients to zero
@@ -47,7 +47,7 @@ extern "C" __global__ void __launch_bounds__(128, 8) blend_vjp_learning(BlendCol
     }
     const float x = float(at.x) + 0.5f, y = float(at.y) + 0.5f;
     const int64 begin = a.ranges[2 * int64(at.tile)], end = a.ranges[2 * int64(at.tile) + 1];
-    const auto learning = [&](int64 i, uint wanted) {  // of the chunk's entries
+    const auto learning = [&](int64 i, uint wanted) {  // returns which entries of the chunk are trained
         const bool mine = wanted >> at.lane & 1u && (!a.learns || a.learns[a.entries[i + at.lane] >> 8]);
         return __ballot_sync(FULL_MASK, mine);
     };
@@ -89,7 +89,7 @@ extern "C" __global__ void __launch_bounds__(128, 8) blend_vjp_learning(BlendCol
             const float mine = transpose_reduce<4>(v, at.lane);
             if (!(at.lane & 7)) atomicAdd(a.gradients + 4 * int64(rows[at.warp][j]) + (at.lane >> 3), mine);
         });
-        __syncwarp();  // the records are overwritten next
+        __syncwarp();  // the records are overwritten in the next iteration
     }
 }
 

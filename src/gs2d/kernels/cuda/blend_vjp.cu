@@ -1,8 +1,9 @@
-// Gradients of the blending, front to back, with the layout of blend.cu: a warp owns 8x8 pixels, a thread two of them.
+// Gradients of the blending, front to back, with the layout of blend.cu: a warp has 8x8 pixels, a thread two of them.
 //
-// The words of the forward pass select the splats of a warp, without culling again. A splat's 16 sums are reduced over
-// the warp by a transposing reduction (16 shuffles), after which 16 lanes hold one sum each and add it to the splat's
-// gradient record: one 64-byte line. The order of those additions varies from run to run, and with it the last digits.
+// The mask words of the forward pass select the splats of a warp, without repeated culling. The 16 sums of a splat are
+// reduced over the warp by a transposing reduction (16 shuffles). Then 16 lanes hold one sum each and add it to the
+// gradient record of the splat, a line of 64 bytes. The order of these additions, and thus the last digits, vary
+// between runs.
 #include "cuda/pixels.h"
 #include "cuda/reduce.h"
 
@@ -17,18 +18,18 @@ struct BlendVjpArguments {
     const uint* seen;
     const float *color, *alpha, *normal, *depth_mean, *distortion, *final_T, *moments;         // of the forward pass
     const float *g_color, *g_alpha, *g_normal, *g_depth_mean, *g_depth_median, *g_distortion;  // null: no gradient
-    const uchar* learns;  // [N], 0 = no gradient; or null: all
+    const uchar* learns;  // [N], 0: no gradient; null: all have gradients
     const int64* slots;   // [entries]: candidate index of each entry, or null
     float* gradients;     // [N, 16], zeros on entry; with slots [4 * candidates, 16]
-    float* extras;        // the same rows of 4: low-pass centre, absolute densification signal
-    const float *depth_transmittance, *slope, *g_depth_transmittance;  // of transmittance.cu; TRANS only
-    Features features;  // FEAT only: learns is null; with slots features.gradients is [4 * candidates, F]
+    float* extras;        // low-pass centre and absolute densification signal: 4 columns, same rows as `gradients`
+    const float *depth_transmittance, *slope, *g_depth_transmittance;  // from transmittance.cu; TRANS only
+    Features features;  // FEAT only: `learns` is null; with slots features.gradients is [4 * candidates, F]
 };
 
-// One value of a plane that may be absent.
+// Returns a value of a plane, 0 if the plane is null.
 __device__ __forceinline__ float at_or_zero(const float* plane, int64 i) { return plane ? plane[i] : 0.f; }
 
-// The upstream gradient for composite_vjp, and S = the sum over all splats of w s, from the image's totals.
+// Computes the upstream gradient for composite_vjp, and S = the sum of w s over all splats, from the image totals.
 template <bool GEO, bool DIST, bool TRANS, bool FEAT>
 __device__ __forceinline__ PixelGradient<float> upstream_of(const BlendVjpArguments& a, int64 i, float& S) {
     const float* bg = a.view.background;
@@ -60,7 +61,7 @@ __device__ __forceinline__ PixelGradient<float> upstream_of(const BlendVjpArgume
         add_transmittance(a.g_depth_transmittance[i], a.depth_transmittance[i], a.slope[i], alpha, g);
     S = fma(g.alpha, alpha, S);
     if constexpr (DIST) {
-        S = fma(2.f * a.g_distortion[i], a.distortion[i], S);  // each pair counts for both of its splats
+        S = fma(2.f * a.g_distortion[i], a.distortion[i], S);  // a pair contributes to both of its splats
         add_distortion(a.g_distortion[i] * a.view.distortion_scale, alpha, a.moments[3 * i], a.moments[3 * i + 1], g);
         g.inverse_depth0 = a.moments[3 * i + 2];
     }
@@ -75,7 +76,7 @@ __device__ __forceinline__ void add_gradient(const BlendVjpArguments& a, int64 r
                    g.iz, g.ln_opacity, g.red, g.green, g.blue, g.nx, g.ny, g.nz};
     const float sum = transpose_reduce<16>(v, lane);
     if (!(lane & 1)) atomicAdd(a.gradients + 16 * row + (lane >> 1), sum);
-    if constexpr (PLAIN && !ABS) return;  // no low-pass filter
+    if constexpr (PLAIN && !ABS) return;  // plain splats do not use the low-pass filter
     if constexpr (ABS) {
         float extra[4] = {g.lowpass_cx, g.lowpass_cy, g.abs_x, g.abs_y};
         const float mine = transpose_reduce<4>(extra, lane);
@@ -90,9 +91,9 @@ __device__ __forceinline__ void add_gradient(const BlendVjpArguments& a, int64 r
 // The upstream gradients of the inner loop, in shared memory; each thread reads only its own values.
 template <bool GEO, bool TRANS = false> struct Upstream {
     float4 color[HALVES][128];             // red, green, blue, alpha
-    float4 normal[HALVES][GEO ? 128 : 1];  // and depth
-    float2 median[HALVES][GEO ? 128 : 1];  // and the transmittance behind the median pair
-    float2 depth[HALVES][TRANS ? 128 : 1];  // by transmittance: factor and depth
+    float4 normal[HALVES][GEO ? 128 : 1];  // normal and depth
+    float2 median[HALVES][GEO ? 128 : 1];  // median and median_below
+    float2 depth[HALVES][TRANS ? 128 : 1];  // depth by transmittance: factor and depth
     __device__ __forceinline__ void put(int h, const PixelGradient<float>& g) {
         color[h][threadIdx.x] = {g.red, g.green, g.blue, g.alpha};
         if constexpr (!GEO) return;
@@ -117,7 +118,7 @@ struct Staged {  // 32 splats of a warp
     uint rows[32];
 };
 
-// For the pairs of PART splats, in shared memory: first the features' part of dL/dw, then the weight.
+// Shared-memory values for the pairs of PART splats: first the features' part of dL/dw, then the weight.
 constexpr int PART = 16;
 using PairValues = float (*)[HALVES][128];
 __device__ __forceinline__ float& value_of(PairValues values, int j, int h) {
@@ -139,7 +140,7 @@ __device__ __forceinline__ void for_each_channels(const BlendVjpArguments& a, co
     }
 }
 
-// The features' part of dL/dw of each selected splat; each gradient of a pixel is read once for all splats.
+// Computes the features' part of dL/dw of each selected splat; each gradient of a pixel is read once for all splats.
 __device__ __forceinline__ void weigh_features(const BlendVjpArguments& a, const Place& at, const Staged& staged,
                                                uint wanted, PairValues to) {
     for (int j = 0; j < PART; ++j) value_of(to, j, 0) = value_of(to, j, 1) = 0.f;
@@ -164,7 +165,7 @@ __device__ __forceinline__ void weigh_features(const BlendVjpArguments& a, const
     });
 }
 
-// The row of `gradients` and `extras` of splat j of a chunk: with slots, the one of this entry and warp.
+// Returns the row of `gradients` and `extras` for splat j of a chunk: with slots, the row of this entry and warp.
 template <bool FEAT>
 __device__ __forceinline__ int64 gradient_row(const BlendVjpArguments& a, const Place& at, const Staged& staged,
                                               int64 chunk, int j) {
@@ -172,7 +173,7 @@ __device__ __forceinline__ int64 gradient_row(const BlendVjpArguments& a, const 
     return staged.rows[j];
 }
 
-// Adds the feature gradients of those splats, from their weights. `chunk` is the first entry of the chunk.
+// Adds the feature gradients of the selected splats, from their weights. `chunk` is the first entry of the chunk.
 __device__ __forceinline__ void add_features(const BlendVjpArguments& a, const Place& at, const Staged& staged,
                                              int64 chunk, uint wanted, PairValues weights) {
     for_each_channels(a, at, [&](int64 c, const float (&g)[HALVES][CHANNELS]) {
@@ -194,7 +195,7 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
                                           PairValues pairs = nullptr) {
     const Place at = place_of(a.view, a.tiles);
     const BlendLimits<float> limits = limits_of(a.view);
-    PixelGradient<float> g[HALVES];  // in registers only members that are not in `upstream`
+    PixelGradient<float> g[HALVES];  // registers hold only members that are not in `upstream`
     float T[HALVES], S[HALVES];
 #pragma unroll
     for (int h = 0; h < HALVES; ++h) {
@@ -220,7 +221,7 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
             const uint splat = a.entries[i + at.lane] >> 8;
             if (a.learns) learns = a.learns[splat];
             fetch_record(a.records, splat, staged.records, at.lane);
-            // Feature values are read by splat, so their kernels look the slot up where they write.
+            // Feature values are read by splat, so the feature code looks up the slot when it writes.
             staged.rows[at.lane] = !FEAT && a.slots ? uint(a.slots[i + at.lane]) * 4u + uint(at.warp) : splat;
             mine_is_plain = plain_for_warp(a.view, at, staged.records);
         }
@@ -263,12 +264,12 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
                 add_features(a, at, staged, i, part, pairs);
             }
         }
-        __syncwarp();  // the records are overwritten next
+        __syncwarp();  // the records are overwritten in the next iteration
     }
 }
 
-// GEO: normal or depth images have gradients (or the distortion has: DIST). ABS: the AbsGS signal is computed. TRANS:
-// the depth by transmittance has. FEAT: further channels have.
+// Outputs with gradients: GEO: normal or depth images (or the distortion, DIST); TRANS: depth by transmittance; FEAT:
+// further channels. ABS: computes the AbsGS signal.
 extern "C" __global__ void __launch_bounds__(128, 7) blend_vjp_color(BlendVjpArguments a) {
     __shared__ Staged staged[4];
     __shared__ Upstream<false> upstream;

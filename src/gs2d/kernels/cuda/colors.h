@@ -1,12 +1,12 @@
-// Colours of splats from their SH coefficients, and back. The degree is a template value inside: coefficients stay in
-// registers.
+// Colours of splats from SH coefficients, and their gradients. The degree is a template parameter inside, so that
+// coefficients stay in registers.
 #pragma once
 
 #include "cuda/common.h"
 
 namespace gs2d {
 
-// One splat's rows. Coefficient k lies in `first` for k = 0, else in `rest`.
+// SH coefficients of one splat: coefficient 0 in `first`, all others in `rest`.
 struct Coefficients {
     const float *first, *rest;
 };
@@ -22,7 +22,7 @@ template <int DEGREE> struct Basis {
 #pragma unroll
         for (int k = 0; k < 3 * COUNT; ++k) sh[k] = k < 3 ? from.first[k] : from.rest[k - 3];
     }
-    // + 1/2, not clamped
+    // colour + 1/2, not clamped
     __device__ __forceinline__ Vec3<float> color() const { return sh_color(sh, values, DEGREE); }
 };
 
@@ -32,7 +32,7 @@ template <int DEGREE> struct Degree {
 };
 template <class F> __device__ __forceinline__ Vec3<float> with_degree(int degree, F f) {
     switch (degree) {
-        case -1: return f(Degree<-1>());  // no harmonics: sh.h
+        case -1: return f(Degree<-1>());  // no harmonics, see sh.h
         case 0: return f(Degree<0>());
         case 1: return f(Degree<1>());
         case 2: return f(Degree<2>());
@@ -40,7 +40,7 @@ template <class F> __device__ __forceinline__ Vec3<float> with_degree(int degree
     }
 }
 
-// The colour + 1/2, not clamped; `size` is the sum of the absolute coefficients.
+// Computes colour + 1/2, not clamped; `size` is the sum of the absolute coefficients.
 __device__ __forceinline__ Vec3<float> color_of(int degree, const Coefficients& from, Vec3<float> direction,
                                                 float& size) {
     return with_degree(degree, [&](auto d) {
@@ -53,8 +53,8 @@ __device__ __forceinline__ Vec3<float> color_of(int degree, const Coefficients& 
     });
 }
 
-// Writes the gradients of the coefficients, zeros for those beyond the degree; returns that of the unit vector to the
-// splat.
+// Writes the gradients of the coefficients, zeros for those beyond the degree. Returns the gradient of the unit vector
+// to the splat.
 __device__ __forceinline__ Vec3<float> color_vjp(int degree, const Coefficients& from, int rest,
                                                  const CoefficientGradients& to, Vec3<float> direction, Vec3<float> g) {
     return with_degree(degree, [&](auto d) {

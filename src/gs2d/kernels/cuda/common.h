@@ -1,6 +1,6 @@
-// Shared code of the CUDA kernels. Every kernel takes one struct by value (a ctypes structure on the Python side) and
-// uses only compiler built-ins, no headers of the toolkit. Warp collectives stand in convergent code, with the full
-// mask: the tests run these sources on the CPU, where anything else is an error (tests/helpers/emulator.h).
+// Shared code of the CUDA kernels. Every kernel takes one struct by value (a ctypes structure in Python) and uses only
+// compiler built-ins, no toolkit headers. Warp collectives require convergent code and the full mask: the tests run
+// these sources on the CPU, where anything else is an error (tests/helpers/emulator.h).
 #pragma once
 
 #include "core/blend.h"
@@ -16,13 +16,13 @@ typedef long long int64;
 
 constexpr uint FULL_MASK = 0xffffffffu;
 
-// One view.
+// Parameters of one view.
 struct View {
     PinholeCamera<float> camera;
     float near, lowpass_px, inv_lowpass2, log2_alpha_min, alpha_max, transmittance_min;
     float error_k2;          // error_cutoff^2
     float distortion_scale;  // (far near / (far - near))^2
-    float inv_depth_width;   // of rule 22
+    float inv_depth_width;   // for rule 22
     float background[3];
     int width, height, tiles_x, tiles_y;
     int sh_degree, near_plane_policy;
@@ -38,7 +38,7 @@ __device__ __forceinline__ BlendLimits<float> limits_of(const View& v) {
 struct Culling {
     BoxTest<float> test;
     bool unbounded;
-    // Relative to the tile's first pixel, for precision at large coordinates.
+    // relative to the first pixel of the tile, for precision at large coordinates
     __device__ __forceinline__ Culling(const float* cull, int left, int top) {
         const float4* from = reinterpret_cast<const float4*>(cull);
         const float4 lo = from[0], hi = from[1];
@@ -53,7 +53,7 @@ struct Culling {
     }
 };
 
-// The sub-blocks of the tile at (left, top) that an outline reaches, a bit each. r: the record of that splat.
+// Returns a bit mask of the sub-blocks of the tile at (left, top) that an outline reaches. r: the record of the splat.
 __device__ __forceinline__ uint blocks_outlined(const float* cull, const float* r, int left, int top, float near,
                                                 int width, int height) {
     const float4* from = reinterpret_cast<const float4*>(r);
@@ -71,7 +71,7 @@ __device__ __forceinline__ uint blocks_outlined(const float* cull, const float* 
     return mask;
 }
 
-// A record or any other row of 16 floats on a 64-byte boundary, four at a time.
+// A record or another row of 16 floats, aligned to 64 bytes; accessed four floats at a time.
 __device__ __forceinline__ Record<float> record_of(const float4& a, const float4& b, const float4& c, const float4& d) {
     return {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w, c.x, c.y, c.z, c.w, d.x, d.y, d.z, d.w};
 }

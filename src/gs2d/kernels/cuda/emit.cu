@@ -1,8 +1,8 @@
-// From splats in depth order to one list of entries per tile: emission before the stable sort by tile, ranges after it.
+// Builds one entry list per tile from splats in depth order: emission before the stable sort by tile, then ranges.
 //
-// A candidate is a splat and a tile of its rectangle. Each is tested exactly against the eight 8x4 sub-blocks of the
-// tile; those that reach none get the sentinel key `tiles`, which sorts behind all tiles. Sub-block b covers columns
-// (b & 1) * 8 and rows (b >> 1) * 4 of its tile.
+// A candidate is a pair of a splat and a tile of its rectangle. It is tested exactly against the eight 8x4 sub-blocks
+// of the tile; candidates that reach no sub-block get the sentinel key `tiles`, which sorts behind all tiles. Sub-block
+// b covers columns (b & 1) * 8 and rows (b >> 1) * 4 of its tile.
 #include "cuda/common.h"
 
 namespace gs2d {
@@ -10,27 +10,27 @@ namespace gs2d {
 struct EmitArguments {
     int width, height, tiles_x, tiles_y;
     float near;
-    int64 candidates;  // ends[visible - 1], or the room; candidates beyond the room are dropped
+    int64 candidates;  // ends[visible - 1], or the capacity; candidates beyond the capacity are dropped
     int64 visible;
     const void* order;  // [visible] int64, or uint32 (`emit_sorted`): splats by depth
-    const void* ends;   // [visible], the same: running sum of tile_counts in that order
+    const void* ends;   // [visible], same type: running sum of tile_counts in depth order
     const float *cull, *records;
     const ushort* rects;
     void* keys;      // [candidates] int16 or int32: tile, or the sentinel
     uint* payloads;  // [candidates]: splat << 8 | mask of sub-blocks
-    int exact;       // 0: all sub-blocks of every candidate (tests)
+    int exact;       // 0: every candidate gets all sub-blocks (tests)
 };
 
 struct RangeArguments {
     int64 candidates;
     const void* keys;          // sorted
-    const int64* permutation;  // of the sort; null if the sort moved the payloads
+    const int64* permutation;  // permutation of the sort; null if the sort moved the payloads
     const uint* payloads;
     uint* entries;  // [candidates]: payloads in sorted order
     int64* ranges;  // [tiles + 1, 2]: begin and end of each tile's entries; zeros on entry
 };
 
-// The first splat in depth order whose candidates end behind `candidate`.
+// Returns the first splat in depth order whose candidates end after `candidate`.
 template <class Place>
 __device__ __forceinline__ int64 owner_of(const Place* ends, int64 visible, int64 candidate) {
     int64 low = 0, high = visible - 1;
@@ -48,7 +48,7 @@ template <class Key, class Place> __device__ __forceinline__ void emit(const Emi
     const int64 i = int64(blockIdx.x) * blockDim.x + threadIdx.x;
     if (i >= a.candidates) return;
     const Place *order = static_cast<const Place*>(a.order), *ends = static_cast<const Place*>(a.ends);
-    if (i >= int64(ends[a.visible - 1])) {  // unused room
+    if (i >= int64(ends[a.visible - 1])) {  // unused capacity
         static_cast<Key*>(a.keys)[i] = Key(a.tiles_x * a.tiles_y), a.payloads[i] = 0u;
         return;
     }

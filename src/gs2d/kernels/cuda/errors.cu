@@ -1,4 +1,4 @@
-// Splat errors (rule 17): one warp per splat, over the pixels of its rectangle of tiles, in a fixed order.
+// Splat errors (rule 17): one warp per splat processes the pixels of its tile rectangle in a fixed order.
 #include "cuda/reduce.h"
 
 namespace gs2d {
@@ -15,11 +15,11 @@ struct ErrorArguments {
     float* errors;       // [N]
 };
 
-// Records are those of a projection with `errors` set: the footprint is rho <= error_k2.
+// Records are from a projection with `errors` set: the footprint is rho <= error_k2.
 extern "C" __global__ void __launch_bounds__(128) splat_errors(ErrorArguments a) {
     const int64 splat = (int64(blockIdx.x) * blockDim.x + threadIdx.x) >> 5;
     const int lane = threadIdx.x & 31;
-    if (splat >= a.count) return;  // the whole warp
+    if (splat >= a.count) return;  // uniform over the warp
     const View& v = a.view;
     float total = 0.f;
     const int tiles = a.tile_counts[splat];

@@ -1,5 +1,5 @@
-// Blending of channels besides the three of a splat's colour: a second pass over the used entries recomputes the
-// weights, for groups of channels whose sums fit the registers.
+// Blending of further channels, in addition to the splat colour: a second pass over the used entries recomputes the
+// weights, for groups of channels whose sums fit in registers.
 #include "cuda/pixels.h"
 
 namespace gs2d {
@@ -68,7 +68,7 @@ extern "C" __global__ void __launch_bounds__(128, 4) features_forward(FeatureArg
                     }
                 }
             });
-            __syncwarp();  // the records are overwritten next
+            __syncwarp();  // the records are overwritten in the next iteration
         }
 #pragma unroll
         for (int h = 0; h < HALVES; ++h) {

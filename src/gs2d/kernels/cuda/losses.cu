@@ -1,16 +1,16 @@
 // Normal consistency, silhouettes, means over valid pixels, and the last step of every mean.
 //
 // Two forms of normal consistency: the official mean(1 - alpha <n, N>) with alpha detached, and the paper's per-splat
-// mean(alpha - <n, N>) with nothing detached. N comes from the depths of the four neighbours, so a depth's gradient is
-// gathered from the four adjacent pixels: no atomics.
+// mean(alpha - <n, N>) with nothing detached. N depends on the depths of the four neighbours, so the depth gradient is
+// gathered from the four adjacent pixels, without atomics.
 #include "core/losses.h"
 #include "cuda/means.h"
 
 namespace gs2d {
 
-constexpr int MEAN_PIXELS = 1024;           // per block; cuda_losses.py has the same
-constexpr int NORMAL_W = 32, NORMAL_H = 8;  // tile of a block in the backward pass; cuda_losses.py has the same
-constexpr int HALO = 2;                     // depths that a depth's gradient depends on, on each side
+constexpr int MEAN_PIXELS = 1024;           // per block; same value in cuda_losses.py
+constexpr int NORMAL_W = 32, NORMAL_H = 8;  // tile of a block in the backward pass; same values in cuda_losses.py
+constexpr int HALO = 2;                     // number of depths on each side that affect a depth gradient
 
 struct NormalArguments {
     int64 height, width;
@@ -19,18 +19,18 @@ struct NormalArguments {
     int per_splat, at_camera;             // at_camera: see makes_normal
     const float *normal, *depth, *alpha;  // [H, W, 3] world frame, [H, W], [H, W]
     const uchar* mask;                    // or null
-    const float* weights;                 // of the pixels, or null
-    float* partials;                      // [2, blocks]: valid pixels; sum of alpha <n, N>, of alpha - <n, N>, or of weighted terms
+    const float* weights;                 // [H, W] per pixel, or null
+    float* partials;                      // [2, blocks]: valid pixels; sum, depending on `per_splat` and `weights`
     const float *means, *cotangent;       // backward: means[0] = 1 / valid pixels; null if `scale` is set
     float *g_normal, *g_depth, *g_alpha;  // null: not computed
     float scale;                          // cotangent / valid pixels
-    const uchar* object;                  // instead of weights: bytes of a photograph [H, W, 4], 1 where its alpha is above 1/2
+    const uchar* object;                  // instead of weights: photo bytes [H, W, 4]; 1 where alpha > 1/2
 };
 
 struct SilhouetteArguments {
     int64 pixels;
     const float* alpha;   // [H, W], rendered
-    const uchar* object;  // bytes of a photograph [H, W, 4]
+    const uchar* object;  // photo bytes [H, W, 4]
     const uchar* mask;    // or null
     float* g_alpha;       // [H, W]
     float scale;          // cotangent / valid pixels
@@ -44,13 +44,13 @@ struct MeanArguments {
 };
 
 struct FinishArguments {
-    const float* partials;  // [1 + values, blocks]; the first row counts
+    const float* partials;  // [1 + values, blocks]; the first row is the count
     int64 blocks;
     int values, complement;  // complement: the mean of 1 - value
-    float* means;            // [1 + values]: 1 / count, means; a count of 0 counts as 1
+    float* means;            // [1 + values]: 1 / count, then the means; a count of 0 is replaced by 1
 };
 
-// Depth of a pixel; 0 in the background. Outside the image and at ignored pixels there is no normal (makes_normal).
+// Returns the depth of a pixel, 0 in the background, negative outside the image and at ignored pixels (makes_normal).
 __device__ __forceinline__ float depth_at(const NormalArguments& a, int64 x, int64 y) {
     const float absent = a.at_camera ? -1.f : 0.f;
     if (x < 0 || y < 0 || x >= a.width || y >= a.height) return absent;
@@ -65,7 +65,7 @@ __device__ __forceinline__ float weight_at(const NormalArguments& a, int64 at) {
     return a.weights ? a.weights[at] : 1.f;
 }
 
-// One pixel: its normal from the depths around it, and the rendered one in the camera frame.
+// Computes the depth normal of a pixel and its rendered normal in the camera frame.
 struct Centre {
     bool defined;
     DepthNormal<float> from_depth;
@@ -102,7 +102,7 @@ extern "C" __global__ void __launch_bounds__(128) normal_consistency(NormalArgum
 
 extern "C" __global__ void __launch_bounds__(128) normal_consistency_vjp(NormalArguments a) {
     constexpr int DW = NORMAL_W + 2 * HALO, DH = NORMAL_H + 2 * HALO, CW = NORMAL_W + 2, CH = NORMAL_H + 2;
-    __shared__ float depth[DH][DW], pull_x[CH][CW], pull_y[CH][CW];  // pulls: see depth_normal_vjp
+    __shared__ float depth[DH][DW], pull_x[CH][CW], pull_y[CH][CW];  // pull_*: see depth_normal_vjp
     const int64 across = (a.width + NORMAL_W - 1) / NORMAL_W;
     const int64 left = blockIdx.x % across * NORMAL_W, top = blockIdx.x / across * NORMAL_H;
     const float of_all = a.means ? *a.cotangent * a.means[0] : a.scale;
@@ -110,7 +110,7 @@ extern "C" __global__ void __launch_bounds__(128) normal_consistency_vjp(NormalA
         depth[i / DW][i % DW] = depth_at(a, left + i % DW - HALO, top + i / DW - HALO);
     __syncthreads();
     for (int i = threadIdx.x; i < CH * CW; i += MEAN_THREADS) {
-        const int cx = i % CW, cy = i / CW;  // the centre's depth is depth[cy + 1][cx + 1]
+        const int cx = i % CW, cy = i / CW;  // depth of this pixel: depth[cy + 1][cx + 1]
         const int64 x = left + cx - 1, y = top + cy - 1, at = y * a.width + x;
         DepthNormalGrad<float> pull = {0.f, 0.f};
         if (x >= 0 && y >= 0 && x < a.width && y < a.height) {
@@ -134,7 +134,7 @@ extern "C" __global__ void __launch_bounds__(128) normal_consistency_vjp(NormalA
     __syncthreads();
     if (!a.g_depth) return;
     for (int i = threadIdx.x; i < NORMAL_H * NORMAL_W; i += MEAN_THREADS) {
-        // its own depth is depth[dy + 2][dx + 2], its pull pull[dy + 1][dx + 1]
+        // depth of this pixel: depth[dy + 2][dx + 2]; its pullbacks: pull_*[dy + 1][dx + 1]
         const int dx = i % NORMAL_W, dy = i / NORMAL_W;
         if (left + dx >= a.width || top + dy >= a.height) continue;
         const float from_left = pull_x[dy + 1][dx] * depth[dy + 2][dx],
@@ -146,7 +146,7 @@ extern "C" __global__ void __launch_bounds__(128) normal_consistency_vjp(NormalA
     }
 }
 
-// Gradient of the mean |alpha - target alpha| over valid pixels; 0 where they are equal.
+// Computes the gradient of the mean |alpha - target alpha| over valid pixels; 0 where both are equal.
 extern "C" __global__ void __launch_bounds__(128) silhouette_vjp(SilhouetteArguments a) {
     const int64 at = int64(blockIdx.x) * MEAN_THREADS + threadIdx.x;
     if (at >= a.pixels) return;
@@ -165,7 +165,7 @@ extern "C" __global__ void __launch_bounds__(128) masked_mean(MeanArguments a) {
     leave_sums(sums, a.partials);
 }
 
-// One block.
+// Runs in a single block.
 extern "C" __global__ void __launch_bounds__(128) finish_means(FinishArguments a) {
     __shared__ double sums[MEAN_THREADS];
     double count = 1., raw_count = 0.;

@@ -1,4 +1,4 @@
-// Means in a fixed order: each block writes partial sums, and one more block adds them (finish_means in losses.cu).
+// Means in a fixed order: each block writes partial sums, and a final block adds them (finish_means in losses.cu).
 #pragma once
 
 #include "cuda/common.h"
@@ -7,7 +7,7 @@ namespace gs2d {
 
 constexpr int MEAN_THREADS = 128;
 
-// Sums of N values over the block, to partials[n * blocks + this block]. All threads call it.
+// Sums N values over the block and writes them to partials[n * blocks + this block]. All threads must call it.
 template <int N> __device__ __forceinline__ void leave_sums(float (&values)[N], float* partials) {
     __shared__ float of_warps[N][MEAN_THREADS / 32];
     const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;

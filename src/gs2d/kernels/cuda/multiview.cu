@@ -1,14 +1,14 @@
-// Comparison of patches of two views: one warp per pixel, one lane per pixel of the patch. All lanes compute the plane
-// and the round trip, which is a small part of the work. The patch is sampled twice, for the sums and for the gradient.
-// Pixels have separate results, which are summed elsewhere.
+// Comparison of patches of two views: one warp per pixel, one lane per patch pixel. Every lane computes the plane and
+// the round trip, which is a small part of the work. The patch is sampled twice, for the sums and for the gradient.
+// Each pixel writes its own results, which are summed in a separate step.
 #include "core/multiview.h"
 #include "cuda/common.h"
 
 namespace gs2d {
 
-constexpr int PATCHES = 4;  // per block; cuda_multiview.py has the same
+constexpr int PATCHES = 4;  // per block; same value in cuda_multiview.py
 
-// An image interpolated between pixel centres; beyond the border, the border's values.
+// An image interpolated between pixel centres; border values extend beyond the border.
 struct ImageBetween {
     const float* pixels;
     int64 width, height;
@@ -36,7 +36,7 @@ struct ClearAt {
     }
 };
 
-// Rows from `row` on of [., P], of one pixel.
+// Rows starting at `row` of an array [., P], for one pixel.
 struct LeaveRows {
     float* rows;
     int64 patch, count;
@@ -44,7 +44,7 @@ struct LeaveRows {
     __device__ __forceinline__ void operator()(int k, float value) const { rows[(row + k) * count + patch] = value; }
 };
 
-// Sums over the lanes, the same in all of them.
+// Sums over the lanes; all lanes get the results.
 template <int N> __device__ __forceinline__ void sum_lanes(float (&values)[N]) {
 #pragma unroll
     for (int n = 0; n < N; ++n) {
@@ -67,7 +67,7 @@ __device__ __forceinline__ PatchPixel patch_pixel(const CompareArguments<float>&
     return {a.reference[pixel + j * a.width + i], s.value, patch_pull(at, s, there)};
 }
 
-// The image of a square is convex, so the corners bound the patch.
+// The warped square is convex, so its corners bound the patch.
 __device__ __forceinline__ bool patch_is_inside(const ImageBetween& source, const PatchPlane<float>& plane,
                                                 const Lens<float>& there, int radius) {
     bool inside = true;
@@ -84,7 +84,7 @@ __device__ __forceinline__ bool patch_is_inside(const ImageBetween& source, cons
 extern "C" __global__ void __launch_bounds__(128) compare_views(CompareArguments<float> a) {
     const int lane = threadIdx.x & 31;
     const int64 patch = int64(blockIdx.x) * PATCHES + (threadIdx.x >> 5);
-    if (patch >= a.count) return;  // whole warps
+    if (patch >= a.count) return;  // uniform over the warp
     const auto rows = [&](float* all, int row) { return LeaveRows{all, patch, a.count, row}; };
     const LeaveRows values = rows(a.values, 0), gradients = rows(a.gradients, 0), moves = rows(a.motion_gradients, 0);
     const bool first = lane == 0;
@@ -135,7 +135,7 @@ extern "C" __global__ void __launch_bounds__(128) compare_views(CompareArguments
     if (!ncc.valid) return;
     if (first) values(0, weight * (1.f - ncc.value));
     if (!a.gradients) return;
-    float g[9] = {0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f};  // of right, down, middle
+    float g[9] = {0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f};  // gradients of right, down, middle
     for (int k = lane; k < side * side; k += 32) {
         const int i = k % side - radius, j = k / side - radius;
         const PatchPixel p = patch_pixel(a, source, plane, there, pixel, i, j);

@@ -1,5 +1,6 @@
-// Splat errors with occlusion (rule 17): a pixel counts until it has stopped at or before the splat. It is the pass of
-// the blending over the lists of the footprint rho <= error_k2. Sums are whole numbers, so their order does not matter.
+// Splat errors with occlusion (rule 17): a pixel counts until it has stopped at or before the splat. The pass is the
+// same as blending, with tile lists for the footprint rho <= error_k2. Sums are integers, so their order does not
+// affect the result.
 #include "cuda/pixels.h"
 #include "cuda/reduce.h"
 
@@ -9,7 +10,7 @@ typedef unsigned long long uint64;
 
 struct OccludedArguments {
     View view;
-    const float* records;  // of a projection with `errors` set
+    const float* records;  // from a projection with `errors` set
     const uint* entries;
     const int64* ranges;
     const int* tiles;
@@ -18,8 +19,8 @@ struct OccludedArguments {
     uint64* errors;      // [N], in units of ERROR_UNIT; zeros on entry
 };
 
-constexpr float ERROR_UNIT = 1.f / (1 << 24);  // cuda_passes.py has the same
-constexpr float MOST_ERROR = 1e9f;             // limit for a splat in the 64 pixels of a warp, against overflow
+constexpr float ERROR_UNIT = 1.f / (1 << 24);  // same value in cuda_passes.py
+constexpr float MOST_ERROR = 1e9f;             // limit for a splat in the 64 pixels of a warp, prevents overflow
 
 extern "C" __global__ void __launch_bounds__(128) splat_errors_occluded(OccludedArguments a) {
     __shared__ float4 staged[4][4][32];
@@ -77,7 +78,7 @@ extern "C" __global__ void __launch_bounds__(128) splat_errors_occluded(Occluded
             const float sum = min(sum_over_warp(error), MOST_ERROR);
             if (at.lane == 0 && sum > 0.f) atomicAdd(a.errors + splats[at.warp][j], uint64(sum * (1.f / ERROR_UNIT)));
         }
-        __syncwarp();  // the records are overwritten next
+        __syncwarp();  // the records are overwritten in the next iteration
     }
 }
 

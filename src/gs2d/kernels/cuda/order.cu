@@ -1,6 +1,5 @@
-// The order in which blocks take tiles: long lists first, so that no long list starts when the others are done. One
-// block counts tiles by the length of their lists and assigns positions; the order within a bucket does not affect
-// results.
+// Order in which blocks process tiles: long lists first, so that no long list starts when the others are done. One
+// block counts tiles by list length and assigns positions; the order within a bucket does not affect results.
 #include "cuda/common.h"
 
 namespace gs2d {
@@ -13,7 +12,7 @@ struct OrderArguments {
     int* order;           // [tiles]
 };
 
-// Longest first; lists of BUCKETS * PER_BUCKET entries or more are equal.
+// Returns the bucket of a list, longest first; lists of BUCKETS * PER_BUCKET entries or more share a bucket.
 __device__ __forceinline__ int bucket_of(const OrderArguments& a, int64 tile) {
     const int64 chunks = (a.ranges[2 * tile + 1] - a.ranges[2 * tile] + PER_BUCKET - 1) / PER_BUCKET;
     return BUCKETS - 1 - int(chunks < BUCKETS ? chunks : BUCKETS - 1);

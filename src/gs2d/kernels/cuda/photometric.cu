@@ -1,29 +1,29 @@
 // L1, SSIM and L2 of an image [H, W, 3], and their gradient: two passes with a map of three derivatives between them.
 //
-// A row of W interleaved pixels is 3 W reals, and the window's taps are 3 reals apart: channels need no planes. A block
-// runs down a strip of 128 reals; each row passes through shared memory once, is blurred horizontally, and enters 11
-// running sums in registers, so that the vertical blur reads no memory at all. 5 rows behind the input a row is
-// finished.
+// A row of W interleaved pixels has 3 W reals, and the window taps are 3 reals apart, so channels need no planes. A
+// block moves down a strip of 128 reals. Each row passes through shared memory once, is blurred horizontally, and is
+// added to 11 running sums in registers, so the vertical blur reads no memory. Output rows are complete 5 rows behind
+// the input.
 #include "core/losses.h"
 #include "cuda/means.h"
 
 namespace gs2d {
 
-constexpr int STRIP = MEAN_THREADS, STRIP_ROWS = 32;              // reals and rows per block; cuda_losses.py has the same
+constexpr int STRIP = MEAN_THREADS, STRIP_ROWS = 32;              // reals and rows per block; same in cuda_losses.py
 constexpr int SIDE = 3 * SSIM_RADIUS, STAGED = STRIP + 2 * SIDE;  // reals of a row that a block reads
 
 // A decoded image [H, W, 3 or 4] instead of `target`, in the variants `rgb` and `rgba`.
 struct Photograph {
     const uchar* bytes;
-    float background[3];  // behind alpha
+    float background[3];  // composited behind alpha
 };
 
 struct PhotometricArguments {
     int64 height, width;
     const float *rendered, *target;  // [H, W, 3]
     const uchar* mask;               // [H, W], 0 = ignore; or null
-    const float* target_mean;        // [H, W, 3]: blur_image of the target; of the variant `known`
-    float* maps;                     // [3, H, W, 3]: derivatives of SSIM by the blurred moments; or null
+    const float* target_mean;        // [H, W, 3]: blur_image of the target; for variant `known`
+    float* maps;                     // [3, H, W, 3]: derivatives of SSIM with respect to the blurred moments; or null
     float* partials;                 // [4, blocks]: valid reals, L1, SSIM, L2; or null
     Photograph photograph;
 };
@@ -45,7 +45,7 @@ struct BlurArguments {
     float* out;
 };
 
-// The part of a thread: one column of reals, STRIP_ROWS rows.
+// Part of a thread: one column of reals, STRIP_ROWS rows.
 struct Strip {
     int64 n, height;  // reals of a row, rows
     int64 first, column, begin, end;
@@ -58,10 +58,10 @@ struct Strip {
     __device__ __forceinline__ bool has_row(int64 y) const { return y >= 0 && y < height; }
 };
 
-// Up to two reals of each of MAPS rows, on their way to shared memory: a row is read while the one before is used.
+// Up to two reals of each of MAPS rows in transit to shared memory: a row is read while the previous row is processed.
 template <int MAPS> struct Staging {
     float value[2][MAPS];
-    // read(column, value) is called where the image has such a real; elsewhere the values are 0.
+    // Calls read(column, value) for reals inside the image; elsewhere the values are 0.
     template <class Read> __device__ __forceinline__ void load(const Strip& s, int64 y, Read read) {
 #pragma unroll
         for (int part = 0; part < 2; ++part) {
@@ -84,7 +84,7 @@ template <int MAPS> struct Staging {
 
 __device__ __forceinline__ float window_weight(int k) { return float(SSIM_WINDOW[k < 0 ? -k : k]); }  // k = -5..5
 
-// Rows enter one by one; after row y, `done` is the window over the rows y - 10 .. y.
+// Adds rows one by one; after row y, `done` is the window over rows y - 10 .. y.
 struct RunningBlur {
     float sums[SSIM_TAPS] = {};
     __device__ __forceinline__ void add(float row) {
@@ -97,7 +97,7 @@ struct RunningBlur {
     __device__ __forceinline__ float done() const { return sums[0]; }
 };
 
-// The horizontal window over a staged row, at this thread's real.
+// Applies the horizontal window to a staged row, at the real of this thread.
 __device__ __forceinline__ float blur_row(const float* row) {
     float sum = 0.f;
 #pragma unroll
@@ -110,14 +110,14 @@ __device__ __forceinline__ bool is_valid(const uchar* mask, int64 y, int64 width
     return !mask || mask[y * width + column / 3];
 }
 
-// byte / 255, rounded like a division: a product plus its error.
+// Returns byte / 255, rounded like a division: a product plus its error.
 __device__ __forceinline__ float part_of_255(uchar byte) {
     constexpr float PART = 1.f / 255.f;
     const float x = float(byte), q = x * PART;
     return fma(fma(-q, 255.f, x), PART, q);
 }
 
-// A real of the target: a float, or made of CHANNELS bytes a pixel.
+// Reads a real of the target: a float (CHANNELS = 0), or composited from CHANNELS bytes per pixel.
 template <int CHANNELS, class Arguments>
 __device__ __forceinline__ float target_of(const Arguments& a, int64 y, int64 column) {
     if constexpr (CHANNELS == 0) return a.target[y * 3 * a.width + column];
@@ -126,7 +126,7 @@ __device__ __forceinline__ float target_of(const Arguments& a, int64 y, int64 co
     const int64 x = column / 3;
     const int channel = int(column - 3 * x);
     const uchar* pixel = from.bytes + 4 * (y * a.width + x);
-    // not by index, which would copy the arguments to local memory
+    // constant indices, since dynamic indexing would copy the arguments to local memory
     const float behind = channel == 0 ? from.background[0] : channel == 1 ? from.background[1] : from.background[2];
     return (part_of_255(pixel[channel]) - behind) * part_of_255(pixel[3]) + behind;
 }
@@ -147,7 +147,7 @@ template <bool KNOWN, int CHANNELS = 0> __device__ __forceinline__ void photomet
     for (int64 y = s.begin - SSIM_RADIUS; y < s.end + SSIM_RADIUS; ++y) {
         float (*row)[STAGED] = rows[y & 1];
         next.store(row);
-        __syncthreads();  // also: the buffer of the next row is free
+        __syncthreads();  // also ensures that the buffer of the next row is free
         next.load(s, y + 1, read(y + 1));
         float m = 0.f, q = 0.f, p = 0.f;
 #pragma unroll
@@ -175,7 +175,7 @@ template <bool KNOWN, int CHANNELS = 0> __device__ __forceinline__ void photomet
         a.maps[plane + at] = keep(valid, point.d_squares);
         a.maps[2 * plane + at] = keep(valid, point.d_product);
     }
-    if (a.partials) leave_sums(sums, a.partials);  // the same for all
+    if (a.partials) leave_sums(sums, a.partials);  // uniform over the grid
 }
 
 extern "C" __global__ void __launch_bounds__(128) photometric_forward(PhotometricArguments a) { photometric<false>(a); }
@@ -230,7 +230,7 @@ extern "C" __global__ void __launch_bounds__(128) photometric_vjp(PhotometricVjp
 extern "C" __global__ void __launch_bounds__(128) photometric_vjp_rgb(PhotometricVjpArguments a) { gradient_of<3>(a); }
 extern "C" __global__ void __launch_bounds__(128) photometric_vjp_rgba(PhotometricVjpArguments a) { gradient_of<4>(a); }
 
-// The window over an image, zero outside: bit for bit what photometric_forward computes for its target.
+// Applies the window to an image, zero outside; bit-identical to the target blur of photometric_forward.
 extern "C" __global__ void __launch_bounds__(128) blur_image(BlurArguments a) {
     __shared__ float rows[2][1][STAGED];
     const Strip s(a.height, a.width);

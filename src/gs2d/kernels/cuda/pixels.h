@@ -1,11 +1,11 @@
-// The pixels of a thread, and code shared by both directions of the blending.
+// Pixels of a thread, and shared code of the forward and backward passes.
 #pragma once
 
 #include "cuda/common.h"
 
 namespace gs2d {
 
-// Plain channels besides the three of sh0, blended with the same weights.
+// Plain channels in addition to the three of sh0, blended with the same weights.
 struct Features {
     int64 count;              // F, a multiple of CHANNELS
     const float* values;      // [N, F]
@@ -14,16 +14,16 @@ struct Features {
     const float* upstream;    // [F, H, W]; the backward pass only, like the next member
     float* gradients;         // [N, F], or a row per slot (blend_vjp.cu); zeros on entry
 };
-constexpr int CHANNELS = 8;  // processed together
+constexpr int CHANNELS = 8;  // channels processed together
 
-constexpr int HALVES = 2;  // pixels per thread: the second lies four rows below the first
+constexpr int HALVES = 2;  // pixels per thread; the second is four rows below the first
 
-// Chunk c of a tile's entries owns the 8 words at this place: unique, without a scan.
+// Returns the first of the 8 words of chunk c of a tile. The index is unique without a prefix sum.
 __device__ __forceinline__ int64 word_of(int64 begin, int tile, int64 chunk) {
     return 8 * ((begin >> 5) + tile + chunk);
 }
 
-// Without a loop, so that it is unrolled in the caller's loops.
+// Unrolled by hand, so that the caller's loops can be unrolled.
 __device__ __forceinline__ uint or_over_warp(uint bits) {
     bits |= __shfl_xor_sync(FULL_MASK, bits, 16);
     bits |= __shfl_xor_sync(FULL_MASK, bits, 8);
@@ -32,10 +32,10 @@ __device__ __forceinline__ uint or_over_warp(uint bits) {
     return bits | __shfl_xor_sync(FULL_MASK, bits, 1);
 }
 
-// A word that is the same for all lanes, in a form that the compiler recognises, so that branches on it are uniform.
+// Returns a word that is the same for all lanes, in a form that lets the compiler treat branches on it as uniform.
 __device__ __forceinline__ uint uniform(uint word, int lane) { return __ballot_sync(FULL_MASK, word >> lane & 1u); }
 
-struct Place {  // of a thread
+struct Place {  // position of a thread
     int lane, warp, tile;
     int x, y;  // first pixel
     uint sub_block[HALVES];
@@ -61,16 +61,16 @@ __device__ __forceinline__ void fetch_record(const float* records, int64 splat, 
     for (int k = 0; k < 4; ++k) to[k][lane] = from[k];
 }
 
-// Whether the splat whose record this lane has fetched is plain (core/blend.h) at all 8x8 pixels of the warp.
+// Returns whether the splat whose record this lane has fetched is plain (core/blend.h) at all 8x8 pixels of the warp.
 __device__ __forceinline__ bool plain_for_warp(const View& v, const Place& at, float4 (*records)[32]) {
     const Record<float> s =
         record_of(records[0][at.lane], records[1][at.lane], records[2][at.lane], records[3][at.lane]);
     const float x = float(at.x - (at.lane & 7) + 4), y = float(at.y - (at.lane >> 3) + 4);
-    // half a pixel to spare
+    // with a margin of half a pixel
     return is_plain(x - s.cx, y - s.cy, s.ai, s.bi, s.iz, plain_from(s, v.lowpass_px), v.near, 4.f);
 }
 
-// The splat's plane at the pixels of a thread; dx, dy: of the first.
+// Evaluates the splat plane at the pixels of a thread; dx, dy belong to the first pixel.
 __device__ __forceinline__ void planes_of(const Record<float>& s, float dx, float dy, PlaneAt<float>* p) {
     p[0] = plane_at(s, dx, dy);
     p[1] = {fma(4.f, s.bu, p[0].X), fma(4.f, s.bv, p[0].Y), fma(4.f, s.bi, p[0].I)};
@@ -92,8 +92,8 @@ struct No {
     static constexpr bool value = false;
 };
 
-// Calls step(Yes or No: plain; j, bit j) for the selected splats of a chunk, in order. Runs of plain splats, nearly
-// all, have a separate loop without the code for the others.
+// Calls step(Yes or No: plain; j, bit j) for the selected splats of a chunk, in order. Runs of plain splats, which are
+// the most frequent, have a separate loop without the code for other splats.
 template <class F> __device__ __forceinline__ void for_each_splat(uint wanted, uint plain, F&& step) {
     while (wanted) {
         const uint others = wanted & ~plain;

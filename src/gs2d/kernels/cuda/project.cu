@@ -9,15 +9,15 @@ struct ProjectArguments {
     const float *means, *quats, *log_scales, *opacity_logits, *sh0, *shN;
     float* records;    // [N, 16]
     float* cull;       // [N, 8], see common.h
-    int* depth_keys;   // [N]; the bits of z_c, which sort as integers; infinity if culled
+    int* depth_keys;   // [N]: bits of z_c, which sort as integers; infinity if culled
     ushort* rects;     // [N, 4]: x0, y0, x1, y1 in tiles
     int* tile_counts;  // [N]: tiles in the rectangle
     float* radii;      // [N]
     int errors;        // 1: the footprint is rho <= error_k2, for any opacity
-    int exact;         // 0: splats without an ellipse are in every tile (tests)
+    int exact;         // 0: splats without an ellipse are listed in every tile (tests)
 };
 
-// The tiles that an outline reaches.
+// Returns the tiles that an outline reaches.
 __device__ TileRectangle outlined_rectangle(const View& v, const Record<float>& r, float k, float disc2) {
     const Outline<float> outline = outline_of(r.au, r.bu, r.av, r.bv, r.ai, r.bi, r.iz, r.cx, r.cy, k, disc2, v.near,
                                               float(v.width), float(v.height));

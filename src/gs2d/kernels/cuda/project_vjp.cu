@@ -1,17 +1,17 @@
-// From gradients of records to gradients of parameters, SH and the densification signal: one thread per splat.
+// Converts record gradients to gradients of parameters, SH and the densification signal: one thread per splat.
 //
 // Rows of SH and of three floats pass through shared memory (rows.h): they are three quarters of the 464 bytes per
-// splat that this reads and writes. So no lane of a warp exits early.
+// splat that this kernel reads and writes. Therefore no lane of a warp may exit early.
 #include "cuda/colors.h"
 #include "cuda/rows.h"
 
 namespace gs2d {
 
-// Sums of the densification signal; splats of radius 0 are skipped. All null: not gathered here.
+// Sums of the densification signal; splats of radius 0 are skipped. If all are null, nothing is accumulated here.
 struct Gathered {
-    float *signed_norms, *absolute_norms, *counts;  // [N]; absolute_norms may be null alone
+    float *signed_norms, *absolute_norms, *counts;  // [N]; absolute_norms may be the only null
     const float* radii;                             // [N] px
-    const int* skip;                                // if not 0, nothing is added; or null
+    const int* skip;                                // if nonzero, nothing is added; may be null
 };
 
 struct ProjectVjpArguments {
@@ -24,12 +24,12 @@ struct ProjectVjpArguments {
     float* extras;           // [N, 4]
     float *g_means, *g_quats, *g_log_scales, *g_opacity_logits, *g_sh0, *g_shN, *g_probe;  // null: not computed
     int64 probe_columns;                                                                   // 2 or 4
-    float* g_intrinsics;  // [N, 4]: gradients of fx, fy, cx, cy by splat; or null
+    float* g_intrinsics;  // [N, 4]: per-splat gradients of fx, fy, cx, cy; or null
     Gathered gathered;
     int clears;  // 1: reset the rows of gradients and extras to zero
 };
 
-// Rows of tensors allocated for this kernel, which are aligned.
+// Rows of tensors that are allocated for this kernel and therefore aligned.
 __device__ __forceinline__ void write_2(float* to, int64 i, float a, float b) {
     reinterpret_cast<float2*>(to)[i] = {a, b};
 }
@@ -39,7 +39,7 @@ __device__ __forceinline__ void write_4(float* to, int64 i, float a, float b, fl
 
 __device__ __forceinline__ float norm_of(float x, float y) { return sqrt(x * x + y * y); }
 
-// A row of three floats of each lane.
+// Loads a row of three floats per lane.
 __device__ __forceinline__ void write_3(float* to, int64 begin, int count, int lane, float a, float b, float c,
                                         float* rows) {
     rows[3 * lane] = a, rows[3 * lane + 1] = b, rows[3 * lane + 2] = c;
@@ -51,8 +51,8 @@ __device__ __forceinline__ Vec3<float> mean_of(const ProjectVjpArguments& a, int
     return {m[0], m[1], m[2]};
 }
 
-// Gradients of the coefficients: of the first one to `first`, of the others over their row. Returns that of the
-// direction.
+// Writes the gradient of the first coefficient to `first`, and overwrites the row with the gradients of the others.
+// Returns the gradient of the direction.
 __device__ __forceinline__ Vec3<float> learn_colors(const ProjectVjpArguments& a, int64 i, Vec3<float> g_color,
                                                     float* row, float* first) {
     const Coefficients sh = {a.sh0 + 3 * i, row};
@@ -62,7 +62,7 @@ __device__ __forceinline__ Vec3<float> learn_colors(const ProjectVjpArguments& a
     return color_vjp(a.view.sh_degree, sh, int(a.sh_rest), g_sh, direction, g_color);
 }
 
-// Blocks per multiprocessor: five would leave 96 registers, too few for sm_120 (8 bytes spilled).
+// Minimum blocks per multiprocessor: five would leave 96 registers, too few for sm_120 (8 bytes spilled).
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 1200
 #define PROJECT_VJP_BLOCKS 4
 #else
@@ -80,7 +80,7 @@ extern "C" __global__ void __launch_bounds__(128, PROJECT_VJP_BLOCKS) project_sp
     const uint wanted = __ballot_sync(FULL_MASK, drawn);
     if (length > 0 && a.view.sh_degree > 0) load_rows(a.shN, begin, count, length, wanted, lane, rows);
 
-    // Colours first, so that coefficients and geometry are not in registers at the same time.
+    // Process colours first, so that coefficients and geometry are not in registers at the same time.
     const float4* g = reinterpret_cast<const float4*>(a.gradients) + 4 * i;
     Vec3<float> g_direction = {0.f, 0.f, 0.f};
     float first[3] = {0.f, 0.f, 0.f};

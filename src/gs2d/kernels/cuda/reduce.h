@@ -5,8 +5,8 @@
 
 namespace gs2d {
 
-// Sums of N = 16, 4 or 2 values over the warp, by exchange: in each step a lane keeps half of the values. Lane l ends
-// with the sum of value l / (32 / N).
+// Sums N = 16, 4 or 2 values over the warp by exchange: in each step a lane keeps half of the values. Lane l returns
+// the sum of value l / (32 / N).
 template <int N, int STEP = 16> __device__ __forceinline__ float transpose_reduce(float* v, int lane) {
     if constexpr (N == 1) {
 #pragma unroll

@@ -1,5 +1,5 @@
-// Rows of the splats of a warp through shared memory: adjacent lanes move 16 bytes each, while a lane that reads its
-// own row would touch a line of memory for every 4 bytes.
+// Transfers the rows of a warp's splats through shared memory: adjacent lanes move 16 bytes each. A lane that read its
+// own row would touch a cache line for every 4 bytes.
 #pragma once
 
 #include "cuda/common.h"
@@ -7,21 +7,21 @@
 namespace gs2d {
 
 constexpr int WARP_ROWS = 32;
-constexpr int MAX_ROW = 45;  // floats: SH of the third degree without the first coefficient
+constexpr int MAX_ROW = 45;  // floats: SH of degree 3 without the first coefficient
 
 template <class T> __device__ __forceinline__ bool is_aligned(const void* at) {
     return reinterpret_cast<unsigned long long>(at) % sizeof(T) == 0;
 }
 
-// Whether four floats are part of a selected row. They belong to at most two rows, since a row has at least three
-// floats.
+// Returns whether four floats are part of a selected row. They belong to at most two rows, since a row has at least
+// three floats.
 __device__ __forceinline__ bool any_wanted(uint wanted, int first_float, int length) {
     const int first = first_float / length, last = (first_float + 3) / length;
     return (wanted >> first | wanted >> (last < WARP_ROWS ? last : first)) & 1u;
 }
 
-// From memory to `rows` [32 * length] the rows from `begin` on whose bit is set; others may be skipped. All lanes must
-// call it.
+// Loads the rows from `begin` whose bit is set into `rows` [32 * length]; others may be skipped. All lanes must call
+// it.
 __device__ __forceinline__ void load_rows(const float* from, int64 begin, int count, int length, uint wanted, int lane,
                                           float* rows) {
     const float* source = from + begin * length;
@@ -49,7 +49,7 @@ __device__ __forceinline__ void store_rows(float* to, int64 begin, int count, in
     __syncwarp();
 }
 
-// One row of two or four floats.
+// Loads or stores one row of two or four floats.
 __device__ __forceinline__ float2 row_of_2(const float* from, int64 i) {
     if (is_aligned<float2>(from)) return reinterpret_cast<const float2*>(from)[i];
     return {from[2 * i], from[2 * i + 1]};

@@ -6,9 +6,9 @@ namespace gs2d {
 
 struct SlotArguments {
     int64 count;
-    int64 candidates;    // with slots; pairs beyond the room were dropped
+    int64 candidates;    // number with slots; pairs beyond the capacity were dropped
     const int64* order;  // [N]: splats by depth
-    // [N]: running sum of candidates in that order; four slots each, one for each warp of a tile
+    // [N]: running sum of candidates in depth order; each candidate has four slots, one per warp of a tile
     const int64* ends;
     const float *slots, *extra_slots;  // [4 * candidates, 16] or null, [4 * candidates, 4]
     float *gradients, *extras;         // [N, 16] or null, [N, 4]
@@ -17,12 +17,12 @@ struct SlotArguments {
     int64 channels;
 };
 
-// One warp per splat. A lane sums the slots of the same warps of all tiles; slots of tiles without the splat are 0 and
-// change no bit.
+// One warp per splat. A lane sums the slots of the same tile warps over all tiles. Slots of tiles without the splat are
+// 0, and adding 0 is exact.
 extern "C" __global__ void __launch_bounds__(128) sum_slots(SlotArguments a) {
     const int64 place = (int64(blockIdx.x) * blockDim.x + threadIdx.x) >> 5;
     const int lane = threadIdx.x & 31;
-    if (place >= a.count) return;  // the whole warp
+    if (place >= a.count) return;  // uniform over the warp
     const int64 splat = a.order[place], end = a.ends[place] < a.candidates ? a.ends[place] : a.candidates;
     const int64 first = place > 0 ? 4 * a.ends[place - 1] : 0, last = 4 * end;
     float sum = 0.f, extra = 0.f;

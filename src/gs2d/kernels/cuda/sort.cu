@@ -1,22 +1,22 @@
-// A stable radix sort of keys with payloads, and running sums, for training iterations without torch operations.
+// Stable radix sort of keys with payloads, and prefix sums, for training iterations without torch operations.
 //
-// Eight bits a pass; a pass reads each key once ("onesweep": Adinets and Merrill, 2022). One launch counts the digits
-// of all passes. A block then takes the next piece of the keys by a ticket, ranks them, publishes its count of each
-// digit, and sums the counts of earlier pieces, going back until one has published the sum of all before it ("decoupled
-// look-back": Merrill and Garland, 2016). A number and its kind are one word, so no memory ordering is required; a
-// piece only waits for earlier tickets, whose blocks are running.
+// Each pass sorts by eight bits and reads each key once ("onesweep": Adinets and Merrill, 2022). One launch counts the
+// digits of all passes. In a pass, a block takes the next piece of the keys by a ticket, ranks the keys and publishes
+// its count of each digit. Then it sums the counts of earlier pieces, going back until one has published its inclusive
+// prefix sum ("decoupled look-back": Merrill and Garland, 2016). A number and its kind share one word, so no memory
+// ordering is required. A piece waits only for earlier tickets, whose blocks are already running.
 #include "cuda/common.h"
 
 namespace gs2d {
 
-constexpr int SORT_THREADS = 256, SORT_ITEMS = 8, DIGITS = 256, MOST_PASSES = 4;  // sort.py has the same
+constexpr int SORT_THREADS = 256, SORT_ITEMS = 8, DIGITS = 256, MOST_PASSES = 4;  // same in sort.py
 constexpr int PIECE = SORT_THREADS * SORT_ITEMS, SORT_WARPS = SORT_THREADS / 32, WARP_ITEMS = 32 * SORT_ITEMS;
-// A word of a piece: nothing yet; its own number; the sum of it and all pieces before.
+// Kinds of a word: empty; the piece's own number; sum of the numbers up to and including the piece.
 constexpr uint OWN = 1u << 30, SUM = 2u << 30, NUMBER = OWN - 1u;
 
 struct ClearArguments {
-    float4* words;  // on a boundary of 16 bytes
-    int64 count;    // of float4
+    float4* words;  // aligned to 16 bytes
+    int64 count;    // number of float4
 };
 
 struct DigitArguments {
@@ -28,23 +28,23 @@ struct DigitArguments {
 
 struct SortArguments {
     const void* keys;
-    const uint* payloads;  // or null: the index of the key
-    void* sorted_keys;     // or null: not written
+    const uint* payloads;  // null: the payload is the index of the key
+    void* sorted_keys;     // null: not written
     uint* sorted_payloads;
     int64 count;
-    int shift, bits;       // of the digit
+    int shift, bits;       // position and width of the digit
     const uint* digits;    // [DIGITS]: number of keys with each digit
-    uint *ticket, *words;  // [pieces, DIGITS]; zeros on entry, both
+    uint *ticket, *words;  // [pieces, DIGITS]; both are zeros on entry
 };
 
 struct RunningArguments {
-    const uint* order;        // [count]: splats by depth
-    const int* tile_counts;   // by splat
-    int64 count, room;        // room: for pairs
-    uint* ends;               // [count]: running sum, in that order
-    uint *ticket, *words;     // [pieces]; zeros on entry, both
-    int64* pairs;             // [1]: the last sum, in host memory
-    int* overflow;            // [1]: whether it exceeds the room
+    const uint* order;        // [count]: splats in depth order
+    const int* tile_counts;   // [splats]
+    int64 count, room;        // room: capacity for pairs
+    uint* ends;               // [count]: prefix sum in depth order
+    uint *ticket, *words;     // [pieces]; both are zeros on entry
+    int64* pairs;             // [1]: total number of pairs, in host memory
+    int* overflow;            // [1]: 1 if the total exceeds the capacity
 };
 
 extern "C" __global__ void __launch_bounds__(256) clear_words(ClearArguments a) {
@@ -55,7 +55,7 @@ extern "C" __global__ void __launch_bounds__(256) clear_words(ClearArguments a) 
 
 __device__ __forceinline__ void publish(uint* word, uint value) { *static_cast<volatile uint*>(word) = value; }
 
-// Waits for the word of a piece.
+// Waits until the word of a piece is published and returns it.
 __device__ __forceinline__ uint said(const uint* word) {
     uint value;
     do value = *static_cast<const volatile uint*>(word);
@@ -63,13 +63,13 @@ __device__ __forceinline__ uint said(const uint* word) {
     return value;
 }
 
-// Sums saturate: any number above the largest room is equivalent.
+// Adds with saturation: any number above the largest capacity is equivalent.
 __device__ __forceinline__ uint saturated(uint a, uint b) {
-    const uint sum = a + b;  // of two numbers below 2^30
+    const uint sum = a + b;  // both below 2^30, so no overflow
     return sum < NUMBER ? sum : NUMBER;
 }
 
-// The next piece, the same for all threads.
+// Returns the next piece; all threads get the same value.
 __device__ __forceinline__ int64 next_piece(uint* ticket) {
     __shared__ uint piece;
     if (threadIdx.x == 0) piece = atomicAdd(ticket, 1u);
@@ -77,7 +77,7 @@ __device__ __forceinline__ int64 next_piece(uint* ticket) {
     return int64(piece);
 }
 
-// Running sums of a number below 2^30 of each thread; without its own. All threads call it.
+// Replaces each thread's numbers (below 2^30) by their exclusive prefix sums over the block. All threads call it.
 template <int N> __device__ __forceinline__ void sums_before(uint (&numbers)[N], uint (*shared)[SORT_THREADS]) {
     const int own = threadIdx.x;
     for (int n = 0; n < N; ++n) shared[n][own] = numbers[n];
@@ -109,12 +109,12 @@ template <class Key> __device__ __forceinline__ void count_digits(const DigitArg
     }
 }
 
-// The lanes whose digit is this lane's.
+// Returns the lanes that have the same digit.
 __device__ __forceinline__ uint peers_of(uint digit, int bits) {
     uint peers = FULL_MASK;
 #pragma unroll
     for (int b = 0; b < 8; ++b) {
-        if (b >= bits) break;  // the same for all
+        if (b >= bits) break;  // uniform over the grid
         const uint set = __ballot_sync(FULL_MASK, digit >> b & 1u);
         peers &= digit >> b & 1u ? set : ~set;
     }
@@ -122,10 +122,10 @@ __device__ __forceinline__ uint peers_of(uint digit, int bits) {
 }
 
 template <class Key> struct SortShared {
-    uint counts[SORT_WARPS][DIGITS];  // of each warp; then how many of the digit lie before it in the piece
+    uint counts[SORT_WARPS][DIGITS];  // per warp; later the number of keys with the digit in earlier warps
     uint sums[2][SORT_THREADS];
-    uint starts[DIGITS];    // where each digit begins in the piece
-    uint targets[DIGITS];   // where the first one of the piece goes, less that; modulo 2^32
+    uint starts[DIGITS];    // first position of each digit in the piece
+    uint targets[DIGITS];   // global position of the digit's first key, minus starts; modulo 2^32
     Key keys[PIECE];
     uint payloads[PIECE];
 };
@@ -143,7 +143,7 @@ template <class Key> __device__ __forceinline__ void sort_pass(const SortArgumen
     for (int j = 0; j < SORT_ITEMS; ++j) {
         const int at = WARP_ITEMS * warp + 32 * j + lane;
         const int64 i = begin + at;
-        keys[j] = Key(~Key(0)), payloads[j] = uint(i);  // behind the last one: digits that come last
+        keys[j] = Key(~Key(0)), payloads[j] = uint(i);  // beyond the end: the largest key sorts last
         if (at < count) {
             keys[j] = static_cast<const Key*>(a.keys)[i];
             if (a.payloads) payloads[j] = a.payloads[i];
@@ -162,7 +162,7 @@ template <class Key> __device__ __forceinline__ void sort_pass(const SortArgumen
     }
     __syncthreads();
 
-    const int own = threadIdx.x;  // a digit each
+    const int own = threadIdx.x;  // one digit per thread
     uint total = 0u;
     for (int w = 0; w < SORT_WARPS; ++w) {
         const uint of_warp = s.counts[w][own];
@@ -177,7 +177,7 @@ template <class Key> __device__ __forceinline__ void sort_pass(const SortArgumen
         if (word >= SUM) break;
     }
     if (piece > 0) publish(words, SUM | (before + total));
-    uint starts[2] = {total, a.digits[own]};  // in the piece, and of all
+    uint starts[2] = {total, a.digits[own]};  // counts in the piece, and in total
     sums_before<2>(starts, s.sums);
     s.starts[own] = starts[0], s.targets[own] = starts[1] + before - starts[0];
     __syncthreads();
@@ -197,13 +197,13 @@ template <class Key> __device__ __forceinline__ void sort_pass(const SortArgumen
     }
 }
 
-// The sum of all earlier pieces, computed by the first warp, 32 pieces at a time.
+// Returns the sum of all earlier pieces, computed by the first warp, 32 pieces at a time.
 __device__ __forceinline__ uint sum_before(const uint* words, int64 piece, int lane) {
     uint sum = 0u;
     for (int64 last = piece - 1; last >= 0; last -= 32) {
         const int64 p = last - lane;
         const uint word = p >= 0 ? said(words + p) : SUM;
-        const uint ends = __ballot_sync(FULL_MASK, word >= SUM);  // the nearest of these ends the search
+        const uint ends = __ballot_sync(FULL_MASK, word >= SUM);  // the search ends at the nearest of these
         const int furthest = ends ? __ffs(int(ends)) - 1 : 31;
         uint number = lane <= furthest ? word & NUMBER : 0u;
         const auto exchange = [&](int step) {
@@ -216,7 +216,7 @@ __device__ __forceinline__ uint sum_before(const uint* words, int64 piece, int l
     return sum;
 }
 
-// Where the pairs of each splat end, in the order of depth; the last piece writes their number.
+// Computes the end of each splat's pairs in depth order; the last piece writes their total number.
 extern "C" __global__ void __launch_bounds__(256) running_counts(RunningArguments a) {
     __shared__ uint sums[1][SORT_THREADS];
     __shared__ uint of_piece, before_piece;

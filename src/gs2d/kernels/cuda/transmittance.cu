@@ -12,8 +12,8 @@ struct DepthArguments {
     const int64* ranges;
     const int* tiles;
     const uint* seen;
-    const float *alpha, *median;  // [H, W] of the blending; the median is the first guess
-    float *depth, *slope;         // [H, W]: where half of alpha lies; -dT/dz there
+    const float *alpha, *median;  // [H, W] from the blending; the median is the initial guess
+    float *depth, *slope;         // [H, W]: depth at which half of alpha is reached; -dT/dz there
 };
 
 // Calls pair(half, alpha, inverse depth) for the pairs that the pixels of this thread have blended.
@@ -51,7 +51,7 @@ __device__ __forceinline__ void walk(const DepthArguments& a, const Place& at, c
                 pair(h, keep(goes_on, alpha), hit.inverse_depth);
             }
         });
-        __syncwarp();  // the records are overwritten next
+        __syncwarp();  // the records are overwritten in the next iteration
     }
 }
 
