@@ -130,7 +130,8 @@ GS2D_HD uint32_t nonzero(const LaneBits* p) {
 #endif
 
 // Conversion between LANES consecutive rows of K < LANES reals and K vectors, with K - 1 shuffles per vector.
-// packed_source and packed_target return the source element for a lane of vector I when vector S is merged into the result so far.
+// packed_source and packed_target return the source element for a lane of vector I when vector S is merged into the
+// result so far.
 template <int K, int I, int S> constexpr int packed_source(int lane) {
     const int e = lane * K + I, vector = e / LANES, at = e % LANES;
     return vector == S ? LANES + at : S > 1 ? lane : vector == 0 ? at : 0;
