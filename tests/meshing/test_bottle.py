@@ -1,4 +1,4 @@
-"""Upper bound of mesh quality: fusing exact depth maps of a scanned object (ray-cast by Embree) restores its surface."""
+"""Upper bound of mesh quality: fusing exact depth maps of a scanned object (ray-cast by Embree) gives its surface."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ def test_evidence_does_not_depend_on_chunks(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def views_of_a_floor(count: int = 12) -> list[RenderedView]:
-    """Render the plane z = 0 from cameras looking down; its depth is noisy with low weight, as for a textureless floor."""
+    """Render the plane z = 0 from above; its depth is noisy with low weight, as on textureless floors."""
     made = []
     for number in range(count):
         angle = 2 * np.pi * number / count

@@ -57,7 +57,7 @@ def test_a_room_seen_from_inside_has_all_its_walls(bounded: bool) -> None:
 
 
 def shining_wall(through: int, views: int = 12) -> list[RenderedView]:
-    """Return views of a wall at y = 0; the first ``through`` have a moving highlight with depth 1 unit behind the wall."""
+    """Return views of a wall at y = 0; the first ``through`` have a moving highlight at depth 1 behind the wall."""
     frames = []
     for k in range(views):
         x = -0.6 + 1.2 * k / (views - 1)

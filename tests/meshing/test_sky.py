@@ -23,9 +23,7 @@ def castle(*, sky: float = 0.9, noise: float = 0.004, height: int = HEIGHT, widt
 
 
 def sky_in(image: np.ndarray, points: np.ndarray, valid: np.ndarray | None = None, horizon: float = 1.0) -> np.ndarray:
-    """Return ``sky_pixels`` of an image; ``horizon`` is the image row, as a fraction of the height, above which rays
-    rise.
-    """
+    """Return ``sky_pixels``; ``horizon`` is the row, as a fraction of the height, above which rays rise."""
     above = np.arange(len(image))[:, None] < horizon * len(image) + np.zeros((1, image.shape[1]))
     return sky_pixels(image, points, above, valid)
 

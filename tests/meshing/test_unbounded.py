@@ -1,4 +1,4 @@
-"""Unbounded scenes: one closed mesh across levels of different voxels, with far ground and no shell around the scene."""
+"""Unbounded scenes: one closed mesh across levels of voxels, with far ground and no shell around the scene."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ def test_the_gradient_of_a_transform_is_that_of_the_whole_loss(scene: Scene) -> 
 
     def loss(change: torch.Tensor) -> float:
         kept = rows.values.clone()
-        rows.values[2] += change * VIEWS / (VIEWS - 1)  # keeping the mean fixed removes this share
+        rows.values[2] += change * VIEWS / (VIEWS - 1)  # centring removes a share of 1 / VIEWS
         total = sum(float(value) for value in trainer._whole.evaluate(state, stage, 1, 2).losses.values())
         rows.values = kept
         return total

@@ -40,7 +40,7 @@ def test_trained_splats_get_the_same_gradients_beside_frozen_ones(backend: str) 
     )
     for trainer in (apart, together):
         trainer.enter(0)
-        trainer.state.step = 7  # halfway to the start of the multi-view losses
+        trainer.state.step = 7  # the multi-view losses are active
     stage, found = compared().stages[0], []
     for trainer in (apart, together):
         probe = torch.zeros(len(trainer.splats), 2, requires_grad=True)

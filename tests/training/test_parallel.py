@@ -48,7 +48,7 @@ def test_two_processes_have_identical_states(case: str, two: dict[str, list[Any]
 
 @pytest.mark.parametrize("case", RECIPES)
 def test_two_processes_equal_one_with_batches_of_two(case: str, two: dict[str, list[Any]]) -> None:
-    """Bit-identical, because a sum of two numbers has no order. Sums over all views (E_i, errors) agree up to rounding."""
+    """Bit-identical, because a sum of two numbers has no order. Sums over all views (E_i, errors) are rounded."""
     state, heard = trained(RECIPES[case](), Batch(2))
     found = two[case][0]
     assert differing(state.state_dict(), found["state"]) == []
@@ -94,7 +94,7 @@ def test_each_view_of_an_iteration_updates_its_learned_rows(two: dict[str, list[
     assert state["processes"] == [[0, 0, 2]]
     assert sum(state["learned"]["exposure"]["steps"]) == 17  # starting with the third
     assert sum(state["learned"]["poses"]["steps"]) >= 8
-    assert state["moments"]["means"]["steps"] <= 5  # last stage: a batch of five counts as five steps
+    assert state["moments"]["means"]["steps"] <= 5  # the last stage has five views
 
 
 def test_rates_for_several_views_follow_grendel() -> None:
@@ -140,7 +140,7 @@ def test_a_run_resumes_with_another_number_of_processes(scene: Scene) -> None:
 
 
 class Guest(Densifier):
-    """A third-party loss that assumes one view per iteration."""
+    """A third-party densifier that assumes one view per iteration."""
 
     def changes(self, iteration: int) -> bool:
         return False

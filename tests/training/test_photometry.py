@@ -57,7 +57,7 @@ def test_images_of_one_camera_share_vignetting_and_response(scene: Scene) -> Non
     powers = reach_of([scene.train[0].camera]) ** np.array([2.0, 4.0, 6.0])
     for index in (0, 2, 4):
         assert seen[index]["vignetting"] * powers == pytest.approx([-0.01, 0.01, -0.01])
-        assert seen[index]["response"] == pytest.approx(0.005)  # each camera takes half of the images
+        assert seen[index]["response"] == pytest.approx(0.005)  # half of the images are from this camera
     assert not seen[1]["vignetting"].any()
     assert seen[1]["response"] == pytest.approx(-0.005)
     only = short().with_learned(VIGNETTING)

@@ -204,7 +204,7 @@ def test_removed_floaters_are_reported_as_events() -> None:
 
 @pytest.mark.parametrize("behind", [True, False])
 def test_trials_render_frozen_splats(behind: bool) -> None:
-    """Removing a dark floater is noticed only if the frozen wall behind it is rendered, not over black."""
+    """Removing a dark floater makes images worse over black, but not if the frozen wall behind it is rendered."""
     frozen = wall_of_splats()[0] if behind else None
     state = full_state(20)
     splats = state.splats
