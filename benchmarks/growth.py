@@ -1,8 +1,10 @@
-"""How the steps outside an iteration grow: with splats to 5 million, with pixels to 4K.
+"""Measure how the steps outside an iteration scale: up to 5 million splats, and up to 4K pixels.
 
 ::
 
-    python -m benchmarks.growth [--quick] [--only densification] [--splats 20000 ... 5000000] [--out FILE.json]
+Reports the minimum CPU milliseconds of a few repetitions on one thread. ``exponent`` is the slope between the two
+largest sizes in log-log space: 1 is linear, 2 quadratic. Exits with 1 if an exponent exceeds 1.35. Sorting, tree
+searches and cache misses stay below that limit; quadratic algorithms do not.
 
 Processor seconds of one thread (what others do on the machine adds little to them), the best of a few. ``exponent`` is
 the slope between the two largest sizes in logarithms: 1 is linear, 2 quadratic. Exits with 1 where one is above 1.35:
@@ -22,7 +24,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before torch loads
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # set before torch loads, as in the command line
 
 import numpy as np
 import torch
@@ -52,7 +54,7 @@ Step = Callable[[], object]
 
 
 def cpu_ms(make: Callable[[], Step], repeats: int) -> float:
-    """Least processor milliseconds of a step; each time it is made anew, unmeasured."""
+    """Return the minimum CPU milliseconds of a step; its setup is repeated each time and not measured."""
     times = []
     for _ in range(repeats):
         step = make()
@@ -63,7 +65,7 @@ def cpu_ms(make: Callable[[], Step], repeats: int) -> float:
 
 
 def small_scene(points: np.ndarray | None = None) -> Scene:
-    """Four grey views of the room."""
+    """Return a scene of four grey views of the room."""
     image = np.full((30, 40, 3), 128, np.uint8)
     views = tuple(View.from_arrays(f"{i}.png", c, image) for i, c in enumerate(places(40, 30)))
     cloud = None if points is None else PointCloud(points, None)
@@ -72,19 +74,19 @@ def small_scene(points: np.ndarray | None = None) -> Scene:
 
 
 def initialisation(splats: Splats) -> Step:
-    """The first splats from points: distances to neighbours by a k-d tree, which points a camera sees."""
+    """Initialise splats from points: neighbour distances by a k-d tree, and visible points per camera."""
     scene = small_scene(splats.means.double().numpy())
     generator = torch.Generator().manual_seed(0)
     return partial(initial_splats, scene, sh_degree=3, random_points=0, near=0.05, generator=generator)
 
 
 def errors_of_a_view(splats: Splats) -> Step:
-    """The inner sum of E_i for one view of 400x400."""
+    """Compute the inner sum of E_i for one view of 400x400."""
     return partial(splat_errors, splats, camera(400), torch.full((400, 400, 3), 0.5), backend="cpu")
 
 
 def ranking(splats: Splats) -> Step:
-    """The order of E_i over four views, and the clone of the worst 1 %."""
+    """Rank E_i over four views and clone the worst 1 %."""
     generator = torch.Generator().manual_seed(0)
     state = TrainState(splats.clone(), generator)
     errors = [torch.rand(len(splats), generator=generator) for _ in range(4)]
@@ -109,19 +111,19 @@ BY_SPLATS: dict[str, Callable[[Splats], Step]] = {
 
 
 def evaluation(width: int, height: int) -> Step:
-    """PSNR and SSIM of an image."""
+    """Compute PSNR and SSIM of an image."""
     generator = torch.Generator().manual_seed(0)
     image, target = (torch.rand(height, width, 3, generator=generator) for _ in range(2))
     return partial(image_metrics, image, target, backend="cpu")
 
 
 def rendering(width: int, height: int) -> Step:
-    """A forward pass over 100 000 splats."""
+    """Render 100 000 splats, forward only."""
     return partial(rasterize, room(100_000), camera(width, height), backend="cpu")
 
 
 def meshing(width: int, height: int) -> Step:
-    """Fusion of four depth maps in voxels of a pixel, marching cubes, components."""
+    """Fuse four depth maps in pixel-sized voxels, run marching cubes and find components."""
     maps = [sphere_map(replace(c, height=height, cy=height / 2)) for c in orbit(4, width)]
     limits = derive_limits([sample_depths(m) for m in maps], [m.camera for m in maps], resolution=width // 4)
 
@@ -139,17 +141,17 @@ BY_PIXELS: dict[str, Callable[[int, int], Step]] = {
 
 
 def exponent(sizes: Sequence[float], times: Sequence[float]) -> float:
-    """Slope of log time over log size between the two largest sizes."""
+    """Return the slope of log time over log size between the two largest sizes."""
     return math.log(times[-1] / max(times[-2], 1e-6)) / math.log(sizes[-1] / sizes[-2])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, print, write; 1 where something grows faster than it may."""
+    """Measure, print and write; return 1 if an exponent exceeds the limit."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.growth", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--quick", action="store_true", help="tiny sizes: shows that everything works")
-    parser.add_argument("--only", nargs="+", help="steps whose name contains one of these")
+    parser.add_argument("--quick", action="store_true", help="tiny sizes, as a smoke test")
+    parser.add_argument("--only", nargs="+", help="run only steps whose name contains one of these words")
     parser.add_argument("--splats", type=int, nargs="+", default=list(SPLATS))
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--out", type=Path)

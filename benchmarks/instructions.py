@@ -1,9 +1,11 @@
-"""Noise-free figures of the kernels: executed instructions of the AVX2 build, loop lengths of the AVX-512 build.
+"""Count executed instructions of the AVX2 build and loop lengths of the AVX-512 build, which have no noise.
 
 ::
 
-    python -m benchmarks.instructions            compare with results/instructions.json (exit status 1 if over)
-    python -m benchmarks.instructions --update   write that file, after a change that is meant
+Callgrind does not support AVX-512, so it counts the instructions of the AVX2 library on a small fixed view
+(``callgrind/driver.cpp``, one thread). The AVX-512 blend loops are compiled with the flags of CMakeLists.txt, and the
+instructions in their vector loops are counted with objdump. Both depend on the compiler: figures of another major
+version are not compared.
 
 Callgrind does not run AVX-512, so it counts what the AVX2 library executes in one small fixed view
 (``callgrind/driver.cpp``, one thread). Of the AVX-512 build the blend loops are compiled with the flags of
@@ -32,7 +34,7 @@ ROOT = Path(__file__).resolve().parents[1]
 COMMITTED = Path(__file__).parent / "results" / "instructions.json"
 CALLGRIND_TOLERANCE = 0.02
 LOOP_TOLERANCE = 0.03
-MIN_VECTOR, LONGEST = 15, 400  # zmm instructions of a loop that counts; longer ones are jumps back from cold code
+MIN_VECTOR, LONGEST = 15, 400  # minimum zmm instructions of a counted loop; longer loops jump back from cold code
 # mangled names of the functions with the blend loops -> label
 LOOP_FUNCTIONS = {
     "blend_tileERNS": "forward",
@@ -43,11 +45,11 @@ Counts = dict[str, int]
 
 
 class Unavailable(Exception):
-    """A tool that the measurement needs is missing; says which, and how to get it."""
+    """Raised if a required tool is missing; the message says how to install it."""
 
 
 def _tool(name: str, package: str) -> str:
-    beside_python = str(Path(sys.executable).parent)  # where pip puts cmake
+    beside_python = str(Path(sys.executable).parent)  # pip installs cmake here
     path = shutil.which(name, path=os.pathsep.join((beside_python, os.environ.get("PATH", os.defpath))))
     if path is None:
         raise Unavailable(f"{name} is not installed (Debian: apt install {package})")
@@ -62,14 +64,14 @@ def _run(words: Sequence[str], **options: Any) -> str:
 
 
 def compiler_version() -> str:
-    """Name and major version of the compiler, for instance "g++ 12"."""
+    """Return name and major version of the compiler, for instance "g++ 12"."""
     compiler = os.environ.get("CXX", "g++")
     version = _run([_tool(compiler, "g++"), "-dumpversion"]).strip()
     return f"{Path(compiler).name} {version.split('.')[0]}"
 
 
 def callgrind_counts() -> Counts:
-    """Instructions that the AVX2 library executes in each call on the driver's view."""
+    """Return the instructions of each library call on the driver's view, AVX2 build."""
     valgrind, compiler = _tool("valgrind", "valgrind"), _tool(os.environ.get("CXX", "g++"), "g++")
     if "v3" not in available_variants():
         raise Unavailable("the AVX2 library was not built, or this processor cannot run it")
@@ -94,7 +96,7 @@ def callgrind_counts() -> Counts:
 
 
 def loop_counts() -> Counts:
-    """Instructions in the vector loops of the AVX-512 blend functions, summed by function; "..., zmm": of them zmm."""
+    """Return instructions in the vector loops of the AVX-512 blend functions by function; "..., zmm": zmm only."""
     cmake, objdump = _tool("cmake", "cmake"), _tool("objdump", "binutils")
     counts: Counts = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -116,7 +118,7 @@ def loop_counts() -> Counts:
 
 
 def _functions(listing: str) -> dict[str, str]:
-    """Disassembly of each function of LOOP_FUNCTIONS."""
+    """Return the disassembly of each function of LOOP_FUNCTIONS."""
     found = {}
     for part in re.split(r"\n(?=[0-9a-f]+ <)", listing):
         for name, label in LOOP_FUNCTIONS.items():
@@ -127,7 +129,7 @@ def _functions(listing: str) -> dict[str, str]:
 
 
 def vector_loops(disassembly: str) -> list[tuple[int, int]]:
-    """(instructions, zmm instructions) of each innermost loop with at least MIN_VECTOR of the latter, sorted."""
+    """Return sorted (instructions, zmm instructions) of innermost loops with at least MIN_VECTOR zmm instructions."""
     lines = re.findall(r"^\s+([0-9a-f]+):\t(\S+)\s*(.*)$", disassembly, flags=re.MULTILINE)
     index = {int(address, 16): i for i, (address, _, _) in enumerate(lines)}
     loops = set()
@@ -141,9 +143,9 @@ def vector_loops(disassembly: str) -> list[tuple[int, int]]:
 
 
 def excess(measured: Counts, committed: Counts, tolerance: float) -> list[str]:
-    """One line for each count that differs from the committed one by more than the tolerance, in either direction.
+    """Return a line per count that differs from the committed one by more than the tolerance, in either direction.
 
-    A large gain must be committed too: otherwise the next loss would pass unseen.
+    A large gain must be committed too; otherwise a later loss would go unnoticed.
     """
     if measured.keys() != committed.keys():
         return [f"counted {', '.join(measured)}; the committed file has {', '.join(committed)}"]
@@ -155,7 +157,7 @@ def excess(measured: Counts, committed: Counts, tolerance: float) -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Compare, or write the committed file."""
+    """Compare with the committed file, or write it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--update", action="store_true")
     args = parser.parse_args(arguments)

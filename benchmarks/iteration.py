@@ -1,9 +1,11 @@
-"""Times whole training iterations: render, all losses, backward, statistics, Adam, in each stage of 2DGS-R.
+"""Time whole training iterations (render, losses, backward, statistics, Adam) in each stage of 2DGS-R.
 
 ::
 
-    python -m benchmarks.iteration [--recipe 2dgs-r] [--splats 20000] [--size 400] [--threads 2] [--repeats 60]
-        [--json FILE]
+The scene is the synthetic room, rendered from four poses and then perturbed, so that there is something to learn.
+Nothing is densified, so every iteration of a stage does the same work. The multiply-add probe runs before and after
+each stage: on a shared machine, compare times only between equal probes. Stage 2 fills its view cache in the first
+iteration; the extra time of that iteration is reported per view.
 
 The splats are the synthetic room, rendered from four places and then disturbed, so that there is something to
 learn; nothing is densified, so every iteration of a stage does the same work. The multiply-add probe runs before and
@@ -22,7 +24,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before torch loads
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # set before torch loads, as in the command line
 
 import numpy as np
 import torch
@@ -43,7 +45,7 @@ from gs2d.training.trainer import Trainer
 
 
 def make_scene(splats: Splats, cameras: Sequence[Camera]) -> Scene:
-    """Pictures of the splats from these cameras."""
+    """Return a scene with renderings of the splats from these cameras."""
     views = []
     for index, camera in enumerate(cameras):
         color = rasterize(splats, camera, backend="cpu").color.clamp(0, 1)
@@ -53,7 +55,7 @@ def make_scene(splats: Splats, cameras: Sequence[Camera]) -> Scene:
 
 
 def steady(stage: Stage) -> Stage:
-    """The stage with every loss active from the first iteration, and nothing that changes N."""
+    """Return the stage with every loss active from the first iteration and a constant number of splats."""
     densify = None if stage.densify is None else replace(stage.densify, start=10**9, stop=10**9 + 1, reset_every=0)
     losses = tuple(replace(term, start=0) for term in stage.losses)
     return replace(stage, losses=losses, densify=densify, sh_interval=0, iterations=10**6)
@@ -61,9 +63,9 @@ def steady(stage: Stage) -> Stage:
 
 @dataclass(frozen=True)
 class StageTime:
-    """An iteration of one stage, the multiply-add probe beside it, and what its first iteration took longer.
+    """Iteration time of one stage, with the multiply-add probe and the extra time of the first iteration.
 
-    Page faults are those of an iteration: memory that the system hands out anew, a microsecond or two a page of 4 kB.
+    Page faults are counted per iteration. Each page of 4 kB that the system allocates costs a microsecond or two.
     """
 
     timing: Timing
@@ -73,7 +75,7 @@ class StageTime:
 
 
 def bench_trainer(workload: Workload, name: str = "2dgs-r") -> Trainer:
-    """A trainer that learns back pictures of the splats; every iteration of a stage does the same work."""
+    """Return a trainer that fits renderings of the splats; every iteration of a stage does the same work."""
     hold()  # as `gs2d train` does
     scene = make_scene(workload.splats, workload.cameras)
     generator = torch.Generator().manual_seed(2)
@@ -85,14 +87,14 @@ def bench_trainer(workload: Workload, name: str = "2dgs-r") -> Trainer:
 
 
 def iteration_times(workload: Workload, library: Library, repeats: int, name: str = "2dgs-r") -> dict[str, StageTime]:
-    """Time of an iteration of each stage of a recipe, on torch's number of threads."""
+    """Time an iteration of each stage of a recipe, on torch's number of threads."""
     trainer = bench_trainer(workload, name)
     scene, recipe = trainer.scene, trainer.recipe
     result = {}
     for index, stage in enumerate(recipe.stages):
         trainer.enter(index)
         before = peak_probe(library)
-        warmup = 2 * len(scene.train) if repeats > 2 else len(scene.train)  # every view once or twice: caches are full
+        warmup = 2 * len(scene.train) if repeats > 2 else len(scene.train)  # fill the caches with every view
         start = time.perf_counter()
         trainer.step()
         first = 1e3 * (time.perf_counter() - start)
@@ -106,12 +108,12 @@ def iteration_times(workload: Workload, library: Library, repeats: int, name: st
 
 
 def page_faults() -> int:
-    """How many pages this process got from the system so far, without reading a disk."""
+    """Return the number of minor page faults of this process."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 
 
 def run(count: int, size: int, threads: int, repeats: int, recipe: str = "2dgs-r") -> dict[str, object]:
-    """Median and best milliseconds of an iteration of each stage."""
+    """Return median and best milliseconds of an iteration of each stage."""
     torch.set_num_threads(threads)
     library = ready_library()
     times = iteration_times(room_workload(count, size, size), library, repeats, recipe)
@@ -132,7 +134,7 @@ def run(count: int, size: int, threads: int, repeats: int, recipe: str = "2dgs-r
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run and print."""
+    """Run the benchmark and print the result."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recipe", default="2dgs-r")
     parser.add_argument("--splats", type=int, default=20_000)

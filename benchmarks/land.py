@@ -1,7 +1,8 @@
-"""Land to fly over: hills, fields and roads, and a house on every other lot; as large as wanted, with known triangles.
+"""Generate land to fly over: hills, fields, roads, and a house on every other lot, as triangles.
 
-Triangles lie in the order of square tiles of the ground, so that a camera is given those near what it sees, however
-many there are in all. Colour is a formula of the place, not a picture: it is as fine far away as near.
+Triangles are sorted by square ground tiles, so that a camera can query the triangles near its view at a cost that does
+not depend on the total. Colour is a procedural function of position, not an image, so its detail does not depend on
+distance.
 """
 
 from __future__ import annotations
@@ -14,14 +15,14 @@ import numpy as np
 from gs2d.synthetic.shapes import merge_vertices
 from gs2d.synthetic.textures import noise, srgb_to_linear
 
-STEP = 4.0  # m, between vertices of the ground
-TILE = 32.0  # m, side of a tile of the list of triangles; a whole number of steps
-LOT = 48.0  # m, side of a lot, with half a road on each side
-ROAD = 4.0  # m, half the width of a road
+STEP = 4.0  # m, between ground vertices
+TILE = 32.0  # m, side of a triangle list tile; a multiple of the step
+LOT = 48.0  # m, side of a lot, including half a road on each side
+ROAD = 4.0  # m, half the road width
 HILLS = 5.0  # m, standard deviation of the ground's height
-DEPTH = 12.0  # m, that walls reach below the ground at the middle of a house
+DEPTH = 12.0  # m, depth of walls below the ground at the house centre
 GROUND, WALL, ROOF = 0, 1, 2
-_TEXELS = 512  # along a side of a tile of noise
+_TEXELS = 512  # samples along a side of a noise tile
 _SUN = np.array([-0.45, -0.35, 0.82]) / np.linalg.norm([-0.45, -0.35, 0.82])  # unit, towards the sun
 
 
@@ -36,17 +37,17 @@ class Land:
     kind : ndarray [F] uint8
         GROUND, WALL or ROOF.
     tint : ndarray [F, 3] float32
-        Linear colour of what is on the face, before noise.
+        Linear base colour of the face, without noise.
     starts : ndarray [T * T + 1] int64
         First triangle of each tile, by rows along x.
     low : float, m
         Smallest x and y.
     tiles : int
-        T, along a side.
+        T, number of tiles along a side.
     grain : float, m
-        Of the finest pattern: about the width of a pixel.
+        Size of the finest pattern: about a pixel's width.
     waves : ndarray [3, 512, 512] float32
-        Noise that repeats.
+        Periodic noise.
     """
 
     corners: np.ndarray
@@ -60,20 +61,21 @@ class Land:
 
     @cached_property
     def normals(self) -> np.ndarray:
-        """Unit normals [F, 3] of the triangles."""
+        """Return unit normals [F, 3] of the triangles."""
         a, b, c = (self.corners[:, k] for k in range(3))
         cross = np.cross(b - a, c - a)
         return np.asarray(cross / np.linalg.norm(cross, axis=1, keepdims=True))
 
     @cached_property
     def heights(self) -> tuple[float, float]:
-        """Return the height of the lowest ground and of the highest roof, m."""
+        """Return the heights of the lowest ground and the highest roof, m."""
         return float(self.corners[self.kind == GROUND][:, :, 2].min()), float(self.corners[:, :, 2].max())
 
     def near(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return the triangles [n] of all tiles that a rectangle of the ground, two corners [2], touches.
+        """Return triangle indices [n] of all tiles that overlap a ground rectangle with two corners [2].
 
-        Houses lie wholly in the tile of their middle, which may be one further: the caller widens by one tile.
+        A house belongs to the tile of its centre, which may be a neighbouring tile: callers extend the rectangle by a
+        tile.
         """
         first = np.clip(((low - self.low) // TILE).astype(int), 0, self.tiles - 1)
         last = np.clip(((high - self.low) // TILE).astype(int), 0, self.tiles - 1)
@@ -85,18 +87,18 @@ class Land:
         return np.concatenate(parts)
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return vertices [P, 3] and faces [F, 3] of all triangles; corners at one place are one."""
+        """Return vertices [P, 3] and faces [F, 3] of all triangles; coincident corners are merged."""
         count = len(self.corners)
         return merge_vertices(self.corners.reshape(-1, 3), np.arange(3 * count).reshape(count, 3))
 
 
 def build_land(side: float, grain: float, seed: int) -> Land:
-    """Return a square of land about the origin.
+    """Return a square of land centred at the origin.
 
     Parameters
     ----------
     side : float, m
-        At least; a whole number of lots.
+        Minimum side; rounded up to a whole number of lots.
     grain : float, m
         See ``Land``.
     seed : int
@@ -127,7 +129,7 @@ def build_land(side: float, grain: float, seed: int) -> Land:
 
 
 def _ground(rng: np.random.Generator, low: float, cells: int) -> np.ndarray:
-    """Heights [cells + 1, cells + 1] of the ground, m, y first: waves of 60 to 700 m."""
+    """Return ground heights [cells + 1, cells + 1], m, y first: waves of 60 to 700 m."""
     x = low + STEP * np.arange(cells + 1)
     height = np.zeros((cells + 1, cells + 1))
     for _ in range(12):
@@ -138,7 +140,7 @@ def _ground(rng: np.random.Generator, low: float, cells: int) -> np.ndarray:
 
 
 def _ground_faces(height: np.ndarray, low: float) -> np.ndarray:
-    """Triangles [F, 3, 3] of a grid of heights."""
+    """Return triangles [F, 3, 3] of a height grid."""
     n = len(height)
     x = low + STEP * np.arange(n)
     points = np.stack([*np.broadcast_arrays(x[None, :], x[:, None]), height], axis=-1)  # [y, x, 3]
@@ -147,13 +149,13 @@ def _ground_faces(height: np.ndarray, low: float) -> np.ndarray:
 
 
 def _field_tints(rng: np.random.Generator, lots: int) -> np.ndarray:
-    """Colours [lots, lots, 3] of what grows on each lot."""
+    """Return field colours [lots, lots, 3] of each lot."""
     kinds = [[0.36, 0.45, 0.22], [0.55, 0.52, 0.30], [0.46, 0.37, 0.27], [0.28, 0.38, 0.20], [0.62, 0.58, 0.50]]
     return np.array(kinds)[rng.integers(len(kinds), size=(lots, lots))] * rng.uniform(0.85, 1.15, (lots, lots, 1))
 
 
 def _house_tints(rng: np.random.Generator) -> np.ndarray:
-    """Colours [2, 3] of the walls and the roof of a house."""
+    """Return colours [2, 3] of the walls and the roof of a house."""
     walls = np.array([[0.82, 0.78, 0.70], [0.70, 0.52, 0.42], [0.60, 0.62, 0.66], [0.88, 0.84, 0.62]])
     roofs = np.array([[0.58, 0.26, 0.18], [0.34, 0.34, 0.37], [0.48, 0.36, 0.28], [0.22, 0.28, 0.36]])
     return np.stack([walls[rng.integers(4)], roofs[rng.integers(4)]])
@@ -162,7 +164,7 @@ def _house_tints(rng: np.random.Generator) -> np.ndarray:
 def _houses(
     rng: np.random.Generator, height: np.ndarray, low: float, lots: int
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Triangles [F, 3, 3] of each house, and which of them are walls and roofs."""
+    """Return triangles [F, 3, 3] of each house and their kind, wall or roof."""
     houses, kinds = [], []
     for row in range(lots):
         for column in range(lots):
@@ -181,7 +183,9 @@ def _houses(
 
 
 def _house(size: np.ndarray, rise: float, peak: float) -> tuple[np.ndarray, np.ndarray]:
-    """Walls of a rectangle, and a flat roof or two slopes along x that rise by ``peak``, m, above the walls."""
+    """Return the walls of a rectangle with a flat roof, or with two slopes along x that rise ``peak`` m above the
+    walls.
+    """
     x, y = size / 2
     base = np.array([[-x, -y], [x, -y], [x, y], [-x, y]])
     lower, upper = (np.column_stack([base, np.full(4, z)]) for z in (-DEPTH, rise))
@@ -202,25 +206,25 @@ def _house(size: np.ndarray, rise: float, peak: float) -> tuple[np.ndarray, np.n
 
 
 def shade(land: Land, face: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Return linear colours [n, 3] of places [n, 3] on faces [n]: sky, sun by the face's normal, pattern, noise."""
+    """Return linear colours [n, 3] of points [n, 3] on faces [n]: sky light, sun light, pattern and noise."""
     kind, color = land.kind[face], land.tint[face].copy()
     normal = land.normals[face]
     ground, wall, roof = (np.flatnonzero(kind == k) for k in (GROUND, WALL, ROOF))
-    x, y = ((place[ground, k] - land.low) % LOT - LOT / 2 for k in range(2))  # from the middle of the lot
+    x, y = ((place[ground, k] - land.low) % LOT - LOT / 2 for k in range(2))  # from the lot centre
     on_road = np.maximum(np.abs(x), np.abs(y)) > LOT / 2 - ROAD
     color[ground[on_road]] = 0.16
     across, along = ((LOT / 2 - f(np.abs(x[on_road]), np.abs(y[on_road]))) for f in (np.maximum, np.minimum))
-    color[ground[on_road][(across < 0.35) & (along % 6 < 3)]] = 0.62  # dashes along the middle
+    color[ground[on_road][(across < 0.35) & (along % 6 < 3)]] = 0.62  # dashes along the centre line
     along = np.where(np.abs(normal[wall, 0]) > np.abs(normal[wall, 1]), place[wall, 1], place[wall, 0])
     color[wall[((along % 3) < 1.2) & ((place[wall, 2] % 3) < 1.5)]] *= 0.18  # windows
-    color[roof[(place[roof, 2] % 0.8 < 0.2) & (normal[roof, 2] < 0.99)]] *= 0.7  # rows of tiles
+    color[roof[(place[roof, 2] % 0.8 < 0.2) & (normal[roof, 2] < 0.99)]] *= 0.7  # rows of roof tiles
     light = 0.45 + 0.15 * normal[:, 2] + 0.75 * np.maximum(normal @ _SUN, 0)
     level = 1 + 0.22 * _waves(land, place)
     return np.asarray(color * (light * np.maximum(level, 0.1))[:, None].astype(np.float32))
 
 
 def _waves(land: Land, place: np.ndarray) -> np.ndarray:
-    """Return the sum [n] of noise of three widths; on walls it goes with the height too."""
+    """Return the sum [n] of noise at three scales; on walls it also varies with height."""
     total = np.zeros(len(place), np.float32)
     slanted = place[:, :2] + place[:, 2:] * (0.37, 0.61)
     for wave, texel in zip(land.waves, land.grain * np.array([0.6, 2.7, 13.0]), strict=True):

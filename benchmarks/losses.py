@@ -1,8 +1,9 @@
-"""Native losses, value and gradient, beside the torch forms that they replace.
+"""Time native losses, value and gradient, next to the torch versions that they replace.
 
 ::
 
-    python -m benchmarks.losses [--sizes 400 800] [--threads 1 2] [--repeats 40] [--json benchmarks/results/losses.json]
+Times include the autograd and ctypes overhead of a training step. Each row also lists the peak rate of fused
+multiply-adds (GFLOP/s, same threads), measured just before it.
 
 Times include the autograd and ctypes overhead of a training step. Each row stands beside the peak rate of fused
 multiply-adds (GFLOP/s, same threads) measured just before it.
@@ -30,7 +31,7 @@ from gs2d.losses import formulas as reference
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table."""
+    """Row of the table."""
 
     loss: str
     size: int
@@ -55,7 +56,7 @@ class Frame:
 
 
 def make_frame(size: int) -> Frame:
-    """Random images; depth with 10 % background."""
+    """Return random images; depth with 10 % background."""
     g = torch.Generator().manual_seed(0)
     T = look_at(
         np.array([1.0, 2.0, 3.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]), width=1, height=1, fx=1.0
@@ -75,37 +76,37 @@ def make_frame(size: int) -> Frame:
 
 
 def photometric_step(frame: Frame, mask: Tensor | None = None, mean: Tensor | None = None) -> None:
-    """0.8 L1 - 0.2 SSIM, native, forward and backward."""
+    """Run 0.8 L1 - 0.2 SSIM, native, forward and backward."""
     l1, ssim, _ = ops.photometric(frame.rendered, frame.target, mask, mean)
     torch.autograd.grad(0.8 * l1 - 0.2 * ssim, frame.rendered)
 
 
 def torch_photometric_step(frame: Frame) -> None:
-    """The same in torch."""
+    """Run 0.8 L1 - 0.2 SSIM in torch, forward and backward."""
     l1, ssim = reference.l1(frame.rendered, frame.target), reference.ssim(frame.rendered, frame.target)
     torch.autograd.grad(0.8 * l1 - 0.2 * ssim, frame.rendered)
 
 
 def ssim_value(frame: Frame) -> None:
-    """SSIM without a gradient, native."""
+    """Compute SSIM without a gradient, native."""
     with torch.no_grad():
         ops.photometric(frame.rendered, frame.target)
 
 
 def torch_ssim_value(frame: Frame) -> None:
-    """The same in torch."""
+    """Compute SSIM without a gradient in torch."""
     with torch.no_grad():
         reference.ssim(frame.rendered, frame.target)
 
 
 def normal_step(frame: Frame) -> None:
-    """Normal consistency, native, forward and backward."""
+    """Run normal consistency, native, forward and backward."""
     value = ops.normal_consistency(frame.normal, frame.depth, frame.alpha, ops.NormalOptions(frame.camera))
     torch.autograd.grad(0.05 * value, (frame.normal, frame.depth))
 
 
 def torch_normal_step(frame: Frame) -> None:
-    """The same in torch."""
+    """Run normal consistency in torch, forward and backward."""
     value = reference.normal_consistency(frame.normal, frame.depth, frame.alpha, frame.camera)
     torch.autograd.grad(0.05 * value, (frame.normal, frame.depth))
 
@@ -134,7 +135,7 @@ def run(sizes: Sequence[int], threads: Sequence[int], repeats: int) -> list[Row]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the table, and write it where ``--json`` says."""
+    """Print the table, and write it to ``--json`` if requested."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", type=int, nargs="+", default=[400, 800])
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])

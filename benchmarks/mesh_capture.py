@@ -1,8 +1,10 @@
-"""A ray-cast capture of scanned meshes that no recipe was tuned on: a bust, a bunny and a cow on the demo's plinth.
+"""Ray-cast a capture of scanned meshes that was not used for tuning: a bust, a bunny and a cow on the demo's plinth.
 
 ::
 
-    python -m benchmarks.mesh_capture MESHES FOLDER [--size 400] [--train 60] [--test 20]
+``MESHES`` holds ``nefertiti/nefertiti.obj``, ``stanford_bunny/stanford-bunny.obj`` and ``spot/spot.obj`` with its
+texture. The first two have no texture: they are painted with patterns of the demo, wrapped around them and mirrored at
+the back to avoid a seam. Light, cameras and layout are those of the demo; the true surface is saved next to the images.
 
 ``MESHES`` holds ``nefertiti/nefertiti.obj``, ``stanford_bunny/stanford-bunny.obj`` and ``spot/spot.obj`` with its
 texture. The first two have none: they are painted with patterns of the demo's, laid around them and mirrored at the
@@ -31,7 +33,7 @@ _Y_UP = Rotation.from_euler("x", 90, degrees=True)  # y up to z up
 def read_patch(file: Path, height: float, place: tuple[float, float], turn: float, up: str) -> shapes.Patch:
     """Return a mesh that stands on the plinth: ``height`` world units, turned about z by ``turn`` radians.
 
-    Its texture coordinates are those of the file, or (angle around its middle, height) where it has none.
+    Texture coordinates are read from the file; without them, they are (angle around the centre, height).
     """
     mesh = trimesh.load_mesh(file, process=False)
     vertices = _Y_UP.apply(mesh.vertices) if up == "y" else np.asarray(mesh.vertices, dtype=float)
@@ -49,7 +51,9 @@ def read_patch(file: Path, height: float, place: tuple[float, float], turn: floa
 
 
 def _merged_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit normals of the places, and the place of each vertex: texture seams shall not show in the light."""
+    """Return unit normals of merged vertices, and the merged index of each vertex, so that texture seams are shaded
+    smoothly.
+    """
     places, same = np.unique(vertices, axis=0, return_inverse=True)
     same = same.reshape(-1)
     mesh = trimesh.Trimesh(places, same[faces], process=False)
@@ -88,7 +92,7 @@ def build(meshes: Path, seed: int = 0) -> ToyScene:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Write the capture; 2 for what the user can mend."""
+    """Write the capture; return 2 for user errors."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.mesh_capture", description=__doc__)
     parser.add_argument("meshes", type=Path)
     parser.add_argument("folder", type=Path)

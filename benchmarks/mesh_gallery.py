@@ -1,8 +1,8 @@
-"""Meshes of some runs of one capture side by side with the true surface, in clay (docs/notebook/best.md).
+"""Draw clay renderings of the meshes of several runs next to the true surface (docs/notebook/best.md).
 
 ::
 
-    python -m benchmarks.mesh_gallery OUT.png TRUTH.ply RUN [RUN ...] [--views 0 4] [--size 300]
+Draws a row per view (indices of test views) and a column per run, labelled with its recipe.
 
 A row for each of the views (numbers of test views), a column for each run, named by its recipe.
 """
@@ -23,11 +23,11 @@ from gs2d.io.run_dir import MESH, RunFolder
 from gs2d.pipeline.prepare.loaded import reload_run
 from gs2d.training.events import ignore
 
-SHADES = 64  # of clay: a third of the bytes, and nobody sees it
+SHADES = 64  # clay quantised to these levels: a third of the bytes without a visible difference
 
 
 def column(name: str, mesh: Mesh, cameras: list[Camera], size: int) -> np.ndarray:
-    """Draw a mesh from each camera, one under the other, with its name above: uint8 [H, size, 3]."""
+    """Draw a mesh from each camera, stacked below its label: uint8 [H, size, 3]."""
     clay = [(image.shape * 255).round().astype(np.uint8) for image in mesh_images(mesh, cameras, width=size)]
     image = Image.fromarray(np.concatenate(clay, axis=0))
     ImageDraw.Draw(image).text((8, 8), name, fill=(20, 20, 20))
@@ -35,7 +35,7 @@ def column(name: str, mesh: Mesh, cameras: list[Camera], size: int) -> np.ndarra
 
 
 def main() -> None:
-    """Draw the columns and put them beside one another."""
+    """Draw the columns side by side."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("truth", type=Path)

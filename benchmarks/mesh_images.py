@@ -1,4 +1,4 @@
-"""Images of a mesh, by ray casting, lit from beside the camera."""
+"""Render images of a mesh by ray casting, lit from beside the camera."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def orbit_cameras(mesh: Mesh, *, count: int = 2, size: int = 420) -> tuple[Camer
 def mesh_images(
     mesh: Mesh, cameras: Sequence[Camera], textured: TexturedMesh | None = None, *, width: int = 420
 ) -> list[MeshImage]:
-    """Render a mesh from each camera at a width of ``width`` px, with the texture of ``textured`` if given."""
+    """Render a mesh from each camera at a width of ``width`` px, optionally with the texture of ``textured``."""
     images = []
     for camera in cameras:
         resized = camera.resized(width, max(round(width * camera.height / camera.width), 1))
@@ -106,7 +106,7 @@ def _texture_colors(mesh: TexturedMesh, hits: Hits, _top: int) -> np.ndarray:
 def _average(hits: Hits, paint: Callable[[Hits, int], np.ndarray]) -> np.ndarray:
     """Return pixels [H, W, 3]: the mean over the rays of each, white where they hit nothing.
 
-    ``paint`` returns the colours of hits from a given row on. Rows are painted in batches to save memory.
+    ``paint`` returns the colours of hits from a start row. Rows are painted in batches to save memory.
     """
     height, width = hits.face.shape
     pixels = np.empty((height // _SAMPLES, width // _SAMPLES, 3), np.float32)

@@ -1,8 +1,10 @@
-"""Times what comparing two views adds to an iteration: the neighbour's render, the losses in torch, and native.
+"""Time the multi-view losses added to an iteration: rendering the neighbour, the losses in torch, and native.
 
 ::
 
-    python -m benchmarks.multiview [--splats 20000] [--size 400] [--threads 1] [--repeats 40] [--json FILE]
+Uses the room of ``benchmarks.iteration`` with 2048 patches of 7 x 7 and both losses with gradients. Reports CPU
+milliseconds of this process, so other load on the machine has little effect. All variants run alternately in one
+process, so that ratios are reliable.
 
 The room of ``benchmarks.iteration``; 2048 patches of 7 x 7, both losses with their gradients. Processor seconds of this
 process, so other work on the machine counts little; all of it in turns in one run, so that ratios hold.
@@ -19,7 +21,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before torch loads
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # set before torch loads, as in the command line
 
 import torch
 from torch import Tensor
@@ -46,7 +48,7 @@ def losses(pair: ViewPair, *, native: bool) -> tuple[Tensor, ...]:
 
 
 def in_turns(works: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, float]:
-    """Median processor milliseconds of each, one after the other."""
+    """Return the median CPU milliseconds of each function, run alternately."""
     times: dict[str, list[float]] = {name: [] for name in works}
     for turn in range(repeats + 3):
         for name, work in works.items():
@@ -58,7 +60,7 @@ def in_turns(works: Mapping[str, Callable[[], object]], repeats: int) -> dict[st
 
 
 def make_pair(trainer: Trainer) -> ViewPair:
-    """Return the first view of a trainer beside the neighbour of the first iteration."""
+    """Return the first view of a trainer and the neighbour of the first iteration."""
     objective = trainer._whole
     state, stage = trainer.state, trainer.recipe.stages[0]
     neighbour = objective.neighbour_of(state, stage, 1, 0, state.splats)
@@ -72,7 +74,7 @@ def make_pair(trainer: Trainer) -> ViewPair:
 
 
 def run(count: int, size: int, threads: int, repeats: int) -> dict[str, object]:
-    """Milliseconds of each part, and their fractions of an iteration without them."""
+    """Return the milliseconds of each part, and their fractions of an iteration without them."""
     torch.set_num_threads(threads)
     workload = room_workload(count, size, size)
     plain, compared = (bench_trainer(workload, name) for name in ("2dgs", RECIPE))
@@ -109,7 +111,7 @@ def run(count: int, size: int, threads: int, repeats: int) -> dict[str, object]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run and print."""
+    """Run the benchmark and print the result."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--splats", type=int, default=20_000)
     parser.add_argument("--size", type=int, default=400)

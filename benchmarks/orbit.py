@@ -1,4 +1,4 @@
-"""An animated orbit around the subject of a run, rendering and clay mesh side by side (README.md).
+"""Render an animated orbit around the subject of a run, with rendering and clay mesh side by side (README.md).
 
 ::
 
@@ -28,7 +28,7 @@ from gs2d.training.events import ignore
 
 
 def cropped(image: Image.Image, width: int, height: int) -> Image.Image:
-    """Return the centre of an image, ``width`` x ``height`` px; the image has this height already."""
+    """Return the centre of an image, ``width`` x ``height`` px; the image already has this height."""
     left = (image.width - width) // 2
     return image.crop((left, 0, left + width, height))
 

@@ -1,9 +1,10 @@
-"""The tables of docs/notebook/paper-tables.md: `gs2d paper` for every table of the paper and every group of captures.
+"""Make the tables of docs/notebook/paper-tables.md: run `gs2d paper` for every paper table and capture group.
 
 ::
 
-    python -m benchmarks.paper_tables --data CAPTURES --out runs/paper [--tables modules k] [--groups bottle-lego]
-        [--slots 2] [--seeds 3]
+``CAPTURES`` holds the captures under the names of ``GROUPS``. `gs2d paper` writes full pages with the paper's figures,
+the deviations and every command. This script prints a summary in the page's format: a table per capture, and which of
+the paper's rankings are reproduced. Finished runs are kept, so an interrupted command can be restarted.
 
 ``CAPTURES`` holds the captures under the names of ``GROUPS``. `gs2d paper` writes whole pages, with the paper's
 figures, the deviations and every command; this prints what a reader compares, in the form of the page: a table for each
@@ -25,7 +26,7 @@ SCALE = "0.1"
 
 @dataclass(frozen=True)
 class Group:
-    """Captures of one table: small enough for two cores."""
+    """Captures of one table, small enough for two cores."""
 
     name: str
     scenes: tuple[str, ...]
@@ -37,7 +38,7 @@ GROUPS = (
     Group("scan24", ("dtu_scan24",), downscale=8),
     Group("fox", ("fox_instant_ngp",), downscale=4),
 )
-CALLED = {  # by `gs2d paper`: here
+CALLED = {  # name in `gs2d paper` -> name here
     "other (nerf-synthetic)": "Bottle",
     "NeRF-Synthetic": "Lego",
     "DTU": "DTU scan 24 (training views)",
@@ -46,7 +47,7 @@ CALLED = {  # by `gs2d paper`: here
 
 
 def make_table(table: str, group: Group, args: argparse.Namespace) -> str:
-    """Run `gs2d paper`, and return what it wrote as Markdown."""
+    """Run `gs2d paper` and return its Markdown."""
     out = args.out / f"{group.name}-{table}"
     words = ["gs2d", "paper", table, "--data", str(args.data), "--scenes", *group.scenes, "--out", str(out)]
     words += ["--cache", str(args.out / "cache"), "--schedule-scale", SCALE, "--downscale", str(group.downscale)]
@@ -56,7 +57,7 @@ def make_table(table: str, group: Group, args: argparse.Namespace) -> str:
 
 
 def shorten(page: str) -> list[str]:
-    """Return the lines of a page that are compared: the tables of what was trained, and the orders that are known."""
+    """Return the lines to compare: the tables of trained runs, and the rankings that could be evaluated."""
     lines = []
     for section in page.split("\n## ")[1:]:
         title, _, text = section.partition("\n")
@@ -80,8 +81,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/paper"))
     parser.add_argument("--tables", nargs="+", choices=TABLES, default=list(TABLES))
     parser.add_argument("--groups", nargs="+", choices=[group.name for group in GROUPS], default=["bottle-lego"])
-    parser.add_argument("--seeds", type=int, default=1, help="how many")
-    parser.add_argument("--slots", type=int, default=0, help="runs at a time")
+    parser.add_argument("--seeds", type=int, default=1, help="number of seeds")
+    parser.add_argument("--slots", type=int, default=0, help="number of parallel runs")
     args = parser.parse_args()
     for group in (group for group in GROUPS if group.name in args.groups):
         pages: list[str] = []

@@ -1,7 +1,7 @@
-"""Other people's CPU rasterizers behind one interface: a forward pass, and a backward pass of what it returned.
+"""Adapters for other CPU rasterizers with a common interface: a forward pass, and a backward pass of its result.
 
-Nothing of theirs is in this repository: each is loaded from a build or a checkout that the user names
-(:mod:`benchmarks.peers` says what must be there).
+This repository contains none of their code: each is loaded from a build or checkout of the user (requirements:
+:mod:`benchmarks.peers`).
 """
 
 from __future__ import annotations
@@ -22,38 +22,38 @@ from gs2d.core.sh import sh_to_rgb
 from gs2d.core.splats import Splats
 
 NEAR, ALPHA_MIN, TRANSMITTANCE_MIN = 0.2, 1.0 / 255.0, 1e-4
-THIN = 1e-3  # third standard deviation of a splat as a 3D Gaussian, relative to its smaller one
-CHUNK = 1 << 22  # pixels of bounding boxes at a time
+THIN = 1e-3  # third standard deviation of a splat as a 3D Gaussian, relative to the smaller of its two
+CHUNK = 1 << 22  # bounding box pixels per batch
 OPENSPLAT_OPERATORS = ("project", "forward", "backward", "pairs")
 
 
 class Peer(Protocol):
-    """What is timed."""
+    """Interface of a timed rasterizer."""
 
     name: str
 
     def forward(self) -> Any:
-        """Render the scene; the result is for :meth:`backward`."""
+        """Render the scene; return the state for :meth:`backward`."""
 
     def backward(self, rendered: Any) -> None:
-        """Gradients of everything that this rasterizer has gradients for."""
+        """Compute all gradients that this rasterizer supports."""
 
     def color(self, rendered: Any) -> Tensor:
-        """[H, W, 3]."""
+        """Return the image [H, W, 3]."""
 
     def pairs(self, rendered: Any) -> int:
-        """Pairs of pixel and splat that were blended."""
+        """Return the number of blended (pixel, splat) pairs."""
 
 
 def colors_of(splats: Splats, camera: Camera) -> Tensor:
-    """View-dependent colour [N, 3]."""
+    """Return view-dependent colours [N, 3]."""
     directions = splats.means - torch.as_tensor(camera.center, dtype=splats.dtype)
     directions = directions / directions.norm(dim=1, keepdim=True)
     return sh_to_rgb(splats.sh0, splats.shN, directions, splats.sh_degree)
 
 
 def in_front(splats: Splats, camera: Camera) -> Splats:
-    """The splats beyond the near plane: neither peer's CPU code culls the others."""
+    """Return the splats beyond the near plane: neither of the other CPU rasterizers culls the rest."""
     depth = splats.means @ torch.as_tensor(camera.rotation[2], dtype=splats.dtype)
     return splats.rows(depth + float(camera.T_cam_world[2, 3]) > NEAR)
 
@@ -93,29 +93,29 @@ class OpenSplat:
         self.cotangent, self.no_alpha = torch.randn(h, w, 3, generator=generator), torch.zeros(h, w)
 
     def forward(self) -> Any:
-        """Image, final transmittance and the address of the lists of splats by pixel."""
+        """Render; return image, final transmittance and the address of the splat lists by pixel."""
         height, width = self.size
         return self.operators.forward(width, height, *self.inputs)
 
     def backward(self, rendered: Any) -> None:
-        """Gradients of centres, conics, colours and opacities; frees the lists."""
+        """Compute gradients of centres, conics, colours and opacities; free the lists."""
         _, final, lists = rendered
         self.operators.backward(*self.size, *self.inputs, final, lists, self.cotangent, self.no_alpha)
 
     def color(self, rendered: Any) -> Tensor:
-        """[H, W, 3]."""
+        """Return the image [H, W, 3]."""
         return torch.as_tensor(rendered[0])
 
     def pairs(self, rendered: Any) -> int:
-        """The length of its lists."""
+        """Return the total length of the splat lists."""
         return int(self.operators.pairs(rendered[2], self.size[0] * self.size[1]))
 
 
 def weights_along_rays(alphas: Tensor, *, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
-    """Blending weights and incoming transmittances [M] of samples sorted by ray, front to back, in plain torch.
+    """Compute blending weights and transmittances [M] of samples sorted by ray, front to back, in plain torch.
 
-    The product of (1 - alpha) of the samples before, per ray: a running sum of logarithms, less its value where the
-    ray begins (float64, because it runs over all rays).
+    The transmittance is the product of (1 - alpha) over the previous samples of the ray. It is computed as a running
+    sum of logarithms minus its value at the start of the ray, in float64 because the sum runs over all rays.
     """
     logs = torch.log1p(-alphas.double())
     before = torch.cumsum(logs, 0) - logs
@@ -126,15 +126,15 @@ def weights_along_rays(alphas: Tensor, *, ray_indices: Tensor, n_rays: int) -> t
 
 
 def accumulate_along_rays(weights: Tensor, values: Tensor | None, *, ray_indices: Tensor, n_rays: int) -> Tensor:
-    """Sums of weight times value [n_rays, C] of samples; of the weights alone without values."""
+    """Return sums of weight times value [n_rays, C] of samples, or of the weights if ``values`` is None."""
     weighted = weights[:, None] if values is None else weights[:, None] * values
     return weighted.new_zeros(n_rays, weighted.shape[1]).index_add(0, ray_indices, weighted)
 
 
 def load_gsplat(checkout: Path) -> ModuleType:
-    """gsplat's torch reference for 2DGS, without its package's imports and with the two functions above for nerfacc's.
+    """Load gsplat's torch reference for 2DGS without its package's imports; replace two nerfacc functions with ours.
 
-    nerfacc's own scans run on CUDA only.
+    nerfacc's own scans require CUDA.
     """
     folder = checkout.resolve() / "gsplat"
     if not (folder / "cuda" / "_torch_impl_2dgs.py").exists():
@@ -150,8 +150,9 @@ def load_gsplat(checkout: Path) -> ModuleType:
 
 
 class Gsplat:
-    """gsplat's torch reference for 2DGS: projection, intersection and compositing of pairs it is given; its search for
-    them is CUDA code, so that search is not timed."""
+    """gsplat's torch reference for 2DGS: projection, intersection and compositing of the pairs passed to it. The pair
+    search of gsplat is CUDA code and is not timed.
+    """
 
     name = "gsplat"
 
@@ -184,7 +185,7 @@ class Gsplat:
         )
 
     def _visible_pairs(self) -> tuple[Tensor, Tensor]:
-        """Indices of splat and pixel of what is seen, sorted by pixel and depth."""
+        """Return splat and pixel indices of visible pairs, sorted by pixel and depth."""
         radii, centers, depths, transforms, _ = (t[0] for t in self._project())
         order = torch.argsort(depths)
         order = order[(radii[order] > 0).all(dim=1)]
@@ -205,7 +206,7 @@ class Gsplat:
             seen = alpha >= ALPHA_MIN
             found.append(torch.stack([of[seen], y[seen] * self.camera.width + x[seen]]))
         nearest, pixels = torch.cat(found, dim=1)
-        by_pixel = torch.argsort(pixels, stable=True)  # depth order stays
+        by_pixel = torch.argsort(pixels, stable=True)  # stable: keeps the depth order
         gaussians, pixels = order[nearest[by_pixel]], pixels[by_pixel]
         alpha = self._alphas(
             gaussians, pixels % self.camera.width, pixels // self.camera.width, centers, transforms
@@ -215,7 +216,7 @@ class Gsplat:
         return gaussians[reached], pixels[reached]
 
     def _alphas(self, splats: Tensor, x: Tensor, y: Tensor, centers: Tensor, transforms: Tensor) -> Tensor:
-        """Opacity of pairs, from the definition of a 2D splat (docs/math.md), for choosing pairs."""
+        """Return the opacity of pairs from the definition of a 2D splat (docs/math.md), to select pairs."""
         M = transforms[splats]
         h_u = -M[:, 0] + M[:, 2] * (x + 0.5)[:, None]
         h_v = -M[:, 1] + M[:, 2] * (y + 0.5)[:, None]
@@ -225,7 +226,7 @@ class Gsplat:
         return self.leaves["opacities"][splats] * torch.exp(-0.5 * torch.fmin(rho3d, rho2d))
 
     def forward(self) -> Any:
-        """Colour with depth [1, H, W, 4], alpha and normals."""
+        """Render; return colour with depth [1, H, W, 4], alpha and normals."""
         _, centers, depths, transforms, normals = self._project()
         features = torch.cat([self.leaves["colors"][None], depths[..., None]], dim=-1)
         return self.module.accumulate_2dgs(
@@ -234,15 +235,15 @@ class Gsplat:
         )
 
     def backward(self, rendered: Any) -> None:
-        """Gradients of means, rotations, scales, opacities and colours."""
+        """Compute gradients of means, rotations, scales, opacities and colours."""
         torch.autograd.grad(list(rendered), list(self.leaves.values()), self.cotangents)
 
     def color(self, rendered: Any) -> Tensor:
-        """[H, W, 3]."""
+        """Return the image [H, W, 3]."""
         return torch.as_tensor(rendered[0][0, ..., :3].detach())
 
     def pairs(self, rendered: Any) -> int:
-        """The pairs it was given."""
+        """Return the number of pairs passed to it."""
         return len(self.pixels)
 
 
@@ -250,5 +251,5 @@ PEERS: dict[str, Callable[[Path, Splats, Camera], Peer]] = {"opensplat": OpenSpl
 
 
 def difference(a: Tensor, b: Tensor) -> float:
-    """Mean absolute difference of two images."""
+    """Return the mean absolute difference of two images."""
     return float(np.abs(a.detach().numpy() - b.detach().numpy()).mean())

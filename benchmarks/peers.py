@@ -1,20 +1,23 @@
-"""The CPU rasterizer beside its peers, forward and backward, in turns in one run.
+"""Time the CPU rasterizer and other CPU rasterizers, forward and backward, alternately in one process.
 
 ::
 
-    python -m benchmarks.peers [--opensplat LIBRARY] [--gsplat CHECKOUT] [--only 20k-400] [--threads 2] [--repeats 9]
-                               [--out benchmarks/results/peers.json]
-
-What must be there (built or checked out by you, outside this repository; none of it is part of it):
+Requirements, built or checked out by the user outside this repository:
 
 - ``--opensplat LIBRARY``: a shared library that registers, for this torch, OpenSplat's public CPU functions as torch
   operators ``opensplat_cpu::project``, ``forward``, ``backward`` and ``pairs``. The first three are
   ``project_gaussians_forward_tensor_cpu`` (with ``glob_scale`` 1 and ``clip_thresh`` 0.01),
-  ``rasterize_forward_tensor_cpu`` and ``rasterize_backward_tensor_cpu``, their own arguments in their own order, the
-  address of the lists of splats by pixel as an integer; ``backward`` frees the lists, ``pairs(lists, pixels)`` adds up
-  their lengths. Compile with the flags of its Release build (``-O3 -DNDEBUG``).
-- ``--gsplat CHECKOUT``: a checkout of gsplat. Only its torch reference of 2DGS is imported, and two functions of ours
-  stand in for nerfacc's, which run on CUDA only.
+  ``rasterize_forward_tensor_cpu`` and ``rasterize_backward_tensor_cpu`` with their own argument order; the address of
+  the splat lists is passed as an integer. ``backward`` frees the lists; ``pairs(lists, pixels)`` returns the sum of
+  their lengths. Compile with the flags of OpenSplat's Release build (``-O3 -DNDEBUG``).
+- ``--gsplat CHECKOUT``: a checkout of gsplat. Only its torch reference of 2DGS is imported. Two of our functions
+  replace those of nerfacc, which require CUDA.
+
+The scene is the room of ``benchmarks/workload.py``. OpenSplat renders the same splats as 3D Gaussians with a thousandth
+of their size as thickness. For OpenSplat, rasterization of colour alone is timed, forward and backward, on its single
+thread; projection and SH are precomputed. For ours, everything is timed: projection, SH, sorting, all six outputs and
+gradients of all parameters. After each switch between rasterizers one pass is not timed. ``ratio`` is the other
+rasterizer's time over ours, of medians and of best times.
 
 The scene is the room of ``benchmarks/workload.py``, and the peers get what they can draw of it: OpenSplat the same
 splats as 3D Gaussians a thousandth as thick. Timed of OpenSplat: rasterize forward and backward of the colour alone, on
@@ -35,7 +38,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before torch loads
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # set before torch loads, as in the command line
 
 import torch
 
@@ -46,13 +49,13 @@ from benchmarks.workload import name_of, room_workload
 from gs2d.kernels.library import Library, load
 
 WORKLOADS = {"opensplat": ((20_000, 400), (100_000, 800)), "gsplat": ((20_000, 400),)}  # gsplat: 10 GB at 100k, 800
-OURS_PER_PEER = 3  # a peer's pass takes twenty of ours
+OURS_PER_PEER = 3  # the other rasterizers take about twenty times as long
 
 
 def compare_with(
     peer_name: str, path: Path, library: Library, count: int, size: int, threads: int, repeats: int
 ) -> dict[str, Any]:
-    """Medians and best times of a peer and of ours, in turns."""
+    """Return medians and best times of another rasterizer and of ours, run alternately."""
     workload = room_workload(count, size, size)
     peer = PEERS[peer_name](path, workload.splats, workload.cameras[0])
     ours = Passes(library, workload, 3)
@@ -68,7 +71,7 @@ def compare_with(
     rate = peak_probe(library)
     for _ in range(repeats):
         for who, passes, turns in (("peer", peer, 1), ("ours", ours, OURS_PER_PEER)):
-            passes.backward(passes.forward())  # not timed: it finds the other's data in the caches
+            passes.backward(passes.forward())  # not timed: the caches hold the other rasterizer's data
             for _ in range(turns):
                 start = time.perf_counter()
                 result: Any = passes.forward()
@@ -93,19 +96,21 @@ def compare_with(
 
 
 def rounded(timing: Timing) -> dict[str, float]:
-    """With two decimals."""
+    """Round to two decimals."""
     return {name: round(value, 2) for name, value in asdict(timing).items()}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run, print a line each, write the file; 2 where a peer is not as it must be."""
+    """Run, print a line each and write the file; return 2 if another rasterizer does not meet the requirements."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.peers", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--opensplat", type=Path)
     parser.add_argument("--gsplat", type=Path)
-    parser.add_argument("--only", nargs="+", help="workloads whose name contains one of these")
-    parser.add_argument("--threads", type=int, nargs="+", default=[2, 1], help="of ours; peers have one")
+    parser.add_argument("--only", nargs="+", help="run only workloads whose name contains one of these words")
+    parser.add_argument(
+        "--threads", type=int, nargs="+", default=[2, 1], help="threads of our rasterizer; the others use one"
+    )
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/peers.json"))
     args = parser.parse_args(arguments)
@@ -125,7 +130,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 if args.only and not any(part in name_of(count, size, size) for part in args.only):
                     continue
                 for threads in args.threads:
-                    torch.set_num_threads(1)  # whatever of a peer is torch: OpenSplat's loops are single-threaded
+                    torch.set_num_threads(1)  # for their torch code: OpenSplat's loops are single-threaded
                     library.use_threads(threads)
                     rows.append(compare_with(peer, path, library, count, size, threads, args.repeats))
                     print(json.dumps(rows[-1]), flush=True)

@@ -1,8 +1,10 @@
-"""How far the sparse points of a capture lie from the mesh of a run: a surface check where no ground truth is.
+"""Measure the distance of a capture's sparse points from a run's mesh, a surface check without ground truth.
 
 ::
 
-    python -m benchmarks.points RUN [RUN ...]
+Structure from motion triangulated these points with an error of about its reprojection error, and training starts from
+them. Distances are in pixel widths of the training images at the point, in the nearest view that sees the point. Points
+outside the mesh's bounding box are ignored.
 
 Structure from motion observed these points, to within about its reprojection error, and training starts from them. The
 unit is the width of a pixel of the training photographs at the point, in the view that sees it from nearest. Points
@@ -32,12 +34,14 @@ class Row:
 
     points: int
     median: float
-    mean: float  # of distances limited to 10
+    mean: float  # mean of distances clipped at 10
     within: dict[float, float]  # shares
 
 
 def pixel_widths(points: np.ndarray, scene: Scene) -> np.ndarray:
-    """Width of a pixel at each point [P] (world units) in the nearest training view that sees it; infinity if none."""
+    """Return the pixel width at each point [P], world units, in the nearest training view that sees it; infinity if
+    none.
+    """
     widths = np.full(len(points), np.inf)
     for view in scene.train:
         pixels, depth = view.camera.project(points)
@@ -47,7 +51,7 @@ def pixel_widths(points: np.ndarray, scene: Scene) -> np.ndarray:
 
 
 def measure(run: Path) -> Row:
-    """Distances of the points of a run's capture to its mesh."""
+    """Return the distances of the capture's points from the run's mesh."""
     job = reload_run(open_run(run), lambda event: None)
     if job.scene.points is None:
         raise SystemExit(f"{run}: its capture has no points")
@@ -62,7 +66,7 @@ def measure(run: Path) -> Row:
 
 
 def main() -> None:
-    """Print a table."""
+    """Run the benchmark and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
     print("| run | points | median, px | mean (at most 10), px | " + " | ".join(f"< {w:g} px" for w in WITHIN) + " |")

@@ -1,14 +1,16 @@
-"""Captures with known depths, to see what they are worth where the true surface is known.
+"""Make captures with depth or normal maps and a known true surface, to measure the gain of priors.
 
 ::
 
-    python -m benchmarks.prior_captures CAPTURE --out OUT --every 5 --maps sensor    # or relative, sparse, none
-    python -m benchmarks.prior_captures room --out OUT --views 12 --maps relative
+CAPTURE is in the NeRF-Synthetic layout with ``mesh_gt.ply``; every N-th training view is kept. ``room`` is a rendered,
+furnished room with plain walls. The output is in COLMAP's layout with the true poses, for ``--test-every 4``, with
+points that pycolmap triangulates from the training views alone. Depth maps are computed from the mesh and degraded like
+those of typical sources:
 
-CAPTURE is in the NeRF-Synthetic layout with ``mesh_gt.ply``; every n-th training view is kept. ``room`` is a furnished
-room with plain walls, drawn here. What is written is in COLMAP's layout at the true poses, for ``--test-every 4``, with
-points that pycolmap triangulates from the training views alone. The depths of the maps are those of the mesh, spoilt as
-their sources spoil them:
+sensor    half the resolution, 1 % noise, invalid within a pixel of an edge and in a tenth of the image
+relative  disparity with a random scale and shift per view, smooth noise of 3 %, 16 bits
+normal    no depths, but normals in OpenGL's axes, smooth noise of 5 degrees, 8 bits
+none      no maps, only the points
 
 sensor    half the resolution, noise of 1 %, nothing known within a pixel of an edge nor in a tenth of the picture
 relative  disparity with a scale and a shift of its own for each view, bent by smooth noise of 3 %, 16 bits
@@ -32,22 +34,22 @@ from gs2d.data.readers.json_captures import read_blender
 from gs2d.io.meshes import read_mesh, write_mesh
 from gs2d.meshing.raycast import Hits, cast_camera
 
-SIZE, ANGLE = 256, 1.2  # of the room's photographs: px, radians
+SIZE, ANGLE = 256, 1.2  # of the room's images: px, radians
 UP = np.array([0.0, 0.0, 1.0])
 TEST_EVERY = 4
-Shot = tuple[str, Camera, bool]  # a photograph's name and camera, and whether it is a test view
+Shot = tuple[str, Camera, bool]  # an image's name and camera, and whether it is a test view
 
 
-# -- what a source makes of true depths ----------------------------------------------------------------------------
+# -- degraded depth maps -------------------------------------------------------------------------------------------
 def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], cells: int) -> np.ndarray:
-    """Normal noise [H, W] with so many cells along each side, interpolated."""
+    """Return normal noise [H, W], interpolated from a grid with this many cells along each side."""
     coarse = rng.normal(size=(cells + 3, cells + 3))
     fine = zoom(coarse, (max(shape) / cells + 1), order=3)
     return np.asarray(fine[: shape[0], : shape[1]])
 
 
 def sensor_map(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """uint16 [h, w] in thousandths of a unit; 0 = unknown."""
+    """Return a sensor depth map, uint16 [h, w] in thousandths of a unit; 0 = invalid."""
     small = depth[::2, ::2]
     edge = grey_dilation(small, (3, 3)) - grey_erosion(small, (3, 3)) > 0.05 * np.maximum(small, 1e-6)
     noise = smooth_noise(rng, small.shape, 12)
@@ -57,7 +59,7 @@ def sensor_map(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def relative_map(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """uint16 [H, W], linear in disparity; 0 = unknown."""
+    """Return a relative depth map, uint16 [H, W], linear in disparity; 0 = invalid."""
     bent = 1 / np.where(depth > 0, depth, 1) * (1 + 0.03 * smooth_noise(rng, depth.shape, 5))
     low, high = bent[depth > 0].min(), bent[depth > 0].max()
     scale, shift = rng.uniform(0.4, 0.8), rng.uniform(0.05, 0.2)
@@ -66,7 +68,7 @@ def relative_map(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def normal_map(mesh: Mesh, hits: Hits, camera: Camera, rng: np.random.Generator) -> np.ndarray:
-    """uint8 [H, W, 3] of (n + 1) / 2, OpenGL axes; black = unknown."""
+    """Return a normal map, uint8 [H, W, 3] of (n + 1) / 2, OpenGL axes; black = invalid."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
@@ -83,7 +85,7 @@ def normal_map(mesh: Mesh, hits: Hits, camera: Camera, rng: np.random.Generator)
 
 # -- captures ------------------------------------------------------------------------------------------------------
 def write_maps(out: Path, mesh: Mesh, order: list[Shot], maps: str, seed: int) -> None:
-    """The maps of the training views."""
+    """Write the maps of the training views."""
     for k, (name, camera, is_test) in enumerate(order):
         if is_test or maps == "none":
             continue
@@ -99,7 +101,7 @@ def write_maps(out: Path, mesh: Mesh, order: list[Shot], maps: str, seed: int) -
 
 
 def write_colmap(out: Path, images: dict[str, list[tuple[Camera, np.ndarray]]]) -> list[Shot]:
-    """A COLMAP capture in which every 4th photograph is a test view; points from the others."""
+    """Write a COLMAP capture in which every 4th image is a test view, with points from the other images."""
     import pycolmap
 
     (out / "images").mkdir()
@@ -136,7 +138,7 @@ def write_colmap(out: Path, images: dict[str, list[tuple[Camera, np.ndarray]]]) 
     found.write_text(work / "txt")
     sparse = out / "sparse" / "0"
     write_model(sparse, order, ids=ids, with_test=True)
-    # The poses stay those that were given; the observations are the triangulation's.
+    # Keep the true poses; take the observations from the triangulation.
     lines = [line for line in (work / "txt" / "images.txt").read_text().splitlines() if not line.startswith("#")]
     observed = {lines[i].split()[-1]: lines[i + 1] for i in range(0, len(lines) - 1, 2)}
     given = (sparse / "images.txt").read_text().splitlines()
@@ -148,7 +150,7 @@ def write_colmap(out: Path, images: dict[str, list[tuple[Camera, np.ndarray]]]) 
 
 
 def write_model(folder: Path, order: list[Shot], *, ids: dict[str, int] | None = None, with_test: bool) -> None:
-    """COLMAP's text files of known cameras, without points."""
+    """Write COLMAP text files of known cameras, without points."""
     from scipy.spatial.transform import Rotation
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -167,7 +169,7 @@ def write_model(folder: Path, order: list[Shot], *, ids: dict[str, int] | None =
 
 
 def of_capture(root: Path, every: int, tests: int) -> tuple[Mesh, dict[str, list[tuple[Camera, np.ndarray]]]]:
-    """Mesh and pictures of a NeRF-Synthetic capture with fewer views."""
+    """Return mesh and images of a NeRF-Synthetic capture, reduced to fewer views."""
     found: dict[str, list[tuple[Camera, np.ndarray]]] = {"train": [], "test": []}
     for frame in read_blender(root).frames:
         k = frame.intrinsics
@@ -179,7 +181,10 @@ def of_capture(root: Path, every: int, tests: int) -> tuple[Mesh, dict[str, list
 
 # -- a room --------------------------------------------------------------------------------------------------------
 def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [8, 3] and faces [12, 3]; face i belongs to side i // 2: x low, x high, y low, y high, z low, z high."""
+    """Return vertices [8, 3] and faces [12, 3].
+
+    Face i belongs to side i // 2: x low, x high, y low, y high, z low, z high.
+    """
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64)
     vertices = np.array(low) + corners * (np.array(high) - np.array(low))
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -191,14 +196,14 @@ ROOM = ((-2.0, -1.6, 0.0), (2.0, 1.6, 2.4))
 THINGS = (  # low, high, colour, whether it has a texture
     ((-1.9, -0.5, 0.0), (-1.1, 0.9, 0.5), (0.55, 0.3, 0.25), True),  # a couch
     ((0.2, -0.4, 0.0), (0.9, 0.3, 0.45), (0.5, 0.4, 0.25), True),  # a table
-    ((0.4, -0.1, 0.45), (0.6, 0.1, 0.75), (0.2, 0.35, 0.6), True),  # what stands on it
+    ((0.4, -0.1, 0.45), (0.6, 0.1, 0.75), (0.2, 0.35, 0.6), True),  # an object on the table
     ((1.5, -1.5, 0.0), (1.95, -0.6, 1.8), (0.75, 0.72, 0.65), False),  # a plain wardrobe
     ((-0.6, 1.56, 1.0), (0.6, 1.6, 1.8), (0.4, 0.5, 0.35), True),  # a picture on the wall
 )
 
 
 def room_mesh() -> tuple[Mesh, np.ndarray]:
-    """The room's mesh, and for each face its thing: 0 the room, 1.. THINGS."""
+    """Return the room's mesh, and the object index of each face: 0 for the room, 1.. for THINGS."""
     vertices, faces, owner, count = [], [], [], 0
     for index, (low, high) in enumerate([ROOM, *((t[0], t[1]) for t in THINGS)]):
         v, f = box(low, high)
@@ -210,7 +215,7 @@ def room_mesh() -> tuple[Mesh, np.ndarray]:
 
 
 def room_image(mesh: Mesh, owner: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
-    """uint8 [H, W, 3]: plain walls and ceiling, a floor of boards, textured things, one lamp, a little noise."""
+    """Render uint8 [H, W, 3]: plain walls and ceiling, board floor, textured objects, one lamp, a little noise."""
     samples = 3
     hits = cast_camera(mesh.vertices, mesh.faces, camera, samples=samples)
     points = (mesh.vertices[mesh.faces[hits.face]] * hits.weights[..., None]).sum(axis=2)
@@ -241,7 +246,7 @@ def room_image(mesh: Mesh, owner: np.ndarray, camera: Camera, rng: np.random.Gen
 
 
 def of_room(views: int, tests: int, seed: int) -> tuple[Mesh, dict[str, list[tuple[Camera, np.ndarray]]]]:
-    """Somebody stands in the middle of the room and turns around, with a step to the side for each photograph."""
+    """Return mesh and images of a camera turning in the room's centre, with a step to the side per image."""
     mesh, owner = room_mesh()
     rng = np.random.default_rng([seed, 7])
     f = SIZE / 2 / np.tan(ANGLE / 2)
@@ -262,11 +267,11 @@ def of_room(views: int, tests: int, seed: int) -> tuple[Mesh, dict[str, list[tup
 def main() -> None:
     """Write one capture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("capture", help="a NeRF-Synthetic capture with mesh_gt.ply, or: room")
+    parser.add_argument("capture", help="NeRF-Synthetic capture with mesh_gt.ply, or: room")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--maps", choices=("sensor", "relative", "normal", "none"), default="none")
-    parser.add_argument("--every", type=int, default=5, help="keep every n-th training view of a capture")
-    parser.add_argument("--views", type=int, default=16, help="training views of the room")
+    parser.add_argument("--every", type=int, default=5, help="keep every N-th training view of a capture")
+    parser.add_argument("--views", type=int, default=16, help="number of training views of the room")
     parser.add_argument("--tests", type=int, default=8)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()

@@ -1,8 +1,9 @@
-"""How far rendered depths are from the true surface, view by view: where a mesh would hide what a wall lacks.
+"""Measure the error of rendered depths against the true surface in all views, where a mesh would hide wall defects.
 
 ::
 
-    python -m benchmarks.prior_depths RUN [RUN ...]
+The capture of each run holds ``mesh_gt.ply``. The error at a pixel that shows the mesh is |z / truth - 1|, with z the
+mean depth, clipped at 1. It is 1 where less than half of the pixel is covered.
 
 The capture of each run holds ``mesh_gt.ply``. An error is |z / truth - 1| at a pixel where the mesh is seen, z the mean
 depth; where less than half of a pixel is covered it is 1, and no error is more.
@@ -31,7 +32,7 @@ WITHIN = (0.01, 0.03)
 
 
 def errors(splats: Splats, views: Sequence[View], mesh: Mesh, job: LoadedRun) -> np.ndarray:
-    """Errors [P] of all pixels of some views in which the mesh is seen."""
+    """Return the errors [P] of all pixels of some views that show the mesh."""
     found = []
     for view in views:
         truth = torch.from_numpy(cast_camera(mesh.vertices, mesh.faces, view.camera).depth)
@@ -44,7 +45,7 @@ def errors(splats: Splats, views: Sequence[View], mesh: Mesh, job: LoadedRun) ->
 
 
 def main() -> None:
-    """Print a table."""
+    """Run the benchmark and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
     print("| run | views | median | mean | " + " | ".join(f"within {100 * w:g} %" for w in WITHIN) + " |")

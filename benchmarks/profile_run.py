@@ -1,10 +1,9 @@
-"""Where a whole run spends its time: reading, each stage, scoring, meshing, report, and within them what.
+"""Profile a whole run by phase (reading, stages, scoring, meshing, report) and by part within each phase.
 
 ::
 
-    python -m benchmarks.profile_run --out FILE.json --demo [--schedule-scale 0.1] [--threads 2]
-    python -m benchmarks.profile_run --out FILE.json --capture FOLDER [--downscale 2] [--schedule-scale 0.03]
-                                     [--keep RUN]
+The first form profiles `gs2d demo`, the second `gs2d train FOLDER`. The file includes the digest of ``splats.ply``:
+versions of the code that train identically have the same digest.
 
 The first form is `gs2d demo`, the second `gs2d train FOLDER`. The file also holds the digest of ``splats.ply``: two
 versions of the code that train the same have the same.
@@ -23,7 +22,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before torch loads
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # set before torch loads, as in the command line
 
 import torch
 
@@ -76,7 +75,7 @@ PARTS = (
 
 
 def table(seconds: Seconds) -> dict[str, Any]:
-    """Seconds by phase and part, largest first, and the rasterizer's share of all."""
+    """Return seconds by phase and part, largest first, and the rasterizer's share of the total."""
     total = sum(sum(parts.values()) for parts in seconds.phases.values())
     rows = sorted(seconds.phases.items(), key=lambda row: -sum(row[1].values()))
     raster = sum(parts.get("rasterizer", 0.0) for parts in seconds.phases.values())
@@ -95,7 +94,7 @@ def table(seconds: Seconds) -> dict[str, Any]:
 
 
 def profile(arguments: argparse.Namespace, out: Path) -> dict[str, Any]:
-    """One run into ``out``, sampled."""
+    """Sample one run into ``out``."""
     library = load()
     probe = peak_probe(library)
     began = time.perf_counter(), time.process_time()
@@ -132,7 +131,7 @@ def profile(arguments: argparse.Namespace, out: Path) -> dict[str, Any]:
 
 
 def show(result: dict[str, Any]) -> None:
-    """The table on the screen."""
+    """Print the table."""
     print(f"{result['what']}: {result['wall_seconds']} s, rasterizer {100 * result['rasterizer_share']:.0f} %")
     for name, phase in result["phases"].items():
         parts = ", ".join(f"{part} {s}" for part, s in phase["parts"].items() if s >= 0.1)
@@ -142,7 +141,7 @@ def show(result: dict[str, Any]) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run and write the file."""
+    """Run the profile and write the file."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.profile_run",
         description=__doc__,
@@ -155,7 +154,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--schedule-scale", type=float)
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--keep", type=Path, help="the run folder; otherwise a temporary one")
+    parser.add_argument("--keep", type=Path, help="run folder (default: a temporary one)")
     args = parser.parse_args(arguments)
     before = torch.get_num_threads()
     try:

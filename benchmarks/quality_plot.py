@@ -1,8 +1,8 @@
-"""The figure of time to quality: for each capture PSNR and, where it has a true surface, F at 0.25 %, against seconds.
+"""Plot time to quality: PSNR, and F-score at 0.25 % if the true surface is known, against seconds, for each capture.
 
-A marker is the end of a schedule of its own: what a person gets who asks for that many iterations. Markers of one
-recipe are joined. A faint line is the course of one of those trainings: half of a long schedule is not a short one,
-because rates and densification are not at their end, so such points have no markers.
+A marker is the end of a complete schedule with that many iterations; markers of one recipe are joined. A faint line is
+the intermediate quality during one training. Intermediate points have no markers, because their learning rates and
+densification are unfinished: half of a long schedule is not a short schedule.
 """
 
 from __future__ import annotations
@@ -13,26 +13,26 @@ from typing import Any
 
 from gs2d.report.plots import INK, line_style, svg_text
 
-FRACTION = "0.0025"  # of the true surface's diagonal: F at coarser ones is near 1 for every recipe
+FRACTION = "0.0025"  # fraction of the true surface's diagonal; coarser thresholds give F near 1 for every recipe
 TIMES = {"user_seconds": "user CPU seconds", "seconds": "seconds"}
 
 Value = Callable[[dict[str, Any]], float | None]
 
 
 def psnr_of(point: dict[str, Any]) -> float | None:
-    """PSNR of a point, dB."""
+    """Return the PSNR of a point, dB."""
     value = point.get("images", {}).get("psnr")
     return None if value is None else float(value)
 
 
 def f_of(point: dict[str, Any]) -> float | None:
-    """F-score of the mesh of a point, where there is a true surface."""
+    """Return the F-score of a point's mesh, or None without a true surface."""
     value = (point.get("surface") or {}).get("f_scores", {}).get(FRACTION)
     return None if value is None else float(value)
 
 
 def ends(curve: dict[str, Any], time: str, value: Value) -> tuple[list[float], list[float]]:
-    """Seconds and means over seeds of a curve, one for each schedule, shortest first."""
+    """Return seconds and means over seeds of a curve, one per schedule, shortest first."""
     scales = sorted({run["scale"] for run in curve["runs"]})
     xs, ys = [], []
     for scale in scales:
@@ -45,7 +45,7 @@ def ends(curve: dict[str, Any], time: str, value: Value) -> tuple[list[float], l
 
 
 def draw(document: dict[str, Any], time: str) -> Any:
-    """A matplotlib figure of a results document: a row for each capture."""
+    """Return a matplotlib figure of a results document, a row per capture."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
@@ -102,7 +102,7 @@ def _panel(axes: Any, capture: dict[str, Any], names: Sequence[str], time: str, 
 
 
 def write_figure(file: Path, document: dict[str, Any], time: str) -> None:
-    """Write the figure of a results document: an SVG whose bytes depend on the document alone, or a PNG."""
+    """Write the figure of a results document as PNG or SVG; the SVG is byte-identical for the same document."""
     figure = draw(document, time)
     file.parent.mkdir(parents=True, exist_ok=True)
     if file.suffix == ".svg":

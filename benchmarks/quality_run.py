@@ -1,8 +1,8 @@
-"""One training of the time-to-quality curves, in a process of its own (``benchmarks/time_to_quality.py`` starts it).
+"""Run one training of the time-to-quality curves in its own process (started by ``benchmarks/time_to_quality.py``).
 
-Scores are taken while the clocks stand still. At every point of its course the state is saved with the clocks, so that
-a training that was cut off goes on from there: the time since is spent again and counted once, and so are the process's
-start, the reading of the capture and whatever the start of the splats takes (a plane sweep).
+Scores are computed while the clocks are stopped. At every point of the curve, the state is saved with the clocks, so
+that an interrupted training resumes from there. Work after the last saved point is repeated and counted once. The same
+holds for process start, reading the capture and the initialisation of the splats (a plane sweep).
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer, TrainerOptions
 
 SPEC, RESULT, STATE = "spec.json", "result.json", "state.pt"
-PROGRESS_EVERY = 10  # iterations: how finely a point of the course can be placed
+PROGRESS_EVERY = 10  # iterations, granularity of the points on the curve
 
 
 @dataclass(frozen=True)
 class Spent:
-    """Seconds: of the clock, of the processor in this program, and of it in the system."""
+    """Wall seconds, CPU seconds in user mode, and CPU seconds in the system."""
 
     seconds: float = 0.0
     user_seconds: float = 0.0
@@ -57,12 +57,12 @@ class Spent:
 
 
 class Clocks:
-    """What a training has spent, without what was done while they stood still.
+    """Clocks of a training that can be stopped.
 
     Parameters
     ----------
     started : float
-        When the process was started (``time.time()``).
+        Start time of the process (``time.time()``).
     """
 
     def __init__(self, started: float) -> None:
@@ -73,27 +73,27 @@ class Clocks:
         return Spent(time.time() - self._started, used.ru_utime, used.ru_stime)
 
     def spent(self) -> Spent:
-        """Return what was spent until now, to a millisecond."""
+        """Return the time spent until now, to a millisecond."""
         exact = self._now() - self._offset
         return Spent(*(round(value, 3) for value in astuple(exact)))
 
     def set(self, spent: Spent) -> None:
-        """Go on from what an earlier process had spent."""
+        """Continue from the time spent by an earlier process."""
         self._offset = self._now() - spent
 
     @contextmanager
     def stopped(self) -> Iterator[None]:
-        """Stand still."""
+        """Stop the clocks within the context."""
         before = self._now()
         yield
         self._offset = self._offset + (self._now() - before)
 
 
 def train_options(spec: dict[str, Any], folder: Path) -> TrainOptions:
-    """Return the options of a training, as ``gs2d train`` would have them."""
+    """Return the options of a training, as ``gs2d train`` sets them."""
     return TrainOptions(
         scene=Path(spec["capture"]),
-        out=folder,  # only its folder is used
+        out=folder,  # only the folder is used
         recipe=spec["recipe"],
         schedule_scale=spec["scale"],
         downscale=spec["downscale"],
@@ -104,12 +104,12 @@ def train_options(spec: dict[str, Any], folder: Path) -> TrainOptions:
 
 
 def marks(iterations: int, points: int) -> list[int]:
-    """Return the iterations, evenly spaced, after which the course has a point; the end is not one of them."""
+    """Return evenly spaced iterations at which the curve has a point, without the last iteration."""
     return sorted({round(iterations * k / points) for k in range(1, points)} - {0, iterations})
 
 
 def train(spec: dict[str, Any], folder: Path, clocks: Clocks) -> dict[str, Any]:
-    """Train, score on the way and at the end, and return what the results file says of it."""
+    """Train, score at intermediate points and at the end, and return the entry of the results file."""
     use_threads(spec["threads"])
     job = prepare_run(train_options(spec, folder), ignore)
     state, course = _saved(folder / STATE, clocks)
@@ -144,14 +144,14 @@ def train(spec: dict[str, Any], folder: Path, clocks: Clocks) -> dict[str, Any]:
 
 
 def _done(job: LoadedRun, state: TrainState | None) -> int:
-    """Return the iterations that a state is after."""
+    """Return the number of finished iterations of a state."""
     if state is None:
         return 0
     return sum(stage.iterations for stage in job.recipe.stages[: state.stage]) + state.step
 
 
 def _saved(file: Path, clocks: Clocks) -> tuple[TrainState | None, list[dict[str, Any]]]:
-    """Return the state and the course so far of a training that was cut off, and set the clocks to it."""
+    """Return the saved state and curve of an interrupted training, and set the clocks."""
     if not file.exists():
         return None, []
     data = torch.load(file, weights_only=True)
@@ -166,13 +166,13 @@ def _save(file: Path, state: TrainState, spent: Spent, course: list[dict[str, An
 
 
 def score(job: LoadedRun, state: TrainState) -> dict[str, Any]:
-    """Return the scores of the test views (of the training views where there are none), and the size of the scene."""
+    """Return the scores of the test views (of the training views if there are none), and the number of splats."""
     return score_splats(job, state.splats, LearnedTable(job.recipe, job.scene).scene_now(state.learned))
 
 
 def score_splats(job: LoadedRun, splats: Splats, learned: Scene | None = None) -> dict[str, Any]:
-    """Return what :func:`score` does, of splats with the scene as it was learned with them."""
-    # Here, while the clocks stand still: a training does not need them.
+    """Return the result of :func:`score` for splats, with the scene as learned with them."""
+    # Imported while the clocks are stopped: training does not need these modules.
     from benchmarks.street_runs import summary_of
     from gs2d.pipeline.finish.scoring import score_views
     from gs2d.pipeline.prepare.predicted_exposure import metered, with_predicted
@@ -188,7 +188,7 @@ def score_splats(job: LoadedRun, splats: Splats, learned: Scene | None = None) -
 
 
 def surface(job: LoadedRun, state: TrainState, spec: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Return how good the mesh is and the seconds that making it took, where there is a true surface."""
+    """Return the mesh quality and the meshing seconds, if there is a true surface."""
     from gs2d.evaluation.evaluators import VISIBLE, choose_truth, score_surface
     from gs2d.evaluation.visible_surface import VISIBLE_SURFACE
     from gs2d.pipeline.in_memory import Trained, extract_mesh
@@ -196,7 +196,7 @@ def surface(job: LoadedRun, state: TrainState, spec: dict[str, Any], folder: Pat
     given = None if spec["ground_truth"] is None else Path(spec["ground_truth"])
     root = job.scene.root or Path(".")
     truth = choose_truth(given, root, lambda text: None)
-    if truth is None or truth.name != VISIBLE:  # an official one has no F at a fraction of its size
+    if truth is None or truth.name != VISIBLE:  # official metrics have no F-score at a fraction of the size
         return {"surface": None}
     start = time.process_time()
     scene = LearnedTable(job.recipe, job.scene).scene_now(state.learned)
@@ -215,7 +215,7 @@ def surface(job: LoadedRun, state: TrainState, spec: dict[str, Any], folder: Pat
 
 
 def main(arguments: list[str]) -> int:
-    """Train what a spec says and write ``result.json`` beside it; 2 for what the user can mend."""
+    """Train a spec and write ``result.json`` next to it; return 2 for user errors."""
     file, started = Path(arguments[0]), float(arguments[1])
     folder = file.parent
     try:

@@ -1,9 +1,9 @@
-"""Times the CPU rasterizer alone, forward and backward of all outputs, beside what the machine can do at that moment.
+"""Time the CPU rasterizer alone, forward and backward of all outputs, with a probe of the machine's current speed.
 
     python benchmarks/raster.py [--threads 2] [--repeats 15] [--json FILE]
 
-Prints one line per workload: minimum and median milliseconds, and peak multiply-add and copy rates measured in the
-same seconds. On a shared machine compare ratios and minimums, not medians.
+Prints a line per workload: minimum and median milliseconds, and the peak multiply-add and copy rates measured at the
+same time. On a shared machine compare ratios and minimums, not medians.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from gs2d.render.types import RasterSettings
 WORKLOADS = ((20_000, 400), (100_000, 400), (100_000, 800))
 # Blended pairs per pixel of these workloads, counted with the reference backend.
 PAIRS = {(20_000, 400): 28.7, (100_000, 400): 29.6, (100_000, 800): 28.4}
-# The figures to beat: ms on two threads and pairs per pixel of a prototype in a similar room, on a machine whose peak
+# Baseline figures: ms on two threads and pairs per pixel of a prototype in a similar room, on a machine whose peak
 # multiply-add rate was 300 to 425 GFLOP/s on two threads. Compare nanoseconds per pair.
 DESIGN = {(20_000, 400): (15.5, 30.4), (100_000, 400): (35.0, 40.6), (100_000, 800): (82.2, 38.9)}
-# gradients that reach the rasterizer: all of them, or what L1 + SSIM alone sends
+# gradients that reach the rasterizer: all, or only those of L1 + SSIM
 UPSTREAM = {"all": IMAGES, "color": ("color",)}
 
 
 def timed(library: Library, splats: Splats, size: int, upstream: tuple[str, ...], repeats: int) -> dict[str, float]:
-    """Milliseconds of forward and backward."""
+    """Return the milliseconds of forward and backward."""
     view, settings = camera(size), RasterSettings()
     leaves = Splats(**{name: tensor.clone().requires_grad_() for name, tensor in splats.items()})
     inputs = [tensor for _, tensor in leaves.items()]
@@ -69,13 +69,13 @@ def timed(library: Library, splats: Splats, size: int, upstream: tuple[str, ...]
 
 
 def main() -> None:
-    """Run the workloads and print or write the results."""
+    """Run the workloads, then print or write the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--variant", default=None)
     parser.add_argument("--upstream", choices=tuple(UPSTREAM), default="all")
-    parser.add_argument("--splats", type=int, help="only this many splats, at 64 px (smoke test)")
+    parser.add_argument("--splats", type=int, help="number of splats, at 64 px (smoke test)")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     library = load(arguments.variant)

@@ -1,8 +1,12 @@
-"""An iteration on a real capture against one on the bench scene with as many visible pairs.
+"""Compare an iteration on a real capture with one on the synthetic room at the same number of visible pairs.
 
 ::
 
-    python -m benchmarks.real --out FILE.json --runs RUN [RUN ...] [--threads 1] [--rounds 12]
+The splats are those of finished runs, rendered with the cameras of their captures. Runs without their folder or capture
+are skipped; the file records the reason. Each run is compared with two seeded rooms of the suite: one with as many
+splats as the run, one with the usual 20,000. The image size of each room is chosen to match the number of visible
+(splat, pixel) pairs. Iterations of all three are timed alternately in CPU time, so that load on the machine affects all
+of them.
 
 The splats are those of finished runs, seen by the cameras of their captures; a run that is absent, or whose capture is,
 is skipped and the reason is in the file. Beside each stands the seeded room of the suite twice: with as many splats,
@@ -24,7 +28,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before torch loads
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # set before torch loads, as in the command line
 
 import torch
 
@@ -36,13 +40,13 @@ from gs2d.kernels.library import Library, ready_library
 from gs2d.training.trainer import Trainer
 
 GOAL = 1.3
-BENCH_SPLATS = 20_000  # of the scene that the other benchmarks are told by
-SIZING_ROUNDS, CLOSE = 6, 0.01  # tries to find the room's picture, and the share of pairs by which it may miss
+BENCH_SPLATS = 20_000  # splats of the scene that the other benchmarks use
+SIZING_ROUNDS, CLOSE = 6, 0.01  # attempts to match the room's image size, and the accepted relative error in pairs
 STAGES = ("surface", "appearance", "refine")
 
 
 def visible_pairs(library: Library, workload: Workload) -> float:
-    """Mean over the views."""
+    """Return the mean number of visible pairs per view."""
     counts = []
     for camera in workload.cameras:
         output = Passes(library, replace(workload, cameras=(camera,)), 3).forward()
@@ -51,7 +55,7 @@ def visible_pairs(library: Library, workload: Workload) -> float:
 
 
 def matched_room(library: Library, count: int, pairs: float) -> tuple[Workload, float]:
-    """The room of ``count`` splats on square pictures with about so many visible pairs, and how many they are."""
+    """Return a room of ``count`` splats on square images with about this many visible pairs, and their number."""
     side = max(16, round((pairs / 28) ** 0.5))
     room = room_workload(count, side, side)
     best, least = room, math.inf
@@ -68,20 +72,20 @@ def matched_room(library: Library, count: int, pairs: float) -> tuple[Workload, 
 
 
 def turns(work: dict[str, Callable[[], object]], views: int, rounds: int) -> dict[str, list[float]]:
-    """Processor milliseconds of one call of each, in turn, mean over the views, for each round."""
+    """Return CPU milliseconds of one call of each function, run alternately: mean over the views, per round."""
     times: dict[str, list[float]] = {name: [] for name in work}
     for round_ in range(rounds + 1):
         for name, step in work.items():
             start = time.process_time()
             for _ in range(views):
                 step()
-            if round_:  # the first fills caches
+            if round_:  # the first call fills caches
                 times[name].append(1e3 * (time.process_time() - start) / views)
     return times
 
 
 def compare_run(library: Library, run: Path, rounds: int) -> dict[str, Any]:
-    """One row of the result: iterations of all stages, of the capture and of both rooms."""
+    """Return one result row: iterations of all stages, of the capture and of both rooms."""
     real = run_workload(run)
     pairs = visible_pairs(library, real)
     rooms = {count: matched_room(library, count, pairs) for count in (len(real.splats), BENCH_SPLATS)}
@@ -113,7 +117,7 @@ def compare_run(library: Library, run: Path, rounds: int) -> dict[str, Any]:
 
 
 def show(row: dict[str, Any]) -> None:
-    """A line a stage."""
+    """Print a line per stage."""
     print(f"{row['workload']}: {row['visible_pairs'] / 1e6:.2f} million visible pairs a view")
     for stage, found in row["stages"].items():
         ratios = ", ".join(f"{ratio:.2f}x the room of {name} splats" for name, ratio in found["ratio"].items())
@@ -121,7 +125,7 @@ def show(row: dict[str, Any]) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Compare and write the file."""
+    """Run the comparison and write the file."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.real", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,8 +1,9 @@
-"""The tables of docs/notebook/results.md: every row is one `gs2d` command, run here and tabulated.
+"""Make the tables of docs/notebook/results.md: every row is a `gs2d` command that is run and tabulated here.
 
 ::
 
-    python -m benchmarks.results --data DIR --out runs/results [--only lego bottle] [--scale 0.1] [--why]
+``DIR`` holds the captures under the names of ``CASES``. Finished runs are not repeated (their ``metrics.json`` is
+read), so an interrupted command can be restarted. Stage 1 is shared through the stage cache.
 
 ``DIR`` holds the captures under the names of ``CASES``. Runs that are finished are not repeated (their ``metrics.json``
 is read), so the command can be stopped and started again. Stage 1 is shared through the stage cache.
@@ -20,7 +21,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Case:
-    """One capture: where it is, how it is shrunk for two cores, and what its geometry is scored against."""
+    """Capture: its folder, its reduction for two cores, and its geometry reference."""
 
     name: str
     folder: str
@@ -40,7 +41,7 @@ CASES = (
 
 @dataclass(frozen=True)
 class Method:
-    """A row: a recipe, with what is changed in it."""
+    """Table row: a recipe with overrides."""
 
     name: str
     title: str
@@ -57,7 +58,7 @@ METHODS = (
 )
 PRESERVE = ("refine.on_enter.clone_in_place.options.opacity=preserve",)
 LONG_STAGE_3 = ("appearance.iterations=1", "refine.iterations=2999")
-# Where the gain of stage 3 comes from. The numbers of iterations are for --scale 0.1.
+# Sources of the gain of stage 3. The numbers of iterations are for --scale 0.1.
 WHY = (
     Method("60k-2000", "2DGS continued for as long as stage 3 alone", "2dgs-60k", ("continue.iterations=2000",)),
     Method("r-2999", "2DGS-R, all but 1 of stage 2 given to stage 3", "2dgs-r", LONG_STAGE_3),
@@ -68,9 +69,9 @@ WHY = (
 
 
 def train_command(case: Case, method: Method, data: str, out: Path, scale: float, seed: int) -> list[str]:
-    """The command of one run, as printed in the table."""
+    """Return the command of one run, as printed in the table."""
     words = ["gs2d", "train", f"{data}/{case.folder}", "--out", str(out / f"{case.name}-{method.name}-s{seed}")]
-    words += ["--recipe", method.recipe, "--schedule-scale", str(scale), "--robust", "off"]  # the paper has none of it
+    words += ["--recipe", method.recipe, "--schedule-scale", str(scale), "--robust", "off"]  # not part of the paper
     words += ["--cache", str(out / "cache"), "--seed", str(seed)]
     for change in method.changes:
         words += ["--set", change]
@@ -80,7 +81,7 @@ def train_command(case: Case, method: Method, data: str, out: Path, scale: float
 
 
 def execute(words: list[str]) -> None:
-    """Run a gs2d command with the interpreter of this process; one that fails has said why, and ends this one too."""
+    """Run a gs2d command with this Python; if it fails, exit (the command has printed the reason)."""
     print("$", " ".join(words), flush=True)
     code = subprocess.run([sys.executable, "-m", "gs2d", *words[1:], "--quiet"]).returncode
     if code:
@@ -88,7 +89,7 @@ def execute(words: list[str]) -> None:
 
 
 def run_case(case: Case, method: Method, data: str, out: Path, scale: float, seed: int) -> dict:
-    """Train and score one run unless it is done; return its metrics.json."""
+    """Train and score one run unless it is finished; return its metrics.json."""
     words = train_command(case, method, data, out, scale, seed)
     run = Path(words[words.index("--out") + 1])
     done = run / "metrics.json"
@@ -100,7 +101,7 @@ def run_case(case: Case, method: Method, data: str, out: Path, scale: float, see
 
 
 def rows_of(case: Case, method: Method, metrics: dict) -> list[list[str]]:
-    """Table rows of one run: one a stage for 2DGS-R, the last stage for the others."""
+    """Return table rows of one run: one per stage for 2DGS-R, the last stage for the others."""
     by_stage = method.name == "2dgs-r"
     stages = metrics["stages"] if by_stage else metrics["stages"][-1:]
     iterations, seconds = 0, 0.0
@@ -131,13 +132,13 @@ def rows_of(case: Case, method: Method, metrics: dict) -> list[list[str]]:
 
 
 def f_score(surface: dict) -> float | None:
-    """F-score at the least threshold of the surface metrics, 0.25 % of the diagonal: at 0.5 % all look alike."""
+    """Return the F-score at the smallest threshold, 0.25 % of the diagonal: at 0.5 % all methods score alike."""
     scores = surface.get("thresholds") or []
     return scores[0]["f_score"] if scores else None
 
 
 def number(value: float | None, digits: int) -> str:
-    """A figure, or a dash where there is none."""
+    """Format a number; a dash if it is missing."""
     return "-" if value is None else f"{value:.{digits}f}"
 
 
@@ -147,7 +148,7 @@ def main() -> None:
     parser.add_argument("--data", required=True)
     parser.add_argument("--out", type=Path, default=Path("runs/results"))
     parser.add_argument("--only", nargs="*", default=[case.name for case in CASES])
-    parser.add_argument("--why", action="store_true", help="the investigation of stage 3 instead of the main table")
+    parser.add_argument("--why", action="store_true", help="print the ablation of stage 3 instead of the main table")
     parser.add_argument("--scale", type=float, default=0.1)
     parser.add_argument("--seeds", type=int, nargs="*", default=[0])
     args = parser.parse_args()

@@ -1,9 +1,8 @@
-"""A capture as large as those of rooms that people publish: 292 photographs of 1560x1040, drawn from splats.
+"""Render a capture of the size of published room captures: 292 images of 1560x1040, rendered from splats.
 
-A room with a table and things on it, all of it splats with colours of several scales, seen by our rasterizer from two
-rings inside; cameras and points are written as COLMAP's text model, with the points that each picture shows, and
-pictures as JPEG. So a run on it reads, shrinks by two, trains on 780x520, scores and meshes as much as one on bonsai of
-Mip-NeRF 360, without its photographs.
+A room with a table and objects, made of splats with colours at several scales, is rendered from two rings of cameras
+inside. Cameras and points with tracks are written as a COLMAP text model, images as JPEG. A run reads, downscales by
+two, trains at 780x520, scores and meshes as much as a run on bonsai of Mip-NeRF 360, without its photographs.
 """
 
 from __future__ import annotations
@@ -22,16 +21,16 @@ from gs2d.core.splats import Splats
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
 
-VIEWS, SIZE = 292, (1560, 1040)  # px; half of it is what bonsai has as images_4
+VIEWS, SIZE = 292, (1560, 1040)  # px; half of it is the size of bonsai's images_4
 SPLATS, POINTS = 200_000, 60_000
-HALF = np.array([3.0, 3.0, 1.4])  # world units, of the room
-QUALITY = 92  # of the JPEG files
-FOUND = 0.15  # of the points that a picture shows: as many as a matcher finds again, about 9 pictures a point
-HIDDEN = 0.02  # of the depth, by which a point may lie behind what is drawn there
+HALF = np.array([3.0, 3.0, 1.4])  # world units, size of the room
+QUALITY = 92  # JPEG quality
+FOUND = 0.15  # share of the visible points that an image observes: about 9 images per point, as after matching
+HIDDEN = 0.02  # relative depth tolerance of the visibility test
 
 
 def surfaces(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Places [count, 3] world units on walls, floor, ceiling, a table top and three balls, with normals."""
+    """Return points [count, 3], world units, on walls, floor, ceiling, a table top and three balls, with normals."""
     places, normals = [], []
     fractions = [0.09] * 6 + [0.16] + [0.1] * 3
     numbers = np.floor(np.array(fractions) * count).astype(int)
@@ -52,7 +51,7 @@ def surfaces(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarr
 
 
 def colors(places: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Colours [P, 3] in [0, 1]: waves from as long as the room down to a hand's breadth."""
+    """Return colours [P, 3] in [0, 1]: waves with lengths from the room's size down to about 10 cm."""
     out = np.full((len(places), 3), 0.5)
     for wave, weight in ((0.8, 0.16), (3.0, 0.12), (9.0, 0.1), (25.0, 0.1)):
         for channel in range(3):
@@ -61,12 +60,12 @@ def colors(places: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def room_splats(count: int, seed: int) -> tuple[Splats, np.ndarray]:
-    """The splats of the room, and their colours [N, 3] uint8."""
+    """Return the splats of the room and their colours [N, 3] uint8."""
     rng = np.random.default_rng(seed)
     places, normals = surfaces(count, rng)
     painted = colors(places, rng)
     axis = np.cross([0.0, 0.0, 1.0], normals)
-    quats = np.concatenate([1 + normals[:, 2:], axis], axis=1)  # half way from z to the normal
+    quats = np.concatenate([1 + normals[:, 2:], axis], axis=1)  # half-way between z and the normal
     quats[np.linalg.norm(quats, axis=1) < 1e-6] = (0.0, 1.0, 0.0, 0.0)
     scale = np.where(np.abs(places[:, :2]).max(axis=1) < 0.85, 0.009, 0.035) * np.exp(0.3 * rng.normal(size=count))
 
@@ -85,7 +84,7 @@ def room_splats(count: int, seed: int) -> tuple[Splats, np.ndarray]:
 
 
 def room_cameras(count: int, size: tuple[int, int]) -> list[Camera]:
-    """Cameras on two rings in the room, which look at the table, a little past its middle."""
+    """Return cameras on two rings in the room that look slightly past the table's centre."""
     found = []
     for number in range(count):
         angle = 4 * math.pi * number / count
@@ -106,7 +105,7 @@ def write_room_capture(
     seed: int = 0,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """Write ``images/*.jpg`` and ``sparse/0/*.txt``; the model last, so that half a capture is not taken for one."""
+    """Write ``images/*.jpg`` and ``sparse/0/*.txt``; the model is written last, so that it marks a complete capture."""
     scene, painted = room_splats(splats, seed)
     cameras = room_cameras(views, size)
     (folder / "images").mkdir(parents=True, exist_ok=True)
@@ -120,7 +119,7 @@ def write_room_capture(
         with torch.no_grad():
             seen = rasterize(scene, camera, RasterSettings(sh_degree=0, with_distortion=False))
         color = seen.color.numpy()
-        noisy = 255 * np.clip(color, 0, 1) + rng.normal(scale=2.0, size=color.shape)  # as of a sensor
+        noisy = 255 * np.clip(color, 0, 1) + rng.normal(scale=2.0, size=color.shape)  # sensor noise
         name = f"room_{number:04d}.jpg"
         Image.fromarray(np.rint(np.clip(noisy, 0, 255)).astype(np.uint8)).save(
             folder / "images" / name, quality=QUALITY
@@ -144,7 +143,7 @@ def write_room_capture(
 
 
 def _shown(places: np.ndarray, camera: Camera, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the places [P, 3] that a picture with this depth [H, W] shows, and where [M, 2] px."""
+    """Return indices of the points [P, 3] visible in an image with this depth [H, W], and their pixels [M, 2]."""
     pixels, z = camera.project(places)
     inside = (z > 0) & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
     rows = np.flatnonzero(inside)

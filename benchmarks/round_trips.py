@@ -1,8 +1,13 @@
-"""What a format keeps of a run: bytes a splat, and pictures drawn from the file that was read back.
+"""Measure the loss of each export format: bytes per splat, and renderings of the file that was read back.
 
 ::
 
-    python -m benchmarks.round_trips RUN [--layouts 3dgs spz] [--split test] [--every 1]
+Writes the splats of a finished run in every layout to a temporary folder, reads them back, and renders every N-th view
+of a split (of the training views if the split is empty). Prints a Markdown row per layout: bytes per splat, PSNR
+against the run's own renderings and against the photographs (mean over views, colours in [0, 1] without rounding),
+seconds to write and to read. "the same" means that no pixel differs by more than 1e-4. For a stream with levels of
+detail, a second table compares each level with the original splats, at full, half, quarter and eighth image size (means
+of pixels), the sizes at which coarse levels are displayed.
 
 Writes the splats of a finished run in every layout into a temporary folder, reads them back, draws the views of a
 split (the training views where it has none; every so many of them) and prints a row of Markdown for each: bytes a
@@ -35,11 +40,11 @@ from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats, reload_run
 from gs2d.render.api import rasterize
 
 Draw = Callable[[Splats], list[np.ndarray]]
-SAME = 1e-4  # of a colour in [0, 1]
+SAME = 1e-4  # difference of a colour in [0, 1]
 
 
 def pictures(splats: Splats, job: LoadedRun, views: Sequence[View]) -> list[np.ndarray]:
-    """Draw views, [H, W, 3] each, in [0, 1]."""
+    """Render views, [H, W, 3] each, in [0, 1]."""
     placed = splats.to(job.backend.device)
     with torch.no_grad():
         drawn = [rasterize(placed, view.camera, job.settings, backend=job.backend).color for view in views]
@@ -47,7 +52,7 @@ def pictures(splats: Splats, job: LoadedRun, views: Sequence[View]) -> list[np.n
 
 
 def photographs(job: LoadedRun, views: Sequence[View]) -> list[np.ndarray]:
-    """The photographs of views, over the run's background."""
+    """Return the photographs of views, over the run's background."""
     found = []
     for view in views:
         image = view.image().astype(np.float64) / 255
@@ -58,13 +63,13 @@ def photographs(job: LoadedRun, views: Sequence[View]) -> list[np.ndarray]:
 
 
 def psnr(a: Sequence[np.ndarray], b: Sequence[np.ndarray]) -> float:
-    """Mean over the pictures, dB."""
+    """Return the mean PSNR of the images, dB."""
     errors = [max(float(np.square(x - y).mean()), 1e-20) for x, y in zip(a, b, strict=True)]
     return float(np.mean([-10 * np.log10(error) for error in errors]))
 
 
 def row(layout: str, splats: Splats, draw: Draw, own: list[np.ndarray], real: list[np.ndarray], home: Path) -> str:
-    """Write, read, draw, and return a row of the table: ``own`` is what the splats themselves look like."""
+    """Write, read and render; return a table row. ``own`` is the rendering of the original splats."""
     path = home / f"a{LAYOUTS.get(layout).ending}"
     start = time.perf_counter()
     write_layout(path, splats, layout)
@@ -80,13 +85,13 @@ def row(layout: str, splats: Splats, draw: Draw, own: list[np.ndarray], real: li
 
 
 def smaller(image: np.ndarray) -> np.ndarray:
-    """Half of a picture's size: means of four pixels; an odd last row or column is left out."""
+    """Halve the image size by averaging 2 x 2 pixels; an odd last row or column is dropped."""
     h, w = (side // 2 * 2 for side in image.shape[:2])
     return image[:h, :w].reshape(h // 2, 2, w // 2, 2, -1).mean(axis=(1, 3))
 
 
 def levels(draw: Draw, own: list[np.ndarray], path: Path) -> Iterator[str]:
-    """The rows of the table of levels of a stream."""
+    """Return the rows of a stream's level table."""
     index = json.loads(path.read_text(encoding="utf-8"))
     for level, count in enumerate(index["counts"]):
         found, theirs = draw(read_level(path, level).to_surfels(path)), own
@@ -104,7 +109,7 @@ def levels(draw: Draw, own: list[np.ndarray], path: Path) -> Iterator[str]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Print the table of a run."""
+    """Run the comparison and print the table of a run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--layouts", nargs="+", default=list(LAYOUTS.builtin))

@@ -1,10 +1,11 @@
-"""What a whole run costs, phase by phase: seconds, processor seconds, and the most memory that was resident in each.
+"""Measure the cost of a whole run by phase: wall seconds, CPU seconds and peak resident memory.
 
 ::
 
-    python -m benchmarks.run_cost --out FILE.json --room [--capture FOLDER] [--schedule-scale 0.01]
-                                  [--set dense_start.cell=2]
-    python -m benchmarks.run_cost --out FILE.json --capture FOLDER [--downscale 2] [--schedule-scale 0.05] [--threads 2]
+Both forms run one `gs2d train` in a fresh process. ``--room`` makes a capture of 292 images of 1560x1040
+(``room_capture.py``; kept in ``--capture``, or in a temporary folder) and trains on it at 780x520. The file includes
+the digest of ``splats.ply`` and the last scores: versions of the code that train identically have the same digest. On a
+shared machine only CPU seconds and shares are meaningful.
 
 Both are one `gs2d train` in a fresh process. ``--room`` makes a capture of 292 photographs of 1560x1040
 (``room_capture.py``; in ``--capture``, where it stays, or in a temporary folder) and trains on it at 780x520. The file
@@ -26,7 +27,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before torch loads
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # set before torch loads, as in the command line
 
 from benchmarks.run_phases import RUN_PHASES
 from benchmarks.sampler import CostSampler, Rule
@@ -36,7 +37,14 @@ PHASES = (
     Rule("log of changes", (("pipeline/train/attribute_changes.py", ""),)),
     Rule("imports", (("importlib._bootstrap>", ""),)),
 )
-_ADDING = ("add", "_add_chunk", "_blend_colors", "_change", "_view_arrays", "_volume_arrays")  # a view to a volume
+_ADDING = (
+    "add",
+    "_add_chunk",
+    "_blend_colors",
+    "_change",
+    "_view_arrays",
+    "_volume_arrays",
+)  # fuse a view
 PARTS = (
     Rule("render", (("render/native_rasterizer.py", ""), ("render/cpu_cached.py", ""))),
     Rule(
@@ -62,7 +70,7 @@ PARTS = (
 
 
 def measure(arguments: argparse.Namespace, capture: Path, out: Path) -> dict[str, Any]:
-    """One run, sampled; the process must be fresh."""
+    """Run once, sampled; the process must be fresh."""
     began = time.perf_counter(), time.process_time()
     with CostSampler(PHASES, PARTS) as costs:
         from gs2d.pipeline.prepare.options import TrainOptions
@@ -114,7 +122,7 @@ def measure(arguments: argparse.Namespace, capture: Path, out: Path) -> dict[str
 
 
 def show(result: dict[str, Any]) -> None:
-    """The table on the screen."""
+    """Print the table."""
     print(f"{result['what']}: {result['cpu_seconds']} s of CPU, peak {result['peak_rss_mb']} MB resident")
     for name, row in result["phases"].items():
         parts = ", ".join(f"{part} {s}" for part, s in row["parts_cpu_seconds"].items() if s >= 0.1)
@@ -123,7 +131,7 @@ def show(result: dict[str, Any]) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run and write the file."""
+    """Run the measurement and write the file."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.run_cost", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -133,9 +141,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--downscale", type=int, default=2)
     parser.add_argument("--schedule-scale", type=float)
     parser.add_argument("--recipe", default="2dgs-r")
-    parser.add_argument("--set", action="append", default=[], help="stage.field=value, as of `gs2d train`")
+    parser.add_argument("--set", action="append", default=[], help="stage.field=value, as in `gs2d train`")
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--keep", type=Path, help="the run folder; otherwise a temporary one")
+    parser.add_argument("--keep", type=Path, help="run folder (default: a temporary one)")
     args = parser.parse_args(arguments)
     if not args.room and args.capture is None:
         parser.error("--capture FOLDER or --room expected")
@@ -145,7 +153,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         capture = args.capture or Path(folder) / "room"
         if args.room and not (capture / "sparse" / "0" / "images.txt").exists():
             make = f"from benchmarks.room_capture import *; write_room_capture(Path({str(capture)!r}))"
-            subprocess.run([sys.executable, "-c", make], check=True)  # what it takes is no cost of the run
+            subprocess.run([sys.executable, "-c", make], check=True)  # making the capture is not a cost of the run
         result = measure(args, capture, args.keep or Path(folder) / "run")
     from benchmarks.timing import machine
 

@@ -1,11 +1,11 @@
-"""The phases of a training run, for the samplers of ``profile_run`` and ``run_cost``."""
+"""Phases of a training run, for the samplers of ``profile_run`` and ``run_cost``."""
 
 from __future__ import annotations
 
 from benchmarks.sampler import Rule
 
 RESULTS, LOOP = "pipeline/train/stage_results.py", "training/trainer.py"
-RUN_PHASES = (  # names that a version of the code does not have are found nowhere in it
+RUN_PHASES = (  # names missing from a version of the code never match
     Rule(
         "read the capture",
         (("pipeline/prepare/loaded.py", "prepare_run"), ("pipeline/prepare/loaded.py", "reload_run")),

@@ -1,6 +1,6 @@
-"""Where the wall time of the main thread goes: its Python stack, looked at every few milliseconds from another thread.
+"""Sample the Python stack of the main thread every few milliseconds to attribute wall time.
 
-Native code counts for the Python function that called it. Nothing is instrumented, so what runs is what users run.
+Native code counts for the Python function that called it. The sampled code is not instrumented.
 """
 
 from __future__ import annotations
@@ -16,40 +16,40 @@ from pathlib import Path
 from types import FrameType
 
 PERIOD = 0.004  # s
-SWITCH = 0.001  # s that Python code may run before the sampler gets its turn
+SWITCH = 0.001  # s that Python code may run before the sampler gets the GIL
 
 Place = tuple[str, str]  # end of the file's path, function ("" = any)
 
 
 @dataclass(frozen=True)
 class Rule:
-    """A stack with one of these places in it belongs to ``name``; the innermost place decides, then the first rule."""
+    """Rule that assigns stacks with one of these frames to ``name``; the innermost frame wins, then the first rule."""
 
     name: str
     places: tuple[Place, ...]
 
     def holds(self, file: str, function: str) -> bool:
-        """Whether a frame is one of the places."""
+        """Return True if a frame is one of ``places``."""
         return any(file.endswith(end) and name in ("", function) for end, name in self.places)
 
 
 @dataclass
 class Seconds:
-    """Seconds by phase, and in each by part; ``deepest`` by function where no part was found."""
+    """Seconds by phase and by part in each phase; ``deepest`` lists functions of samples without a part."""
 
     phases: dict[str, dict[str, float]] = field(default_factory=lambda: defaultdict(lambda: defaultdict(float)))
     deepest: dict[str, float] = field(default_factory=lambda: defaultdict(float))
 
 
 def frames(frame: FrameType | None) -> Iterator[FrameType]:
-    """From the innermost frame out."""
+    """Yield (file, function) from the innermost frame outwards."""
     while frame is not None:
         yield frame
         frame = frame.f_back
 
 
 def classify(stack: Sequence[tuple[str, str]], rules: Sequence[Rule]) -> str | None:
-    """The rule of a stack of (file, function), innermost first."""
+    """Return the rule of a stack of (file, function), innermost first."""
     for file, function in stack:
         for rule in rules:
             if rule.holds(file, function):
@@ -58,7 +58,7 @@ def classify(stack: Sequence[tuple[str, str]], rules: Sequence[Rule]) -> str | N
 
 
 class Sampler:
-    """Samples the thread that enters it until it leaves.
+    """Sampler of the thread that enters the context, until it leaves.
 
     Parameters
     ----------
@@ -102,15 +102,15 @@ class Sampler:
 
 @dataclass
 class Cost:
-    """What one part of one phase took."""
+    """Cost of one part of one phase."""
 
     wall: float = 0.0  # s
     cpu: float = 0.0  # s, of all threads of the process
-    rss: int = 0  # bytes, the most that were resident at once
+    rss: int = 0  # bytes, peak resident memory
 
 
 class CostSampler:
-    """Samples where the thread that enters it is, what the whole process used meanwhile, and how large it is.
+    """Sampler of the entering thread's position, with CPU time and resident memory of the process.
 
     Parameters
     ----------
@@ -150,5 +150,5 @@ class CostSampler:
 
 
 def resident_bytes() -> int:
-    """Resident memory of this process now (Linux)."""
+    """Return the resident memory of this process (Linux)."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")

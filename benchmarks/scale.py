@@ -1,8 +1,14 @@
-"""Peak memory of training, meshing and reporting over the number of photographs, which it is not to depend on.
+"""Check that peak memory of training, meshing and reporting does not depend on the number of photographs.
 
 ::
 
-    python -m benchmarks.scale FOLDER [--photographs 100 400 1600 6400] [--size 96] [--splats 20000] [--memory GIB]
+For each number, a flown capture (``benchmarks.flown_capture``) is made if missing. Training starts from ``--splats``
+splats on the true surface, with photographs prepared on disk. The run is then meshed in unbounded mode and its report
+is written. Each step is a separate command. Memory is the maximum resident sum of a command and its children, sampled
+fifty times a second. A hundred photographs show less of the land's edge than thousands, and a larger surface takes more
+memory. ``--land`` therefore limits the land to the area flown over, and ``--bbox`` also meshes a region that all
+captures show. Numbers listed in ``--compare`` are also trained with all data in memory, and must give identical bytes.
+The table is printed; figures are written to ``FOLDER/scale.json``.
 
 For each number a flown capture (``benchmarks.flown_capture``), which is made where it is not there, is trained on from
 so many splats on its true surface, with photographs prepared on the disk; then it is meshed whole and its report is
@@ -38,13 +44,13 @@ from gs2d.io.meshes import read_mesh
 from gs2d.io.splat_ply import write_splats
 from gs2d.training.start.initialize import initial_splats
 
-EVERY = 0.02  # s, between looks at memory
+EVERY = 0.02  # s, sampling interval of memory
 ITERATIONS_OF_ALL = 30_000  # of the recipe 2dgs
 
 
 @dataclass(frozen=True)
 class Measured:
-    """One command: the largest sum of resident memory, MiB, and how long it took, s."""
+    """One command: peak resident memory, MiB, and wall time, s."""
 
     photographs: int
     command: str
@@ -53,9 +59,10 @@ class Measured:
 
 
 def resident(process: int) -> int:
-    """Bytes that a process and its children have in memory (Linux).
+    """Return the resident bytes of a process and its children (Linux).
 
-    A child that is not yet a program of its own (it has its parent's words) has its parent's pages, not others.
+    A forked child that has not yet called exec (it has its parent's command line) shares its parent's pages and is
+    skipped.
     """
     try:
         own = int(Path(f"/proc/{process}/statm").read_text().split()[1]) * 4096
@@ -68,12 +75,12 @@ def resident(process: int) -> int:
 
 
 def measure(photographs: int, name: str, arguments: list[str], log: Path) -> Measured:
-    """Run a command of gs2d.
+    """Run a gs2d command and measure it.
 
     Raises
     ------
     RuntimeError
-        It failed.
+        If the command fails.
     """
     begun, peak = time.perf_counter(), 0
     with log.open("w") as file:
@@ -91,7 +98,7 @@ def measure(photographs: int, name: str, arguments: list[str], log: Path) -> Mea
 
 
 def surface_splats(capture: Path, count: int) -> Splats:
-    """Splats at so many places of the true surface, by its area: the same number whatever the capture."""
+    """Sample this many splats on the true surface, uniform by area, for every capture."""
     mesh = read_mesh(capture / "mesh_gt.ply")
     rng = np.random.default_rng(0)
     a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
@@ -107,7 +114,7 @@ def surface_splats(capture: Path, count: int) -> Splats:
 
 
 def train_arguments(capture: Path, run: Path, args: argparse.Namespace, prepare: str) -> list[str]:
-    """Return those of a training that is short and of a fixed number of splats."""
+    """Return the options of a short training with a fixed number of splats."""
     words = ["train", capture, "--out", run, "--overwrite", "--init", capture / "start.ply", "--recipe", "2dgs"]
     words += ["--robust", "off", "--set", "surface.densify=null", "--set", f"prepare={prepare}", "--quiet", "--scene"]
     words += ["--schedule-scale", args.iterations / ITERATIONS_OF_ALL, "--memory", args.memory]
@@ -145,7 +152,7 @@ def run_one(folder: Path, photographs: int, args: argparse.Namespace) -> list[Me
 
 
 def table(found: list[Measured]) -> str:
-    """Return the figures in Markdown: a row for each number of photographs."""
+    """Return the figures as Markdown, a row per number of photographs."""
     names = list(dict.fromkeys(one.command for one in found))
     lines = ["| photographs | " + " | ".join(f"`{name}`" for name in names) + " |", "|---" * (len(names) + 1) + "|"]
     for count in dict.fromkeys(one.photographs for one in found):
@@ -156,20 +163,20 @@ def table(found: list[Measured]) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Measure all; 2 for what the user can mend, 1 where bytes differ or a command fails."""
+    """Run all measurements; return 2 for user errors, 1 if bytes differ or a command fails."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scale", description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--photographs", type=int, nargs="+", default=[100, 400, 1600, 6400])
     parser.add_argument("--compare", type=int, nargs="*", default=[100])
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument(
-        "--side", type=float, default=200.0, help="m flown over, the same for any number of photographs"
+        "--side", type=float, default=200.0, help="side of the area flown over, m, for any number of photographs"
     )
-    parser.add_argument("--land", type=float, help="side of the land, m, where it is to end within what is flown over")
+    parser.add_argument("--land", type=float, help="side of the land, m, to limit it to the area flown over")
     parser.add_argument("--splats", type=int, default=20_000)
-    parser.add_argument("--bbox", type=float, nargs=6, help="also mesh this part, of which any number shows the same")
+    parser.add_argument("--bbox", type=float, nargs=6, help="also mesh this box, which all captures show equally")
     parser.add_argument("--iterations", type=int, default=150)
-    parser.add_argument("--memory", type=float, default=2.0, help="GiB, as of gs2d train")
+    parser.add_argument("--memory", type=float, default=2.0, help="GiB, as in gs2d train")
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args(arguments)
     found: list[Measured] = []

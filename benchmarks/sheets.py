@@ -1,8 +1,10 @@
-"""How much long and unseen splats of a run cost: the figures of docs/notebook/results.md, "Longer schedules".
+"""Measure the effect of long and unseen splats of a run (docs/notebook/results.md, "Longer schedules").
 
 ::
 
-    python -m benchmarks.sheets RUN [RUN ...] [--longer 0.1]
+Prints for each run, under its rasterizer settings: the number of splats that no training view sees, the number of
+splats longer than a fraction of the scene's extent, their coverage of the empty background of the test views (alpha of
+the photographs < 1/2), and the PSNR of the test views (8 bit) with and without each group.
 
 Prints, for the splats of each run under its rasterizer settings: how many no training view sees, how many are
 longer than a share of the scene's extent, how much of the empty background (alpha of the photographs < 1/2) of the test
@@ -28,7 +30,7 @@ from gs2d.training.objective import visible_mask
 
 @torch.no_grad()
 def score(splats: Splats, job: LoadedRun) -> tuple[float, float, float]:
-    """Mean and least PSNR of the test views in dB, and the mean alpha of their empty background."""
+    """Return mean and minimum PSNR of the test views, dB, and the mean alpha of their empty background."""
     values, covered = [], []
     for view in job.scene.test:
         out = rasterize(splats, view.camera, job.settings, backend=job.backend)
@@ -41,7 +43,7 @@ def score(splats: Splats, job: LoadedRun) -> tuple[float, float, float]:
 
 
 def report(run: Path, longer: float) -> None:
-    """The figures of one run."""
+    """Print the figures of one run."""
     job = reload_run(open_run(run), lambda event: None)
     splats = read_splats(run / "splats.ply")
     seen = visible_mask(splats, job.scene.train, job.settings, job.backend)
@@ -59,10 +61,10 @@ def report(run: Path, longer: float) -> None:
 
 
 def main() -> None:
-    """Parse the arguments."""
+    """Parse the arguments and report each run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path, nargs="+")
-    parser.add_argument("--longer", type=float, default=0.1, help="share of the scene's extent")
+    parser.add_argument("--longer", type=float, default=0.1, help="fraction of the scene's extent")
     args = parser.parse_args()
     for run in args.runs:
         report(run, args.longer)

@@ -1,4 +1,4 @@
-"""Times of one workload stage by stage, with its work counted exactly and its memory."""
+"""Time one workload stage by stage, with exact counts of its work and its memory."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from gs2d.training.optimizer import adam_step, begin_stage
 from gs2d.training.state import TrainState
 
 NATIVE = ("project", "sort", "bin", "blend_forward", "index_slots", "blend_backward", "project_backward")
-FORWARD_STAGES = 4  # of NATIVE; the others belong to the backward pass
+FORWARD_STAGES = 4  # indices into NATIVE; the others belong to the backward pass
 LIMIT_REPEATS = 200
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Times by step, what the view holds, and the best probe seen between the steps."""
+    """Times by step, counts of the view, and the best probe between the steps."""
 
     steps: dict[str, Timing]
     work: ViewWork
@@ -43,7 +43,7 @@ class Measured:
 
 
 def stage_times(library: Library) -> list[float]:
-    """Milliseconds of this thread's last forward and backward pass, in the order of NATIVE."""
+    """Return milliseconds of this thread's last forward and backward pass, in the order of NATIVE."""
     buffer = (ctypes.c_int64 * 16)()
     count = library.function("gs2d_stage_times", ctypes.c_int, [ctypes.c_void_p])(buffer)
     if count != len(NATIVE):
@@ -52,18 +52,18 @@ def stage_times(library: Library) -> list[float]:
 
 
 def trim(library: Library) -> None:
-    """Free what the library keeps for the next view."""
+    """Free the buffers that the library keeps for the next view."""
     library.function("gs2d_trim", None, [])()
 
 
 def frame_bytes(library: Library, output: RenderOutput) -> int:
-    """Bytes that a view holds at the moment."""
+    """Return the bytes that a view currently holds."""
     frame: Any = output.color.grad_fn
     return int(library.function("gs2d_frame_bytes", ctypes.c_int64, [ctypes.c_void_p])(frame.frame.pointer))
 
 
 def count_work(library: Library, output: RenderOutput, splats: int) -> ViewWork:
-    """Exact counts of the view that was rendered; of its largest chunk, after the backward pass."""
+    """Count the work of the rendered view; after the backward pass, also of its largest chunk."""
     frame: Any = output.color.grad_fn
     counts = (ctypes.c_int64 * 6)()
     function = library.function("gs2d_frame_counts", ctypes.c_int, [ctypes.c_void_p] * 2)
@@ -75,7 +75,7 @@ def count_work(library: Library, output: RenderOutput, splats: int) -> ViewWork:
 
 
 class Passes:
-    """Forward and backward of all outputs, or of colour alone, as often as asked, on one workload."""
+    """Repeatable forward and backward passes of all outputs, or of colour alone, on one workload."""
 
     def __init__(self, library: Library, workload: Workload, sh_degree: int, *, probe_columns: int = 2) -> None:
         self.library, self.camera = library, workload.cameras[0]
@@ -89,7 +89,7 @@ class Passes:
         return rasterize_with(self.library, self.leaves, self.camera, self.settings, self.signal)
 
     def backward(self, output: RenderOutput) -> None:
-        """Gradients of every parameter and the densification signal."""
+        """Compute gradients of every parameter and the densification signal."""
         images = [getattr(output, name) for name in IMAGES]
         if not self.cotangents:
             generator = torch.Generator().manual_seed(1)
@@ -97,7 +97,7 @@ class Passes:
         torch.autograd.grad(images, [*(t for _, t in self.leaves.items()), self.signal], self.cotangents)
 
     def times(self, seconds: float, least: int) -> dict[str, list[float]]:
-        """Milliseconds by native stage, and of both passes as Python sees them."""
+        """Return milliseconds by native stage, and of both passes measured in Python."""
         self.backward(self.forward())
         rows: dict[str, list[float]] = {name: [] for name in (*NATIVE, "raster_forward", "raster_backward")}
         end = time.perf_counter() + seconds
@@ -117,7 +117,7 @@ class Passes:
 
 
 def repeated(work: Callable[[], float], seconds: float, least: int) -> Timing:
-    """Summary of a function that returns its own milliseconds; the first call is not counted."""
+    """Summarise a function that returns its own milliseconds, without the first call."""
     work()
     times: list[float] = []
     end = time.perf_counter() + seconds
@@ -127,7 +127,7 @@ def repeated(work: Callable[[], float], seconds: float, least: int) -> Timing:
 
 
 def loss_step(output: RenderOutput, workload: Workload) -> Callable[[], float]:
-    """L1 + SSIM, normal consistency and the distortion's mean, forward and backward, as training computes them."""
+    """Return a step of L1 + SSIM, normal consistency and mean distortion, forward and backward, as in training."""
     names = ("color", "normal", "depth_mean", "distortion")
     leaves = {name: getattr(output, name).detach().clone().requires_grad_() for name in names}
     alpha, camera = output.alpha.detach(), workload.cameras[0]
@@ -148,7 +148,7 @@ def loss_step(output: RenderOutput, workload: Workload) -> Callable[[], float]:
 
 
 def optimizer_step(workload: Workload) -> Callable[[], float]:
-    """Adam on every attribute of every splat."""
+    """Return a step of Adam on every attribute of every splat."""
     stage = two_dgs_r().stages[0]
     state = TrainState(workload.splats.clone(), torch.Generator().manual_seed(4))
     begin_stage(state, stage)
@@ -164,11 +164,11 @@ def optimizer_step(workload: Workload) -> Callable[[], float]:
 
 
 def densification_case(splats: Splats) -> Callable[[], object]:
-    """One densification in which 5 % of the splats pass the threshold: half of them, the larger, are split."""
+    """Return a densification in which 5 % of the splats pass the threshold; the larger half of them is split."""
     stage = two_dgs_r().stages[0]
     assert isinstance(stage.densify, GradDensify)
     size = float(splats.scales.amax(dim=1).median())
-    densify = replace(stage.densify, percent_dense=size)  # at an extent of 1
+    densify = replace(stage.densify, percent_dense=size)  # for an extent of 1
     n = len(splats)
     passes = torch.rand(n, generator=torch.Generator().manual_seed(5)) < 0.05
     signal = torch.where(passes, 2.0, 0.5) * densify.grad_threshold
@@ -179,7 +179,7 @@ def densification_case(splats: Splats) -> Callable[[], object]:
 
 
 def densification_step(workload: Workload) -> Callable[[], float]:
-    """The same, each time from the same state."""
+    """Return a densification step that starts from the same state each time."""
 
     def step() -> float:
         work = densification_case(workload.splats)
@@ -191,7 +191,7 @@ def densification_step(workload: Workload) -> Callable[[], float]:
 
 
 def measure_stages(library: Library, workload: Workload, seconds: float, least: int) -> Measured:
-    """Every step of a training iteration on its own, ``seconds`` or ``least`` repeats each, whichever is longer."""
+    """Time every step of a training iteration alone, for ``seconds`` or ``least`` repeats, whichever takes longer."""
     best = probe(library)
     trim(library)
     passes = Passes(library, workload, 3)
@@ -207,7 +207,7 @@ def measure_stages(library: Library, workload: Workload, seconds: float, least: 
     flat = Passes(library, workload, 0).times(seconds / 3, least)
     for name, stage in (("sh_forward", "project"), ("sh_backward", "project_backward")):
         low = summary(flat[stage])
-        full = steps[stage]  # SH is evaluated where splats are projected: what degree 3 costs over degree 0
+        full = steps[stage]  # SH is evaluated during projection: the cost of degree 3 over degree 0
         difference = max(0.0, full.median - low.median)
         spread = (full.spread**2 + low.spread**2) ** 0.5
         steps[name] = Timing(difference, max(0.0, full.best - low.best), full.repeats, spread)

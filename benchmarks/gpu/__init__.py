@@ -1,1 +1,1 @@
-"""Three commands that measure the CUDA backend on a GPU: METHOD.md."""
+"""Measure the CUDA backend on a GPU with three commands: see METHOD.md."""

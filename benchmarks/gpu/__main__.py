@@ -1,15 +1,10 @@
-"""Measure the CUDA backend on a GPU (METHOD.md); ``host`` needs none.
+"""Measure the CUDA backend on a GPU (METHOD.md); ``host`` needs no GPU.
 
 ::
 
-    python -m benchmarks.gpu first       [--out FILE.json] [--dry-run]
-    python -m benchmarks.gpu host        [--out FILE.json]
-    python -m benchmarks.gpu correctness [--out FILE.json] [--dry-run] [--only parity memcheck ...]
-    python -m benchmarks.gpu kernels     [--out FILE.json] [--dry-run] [--only 1000000 ...]
-    python -m benchmarks.gpu real        [--out FILE.json] [--dry-run] --capture FOLDER ... [--recipe best]
-                                         [--schedule-scale 1.0] [--downscale 1]
-    python -m benchmarks.gpu training    [--out FILE.json] [--dry-run] --capture FOLDER ... [--schedule-scale 1.0]
-                                         [--downscale 1] [--runs FOLDER] [--synthetic]
+Each command writes one file, updated after every part, and prints a short table at the end. ``--minutes M`` starts no
+part after M minutes, for machines that are lent by the minute. ``--dry-run`` runs everything on any machine at toy size
+with emulated kernels; its times are meaningless.
 
 Each writes one file, after every part of it, and prints a short table last. ``--minutes M`` begins no part after so
 many, for machines that are lent by the minute. ``--dry-run`` goes through all of it on any machine, at toy size, with
@@ -35,7 +30,7 @@ NEEDED = ("torch", "numpy", "scipy", "PIL")
 
 
 def unfit() -> str:
-    """Why this Python cannot run the benchmarks; "" where it can."""
+    """Return why this Python cannot run the benchmarks, or ""."""
     version: tuple[int, ...] = tuple(sys.version_info[:2])
     here = ".".join(map(str, version))
     if version < (3, 11):
@@ -49,21 +44,25 @@ def unfit() -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; the exit status is 1 where the kernels were wrong, 2 where they cannot run."""
+    """Run one command; the exit status is 1 if a check failed and 2 if the command cannot run."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.gpu", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("command", choices=("first", "correctness", "kernels", "training", "real", "exercise", "host"))
     parser.add_argument("--out", type=Path)
     parser.add_argument("--dry-run", action="store_true")
-    parser.add_argument("--only", nargs="+", default=[], help="parts or scenes whose name contains one of these")
+    parser.add_argument(
+        "--only", nargs="+", default=[], help="run only parts or scenes whose name contains one of these words"
+    )
     parser.add_argument("--capture", type=Path, nargs="*", default=[])
-    parser.add_argument("--synthetic", action="store_true", help="train on a capture that is made here, too")
-    parser.add_argument("--recipe", default="best", help="of real")
+    parser.add_argument(
+        "--synthetic", action="store_true", help="also train on a synthetic capture made by this command"
+    )
+    parser.add_argument("--recipe", default="best", help="recipe of the command real")
     parser.add_argument("--schedule-scale", type=float, default=1.0)
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--runs", type=Path, help="keep the run folders here")
-    parser.add_argument("--minutes", type=float, default=math.inf, help="begin no part after so many")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="start no part after this many minutes")
     args = parser.parse_args(arguments)
     if args.command == "training" and not args.capture and not args.dry_run and not args.synthetic:
         parser.error("training needs --capture FOLDER or --synthetic")
@@ -73,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if reason:
         print(f"error: {reason}", file=sys.stderr)
         return 2
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before torch loads
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # set before torch loads, as in the command line
     from benchmarks.gpu import correctness
     from benchmarks.gpu.bench import RESULTS, opened
     from gs2d.errors import Gs2dError
@@ -93,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def host_alone(out: Path) -> int:
-    """What an iteration costs the host in each way, and what the compiler makes of its kernels, on any machine."""
+    """Measure the host cost of an iteration for each execution mode, and the compiled kernels, on any machine."""
     from benchmarks.gpu import host
     from benchmarks.gpu.bench import commit, write
     from benchmarks.timing import machine
@@ -108,7 +107,7 @@ def host_alone(out: Path) -> int:
 
 
 def run(args: argparse.Namespace, bench: Bench, out: Path) -> int:
-    """One command to its file."""
+    """Run one command and write its result file."""
     from benchmarks.gpu import correctness, first, kernels
     from benchmarks.gpu.bench import clocks, commit, facts, write
 
@@ -117,7 +116,7 @@ def run(args: argparse.Namespace, bench: Bench, out: Path) -> int:
     def progress(results: dict[str, Any]) -> None:
         write(out, {**document, "results": results})
 
-    progress({})  # where it cannot be written is known before anything slow
+    progress({})  # detect an unwritable path before anything slow runs
     module: ModuleType
     if args.command == "first":
         results, module = first.run(bench, args.only, progress), first
@@ -131,7 +130,7 @@ def run(args: argparse.Namespace, bench: Bench, out: Path) -> int:
         given = (args.capture, args.recipe, args.schedule_scale, args.downscale)
         results, module = real.run(bench, *given, progress), real
     else:
-        from benchmarks.gpu import training  # the pipeline, which the other commands need not have
+        from benchmarks.gpu import training  # imported here: only this command needs the pipeline
 
         captures = (args.capture, args.schedule_scale, args.downscale, args.runs)
         results, module = training.run(bench, *captures, progress, synthetic=args.synthetic), training

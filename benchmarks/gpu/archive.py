@@ -1,4 +1,4 @@
-"""One archive of what a part leaves, small enough to be brought home: results first, what does not fit is named."""
+"""Pack the files of a part into one small archive: results first; omitted files are listed."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 LIMIT_BYTES = 12 << 20
-# In this order; of a run folder the figures and the report, not splats, checkpoints and pictures.
+# In this order. Of a run folder, pack figures and report, not splats, checkpoints and images.
 WANTED = ("*.json", "*.txt", "metrics.json", "report.html", "*.csv", "*.json.gz")
 LEFT_OUT = "left_out.txt"
 
 
 def chosen(folder: Path) -> list[Path]:
-    """What is worth bringing home, the most wanted first; not what lies under a name with a dot."""
+    """Return the files to pack, the most important first; paths with a hidden folder or file are skipped."""
     files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
     files = [path for path in files if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
     found: dict[Path, None] = {}
@@ -25,13 +25,13 @@ def chosen(folder: Path) -> list[Path]:
 
 
 def pack(folder: Path, archive: Path, limit_bytes: int = LIMIT_BYTES) -> list[str]:
-    """Write the archive, whole or not at all; returns what had no room, which the archive says too."""
+    """Write the archive atomically; return the omitted files, which are also listed in the archive."""
     temporary = archive.with_name(archive.name + ".part")
     left_out: list[str] = []
     with temporary.open("wb") as file, tarfile.open(fileobj=file, mode="w:gz") as tar:
         for path in chosen(folder):
             name, size = path.relative_to(folder).as_posix(), path.stat().st_size
-            # counted as if nothing of it could be compressed: pictures in a report are
+            # assume no compression: reports embed compressed images
             if file.tell() + size > limit_bytes:
                 left_out.append(f"{name} ({size} bytes)")
                 continue
@@ -46,7 +46,7 @@ def pack(folder: Path, archive: Path, limit_bytes: int = LIMIT_BYTES) -> list[st
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """``python -m benchmarks.gpu.archive FOLDER ARCHIVE``."""
+    """Run ``python -m benchmarks.gpu.archive FOLDER ARCHIVE``."""
     folder, archive = map(Path, sys.argv[1:] if arguments is None else arguments)
     for name in pack(folder, archive):
         print(f"not in {archive.name}: {name}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""What the three commands share: the device or its emulator, clocks, the result file."""
+"""Shared parts of the GPU commands: the device or its emulator, clocks, and the result file."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ CLOCKS = "clocks.sm,clocks.mem,clocks.max.sm,temperature.gpu,power.draw,driver_v
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """Where things run.
+    """Execution environment of the measurements.
 
     Attributes
     ----------
     backend : Backend
-        "cuda"; with ``dry`` its kernels run emulated on the CPU, at toy size, and no time means anything.
+        "cuda". With ``dry``, its kernels are emulated on the CPU at toy size and times are meaningless.
     launcher : Launcher
     dry : bool
     end : float
-        By ``time.monotonic()``: no part is begun after it.
+        Deadline by ``time.monotonic()``: no part starts after it.
     """
 
     backend: Backend
@@ -49,7 +49,7 @@ class Bench:
     end: float = math.inf
 
     def attempt(self, name: str, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """:func:`attempt`, unless the time is up: what is done by then is in the file."""
+        """Run :func:`attempt` unless the time is up; finished parts are already in the file."""
         if time.monotonic() >= self.end:
             return {"skipped": "out of time (--minutes)"}
         return attempt(name, work)
@@ -60,7 +60,9 @@ class Bench:
         only: Sequence[str],
         progress: Callable[[dict[str, Any]], None],
     ) -> dict[str, Any]:
-        """Return the results of the parts whose name has a word of ``only`` in it; ``progress`` sees them grow."""
+        """Return the results of the parts whose name contains a word of ``only``; ``progress`` gets each intermediate
+        result.
+        """
         found: dict[str, Any] = {}
         for name, work in parts.items():
             if not only or any(word in name for word in only):
@@ -69,21 +71,21 @@ class Bench:
         return found
 
     def seconds_left(self, most: float) -> float:
-        """Until the time is up, at most so many."""
+        """Return the seconds until the deadline, at most this many."""
         return max(1.0, min(most, self.end - time.monotonic()))
 
     @property
     def device(self) -> torch.device:
-        """Where tensors belong."""
+        """Return the device of the tensors."""
         return torch.device("cpu") if self.dry else torch.device("cuda", torch.cuda.current_device())
 
     def wait(self) -> None:
-        """Until the device is idle."""
+        """Wait until the device is idle."""
         if not self.dry:
             torch.cuda.synchronize()
 
     def times(self, work: Callable[[int], object], *, repeats: int, warmup: int) -> dict[str, float]:
-        """Milliseconds of ``work(i)``, i = 0, 1, ...: median, best and interquartile distance, by events."""
+        """Time ``work(i)``, i = 0, 1, ..., with events: median, best and interquartile range, milliseconds."""
         if self.dry:
             repeats, warmup = 2, 0
         for i in range(warmup):
@@ -99,7 +101,7 @@ class Bench:
 
     @contextmanager
     def replaced(self, launcher: Launcher) -> Iterator[None]:
-        """Everything that looks for the device's launcher finds this one."""
+        """Replace the launcher for all code that looks up the device's launcher."""
         before = launch.launcher_for
         launch.launcher_for = lambda device: launcher
         try:
@@ -109,13 +111,13 @@ class Bench:
 
     @contextmanager
     def recorded(self) -> Iterator[set[str]]:
-        """The names of the kernels that are launched."""
+        """Record the names of launched kernels."""
         launcher = RecordingLauncher(self.launcher)
         with self.replaced(launcher):
             yield launcher.names
 
     def peak_memory(self, work: Callable[[], object]) -> int:
-        """Bytes that torch's allocator held at most during ``work``, beyond those before."""
+        """Return the peak memory of ``work``, bytes, in torch's allocator, beyond the memory held at the start."""
         if self.dry:
             work()
             return 0
@@ -128,7 +130,7 @@ class Bench:
 
 
 class _Clock:
-    """Runs from its making; ``stop`` returns what will give the milliseconds."""
+    """Clock that starts when created; ``stop`` returns a function for the milliseconds."""
 
     def __init__(self, dry: bool) -> None:
         self._start = time.perf_counter()
@@ -152,7 +154,7 @@ class _Clock:
 
 @dataclass(eq=False)
 class RecordingLauncher(OneByOne):
-    """Notes the names of what another launcher launches."""
+    """Launcher that records the kernel names and forwards to another launcher."""
 
     inner: Launcher
     names: set[str] = field(default_factory=set)
@@ -164,7 +166,7 @@ class RecordingLauncher(OneByOne):
 
 @dataclass(eq=False)
 class TimingLauncher(OneByOne):
-    """Times every launch of another launcher, by kernel."""
+    """Launcher that times every launch of another launcher by kernel."""
 
     inner: Launcher
     dry: bool
@@ -176,7 +178,7 @@ class TimingLauncher(OneByOne):
         self.spans.setdefault(name, []).append(clock.stop())
 
     def medians(self, skip: int) -> dict[str, float]:
-        """Milliseconds by kernel; the first ``skip`` launches of each warm up."""
+        """Return the median milliseconds by kernel, without the first ``skip`` launches of each."""
         return rounded(
             {
                 name: statistics.median([span() for span in (spans[skip:] or spans)])
@@ -186,7 +188,7 @@ class TimingLauncher(OneByOne):
 
 
 def kernel_times(bench: Bench, work: Callable[[], object], repeats: int) -> dict[str, float]:
-    """Microseconds of each kernel in one ``work``, the most first, by torch's profiler: those in graphs, too."""
+    """Return microseconds per kernel in one ``work``, largest first, by torch's profiler, including graphs."""
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
         for _ in range(repeats):
             work()
@@ -200,14 +202,14 @@ def kernel_times(bench: Bench, work: Callable[[], object], repeats: int) -> dict
 
 
 class EmulatedBackend(CudaBackend):
-    """The backend "cuda" on the CPU's memory."""
+    """Backend "cuda" in CPU memory."""
 
     device = "cpu"
 
 
 @contextmanager
 def opened(dry: bool, minutes: float = math.inf) -> Iterator[Bench]:
-    """The bench; with ``dry`` every launcher and the backend "cuda" are the emulator's until the end."""
+    """Yield the bench; with ``dry``, all launchers and the backend "cuda" are emulated until it closes."""
     end = time.monotonic() + 60 * minutes
     if not dry:
         backend = get_backend("cuda")
@@ -228,7 +230,7 @@ def opened(dry: bool, minutes: float = math.inf) -> Iterator[Bench]:
 
 
 def facts(bench: Bench) -> dict[str, Any]:
-    """What the numbers were measured on, and with which versions."""
+    """Return the machine and the versions of the measurement."""
     found: dict[str, Any] = {**machine(), "dry_run": bench.dry}
     if bench.dry:
         return found
@@ -246,9 +248,9 @@ def facts(bench: Bench) -> dict[str, Any]:
 
 
 def clocks() -> dict[str, str] | str:
-    """Clocks, temperature and power now; or why they are not known."""
+    """Return current clocks, temperature and power, or why they are unknown."""
     device = torch.cuda.current_device()
-    known = getattr(torch.cuda.get_device_properties(device), "uuid", None)  # its numbers ignore CUDA_VISIBLE_DEVICES
+    known = getattr(torch.cuda.get_device_properties(device), "uuid", None)  # nvidia-smi ignores CUDA_VISIBLE_DEVICES
     which = str(device) if known is None else f"GPU-{known}"
     command = ["nvidia-smi", f"--query-gpu={CLOCKS}", "--format=csv,noheader", "-i", which]
     try:
@@ -259,7 +261,7 @@ def clocks() -> dict[str, str] | str:
 
 
 def commit() -> str:
-    """The checkout that was measured; of a copy without history what ``GS2D_COMMIT`` says."""
+    """Return the measured commit; for a copy without history, the value of ``GS2D_COMMIT``."""
     given = os.environ.get("GS2D_COMMIT")
     if given:
         return given
@@ -273,14 +275,14 @@ def commit() -> str:
 
 @dataclass(frozen=True)
 class Finished:
-    """A program that ended, or was ended: ``exit`` is None where its time was up. Output and errors in one."""
+    """Finished program. ``exit`` is None if it was stopped at the deadline; output and errors are merged."""
 
     exit: int | None
     lines: list[str]
 
 
 def run_program(command: Sequence[str], *, seconds: float, environment: Mapping[str, str] | None = None) -> Finished:
-    """Run a program in the checkout; when its time is up it ends with all it has started, and what it said is kept."""
+    """Run a program in the checkout; at the deadline, stop it and its children and keep its output."""
     process = subprocess.Popen(
         command,
         cwd=ROOT,
@@ -304,12 +306,12 @@ def run_program(command: Sequence[str], *, seconds: float, environment: Mapping[
 
 
 def rounded(values: dict[str, float], digits: int = 4) -> dict[str, float]:
-    """Numbers as a result file holds them."""
+    """Round numbers for a result file."""
     return {name: round(value, digits) for name, value in values.items()}
 
 
 def attempt(name: str, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """The result of ``work``, or what stopped it: one failing part must not lose the others of an expensive run."""
+    """Return the result of ``work``, or its error: one failing part must not lose the others of an expensive run."""
     try:
         return work()
     except Exception as error:
@@ -319,7 +321,7 @@ def attempt(name: str, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 
 
 def write(path: Path, document: dict[str, Any]) -> None:
-    """The result file, whole or not at all."""
+    """Write the result file atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".part")
     temporary.write_text(json.dumps(document, indent=1, sort_keys=False) + "\n")

@@ -1,6 +1,7 @@
-"""A capture that is made where it is trained on: pictures of the room from a hundred poses around it.
+"""Make a synthetic capture on the benchmark machine: images of the room from a hundred poses around it.
 
-Photographs of others may not be where a GPU is. Its quality says nothing about scenes of the world; its times do.
+Other people's photographs cannot be copied to every GPU machine. The quality on this capture is not representative of
+real scenes, but the times are.
 """
 
 from __future__ import annotations
@@ -25,11 +26,14 @@ SYNTHETIC = "synthetic"
 TEACHER, SIDE, TRAIN, TEST = 300_000, 800, 100, 20
 TOY = (60, 24, 4, 1)
 FOV = math.radians(60)
-NEVER_BELOW, RADIUS = 0.35, 4.2  # of the cameras: world units above the floor, from the middle of the room
+NEVER_BELOW, RADIUS = (
+    0.35,
+    4.2,
+)  # camera height above the floor and distance from the centre, world units
 
 
 def poses(count: int, side: int, phase: float) -> list[Camera]:
-    """Cameras on arcs before the spheres, at heights in turn, all looking at the middle."""
+    """Return cameras on arcs in front of the spheres, at alternating heights, all facing the centre."""
     focal = 0.5 * side / math.tan(0.5 * FOV)
     found = []
     for k in range(count):
@@ -42,7 +46,7 @@ def poses(count: int, side: int, phase: float) -> list[Camera]:
 
 
 def write_capture(bench: Bench, folder: Path) -> Path:
-    """Render the teacher and write the capture as Blender's synthetic ones are; the folder."""
+    """Render the teacher, write the capture in the NeRF-Synthetic layout, and return its folder."""
     count, side, train, test = TOY if bench.dry else (TEACHER, SIDE, TRAIN, TEST)
     teacher, settings = room(count).to(bench.device), RasterSettings(background=(1.0, 1.0, 1.0))
     with ThreadPoolExecutor(8) as pool:

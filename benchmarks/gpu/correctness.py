@@ -1,4 +1,4 @@
-"""Command 1: what the machine can do, whether the kernels are right on it, and what the sanitizer says."""
+"""Command 3: measure the machine's ceilings, check the kernels, and run the sanitizer."""
 
 from __future__ import annotations
 
@@ -37,7 +37,9 @@ IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion"
 
 
 def run(bench: Bench, only: list[str], progress: Any) -> dict[str, Any]:
-    """Ceilings, registers, parity, determinism, tests, sanitizer; ``progress`` gets the results so far after each."""
+    """Run all parts: ceilings, registers, parity, determinism, tests, sanitizer; ``progress`` gets the results after
+    each.
+    """
     parts: dict[str, Any] = {
         "ceilings": lambda: ceilings(bench),
         "registers": lambda: registers(bench),
@@ -51,12 +53,12 @@ def run(bench: Bench, only: list[str], progress: Any) -> dict[str, Any]:
 
 
 def wrong(found: dict[str, Any]) -> bool:
-    """Whether a test failed, a tool found something, or a part could not be done."""
+    """Return True if a test failed, a tool reported an error, or a part could not run."""
     return any("failed" in part or part.get("clean") is False or part.get("exit", 0) != 0 for part in found.values())
 
 
 def registers(bench: Bench) -> dict[str, Any]:
-    """Registers, spills and shared memory of each kernel for this device."""
+    """Return registers, spills and shared memory of each kernel for this device."""
     arch = ARCHITECTURES[4] if bench.dry else str(bench.launcher.architecture)  # type: ignore[attr-defined]
     names = source_names()[:1] if bench.dry else source_names()
     used = {kernel: usage for name in names for kernel, usage in compile_source(name, arch).usage().items()}
@@ -64,7 +66,7 @@ def registers(bench: Bench) -> dict[str, Any]:
 
 
 def _scenes() -> Any:
-    """The random scenes of the rasterizer's tests."""
+    """Return the random scenes of the rasterizer tests."""
     sys.path.insert(0, str(ROOT / "tests" / "helpers"))
     import render_scenes
 
@@ -72,7 +74,7 @@ def _scenes() -> Any:
 
 
 def parity(bench: Bench, count: int) -> dict[str, Any]:
-    """Images and gradients of random scenes against the float64 reference: medians, quantiles, flipped pixels."""
+    """Compare images and gradients of random scenes with the float64 reference: medians, quantiles, flipped pixels."""
     scenes = _scenes()
     differences: dict[str, list[Tensor]] = {name: [] for name in IMAGES}
     gradients: dict[str, list[float]] = {}
@@ -115,7 +117,7 @@ def _differentiate(
 
 
 def small_scene(bench: Bench) -> tuple[Splats, Any]:
-    """Some splats at 64 x 48 px: enough for every path, little enough for a sanitizer."""
+    """Return a few splats at 64 x 48 px: large enough for every code path, small enough for a sanitizer."""
     scenes = _scenes()
     rng = np.random.default_rng(7)
     camera = scenes.random_camera(rng).resized(*((16, 12) if bench.dry else (64, 48)))
@@ -124,7 +126,7 @@ def small_scene(bench: Bench) -> tuple[Splats, Any]:
 
 
 def exercise(bench: Bench) -> list[str]:
-    """Every kernel at least once, at a size for a sanitizer; the names of those that were not run."""
+    """Run every kernel at least once at sanitizer size; return the names of kernels that did not run."""
     with bench.recorded() as launched:
         _render_all_ways(bench)
         _all_losses(bench)
@@ -136,7 +138,7 @@ def exercise(bench: Bench) -> list[str]:
 
 
 def _render_all_ways(bench: Bench) -> None:
-    """Forward, all variants of backward, splat errors; images of more than 32767 tiles only on a GPU."""
+    """Run forward, all backward variants and splat errors; images of more than 32767 tiles only on a GPU."""
     splats, camera = small_scene(bench)
     launcher = launch.launcher_for(bench.device)
     every = ("color", "normal", "depth_median", "distortion")
@@ -164,7 +166,7 @@ def _render_all_ways(bench: Bench) -> None:
 
 
 def _all_losses(bench: Bench) -> None:
-    """L1, SSIM and L2 with the target's mean at hand, and the mean of a map; training runs the others."""
+    """Run L1, SSIM and L2 with a precomputed target mean, and the mean of a map; training covers the other losses."""
     launcher = launch.launcher_for(bench.device)
     image, target = (torch.rand(45, 70, 3, device=bench.device, requires_grad=k == 0) for k in range(2))
     l1, ssim, l2 = ops.photometric(image, target, target_mean=ops.blur(target, launcher=launcher), launcher=launcher)
@@ -172,7 +174,7 @@ def _all_losses(bench: Bench) -> None:
 
 
 def _three_stages(bench: Bench) -> None:
-    """Three short stages: normals, Adam, densification, ranking, clones, frozen rows, two views in the first."""
+    """Train three short stages: normals, Adam, densification, ranking, clones, frozen rows, two views in the first."""
     sys.path.insert(0, str(ROOT / "tests" / "helpers"))
     import train_toys
 
@@ -186,7 +188,7 @@ def _three_stages(bench: Bench) -> None:
 
 
 def _fusion(bench: Bench) -> None:
-    """A depth map into three blocks of voxels before and behind it, with colours."""
+    """Fuse a depth map into three blocks of voxels in front of and behind it, with colours."""
     height, width, blocks = 24, 30, 3
 
     def random(*shape: int) -> Tensor:
@@ -203,14 +205,14 @@ def _fusion(bench: Bench) -> None:
 
 
 def whole_steps(bench: Bench) -> dict[str, Any]:
-    """Iterations by kernels alone beside those through torch: wrong where a hundredth of what was learned differs."""
+    """Compare kernel-only iterations with torch iterations; they fail if parameter updates differ by 1 % or more."""
     _scenes()
     found = whole.differences(bench)
     return found | {"exit": int(max(value for way in found.values() for value in way.values()) > 1e-2)}
 
 
 def determinism(bench: Bench) -> dict[str, Any]:
-    """Two renderings: images bit for bit, gradients by relative norm."""
+    """Render twice and compare: images bitwise, gradients by relative norm."""
     scenes = _scenes()
     splats, camera = small_scene(bench)
     cotangents = scenes.random_cotangents(np.random.default_rng(1), camera)
@@ -226,15 +228,15 @@ def determinism(bench: Bench) -> dict[str, Any]:
 
 
 def gpu_tests(bench: Bench) -> dict[str, Any]:
-    """``pytest -m gpu``: how many passed, failed and were skipped; as far as it came where its time was up."""
+    """Run ``pytest -m gpu``; return the numbers of passed, failed and skipped tests, partial at the deadline."""
     if importlib.util.find_spec("pytest") is None:
         return {"skipped": "pytest is not installed here"}
-    # Warnings of other versions of packages than the pinned ones are no failures here; -v names each test as it ends.
+    # Warnings of package versions other than the pinned ones are not failures; -v prints each test as it ends.
     command = [sys.executable, "-m", "pytest", "-W", "default", "-m", "gpu", "-q" if bench.dry else "-v"]
     if importlib.util.find_spec("pytest_timeout") is None:
-        command += ["-o", "addopts=-ra --import-mode=importlib"]  # the project's name an option of it
+        command += ["-o", "addopts=-ra --import-mode=importlib"]  # an option with the project's name
     command += ["--collect-only"] if bench.dry else []
-    # where they are: other folders need other packages
+    # only these folders: others need more packages
     command += ["tests/gpu", *([] if bench.dry else ["tests/render"])]
     path = {"PYTHONPATH": f"{ROOT / 'src'}:{ROOT}"}
     done = run_program(command, seconds=bench.seconds_left(1500), environment=path)
@@ -247,7 +249,7 @@ def gpu_tests(bench: Bench) -> dict[str, Any]:
 
 
 def sanitize(bench: Bench, tool: str) -> dict[str, Any]:
-    """Every kernel once under a tool of compute-sanitizer, without torch's cache of memory, which would hide faults."""
+    """Run every kernel once under a compute-sanitizer tool, without torch's caching allocator: it hides errors."""
     command = [sys.executable, "-m", "benchmarks.gpu", "exercise"]
     environment = {"PYTHONPATH": f"{ROOT / 'src'}:{ROOT}", "PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
     if bench.dry:
@@ -268,14 +270,14 @@ def sanitize(bench: Bench, tool: str) -> dict[str, Any]:
 
 
 def sanitizer() -> str | None:
-    """The path of compute-sanitizer: on the PATH, or in the folder of a toolkit."""
+    """Return the path of compute-sanitizer: from the PATH, or from a toolkit folder."""
     homes = [os.environ[name] for name in ("CUDA_HOME", "CUDA_PATH") if os.environ.get(name)] + ["/usr/local/cuda"]
     folders = [str(Path(home) / part) for home in homes for part in ("bin", "compute-sanitizer")]
     return shutil.which("compute-sanitizer") or shutil.which("compute-sanitizer", path=os.pathsep.join(folders))
 
 
 def table(found: dict[str, Any]) -> list[str]:
-    """A few lines for people."""
+    """Return a short table."""
     images = found.get("parity", {}).get("images", {})
     lines = [
         f"{name}: median {row['median']:.1e}, q99.9 {row['q999']:.1e}, flipped {row['flipped']:.1e}"

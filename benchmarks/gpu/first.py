@@ -1,8 +1,8 @@
-"""Part 0, three minutes before everything else: is it right, and where does the time go.
+"""Part 0, a three-minute check: are the kernels correct, and where is the time spent.
 
-In the order of what one must know first: what the machine lacks; the first kernel that fails, by name; whether images
-and gradients are the reference's; how long an iteration is, what of it the host needs and what share of it the GPU
-works; a trace of it.
+The parts run in order of importance: missing requirements of the machine; the name of the first failing kernel; parity
+of images and gradients with the reference; milliseconds of an iteration with its host time and GPU utilisation; and a
+trace.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ITERATIONS, WARMUP, TRACED = 200, 16, 5
 
 
 def run(bench: Bench, only: list[str], progress: Any) -> dict[str, Any]:
-    """All parts; ``progress`` gets the results so far after each."""
+    """Run all parts; ``progress`` gets the results after each."""
     sizes = TOY if bench.dry else FIRST
     parts: dict[str, Any] = {
         "machine": machine,
@@ -41,7 +41,7 @@ def run(bench: Bench, only: list[str], progress: Any) -> dict[str, Any]:
 
 
 def machine() -> dict[str, Any]:
-    """What the backend needs of this machine, as found: needs no command line and no package of one."""
+    """Report the backend's requirements on this machine, without importing the command line or its packages."""
     facts = diagnose.gather()
     lacking = diagnose.missing(facts)
     found = {name: value if isinstance(value, bool | int) else str(value) for name, value in vars(facts).items()}
@@ -55,7 +55,7 @@ def machine() -> dict[str, Any]:
 
 
 def exercise(bench: Bench) -> dict[str, Any]:
-    """Every kernel once, each waited for: a fault is then said at the launch that made it, with the kernel's name."""
+    """Run every kernel once and wait for each, so that an error names the kernel that caused it."""
     command = [sys.executable, "-m", "benchmarks.gpu", "exercise", *(["--dry-run"] if bench.dry else [])]
     environment = {"PYTHONPATH": f"{ROOT / 'src'}:{ROOT}", "CUDA_LAUNCH_BLOCKING": "1"}
     done = run_program(command, seconds=bench.seconds_left(200 if bench.dry else 60), environment=environment)
@@ -63,7 +63,7 @@ def exercise(bench: Bench) -> dict[str, Any]:
 
 
 def speed(bench: Bench, count: int, width: int, height: int) -> dict[str, Any]:
-    """By stage: milliseconds of an iteration, of the host in it, share of the time that the GPU works, and a trace."""
+    """Measure by stage: milliseconds of an iteration, host time, GPU utilisation, and a trace."""
     scene = gpu_scene(count, width, height, "A", bench.device)
     trainer = bench_trainer(bench, scene)
     found: dict[str, Any] = {}
@@ -79,7 +79,7 @@ def speed(bench: Bench, count: int, width: int, height: int) -> dict[str, Any]:
 
 
 def timed(bench: Bench, trainer: Any, repeats: int) -> dict[str, float]:
-    """Of all iterations together, and of the calls alone, which wait for the number of pairs of the one before."""
+    """Time all iterations together, and the calls alone; each call waits for the previous number of pairs."""
     bench.wait()
     begun, cpu = time.perf_counter(), time.thread_time()
     for _ in range(repeats):
@@ -92,7 +92,7 @@ def timed(bench: Bench, trainer: Any, repeats: int) -> dict[str, float]:
 
 
 def traced(bench: Bench, trainer: Any, name: str) -> dict[str, Any]:
-    """Five iterations under torch's profiler: the share of them in which a kernel runs; the trace, gzipped."""
+    """Profile five iterations with torch; return the GPU-busy share of time, and write the gzipped trace."""
     activities = [torch.profiler.ProfilerActivity.CPU]
     activities += [] if bench.dry else [torch.profiler.ProfilerActivity.CUDA]
     with torch.profiler.profile(activities=activities) as profile:
@@ -115,7 +115,7 @@ def traced(bench: Bench, trainer: Any, name: str) -> dict[str, Any]:
 
 
 def busy_fraction(spans: list[tuple[float, float]]) -> float | None:
-    """The share of the time from the first to the last in which at least one runs; None without any."""
+    """Return the share of the total time range covered by at least one interval; None without intervals."""
     if not spans:
         return None
     covered, reached = 0.0, min(start for start, _ in spans)
@@ -127,12 +127,12 @@ def busy_fraction(spans: list[tuple[float, float]]) -> float | None:
 
 
 def wrong(found: dict[str, Any]) -> bool:
-    """Whether a kernel failed, or a part could not be done."""
+    """Return True if a kernel failed or a part could not run."""
     return correctness.wrong({name: part for name, part in found.items() if isinstance(part, dict)})
 
 
 def table(found: dict[str, Any]) -> list[str]:
-    """A few lines for people."""
+    """Return a short table."""
     lines = [f"missing: {found.get('machine', {}).get('missing')}", f"exercise: {found.get('exercise')}"]
     images = found.get("parity", {}).get("images", {})
     lines += [f"{name}: median {row['median']:.1e}, flipped {row['flipped']:.1e}" for name, row in images.items()]

@@ -1,7 +1,7 @@
-"""What an iteration costs the host: its time with kernels that do nothing, and what it gives the device to do.
+"""Measure the host cost of an iteration with kernels that do nothing, and count its device operations.
 
-Needs no GPU: tensors lie in host memory and are so few that torch's work on them is its overhead. Kernels go the whole
-way to the driver, which does nothing. What a GPU adds is the driver's own time for a launch.
+Needs no GPU. Tensors are in host memory and so small that torch's time is its overhead. Kernel launches run the full
+path to a driver that does nothing. A real GPU adds the driver's own time per launch.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ SOURCES = tuple(
     for name in "sort project emit order blend photometric losses blend_vjp blend_colors project_vjp adam".split()
 )
 SPLATS, WIDTH, HEIGHT = 256, 64, 48
-# Of torch on a GPU: what makes or looks at a tensor launches nothing, a sort by radix launches one kernel a pass of
-# 8 bits and five more (indices, histogram, offsets, two copies), everything else one.
+# torch on a GPU: creating or viewing a tensor launches nothing; a radix sort launches one kernel per pass of
+# 8 bits and five more (indices, histogram, offsets, two copies); every other operation launches one.
 MADE = ("empty", "new_empty", "empty_like", "empty_strided")
 LOOKED_AT = frozenset(
     "view slice select detach alias as_strided expand unsqueeze squeeze permute transpose t _unsafe_view "
@@ -53,7 +53,7 @@ LOOKED_AT = frozenset(
 
 
 class NullDriver:
-    """The functions of ``cuda.bindings.driver`` that a launch calls; nothing happens."""
+    """Stand-in for the functions of ``cuda.bindings.driver`` that a launch calls; nothing is executed."""
 
     CUresult = SimpleNamespace(CUDA_SUCCESS=0)
     CUfunction_attribute = SimpleNamespace(CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES=8)
@@ -62,8 +62,8 @@ class NullDriver:
 
     def __init__(self) -> None:
         self.launches = 0
-        self.nodes = 0  # of graphs, changed before they were started
-        self.kernels: dict[int, int] = {}  # of a graph
+        self.nodes = 0  # graph nodes that were updated before the launch
+        self.kernels: dict[int, int] = {}  # nodes of a graph
 
     def cuDriverGetVersion(self) -> tuple[int, int]:
         return 0, 13000
@@ -96,7 +96,7 @@ class NullDriver:
 
 
 class OperationCount(TorchDispatchMode):
-    """Counts torch's operations by name, and what a GPU would launch for them."""
+    """Count torch's operations by name, and the launches they would cause on a GPU."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -108,7 +108,7 @@ class OperationCount(TorchDispatchMode):
         self.names[name] += 1
         if name in ("sort", "argsort"):
             self.launches += 5 + args[0].element_size()
-        elif name not in LOOKED_AT and name not in MADE and name != "randperm":  # that is the host's
+        elif name not in LOOKED_AT and name not in MADE and name != "randperm":  # host operations
             self.launches += 1
         return func(*args, **(kwargs or {}))
 
@@ -121,7 +121,7 @@ def _nothing_overflowed(budget: pair_budget.PairBudget) -> bool:
 
 @contextmanager
 def nothing_runs() -> Iterator[NullDriver]:
-    """The cuda backend in host memory, over a driver that does nothing; numbers of pairs are not looked at."""
+    """Yield the cuda backend in host memory with a driver that does nothing; pair counts are not checked."""
     driver = NullDriver()
     launcher = launch.GpuLauncher(
         torch.device("cuda", 0),
@@ -136,7 +136,7 @@ def nothing_runs() -> Iterator[NullDriver]:
         (trainer, "is_async", lambda device: True),
         (objective, "is_async", lambda device: True),
         (targets, "is_async", lambda device: True),
-        (trainer, "validate", lambda recipe: recipe),  # the row group that stage 2 learns is made, not ranked
+        (trainer, "validate", lambda recipe: recipe),  # the row group of stage 2 is created without ranking
         (budget, "room", lambda self, rendering: 1 << 10),
         (budget, "overflowed", _nothing_overflowed),
     ]
@@ -151,7 +151,9 @@ def nothing_runs() -> Iterator[NullDriver]:
 
 
 def null_trainer() -> Trainer:
-    """All three stages of 2DGS-R, then that of ``best``, on a few splats: nothing is densified, no Progress comes."""
+    """Return a trainer of the 2DGS-R stages and the stage of ``best`` on a few splats, without densification or
+    Progress.
+    """
     splats = room(SPLATS)
     rng = np.random.default_rng(0)
     images = (rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8) for _ in PLACES)
@@ -177,7 +179,7 @@ def null_trainer() -> Trainer:
 
 @contextmanager
 def iterations_by(way: str) -> Iterator[None]:
-    """Iterations of a training through torch ("torch"), by "launches", by "graph", or as it is set ("")."""
+    """Run iterations through torch ("torch"), by "launches", by "graph", or as configured ("")."""
     before, takes = os.environ.get(launch.STEP_VARIABLE), CudaBackend.takes_whole_steps
     if way == "torch":
         CudaBackend.takes_whole_steps = lambda self: False  # type: ignore[method-assign]
@@ -194,9 +196,9 @@ def iterations_by(way: str) -> Iterator[None]:
 
 
 def host_cost(repeats: int = 300, stages: int = 4, way: str = "") -> dict[str, Any]:
-    """By stage: microseconds of the host an iteration, its launches, torch operations and allocations.
+    """Measure by stage: host microseconds per iteration, launches, torch operations and allocations.
 
-    ``way`` is that of :func:`iterations_by`.
+    ``way`` is as in :func:`iterations_by`.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -215,7 +217,7 @@ def host_cost(repeats: int = 300, stages: int = 4, way: str = "") -> dict[str, A
 
 
 def machine_code(arch: str = "sm_90") -> dict[str, Any]:
-    """By kernel of an iteration: registers, shared memory, instructions and accesses; empty without a compiler here."""
+    """Return registers, shared memory, instructions and accesses of each iteration kernel; empty without a compiler."""
     try:
         code = {name: compile_source(name, arch) for name in SOURCES}
         kernels = {name: listing(made.code) for name, made in code.items()}
@@ -235,7 +237,7 @@ def machine_code(arch: str = "sm_90") -> dict[str, Any]:
 
 
 def _time(made: Trainer, repeats: int) -> dict[str, float]:
-    """Of the thread, not of the clock: what others do on this machine does not count."""
+    """Time the thread, not the wall clock, so that other processes do not count."""
     times = []
     for _ in range(repeats):
         begun = time.thread_time_ns()
@@ -245,7 +247,7 @@ def _time(made: Trainer, repeats: int) -> dict[str, float]:
 
 
 def _count(made: Trainer, driver: NullDriver) -> dict[str, int]:
-    """Of one iteration."""
+    """Count the operations of one iteration."""
     driver.launches = driver.nodes = 0
     with OperationCount() as count:
         made.step()
@@ -260,5 +262,5 @@ def _count(made: Trainer, driver: NullDriver) -> dict[str, int]:
 
 
 def table(found: dict[str, Any]) -> list[str]:
-    """A line for each stage."""
+    """Return a line per stage."""
     return [f"{stage}: " + ", ".join(f"{name} {value}" for name, value in row.items()) for stage, row in found.items()]

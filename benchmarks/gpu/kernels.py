@@ -1,4 +1,4 @@
-"""Command 2: the kernels alone against their floors, and whole iterations side by side with other rasterizers."""
+"""Command 1: measure the kernels against their lower bounds, and iterations next to other rasterizers."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer, TrainerOptions
 
 SETTINGS = RasterSettings()
-Parts = Iterator[tuple[str, Callable[[], dict[str, Any]]]]  # to be done in turn
+Parts = Iterator[tuple[str, Callable[[], dict[str, Any]]]]  # run in this order
 REPEATS, WARMUP = 50, 10
-# Counted for the design (not measured): milliseconds at the issue limit of an H200, scene A.
+# Computed for the design (not measured): milliseconds at the issue limit of an H200, scene A.
 FLOORS = {
     (1_000_000, 1600): {
         "project_splats": 0.08,
@@ -48,15 +48,15 @@ FLOORS = {
         "adam_step": 0.04,
     },
 }
-# Instructions of a warp for a visited splat, and for each half of the warp's pixels that it touches; counted in the
-# compiled code of the design's prototype.
+# Instructions of a warp per visited splat, and per touched half of the warp's pixels, counted in the
+# compiled code of the design prototype.
 INSTRUCTIONS = {"blend_forward": (20, 50), "blend_vjp": (108, 77)}
 
 
 def run(bench: Bench, only: list[str], progress: Any) -> dict[str, Any]:
-    """All scenes, then all scenes with the peers; ``progress`` gets the document so far after each part.
+    """Measure all scenes, then all scenes with other rasterizers; ``progress`` gets the document after each part.
 
-    A peer may compile for minutes, or leave an error behind after which nothing runs in this process: they come last.
+    Other rasterizers run last: they may compile for minutes, or cause an error that ends GPU work in this process.
     """
     sizes = [(*size, spread) for size in (TOY if bench.dry else SIZES) for spread in ("A" if bench.dry else "AB")]
     chosen = [size for size in sizes if not only or any(word in scene_name(*size) for word in only)]
@@ -66,11 +66,11 @@ def run(bench: Bench, only: list[str], progress: Any) -> dict[str, Any]:
         for size in chosen:
             result = found[scene_name(*size)]
             stopped = bench.attempt(kind.__name__, partial(_through, bench, kind(bench, *size, result), result, report))
-            if stopped:  # beside its parts: the scene could not be made, or there is no time for it
+            if stopped:  # a scene-level error: the scene could not be made, or no time was left
                 result[kind.__name__] = stopped
             report()
             if not bench.dry:
-                with suppress(RuntimeError):  # an error that a part has left behind
+                with suppress(RuntimeError):  # a pending error of an earlier part
                     torch.cuda.empty_cache()
     return found
 
@@ -88,7 +88,7 @@ def _scene(bench: Bench, count: int, width: int, height: int, spread: str) -> Gp
 
 
 def measure_scene(bench: Bench, count: int, width: int, height: int, spread: str, result: dict[str, Any]) -> Parts:
-    """Counts, kernels, passes, iterations of one scene."""
+    """Measure counts, kernels, passes and iterations of one scene."""
     scene = _scene(bench, count, width, height, spread)
     yield "counts", lambda: counts(bench, scene)
     yield "kernels_ms", lambda: kernels(bench, scene)
@@ -102,7 +102,7 @@ def measure_scene(bench: Bench, count: int, width: int, height: int, spread: str
 
 
 def measure_peers(bench: Bench, count: int, width: int, height: int, spread: str, result: dict[str, Any]) -> Parts:
-    """Other rasterizers on one scene, with an iteration of ours measured again beside them."""
+    """Measure other rasterizers on one scene, and repeat one of our iterations next to them."""
     if not any(installed(name) for name in PEERS):
         yield from ((name, lambda name=name: peer(bench, None, [], name)) for name in PEERS)
         return
@@ -118,15 +118,15 @@ def measure_peers(bench: Bench, count: int, width: int, height: int, spread: str
 
 
 def parameters(scene: GpuScene) -> list[Tensor]:
-    """As the passes take them."""
+    """Return the parameters in the form that the passes take."""
     return [tensor.detach().contiguous() for _, tensor in scene.splats.items()]
 
 
 def counts(bench: Bench, scene: GpuScene) -> dict[str, Any]:
-    """Work of one view, and the instructions that the design counts for it."""
+    """Count the work of one view, and the instructions that the design computes for it."""
     frame = cuda_passes.forward(bench.launcher, cuda_passes.view_of(scene.cameras[0], SETTINGS), parameters(scene))
     seen = frame.seen.cpu().numpy().view(np.uint32)  # [words, 8]
-    below = [(warp >> 1) * 4 + (warp & 1) for warp in range(4)]  # the upper half of a warp; the lower is two further
+    below = [(warp >> 1) * 4 + (warp & 1) for warp in range(4)]  # upper half of a warp; the lower half is two further
     visits = sum(_bits(seen[:, b] | seen[:, b + 2]) for b in below)
     halves = _bits(seen)
     drawn = int((frame.radii > 0).sum())
@@ -141,12 +141,12 @@ def counts(bench: Bench, scene: GpuScene) -> dict[str, Any]:
 
 
 def _bits(words: np.ndarray) -> int:
-    """How many are set (numpy has a function for it from 2.0 on)."""
+    """Return the number of set bits (numpy has a function for this only from 2.0 on)."""
     return int(np.unpackbits(np.ascontiguousarray(words).view(np.uint8)).sum(dtype=np.int64))
 
 
 def kernels(bench: Bench, scene: GpuScene) -> dict[str, float]:
-    """Median time of each kernel, each between two events, over the views; all images have gradients but distortion."""
+    """Return the median time per kernel over the views, from events; all images except distortion have gradients."""
     timing = TimingLauncher(bench.launcher, bench.dry)
     repeats, warmup = (2, 0) if bench.dry else (REPEATS, WARMUP)
     leaves = Splats(**{name: tensor.detach().requires_grad_() for name, tensor in scene.splats.items()})
@@ -163,7 +163,7 @@ def kernels(bench: Bench, scene: GpuScene) -> dict[str, float]:
 
 
 def passes(bench: Bench, scene: GpuScene) -> dict[str, Any]:
-    """Forward alone, and forward with backward, of the public function; and what they keep in memory."""
+    """Time the public function: forward alone, and forward with backward; and its memory."""
     leaves = Splats(**{name: tensor.detach().requires_grad_() for name, tensor in scene.splats.items()})
 
     def forward(i: int) -> None:
@@ -184,7 +184,7 @@ def passes(bench: Bench, scene: GpuScene) -> dict[str, Any]:
 
 
 def sorts(bench: Bench, scene: GpuScene) -> dict[str, Any]:
-    """torch.sort as the passes call it, at this scene's sizes."""
+    """Time torch.sort with the arguments and sizes of the passes on this scene."""
     frame = cuda_passes.forward(bench.launcher, cuda_passes.view_of(scene.cameras[0], SETTINGS), parameters(scene))
     count, entries = len(scene.splats), max(len(frame.entries), 1)
     depth = torch.randint(0, 1 << 30, (count,), dtype=torch.int32, device=bench.device)
@@ -197,7 +197,7 @@ def sorts(bench: Bench, scene: GpuScene) -> dict[str, Any]:
 
 
 def images(bench: Bench, scene: GpuScene) -> list[Tensor]:
-    """Targets [H, W, 3] of the cameras, in [0, 1]."""
+    """Return target images [H, W, 3] of the cameras, in [0, 1]."""
     with torch.no_grad():
         return [
             cuda.rasterize_with(bench.launcher, scene.splats, camera, SETTINGS).color.clamp(0, 1)
@@ -206,7 +206,7 @@ def images(bench: Bench, scene: GpuScene) -> list[Tensor]:
 
 
 def disturbed(splats: Splats) -> Splats:
-    """The same with other colours, so that there is something to learn."""
+    """Return the splats with other colours, so that there is something to learn."""
     start = splats.clone()
     noise = torch.randn(start.sh0.shape, generator=torch.Generator().manual_seed(2))
     start.sh0 += 0.2 * noise.to(start.sh0)
@@ -214,13 +214,13 @@ def disturbed(splats: Splats) -> Splats:
 
 
 def iterations(bench: Bench, scene: GpuScene, targets: list[Tensor], *, stages: int = 3) -> dict[str, Any]:
-    """Whole iterations of the trainer in the stages of 2DGS-R, with all losses; nothing is densified."""
+    """Time whole trainer iterations in the stages of 2DGS-R with all losses, without densification."""
     trainer = bench_trainer(bench, scene, targets, stages=stages)
     found: dict[str, Any] = {}
     for index, stage in enumerate(trainer.recipe.stages):
         trainer.enter(index)
         for _ in scene.cameras:
-            trainer.step()  # every photograph is taken in
+            trainer.step()  # every training image has been loaded
         found[stage.name] = bench.times(lambda _: trainer.step(), repeats=REPEATS, warmup=WARMUP)
         found[f"{stage.name}_peak_bytes"] = bench.peak_memory(trainer.step)
         found[f"{stage.name}_kernels_ms"] = _in_iterations(bench, trainer)
@@ -228,7 +228,7 @@ def iterations(bench: Bench, scene: GpuScene, targets: list[Tensor], *, stages: 
 
 
 def bench_trainer(bench: Bench, scene: GpuScene, targets: list[Tensor] | None = None, *, stages: int = 3) -> Trainer:
-    """A trainer of the stages of 2DGS-R that learns back pictures of the splats; all iterations do the same work."""
+    """Return a 2DGS-R trainer that fits renderings of the splats; all iterations do the same work."""
     targets = images(bench, scene) if targets is None else targets
     views = tuple(
         View.from_arrays(f"{i}.png", camera, (target * 255).round().byte().cpu().numpy())
@@ -246,8 +246,8 @@ def bench_trainer(bench: Bench, scene: GpuScene, targets: list[Tensor] | None = 
 
 
 def _in_iterations(bench: Bench, trainer: Trainer) -> dict[str, float]:
-    """Milliseconds of each kernel of the trainer's iterations, losses and Adam too."""
-    if not bench.dry:  # they are started as graphs, past any launcher
+    """Return the milliseconds per kernel in the trainer's iterations, including losses and Adam."""
+    if not bench.dry:  # graph launches bypass the launcher
         return {name: value / 1e3 for name, value in kernel_times(bench, trainer.step, WARMUP).items()}
     timing = TimingLauncher(bench.launcher, bench.dry)
     with bench.replaced(timing):
@@ -256,7 +256,7 @@ def _in_iterations(bench: Bench, trainer: Trainer) -> dict[str, float]:
 
 
 def installed(name: str) -> bool:
-    """Whether a peer can be imported."""
+    """Return True if the package can be imported."""
     try:
         PEERS[name]()
     except BackendError:
@@ -265,7 +265,7 @@ def installed(name: str) -> bool:
 
 
 def peer(bench: Bench, scene: GpuScene | None, targets: list[Tensor], name: str) -> dict[str, Any]:
-    """The same splats and views with another rasterizer."""
+    """Render the same splats and views with another rasterizer."""
     found = PEERS[name]()
     if bench.dry or scene is None:
         return {"skipped": "peers need a GPU"}
@@ -297,13 +297,13 @@ def peer(bench: Bench, scene: GpuScene | None, targets: list[Tensor], name: str)
 
 
 def table(found: dict[str, Any]) -> list[str]:
-    """A few lines for people."""
+    """Return a short table."""
     lines = []
     for name, scene in found.items():
         iteration = scene.get("iteration", {}).get("surface", {})
         times = {name: time for name, time in scene.get("kernels_ms", {}).items() if isinstance(time, float)}
         slow = sorted(times.items(), key=lambda item: -item[1])[:3]
-        why = {p: next(iter(scene.get(p, {}).values()), "?") for p in PEERS}  # what stopped it
+        why = {p: next(iter(scene.get(p, {}).values()), "?") for p in PEERS}  # the error
         peers = ", ".join(f"{p}: {scene.get(f'times_faster_than_{p}', why[p])}" for p in PEERS)
         lines.append(f"{name}: iteration {iteration.get('median', '?')} ms; {dict(slow)}; times faster than {peers}")
     return lines

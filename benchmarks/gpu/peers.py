@@ -1,4 +1,4 @@
-"""Other 2DGS rasterizers on the same splats, cameras and losses, where installed; none of their code is here."""
+"""Adapters for other installed 2DGS rasterizers, for the same splats, cameras and losses; has no code of theirs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NEAR, FAR = 0.2, 100.0
 
 @dataclass(frozen=True, eq=False)
 class PeerImages:
-    """What a peer renders: colour [H, W, 3]; normal and its depth's normal [H, W, 3] in one frame; alpha [H, W]."""
+    """Rendered images: colour [H, W, 3]; normal and depth normal [H, W, 3] in one frame; alpha [H, W]."""
 
     color: Tensor
     normal: Tensor
@@ -32,7 +32,7 @@ class PeerImages:
 
 @dataclass(frozen=True, eq=False)
 class Peer:
-    """A rasterizer: from activated parameters and a camera to images."""
+    """Rasterizer: maps activated parameters and a camera to images."""
 
     name: str
     version: str
@@ -40,7 +40,7 @@ class Peer:
 
 
 def activated(leaves: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Parameters as peers take them: normalised, exponentiated, squashed, SH in one tensor."""
+    """Return activated parameters: normalised rotations, exponentiated scales, sigmoid opacities, SH in one tensor."""
     scales = leaves["log_scales"].exp()
     return {
         "means": leaves["means"],
@@ -59,7 +59,7 @@ def _module(name: str) -> Any:
 
 
 class _Kept:
-    """What a peer needs of a camera, made when it is first seen: their trainers too hold cameras on the device."""
+    """Cache of per-camera data on the device, filled on first use: other trainers also keep cameras on the device."""
 
     def __init__(self, make: Callable[[Camera, torch.device], Any]) -> None:
         self._make = make
@@ -68,7 +68,7 @@ class _Kept:
     def of(self, camera: Camera, device: torch.device) -> Any:
         key = (id(camera), device)
         if key not in self._made:
-            self._made[key] = camera, self._make(camera, device)  # the camera too, so that no other gets its id
+            self._made[key] = camera, self._make(camera, device)  # keep the camera too, so that its id is not reused
         return self._made[key][1]
 
 
@@ -77,19 +77,21 @@ def _pose(camera: Camera, device: torch.device) -> Tensor:
 
 
 def build_gsplat() -> None:
-    """Let gsplat compile its kernels for this GPU alone, as its wheel does when it is first used: minutes."""
+    """Compile gsplat's kernels for this GPU only; its wheel does this on first use and takes minutes."""
     major, minor = torch.cuda.get_device_capability()
-    os.environ.setdefault("TORCH_CUDA_ARCH_LIST", f"{major}.{minor}")  # all it knows would take three times as long
+    os.environ.setdefault(
+        "TORCH_CUDA_ARCH_LIST", f"{major}.{minor}"
+    )  # all architectures would take three times as long
     _module("gsplat.cuda._backend")
 
 
 def gsplat() -> Peer:
-    """gsplat's 2DGS, of versions 1.4 to 1.6.
+    """Return gsplat's 2DGS rasterizer, versions 1.4 to 1.6.
 
     Raises
     ------
     BackendError
-        It is not installed, or has no 2DGS.
+        If gsplat is not installed or has no 2DGS.
     """
     module = _module("gsplat")
     if torch.cuda.is_available():
@@ -128,12 +130,12 @@ def gsplat() -> Peer:
 
 
 def official() -> Peer:
-    """The official 2DGS rasterizer (non-commercial licence: only to compare with, where the user has built it).
+    """Return the official 2DGS rasterizer (non-commercial licence: for comparison only, built by the user).
 
     Raises
     ------
     BackendError
-        It is not installed.
+        If it is not installed.
     """
     module = _module("diff_surfel_rasterization")
 
@@ -184,10 +186,9 @@ PEERS: dict[str, Callable[[], Peer]] = {"gsplat": gsplat, "official": official}
 
 
 class PeerIteration:
-    """A training iteration around a peer's rasterizer: activations, losses in torch, backward, torch's fused Adam.
+    """Training iteration around another rasterizer: activations, torch losses, backward, torch's fused Adam.
 
-    The fused SSIM of the package ``fused_ssim`` is used where it is installed, as these trainers do; else the SSIM of
-    the reference losses.
+    Uses the fused SSIM of the package ``fused_ssim`` if installed, as these trainers do; otherwise the reference SSIM.
     """
 
     def __init__(self, peer: Peer, splats: Splats, targets: list[Tensor]) -> None:
@@ -202,11 +203,11 @@ class PeerIteration:
         self.ssim = "reference losses, torch" if self._fused_ssim is None else "fused_ssim"
 
     def forward(self, camera: Camera) -> PeerImages:
-        """Images with their graph."""
+        """Render images with their graph."""
         return self._peer.render(activated(self.leaves), camera)
 
     def loss(self, images: PeerImages, index: int) -> Tensor:
-        """0.8 L1 + 0.2 (1 - SSIM) + 0.05 normal consistency."""
+        """Return 0.8 L1 + 0.2 (1 - SSIM) + 0.05 normal consistency."""
         target = self._targets[index]
         if self._fused_ssim is None:
             ssim = losses_reference.ssim(images.color, target)
@@ -217,7 +218,7 @@ class PeerIteration:
         return 0.8 * l1 + 0.2 * (1 - ssim) + 0.05 * (1 - agreement).mean()
 
     def step(self, camera: Camera, index: int) -> None:
-        """One iteration."""
+        """Run one iteration."""
         self._adam.zero_grad(set_to_none=True)
         self.loss(self.forward(camera), index).backward()
         self._adam.step()

@@ -1,4 +1,4 @@
-"""Ceilings of this GPU: instructions a second by kind, additions to memory, copying."""
+"""Measure ceilings of this GPU: instruction rates by kind, atomic additions, copying."""
 
 from __future__ import annotations
 
@@ -15,7 +15,13 @@ from gs2d.kernels.cuda.launch import GpuLauncher
 SOURCE = Path(__file__).with_name("probes.cu")
 CHAINS, THREADS = 16, 128
 LINES = 1 << 20
-REDS = ((1, 1), (16, 1), (32, 1), (32, 0), (16, 0))  # lanes, floats between their addresses (0: one address)
+REDS = (
+    (1, 1),
+    (16, 1),
+    (32, 1),
+    (32, 0),
+    (16, 0),
+)  # lanes, address stride in floats (0: one address)
 
 
 class _Arguments(ctypes.Structure):
@@ -28,7 +34,7 @@ class _Arguments(ctypes.Structure):
 
 
 def ceilings(bench: Bench) -> dict[str, Any]:
-    """Warp instructions a second (1e12), additions to memory a second (1e9 warps), bytes copied a second (1e12)."""
+    """Return warp instructions (1e12/s), atomic additions to memory (1e9 warps/s) and copy bandwidth (1e12 B/s)."""
     if bench.dry:
         return {"skipped": "the probes need a GPU"}
     text = SOURCE.read_text()

@@ -1,7 +1,7 @@
-"""Where iterations of real trainings spend their time: made scenes have short lists in all tiles, photographs do not.
+"""Profile iterations of trainings on real captures, whose tile lists are less uniform than those of synthetic scenes.
 
-A capture is trained by a recipe; at some parts of its schedule: milliseconds of an iteration and of the host in it,
-microseconds of each kernel, and how long the lists of tiles are.
+Trains a capture with a recipe. At several points of the schedule, measures milliseconds of an iteration and of the
+host, microseconds per kernel, and tile list lengths.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from gs2d.data import load_scene
 from gs2d.render import cuda_passes
 from gs2d.training.trainer import Trainer, TrainerOptions
 
-PARTS = (0.1, 0.5, 0.9)  # of the schedule
+PARTS = (0.1, 0.5, 0.9)  # fractions of the schedule
 MEASURED = 100  # iterations
 
 
 def run(bench: Bench, captures: list[Path], recipe: str, scale: float, downscale: int, progress: Any) -> dict[str, Any]:
-    """Every capture; ``progress`` gets the document so far after each part of each."""
+    """Measure every capture; ``progress`` gets the document after each part."""
     found: dict[str, Any] = {}
     for capture in captures:
         rows: dict[str, Any] = found.setdefault(capture.resolve().name, {})
@@ -42,7 +42,7 @@ def run(bench: Bench, captures: list[Path], recipe: str, scale: float, downscale
 def of_capture(
     bench: Bench, capture: Path, asked: tuple[str, float, int], rows: dict[str, Any], told: Any
 ) -> dict[str, Any]:
-    """Train the recipe's first stage, and look at it on the way."""
+    """Train the recipe's first stage and measure at several points."""
     (recipe, scale, downscale), begun = asked, time.perf_counter()
     scene = load_scene(capture, downscale=downscale)
     steps = scale_schedule(get_recipe(recipe), scale)
@@ -70,7 +70,7 @@ def of_capture(
 
 
 def lists(bench: Bench, trainer: Trainer) -> dict[str, Any]:
-    """How many pairs some views have, and how long the lists of tiles are."""
+    """Return pair counts and tile list lengths of some views."""
     pairs, longest, spread = [], [], []
     for view in trainer.scene.train[:: max(1, len(trainer.scene.train) // 4)]:
         parameters = [tensor.detach().contiguous() for _, tensor in trainer.splats.items()]
@@ -84,7 +84,7 @@ def lists(bench: Bench, trainer: Trainer) -> dict[str, Any]:
 
 
 def table(found: dict[str, Any]) -> list[str]:
-    """A line for each part of each capture."""
+    """Return a line per capture and point."""
     lines = []
     for name, rows in found.items():
         for part, row in rows.items():

@@ -1,7 +1,7 @@
-"""What the compiler makes of the kernels: registers, instructions, loops, and how wide memory is read and written.
+"""Disassemble the compiled kernels: registers, instructions, loops, and memory access widths.
 
-``python -m benchmarks.gpu.sass [--arch sm_90] [NAME ...]`` prints it for every kernel, or those whose names contain one
-of the words. Needs NVRTC and ``nvdisasm``, no GPU.
+``python -m benchmarks.gpu.sass [--arch sm_90] [NAME ...]`` prints a row per kernel, or only for kernels whose name
+contains one of the words. Needs NVRTC and ``nvdisasm``, but no GPU.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ GLOBAL = re.compile(r"^(LDG|STG|RED|ATOMG)\.")
 
 @dataclass(frozen=True)
 class Listing:
-    """The instructions of a kernel: what is executed, without the predicate, and the labels between them."""
+    """Instructions of a kernel, without predicates, and their labels."""
 
     instructions: tuple[str, ...]
-    labels: dict[str, int]  # the instruction that follows
+    labels: dict[str, int]  # index of the following instruction
 
     def loops(self) -> list[tuple[str, ...]]:
-        """The bodies that a branch goes back to."""
+        """Return the bodies of backward branches."""
         found = []
         for index, line in enumerate(self.instructions):
             target = re.search(r"`\((\.L_x_\d+)\)", line)
             if line.startswith("BRA") and target and self.labels[target[1]] <= index:
                 body = self.instructions[self.labels[target[1]] : index + 1]
-                if len(body) > 1:  # what follows the last instruction jumps to itself
+                if len(body) > 1:  # skip the final jump to itself
                     found.append(body)
         return found
 
     def accesses(self) -> dict[str, int]:
-        """Accesses to global memory by kind and width: ``{"LDG.128": 4, "STG.32": 3}``."""
+        """Count global memory accesses by kind and width: ``{"LDG.128": 4, "STG.32": 3}``."""
         found: Counter[str] = Counter()
         for line in self.instructions:
             if GLOBAL.match(line):
@@ -51,7 +51,7 @@ class Listing:
 
 
 def disassembler() -> str | None:
-    """``nvdisasm``, of a toolkit or of its wheel."""
+    """Return the path of ``nvdisasm``, from a toolkit or its wheel."""
     found = shutil.which("nvdisasm")
     if found:
         return found
@@ -60,12 +60,12 @@ def disassembler() -> str | None:
 
 
 def listing(code: bytes) -> dict[str, Listing]:
-    """The kernels of a cubin, by name.
+    """Return the kernels of a cubin by name.
 
     Raises
     ------
     FileNotFoundError
-        There is no ``nvdisasm`` here.
+        If ``nvdisasm`` is not installed.
     """
     program = disassembler()
     if program is None:
@@ -89,7 +89,7 @@ def listing(code: bytes) -> dict[str, Listing]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print a row for each kernel."""
+    """Print a row per kernel."""
     from gs2d.kernels.cuda.compile import compile_source, source_names
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

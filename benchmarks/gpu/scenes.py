@@ -1,4 +1,4 @@
-"""The scenes of the GPU measurements: two spheres, a floor and a wall, in the two spreads of the counted design."""
+"""Scenes of the GPU measurements: two spheres, a floor and a wall, with two distributions of scales."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from benchmarks.workload import PLACES, camera, room
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 
-# The largest of the usual ones first: it decides most, and time may be short.
+# The largest common scene first: it matters most, and time may run out.
 SIZES = ((1_000_000, 1600, 1060), (300_000, 800, 800), (100_000, 800, 800), (3_000_000, 1600, 1060))
-FIRST = ((300_000, 800, 800), (1_000_000, 1600, 1060))  # of part 0: an object, and a scene
+FIRST = ((300_000, 800, 800), (1_000_000, 1600, 1060))  # scenes of part 0: an object and a room
 TOY = ((60, 32, 16),)
 
 
 @dataclass(frozen=True, eq=False)
 class GpuScene:
-    """Splats on a device, and eight cameras so that the cache does not hold the inputs of the next repeat."""
+    """Splats on a device, and eight cameras, so that the cache does not hold the inputs of the next repeat."""
 
     name: str
     splats: Splats
@@ -26,7 +26,7 @@ class GpuScene:
 
 
 def gpu_scene(count: int, width: int, height: int, spread: str, device: torch.device) -> GpuScene:
-    """Scene A (scales spread by exp(0.4 N)) or B (more like a trained one: elongated, scales spread by exp(0.8 N))."""
+    """Return scene A (scales spread by exp(0.4 N)) or B (elongated as if trained, scales spread by exp(0.8 N))."""
     splats = room(count)
     if spread == "B":
         generator = torch.Generator().manual_seed(1)
@@ -39,5 +39,5 @@ def gpu_scene(count: int, width: int, height: int, spread: str, device: torch.de
 
 
 def scene_name(count: int, width: int, height: int, spread: str) -> str:
-    """For instance ``1000000-1600x1060-A``."""
+    """Return the scene name, for instance ``1000000-1600x1060-A``."""
     return f"{count}-{width}x{height}-{spread}"

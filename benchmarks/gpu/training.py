@@ -1,4 +1,4 @@
-"""Command 3: whole runs of 2DGS-R on the GPU, by the path that users take, with their metrics."""
+"""Command 2: train 2DGS-R on the GPU through the user-facing API, and report metrics."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gs2d.pipeline.prepare.options import TrainOptions
 from gs2d.pipeline.train.train_run import train
 from gs2d.training.events import Phase, StageScored
 
-RECIPE = "2dgs-r"  # the paper's, three stages; goals of seconds are its
+RECIPE = "2dgs-r"  # the paper's three stages; the time goals refer to it
 STAGE = ("name", "iterations", "seconds", "splats", "bytes", "train", "test", "after_clone")
 
 
@@ -29,7 +29,7 @@ def run(
     *,
     synthetic: bool = False,
 ) -> dict[str, Any]:
-    """Every capture, then a synthetic one; ``progress`` gets the document so far after each stage of each."""
+    """Train every capture, then a synthetic one; ``progress`` gets the document after each stage."""
     found: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) if out is None else out
@@ -53,7 +53,7 @@ def run(
 
 
 def toy_capture(folder: Path) -> Path:
-    """The tests' ball, 24 x 24 px."""
+    """Return the tests' ball capture, 24 x 24 px."""
     import sys
 
     sys.path.insert(0, str(ROOT / "tests" / "helpers"))
@@ -65,9 +65,9 @@ def toy_capture(folder: Path) -> Path:
 def whole_run(
     bench: Bench, capture: Path, scale: float, downscale: int, folder: Path, report: Any = lambda partial: None
 ) -> dict[str, Any]:
-    """Train to the end; seconds of each stage without loading and scoring, quality, memory, and all of it together.
+    """Train to the end; return stage times without loading and scoring, quality, memory, and the total time.
 
-    ``report`` gets the stages so far after each: a run that is cut off has told what it had.
+    ``report`` gets the stages after each, so that an interrupted run keeps its results.
     """
     overrides = ("init_points=60", "surface.densify.max_splats=90") if bench.dry else ()
     options = TrainOptions(
@@ -114,7 +114,7 @@ def whole_run(
 
 
 def table(found: dict[str, Any]) -> list[str]:
-    """A few lines for people."""
+    """Return a short table."""
     lines = []
     for name, row in found.items():
         if "stages" not in row:

@@ -1,4 +1,4 @@
-"""Iterations by kernels alone (``gs2d.render.cuda_step``): every kernel of theirs, and beside those through torch."""
+"""Check iterations by kernels alone (``gs2d.render.cuda_step``): run every kernel and compare with torch."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ROOM = 1 << 20  # pairs
 
 
 def run_kernels(bench: Bench, splats: Splats, camera: Camera) -> None:
-    """Photographs with and without alpha; more than 32767 tiles only on a GPU."""
+    """Train on images with and without alpha; more than 32767 tiles only on a GPU."""
     for channels in (3, 4):
         _step(bench, splats, camera, channels)
     if not bench.dry:
@@ -68,7 +68,7 @@ def _step(bench: Bench, splats: Splats, camera: Camera, channels: int) -> None:
 
 @contextmanager
 def _way(chosen: str, dry: bool) -> Iterator[None]:
-    """Iterations done in one way; with ``dry`` as on a device that nobody waits for."""
+    """Run iterations in one mode; with ``dry``, treat the emulated device as asynchronous."""
     asked = objective.is_async
     places: tuple[Any, ...] = (trainer, objective, targets)
     for place in places if dry else ():
@@ -82,7 +82,7 @@ def _way(chosen: str, dry: bool) -> Iterator[None]:
 
 
 def differences(bench: Bench) -> dict[str, Any]:
-    """A stage in each way: how far parameters are from those that went through torch, by norms of what they moved."""
+    """Compare the modes on a stage: parameter difference to the torch run, relative to the norm of the update."""
     import train_toys  # of tests/helpers
 
     recipe = train_toys.short()
