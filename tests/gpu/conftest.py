@@ -1,4 +1,4 @@
-"""Tests that need an NVIDIA GPU: all are marked ``gpu``, and skip with the reason where the backend cannot run."""
+"""Tests that need an NVIDIA GPU: all are marked ``gpu``, and skip with the reason if the backend cannot run."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gs2d.render.backends import Backend, get_backend
 
 @pytest.fixture(scope="session")
 def gpu() -> Backend:
-    """The cuda backend, or skip."""
+    """Return the cuda backend, or skip."""
     try:
         return get_backend("cuda")
     except BackendError as error:

@@ -1,4 +1,4 @@
-"""What only a GPU can show: streams, devices, waiting, memory, determinism, the emulator's word, training."""
+"""Tests that need a real GPU: streams, devices, synchronisation, memory, determinism, training."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
 
 
 def scene(count: int = 3000, size: tuple[int, int] = (150, 110), seed: int = 5) -> tuple[Splats, Camera]:
-    """Many tiles and layers, in host memory."""
+    """Return a scene with many tiles and layers, in host memory."""
     rng = np.random.default_rng(seed)
     camera = random_camera(rng).resized(*size)
     splats = random_splats(rng, camera, count)
@@ -40,7 +40,7 @@ def scene(count: int = 3000, size: tuple[int, int] = (150, 110), seed: int = 5) 
 
 
 def differentiate(splats: Splats, camera: Camera, device: torch.device) -> tuple[RenderOutput, dict[str, Tensor]]:
-    """Images, and the gradients of everything under fixed cotangents."""
+    """Return images, and gradients of all parameters for fixed cotangents."""
     leaves = Splats(**{k: t.detach().to(device).requires_grad_() for k, t in splats.items()})
     probe = torch.zeros(len(splats), 4, device=device, requires_grad=True)
     output = rasterize(leaves, camera, SETTINGS, backend="cuda", screen_probe=probe)
@@ -68,7 +68,7 @@ def test_every_kernel_loads(gpu: Backend) -> None:
 
 
 def test_the_gpu_gives_what_the_emulator_gives(gpu: Backend) -> None:
-    """The same sources: images differ by approximate instructions and flipped decisions only."""
+    """Images differ only by approximate instructions and flipped decisions."""
     splats, camera = scene(300, (70, 45))
     low = cuda.rasterize_with(Emulator(), splats, camera, SETTINGS)
     high = rasterize(splats.to("cuda"), camera, SETTINGS, backend="cuda")
@@ -107,7 +107,7 @@ def test_deterministic_gradients_are_the_same_bits_each_time(gpu: Backend) -> No
 
 
 def test_ptx_for_devices_to_come_is_translated_by_the_driver(gpu: Backend) -> None:
-    """Of a device that NVRTC does not know; here the device is known, and gives the same image to rounding."""
+    """Simulates a device unknown to NVRTC; images must agree up to rounding."""
     splats, camera = scene()
     device = torch.device("cuda", torch.cuda.current_device())
     valid = launch.launcher_for(device)
@@ -128,7 +128,7 @@ def test_ptx_for_devices_to_come_is_translated_by_the_driver(gpu: Backend) -> No
 
 
 def test_work_is_queued_on_the_current_stream(gpu: Backend) -> None:
-    """What an earlier operation of the stream writes, long after it was queued, is what the kernels read."""
+    """Kernels read data that an earlier, still queued operation of the same stream writes."""
     splats, camera = scene()
     there = splats.to("cuda")
     expected = rasterize(there, camera, SETTINGS, backend="cuda").color
@@ -177,7 +177,7 @@ def test_every_device_renders_its_own_tensors_whatever_is_current(gpu: Backend) 
 
 @contextmanager
 def no_waiting(allowed: int) -> Iterator[None]:
-    """Count what torch says makes the host wait."""
+    """Count the synchronising operations that torch reports."""
     torch.cuda.synchronize()
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -208,7 +208,7 @@ def test_an_iteration_waits_for_nothing_once_it_knows_how_many_pairs_to_expect(g
     )
     for index in range(stage + 1):
         trainer.enter(index)
-    for _ in range(8):  # every photograph is taken in
+    for _ in range(8):  # every image is uploaded
         trainer.step()
     with no_waiting(allowed=0):
         for _ in range(5):
@@ -261,7 +261,7 @@ def test_photographs_in_pinned_memory_are_those_on_the_device(gpu: Backend) -> N
 
 
 def test_peak_memory_is_bounded_by_what_is_documented(gpu: Backend) -> None:
-    """docs/kernels.md: some 1.2 kB a splat and 200 bytes a pixel beside parameters; here 20k splats at 400 x 400."""
+    """docs/kernels.md: 1.2 kB per splat and 200 bytes per pixel beside parameters; here 20k splats at 400 x 400."""
     splats, camera = scene(20_000, (400, 400))
     differentiate(splats, camera, torch.device("cuda"))
     torch.cuda.synchronize()

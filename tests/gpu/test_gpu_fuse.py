@@ -1,4 +1,4 @@
-"""Fusion on a GPU leaves the field of numpy: no operation of it is fused or approximate there either."""
+"""Fusion on a GPU equals numpy's field: it uses no fused or approximate operations."""
 
 from __future__ import annotations
 

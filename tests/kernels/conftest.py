@@ -1,4 +1,4 @@
-"""What the kernels' tests share: every library this machine can run, and the emulator of the CUDA kernels."""
+"""Fixtures of the kernel tests: every library this machine can run, and the CUDA emulator."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gs2d.kernels.library import Library, available_variants, load
 
 @pytest.fixture(params=["v4", "v3", "portable"])
 def native(request: pytest.FixtureRequest) -> Library:
-    """Each float32 library that this processor can run, on two threads."""
+    """Return each float32 library that this processor can run, with two threads."""
     if request.param not in available_variants():
         pytest.skip(f"this machine cannot run variant {request.param}, or the native library was not built")
     library = load(request.param)
@@ -21,7 +21,7 @@ def native(request: pytest.FixtureRequest) -> Library:
 
 @pytest.fixture
 def native64() -> Library:
-    """The float64 build of the same sources."""
+    """Return the float64 build of the same sources."""
     try:
         library = load("f64")
     except BackendError as error:
@@ -32,7 +32,7 @@ def native64() -> Library:
 
 @pytest.fixture(params=["v4", "v3", "portable", "f64"])
 def any_native(request: pytest.FixtureRequest) -> Library:
-    """Each library, the float64 one included."""
+    """Return each library, including the float64 one."""
     if request.param not in (*available_variants(), "f64"):
         pytest.skip(f"this machine cannot run variant {request.param}")
     try:
@@ -45,5 +45,5 @@ def any_native(request: pytest.FixtureRequest) -> Library:
 
 @pytest.fixture(scope="session")
 def emulator() -> emulate.Emulator:
-    """A launcher that runs the package's CUDA kernels on the CPU."""
+    """Return a launcher that runs the package's CUDA kernels on the CPU."""
     return emulate.Emulator()

@@ -1,4 +1,4 @@
-"""The native and the CUDA Adam (emulated) against torch's fused Adam: all rows, some rows, any number of threads."""
+"""Native and (emulated) CUDA Adam against torch's fused Adam: all rows, some rows, any thread count."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SHAPES = ((3,), (4,), (2,), (), (1, 3), (15, 3))
 
 
 def attribute(count: int, shape: tuple[int, ...], dtype: torch.dtype, seed: int = 0) -> AdamUpdate:
-    """Parameters of different sizes, moments of some steps, gradients with exact zeros."""
+    """Return parameters, moments after a few steps, and gradients with exact zeros."""
     g = torch.Generator().manual_seed(seed)
 
     def rand() -> Tensor:
@@ -38,7 +38,7 @@ def copied(update: AdamUpdate) -> AdamUpdate:
 
 
 def by_torch(update: AdamUpdate) -> AdamUpdate:
-    """The same step, of all rows."""
+    """Apply the same step to all rows with torch."""
     out = copied(update)
     lists = [[t] for t in (out.parameter, out.gradient, out.mean, out.square)]
     adam(
@@ -54,14 +54,14 @@ def equal(a: AdamUpdate, b: AdamUpdate) -> bool:
 
 @pytest.fixture(params=["native", "emulated"])
 def step(request: pytest.FixtureRequest) -> Callable[..., None]:
-    """A step on each device."""
+    """Return the step function of each device."""
     if request.param == "native":
         return partial(adam_step, **BETAS, library=load())
     return partial(cuda.adam_step, **BETAS, launcher=request.getfixturevalue("emulator"))
 
 
 def assert_torchs_step(step: Callable[..., None], count: int, dtype: torch.dtype = torch.float32) -> None:
-    """To the last digits: torch contracts differently from one processor to another."""
+    """Compare up to the last digits: torch contracts operations differently between processors."""
     updates = [attribute(count + (shape == ()), shape, dtype, seed=k) for k, shape in enumerate(SHAPES)]
     before, expected = [copied(u) for u in updates], [by_torch(u) for u in updates]
     step(updates)
@@ -74,7 +74,7 @@ def assert_torchs_step(step: Callable[..., None], count: int, dtype: torch.dtype
 
 
 def test_it_takes_torchs_fused_step(any_native: Library) -> None:
-    """1000 rows of 45 are several pieces of 8192 elements; 1001 of 1 end within a vector."""
+    """1000 rows of 45 are several chunks of 8192 elements; 1001 rows of 1 end within a vector."""
     assert_torchs_step(partial(adam_step, **BETAS, library=any_native), 1000, any_native.dtype)
 
 
@@ -142,7 +142,9 @@ def test_the_first_tensor_that_is_not_finite_is_found_wherever_it_is(any_native:
     for which, size in enumerate(sizes):
         for at in (0, size // 2, size - 1):
             tensors = [torch.full((n,), large, dtype=any_native.dtype) for n in sizes]
-            assert first_not_finite(tensors, library=any_native) is None  # their sum is not finite: each of them is
+            assert (
+                first_not_finite(tensors, library=any_native) is None
+            )  # the sum overflows although each element is finite
             tensors[which][at] = value
             tensors[-1][-1] = value
             assert first_not_finite(tensors, library=any_native) == which

@@ -1,4 +1,4 @@
-"""Memory of large tensors is used again, and only when nobody holds it."""
+"""Memory of large tensors is reused, but only when no tensor refers to it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_memory_comes_back_when_the_last_view_of_a_tensor_is_gone() -> None:
     assert tensor.shape == (10, 3)
     assert first % LINE == 0
     del tensor
-    assert pool.free_bytes == 0  # the row is still there
+    assert pool.free_bytes == 0  # the row still refers to it
     other = pool.empty((10, 3), FLOAT)
     assert other.data_ptr() != first
     del row

@@ -1,4 +1,4 @@
-"""Cached views: the same image and the same gradients as blending everything, for the splats whose colours learn."""
+"""Cached views give the same image and gradients as full blending, for splats whose colours are trained."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ COUNT, ROOM = 300, 1 << 30
 
 
 def make_splats(dtype: torch.dtype) -> Splats:
-    """300 splats in a ball; every tenth is so dark that its colour is clamped."""
+    """Return 300 splats in a ball; every tenth is so dark that its colour is clamped."""
     g = torch.Generator().manual_seed(4)
 
     def normal(*shape: int) -> Tensor:
@@ -37,7 +37,7 @@ def make_splats(dtype: torch.dtype) -> Splats:
 
 
 def camera(width: int = 53, height: int = 41) -> Camera:
-    """A camera whose image ends inside a tile on both sides."""
+    """Return a camera whose image ends inside a tile on both axes."""
     up = np.array([0.0, 0.0, 1.0])
     return look_at(np.array([3.0, 0.0, 1.0]), np.zeros(3), up, width=width, height=height, fx=50.0)
 
@@ -56,7 +56,7 @@ def cached_view(library: Library, splats: Splats, degree: int = 3, rows: Tensor 
 
 
 def differentiated(view: CachedView, splats: Splats, upstream: Tensor, rows: Tensor = ROWS) -> tuple[Tensor, ...]:
-    """Image and gradients of the rows' sh0 and shN."""
+    """Return the image, and gradients of sh0 and shN for the rows."""
     sh0, shN = splats.sh0[rows].requires_grad_(), splats.shN[rows].requires_grad_()
     image = view.render(sh0, shN)
     image.backward(upstream)

@@ -1,6 +1,6 @@
-"""Splats without an ellipse, because their disc reaches the camera plane: culled by tiles and blocks, the same bits.
+"""Splats whose disc reaches the camera plane have no ellipse: culling by tiles and blocks changes no bit.
 
-``exact_masks=False`` is the old way: such a splat enters every tile and is met at every pixel.
+With ``exact_masks=False``, such a splat enters every tile and is evaluated at every pixel.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ KINDS = ("crossing", "crossing", "near_plane", "huge", "edge_on", "plain")
 
 
 def crossing_scene(seed: int, count: int = 60) -> tuple[Splats, Camera]:
-    """Many tiles, most splats across the camera plane; some are slivers, some a thousand times as large."""
+    """Return a scene of many tiles, most splats crossing the camera plane; some are slivers, some 1000 times larger."""
     rng = np.random.default_rng(seed)
     camera = random_camera(rng).resized(int(rng.integers(40, 130)), int(rng.integers(40, 100)))
     splats = random_splats(rng, camera, count, KINDS)
@@ -39,7 +39,7 @@ def crossing_scene(seed: int, count: int = 60) -> tuple[Splats, Camera]:
 def everything(
     library: Library, splats: Splats, camera: Camera, settings: RasterSettings, *, exact: bool
 ) -> dict[str, Tensor]:
-    """Images, radii, gradients and splat errors of one view, by name."""
+    """Return images, radii, gradients and splat errors of one view, by name."""
     leaves = requiring_grad(splats.to(dtype=library.dtype))
     probe = torch.zeros(len(splats), 4, dtype=library.dtype, requires_grad=True)
     output = cpu.rasterize_with(library, leaves, camera, settings, probe, exact_masks=exact)
@@ -66,22 +66,22 @@ def test_culling_splats_without_an_ellipse_changes_no_bit(any_native: Library, c
         for name, tensor in full.items():
             assert torch.equal(culled[name], tensor), (seed, name)
         seen += int((full["d_sh0"][full["radii"] == max(camera.width, camera.height) / 2] != 0).any(2).sum())
-    assert seen > 15  # of those that cross
+    assert seen > 15  # of the crossing splats
 
 
 # --------------------------------------------------------------------------------------------- outlines against pixels
 
 
 def outlines(rng: np.random.Generator, lanes: int, kind: str) -> np.ndarray:
-    """What outline_of takes of random splats [11, lanes]: au, bu, av, bv, ai, bi, iz, cx, cy, k, disc2."""
+    """Return random inputs of outline_of [11, lanes]: au, bu, av, bv, ai, bi, iz, cx, cy, k, disc2."""
     coefficients = rng.normal(size=(6, lanes)) * 10 ** rng.uniform(-3, 0, size=(6, lanes))
     iz, k = 10 ** rng.uniform(-1.5, 0.5, lanes), rng.uniform(0.01, 4, lanes)
     center = rng.uniform(-30, 90, size=(2, lanes))
-    if kind == "far":  # a centre far outside of the image: large terms that cancel in a pixel that is seen
+    if kind == "far":  # centre far outside the image: large terms cancel in a visible pixel
         center *= 10 ** rng.uniform(1, 4, size=(2, lanes))
         dx, dy = rng.uniform(0, [[64], [48]], size=(2, lanes)) - center
         inverse, part = rng.uniform(0.1, 6, lanes), 0.6 * k * rng.normal(size=(2, lanes))
-        wanted = (*(part * inverse), inverse - iz)  # X, Y and I - iz there
+        wanted = (*(part * inverse), inverse - iz)  # X, Y and I - iz at that pixel
         for row, value in zip((0, 2, 4), wanted, strict=True):
             coefficients[row + 1] = (value - coefficients[row] * dx) / dy
     if kind == "extreme":

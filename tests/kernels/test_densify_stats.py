@@ -1,4 +1,4 @@
-"""The native sums of the densification signal against torch's."""
+"""Native densification statistics against torch."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def test_seen_splats_get_the_norms_and_are_counted(any_native: Library, columns:
     g = torch.Generator().manual_seed(n)
     dtype = any_native.dtype
     signal = torch.randn(n, columns, generator=g).to(dtype)
-    radii = torch.randint(0, 3, (n,), generator=g).to(dtype)  # a third of them unseen
+    radii = torch.randint(0, 3, (n,), generator=g).to(dtype)  # a third of them is invisible
     sums = [torch.rand(n, generator=g).to(dtype) for _ in range(3)]
     before = [tensor.clone() for tensor in sums]
     accumulate(*sums, signal, radii, library=any_native)

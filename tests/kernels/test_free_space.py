@@ -1,4 +1,4 @@
-"""Splats in free space, natively, against what torch counts."""
+"""Native counting of splats in free space against torch."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def maps() -> FreeSpaceMaps:
 
 
 def scattered(count: int, seed: int = 0) -> Splats:
-    """Splats before the wall, in it, behind it, beside all pictures and behind all cameras; from tiny to huge."""
+    """Return splats in front of, inside and behind the wall, outside all images, and behind cameras; any scale."""
     splats = random_splats(count, seed=seed)
     generator = torch.Generator().manual_seed(seed)
     splats.means.copy_((torch.rand(count, 3, generator=generator) - 0.5) * torch.tensor([10.0, 8.0, 3.0 * WALL]))
@@ -50,7 +50,7 @@ def test_counts_agree_with_torch(maps: FreeSpaceMaps, monkeypatch: pytest.Monkey
     assert 0.02 < (true[0] > 1).float().mean() < 0.9
     assert 0.001 < (true[1] > 0).float().mean() < 0.9
     for ours, theirs in zip(found, true, strict=True):
-        assert int((ours != theirs).sum()) <= 10  # places on the border of two pixels
+        assert int((ours != theirs).sum()) <= 10  # points on the border between two pixels
         assert int((ours - theirs).abs().max()) <= 1
     inside = maps.against(splats)
     monkeypatch.setattr(free_space, "look_at_free_space", lambda *_, **__: False)

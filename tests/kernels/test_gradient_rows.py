@@ -1,4 +1,4 @@
-"""Rows without gradients, and sums of gradients over chunks of tiles: the bits of everything else do not change."""
+"""Rows without gradients, and chunked gradient sums over tiles, leave all other bits unchanged."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def gradients(
     rows: Tensor | None,
     names: tuple[str, ...] = (),
 ) -> tuple[list[Tensor], dict[str, Tensor]]:
-    """Images, and the gradients of the parameters (or those named) and of the probe."""
+    """Return images, and gradients of the parameters (or those named) and of the probe."""
     leaves = requiring_grad(room.splats.to(dtype=library.dtype))
     zeros = torch.zeros(len(leaves), max(probe, 2), dtype=library.dtype, requires_grad=probe > 0)
     settings = RasterSettings(background=(0.2, 0.5, 0.7))
@@ -92,7 +92,7 @@ def test_many_chunks_of_tiles_add_up_to_the_same_bits_on_any_number_of_threads(n
 def test_sums_are_the_same_with_and_without_room_in_the_gradient_of_the_coefficients(
     native: Library, room: Workload
 ) -> None:
-    # with all parameters the sums lie in the rows of shN's gradient, without shN in memory of their own
+    # with all parameters the sums use the rows of shN's gradient, without shN their own memory
     names = ("means", "quats", "log_scales", "opacity_logits", "sh0")
     _, inside = gradients(native, room, IMAGES, 4, None)
     _, outside = gradients(native, room, IMAGES, 4, None, names)
@@ -102,7 +102,7 @@ def test_sums_are_the_same_with_and_without_room_in_the_gradient_of_the_coeffici
 def test_gradients_written_over_sums_are_the_same_for_any_number_of_coefficients(
     native: Library, room: Workload
 ) -> None:
-    # 45 and 24 reals a row over 16 of sums: row i is written where the sums of splats 2.8 i and 1.5 i were. 9: no room
+    # 45 and 24 reals per row over 16 of sums: row i overwrites the sums of splats 2.8 i and 1.5 i. 9: does not fit
     splats, found = room.splats, {}
     for stored in (15, 8, 3):
         cut = Workload(room.name, replace(splats, shN=splats.shN[:, :stored].contiguous()), room.cameras)

@@ -1,4 +1,4 @@
-"""The native losses against the torch references, on every instruction set this machine can run."""
+"""Native losses against the torch references, on every instruction set of this machine."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SIZES = [(1, 1), (2, 9), (5, 3), (11, 16), (37, 53), (70, 21)]
 
 @pytest.fixture(params=["v4", "v3", "portable"])
 def library(request: pytest.FixtureRequest) -> Library:
-    """Each float32 library that this processor can run, on two threads."""
+    """Return each float32 library that this processor can run, with two threads."""
     if request.param not in available_variants():
         pytest.skip(f"this machine cannot run variant {request.param}, or the native library was not built")
     library = load(request.param)
@@ -29,7 +29,7 @@ def library(request: pytest.FixtureRequest) -> Library:
 
 @pytest.fixture
 def double() -> Library:
-    """The float64 build of the same sources."""
+    """Return the float64 build of the same sources."""
     try:
         library = load("f64")
     except BackendError as error:
@@ -46,7 +46,7 @@ def make_camera(height: int, width: int) -> Camera:
 
 
 def photographs(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-    """A smooth target, a noisy rendering of it with some equal pixels, and a mask; float64."""
+    """Return a noisy rendering of a smooth target with some equal pixels, the target, and a mask; float64."""
     g = torch.Generator().manual_seed(seed)
     target = reference.blur(torch.rand(height, width, 3, generator=g, dtype=torch.float64))
     rendered = (target + 0.2 * torch.randn(height, width, 3, generator=g, dtype=torch.float64)).clamp(0, 1)
@@ -55,7 +55,7 @@ def photographs(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor,
 
 
 def geometry(height: int, width: int, seed: int = 0, empty: float = 0.05) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Rendered normals, depth with holes, alpha and a mask; float64."""
+    """Return rendered normals, depth with holes, alpha and a mask; float64."""
     g = torch.Generator().manual_seed(seed)
 
     def rand(*shape: int) -> Tensor:
@@ -66,7 +66,7 @@ def geometry(height: int, width: int, seed: int = 0, empty: float = 0.05) -> tup
 
 
 def relative_error(found: Tensor, expected: Tensor) -> float:
-    """Relative Frobenius norm of a difference."""
+    """Return the relative Frobenius norm of a difference."""
     return float((found.double() - expected).norm() / expected.norm().clamp(min=1e-30))
 
 
@@ -78,12 +78,12 @@ def test_l1_ssim_l2_and_their_gradient_are_those_of_the_reference(
     rendered, target, mask = photographs(*size)
     valid = mask if masked else None
     x, y = rendered.float().requires_grad_(), target.float()
-    exact, exact_y = x.detach().double().requires_grad_(), y.double()  # the very numbers that the native op sees
+    exact, exact_y = x.detach().double().requires_grad_(), y.double()  # exactly the inputs of the native op
     values = ops.photometric(x, y, valid, library=library)
     exact_values = [value(exact, exact_y, valid) for value in (reference.l1, reference.ssim, reference.l2)]
     for value, exact_value, atol in zip(values, exact_values, (1e-7, 1e-6, 1e-7), strict=True):
         assert value.item() == pytest.approx(exact_value.item(), abs=atol)
-    # the first is what the op prepared for
+    # the first matches the gradient computed in the forward pass
     for weights in [(0.8, -0.2, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (-0.3, 2.0, 10.0)]:
         (found,) = torch.autograd.grad(values, x, tuple(map(torch.tensor, weights)), retain_graph=True)
         total = sum(weight * value for weight, value in zip(weights, exact_values, strict=True))
@@ -92,7 +92,7 @@ def test_l1_ssim_l2_and_their_gradient_are_those_of_the_reference(
 
 
 @pytest.mark.parametrize(
-    ("edges", "weighted", "per_splat", "masked"),  # each value with each other one at least once
+    ("edges", "weighted", "per_splat", "masked"),  # each pair of values occurs at least once
     [
         ("undefined", False, False, True),
         ("undefined", True, True, False),
@@ -118,7 +118,7 @@ def test_normal_consistency_and_its_gradients_are_those_of_the_reference(
     if min(size) < 3:
         assert weighted or value.item() == (0 if per_splat else 1)
         return
-    for cotangent in (0.05, 3.0):  # the first is what the op prepared for
+    for cotangent in (0.05, 3.0):  # the first matches the gradient computed in the forward pass
         found = torch.autograd.grad(value, found_in, torch.tensor(cotangent), allow_unused=True, retain_graph=True)
         expected = torch.autograd.grad(
             exact, exact_in, torch.tensor(cotangent).double(), allow_unused=True, retain_graph=True
@@ -145,7 +145,7 @@ def test_the_masked_mean_and_its_gradient_are_those_of_the_reference(library: Li
 def test_the_native_formulas_pass_a_float64_gradient_check(double: Library, masked: bool) -> None:
     size = (8, 9)
     rendered, target, mask = photographs(*size, seed=3)
-    rendered = torch.where((rendered - target).abs() < 1e-3, target + 0.05, rendered)  # |x - y| has a corner
+    rendered = torch.where((rendered - target).abs() < 1e-3, target + 0.05, rendered)  # |x - y| has a kink
     valid = mask if masked else None
     assert torch.autograd.gradcheck(
         lambda x: ops.photometric(x, target, valid, library=double), (rendered.requires_grad_(),)
@@ -176,7 +176,7 @@ def test_the_native_formulas_pass_a_float64_gradient_check(double: Library, mask
 
 
 def everything(library: Library, height: int = 150, width: int = 41) -> list[Tensor]:
-    """Values and gradients of every native loss."""
+    """Return values and gradients of every native loss."""
     rendered, target, mask = photographs(height, width, seed=6)
     normal, depth, alpha, _ = geometry(height, width, seed=7)
     leaves = [image.float().requires_grad_() for image in (rendered, normal, depth, alpha)]

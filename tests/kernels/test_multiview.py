@@ -1,4 +1,4 @@
-"""The comparison of two views against the formulas in torch: every instruction set, and the emulated CUDA kernels."""
+"""Two-view comparison against the torch formulas: every instruction set, and the emulated CUDA kernels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DOUBLE = torch.float64
 
 
 def results(case: Scenario, compare: Callable[..., object] | None, *, learns: bool = False) -> list[Tensor]:
-    """Both values, and of each the gradients to depth, normal and, where it learns, the camera's motion; float64."""
+    """Return both values and their gradients to depth, normal and, if ``learns``, camera motion; float64."""
     leaves = [case.depth.clone().requires_grad_(), case.normal.clone().requires_grad_()]
     motion = torch.zeros(6, dtype=DOUBLE, requires_grad=True) if learns else None
     views = case.views(leaves[0], leaves[1], motion)
@@ -72,15 +72,15 @@ def assert_as_in_torch(compare: Callable[..., object], masked: bool, learns: boo
     found, expected = results(case, compare, learns=learns), results(case.double(), None, learns=learns)
     assert int((expected[2] != 0).sum()) >= patches // 2  # as many patches have a gradient
     for f, e in zip(found[:2], expected[:2], strict=True):
-        assert relative_error(f, e) < 5e-5  # a round trip is the small difference of two places
+        assert relative_error(f, e) < 5e-5  # a round trip is a small difference of two positions
     for f, e in zip(found[2:], expected[2:], strict=True):
-        # A place within a rounding of a pixel's centre may be read on its other side, where the slope is another.
+        # A point within rounding of a pixel centre may be sampled on the other side, with another slope.
         off = (f - e).abs() > 2e-4 * e.abs() + 2e-5 * e.abs().max()
         assert int(off.sum()) <= 0.01 * int((e != 0).sum())
 
 
 def test_pixels_at_every_validity_limit_agree_with_torch(native64: Library) -> None:
-    """Normals edge-on, turned away and of no length, an image that the patch leaves, and a neighbour far too near."""
+    """Normals edge-on, facing away and zero; a patch that leaves the image; a neighbour that is much too close."""
     case = scenario(dtype=DOUBLE, settings=MultiView(patches=2000, radius=2, texture=0.03, occluded=4.0))
     g = torch.Generator().manual_seed(5)
     normal = torch.randn(case.normal.shape, generator=g, dtype=DOUBLE)

@@ -1,4 +1,4 @@
-"""The native colour transform of a photograph against the formula in torch."""
+"""The native colour transform of an image against the torch formula."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gs2d.render.native_image_ops import expose, expose_vjp
 @pytest.mark.parametrize("cut_out", [False, True])
 @pytest.mark.parametrize("size", [(1, 1), (3, 5), (130, 129)])
 def test_image_and_gradients_agree_with_torch(any_native: Library, cut_out: bool, size: tuple[int, int]) -> None:
-    """130 x 129 pixels are nine pieces, the last one of 386, which is no multiple of a vector."""
+    """130 x 129 pixels are nine chunks; the last has 386 pixels, not a multiple of a vector."""
     g = torch.Generator().manual_seed(size[0])
 
     def random(*shape: int) -> Tensor:

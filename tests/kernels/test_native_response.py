@@ -1,4 +1,4 @@
-"""The native vignetting and response of a camera against the formula in torch."""
+"""The native vignetting and response against the torch formula."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_image_and_gradients_agree_with_torch(
     def random(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=g).to(any_native.dtype)
 
-    color = (1.6 * random(*size, 3) - 0.3).requires_grad_()  # below 0 and above 1, too
+    color = (1.6 * random(*size, 3) - 0.3).requires_grad_()  # includes values below 0 and above 1
     numbers = torch.tensor([0.3, -0.1, 0.2, 0.7], dtype=any_native.dtype, requires_grad=True)
     squares, upstream = random(*size) if darkens else None, random(*size, 3) - 0.5
     cover = (random(*size).mul(2).clamp(max=1), random(3)) if cut_out else (None, None)

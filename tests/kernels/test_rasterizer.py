@@ -1,4 +1,4 @@
-"""The native rasterizer: gradients, instruction sets, threads, culling. Its contract is tested in tests/render."""
+"""Native rasterizer: gradients, instruction sets, threads, culling. Its contract is tested in tests/render."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def cotangents(camera: Camera, dtype: torch.dtype, seed: int) -> dict[str, Tenso
 
 
 def everything(library: Library, splats: Splats, camera: Camera, *, seed: int = 0, probe: int = 4) -> dict[str, Tensor]:
-    """All images, radii, gradients and splat errors of one view, by name."""
+    """Return all images, radii, gradients and splat errors of one view, by name."""
     leaves = requiring_grad(splats.to(dtype=library.dtype))
     zeros = torch.zeros(len(splats), probe, dtype=library.dtype, requires_grad=True) if probe else None
     output = cpu.rasterize_with(library, leaves, camera, SETTINGS, zeros)
@@ -86,7 +86,7 @@ def test_the_float64_build_equals_the_reference_to_rounding(native64: Library, s
 
 
 def smooth_scene() -> tuple[Splats, Camera]:
-    """Five overlapping splats: hits, a filtered sliver, a clamped colour; no pair within 1e-4 of a threshold."""
+    """Return five overlapping splats: hits, a filtered sliver, a clamped colour; no pair is near a threshold."""
     rng = np.random.default_rng(4)
     camera = look_at(
         np.array([0.1, -0.2, -3.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]), width=9, height=7, fx=9.0, fy=8.0
@@ -164,7 +164,7 @@ def test_culling_inside_tiles_does_not_change_a_single_bit(any_native: Library, 
 
 @pytest.mark.parametrize("size", [(1, 1), (4, 4), (15, 17), (16, 16), (33, 5), (3, 50)])
 def test_images_of_any_size_are_filled_to_the_last_pixel(any_native: Library, size: tuple[int, int]) -> None:
-    # One opaque splat that covers everything: alpha is 0.99 in every pixel, whatever the tiles and blocks.
+    # One opaque splat covers everything: alpha is 0.99 in every pixel, for all tiles and blocks.
     width, height = size
     camera = look_at(np.array([0.0, 0, -2]), np.zeros(3), np.array([0.0, -1, 0]), width=width, height=height, fx=100.0)
     one = torch.ones(1, 3, dtype=any_native.dtype)
@@ -208,7 +208,7 @@ def test_memory_of_views_without_a_backward_pass_is_given_back() -> None:
     resource, native = pytest.importorskip("resource"), load()
     splats, camera = awkward_scene(8)
     splats = requiring_grad(splats.to(dtype=torch.float32))
-    camera = camera.resized(800, 800)  # 10 MB of saved planes each
+    camera = camera.resized(800, 800)  # 10 MB of saved images each
     for i in range(40):
         if i == 5:
             gc.collect()

@@ -1,6 +1,6 @@
-"""The native library built with sanitizers: its own tests run on that build, in a process that stops at a finding.
+"""The native library built with sanitizers: its tests run on that build, in a process that aborts on an error.
 
-Slow: a build takes minutes. A seeded fault shows that a finding would stop the process.
+Slow: a build takes minutes. A seeded fault confirms that errors abort the process.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(3000)]
 
 ROOT = Path(__file__).parents[2]
 HERE = Path(__file__).parent
-FINDING = 66  # exit code of a process that a sanitizer stops
+FINDING = 66  # exit code after a sanitizer error
 USE = """
 import os
 from pathlib import Path
@@ -47,18 +47,18 @@ extern "C" int race(int n) {
 
 @dataclass(frozen=True)
 class Sanitizer:
-    """How to build with one, and what a process that uses such a library needs in its environment."""
+    """Build flags of a sanitizer, and the environment of a process that uses such a library."""
 
     flags: str
     runtime: str
 
     def environment(self) -> dict[str, str]:
-        """Return the environment: the runtime comes first in the process; libstdc++ with it, whose throw it wraps."""
+        """Return the environment: preloads the runtime, and libstdc++, whose throw it wraps."""
         preload = " ".join(_of_compiler(name) for name in (self.runtime, "libstdc++.so"))
         common = f"exitcode={FINDING}:handle_segv=0"
         return os.environ | {
             "LD_PRELOAD": preload,
-            "ASAN_OPTIONS": f"{common}:detect_leaks=0",  # Python keeps what it has until it ends
+            "ASAN_OPTIONS": f"{common}:detect_leaks=0",  # Python does not free everything at exit
             "UBSAN_OPTIONS": "print_stacktrace=1",
             "TSAN_OPTIONS": f"{common}:report_signal_unsafe=0",
             "OMP_NUM_THREADS": "1",
@@ -78,7 +78,7 @@ def _of_compiler(name: str) -> str:
 
 @pytest.fixture(scope="module", params=list(SANITIZERS))
 def sanitizer(request: pytest.FixtureRequest) -> Sanitizer:
-    """Each sanitizer whose runtime the compiler has."""
+    """Return each sanitizer whose runtime the compiler provides."""
     found = SANITIZERS[request.param]
     if sys.platform != "linux" or shutil.which("g++") is None or shutil.which("setarch") is None:
         pytest.skip("needs Linux with g++ and setarch")
@@ -88,7 +88,7 @@ def sanitizer(request: pytest.FixtureRequest) -> Sanitizer:
 
 
 def _run(sanitizer: Sanitizer, *command: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run Python with a sanitizer's runtime; without random addresses, of which older runtimes know only some."""
+    """Run Python with a sanitizer's runtime, without address randomisation, which older runtimes partly lack."""
     return subprocess.run(
         ["setarch", "-R", sys.executable, *command],
         cwd=ROOT,

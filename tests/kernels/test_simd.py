@@ -1,4 +1,4 @@
-"""The vector wrapper: its functions against numpy, on every instruction set."""
+"""SIMD wrapper functions against numpy, on every instruction set."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_transposing_reduction_sums_each_vector_into_its_own_lane(any_native: Li
 
 @pytest.mark.parametrize("n", [0, 1, 7, 8, 15, 16, 17, 31, 64, 255])
 def test_lists_of_entries_hold_exactly_those_with_the_bit_in_order(any_native: Library, n: int) -> None:
-    masks = np.random.default_rng(n).integers(0, 2**32, size=n + 64, dtype=np.uint32)  # what follows must not count
+    masks = np.random.default_rng(n).integers(0, 2**32, size=n + 64, dtype=np.uint32)  # bits beyond n must not count
     out = np.zeros(n + 64, dtype=np.uint32)
     compress = any_native.function(
         "gs2d_selftest_indices_with_bit", ctypes.c_int, [ctypes.c_void_p, ctypes.c_int, ctypes.c_int, ctypes.c_void_p]

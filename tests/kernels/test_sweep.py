@@ -1,4 +1,4 @@
-"""The native plane sweep against the one in torch."""
+"""The native plane sweep against torch."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Z = 1 / torch.linspace(1 / 7.0, 1 / 2.5, 23)
 
 @pytest.fixture(autouse=True)
 def variant(native: Library, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Each library in turn is the one that a sweep takes."""
+    """Use each library in turn for the sweep."""
     monkeypatch.setenv("GS2D_CPU_VARIANT", native.variant)
     return native.variant
 
@@ -30,7 +30,7 @@ def views() -> list[SmallView]:
 
 
 def assert_like(score: torch.Tensor, true: torch.Tensor, view: SmallView) -> None:
-    """Scores of float32: a bare patch has a variance of 1e-4 (the noise), of which rounding is a thousandth."""
+    """Compare float32 scores: a textureless patch has a variance of 1e-4 (noise), of which rounding is 1/1000."""
     torch.testing.assert_close(score, true, atol=3e-3, rtol=0)
     textured = plane_sweep._variance(view, 1)[0, 0] > 1e-3
     assert textured.float().mean() > 0.3
@@ -60,7 +60,7 @@ def test_images_of_other_sizes_are_compared_and_pixels_outside_them_are_unknown(
     assert_like(found.score, true.score, views[2])
     assert (found.score == -1).float().mean() > 0.1
     turned = views[3].T.copy()
-    turned[:3] = np.diag([-1.0, 1.0, -1.0]) @ turned[:3]  # it looks the other way
+    turned[:3] = np.diag([-1.0, 1.0, -1.0]) @ turned[:3]  # facing away
     away = replace(views[3], T=turned)
     assert (best_planes(views[2], [away], Z, 2).score == -1).all()
 

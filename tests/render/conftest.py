@@ -1,4 +1,4 @@
-"""``backend`` runs a test on every rasterizer that this machine has; the CUDA kernels also run emulated on the CPU."""
+"""``backend`` runs a test on every rasterizer of this machine; the CUDA kernels also run emulated on the CPU."""
 
 from __future__ import annotations
 
@@ -22,10 +22,9 @@ from gs2d.render.types import Features, RasterSettings, RenderOutput
 
 @pytest.fixture
 def backend_named(request: pytest.FixtureRequest) -> Callable[[str], Backend]:
-    """A backend by name; one that cannot run here skips with its reason.
+    """Return a backend by name; skip with the reason if it cannot run here.
 
-    ``cuda`` takes tensors in host memory, as the tests make them, and gives its results back there; ``emulated`` runs
-    the same kernels on the CPU.
+    ``cuda`` accepts and returns tensors in host memory; ``emulated`` runs the same kernels on the CPU.
     """
 
     def named(name: str) -> Backend:
@@ -39,25 +38,25 @@ def backend_named(request: pytest.FixtureRequest) -> Callable[[str], Backend]:
 
 @pytest.fixture(params=["reference", "cpu", "emulated", pytest.param("cuda", marks=pytest.mark.gpu)])
 def backend(request: pytest.FixtureRequest, backend_named: Callable[[str], Backend]) -> Backend:
-    """Every available backend."""
+    """Return each available backend in turn."""
     return backend_named(request.param)
 
 
 @pytest.fixture
 def cpu() -> Backend:
-    """The native backend, or skip."""
+    """Return the native backend, or skip."""
     return _available("cpu")
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def native(request: pytest.FixtureRequest, backend_named: Callable[[str], Backend]) -> Backend:
-    """A backend of kernels, to be compared with the reference on many scenes: the native one, and a real GPU."""
+    """Return a kernel backend for comparison with the reference on many scenes: native, or a real GPU."""
     return backend_named(request.param)
 
 
 @pytest.fixture(scope="session")
 def emulator() -> emulate.Emulator:
-    """A launcher that runs the CUDA kernels on the CPU."""
+    """Return a launcher that runs the CUDA kernels on the CPU."""
     return emulate.Emulator()
 
 
@@ -94,7 +93,7 @@ def _emulated(launcher: Launcher) -> Backend:
 
 
 def _from_host(backend: Backend) -> Backend:
-    """The same backend for tensors in host memory: they go to the device and come back, gradients too."""
+    """Wrap a backend for tensors in host memory: copies them to the device and back, including gradients."""
     device = torch.device(backend.device)
 
     def there(tensor: Tensor | None) -> Tensor | None:

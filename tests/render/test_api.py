@@ -1,4 +1,4 @@
-"""The public face: arguments are checked before anything runs, backends are chosen by name and never silently."""
+"""The public API checks arguments before running, and selects backends by name without silent fallback."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_settings_out_of_range_are_refused(change: dict[str, Any], message: str)
 
 def test_splats_with_different_numbers_of_rows_are_refused() -> None:
     scene = splat()
-    scene.quats = torch.ones(2, 4)  # Splats checks at birth, but its tensors are mutable
+    scene.quats = torch.ones(2, 4)  # Splats are checked on construction, but their tensors are mutable
     with pytest.raises(ShapeError, match="quats"):
         rasterize(scene, front_camera(), backend="reference")
 

@@ -1,4 +1,4 @@
-"""The numbered contract of ``gs2d.render.api``: rules 7 to 12, what pixels and gradients become.
+"""The numbered contract of ``gs2d.render.api``, rules 7 to 12: pixel values and gradients.
 
 Every test runs on every backend. Unless stated: camera at the origin along +z, 9 x 9 px, focal length 10 px, so that
 pixel (column 4 + k, row 4) looks along (k / 10, 0, 1); a splat faces it at z = 2 with scale 0.4, where one pixel is
@@ -66,13 +66,13 @@ def test_07_the_stop_is_a_setting(backend: Backend) -> None:
 # 8 ---------------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("degrees", [0, 180])
 def test_08_normals_face_the_camera(backend: Backend, degrees: float) -> None:
-    # t_w = (0, 0, 1) points away and is turned; after half a turn about y it is (0, 0, -1) and stays.
+    # t_w = (0, 0, 1) points away and is flipped; after half a turn about y it is (0, 0, -1) and is kept.
     out = rasterize(splat(axis=Y_AXIS, degrees=degrees, opacity=0.7), front_camera(), backend=backend)
     equal(out.normal[4, 4], [0.0, 0.0, -0.7])
 
 
 def test_08_normals_are_weighted_sums_and_not_normalised(backend: Backend) -> None:
-    # Front: 60 degrees about y, t_w = (0.866, 0, 0.5), turned to (-0.866, 0, -0.5); behind: (0, 0, -1). w = 0.5, 0.25.
+    # Front: 60 degrees about y, t_w = (0.866, 0, 0.5), flipped to (-0.866, 0, -0.5); behind: (0, 0, -1). w = 0.5, 0.25.
     scene = stack(splat(axis=Y_AXIS, degrees=60), splat((0, 0, 3)))
     normal = rasterize(scene, front_camera(), backend=backend).normal
     equal(normal[4, 4], [-0.5 * sqrt(3) / 2, 0.0, -0.5 * 0.5 - 0.25])
@@ -86,7 +86,7 @@ def test_08_normals_are_in_the_world_frame(backend: Backend) -> None:
 
 def test_08_the_facing_side_is_determined_at_the_splats_centre_for_all_pixels(backend: Backend) -> None:
     # Centre (1, 0, 2), normal t_w = (cos a, 0, -sin a) with <t_w, p> = cos a - 2 sin a: a = 30 degrees: -0.134 < 0, so
-    # t_w stays, in every pixel that the splat touches; with a = 20 degrees +0.256 > 0, and it turns.
+    # t_w is kept in every pixel of the splat; with a = 20 degrees +0.256 > 0, and it is flipped.
     for a, sign in ((30, 1.0), (20, -1.0)):
         scene = splat((1, 0, 2), scales=(3, 3), axis=Y_AXIS, degrees=90 + a)  # t_w = (sin(90+a), 0, cos(90+a))
         out = rasterize(scene, front_camera(), backend=backend)

@@ -1,6 +1,6 @@
 """Rule 20 of the contract: the gradient of a camera's pose, on every backend.
 
-The judge is autograd straight through the reference, whose formulas take a camera of tensors like one of arrays.
+Expected values come from autograd through the reference, whose formulas also accept a camera made of tensors.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from render_scenes import (
     splat,
 )
 
-SMOOTH = ("plain", "opaque", "huge")  # kinds of splats without decisions near by
+SMOOTH = ("plain", "opaque", "huge")  # kinds of splats without nearby threshold decisions
 
 
 def scene(seed: int, count: int = 12, dtype: torch.dtype = torch.float64) -> tuple[Splats, Camera, dict[str, Tensor]]:
@@ -49,13 +49,13 @@ def scene(seed: int, count: int = 12, dtype: torch.dtype = torch.float64) -> tup
 
 
 def learning(camera: Camera) -> tuple[Camera, Tensor]:
-    """The same camera, and the pose that learns."""
+    """Return the same camera, and a pose that requires a gradient."""
     pose = torch.tensor(camera.T_cam_world, requires_grad=True)
     return replace(camera, T_cam_world=pose), pose
 
 
 def live(camera: Camera) -> tuple[Any, Tensor]:
-    """What the reference takes for a camera, made of tensors, and its pose."""
+    """Return a camera made of tensors for the reference, and its pose."""
     T = torch.tensor(camera.T_cam_world, requires_grad=True)
     facts = {f.name: getattr(camera, f.name) for f in fields(camera) if f.name not in ("T_cam_world", "pose")}
     R, t = T[:3, :3], T[:3, 3]
@@ -63,7 +63,7 @@ def live(camera: Camera) -> tuple[Any, Tensor]:
 
 
 def along_motions(gradient: Tensor | None, camera: Camera) -> Tensor:
-    """Its products with the six motions of the camera in its own frame: three turns, three shifts [6]."""
+    """Project the gradient on six motions in the camera's frame: three rotations, three translations [6]."""
     assert gradient is not None
     at_rest = torch.zeros(6, dtype=torch.float64)
 
@@ -77,7 +77,7 @@ def along_motions(gradient: Tensor | None, camera: Camera) -> Tensor:
 
 
 def straight(splats: Splats, camera: Camera, settings: RasterSettings, cotangents: dict[str, Tensor]) -> Tensor:
-    """What autograd says of the six motions [6]."""
+    """Return the gradient of the six motions [6] by autograd."""
     lens, pose = live(camera)
     contraction(reference.rasterize(splats, lens, settings), cotangents).backward()
     return along_motions(pose.grad, camera)
@@ -211,7 +211,9 @@ def test_20_the_bits_do_not_depend_on_the_number_of_threads(cpu: Backend) -> Non
 def test_20_the_native_sums_are_those_of_torch(cpu: Backend, monkeypatch: pytest.MonkeyPatch, degree: int) -> None:
     rng = np.random.default_rng(4)
     camera = random_camera(rng)
-    splats = random_splats(rng, camera, 3001).to(dtype=torch.float32)  # three pieces, the last no multiple of a vector
+    splats = random_splats(rng, camera, 3001).to(
+        dtype=torch.float32
+    )  # three chunks, the last not a multiple of a vector
     cotangents, found = random_cotangents(rng, camera), []
     for natively in (True, False):
         if not natively:
@@ -245,7 +247,7 @@ def test_20_normal_consistency_lets_both_normals_rotate_with_the_camera(kind: st
 
     assert_close(found(), along_motions(expected.grad, camera), rtol=1e-9, atol=1e-12)
 
-    def copied(output: RenderOutput) -> RenderOutput:  # normals that somebody has touched
+    def copied(output: RenderOutput) -> RenderOutput:  # simulates modified normals
         return replace(output, normal=output.normal * 1)
 
     assert_close(found(copied), along_motions(expected.grad, camera), rtol=1e-9, atol=1e-12)
@@ -281,7 +283,7 @@ def test_20_a_pose_that_moved_on_without_its_camera_is_refused(cpu: Backend, dra
     splats, camera, _ = scene(0)
     lens, pose = learning(camera)
     with torch.no_grad():
-        pose[0, 3] += 0.1  # as an optimizer's step does
+        pose[0, 3] += 0.1  # like an optimizer step
     image = [torch.zeros(camera.height, camera.width, 3)] if drawing is splat_errors else []
     with pytest.raises(ShapeError, match="create a camera with the new pose"):
         drawing(splats.to(dtype=torch.float32), lens, *image, backend=cpu)

@@ -27,7 +27,7 @@ from render_scenes import (
     splat,
 )
 
-SMOOTH = ("plain", "opaque", "huge")  # kinds of splats without decisions near by
+SMOOTH = ("plain", "opaque", "huge")  # kinds of splats without nearby threshold decisions
 
 
 def scene(seed: int, kinds: tuple[str, ...] = SMOOTH) -> tuple[Splats, Camera, dict[str, Tensor]]:
@@ -37,7 +37,7 @@ def scene(seed: int, kinds: tuple[str, ...] = SMOOTH) -> tuple[Splats, Camera, d
 
 
 def learning(camera: Camera, dtype: torch.dtype = torch.float64) -> tuple[Camera, Tensor]:
-    """The same camera, rounded to ``dtype``, and the intrinsics that learn."""
+    """Return the same camera, rounded to ``dtype``, and intrinsics that require a gradient."""
     intrinsics = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=dtype, requires_grad=True)
     fx, fy, cx, cy = intrinsics.tolist()
     return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, intrinsics=intrinsics), intrinsics
@@ -88,9 +88,9 @@ def test_21_awkward_splats_agree_with_the_reference(backend: Backend, seed: int)
 
 
 def test_21_a_splat_that_moves_with_the_principal_point_is_worked_out_by_hand(backend: Backend) -> None:
-    """A small round splat at (x, y, z): its spot moves by dcx + x/z dfx, so the first moment of the image does too.
+    """The spot of a small round splat at (x, y, z) moves by dcx + x/z dfx, and so does the image's first moment.
 
-    But for the rim where alpha falls below alpha_min, a fortieth of the mass.
+    The tolerance covers the rim where alpha falls below alpha_min, 1/40 of the mass.
     """
     one = splat(mean=(0.5, -0.25, 5.0), scales=(0.3, 0.3), opacity=0.9, color=(1.0, 1.0, 1.0))
     camera = Camera(80, 80, 60.0, 60.0, 40.0, 40.0, np.eye(4))
@@ -174,7 +174,7 @@ def test_21_intrinsics_that_moved_on_without_their_camera_are_refused(cpu: Backe
     splats, camera, _ = scene(0)
     lens, intrinsics = learning(camera)
     with torch.no_grad():
-        intrinsics[0] += 1.0  # as an optimizer's step does
+        intrinsics[0] += 1.0  # like an optimizer step
     with pytest.raises(ShapeError, match="camera"):
         rasterize(splats.to(torch.float32), lens, backend=cpu)
     with pytest.raises(ShapeError, match="must be a tensor"):

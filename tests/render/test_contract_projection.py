@@ -1,4 +1,4 @@
-"""The numbered contract of ``gs2d.render.api``: rules 1 to 6, where splats land.
+"""The numbered contract of ``gs2d.render.api``, rules 1 to 6: projection of splats.
 
 Every test runs on every backend. Unless stated: camera at the origin along +z, 9 x 9 px, focal length 10 px, so that
 pixel (column 4 + k, row 4) looks along (k / 10, 0, 1); a splat faces it at z = 2 with scale 0.4, where one pixel is
@@ -67,7 +67,7 @@ def test_02_equal_depths_go_by_row(backend: Backend) -> None:
 
 # 3 ---------------------------------------------------------------------------------------------------------------
 def test_03_a_slanted_splat_is_met_on_its_plane(backend: Backend) -> None:
-    # Turned 45 degrees about y its plane is x + z = 2. Pixel (5, 4): x = z / 10, so z = 2 / 1.1; its distance from the
+    # Rotated 45 degrees about y its plane is x + z = 2. Pixel (5, 4): x = z / 10, so z = 2 / 1.1; its distance from the
     # centre along t_u is sqrt(2) (2 - z), so u = sqrt(2) (2 - z) / s with s = 2.
     out = rasterize(splat(scales=(2, 2), axis=Y_AXIS, degrees=45, opacity=0.5), front_camera(), backend=backend)
     for k in (-4, -1, 1, 4):
@@ -78,7 +78,7 @@ def test_03_a_slanted_splat_is_met_on_its_plane(backend: Backend) -> None:
 
 
 def test_03_the_two_scales_follow_the_two_tangents(backend: Backend) -> None:
-    # s_u = 0.8 along x: u = k / 4. s_v = 0.4 along y: v = k / 2. Turned 90 degrees about z they change places.
+    # s_u = 0.8 along x: u = k / 4. s_v = 0.4 along y: v = k / 2. Rotation by 90 degrees about z swaps them.
     alpha = rasterize(splat(scales=(0.8, 0.4)), front_camera(), backend=backend).alpha
     equal([float(alpha[4, 6]), float(alpha[6, 4])], [0.5 * exp(-0.25 / 2), 0.5 * exp(-1 / 2)])
     turned = rasterize(splat(scales=(0.8, 0.4), degrees=90), front_camera(), backend=backend).alpha
@@ -95,7 +95,7 @@ def test_03_quaternions_are_normalised(backend: Backend) -> None:
 
 
 def test_03_the_camera_pose_moves_the_splat_into_its_frame(backend: Backend) -> None:
-    # A camera at (5, 0, 0) that looks along -x sees a splat at (3, 0, 0) with normal x as the plain scene.
+    # A camera at (5, 0, 0) that looks along -x sees a splat at (3, 0, 0) with normal x like the plain scene.
     camera = look_at(np.array([5.0, 0, 0]), np.zeros(3), np.array([0, -1.0, 0]), width=9, height=9, fx=10)
     out = rasterize(splat((3, 0, 0), axis=Y_AXIS, degrees=90), camera, backend=backend)
     plain = rasterize(splat(), front_camera(), backend=backend)
@@ -104,7 +104,7 @@ def test_03_the_camera_pose_moves_the_splat_into_its_frame(backend: Backend) -> 
 
 
 def test_03_an_edge_on_plane_is_not_hit_and_the_low_pass_filter_decides(backend: Backend) -> None:
-    # Turned 90 degrees, the plane x = 0 holds the camera. rho = rho2d = 2 k^2; alpha = 0.5 exp(-k^2), depth z_c;
+    # Rotated 90 degrees, the plane x = 0 contains the camera. rho = rho2d = 2 k^2; alpha = 0.5 exp(-k^2), depth z_c;
     # k = 2: 0.0092 > 1/255; k = 3: 6e-5, nothing.
     out = rasterize(splat(axis=Y_AXIS, degrees=90), front_camera(), backend=backend)
     equal(out.alpha[4, 4:8], [0.5, 0.5 * exp(-1), 0.5 * exp(-4), 0.0])
@@ -112,8 +112,8 @@ def test_03_an_edge_on_plane_is_not_hit_and_the_low_pass_filter_decides(backend:
 
 
 def test_03_a_plane_met_behind_the_camera_is_not_hit(backend: Backend) -> None:
-    # Turned 85 degrees: sin85 x + cos85 (z - 2) = 0, so z (sin85 k/10 + cos85) = 2 cos85.
-    # k = -1 meets it behind the camera, where rho3d would be 0.64 < 2: the filter gives exp(-1), z_c. k = 1: z = 0.93.
+    # Rotated 85 degrees: sin85 x + cos85 (z - 2) = 0, so z (sin85 k/10 + cos85) = 2 cos85.
+    # k = -1 hits it behind the camera, where rho3d would be 0.64 < 2: the filter gives exp(-1), z_c. k = 1: z = 0.93.
     s, c = sin(radians(85)), cos(radians(85))
     out = rasterize(splat(scales=(20, 20), axis=Y_AXIS, degrees=85, opacity=0.5), front_camera(), backend=backend)
     equal(out.alpha[4, 3], 0.5 * exp(-1))
@@ -139,7 +139,7 @@ def test_04_the_filter_width_is_a_setting(backend: Backend) -> None:
 
 
 def test_04_where_the_filter_wins_the_depth_is_the_centres(backend: Backend) -> None:
-    # Turned 45 degrees about y, s = 0.02. Pixel (5, 4): z = 2 / 1.1 on the plane, u = 12.9: the filter (rho 2) wins.
+    # Rotated 45 degrees about y, s = 0.02. Pixel (5, 4): z = 2 / 1.1 on the plane, u = 12.9: the filter (rho 2) wins.
     out = rasterize(splat(scales=(0.02, 0.02), axis=Y_AXIS, degrees=45), front_camera(), backend=backend)
     equal(out.depth_mean[4, 5], 2.0)
     equal(out.alpha[4, 5], 0.5 * exp(-1))
@@ -156,7 +156,7 @@ def test_04_the_ray_plane_depth_is_a_setting_of_the_reference() -> None:
     scene = splat(scales=(0.02, 0.02), axis=Y_AXIS, degrees=45)
     out = rasterize(scene, front_camera(), RasterSettings(lowpass_depth="plane"), backend="reference")
     equal(out.depth_mean[4, 5], 2 / 1.1)
-    edge_on = splat(axis=Y_AXIS, degrees=90)  # no hit: the centre's depth remains
+    edge_on = splat(axis=Y_AXIS, degrees=90)  # no hit: the depth is that of the centre
     out = rasterize(edge_on, front_camera(), RasterSettings(lowpass_depth="plane", near=0.5), backend="reference")
     assert float(out.depth_mean[4, 4]) == pytest.approx(2.0)
 
@@ -181,7 +181,7 @@ def test_05_pairs_nearer_than_near_are_skipped(backend: Backend) -> None:
 
 
 def test_05_a_splat_that_crosses_the_camera_plane_is_drawn_where_it_is_in_front(backend: Backend) -> None:
-    # Centre at z = 0.5, turned 85 degrees, s = 3: the disc reaches z = 0.5 - 3 sin85. Focal 100: the ray is k / 100.
+    # Centre at z = 0.5, rotated 85 degrees, s = 3: the disc reaches z = 0.5 - 3 sin85. Focal 100: the ray is k / 100.
     # z = 0.5 cos85 / (sin85 k/100 + cos85): k = -4 gives 0.921, k = 4 gives 0.343.
     s, c = sin(radians(85)), cos(radians(85))
     scene = splat((0, 0, 0.5), scales=(3, 3), axis=Y_AXIS, degrees=85)
@@ -238,6 +238,6 @@ def test_06_alpha_is_limited_and_the_limit_passes_gradients(backend: Backend) ->
     out = rasterize(scene, front_camera(), backend=backend)
     equal(out.alpha[4, 4], 0.99)
     out.alpha[4, 4].backward()
-    # d alpha / d logit = o (1 - o), as if there were no limit. o = sigmoid(logit) in float32.
+    # d alpha / d logit = o (1 - o), as if alpha were not clamped. o = sigmoid(logit) in float32.
     o = torch.sigmoid(scene.opacity_logits.detach().double())
     equal(scene.opacity_logits.grad, o * (1 - o))

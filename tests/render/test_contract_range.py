@@ -1,6 +1,6 @@
-"""The numbered contract of ``gs2d.render.api``: rule 23, the edges of float32, on every backend.
+"""The numbered contract of ``gs2d.render.api``, rule 23: limits of float32, on every backend.
 
-The judge is the reference in float64 on the same float32 numbers.
+Expected values come from the float64 reference on the same float32 inputs.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SETTINGS = RasterSettings(background=(0.1, 0.2, 0.3), sh_degree=1)
 
 
 def scene() -> Splats:
-    """A slanted splat that is altered, and a plain one behind it: off the middle, where no pixel is on its edge."""
+    """Return a slanted splat to modify, with a plain one behind it; off-centre, so that no pixel is on its edge."""
     front = splat((0.1, -0.05, 2.0), axis=Y_AXIS, degrees=25)
     return replace(stack(front, splat((0.003, -0.002, 3.0))), shN=torch.full((2, 3, 3), 0.1))
 
@@ -87,7 +87,7 @@ def test_23_a_quaternion_of_any_length_is_its_direction(backend: Backend, size: 
     color, grad = drawn(unit)
     same, small = drawn(unit * size)
     equal(same, color)
-    if size < 1e30:  # what float32 can hold of it
+    if size < 1e30:  # representable in float32
         torch.testing.assert_close(small * size, grad, rtol=1e-4, atol=1e-5)
     assert bool(small.isfinite().all())
 

@@ -1,4 +1,4 @@
-"""The numbered contract of ``gs2d.render.api``: rules 13 to 17 and 19, facts of each splat, and degenerate scenes.
+"""The numbered contract of ``gs2d.render.api``, rules 13 to 17 and 19: per-splat outputs, and degenerate scenes.
 
 Every test runs on every backend. Unless stated: camera at the origin along +z, 9 x 9 px, focal length 10 px, so that
 pixel (column 4 + k, row 4) looks along (k / 10, 0, 1); a splat faces it at z = 2 with scale 0.4, where one pixel is
@@ -24,7 +24,7 @@ from render_scenes import IMAGES, Y_AXIS, equal, front_camera, requiring_grad, s
 
 # 13 --------------------------------------------------------------------------------------------------------------
 def signal(backend: Backend, scene: Splats, columns: int, *pixels: tuple[int, int]) -> Tensor:
-    """Gradient of the screen probe for the sum of alpha over (row, column) pixels; 9 x 11 px, middle pixel (5, 4)."""
+    """Return the screen-probe gradient of alpha summed over (row, column) pixels; 9 x 11 px, centre pixel (5, 4)."""
     probe = torch.zeros(len(scene), columns, requires_grad=True)
     alpha = rasterize(requiring_grad(scene), front_camera(9, 11), backend=backend, screen_probe=probe).alpha
     sum(alpha[p] for p in pixels).backward()  # type: ignore[union-attr]
@@ -68,7 +68,7 @@ def test_14_the_radius_is_half_the_longer_side_of_the_box(backend: Backend) -> N
 
 def test_14_the_box_of_a_slanted_splat_bounds_its_perspective_image(backend: Backend) -> None:
     # 45 degrees about y, a = k s sin45: y = f k s sin(phi) / (z_c - a cos(phi)), at most f k s / sqrt(z_c^2 - a^2);
-    # x spans a f / (z_c - a) and -a f / (z_c + a), which is less.
+    # x spans a f / (z_c - a) and -a f / (z_c + a), which is smaller.
     k_s = K_HALF * 0.4
     expected = 10 * k_s / sqrt(4 - k_s**2 / 2)
     camera = front_camera(33, 33)
@@ -165,7 +165,7 @@ def test_16_coefficients_above_the_evaluated_degree_do_not_matter(backend: Backe
 
 # 17 --------------------------------------------------------------------------------------------------------------
 def lattice(limit: float, half: int) -> int:
-    """Number of integer points with i^2 + j^2 <= limit and |i|, |j| <= half."""
+    """Return the number of integer points with i^2 + j^2 <= limit and |i|, |j| <= half."""
     return sum(i * i + j * j <= limit for i in range(-half, half + 1) for j in range(-half, half + 1))
 
 
@@ -185,7 +185,7 @@ def test_17_the_default_cutoff_is_three_and_the_low_pass_disc_counts(backend: Ba
 
 
 def test_17_pixels_outside_the_image_or_masked_out_do_not_count(backend: Backend) -> None:
-    # On 5 x 5 px all 25 pixels are inside (k^2 <= 8); a mask that keeps two columns leaves 10.
+    # On 5 x 5 px all 25 pixels are inside (k^2 <= 8); a mask of two columns leaves 10.
     image = torch.zeros(5, 5, 3)
     equal(splat_errors(splat(), front_camera(5, 5), image, backend=backend), [25 * 1.75])
     mask = torch.zeros(5, 5, dtype=torch.bool)
@@ -230,8 +230,8 @@ CULL = RasterSettings(near_plane_policy="cull")
 
 @pytest.mark.parametrize("opacity", [0.02, 0.9])
 def test_19_crossing_splats_are_culled_by_their_3_sigma_disc_if_wanted(backend: Backend, opacity: float) -> None:
-    # Turned 30 degrees about y at z = 2 the disc reaches 3 s_u sin30 in depth, whatever the opacity: s_u = 4/3 is the
-    # limit, and s_v does not matter.
+    # Rotated 30 degrees about y at z = 2, the disc reaches 3 s_u sin30 in depth at any opacity: s_u = 4/3 is the
+    # limit, independent of s_v.
     for s_u, drawn in ((1.32, True), (1.35, False)):
         scene = splat(scales=(s_u, 9), axis=Y_AXIS, degrees=30, opacity=opacity)
         out = rasterize(scene, front_camera(), CULL, backend=backend)
@@ -239,7 +239,7 @@ def test_19_crossing_splats_are_culled_by_their_3_sigma_disc_if_wanted(backend: 
         assert bool(out.radii[0] > 0) is drawn
         errors = splat_errors(scene, front_camera(), torch.zeros(9, 9, 3), CULL, backend=backend)
         assert bool(errors[0] > 0) is drawn
-        assert float(rasterize(scene, front_camera(), backend=backend).alpha.max()) > 0  # drawn unless said otherwise
+        assert float(rasterize(scene, front_camera(), backend=backend).alpha.max()) > 0  # drawn by default
 
 
 def test_19_the_cutoff_is_that_of_the_errors(backend: Backend) -> None:
@@ -251,7 +251,7 @@ def test_19_the_cutoff_is_that_of_the_errors(backend: Backend) -> None:
 
 
 def test_19_both_axes_reach_together(backend: Backend) -> None:
-    # Turned about the diagonal of its plane by 30 degrees both axes rise by sin30 / sqrt(2): 3 s sin30 = 2 again.
+    # Rotated about the diagonal of its plane by 30 degrees, both axes rise by sin30 / sqrt(2): 3 s sin30 = 2 again.
     for s, drawn in ((1.32, True), (1.35, False)):
         scene = splat(scales=(s, s), axis=(sqrt(0.5), sqrt(0.5), 0.0), degrees=30)
         assert bool(rasterize(scene, front_camera(), CULL, backend=backend).radii[0] > 0) is drawn
@@ -277,7 +277,7 @@ BOX = RasterSettings(near_plane_policy="box")
 
 
 def slanted(backend: Backend, camera: Camera, settings: RasterSettings) -> tuple[Tensor, float, float]:
-    """Alpha image, radius and splat error of a splat turned 60 degrees about y, s_u = 1: it reaches z = 2 - 3 sin60."""
+    """Return alpha image, radius and error of a splat rotated 60 degrees about y, s_u = 1: to z = 2 - 3 sin60."""
     scene = splat(scales=(1, 0.1), axis=Y_AXIS, degrees=60, opacity=0.9)
     out = rasterize(scene, camera, settings, backend=backend)
     errors = splat_errors(scene, camera, torch.zeros(camera.height, camera.width, 3), settings, backend=backend)
@@ -288,7 +288,7 @@ def test_19_a_box_is_the_tiles_of_the_official_square(backend: Backend) -> None:
     # 64 x 48 px, focal length 32: xu = 32 cos60 = 16, a.z = -sin60, yv = 3.2. <Tw, Tw> = 9 * 3/4 - 4 = 2.75, so
     # e_x = -9 * 16 sin60 / 2.75 = -45.35 and |e_x^2 - 9 * 16^2 / 2.75|^1/2 = 34.91, up to 35: the square reaches from
     # column 32 - 45.35 - 0.5 - 35 < 0 to 21.15, which touches the tiles of columns 0 to 31, and all rows.
-    # The splat is seen right of u = -3: x = 32 - 32 * 1.5 / 4.6 = 21.6.
+    # The splat is visible right of u = -3: x = 32 - 32 * 1.5 / 4.6 = 21.6.
     camera = front_camera(64, 48, 32.0)
     drawn, _, all_errors = slanted(backend, camera, RasterSettings())
     boxed, radius, errors = slanted(backend, camera, BOX)
@@ -307,8 +307,8 @@ def test_19_a_box_beside_the_image_culls(backend: Backend) -> None:
 
 
 def test_19_the_square_is_at_least_that_of_the_low_pass_filter_and_clipped_to_the_image(backend: Backend) -> None:
-    # Seen edge-on, along x = 0: xu = xv = 0, so e_x = 0 and the half width is that of 0.01; y: yv = 0 as well, a.z = -1
-    # alone reaches. 3 lowpass_px = 2.1, up to 3: columns 10 - 0.5 - 3 = 6.5 to 12.5, the tiles of columns 0 to 15.
+    # Edge-on, along x = 0: xu = xv = 0, so e_x = 0 and the half width is that of 0.01; y: yv = 0 as well, only
+    # a.z = -1 counts. 3 lowpass_px = 2.1, up to 3: columns 10 - 0.5 - 3 = 6.5 to 12.5, the tiles of columns 0 to 15.
     scene = splat(scales=(1, 1e-4), axis=Y_AXIS, degrees=90, opacity=0.9)
     radii = rasterize(scene, front_camera(40, 12, 32.0, cx=10.0), BOX, backend=backend).radii
     assert float(radii[0]) == 8.0  # 16 columns, 12 rows

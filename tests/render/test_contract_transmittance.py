@@ -1,8 +1,8 @@
-"""The numbered contract of ``gs2d.render.api``: rule 22, depth by continuous transmittance, on every backend.
+"""The numbered contract of ``gs2d.render.api``, rule 22: depth from continuous transmittance, on every backend.
 
 Camera at the origin along +z, 9 x 9 px, focal length 10 px; with ``depth_width_px`` = 1, kappa = 0.1. Pixel (4, 4)
-looks along the axis, through the middles of splats at (0, 0, z) that face it. Where F(x) = (2 + 3x - x^3) / 4 is
-wanted, x = (4F - 2 + x^3) / 3 is iterated by hand.
+looks along the axis, through the centres of splats at (0, 0, z) that face it. F(x) = (2 + 3x - x^3) / 4 is inverted
+by hand, by iterating x = (4F - 2 + x^3) / 3.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def depth_of(scene: Splats, backend: Backend, settings: RasterSettings = SETTING
 
 
 def facing(z: float, opacity: float) -> Splats:
-    """A wide splat across the axis."""
+    """Return a wide splat perpendicular to the axis."""
     return splat((0, 0, z), scales=(4, 4), opacity=opacity)
 
 
@@ -87,10 +87,10 @@ def test_22_the_width_is_a_setting_and_goes_with_the_focal_length(backend: Backe
 
 
 def test_22_the_order_of_blending_does_not_matter(backend: Backend) -> None:
-    # Two slanted splats that cross: beside the middle the second to be blended is in front of the first.
+    # Two slanted splats cross: beside the centre the second in blending order is in front of the first.
     first = splat((0, 0, 2.0), scales=(2, 2), axis=Y_AXIS, degrees=40, opacity=0.6)
     second = splat((0, 0, 2.0), scales=(2, 2), axis=Y_AXIS, degrees=-40, opacity=0.7)
-    either = [stack(first, second), stack(second, first)]  # equal centres: the row decides the order (rule 2)
+    either = [stack(first, second), stack(second, first)]  # equal centres: the row index decides the order (rule 2)
     depths = [depth_of(scene, backend) for scene in either]
     medians = [rasterize(scene, front_camera(), SETTINGS, backend=backend).depth_median for scene in either]
     equal(depths[0], depths[1])
@@ -123,8 +123,8 @@ def test_22_the_gradient_reaches_every_splat_of_the_pixel(backend: Backend) -> N
     by_z = scene.means.grad[:, 2]
     assert bool((by_z[:3] > 0.1).all())
     assert float(by_z[3]) == 0  # beyond the width
-    equal((by_z * scene.means[:, 2]).sum(), depth)  # all depths scaled: z is scaled
-    # What is in front pulls the depth forward as it gains opacity, what is behind pulls it back, however far behind.
+    equal((by_z * scene.means[:, 2]).sum(), depth)  # scaling all depths scales z
+    # A splat in front pulls the depth forward as its opacity grows; any splat behind pushes it back.
     assert float(scene.opacity_logits.grad[0]) < 0 < float(scene.opacity_logits.grad[3])
 
 
@@ -169,7 +169,7 @@ def random_cases(count: int) -> Iterator[tuple[int, Splats, Camera]]:
 
 
 def gradients(output_depth: Tensor, distortion: Tensor, leaves: Splats, valid: Tensor, seed: int) -> dict[str, Tensor]:
-    """Of random cotangents, with every second seed beside those of the distortion."""
+    """Return gradients for random cotangents; every second seed includes the distortion."""
     rng = np.random.default_rng(seed)
     of_depth, of_distortion = (torch.tensor(rng.normal(size=valid.shape)) for _ in range(2))
     loss = (output_depth.double() * of_depth * valid).sum() + seed % 2 * (distortion.double() * of_distortion).sum()
@@ -233,7 +233,7 @@ def test_22_the_rows_that_learn_get_the_same_bits(backend: Backend) -> None:
     assert bool((found[0][~rows] != 0).any())
 
 
-# what is asked for ---------------------------------------------------------------------------------------------------
+# requested outputs ---------------------------------------------------------------------------------------------------
 def test_22_without_the_setting_there_is_none_and_all_else_is_the_same(backend: Backend) -> None:
     scene = random_splats(np.random.default_rng(1), front_camera(), 20).to(dtype=torch.float32)
     without = rasterize(scene, front_camera(), RasterSettings(), backend=backend)

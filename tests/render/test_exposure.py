@@ -1,4 +1,4 @@
-"""The colour transform of a photograph: its formula, gradients, fit and inverse."""
+"""The colour transform of an image: formula, gradients, fit and inverse."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_a_fit_finds_the_transform_that_made_the_picture(cut_out: bool) -> None:
     color, truth = random(20, 20, 3), gains(1.3, 0.9, 0.7, 0.05)
     cover = (random(20, 20, seed=2), random(3, seed=3)) if cut_out else ()
     found = fit_exposure(color, expose(color, truth, *cover), torch.ones(20, 20, dtype=torch.bool), *cover)
-    assert (found - truth).abs().max() < 0.02  # the ridge pulls a little
+    assert (found - truth).abs().max() < 0.02  # the ridge term biases slightly
 
 
 def test_a_fit_looks_at_its_pixels_only_and_says_identity_where_there_are_none() -> None:
@@ -76,7 +76,7 @@ def test_a_fit_looks_at_its_pixels_only_and_says_identity_where_there_are_none()
 
 
 def test_a_grey_picture_fits_without_wild_colours() -> None:
-    # Every pixel (0.5, 0.5, 0.5): any row [a, a, a, b] with 1.5 a + b = 0.4 fits; the ridge takes the smallest change.
+    # Every pixel is (0.5, 0.5, 0.5): any row [a, a, a, b] with 1.5 a + b = 0.4 fits; the ridge picks the smallest one.
     grey = torch.full((8, 8, 3), 0.5, dtype=torch.float64)
     found = fit_exposure(grey, 0.8 * grey, torch.ones(8, 8, dtype=torch.bool))
     assert expose(grey, found).flatten().tolist() == pytest.approx([0.4] * 192, abs=1e-3)

@@ -1,8 +1,8 @@
-"""The native kernels against the reference: random scenes, every image, every gradient.
+"""Native kernels against the reference: random scenes, all images, all gradients.
 
-The kernels compute in float32, the reference judges in float64 on the same (float32) inputs. Decisions at thresholds
-may flip for a pair in 1e5 or so; so images are compared by quantiles and a count of outliers, and gradients by relative
-Frobenius norm on scenes in which every decision keeps a margin.
+The kernels compute in float32, the reference in float64 on the same float32 inputs. Threshold decisions may flip for
+about one pair in 1e5. Images are therefore compared by quantiles and outlier counts, and gradients by relative
+Frobenius norm on scenes in which every decision has a margin.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def native(request: pytest.FixtureRequest, backend_named: Callable[[str], Backen
 
 @pytest.fixture
 def part(request: pytest.FixtureRequest) -> int:
-    """The emulator takes one in so many cases: it is slow."""
+    """Fraction of cases to run; the slow emulator runs only a few."""
     return 8 if "emulated" in request.node.callspec.id else 1
 
 
@@ -103,7 +103,7 @@ def test_every_setting_is_used_alike(native: Backend, part: int, change: dict[st
             differences.append((getattr(low, name).double() - getattr(high, name)).abs().flatten())
         moved += float((high.color - default.color).abs().sum() + (high.distortion - default.distortion).abs().sum())
     assert quantile(torch.cat(differences), 0.998) < 1e-4
-    assert moved > 1 / part  # the setting matters here
+    assert moved > 1 / part  # the setting has an effect
 
 
 @pytest.mark.parametrize("columns", [2, 4])
@@ -130,7 +130,7 @@ def test_gradients_agree_where_every_decision_has_a_margin(
 
 @pytest.mark.parametrize("name", IMAGES)
 def test_gradients_of_each_image_alone_agree(native: Backend, part: int, clear_cases: list[Case], name: str) -> None:
-    """So that a wrong sign in a small channel is not drowned by a large one."""
+    """A wrong sign in a small channel is not hidden by a large one."""
     errors = []
     for case in clear_cases[: 20 // part]:
         cotangents = {name: random_cotangents(np.random.default_rng(case.seed), case.camera)[name]}
@@ -162,4 +162,4 @@ def test_splat_errors_agree(native: Backend, part: int, occlusion: bool) -> None
     merged = torch.cat(relative)
     assert quantile(merged, 0.5) < 1e-6
     assert quantile(merged, 0.97) < 1e-4
-    assert float((merged > 0.05).double().mean()) < 0.01  # one flipped pixel of a few
+    assert float((merged > 0.05).double().mean()) < 0.01  # one flipped pixel in a small image

@@ -1,4 +1,4 @@
-"""Vignetting and response around the exposure of a photograph: formulas, gauge, inverse."""
+"""Vignetting and response in addition to exposure: formulas, gauge, inverse."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_vignetting_is_1_at_the_principal_point_and_decreases_outwards() -> None
     reach = reach_of([CAMERA])
     assert reach == pytest.approx(0.5)  # hypot(4, 3) / 10
     squares = torch.from_numpy(squared_radii(CAMERA, reach))
-    assert squares[0, 0] == pytest.approx((0.35**2 + 0.25**2) / 0.25)  # the middle of the corner's pixel
+    assert squares[0, 0] == pytest.approx((0.35**2 + 0.25**2) / 0.25)  # the centre of the corner pixel
     a = torch.tensor([0.3, 0.1, 0.2])
     assert vignetting(torch.tensor([0.0, 1.0]), a).tolist() == pytest.approx([1.0, math.exp(-0.6)])
 
@@ -49,7 +49,7 @@ def test_vignetting_is_1_at_the_principal_point_and_decreases_outwards() -> None
 def test_an_image_of_half_the_size_has_the_same_vignetting() -> None:
     reach = reach_of([CAMERA])
     small = squared_radii(CAMERA.downscaled(2), reach)
-    # Four pixels lie half a pixel from their middle along each axis: their mean square is its square and 2 x 0.25 px^2.
+    # Four pixels lie half a pixel from their centre along each axis: mean square = square of the mean + 2 x 0.25 px^2.
     large = squared_radii(CAMERA, reach).reshape(3, 2, 4, 2).mean(axis=(1, 3))
     assert np.allclose(small, large - 2 * 0.25 / (10 * reach) ** 2, atol=1e-6)
 

@@ -1,11 +1,13 @@
-"""Random scenes, the CPU kernels against the reference: images, radii, errors and gradients, the edges of float32 among
-them. A few in every run of the tests, two thousand in `make test-all`.
+"""CPU kernels against the reference on random scenes: images, radii, errors and gradients.
 
-What is compared how is that of ``test_parity``: the reference judges in float64 on the same float32 numbers; decisions
-at thresholds may flip for one pair in some 1e5, and gradients are compared where no decision is near its threshold.
-Every second scene has numbers at the edge of float32. There the kernels, which find what lies behind a splat as all of
-the pixel minus what lies before, cannot know a small gradient beside one of 1e14; the largest one is the measure.
-``KNOWN`` names the plain scene, of a thousand, in which gradients are off by more (docs/notebook/reliability.md).
+A few scenes run in every test run, two thousand in `make test-all`. The comparison follows ``test_parity``: the
+reference uses float64 on the same float32 inputs, decisions may flip for about one pair in 1e5, and gradients are
+compared only away from thresholds.
+
+Every second scene has values at the limits of float32. The kernels compute what lies behind a splat as the pixel minus
+what lies in front, which cannot resolve a small gradient next to one of 1e14; tolerances are therefore relative to the
+largest gradient. ``KNOWN`` lists the one plain scene in a thousand with a larger gradient error
+(docs/notebook/reliability.md).
 """
 
 from __future__ import annotations
@@ -25,8 +27,8 @@ from render_scenes import IMAGES, contraction, random_camera, random_cotangents,
 
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
 GRADIENT_ERROR = 5e-3  # relative
-OF_LARGEST = 1e-5  # where there are edges: of the largest attribute's gradient
-KNOWN = {708}  # a disc 0.04 degrees from edge-on: the inverse of its frame has few digits left; off by 1.1 %
+OF_LARGEST = 1e-5  # with extreme values: relative to the attribute's largest gradient
+KNOWN = {708}  # a disc 0.04 degrees from edge-on: inverting its frame loses digits; error 1.1 %
 
 
 def has_edges(seed: int) -> bool:
@@ -34,7 +36,7 @@ def has_edges(seed: int) -> bool:
 
 
 def random_scene(seed: int) -> tuple[Splats, Camera]:
-    """Every second scene has numbers of any magnitude that float32 has in some of its splats."""
+    """Return a random scene; in every second, some splats have values of any magnitude in float32."""
     rng = np.random.default_rng(10_000 + seed)
     camera = random_camera(rng)
     camera = camera.resized(min(camera.width, 20), min(camera.height, 20))

@@ -1,4 +1,4 @@
-"""The reference: against a pixel-by-pixel oracle, against finite differences, and its own internal laws."""
+"""The reference compared with a pixel-by-pixel oracle and finite differences, and its invariants."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_the_reference_is_the_pixel_by_pixel_oracle() -> None:
 
 
 def test_gradients_are_those_of_finite_differences() -> None:
-    """Away from every threshold; all images, all parameters, and the signed half of the screen probe."""
+    """All images, all parameters, and the signed half of the screen probe, away from thresholds."""
     kinds = tuple(kind for kind in KINDS if kind not in ("twins", "opaque"))  # ties and limits: see the contract tests
     checked: Counter[str] = Counter()
     seed = 0
@@ -84,7 +84,7 @@ def test_gradients_are_those_of_finite_differences() -> None:
 
 
 def test_absolute_columns_sum_the_absolute_signals_of_single_pixels() -> None:
-    """The definition itself: one backward pass per pixel of the image."""
+    """Recomputed by definition, with one backward pass per pixel."""
     splats, camera = small_scene(5)
     cotangents = random_cotangents(np.random.default_rng(5), camera)
     probe = torch.zeros(len(splats), 4, dtype=torch.float64, requires_grad=True)
@@ -122,7 +122,7 @@ def test_the_order_of_rows_does_not_matter_without_ties() -> None:
 
 
 def test_moving_the_world_and_the_camera_together_changes_nothing() -> None:
-    """Rigid motion of scene and camera: images stay, normals turn along (degree-0 colour)."""
+    """Rigid motion of scene and camera: images are unchanged, normals rotate (degree-0 colour)."""
     splats, camera = small_scene(9)
     splats = replace(splats, shN=splats.shN[:, :0])
     turn = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # 120 degrees about (1, 1, 1)
@@ -146,7 +146,7 @@ def test_moving_the_world_and_the_camera_together_changes_nothing() -> None:
 
 
 def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
-    """a [4] times each row of b [N, 4] (Hamilton)."""
+    """Multiply quaternion a [4] by each row of b [N, 4] (Hamilton)."""
     w, x, y, z = a
     left = torch.stack(
         [

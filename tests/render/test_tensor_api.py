@@ -1,4 +1,4 @@
-"""``rasterize_2dgs``: batches of cameras and channels on bare tensors, with the bits of ``rasterize``."""
+"""``rasterize_2dgs``: batches of cameras and channels on plain tensors, bit-identical to ``rasterize``."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ SIZE = (18, 14)
 
 
 class Scene:
-    """Tensors as gsplat has them, and the same as gs2d's own types."""
+    """The same scene as gsplat-style tensors and as gs2d types."""
 
     def __init__(self, seed: int = 0, cameras: int = 2, channels: int = 3, count: int = 12) -> None:
         rng = np.random.default_rng(seed)
         first = replace(random_camera(rng), width=SIZE[0], height=SIZE[1], fx=17.0, fy=19.0, cx=9.5, cy=6.25)
-        first = replace(first, T_cam_world=first.T_cam_world.astype(np.float32))  # as tensors have it
+        first = replace(first, T_cam_world=first.T_cam_world.astype(np.float32))  # same precision as the tensors
         self.cameras = [first]
         for _ in range(cameras - 1):
             T = first.T_cam_world.copy()
@@ -50,7 +50,7 @@ class Scene:
         self.screen_probe = torch.zeros(cameras, count, 2)
 
     def learning(self, *names: str, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
-        """The arguments, of which those named (all by default) are leaves that require a gradient."""
+        """Return the arguments; those named (all by default) are leaves that require a gradient."""
         found = {name: getattr(self, name).to(dtype) for name in NAMES}
         return {name: t.clone().requires_grad_(name in (names or NAMES)) for name, t in found.items()}
 
@@ -64,13 +64,13 @@ def render(arguments: dict[str, Any], **options: Any) -> Rasterization:
 
 
 def contraction(out: Rasterization, seed: int = 0) -> Tensor:
-    """A sum over all images with random weights."""
+    """Return a randomly weighted sum over all images."""
     g = torch.Generator().manual_seed(seed)
     return sum(((image * torch.randn(image.shape, generator=g)).sum() for image in out[:-1]), torch.zeros(()))
 
 
 def same_images(out: Rasterization, index: int, expected: RenderOutput) -> None:
-    """The images of one camera are those of ``rasterize``, bit for bit; colours are left to the caller."""
+    """Check that a camera's images equal those of ``rasterize`` bit for bit; colours are checked by the caller."""
     for ours, theirs in zip(Rasterization._fields[1:-1], IMAGES[1:], strict=True):
         image = getattr(out, ours)[index]
         assert torch.equal(image, getattr(expected, theirs).reshape(image.shape)), ours
@@ -156,7 +156,7 @@ def test_every_tensor_has_the_gradient_of_finite_differences() -> None:
 
 
 def three_at_a_time(backend: Backend) -> Backend:
-    """The same backend without a pass for further channels."""
+    """Return a backend that renders only three channels per pass."""
     return altered(backend, rasterize_features=partial(Backend.rasterize_features, backend))
 
 
@@ -254,7 +254,7 @@ def test_the_ends_of_opacity_and_scale_are_drawn_and_learn(backend: Backend) -> 
     out = render(one, backend=backend)
     assert float(out.alphas.detach().max()) == pytest.approx(0.99, abs=1e-5)
     out.alphas.sum().backward()
-    x, y = torch.arange(18) - 9, torch.arange(14) - 7  # px; the disc has 2 of them
+    x, y = torch.arange(18) - 9, torch.arange(14) - 7  # px; the disc has a radius of 2 px
     falloff = torch.exp(-(x[None] ** 2 + y[:, None] ** 2) / 8.0)
     assert float(one["opacities"].grad) == pytest.approx(float(falloff.sum()), rel=2e-2)  # type: ignore[arg-type]
     nothing = render({**one, "opacities": torch.zeros(1, requires_grad=True)}, backend=backend)
@@ -262,7 +262,7 @@ def test_the_ends_of_opacity_and_scale_are_drawn_and_learn(backend: Backend) -> 
     dot = torch.zeros(1, 2, requires_grad=True)
     drawn = render({**one, "scales": dot}, backend=backend)
     drawn.alphas.sum().backward()
-    assert float(drawn.alphas.detach().max()) > 0.3  # by the low-pass filter
+    assert float(drawn.alphas.detach().max()) > 0.3  # from the low-pass filter
     assert dot.grad is not None
     assert dot.grad.isfinite().all()
 
@@ -292,7 +292,7 @@ def test_a_mistake_is_named_with_its_remedy(cpu: Backend, case: str) -> None:
 
 # The operator -----------------------------------------------------------------------------------------------------
 def operands(scene: Scene, dtype: torch.dtype = torch.float32, backend: str = "cpu") -> tuple[Any, ...]:
-    """The operator's arguments; no splat's opacity is near a threshold."""
+    """Return the operator's arguments; no opacity is near a threshold."""
     constants = [float(getattr(RasterSettings(), name)) for name in CONSTANTS]
     tensors = scene.learning(dtype=dtype).values()
     return (*tensors, *SIZE, PLAIN_COLORS, constants, "center", "draw", True, backend)
