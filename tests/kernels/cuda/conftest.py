@@ -1,4 +1,4 @@
-"""What the CUDA tests share: scenes with a margin, and what a torch without CUDA lacks."""
+"""Fixtures of the CUDA tests: scenes with a margin, and a device guard for torch without CUDA."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gs2d.render import pair_budget
 
 @pytest.fixture(scope="session", autouse=True)
 def little_room_for_pairs() -> Iterator[None]:
-    """Round the room for pairs up to 512, not 65,536: the emulator sorts all of it, which takes most of the time."""
+    """Round the pair capacity up to 512 instead of 65,536: the emulator sorts all of it, which dominates run time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pair_budget, "STEP", 512)
         yield
@@ -25,13 +25,13 @@ def little_room_for_pairs() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def clear_cases() -> list[kernel_cases.Case]:
-    """Small scenes in which no decision is within 1e-4 of its threshold."""
+    """Return small scenes in which no decision is within 1e-4 of its threshold."""
     return kernel_cases.cases_with_margins()
 
 
 @pytest.fixture(scope="session")
 def guard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a torch without CUDA needs to know of its devices: for processes of tests, because it stays."""
+    """Build the device guard that torch without CUDA lacks; it stays loaded, so use it only in subprocesses."""
     root = Path(torch.__file__).parent
     if torch.version.cuda is not None:
         pytest.skip("torch is built with CUDA here: tests/gpu")

@@ -1,4 +1,4 @@
-"""NVRTC: every kernel for every architecture without spills, and a cache that nothing can corrupt."""
+"""NVRTC: every kernel compiles for every architecture without spills; the cache detects corruption."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _absent() -> str:
 needs_nvrtc = pytest.mark.skipif(bool(_absent()), reason=_absent() or "NVRTC is here")
 
 
-MEASURED = "sm_90"  # the architecture of the GPU on which gs2d has run
+MEASURED = "sm_90"  # the architecture of the GPU used for measurements
 
 
 @needs_nvrtc
@@ -99,7 +99,7 @@ def test_a_changed_source_architecture_or_option_is_another_entry(
 @needs_nvrtc
 @pytest.mark.parametrize("damage", ["empty", "cut", "flipped"])
 def test_a_damaged_entry_is_compiled_again(tmp_path: Path, damage: str) -> None:
-    # Not emit.cu: the compiler orders instructions of emit_entries_* now one way, now another.
+    # Not emit.cu: the compiler's instruction order for emit_entries_* varies between runs.
     whole = cubin("cuda/slots.cu", "sm_90", tmp_path).code
     (path,) = tmp_path.iterdir()
     data = bytearray(path.read_bytes())
@@ -113,10 +113,10 @@ def test_a_damaged_entry_is_compiled_again(tmp_path: Path, damage: str) -> None:
 
 @needs_nvrtc
 def test_without_a_home_kernels_are_compiled_and_nothing_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A container's user may be a number without a name or a home."""
+    """A container user may be a number without a name or a home directory."""
     for name in ("HOME", "GS2D_CACHE", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr("os.path.expanduser", lambda path: path)  # what it does where it finds no home
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)  # what it does without a home directory
     assert nvrtc_compile.cache_folder() is None
     assert not nvrtc_compile.is_writable(None)
     monkeypatch.setattr(nvrtc_compile, "_write", lambda path, code: pytest.fail(f"written: {path}"))

@@ -1,7 +1,7 @@
-"""What an iteration gives host and device to do, and what the compiler makes of the kernels: gates, without a GPU.
+"""Limits on the work of an iteration for host and device, and on the machine code of kernels; no GPU needed.
 
-Counts, not times: they are the same on every machine. ``python -m benchmarks.gpu host`` and ``python -m
-benchmarks.gpu.sass`` print them with the times.
+They are counts, not times, so they are the same on every machine. ``python -m benchmarks.gpu host`` and
+``python -m benchmarks.gpu.sass`` print them together with times.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from emulate import Emulator
 from gs2d.kernels.cuda.kernel_arguments import OrderArguments, fill
 from gs2d.render import cuda_works
 
-# Own launches, device launches, torch operations, allocations. A tile more than 256 in the image is a launch more. The
-# operation is the order of the views, on the host, once in an epoch.
+# gs2d launches, device launches, torch operations, allocations. More than 256 tiles per image add a launch. The torch
+# operation shuffles the views on the host, once per epoch.
 LIMITS = {
     "graph": {
         "surface": (20, 20, 1, 0),
@@ -39,7 +39,7 @@ LIMITS = {
         "best": (14, 70, 133, 40),  # with L2
     },
 }
-CHANGED = 11  # nodes of a graph: those that hold a camera, a photograph or rates
+CHANGED = 11  # graph nodes that hold a camera, an image or learning rates
 
 
 @pytest.mark.parametrize("way", list(LIMITS))
@@ -71,7 +71,7 @@ def test_tiles_are_taken_longest_first_each_once(emulator: Emulator, lengths: li
 def test_rows_that_begin_in_the_middle_of_sixteen_bytes_have_the_same_gradients(
     emulator: Emulator, tmp_path: Path
 ) -> None:
-    """A view of another tensor's rows is contiguous, and begins anywhere."""
+    """A view of another tensor's rows is contiguous, but may start at any address."""
     import numpy as np
 
     from gs2d.render import cuda_rasterizer as cuda

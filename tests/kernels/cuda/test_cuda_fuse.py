@@ -1,4 +1,4 @@
-"""Fusion on a GPU, executed on the CPU by the emulator, against numpy."""
+"""GPU fusion, emulated on the CPU, against numpy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The CUDA losses, executed on the CPU by the emulator, against the torch references in float64."""
+"""CUDA losses, emulated on the CPU, against the torch references in float64."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gs2d.kernels.cuda import cuda_losses as ops
 from gs2d.kernels.native_losses import NormalOptions
 from gs2d.losses import formulas as reference
 
-# Smaller than the window; a row and a strip of 128 reals (43 pixels) and of 32 rows begun and passed.
+# Smaller than the window; a single row; just over one strip of 128 reals (43 pixels) or 32 rows.
 SIZES = [(1, 1), (5, 3), (37, 44), (33, 20)]
 
 
@@ -27,7 +27,7 @@ def make_camera(height: int, width: int) -> Camera:
 
 
 def photographs(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-    """A noisy rendering with some equal pixels, its target, and a mask; float32."""
+    """Return a noisy rendering with some pixels equal to the target, the target, and a mask; float32."""
     g = torch.Generator().manual_seed(seed)
     target = reference.blur(torch.rand(height, width, 3, generator=g))
     rendered = (target + 0.2 * torch.randn(height, width, 3, generator=g)).clamp(0, 1)
@@ -36,7 +36,7 @@ def photographs(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor,
 
 
 def geometry(height: int, width: int, seed: int = 0, empty: float = 0.05) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Rendered normals, depth with holes, alpha and a mask; float32."""
+    """Return rendered normals, depth with holes, alpha and a mask; float32."""
     g = torch.Generator().manual_seed(seed)
 
     def rand(*shape: int) -> Tensor:
@@ -85,7 +85,7 @@ def test_without_a_valid_pixel_values_and_gradients_are_0(emulator: emulate.Emul
 
 
 @pytest.mark.parametrize(
-    ("edges", "weighted", "per_splat", "masked"),  # each value with each other one at least once
+    ("edges", "weighted", "per_splat", "masked"),  # each pair of values occurs at least once
     [
         ("undefined", False, False, True),
         ("undefined", True, True, False),
@@ -135,7 +135,7 @@ def test_the_mean_of_a_map_and_its_gradient_are_those_of_the_reference(
 
 
 def test_values_and_gradients_do_not_depend_on_the_order_of_threads(emulator: emulate.Emulator) -> None:
-    """Sums are taken in a fixed order; a missing barrier would show too."""
+    """Sums have a fixed order; a missing barrier would also show."""
     x, y, mask = photographs(37, 44)
     *images, _ = geometry(37, 44)
     results = []

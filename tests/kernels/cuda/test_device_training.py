@@ -1,7 +1,7 @@
-"""Training with the cuda backend in the emulator: the CPU's result within rounding, and a host that never waits.
+"""Training with the emulated cuda backend equals the CPU's result up to rounding, and never blocks the host.
 
-Tensors lie in host memory here, so what would be a copy to or a wait for the GPU is counted by operation: reading a
-value, looking up which rows are True, or making a tensor from Python numbers.
+Tensors are in host memory, so would-be GPU copies and synchronisations are counted by operation: reading a value,
+finding the rows that are True, or making a tensor from Python numbers.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from render_scenes import front_camera, splat, stack
 
 @pytest.fixture
 def emulated(emulator: Emulator, monkeypatch: pytest.MonkeyPatch) -> Backend:
-    """The cuda backend with the emulator in the place of the GPU."""
+    """Return the cuda backend with the emulator in place of the GPU."""
     monkeypatch.setattr(launch, "launcher_for", lambda device: emulator)
     return cuda_on_host()
 
@@ -82,7 +82,7 @@ VARIANTS = {
 def test_three_stages_give_the_cpu_backends_scene_within_rounding(
     emulated: Backend, scene: Scene, variant: str
 ) -> None:
-    """19 iterations with densifications, a reset, ranking, a clone and frozen rows; decisions and counts are equal."""
+    """19 iterations with densification, a reset, ranking, a clone and frozen rows; decisions and counts are equal."""
     recipe = VARIANTS[variant]
     results = [
         train_toys.train(scene, recipe, backend=backend, stage2_cache_bytes=0) for backend in (cpu_backend(), emulated)
@@ -126,13 +126,13 @@ class TrainingObserver(TorchDispatchMode):
 
 @contextmanager
 def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[Counter[str]]:
-    """Operations that wait, and tensors made of Python numbers (a copy that the host waits for)."""
+    """Record synchronising operations and tensors made from Python numbers (a blocking copy)."""
     with monkeypatch.context() as patch, TrainingObserver() as watch:
         for where, name in ((torch, "tensor"), (torch, "as_tensor"), (torch.Tensor, "new_tensor")):
             original = getattr(where, name)
 
             def recording(*args: Any, _original: Any = original, _name: str = name, **kwargs: Any) -> Any:
-                if str(kwargs.get("device", "")) != "cpu":  # said to be for the host
+                if str(kwargs.get("device", "")) != "cpu":  # explicitly on the host
                     watch.seen[_name] += 1
                 return _original(*args, **kwargs)
 
@@ -152,7 +152,7 @@ def in_stage(trainer: Trainer, stage: int) -> None:
 
 
 def quiet(recipe: Recipe) -> Recipe:
-    """Nothing is densified or reset in the iterations that are watched."""
+    """Return the recipe without densification or resets in the observed iterations."""
     first = recipe.stages[0]
     assert first.densify is not None
     densify = replace(first.densify, start=1000, stop=2000, reset_every=0)
@@ -174,15 +174,15 @@ def test_an_iteration_waits_for_nothing_once_it_knows_how_many_pairs_to_expect(
     in_stage(trainer, stage)
     trainer.step()
     for index in range(len(scene.train)):
-        target = trainer._targets[index]  # each photograph is taken in once
+        target = trainer._targets[index]  # every image is loaded
         if variant == "multiview":
-            trainer.state.step = 6  # the next iteration compares
+            trainer.state.step = 6  # the next iteration has multi-view losses
             trainer._whole._images.of(index, target)
     with watched(monkeypatch) as seen:
         trainer.step()
         trainer.step()
     through_torch = stage == 0 and variant != "plain"
-    looks_at_probe = {"_local_scalar_dense": 2} if through_torch else {}  # for tensors in host memory, as here
+    looks_at_probe = {"_local_scalar_dense": 2} if through_torch else {}  # these tensors are in host memory
     assert dict(seen) == looks_at_probe
 
 
@@ -206,7 +206,7 @@ def test_a_loss_that_is_not_finite_stops_training_at_the_next_report(
 def test_without_waiting_for_the_number_of_pairs_training_gives_the_same_bits(
     emulated: Backend, scene: Scene, slack: float, variant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With room for half of the pairs every iteration that may be cut short is, changes nothing, and is done again."""
+    """With capacity for half of the pairs, truncated iterations change nothing and are repeated."""
     recipe = VARIANTS[variant]
     kept = train_toys.train(scene, recipe, backend=altered(emulated, for_training=lambda: emulated))[0]
     monkeypatch.setattr(cuda_budget, "SLACK", slack)
@@ -227,9 +227,9 @@ def test_without_waiting_for_the_number_of_pairs_training_gives_the_same_bits(
 def test_unused_room_is_empty_and_too_little_room_sets_overflow(
     emulator: Emulator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The last splat by depth lies at the top: pairs that do not exist would count on, into the tiles below it.
+    """The last splat by depth is at the top: unused entries would be counted in the tiles below it.
 
-    Without culling inside tiles, which would hide them.
+    Culling inside tiles is disabled because it would hide them.
     """
     monkeypatch.setattr(cuda_budget, "STEP", 1)
     camera = front_camera(40, 200)
@@ -248,7 +248,7 @@ def test_unused_room_is_empty_and_too_little_room_sets_overflow(
         assert len(frame.entries) == int(slack * pairs)
         assert bool(budget.overflow) == short
         assert budget.overflowed() == short
-        assert not budget.overflowed()  # settled
+        assert not budget.overflowed()  # reading it resets it
         same = [torch.equal(frame.images[name], exact.images[name]) for name in ("color", "alpha", "depth_median")]
         assert all(same) != short
         if not short:
@@ -256,7 +256,7 @@ def test_unused_room_is_empty_and_too_little_room_sets_overflow(
 
 
 def test_room_follows_the_number_of_pairs_up_at_once_and_down_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Room is sorted whether it is used or not: large splats of a start must not cost for the rest of a run."""
+    """All capacity is sorted, used or not: large initial splats must not slow down the rest of a run."""
     monkeypatch.setattr(cuda_budget, "STEP", 1)
     budget, size = cuda_budget.PairBudget(), Rendering(7)
     budget.learn(size, 1_000_000)
@@ -267,11 +267,11 @@ def test_room_follows_the_number_of_pairs_up_at_once_and_down_slowly(monkeypatch
         budget.learn(size, 100_000)
     assert budget.room(size) == 125_000
     budget.learn(size, cuda_budget.MAX_PAIRS)
-    assert budget.room(size) == cuda_budget.MAX_PAIRS  # 1.25 times as many would not fit in an index
+    assert budget.room(size) == cuda_budget.MAX_PAIRS  # 1.25 times as many would overflow the index
 
 
 def test_each_view_has_room_for_its_own_pairs_and_for_splats_that_were_added(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One number for all views of a size sorted 3.75 times as much as there was, where views differ by three."""
+    """A common capacity for views that differ by a factor of 3 would sort 3.75 times as many pairs as exist."""
     monkeypatch.setattr(cuda_budget, "STEP", 1)
     budget = cuda_budget.PairBudget()
     small, large = (Rendering(7, 1000, name) for name in (b"small", b"large"))
@@ -281,7 +281,9 @@ def test_each_view_has_room_for_its_own_pairs_and_for_splats_that_were_added(mon
     assert budget.room(large) == pytest.approx(990_000, abs=1)
     assert budget.room(Rendering(7, 1000, b"new")) == 1_125_000
     assert budget.room(small._replace(splats=2000)) == pytest.approx(660_000, abs=1)
-    assert budget.room(small._replace(splats=500)) == pytest.approx(330_000, abs=1)  # the faint ones are few pairs
+    assert budget.room(small._replace(splats=500)) == pytest.approx(
+        330_000, abs=1
+    )  # pruned splats are faint and have few pairs
     budget.learn(small, 200_000)
     assert budget.room(small) == pytest.approx(220_000, abs=1)
 
@@ -301,7 +303,7 @@ def test_a_fault_that_a_kernel_left_is_one_line_with_a_remedy_where_torch_meets_
 
 
 def image_scene() -> tuple[View, ...]:
-    """Four views of 6 x 4 px: opaque, with alpha, with a mask, opaque."""
+    """Return four views of 6 x 4 px: opaque, with alpha, with a mask, opaque."""
     rng = np.random.default_rng(0)
     camera = front_camera(6, 4)
     images = [rng.integers(0, 256, (4, 6, channels), dtype=np.uint8) for channels in (3, 4, 3, 3)]
@@ -313,7 +315,7 @@ def image_scene() -> tuple[View, ...]:
 
 
 def test_images_are_stored_as_bytes_and_convert_to_the_targets_of_the_cpu() -> None:
-    """72 bytes opaque, 96 with alpha, 96 with a mask: of 170 bytes on the device the first two use 168.
+    """72 bytes opaque, 96 with alpha, 96 with a mask: the first two use 168 of the 170 bytes on the device.
 
     Pinned, the third takes 128 + 32 bytes.
     """
@@ -333,7 +335,7 @@ def test_images_are_stored_as_bytes_and_convert_to_the_targets_of_the_cpu() -> N
             assert torch.allclose(target.image, expected.image, rtol=0, atol=2e-7)
             assert (target.mask is None) == (expected.mask is None)
             assert target.mask is None or torch.equal(target.mask, expected.mask)  # type: ignore[arg-type]
-    assert pinned == [72, 24]  # the third, image and mask; the fourth does not fit any more and is read each time
+    assert pinned == [72, 24]  # the third view's image and mask; the fourth does not fit and is read each time
     assert sorted(targets._kept) == [0, 1, 2]
 
 

@@ -1,8 +1,9 @@
-"""Where tensors lie when the splats are on a GPU: nothing from the host's memory reaches a kernel or is mixed in.
+"""Device placement with splats on a GPU: kernels get no host tensors, and devices are never mixed.
 
-torch's fake tensors say "cuda:0" without a GPU: they have shapes and devices but no values, refuse to be mixed with
-those of another device, and cannot be read, so a look at a value, for which the host would wait, is an error. A torch
-without CUDA needs a stand-in for the part that knows devices, which is compiled here.
+torch's fake tensors report "cuda:0" without a GPU. They have shapes and devices but no values, and refuse mixed
+devices.
+Reading a value, which would block the host, is an error. A torch without CUDA needs a device guard, which is compiled
+here.
 """
 
 from __future__ import annotations
@@ -146,7 +147,7 @@ with FakeTensorMode():
 
 @pytest.fixture(scope="module")
 def said(guard: Path) -> list[str]:
-    """What both scripts print: a line each, and the refusal; in a process of their own, because the stand-in stays."""
+    """Return the output lines of both scripts and the error, from a subprocess, because the guard stays loaded."""
     given = [str(guard), str(Path(__file__).resolve().parents[2] / "helpers")]
     command = [sys.executable, "-c", COMMON + ITERATIONS + "launched.clear()\n" + GRADIENTS, *given]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=dict(os.environ))

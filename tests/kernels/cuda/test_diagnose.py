@@ -1,4 +1,4 @@
-"""Why the CUDA backend cannot run, in the order in which a user would mend it, and what to do each time."""
+"""Diagnosis of an unavailable CUDA backend: causes in the order in which to fix them, with instructions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gs2d.render.backends import backend_report, get_backend
 
 H200 = ("NVIDIA H200", (9, 0))
 WORKS = Facts("2.15.0", (13, 0), nvrtc=(13, 0), driver=(13, 2), devices=(H200,))
-# Everything is wrong; each line of the table mends one thing more.
+# Everything is broken; each row of the table fixes one more cause.
 BROKEN = Facts(
     "2.15.0+cpu",
     None,
@@ -48,7 +48,7 @@ MENDING = (
 
 @pytest.fixture(autouse=True)
 def nothing_brought(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever scripts/build_cubins.py has left in this checkout."""
+    """Hide cubins that scripts/build_cubins.py may have left in this checkout."""
     monkeypatch.setattr(nvrtc, "shipped_kernels", lambda: None)
 
 
@@ -67,7 +67,7 @@ def test_each_missing_piece_is_named_in_order_with_its_remedy() -> None:
 def test_bindings_that_mean_another_default_stream_than_torch_are_refused(
     value: str | None, refused: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Kernels would run beside torch's sorts, not after them: wrong images now and then, and no error."""
+    """Kernels would run concurrently with torch's sorts: occasional wrong images, and no error."""
     name = "CUDA_PYTHON_CUDA_PER_THREAD_DEFAULT_STREAM"
     monkeypatch.setenv(name, value) if value else monkeypatch.delenv(name, raising=False)
     assert own_default_stream() == refused
@@ -83,7 +83,7 @@ def test_bindings_that_mean_another_default_stream_than_torch_are_refused(
 
 @pytest.mark.skipif(torch.version.cuda is not None, reason="torch is built with CUDA here")
 def test_facts_are_gathered_to_the_end_whatever_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A CUDA torch on a machine like this one: no driver, no device, and every line filled in."""
+    """A CUDA build of torch without driver or device: every field is filled in."""
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     facts = diagnose.gather()
     assert facts.torch_cuda == (13, 0)
@@ -99,7 +99,7 @@ def test_facts_are_gathered_to_the_end_whatever_fails(monkeypatch: pytest.Monkey
 
 
 class Compiler:
-    """NVRTC, as far as the choice of an architecture asks it."""
+    """NVRTC as used for the choice of an architecture."""
 
     known: tuple[int, ...] = (75, 80, 86, 87, 90, 100, 103, 110, 120)
 
@@ -123,7 +123,7 @@ def test_a_device_newer_than_the_compiler_takes_the_newest_code_of_its_major_ver
 
 
 def test_code_for_a_processor_with_a_cpu_on_its_chip_is_for_that_one_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """NVRTC 12.8 knows 10.0 and 10.1 (Thor): a B300 (10.3) runs the code of the former, not of the latter."""
+    """NVRTC 12.8 supports 10.0 and 10.1 (Thor): a B300 (10.3) runs code for 10.0 but not for 10.1."""
     monkeypatch.setattr(nvrtc, "_nvrtc", lambda: Compiler)
     monkeypatch.setattr(Compiler, "known", (75, 80, 86, 87, 90, 100, 101, 120))
     assert nvrtc.architecture_for((10, 3)) == "sm_100"

@@ -1,4 +1,4 @@
-"""The emulator that runs CUDA kernels on the CPU: it computes what a GPU would, and finds what would hang one."""
+"""The emulator of CUDA kernels computes what a GPU would, and detects deadlocks."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_missing_barrier_gives_wrong_results(cases: emulate.EmulatedKernels) -
 
 
 def test_warps_that_run_ahead_expose_a_vote_used_as_a_barrier(cases: emulate.EmulatedKernels) -> None:
-    """Where all warps go from collective to collective together it would pass for one; with a barrier all is well."""
+    """With all warps in lockstep the vote would pass as a barrier; with a real barrier the results are correct."""
     right = [*range(63, -1, -1), *range(127, 63, -1)]
 
     def results(name: str, **order: int) -> list[int]:

@@ -1,7 +1,7 @@
-"""All of training, meshing and scoring with tensors on "cuda", with their values: nothing is mixed with the host's.
+"""Training, meshing and scoring with tensors on "cuda" that have values: host and device are never mixed.
 
-``fake_gpu.py`` has what torch takes for a GPU, the emulator runs the kernels. ``test_devices.py`` sees one iteration,
-and that nothing waits; here densification, ranking, cloning, checkpoints, fusion and scores look at values too.
+``fake_gpu.py`` acts as the GPU for torch, the emulator runs the kernels. ``test_devices.py`` covers a single iteration
+and synchronisation; densification, ranking, cloning, checkpoints, fusion and scores also read values.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ print(render_run(folder / "run", RenderOptions(orbit=1))["images"])
 
 
 def said(script: str, guard: Path, emulator: emulate.Emulator, folder: Path) -> list[str]:
-    """What a script prints in a process of its own; kernels that these tests have compiled already are taken."""
+    """Return a script's output from a subprocess; it reuses the kernels compiled for these tests."""
     given = [str(guard), str(Path(__file__).resolve().parents[2] / "helpers"), str(folder)]
     command = [sys.executable, "-c", COMMON + script, *given]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=dict(os.environ))

@@ -1,4 +1,4 @@
-"""The CUDA kernels, executed on the CPU by the emulator: chunks of lists, order of threads, what is refused.
+"""CUDA kernels, emulated on the CPU: list chunks, thread order, rejected input.
 
 Images and gradients against the reference: tests/render/test_parity.py.
 """
@@ -23,7 +23,7 @@ from render_scenes import IMAGES, front_camera, random_cotangents, splat, stack
 
 
 def layers(count: int) -> Splats:
-    """Faint splats one behind another, all seen by every pixel of a small image."""
+    """Return faint splats behind each other, all visible in every pixel of a small image."""
     parts = [splat((0.0, 0.0, 2.0 + 0.01 * i), (3.0, 3.0), 0.02, (i % 3 / 2, 0.5, 0.2)) for i in range(count)]
     return stack(*parts)
 
@@ -61,7 +61,7 @@ def test_a_pixel_that_stops_on_the_last_bit_of_a_chunk_stays_stopped(emulator: E
 
 
 def test_the_order_of_threads_warps_and_blocks_does_not_change_images(emulator: Emulator) -> None:
-    """A missing barrier would."""
+    """A missing barrier would change them."""
     case = many_tiles()
     usual = render(emulator, case.splats, case.camera, SETTINGS)
     cotangents = random_cotangents(np.random.default_rng(1), case.camera)
@@ -71,14 +71,14 @@ def test_the_order_of_threads_warps_and_blocks_does_not_change_images(emulator: 
         for name in (*IMAGES, "radii"):
             assert torch.equal(getattr(usual, name), getattr(images, name)), name
         b = gradients(partial(render, other), case.splats, case.camera, cotangents, 4)
-        for name in a:  # gradients are sums in the order of the threads
+        for name in a:  # gradient sums depend on the thread order
             assert float((a[name] - b[name]).norm()) <= 1e-5 * float(a[name].norm()), name
 
 
 def test_arguments_that_would_read_beyond_an_array_are_refused(emulator: Emulator) -> None:
     camera, scene = front_camera(), splat()
     with pytest.raises(ShapeError, match="sh_degree"):
-        cuda.rasterize_with(emulator, scene, camera, SETTINGS)  # degree 3, but no coefficients beyond the first
+        cuda.rasterize_with(emulator, scene, camera, SETTINGS)  # degree 3, but only the first coefficient
     with pytest.raises(ShapeError, match="float32"):
         cuda.rasterize_with(emulator, double(scene), camera, replace(SETTINGS, sh_degree=0))
     with pytest.raises(ShapeError, match="image"):

@@ -1,4 +1,4 @@
-"""The machine code of the CUDA kernels: registers, shared memory and inner loops are those committed."""
+"""Machine code of the CUDA kernels: registers, shared memory and inner loops match the committed values."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LISTING = """
 
 def test_only_innermost_loops_count_and_the_trap_at_the_end_does_not() -> None:
     loops = cuda_loops.innermost_loops(LISTING)
-    assert [len(loop) for loop in loops["outer"]] == [5]  # 0010 to 0050; the one from 0000 holds it
+    assert [len(loop) for loop in loops["outer"]] == [5]  # 0010 to 0050; the loop from 0000 contains it
     assert loops["straight"] == []
     assert cuda_loops.mix(loops["outer"][0]) == {"total": 5, "shared": 1, "arithmetic": 2, "special": 1, "branch": 1}
 
@@ -65,8 +65,11 @@ def test_loops_registers_and_shared_memory_are_as_committed(measured: dict[str, 
 def test_the_blend_kernels_leave_room_for_the_warps_that_hide_their_latencies(
     measured: dict[str, dict[str, Any]],
 ) -> None:
-    """sm_90 has 65536 registers and 228 KB of shared memory (1 KB of each block's is the system's): 128 threads of 72
-    registers are 7 blocks, 28 warps; of 64 registers 8 blocks, 32 warps. The distortion's loss is rare: 7 and 5."""
+    """sm_90 has 65536 registers and 228 KB of shared memory, of which each block loses 1 KB to the system.
+
+    128 threads of 72 registers give 7 blocks (28 warps), of 64 registers 8 blocks (32 warps). The
+    distortion loss, rarely used, has 7 and 5 blocks.
+    """
     least = {
         "blend_forward": 8,
         "blend_forward_distortion": 7,

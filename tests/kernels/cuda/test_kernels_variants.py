@@ -1,4 +1,4 @@
-"""Variants of the CUDA passes, run by the emulator: colours alone, some rows, no distortion, the same bits each run."""
+"""Variants of the CUDA passes, emulated: only colours, some rows, no distortion, deterministic sums."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ COLORS = ("sh0", "shN")
 
 
 class Recording:
-    """Runs kernels and notes their names."""
+    """Runs kernels and records their names."""
 
     def __init__(self, emulator: Emulator) -> None:
         self.emulator, self.names = emulator, list[str]()
@@ -46,7 +46,7 @@ def gradients(
     columns: int = 0,
     **options: Any,
 ) -> dict[str, Tensor]:
-    """Of the trained attributes, and with ``columns`` of the probe; ``options`` are CudaChoices and the like."""
+    """Return gradients of the trained attributes, and of the probe if it has ``columns``."""
     scene = Splats(**{name: t.clone().requires_grad_(name in trained) for name, t in case.splats.items()})
     probe = torch.zeros(len(scene), columns, requires_grad=True) if columns else None
     rows, distortion = options.pop("gradient_rows", None), options.pop("distortion", True)
@@ -125,7 +125,7 @@ def test_deterministic_gradients_of_features_do_not_depend_on_order_or_culling(
 def test_rows_that_learn_have_the_gradients_they_have_anyway_and_all_others_zero(
     emulator: Emulator, trained: tuple[str, ...]
 ) -> None:
-    """With sums in a fixed order: bit for bit."""
+    """Bit-identical, with deterministic sums."""
     case = many_tiles()
     rows = some_rows(len(case.splats), 2)
     cotangents = (
@@ -144,7 +144,7 @@ def test_rows_that_learn_have_the_gradients_they_have_anyway_and_all_others_zero
 
 
 def test_a_warp_stops_behind_the_last_splat_that_learns(emulator: Emulator) -> None:
-    """100 faint layers; of those that learn the last is in the first, the second, or no chunk of 32."""
+    """100 faint layers; the last trained splat is in the first, the second, or no chunk of 32."""
     layers = stack(*(splat((0.0, 0.0, 2.0 + 0.01 * i), (3.0, 3.0), 0.02, (i % 3 / 2, 0.5, 0.2)) for i in range(100)))
     case = Case(0, layers, front_camera(9, 5))
     cotangents = color_cotangent(case)
@@ -180,7 +180,7 @@ def test_deterministic_gradients_do_not_depend_on_order_or_culling(
 
 @pytest.mark.parametrize("seed", range(3))
 def test_culling_splats_without_an_ellipse_changes_no_bit(emulator: Emulator, seed: int) -> None:
-    """Those that reach the camera plane: tiles that they cannot touch are not even candidates."""
+    """Splats that reach the camera plane: tiles that they cannot touch are not even candidates."""
     case = crossing_tiles(seed)
     view = cuda_passes.view_of(case.camera, SETTINGS)
     parameters = [tensor.contiguous() for _, tensor in case.splats.items()]
@@ -204,7 +204,7 @@ def test_without_distortion_the_other_images_and_gradients_keep_every_bit(emulat
     case = many_tiles()
     full = cuda.rasterize_with(emulator, case.splats, case.camera, SETTINGS)
     part = cuda.rasterize_with(emulator, case.splats, case.camera, replace(SETTINGS, with_distortion=False))
-    assert bool(part.distortion.isnan().all())  # whoever uses it by mistake will notice
+    assert bool(part.distortion.isnan().all())  # reveals accidental use
     for name in ("color", "alpha", "normal", "depth_mean", "depth_median", "radii"):
         assert torch.equal(getattr(full, name), getattr(part, name)), name
     cotangents = random_cotangents(np.random.default_rng(1), case.camera)
@@ -214,14 +214,14 @@ def test_without_distortion_the_other_images_and_gradients_keep_every_bit(emulat
 
 
 class FewBlocks(Recording):
-    """Of the blending only the first blocks: those of the longest lists."""
+    """Runs only the first blocks of the blend kernels, which have the longest lists."""
 
     def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
         super().launch(name, min(blocks, 3) if name.startswith("blend") else blocks, threads, arguments, shared_bytes)
 
 
 def test_tiles_beyond_32767_are_blended_as_any_other(emulator: Emulator) -> None:
-    """3200 x 3200 px are 40000 tiles. The last one, against a camera that sees nothing else."""
+    """3200 x 3200 px are 40000 tiles. Compares the last tile with a camera that sees only this tile."""
     camera = front_camera(3200, 3200, 1600.0)
     near = Camera(16, 16, camera.fx, camera.fy, camera.cx - 3184, camera.cy - 3184, camera.T_cam_world)
     x, y = (3192.0 - 1600.0) / 800, (3192.0 - 1600.0) / 800  # px at depth 2
@@ -241,5 +241,5 @@ def test_tiles_beyond_32767_are_blended_as_any_other(emulator: Emulator) -> None
         found.append((frame.images["color"][-16:, -16:], means))
     (far_color, far_means), (near_color, near_means) = found
     assert float((near_color - torch.tensor(SETTINGS.background)).abs().max()) > 0.3
-    assert float((far_color - near_color).abs().max()) < 1e-3  # a float at 3200 px has 2e-4 px
+    assert float((far_color - near_color).abs().max()) < 1e-3  # float32 resolution at 3200 px: 2e-4 px
     assert relative_error(far_means, near_means.double()) < 1e-2

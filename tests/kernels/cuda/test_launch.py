@@ -1,4 +1,4 @@
-"""The launcher over a driver that records: streams, contexts, packing, caching, errors; and over the real bindings."""
+"""The launcher on a recording driver: streams, contexts, packing, caching, errors; also with the real bindings."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_tensors_that_are_not_on_a_gpu_are_refused_with_the_way_out() -> None:
 
 
 def test_a_scene_through_launcher_and_driver_equals_the_kernels_result(emulator: Emulator) -> None:
-    """The whole path of a GPU, but for torch's memory and the GPU: pointers reach the kernels through the driver."""
+    """The whole GPU path except torch's memory and the GPU: pointers reach the kernels through the driver."""
     rng = np.random.default_rng(3)
     camera = random_camera(rng)
     splats = random_splats(rng, camera, 40).to(dtype=torch.float32)
@@ -145,13 +145,13 @@ for name in sys.argv[2:]:
     except BackendError as error:
         print(error)
 """
-WITHOUT_GRAPHS = ("cuGraphCreate", "cuGraphAddKernelNode", "cuGraphInstantiate")  # each fails in a case of its own
+WITHOUT_GRAPHS = ("cuGraphCreate", "cuGraphAddKernelNode", "cuGraphInstantiate")  # one failing call per case
 Calls = dict[str, list[dict[str, object]]]
 
 
 @pytest.fixture(scope="module")
 def calls(tmp_path_factory: pytest.TempPathFactory) -> Calls:
-    """Calls that a fake libcuda receives through the real bindings, by case; one process runs all cases."""
+    """Return the calls that a fake libcuda receives through the real bindings, by case; one process runs all cases."""
     pytest.importorskip("cuda.bindings", reason="cuda-bindings is not here")
     if shutil.which("g++") is None or sys.platform != "linux":
         pytest.skip("no g++ on Linux here to build a fake libcuda")
@@ -169,7 +169,7 @@ def calls(tmp_path_factory: pytest.TempPathFactory) -> Calls:
 
 
 def test_the_real_bindings_pass_on_every_launch(calls: Calls) -> None:
-    """Only libcuda is fake here: it records the calls, and refuses a launch without a current context."""
+    """Only libcuda is fake: it records the calls, and rejects a launch without a current context."""
     launched = {"call": "launch", "kernel": "project_splats", "block": [128, 1, 1], "stream": 0x1234, "device": 1}
     assert [call for call in calls["single"] if call["call"] != "load"] == [
         {**launched, "grid": [5, 1, 1], "shared": 0, "first": 77},
@@ -205,7 +205,7 @@ def test_a_driver_that_makes_no_graph_launches_one_by_one(calls: Calls, function
     assert "replay" not in {call["call"] for call in made}
 
 
-NEWER = "_accelerator_setAllocatorSettings"  # of later versions of torch
+NEWER = "_accelerator_setAllocatorSettings"  # in later versions of torch
 
 
 @pytest.mark.parametrize("newer", [True, False])

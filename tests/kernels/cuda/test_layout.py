@@ -1,7 +1,7 @@
-"""The structures of ``kernel_arguments.py`` have the memory layout that NVRTC gives those of the kernels.
+"""The structures of ``kernel_arguments.py`` have the memory layout that NVRTC gives to those of the kernels.
 
-The emulator's compiler is another: what it agrees with Python about, NVRTC might not, and then a kernel would read a
-pointer from the middle of two.
+The emulator uses another compiler. Agreement between it and Python does not guarantee the same layout in NVRTC, where a
+mismatch would make a kernel read pointers from wrong offsets.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from gs2d.kernels.cuda import compile
 from gs2d.kernels.cuda import kernel_arguments as arguments
 
 KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )?(\w+)\((\w+)(<float>)? ')
-NAMES = {  # of the C++ structures, where they differ
+NAMES = {  # C++ names that differ
     "KernelView": "View",
     "FeatureBuffers": "Features",
     "GatheredSignal": "Gathered",
     "DecodedTarget": "Photograph",
 }
-CAMERA = {name: f"camera.{name}" for name in ("R", "t", "center", "fx", "fy", "cx", "cy")}  # of View
+CAMERA = {name: f"camera.{name}" for name in ("R", "t", "center", "fx", "fy", "cx", "cy")}  # members of View
 
 
 def structures() -> dict[str, type[ctypes.Structure]]:
-    """By name."""
+    """Return the argument structures by name."""
     found = {}
     for module in (arguments, fusion, multiview):
         for name, value in vars(module).items():
@@ -38,12 +38,12 @@ def structures() -> dict[str, type[ctypes.Structure]]:
 
 
 def assertions(name: str, structure: type[ctypes.Structure]) -> list[str]:
-    """What must hold in C++, for the structure and those inside it."""
+    """Return C++ assertions for a structure and its members."""
     bare = name.partition("<")[0]
     lines = [f'static_assert(sizeof(gs2d::{name}) == {ctypes.sizeof(structure)}, "{bare}");']
     for field, kind in structure._fields_:  # type: ignore[misc]
         place, there = getattr(structure, field).offset, CAMERA.get(field, field) if bare == "View" else field
-        offset = f"__INTADDR__(&static_cast<gs2d::{name}*>(nullptr)->{there})"  # what NVRTC has for offsetof
+        offset = f"__INTADDR__(&static_cast<gs2d::{name}*>(nullptr)->{there})"  # NVRTC's definition of offsetof
         lines.append(f'static_assert({offset} == {place}, "{bare}.{field}");')
         inner = getattr(kind, "_type_", kind)
         if isinstance(inner, type) and issubclass(inner, ctypes.Structure):
@@ -65,5 +65,5 @@ def test_kernels_and_python_agree_where_every_field_lies(name: str, monkeypatch:
     lines = [line for kind in sorted(kinds) for line in assertions(kind, known[kind.partition("<")[0]])]
     assert len(lines) > 3
     headers = {key: value for key, value in compile.sources().items() if key.endswith(".h")}
-    # the structures alone: kernels, and what only they use, are not wanted again
+    # only the structures: no need to recompile the kernels
     compile.compile_text(text + "\n" + "\n".join(lines), name, "compute_75", headers=headers)

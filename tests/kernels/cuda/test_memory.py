@@ -1,4 +1,4 @@
-"""What nobody has written is never read: on a GPU fresh memory holds what an earlier tensor left there."""
+"""Uninitialised memory is never read: on a GPU it holds the values of earlier tensors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from render_scenes import IMAGES, contraction, random_cotangents, requiring_grad
 
 @contextmanager
 def fresh_memory(*, poisoned: bool) -> Iterator[None]:
-    """``torch.empty`` and its kin give NaN and the largest integers, or whatever there is."""
+    """Make ``torch.empty`` and similar return NaN and the largest integers, or arbitrary values."""
     before = torch.utils.deterministic.fill_uninitialized_memory  # type: ignore[attr-defined]
     torch.use_deterministic_algorithms(True)
     torch.utils.deterministic.fill_uninitialized_memory = poisoned  # type: ignore[attr-defined]
@@ -33,7 +33,7 @@ def fresh_memory(*, poisoned: bool) -> Iterator[None]:
 
 
 def unchanged_by_poison(work: Callable[[], list[Tensor]]) -> int:
-    """Runs it twice; how many tensors it gave."""
+    """Run ``work`` with and without poisoned memory; return the number of its tensors."""
     with fresh_memory(poisoned=False):
         plain = work()
     with fresh_memory(poisoned=True):
@@ -66,7 +66,7 @@ def test_no_pass_of_the_rasterizer_reads_uninitialised_memory(emulator: Emulator
 
 
 def test_training_reads_no_uninitialised_memory(emulator: Emulator, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Losses, Adam, densification, ranking, clones and frozen rows of three short stages."""
+    """Covers losses, Adam, densification, ranking, clones and frozen rows in three short stages."""
     monkeypatch.setattr(launch, "launcher_for", lambda device: emulator)
     backend = cuda_on_host()
     scene, recipe = train_toys.make_scene(), train_toys.short()

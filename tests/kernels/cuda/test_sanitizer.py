@@ -1,6 +1,6 @@
-"""No kernel reads or writes beyond a tensor, or does what C++ leaves undefined: emulated under gcc's sanitizers.
+"""No kernel accesses memory out of bounds or has undefined behaviour: emulated under gcc's sanitizers.
 
-They must be in the process from its start, so the kernels run in one of their own.
+Sanitizers must be loaded at process start, so the kernels run in a subprocess.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ SANITIZERS = {"addresses": "libasan.so", "undefined": "libubsan.so"}
 
 
 def run(script: str, kind: str = "addresses") -> subprocess.CompletedProcess[str]:
-    """The script under a sanitizer."""
+    """Run the script under a sanitizer."""
     if shutil.which("g++") is None:
         pytest.skip("no g++ here")
     named = subprocess.run(["g++", f"-print-file-name={SANITIZERS[kind]}"], capture_output=True, text=True, check=True)
     library = Path(named.stdout.strip())
     if not library.is_absolute():
         pytest.skip("this g++ has no such sanitizer")
-    # Fibers have stacks of their own, which it does not follow; the rest is about other libraries.
+    # Fibers have their own stacks, which it cannot follow; the other options concern other libraries.
     options = "detect_leaks=0:detect_stack_use_after_return=0:alloc_dealloc_mismatch=0:detect_odr_violation=0"
     settings = {**os.environ, "LD_PRELOAD": str(library), "ASAN_OPTIONS": options, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-c", COMMON + script, str(HELPERS), kind]

@@ -1,4 +1,4 @@
-"""Machine code that a wheel brings: taken where it is of these sources and this version; then nothing is compiled."""
+"""Precompiled machine code in a wheel is used if it matches sources and version; then nothing is compiled."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 
 def folder_with(folder: Path, architectures: tuple[str, ...], **changes: object) -> Path:
-    """As the script leaves it, with words for code."""
+    """Write a folder like scripts/build_cubins.py, with text in place of machine code."""
     folder.mkdir(exist_ok=True)
     for arch in architectures:
         with zipfile.ZipFile(folder / f"{arch}.zip", "w") as archive:
@@ -41,7 +41,7 @@ def no_compiler() -> ModuleType:
 
 @pytest.fixture
 def bring(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., None]:
-    """Let the package bring a folder, on a machine without a compiler."""
+    """Let the package ship a folder, on a machine without a compiler."""
 
     def with_folder(*architectures: str, **changes: object) -> None:
         folder = folder_with(tmp_path / "brought", architectures, **changes)

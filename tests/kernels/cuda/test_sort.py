@@ -1,4 +1,4 @@
-"""The sort and the running sums of sort.cu, emulated: torch's stable sort, in any order of threads and blocks."""
+"""Sort and prefix sums of sort.cu, emulated: equal to torch's stable sort in any order of threads and blocks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SEEDS = (0, 7)  # ascending; shuffled
 
 
 def sort(emulator: Emulator, keys: Tensor, payloads: Tensor | None, bits: int) -> tuple[Tensor, Tensor]:
-    """Keys int16 or int32 by their lowest bits, with payloads, or the places that they had."""
+    """Sort int16 or int32 keys by their lowest bits, with payloads, or by default the original indices."""
     width = 16 if keys.dtype == torch.int16 else 32
     count, plan = len(keys), passes_of(bits)
     digits = torch.zeros(MOST_PASSES, DIGITS, dtype=torch.int32)
@@ -47,7 +47,7 @@ def sort(emulator: Emulator, keys: Tensor, payloads: Tensor | None, bits: int) -
 def test_a_sort_by_radix_is_torchs_stable_sort(emulator: Emulator, count: int, seed: int) -> None:
     emulator = Emulator(seed=seed)
     generator = torch.Generator().manual_seed(count)
-    depths = torch.rand(count, generator=generator).mul(100).floor().div(7)  # many equal ones
+    depths = torch.rand(count, generator=generator).mul(100).floor().div(7)  # many ties
     depths[::5] = float("inf")
     found = sort(emulator, depths.view(torch.int32), None, 32)
     expected = torch.sort(depths, stable=True)
@@ -71,7 +71,7 @@ def test_pairs_are_sorted_by_tile_with_their_payloads(emulator: Emulator, tiles:
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("count", [1, 300, PIECE, 40 * PIECE + 5])
 def test_running_sums_follow_an_order_and_say_whether_there_is_room(emulator: Emulator, count: int, seed: int) -> None:
-    """Of 41 pieces the last looks back further than a warp is wide, unless one before it has said its sum."""
+    """The last of 41 chunks looks back further than a warp is wide, unless an earlier one has published its sum."""
     emulator = Emulator(seed=seed)
     generator = torch.Generator().manual_seed(count)
     counts = torch.randint(0, 9, (count,), generator=generator, dtype=torch.int32)

@@ -1,4 +1,4 @@
-"""An iteration by kernels alone: the bits of the one that goes through torch part by part, alone and as a graph."""
+"""Fused iterations (kernels only) are bit-identical to iterations through torch, as launches and as a graph."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def scene() -> Scene:
 
 @contextmanager
 def mode(chosen: str, launcher: Launcher) -> Iterator[list[bool]]:
-    """Training on a device that is not waited for, in one way of doing iterations; which were done in one piece."""
+    """Train on an asynchronous device with one kind of iteration; yields whether each iteration was fused."""
     done: list[bool] = []
     run = cuda_step.Stepper.run
 
@@ -61,7 +61,7 @@ def mode(chosen: str, launcher: Launcher) -> Iterator[list[bool]]:
 def trained(
     launcher: Launcher, scene: Scene, recipe: Recipe, chosen: str, protocol: Protocol = GENERIC, **options: Any
 ) -> tuple[Trainer, int]:
-    """The trainer at the end, and its iterations in one piece."""
+    """Train; return the trainer and the number of fused iterations."""
     with mode(chosen, launcher) as done:
         trainer = Trainer(
             scene, recipe, protocol, **train_toys.grouped({"backend": cuda_on_host(), "progress_every": 100, **options})
@@ -71,14 +71,14 @@ def trained(
 
 
 def same(a: Trainer, b: Trainer) -> bool:
-    """Splats and Adam's memory, bit for bit."""
+    """Return whether splats and Adam moments are bit-identical."""
     assert {name: m.steps for name, m in a.state.moments.items()} == {k: m.steps for k, m in b.state.moments.items()}
     pairs = [(m.square, b.state.moments[name].square) for name, m in a.state.moments.items()]
     return train_toys.same(a.splats, b.splats) and all(torch.equal(x, y) for x, y in pairs)
 
 
 def masked(scene: Scene) -> Scene:
-    """With masks, and with alpha in every other photograph."""
+    """Return the scene with masks, and with alpha in every other image."""
     rng, views = np.random.default_rng(1), []
     for number, view in enumerate(scene.train):
         image = view.image()
@@ -89,7 +89,7 @@ def masked(scene: Scene) -> Scene:
 
 
 def two_sizes(scene: Scene) -> Scene:
-    """Every third photograph has half as many rows."""
+    """Return the scene with half as many rows in every third image."""
     small = []
     for number, view in enumerate(scene.train):
         camera = view.camera if number % 3 else view.camera.resized(view.camera.width, view.camera.height // 2)
@@ -108,27 +108,27 @@ def with_options(recipe: Recipe, **options: str) -> Recipe:
 
 
 def at_camera(recipe: Recipe) -> Recipe:
-    """Normals of depth as in the official code."""
+    """Return the recipe with normals from depth as in the official code."""
     return with_options(recipe, edges="camera")
 
 
 def of_object(recipe: Recipe) -> Recipe:
-    """Normal consistency of the object alone, as in ``best``."""
+    """Return the recipe with normal consistency only on the object, as in ``best``."""
     return with_options(recipe, where="object")
 
 
 def with_silhouettes(recipe: Recipe) -> Recipe:
-    """Alpha of the photographs that have one kept, as in ``best``."""
+    """Return the recipe with the silhouette loss for images with alpha, as in ``best``."""
     return with_term(recipe, LossTerm("silhouette", 0.1, options={"required": False}))
 
 
 def with_squares(recipe: Recipe) -> Recipe:
-    """Squares of differences after the first iterations, as in ``best``."""
+    """Return the recipe with a squared loss after the first iterations, as in ``best``."""
     return with_term(recipe, LossTerm("l2", 10.0, start=3))
 
 
 def with_term(recipe: Recipe, term: LossTerm) -> Recipe:
-    """A term more in all stages."""
+    """Return the recipe with an additional term in all stages."""
     return replace(recipe, stages=tuple(replace(stage, losses=(*stage.losses, term)) for stage in recipe.stages))
 
 
@@ -136,7 +136,7 @@ QUIET = GradDensify(every=100, start=500, stop=900, reset_every=0, opacity_cull=
 
 
 def brief(recipe: Recipe | None = None) -> Recipe:
-    """Eight iterations of the first stage, six of which nobody looks at."""
+    """Return eight iterations of the first stage, six of them without an observer."""
     recipe = recipe or train_toys.short()
     return replace(recipe, stages=(replace(recipe.stages[0], iterations=8, densify=QUIET),))
 
@@ -154,13 +154,13 @@ VARIANTS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", list(VARIANTS))
 def test_three_stages_have_the_bits_of_training_through_torch(emulator: Emulator, scene: Scene, variant: str) -> None:
-    """Densified, reset, ranked and cloned in between; what counts then has been gathered by a kernel."""
+    """Includes densification, reset, ranking and cloning, whose statistics a kernel gathers."""
     change, recipe, protocol = VARIANTS[variant]
     given = emulator, change(scene), recipe
     parts, none = trained(*given, "torch", protocol)
     whole, some = trained(*given, "launches", protocol)
     assert none == 0
-    assert some >= 10  # of 19: those that densify or end a stage, and the first one of a size, are looked at
+    assert some >= 10  # of 19: not densifying iterations, last ones, or the first of a resolution
     assert same(parts, whole)
 
 
@@ -169,7 +169,7 @@ def test_three_stages_have_the_bits_of_training_through_torch(emulator: Emulator
 def test_reused_memory_and_the_order_of_threads_change_nothing(
     emulator: Emulator, scene: Scene, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All that is not promised to be zeros is NaN or -1 when an iteration begins; the sums are zeros when it ends."""
+    """Memory not guaranteed to be zero is NaN or -1 at the start of an iteration; sums are zero at its end."""
     checked = Counter[str]()
     run = cuda_step.Stepper.run
 
@@ -179,7 +179,7 @@ def test_reused_memory_and_the_order_of_threads_change_nothing(
             if name not in ("gradient_rows", "extras"):
                 tensor.view(torch.int16).fill_(-1)
         done = run(self, *given)
-        for name in held.keys() & {"gradient_rows", "extras"}:  # stages of colours alone have no gradient rows
+        for name in held.keys() & {"gradient_rows", "extras"}:  # stages that train only colours have no gradient rows
             if done:
                 assert not held[name].any()
                 checked[name] += 1
@@ -191,7 +191,7 @@ def test_reused_memory_and_the_order_of_threads_change_nothing(
     whole, some = trained(shuffled, scene, train_toys.short(), "launches")
     assert some == checked["extras"] >= 11
     for (name, a), (_, b) in zip(parts.splats.items(), whole.splats.items(), strict=True):
-        assert float((a - b).norm()) <= 1e-3 * float(a.norm()), name  # atomics in another order
+        assert float((a - b).norm()) <= 1e-3 * float(a.norm()), name  # atomics add in another order
 
 
 def test_an_iteration_without_room_for_its_pairs_changes_nothing_and_is_repeated(
@@ -213,27 +213,27 @@ def on_gpu(driver: FakeDriver) -> GpuLauncher:
 
 @pytest.mark.parametrize("stages", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_repeated_iteration_is_a_graph_with_the_same_bits(emulator: Emulator, scene: Scene, stages: int) -> None:
-    """Rows are added in between and cameras, rates and rooms change: in the graph, where they differ."""
+    """Rows are added; cameras, learning rates and capacities change: the graph is updated where they differ."""
     recipe = brief() if stages == 1 else train_toys.short()
     plain, some = trained(emulator, scene, recipe, "launches")
     driver = FakeDriver(emulator=emulator)
     replayed, as_many = trained(on_gpu(driver), scene, recipe, "graph")
     assert some == as_many
     assert same(plain, replayed)
-    assert len(driver.replays) >= 6  # two an iteration, from the third on
+    assert len(driver.replays) >= 6  # two per iteration, from the third on
     assert driver.changes > 0
     launched = Counter(done.kernel for done in driver.launches)
-    assert 0 < launched["running_counts"] < some  # until it was a graph
+    assert 0 < launched["running_counts"] < some  # until a graph was used
 
 
 def test_a_driver_without_graphs_launches_one_by_one(emulator: Emulator, scene: Scene) -> None:
-    """Other refusals: tests/kernels/cuda/test_launch.py."""
+    """Other failures: tests/kernels/cuda/test_launch.py."""
     plain, some = trained(emulator, scene, brief(), "launches")
     driver = FakeDriver(emulator=emulator, failing={"cuGraphExecKernelNodeSetParams": Result.CUDA_ERROR_NOT_SUPPORTED})
     found, as_many = trained(on_gpu(driver), scene, brief(), "graph")
     assert same(plain, found)
     assert some == as_many
-    assert len(driver.replays) <= 2  # both halves once, where the refusal comes afterwards
+    assert len(driver.replays) <= 2  # each half once, if the failure comes afterwards
 
 
 def test_an_unknown_step_mode_is_an_error_of_one_line(scene: Scene, emulator: Emulator) -> None:
@@ -242,7 +242,7 @@ def test_an_unknown_step_mode_is_an_error_of_one_line(scene: Scene, emulator: Em
 
 
 class OfItsOwn(GradientDensifier):
-    """Looks at every iteration itself."""
+    """Observes every iteration itself."""
 
     seen = 0
 
@@ -256,7 +256,7 @@ def test_learned_cameras_and_custom_densifiers_train_through_torch(
 ) -> None:
     recipe = train_toys.short()
     short = replace(recipe, stages=(replace(recipe.stages[0], iterations=5),))
-    assert trained(emulator, scene, short, "launches")[1] == 2  # 1 and 3 are looked at, 5 is the last
+    assert trained(emulator, scene, short, "launches")[1] == 2  # 1 and 3 are observed, 5 is the last
     posed = short.with_learned(replace(POSES, start=2, decay_steps=10))
     assert trained(emulator, scene, posed, "launches")[1] == 0
     made = loop.densifier_of
@@ -273,7 +273,7 @@ def test_learned_cameras_and_custom_densifiers_train_through_torch(
 def test_an_iteration_by_kernels_has_the_bits_of_an_iteration_through_torch(
     emulator: Emulator, scene: Scene, case: str
 ) -> None:
-    """In the host's memory: where the device has no room for the bytes of the photographs."""
+    """With images in host memory, if they do not fit on the device."""
     recipe, given, count, options = brief(), scene, 6, {}
     if case == "object":
         recipe, given = of_object(recipe), masked(scene)
@@ -282,7 +282,7 @@ def test_an_iteration_by_kernels_has_the_bits_of_an_iteration_through_torch(
     elif case == "silhouettes":
         recipe, given = with_silhouettes(of_object(recipe)), masked(scene)
     elif case == "compared later":
-        recipe, count = brief(train_toys.compared()), 5  # from the seventh on
+        recipe, count = brief(train_toys.compared()), 5  # active from the seventh iteration on
     else:
         options = {"target_bytes": 0}
     parts, _ = trained(emulator, given, recipe, "torch", **options)
@@ -292,7 +292,7 @@ def test_an_iteration_by_kernels_has_the_bits_of_an_iteration_through_torch(
 
 
 def test_an_iteration_uses_no_torch_operations(emulator: Emulator, scene: Scene) -> None:
-    """Neither an operation nor memory; only the order of the views is drawn, once in an epoch."""
+    """No operations and no allocations, except shuffling the views once per epoch."""
     recipe = of_object(brief())
     first = replace(recipe.stages[0], iterations=200)
     with mode("launches", emulator) as done:
@@ -311,11 +311,11 @@ def test_an_iteration_uses_no_torch_operations(emulator: Emulator, scene: Scene)
             for _ in range(6):
                 trainer.step()
     assert sum(done) - before == 6
-    assert set(count.names) <= {"randperm", "detach"}, count.names  # detach: the number of pairs, in the host's memory
+    assert set(count.names) <= {"randperm", "detach"}, count.names  # detach: the number of pairs, in host memory
 
 
 def test_a_byte_converts_to_the_same_number_as_by_division(emulator: Emulator) -> None:
-    """All 256: a row of them, against a target of floats, is an L1 of exactly 0."""
+    """A row of all 256 values against a float target has an L1 of exactly 0."""
     from gs2d.kernels.cuda.cuda_losses import THREADS, strips
     from gs2d.kernels.cuda.kernel_arguments import PhotometricArguments, fill
 
