@@ -2,15 +2,14 @@
 
 ::
 
+    python -m benchmarks --out FILE.json [--quick] [--threads 2] [--only 20k 100k-800] [--variant v3]
+                         [--splats RUN_OR_PLY --capture FOLDER [--downscale N]] [--runs RUN [RUN ...]]
+    python -m benchmarks compare A.json B.json
+
 The first form times every workload stage by stage. ``--quick`` is a smoke test that takes a few seconds. ``--splats``
 adds a workload of trained splats, viewed by the cameras of their capture. ``--runs`` adds the splats of finished runs;
 captures are located through the run folders, and missing ones are skipped with a message. The second form exits with 1
 if B is slower than A by more than noise (rule: benchmarks/compare.py), and with 2 if the files cannot be compared.
-
-The first form times every workload stage by stage; ``--quick`` takes a few seconds and only shows that everything
-works. ``--splats`` adds splats trained on photographs, seen by the cameras of their capture; ``--runs`` those of
-finished runs, which say themselves where their captures are (absent ones are skipped, and named). The second form exits
-with 1 if B is slower than A by more than noise (the rule: benchmarks/compare.py), with 2 if they cannot be compared.
 """
 
 from __future__ import annotations

@@ -2,17 +2,13 @@
 
 ::
 
+    python -m benchmarks.absgs --data CAPTURES --out runs/absgs [--scenes lego scan24] [--schedule-scale 0.1]
+
 The paper only says "more sensitive thresholds for size and positional gradient". The sweep therefore divides the
 thresholds of AbsGS-D: both gradient thresholds by one factor, the size threshold (``percent_dense``) by another. Every
 candidate trains stage 3 only; stages 1 and 2 are shared through ``--cache``, also with `gs2d paper`. A is the candidate
 more sensitive than D with the highest mean PSNR, because the paper tuned for rendering quality. The PSNR is measured on
 the reported test views, so row A is optimistic. An interrupted sweep can be restarted.
-
-"More sensitive thresholds for size and positional gradient" is all the paper says. So AbsGS-D's thresholds are divided:
-both of the gradient by one factor, that of the size (``percent_dense``) by another. Every candidate trains stage 3 only
-(stages 1 and 2 are shared, also with `gs2d paper` through ``--cache``), and of those that are more sensitive than D the
-one with the best mean PSNR is A: the paper tuned for the rendering, and reports the harm to the surface. The views are
-those that the table reports, so row A is an optimistic one. The command can be stopped and started again.
 """
 
 from __future__ import annotations

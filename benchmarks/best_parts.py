@@ -2,11 +2,11 @@
 
 ::
 
+    python -m benchmarks.time_to_quality demo ../shared/data/nerf_synthetic_lego:2 --scales 0.1
+        --recipes best $(python -m benchmarks.best_parts)
+
 As a program, the module prints the variants in the form that ``gs2d train --recipe`` accepts
 (``benchmarks/best_parts.py:median``). Results are in docs/notebook/best.md.
-
-Run as a program it prints the variants as ``gs2d train --recipe`` takes them (``benchmarks/best_parts.py:median``).
-The figures are in docs/notebook/best.md.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 ::
 
+    python -m benchmarks.blocks FOLDER [--photographs 100] [--size 96] [--grid 2x2] [--iterations 4000] [--splats 40000]
+
 A flown capture (``benchmarks.flown_capture``) is trained as a whole and by ``gs2d blocks``. The coarse model and all
 blocks together have as many iterations as the single training; ``--block-iterations`` sets the iterations per block
 instead. Both runs are scored on the test views (mean PSNR, and PSNR of the pixels that show land within ``--near`` of a
@@ -11,16 +13,6 @@ and the seam drawn on the photograph. The table is printed; figures are written 
 table lists PSNR by distance from a seam, for the single training and for the blocks before and after the seams are
 refined. JOB is ``blocks``, or ``blocks-N`` with ``--block-iterations N``, so that both can share a folder and one whole
 training; ``--job`` sets another name, for instance for another ``--partition FIELD=VALUE``.
-
-A flown capture (``benchmarks.flown_capture``) is trained on whole and by ``gs2d blocks``; the coarse model and all
-blocks together have as many iterations as the one training, or each block has ``--block-iterations``. Both are scored
-on the views that are held out (mean PSNR; and that of all pixels which show the land within ``--near`` of a seam) and
-against the true surface (F at ``--within``, overall and near seams). Seconds are of training. Pictures of the views
-with the most seam go to ``FOLDER/JOB-seam-*.png``: photograph, whole, blocks, and the seam on the photograph. The table
-goes to standard output, figures to ``FOLDER/JOB-figures.json``; then PSNR by distance from a seam, of one training and
-of the blocks before and after what lies at seams learned once more. JOB is ``blocks``, or ``blocks-N`` with
-``--block-iterations N``, so that both fit in one folder, beside one training; ``--job`` is another name, for another
-``--partition FIELD=VALUE`` of this script.
 """
 
 from __future__ import annotations

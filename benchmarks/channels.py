@@ -2,11 +2,10 @@
 
 ::
 
+    python -m benchmarks.channels [--splats 20000] [--size 400] [--repeats 10] [--backend cpu]
+
 Runs forward and backward passes of one view of the synthetic room on one thread. Each variant is timed next to
 ``gs2d.rasterize`` with three plain channels in the same round. Prints the median and quartiles of the CPU time ratio.
-
-Forward and backward passes of one view of the synthetic room on one thread. Each variant is timed next to
-``gs2d.rasterize`` with three plain channels in the same round. Prints the median ratio of all rounds and its quartiles.
 """
 
 from __future__ import annotations

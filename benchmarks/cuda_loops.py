@@ -2,13 +2,12 @@
 
 ::
 
+    python -m benchmarks.cuda_loops            compare with results/cuda_loops.json (exit status 1 if it differs)
+    python -m benchmarks.cuda_loops --update   write that file, after a change that is meant
+
 Every kernel is compiled for sm_90 and disassembled with nvdisasm (``pip install nvidia-cuda-nvdisasm``). For blend
 kernels, the innermost loop with the most arithmetic is counted: one iteration processes one splat at the 8x8 pixels of
 a warp. Both halves and all branches are counted. Figures of different compilers are not compared.
-
-Every kernel is compiled for sm_90 and disassembled with nvdisasm (``pip install nvidia-cuda-nvdisasm``). Of the blend
-kernels the innermost loop with the most arithmetic is what matters: one round of it is one splat at the 8x8 pixels of a
-warp, both halves and all branches counted. Figures of another compiler are not compared.
 """
 
 from __future__ import annotations

@@ -2,15 +2,12 @@
 
 ::
 
+    python -m benchmarks.duel BEFORE AFTER [--splats 20000] [--size 400] [--threads 2] [--stage 0] [--rounds 40]
+
 BEFORE and AFTER are checkouts with built kernels (``scripts/build_kernels.sh``). Each runs its own code in its own
 process, on the workload of ``benchmarks.iteration``. The processes take turns of a few iterations; one waits while the
 other works. The first iteration of each turn is not counted, because the caches hold the other process's data.
 ``--splats 200 --size 16`` measures the overhead outside the kernels.
-
-BEFORE and AFTER are checkouts with their kernels built (``scripts/build_kernels.sh``); each runs its own code in a
-process of its own, on the workload of ``benchmarks.iteration``, some iterations at a time, one waiting while the other
-works. The first iteration of each turn is not counted: the other one's data is in the caches. ``--splats 200
---size 16`` shows what is left without the kernels' work.
 """
 
 from __future__ import annotations

@@ -2,17 +2,14 @@
 
 ::
 
+    python -m benchmarks.evidence DATA FOLDER [--scale 1] [--seed 0] [--captures lego bottle] [--recipes 2dgs ...]
+        [--results FILE]
+
 DATA holds the captures. Runs use ``gs2d train ... --cache``, so the first 30,000 iterations are trained once. Finished
 runs are skipped and interrupted runs are resumed. Times are wall time in seconds, summed over all stages of a recipe,
 including cached ones. Figures are written to ``FOLDER/evidence.json`` and a table is printed. ``--results`` merges the
 rows into FILE, which can collect rows of several days. Each row records its commit and machine; check out the same
 commit before continuing.
-
-DATA holds the captures. Runs are those of ``gs2d train ... --cache``, so that the first 30,000 iterations are trained
-once; a run that is finished is not done again, one that was cut off goes on. Seconds are of the clock, summed over a
-recipe's stages, whoever trained them. Figures go to ``FOLDER/evidence.json`` and a table to standard output. A full
-schedule takes longer than most machines are had for: ``--results`` puts the rows beside those of other days in FILE,
-each with the commit and the machine that it is of, so check the same commit out again before going on.
 """
 
 from __future__ import annotations

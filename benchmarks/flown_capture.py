@@ -2,13 +2,11 @@
 
 ::
 
+    python -m benchmarks.flown_capture FOLDER --photographs 6400 [--size 96] [--points 20000] [--gps-noise 1.5]
+
 The capture has COLMAP's layout with ground-truth cameras, so training needs no structure from motion. The photographs'
 EXIF data has GPS positions, and the true surface is ``mesh_gt.ply``. The land grows with the number of photographs,
 with 80 % forward and 70 % side overlap. On two cores, 6,400 photographs of 96x72 or 100 of 1600x1200 take two minutes.
-
-COLMAP's layout with true cameras, so that training needs no structure from motion; GPS positions in the photographs'
-EXIF for those who want to try it; the true surface is ``mesh_gt.ply``. Land grows with the photographs, which overlap
-by 80 % ahead and 70 % to the side. Two cores make 6,400 photographs of 96x72 in two minutes, and 100 of 1600x1200 too.
 """
 
 from __future__ import annotations

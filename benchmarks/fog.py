@@ -2,19 +2,14 @@
 
 ::
 
+    python -m benchmarks.fog CAPTURE[:DOWNSCALE] ... [--variants off robust ...] [--scale 0.05] [--out FILE.json]
+
 Trains each capture, which must have COLMAP sparse points with tracks, once per variant. Every 8th view is held out.
 Reports PSNR and SSIM of test views, the worst test view, PSNR after an affine colour fit (which removes exposure
 differences), PSNR of training views, the share of sparse points hidden in test views (mean and worst view), the share
 of blending weight of all training views that lies clearly closer to a camera than 99 % of the sparse points, the share
 of training pixels with alpha below 0.9, the number of splats, and CPU time. Runs on one thread; on a shared machine,
 CPU times are only roughly comparable, and only within one run.
-
-Trains each capture (with the sparse points that its photographs show: COLMAP's) once for each variant, every 8th view
-held out, and measures: PSNR and SSIM of test views, the worst one, PSNR after an affine fit of colour (what exposure
-explains), PSNR of training views, sparse points hidden in test views (mean and worst view), the share of the blending
-weight of all training views that lies clearly nearer to a camera than 99 % of the sparse points, the share of the
-pixels of training views with alpha below 0.9, splats and CPU seconds. One thread; CPU seconds of a shared machine are
-comparable within one run only, and only roughly.
 """
 
 from __future__ import annotations

@@ -2,12 +2,10 @@
 
 ::
 
+    python -m benchmarks.free_space CAPTURE[:DOWNSCALE] ... [--repeat 3]
+
 For each capture with sparse points, the initial splats are checked in all photographs. Reports CPU seconds per check
 (minimum of the repetitions) and the number of splats on which both implementations disagree. Runs on one thread.
-
-Of each capture (whose sparse points are known) the splats that training starts from are looked at in all photographs.
-Told are seconds of the processor of a look, the least of the repetitions, and of how many splats the two do not agree.
-One thread.
 """
 
 from __future__ import annotations

@@ -2,15 +2,13 @@
 
 ::
 
+    python -m benchmarks.fuse [--views 60] [--size 400] [--resolution 512] [--threads 2] [--unbounded]
+                              [--backend auto] [--json FILE]
+
 The scene is a sphere of radius 0.9 with coloured waves, viewed from all sides; its surface is about as large as that of
 ``rendered_bottle``. With ``--unbounded`` the same frames are fused into nested levels; the innermost level has half the
 side of the sphere and the voxel size of the bounded run. ``--backend reference`` fuses in numpy, ``cpu`` natively,
 ``cuda`` on a GPU. Compare CPU times on a shared machine.
-
-The scene is a sphere of radius 0.9 with coloured waves, seen from all round: as much surface as ``rendered_bottle``.
-With ``--unbounded`` the same frames go into a nest of levels; the innermost has half the side of the sphere, and the
-voxel of the bounded run. ``--backend reference`` fuses in numpy, ``cpu`` natively, ``cuda`` on a GPU. On a shared
-machine the processor seconds are the ones to compare.
 """
 
 from __future__ import annotations

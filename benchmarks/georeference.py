@@ -2,6 +2,8 @@
 
 ::
 
+    python -m benchmarks.georeference FOLDER [--photographs 60] [--size 400] [--seeds 10] [--results FILE.json]
+
 A flown capture (``benchmarks/flown_capture.py``) is rendered; ``gs2d poses`` estimates cameras from its photographs
 alone, and ``gs2d train`` makes a short run. For each seed, `gs2d survey` then gets
 
@@ -12,9 +14,6 @@ alone, and ``gs2d train`` makes a short run. For each seed, `gs2d survey` then g
 
 The table lists the scale error (relative to a fit of all cameras to the ground truth) and the command's estimate of
 that error, the distance of the cameras from their true positions, and the check point residuals beside the true errors.
-
-Reported are the error of the scale (against that of a fit of all cameras to the truth) and what the command says of it,
-how far the cameras come to lie from their true places, and the residuals of the check points, beside the true errors.
 """
 
 from __future__ import annotations

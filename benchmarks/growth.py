@@ -2,13 +2,11 @@
 
 ::
 
+    python -m benchmarks.growth [--quick] [--only densification] [--splats 20000 ... 5000000] [--out FILE.json]
+
 Reports the minimum CPU milliseconds of a few repetitions on one thread. ``exponent`` is the slope between the two
 largest sizes in log-log space: 1 is linear, 2 quadratic. Exits with 1 if an exponent exceeds 1.35. Sorting, tree
 searches and cache misses stay below that limit; quadratic algorithms do not.
-
-Processor seconds of one thread (what others do on the machine adds little to them), the best of a few. ``exponent`` is
-the slope between the two largest sizes in logarithms: 1 is linear, 2 quadratic. Exits with 1 where one is above 1.35:
-a sort, a tree and leaving the caches are below that, anything quadratic is not.
 """
 
 from __future__ import annotations

@@ -2,14 +2,12 @@
 
 ::
 
+    python -m benchmarks.instructions            compare with results/instructions.json (exit status 1 if over)
+    python -m benchmarks.instructions --update   write that file, after a change that is meant
+
 Callgrind does not support AVX-512, so it counts the instructions of the AVX2 library on a small fixed view
 (``callgrind/driver.cpp``, one thread). The AVX-512 blend loops are compiled with the flags of CMakeLists.txt, and the
 instructions in their vector loops are counted with objdump. Both depend on the compiler: figures of another major
-version are not compared.
-
-Callgrind does not run AVX-512, so it counts what the AVX2 library executes in one small fixed view
-(``callgrind/driver.cpp``, one thread). Of the AVX-512 build the blend loops are compiled with the flags of
-CMakeLists.txt and their vector loops counted with objdump. Both depend on the compiler: figures of another major
 version are not compared.
 """
 

@@ -2,15 +2,13 @@
 
 ::
 
+    python -m benchmarks.iteration [--recipe 2dgs-r] [--splats 20000] [--size 400] [--threads 2] [--repeats 60]
+        [--json FILE]
+
 The scene is the synthetic room, rendered from four poses and then perturbed, so that there is something to learn.
 Nothing is densified, so every iteration of a stage does the same work. The multiply-add probe runs before and after
 each stage: on a shared machine, compare times only between equal probes. Stage 2 fills its view cache in the first
 iteration; the extra time of that iteration is reported per view.
-
-The splats are the synthetic room, rendered from four places and then disturbed, so that there is something to
-learn; nothing is densified, so every iteration of a stage does the same work. The multiply-add probe runs before and
-after each stage: on a shared machine compare times only beside equal probes. Stage 2 fills its cache of views in its
-first iteration: what that takes longer than the others is the fill, given per view.
 """
 
 from __future__ import annotations

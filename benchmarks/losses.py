@@ -2,11 +2,10 @@
 
 ::
 
+    python -m benchmarks.losses [--sizes 400 800] [--threads 1 2] [--repeats 40] [--json benchmarks/results/losses.json]
+
 Times include the autograd and ctypes overhead of a training step. Each row also lists the peak rate of fused
 multiply-adds (GFLOP/s, same threads), measured just before it.
-
-Times include the autograd and ctypes overhead of a training step. Each row stands beside the peak rate of fused
-multiply-adds (GFLOP/s, same threads) measured just before it.
 """
 
 from __future__ import annotations

@@ -2,13 +2,11 @@
 
 ::
 
+    python -m benchmarks.mesh_capture MESHES FOLDER [--size 400] [--train 60] [--test 20]
+
 ``MESHES`` holds ``nefertiti/nefertiti.obj``, ``stanford_bunny/stanford-bunny.obj`` and ``spot/spot.obj`` with its
 texture. The first two have no texture: they are painted with patterns of the demo, wrapped around them and mirrored at
 the back to avoid a seam. Light, cameras and layout are those of the demo; the true surface is saved next to the images.
-
-``MESHES`` holds ``nefertiti/nefertiti.obj``, ``stanford_bunny/stanford-bunny.obj`` and ``spot/spot.obj`` with its
-texture. The first two have none: they are painted with patterns of the demo's, laid around them and mirrored at the
-back, so that no seam shows. Light, cameras and layout are the demo's; the true surface lies beside the pictures.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 ::
 
-Draws a row per view (indices of test views) and a column per run, labelled with its recipe.
+    python -m benchmarks.mesh_gallery OUT.png TRUTH.ply RUN [RUN ...] [--views 0 4] [--size 300]
 
-A row for each of the views (numbers of test views), a column for each run, named by its recipe.
+Draws a row per view (indices of test views) and a column per run, labelled with its recipe.
 """
 
 from __future__ import annotations

@@ -2,12 +2,11 @@
 
 ::
 
+    python -m benchmarks.multiview [--splats 20000] [--size 400] [--threads 1] [--repeats 40] [--json FILE]
+
 Uses the room of ``benchmarks.iteration`` with 2048 patches of 7 x 7 and both losses with gradients. Reports CPU
 milliseconds of this process, so other load on the machine has little effect. All variants run alternately in one
 process, so that ratios are reliable.
-
-The room of ``benchmarks.iteration``; 2048 patches of 7 x 7, both losses with their gradients. Processor seconds of this
-process, so other work on the machine counts little; all of it in turns in one run, so that ratios hold.
 """
 
 from __future__ import annotations

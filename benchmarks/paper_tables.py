@@ -2,13 +2,12 @@
 
 ::
 
+    python -m benchmarks.paper_tables --data CAPTURES --out runs/paper [--tables modules k] [--groups bottle-lego]
+        [--slots 2] [--seeds 3]
+
 ``CAPTURES`` holds the captures under the names of ``GROUPS``. `gs2d paper` writes full pages with the paper's figures,
 the deviations and every command. This script prints a summary in the page's format: a table per capture, and which of
 the paper's rankings are reproduced. Finished runs are kept, so an interrupted command can be restarted.
-
-``CAPTURES`` holds the captures under the names of ``GROUPS``. `gs2d paper` writes whole pages, with the paper's
-figures, the deviations and every command; this prints what a reader compares, in the form of the page: a table for each
-capture, and which of the paper's orders hold. Finished runs stay, so the command can be stopped and started again.
 """
 
 from __future__ import annotations

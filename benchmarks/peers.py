@@ -2,6 +2,9 @@
 
 ::
 
+    python -m benchmarks.peers [--opensplat LIBRARY] [--gsplat CHECKOUT] [--only 20k-400] [--threads 2] [--repeats 9]
+                               [--out benchmarks/results/peers.json]
+
 Requirements, built or checked out by the user outside this repository:
 
 - ``--opensplat LIBRARY``: a shared library that registers, for this torch, OpenSplat's public CPU functions as torch
@@ -18,12 +21,6 @@ of their size as thickness. For OpenSplat, rasterization of colour alone is time
 thread; projection and SH are precomputed. For ours, everything is timed: projection, SH, sorting, all six outputs and
 gradients of all parameters. After each switch between rasterizers one pass is not timed. ``ratio`` is the other
 rasterizer's time over ours, of medians and of best times.
-
-The scene is the room of ``benchmarks/workload.py``, and the peers get what they can draw of it: OpenSplat the same
-splats as 3D Gaussians a thousandth as thick. Timed of OpenSplat: rasterize forward and backward of the colour alone, on
-its one thread, projection and SH done before. Timed of ours: everything (projection, SH, sorting, all six outputs,
-gradients of all parameters). After each change from one to the other a pass is not timed. ``ratio`` is the peer's time
-over ours, of medians and of best times.
 """
 
 from __future__ import annotations

@@ -2,13 +2,11 @@
 
 ::
 
+    python -m benchmarks.points RUN [RUN ...]
+
 Structure from motion triangulated these points with an error of about its reprojection error, and training starts from
 them. Distances are in pixel widths of the training images at the point, in the nearest view that sees the point. Points
 outside the mesh's bounding box are ignored.
-
-Structure from motion observed these points, to within about its reprojection error, and training starts from them. The
-unit is the width of a pixel of the training photographs at the point, in the view that sees it from nearest. Points
-outside the mesh's box do not count.
 """
 
 from __future__ import annotations

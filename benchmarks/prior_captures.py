@@ -2,6 +2,9 @@
 
 ::
 
+    python -m benchmarks.prior_captures CAPTURE --out OUT --every 5 --maps sensor    # or relative, sparse, none
+    python -m benchmarks.prior_captures room --out OUT --views 12 --maps relative
+
 CAPTURE is in the NeRF-Synthetic layout with ``mesh_gt.ply``; every N-th training view is kept. ``room`` is a rendered,
 furnished room with plain walls. The output is in COLMAP's layout with the true poses, for ``--test-every 4``, with
 points that pycolmap triangulates from the training views alone. Depth maps are computed from the mesh and degraded like
@@ -10,11 +13,6 @@ those of typical sources:
 sensor    half the resolution, 1 % noise, invalid within a pixel of an edge and in a tenth of the image
 relative  disparity with a random scale and shift per view, smooth noise of 3 %, 16 bits
 normal    no depths, but normals in OpenGL's axes, smooth noise of 5 degrees, 8 bits
-none      no maps, only the points
-
-sensor    half the resolution, noise of 1 %, nothing known within a pixel of an edge nor in a tenth of the picture
-relative  disparity with a scale and a shift of its own for each view, bent by smooth noise of 3 %, 16 bits
-normal    no depths, but normals in OpenGL's axes, bent by smooth noise of 5 degrees, 8 bits
 none      no maps, only the points
 """
 

@@ -2,11 +2,10 @@
 
 ::
 
+    python -m benchmarks.prior_depths RUN [RUN ...]
+
 The capture of each run holds ``mesh_gt.ply``. The error at a pixel that shows the mesh is |z / truth - 1|, with z the
 mean depth, clipped at 1. It is 1 where less than half of the pixel is covered.
-
-The capture of each run holds ``mesh_gt.ply``. An error is |z / truth - 1| at a pixel where the mesh is seen, z the mean
-depth; where less than half of a pixel is covered it is 1, and no error is more.
 """
 
 from __future__ import annotations

@@ -2,11 +2,12 @@
 
 ::
 
+    python -m benchmarks.profile_run --out FILE.json --demo [--schedule-scale 0.1] [--threads 2]
+    python -m benchmarks.profile_run --out FILE.json --capture FOLDER [--downscale 2] [--schedule-scale 0.03]
+                                     [--keep RUN]
+
 The first form profiles `gs2d demo`, the second `gs2d train FOLDER`. The file includes the digest of ``splats.ply``:
 versions of the code that train identically have the same digest.
-
-The first form is `gs2d demo`, the second `gs2d train FOLDER`. The file also holds the digest of ``splats.ply``: two
-versions of the code that train the same have the same.
 """
 
 from __future__ import annotations

@@ -2,16 +2,13 @@
 
 ::
 
+    python -m benchmarks.real --out FILE.json --runs RUN [RUN ...] [--threads 1] [--rounds 12]
+
 The splats are those of finished runs, rendered with the cameras of their captures. Runs without their folder or capture
 are skipped; the file records the reason. Each run is compared with two seeded rooms of the suite: one with as many
 splats as the run, one with the usual 20,000. The image size of each room is chosen to match the number of visible
 (splat, pixel) pairs. Iterations of all three are timed alternately in CPU time, so that load on the machine affects all
 of them.
-
-The splats are those of finished runs, seen by the cameras of their captures; a run that is absent, or whose capture is,
-is skipped and the reason is in the file. Beside each stands the seeded room of the suite twice: with as many splats,
-and with its usual 20,000, each on pictures of such a size that as many pairs of splat and pixel are visible. Iterations
-of all three are timed in turn, in processor time: what others do on the machine falls on all of them.
 """
 
 from __future__ import annotations

@@ -2,11 +2,10 @@
 
 ::
 
+    python -m benchmarks.results --data DIR --out runs/results [--only lego bottle] [--scale 0.1] [--why]
+
 ``DIR`` holds the captures under the names of ``CASES``. Finished runs are not repeated (their ``metrics.json`` is
 read), so an interrupted command can be restarted. Stage 1 is shared through the stage cache.
-
-``DIR`` holds the captures under the names of ``CASES``. Runs that are finished are not repeated (their ``metrics.json``
-is read), so the command can be stopped and started again. Stage 1 is shared through the stage cache.
 """
 
 from __future__ import annotations

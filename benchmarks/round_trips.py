@@ -2,19 +2,14 @@
 
 ::
 
+    python -m benchmarks.round_trips RUN [--layouts 3dgs spz] [--split test] [--every 1]
+
 Writes the splats of a finished run in every layout to a temporary folder, reads them back, and renders every N-th view
 of a split (of the training views if the split is empty). Prints a Markdown row per layout: bytes per splat, PSNR
 against the run's own renderings and against the photographs (mean over views, colours in [0, 1] without rounding),
 seconds to write and to read. "the same" means that no pixel differs by more than 1e-4. For a stream with levels of
 detail, a second table compares each level with the original splats, at full, half, quarter and eighth image size (means
 of pixels), the sizes at which coarse levels are displayed.
-
-Writes the splats of a finished run in every layout into a temporary folder, reads them back, draws the views of a
-split (the training views where it has none; every so many of them) and prints a row of Markdown for each: bytes a
-splat, PSNR against the run's own renderings and against the photographs (mean over views, colours in [0, 1] without
-rounding), seconds to write and to read. "the same" is a rendering that does not differ in any pixel by more than
-1e-4. Of a stream with levels of detail a second table has each level against the splats themselves, in pictures of full
-size and of a half, a quarter and an eighth (means of pixels), which is where coarse levels are shown.
 """
 
 from __future__ import annotations

@@ -2,15 +2,14 @@
 
 ::
 
+    python -m benchmarks.run_cost --out FILE.json --room [--capture FOLDER] [--schedule-scale 0.01]
+                                  [--set dense_start.cell=2]
+    python -m benchmarks.run_cost --out FILE.json --capture FOLDER [--downscale 2] [--schedule-scale 0.05] [--threads 2]
+
 Both forms run one `gs2d train` in a fresh process. ``--room`` makes a capture of 292 images of 1560x1040
 (``room_capture.py``; kept in ``--capture``, or in a temporary folder) and trains on it at 780x520. The file includes
 the digest of ``splats.ply`` and the last scores: versions of the code that train identically have the same digest. On a
 shared machine only CPU seconds and shares are meaningful.
-
-Both are one `gs2d train` in a fresh process. ``--room`` makes a capture of 292 photographs of 1560x1040
-(``room_capture.py``; in ``--capture``, where it stays, or in a temporary folder) and trains on it at 780x520. The file
-holds the digest of ``splats.ply`` and the last scores: versions of the code that train alike have the same. On a shared
-machine processor seconds and shares mean something, seconds do not.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 ::
 
+    python -m benchmarks.scale FOLDER [--photographs 100 400 1600 6400] [--size 96] [--splats 20000] [--memory GIB]
+
 For each number, a flown capture (``benchmarks.flown_capture``) is made if missing. Training starts from ``--splats``
 splats on the true surface, with photographs prepared on disk. The run is then meshed in unbounded mode and its report
 is written. Each step is a separate command. Memory is the maximum resident sum of a command and its children, sampled
@@ -9,15 +11,6 @@ fifty times a second. A hundred photographs show less of the land's edge than th
 memory. ``--land`` therefore limits the land to the area flown over, and ``--bbox`` also meshes a region that all
 captures show. Numbers listed in ``--compare`` are also trained with all data in memory, and must give identical bytes.
 The table is printed; figures are written to ``FOLDER/scale.json``.
-
-For each number a flown capture (``benchmarks.flown_capture``), which is made where it is not there, is trained on from
-so many splats on its true surface, with photographs prepared on the disk; then it is meshed whole and its report is
-written, each by a command of its own. Memory is the largest sum of what a command and its children have resident,
-looked at fifty times a second. A hundred photographs show less of the land's rim than thousands, and a larger surface
-takes more memory: ``--land`` ends the land within what is flown over, so that any number shows all of it, and
-``--bbox`` meshes a part that all show, too. Where ``--compare`` names numbers, those are trained on
-with all in memory, too, and must give the same bytes. The table goes to standard output, figures to
-``FOLDER/scale.json``.
 """
 
 from __future__ import annotations

@@ -2,13 +2,11 @@
 
 ::
 
+    python -m benchmarks.sheets RUN [RUN ...] [--longer 0.1]
+
 Prints for each run, under its rasterizer settings: the number of splats that no training view sees, the number of
 splats longer than a fraction of the scene's extent, their coverage of the empty background of the test views (alpha of
 the photographs < 1/2), and the PSNR of the test views (8 bit) with and without each group.
-
-Prints, for the splats of each run under its rasterizer settings: how many no training view sees, how many are
-longer than a share of the scene's extent, how much of the empty background (alpha of the photographs < 1/2) of the test
-views they cover, and the PSNR of the test views (8 bit) with and without either.
 """
 
 from __future__ import annotations

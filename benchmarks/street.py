@@ -1,4 +1,4 @@
-"""Real photographs at the first try: every capture through ``gs2d reconstruct``, beside a peer on the same pictures.
+"""Run ``gs2d reconstruct`` on real captures with default settings, optionally next to OpenSplat on the same images.
 
 ::
 
@@ -6,16 +6,16 @@
                                 [--opensplat BINARY] [--gallery FOLDER] [--results benchmarks/results/street.json]
                                 [--options=--learn=exposure]
 
-``--data`` holds the captures in the folders that ``CAPTURES`` names; only their photographs are used. Each is run once,
-in a process of its own, and scored; what is finished is not repeated, so that the command can be stopped and started
-again (scores are taken anew, they are quick). Captures of fewer than 24 photographs get ``--test-every 8``, because
-``reconstruct`` would hold none out.
+``--data`` holds the captures in the folders that ``CAPTURES`` names; only their photographs are used. Each capture runs
+once in its own process and is scored. Finished runs are not repeated, so an interrupted command can be restarted;
+scores are recomputed because they are fast. Captures with fewer than 24 photographs get ``--test-every 8``, because
+``reconstruct`` would hold out no test views.
 
-With ``--opensplat`` the peer trains on our cameras and on the same pictures, for no more seconds of the processor than
-our run took *after* it had the cameras: training, scoring, mesh, report and page (``benchmarks/street_peer.py``).
+With ``--opensplat``, OpenSplat trains on our cameras and the same images. Its CPU budget is the time our run took
+*after* camera estimation: training, scoring, mesh, report and page (``benchmarks/street_peer.py``).
 
-``--gallery`` writes a picture of each finished capture: photograph, rendering of a test view, normals, mesh. Most of
-these photographs may not be passed on, nor what was made of them: ``gallery.md`` beside the pictures says which may.
+``--gallery`` writes an image of each finished capture: photograph, rendering of a test view, normals, mesh. Most of
+these photographs and their renderings may not be redistributed; ``gallery.md`` next to the images lists which may.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ from gs2d.errors import Gs2dError
 
 @dataclass(frozen=True)
 class Capture:
-    """Photographs by somebody else.
+    """Capture by a third party.
 
     Attributes
     ----------
     name, folder : str
-        What the table calls it, and where its photographs lie below ``--data``.
+        Name in the table, and the folder of the photographs below ``--data``.
     licence : str
-        Of the photographs, as their source states it.
+        Licence of the photographs, as stated by their source.
     may_be_shown : bool
-        Whether pictures of it may be published.
+        Whether images of the capture may be published.
     """
 
     name: str
@@ -57,7 +57,7 @@ class Capture:
     may_be_shown: bool = False
 
 
-TUNED = (  # bust, monster tree and temple; the settings were chosen on all of them
+TUNED = (  # bust, monster tree and temple; settings were tuned on all of these
     Capture("fox", "fox_instant_ngp/images", "NVIDIA Source Code License (non-commercial)"),
     Capture("castle", "sceaux_castle/images", "none stated, copyright Pierre Moulon"),
     Capture("fountain", "strecha_fountain_P11/images", "none stated"),
@@ -67,7 +67,7 @@ TUNED = (  # bust, monster tree and temple; the settings were chosen on all of t
     Capture("bust", "alexander_bust/images", "CC BY-NC-SA"),
     Capture("bottle", "rendered_bottle/train", "CC BY 4.0 (YCB) and public domain, rendered", may_be_shown=True),
 )
-UNTUNED = (  # nothing was chosen on these: examples in public repositories, OWNER+NAME/FOLDER below --data
+UNTUNED = (  # not used for tuning: examples in public repositories, OWNER+NAME/FOLDER below --data
     Capture("frog", "snavely+bundler_sfm/examples/kermit", "none stated"),
     Capture("doll", "snavely+bundler_sfm/examples/ET", "none stated"),
     Capture("lane", "mapillary+OpenSfM/data/lund/images", "none stated"),
@@ -105,34 +105,34 @@ COLUMNS = {
 
 # -- the table -----------------------------------------------------------------------------------------------------
 def of(template: str, value: Any) -> str:
-    """A value as text; a dash where there is none."""
+    """Format a value; a dash if it is missing."""
     return "-" if value is None else template.format(value)
 
 
 def scores_of(peer: dict[str, Any] | None) -> dict[str, Any] | None:
-    """The peer's scores, where it has some."""
+    """Return OpenSplat's scores, if any."""
     return (peer or {}).get("scores")
 
 
 def test_of(scores: dict[str, Any] | None) -> dict[str, Any] | None:
-    """The scores of test views, where there are some."""
+    """Return the scores of test views, if any."""
     return (scores or {}).get("test")
 
 
 def image_scores(scores: dict[str, Any] | None) -> str:
-    """Mean PSNR and SSIM of test views."""
+    """Format mean PSNR and SSIM of test views."""
     return of("{0[psnr]:.2f} / {0[ssim]:.3f}", test_of(scores))
 
 
 def told(row: dict[str, Any]) -> str:
-    """The bounds of the estimate, and what training took, minutes."""
+    """Format the bounds of the time estimate and the actual training time, minutes."""
     estimate = row["estimate"]
     bounds = of("{0[0]:.1f} to {0[1]:.1f}", estimate and (estimate["least"] / 60, estimate["most"] / 60))
     return f"{bounds}, {of('{0:.1f}', row['training_seconds'] and row['training_seconds'] / 60)}"
 
 
 def markdown(rows: Sequence[dict[str, Any]]) -> str:
-    """The table of finished captures."""
+    """Return the table of finished captures."""
     lines = ["| " + " | ".join(COLUMNS) + " |", "|---" * len(COLUMNS) + "|"]
     lines += ["| " + " | ".join(column(row) for column in COLUMNS.values()) + " |" for row in rows]
     return "\n".join(lines) + "\n"
@@ -140,7 +140,7 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
 
 # -- the captures --------------------------------------------------------------------------------------------------
 def measure(capture: Capture, args: argparse.Namespace) -> dict[str, Any]:
-    """One row: our run, and the peer's where there is one."""
+    """Return one row: our run, and OpenSplat's if available."""
     folder = args.out / args.quality / capture.name
     row = {"capture": capture.name, "quality": args.quality}
     row |= measure_run(args.data / capture.folder, folder, args.quality, shlex.split(args.options))
@@ -156,21 +156,21 @@ def measure(capture: Capture, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """The command line, checked."""
+    """Parse and check the command line."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.street", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--out", type=Path, default=Path("runs/street"), help="runs, peers and their results")
+    parser.add_argument("--out", type=Path, default=Path("runs/street"), help="folder of runs and results")
     parser.add_argument("--captures", nargs="+", choices=[c.name for c in CAPTURES], default=list(STREET))
     parser.add_argument("--quality", choices=("draft", "normal", "full"), default="draft")
     parser.add_argument(
         "--options",
         default="",
-        help="options of `gs2d reconstruct`, in one word: --options='--learn exposure --seed 1'",
+        help="options for `gs2d reconstruct` as one argument: --options='--learn exposure --seed 1'",
     )
-    parser.add_argument("--opensplat", type=Path, metavar="BINARY", help="the peer; without it there is none")
-    parser.add_argument("--gallery", type=Path, metavar="FOLDER", help="write pictures of what is finished")
+    parser.add_argument("--opensplat", type=Path, metavar="BINARY", help="OpenSplat binary (default: no comparison)")
+    parser.add_argument("--gallery", type=Path, metavar="FOLDER", help="write images of finished captures")
     parser.add_argument("--results", type=Path, help="also write the rows here")
     args = parser.parse_args(arguments)
     for capture in CAPTURES:
@@ -182,7 +182,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run what is missing, write rows as they are there, print the table; 1 where a run did not end with code 0."""
+    """Run what is missing, write rows as they finish and print the table; return 1 if a run failed."""
     args = parse(arguments)
     rows: list[dict[str, Any]] = []
     document = {"format": 1, "date": time.strftime("%Y-%m-%d"), "machine": machine(), "rows": rows}

@@ -1,4 +1,4 @@
-"""Pictures of finished captures: photograph, rendering of a test view, normals and mesh, side by side."""
+"""Draw images of finished captures: photograph, rendering of a test view, normals and mesh, side by side."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from PIL import Image
 from benchmarks.figure import images_of, views_of
 from gs2d.io.run_dir import MESH, METRICS
 
-HEIGHT, GAP, QUALITY = 240, 4, 85  # px, px, of JPEG
+HEIGHT, GAP, QUALITY = 240, 4, 85  # px, px, JPEG quality
 KINDS = ("color", "normal")
 
 
 class Shown(Protocol):
-    """A capture as the gallery needs it."""
+    """Interface of a capture in the gallery."""
 
     @property
     def name(self) -> str:
-        """What it is called."""
+        """Return the display name."""
 
     @property
     def licence(self) -> str:
-        """Of its photographs."""
+        """Return the licence of the photographs."""
 
     @property
     def may_be_shown(self) -> bool:
-        """Whether its pictures may be published."""
+        """Return True if images of the capture may be published."""
 
 
 def gallery_row(run: Path, height: int = HEIGHT) -> Image.Image:
-    """The middle one of the views that a run drew, as photograph, rendering, normals and mesh at one height."""
+    """Return the middle rendered view of a run as photograph, rendering, normals and mesh at one height."""
     view = views_of(run) // 2
     images = [
         Image.fromarray(p).resize((max(1, round(height * p.shape[1] / p.shape[0])), height), Image.Resampling.LANCZOS)
@@ -47,7 +47,7 @@ def gallery_row(run: Path, height: int = HEIGHT) -> Image.Image:
 
 
 def write_gallery(folder: Path, captures: Sequence[Shown], runs: Path, quality: str) -> list[Path]:
-    """Write a JPEG of each finished run and a page that says which of them may be published; the pictures' files."""
+    """Write a JPEG per finished run and a page that lists which may be published; return the image paths."""
     folder.mkdir(parents=True, exist_ok=True)
     files, lines = [], ["| capture | photograph, rendering, normals, mesh | may be published |", "|---|---|---|"]
     for capture in captures:

@@ -1,21 +1,21 @@
-"""A peer on the photographs and cameras of a run, for no more processor time: OpenSplat, 3D Gaussian splatting.
+"""Train OpenSplat (3D Gaussian splatting) on the images and cameras of a run, within the run's CPU time.
 
-The binary is the user's own build (``docs/notebook/real-captures.md`` says how); nothing of it is in this repository.
-It trains on our cameras, on the undistorted training views of the run, at the run's size. So that it shows the
-best it can:
+The binary is the user's own build (see ``docs/notebook/real-captures.md``); this repository contains no OpenSplat code.
+OpenSplat trains on our cameras and the undistorted training views, at the run's image size. Several adjustments let it
+perform at its best:
 
-- It knows no principal point: each picture is cut, or a canvas is laid around it, so that this point is in the middle.
-- It knows no masks of single pixels: training pictures are cut to where the undistorted photograph has pixels.
-- Its schedule is made for 30,000 iterations: it is scaled to those it gets. It refines at most every
-  50 iterations, because ten views are rendered each time.
-- In the second half of a training, where it refines no more, its optimizer moves every 32nd, then every 64th iteration
-  only. That is made for long trainings; in a short one it is two dozen steps. So it is trained twice, each time for all
-  the seconds: as it is ("own"), and refining after each tenth but the last, so that it always moves ("moving"). The
-  better one counts.
+- It does not support a principal point: images are cropped or padded so that the principal point is in the centre.
+- It does not support pixel masks: training images are cropped to the valid region of the undistorted photograph.
+- Its schedule is designed for 30,000 iterations and is scaled to the available iterations. It refines at most every
+  50 iterations, because it renders ten views each time.
+- In the second half of a training, it does not refine and its optimizer steps only every 32nd, later every 64th
+  iteration. In a short training these are only about two dozen steps. OpenSplat is therefore trained twice, each time
+  with the full budget: unchanged ("own"), and refining after every tenth of the training except the last, so that the
+  optimizer always steps ("moving"). The better result counts.
 
-Its pictures of the test views are drawn by itself. It draws a view that it leaves out of training in every tenth
-iteration, and its optimizer moves every 32nd (64th): after a multiple of 64 iterations it can be resumed for ten more,
-in which nothing changes, with each test view left out in turn.
+OpenSplat renders the test views itself. It renders a view that is left out of training every ten iterations, and its
+optimizer steps every 32nd (64th) iteration. After a multiple of 64 iterations it is therefore resumed for ten
+iterations, which change nothing, once per left-out test view.
 """
 
 from __future__ import annotations
@@ -49,17 +49,17 @@ OWN = {"refine-every": 500, "densify-from": 500, "sh-degree-interval": 1000}  # 
 LEAST = {"refine-every": 50, "densify-from": 1, "sh-degree-interval": 1}
 MOVES_EVERY, DRAWS_EVERY = 64, 10  # iterations
 PROBE = 4 * MOVES_EVERY
-ENOUGH, TRIES, CAUTION = 0.8, 4, 0.95  # share of the budget to use, trainings to find how, and what is aimed at
+ENOUGH, TRIES, CAUTION = 0.8, 4, 0.95  # share of the budget to use, number of calibration trainings, and target share
 TRAIN, ALL, SPLATS = "train", "all", "splat.ply"
 OWN_SCHEDULE, MOVING = "own", "moving"
 VARIANTS = (OWN_SCHEDULE, MOVING)
-REFINED = 10  # parts of a training, after each of which but the last "moving" refines
+REFINED = 10  # number of segments of a training; "moving" refines after each except the last
 
 
-# -- what it is given ----------------------------------------------------------------------------------------------
+# -- inputs --------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Window:
-    """A part of a view's pixels, or a canvas around them: its corner in the view, and its size, px."""
+    """Crop of a view or a canvas around it: its corner in the view, and its size, px."""
 
     x: int
     y: int
@@ -67,14 +67,14 @@ class Window:
     height: int
 
     def cut(self, image: np.ndarray) -> np.ndarray:
-        """The pixels [height, width, C] of an image; black where it has none."""
+        """Return the pixels [height, width, C] of the window; black outside the image."""
         out = np.zeros((self.height, self.width, *image.shape[2:]), dtype=image.dtype)
         (a, b, i, j), (c, d, k, m) = (self._overlap(*span) for span in self._spans(image))
         out[c:d, a:b] = image[k:m, i:j]
         return out
 
     def place(self, image: np.ndarray, height: int, width: int) -> np.ndarray:
-        """The reverse of :meth:`cut`: an image [height, width, C] with these pixels; black elsewhere."""
+        """Invert :meth:`cut`: return an image [height, width, C] with these pixels; black elsewhere."""
         out = np.zeros((height, width, *image.shape[2:]), dtype=image.dtype)
         (a, b, i, j), (c, d, k, m) = (self._overlap(*span) for span in self._spans(out))
         out[k:m, i:j] = image[c:d, a:b]
@@ -85,12 +85,12 @@ class Window:
 
     @staticmethod
     def _overlap(start: int, size: int, whole: int) -> tuple[int, int, int, int]:
-        """First and last pixel of what both have: in the window, in the image."""
+        """Return first and last pixel of the overlap, in the window and in the image."""
         low, high = max(start, 0), min(start + size, whole)
         return low - start, max(high - start, low - start), low, max(high, low)
 
     def camera(self, camera: Camera) -> Camera:
-        """The camera of these pixels."""
+        """Return the camera of the window."""
         return Camera(
             self.width,
             self.height,
@@ -103,30 +103,30 @@ class Window:
 
 
 def canvas(camera: Camera) -> Window:
-    """The smallest window around a whole view whose middle is the principal point, to a quarter of a pixel."""
+    """Return the smallest window around a whole view centred at the principal point, to a quarter of a pixel."""
     spans = [_centred(c, max(c, size - c)) for c, size in ((camera.cx, camera.width), (camera.cy, camera.height))]
     return Window(spans[0][0], spans[1][0], spans[0][1], spans[1][1])
 
 
 def _centred(middle: float, reach: float) -> tuple[int, int]:
-    """First pixel and size of a span around ``middle`` that reaches at least so far on both sides."""
+    """Return first pixel and size of the smallest span centred at ``middle`` that covers the view."""
     twice = round(2 * middle)
     half = math.ceil(2 * reach - 1e-6 + abs(2 * middle - twice))
-    half += (half - twice) % 2  # the first pixel is a whole number
+    half += (half - twice) % 2  # the first pixel must be an integer
     return (twice - half) // 2, half
 
 
 def seen_window(camera: Camera, mask: np.ndarray | None) -> Window:
-    """The largest window with the canvas's middle and shape in which every pixel of a view counts.
+    """Return the largest window with the canvas's centre and shape that has only valid pixels.
 
     Raises
     ------
     DataError
-        There is none.
+        If there is none.
     """
     whole = canvas(camera)
     good = whole.cut(np.ones((camera.height, camera.width), dtype=bool) if mask is None else mask)
-    low, high = 0, min(whole.width, whole.height) // 2 - 1  # px cut from the shorter sides; more of them is safer
+    low, high = 0, min(whole.width, whole.height) // 2 - 1  # px cropped from the shorter sides; larger values are safer
     while low < high:
         middle = (low + high) // 2
         low, high = (low, middle) if _is_full(_inset(whole, middle), whole, good) else (middle + 1, high)
@@ -137,13 +137,13 @@ def seen_window(camera: Camera, mask: np.ndarray | None) -> Window:
 
 
 def _is_full(window: Window, whole: Window, good: np.ndarray) -> bool:
-    """Whether every pixel of a window is good; ``good`` is [whole.height, whole.width]."""
+    """Return True if every pixel of a window is valid; ``good`` is [whole.height, whole.width]."""
     top, left = window.y - whole.y, window.x - whole.x
     return bool(good[top : top + window.height, left : left + window.width].all())
 
 
 def _inset(whole: Window, by: int) -> Window:
-    """A window with ``by`` pixels less on its shorter sides, and as large a share less on the others."""
+    """Return a window cropped by ``by`` pixels on its shorter sides, and proportionally on the others."""
     shorter = min(whole.width, whole.height)
     dx, dy = (round(by * size / shorter) for size in (whole.width, whole.height))
     return Window(whole.x + dx, whole.y + dy, whole.width - 2 * dx, whole.height - 2 * dy)
@@ -156,9 +156,9 @@ def write_capture(
     windows: Sequence[Window],
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> None:
-    """Views in COLMAP's layout: PNG pictures and binary model, a pinhole camera each, and the scene's sparse points.
+    """Write views in COLMAP's layout: PNG images, a binary model with one pinhole camera each, and the sparse points.
 
-    The peer knows no alpha: photographs that have it are laid over ``background``.
+    OpenSplat does not support alpha: photographs with alpha are composited over ``background``.
     """
     model = folder / "sparse" / "0"
     model.mkdir(parents=True, exist_ok=True)
@@ -179,12 +179,12 @@ def write_capture(
 
 
 def image_name(number: int, view: View) -> str:
-    """A name of its own for a view's picture, whatever folders and endings the views have."""
+    """Return a unique image name for a view, independent of its folder and file extension."""
     return f"{number:04d}-{Path(view.name).stem}.png"
 
 
 def _points(scene: Scene) -> bytes:
-    """``points3D.bin`` of the scene's sparse points, without tracks."""
+    """Return ``points3D.bin`` of the scene's sparse points, without tracks."""
     if scene.points is None:
         raise DataError("the capture has no sparse points for the peer to start from")
     colors = scene.points.colors
@@ -198,9 +198,9 @@ def _points(scene: Scene) -> bytes:
     return struct.pack("<Q", len(rows)) + rows.tobytes()
 
 
-# -- what it does --------------------------------------------------------------------------------------------------
+# -- commands and runs ---------------------------------------------------------------------------------------------
 def schedule(iterations: int, variant: str) -> list[str]:
-    """Its options for so many iterations: its own schedule of 30,000, scaled; "moving" as the module says."""
+    """Return OpenSplat's options for this many iterations: its 30,000-iteration schedule, scaled; "moving" as above."""
     scaled = {name: max(LEAST[name], round(value * iterations / OWN_ITERATIONS)) for name, value in OWN.items()}
     words = ["-n", str(iterations)]
     if variant == MOVING:
@@ -210,12 +210,12 @@ def schedule(iterations: int, variant: str) -> list[str]:
 
 
 def train_command(binary: Path, capture: Path, out: Path, iterations: int, variant: str) -> list[str]:
-    """A training of the peer."""
+    """Return the training command."""
     return [str(binary), str(capture), "--cpu", "-o", str(out), *schedule(iterations, variant)]
 
 
 def draw_command(binary: Path, capture: Path, splats: Path, iterations: int, name: str, out: Path) -> list[str]:
-    """Draw one view with splats of so many iterations, a multiple of 64; nothing of them changes."""
+    """Return the command that renders one view with splats of a multiple of 64 iterations, without changing them."""
     last = iterations + DRAWS_EVERY - iterations % DRAWS_EVERY
     words = [str(binary), str(capture), "--cpu", "--resume", str(splats), "-o", str(out / SPLATS)]
     words += schedule(iterations, OWN_SCHEDULE)
@@ -224,28 +224,28 @@ def draw_command(binary: Path, capture: Path, splats: Path, iterations: int, nam
 
 
 def whole_steps(iterations: float) -> int:
-    """The largest number of iterations after which it can be drawn, at least one step of its optimizer."""
+    """Return the largest number of iterations after which a view can be rendered, at least one optimizer step."""
     return max(1, int(iterations // MOVES_EVERY)) * MOVES_EVERY
 
 
 @dataclass(frozen=True)
 class Trained:
-    """A training of the peer that kept to the budget."""
+    """OpenSplat training that stayed within the budget."""
 
     iterations: int
     process: Process
 
 
 def train_within(binary: Path, capture: Path, folder: Path, budget: float, variant: str) -> Trained:
-    """Train for as many iterations as fit into ``budget`` seconds of the processor.
+    """Train for as many iterations as fit into ``budget`` CPU seconds.
 
-    A short training tells what an iteration costs; its schedule is scaled like that of the long one, so that it grows
-    alike. A training that took more than the budget does not count.
+    A short training, with its schedule scaled in the same way, measures the cost of an iteration. A training that
+    exceeds the budget is discarded.
 
     Raises
     ------
     DataError
-        The peer failed, or does not fit into the budget at all.
+        If OpenSplat fails, or if no training fits into the budget.
     """
     iterations, best = PROBE, None
     for attempt in range(TRIES):
@@ -267,12 +267,12 @@ def train_within(binary: Path, capture: Path, folder: Path, budget: float, varia
 def run_peer(
     command: Sequence[str], folder: Path, number: int | str, environment: Mapping[str, str] | None = None
 ) -> Process:
-    """Run the peer to its end, what it says going to ``NUMBER-console.txt`` in a folder.
+    """Run OpenSplat to its end and write its output to ``NUMBER-console.txt`` in a folder.
 
     Raises
     ------
     DataError
-        It failed.
+        If it fails.
     """
     console = folder / f"{number}-console.txt"
     process = watch_process(command, console, environment=environment)
@@ -285,7 +285,7 @@ def run_peer(
 def draw_test_views(
     binary: Path, capture: Path, folder: Path, scene: Scene, windows: Sequence[Window], iterations: int
 ) -> list[Path]:
-    """Its pictures of the test views, cut to the views' pixels; files that are there are not drawn again."""
+    """Return OpenSplat's renderings of the test views, cropped to the views' pixels; existing files are kept."""
     files, images = [], folder / "renders"
     for number, view in list(enumerate(scene.views, start=1))[len(scene.train) :]:
         name, file = image_name(number, view), images / f"{number:04d}.png"
@@ -307,7 +307,7 @@ def draw_test_views(
 
 
 def score_images(job: LoadedRun, files: Sequence[Path]) -> dict[str, Any]:
-    """Our metrics of pictures of the test views, as they are and with colours matched."""
+    """Return our metrics of test view images, unchanged and with matched colours."""
     plain: dict[str, ImageMetrics] = {}
     matched: dict[str, ImageMetrics] = {}
     background = job.settings.background
@@ -325,12 +325,12 @@ def score_images(job: LoadedRun, files: Sequence[Path]) -> dict[str, Any]:
 def measure_peer(
     binary: Path, run: Path, folder: Path, budget: float, variants: Sequence[str] = VARIANTS
 ) -> dict[str, Any]:
-    """Train the peer on a run's capture, each variant for at most ``budget`` seconds of the processor, and score it.
+    """Train OpenSplat on a run's capture, each variant for at most ``budget`` CPU seconds, and score it.
 
     Returns
     -------
     dict
-        The row of the variant with the higher PSNR of test views, and those of all of them.
+        Row of the variant with the higher test PSNR, and the rows of all variants.
 
     Raises
     ------
@@ -357,7 +357,7 @@ def measure_peer(
 
 
 def _trained(binary: Path, capture: Path, folder: Path, budget: float, variant: str) -> dict[str, Any]:
-    """What a training took; one that was finished before is not repeated, if it kept to the budget."""
+    """Return a training; a finished one that stayed within the budget is reused."""
     file = folder / "trained.json"
     if file.exists():
         before = dict(json.loads(file.read_text()))
@@ -372,7 +372,7 @@ def _trained(binary: Path, capture: Path, folder: Path, budget: float, variant: 
 
 
 def vertices_of(ply: Path) -> int:
-    """The number of vertices that a PLY's header tells."""
+    """Return the number of vertices in a PLY header."""
     with open(ply, "rb") as file:
         for line in file:
             if line.startswith(b"element vertex "):

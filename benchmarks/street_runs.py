@@ -1,7 +1,7 @@
-"""One capture from its photographs alone: the command is run, watched and scored.
+"""Run one capture from its photographs alone: start the command, measure it and score the result.
 
-A run is ``gs2d reconstruct`` in a process of its own, so that its exit code, processor time and memory are those a
-person would see. What it left is scored here, in the same way for every capture and every version of the program.
+A run is ``gs2d reconstruct`` in its own process, so that exit code, CPU time and memory are those of a user's run. The
+result is scored here, in the same way for every capture and every version of the program.
 """
 
 from __future__ import annotations
@@ -48,29 +48,29 @@ from gs2d.training.events import ignore
 
 POLL_SECONDS = 0.2
 PROCESS, CONSOLE, PHOTOS, PEER = "process.json", "console.txt", "photographs", "peer"
-SAME_SURFACE = 0.01  # of the scene's extent, by which a mesh and a rendered depth that saw it may differ
-TEST_EVERY = 8  # where `reconstruct` itself would hold nothing out
+SAME_SURFACE = 0.01  # fraction of the scene's extent, tolerance between a mesh and a rendered depth
+TEST_EVERY = 8  # for captures of which `reconstruct` would hold out nothing
 UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "day": 86400.0, "days": 86400.0}
 _DURATION = r"([\d.]+)\s*(s|min|h|days?)\b"
 
 
-# -- a process and what it took ------------------------------------------------------------------------------------
+# -- processes -----------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Process:
-    """What a finished process took, with all its children.
+    """Resources of a finished process, including its children.
 
     Attributes
     ----------
     exit_code : int
         Negative: the signal that ended it.
     seconds, cpu_seconds : float
-        Of the clock and of the processor.
+        Wall and CPU time.
     cpu_seconds_before : float or None
-        Of the processor until the file ``when`` was there; None where it never was.
+        CPU time until the file ``when`` appeared; None if it never did.
     peak_rss_bytes : int
         Of the largest process among them.
     user_seconds : float
-        The part of ``cpu_seconds`` in which it computed itself; 0 in files of before it was kept.
+        Part of ``cpu_seconds`` spent in user mode; 0 in older files without this value.
     """
 
     command: list[str]
@@ -85,20 +85,20 @@ class Process:
 def watch_process(
     command: Sequence[str], console: Path, *, when: Path | None = None, environment: Mapping[str, str] | None = None
 ) -> Process:
-    """Run a command to its end, what it says going to a file.
+    """Run a command to its end and write its output to a file.
 
     Parameters
     ----------
     when : Path, optional
-        The processor time is also taken when this file appears.
+        The CPU time is also recorded when this file appears.
 
     Raises
     ------
     OSError
-        The command cannot be started.
+        If the command cannot be started.
     """
     start, before = time.perf_counter(), None
-    variables = {**os.environ, "OMP_WAIT_POLICY": "PASSIVE", **(environment or {})}  # waiting threads take no time
+    variables = {**os.environ, "OMP_WAIT_POLICY": "PASSIVE", **(environment or {})}  # waiting threads use no CPU time
     with open(console, "w") as file:
         child = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, env=variables)
     try:
@@ -127,7 +127,7 @@ def watch_process(
 
 
 def _cpu_seconds_so_far(pid: int) -> float | None:
-    """Of a running process and of its children that have ended; None where the system does not tell."""
+    """Return the CPU time of a running process and its finished children; None if the system does not report it."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
@@ -137,12 +137,12 @@ def _cpu_seconds_so_far(pid: int) -> float | None:
 
 # -- a capture -----------------------------------------------------------------------------------------------------
 def copy_images(source: Path, target: Path) -> int:
-    """Copy the photographs of a folder to one where nothing else is; how many there are.
+    """Copy the photographs of a folder to an empty folder; return their number.
 
     Raises
     ------
     DataError
-        There are none.
+        If there are none.
     """
     photos = find_photos(source)[0]
     target.mkdir(parents=True, exist_ok=True)
@@ -154,7 +154,7 @@ def copy_images(source: Path, target: Path) -> int:
 
 
 def reconstruct_command(photos: Path, count: int, run: Path, quality: str, extra: Sequence[str] = ()) -> list[str]:
-    """The command of one run, as a person types it after ``gs2d``."""
+    """Return the command of one run, without ``gs2d``."""
     words = ["reconstruct", str(photos), "--out", str(run), "--quality", quality]
     if count < FEW and "--test-every" not in extra:
         words += ["--test-every", str(TEST_EVERY)]
@@ -162,7 +162,7 @@ def reconstruct_command(photos: Path, count: int, run: Path, quality: str, extra
 
 
 def run_reconstruct(source: Path, folder: Path, quality: str, extra: Sequence[str] = ()) -> tuple[Path, Process, int]:
-    """Run the command for a capture unless it was run to its end before; run folder, what it took, photographs."""
+    """Run the command for a capture unless finished; return run folder, resources and number of photographs."""
     run, process_file = folder / "run", folder / PROCESS
     photos = folder / PHOTOS / folder.name  # the report is named after its folder
     count = copy_images(source, photos)
@@ -171,7 +171,7 @@ def run_reconstruct(source: Path, folder: Path, quality: str, extra: Sequence[st
         before = Process(**json.loads(process_file.read_text()))
         if before.command[3:] == words:
             return run, before, count
-    for left in (run, folder / PEER):  # of a run that was cut off, whose time is not known, or of another command
+    for left in (run, folder / PEER):  # an interrupted run, whose time is unknown, or a run of another command
         shutil.rmtree(left, ignore_errors=True)
     print("$ gs2d", " ".join(words), flush=True)
     process = watch_process([sys.executable, "-m", "gs2d", *words], folder / CONSOLE, when=run / CAPTURE / POSES_JSON)
@@ -179,9 +179,9 @@ def run_reconstruct(source: Path, folder: Path, quality: str, extra: Sequence[st
     return run, process, count
 
 
-# -- what it told and what it left ---------------------------------------------------------------------------------
+# -- output and results --------------------------------------------------------------------------------------------
 def told_estimate(console: str) -> dict[str, Any] | None:
-    """The first estimate of the training's time in what a run said: the line, and its bounds in seconds."""
+    """Return the first training time estimate in a run's output: the line, and its bounds in seconds."""
     for line in console.splitlines():
         found = re.search(rf"will take about {_DURATION}(?:\s*(?:to|-)\s*{_DURATION})?", line)
         if found:
@@ -192,14 +192,14 @@ def told_estimate(console: str) -> dict[str, Any] | None:
 
 
 def estimate_error(estimate: Mapping[str, Any] | None, seconds: float | None) -> float | None:
-    """By what factor the time lay outside the bounds that were told: 1 within them, 2 twice as long or half."""
+    """Return the factor by which the time misses the estimate: 1 within the bounds, 2 for twice as long or half."""
     if estimate is None or not seconds:
         return None
     return max(1.0, seconds / estimate["most"], estimate["least"] / seconds)
 
 
 def summary_of(scores: Mapping[str, ImageMetrics]) -> dict[str, Any] | None:
-    """Mean PSNR and SSIM of some views and the worst of them; None where there are no views."""
+    """Return mean PSNR and SSIM and the worst view; None without views."""
     psnr = {name: score.psnr.value for name, score in scores.items() if score.psnr.value is not None}
     ssim = [score.ssim.value for score in scores.values() if score.ssim.value is not None]
     if not psnr or not ssim:
@@ -216,10 +216,10 @@ def summary_of(scores: Mapping[str, ImageMetrics]) -> dict[str, Any] | None:
 
 
 def score_run(path: Path) -> dict[str, Any]:
-    """Scores of a run's splats: both splits, with colours matched, and the sparse points that test views hide.
+    """Return scores of a run's splats: both splits, with matched colours, and hidden sparse points of test views.
 
-    Test views have the exposure that the training photographs around them predict, as in the run's own scores, and none
-    in "test_plain".
+    Test views use the exposure predicted from neighbouring training images, as in the run's own scores, and none in
+    "test_plain".
     """
     _, job, splats = open_finished(path, None, ignore)
     drawing = (job.settings, job.backend)
@@ -241,7 +241,7 @@ def score_run(path: Path) -> dict[str, Any]:
 
 
 def hidden_fraction(job: LoadedRun, splats: Splats) -> dict[str, Any] | None:
-    """Sparse points that the rendered median depth of test views hides; None without test views or points."""
+    """Return the share of sparse points hidden by the median depth of test views; None without test views or points."""
     observed, counts = job.scene.observed(guessed=False), {}
     if observed is None or not job.scene.test:
         return None
@@ -263,7 +263,7 @@ def hidden_fraction(job: LoadedRun, splats: Splats) -> dict[str, Any] | None:
 
 
 def placed(run: Path) -> dict[str, Any] | None:
-    """How many photographs have a place, and with which cameras; None where none were found."""
+    """Return the number of registered photographs and their cameras; None if there are none."""
     file = run / CAPTURE / POSES_JSON
     if not file.exists():
         return None
@@ -277,12 +277,12 @@ def placed(run: Path) -> dict[str, Any] | None:
 
 
 def typed(process: Process, folder: Path) -> str:
-    """The command as a person types it, with OUT for where all captures' folders are: results name no machine's."""
+    """Return the command as a user types it, with OUT for the results folder: results contain no local paths."""
     return " ".join(["gs2d", *process.command[3:]]).replace(str(folder.parent.parent), "OUT")
 
 
 def measure_run(source: Path, folder: Path, quality: str, extra: Sequence[str] = ()) -> dict[str, Any]:
-    """Run a capture, if that is not done, and tabulate what it took, told and left."""
+    """Run a capture unless finished, and tabulate its resources, output and scores."""
     folder.mkdir(parents=True, exist_ok=True)
     run, process, count = run_reconstruct(source, folder, quality, extra)
     row: dict[str, Any] = {
@@ -301,7 +301,7 @@ def measure_run(source: Path, folder: Path, quality: str, extra: Sequence[str] =
 
 
 def _times_of(run: Path, folder: Path) -> dict[str, Any]:
-    """Seconds that training took, and what had been told."""
+    """Return the training seconds and the estimate."""
     estimate = told_estimate((folder / CONSOLE).read_text(errors="replace"))
     stages = read_json(run / METRICS)["stages"] if (run / METRICS).exists() else []
     seconds = round(sum(stage["seconds"] for stage in stages), 1) if stages else None
@@ -315,9 +315,10 @@ def _times_of(run: Path, folder: Path) -> dict[str, Any]:
 
 
 def measure_mesh(path: Path) -> dict[str, Any]:
-    """The size of a run's mesh, and how much of its area lies in the box of what the cameras look at.
+    """Return the size of a run's mesh, and the share of its area inside the bounding box of the cameras' subject.
 
-    The box is found from the splats by today's program, whatever the run's own says and whether its mesh was cut to it.
+    The box is computed from the splats by the current program, whatever box the run used or whether its mesh was
+    cropped.
     """
     run, job, splats = open_finished(path, None, ignore)
     mesh = read_mesh(run.file(MESH))
@@ -331,7 +332,7 @@ def measure_mesh(path: Path) -> dict[str, Any]:
 
 
 def pixels_of(job: LoadedRun, splats: Splats, mesh: Mesh) -> float:
-    """How many pixels of the training views saw a mesh: each part of it counts in the view that saw it best."""
+    """Return the number of training pixels that show a mesh; each part counts in the view that sees it best."""
     views = ((view, render_view(splats, view, job.settings, job.backend)) for view in job.scene.train)
     reach = surface_reach(job)
     maps = (depth_map(fusion_frame(job, view, output, "median", reach)) for view, output in views)
@@ -339,7 +340,7 @@ def pixels_of(job: LoadedRun, splats: Splats, mesh: Mesh) -> float:
 
 
 def fraction_in_box(mesh: Mesh, box: np.ndarray) -> float:
-    """Part of a mesh's area that is of faces whose middle lies in a box [2, 3]; 0 of a mesh without area."""
+    """Return the share of a mesh's area whose face centres lie in a box [2, 3]; 0 for a mesh without area."""
     corners = mesh.vertices.astype(np.float64)[mesh.faces]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     middles = corners.mean(axis=1)

@@ -1,14 +1,14 @@
-"""How much of a run's mesh is the subject, judged by masks of it.
+"""Measure how much of a run's mesh belongs to the subject, using masks.
 
 ::
 
     python -m benchmarks.subject RUN --masks FOLDER [--mesh FILE.ply] [--out FILE.json]
 
-FOLDER has a mask, white on the subject, for some of the photographs: ``NAME_mask.png``, or named as COLMAP's masks are.
-The middle of each face is projected into the photographs that have one, undistorted and reduced as they are for
-training. A face is inside where at least half of the photographs that have it in frame have it in the mask; one that
-none has in frame is outside. Nothing is hidden by anything: shreds before and behind the subject count as inside, what
-stands beside it in half of the photographs does not.
+FOLDER has a mask, white on the subject, for some of the photographs: ``NAME_mask.png``, or named like COLMAP's masks.
+Face centres are projected into the masked photographs, which are undistorted and downscaled as in training. A face is
+inside if at least half of the photographs that have it in frame have it in the mask. A face that is in no frame is
+outside. Occlusion is ignored: floaters in front of and behind the subject count as inside; objects beside it do not, if
+at least half of the photographs separate them.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, open_run
 from gs2d.pipeline.prepare.loaded import reload_run
 
-HALF = 0.5  # of the photographs that have a face in frame, which must have it in the mask
-GOAL = 0.98  # of the area
+HALF = 0.5  # share of the photographs with a face in frame that must have it in the mask
+GOAL = 0.98  # share of the area
 
 
 @dataclass(frozen=True)
 class Fraction:
-    """What of a mesh lies in the masks of its subject.
+    """Share of a mesh that lies in the masks of its subject.
 
     Attributes
     ----------
     masks : int
-        Photographs with a mask.
+        Number of photographs with a mask.
     faces, inside_faces : int
     area : float
         world units^2.
     inside, unseen : float
-        Parts of the area: in the masks, and in no frame.
+        Shares of the area: inside the masks, and in no frame.
     """
 
     masks: int
@@ -60,12 +60,12 @@ class Fraction:
 
 
 def fraction_inside(mesh: Mesh, masks: Iterable[tuple[Camera, np.ndarray]]) -> Fraction:
-    """Return the part of a mesh's area that lies in the masks (bool [H, W]) of the cameras.
+    """Return the share of a mesh's area that lies in the masks (bool [H, W]) of the cameras.
 
     Raises
     ------
     DataError
-        There is no mask, or no area.
+        If there is no mask or no area.
     """
     corners = np.asarray(mesh.vertices, np.float64)[mesh.faces]  # [F, 3, 3]
     middles = corners.mean(axis=1)
@@ -88,7 +88,7 @@ def fraction_inside(mesh: Mesh, masks: Iterable[tuple[Camera, np.ndarray]]) -> F
 
 
 def masks_of(views: Iterable[View], folder: Path) -> list[tuple[Camera, np.ndarray]]:
-    """Return the cameras of the photographs that have a mask in a folder, and these masks bool [H, W] as they see."""
+    """Return the cameras of the photographs with a mask in a folder, and the masks bool [H, W] for these cameras."""
     found = []
     views = list(views)
     for view, file in zip(views, find_masks_in([folder], [view.name for view in views]), strict=True):
@@ -114,11 +114,11 @@ def measure(run: Path, folder: Path, mesh: Path | None = None) -> dict[str, Any]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Parse the arguments, print a line, write the figures."""
+    """Parse the arguments, print a line and write the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--masks", type=Path, required=True, metavar="FOLDER")
-    parser.add_argument("--mesh", type=Path, help="another mesh than the run's")
+    parser.add_argument("--mesh", type=Path, help="mesh file (default: the run's mesh)")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args(arguments)
     try:

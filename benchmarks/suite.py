@@ -1,4 +1,4 @@
-"""All workloads, stage by stage, with whole iterations, as one JSON document."""
+"""Run all workloads, stage by stage and with whole iterations, and return one JSON document."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from benchmarks.workload import Workload
 from gs2d.kernels.library import Library, load
 
 FORMAT = 1
-DIGITS = 4  # of every figure
+DIGITS = 4  # significant digits of every figure
 
 
 def rounded(value: float) -> float:
-    """Four significant digits."""
+    """Round to four significant digits."""
     return float(f"{value:.{DIGITS}g}")
 
 
 def workload_result(library: Library, workload: Workload, seconds: float, least: int) -> dict[str, Any]:
-    """One entry of ``workloads``. All times in ms; fractions use the best times and the best probe (see docs)."""
+    """Return one entry of ``workloads``. Times in ms; fractions use the best times and the best probe (see docs)."""
     measured = measure_stages(library, workload, seconds, least)
     steps, work, peak = measured.steps, measured.work, measured.probe
     repeats = max(least, min(30, round(1e3 * seconds / max(steps["raster_backward"].median * 2, 1.0))))
@@ -78,9 +78,9 @@ def run_suite(
     on_result: Callable[[str, dict[str, Any]], None] = lambda name, document: None,
     variant: str | None = None,
 ) -> dict[str, Any]:
-    """Measure every workload on ``threads`` threads; torch's number of threads is put back afterwards.
+    """Measure every workload on ``threads`` threads; restore torch's number of threads afterwards.
 
-    ``on_result`` gets the name of each workload when it is done, and the document as it is then.
+    ``on_result`` gets the name of each finished workload and the document at that point.
     """
     before = torch.get_num_threads()
     try:

@@ -1,19 +1,19 @@
-"""Compare textured meshes with the photographs of views that were not baked.
+"""Compare textured meshes with the photographs of views that were not used for baking.
 
 ::
 
     python -m benchmarks.texture RUN [--downscale N] [--faces 50000] [--every 1] [--hold-out 4] [--pictures FOLDER]
 
-Bakes a texture from the photographs of a run with a ``mesh.ply``. Draws the mesh with the
-texture and with its vertex colours, by the ray caster of the demo (2 x 2 rays per pixel), from the test views. A run
-without test views leaves every N-th training view out of the baking (``--hold-out``). Prints means over these views:
+Bakes a texture from the photographs of a run with a ``mesh.ply``. Renders the mesh with the texture and with its vertex
+colours from the test views, with the demo's ray caster (2 x 2 rays per pixel). For a run without test views, every N-th
+training view is left out of baking (``--hold-out``). Prints means over these views:
 
-- PSNR of the whole image, and of the pixels that the mesh and the photograph's alpha channel, if any, cover entirely;
-- PSNR of those pixels after one gain per channel and image, which the exposure of the photograph does not change;
-- the median absolute error of those pixels, which obstacles in the photographs hardly change;
+- PSNR of the whole image, and of the pixels that mesh and alpha channel, if any, cover entirely;
+- PSNR of those pixels after one gain per channel and image, which removes the photograph's exposure;
+- the median absolute error of those pixels, which is robust to obstacles in the photographs;
 - sharpness: the mean gradient of those pixels relative to the photograph's.
 
-Photographs are compared in the mean exposure of the run. ``--downscale`` is that of the photographs that are baked and
+Photographs are compared in the mean exposure of the run. ``--downscale`` applies to the photographs that are baked and
 compared (default: the run's).
 """
 
@@ -42,13 +42,13 @@ from gs2d.pipeline.prepare.open_capture import read_scene
 from gs2d.pipeline.prepare.options import TextureOptions
 from gs2d.pipeline.prepare.run_appearance import as_scene
 
-SAMPLES = 2  # rays a pixel along each axis
+SAMPLES = 2  # rays per pixel along each axis
 
 
 def image(
     mesh: Mesh | TexturedMesh, camera: Camera, background: Sequence[float] = (1.0, 1.0, 1.0), samples: int = SAMPLES
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh, unshaded, [H, W, 3] in [0, 1], and how much of each pixel it covers [H, W]."""
+    """Return the unshaded mesh image [H, W, 3] in [0, 1], and the coverage of each pixel [H, W]."""
     hits = cast_camera(mesh.vertices.astype(np.float64), mesh.faces, camera, samples=samples)
     rays = np.ones((*hits.face.shape, 3)) * np.asarray(background)
     rays[hits.face >= 0] = _colors(mesh, hits)
@@ -58,7 +58,7 @@ def image(
 
 
 def _colors(mesh: Mesh | TexturedMesh, hits: Hits) -> np.ndarray:
-    """Colours [hits, 3] in [0, 1]: interpolated between vertices, or from the texture."""
+    """Return colours [hits, 3] in [0, 1], interpolated between vertices or sampled from the texture."""
     hit = hits.face >= 0
     corners, weights = mesh.faces[hits.face[hit]], hits.weights[hit].astype(np.float64)
     if isinstance(mesh, Mesh):
@@ -69,12 +69,12 @@ def _colors(mesh: Mesh | TexturedMesh, hits: Hits) -> np.ndarray:
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    """dB, of values in [0, 1]."""
+    """Return the PSNR in dB of values in [0, 1]."""
     return float(-10 * np.log10(np.mean((a - b) ** 2)))
 
 
 def sharpness(image: np.ndarray, inside: np.ndarray) -> float:
-    """Mean gradient of the grey image [H, W, 3] between pixels that are both ``inside`` [H, W]."""
+    """Return the mean gradient of the grey image [H, W, 3] between pixels that are both ``inside`` [H, W]."""
     grey = image.mean(axis=2)
     steps = [
         np.abs(np.diff(grey, axis=k))[
@@ -91,7 +91,7 @@ def compare(
     background: Sequence[float],
     pictures: Path | None,
 ) -> None:
-    """Print the figures of each mesh, and write the pictures."""
+    """Print the figures of each mesh and write the images."""
     for name, mesh in meshes.items():
         figures = []
         for i, view in enumerate(views):
@@ -117,15 +117,15 @@ def compare(
 
 
 def main() -> None:
-    """Parse the arguments."""
+    """Parse the arguments and run the comparison."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--downscale", type=int)
     parser.add_argument("--faces", type=int, default=TextureOptions().faces)
     parser.add_argument("--size", type=int)
-    parser.add_argument("--every", type=int, default=1, help="only every so many test views")
+    parser.add_argument("--every", type=int, default=1, help="use only every N-th test view")
     parser.add_argument("--hold-out", type=int, default=4, help="without test views: leave out every N-th view")
-    parser.add_argument("--pictures", type=Path, help="an existing folder")
+    parser.add_argument("--pictures", type=Path, help="existing folder for images")
     arguments = parser.parse_args()
     run = open_run(arguments.run)
     job, mesh = reload_run(run, lambda _event: None), read_mesh(run.file(MESH))

@@ -1,4 +1,4 @@
-"""Time to quality: PSNR of test views, and F at 0.25 % where the true surface is known, against seconds of training.
+"""Measure time to quality: test PSNR, and F-score at 0.25 % if the true surface is known, against training time.
 
 ::
 
@@ -6,19 +6,19 @@
         [--scales 0.02 0.05 0.1] [--seeds 0] [--opensplat BINARY] [--opensplat-scales 0.005 0.01] [--threads 2]
         [--out runs/time_to_quality] [--results FILE.json] [--figure FILE.svg] [--ground-truth MESH]
 
-``demo`` is the synthetic capture of ``gs2d demo``, made where it is missing. Recipes are names that ``gs2d recipes``
-lists, or files. Each recipe is trained once for each schedule and seed, in a process of its own, one after the other,
-shortest schedules first; the clock runs from the process's start to the end of training: imports, reading the
-capture, finding the first splats. Not counted are scores, states that are saved, and the mesh (its seconds are in the
-results). With ``--opensplat`` the peer of ``benchmarks/street_peer.py`` trains for as many iterations of its own
-schedule on the same photographs (laid over the background of ours, which it cannot leave out) and from as many random
-points where the capture has none; its clock is that of its process, reading included. Both of its variants are
-trained, and the better one of each schedule is drawn. An iteration of it can take ten times as long as ours:
-``--opensplat-scales`` gives it schedules of its own.
+``demo`` is the synthetic capture of ``gs2d demo``, made if missing. Recipes are names listed by ``gs2d recipes``, or
+files. Each recipe is trained once per schedule and seed, in a separate process, sequentially, shortest schedules first.
+The clock runs from process start to the end of training and includes imports, reading the capture and the
+initialisation. Scoring, saving states and meshing are not counted (meshing seconds are in the results). With
+``--opensplat``, OpenSplat (``benchmarks/street_peer.py``) trains for as many iterations of its own schedule on the same
+photographs. They are composited over our background, because OpenSplat does not support alpha. Captures without points
+start from equally many random points. OpenSplat's clock is that of its process, including reading. Both variants are
+trained, and the better one per schedule is plotted. Its iterations can take ten times as long as ours:
+``--opensplat-scales`` sets separate schedules.
 
-It can be stopped and started again: what is finished is not repeated, and a training goes on from its last point.
-A change of a recipe, of the seed or of the threads begins its trainings anew. Seconds of the wall are those of a
-machine that may do other work; those of the processor depend on that less, and are what is drawn (``--time``).
+The command can be interrupted and restarted: finished trainings are not repeated, and an interrupted one resumes from
+its last point. Changing a recipe, the seed or the threads restarts its trainings. Wall time depends on other load on
+the machine; CPU time depends less on it and is plotted by default (``--time``).
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ DEMO, PEER = "demo", "opensplat"
 CONSOLE, RECIPES, SCALES = "console.txt", ("2dgs", "2dgs-60k", "2dgs-r"), (0.02, 0.05, 0.1)
 
 
-# -- ours ----------------------------------------------------------------------------------------------------------
+# -- gs2d ----------------------------------------------------------------------------------------------------------
 def specification(capture: Path, downscale: int, recipe: str, scale: float, seed: int, args: Any) -> dict[str, Any]:
     """Return everything that decides a training and its curve."""
     return {
@@ -91,12 +91,12 @@ def specification(capture: Path, downscale: int, recipe: str, scale: float, seed
 
 
 def run_recipe(spec: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Train what a specification says, unless that is done, and return its row.
+    """Train a specification unless finished, and return its row.
 
     Raises
     ------
     DataError
-        The training failed; with its last words.
+        If the training failed; the message includes its last output.
     """
     file, result = folder / SPEC, folder / RESULT
     if not (file.exists() and json.loads(file.read_text()) == spec):
@@ -112,9 +112,9 @@ def run_recipe(spec: dict[str, Any], folder: Path) -> dict[str, Any]:
     return {"scale": spec["scale"], "seed": spec["seed"], **json.loads(result.read_text())}
 
 
-# -- the peer ------------------------------------------------------------------------------------------------------
+# -- OpenSplat -----------------------------------------------------------------------------------------------------
 def with_start(scene: Scene, count: int, seed: int) -> Scene:
-    """Return a scene with points: its own, or as many random grey ones in its bounds as 2DGS would start from."""
+    """Return the scene with points: its own, or as many random grey points in its bounds as 2DGS would use."""
     if scene.points is not None and len(scene.points):
         return scene
     low, high = scene.bounds
@@ -123,12 +123,12 @@ def with_start(scene: Scene, count: int, seed: int) -> Scene:
 
 
 def run_opensplat(binary: Path, job: LoadedRun, scale: float, threads: int | None, folder: Path) -> dict[str, Any]:
-    """Train the peer for a schedule, each variant unless that is done, and return the row of the better one.
+    """Train OpenSplat for a schedule, each variant unless finished, and return the row of the better one.
 
     Raises
     ------
     DataError
-        It failed.
+        If OpenSplat failed.
     """
     iterations = whole_steps(scale * OWN_ITERATIONS)
     scene = with_start(job.scene, job.recipe.init_points, job.recipe.seed)
@@ -166,7 +166,7 @@ def _trained(
     return dict(json.loads(file.read_text()))
 
 
-# -- all of it -----------------------------------------------------------------------------------------------------
+# -- command -------------------------------------------------------------------------------------------------------
 def place_of(text: str, out: Path) -> tuple[str, Path, int]:
     """Return name, folder and downscale of ``CAPTURE[:DOWNSCALE]``.
 
@@ -187,7 +187,7 @@ def place_of(text: str, out: Path) -> tuple[str, Path, int]:
 
 
 def measure(text: str, args: argparse.Namespace, keep: Any) -> None:
-    """Train everything on a capture; ``keep`` gets its entry of the results whenever there is more in it."""
+    """Train everything on a capture; ``keep`` gets its results entry after every update."""
     name, capture, downscale = place_of(text, args.out)
     if name == DEMO and not (capture / "transforms_train.json").exists():
         print("photographing the demo scene", flush=True)
@@ -217,13 +217,13 @@ def measure(text: str, args: argparse.Namespace, keep: Any) -> None:
 
 
 def told(capture: str, curve: dict[str, Any], row: dict[str, Any]) -> None:
-    """Keep a row and say it."""
+    """Keep a row and print it."""
     curve["runs"].append(row)
     print(table([{"name": capture, "curves": [{**curve, "runs": [row]}]}]).splitlines()[-1], flush=True)
 
 
 def table(captures: Sequence[dict[str, Any]]) -> str:
-    """Return the ends of all schedules as Markdown; the longest splat is a share of the scene's extent."""
+    """Return the ends of all schedules as Markdown; the longest splat is a fraction of the scene's extent."""
     head = (
         "| capture | recipe | schedule | user CPU s | s | PSNR | worst view | F 0.25 % | Chamfer | splats | longest |"
     )
@@ -241,12 +241,12 @@ def table(captures: Sequence[dict[str, Any]]) -> str:
 
 
 def text(value: float | None, digits: int) -> str:
-    """A figure, or a dash where there is none."""
+    """Format a figure; a dash if it is missing."""
     return "-" if value is None else f"{value:.{digits}f}"
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """The command line, checked: nothing is trained before all of it is good."""
+    """Parse and check the command line before any training starts."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.time_to_quality",
         description=__doc__,
@@ -256,17 +256,19 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--recipes", nargs="+", default=list(RECIPES))
     parser.add_argument("--scales", nargs="+", type=float, default=list(SCALES), help="lengths of the schedule")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--set", nargs="*", default=[], metavar="FIELD=VALUE", help="overrides of every recipe")
-    parser.add_argument("--opensplat", type=Path, metavar="BINARY", help="the peer; without it there is none")
+    parser.add_argument("--set", nargs="*", default=[], metavar="FIELD=VALUE", help="overrides for every recipe")
+    parser.add_argument("--opensplat", type=Path, metavar="BINARY", help="OpenSplat binary (default: no comparison)")
     parser.add_argument("--opensplat-scales", nargs="+", type=float, metavar="SCALE", help="default: --scales")
-    parser.add_argument("--ground-truth", type=Path, metavar="MESH", help="default: what lies beside a capture")
+    parser.add_argument("--ground-truth", type=Path, metavar="MESH", help="default: the file next to a capture")
     parser.add_argument("--threads", type=int)
     parser.add_argument("--backend", default="auto")
-    parser.add_argument("--points", type=int, default=8, help="of the course of a training, its end included")
-    parser.add_argument("--time", choices=list(TIMES), default="user_seconds", help="what is drawn against")
+    parser.add_argument(
+        "--points", type=int, default=8, help="number of points of a training's curve, including its end"
+    )
+    parser.add_argument("--time", choices=list(TIMES), default="user_seconds", help="time axis of the figure")
     parser.add_argument("--out", type=Path, default=Path("runs/time_to_quality"))
     parser.add_argument("--results", type=Path, metavar="FILE.json", help="also write the results here")
-    parser.add_argument("--figure", type=Path, metavar="FILE.svg", help="also draw here (.svg or .png)")
+    parser.add_argument("--figure", type=Path, metavar="FILE.svg", help="also plot here (.svg or .png)")
     args = parser.parse_args(arguments)
     try:
         for recipe in args.recipes:
@@ -289,7 +291,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Train what is missing; results and figure are written as they grow. 2 for what the user can mend."""
+    """Train what is missing; update results and figure after each training. Return 2 for user errors."""
     args = parse(arguments)
     captures: dict[str, Any] = {}
     document = {"format": 1, "date": time.strftime("%Y-%m-%d"), "machine": machine(), "threads": args.threads}

@@ -1,4 +1,6 @@
-"""Times beside a probe of what the machine gave at that moment: on a shared machine a time alone means nothing."""
+"""Time functions together with a probe of the machine's current speed, which is needed to compare times on shared
+hosts.
+"""
 
 from __future__ import annotations
 
@@ -24,23 +26,25 @@ class Timing:
     median: float
     best: float
     repeats: int
-    spread: float = 0.0  # distance between the quartiles
+    spread: float = 0.0  # interquartile range
 
 
 @dataclass(frozen=True)
 class Probe:
-    """What the library's threads could do: multiply-adds (2 flops each) and copying (bytes read + bytes written)."""
+    """Rates that the library's threads can reach: multiply-adds (2 flops each) and copying (bytes read + bytes
+    written).
+    """
 
     fma_gflops: float
     copy_gb_s: float
 
     def better(self, other: Probe) -> Probe:
-        """The larger of each rate: interruptions only ever make a probe smaller."""
+        """Return the larger of each rate: interruptions only ever reduce a probe."""
         return Probe(max(self.fma_gflops, other.fma_gflops), max(self.copy_gb_s, other.copy_gb_s))
 
 
 def summary(times_ms: Sequence[float]) -> Timing:
-    """Median, minimum and interquartile distance of repeated times."""
+    """Return median, minimum and interquartile range of repeated times."""
     low, high = np.percentile(times_ms, (25, 75))
     return Timing(statistics.median(times_ms), min(times_ms), len(times_ms), float(high - low))
 
@@ -58,9 +62,9 @@ def measure(work: Callable[[], object], *, repeats: int, warmup: int = 5) -> Tim
 
 
 def _rate(library: Library, name: str, *, scales: bool) -> float:
-    """The best of three on all threads; also, where ``scales``, of the best of three on one thread times the threads.
+    """Return the best of three rates on all threads; if ``scales``, also consider one thread's rate times the threads.
 
-    A neighbour on the machine takes a core away for seconds, and then no probe on all threads sees the peak, though a
+    Other load on the machine can occupy a core for seconds. A probe on all threads then misses the peak, although a
     short kernel between two interruptions reaches it.
     """
     function, threads = library.function(name, ctypes.c_double, []), library.threads
@@ -73,20 +77,21 @@ def _rate(library: Library, name: str, *, scales: bool) -> float:
 
 
 def peak_probe(library: Library) -> float:
-    """GFLOP/s of fused multiply-adds that the library's threads can reach with a core each, at today's clock.
+    """Return the GFLOP/s of fused multiply-adds that the library's threads can reach with a core each, at the current
+    clock.
 
-    Compare it with the same figure of another run before comparing times.
+    Compare this figure between runs before comparing times.
     """
     return _rate(library, "gs2d_probe_fma", scales=True)
 
 
 def probe(library: Library) -> Probe:
-    """Both rates right now. Copying is not scaled: the cores share the memory."""
+    """Measure both rates now. Copying is not scaled: the cores share the memory."""
     return Probe(peak_probe(library), _rate(library, "gs2d_probe_copy", scales=False))
 
 
 def machine() -> dict[str, str | int]:
-    """What the numbers were measured on."""
+    """Return the hardware and software that the numbers were measured on."""
     model, count = platform.processor() or platform.machine(), 0
     info = Path("/proc/cpuinfo")
     if info.exists():

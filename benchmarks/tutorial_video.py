@@ -1,9 +1,9 @@
-"""A video for the tutorials: the demo's still life, filmed by hand in two rounds, as a phone would.
+"""Render a video for the tutorials: the demo's still life, as filmed with a handheld phone in two rounds.
 
     python -m benchmarks.tutorial_video still_life.mp4          # needs ffmpeg
 
-The camera walks round the table twice, higher the second time, with small motions of a hand. It needs no photographs of
-anybody, and its truth is known (`gs2d.synthetic`).
+The camera moves around the table twice, higher the second time, with small hand motions. No real photographs are
+needed, and the ground truth is known (`gs2d.synthetic`).
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from gs2d.synthetic.demo_scene import build_scene
 from gs2d.synthetic.shading import bake
 
 ROUNDS, ELEVATIONS = 2, (16.0, 46.0)  # degrees
-WALL = np.array([196, 203, 208], dtype=np.float64)  # what is behind the table, sRGB
+WALL = np.array([196, 203, 208], dtype=np.float64)  # background behind the table, sRGB
 FRAMES_PER_SECOND = 12
 
 
 def cameras(count: int, size: int, seed: int = 0) -> list[Camera]:
-    """Return the cameras of the frames in their order."""
+    """Return the cameras of the frames in order."""
     rng = np.random.default_rng(seed)
     sway = np.cumsum(rng.normal(0, 0.006, (count, 3)), axis=0)
-    sway -= np.linspace(0, 1, count)[:, None] * sway[-1]  # the hand comes back to where it was
+    sway -= np.linspace(0, 1, count)[:, None] * sway[-1]  # hand motion, periodic over the video
     views = []
     for k in range(count):
         along = k / count
@@ -48,7 +48,7 @@ def cameras(count: int, size: int, seed: int = 0) -> list[Camera]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Render the frames and write the video."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("video", type=Path, help="the file to write, .mp4")
+    parser.add_argument("video", type=Path, help="output file, .mp4")
     parser.add_argument("--frames", type=int, default=96)
     parser.add_argument("--size", type=int, default=720, help="width and height, px")
     args = parser.parse_args(argv)

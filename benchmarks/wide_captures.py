@@ -1,16 +1,16 @@
-"""Panoramas and fisheyes, drawn in a room, and how well their cameras are found.
+"""Render panoramas and fisheye images in a room, and measure the accuracy of the estimated cameras.
 
 ::
 
     python -m benchmarks.wide_captures panorama FOLDER [--count 10] [--width 1024] [--tilt 3]
     python -m benchmarks.wide_captures fisheye FOLDER [--angle 180] [--across width] [--off 0] [--camera-model auto] ...
 
-Somebody walks through a closed room of 4 x 3.2 x 2.4 m with mottled walls (and three boxes, for fisheyes), turns as it
-comes, and holds the camera level up to ``--tilt`` degrees (one sigma about each axis). The circle of a fisheye fits
-into the ``--across`` height (round pictures), the width (dark corners), or the diagonal of a picture (all of it is
-shown), and its middle may be ``--off`` that of the picture. ``FOLDER/photos`` has the photographs, which tell nothing
-of their lens, ``FOLDER/truth.json`` their poses (world to camera). Then ``gs2d poses`` finds the cameras
-(``FOLDER/capture``), and it is printed how far they are from the truth after the best similarity.
+The camera moves through a closed room of 4 x 3.2 x 2.4 m with mottled walls (and three boxes, for fisheyes), turns
+randomly, and is held level up to ``--tilt`` degrees (one sigma about each axis). The fisheye circle fits the
+``--across`` height (circular images), width (dark corners) or diagonal of the image (all pixels valid), and its centre
+may be ``--off`` the image centre. ``FOLDER/photos`` has the images, without lens metadata, and ``FOLDER/truth.json``
+their poses (world to camera). ``gs2d poses`` then estimates the cameras (``FOLDER/capture``), and their errors are
+printed after the best similarity alignment.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from gs2d.pipeline.prepare.options import PosesOptions
 from gs2d.pipeline.prepare.pose_finding import CAMERA_MODELS, find_poses
 from gs2d.training.events import Notice
 
-LOW, HIGH = np.array([-2.0, -1.6, 0.0]), np.array([2.0, 1.6, 2.4])  # m, of the room
-CELLS, METRES = 256, 4.0  # of a wall's pattern, and what it covers
-BENT = (0.02, -0.006, 0.001, 0.0)  # of the fisheye: r = f (t + k1 t^3 + ...), as OPENCV_FISHEYE has it
+LOW, HIGH = np.array([-2.0, -1.6, 0.0]), np.array([2.0, 1.6, 2.4])  # m, size of the room
+CELLS, METRES = 256, 4.0  # cells of a wall's pattern, and its size
+BENT = (0.02, -0.006, 0.001, 0.0)  # fisheye coefficients: r = f (t + k1 t^3 + ...), as in OPENCV_FISHEYE
 NO_BOXES = np.zeros((0, 2, 3))
 BOXES = np.array(  # m: a shelf, a chest, a stool
     [
@@ -46,12 +46,12 @@ BOXES = np.array(  # m: a shelf, a chest, a stool
         [[-0.4, 0.7, 0.0], [-0.1, 1.0, 0.45]],
     ]
 )
-LEVEL = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # x right, y down, z ahead of who looks along the world's y
-Rays = Callable[[np.ndarray, np.ndarray], np.ndarray]  # columns and rows, px -> rays of the camera; zeros: nothing
+LEVEL = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # x right, y down, z forward, along the world's y
+Rays = Callable[[np.ndarray, np.ndarray], np.ndarray]  # columns and rows, px -> rays of the camera; zeros: no ray
 
 
 def walls(seed: int = 0) -> np.ndarray:
-    """Noise of several scales [6, CELLS, CELLS, 3] in [0, 255]."""
+    """Return noise at several scales [6, CELLS, CELLS, 3] in [0, 255]."""
     rng = np.random.default_rng(seed)
     made = np.zeros((6, CELLS, CELLS, 3))
     for cells, weight in ((8, 1.0), (32, 1.2), (64, 1.0), (128, 0.7)):
@@ -61,9 +61,9 @@ def walls(seed: int = 0) -> np.ndarray:
 
 
 def colours(patterns: np.ndarray, eye: np.ndarray, rays: np.ndarray, boxes: np.ndarray = NO_BOXES) -> np.ndarray:
-    """Colours [..., 3] that rays of the world [..., 3] see from within the room; black for zeros.
+    """Return colours [..., 3] of world rays [..., 3] from inside the room; black for zeros.
 
-    ``boxes`` [B, 2, 3] have their corners there, m; nobody is in one.
+    ``boxes`` [B, 2, 3] holds two corners per box, m; no camera is inside a box.
     """
     flat = rays.reshape(-1, 3)
     seen = np.flatnonzero(flat.any(axis=1))
@@ -89,7 +89,7 @@ def colours(patterns: np.ndarray, eye: np.ndarray, rays: np.ndarray, boxes: np.n
 
 
 def _painted(patterns: np.ndarray, which: np.ndarray, points: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Colours [P, 3] of points [P, 3] on planes across these axes of the world [P], in these patterns [P]."""
+    """Return colours [P, 3] of points [P, 3] on planes normal to world axes [P], with patterns [P]."""
     others = np.array([[1, 2], [0, 2], [0, 1]])[axis]
     cell = np.floor(np.take_along_axis(points, others, axis=1) * (CELLS / METRES)).astype(int) % CELLS
     return np.asarray(patterns[which, cell[:, 0], cell[:, 1]])
@@ -112,16 +112,16 @@ def fisheye_focal(width: float, angle: float) -> float:
 
 
 def across(size: tuple[int, int], what: str) -> float:
-    """Return the "width", "height" or "diagonal" of a picture, px."""
+    """Return the "width", "height" or "diagonal" of an image, px."""
     return {"width": size[0], "height": size[1], "diagonal": float(np.hypot(*size))}[what]
 
 
 def fisheye_rays(
     width: int, height: int, angle: float, *, circle: float | None = None, off: tuple[float, float] = (0.0, 0.0)
 ) -> Rays:
-    """Return the rays of a fisheye; zeros beyond its circle of ``angle`` degrees.
+    """Return the rays of a fisheye; zeros outside its circle of ``angle`` degrees.
 
-    The circle is ``circle`` px across (the width of the picture), its middle ``off`` px from that of the picture.
+    The circle is ``circle`` px wide (the image width), and its centre is ``off`` px from the image centre.
     """
     circle = float(width) if circle is None else circle
     f, t = fisheye_focal(circle, angle), np.linspace(0, np.radians(angle / 2), 4000)
@@ -141,7 +141,7 @@ def fisheye_rays(
 def photograph(
     patterns: np.ndarray, pose: np.ndarray, rays: Rays, size: tuple[int, int], boxes: np.ndarray = NO_BOXES
 ) -> np.ndarray:
-    """uint8 [H, W, 3] from a pose T_cam_world [4, 4]; four rays a pixel."""
+    """Render uint8 [H, W, 3] from a pose T_cam_world [4, 4], with four rays per pixel."""
     width, height = size
     v, u = (np.mgrid[: height * 2, : width * 2] + 0.5) / 2
     eye = -pose[:3, :3].T @ pose[:3, 3]
@@ -150,7 +150,7 @@ def photograph(
 
 
 def walk(count: int, *, tilt: float, turn: float, seed: int = 0) -> list[np.ndarray]:
-    """Poses T_cam_world [4, 4] of a walk through the room; each looks up to ``turn`` degrees aside."""
+    """Return poses T_cam_world [4, 4] of a walk through the room; each looks up to ``turn`` degrees aside."""
     rng = np.random.default_rng(seed)
     found = []
     for i in range(count):
@@ -175,9 +175,9 @@ def write_photographs(
     off: tuple[float, float] = (0.0, 0.0),
     tilt: float = 3.0,
 ) -> dict[str, np.ndarray]:
-    """Write ``000.jpg`` ... of a "panorama" or "fisheye" (4:3); returns their poses.
+    """Write ``000.jpg`` ... of a "panorama" or "fisheye" (4:3); return their poses.
 
-    The circle of a fisheye, of ``angle`` degrees, ``fits`` the width, the height or the diagonal.
+    The fisheye circle of ``angle`` degrees fits the width, height or diagonal (``fits``).
     """
     folder.mkdir(parents=True, exist_ok=True)
     size, rays, boxes = (width, width // 2), panorama_rays(width), NO_BOXES
@@ -192,7 +192,7 @@ def write_photographs(
 
 
 def errors(capture: Path, truth: dict[str, np.ndarray]) -> dict[str, float]:
-    """How far the cameras of a capture are from the truth: m (root mean square and worst), and degrees (worst)."""
+    """Return camera errors against the ground truth: m (root mean square and worst), and degrees (worst)."""
     mine = {image.name: image.T_cam_world for image in read_images(capture / "sparse/0", "bin")}
     names = sorted(mine.keys() & truth.keys())
     found, there = (np.stack([-T[n][:3, :3].T @ T[n][:3, 3] for n in names]) for T in (mine, truth))
@@ -209,18 +209,25 @@ def errors(capture: Path, truth: dict[str, np.ndarray]) -> dict[str, float]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Draw, find the cameras and print how well they were found; 2 for what the user can mend."""
+    """Render, estimate the cameras and print their errors; return 2 for user errors."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.wide_captures", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("kind", choices=("panorama", "fisheye"))
     parser.add_argument("folder", type=Path)
     parser.add_argument("--count", type=int, default=10)
-    parser.add_argument("--width", type=int, default=1024, help="px")
+    parser.add_argument("--width", type=int, default=1024, help="width, px")
     parser.add_argument("--angle", type=float, default=180.0, help="degrees across the circle of a fisheye")
-    parser.add_argument("--across", choices=("width", "height", "diagonal"), default="width", help="that it fits into")
-    parser.add_argument("--off", type=float, default=0.0, help="px, of its middle to the right and down")
-    parser.add_argument("--camera-model", choices=("auto", *CAMERA_MODELS), default="auto", help="for gs2d poses")
+    parser.add_argument(
+        "--across",
+        choices=("width", "height", "diagonal"),
+        default="width",
+        help="image dimension that the fisheye circle fits",
+    )
+    parser.add_argument(
+        "--off", type=float, default=0.0, help="offset of the circle's centre to the right and down, px"
+    )
+    parser.add_argument("--camera-model", choices=("auto", *CAMERA_MODELS), default="auto", help="passed to gs2d poses")
     parser.add_argument("--tilt", type=float, default=3.0, help="degrees, one sigma")
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args(arguments)

@@ -1,4 +1,4 @@
-"""What is timed: the synthetic room (two spheres, a floor and a wall, seeded), or splats that were trained."""
+"""Workloads of the benchmarks: the seeded synthetic room (two spheres, a floor and a wall), or trained splats."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from gs2d.core.splats import Splats
 from gs2d.data import load_scene
 from gs2d.io.splat_ply import read_splats
 
-NEAR_PLANE_POLICIES = 0.003  # of the splats, in addition: what views of indoor captures hold
+NEAR_PLANE_POLICIES = 0.003  # additional fraction of the splats, as in views of indoor captures
 PLACES = ((0.3, -0.5, -4.0), (-0.9, -0.8, -3.8), (1.2, -0.3, -3.9), (0.0, -1.4, -4.2))
 
 
 def room(n: int, seed: int = 0) -> Splats:
-    """n splats on two spheres, a floor and a wall.
+    """Return n splats on two spheres, a floor and a wall.
 
     Normals are jittered by 0.15, scales are 0.9 x the mean distance to 3 neighbours x exp(0.4 N(0, 1)), opacities are
     half U(0.1, 0.5), half U(0.5, 0.95).
@@ -52,7 +52,7 @@ def room(n: int, seed: int = 0) -> Splats:
     spacing = np.asarray(distances)[:, 1:].mean(axis=1)
     scales = 0.9 * spacing[:, None] * np.exp(0.4 * np.asarray(rng.normal(size=(n, 2))))
     opacity = np.where(rng.random(n) < 0.5, rng.uniform(0.1, 0.5, n), rng.uniform(0.5, 0.95, n))
-    order = rng.permutation(n)  # nothing is sorted in space
+    order = rng.permutation(n)  # no spatial order
 
     def tensor(x: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(x[order], dtype=np.float32))
@@ -68,9 +68,9 @@ def room(n: int, seed: int = 0) -> Splats:
 
 
 def underfoot(n: int, seed: int = 0) -> Splats:
-    """n splats on the floor beneath the cameras, which reach the camera planes of some views and are seen in none.
+    """Return n splats on the floor below the cameras that cross the camera planes of some views and are never visible.
 
-    Such splats have no ellipse on the image. Indoors there are hundreds a view: floors and walls nearby.
+    Such splats have no ellipse on the image. Indoor captures have hundreds per view, on nearby floors and walls.
     """
     rng = np.random.default_rng(seed)
     points = np.stack([rng.uniform(-1.2, 1.2, n), np.full(n, 0.9), rng.uniform(-4.2, -3.4, n)], axis=1)
@@ -91,7 +91,7 @@ def underfoot(n: int, seed: int = 0) -> Splats:
 
 
 def _quats_of(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Rotations (w, x, y, z) [N, 4] whose third column is the normal, turned at random about it."""
+    """Return rotations (w, x, y, z) [N, 4] whose third column is the normal, randomly turned about it."""
     z = np.array([0.0, 0.0, 1.0])
     axis = np.cross(z, normals)
     quats = np.concatenate([1 + normals @ z[:, None], axis], axis=1)  # half-way quaternion
@@ -103,7 +103,7 @@ def _quats_of(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def camera(width: int, height: int | None = None, place: tuple[float, float, float] = (0.3, -0.5, -4.0)) -> Camera:
-    """A view of the room, square without a height; the focal length is 0.9 x the width."""
+    """Return a view of the room, square if no height is passed; the focal length is 0.9 x the width."""
     return look_at(
         np.array(place),
         np.array([0.0, 0.0, 0.2]),
@@ -115,13 +115,13 @@ def camera(width: int, height: int | None = None, place: tuple[float, float, flo
 
 
 def places(width: int, height: int) -> tuple[Camera, ...]:
-    """The four training views of the room."""
+    """Return the four training views of the room."""
     return tuple(camera(width, height, place) for place in PLACES)
 
 
 @dataclass(frozen=True, eq=False)
 class Workload:
-    """Splats and the cameras that look at them; the first camera is the one the rasterizer is timed on."""
+    """Splats and cameras; the rasterizer is timed on the first camera."""
 
     name: str
     splats: Splats
@@ -143,13 +143,13 @@ QUICK = ((2_000, 96, 96), (4_000, 160, 106))
 
 
 def name_of(count: int, width: int, height: int) -> str:
-    """For instance "room-100k-800x800"."""
+    """Return the workload name, for instance "room-100k-800x800"."""
     size = f"{count // 1_000_000}M" if count % 1_000_000 == 0 else f"{count // 1000}k"
     return f"room-{size}-{width}x{height}"
 
 
 def room_workload(count: int, width: int, height: int, *, crossing: bool = False) -> Workload:
-    """The room with four views; ``near_plane_policy`` appends splats across the camera plane that nobody sees."""
+    """Return the room with four views; ``near_plane_policy`` appends invisible splats across the camera plane."""
     splats, name = room(count), name_of(count, width, height)
     if crossing:
         more = underfoot(max(1, round(NEAR_PLANE_POLICIES * count)))
@@ -158,7 +158,7 @@ def room_workload(count: int, width: int, height: int, *, crossing: bool = False
 
 
 def trained_workload(splats_file: Path, capture: Path, downscale: int) -> Workload:
-    """Splats that were trained on photographs (a PLY, or a run folder with its splats.ply), seen by its cameras."""
+    """Return trained splats (a PLY, or a run folder with splats.ply) with the cameras of their capture."""
     file = splats_file / "splats.ply" if splats_file.is_dir() else splats_file
     splats = read_splats(file)
     views = load_scene(capture, downscale=downscale).train
@@ -167,16 +167,16 @@ def trained_workload(splats_file: Path, capture: Path, downscale: int) -> Worklo
 
 
 class AbsentError(Exception):
-    """What a workload is made of is not on this machine; says what."""
+    """Raised if data of a workload is missing on this machine; the message names it."""
 
 
 def run_workload(run: Path) -> Workload:
-    """The splats of a finished run, seen by the cameras of the capture that its ``run.json`` names.
+    """Return the splats of a finished run with the cameras of the capture that its ``run.json`` names.
 
     Raises
     ------
     AbsentError
-        The run, its splats or its capture is not there. Captures are other people's: none is in the repository.
+        If the run, its splats or its capture is missing. The repository contains no third-party captures.
     """
     if not (run / "run.json").is_file() or not (run / "splats.ply").is_file():
         raise AbsentError(f"{run} is no finished run")

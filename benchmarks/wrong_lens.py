@@ -1,11 +1,11 @@
-"""What `--learn intrinsics` is worth on a capture whose lens nobody knows: its distortion is taken out of the file.
+"""Measure the gain of `--learn intrinsics` on a capture with unknown lens distortion.
 
 ::
 
     python -m benchmarks.wrong_lens CAPTURE FOLDER [--downscale 4] [--scale 0.05] [--recipe 2dgs] [--seeds 0]
 
 CAPTURE has a ``transforms.json`` with distortion coefficients. FOLDER gets a copy of that file without them, links to
-the photographs, and the runs; what is finished is not done again. The table goes to standard output.
+the photographs, and the runs; finished runs are not repeated. The table is printed.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ WAYS = {
 
 
 def without_lens(capture: Path, folder: Path) -> Path:
-    """Return a copy of a capture that says nothing of its lens."""
+    """Return a copy of a capture without lens parameters."""
     copy = folder / "without-lens"
     copy.mkdir(parents=True, exist_ok=True)
     data = json.loads((capture / "transforms.json").read_text())
@@ -47,7 +47,7 @@ def without_lens(capture: Path, folder: Path) -> Path:
 
 
 def run(capture: Path, out: Path, words: tuple[str, ...], args: argparse.Namespace, seed: int) -> Mapping[str, Any]:
-    """Train and score one run unless it is done, and return its last stage's figures."""
+    """Train and score one run unless it is finished, and return the figures of its last stage."""
     if not (out / "metrics.json").exists() or not (out / "mesh.ply").exists():
         command = ["train", str(capture), "--out", str(out), "--recipe", args.recipe, "--seed", str(seed)]
         command += ["--downscale", str(args.downscale), "--schedule-scale", str(args.scale), "--threads", "1"]
@@ -57,7 +57,7 @@ def run(capture: Path, out: Path, words: tuple[str, ...], args: argparse.Namespa
 
 
 def found(out: Path) -> str:
-    """Return what became of focal length and lens, in words."""
+    """Describe the change of focal length and lens."""
     path = out / "poses.json"
     frames = json.loads(path.read_text())["frames"] if path.exists() else [{}]
     zoom = frames[0].get("zoom")

@@ -1,6 +1,6 @@
-"""Check the licences of the dependencies, by metadata, and known vulnerabilities, with pip-audit (`make audit`).
+"""Check the dependencies' licences by metadata and known vulnerabilities with pip-audit (`make audit`).
 
-Exit codes: 0 without findings, 1 with findings, 3 if pip-audit is not installed or cannot reach its database; licences
+Exit codes: 0 without findings, 1 with findings, 3 if pip-audit is not installed or cannot reach its database. Licences
 are checked in any case.
 """
 
@@ -17,7 +17,7 @@ FOUND, NOT_CHECKED = 1, 3
 
 
 def licences() -> int:
-    """Run the test that knows which licences are allowed; 0 where all are."""
+    """Run the test that checks licences against the allowed list; return 0 if all pass."""
     words = [
         sys.executable,
         "-m",
@@ -33,7 +33,7 @@ def licences() -> int:
 
 
 def vulnerabilities(requirements: Path) -> int:
-    """Ask pip-audit about the pinned versions; says so where it cannot tell."""
+    """Check the pinned versions with pip-audit; print a message if the check is not possible."""
     if importlib.util.find_spec("pip_audit") is None:
         print(f"vulnerabilities: not checked, pip-audit is not installed; {sys.executable} -m pip install pip-audit")
         return NOT_CHECKED

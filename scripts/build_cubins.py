@@ -6,8 +6,8 @@
     python -m pip wheel . --no-deps
 
 FOLDER is ``src/gs2d/kernels/cuda/cubins`` by default, which git ignores and wheels include. Build with the oldest CUDA
-that knows all architectures, 12.8 (``pip install cuda-bindings==12.8.* nvidia-cuda-nvrtc-cu12==12.8.*``): a driver
-accepts code of its own and of older major versions of CUDA. Kernels that spill are refused. No GPU is needed.
+version that supports all architectures, 12.8 (``pip install cuda-bindings==12.8.* nvidia-cuda-nvrtc-cu12==12.8.*``): a
+driver accepts code of its own and of older major CUDA versions. Kernels that spill are rejected. No GPU is needed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gs2d.kernels.cuda.shipped import FOLDER, PTX, SHIPPED, digest_of, write_arc
 
 
 def build(folder: Path, architectures: Sequence[str] = (*SHIPPED, PTX), names: Sequence[str] | None = None) -> int:
-    """Write archives and their manifest; bytes of all."""
+    """Write archives and their manifest; return their total bytes."""
 
     def code_of(name: str, arch: str) -> bytes:
         made = nvrtc.compile_source(name, arch)
@@ -41,7 +41,7 @@ def build(folder: Path, architectures: Sequence[str] = (*SHIPPED, PTX), names: S
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Build into the folder that is named, or into the package."""
+    """Build into the requested folder, or into the package."""
     given = sys.argv[1:] if arguments is None else list(arguments)
     folder = Path(given[0]) if given else Path(nvrtc.__file__).parent / FOLDER
     try:

@@ -3,7 +3,7 @@
     python -m venv build/recipe-tools && build/recipe-tools/bin/pip install py-rattler-build==0.73.0
     build/recipe-tools/bin/python scripts/check_recipe.py
 
-A mistake in the recipe or its variants is reported by rattler-build, with exit code 1.
+rattler-build reports a mistake in the recipe or its variants, and the script exits with 1.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ PLATFORMS = ("linux-64", "linux-aarch64", "osx-arm64", "win-64")
 
 
 def rendered(platform: str) -> list[rb.RenderedVariant]:
-    """The recipe for a platform, a variant for each Python."""
+    """Return the rendered recipe of a platform, a variant per Python version."""
     config = rb.PlatformConfig(target_platform=platform)
     variants = rb.VariantConfig.from_file_with_context(RECIPE.parent / "variants.yaml", rb.JinjaConfig(platform=config))
     return rb.Stage0Recipe.from_file(RECIPE).render(variants, rb.RenderConfig(config))
 
 
 def main() -> int:
-    """Render for all platforms, and say what each is built with."""
+    """Render for all platforms and print the dependencies of each."""
     for platform in PLATFORMS:
         variants = rendered(platform)
         pythons = [variant.variant["python"] for variant in variants]

@@ -1,4 +1,4 @@
-"""Compare two processors: images and gradients of random splats, and a short training.
+"""Compare the results of two processors: images and gradients of random splats, and a short training.
 
     python scripts/compare_machines.py make OUT.npz --capture FOLDER     # on each machine; creates FOLDER
     python scripts/compare_machines.py compare A.npz B.npz               # fails if they differ by more than rounding
@@ -27,7 +27,7 @@ IMAGES = ("color", "alpha", "normal", "depth_mean", "distortion")
 
 
 def make(out: Path, capture: Path) -> None:
-    """Write what this processor computes."""
+    """Write the results of this processor."""
     print(
         f"{platform.machine()}: python {platform.python_version()}, torch {torch.__version__}, gs2d {gs2d.__version__}"
     )
@@ -36,7 +36,7 @@ def make(out: Path, capture: Path) -> None:
 
 
 def _drawn() -> dict[str, np.ndarray]:
-    """Images of a cloud of splats, and the gradients of a weighted sum of all of them."""
+    """Return images of random splats, and the gradients of a weighted sum of all images."""
     rng = np.random.default_rng(0)
 
     def normal(*shape: int) -> torch.Tensor:
@@ -69,7 +69,7 @@ def _drawn() -> dict[str, np.ndarray]:
 
 
 def _trained(capture: Path) -> dict[str, np.ndarray]:
-    """PSNR of test views, and the number of splats, after a short training."""
+    """Return test PSNR and the number of splats after a short training."""
     if not capture.exists():
         write_demo_capture(capture, seed=0, train_views=VIEWS, test_views=2, size=SIZE)
     started = time.process_time()
@@ -80,13 +80,13 @@ def _trained(capture: Path) -> dict[str, np.ndarray]:
 
 
 def compare(first: Path, second: Path) -> int:
-    """Print the differences; return the number of those that are more than rounding."""
+    """Print the differences; return the number of differences beyond rounding."""
     a, b = np.load(first), np.load(second)
     faults = 0
     for name in a.files:
         x, y = a[name].astype(np.float64), b[name].astype(np.float64)
         apart = np.abs(x - y)
-        if name.startswith("image"):  # a pair at a threshold may be drawn on one of them alone
+        if name.startswith("image"):  # a pair at a threshold may be drawn on one processor only
             value, limit = float(np.quantile(apart, 0.999)) / float(np.abs(x).max()), 1e-4
             told = f"99.9 % of pixels within {value:.1e} of the largest value, the rest within {apart.max():.1e}"
         elif name.startswith("gradient"):
@@ -98,13 +98,13 @@ def compare(first: Path, second: Path) -> int:
         else:
             value, limit = float(apart / x), 0.1
             told = f"{int(x)} and {int(y)}"
-        faults += not value <= limit  # NaN is one
+        faults += not value <= limit  # NaN counts as a difference
         print(f"{'ok   ' if value <= limit else 'FAULT'} {name}: {told}")
     return faults
 
 
 def main() -> int:
-    """Run one of the two."""
+    """Run the requested command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     maker = commands.add_parser("make")

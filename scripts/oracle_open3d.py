@@ -1,13 +1,14 @@
 """Score the seeded scenes of ``tests/helpers/oracle_scenes.py`` with Open3D 0.19.
 
-An independent check of ``gs2d.evaluation``, which never imports Open3D. Run once, in a separate environment::
+Provides an independent reference for ``gs2d.evaluation``, which never imports Open3D. Run once, in a separate
+environment::
 
     python -m venv build/oracle && build/oracle/bin/pip install open3d-cpu==0.19.0
     build/oracle/bin/python scripts/oracle_open3d.py > tests/helpers/oracle_open3d.json
 
-Tanks and Temples: Open3D crops, thins, runs RANSAC over camera centres and ICP with scale, and computes nearest
-distances, in the steps and with the criteria of the official script. DTU: points are sampled on every triangle, one
-triangle at a time, and thinned one by one in a shuffled order; Open3D computes the distances.
+Tanks and Temples: Open3D crops, downsamples, runs RANSAC over camera centres and ICP with scale, and computes nearest
+distances, with the steps and criteria of the official script. DTU: points are sampled on every triangle, one triangle
+at a time, and thinned one by one in a shuffled order; Open3D computes the distances.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def crop_volume(data: dict, folder: Path) -> o3d.visualization.SelectionPolygonV
 
 
 def tnt(seed: int, folder: Path) -> dict:
-    """Precision, recall and F, with what every step gave."""
+    """Return precision, recall and F-score, with the result of every step."""
     scene = tnt_scene(seed)
     volume = crop_volume(scene.crop, folder)
     source = cloud(np.concatenate([scene.vertices, scene.vertices[scene.faces].mean(axis=1)]))
@@ -49,7 +50,7 @@ def tnt(seed: int, folder: Path) -> dict:
         cloud(scene.centers), log, pairs, 0.2, point_to_point, 6,
         criteria=registration.RANSACConvergenceCriteria(100000, 0.999),
     )  # fmt: skip
-    fit = point_to_point.compute_transformation(cloud(scene.centers), log, pairs)  # of all pairs: no randomness
+    fit = point_to_point.compute_transformation(cloud(scene.centers), log, pairs)  # use all pairs: no randomness
     T = np.asarray(fit)
     stages = []
     for voxel, threshold in ((TAU, 80 * TAU), (TAU / 2, 20 * TAU), (None, 2 * TAU)):
@@ -86,7 +87,7 @@ def T_list(T: np.ndarray) -> list:
 
 
 def one_triangle(a: np.ndarray, b: np.ndarray, c: np.ndarray, density: float) -> list[np.ndarray]:
-    """Half steps of a skew grid on one triangle."""
+    """Sample one triangle at half steps of a skewed grid."""
     l1, l2, area2 = np.linalg.norm(b - a), np.linalg.norm(c - a), np.linalg.norm(np.cross(b - a, c - a))
     if area2 == 0:
         return []
@@ -102,7 +103,7 @@ def one_triangle(a: np.ndarray, b: np.ndarray, c: np.ndarray, density: float) ->
 
 
 def dtu(seed: int) -> dict:
-    """Chamfer distance of the DTU-like scene, mm."""
+    """Return the Chamfer distance of the DTU-like scene, mm."""
     scene, density = dtu_scene(seed), 0.2
     points = [*scene.vertices]
     for face in scene.faces:

@@ -2,13 +2,18 @@
 
 ::
 
+    python -m benchmarks.gpu first       [--out FILE.json] [--dry-run]
+    python -m benchmarks.gpu host        [--out FILE.json]
+    python -m benchmarks.gpu correctness [--out FILE.json] [--dry-run] [--only parity memcheck ...]
+    python -m benchmarks.gpu kernels     [--out FILE.json] [--dry-run] [--only 1000000 ...]
+    python -m benchmarks.gpu real        [--out FILE.json] [--dry-run] --capture FOLDER ... [--recipe best]
+                                         [--schedule-scale 1.0] [--downscale 1]
+    python -m benchmarks.gpu training    [--out FILE.json] [--dry-run] --capture FOLDER ... [--schedule-scale 1.0]
+                                         [--downscale 1] [--runs FOLDER] [--synthetic]
+
 Each command writes one file, updated after every part, and prints a short table at the end. ``--minutes M`` starts no
 part after M minutes, for machines that are lent by the minute. ``--dry-run`` runs everything on any machine at toy size
 with emulated kernels; its times are meaningless.
-
-Each writes one file, after every part of it, and prints a short table last. ``--minutes M`` begins no part after so
-many, for machines that are lent by the minute. ``--dry-run`` goes through all of it on any machine, at toy size, with
-the kernels emulated; its times mean nothing.
 """
 
 from __future__ import annotations
