@@ -30,7 +30,7 @@ def native(request: pytest.FixtureRequest, backend_named: Callable[[str], Backen
 
 @pytest.fixture
 def part(request: pytest.FixtureRequest) -> int:
-    """Fraction of cases to run; the slow emulator runs only a few."""
+    """Return N to run one case in N; the emulator is slow and runs fewer."""
     return 8 if "emulated" in request.node.callspec.id else 1
 
 

@@ -98,7 +98,7 @@ def test_pixels_outside_the_circle_are_masked(tmp_path: Path) -> None:
     assert (both == alone & (np.arange(150) < 75)[:, None]).all()
 
 
-# -- what matches tell -------------------------------------------------------------------------------------------------
+# -- evidence in matches -----------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def pycolmap(colmap: None) -> Any:
     import pycolmap

@@ -108,7 +108,7 @@ def test_without_pycolmap_the_error_names_the_extra(
     assert "pip install 'pycolmap>=" in one_line(capsys.readouterr().err)
 
 
-# -- where the capture goes --------------------------------------------------------------------------------------------
+# -- output folders ----------------------------------------------------------------------------------------------------
 def test_out_must_not_overlap_the_folder_of_photographs(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()

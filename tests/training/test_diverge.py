@@ -1,4 +1,4 @@
-"""Diverging training stops with a message that names the place and the cause."""
+"""Diverging training stops with a message that names the location and the cause."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ def test_resuming_from_any_event_gives_the_same_splats_and_rows(scene: Scene) ->
     )
     end = trainer.run()
     found = trainer.state.learned
-    assert all(rows.values.abs().max() > 1e-4 for name, rows in found.items() if name != "response")  # per camera
+    assert all(rows.values.abs().max() > 1e-4 for name, rows in found.items() if name != "response")  # one camera
     for data in kept[:: 3 if backend == "cpu" else 9]:
         resumed = Trainer(scene, recipe, GENERIC, backend=backend, state=TrainState.from_state_dict(data))
         assert same(resumed.run(), end)

@@ -1,9 +1,8 @@
 """Device placement with splats on a GPU: kernels get no host tensors, and devices are never mixed.
 
 torch's fake tensors report "cuda:0" without a GPU. They have shapes and devices but no values, and refuse mixed
-devices.
-Reading a value, which would block the host, is an error. A torch without CUDA needs a device guard, which is compiled
-here.
+devices. Reading a value, which would block the host, is an error. A torch without CUDA needs a device guard, which is
+compiled here.
 """
 
 from __future__ import annotations
