@@ -14,7 +14,7 @@ from room_photos import Room, found_room, write_room
 
 @pytest.fixture(scope="session")
 def colmap() -> None:
-    """Skip where pycolmap is not installed."""
+    """Skip if pycolmap is not installed."""
     if importlib.util.find_spec("pycolmap") is None:
         pytest.skip("no pycolmap: pip install pycolmap")
 

@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 
 def folder_with(folder: Path, architectures: tuple[str, ...], **changes: object) -> Path:
-    """Write a folder like scripts/build_cubins.py, with text in place of machine code."""
+    """Write a folder as scripts/build_cubins.py does, with text in place of machine code."""
     folder.mkdir(exist_ok=True)
     for arch in architectures:
         with zipfile.ZipFile(folder / f"{arch}.zip", "w") as archive:
