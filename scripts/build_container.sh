@@ -1,13 +1,13 @@
 #!/bin/sh
-# Build the container image `gs2d` with docker, podman or buildah, and test it without network, as a user id without a
-# name, with a mounted work folder: version, doctor, a short demo, and COLMAP on the images of the demo. Prints the size
-# of the image and of its parts.
+# Build the container image `gs2d` with docker, podman or buildah. Test it without network, as an unnamed user id, with
+# a mounted work folder: version, doctor, a short demo, and COLMAP on the demo images. Print the size of the image and its
+# folders.
 # Usage: scripts/build_container.sh [--debootstrap] [OPTION OF THE BUILDER...]
 #
 #   scripts/build_container.sh --build-arg PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu   # for CPUs only
 #
 # --debootstrap (as root, on Debian) makes the base image from Debian packages, without an image registry.
-# BUILDAH_ISOLATION=chroot is needed where a builder may not create namespaces (in containers, some virtual machines).
+# Set BUILDAH_ISOLATION=chroot if the builder cannot create namespaces (in containers and some virtual machines).
 set -eu
 cd "$(dirname "$0")/.."
 tool=""
@@ -31,7 +31,7 @@ if [ "${1:-}" = --debootstrap ]; then
     shift
     root="$scratch/root"
     debootstrap --variant=minbase bookworm "$root" >"$scratch/log" 2>&1 || { cat "$scratch/log" >&2; exit 1; }
-    # As Debian's own slim image: no pages, no languages.
+    # Like Debian's slim image: no manual pages, no translations.
     find "$root/usr/share/doc" -type f ! -name copyright -delete
     rm -rf "$root"/var/cache/apt/archives/*.deb "$root"/var/lib/apt/lists/* "$root"/usr/share/man/* \
         "$root"/usr/share/info/* "$root"/usr/share/locale/*
@@ -59,7 +59,7 @@ started=$(date +%s)
 $tool build "$@" -t gs2d .
 echo "built by $tool in $(($(date +%s) - started)) s"
 
-# The user: whoever runs this; for root somebody else, who has no name in the image.
+# Run as the current user; root uses another id that has no name in the image.
 work="$scratch/work"
 mkdir "$work"
 user="$(id -u):$(id -g)"
@@ -88,7 +88,7 @@ for made in demo/mesh.ply demo/report.html demo/scene.html poses/sparse/0/images
 done
 echo "cameras found of $(ls "$work/poses/images" | wc -l) photographs, as user $user, without network and display"
 
-# Its folders by size, MB.
+# Folders of the image by size, MB.
 run sh -c 'du -xsm /usr /opt/gs2d; du -xm --max-depth=1 /opt/gs2d/lib/python3*/site-packages | sort -rn | sed -n 2,8p'
 if [ $tool = buildah ]; then
     buildah push -q localhost/gs2d "docker-archive:$scratch/image.tar:gs2d"

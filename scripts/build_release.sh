@@ -3,11 +3,11 @@
 # Usage: scripts/build_release.sh [--aarch64] [PYTHON]
 #        (Linux, g++ >= 12 or clang++ >= 14; the tools go to build/release-tools)
 #
-# --aarch64 makes the wheel of 64-bit Arm beside it, on any machine that has a cross compiler (Debian's
-# g++-aarch64-linux-gnu). On an aarch64 machine leave it out: its own wheel is that one.
+# --aarch64 also builds the 64-bit Arm wheel, on any machine with a cross compiler (Debian: g++-aarch64-linux-gnu). Omit
+# it on an aarch64 machine, whose own wheel is for that platform.
 #
-# Wheels are of every Python 3 (py3-none): the library is plain C++ that ctypes loads. auditwheel finds the oldest glibc
-# that it runs on (built on Debian 12: 2.34) and refuses libraries that a user might not have.
+# Wheels support every Python 3 (py3-none): ctypes loads a plain C++ library. auditwheel determines the oldest
+# compatible glibc (2.34 if built on Debian 12) and rejects dependencies on libraries that users might not have.
 set -eu
 cd "$(dirname "$0")/.."
 arm=""
@@ -26,7 +26,7 @@ python -m build --outdir build/release .    # the sdist, then the wheel from the
 if [ -n "$arm" ]; then
     mkdir -p build/unpacked
     tar -xzf build/release/*.tar.gz -C build/unpacked
-    # The platform is what scikit-build-core would otherwise ask this machine's Python for.
+    # Set the target platform; scikit-build-core would use this machine's.
     CMAKE_ARGS="-DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64 -DCMAKE_CXX_COMPILER=aarch64-linux-gnu-g++" \
         _PYTHON_HOST_PLATFORM=linux-aarch64 python -m build --wheel --outdir build/release build/unpacked/*
 fi
@@ -36,7 +36,7 @@ for wheel in build/release/*.whl; do
 done
 cp build/release/*.tar.gz dist/
 for wheel in dist/*.whl; do
-    # Without a compiler the build goes on without kernels: such a wheel is not released.
+    # Without a compiler the build succeeds without kernels; do not release such a wheel.
     python -m zipfile -l "$wheel" | grep 'kernels/lib/libgs2d_cpu_portable.so' >/dev/null ||
         { echo "error: $wheel must hold the native kernels; install a C++20 compiler" >&2; exit 1; }
 done

@@ -2,11 +2,11 @@
 # Install the 64-bit Arm wheel with an Arm Python under QEMU, run `gs2d doctor` from it, and compare images, gradients
 # and a short training with this machine (scripts/compare_machines.py).
 # Usage: scripts/check_aarch64.sh WHEEL PYTHON
-#        (Debian, as root, on x86-64: apt install qemu-user-static debootstrap; PYTHON has gs2d of the same sources,
-#        installed or by PYTHONPATH)
+#        (Debian, as root, on x86-64: apt install qemu-user-static debootstrap; PYTHON must import gs2d of the same
+#        sources, installed or through PYTHONPATH)
 #
-# No setting of this machine is changed: Debian packages are unpacked into a temporary folder, not configured, and Arm
-# programs are started by QEMU explicitly. torch is 2.10.0, whose Arm wheel needs no CUDA libraries.
+# The script changes no machine settings: Debian packages are unpacked into a temporary folder without configuration,
+# and QEMU is invoked explicitly. torch is 2.10.0, whose Arm wheel needs no CUDA libraries.
 set -eu
 [ $# = 2 ] || { sed -n "s/^# *//; 4,6p" "$0" >&2; exit 2; }
 wheel=$(cd "$(dirname "$1")" && pwd)/$(basename "$1")
@@ -20,20 +20,20 @@ done
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 root="$work/root"
-# Its first stage downloads all packages and unpacks those that every Debian has; the rest is unpacked here.
+# The first stage of debootstrap downloads all packages and unpacks the required ones; unpack the rest here.
 debootstrap --foreign --arch=arm64 --variant=minbase --include=python3,python3-pip-whl,ca-certificates \
     bookworm "$root" >"$work/log" 2>&1 || { tail "$work/log" >&2; exit 1; }
 for package in "$root"/var/cache/apt/archives/*.deb; do
     dpkg-deb --fsys-tarfile "$package" | tar -x --keep-directory-symlink -C "$root"
 done
 site="$work/site"
-arm() {    # a Python of Arm, with what was installed
+arm() {    # run the Arm Python with the installed packages
     PYTHONPATH="$site" PYTHONDONTWRITEBYTECODE=1 OMP_NUM_THREADS=1 \
         qemu-aarch64-static -L "$root" "$root/usr/bin/python3" "$@"
 }
-cd "$work"    # nothing of a checkout is importable
+cd "$work"    # outside the checkout, so that it cannot be imported
 pip=$(echo "$root"/usr/share/python-wheels/pip-*.whl)
-# pip itself runs there: it asks the processor and the C library of Debian for the tags of wheels that fit.
+# Run pip under QEMU, so that it selects wheels for that processor and C library.
 arm "$pip/pip" --disable-pip-version-check -q install --only-binary :all: --no-compile --target "$site" \
     torch==2.10.0 "$wheel"
 arm -m gs2d --version

@@ -1,12 +1,12 @@
-// A small fixed view through a built kernel library, for counting instructions: no Python, no threads, no clock and no
-// random numbers of a C library. Usage: driver LIBRARY all|color
+// Render a small fixed view with a built kernel library, to count instructions. Uses no Python, threads, clock or C
+// library random numbers. Usage: driver LIBRARY all|color
 #include <dlfcn.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <string.h>
 #include <vector>
 
-#include "cpu/frame.h"  // the layout of the structures; the arithmetic is the library's
+#include "cpu/frame.h"  // for the structure layouts only; the library does the arithmetic
 
 using namespace gs2d;
 

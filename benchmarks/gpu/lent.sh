@@ -1,16 +1,16 @@
 #!/bin/bash
-# Measures in four calls on a GPU that is lent by the minute (METHOD.md); part 0 first: it says what the others are for.
+# Run the GPU measurements in four calls, for machines with limited time (METHOD.md). Run part 0 first.
 #
-#   bash benchmarks/gpu/lent.sh 0 OUT                three minutes: facts, every kernel once, parity, where the time goes
-#   bash benchmarks/gpu/lent.sh 1 OUT                kernels and iterations, counters, what-ifs, beside gsplat
-#   bash benchmarks/gpu/lent.sh 2 OUT [CAPTURE ...]  whole runs: of captures, and of a synthetic one that is made there
-#   bash benchmarks/gpu/lent.sh 3 OUT                ceilings, parity, tests, sanitizers as far as time allows
+#   bash benchmarks/gpu/lent.sh 0 OUT                three minutes: machine, every kernel once, parity, time breakdown
+#   bash benchmarks/gpu/lent.sh 1 OUT                kernels and iterations, counters, comparison with gsplat
+#   bash benchmarks/gpu/lent.sh 2 OUT [CAPTURE ...]  whole runs of captures and of a synthetic capture
+#   bash benchmarks/gpu/lent.sh 3 OUT                ceilings, parity, tests, sanitizers if time allows
 #
-# Results come to OUT/gpu_*.json as they are had, whatever stops the rest, and what belongs to them (reports, traces,
-# logs) to OUT/part_N.tar.gz: two files a part, none in a folder, and small enough to be brought home. Needs no index
-# and installs nothing: it takes .venv or the first Python >= 3.11 whose torch is built with CUDA. What is in carried/
-# is used: captures/*, *.whl (gsplat, for one: METHOD.md). MINUTES (8.3; of part 0: 3) and DRY=--dry-run (no GPU: toy sizes,
-# emulated) may be set. The exit status is that of the measurement: 0, 1 (something is wrong), 2 (cannot run), 124 (time).
+# Results are written to OUT/gpu_*.json after every measurement. Reports, traces and logs are packed into
+# OUT/part_N.tar.gz. Each part thus leaves two small files and no folders. The script needs no package index and installs
+# nothing: it uses .venv or the first Python >= 3.11 whose torch is built with CUDA. It uses captures/* and *.whl in
+# carried/ (for instance gsplat: METHOD.md). Variables: MINUTES (8.3; 3 for part 0) and DRY=--dry-run (no GPU: emulated,
+# toy sizes). Exit status: that of the measurement: 0, 1 (a check failed), 2 (cannot run), 124 (time limit).
 begun=$(date +%s)
 set -u
 cd "$(dirname "$0")/../.." || exit 2
@@ -27,7 +27,7 @@ export PYTHONPATH="src${PYTHONPATH:+:$PYTHONPATH}" PYTHONUNBUFFERED=1 GS2D_WORK=
 
 left() { echo $(($(date +%s) < end ? end - $(date +%s) : 0)); }
 
-fits() {  # whether a Python does, by its exit status: what a package has to say while it loads is no reason
+fits() {  # check a Python by its exit status; messages printed during imports are ignored
     timeout -k 5 $(($(left) + 30)) "$1" -W ignore - "$dry" 2>"$work/python.err" <<'PY'
 import sys
 if sys.version_info < (3, 11):
@@ -53,11 +53,11 @@ done
 [ -n "${GS2D_COMMIT:-}" ] || GS2D_COMMIT=$(git describe --always --dirty 2>/dev/null) && export GS2D_COMMIT
 trap '"$python" -m benchmarks.gpu.archive "$work" "$out/part_$part.tar.gz"; rm -rf "$work"' EXIT
 
-measure() {  # a command within the time that is left; a kill comes half a minute after it was to stop by itself
+measure() {  # run a command within the remaining time; kill it half a minute after its own deadline
     timeout -k 5 $(($(left) + 30)) "$python" -m benchmarks.gpu "$@" --minutes "$(awk "BEGIN{print $(left)/60}")" $dry \
         > >(tee -a "$work/log.txt") 2> >(tee -a "$work/log.txt" >&2)
 }
-if ls carried/*.whl >/dev/null 2>&1; then  # pure Python, or for this one
+if ls carried/*.whl >/dev/null 2>&1; then  # pure Python wheels, or wheels for this Python
     timeout 60 "$python" -m pip install -q --no-index --no-deps --target "$work/.site" carried/*.whl >>"$work/log.txt" 2>&1
     export PYTHONPATH="$PYTHONPATH:$work/.site"
 fi
@@ -66,7 +66,7 @@ case "$part" in
     1)
         export TORCH_EXTENSIONS_DIR="$work/.extensions"
         if [ -z "$dry" ] && command -v nvcc >/dev/null && ls carried/gsplat-*.whl >/dev/null 2>&1; then
-            # its kernels are compiled beside what is measured first, on other cores; it is wanted last
+            # compile gsplat's kernels on other cores during the first measurements; gsplat is measured last
             (timeout -k 5 "$(left)" nice "$python" -W ignore -c 'from benchmarks.gpu.peers import build_gsplat as b; b()' \
                 >"$work/gsplat.txt" 2>&1 &)
         fi

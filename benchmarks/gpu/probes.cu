@@ -1,22 +1,22 @@
-// What one GPU can issue: the ceilings against which the kernels are held. 16 independent chains per thread, so that
-// latency is hidden; the result is written behind a test that never holds, so that nothing is optimised away.
+// Instruction rate ceilings of a GPU, the reference for the kernels. Each thread runs 16 independent chains to hide
+// latency. The result is written under a condition that never holds, so that the compiler cannot remove the work.
 typedef unsigned int uint;
 typedef unsigned long long uint64;
 
 struct ProbeArguments {
     float* out;
     uint64 rounds;
-    int stride;  // of red: floats between the addresses of neighbouring lanes
-    int lanes;   // of red: how many lanes of a warp add
+    int stride;  // for red: floats between the addresses of neighbouring lanes
+    int lanes;   // for red: number of lanes of a warp that add
 };
 
 constexpr int CHAINS = 16;
-constexpr int FMA_ROUNDS = 16;  // in a loop; their number is a multiple of it
+constexpr int FMA_ROUNDS = 16;  // unrolled; the number of rounds is a multiple of this
 
 extern "C" __global__ void __launch_bounds__(128) probe_fma(ProbeArguments a) {
     float v[CHAINS];
     for (int k = 0; k < CHAINS; ++k) v[k] = float(threadIdx.x + k);
-    // Counting rounds costs seven instructions, which are issued, too: a tenth where it is done every fourth round.
+    // Counting rounds costs seven instructions: a tenth of the total if done every fourth round.
     for (int i = 0; i < int(a.rounds); i += FMA_ROUNDS)
 #pragma unroll
         for (int n = 0; n < FMA_ROUNDS; ++n)
@@ -49,7 +49,7 @@ extern "C" __global__ void __launch_bounds__(128) probe_exp2(ProbeArguments a) {
     if (sum == -1.f) a.out[threadIdx.x] = sum;
 }
 
-// One addition to global memory per warp and round, by `lanes` lanes; blocks spread over the array.
+// Add to global memory once per warp and round, with `lanes` lanes; blocks are spread over the array.
 extern "C" __global__ void __launch_bounds__(128) probe_red(ProbeArguments a) {
     const int lane = threadIdx.x & 31;
     const uint64 warp = (uint64(blockIdx.x) * 128 + threadIdx.x) >> 5;
