@@ -1,7 +1,7 @@
 #!/bin/sh
 # Build the container image `gs2d` with docker, podman or buildah. Test it without network, as an unnamed user id, with
-# a mounted work folder: version, doctor, a short demo, and COLMAP on the demo images. Print the size of the image and its
-# folders.
+# a mounted work folder: version, doctor, a short demo, and COLMAP on the demo images. Print the size of the image and
+# its folders.
 # Usage: scripts/build_container.sh [--debootstrap] [OPTION OF THE BUILDER...]
 #
 #   scripts/build_container.sh --build-arg PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu   # for CPUs only
