@@ -27,7 +27,7 @@ from gs2d.render.types import PLAIN_COLORS, RasterSettings
 
 CHANNELS = (1, 3, 4, 6, 16, 64)
 Row = tuple[str, float, float, float]
-"""What was timed; median, first and third quartile of its time over that of three channels of one view."""
+"""Variant, and median, first and third quartile of its time relative to three channels of one view."""
 
 
 def ways(splats: Splats, size: int, backend: str) -> dict[str, Callable[[], object]]:

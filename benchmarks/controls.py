@@ -13,7 +13,7 @@ from typing import Any
 from gs2d.config.presets import DENSE_START, PHOTOMETRIC, get_recipe
 from gs2d.config.recipe import GradDensify, LearningRates, LossTerm, Recipe
 
-#: What tables call a control -> its function.
+#: Table name of a control -> its function.
 CONTROLS = {
     "2dgs-60k-restart": "restart_2dgs_60k",
     "2dgs-r-restart": "restart_2dgs_r",

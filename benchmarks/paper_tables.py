@@ -74,7 +74,7 @@ def shorten(page: str) -> list[str]:
 
 
 def main() -> None:
-    """Run what is missing and print the tables as Markdown."""
+    """Run missing experiments and print the tables as Markdown."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--out", type=Path, default=Path("runs/paper"))

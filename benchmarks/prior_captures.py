@@ -196,7 +196,7 @@ THINGS = (  # low, high, colour, whether it has a texture
     ((0.2, -0.4, 0.0), (0.9, 0.3, 0.45), (0.5, 0.4, 0.25), True),  # a table
     ((0.4, -0.1, 0.45), (0.6, 0.1, 0.75), (0.2, 0.35, 0.6), True),  # an object on the table
     ((1.5, -1.5, 0.0), (1.95, -0.6, 1.8), (0.75, 0.72, 0.65), False),  # a plain wardrobe
-    ((-0.6, 1.56, 1.0), (0.6, 1.6, 1.8), (0.4, 0.5, 0.35), True),  # a picture on the wall
+    ((-0.6, 1.56, 1.0), (0.6, 1.6, 1.8), (0.4, 0.5, 0.35), True),  # an image on the wall
 )
 
 

@@ -37,7 +37,7 @@ from gs2d.kernels.library import Library, ready_library
 from gs2d.training.trainer import Trainer
 
 GOAL = 1.3
-BENCH_SPLATS = 20_000  # splats of the scene that the other benchmarks use
+BENCH_SPLATS = 20_000  # splats of the common scene of the other benchmarks
 SIZING_ROUNDS, CLOSE = 6, 0.01  # attempts to match the room's image size, and the accepted relative error in pairs
 STAGES = ("surface", "appearance", "refine")
 

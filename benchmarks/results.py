@@ -142,7 +142,7 @@ def number(value: float | None, digits: int) -> str:
 
 
 def main() -> None:
-    """Run what is missing and print the table as Markdown."""
+    """Run missing experiments and print the table as Markdown."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", required=True)
     parser.add_argument("--out", type=Path, default=Path("runs/results"))

@@ -182,7 +182,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run what is missing, write rows as they finish and print the table; return 1 if a run failed."""
+    """Run missing captures, write rows as they finish and print the table; return 1 if a run failed."""
     args = parse(arguments)
     rows: list[dict[str, Any]] = []
     document = {"format": 1, "date": time.strftime("%Y-%m-%d"), "machine": machine(), "rows": rows}

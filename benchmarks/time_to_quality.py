@@ -74,7 +74,7 @@ CONSOLE, RECIPES, SCALES = "console.txt", ("2dgs", "2dgs-60k", "2dgs-r"), (0.02,
 
 # -- gs2d ----------------------------------------------------------------------------------------------------------
 def specification(capture: Path, downscale: int, recipe: str, scale: float, seed: int, args: Any) -> dict[str, Any]:
-    """Return everything that decides a training and its curve."""
+    """Return all settings that determine a training and its curve."""
     return {
         "capture": str(capture),
         "downscale": downscale,
@@ -291,7 +291,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Train what is missing; update results and figure after each training. Return 2 for user errors."""
+    """Run missing trainings; update results and figure after each training. Return 2 for user errors."""
     args = parse(arguments)
     captures: dict[str, Any] = {}
     document = {"format": 1, "date": time.strftime("%Y-%m-%d"), "machine": machine(), "threads": args.threads}

@@ -68,7 +68,7 @@ def found(out: Path) -> str:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run what is missing and print the table."""
+    """Run missing trainings and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("capture", type=Path)
     parser.add_argument("folder", type=Path)
