@@ -335,6 +335,7 @@ def measure_peer(
     Raises
     ------
     DataError
+        If no variant can be trained, or its results cannot be read.
     """
     _, job, _ = open_finished(run, None, ignore)
     scene, whole = job.scene, folder / "whole.json"

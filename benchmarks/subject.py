@@ -106,6 +106,7 @@ def measure(run: Path, folder: Path, mesh: Path | None = None) -> dict[str, Any]
     Raises
     ------
     Gs2dError
+        If the run, its mesh or the masks cannot be read.
     """
     file = run / MESH if mesh is None else mesh
     job = reload_run(open_run(run), lambda event: None)
