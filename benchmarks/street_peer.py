@@ -335,7 +335,7 @@ def measure_peer(
     Raises
     ------
     DataError
-        If no variant can be trained, or its results cannot be read.
+        If OpenSplat fails, or a training does not fit into the budget.
     """
     _, job, _ = open_finished(run, None, ignore)
     scene, whole = job.scene, folder / "whole.json"

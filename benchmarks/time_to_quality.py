@@ -173,7 +173,7 @@ def place_of(text: str, out: Path) -> tuple[str, Path, int]:
     Raises
     ------
     DataError
-        If the folder does not exist.
+        If the folder does not exist or the downscale is below 1.
     """
     path, colon, factor = text.rpartition(":")
     path, factor = (path, factor) if colon and factor.isdigit() else (text, "1")
