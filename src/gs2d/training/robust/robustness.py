@@ -39,6 +39,7 @@ from gs2d.training.state import TrainState
 PARTS = 5  # of a stage: at the end of each, all proposed splats are tried again, also those that were missed before
 FEW_NEW = 0.002  # fraction of the splats: fewer new proposals wait, because a trial costs about 50 iterations
 SHOWN = 0.25  # fraction of the images, and at least 3, that must show a surface on which splats are kept small
+LIMITED_FROM = 0.4  # of a stage: before, training goes from coarse to fine, and shrinking costs up to 1.2 dB
 MAX_WITNESSES = 24  # images of a trial; with more images, each trial uses others
 DECAY_EVERY, LEAST_OPACITY = 10, 0.005  # iterations between decays; opacity that decay does not go below
 NEEDED, REMOVED = 1, 2  # verdicts; 0: not tried
@@ -143,7 +144,8 @@ class Robustness:
         """Shrink splats that are too large for a known surface and remove floaters, if due."""
         if not self.removes(stage, iteration):
             return []
-        if iteration < stage.iterations:  # other splats must still learn to cover what shrinking uncovers
+        # After shrinking, other splats must still learn to cover what it uncovers.
+        if LIMITED_FROM * stage.iterations <= iteration < stage.iterations:
             self._limit_scales(state)
         nobody = torch.zeros(state.splats.means.shape[0], dtype=torch.bool, device=state.splats.device)
         known = nobody if ends_part(self._recipe, stage, iteration) else state.groups.get(MISSED, nobody)
