@@ -19,8 +19,8 @@ from cli_runs import TINY
 from tiny import write_capture
 
 # -- runs --------------------------------------------------------------------------------------------------------------
-_RARE = 25  # one in so many run folders is reported and resumed, which takes a second
-_DRAWN = 8  # one in so many of those has its curves drawn, which takes several; else each is one dot
+_RARE = 25  # one of 25 run folders is reported and resumed, which takes a second
+_DRAWN = 8  # of these, one of 8 has its curves drawn, which takes several seconds; otherwise each curve is one dot
 
 
 @contextlib.contextmanager
@@ -68,7 +68,7 @@ def run_seeds() -> list[dict[str, bytes]]:
 
 
 def read_run(root: Path) -> None:
-    """`gs2d info`, `export`, and a page or `render`; `evaluate` and `train --resume` for one in so many."""
+    """Run `gs2d info`, `export`, and a page or `render`; on some folders also `evaluate` and `train --resume`."""
     from gs2d.errors import Gs2dError
 
     changed = sum((root / "run" / name).stat().st_size for name in ("run.json", "metrics.json", "events.jsonl"))

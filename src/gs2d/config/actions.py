@@ -92,6 +92,6 @@ With the option ``occlusion`` a pixel counts only for the splats that are blende
 CLONE_IN_PLACE = Action("clone_in_place", {"rows": "high_error", "writes": "clones", "opacity": "copy"})
 """Append an exact copy of the rows of a group.
 
-``opacity`` "copy" keeps the opacity of both (the paper). "preserve" gives both 1 - sqrt(1 - o), so that the pair
-transmits at its centre what one splat did; beside it the pair is a little denser.
+``opacity`` "copy" keeps the opacity of both (the paper). "preserve" gives both 1 - sqrt(1 - o). The transmittance at
+the centre of the pair then equals that of the single splat; away from the centre it is slightly lower.
 """

@@ -28,7 +28,7 @@ def head(path: Path) -> bytes:
 
 
 def parsed(text: str) -> float:
-    """Parse a number; NaN for ``-nan(ind)``, ``1.#INF`` and the like, which C programs write on Windows.
+    """Parse a number. ``-nan(ind)`` and ``1.#INF``, as C programs on Windows write them, are NaN.
 
     Raises
     ------

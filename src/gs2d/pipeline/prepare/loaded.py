@@ -197,7 +197,7 @@ def read_init(path: Path, on_event: OnEvent) -> tuple[Splats, str]:
 
 
 def scene_digest(scene: Scene, on_event: OnEvent, *, uses_masks: bool = False) -> str:
-    """Decode every photograph and return a hash of what training sees.
+    """Decode every photograph and return a hash of the training input.
 
     Raises
     ------

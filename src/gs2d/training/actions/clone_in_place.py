@@ -26,8 +26,7 @@ class CloneInPlace(EntryAction):
     rows, writes : str
         Row groups of the originals and of the clones.
     opacity : "copy" or "preserve"
-        With "preserve", originals and clones get 1 - sqrt(1 - o): at their centre two such splats transmit what one of
-        opacity o does.
+        With "preserve", originals and clones get 1 - sqrt(1 - o). The transmittance at their centre stays 1 - o.
     """
 
     def __init__(self, rows: str, writes: str, opacity: str = "copy") -> None:

@@ -44,7 +44,7 @@ class EntryAction:
     """
 
     def run(self, state: TrainState, entry: StageEntry) -> Sequence[events.TrainingEvent]:
-        """Change the state, and return the events of what happened."""
+        """Change the state, and return its events."""
         raise NotImplementedError
 
 
