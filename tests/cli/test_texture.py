@@ -14,7 +14,6 @@ from gs2d.cli import run
 from tiny import RADIUS, write_ball_mesh
 
 pytest.importorskip("xatlas", reason="xatlas is not installed (extra `texture`)")
-pytest.importorskip("fast_simplification", reason="fast-simplification is not installed (extra `texture`)")
 
 
 @pytest.fixture

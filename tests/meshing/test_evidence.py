@@ -1,6 +1,8 @@
-"""Mesh cleaning keeps observed surface: removes sheets seen by few views, limits faces, keeps borders and colours."""
+"""Mesh cleaning keeps observed surface: removes sheets seen by few views, merges faces, keeps borders and colours."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ import pytest
 from gs2d.core.camera import look_at
 from gs2d.core.mesh import Mesh
 from gs2d.meshing.depth_maps import RenderedView, depth_map
-from gs2d.meshing.evidence import FACES_A_PIXEL, areas, gather
+from gs2d.meshing.evidence import areas, gather
 from gs2d.meshing.extract import ExtractOptions, extract
 from gs2d.meshing.fusion_bounds import backproject
 from surface_shapes import orbit, sphere_depth
@@ -54,12 +56,15 @@ def test_no_face_extends_beyond_the_box() -> None:
     assert (np.abs(mesh.vertices[:, 0] - 0.02) <= 0.75).all()
 
 
-def test_the_number_of_faces_follows_the_pixels() -> None:
-    found = extract(frames(14), ExtractOptions(bbox=BOX, voxel=0.06, by_evidence=True), threads=1)
+def test_the_number_of_faces_follows_the_error_in_pixels() -> None:
+    options = ExtractOptions(bbox=BOX, voxel=0.06, by_evidence=True)
+    dense = extract(frames(14), options, threads=1)
+    found = extract(frames(14), replace(options, error=0.5), threads=1)
     assert found.pixels is not None
     # a pixel at distance 3 is 3 / 40 wide, and the best view of each part is nearly perpendicular to it
     assert found.pixels == pytest.approx(4 * np.pi * (40 / 3) ** 2, rel=0.3)
-    assert len(found.mesh.faces) <= 1.05 * FACES_A_PIXEL * found.pixels
+    assert found.pixels == dense.pixels
+    assert len(found.mesh.faces) < 0.25 * len(dense.mesh.faces)
     assert np.abs(np.linalg.norm(found.mesh.vertices, axis=1) - 1).max() < 0.1
     assert found.mesh.colors is not None
     assert (np.abs(found.mesh.colors.astype(int) - (200, 40, 90)).max(axis=0) <= 1).all()

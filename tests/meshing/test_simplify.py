@@ -1,41 +1,146 @@
-"""Edge collapse in a separate process gives the same bytes as in-process, and also works where no process can start."""
+"""Simplification keeps the surface within an error in pixels, its outline and its colours, and gives the same bits in
+Python and natively."""
 
 from __future__ import annotations
+
+import dataclasses
+import math
 
 import numpy as np
 import pytest
 
-from gs2d.meshing import simplify
+from gs2d.core.camera import Camera, look_at
+from gs2d.core.mesh import Mesh
+from gs2d.meshing import simplify as module
+from gs2d.meshing.simplify import pixel_scale, simplify
 
-pytest.importorskip("fast_simplification")
 
-
-def sheet(n: int = 30) -> tuple[np.ndarray, np.ndarray]:
+def sheet(n: int = 30, height: float = 0.1, colors: np.ndarray | None = None) -> Mesh:
+    """A square with waves along x."""
     x, y = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n))
-    points = np.stack([x.ravel(), y.ravel(), 0.1 * np.sin(7 * x.ravel())], axis=1).astype(np.float32)
+    points = np.stack([x.ravel(), y.ravel(), height * np.sin(7 * x.ravel())], axis=1).astype(np.float32)
     corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
     faces = [np.stack([corner, corner + 1, corner + n], 1), np.stack([corner + 1, corner + n + 1, corner + n], 1)]
-    return points, np.concatenate(faces).astype(np.int32)
+    return Mesh(points, np.concatenate(faces).astype(np.int32), colors)
 
 
-def test_a_separate_process_gives_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
-    points, faces = sheet()
-    here = simplify.collapse(points, faces, 300)
-    monkeypatch.setattr(simplify, "OWN_PROCESS_FACES", 1)
-    there = simplify._elsewhere(points, faces, 300)
-    assert there is not None
-    assert len(here[1]) <= 310
-    for one, other, asked in zip(here, there, simplify.collapse(points, faces, 300), strict=True):
-        assert one.dtype == other.dtype
-        assert one.tobytes() == other.tobytes() == asked.tobytes()
+def ball(n: int = 24) -> Mesh:
+    """A closed sphere of radius 1 with 2 n (n - 1) faces."""
+    a, e = np.meshgrid(np.arange(n) * 2 * np.pi / n, np.linspace(-np.pi / 2, np.pi / 2, n + 1)[1:-1])
+    ring = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1).reshape(-1, 3)
+    points = np.concatenate([ring, [[0, 0, -1], [0, 0, 1]]])
+    i, faces = np.arange(n), []
+    for row in range(n - 2):
+        low, high = row * n, (row + 1) * n
+        faces += [np.stack([low + i, low + (i + 1) % n, high + i], 1)]
+        faces += [np.stack([low + (i + 1) % n, high + (i + 1) % n, high + i], 1)]
+    faces += [np.stack([(i + 1) % n, i, np.full(n, n * (n - 1))], 1)]
+    faces += [np.stack([(n - 2) * n + i, (n - 2) * n + (i + 1) % n, np.full(n, n * (n - 1) + 1)], 1)]
+    return Mesh(points, np.concatenate(faces).astype(np.int32))
 
 
-@pytest.mark.parametrize("program", ["raise SystemExit(1)", "print('no arrays')"])
-def test_a_failing_process_falls_back_to_this_one(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
-    points, faces = sheet()
-    expected = simplify.collapse(points, faces, 300)
-    monkeypatch.setattr(simplify, "OWN_PROCESS_FACES", 1)
-    monkeypatch.setattr(simplify, "_PROGRAM", program)
-    assert simplify._elsewhere(points, faces, 300) is None
-    found = simplify.collapse(points, faces, 300)
-    assert found[1].tobytes() == expected[1].tobytes()
+def camera(distance: float, focal: float = 400.0) -> Camera:
+    at = np.array([0.5, 0.5, 0.0])
+    return look_at(np.array([0.5, 0.5, distance]), at, np.array([0, 1.0, 0]), width=400, height=400, fx=focal)
+
+
+def edge_counts(mesh: Mesh) -> np.ndarray:
+    edges = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
+    return np.unique(edges, axis=0, return_counts=True)[1]
+
+
+def in_python(mesh: Mesh, monkeypatch: pytest.MonkeyPatch, **options: object) -> Mesh:
+    with monkeypatch.context() as patched:
+        patched.setattr(module, "collapse_natively", lambda arrays, rules: False)
+        return simplify(mesh, **options)
+
+
+@pytest.mark.parametrize("painted", [False, True])
+def test_python_and_native_code_give_the_same_bits(monkeypatch: pytest.MonkeyPatch, painted: bool) -> None:
+    colors = np.random.default_rng(0).integers(0, 256, (400, 3), np.uint8) if painted else None
+    rough = sheet(20, colors=colors)
+    rough.vertices[:, 2] += np.random.default_rng(1).normal(0, 0.002, 400)
+    for mesh, options in (
+        (rough, {"cameras": [camera(2.0)], "error": 1.0}),
+        (rough, {"faces": 90}),
+        (dataclasses.replace(rough, faces=rough.faces[::3]), {"faces": 40}),  # open edges everywhere
+        (ball(12), {"faces": 60}),
+    ):
+        native, reference = simplify(mesh, **options), in_python(mesh, monkeypatch, **options)
+        assert len(native.faces) < len(mesh.faces)
+        assert native.vertices.tobytes() == reference.vertices.tobytes()
+        assert native.faces.tobytes() == reference.faces.tobytes()
+        assert painted is False or mesh.colors is None or native.colors.tobytes() == reference.colors.tobytes()
+
+
+@pytest.mark.parametrize("error", [0.25, 1.0])
+def test_the_surface_stays_within_the_error_in_pixels(error: float) -> None:
+    mesh, view = sheet(120), camera(2.0)
+    small = simplify(mesh, error=error, cameras=[view])
+    wrong = 200.0 * np.abs(small.vertices[:, 2] - 0.1 * np.sin(7 * small.vertices[:, 0]))  # 200 px a world unit
+    middle = small.vertices[small.faces].mean(axis=1)
+    between = 200.0 * np.abs(middle[:, 2] - 0.1 * np.sin(7 * middle[:, 0]))
+    assert len(small.faces) < 0.05 * len(mesh.faces)
+    assert np.sqrt((wrong**2).mean()) < error
+    assert np.sqrt((between**2).mean()) < 2 * error
+    assert len(simplify(mesh, error=4 * error, cameras=[view]).faces) < 0.7 * len(small.faces)
+
+
+def test_a_nearer_camera_keeps_more_faces() -> None:
+    mesh = sheet(120)
+    far, near = (simplify(mesh, error=0.5, cameras=[camera(z)]) for z in (8.0, 2.0))
+    assert len(near.faces) > 1.3 * len(far.faces)
+
+
+def test_a_flat_square_becomes_a_few_faces_with_its_outline() -> None:
+    small = simplify(sheet(60, height=0.0), error=0.5, cameras=[camera(2.0)])
+    a, b, c = (small.vertices[small.faces[:, k]].astype(np.float64) for k in range(3))
+    assert len(small.faces) < 60
+    assert 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() == pytest.approx(1.0, abs=5e-3)  # 1 px
+    np.testing.assert_allclose(np.ptp(small.vertices[:, :2], axis=0), 1.0, atol=5e-3)
+
+
+def test_a_small_detail_on_a_large_plane_stays() -> None:
+    mesh = sheet(61, height=0.0)
+    pin = 30 * 61 + 30
+    mesh.vertices[pin, 2] = 0.02  # 4 px high, 1 of 3721 vertices
+    assert simplify(mesh, error=0.5, cameras=[camera(2.0)]).vertices[:, 2].max() > 0.015
+
+
+def test_a_closed_surface_stays_closed() -> None:
+    small = simplify(ball(), faces=200)
+    assert len(small.faces) <= 200
+    assert (edge_counts(small) == 2).all()
+    a, b, c = (small.vertices[small.faces[:, k]] for k in range(3))
+    assert np.einsum("fi,fi->f", a, np.cross(b, c)).sum() / 6 == pytest.approx(4 / 3 * math.pi, rel=0.06)
+
+
+def test_an_open_surface_stays_a_manifold() -> None:
+    holed = sheet(40)
+    holed = dataclasses.replace(holed, faces=holed.faces[np.random.default_rng(2).random(len(holed.faces)) > 0.2])
+    assert (edge_counts(simplify(holed, faces=100)) <= 2).all()
+
+
+def test_a_coloured_pattern_keeps_more_faces_than_a_plain_wall() -> None:
+    x, _ = np.meshgrid(np.arange(60), np.arange(60))
+    stripes = np.repeat(np.where(x.ravel() < 30, 20, 230).astype(np.uint8)[:, None], 3, axis=1)
+    plain, striped = (sheet(60, 0.0, colors) for colors in (np.full_like(stripes, 128), stripes))
+    few, many = (simplify(mesh, error=0.5, cameras=[camera(2.0)]) for mesh in (plain, striped))
+    assert (few.colors == 128).all()
+    assert len(many.faces) > len(few.faces)
+    left, right = many.vertices[:, 0] < 0.4, many.vertices[:, 0] > 0.6
+    assert np.ptp(many.colors[left]) < 30
+    assert np.ptp(many.colors[right]) < 30
+
+
+def test_what_needs_no_simplification_is_returned_unchanged() -> None:
+    mesh = sheet(10)
+    assert simplify(mesh, error=0.0) is mesh
+    assert simplify(mesh, faces=len(mesh.faces)) is mesh
+
+
+def test_the_scale_is_that_of_the_nearest_camera_and_else_the_median() -> None:
+    points = np.array([[0.5, 0.5, 0.0], [0.5, 0.5, 1.0], [90.0, 0.0, 0.0]])
+    scale = pixel_scale(points, [camera(2.0), camera(4.0)])
+    np.testing.assert_allclose(scale, [200.0, 400.0, 300.0])
+    np.testing.assert_array_equal(pixel_scale(points[2:], [camera(2.0)]), [1.0])

@@ -159,7 +159,6 @@ def test_texels_outside_charts_get_the_nearest_colour() -> None:
 
 
 def test_simplification_keeps_the_shape() -> None:
-    pytest.importorskip("fast_simplification")
     mesh = box(20)
     assert simplified(mesh, len(mesh.faces)) is mesh
     far = Mesh((mesh.vertices.astype(np.float64) + 1e6), mesh.faces)  # float32 has a resolution of only 1/16 here

@@ -65,7 +65,10 @@ class Library:
         key = (name, restype, *argtypes)  # one object per signature, so that callers do not share argtypes
         function = self._functions.get(key)
         if function is None:
-            function = self._dll[name]
+            try:
+                function = self._dll[name]
+            except AttributeError as error:
+                raise BackendError(f"the CPU kernels {self.path.name} are older than gs2d; {REMEDY}") from error
             function.restype, function.argtypes = restype, list(argtypes)
             self._functions[key] = function
         return function

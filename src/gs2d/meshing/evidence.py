@@ -2,8 +2,7 @@
 
 A view supports a vertex if it sees its front at that depth, and contradicts it if it sees farther. Vertices with more
 contradiction than support are removed: sheets in front of a camera, ribbons at depth edges, fragments of background. A
-view without depth there, for example because of missing texture, removes nothing. The number of faces follows the
-pixels that show the surface, not the voxels.
+view without depth there, for example because of missing texture, removes nothing.
 """
 
 from __future__ import annotations
@@ -12,17 +11,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
 from gs2d.meshing.depth_maps import DepthMap
 from gs2d.meshing.marching_cubes import components, select_faces
-from gs2d.meshing.simplify import collapse
 
 SMALL = 0.01  # of the area of the largest component: smaller components are removed
 VIEWS = 2  # that must see a vertex: a single view does not measure depth
-FACES_A_PIXEL = 2.0  # as many as a triangulated depth map has
 VERTICES_AT_ONCE = 1 << 15  # temporaries of this many vertices fit in the cache of a core
 FACES_AT_ONCE = 1 << 16  # bounds the memory for corners of faces
 GRAZING = 0.1  # cosine between ray and surface below which a view does not see the surface
@@ -187,20 +183,3 @@ def _selected(mesh: Mesh, evidence: Evidence, faces: np.ndarray) -> tuple[Mesh, 
     used = np.zeros(len(mesh.vertices), bool)
     used[mesh.faces[faces]] = True
     return select_faces(mesh, faces), evidence.rows(used)
-
-
-def simplified_to(mesh: Mesh, faces: int) -> Mesh:
-    """Simplify to about ``faces`` faces by quadric edge collapse; vertices get the colour of the nearest original."""
-    if len(mesh.faces) <= max(faces, 4):
-        return mesh
-    vertices = mesh.vertices.astype(np.float64)
-    middle, size = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max()) or 1.0
-    scaled = np.ascontiguousarray((vertices - middle) / size, np.float32)
-    del vertices
-    triangles = np.ascontiguousarray(mesh.faces, np.int32)
-    points, left = collapse(scaled, triangles, max(faces, 4))
-    del scaled, triangles
-    points = points * size + middle
-    colors = None if mesh.colors is None else mesh.colors[cKDTree(mesh.vertices.astype(np.float64)).query(points)[1]]
-    small = Mesh(points.astype(mesh.vertices.dtype), np.asarray(left, np.int32), colors)
-    return select_faces(small, np.ones(len(small.faces), bool))

@@ -12,9 +12,10 @@ from gs2d.core.memory import trim
 from gs2d.core.mesh import Mesh
 from gs2d.meshing.consistency import depth_noise
 from gs2d.meshing.depth_maps import RenderedView, Spool
-from gs2d.meshing.evidence import FACES_A_PIXEL, clean, simplified_to
+from gs2d.meshing.evidence import clean
 from gs2d.meshing.fusion_bounds import DepthSample, FusionBounds, derive_limits, sample_depths, widen_truncation
 from gs2d.meshing.marching_cubes import inside_box, keep_components
+from gs2d.meshing.simplify import simplify
 from gs2d.meshing.slabs import SLAB_BYTES, fused_surface
 from gs2d.meshing.tsdf_volume import find_blocks, fusion_backend
 from gs2d.meshing.unbounded import FAR_VIEWS, derive_cascade, find_cascade_blocks, fused_cascade_surface
@@ -54,8 +55,9 @@ class ExtractOptions:
     keep : int or None
         Number of components to keep, see ``keep_components``.
     by_evidence : bool
-        Keep only surface that more views see than see through, and limit the number of faces by the pixels that show
-        the surface (``evidence.clean``). Not for unbounded scenes.
+        Keep only surface that more views see than see through (``evidence.clean``). Not for unbounded scenes.
+    error : float, px
+        Simplify with this error, see ``simplify``; 0 keeps all faces.
     max_bytes : int
         Limit of the volume.
     slab_bytes : int
@@ -70,6 +72,7 @@ class ExtractOptions:
     min_weight: float = 1.0
     keep: int | None = None
     by_evidence: bool = False
+    error: float = 0.0
     max_bytes: int = 4 << 30
     slab_bytes: int = SLAB_BYTES
 
@@ -133,7 +136,7 @@ def extract(
         pixels = None
         if options.by_evidence:
             mesh, pixels = clean(mesh, spool, limits.truncation)
-            mesh = simplified_to(mesh, int(FACES_A_PIXEL * pixels))
+        mesh = simplify(mesh, error=options.error, cameras=spool.cameras)
         return Extraction(mesh, limits, count, volume_bytes, 1, backend.name, pixels)
 
 
@@ -184,7 +187,8 @@ def extract_unbounded(
             threads=threads,
             backend=backend,
         )
-    mesh = keep_components(mesh, keep=options.keep)
+        trim()
+        mesh = simplify(keep_components(mesh, keep=options.keep), error=options.error, cameras=spool.cameras)
     limits = replace(cascade.levels[0], lower=cascade.levels[-1].lower, upper=cascade.levels[-1].upper)
     return Extraction(mesh, limits, count, volume_bytes, len(cascade.levels), backend.name)
 

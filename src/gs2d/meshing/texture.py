@@ -35,7 +35,7 @@ from gs2d.errors import ProtocolError
 from gs2d.meshing.agreement import VOTE, Agreement, agree, corrected
 from gs2d.meshing.evidence import areas
 from gs2d.meshing.raycast import cast_camera
-from gs2d.meshing.simplify import collapse
+from gs2d.meshing.simplify import simplify
 
 # -- charts and texels -------------------------------------------------------------------------------------------------
 PADDING = 4  # texels between charts: two mipmap levels do not mix them
@@ -112,13 +112,7 @@ def simplified(mesh: Mesh, faces: int) -> Mesh:
     """Simplify to at most ``faces`` triangles by quadric edge collapse; a simplified mesh has no vertex colours."""
     if faces < 4:
         raise ProtocolError(f"faces must be an integer >= 4, got {faces}")
-    if len(mesh.faces) <= faces:
-        return mesh
-    vertices = mesh.vertices.astype(np.float64)
-    middle, size = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max()) or 1.0  # the library uses float32
-    required("fast_simplification")
-    points, triangles = collapse((vertices - middle) / size, mesh.faces, faces)
-    return Mesh((points.astype(np.float64) * size + middle).astype(mesh.vertices.dtype), triangles.astype(np.int32))
+    return mesh if len(mesh.faces) <= faces else simplify(Mesh(mesh.vertices, mesh.faces), faces=faces)
 
 
 def unwrap(mesh: Mesh, size: int) -> Atlas:

@@ -18,7 +18,7 @@ from gs2d.core.transforms import up_direction
 from gs2d.data.subject_box import read_subject
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH
-from gs2d.meshing.evidence import simplified_to
+from gs2d.meshing.simplify import simplify
 from gs2d.meshing.web_mesh import web_mesh
 
 MAX_FACES = 4_000_000  # larger meshes need gigabytes of memory to simplify
@@ -71,7 +71,7 @@ def mesh_view(run: Path, cameras: Sequence[Camera]) -> MeshView | str:
         return "mesh.ply has no faces: no surface was visible in enough photographs."
     if len(mesh.faces) > MAX_FACES:
         return f"mesh.ply has {len(mesh.faces):,} faces; the report shows at most {MAX_FACES:,}. Use `gs2d view RUN`."
-    small = simplified_to(mesh, SHOWN_FACES)
+    small = simplify(mesh, faces=SHOWN_FACES)
     data = base64.b64encode(gzip.compress(web_mesh(small), mtime=0)).decode()
     return MeshView(json.dumps(_orbit(mesh, run, cameras)), data, len(mesh.faces), len(small.faces))
 

@@ -23,7 +23,7 @@ from gs2d.errors import DataError, RunError
 from gs2d.io.formats.splat_formats import read_splats
 from gs2d.io.meshes import read_mesh, read_textured
 from gs2d.io.run_dir import GEOREFERENCE, MESH, PAGE, TEXTURED, RunFolder, is_run, open_run
-from gs2d.meshing.evidence import simplified_to
+from gs2d.meshing.simplify import simplify
 from gs2d.meshing.web_mesh import web_mesh
 from gs2d.pipeline.prepare.loaded import LoadedRun, finished_splats, reload_run
 from gs2d.render.types import RasterSettings
@@ -107,7 +107,7 @@ def _embedded_meshes(run: RunFolder) -> dict[str, bytes]:
     """Return the meshes of a run, small enough for a page. A textured mesh with more faces is left out."""
     meshes = {}
     if run.file(MESH).exists():
-        meshes["mesh"] = web_mesh(simplified_to(read_mesh(run.file(MESH)), EMBEDDED_FACES))
+        meshes["mesh"] = web_mesh(simplify(read_mesh(run.file(MESH)), faces=EMBEDDED_FACES))
     if run.file(TEXTURED).exists():
         textured = read_textured(run.file(TEXTURED))
         if len(textured.faces) <= EMBEDDED_FACES:

@@ -1,0 +1,117 @@
+"""Native edge collapse; ``meshing/simplify.py`` has the same in Python."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import numpy as np
+
+from gs2d.errors import BackendError
+from gs2d.kernels.library import load
+
+__all__ = ["CollapseArrays", "CollapseRules", "collapse_natively"]
+
+_CANDIDATE_BYTES = 24  # of cpu/collapse.cpp
+_RULES = ("target", "limit", "length_weight", "tint_weight", "border_weight", "turn", "pull")
+
+
+class CollapseRules(NamedTuple):
+    """Where a collapse ends and what it costs; the weights are those of ``meshing/simplify.py``.
+
+    Attributes
+    ----------
+    target : int
+        Stop at this number of faces.
+    limit : float, px^2
+        Largest cost.
+    length_weight, tint_weight : float
+        Squares of ``LENGTH`` and ``TINT``.
+    border_weight, turn, pull : float
+        ``BORDER``, ``TURN`` and ``PULL``.
+    """
+
+    target: int
+    limit: float
+    length_weight: float
+    tint_weight: float
+    border_weight: float
+    turn: float
+    pull: float
+
+
+@dataclass(frozen=True, eq=False)
+class CollapseArrays:
+    """A mesh and the sums of its vertices, changed in place.
+
+    Attributes
+    ----------
+    points : ndarray [P, 3] float64
+    scale : ndarray [P] float64
+        Pixels per unit of length.
+    colors : ndarray [P, 3] float64 or None
+        In [0, 1].
+    corners : ndarray [F, 3] int32
+        The first corner of a removed face becomes -1.
+    quadric : ndarray [P, 12] float64
+        A (6), b (3) and c of the sum of a s^2 (n.x + d)^2; then the sums of a and of a s^2.
+    color : ndarray [P, 4] float64
+        Sums of a times the colour (3) and of a times its square.
+    """
+
+    points: np.ndarray
+    scale: np.ndarray
+    colors: np.ndarray | None
+    corners: np.ndarray
+    quadric: np.ndarray
+    color: np.ndarray
+
+    @classmethod
+    def of(cls, points: np.ndarray, faces: np.ndarray, scale: np.ndarray, colors: np.ndarray | None) -> CollapseArrays:
+        """Copy a mesh; the sums are zeros."""
+        count = len(points)
+        return cls(
+            np.array(points, np.float64, order="C"),
+            np.ascontiguousarray(scale, np.float64),
+            None if colors is None else np.ascontiguousarray(colors, np.float64),
+            np.array(faces, np.int32, order="C"),
+            np.zeros((count, 12)),
+            np.zeros((count if colors is not None else 0, 4)),
+        )
+
+
+class _CollapseArguments(ctypes.Structure):
+    """``CollapseArguments`` of cpu/collapse.cpp."""
+
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("vertices", "faces", "capacity", _RULES[0])),
+        *((name, ctypes.c_double) for name in _RULES[1:]),
+        *((field.name, ctypes.c_void_p) for field in fields(CollapseArrays)),
+        *((name, ctypes.c_void_p) for name in ("next", "head", "tail", "stamp", "mark", "border", "heap")),
+    )
+
+
+def collapse_natively(arrays: CollapseArrays, rules: CollapseRules) -> bool:
+    """Collapse edges in place, with 180 bytes per face of temporary memory.
+
+    Returns
+    -------
+    bool
+        False without the native library; nothing is done then.
+    """
+    try:
+        library = load()
+    except BackendError:
+        return False
+    count, faces = len(arrays.points), len(arrays.corners)
+    capacity = 3 * faces  # edges of separate triangles
+    work = {name: np.empty(count, np.int32) for name in ("head", "tail", "stamp", "mark")}
+    work |= {"border": np.empty(count, np.uint8), "next": np.empty(3 * faces, np.int32)}
+    work["heap"] = np.empty(capacity * _CANDIDATE_BYTES, np.uint8)
+    inputs = {field.name: getattr(arrays, field.name) for field in fields(arrays)}
+    pointers = {name: None if array is None else array.ctypes.data for name, array in (inputs | work).items()}
+    rules_of = dict(zip(_RULES, rules, strict=True))
+    arguments = _CollapseArguments(vertices=count, faces=faces, capacity=capacity, **rules_of, **pointers)
+    library.function("gs2d_collapse", None, [ctypes.c_void_p])(ctypes.byref(arguments))
+    return True
