@@ -51,7 +51,7 @@ def cheap_demo_captures(request: pytest.FixtureRequest) -> Iterator[None]:
 
     def baked(scene: demo_capture.ToyScene, *, threads: int) -> demo_capture.BakedLight:
         if scene not in _light:
-            _light[scene] = bake(scene, threads=threads)
+            _light[scene] = bake(scene.patch, threads=threads)
         return _light[scene]
 
     with pytest.MonkeyPatch.context() as patch:

@@ -67,7 +67,12 @@ def sample_surface(mesh: Mesh, count: int, *, seed: int = 0) -> SurfaceSamples:
 
 
 def distances_to_mesh(queries: np.ndarray, mesh: Mesh, *, samples: int = 200_000) -> np.ndarray:
-    """Return the distance [Q] of each query [Q, 3] to the surface.
+    """Return the distance [Q] of each query [Q, 3] to the surface (``nearest_on_mesh``)."""
+    return nearest_on_mesh(queries, mesh, samples=samples)[0]
+
+
+def nearest_on_mesh(queries: np.ndarray, mesh: Mesh, *, samples: int = 200_000) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distance [Q] of each query [Q, 3] to the surface, and the nearest face [Q].
 
     It is the smallest exact distance to the faces of the eight nearest points among all face centroids and ``samples``
     points of the surface. In rare cases, the nearest face is large and has no sample nearby; then the distance is too
@@ -77,20 +82,21 @@ def distances_to_mesh(queries: np.ndarray, mesh: Mesh, *, samples: int = 200_000
     spread = sample_surface(mesh, samples)
     points = np.concatenate([t.mean(axis=1), spread.points])
     _, index = Cloud(points).nearest(queries, neighbours=_CANDIDATES)
-    owner = np.concatenate([np.arange(len(t)), spread.faces, [0]])  # a missing neighbour stands for face 0
-    return _min_distances(queries, t, owner[index])
+    owner = np.concatenate([np.arange(len(t)), spread.faces, [0]])[index]  # a missing neighbour stands for face 0
+    distances, first = _min_distances(queries, t, owner)
+    return distances, np.take_along_axis(owner, first[:, None], axis=1)[:, 0]
 
 
-def _min_distances(queries: np.ndarray, t: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return the smallest distance [Q] of each query to its triangles ``faces`` [Q, K] among [F, 3, 3]."""
+def _min_distances(queries: np.ndarray, t: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least distances [Q] of queries to their triangles ``faces`` [Q, K], and the columns [Q] of these."""
     corners = _tensor(t)
-    best = np.empty(len(queries))
+    best, column = np.empty(len(queries)), np.empty(len(queries), np.int64)
     for start in range(0, len(queries), _CHUNK):
         part = slice(start, start + _CHUNK)
         p, columns = _tensor(queries[part]), _tensor(faces[part], np.int64).unbind(dim=1)
-        distances = [triangle_distances(p, corners[column]) for column in columns]
-        best[part] = torch.stack(distances).amin(dim=0).numpy()
-    return best
+        least = torch.stack([triangle_distances(p, corners[index]) for index in columns]).min(dim=0)
+        best[part], column[part] = least.values.numpy(), least.indices.numpy()
+    return best, column
 
 
 def _tensor(array: np.ndarray, dtype: type = np.float64) -> Tensor:

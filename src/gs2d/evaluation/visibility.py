@@ -13,7 +13,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
 from gs2d.meshing.raycast import cast_camera
 
-_NEAR = 1e-9  # world units; occluders at any distance count, in captures of any scale
+NEAR = 1e-9  # world units; occluders at any distance count, in captures of any scale
 
 
 def visible_counts(
@@ -26,11 +26,10 @@ def visible_counts(
 ) -> np.ndarray:
     """Count the views in which each point [P, 3] is visible, with the mesh as the only occluder.
 
-    A point is visible if it is in the image and at most ``tolerance`` world units behind the deepest of the 3x3 pixels
-    around it, because the depth of slanted surfaces changes within a pixel.
-
     Parameters
     ----------
+    tolerance : float, world units
+        See ``shown_points``.
     max_side : int, px
         Largest side of the depth maps.
 
@@ -42,16 +41,25 @@ def visible_counts(
 
     def visible(camera: Camera) -> np.ndarray:
         small = _shrunk(camera, max_side)
-        depths = cast_camera(vertices, mesh.faces, small, near=_NEAR).depth
-        deepest = maximum_filter(np.where(depths > 0, depths, np.inf), 3, mode="nearest").reshape(-1)
-        inside, pixel, z = _in_image(points, small)
-        return np.asarray(inside & (z <= deepest[pixel] + tolerance))
+        depths = cast_camera(vertices, mesh.faces, small, near=NEAR).depth
+        return shown_points(points, small, depths, tolerance)
 
     counts = np.zeros(len(points), np.int64)
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         for seen in pool.map(visible, cameras):
             counts += seen
     return counts
+
+
+def shown_points(points: np.ndarray, camera: Camera, depths: np.ndarray, tolerance: float | np.ndarray) -> np.ndarray:
+    """Return which points [P, 3] are visible in an image with these depths [H, W], 0 where there is no surface.
+
+    A point is visible if it is in the image and at most ``tolerance`` world units behind the deepest of the 3x3 pixels
+    around it, because the depth of slanted surfaces changes within a pixel.
+    """
+    deepest = maximum_filter(np.where(depths > 0, depths, np.inf), 3, mode="nearest").reshape(-1)
+    inside, pixel, z = _in_image(points, camera)
+    return np.asarray(inside & (z <= deepest[pixel] + tolerance))
 
 
 def frustum_counts(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:

@@ -147,7 +147,7 @@ def _photograph(
 ) -> None:
     """Write images, mesh, and the number of training views that see each face; applies gains to training images."""
     workers = threads or min(os.cpu_count() or 1, 8)
-    light = bake(scene, threads=workers)
+    light = bake(scene.patch, threads=workers)
     jobs = [(split, k, camera) for split, split_cameras in cameras.items() for k, camera in enumerate(split_cameras)]
 
     def image(job: tuple[str, int, Camera]) -> np.ndarray:

@@ -10,8 +10,9 @@ import numpy as np
 
 from gs2d.meshing.raycast import Hits, occluded
 from gs2d.synthetic.demo_scene import ToyScene
+from gs2d.synthetic.shapes import Patch
 
-_LAMP = np.array([-0.70, -0.55, 1.0]) / np.linalg.norm([-0.70, -0.55, 1.0])  # unit, towards the lamp
+LAMP = np.array([-0.70, -0.55, 1.0]) / np.linalg.norm([-0.70, -0.55, 1.0])  # unit, towards the lamp
 _LAMP_COLOR = np.array([1.80, 1.62, 1.36])
 _LAMP_SPREAD = 0.16  # half-angle of the lamp, radians
 _LIFT = 2e-3  # world units, offset of shadow rays from the surface
@@ -33,21 +34,32 @@ class BakedLight:
     lamp: np.ndarray
 
 
-def bake(scene: ToyScene, *, sky_directions: int = 72, lamp_directions: int = 14, threads: int = 2) -> BakedLight:
-    """Cast shadow rays from every vertex to points of the sky and of the lamp."""
-    patch = scene.patch
+def bake(
+    patch: Patch,
+    *,
+    occluders: Patch | None = None,
+    sky_directions: int = 72,
+    lamp_directions: int = 14,
+    threads: int = 2,
+) -> BakedLight:
+    """Cast shadow rays from every vertex to points of the sky and of the lamp; ``occluders`` default to the patch."""
+    solid = patch if occluders is None else occluders
     sky_rays = _sphere(sky_directions)
-    lamp_rays = _cone(_LAMP, _LAMP_SPREAD, lamp_directions)
+    lamp_rays = _cone(LAMP, _LAMP_SPREAD, lamp_directions)
 
     def seen(direction: np.ndarray) -> np.ndarray:
         cosine = np.maximum(patch.normals @ direction, 0.0)
         facing = np.flatnonzero(cosine > 0)
         points = patch.vertices[facing] + _LIFT * patch.normals[facing]
-        cosine[facing[occluded(patch.vertices, patch.faces, points, direction)]] = 0.0
+        cosine[facing[occluded(solid.vertices, solid.faces, points, direction)]] = 0.0
         return cosine
 
     with ThreadPoolExecutor(threads) as pool:
-        sky = _sum(pool.map(seen, sky_rays), lambda k, c: c[:, None] * _sky(sky_rays[k]), (len(patch.vertices), 3))
+        sky = _sum(
+            pool.map(seen, sky_rays),
+            lambda k, c: c[:, None] * sky_radiance(sky_rays[k : k + 1]),
+            (len(patch.vertices), 3),
+        )
         lamp = _sum(pool.map(seen, lamp_rays), lambda k, c: c, (len(patch.vertices),))
     return BakedLight(sky * 4 / sky_directions, lamp / lamp_directions)
 
@@ -62,11 +74,12 @@ def _sum(
     return total
 
 
-def _sky(direction: np.ndarray) -> np.ndarray:
-    """Return the radiance of the environment: blue zenith, white horizon, warm ground."""
-    z = float(direction[2])
+def sky_radiance(directions: np.ndarray) -> np.ndarray:
+    """Return the radiance [n, 3] in unit directions [n, 3]: blue zenith, white horizon, warm ground."""
+    z = directions[:, 2:]
     zenith, horizon, ground = np.array([0.66, 0.76, 0.92]), np.array([0.86, 0.84, 0.80]), np.array([0.42, 0.38, 0.34])
-    return horizon + (zenith - horizon) * z if z > 0 else horizon + (ground - horizon) * min(-3 * z, 1.0)
+    above, below = horizon + (zenith - horizon) * z, horizon + (ground - horizon) * np.minimum(-3 * z, 1.0)
+    return np.asarray(np.where(z > 0, above, below))
 
 
 def _sphere(count: int) -> np.ndarray:
@@ -113,10 +126,10 @@ def shade(scene: ToyScene, light: BakedLight, hits: Hits, eye: np.ndarray) -> np
     position, normal = at_hit(scene.patch.vertices), at_hit(scene.patch.normals)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
     view = eye.astype(np.float32) - position
-    half = view / np.linalg.norm(view, axis=1, keepdims=True) + _LAMP.astype(np.float32)
+    half = view / np.linalg.norm(view, axis=1, keepdims=True) + LAMP.astype(np.float32)
     half /= np.linalg.norm(half, axis=1, keepdims=True)
     facing = np.maximum((normal * half).sum(axis=1), 0.0)
-    cosine = np.maximum(normal @ _LAMP.astype(np.float32), 0.05)
+    cosine = np.maximum(normal @ LAMP.astype(np.float32), 0.05)
     visible = np.minimum(lamp / cosine, 1.0)
     shaded += (gloss * visible * facing**40)[:, None] * _LAMP_COLOR.astype(np.float32)
     color[mask] = shaded
