@@ -107,36 +107,6 @@ def write_demo_capture(
     _write_cameras(root, cameras)
 
 
-def write_capture(
-    folder: str | os.PathLike[str],
-    scene: ToyScene,
-    cameras: Mapping[str, Sequence[Camera]],
-    *,
-    on_progress: Callable[[int, int], None] | None = None,
-    threads: int | None = None,
-) -> None:
-    """Write a capture of any scene, like ``write_demo_capture``.
-
-    Parameters
-    ----------
-    folder : path
-    scene : ToyScene
-    cameras : mapping of "train" and "test" to cameras
-        With the field of view ``CAMERA_ANGLE_X``.
-    on_progress, threads
-        As in ``write_demo_capture``.
-
-    Raises
-    ------
-    DiskError
-        If a file could not be written.
-    """
-    root = Path(folder)
-    _make_folders(root, tuple(split for split, of_split in cameras.items() if of_split))
-    _photograph(root, scene, cameras, None, on_progress, threads)
-    _write_cameras(root, cameras)
-
-
 def _photograph(
     root: Path,
     scene: ToyScene,
