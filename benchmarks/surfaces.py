@@ -3,7 +3,7 @@
 ::
 
     python -m benchmarks.surfaces [--scenes tuning | reported | NAME ...] [--recipes best 2dgs-60k FILE ...]
-        [--scale 0.06] [--seeds 0] [--size 400] [--threads 1] [--set FIELD=VALUE ...] [--train="OPTIONS"]
+        [--scale 0.03] [--seeds 0] [--size 400] [--threads 1] [--set FIELD=VALUE ...] [--train="OPTIONS"]
         [--mesh NAME=FOLDER ...] [--captures FOLDER] [--out runs/surfaces] [--results FILE.json] [--pictures]
 
 Scenes (``benchmarks/surface_scenes.py``) are rendered if missing, into OUT/scenes/SIZE-SEED or ``--captures``. Each
@@ -204,7 +204,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--scenes", nargs="+", default=["all"], help=f"{', '.join(GROUPS)}, or {', '.join(SCENES)}")
     parser.add_argument("--recipes", nargs="*", default=["best"], help="names or files, as `gs2d train --recipe` takes")
-    parser.add_argument("--scale", type=float, default=0.06, help="length of the schedule")
+    parser.add_argument("--scale", type=float, default=0.03, help="length of the schedule")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="of trainings; scenes use --scene-seed")
     parser.add_argument("--scene-seed", type=int, default=0)
     parser.add_argument("--size", type=int, default=400, help="width of the photographs, px")
