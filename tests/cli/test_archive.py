@@ -25,7 +25,7 @@ def train(path: Path, out: Path, *more: str) -> int:
     return run(["train", str(path), "--out", str(out), "--quiet", "--threads", "1", *TINY, *more])
 
 
-def test_a_zip_trains_as_its_folder_does_and_is_found_by_what_comes_after(
+def test_a_zip_trains_like_its_folder_and_later_commands_find_it(
     capture: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, out = packed(capture, tmp_path / "my ball.zip"), tmp_path / "run"
@@ -44,7 +44,7 @@ def test_a_zip_trains_as_its_folder_does_and_is_found_by_what_comes_after(
     assert "already holds a run" in one_line(capsys.readouterr().err)
 
 
-def test_another_archive_neither_resumes_a_run_nor_spoils_it_and_replaces_it_when_told_to(
+def test_another_archive_cannot_resume_a_run_but_replaces_it_with_overwrite(
     capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"

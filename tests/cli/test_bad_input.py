@@ -104,21 +104,21 @@ def test_a_capture_that_cannot_be_read_gives_one_line_and_exit_code_2_and_leaves
 
 
 @pytest.mark.parametrize(
-    ("start", "said"),
+    ("start", "message"),
     [
         ('{"min_angle": 34.9}', "photographs"),
         ('{"side": 1}', "dense_start.side"),
         ('{"fit": 3}', "dense_start.fit must be true or false"),
     ],
 )
-def test_a_plane_sweep_that_finds_nothing_is_told_in_one_line_and_leaves_no_run(
-    start: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_plane_sweep_without_points_is_a_one_line_error_and_leaves_no_run(
+    start: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_capture(tmp_path / "capture")
     out = tmp_path / "run"
     words = ["train", str(tmp_path / "capture"), "--out", str(out), "--quiet", *TINY, "--set", f"dense_start={start}"]
     assert run(words) == 2
-    assert said in one_line(capsys.readouterr().err)
+    assert message in one_line(capsys.readouterr().err)
     assert not out.exists()
 
 
@@ -213,7 +213,7 @@ def test_a_failing_overwrite_keeps_the_old_run(
 
 
 @pytest.mark.parametrize("command", ["mesh", "render", "evaluate"])
-def test_a_command_on_what_is_no_run_says_what_it_found(
+def test_a_command_on_a_path_that_is_no_run_names_what_it_is(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run([command, str(tmp_path)]) == 2
@@ -224,7 +224,7 @@ def test_a_command_on_what_is_no_run_says_what_it_found(
 @pytest.mark.parametrize(
     ("name", "old", "new", "command", "code"),
     [
-        # The report is written without its pictures, and says so: 3.
+        # The report lacks its images: exit code 3.
         ("renders/index.json", '"camera"', '"cam"', "evaluate", 3),
         ("renders/index.json", '"stages": [', '"stages": 5, "x": [', "evaluate", 3),
         ("metrics.json", '"iterations": ', '"iterations": "x", "y": ', "info", 2),
@@ -248,9 +248,9 @@ def test_a_damaged_file_of_a_run_is_named(
     assert old in text
     (copy / name).write_text(text.replace(old, new))
     assert run([command, str(copy), "--quiet"]) == code
-    said = capsys.readouterr().err
+    error_output = capsys.readouterr().err
     if code == 2:
-        assert Path(name).name in one_line(said)
+        assert Path(name).name in one_line(error_output)
     else:
-        assert said != ""
-        assert all(line.startswith("not made: ") and Path(name).name in line for line in said.splitlines())
+        assert error_output != ""
+        assert all(line.startswith("not made: ") and Path(name).name in line for line in error_output.splitlines())

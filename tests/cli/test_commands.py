@@ -29,7 +29,7 @@ def test_recipes_lists_three_or_all_and_shows_one(capsys: pytest.CaptureFixture[
     assert "2. appearance: 1,000 iterations" in shown
 
 
-def test_doctor_says_what_runs_and_why_the_rest_does_not(capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_lists_backends_and_why_others_are_unavailable(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["doctor"]) == 0
     text = capsys.readouterr().out
     assert "yes  reference" in text
@@ -98,7 +98,7 @@ def test_the_splats_of_a_file_are_drawn_and_meshed_with_the_cameras_of_a_run(
     mesh = ["mesh", str(trained), "--threads", "1", "--splats", str(glb)]
     assert run([*mesh, "--out", str(tmp_path / "m.ply"), "--quiet"]) == 0
     assert (tmp_path / "m.ply").stat().st_size > 100
-    for words, told in (
+    for words, message in (
         (mesh, "--splats needs --out: files in the run are made from its own splats"),
         ([*mesh, "--out", str(trained / "mesh.ply")], "is the mesh of the run's own splats"),
         ([*mesh, "--texture"], "--texture needs the mesh of the run"),
@@ -106,7 +106,7 @@ def test_the_splats_of_a_file_are_drawn_and_meshed_with_the_cameras_of_a_run(
         (["render", str(trained), "--splats", str(trained), "--out", str(tmp_path / "x")], "got the folder"),
     ):
         assert run(words) == 2
-        assert told in capsys.readouterr().err
+        assert message in capsys.readouterr().err
     assert not (tmp_path / "x").exists()
 
 
@@ -119,9 +119,9 @@ def test_an_export_whose_layout_and_ending_contradict_each_other_is_refused(
     assert "--out" in capsys.readouterr().err
     assert run(["export", str(trained), "--out", str(tmp_path / "a.fbx")]) == 2
     endings = ".ply, .spz, .compressed.ply, .splat, .usd, .glb, .sog, lod-meta.json"
-    told = capsys.readouterr().err
-    assert f"--out must end in {endings}, got" in told
-    assert "meshes are written by `gs2d mesh RUN`" in told
+    error_output = capsys.readouterr().err
+    assert f"--out must end in {endings}, got" in error_output
+    assert "meshes are written by `gs2d mesh RUN`" in error_output
     assert list(tmp_path.iterdir()) == []
 
 

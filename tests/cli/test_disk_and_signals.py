@@ -37,7 +37,7 @@ def test_a_full_disk_stops_training_with_one_line_and_leaves_nothing(capture: Pa
         subprocess.run(["umount", str(disk)], check=True)
 
 
-def test_a_fault_of_ours_is_exit_code_1_with_a_traceback_only_for_debug(
+def test_an_internal_error_is_exit_code_1_with_a_traceback_only_for_debug(
     trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from gs2d.pipeline.finish import evaluate
@@ -55,7 +55,7 @@ def test_a_fault_of_ours_is_exit_code_1_with_a_traceback_only_for_debug(
     assert "Traceback" in capsys.readouterr().err
 
 
-def test_ctrl_c_exits_with_130_and_says_how_to_go_on(
+def test_ctrl_c_exits_with_130_and_names_the_command_that_resumes(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from gs2d.pipeline.train.stage_results import StageResults
@@ -93,7 +93,7 @@ main(["evaluate", {str(trained)!r}])
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
 
 
-def test_a_second_ctrl_c_right_after_the_first_does_not_stop_the_cleaning_up(
+def test_a_second_ctrl_c_does_not_interrupt_the_cleanup(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from gs2d.io.run_dir import RunFolder
@@ -120,7 +120,7 @@ def test_a_second_ctrl_c_right_after_the_first_does_not_stop_the_cleaning_up(
         (["train", "--help"], "closed pipe", 141, ""),
     ],
 )
-def test_a_stdout_that_takes_nothing_is_no_fault_of_ours(
+def test_a_stdout_that_cannot_be_written_is_not_an_internal_error(
     words: list[str], stdout: str, code: int, message: str
 ) -> None:
     if stdout == "full disk":
@@ -139,7 +139,7 @@ def test_a_stdout_that_takes_nothing_is_no_fault_of_ours(
     assert len(done.stderr.splitlines()) == bool(message)
 
 
-def test_ctrl_c_before_the_first_iteration_leaves_nothing_and_says_so(
+def test_ctrl_c_before_the_first_iteration_leaves_no_run(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from gs2d.training.trainer import Trainer
@@ -177,7 +177,7 @@ def test_out_of_memory_names_the_remedy(
 
 
 @pytest.mark.parametrize("quiet", [True, False])
-def test_what_could_not_be_made_is_exit_code_3_and_names_the_command_that_makes_it(
+def test_a_missing_result_is_exit_code_3_with_the_command_that_makes_it(
     quiet: bool, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def broken(*_args: object) -> str:
@@ -187,8 +187,8 @@ def test_what_could_not_be_made_is_exit_code_3_and_names_the_command_that_makes_
     monkeypatch.setattr("gs2d.report.sections.training_section.curves", broken)
     assert run(["evaluate", str(copy), "--json", *["--quiet"] * quiet]) == app_module.INCOMPLETE == 3
     out, err = capsys.readouterr()
-    said = "fault in gs2d: ValueError: broken data stream"
-    assert json.loads(out)["missing"] == [{"what": "section training in report.html", "reason": said}]
+    reason = "fault in gs2d: ValueError: broken data stream"
+    assert json.loads(out)["missing"] == [{"what": "section training in report.html", "reason": reason}]
     last = err.splitlines()[-1]
-    assert last == f"not made: section training in report.html{f' ({said})' * quiet}; again: gs2d evaluate {copy}"
-    assert err.count(said) == 1
+    assert last == f"not made: section training in report.html{f' ({reason})' * quiet}; again: gs2d evaluate {copy}"
+    assert err.count(reason) == 1

@@ -23,7 +23,7 @@ def test_an_extra_is_what_pyproject_says_and_is_installed_by_the_names_of_its_pa
         assert install(extra) == "pip install " + " ".join(f"'{requirement}'" for requirement in requirements)
 
 
-def test_the_doctor_looks_for_all_that_single_commands_need(
+def test_doctor_checks_the_requirements_of_every_command(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("PATH", "")
@@ -40,7 +40,7 @@ def test_the_doctor_looks_for_all_that_single_commands_need(
     assert f"{ffmpeg}\n       to get it: apt" in text
 
 
-def test_a_torch_with_cuda_where_there_is_no_gpu_is_told_with_the_command_for_one_without(
+def test_doctor_suggests_the_cpu_build_of_torch_without_a_gpu(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)

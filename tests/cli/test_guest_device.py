@@ -28,7 +28,7 @@ class OnMetal(ReferenceBackend):
     device = "mps"
 
 
-def test_it_trains_meshes_and_scores_by_the_command_line(
+def test_a_third_party_device_trains_meshes_and_scores(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(BACKENDS._things, "guest", OnNamedDevice)

@@ -1,4 +1,4 @@
-"""Help, the version, and what is said of a command line with a mistake."""
+"""Help, version, and errors of the command line."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from gs2d.cli.parser import parse
         ("train here --out there --resume --overwrite", "exclude each other"),
     ],
 )
-def test_a_command_line_with_a_mistake_is_one_line_that_says_what_was_meant(
+def test_a_mistyped_command_line_gives_one_line_with_a_suggestion(
     words: str, named: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(words.split()) == 2
@@ -52,7 +52,7 @@ def test_a_command_line_with_a_mistake_is_one_line_that_says_what_was_meant(
     assert named in one_line(err)
 
 
-def test_a_folder_in_the_place_of_a_command_is_photographs(
+def test_a_folder_instead_of_a_command_suggests_reconstruct(
     tmp_path: object, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run([str(tmp_path)]) == 2
@@ -91,10 +91,10 @@ def test_every_option_is_parsed_and_fills_its_field() -> None:
     for name, command in NAMES.items():
         options = options_of(command)
         for option in options:
-            given = sorted(
+            needed = sorted(
                 (o for o in options if o.required or o.positional or o is option), key=lambda o: not o.positional
             )
-            parsed = parse([name, *(word for other in given for word in written(other))])
+            parsed = parse([name, *(word for other in needed for word in written(other))])
             assert option.default not in values_of(parsed, option.field), option
     assert "--no-page" in {flag for option in options_of(NAMES["train"]) for flag in option.flags}
 
@@ -134,7 +134,7 @@ def values_of(parsed: object, field: str) -> list[object]:
         ("train in --out out --set prepare=never --set a=1", "overrides", ("a=1",)),
     ],
 )
-def test_words_become_values(words: str, field: str, value: object) -> None:
+def test_option_words_become_values(words: str, field: str, value: object) -> None:
     assert getattr(parse(words.split()), field) == value
 
 

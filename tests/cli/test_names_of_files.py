@@ -32,7 +32,7 @@ def named_capture(root: Path) -> Path:
     return capture
 
 
-def test_every_command_works_on_such_names_and_prints_none_of_their_bytes(
+def test_every_command_works_on_unprintable_names_and_prints_none_of_their_bytes(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     capture, out = named_capture(tmp_path), tmp_path / f"{NAME}run"
@@ -48,9 +48,9 @@ def test_every_command_works_on_such_names_and_prints_none_of_their_bytes(
         ["train", capture, "--out", out, "--threads", "1", *TINY, "--resume"],
     ):
         code = run([str(word) for word in words])
-        said = "".join(capfd.readouterr())
-        assert code == 0, (words, said)
-        assert not {"\x1b", "\x07", "\x9b", NAME[0]} & set(said), words
+        output = "".join(capfd.readouterr())
+        assert code == 0, (words, output)
+        assert not {"\x1b", "\x07", "\x9b", NAME[0]} & set(output), words
     for words in (["train", capture, "--out", out], ["mesh", NAME], ["info", out / NAME]):
         assert run([str(word) for word in words]) == 2
         assert "\\xe9\\x1b]0;owned\\x07 \\x9b" in capfd.readouterr().err

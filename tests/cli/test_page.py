@@ -52,7 +52,7 @@ def test_a_run_becomes_a_page_in_it(trained: Path, tmp_path: Path, capsys: pytes
         (["cloud.ply", "--bbox", *"0 0 0 1 1 1".split()], "leave them out"),
     ],
 )
-def test_what_cannot_become_a_page_is_one_line(
+def test_input_that_cannot_become_a_page_is_a_one_line_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: list[str], message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -74,7 +74,7 @@ def test_a_dumb_terminal_gets_no_escape_and_no_color_no_style(module: str) -> No
     assert "3,000/6,000" in plain
 
 
-def test_a_log_file_gets_a_line_a_phase_and_now_and_then_how_far_it_is(
+def test_a_log_file_gets_one_line_per_phase_and_occasional_progress(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     clock = Clock()

@@ -1,4 +1,4 @@
-"""``gs2d mesh RUN --texture``: the files, what the user is told, and what is refused."""
+"""``gs2d mesh RUN --texture``: files, messages and errors."""
 
 from __future__ import annotations
 
@@ -25,9 +25,7 @@ def ball(trained: Path, tmp_path: Path) -> Path:
     return folder
 
 
-def test_the_runs_mesh_gets_a_texture_of_what_the_photographs_show(
-    ball: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_mesh_of_a_run_gets_a_texture_from_the_photographs(ball: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = (ball / "mesh.ply").read_bytes()
     assert run(["mesh", str(ball), "--texture", "--threads", "1"]) == 0
     out, _ = capsys.readouterr()
@@ -38,10 +36,10 @@ def test_the_runs_mesh_gets_a_texture_of_what_the_photographs_show(
     scene = trimesh.load(ball / "mesh.glb")
     mesh = next(iter(scene.geometry.values()))
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), RADIUS, rtol=1e-5)  # in the capture's frame
-    seen = mesh.vertices[:, 2] > 0.1  # red, green and blue follow x, y, z; the cameras are above
+    visible = mesh.vertices[:, 2] > 0.1  # red, green and blue follow x, y, z; the cameras are above
     colors = np.asarray(mesh.visual.to_color().vertex_colors)[:, :3] / 255
     expected = 0.5 + 0.4 * mesh.vertices / RADIUS + 0.1 * np.sin(9 * mesh.vertices)
-    assert np.median(np.abs(colors - expected)[seen]) < 0.03  # photographs of 20 x 20
+    assert np.median(np.abs(colors - expected)[visible]) < 0.03  # photographs of 20 x 20
 
 
 @pytest.mark.parametrize(
@@ -56,7 +54,7 @@ def test_the_runs_mesh_gets_a_texture_of_what_the_photographs_show(
         (["--texture", "--out", "no/such/folder/a.glb"], "existing folder"),
     ],
 )
-def test_what_makes_no_texture_is_one_line(
+def test_a_run_that_cannot_be_textured_is_a_one_line_error(
     trained: Path, words: list[str], named: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["mesh", str(trained), *words]) == 2

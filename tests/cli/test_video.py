@@ -13,9 +13,7 @@ from cli_runs import one_line
 from gs2d.cli import run
 
 
-def test_a_flight_becomes_pictures_and_a_video(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_flight_becomes_images_and_a_video(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     copy, video = tmp_path / "run", tmp_path / "video.webp"
     shutil.copytree(trained, copy)
     words = ["--flight", "5", "--video", str(video), "--set", "fps=10", "--threads", "1"]
@@ -38,7 +36,7 @@ def test_a_flight_becomes_pictures_and_a_video(
     }
 
 
-def test_a_video_without_an_ending_is_what_can_be_made_here_and_mp4_without_ffmpeg_is_refused(
+def test_a_video_without_a_suffix_gets_an_available_format_and_mp4_needs_ffmpeg(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", "")
@@ -66,7 +64,7 @@ def test_a_video_without_an_ending_is_what_can_be_made_here_and_mp4_without_ffmp
         (["--orbit", "9", "--video", f"{'a' * 300}.webp"], "choose a shorter name"),
     ],
 )
-def test_what_makes_no_video_is_one_line(
+def test_invalid_video_options_are_one_line_errors(
     trained: Path, words: list[str], named: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["render", str(trained), *words]) == 2

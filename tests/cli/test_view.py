@@ -55,8 +55,8 @@ def test_a_run_is_served_with_its_stages_its_mesh_and_its_cameras(trained: Path,
         assert stages == ["surface", "appearance", "final"]
         for stage in stages:
             headers, data = fetch(server, "splats", stage=stage)
-            told = json.loads(headers["X-Splats"])
-            assert len(data) == (32 + 16 * told["texels"]) * told["splats"] > 0
+            facts = json.loads(headers["X-Splats"])
+            assert len(data) == (32 + 16 * facts["texels"]) * facts["splats"] > 0
         assert fetch(server, "mesh")[1] == web_mesh(read_mesh(copy / "mesh.ply"))
         assert len(facts["cameras"]) == 3
         with Image.open(io.BytesIO(fetch(server, "photograph", view="2")[1])) as image:
@@ -83,7 +83,7 @@ def test_nothing_or_a_mesh_is_refused(tmp_path: Path) -> None:
         open_viewer(tmp_path / "mesh.glb")
 
 
-def test_a_defect_ends_the_command() -> None:
+def test_an_error_in_the_server_ends_the_command() -> None:
     server = PageServer(None, {})
     server.failure = ValueError("a defect")
     with pytest.raises(ValueError, match="a defect"):
@@ -91,7 +91,7 @@ def test_a_defect_ends_the_command() -> None:
     server.close()
 
 
-def test_it_serves_until_ctrl_c_and_ends_with_130(trained: Path) -> None:
+def test_view_serves_until_ctrl_c_and_exits_with_130(trained: Path) -> None:
     words = [sys.executable, "-m", "gs2d", "view", str(trained), "--json"]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None

@@ -89,7 +89,7 @@ def named(line: str) -> list[str]:
 
 @pytest.mark.parametrize("path", INPUTS)
 @pytest.mark.parametrize("command", NEEDS)
-def test_a_wrong_input_is_one_line_whose_remedy_names_what_is_there(
+def test_a_wrong_input_is_one_line_with_a_remedy_for_what_the_path_is(
     there: Path, capsys: pytest.CaptureFixture[str], command: str, path: str
 ) -> None:
     kind, better = INPUTS[path]
@@ -125,7 +125,7 @@ def test_photographs_in_an_archive_are_unpacked_as_the_message_says(
     shutil.rmtree(folder)
 
 
-def test_what_is_wrong_inside_an_archive_names_the_archive(
+def test_an_error_inside_an_archive_names_the_archive(
     there: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     small_nerfstudio(tmp_path / "broken", count=3)
@@ -153,7 +153,7 @@ def test_a_run_without_scale_gets_one_and_then_an_orthophoto(there: Path, capsys
     "write",
     [small_colmap, small_nerfstudio, small_blender, small_dtu, small_opensfm, small_metashape, small_alicevision],
 )
-def test_captures_of_every_format_are_told_from_photographs_by_names(tmp_path: Path, write: object) -> None:
+def test_captures_of_every_format_are_distinguished_from_photographs_by_name(tmp_path: Path, write: object) -> None:
     write(tmp_path / "some")  # type: ignore[operator]
     assert detect_format(tmp_path / "some")
     assert not holds_photographs(tmp_path / "some")
@@ -193,6 +193,6 @@ def test_a_misspelt_path_is_found_before_anything_heavy_is_imported(there: Path)
         assert re.match(r"error: expected .* at photoz, found nothing; did you mean photos(\.zip)?\?", line), line
 
 
-def test_a_search_that_goes_on_does_not_need_the_photographs(there: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_continued_search_does_not_need_the_photographs(there: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["reconstruct", "gone", "--out", "run", "--resume"]) == 2
     assert "found nothing" not in capsys.readouterr().err

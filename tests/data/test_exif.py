@@ -38,13 +38,13 @@ def write(path: Path, *, xmp: str = "", gps: dict[int, object] | None = None, ti
 
 def gps(latitude: float, longitude: float, *, height: float | None = None) -> dict[int, object]:
     tags = ExifTags.GPS
-    told: dict[int, object] = {
+    entries: dict[int, object] = {
         **{tags.GPSLatitudeRef: "S" if latitude < 0 else "N", tags.GPSLatitude: (abs(latitude), 0.0, 0.0)},
         **{tags.GPSLongitudeRef: "W" if longitude < 0 else "E", tags.GPSLongitude: (abs(longitude), 0.0, 0.0)},
     }
     if height is not None:
-        told |= {tags.GPSAltitudeRef: b"\1" if height < 0 else b"\0", tags.GPSAltitude: abs(height)}
-    return told
+        entries |= {tags.GPSAltitudeRef: b"\1" if height < 0 else b"\0", tags.GPSAltitude: abs(height)}
+    return entries
 
 
 @pytest.mark.parametrize(

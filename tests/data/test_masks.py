@@ -77,9 +77,9 @@ def test_an_ineffective_masked_option_is_reported(tmp_path: Path, masked: str) -
         assert silhouette is not None
         assert before is not None
         assert np.array_equal(silhouette, before)
-    said = [note for note in load_scene(tmp_path / "bare", masked=masked).notes if note.startswith("masks:")]
+    notes = [note for note in load_scene(tmp_path / "bare", masked=masked).notes if note.startswith("masks:")]
     none = f"masks: none of 9 views has one in masks (a/b.jpg.png for a/b.jpg): --masked {masked} has no effect"
-    assert said == ([] if masked == "off" else [none])  # without masks none is used: what was asked for
+    assert notes == ([] if masked == "off" else [none])  # without masks, `off` changes nothing
 
 
 def test_empty_makes_an_alpha_channel_of_the_mask_in_every_view(tmp_path: Path) -> None:

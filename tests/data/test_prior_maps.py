@@ -172,8 +172,8 @@ def test_points_are_assigned_to_the_images_that_observe_them(tmp_path: Path, kin
     model = small_colmap(tmp_path, kind=kind)
     ids = [5, 2, 99]
     model.points = [(i, (i, 0.0, 1.0), (1, 2, 3), 0.25 * i, []) for i in ids]
-    seen = {0: [(1.0, 2.0, 5), (3.0, 4.0, 2), (3.1, 4.0, 2)], 1: [(1.0, 1.0, 2), (0.0, 0.0, -1), (9.0, 9.0, 7)]}
-    model.images = [(*image[:4], seen.get(k, [])) for k, image in enumerate(model.images)]
+    observations = {0: [(1.0, 2.0, 5), (3.0, 4.0, 2), (3.1, 4.0, 2)], 1: [(1.0, 1.0, 2), (0.0, 0.0, -1), (9.0, 9.0, 7)]}
+    model.images = [(*image[:4], observations.get(k, [])) for k, image in enumerate(model.images)]
     model.write(tmp_path / "sparse/0", kind)
     observed = load_scene(tmp_path, test_every=0).observe()
     assert observed.points.tolist() == [[5, 0, 1], [2, 0, 1], [99, 0, 1]]

@@ -23,17 +23,17 @@ def observations(root: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     row = {int(i): r for r, i in enumerate(points.ids)}
     out = {}
     for image in read_images(folder, kind, observations=True):
-        seen = image.point_ids >= 0
-        rows = [row[int(i)] for i in image.point_ids[seen]]
-        out[image.name] = points.xyz[rows], image.observations[seen]
+        observed = image.point_ids >= 0
+        rows = [row[int(i)] for i in image.point_ids[observed]]
+        out[image.name] = points.xyz[rows], image.observations[observed]
     return out
 
 
 def errors_px(scene: Scene, root: Path, shift: float = 0.0) -> np.ndarray:
-    seen = observations(root)
+    by_image = observations(root)
     out = []
     for view in scene.views:
-        points, pixels = seen[view.name]
+        points, pixels = by_image[view.name]
         projected, depth = view.camera.project(points)
         assert (depth > 0).all()
         out.append(np.linalg.norm(projected + shift - pixels, axis=1))
@@ -48,7 +48,7 @@ def errors_px(scene: Scene, root: Path, shift: float = 0.0) -> np.ndarray:
         ("dtu_scan24", 49, 10101, 0.647),
     ],
 )
-def test_sparse_points_project_to_where_they_were_seen(
+def test_sparse_points_project_to_their_observations(
     shared: Shared, name: str, views: int, points: int, mean_px: float
 ) -> None:
     """Within the error that the data set's README states; DTU's cameras are our decomposition of its matrices."""

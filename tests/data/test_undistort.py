@@ -56,11 +56,11 @@ def test_parameters_of_each_colmap_model_are_in_colmap_s_order() -> None:
 def ideal_pixels_of_sensor(k: Intrinsics) -> np.ndarray:
     """Where each pixel centre of the distorted image would be in a pinhole image [H, W, 2] (damped fixed point)."""
     u, v = np.meshgrid(np.arange(k.width) + 0.5, np.arange(k.height) + 0.5)
-    seen = np.stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy], axis=-1)
-    ideal = seen.copy()
+    distorted = np.stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy], axis=-1)
+    ideal = distorted.copy()
     for _ in range(300):
-        ideal += 0.7 * (seen - k.lens.distort(ideal))
-    assert np.abs(k.lens.distort(ideal) - seen).max() < 1e-6
+        ideal += 0.7 * (distorted - k.lens.distort(ideal))
+    assert np.abs(k.lens.distort(ideal) - distorted).max() < 1e-6
     return ideal * (k.fx, k.fy) + (k.cx, k.cy)
 
 
@@ -103,13 +103,13 @@ def test_a_distorted_grid_becomes_straight(tmp_path: Path, model: str) -> None:
 
 
 def test_pixels_outside_the_photograph_are_invalid_and_black(tmp_path: Path) -> None:
-    """Pincushion n1 = +0.3: the ideal corner (0.7, 0.5) is seen at 1.22 times its radius, outside the sensor."""
+    """Pincushion n1 = +0.3: the ideal corner (0.7, 0.5) is imaged at 1.22 times its radius, outside the sensor."""
     k = Intrinsics(140, 100, 100.0, 100.0, 70.0, 50.0, Lens("perspective", (0.3,)))
     positions, valid = source_positions(k)
     assert not valid[0, 0]
     assert not valid[-1, -1]
     assert valid[50, 70]
-    # On the middle row y is about 0; x = 0.595 is seen at 0.595 (1 + 0.3 0.354) = 0.658 (inside 0.7), x = 0.665 at
+    # On the middle row y is about 0; x = 0.595 is imaged at 0.595 (1 + 0.3 0.354) = 0.658 (inside 0.7), x = 0.665 at
     # 0.753 (outside).
     assert valid[50, 129]
     assert not valid[50, 136]
@@ -145,5 +145,5 @@ def test_masks_are_undistorted_with_their_image(tmp_path: Path) -> None:
     got = load_scene(tmp_path, test_every=0).train[0].mask()
     lens = Lens("perspective", (0.4,))
     x = (np.arange(WIDTH) + 0.5 - 80) / F
-    seen = lens.distort(np.stack([x, np.full(WIDTH, 0.5 / F)], axis=-1))[:, 0] * F + 80
-    np.testing.assert_array_equal(got[60], (seen >= 0.5) & (seen <= 99.5))  # all taps are white up to 99.5
+    columns = lens.distort(np.stack([x, np.full(WIDTH, 0.5 / F)], axis=-1))[:, 0] * F + 80
+    np.testing.assert_array_equal(got[60], (columns >= 0.5) & (columns <= 99.5))  # all taps are white up to 99.5

@@ -27,7 +27,7 @@ LAYOUT = (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 51
 
 
 def features(state: dict[str, Tensor]) -> nn.Sequential:
-    """``torchvision.models.vgg16().features`` with given weights (torchvision itself is not needed)."""
+    """``torchvision.models.vgg16().features`` with the weights of the test (torchvision itself is not needed)."""
     layers: list[nn.Module] = []
     width = 3
     for entry in LAYOUT:

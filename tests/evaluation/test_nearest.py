@@ -1,4 +1,4 @@
-"""Nearest neighbours: as far as asked for, and never of numbers that are none."""
+"""Nearest neighbours: limits of distance, and coordinates that are not finite."""
 
 from __future__ import annotations
 

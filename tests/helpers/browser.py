@@ -43,14 +43,14 @@ class Page:
         number = next(self._numbers)
         self.socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
         while True:
-            told = json.loads(self.socket.recv(timeout=PATIENCE))
-            if told.get("method") == "Runtime.exceptionThrown":
-                self.errors.append(json.dumps(told["params"]["exceptionDetails"])[:600])
-            if told.get("method") == "Log.entryAdded" and told["params"]["entry"]["level"] == "error":
-                self.errors.append(told["params"]["entry"]["text"])
-            if told.get("id") == number:
-                assert "error" not in told, f"{method}: {told['error']}"
-                return dict(told["result"])
+            message = json.loads(self.socket.recv(timeout=PATIENCE))
+            if message.get("method") == "Runtime.exceptionThrown":
+                self.errors.append(json.dumps(message["params"]["exceptionDetails"])[:600])
+            if message.get("method") == "Log.entryAdded" and message["params"]["entry"]["level"] == "error":
+                self.errors.append(message["params"]["entry"]["text"])
+            if message.get("id") == number:
+                assert "error" not in message, f"{method}: {message['error']}"
+                return dict(message["result"])
 
     def open(self, url: str) -> None:
         """Open a page and wait until it is loaded."""
@@ -155,12 +155,12 @@ def _address(profile: Path, process: subprocess.Popen[bytes]) -> str:
     import urllib.request
 
     end = time.monotonic() + PATIENCE
-    told = profile / "DevToolsActivePort"
-    while not (told.is_file() and len(told.read_text().splitlines()) == 2):
+    port_file = profile / "DevToolsActivePort"
+    while not (port_file.is_file() and len(port_file.read_text().splitlines()) == 2):
         assert process.poll() is None, "the browser ended at once"
         assert time.monotonic() < end, "the browser did not start"
         time.sleep(0.1)
-    port = told.read_text().splitlines()[0]
+    port = port_file.read_text().splitlines()[0]
     while True:
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=PATIENCE) as answer:
             tabs = [tab for tab in json.load(answer) if tab["type"] == "page"]

@@ -70,8 +70,8 @@ def rendering(emulator: Emulator, case: Case) -> dict[str, Tensor]:
     render("by transmittance", every, SETTINGS.for_depths("transmittance"))
     image, mask = torch.rand(45, 70, 3, generator=_numbers()), torch.rand(45, 70, generator=_numbers()) > 0.3
     for occlusion in (False, True):
-        given = (case.splats, case.camera, image, SETTINGS, mask, occlusion)
-        found[f"errors {occlusion}"] = cuda.splat_errors_with(emulator, *given)
+        inputs = (case.splats, case.camera, image, SETTINGS, mask, occlusion)
+        found[f"errors {occlusion}"] = cuda.splat_errors_with(emulator, *inputs)
     return found
 
 
@@ -113,13 +113,13 @@ def steps(emulator: Emulator) -> dict[str, Tensor]:
     g, found = _numbers(), {}
     trained = torch.arange(57) % 2 == 0
     index = trained.nonzero().squeeze(1)
-    given = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-8, "launcher": emulator}
+    constants = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-8, "launcher": emulator}
     for columns in ((3,), (15, 3), ()):
         tensors = [torch.rand(57, *columns, generator=g) for _ in range(3)]
         gradient = torch.rand(57, *columns, generator=g)
         for choice in ({}, {"trained": trained}, {"rows": index}):
-            adam_step([AdamUpdate(*tensors, gradient, 0.1, 1, **choice)], **given)  # type: ignore[arg-type]
-        adam_step([AdamUpdate(*tensors, gradient[index], 0.1, 1, rows=index, compact=True)], **given)  # type: ignore[arg-type]
+            adam_step([AdamUpdate(*tensors, gradient, 0.1, 1, **choice)], **constants)  # type: ignore[arg-type]
+        adam_step([AdamUpdate(*tensors, gradient[index], 0.1, 1, rows=index, compact=True)], **constants)  # type: ignore[arg-type]
         found |= {f"adam {columns}.{k}": tensor for k, tensor in enumerate(tensors)}
     return found
 

@@ -24,8 +24,9 @@ def synthetic_model(
     for i, angle in enumerate(np.linspace(0, 2.5, count)):
         eye = np.array([4 * np.cos(angle), 4 * np.sin(angle), 1 + 0.8 * np.sin(3 * angle)])
         T = look_at(eye, np.zeros(3), np.array([0.0, 0.0, 1.0]), width=8, height=8, fx=8.0).T_cam_world
-        seen = [(number, lens.img_from_cam(T[:3, :3] @ p + T[:3, 3])) for number, p in zip(numbers, xyz, strict=True)]
-        inside = [(n, at + rng.normal(0, noise, 2)) for n, at in seen if at is not None and (at > 0).all()
+        in_camera = xyz @ T[:3, :3].T + T[:3, 3]
+        projected = [(number, lens.img_from_cam(p)) for number, p in zip(numbers, in_camera, strict=True)]
+        inside = [(n, at + rng.normal(0, noise, 2)) for n, at in projected if at is not None and (at > 0).all()
                   and (at < (WIDTH, HEIGHT)).all()]  # fmt: skip
         image = pycolmap.Image(name=f"{i:03}.jpg", camera_id=1, image_id=i + 1)
         image.points2D = pycolmap.Point2DList([pycolmap.Point2D(at) for _, at in inside])

@@ -39,7 +39,7 @@ def write_frames(folder: Path, width: int, height: int) -> list[Path]:
 
 
 def probed(path: Path) -> dict[str, Any]:
-    """What ffprobe says of the video."""
+    """Return the first stream that ffprobe reports."""
     words = ["ffprobe", "-v", "error", "-count_frames", "-show_streams", "-of", "json", str(path)]
     (stream,) = json.loads(subprocess.run(words, capture_output=True, check=True).stdout)["streams"]
     return dict(stream)
@@ -53,10 +53,10 @@ def decoded(path: Path, width: int, height: int) -> np.ndarray:
 
 
 @real
-def test_an_mp4_video_has_all_frames_at_its_rate_as_every_player_takes_them(frames: list[Path], tmp_path: Path) -> None:
-    told: list[int] = []
-    write_video(tmp_path / "a.mp4", frames, fps=12.5, on_frame=told.append)
-    assert told == [1, 2, 3, 4, 5, 6]
+def test_an_mp4_video_has_all_frames_at_its_rate_in_a_common_pixel_format(frames: list[Path], tmp_path: Path) -> None:
+    reported: list[int] = []
+    write_video(tmp_path / "a.mp4", frames, fps=12.5, on_frame=reported.append)
+    assert reported == [1, 2, 3, 4, 5, 6]
     stream = probed(tmp_path / "a.mp4")
     assert (stream["codec_name"], stream["pix_fmt"], stream["color_space"]) == ("h264", "yuv420p", "bt709")
     assert (stream["width"], stream["height"], stream["nb_read_frames"]) == (WIDTH, HEIGHT, "6")
@@ -71,9 +71,9 @@ def test_an_mp4_video_has_all_frames_at_its_rate_as_every_player_takes_them(fram
 
 
 def test_a_webp_video_has_all_frames_at_its_rate(frames: list[Path], tmp_path: Path) -> None:
-    told: list[int] = []
-    write_video(tmp_path / "a.webp", frames, fps=30, on_frame=told.append)
-    assert told == [1, 2, 3, 4, 5, 6]
+    reported: list[int] = []
+    write_video(tmp_path / "a.webp", frames, fps=30, on_frame=reported.append)
+    assert reported == [1, 2, 3, 4, 5, 6]
     with Image.open(tmp_path / "a.webp") as video:
         assert video.n_frames == 6  # type: ignore[attr-defined]
         durations = []
@@ -88,7 +88,7 @@ def test_a_webp_video_has_all_frames_at_its_rate(frames: list[Path], tmp_path: P
 
 
 @pytest.mark.parametrize("name", [pytest.param("a.mp4", marks=real), "a.webp"])
-def test_whoever_stops_leaves_no_file_and_an_older_one_as_it_was(frames: list[Path], tmp_path: Path, name: str) -> None:
+def test_an_interrupted_writer_keeps_an_older_file(frames: list[Path], tmp_path: Path, name: str) -> None:
     def stop(done: int) -> None:
         if done == 4:
             raise KeyboardInterrupt
@@ -101,7 +101,7 @@ def test_whoever_stops_leaves_no_file_and_an_older_one_as_it_was(frames: list[Pa
 
 
 def a_program(folder: Path, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An ffmpeg that does what ``text`` says."""
+    """Put an ffmpeg on the PATH that runs the shell script ``text``."""
     folder.mkdir()
     (folder / "ffmpeg").write_text(f"#!/bin/sh\n{text}\n")
     (folder / "ffmpeg").chmod(0o755)
@@ -112,17 +112,22 @@ KNOWS = 'for word; do [ "$word" = -encoders ] && echo " V libx264 x" && exit 0; 
 
 
 @pytest.mark.parametrize(
-    ("does", "error", "said"),
+    ("script", "error", "message"),
     [
         ("echo a >&2; echo no such luck >&2; exit 7", BackendError, r"a\.mp4"),
         ("exit 7", BackendError, r"a\.mp4"),
         ("echo x: No space left on device >&2; exit 1", DiskError, "free some space"),
     ],
 )
-def test_what_ffmpeg_says_last_is_told(
-    frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, does: str, error: type[Exception], said: str
+def test_the_last_line_of_ffmpeg_is_in_the_error(
+    frames: list[Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    script: str,
+    error: type[Exception],
+    message: str,
 ) -> None:
-    a_program(tmp_path / "bin", f"{KNOWS}\n{does}", monkeypatch)
-    with pytest.raises(error, match=said):
+    a_program(tmp_path / "bin", f"{KNOWS}\n{script}", monkeypatch)
+    with pytest.raises(error, match=message):
         write_video(tmp_path / "a.mp4", frames, fps=30)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bin", "frames"]

@@ -29,7 +29,7 @@ def decoded(html: str) -> np.ndarray:
 
 @pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize("width", [360, 960])
-def test_noise_of_any_size_becomes_a_picture_of_the_report(side: int, width: int) -> None:
+def test_noise_of_any_size_becomes_an_image_of_the_report(side: int, width: int) -> None:
     image = noise(max(side * 3 // 4, 1), side)
     shown = decoded(image_tag(image, alt="noise", width=width))
     assert shown.shape[1] == min(side, width)

@@ -113,7 +113,7 @@ def test_the_report_fits_the_window(height: int, tmp_path: Path) -> None:
                 assert page.ask(EMPTY) == [], width
 
 
-def test_a_phone_reads_it_without_moving_sideways_and_wipes_by_finger(page: Page) -> None:
+def test_a_phone_scrolls_the_report_vertically_and_wipes_by_touch(page: Page) -> None:
     page.size(375, 812, phone=True)
     try:
         assert page.ask("document.documentElement.scrollWidth") <= 375

@@ -157,13 +157,13 @@ def test_matches_determine_a_fisheye_and_its_focal_length(
     pycolmap: Any, model: str, params: tuple[float, ...], focal: float | None
 ) -> None:
     camera = pycolmap.Camera(model="SIMPLE_FISHEYE", width=SIZE[0], height=SIZE[1], params=[F, 200, 150], camera_id=1)
-    told = probe(pycolmap, _Database(pycolmap, model, params), camera, reach=250.0, seed=0)
-    assert told is not None
-    assert 0.5 < told.plain <= 0.95
-    assert told.is_fisheye is (focal is not None)
+    result = probe(pycolmap, _Database(pycolmap, model, params), camera, reach=250.0, seed=0)
+    assert result is not None
+    assert 0.5 < result.plain <= 0.95
+    assert result.is_fisheye is (focal is not None)
     if focal is not None:
-        assert told.focal == pytest.approx(focal, rel=0.12)
-        assert told.bent > 0.85
+        assert result.focal == pytest.approx(focal, rel=0.12)
+        assert result.bent > 0.85
 
 
 @pytest.mark.parametrize(
@@ -200,20 +200,20 @@ def test_placed_images_can_raise_doubts_about_a_camera(
 
 # -- whole searches ----------------------------------------------------------------------------------------------------
 def searched(root: Path, **options: Any) -> tuple[dict[str, Any], list[str]]:
-    said: list[str] = []
+    notices: list[str] = []
 
     def note(event: Event) -> None:
-        said.extend([event.text] if isinstance(event, Notice) else [])
+        notices.extend([event.text] if isinstance(event, Notice) else [])
 
     poses = PosesOptions(photos=root / "photos", out=root / "capture", threads=2, feature_size=320, **options)
-    return find_poses(poses, note), said
+    return find_poses(poses, note), notices
 
 
 @pytest.mark.slow
 def test_round_photographs_of_185_degrees_are_placed_masked_and_cut_into_faces(colmap: None, tmp_path: Path) -> None:
     """Measured at 16 of 800 px: an error of 0.4 mm in a room of 4 m."""
     truth = write_photographs(tmp_path / "photos", "fisheye", count=8, width=480, angle=185, fits="height", off=(8, -6))
-    made, said = searched(tmp_path)
+    made, notices = searched(tmp_path)
     off = errors(tmp_path / "capture", truth)
     assert off["placed"] == 8
     assert off["centres_worst_m"] < 0.01
@@ -221,7 +221,7 @@ def test_round_photographs_of_185_degrees_are_placed_masked_and_cut_into_faces(c
     assert made["lens"]["chosen"].endswith("_FISHEYE")
     assert made["lens"]["fisheyes"][0]["why"] == "circle"
     assert read_json(tmp_path / "capture/poses.json")["lens"] == made["lens"]
-    assert any("(round images)" in line for line in said)
+    assert any("(round images)" in line for line in notices)
     assert made["masks"] == 8  # the command may overwrite these
     assert searched(tmp_path, overwrite=True)[0]["lens"] == made["lens"]
     (camera,) = read_cameras(tmp_path / "capture/sparse/0", "bin").values()

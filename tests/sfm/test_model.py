@@ -61,9 +61,9 @@ def request(work: Path) -> Request:
 def follow(work: Path, code: str) -> tuple[list[object], Solved]:
     """Run a worker with this Python code, in which ``say(...)`` sends a message."""
     program = "import json, os, sys\ndef say(**m): print(json.dumps(m), flush=True)\n" + code
-    seen: list[object] = []
-    solved = solve(request(work), lambda *step: seen.append(step), command=(sys.executable, "-c", program))
-    return seen, solved
+    steps: list[object] = []
+    solved = solve(request(work), lambda *step: steps.append(step), command=(sys.executable, "-c", program))
+    return steps, solved
 
 
 def test_messages_of_the_worker_become_progress(tmp_path: Path) -> None:
@@ -71,8 +71,8 @@ def test_messages_of_the_worker_become_progress(tmp_path: Path) -> None:
         "assert json.load(open(sys.argv[1]))['groups'][0]['camera_model'] == 'OPENCV'\n"
         "say(phase='cameras', total=5); say(done=2); say(done=5); say(models=[{'upright': True}])"
     )
-    seen, solved = follow(tmp_path, code)
-    assert seen == [("placing cameras", 0, 5), ("placing cameras", 2, 5), ("placing cameras", 5, 5)]
+    steps, solved = follow(tmp_path, code)
+    assert steps == [("placing cameras", 0, 5), ("placing cameras", 2, 5), ("placing cameras", 5, 5)]
     assert solved == Solved([{"upright": True}], {})
 
 

@@ -107,21 +107,21 @@ def panoramas(colmap: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
     mask[-60:] = 0  # the person holding the camera
     for name in truth:
         Image.fromarray(mask).save(root / "photos" / "masks" / f"{name}.png")
-    said: list[str] = []
+    notices: list[str] = []
 
     def note(event: Event) -> None:
-        said.extend([event.text] if isinstance(event, Notice) else [])
+        notices.extend([event.text] if isinstance(event, Notice) else [])
 
     find_poses(PosesOptions(photos=root / "photos", out=root / "capture", threads=2), note)
-    return root, truth, said
+    return root, truth, notices
 
 
 def test_poses_of_panoramas_are_estimated(
     panoramas: tuple[Path, dict[str, np.ndarray], list[str]],
 ) -> None:
     """Measured: 0.3 mm in a room of 4 m, 0.02 degrees."""
-    root, truth, said = panoramas
-    assert "7 photographs are 360-degree panoramas: each has one pose, and is trained as several faces" in said
+    root, truth, notices = panoramas
+    assert "7 photographs are 360-degree panoramas: each has one pose, and is trained as several faces" in notices
     found = errors(root / "capture", truth)
     assert found["placed"] == 7
     assert found["centres_worst_m"] < 0.003

@@ -88,13 +88,13 @@ def test_masked_pixels_give_no_features(colmap: None, tmp_path: Path) -> None:
     mask[:, :40] = 0
     for i in range(6):
         write(tmp_path / "masks" / f"{i:03}.png", mask)
-    seen: list[np.ndarray] = []
+    found_features: list[np.ndarray] = []
     lines: list[str] = []
 
     def watch(event: Event) -> None:
         database = hidden_workspace(tmp_path / "capture") / "database.db"
-        if getattr(event, "name", "") == "placing cameras" and not seen:
-            seen.append(features(database))
+        if getattr(event, "name", "") == "placing cameras" and not found_features:
+            found_features.append(features(database))
         if isinstance(event, Notice):
             lines.append(event.text)
 
@@ -103,12 +103,12 @@ def test_masked_pixels_give_no_features(colmap: None, tmp_path: Path) -> None:
     found = find_poses(PosesOptions(**options), watch)  # type: ignore[arg-type]
     assert found["placed"] == 6
     assert found["masks"] == 6
-    assert (seen[0][:, 0] >= 40).all()
-    assert (seen[0][:, 0] < 60).any()
+    assert (found_features[0][:, 0] >= 40).all()
+    assert (found_features[0][:, 0] < 60).any()
     assert any(line.startswith("masks: 6 of 6 views have one in ") for line in lines)
     scene = load_scene(tmp_path / "capture", test_every=0)
     assert scene.masks.found == 6
     assert scene.train[0].mask() is not None
-    seen.clear()
+    found_features.clear()
     find_poses(PosesOptions(**options, match_masked=True, overwrite=True), watch)  # type: ignore[arg-type]
-    assert (seen[0][:, 0] < 40).any()
+    assert (found_features[0][:, 0] < 40).any()

@@ -51,11 +51,11 @@ def test_photographs_become_a_run_with_its_capture(
 ) -> None:
     out = tmp_path / "runs" / "a room"
     assert run(words_for(room.photos, out)) == 0
-    said = capsys.readouterr()
-    assert "photographs" in said.err
-    assert "--downscale" in said.err
-    assert re.search(r"the run will take about \d+ s", said.err)
-    assert said.out.splitlines()[-1] == f"look at it: open scene.html in a browser, or gs2d view '{out}'"
+    output = capsys.readouterr()
+    assert "photographs" in output.err
+    assert "--downscale" in output.err
+    assert re.search(r"the run will take about \d+ s", output.err)
+    assert output.out.splitlines()[-1] == f"look at it: open scene.html in a browser, or gs2d view '{out}'"
     assert (out / "scene.html").exists()
     assert {"capture", "splats.ply", "mesh.ply", "report.html"} <= {path.name for path in out.iterdir()}
     assert sorted(path.name for path in (out / "capture").iterdir()) == ["images", "poses.json", "poses.png", "sparse"]
@@ -75,8 +75,8 @@ def test_estimated_cameras_are_reused(room: Room, tmp_path: Path, monkeypatch: p
     out = started(room, tmp_path)
     monkeypatch.setattr(module, "find_poses", lambda *_: pytest.fail("cameras were looked for again"))
     options = ReconstructOptions(photos=room.photos, out=out, resume=True, training=TRAINING, **SMALL)  # type: ignore[arg-type]
-    said = notices(options)
-    assert any(text.startswith(f"using the cameras in {out / 'capture'}: 12 of 12") for text in said)
+    texts = notices(options)
+    assert any(text.startswith(f"using the cameras in {out / 'capture'}: 12 of 12") for text in texts)
     assert (out / "mesh.ply").exists()
 
 
@@ -145,8 +145,8 @@ def test_bad_input_is_an_error_before_files_are_written(
     photos = tmp_path / "photos"
     photos.mkdir()
     fill(photos)
-    given = ["reconstruct", str(photos), "--out", str(tmp_path / "run"), "--quiet", *words]
-    assert run(given) == 2
+    words_of_command = ["reconstruct", str(photos), "--out", str(tmp_path / "run"), "--quiet", *words]
+    assert run(words_of_command) == 2
     assert message in one_line(capsys.readouterr().err)
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
 
@@ -197,25 +197,25 @@ def interrupt(words: list[str], until: str) -> str:
     """Send Ctrl-C when a phase is reported; return stderr."""
     with subprocess.Popen([sys.executable, "-m", "gs2d", *words], stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
-        said = ""
+        error_output = ""
         for line in process.stderr:
-            said += line
+            error_output += line
             if line.startswith(until):
                 time.sleep(0.3)
                 process.send_signal(signal.SIGINT)
                 break
-        said += process.stderr.read()
-    assert process.returncode == 130, said
-    assert "Traceback" not in said
-    return said
+        error_output += process.stderr.read()
+    assert process.returncode == 130, error_output
+    assert "Traceback" not in error_output
+    return error_output
 
 
 def test_ctrl_c_during_the_search_keeps_results(room: Room, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    said = interrupt(words_for(room.photos, out), "finding features")
-    line = said.splitlines()[-1]
+    error_output = interrupt(words_for(room.photos, out), "finding features")
+    line = error_output.splitlines()[-1]
     assert line.startswith("interrupted; the search for cameras is kept; resume with: gs2d reconstruct ")
-    assert said.splitlines()[-1].endswith(" --resume")
+    assert error_output.splitlines()[-1].endswith(" --resume")
     assert [path.name for path in out.iterdir()] == [".capture.poses"]
     heard: list[Event] = []
     options = ReconstructOptions(photos=room.photos, out=out, resume=True, training=TRAINING, **SMALL)  # type: ignore[arg-type]
@@ -228,8 +228,8 @@ def test_ctrl_c_during_the_search_keeps_results(room: Room, tmp_path: Path) -> N
 def test_ctrl_c_during_training_keeps_the_cameras(room: Room, tmp_path: Path) -> None:
     out = started(room, tmp_path)
     words = [*words_for(room.photos, out, "--resume"), "--schedule-scale", "1.0"]
-    said = interrupt(words, "training 2dgs-r")
-    assert said.splitlines()[-1].endswith(" --resume")
+    error_output = interrupt(words, "training 2dgs-r")
+    assert error_output.splitlines()[-1].endswith(" --resume")
     assert {"capture", "checkpoints"} <= {path.name for path in out.iterdir()}
 
 

@@ -108,15 +108,16 @@ def test_a_video_becomes_a_capture_with_its_frames(tmp_path: Path, monkeypatch: 
     photos = [Image.open(path).convert("RGB") for path in sorted((tmp_path / "room").rglob("*.jpg"))]
     blurred = [photo.filter(ImageFilter.GaussianBlur(4)) for photo in photos]
     video = write_video(tmp_path / "room.mp4", [image for pair in zip(blurred, photos, strict=True) for image in pair])
-    said: list[Event] = []
+    events: list[Event] = []
     options = PosesOptions(photos=video, out=tmp_path / "capture", frames=len(photos), threads=2)
-    result = find_poses(replace(options, camera_model="SIMPLE_PINHOLE"), said.append)
+    result = find_poses(replace(options, camera_model="SIMPLE_PINHOLE"), events.append)
     assert (result["count"], result["requested"]["frames"]) == (len(photos), len(photos))
     assert result["placed"] == len(photos)
     assert len(result["cameras"]) == 1
     names = [row["name"] for row in result["photographs"]]
     assert names == [f"frame_{2 * i + 1:06d}.jpg" for i in range(len(photos))]
     assert sorted(path.name for path in (tmp_path / "capture/images").iterdir()) == names
-    assert f"using {len(photos)} of {2 * len(photos)} frames" in "".join(e.text for e in said if isinstance(e, Notice))
+    notices = "".join(event.text for event in events if isinstance(event, Notice))
+    assert f"using {len(photos)} of {2 * len(photos)} frames" in notices
     assert read_json(tmp_path / "capture/poses.json")["photos"] == str(video.resolve())
     assert not list(tmp_path.glob(".*"))

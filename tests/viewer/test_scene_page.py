@@ -57,7 +57,7 @@ def some_splats(count: int = 400, seed: int = 0) -> Splats:
 
 
 def unpacked(data: bytes, count: int, degree: int, scales: list[float]) -> Splats:
-    """What the page's bytes mean, read as its documentation says, relative to the origin."""
+    """Decode the splats of a page as documented; positions are relative to the origin."""
     words, rest = data[: 32 * count], np.frombuffer(data[32 * count :], np.int8).reshape(count, -1)
     means, log_scales, quats, light = [], [], [], []
     for i in range(count):
@@ -80,7 +80,7 @@ def unpacked(data: bytes, count: int, degree: int, scales: list[float]) -> Splat
 
 
 def data_of(packed: PackedSplats) -> bytes:
-    """What the page is given, in one piece."""
+    """Return the bytes of packed splats."""
     return b"".join(packed.data)
 
 
@@ -95,7 +95,7 @@ def at_origin(camera: Camera) -> Camera:
 
 
 @pytest.mark.parametrize(("degree", "least"), [(3, 50.0), (1, 50.0), (0, 50.0)])
-def test_what_is_stored_renders_as_the_splats_do(degree: int, least: float) -> None:
+def test_stored_splats_render_like_the_originals(degree: int, least: float) -> None:
     splats, settings = some_splats(), replace(SETTINGS, sh_degree=degree)
     packed = pack_splats(splats, ORIGIN, degree, settings.alpha_min)
     assert (packed.degree, packed.facts["texels"]) == (degree, sh_texels(degree))
@@ -118,9 +118,9 @@ class Scripts(HTMLParser):
         self._in_title = False
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given = dict(attrs)
+        attributes = dict(attrs)
         self.loads += [value for name, value in attrs if name in ("src", "href", "data", "action") and value]
-        self._id = str(given.get("id", "main")) if tag == "script" else ""
+        self._id = str(attributes.get("id", "main")) if tag == "script" else ""
         self._in_title = tag == "title"
 
     def handle_data(self, data: str) -> None:

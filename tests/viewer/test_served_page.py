@@ -166,7 +166,7 @@ def test_without_the_token_there_is_nothing() -> None:
 def test_another_site_gets_nothing_even_with_the_token(tmp_path: Path) -> None:
     training = Training()
     address = training.server.url.replace("/?", "/state?")
-    attack = f"""<script>fetch("{address}").then(() => (document.title = "told"), () => (document.title = "refused"));
+    attack = f"""<script>fetch("{address}").then(() => (document.title = "read"), () => (document.title = "refused"));
         </script><iframe src="{training.server.url}"></iframe>"""
     (tmp_path / "index.html").write_text(attack, encoding="utf-8")
 

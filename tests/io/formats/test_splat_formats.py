@@ -141,7 +141,7 @@ def test_spz_keeps_coordinates_in_a_round_trip(tmp_path: Path) -> None:
 
 def test_spz_reports_clipped_splats(tmp_path: Path) -> None:
     splats = a_scene(10)
-    assert write_spz(tmp_path / "a.spz", Gaussians.of(splats)) == ()  # rounding alone is not told
+    assert write_spz(tmp_path / "a.spz", Gaussians.of(splats)) == ()  # rounding alone is not reported
     splats.log_scales[:2] = -12.0
     splats.log_scales[2, 0] = 7.0
     splats.shN[3, 0, 0] = 1.5
@@ -234,7 +234,7 @@ def test_a_truncated_file_is_a_one_line_error(tmp_path: Path, layout: str, kept:
     write_layout(path, a_scene(300), layout)
     path.write_bytes(path.read_bytes()[:kept])
     if layout == "splat" and kept == 0:
-        assert len(read_splat_file(path).gaussians) == 0  # it says nothing of itself
+        assert len(read_splat_file(path).gaussians) == 0  # empty
         return
     with pytest.raises(DataError, match="cut") as caught:
         read_splat_file(path)
