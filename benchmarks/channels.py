@@ -22,7 +22,7 @@ from torch import Tensor
 from benchmarks.workload import camera, room
 from gs2d.core.splats import Splats
 from gs2d.render.api import rasterize
-from gs2d.render.tensor_api import rasterize_2dgs
+from gs2d.render.tensor_api import CameraTensors, SplatTensors, rasterize_2dgs
 from gs2d.render.types import PLAIN_COLORS, RasterSettings
 
 CHANNELS = (1, 3, 4, 6, 16, 64)
@@ -49,7 +49,8 @@ def ways(splats: Splats, size: int, backend: str) -> dict[str, Callable[[], obje
         return [*tensors, *(tensor.detach().requires_grad_(cameras) for tensor in (pose, K))]
 
     def loss(*tensors: Tensor) -> Tensor:
-        return rasterize_2dgs(*tensors, width=size, height=size, backend=backend).colors.sum()  # type: ignore[misc]
+        cameras = CameraTensors(*tensors[5:], width=size, height=size)
+        return rasterize_2dgs(SplatTensors(*tensors[:5]), cameras, backend=backend).colors.sum()
 
     def plain(channels: int, cameras: bool) -> None:
         loss(*leaves(channels, cameras)).backward()

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from gs2d.pipeline.prepare.options import MeshOptions, Training, TrainOptions
     from gs2d.render.api import rasterize, splat_errors
     from gs2d.render.backends import backend_report, get_backend, register_backend
-    from gs2d.render.tensor_api import rasterize_2dgs
+    from gs2d.render.tensor_api import CameraTensors, SplatTensors, rasterize_2dgs
     from gs2d.render.types import RasterSettings, RenderOutput
     from gs2d.report.sections.section_registry import register_section
     from gs2d.training.learned.quantity import LearnedQuantity
@@ -46,6 +46,7 @@ __version__ = "0.2.0"  # the one place: pyproject.toml reads it from here
 
 __all__ = [
     "Camera",
+    "CameraTensors",
     "Gs2dError",
     "LearnedQuantity",
     "Loss",
@@ -59,6 +60,7 @@ __all__ = [
     "Recipe",
     "RenderOutput",
     "Scene",
+    "SplatTensors",
     "Splats",
     "Stage",
     "TrainOptions",
@@ -103,6 +105,7 @@ __all__ = [
 
 _HOME = {
     "Camera": "gs2d.core.camera",
+    "CameraTensors": "gs2d.render.tensor_api",
     "Gs2dError": "gs2d.errors",
     "Loss": "gs2d.losses.base",
     "LearnedQuantity": "gs2d.training.learned.quantity",
@@ -116,6 +119,7 @@ _HOME = {
     "Recipe": "gs2d.config.recipe",
     "RenderOutput": "gs2d.render.types",
     "Scene": "gs2d.data.scene",
+    "SplatTensors": "gs2d.render.tensor_api",
     "Splats": "gs2d.core.splats",
     "Stage": "gs2d.config.recipe",
     "TrainOptions": "gs2d.pipeline.prepare.options",

@@ -23,7 +23,7 @@ from gs2d.render import native_rasterizer as cpu
 from gs2d.render import reference_rasterizer as reference
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
-from gs2d.render.tensor_api import rasterize_2dgs
+from gs2d.render.tensor_api import CameraTensors, SplatTensors, rasterize_2dgs
 from gs2d.render.types import RasterSettings
 from render_scenes import (
     Y_AXIS,
@@ -253,6 +253,7 @@ def test_22_a_width_that_is_none_is_refused(width: float) -> None:
 
 def test_22_bare_tensors_refuse_it() -> None:
     s = splat()
-    given = (s.means, s.quats, s.scales, s.opacities, torch.ones(1, 3), torch.eye(4)[None], torch.eye(3)[None], 8, 8)
+    splats = SplatTensors(s.means, s.quats, s.scales, s.opacities, torch.ones(1, 3))
+    cameras = CameraTensors(torch.eye(4)[None], torch.eye(3)[None], 8, 8)
     with pytest.raises(ShapeError, match="no depth by transmittance"):
-        rasterize_2dgs(*given, settings=SETTINGS, backend="reference")
+        rasterize_2dgs(splats, cameras, settings=SETTINGS, backend="reference")

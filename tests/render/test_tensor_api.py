@@ -18,7 +18,7 @@ from gs2d.core.splats import Splats
 from gs2d.errors import ShapeError
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend, get_backend
-from gs2d.render.tensor_api import CONSTANTS, Rasterization, rasterize_2dgs
+from gs2d.render.tensor_api import CONSTANTS, CameraTensors, Rasterization, SplatTensors, rasterize_2dgs
 from gs2d.render.types import PLAIN_COLORS, RasterSettings, RenderOutput
 from render_scenes import IMAGES, random_camera, random_splats
 
@@ -60,7 +60,11 @@ class Scene:
 
 
 def render(arguments: dict[str, Any], **options: Any) -> Rasterization:
-    return rasterize_2dgs(**arguments, width=SIZE[0], height=SIZE[1], **options)
+    splats = SplatTensors(**{name: arguments[name] for name in SplatTensors._fields})
+    cameras = CameraTensors(arguments["viewmats"], arguments["Ks"], *SIZE)
+    grouped = {*SplatTensors._fields, *CameraTensors._fields}
+    others = {name: value for name, value in arguments.items() if name not in grouped}
+    return rasterize_2dgs(splats, cameras, **others, **options)
 
 
 def contraction(out: Rasterization, seed: int = 0) -> Tensor:

@@ -25,7 +25,7 @@ from gs2d.render.api import check_dense, rasterize, rasterize_features
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import PLAIN_COLORS, Features, RasterSettings, RenderOutput
 
-__all__ = ["Rasterization", "rasterize_2dgs"]
+__all__ = ["CameraTensors", "Rasterization", "SplatTensors", "rasterize_2dgs"]
 
 COLORS = 3  # channels in ``sh0``
 MIN_SCALE = 1e-18  # world units; limit of the kernels: only the low-pass filter draws a smaller disc
@@ -60,36 +60,10 @@ class Rasterization(NamedTuple):
     radii: Tensor
 
 
-def rasterize_2dgs(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    *,
-    sh_degree: int | None = None,
-    backgrounds: Tensor | None = None,
-    screen_probe: Tensor | None = None,
-    settings: RasterSettings = RasterSettings(),  # noqa: B008 (frozen)
-    backend: str | Backend = "auto",
-) -> Rasterization:
-    """Render 2D Gaussians given as tensors into C cameras, differentiable in every tensor.
+class SplatTensors(NamedTuple):
+    """N splats as tensors with gsplat's names, shapes and units: activated values, not parameters.
 
-    Names, shapes and units are those of gsplat's ``rasterization_2dgs``, with these differences: images are returned as
-    one named tuple, always with both depths; ``near_plane`` and all other constants are fields of ``settings``; splats
-    are low-pass filtered and cut off as in the 2DGS code (no ``eps2d``, ``radius_clip`` and ``tile_size``); the
-    distortion is the squared one; ``Ks`` has gradients; the densification signal is the gradient of ``screen_probe``.
-    docs/migration.md has the full table.
-
-    Each camera is one call of :func:`gs2d.rasterize`, with the same bits. Further channels share one more pass: 64
-    channels take up to 7 times as long as 3 (docs/notebook/performance.md). Under ``torch.compile`` and
-    ``torch.export`` this is the operator ``torch.ops.gs2d.rasterize_2dgs``, whose backward pass renders a second time.
-
-    Parameters
+    Attributes
     ----------
     means : Tensor [N, 3]
         Centres, world units. float32, or float64 with the reference backend; other tensors have the same dtype.
@@ -102,6 +76,20 @@ def rasterize_2dgs(
     colors : Tensor [N, D] or [C, N, D]; with ``sh_degree`` [N, K, 3] or [C, N, K, 3]
         D features of any sign, blended unchanged; or SH coefficients as in rule 11 (0.5 is added, negative colours
         become 0), in the order of the official code: by degree, then red, green, blue.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+
+
+class CameraTensors(NamedTuple):
+    """C pinhole cameras of one image size as tensors with gsplat's names and shapes.
+
+    Attributes
+    ----------
     viewmats : Tensor [C, 4, 4]
         World to camera, OpenCV axes (x right, y down, z forward), any dtype. The gradient is defined for rigid motions
         (rule 20), not for scale and shear.
@@ -109,8 +97,44 @@ def rasterize_2dgs(
         Intrinsics, px, without skew; pixel (0, 0) is centred at (0.5, 0.5). Gradients reach fx, fy, cx and cy.
     width, height : int
         px, of all C images.
+    """
+
+    viewmats: Tensor
+    Ks: Tensor
+    width: int
+    height: int
+
+
+def rasterize_2dgs(
+    splats: SplatTensors,
+    cameras: CameraTensors,
+    *,
+    sh_degree: int | None = None,
+    backgrounds: Tensor | None = None,
+    screen_probe: Tensor | None = None,
+    settings: RasterSettings = RasterSettings(),  # noqa: B008 (frozen)
+    backend: str | Backend = "auto",
+) -> Rasterization:
+    """Render 2D Gaussians given as tensors into C cameras, differentiable in every tensor.
+
+    Names, shapes and units are those of gsplat's ``rasterization_2dgs``, with these differences: splats and cameras are
+    one named tuple each, as are the returned images, always with both depths; ``near_plane`` and all other constants
+    are fields of ``settings``; splats are low-pass filtered and cut off as in the 2DGS code (no ``eps2d``,
+    ``radius_clip`` and ``tile_size``); the distortion is the squared one; ``Ks`` has gradients; the densification
+    signal is the gradient of ``screen_probe``. docs/migration.md has the full table.
+
+    Each camera is one call of :func:`gs2d.rasterize`, with the same bits. Further channels share one more pass: 64
+    channels take up to 7 times as long as 3 (docs/notebook/performance.md). Under ``torch.compile`` and
+    ``torch.export`` this is the operator ``torch.ops.gs2d.rasterize_2dgs``, whose backward pass renders a second time.
+
+    Parameters
+    ----------
+    splats : SplatTensors
+        ``means``, ``quats``, ``scales``, ``opacities``, ``colors``.
+    cameras : CameraTensors
+        ``viewmats``, ``Ks``, ``width``, ``height``.
     sh_degree : int, optional
-        Degree to evaluate, at most that of ``colors``; None: ``colors`` are plain features.
+        Degree to evaluate, at most that of ``splats.colors``; None: they are plain features.
     backgrounds : Tensor [C, D] or [D], optional
         Background; default 0. In [0, 1] with ``sh_degree``.
     screen_probe : Tensor [C, N, 2] or [C, N, 4], optional
@@ -118,7 +142,7 @@ def rasterize_2dgs(
     settings : RasterSettings
         The constants; ``background`` and ``sh_degree`` are ignored.
     backend : str or Backend
-        As for :func:`gs2d.rasterize`; "auto" uses the device of ``means``.
+        As for :func:`gs2d.rasterize`; "auto" uses the device of ``splats.means``.
 
     Returns
     -------
@@ -140,9 +164,8 @@ def rasterize_2dgs(
     >>> viewmat[2, 3] = 3.0
     >>> K = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
     >>> features = torch.randn(50, 8)
-    >>> out = gs2d.rasterize_2dgs(
-    ...     means, quats, torch.full((50, 2), 0.1), torch.full((50,), 0.7), features, viewmat[None], K[None], 64, 48
-    ... )
+    >>> splats = gs2d.SplatTensors(means, quats, torch.full((50, 2), 0.1), torch.full((50,), 0.7), features)
+    >>> out = gs2d.rasterize_2dgs(splats, gs2d.CameraTensors(viewmat[None], K[None], width=64, height=48))
     >>> out.colors.shape, out.alphas.shape, out.radii.shape
     (torch.Size([1, 48, 64, 8]), torch.Size([1, 48, 64, 1]), torch.Size([1, 50]))
     """
@@ -151,12 +174,13 @@ def rasterize_2dgs(
             "rasterize_2dgs has no depth by transmittance, got settings with it: render with gs2d.rasterize, or leave "
             "with_transmittance_depth False"
         )
-    tensors = _Tensors(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, screen_probe)
+    viewmats, Ks, width, height = cameras
+    tensors = _Tensors(*splats, viewmats, Ks, backgrounds, screen_probe)
     if not torch.compiler.is_compiling():
         for name, tensor in tensors._asdict().items():
             if tensor is not None or name not in ("backgrounds", "screen_probe"):
                 check_dense(name, tensor)
-    if torch.compiler.is_compiling() or not _is_plain(means):
+    if torch.compiler.is_compiling() or not _is_plain(splats.means):
         if not isinstance(backend, str):
             raise BackendError(f"a captured graph needs the name of a backend: use backend={backend.name!r}")
         constants = [float(getattr(settings, name)) for name in CONSTANTS]

@@ -48,7 +48,7 @@ def cells(tags: dict[str, Any], shape: tuple[int, ...]) -> tuple[np.ndarray, np.
 
 
 def test_heights_and_colours_match_the_ball(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert gs2d(["survey", str(run), "--orthophoto", "--resolution", "0.25", "--json"]) == 0
+    assert gs2d(["survey", str(run), "--orthophoto", "--set", "resolution=0.25", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)["orthophoto"]
     assert (told["epsg"], told["resolution"]) == (32632, 0.25)
     with tifffile.TiffFile(run / "orthophoto_elevation.tif") as file:
@@ -80,9 +80,9 @@ def test_heights_and_colours_match_the_ball(run: Path, capsys: pytest.CaptureFix
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--resolution", "0"], "--resolution must be a positive number of metres, got 0"),
-        (["--resolution", "nan"], "--resolution must be a positive number of metres, got nan"),
-        (["--resolution", "0.0001"], "more than 36,000,000; use 0.0027 m or more"),
+        (["--set", "resolution=0"], "--set resolution must be a positive number of metres, got 0"),
+        (["--set", "resolution=nan"], "--set resolution must be a positive number of metres, got nan"),
+        (["--set", "resolution=0.0001"], "more than 36,000,000; use 0.0027 m or more"),
         (["--out", "map.png"], "--out must end in .tif or .tiff, got map.png"),
         (["--out", "nowhere/map.tif"], "nowhere"),
     ],

@@ -129,11 +129,11 @@ with FakeTensorMode():
         there_and_back(cuda._CudaRasterize, (*[False] * 8, True, True), options, None, None, None, *splats)
     image, plane, mask = rand(24, 40, 3), rand(24, 40), torch.ones(24, 40, dtype=torch.bool, device="cuda:0")
     mean = ops.blur(image, launcher=launcher)
-    there_and_back(ops._Photometric, (True,), image, rand(24, 40, 3), mask, mean, True, launcher)
+    there_and_back(ops._CudaPhotometric, (True,), image, rand(24, 40, 3), mask, mean, True, launcher)
     for form, weights in ((False, None), (True, plane)):
         how = NormalOptions(camera, mask, weights, form, form)
-        there_and_back(ops._NormalConsistency, (True, True, True), image, plane, plane, how, launcher)
-    there_and_back(ops._MaskedMean, (True,), plane, mask, launcher)
+        there_and_back(ops._CudaNormalConsistency, (True, True, True), image, plane, plane, how, launcher)
+    there_and_back(ops._CudaMaskedMean, (True,), plane, mask, launcher)
     cuda_passes.errors(launcher, view, splats, image, mask)
     print(sorted(launched), pointers[0])
     torch.cumsum = lambda x, *_, **__: torch.arange(len(x))  # in host memory

@@ -119,13 +119,13 @@ def _raster(local: np.ndarray, resolution: float | None, pixel: float) -> Raster
         power = 10.0 ** math.floor(math.log10(least))
         resolution = next(nice * power for nice in _NICE if nice * power >= least * (1 - 1e-9))
     if not (math.isfinite(resolution) and resolution > 0):
-        raise ProtocolError(f"--resolution must be a positive number of metres, got {resolution:g}")
+        raise ProtocolError(f"--set resolution must be a positive number of metres, got {resolution:g}")
     first, last = np.floor(low / resolution), np.ceil(high / resolution)
     columns, rows = np.maximum(last - first, 1)
     if rows * columns > MAX_CELLS:
         finest = math.sqrt(float(np.prod(high - low)) / MAX_CELLS)
         raise ProtocolError(
-            f"--resolution {resolution:g} needs {rows * columns:,.0f} cells, more than {MAX_CELLS:,}; "
+            f"--set resolution={resolution:g} needs {rows * columns:,.0f} cells, more than {MAX_CELLS:,}; "
             f"use {finest:.2g} m or more"
         )
     corner = float(first[0] * resolution), float(last[1] * resolution)

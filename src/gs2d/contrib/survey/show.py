@@ -18,7 +18,7 @@ from gs2d.pipeline.look.page import page_run
 def survey(command: SurveyCommand, console: Console) -> None:
     """Run ``gs2d survey``; a run that changes gets its report and its page again."""
     if command.resolution is not None and not command.orthophoto:
-        raise RunError("--resolution belongs to --orthophoto, which was not given")
+        raise RunError("--set resolution belongs to --orthophoto, which was not given")
     georeference = georeference_run(command.run, command, console.on_event)
     if command.remove or any(getattr(command, source) not in (None, False) for source in SOURCES):
         run = open_run(command.run)

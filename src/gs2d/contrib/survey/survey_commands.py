@@ -49,7 +49,7 @@ class GeoreferenceOptions:
 class OrthophotoOptions:
     """Options of the orthophoto."""
 
-    resolution: Annotated[float | None, Arg(metavar="METRES")] = None
+    resolution: Annotated[float | None, Arg(metavar="METRES", setting=True)] = None
     """With --orthophoto: cell size (default: pixel size on the surface, rounded up to 1, 2, 2.5 or 5)."""
 
 

@@ -93,7 +93,7 @@ def blur(image: Tensor, *, launcher: Launcher) -> Tensor:
     return out
 
 
-class _Photometric(torch.autograd.Function):
+class _CudaPhotometric(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
@@ -178,7 +178,7 @@ def photometric(
     _, target, *known = ready(**images)
     mask = _mask_of(mask, rendered.device)
     mean = known[0] if known else None
-    l1, ssim, l2 = _Photometric.apply(rendered.contiguous(), target, mask, mean, needs_gradient(rendered), launcher)
+    l1, ssim, l2 = _CudaPhotometric.apply(rendered.contiguous(), target, mask, mean, needs_gradient(rendered), launcher)
     return l1, ssim, l2
 
 
@@ -195,7 +195,7 @@ def _normal_arguments(images: Sequence[Tensor], how: NormalOptions, **more: Tens
     return arguments
 
 
-class _NormalConsistency(torch.autograd.Function):
+class _CudaNormalConsistency(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
@@ -267,11 +267,11 @@ def normal_consistency(
     weights = None if how.weights is None else ready(normal=normal, weights=how.weights)[1]
     how = replace(how, mask=_mask_of(how.mask, normal.device), weights=weights)
     images = (normal.contiguous(), depth.contiguous(), alpha.contiguous())
-    value: Tensor = _NormalConsistency.apply(*images, how, launcher)
+    value: Tensor = _CudaNormalConsistency.apply(*images, how, launcher)
     return value
 
 
-class _MaskedMean(torch.autograd.Function):
+class _CudaMaskedMean(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, mask: Tensor | None, launcher: Launcher) -> Tensor:
         blocks = -(-values.numel() // MEAN_PIXELS)
@@ -300,5 +300,5 @@ def masked_mean(values: Tensor, mask: Tensor | None = None, *, launcher: Launche
     """
     check_shapes({"values": (values, "H W")} | ({} if mask is None else {"mask": (mask, "H W")}))
     ready(values=values)
-    mean: Tensor = _MaskedMean.apply(values.contiguous(), _mask_of(mask, values.device), launcher)
+    mean: Tensor = _CudaMaskedMean.apply(values.contiguous(), _mask_of(mask, values.device), launcher)
     return mean
