@@ -33,7 +33,6 @@ from benchmarks.sampler import CostSampler, Rule
 
 PHASES = (
     *RUN_PHASES,
-    Rule("log of changes", (("pipeline/train/attribute_changes.py", ""),)),
     Rule("imports", (("importlib._bootstrap>", ""),)),
 )
 _ADDING = (

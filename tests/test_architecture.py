@@ -51,7 +51,6 @@ INSIDE = {
         "residual_lens transforms vignetting": 3,
     },
     "data": {
-        "archive": 12,
         "load subject_box": 11,
         "known_captures": 10,
         "prepared": 9,

@@ -6,7 +6,6 @@ import base64
 import json
 import random
 import struct
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
@@ -416,24 +415,7 @@ def read_official(root: Path) -> None:
         raise refused
 
 
-# -- archives, checkpoints, recipes ------------------------------------------------------------------------------------
-def _packed(method: int) -> Callable[[Path], object]:
-    def write(root: Path) -> None:
-        (files,) = written(partial(small_nerfstudio, count=3))()
-        with zipfile.ZipFile(root / "a.zip", "w", method) as file:
-            for name, data in files.items():
-                file.writestr(f"garden/{name}", data)
-
-    return write
-
-
-def read_archive(root: Path) -> None:
-    from gs2d.data.archive import unpack
-
-    (root / "home").mkdir()
-    read_capture(unpack(root / "a.zip", root / "home"))
-
-
+# -- checkpoints, recipes ----------------------------------------------------------------------------------------------
 def _checkpoint(root: Path) -> None:
     from gs2d.io.run_dir import save_tensors
 
@@ -516,8 +498,6 @@ _ALL = (
     Family("places", written(lambda root: [(root / name).write_text(text) for name, text in _TABLES.items()]),
            {".csv": _TEXT, ".txt": _TEXT}, read_places),
     Family("official", written(_official), {".json": _JSON, ".txt": _TEXT, ".log": _TEXT}, read_official),
-    Family("zip", written(_packed(zipfile.ZIP_DEFLATED), _packed(zipfile.ZIP_STORED)),
-           {".zip": m.either(m.of_zip(_JSON), m.of_bytes)}, read_archive),
     Family("checkpoint", written(_checkpoint), {".pt": m.either(m.of_zip(m.of_bytes), m.of_bytes)}, read_checkpoint),
     Family("recipe", written(_recipe), {".json": _JSON}, read_recipe),
     Family("run-files", c.run_seeds, c.RUN_FILES, c.read_run),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import signal
 from pathlib import Path
 
@@ -103,15 +102,6 @@ def test_process_0_reports_differences(
     assert gs2d.cli.run(["mesh", "runs/x"]) == 2
     line = "error: gs2d mesh runs in one process, got 2; gs2d train is for torchrun\n"
     assert capsys.readouterr().err == (line if rank == "0" else "")
-
-
-@pytest.mark.slow
-def test_prepared_photographs_of_an_archive_give_the_same_bytes(capture: Path, whole: Path, tmp_path: Path) -> None:
-    """Process 0 unpacks and prepares; the other one reads the result."""
-    archive = Path(shutil.make_archive(str(tmp_path / "ball"), "zip", capture))
-    command = words(archive, tmp_path / "run", "--set", "prepare=always")
-    assert in_processes(2, command) == [(0, ""), (0, "")]
-    assert splats(tmp_path / "run") == splats(whole)
 
 
 @pytest.mark.slow

@@ -212,4 +212,4 @@ class InfoCommand(Common):
     """Describe a run, a capture, or a file of splats, mesh or points."""
 
     path: Annotated[Path, Arg(metavar="PATH", positional=True)]
-    """Run folder, capture (folder or .zip), or file: PLY, .spz, .splat, .usd, .glb or .sog."""
+    """Run folder, capture, or file: PLY, .spz, .splat, .usd, .glb or .sog."""

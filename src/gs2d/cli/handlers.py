@@ -252,7 +252,6 @@ def poses(command: c.PosesCommand, console: Console) -> None:
 
 def info(command: c.InfoCommand, console: Console) -> None:
     """``gs2d info``."""
-    from gs2d.data.archive import is_archive
     from gs2d.io.run_dir import is_run, open_run
     from gs2d.pipeline.look.info import describe_capture, describe_file
 
@@ -261,7 +260,7 @@ def info(command: c.InfoCommand, console: Console) -> None:
         run = open_run(path)
         show_run(path, run.metrics(), console, definition=run.definition())
         return
-    facts = describe_capture(path) if path.is_dir() or is_archive(path) else describe_file(path)
+    facts = describe_capture(path) if path.is_dir() else describe_file(path)
     for name, value in facts.items():
         for part in value if isinstance(value, list) else [value]:
             console.say(f"{name}: {part}")

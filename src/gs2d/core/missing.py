@@ -64,7 +64,7 @@ def suggestion(path: Path, needed: str) -> str:
         if run is not None:
             return f"; give the run folder {run}"
         if capture is not None:
-            return f"; `gs2d train {_quoted(capture)} --out RUN` makes a run of it"
+            return _with_training(capture)
         if holds_photographs(photos):
             return _with_cameras(photos)
         return "; give a folder that `gs2d train` or `gs2d reconstruct` made"
@@ -77,7 +77,7 @@ def suggestion(path: Path, needed: str) -> str:
             return f"; unpack it with `{_unpacking(capture)[0]}`, and give the folder with the capture"
         return _with_cameras(photos) if holds_photographs(photos) else "; give photographs with their cameras"
     if capture is not None and capture.is_file():
-        return f"; `gs2d train {_quoted(capture)} --out RUN` makes a run of it"
+        return _with_training(capture)
     if capture is not None and holds_photographs(capture / "images"):
         return f"; give the folder of its photographs, {capture / 'images'}"
     if not holds_photographs(photos):
@@ -130,11 +130,24 @@ def _capture_of(run: Path) -> Path | None:
     return capture if capture.is_dir() else None
 
 
+def _with_training(capture: Path) -> str:
+    """Return how to make a run from a capture, which may be in a ZIP file."""
+    first, folder = _after_unpacking(capture)
+    return f"; {first}`gs2d train {_quoted(folder)} --out RUN` makes a run of it"
+
+
 def _with_cameras(photos: Path) -> str:
     """Return how to make a run from images, which may be in a ZIP file."""
-    unpack, folder = _unpacking(photos) if photos.is_file() else ("", photos)
-    first = f"unpack it with `{unpack}`, then " if unpack else ""
+    first, folder = _after_unpacking(photos)
     return f"; {first}`gs2d reconstruct {_quoted(folder)} --out RUN` makes a run of its photographs"
+
+
+def _after_unpacking(path: Path) -> tuple[str, Path]:
+    """Return the beginning of a suggestion and the folder that it continues with; "" and the path for a folder."""
+    if not path.is_file():
+        return "", path
+    command, folder = _unpacking(path)
+    return f"unpack it with `{command}`, then ", folder
 
 
 def _unpacking(archive: Path) -> tuple[str, Path]:

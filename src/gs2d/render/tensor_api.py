@@ -130,9 +130,9 @@ def rasterize_2dgs(
     Parameters
     ----------
     splats : SplatTensors
-        ``means``, ``quats``, ``scales``, ``opacities``, ``colors``.
+        ``means`` [N, 3], ``quats`` [N, 4], ``scales`` [N, 2], ``opacities`` [N], ``colors`` [N, D] or [N, K, 3].
     cameras : CameraTensors
-        ``viewmats``, ``Ks``, ``width``, ``height``.
+        ``viewmats`` [C, 4, 4], ``Ks`` [C, 3, 3], ``width`` and ``height``.
     sh_degree : int, optional
         Degree to evaluate, at most that of ``splats.colors``; None: they are plain features.
     backgrounds : Tensor [C, D] or [D], optional

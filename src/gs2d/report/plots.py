@@ -12,7 +12,6 @@ import numpy as np
 
 INK = "#858b94"  # readable on white and on black
 _COLORS = ("#3f86d6", "#e0893a", "#46a56b", "#c6509f", "#8a74d8", "#b9a02d", "#50a9b8")
-_CHANGES = ("mean", "covariance", "opacity", "sh")
 MAX_VALUE = 1e30  # larger values are not drawn; the limits of axes overflow at 1e308
 
 
@@ -33,8 +32,7 @@ class History:
     ----------
     stages : tuple of StageSpan
     series : mapping of name to (iterations, values)
-        "splats", "mean_opacity", "mean_area", "psnr", "loss/<term>" for each term, and "change/<attribute>" for each
-        attribute whose change in an iteration was logged.
+        "splats", "mean_opacity", "mean_area", "psnr", and "loss/<term>" for each term.
     """
 
     stages: tuple[StageSpan, ...] = ()
@@ -54,7 +52,7 @@ def read_history(events: Sequence[Mapping[str, Any]]) -> History:
     points: dict[str, list[tuple[float, float]]] = {}
     for event in events:
         span = spans.get(str(event.get("stage")))
-        if event.get("kind") in ("progress", "changes") and span is not None and "iteration" in event:
+        if event.get("kind") == "progress" and span is not None and "iteration" in event:
             for name, value in _figures(event).items():
                 points.setdefault(name, []).append((span.start + _whole(event["iteration"]), value))
     series = {name: (np.array(rows)[:, 0], np.array(rows)[:, 1]) for name, rows in points.items()}
@@ -71,12 +69,9 @@ def _is_number(value: Any) -> TypeGuard[float]:
 
 
 def _figures(event: Mapping[str, Any]) -> dict[str, float]:
-    """Return the finite numbers of a step, or of the changes after it."""
-    if event.get("kind") == "changes":
-        named = {f"change/{name}": event.get(name) for name in _CHANGES}
-    else:
-        named = {name: event.get(name) for name in ("psnr", "splats", "mean_opacity", "mean_area")}
-        named |= {f"loss/{term}": value for term, value in (event.get("losses") or {}).items()}
+    """Return the finite numbers of a step."""
+    named = {name: event.get(name) for name in ("psnr", "splats", "mean_opacity", "mean_area")}
+    named |= {f"loss/{term}": value for term, value in (event.get("losses") or {}).items()}
     return {name: float(value) for name, value in named.items() if _is_number(value)}
 
 

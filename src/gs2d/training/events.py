@@ -1,8 +1,8 @@
 """Events of a run, as small frozen values: the trainer, the pipeline, the log and the console all use these.
 
 Events of the trainer are sent while its state is complete and can be saved. ``kind`` is the name of an event in
-``events.jsonl``. The log has four more kinds: ``notice`` (a detail), ``changes`` (mean change of each attribute per
-iteration), ``after_clone`` (scores just after the entry actions of a stage) and ``processes`` (their number).
+``events.jsonl``. The log has three more kinds: ``notice`` (a detail), ``after_clone`` (scores just after the entry
+actions of a stage) and ``processes`` (their number).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Draws the figures of the paper from finished runs: K_a and opacity, traces of attributes, E_i maps."""
+"""Draws the figures of the paper from finished runs: K_a and opacity, E_i maps."""
 
 from __future__ import annotations
 
@@ -37,12 +37,6 @@ TRACES = (
     Panel("mean_area", r"Mean $K_a = s_u s_v$, square world units", log=True),
     Panel("mean_opacity", "Mean opacity"),
 )
-CHANGES = (
-    Panel("change/mean", r"$\mu$: shift an iteration, share of the scene's extent", log=True, smooth=True),
-    Panel("change/covariance", r"$\Sigma$: relative change an iteration", log=True, smooth=True),
-    Panel("change/opacity", r"$\alpha$: change an iteration", log=True, smooth=True),
-    Panel("change/sh", "SHs: change an iteration, norm of all coefficients", log=True, smooth=True),
-)
 MAP_PERCENTILES = (50.0, 99.9)  # of E_i: the ends of the colour scale, which is logarithmic
 SMALLEST_TOP = 0.01  # least coverage of a coloured pixel
 DEFAULT_RANK = RANK_BY_ERROR  # of runs whose recipe ranks nothing
@@ -59,10 +53,9 @@ def write_figures(
 ) -> tuple[Path, ...]:
     """Draw the paper's figures from finished runs.
 
-    ``traces.svg``: mean K_a and mean opacity over the iterations, a line for each run. ``changes.svg``: how much mu,
-    Sigma, alpha and SHs change an iteration. ``errors-LABEL.png``: for a few views the photograph, the rendering, its
-    error, E_i splatted, and the high-error splats. A figure without data, or whose capture cannot be
-    read, is omitted with a notice.
+    ``traces.svg``: mean K_a and mean opacity over the iterations, a line for each run. ``errors-LABEL.png``: for a few
+    views the photograph, the rendering, its error, E_i splatted, and the high-error splats. A figure without data, or
+    whose capture cannot be read, is omitted with a notice.
 
     Parameters
     ----------
@@ -88,14 +81,13 @@ def write_figures(
     make_folder(out)
     histories = {label: read_history(run.events.read()) for label, run in folders.items()}
     files = []
-    for name, panels in (("traces.svg", TRACES), ("changes.svg", CHANGES)):
-        drawing = compared_runs(histories, panels) if histories else None
-        if drawing is None:
-            on_event(Notice(f"no figure {name}: the logs of these runs do not hold its numbers"))
-            continue
-        with atomic_write(out / name, "w") as file:
+    drawing = compared_runs(histories, TRACES) if histories else None
+    if drawing is None:
+        on_event(Notice("no figure traces.svg: the logs of these runs do not hold its numbers"))
+    else:
+        with atomic_write(out / "traces.svg", "w") as file:
             file.write(drawing)
-        files.append(out / name)
+        files.append(out / "traces.svg")
     for label, run in folders.items():
         if label not in maps if maps is not None else not _ranks(run):
             continue

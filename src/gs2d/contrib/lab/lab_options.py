@@ -111,7 +111,7 @@ class BlocksOptions(CommonTraining, Resources):
     """Options of `gs2d blocks`."""
 
     scene: Annotated[Path, Arg(metavar="CAPTURE", positional=True)]
-    """Folder or .zip of a capture, as in `gs2d train`."""
+    """Folder of a capture, as in `gs2d train`."""
     out: Annotated[Path, Arg(metavar="JOB")]
     """Run folder of the merged scene. The same command continues an interrupted one."""
     blocks: str = "auto"

@@ -34,7 +34,6 @@ IMAGES = {"color": "Colour", "normal": "Normals", "error": "Error"}
 IMAGE_WIDTH = 300  # px
 FIGURE_TITLES = {
     "traces": "Mean coverage K_a and mean opacity over the iterations",
-    "changes": "How much each attribute changes an iteration",
 }
 MAP_TITLE = "E_i, the colour error of each splat, and the high-error splats"
 

@@ -21,10 +21,8 @@ from gs2d.contrib.lab.partition import Partition, grid_for
 from gs2d.contrib.lab.partition import to_json as partition_json
 from gs2d.contrib.lab.split import BlockOfSplit
 from gs2d.core.memory_limit import memory_budget
-from gs2d.core.missing import suggestion
 from gs2d.core.text import name_bytes
 from gs2d.data import Scene
-from gs2d.data.archive import is_archive
 from gs2d.errors import DataError, RecipeError
 from gs2d.pipeline.prepare.estimate import Estimate, estimate, expected_splats, limit_of
 from gs2d.pipeline.prepare.open_capture import open_capture
@@ -77,9 +75,6 @@ class Settled:
 def settle(options: TrainOptions, on_event: OnEvent) -> Settled:
     """Read the headers of a capture and resolve what all blocks share; nothing is written."""
     check_options(options)
-    if is_archive(options.scene):
-        remedy = suggestion(options.scene, "capture")
-        raise DataError(f"blocks need the folder of a capture, got the file {options.scene}{remedy}")
     opened = open_capture(replace(options, downscale=options.downscale or 1), on_event)
     scale = 1.0 if options.schedule_scale is None else options.schedule_scale
     recipe, resolved = resolve(options, opened, on_event, seed=options.seed, schedule_scale=scale)

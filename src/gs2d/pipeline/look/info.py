@@ -7,7 +7,6 @@ from typing import Any
 
 from gs2d.core.missing import belongs_to_run, suggestion
 from gs2d.data import detect_format, load_scene
-from gs2d.data.archive import is_archive, unpacked_temporarily
 from gs2d.data.known_captures import missing_lines
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import is_splat_file, read_splat_file, reader_of
@@ -18,10 +17,7 @@ _OF_MODELS = (".ply", *FOREIGN)
 
 
 def describe_capture(path: Path) -> dict[str, Any]:
-    """Describe a capture: a folder, or a ZIP file, which is unpacked temporarily."""
-    if is_archive(path):
-        with unpacked_temporarily(path) as folder:
-            return {**describe_capture(folder), "capture": str(path)}
+    """Describe a capture, which is a folder."""
     scene = load_scene(path, format=detect_format(path))
     sizes = sorted({(view.camera.width, view.camera.height) for view in scene.views})
     facts: dict[str, Any] = {

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +22,6 @@ from gs2d.core.memory_limit import memory_budget
 from gs2d.core.splats import Splats
 from gs2d.core.text import duration
 from gs2d.data import Scene
-from gs2d.data.archive import is_archive, unpacked_temporarily
 from gs2d.data.prepared import decoded_bytes, packed_bytes
 from gs2d.errors import DataError
 from gs2d.pipeline.prepare.limits import DECODING_BYTES, ITERATION_BYTES, use_memory, use_threads
@@ -138,9 +137,6 @@ def plan(options: TrainOptions, on_event: OnEvent = ignore) -> Estimate:
     Gs2dError
         If the capture cannot be read, or the training does not fit into memory.
     """
-    if is_archive(options.scene):
-        with unpacked_temporarily(options.scene) as folder:
-            return plan(replace(options, scene=folder), on_event)
     check_options(options)
     use_threads(options.threads)
     use_memory(options.memory)

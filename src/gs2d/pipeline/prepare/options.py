@@ -196,7 +196,7 @@ class TrainOptions(Training, Effort, Resources, HowItRuns):
     """Options of a training run. Overrides are applied after the schedule is scaled."""
 
     scene: Annotated[Path, Arg(metavar="CAPTURE", positional=True)]
-    """Folder or .zip of a capture: COLMAP, Blender, nerfstudio, DTU, OpenSfM, OpenDroneMap, Metashape or Meshroom."""
+    """Folder of a capture: COLMAP, Blender, nerfstudio, DTU, OpenSfM, OpenDroneMap, Metashape or Meshroom."""
     out: Annotated[Path, Arg(metavar="RUN")]
     """Run folder to create."""
     format: str = "auto"

@@ -17,7 +17,6 @@ from gs2d.pipeline.finish.scoring import PeakGpuMemory, PeakMemory, Visitor
 from gs2d.pipeline.prepare.limits import release_buffers
 from gs2d.pipeline.prepare.loaded import LoadedRun
 from gs2d.pipeline.prepare.resolve import checkpoint_interval
-from gs2d.pipeline.train.attribute_changes import Snapshot, mean_changes, take_snapshot
 from gs2d.pipeline.train.interruption import HeldSignals
 from gs2d.pipeline.train.resume import ResumePoint
 from gs2d.pipeline.train.stage_results import StageResults
@@ -30,7 +29,6 @@ LOG_LINES = 300  # progress lines per stage
 PROBES = 30  # times per stage at which the probe views are scored for the PSNR curve
 GROWTH = 1.1  # of the cost of iterations, while splats are added (``Phase.growth``)
 REPORT_EVERY, REPORT_EVERY_ON_GPU = 10, 50  # iterations between progress events, for which the host waits for a GPU
-_ROWS_OR_JUMPS = (events.Densified, events.OpacityLimited, events.FloatersRemoved)
 
 
 class StageClock:
@@ -89,7 +87,6 @@ class RunLogger:
         self._clock, self._peak, self._at_entry = StageClock(start.seconds), start.peak_memory, dict(start.at_entry)
         self._saved_at, self._saved_iteration = time.perf_counter(), 0
         self.psnr: float | None = None  # of the probe views
-        self._before: Snapshot | None = None  # taken at a logged progress, compared with the next progress
         self._signals = HeldSignals()
 
     # -- called by the pipeline ----------------------------------------------------------------------------------------
@@ -100,8 +97,6 @@ class RunLogger:
             if state.stage > 0:
                 self._results.take_over(state.stage - 1, self._facts())
             self._reset_stage()
-        elif state.step and self._due(state.step, self._stage(state.stage).iterations, LOG_LINES):
-            self._before = take_snapshot(state.splats, state.step)  # as in the interrupted run
         self._saved_iteration = state.step
         if state.processes and state.processes[-1][:2] == (state.stage, state.step):
             stage, count = min(state.stage, len(self._loaded.recipe.stages) - 1), self._trainer.processes.size
@@ -117,8 +112,6 @@ class RunLogger:
         state, processes = self._state, self._trainer.processes
         if not (self._signals.pending or processes.stop_asked) or not state.entered:
             return
-        if self._before is not None and self._before.iteration != state.step:
-            return  # a line of changes is due at the next progress
         if state.step == self._stage(state.stage).iterations:
             return  # the checkpoint at the end of the stage is due
         if state.step > 0:
@@ -157,8 +150,6 @@ class RunLogger:
             self._clock.stop()
         elif isinstance(event, events.Initialised):
             self._on_event(Notice(start_text(event), detail=True))
-        elif isinstance(event, _ROWS_OR_JUMPS):
-            self._before = None  # other rows, or a change without gradients
         self._log(event)
         if isinstance(event, events.StageStarted):
             self._score_entry(event)
@@ -173,7 +164,6 @@ class RunLogger:
 
     def _on_progress(self, event: events.Progress) -> None:
         last, total = event.iteration == event.iterations, self._iterations_before(event.index) + event.iteration
-        self._log_changes(event)
         if last or self._due(event.iteration, event.iterations, LOG_LINES):
             extra: dict[str, Any] = {"total_iteration": total, "mean_area": event.mean_k_a}
             with self._clock.paused():
@@ -181,8 +171,6 @@ class RunLogger:
                     psnr = self._results.probe_psnr()
                     if psnr is not None:
                         self.psnr = extra["psnr"] = psnr
-                if not last:
-                    self._before = take_snapshot(self._state.splats, event.iteration)
             self._log(event, **extra)
         detail = (
             f"{event.stage} {event.iteration:,}/{event.iterations:,}  {event.splats:,} splats  loss {event.loss:.4f}"
@@ -199,17 +187,6 @@ class RunLogger:
         """Return whether something that happens about ``count`` times per stage was due in the last iteration."""
         every = max(1, math.ceil(iterations / count / self._progress_every)) * self._progress_every
         return iteration // every > (iteration - self._trainer.views) // every
-
-    def _log_changes(self, event: events.Progress) -> None:
-        """Log the changes since the previous progress, if a snapshot was taken there."""
-        before, self._before = self._before, None
-        if before is None:
-            return
-        with self._clock.paused():
-            over = event.iteration - before.iteration
-            changes = mean_changes(before, self._state.splats, iterations=over, extent=self._loaded.scene.extent)
-            fact = {"stage": event.stage, "iteration": event.iteration, "over": over}
-            self._run.events.append({"kind": "changes", **fact, **changes})
 
     # -- checkpoints and stages ----------------------------------------------------------------------------------------
     def _save(self, index: int, iteration: int | None) -> None:

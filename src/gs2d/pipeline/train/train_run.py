@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 
 from gs2d.core.memory import hold
 from gs2d.core.splats import Splats
-from gs2d.data.archive import is_archive, named_by, unpack
 from gs2d.data.scene import Scene
 from gs2d.errors import RunError
 from gs2d.io.run_dir import (
@@ -24,7 +21,6 @@ from gs2d.io.run_dir import (
     claim_run,
     is_run,
     make_folder,
-    remove_made,
 )
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.run_mesh import MeshFrames, extract_mesh, keep_facts
@@ -38,7 +34,6 @@ from gs2d.pipeline.prepare.limits import release, use_memory, use_threads
 from gs2d.pipeline.prepare.loaded import LoadedRun, prepare_run
 from gs2d.pipeline.prepare.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare.photographs import PREPARED
-from gs2d.pipeline.prepare.resolve import check_options
 from gs2d.pipeline.prepare.resolved import check_same_run
 from gs2d.pipeline.prepare.scene_part import TrainedPart
 from gs2d.pipeline.run_parts import TRAINED
@@ -49,8 +44,6 @@ from gs2d.pipeline.train.run_logger import RunLogger, progress_every
 from gs2d.training.events import Event, Notice, OnEvent, Phase, Progress, RunPlan, TrainingEvent, ignore
 from gs2d.training.parallel import ONE_PROCESS, ManyProcesses, OneProcess
 from gs2d.viewer.page_server import free_port
-
-UNPACKED = "unpacked"  # in the run folder: the contents of a ZIP file
 
 
 def train(
@@ -93,12 +86,7 @@ def train(
             use_threads(options.threads, together.place.local_size)
             use_memory(memory_of(together.place, options.memory))
             return follow(options, together)
-        if not is_archive(options.scene):
-            return _train(options, on_event, together, title, allowed, part)
-        check_options(options)
-        with _unpacked(options, allowed, on_event) as scene:
-            unpacked = replace(options, scene=scene)
-            return _train(unpacked, on_event, together, title or options.scene.stem, (*allowed, UNPACKED), part)
+        return _train(options, on_event, together, title, allowed, part)
 
 
 def _train(
@@ -155,26 +143,6 @@ def _train(
             release(loaded.scene)  # before the volume of the mesh
             finish(run, replace(loaded, scene=now), splats, on_event, frames, collected)
     return run
-
-
-@contextmanager
-def _unpacked(options: TrainOptions, allowed: tuple[str, ...], on_event: OnEvent) -> Iterator[Path]:
-    """Unpack the ZIP file of a capture into the run folder, where later commands read it."""
-    allowed = (*allowed, UNPACKED)
-    check_claim(options.out, resume=options.resume, overwrite=options.overwrite, allowed=allowed)
-    home = options.out / UNPACKED
-    made = make_folder(home)
-    try:
-        on_event(Phase(f"unpacking {options.scene.name}", 0))
-        scene = unpack(options.scene, home)
-        with named_by(options.scene, scene):
-            yield scene
-    finally:  # remove what the run does not use: everything if there is no run, the older copy if it was replaced
-        used = RunFolder(options.out).definition()["scene"]["path"] if is_run(options.out) else ""
-        for folder in home.iterdir():
-            if folder.resolve() not in Path(used).resolve().parents:
-                shutil.rmtree(folder, ignore_errors=True)
-        remove_made((home, *made))
 
 
 @contextmanager
