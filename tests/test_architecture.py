@@ -48,7 +48,7 @@ INSIDE = {
         "checks growth locks extras memory memory_limit missing processes spill text": 0,
         "atomic_files image_arrays similarity": 1,
         "json_files camera mesh sh splats": 2,
-        "residual_lens transforms vignetting": 3,
+        "residual_lens transforms": 3,
     },
     "data": {
         "load subject_box": 11,
@@ -80,7 +80,7 @@ INSIDE = {
     "render": {
         "tensor_api": 7,
         "api cpu_backend cuda_backend reference_backend": 6,
-        "backends camera_response": 5,
+        "backends": 5,
         "cpu_cached pose_gradient exposure_transform": 4,
         "native_rasterizer cuda_rasterizer cuda_step reference_errors": 3,
         "cuda_passes reference_rasterizer": 2,

@@ -16,7 +16,7 @@ from gs2d.cli.command_line import NAMES, options_of
 from gs2d.config.multiview import MultiView
 from gs2d.config.presets import get_recipe
 from gs2d.config.prior_settings import DepthPrior, NormalPrior
-from gs2d.config.quantities import EXPOSURE, INTRINSICS, POSES, RESPONSE, VIGNETTING
+from gs2d.config.quantities import EXPOSURE, INTRINSICS, POSES
 from gs2d.config.serialize import apply_overrides
 
 PACKAGE = Path(gs2d.__file__).parent
@@ -111,7 +111,7 @@ def test_set_paths_in_messages_exist_in_a_recipe_with_other_stage_names() -> Non
     whole = replace(
         base,
         stages=(replace(base.stages[0], name="mine"),),
-        learned=(EXPOSURE, POSES, INTRINSICS, VIGNETTING, RESPONSE),
+        learned=(EXPOSURE, POSES, INTRINSICS),
         multiview=MultiView(),
         depth_prior=DepthPrior(),
         normal_prior=NormalPrior(),

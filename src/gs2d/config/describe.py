@@ -41,8 +41,6 @@ def _describe_learned(recipe: Recipe) -> Iterator[str]:
         "exposure": "a colour transform for each image",
         "poses": "a motion (rad, scene extents) for each training camera, while all splats move",
         "intrinsics": "focal length of each camera, with the poses",
-        "vignetting": "light falloff of each camera",
-        "response": "response curve of each camera",
     }
     for name, quantity in recipe.quantities.items():
         options = "".join(f", {key}={value}" for key, value in quantity.options.items())

@@ -17,7 +17,7 @@ from typing import Any
 from gs2d.config.actions import CLONE_IN_PLACE, RANK_BY_ERROR
 from gs2d.config.multiview import MultiView
 from gs2d.config.prior_settings import DepthPrior, NormalPrior
-from gs2d.config.quantities import EXPOSURE, INTRINSICS, POSES, RESPONSE, VIGNETTING
+from gs2d.config.quantities import EXPOSURE, INTRINSICS, POSES
 from gs2d.config.recipe import (
     ALL,
     ALPHA,
@@ -162,18 +162,6 @@ def with_exposure(recipe: Recipe) -> Recipe:
     stages = (replace(stage, sh_interval=SH_PATIENCE * stage.sh_interval) for stage in recipe.stages)
     learning = recipe.with_learned(EXPOSURE)
     return replace(learning, name=f"{recipe.name}-exposure", stages=tuple(stages))
-
-
-def with_photometry(recipe: Recipe, *, vignetting: bool = True, response: bool = True) -> Recipe:
-    """Return the recipe with learned vignetting, response or both (``NAME-photometry``); itself if it has one.
-
-    Not in the paper. For lenses that darken corners, and for cameras with different response curves
-    (docs/notebook/exposure.md).
-    """
-    if recipe.learns("vignetting", "response"):
-        return recipe
-    learned = ([VIGNETTING] if vignetting else []) + ([RESPONSE] if response else [])
-    return replace(recipe.with_learned(*learned), name=f"{recipe.name}-photometry")
 
 
 def with_multiview(

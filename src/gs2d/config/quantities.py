@@ -17,9 +17,7 @@ QUANTITIES: Registry[Any] = Registry(
     builtin={
         "intrinsics": "gs2d.training.learned.camera_intrinsics",
         "poses": "gs2d.training.learned.camera_pose",
-        "vignetting": "gs2d.training.learned.camera_light",
         "exposure": "gs2d.training.learned.image_exposure",
-        "response": "gs2d.training.learned.camera_light",
     },
     error=RecipeError,
 )
@@ -64,7 +62,7 @@ class Quantity:
     Attributes
     ----------
     name : str
-        "exposure", "poses", "intrinsics", "vignetting", "response" or a registered one (docs/extending.md).
+        "exposure", "poses", "intrinsics" or a registered one (docs/extending.md).
     rate, rate_final, decay_steps : float, float, int
         The learning rate decays log-linearly from ``rate`` to ``rate_final`` over ``decay_steps`` iterations of the
         run, all stages counted.
@@ -146,7 +144,3 @@ INTRINSICS = Quantity("intrinsics", 1e-4, 1e-6)
 Images whose files have the same intrinsics share a camera. Options: ``distortion`` (two radial coefficients of a
 residual lens) and ``principal_point``, both false by default.
 """
-VIGNETTING = Quantity("vignetting", prior=0.001)
-"""Light falloff towards the corners, of each camera."""
-RESPONSE = Quantity("response", prior=0.001)
-"""Curve by which a camera turns light into values, relative to the other cameras."""

@@ -1,6 +1,6 @@
-"""Native exposure, camera response and pose gradient (``kernels/cpu``: exposure.cpp, photometry.cpp, camera.cpp).
+"""Native exposure and pose gradient (``kernels/cpu``: exposure.cpp, camera.cpp).
 
-``exposure_transform``, ``camera_response`` and ``pose_gradient`` have the same formulas in torch. All functions raise
+``exposure_transform`` and ``pose_gradient`` have the same formulas in torch. All functions raise
 ShapeError for a tensor that is not on the CPU or of another dtype than the library's. Their results do not depend on
 the number of threads.
 """
@@ -17,7 +17,7 @@ from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
 from gs2d.kernels.library import Library
 
-__all__ = ["Wrench", "expose", "expose_vjp", "respond", "respond_vjp", "wrench"]
+__all__ = ["Wrench", "expose", "expose_vjp", "wrench"]
 
 POINTER = ctypes.c_void_p
 Wrench = tuple[Tensor, Tensor]
@@ -32,20 +32,6 @@ class _ExposureImage(ctypes.Structure):
         ("coverage", POINTER),
         ("pixels", ctypes.c_int64),
         ("transform", ctypes.c_double * 12),
-        ("background", ctypes.c_double * 3),
-    )
-
-
-class _ResponseImage(ctypes.Structure):
-    """``struct Shown`` of kernels/cpu/photometry.cpp."""
-
-    _fields_ = (
-        ("color", POINTER),
-        ("coverage", POINTER),
-        ("squares", POINTER),
-        ("pixels", ctypes.c_int64),
-        ("falloff", ctypes.c_double * 3),
-        ("shift", ctypes.c_double),
         ("background", ctypes.c_double * 3),
     )
 
@@ -109,55 +95,6 @@ def expose_vjp(
     image = _exposure_image(color, transform, coverage, background)
     pointers = (ctypes.byref(image), None, upstream.data_ptr(), to_color.data_ptr())
     return to_color, _sums(library, "gs2d_expose_vjp", 12, *pointers).reshape(3, 4).to(transform.dtype)
-
-
-def _response_image(
-    color: Tensor, coverage: Tensor | None, squares: Tensor | None, numbers: Tensor, background: Tensor | None
-) -> Any:
-    *falloff, shift = numbers.detach().tolist()
-    return _ResponseImage(
-        color.data_ptr(),
-        _address(coverage),
-        _address(squares),
-        color.numel() // 3,
-        (ctypes.c_double * 3)(*falloff),
-        shift,
-        _background(background),
-    )
-
-
-def respond(
-    library: Library,
-    color: Tensor,
-    numbers: Tensor,
-    squares: Tensor | None,
-    coverage: Tensor | None,
-    background: Tensor | None,
-) -> Tensor:
-    """Return the image; arguments as for ``gs2d.render.camera_response.show``."""
-    color, coverage, squares = library.arrays(color=color, coverage=coverage, squares=squares)
-    out = torch.empty_like(color)
-    image = _response_image(color, coverage, squares, numbers, background)
-    library.function("gs2d_shown", None, [POINTER] * 2)(ctypes.byref(image), out.data_ptr())
-    return out
-
-
-def respond_vjp(
-    library: Library,
-    upstream: Tensor,
-    color: Tensor,
-    numbers: Tensor,
-    squares: Tensor | None,
-    coverage: Tensor | None,
-    background: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    """Return the gradients of ``color`` [H, W, 3] and ``numbers`` [4]."""
-    tensors = {"upstream": upstream, "color": color, "coverage": coverage, "squares": squares}
-    upstream, color, coverage, squares = library.arrays(**tensors)
-    to_color = torch.empty_like(color)
-    image = _response_image(color, coverage, squares, numbers, background)
-    pointers = (ctypes.byref(image), upstream.data_ptr(), to_color.data_ptr())
-    return to_color, _sums(library, "gs2d_shown_vjp", 4, *pointers).to(numbers.dtype)
 
 
 def wrench(

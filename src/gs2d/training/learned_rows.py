@@ -46,7 +46,6 @@ class LearnedRows:
         *,
         constants: tuple[float, float, float],
         assign: Callable[[Tensor, Tensor], Any] = Tensor.copy_,
-        limit: float | None = None,
     ) -> None:
         """Update one row in place.
 
@@ -61,8 +60,6 @@ class LearnedRows:
             Adam's beta1, beta2 and eps.
         assign : callable
             Writes new values into a tensor. The step is counted even if it writes nothing.
-        limit : float, optional
-            Largest absolute value.
         """
         self.steps[row] += 1
         count, (beta1, beta2, eps) = self.steps[row], constants
@@ -71,7 +68,6 @@ class LearnedRows:
         square = beta2 * self.square[row] + (1 - beta2) * gradient * gradient
         scale = (square / (1 - beta2**count)).sqrt() + eps
         values = self.values[row] - rate / (1 - beta1**count) * mean / scale
-        values = values if limit is None else values.clamp(-limit, limit)
         for target, new in ((self.values, values), (self.mean, mean), (self.square, square)):
             assign(target[row], new)
 

@@ -83,10 +83,6 @@ def settle(options: TrainOptions, on_event: OnEvent) -> Settled:
             "blocks need fixed cameras, got a recipe that learns poses; learn them in a run of its own, or leave poses "
             "out of --learn"
         )
-    if recipe.learns("vignetting", "response"):
-        raise RecipeError(
-            "blocks learn neither vignetting nor response, got a recipe that does; leave both out of --learn"
-        )
     protocol = replace(resolved.protocol, near=resolved.protocol.near_for(opened.scene.extent))
     return Settled(opened.scene, recipe, protocol, opened.backend, capture_digest(opened.scene))
 

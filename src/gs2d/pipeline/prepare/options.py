@@ -112,8 +112,8 @@ class CommonTraining:
     robust: Robust = "auto"
     """Robust training for real captures: dense start, removal of floaters. auto: except for known data sets."""
     learn: Annotated[str | tuple[str, ...], Arg(metavar="NAMES")] = "auto"
-    """Learn also exposure, poses, intrinsics, vignetting or response, separated by commas; none; or auto: exposure if
-    photographs differ, in robust training. auto,poses adds poses to that."""
+    """Learn also exposure, poses or intrinsics, separated by commas; none; or auto: exposure if photographs differ, in
+    robust training. auto,poses adds poses to that."""
     test_every: int | None = None
     """Hold out every N-th view (sorted by name) for testing; 0 trains on all (default: 8, or by
     protocol; 0 for captures of `gs2d poses` with fewer than 24 photographs)."""

@@ -12,7 +12,6 @@ from gs2d.config.presets import (
     with_few_views,
     with_intrinsics,
     with_normal_prior,
-    with_photometry,
     with_poses,
     with_robustness,
 )
@@ -72,8 +71,6 @@ def build_recipe(
     value = recipe_of(training.recipe)
     value = with_exposure(value) if exposure else value
     learned = training.learned
-    if "vignetting" in learned or "response" in learned:
-        value = with_photometry(value, vignetting="vignetting" in learned, response="response" in learned)
     value = with_poses(value) if "poses" in learned else value
     value = with_intrinsics(value) if "intrinsics" in learned else value
     value = with_depth_prior(value, training.depth_prior) if training.depth_prior is not None else value

@@ -1,10 +1,8 @@
-"""Learned appearance of photographs (exposure, vignetting, response): its file, and its effect on images."""
+"""Learned appearance of photographs, such as exposure: its file, and its effect on images."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +11,6 @@ from torch import Tensor
 from gs2d.config.quantities import QUANTITIES
 from gs2d.config.recipe import Recipe
 from gs2d.core.json_files import read_json, write_json
-from gs2d.core.vignetting import reach_of
 from gs2d.data import Scene, View
 from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import LEARNED, SPLATS, RunFolder
@@ -24,10 +21,7 @@ from gs2d.training.learned.quantity import ImagePoints
 
 ABOUT = (
     "learned quantities of each view, by name (docs/math.md). exposure [A | b]: colour in the photograph = A c + b "
-    "for colour c of the scene, sRGB values in [0, 1]; the mean over the photographs is the identity. cameras: at a "
-    "pixel whose distance from the principal point is r times reach, in focal lengths, a camera receives "
-    "exp(-(a r^2 + b r^4 + c r^6)) of the light, falloff = [a, b, c]; corner: this at r = 1. f(x) = k x / (1 + "
-    "(k - 1) x), k = e^s, maps light to values, s = shift"
+    "for colour c of the scene, sRGB values in [0, 1]; the mean over the photographs is the identity"
 )
 
 
@@ -36,44 +30,18 @@ def write_appearance(run: RunFolder, scene: Scene, on_event: OnEvent) -> None:
     known = {view.name: view.appearance for view in scene.views if view.appearance}
     if not known:
         return
-    cameras = _camera_facts(scene) if any(found.keys() & {"vignetting", "response"} for found in known.values()) else []
     views = {view: {name: numbers.tolist() for name, numbers in found.items()} for view, found in known.items()}
-    write_json(run.file(LEARNED), {"format": 2, "about": ABOUT, "views": views, "cameras": cameras})
+    write_json(run.file(LEARNED), {"format": 2, "about": ABOUT, "views": views})
     exposures = {view.name: view.appearance["exposure"] for view in scene.train if "exposure" in view.appearance}
     if exposures:
         gains = {name: exposure_gain(transform) for name, transform in exposures.items()}
         low, high = min(gains, key=gains.__getitem__), max(gains, key=gains.__getitem__)
         on_event(Notice(f"exposures: {gains[low]:.2f} ({low}) to {gains[high]:.2f} ({high}) times the mean: {LEARNED}"))
-    if cameras:
-        corners, shifts = (sorted(camera[name] for camera in cameras) for name in ("corner", "shift"))
-        light, shift = _range(corners, ".3f"), _range(shifts, "+.3f")
-        on_event(Notice(f"vignetting leaves {light} of the light in corners, response shift {shift}: {LEARNED}"))
 
 
 def exposure_gain(transform: np.ndarray) -> float:
     """Return the mean brightness of medium grey under an exposure [3, 4], relative to the scene."""
     return float(np.mean(0.5 * transform[:, :3].sum(axis=1) + transform[:, 3]) / 0.5)
-
-
-def _camera_facts(scene: Scene) -> list[dict[str, Any]]:
-    """Return vignetting and response of each camera, with its photographs."""
-    of_camera: dict[tuple[float, ...], list[View]] = {}
-    for view in scene.views:
-        falloff, response = (view.appearance.get(name, np.zeros(3)) for name in ("vignetting", "response"))
-        if view.appearance:
-            of_camera.setdefault((*falloff.tolist(), float(response[0])), []).append(view)
-    cameras: list[dict[str, Any]] = []
-    for (a, b, c, shift), views in of_camera.items():
-        reach = reach_of([view.camera for view in views])
-        numbers = [a * reach**2, b * reach**4, c * reach**6]
-        facts = {"falloff": numbers, "reach": reach, "shift": shift, "corner": math.exp(-sum(numbers))}
-        cameras.append({**facts, "photographs": [view.name for view in views]})
-    return cameras
-
-
-def _range(values: list[float], form: str) -> str:
-    low, high = format(values[0], form), format(values[-1], form)
-    return low if low == high else f"{low} to {high}"
 
 
 def with_learned_appearance(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:

@@ -25,7 +25,7 @@ FILES = {  # the most useful first
     METRICS: "all scores",
     RUN_JSON: "settings, machine and versions",
     EVENTS: "training log",
-    LEARNED: "learned exposure, vignetting and response",
+    LEARNED: "learned exposure",
     POSES: "refined cameras",
 }
 

@@ -1,4 +1,4 @@
-"""Learned properties of photographs and cameras: exposure, vignetting, response, poses and intrinsics."""
+"""Learned properties of photographs and cameras: exposure, poses and intrinsics."""
 
 from __future__ import annotations
 
@@ -35,22 +35,14 @@ def _appearance(data: Mapping[str, Any]) -> str:
         if "exposure" in found
     }
     gains = {name: float(value) / 0.5 for name, value in grey.items()}
-    texts = []
-    if gains:
-        dark, bright = min(gains, key=gains.__getitem__), max(gains, key=gains.__getitem__)
-        texts.append(
-            f"Exposure: {dark} is the darkest photograph ({gains[dark]:.2f} times the mean brightness), {bright} the "
-            f"brightest ({gains[bright]:.2f} times). Training views are scored in the exposure of their photograph, "
-            "test views in a predicted one. The mesh and new renderings use the mean exposure."
-        )
-    cameras = [
-        f"{len(entry['photographs'])} photographs ({entry['photographs'][0]}, ...) with {float(entry['corner']):.3f} "
-        f"of the light in the corners and a response that deviates by {float(entry['shift']):+.3f}"
-        for entry in data["cameras"]
-    ]
-    if cameras:
-        texts.append(f"Vignetting and response: {'; '.join(cameras)}. New renderings and the mesh have no vignetting.")
-    return " ".join(texts)
+    if not gains:
+        return ""
+    dark, bright = min(gains, key=gains.__getitem__), max(gains, key=gains.__getitem__)
+    return (
+        f"Exposure: {dark} is the darkest photograph ({gains[dark]:.2f} times the mean brightness), {bright} the "
+        f"brightest ({gains[bright]:.2f} times). Training views are scored in the exposure of their photograph, "
+        "test views in a predicted one. The mesh and new renderings use the mean exposure."
+    )
 
 
 def _poses(data: Mapping[str, Any]) -> str:

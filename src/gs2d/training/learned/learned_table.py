@@ -111,7 +111,6 @@ class LearnedTable:
                 quantity.rates(rate, index),
                 constants=(quantity.beta1, quantity.beta2, quantity.eps),
                 assign=backend.assign if quantity.on_device else Tensor.copy_,
-                limit=quantity.limit,
             )
 
     def rollback(self, rows: Rows, index: int, rates: Mapping[str, float]) -> None:

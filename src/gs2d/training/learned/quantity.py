@@ -13,9 +13,7 @@ from torch import Tensor
 
 from gs2d.config.quantities import Quantity
 from gs2d.core.camera import Camera
-from gs2d.core.vignetting import reach_of
 from gs2d.data.scene import Scene, View
-from gs2d.render.camera_response import squares_of
 from gs2d.training.targets import Target
 
 
@@ -41,18 +39,6 @@ class ImagePoints:
     background: Tensor | None = None
     points: Tensor | None = None
     inside: Tensor | None = None
-
-    def squared_radii(self, like: Tensor) -> Tensor:
-        """Return squared distances from the principal point [H, W] in focal lengths, at most that of a corner.
-
-        They have the dtype and device of ``like``.
-        """
-        if self.points is None:
-            return squares_of(self.camera, 1.0, like)
-        T = torch.as_tensor(self.camera.T_cam_world).to(self.points)
-        seen = self.points @ T[:3, :3].T + T[:3, 3]
-        tangents = (seen[:, :2] / seen[:, 2:].clamp(min=1e-6)).square().sum(dim=1)
-        return tangents.clamp(max=reach_of([self.camera]) ** 2)[None].to(like)
 
 
 class LearnedQuantity:
@@ -82,8 +68,6 @@ class LearnedQuantity:
         Whether it is learned only in stages that train the means of all splats.
     learns : bool
         Whether rows are updated.
-    limit : float or None
-        Largest absolute value in a row.
     beta1, beta2, eps : float
         Constants of Adam.
     row_of : list of int
@@ -96,7 +80,6 @@ class LearnedQuantity:
     changes_color = True
     needs_moving_splats = False
     learns = True
-    limit: float | None = None
     beta1, beta2, eps = 0.9, 0.999, 1e-15
 
     def __init__(self, settings: Quantity, scene: Scene) -> None:
