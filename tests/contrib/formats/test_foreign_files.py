@@ -17,12 +17,12 @@ import torch
 from PIL import Image
 
 from gs2d.contrib.formats.sog import packed_sog
+from gs2d.contrib.formats.spz import read_spz, write_spz
 from gs2d.core.sh import sh_basis
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import LAYOUTS, read_splat_file, read_splats, write_layout
-from gs2d.io.formats.spz import read_spz, write_spz
 from gs2d.io.gaussians import Gaussians
 from gs2d.io.ply_format import read_ply, write_ply
 from gs2d.io.splat_ply import write_splats

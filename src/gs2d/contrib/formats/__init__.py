@@ -1,1 +1,1 @@
-"""Splat files beyond PLY and SPZ."""
+"""Splat files beyond PLY."""

@@ -16,7 +16,6 @@ from gs2d.core.missing import suggestion
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.io import splat_ply
-from gs2d.io.formats.spz import read_spz, write_spz
 from gs2d.io.gaussians import NO_SCALE, Gaussians, Tell, logit
 from gs2d.io.splat_ply import ply_kind, read_gaussians
 
@@ -69,14 +68,12 @@ class SplatReader:
 LAYOUTS: Registry[Layout] = Registry(
     "layout",
     "gs2d.formats",
-    builtin=dict.fromkeys(("3dgs", "2dgs", "spz", "spz4"), __name__),
+    builtin=dict.fromkeys(("3dgs", "2dgs"), __name__),
     error=DataError,
 )
 """Formats for writing, by name. If two have the same suffix, the first is the default for file names."""
 
-SPLAT_READERS: Registry[SplatReader] = Registry(
-    "splat reader", "gs2d.splat_readers", builtin={"spz": __name__}, error=DataError
-)
+SPLAT_READERS: Registry[SplatReader] = Registry("splat reader", "gs2d.splat_readers", error=DataError)
 """Formats for reading, by name, in addition to PLY files of 2DGS and 3DGS."""
 
 
@@ -170,22 +167,6 @@ def _write_3dgs(path: Path, splats: Splats) -> None:
 @register_format("2dgs", ending=".ply")
 def _write_2dgs(path: Path, splats: Splats) -> None:
     splat_ply.write_splats(path, splats, layout="2dgs")
-
-
-@register_format("spz", ending=".spz")
-def _write_spz(path: Path, splats: Splats) -> tuple[str, ...]:
-    return write_spz(path, Gaussians.of(splats))
-
-
-@register_format("spz4", ending=".spz")
-def _write_spz4(path: Path, splats: Splats) -> tuple[str, ...]:
-    return write_spz(path, Gaussians.of(splats), version=4)
-
-
-@register_splat_reader("spz", endings=(".spz",))
-def _read_spz(path: str | os.PathLike[str], tell: Tell) -> tuple[Gaussians, str]:
-    gaussians, version = read_spz(path, tell)
-    return gaussians, f"SPZ version {version}"
 
 
 def endings() -> tuple[str, ...]:

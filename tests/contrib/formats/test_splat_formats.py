@@ -15,10 +15,10 @@ from scipy.spatial import cKDTree
 
 from gs2d.contrib.formats.antimatter import read_splat, write_splat
 from gs2d.contrib.formats.compressed_ply import read_compressed_ply, write_compressed_ply
+from gs2d.contrib.formats.spz import read_spz, write_spz
 from gs2d.core.sh import sh_basis
 from gs2d.errors import DataError
 from gs2d.io.formats.splat_formats import LAYOUTS, layout_of, read_splat_file, write_layout
-from gs2d.io.formats.spz import read_spz, write_spz
 from gs2d.io.gaussians import FLAT_LOG_SCALE, Gaussians, sigmoid, unit_quats
 from gs2d.io.splat_ply import read_gaussians
 from splat_scenes import a_scene, turned_by

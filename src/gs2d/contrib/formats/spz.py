@@ -26,7 +26,9 @@ import numpy as np
 from gs2d.core.atomic_files import atomic_write
 from gs2d.core.extras import required
 from gs2d.core.growth import check_growth
+from gs2d.core.splats import Splats
 from gs2d.errors import DataError
+from gs2d.io.formats.splat_formats import register_format, register_splat_reader
 from gs2d.io.gaussians import (
     THIN,
     Gaussians,
@@ -346,3 +348,19 @@ def _completed(q: np.ndarray, left_out: np.ndarray) -> np.ndarray:
     """Complete (x, y, z, w) whose ``left_out`` component is 0, and return (w, x, y, z)."""
     q[np.arange(len(q)), left_out] = np.sqrt(np.maximum(0.0, 1.0 - np.square(q).sum(axis=1)))
     return q[:, [3, 0, 1, 2]].astype(np.float32)
+
+
+@register_format("spz", ending=".spz")
+def _write(path: Path, splats: Splats) -> tuple[str, ...]:
+    return write_spz(path, Gaussians.of(splats))
+
+
+@register_format("spz4", ending=".spz")
+def _write_4(path: Path, splats: Splats) -> tuple[str, ...]:
+    return write_spz(path, Gaussians.of(splats), version=4)
+
+
+@register_splat_reader("spz", endings=(".spz",))
+def _read(path: str | os.PathLike[str], tell: Tell) -> tuple[Gaussians, str]:
+    gaussians, version = read_spz(path, tell)
+    return gaussians, f"SPZ version {version}"
