@@ -23,10 +23,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gs2d.config.presets import ABSGS_DEFAULT
 from gs2d.contrib.lab.aggregate import Cell, read_cell
 from gs2d.contrib.lab.execute import Workers, execute
 from gs2d.contrib.lab.lab_options import PaperOptions
+from gs2d.contrib.lab.paper_recipes import ABSGS_DEFAULT
 from gs2d.contrib.lab.scenes import FoundScene, find_scenes
 from gs2d.contrib.lab.table_plan import make_task, trained_recipe
 from gs2d.contrib.lab.training_task import TrainingTask

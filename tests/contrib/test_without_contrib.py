@@ -9,6 +9,7 @@ from pathlib import Path
 import gs2d
 from cli_process import CliProcess
 from gs2d.cli.command_registry import COMMANDS
+from gs2d.config.presets import RECIPES
 from gs2d.config.protocols import PROTOCOLS
 from gs2d.config.registry import Registry, contrib_entries
 from gs2d.data.known_captures import DATA_SETS
@@ -20,7 +21,7 @@ from tiny import write_capture
 
 SOURCE = Path(gs2d.__file__).parent
 CONTRIB_USES: tuple[Registry, ...] = (
-    *(COMMANDS, PROTOCOLS, DATA_SETS, READERS, EVALUATORS),
+    *(COMMANDS, PROTOCOLS, RECIPES, DATA_SETS, READERS, EVALUATORS),
     *(LAYOUTS, SPLAT_READERS, SECTIONS),
 )
 

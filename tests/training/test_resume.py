@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gs2d.config.presets import continue_training
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe
+from gs2d.contrib.lab.paper_recipes import continue_training
 from gs2d.data.scene import Scene
 from gs2d.errors import RunError
 from gs2d.training import events

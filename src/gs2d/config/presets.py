@@ -1,4 +1,4 @@
-"""The recipes for users, and one for each row of the tables of the 2DGS-R paper.
+"""The recipes for users; ``contrib/lab/paper_recipes.py`` has those of the other rows of the 2DGS-R paper.
 
 Stage 1 is the official 2DGS training (hbb1/2d-gaussian-splatting); stages 2 and 3 are those of the paper. Settings that
 depend on the data set belong to the protocol. Pure Python; never imports torch.
@@ -7,11 +7,10 @@ depend on the data set belong to the protocol. Pure Python; never imports torch.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import partial
-from types import MappingProxyType
 from typing import Any
 
 from gs2d.config.actions import CLONE_IN_PLACE, RANK_BY_ERROR
@@ -51,20 +50,6 @@ SETTLING, SETTLED = 0.3, 0.1  # last fraction of iterations in which rates fall,
 DENSE_START = DenseStart(side=256, neighbours=3, fit=True)  # docs/notebook/training.md
 STREET_START = DenseStart(sphere=True)  # docs/notebook/floaters.md
 
-# AbsGS, the numbers of its released code: clone 2e-4 signed, split 4e-4 absolute, percent_dense 0.001, cull 0.005,
-# reset every 3000, opacity capped at 0.8 every 500. "D" in the paper's table.
-ABSGS_DEFAULT = GradDensify(
-    absolute=True,
-    abs_threshold=4e-4,
-    percent_dense=0.001,
-    opacity_cull=0.005,
-    cap_every=500,
-    reset_at_start_on_white=False,  # stage 3 starts from a trained scene, not from random points
-)
-# "A": "more sensitive thresholds for size and positional gradient", without numbers in the paper. Half of D's gradient
-# thresholds were best in a sweep on lego (`python -m benchmarks.absgs`); the size threshold had no effect.
-ABSGS_ADJUSTED = replace(ABSGS_DEFAULT, grad_threshold=1e-4, abs_threshold=2e-4, percent_dense=0.0005)
-
 
 def surface(nc: float = 0.05, distortion: float | None = 0.0, iterations: int = 30_000) -> Stage:
     """Return stage 1: the official 2DGS training. ``distortion`` None: weight of the protocol; 0 drops a term."""
@@ -84,7 +69,7 @@ def appearance(k: float = 1.0) -> Stage:
         10_000,
         train=dict.fromkeys(SH, "high_error"),
         losses=PHOTOMETRIC,
-        lr=_lr_after_surface(),
+        lr=rates_after_surface(),
         on_enter=(RANK_BY_ERROR.with_options(top_percent=k),),
     )
 
@@ -99,31 +84,15 @@ def refine(nc: float = 0.05, freeze: tuple[str, ...] = ALPHA, *, densify: GradDe
         20_000,
         train={name: "all" for name in ALL if name not in freeze},
         losses=(*PHOTOMETRIC, *_normal_consistency(nc, 0)),
-        lr=_lr_after_surface(),
+        lr=rates_after_surface(),
         densify=densify,
         on_enter=(CLONE_IN_PLACE,) if densify is None else (),
-    )
-
-
-def continue_training() -> Stage:
-    """Return a stage that continues stage 1 with its last rates and moments, NC, and no densification."""
-    return Stage(
-        "continue",
-        30_000,
-        losses=(*PHOTOMETRIC, *_normal_consistency(0.05, 0)),
-        lr=_lr_after_surface(),
-        moments="kept",
     )
 
 
 def two_dgs(nc: float = 0.05, distortion: float | None = 0.0, *, name: str = "2dgs") -> Recipe:
     """Return plain 2DGS, 30k iterations."""
     return Recipe(name, (surface(nc, distortion),))
-
-
-def two_dgs_60k(*, name: str = "2dgs-60k") -> Recipe:
-    """Return the control of 2DGS-R: 2DGS for as many iterations; its first stage is that of ``2dgs``."""
-    return Recipe(name, (surface(), continue_training()))
 
 
 def two_dgs_r(*, name: str = "2dgs-r", stage_2: Stage | None = None, stage_3: Stage | None = None) -> Recipe:
@@ -330,7 +299,7 @@ def _distortion(weight: float | None, start: int) -> tuple[LossTerm, ...]:
     return (LossTerm("distortion", weight, start),) if weight is None or weight > 0 else ()
 
 
-def _lr_after_surface() -> LearningRates:
+def rates_after_surface() -> LearningRates:
     """Return the constant rates at the end of stage 1."""
     return LearningRates().at_end(30_000)
 
@@ -379,26 +348,7 @@ def _registry() -> dict[str, NamedRecipe]:
     add("best-fast", "best in a third of its iterations", partial(best, FAST_ITERATIONS))
     add("best-surface", "best with multi-view losses at the end: more accurate surface, lower PSNR", best_surface)
     add("2dgs", "2DGS with normal consistency 0.05: the paper's baseline and its stage 1", two_dgs)
-    add("2dgs-no-nc", "2DGS without normal consistency", partial(two_dgs, nc=0.0))
-    add("2dgs-60k", "2DGS for as many iterations as 2DGS-R: its control", two_dgs_60k)
-    for label, nc in {"distortion": 0.05, "distortion-no-nc": 0.0}.items():
-        about = f"Table 1: the protocol's distortion weight (100/10), NC {nc:g}"
-        add(f"2dgs-{label}", about, partial(two_dgs, nc, None))
-    for nc in (0.1, 0.3):
-        add(f"2dgs-nc-{nc}", f"Table 1: NC {nc}", partial(two_dgs, nc))
     add("2dgs-r", "2DGS-R: surface, appearance of the worst 1 %, clone in place and refine", two_dgs_r)
-    for k in (3, 5, 10, 30, 50):
-        add(f"2dgs-r-k{k}", f"K ablation: the worst {k} %", partial(two_dgs_r, stage_2=appearance(float(k))))
-    for label, freeze in {"none": (), "alpha-sh": ALPHA + SH, "sh": SH}.items():
-        about = f"Freeze ablation: stage 3 freezes {', '.join(freeze) or 'nothing'}"
-        add(f"2dgs-r-freeze-{label}", about, partial(two_dgs_r, stage_3=refine(freeze=freeze)))
-    module_ii = partial(two_dgs_r, stage_3=refine(nc=0.0, freeze=()))
-    add("2dgs-r-module-ii", "Module row II: clone; opacity free, no NC in stage 3", module_ii)
-    add("2dgs-r-module-iii", "Module row III: II with opacity frozen", partial(two_dgs_r, stage_3=refine(nc=0.0)))
-    for label, densify in {"d": ABSGS_DEFAULT, "a": ABSGS_ADJUSTED}.items():
-        stage_3 = refine(freeze=(), densify=densify)
-        about = f"AbsGS-{label.upper()}: stage 3 densifies by absolute gradients instead of the clone; opacity free"
-        add(f"2dgs-r-absgs-{label}", about, partial(two_dgs_r, stage_3=stage_3))
     about = "2dgs with multi-view losses, for better surfaces of textured objects"
     add("2dgs-multiview", about, partial(with_multiview, two_dgs()))
     return entries
@@ -451,47 +401,6 @@ def about_recipe(name: str) -> str:
     if isinstance(found, Recipe):
         return ", ".join(f"{stage.name} ({stage.iterations:,})" for stage in found.stages)
     return (getattr(found, "__doc__", None) or "").strip().partition("\n")[0] or f"a recipe of {RECIPES.source(name)}"
-
-
-# Tables of the paper: row label -> recipe. "tab:..." are its LaTeX labels.
-TABLES: Mapping[str, Mapping[str, str]] = MappingProxyType(
-    {
-        "regularisation": {  # tab:alpha_beta
-            "alpha=0 beta=0": "2dgs-no-nc",
-            "alpha=100/10 beta=0": "2dgs-distortion-no-nc",
-            "alpha=100/10 beta=0.05": "2dgs-distortion",
-            "alpha=0 beta=0.05": "2dgs",
-            "alpha=0 beta=0.1": "2dgs-nc-0.1",
-            "alpha=0 beta=0.3": "2dgs-nc-0.3",
-        },
-        "benchmark": {  # tab:benchmark, and a control
-            "2DGS": "2dgs",
-            "2DGS (w/o NC)": "2dgs-no-nc",
-            "2DGS-R": "2dgs-r",
-            "2DGS (60k)": "2dgs-60k",
-        },
-        "k": {"K=1": "2dgs-r", **{f"K={k}": f"2dgs-r-k{k}" for k in (3, 5, 10, 30, 50)}},  # tab:ablation_K
-        "freeze": {  # tab:ablation_freeze
-            "(,)": "2dgs-r-freeze-none",
-            "(alpha,SHs)": "2dgs-r-freeze-alpha-sh",
-            "(SHs)": "2dgs-r-freeze-sh",
-            "(alpha)": "2dgs-r",
-        },
-        "modules": {  # tab:ab_module
-            "(I)": "2dgs",
-            "(II)": "2dgs-r-module-ii",
-            "(III)": "2dgs-r-module-iii",
-            "(IV)": "2dgs-r",
-        },
-        "absgs": {  # tab:absgs
-            "2DGS (w/o NC)": "2dgs-no-nc",
-            "2DGS (w NC)": "2dgs",
-            "2DGS-R (AbsGS-D)": "2dgs-r-absgs-d",
-            "2DGS-R (AbsGS-A)": "2dgs-r-absgs-a",
-            "2DGS-R (ours)": "2dgs-r",
-        },
-    }
-)
 
 
 def get_recipe(name: str) -> Recipe:

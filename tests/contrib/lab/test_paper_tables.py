@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from gs2d.config.presets import RECIPES, TABLES
+from gs2d.config.presets import RECIPES
 from gs2d.contrib.lab.aggregate import FIGURES, Cell, Results, Row, check_claims
+from gs2d.contrib.lab.paper_recipes import TABLES
 from gs2d.contrib.lab.paper_tables import DTU, NERF_SYNTHETIC, PAPER_TABLES, TNT, PaperTable, printed
 
 # How the paper writes the labels of our rows, where it is not the same.

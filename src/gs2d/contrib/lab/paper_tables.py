@@ -14,9 +14,9 @@ from importlib.resources import files
 from types import MappingProxyType
 from typing import Any
 
-from gs2d.config.presets import TABLES
 from gs2d.config.recipe_files import short_name
 from gs2d.contrib.lab.lab_options import SWEEP
+from gs2d.contrib.lab.paper_recipes import TABLES
 from gs2d.errors import RecipeError
 
 TNT, NERF_SYNTHETIC, DTU = "TnT", "NeRF-Synthetic", "DTU"  # names of data sets in results
