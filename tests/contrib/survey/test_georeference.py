@@ -194,7 +194,7 @@ def test_a_known_distance_and_up(run: Path) -> None:
         (["--gps", "--markers", "0.1"], "one source at a time"),
         (["--epsg", "32632"], "needs --gps"),
         (["--gps", "--epsg", "4326"], "projected system in metres"),
-        (["--gps", "--epsg", "32632", "--enu"], "exclude each other"),
+        (["--gps", "--epsg", "32632", "--set", "enu=true"], "exclude each other"),
         (["--known-distance", *"0 0 0 0 0 0 1".split()], "two different points"),
         (["--known-distance", *"0 0 0 1 0 0 -1".split()], "positive distance"),
         (["--positions", "no-such.csv"], "expected a file at no-such.csv"),

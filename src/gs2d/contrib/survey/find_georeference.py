@@ -92,7 +92,7 @@ def _check(options: GeoreferenceOptions, chosen: Sequence[str]) -> None:
             of = " or ".join(f"--{source.replace('_', '-')}" for source in sources)
             raise RunError(f"{name} needs {of}")
     if options.enu and options.epsg is not None:
-        raise RunError("--enu and --epsg exclude each other; leave one out")
+        raise RunError("--set enu and --epsg exclude each other; leave one out")
     if options.up is not None and not (np.isfinite(options.up).all() and np.linalg.norm(options.up) > _ON_LINE):
         raise RunError(f"up must be a direction of three finite numbers, got {options.up}")
 

@@ -44,7 +44,7 @@ def utm_epsg(latitude: float, longitude: float) -> int:
         Beyond 84 degrees north or 80 degrees south, where UTM is undefined.
     """
     if not -80 <= latitude <= 84:
-        raise DataError(f"UTM is defined from 80 degrees south to 84 north, got latitude {latitude:.4f}; use --enu")
+        raise DataError(f"UTM is defined from 80 degrees south to 84 north, got latitude {latitude:.4f}; use --set enu=true")
     longitude = (longitude + 180) % 360 - 180
     zone = int((longitude + 180) // 6) + 1
     if 56 <= latitude < 64 and 3 <= longitude < 12:
@@ -58,7 +58,7 @@ def utm_epsg(latitude: float, longitude: float) -> int:
 
 def required_pyproj() -> Any:
     """Return the package pyproj, or raise BackendError if it is not installed."""
-    return required("geo", "pyproj", "a map projection", "use --enu, a local frame")
+    return required("geo", "pyproj", "a map projection", "use --set enu=true, a local frame")
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def in_frame(
     if epsg is None and enu:
         return to_enu(positions, middle), MapFrame(None, np.zeros(3), middle, 1.0)
     if enu:
-        raise DataError(f"--enu needs latitudes and longitudes, got positions in EPSG:{epsg}; leave --enu out")
+        raise DataError(f"--set enu needs latitudes and longitudes, got positions in EPSG:{epsg}; leave it out")
     if epsg is not None and requested not in (None, epsg):
         raise DataError(f"the positions are in EPSG:{epsg}, --epsg requests {requested}; leave --epsg out")
     projection = Projection(epsg or requested or utm_epsg(middle[0], middle[1]))

@@ -34,7 +34,7 @@ class GeoreferenceOptions:
     """With --markers: 4x4_50 to 7x7_1000, aruco_original, apriltag_36h11."""
     epsg: int | None = None
     """Projected coordinate system in metres (default: that of the file, or the UTM zone)."""
-    enu: bool = False
+    enu: Annotated[bool, SETTING] = False
     """With --gps or --positions: use metres east, north and up of their centre instead of a map projection."""
     up: Annotated[tuple[float, float, float] | None, Arg(metavar="X,Y,Z", setting=True)] = None
     """Up direction in the run (default: from the positions, else from the cameras)."""
