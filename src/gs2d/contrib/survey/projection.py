@@ -44,7 +44,9 @@ def utm_epsg(latitude: float, longitude: float) -> int:
         Beyond 84 degrees north or 80 degrees south, where UTM is undefined.
     """
     if not -80 <= latitude <= 84:
-        raise DataError(f"UTM is defined from 80 degrees south to 84 north, got latitude {latitude:.4f}; use --set enu=true")
+        raise DataError(
+            f"UTM is defined from 80 degrees south to 84 north, got latitude {latitude:.4f}; use --set enu=true"
+        )
     longitude = (longitude + 180) % 360 - 180
     zone = int((longitude + 180) // 6) + 1
     if 56 <= latitude < 64 and 3 <= longitude < 12:
