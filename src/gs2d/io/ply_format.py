@@ -137,26 +137,10 @@ def read_ply(path: str | os.PathLike[str]) -> PlyFile:
     return PlyFile({e.name: reader.element(e) for e in header.elements}, header.comments)
 
 
-def read_ply_comments(path: str | os.PathLike[str]) -> tuple[str, ...]:
-    """Read the comment lines of a PLY file without its rows; empty for other files.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be read.
-    """
-    head = _read(path, _HEADER_LIMIT)
-    end = head.find(b"end_header")
-    if not head.startswith((b"ply\n", b"ply\r")) or end < 0:
-        return ()
-    lines = (line.strip() for line in head[:end].decode("latin-1").splitlines())
-    return tuple(line.removeprefix("comment").strip() for line in lines if line.startswith("comment "))
-
-
-def _read(path: str | os.PathLike[str], size: int = -1) -> bytes:
+def _read(path: str | os.PathLike[str]) -> bytes:
     try:
         with open(path, "rb") as file:
-            return file.read(size)
+            return file.read()
     except OSError as error:
         raise DataError(f"{path}: expected a PLY file, but it cannot be read: {error.strerror}") from error
 
