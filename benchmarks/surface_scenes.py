@@ -44,7 +44,6 @@ CANDIDATES, TEXTURED = 14000, 0.02  # points tried per photograph; luminance ste
 POINT_NOISE = 0.5  # px, of observations and points
 FOUND = 0.4  # share of the photographs showing a point in which it is matched
 LEAST_TRACK = 3
-LIT_VERTICES = 12_000  # vertices whose light is computed
 NORMALS_APART = 0.3  # world units that a radian between normals counts when light is interpolated
 
 
@@ -110,6 +109,8 @@ class Design:
         Parts (by index) that neither cast nor receive shadows, and their light.
     crowd : callable, optional
         Returns the parts of the people in a photograph, by its number.
+    light_samples : (int, int)
+        Number of vertices whose light is computed, and of directions of the sky.
     """
 
     parts: tuple[Part, ...]
@@ -118,6 +119,7 @@ class Design:
     lamp: float = 1.0
     lit: dict[int, float] | None = None
     crowd: Callable[[int], list[Part]] | None = None
+    light_samples: tuple[int, int] = (12_000, 60)
 
 
 # -- cameras -------------------------------------------------------------------------------------------------------
@@ -210,7 +212,8 @@ def porcelain(rng: np.random.Generator, size: int) -> Design:
         Part(white, Material(things.plain((0.93, 0.92, 0.90)), **glaze)),
         Part(blue, Material(things.plain((0.16, 0.24, 0.55)), **glaze)),
     ]
-    return _on_table(rng, subject, orbit(rng, size, (-0.05, 0.15, 0.36), 1.9, ((8, 18), (30, 16), (58, 10))))
+    design = _on_table(rng, subject, orbit(rng, size, (-0.05, 0.15, 0.36), 1.9, ((8, 18), (30, 16), (58, 10))))
+    return replace(design, light_samples=(30_000, 120))  # bands of light would be texture
 
 
 def thin(rng: np.random.Generator, size: int) -> Design:
@@ -452,7 +455,7 @@ def _lit(design: Design) -> _Lit:
     """Bake the light of all parts."""
     apart = design.lit or {}
     solid = shapes.join([part.patch for k, part in enumerate(design.parts) if k not in apart])
-    baked = _baked(solid)
+    baked = _baked(solid, *design.light_samples)
     sky, lamp, at = [], [], 0
     for k, part in enumerate(design.parts):
         count = len(part.patch.vertices)
@@ -470,11 +473,11 @@ def _lit(design: Design) -> _Lit:
     )
 
 
-def _baked(patch: shapes.Patch) -> BakedLight:
-    """Return the light of all vertices, interpolated from ``LIT_VERTICES`` with similar places and normals."""
-    rows = np.arange(0, len(patch.vertices), max(len(patch.vertices) // LIT_VERTICES, 1))
+def _baked(patch: shapes.Patch, count: int, directions: int) -> BakedLight:
+    """Return the light of all vertices, interpolated from ``count`` of them by similar places and normals."""
+    rows = np.arange(0, len(patch.vertices), max(len(patch.vertices) // count, 1))
     few = replace(patch, vertices=patch.vertices[rows], normals=patch.normals[rows])
-    found = bake(few, occluders=patch, sky_directions=60, lamp_directions=8, threads=1)
+    found = bake(few, occluders=patch, sky_directions=directions, lamp_directions=8, threads=1)
     keys = np.concatenate([patch.vertices, NORMALS_APART * patch.normals], axis=1)
     distances, near = cKDTree(keys[rows]).query(keys, k=4)
     weights = 1 / (distances + 1e-3)
