@@ -81,7 +81,7 @@ def test_a_run_uses_all_of_them_and_says_so(trained: Path) -> None:
     assert [(event["iteration"], event["splats"]) for event in pruned] == [(3, 58)]
 
 
-def test_its_loss_and_its_section_are_in_the_report(trained: Path) -> None:
+def test_its_loss_quantity_and_section_are_in_the_report(trained: Path) -> None:
     said = json.loads((trained / "metrics.json").read_text())["stages"][-1]["losses"]["example-brightness"]
     assert said["median"] > 0
     assert len(said["by_view"]) == 6
@@ -89,6 +89,9 @@ def test_its_loss_and_its_section_are_in_the_report(trained: Path) -> None:
     report = (trained / "report.html").read_text()
     assert "<h3>Brightness of the photographs</h3>" in report
     assert "Error of brightness, levels of 255, by photograph" in report
+    assert "<h3>Tint of the photographs</h3>" in report
+    assert "<p>Numbers of 6 photographs, from -0." in report
+    assert "Tint of the photographs, by photograph" in report
     assert "<summary>Seed of the run</summary>" in report
     assert "<p>Seed 0, " in report
 

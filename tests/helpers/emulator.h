@@ -1,10 +1,10 @@
 // Runs CUDA kernels on the CPU, for tests: blocks one after another, one fiber per thread, switched only at collectives.
 //
-// Stricter than a GPU: a warp collective wants all 32 lanes of the warp at the same call with the full mask, a block
-// barrier wants every thread, and what does not come together is an error with the lines, never a hang. Shared memory is
-// filled with NaN before each block. Threads run in ascending or descending order between collectives, or shuffled: then
-// blocks come in any order too, and of the warps that could go on some stay behind, so that others run ahead of them as far
-// as barriers let them. A missing barrier changes the result of one of these. Races between collectives are not found.
+// Stricter than a GPU: a warp collective needs all 32 lanes of the warp at the same call with the full mask, and a block
+// barrier needs every thread. A mismatch is an error that names the lines, never a hang. Shared memory is filled with NaN
+// before each block. Between collectives, threads run in ascending, descending or shuffled order. Shuffled, blocks run in
+// any order too, and some warps are held back, so that others run ahead as far as barriers allow. A missing barrier changes
+// the result of one of these orders. Races between collectives are not found.
 #pragma once
 
 #include <link.h>
@@ -20,7 +20,7 @@
 #define __host__
 #define __forceinline__ inline __attribute__((always_inline))
 #define __launch_bounds__(...)
-#define __shared__ static thread_local  // not a section of its own: g++ < 14 ignores one in a template, later ones refuse it
+#define __shared__ static thread_local  // not a section: g++ < 14 ignores it in templates, later versions reject it
 
 struct dim3 {
     unsigned x, y, z;
@@ -49,7 +49,7 @@ struct Fiber {
     ucontext_t context;
     void* stack;
     bool runnable, done;
-    Op op;  // waits here
+    Op op;  // the collective at which it waits
     int line, operand;
     uint32_t value;
 };
@@ -70,7 +70,7 @@ inline void fail(const char* what, const Fiber& a, unsigned thread_a, const Fibe
              blockIdx.y, blockIdx.z, thread_a, where(a), a.line, thread_b, where(b), b.line);
 }
 
-// Leaves the running thread until the scheduler has completed the collective; returns what it left in `value`.
+// Suspends the running thread until the scheduler has completed the collective; returns the thread's `value`.
 inline uint32_t wait(Op op, int line, unsigned mask, uint32_t value, int operand) {
     Fiber& f = fibers[current];
     f.op = op, f.line = line, f.value = value, f.operand = operand, f.runnable = false;
@@ -121,7 +121,7 @@ inline void complete_warp(unsigned first) {
     release(first, WARP);
 }
 
-// After every thread has run as far as it can: completes what came together. True when the block is finished.
+// Called when no thread can continue: completes the collectives that all threads reached. True: the block is finished.
 inline bool complete_collectives() {
     bool all_done = true, barrier = true, progress = false;
     for (unsigned i = 0; i < threads; ++i) all_done &= fibers[i].done, barrier &= fibers[i].op == Op::BARRIER;
@@ -148,7 +148,7 @@ inline void shuffle(unsigned* items, unsigned n) {
     }
 }
 
-// All shared memory: what this library keeps for each thread of the machine, of which one runs all fibers.
+// All shared memory: the thread-local memory of this library in the one thread that runs all fibers.
 struct Shared {
     char* begin;
     size_t bytes;
@@ -174,7 +174,7 @@ inline Shared find_shared() {
     return search.found;
 }
 
-// The threads in the order in which they run until they meet at collectives; returns how many do.
+// Lists the threads in the order in which they run until their next collective; returns their number.
 inline unsigned choose_threads(int order, unsigned* chosen) {
     if (order == ASCENDING || order == DESCENDING) {
         for (unsigned k = 0; k < threads; ++k) chosen[k] = order == DESCENDING ? threads - 1 - k : k;
@@ -210,7 +210,7 @@ inline void run_block(int order, Shared shared) {
     } while (!failed && !complete_collectives());
 }
 
-// Null, or what went wrong (the rest of the grid is not run).
+// Null, or the error, after which the rest of the grid is not run.
 template <class A>
 const char* launch(void (*kernel)(A), unsigned grid_x, unsigned grid_y, unsigned block_x, int order, const void* arguments) {
     static void (*the_kernel)(A);

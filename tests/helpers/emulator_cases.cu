@@ -1,4 +1,4 @@
-// Kernels for the emulator's own tests: correct ones, and ones with the faults it must find.
+// Kernels for the tests of the emulator: correct ones, and ones with faults that it must detect.
 struct Ints {
     const int* in;
     int* out;
@@ -26,7 +26,7 @@ extern "C" __global__ void reverse_block_without_barrier(Ints a) {
     a.out[blockIdx.x * 64 + threadIdx.x] = values[63 - threadIdx.x];
 }
 
-extern "C" __global__ void reverse_block_behind_a_vote(Ints a) {  // of a warp, where the whole block should meet
+extern "C" __global__ void reverse_block_behind_a_vote(Ints a) {  // a warp barrier where a block barrier is needed
     __shared__ int values[64];
     values[threadIdx.x] = a.in[blockIdx.x * 64 + threadIdx.x];
     __any_sync(0xffffffffu, 1);
@@ -59,7 +59,7 @@ template <int N> __device__ __forceinline__ void leave_unwritten_shared(Floats a
     values[threadIdx.x] = a.in[threadIdx.x];
 }
 extern "C" __global__ void read_unwritten_shared_of_a_template(Floats a) {
-    __shared__ float values[32];  // beside the template's own
+    __shared__ float values[32];  // in addition to that of the template
     values[threadIdx.x] = 0.f;
     leave_unwritten_shared<32>(a);
     a.out[threadIdx.x] += values[threadIdx.x];
@@ -83,7 +83,7 @@ extern "C" __global__ void barrier_of_one_warp(Ints a) {
     a.out[threadIdx.x] = 1;
 }
 
-extern "C" __global__ void warps_that_part(Ints a) {  // they vote different numbers of times, and one leaves early
+extern "C" __global__ void warps_that_part(Ints a) {  // warps vote different numbers of times, and one exits early
     const int warp = int(threadIdx.x >> 5);
     if (warp == 2) return;
     int votes = 0;

@@ -1,6 +1,6 @@
-/* A layer under a process (LD_PRELOAD): every call of libc that changes files below one folder is counted, and the
-   n-th ends the process as a power switch would, or fails as on a full disk, and so do all that write after it. Or the
-   process stands still at each of them in turn, while another looks at what a kill would leave there. */
+/* Preloaded library (LD_PRELOAD) that counts the libc calls which change files below one folder. The n-th call kills
+   the process, or fails as on a full disk, like all later calls that write. Alternatively the process pauses at each
+   call, while another process inspects the files that a kill would leave. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <errno.h>
@@ -22,22 +22,22 @@ enum { COUNT = 0, KILL = -1, TEAR = -2 }; /* > 0: an errno */
 static char folder[PATH_MAX];
 static long target = -1, count;
 static int action, record = -1, backwards;
-static int told = -1, answered = -1; /* pipes to whoever looks on, and from there */
+static int report_to = -1, answer_from = -1; /* pipes to and from the watching process */
 
-/* Called by the test: from now on count, from 0; do ACTION at call NUMBER; write "name path" to RECORD, if >= 0. */
+/* Start counting at 0: apply ACTION at call NUMBER, and write "name path" of each call to RECORD, if >= 0. */
 void failing_arm(const char *below, long number, int what, int descriptor) {
     snprintf(folder, sizeof folder, "%s", below);
     target = number, action = what, record = descriptor, count = 0;
 }
 
-/* Called by the test: tell each call to TO, as "B name path", and wait for a line of FROM. Half of a write is told as
-   "H". On "full" a copy of the process goes on with a full disk, to its end: its status is told as "E", and waited. */
+/* Report each call to TO as "B name path" and wait for a line from FROM. Half of a write is reported as "H". The answer
+   "full" lets a copy of the process run to its end with a full disk; its exit status is then reported as "E". */
 void failing_watch(const char *below, int to, int from) {
     failing_arm(below, -1, 0, -1);
-    told = to, answered = from;
+    report_to = to, answer_from = from;
 }
 
-/* Called by the test: from now on each look at the clock on the wall finds it an hour earlier. */
+/* Let every reading of the wall clock be an hour earlier than the previous one. */
 void failing_clock(void) { backwards = 1; }
 
 int clock_gettime(clockid_t clock, struct timespec *now) {
@@ -70,18 +70,18 @@ static const char *full(int at, const char *path, char *buffer) {
     return buffer;
 }
 
-/* Say something to whoever looks on; the first letter of the answer. */
+/* Send a line to the watching process; return the first letter of its answer. */
 static char ask(const char *line, size_t size) {
     char answer = 0;
-    if (syscall(SYS_write, told, line, size) < 0 || syscall(SYS_read, answered, &answer, 1) != 1) _exit(99);
+    if (syscall(SYS_write, report_to, line, size) < 0 || syscall(SYS_read, answer_from, &answer, 1) != 1) _exit(99);
     return answer;
 }
 
-/* A copy of this process finds the disk full from this call on, and ends: meanwhile this one waits. 1 in the copy. */
+/* Fork: the disk is full for the copy from this call on. The original waits for its end. Returns 1 in the copy. */
 static int copied(long here) {
     pid_t child = fork();
     if (!child) {
-        told = -1, target = here, action = ENOSPC;
+        report_to = -1, target = here, action = ENOSPC;
         return 1;
     }
     int status = 0, late = child < 0;
@@ -95,11 +95,11 @@ static int copied(long here) {
     return 0;
 }
 
-/* What is to happen at this call: 0 nothing, KILL, TEAR, or an errno. MAKES: it needs room on the disk. */
+/* Return the action for this call: 0 (none), KILL, TEAR or an errno. MAKES: the call needs disk space. */
 static int due(const char *name, const char *path, int makes) {
     if (!below(path)) return 0;
     long here = count++;
-    if (told >= 0) {
+    if (report_to >= 0) {
         char line[PATH_MAX + 32];
         size_t size = (size_t)snprintf(line, sizeof line, "B %s %s\n", name, path + strlen(folder));
         if (ask(line, size) != 'f' || !copied(here)) return 0;
@@ -123,7 +123,7 @@ static void die(void) {
     static type (*real)(__VA_ARGS__);                                                                                  \
     if (!real) real = (type(*)(__VA_ARGS__))dlsym(RTLD_NEXT, name)
 
-/* A call that is all or nothing: a kill comes before it; TEAR, right after it. */
+/* An atomic call: KILL acts before it, TEAR directly after it. */
 #define GUARDED(name, path, makes, call)                                                                               \
     int what = due(name, path, makes);                                                                                 \
     if (what == KILL) die();                                                                                           \
@@ -172,7 +172,7 @@ ssize_t write(int descriptor, const void *data, size_t size) {
         die();
     }
     if (what > 0) return errno = what, -1;
-    if (told < 0 || size < 2 || !folder[0] || !below(of(descriptor, buffer))) return real(descriptor, data, size);
+    if (report_to < 0 || size < 2 || !folder[0] || !below(of(descriptor, buffer))) return real(descriptor, data, size);
     ssize_t first = real(descriptor, data, size / 2);
     if (first < 0) return first;
     ask("H\n", 2);

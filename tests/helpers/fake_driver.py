@@ -64,10 +64,10 @@ class Node:
     threads: int = 0
     argument: ctypes.Array[ctypes.c_char] | None = None
 
-    def take(self, given: NodeParameters) -> None:
-        address = ctypes.cast(given.kernelParams, ctypes.POINTER(ctypes.c_void_p))[0]
+    def take(self, parameters: NodeParameters) -> None:
+        address = ctypes.cast(parameters.kernelParams, ctypes.POINTER(ctypes.c_void_p))[0]
         assert address is not None
-        self.blocks, self.threads = given.gridDimX, given.blockDimX
+        self.blocks, self.threads = parameters.gridDimX, parameters.blockDimX
         self.argument = ctypes.create_string_buffer(ctypes.string_at(address, ARGUMENT_BYTES), ARGUMENT_BYTES)
 
 
@@ -148,20 +148,22 @@ class FakeDriver:
         self.graphs.append([])
         return self._done("cuGraphCreate", len(self.graphs))
 
-    def cuGraphAddKernelNode(self, graph: int, after: list[int], count: int, given: NodeParameters) -> tuple[Any, ...]:
+    def cuGraphAddKernelNode(
+        self, graph: int, after: list[int], count: int, parameters: NodeParameters
+    ) -> tuple[Any, ...]:
         nodes = self.graphs[graph - 1]
         assert count == len(after) == min(len(nodes), 1)
-        nodes.append(Node(given.kern, after))
-        nodes[-1].take(given)
+        nodes.append(Node(parameters.kern, after))
+        nodes[-1].take(parameters)
         return self._done("cuGraphAddKernelNode", len(nodes))
 
     def cuGraphInstantiate(self, graph: int, flags: int) -> tuple[Any, ...]:
         return self._done("cuGraphInstantiate", graph)
 
-    def cuGraphExecKernelNodeSetParams(self, graph: int, node: int, given: NodeParameters) -> tuple[Any, ...]:
+    def cuGraphExecKernelNodeSetParams(self, graph: int, node: int, parameters: NodeParameters) -> tuple[Any, ...]:
         self.changes += 1
         if "cuGraphExecKernelNodeSetParams" not in self.failing:
-            self.graphs[graph - 1][node - 1].take(given)
+            self.graphs[graph - 1][node - 1].take(parameters)
         return self._done("cuGraphExecKernelNodeSetParams")
 
     def cuGraphLaunch(self, graph: int, stream: int) -> tuple[Any, ...]:

@@ -1,5 +1,5 @@
-// Stands in for libcuda.so.1, so that the real cuda.bindings can be called without a GPU: it counts contexts, keeps what
-// was loaded, and writes one line of JSON for each launch to the file named by FAKE_CUDA_LOG.
+// Replaces libcuda.so.1, so that cuda.bindings can be called without a GPU: counts contexts, stores loaded modules, and
+// writes one line of JSON per launch to the file named by FAKE_CUDA_LOG.
 //
 // FAKE_CUDA_FAIL=name:code makes one function fail. A kernel's first argument is logged as its first 8 bytes.
 #include <cstdint>
@@ -73,7 +73,7 @@ int cuLaunchKernel(void* f, unsigned gx, unsigned gy, unsigned gz, unsigned bx, 
     return fails("cuLaunchKernel");
 }
 
-// Graphs: a line for each node as it is made or changed, and one for each start.
+// Graphs: one line for each node that is added or changed, and one for each launch.
 struct NodeParameters {  // CUDA_KERNEL_NODE_PARAMS_v2
     void* func;
     unsigned gx, gy, gz, bx, by, bz, shared;
@@ -110,7 +110,7 @@ int cuGraphLaunch(void*, void* stream) {
     return fails("cuGraphLaunch");
 }
 
-// How cuda.bindings finds the functions.
+// The entry point by which cuda.bindings looks up functions.
 #define NAME(shown, real) \
     if (!strcmp(name, #shown)) return *out = reinterpret_cast<void*>(&real), 0
 int cuGetProcAddress_v2(const char* name, void** out, int, uint64_t, void* status) {

@@ -48,9 +48,9 @@ class Layer:
         """Start counting in this process; apply ``action`` at call ``number``."""
         self._library.failing_arm(os.fsencode(folder), ctypes.c_long(number), action, record)
 
-    def watch(self, folder: Path, told: int, answered: int) -> None:
+    def watch(self, folder: Path, report_to: int, answer_from: int) -> None:
         """Report each call from now on and wait for a reply (``kill_states``)."""
-        self._library.failing_watch(os.fsencode(folder), told, answered)
+        self._library.failing_watch(os.fsencode(folder), report_to, answer_from)
 
     def turn_back_the_clock(self) -> None:
         """Make the wall clock of this process run backwards."""
@@ -132,9 +132,9 @@ def at_call(command: Command, layer: Layer, number: int, action: str, expected: 
         return wrong + gone_on(command, folder, expected)
 
 
-def at_every_call(command: Command, layer: Layer, given: argparse.Namespace) -> Iterator[dict[str, Any]]:
+def at_every_call(command: Command, layer: Layer, arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Check and resume from every state that each action leaves at each call; return the result lines."""
-    actions = [action for action in given.actions.split(",") if action in AT_EACH_CALL]
+    actions = [action for action in arguments.actions.split(",") if action in AT_EACH_CALL]
     _, expected, _ = undisturbed(command, layer)
     with scratch(command.work) as folder:
         command.prepare(folder)
@@ -142,9 +142,11 @@ def at_every_call(command: Command, layer: Layer, given: argparse.Namespace) -> 
         if wrong := differing(command.leaves(folder), expected):
             raise SystemExit(f"looking on changed what {command.name} does: {wrong}")
         whole: set[bytes] = set()
-        gone_on_from(states, folder, lambda at: half_written(at, whole) + gone_on(command, at, expected), given.seconds)
-        if given.compare:
-            check_states(command, layer, folder, states, given)
+        gone_on_from(
+            states, folder, lambda at: half_written(at, whole) + gone_on(command, at, expected), arguments.seconds
+        )
+        if arguments.compare:
+            check_states(command, layer, folder, states, arguments)
     for action in actions:
         mine = [state for state in states.found.values() if action in state.left_by]
         wrong = states.ended_wrong if action == "full" else []
@@ -160,12 +162,12 @@ def at_every_call(command: Command, layer: Layer, given: argparse.Namespace) -> 
         yield {**named, "tried": tried, "states": len(mine), "states of all": len(states.found), "wrong": wrong}
 
 
-def check_states(command: Command, layer: Layer, folder: Path, states: States, given: argparse.Namespace) -> None:
+def check_states(command: Command, layer: Layer, folder: Path, states: States, arguments: argparse.Namespace) -> None:
     """Disturb the command for real and check that it leaves the recorded state, except for times."""
     for state in states.found.values():
         for action, numbers in state.left_by.items():
             for number in numbers:
-                if number % given.every != given.first:
+                if number % arguments.every != arguments.first:
                     continue
                 shutil.rmtree(folder, ignore_errors=True)
                 disturbed_at(command, layer, folder, number, action)
@@ -279,16 +281,16 @@ def undisturbed(command: Command, layer: Layer) -> tuple[list[str], dict[str, An
         return record.read_text().splitlines(), command.leaves(folder), seconds
 
 
-def tries(command: Command, layer: Layer, action: str, given: argparse.Namespace) -> dict[str, Any]:
+def tries(command: Command, layer: Layer, action: str, arguments: argparse.Namespace) -> dict[str, Any]:
     """Try one action on one command; return the result line."""
     calls, expected, seconds = undisturbed(command, layer)
     if action == "random":
         seconds = undisturbed(command, layer)[2]  # all modules are imported by this point
     wrong: list[str] = []
-    tried, kills, began, chance = 0, 0, time.monotonic(), random.Random(given.seed)
-    numbers = range(given.first, len(calls), given.every) if action in AT_EACH_CALL else range(given.times)
+    tried, kills, began, chance = 0, 0, time.monotonic(), random.Random(arguments.seed)
+    numbers = range(arguments.first, len(calls), arguments.every) if action in AT_EACH_CALL else range(arguments.times)
     for number in numbers:
-        if time.monotonic() - began > given.seconds:
+        if time.monotonic() - began > arguments.seconds:
             break
         if action in AT_EACH_CALL:
             found = [f"{text} ({calls[number]})" for text in at_call(command, layer, number, action, expected)]
@@ -321,18 +323,18 @@ def main() -> None:
     parser.add_argument("--times", type=int, default=1, help="of the actions that are not at a call")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=float("inf"), help="for each command and action")
-    parser.add_argument("--states", action="store_true", help="at each call, from one run: kill_states.py says how")
+    parser.add_argument("--states", action="store_true", help="at each call, from one run: see kill_states.py")
     parser.add_argument("--compare", action="store_true", help="such states with those that real kills leave")
-    given = parser.parse_args()
-    layer, work = Layer(), given.work.resolve()
+    arguments = parser.parse_args()
+    layer, work = Layer(), arguments.work.resolve()
     work.mkdir(parents=True, exist_ok=True)
-    for name in given.commands.split(","):
-        if given.states:
-            for line in at_every_call(COMMANDS[name](work), layer, given):
+    for name in arguments.commands.split(","):
+        if arguments.states:
+            for line in at_every_call(COMMANDS[name](work), layer, arguments):
                 print(json.dumps(line), flush=True)
             continue
-        for action in given.actions.split(","):
-            print(json.dumps(tries(COMMANDS[name](work), layer, action, given)), flush=True)
+        for action in arguments.actions.split(","):
+            print(json.dumps(tries(COMMANDS[name](work), layer, action, arguments)), flush=True)
 
 
 if __name__ == "__main__":

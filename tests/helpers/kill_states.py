@@ -162,19 +162,19 @@ def watched(command: Command, layer: Any, folder: Path, actions: list[str]) -> S
     actions
         A subset of kill, tear and full.
     """
-    told, answered = os.pipe(), os.pipe()
+    reports, answers = os.pipe(), os.pipe()
 
     def looked_at() -> None:
-        os.close(told[0]), os.close(answered[1])
-        layer.watch(folder, told[1], answered[0])
+        os.close(reports[0]), os.close(answers[1])
+        layer.watch(folder, reports[1], answers[0])
         command.run(folder)
 
     child = started(looked_at)
-    os.close(told[1]), os.close(answered[0])
+    os.close(reports[1]), os.close(answers[0])
     look = Look(folder, actions)
-    while line := os.read(told[0], 1 << 16):  # the process waits after each line, so one line arrives at a time
-        os.write(answered[1], look.hear(line.decode(errors="surrogateescape").rstrip("\n")))
-    os.close(told[0]), os.close(answered[1])
+    while line := os.read(reports[0], 1 << 16):  # the process waits after each line, so one line arrives at a time
+        os.write(answers[1], look.hear(line.decode(errors="surrogateescape").rstrip("\n")))
+    os.close(reports[0]), os.close(answers[1])
     if (code := ended(child)) != DONE:
         raise SystemExit(f"the command that was looked at ended with {code}")
     look.after(tree_of(folder))

@@ -155,18 +155,18 @@ class RunLogger:
         raise AssertionError(f"no {kind.__name__} in {stage}")
 
 
-def grouped(given: dict[str, Any]) -> dict[str, Any]:
+def grouped(values: dict[str, Any]) -> dict[str, Any]:
     """Return trainer arguments with option fields grouped into their option objects."""
-    names = {entry.name for entry in fields(TrainerOptions)} & given.keys()
-    rest = {name: value for name, value in given.items() if name not in names}
-    return rest | {"options": TrainerOptions(**{name: given[name] for name in names})}
+    names = {entry.name for entry in fields(TrainerOptions)} & values.keys()
+    rest = {name: value for name, value in values.items() if name not in names}
+    return rest | {"options": TrainerOptions(**{name: values[name] for name in names})}
 
 
 def train(scene: Scene, recipe: Recipe, **options: object) -> tuple[Trainer, RunLogger]:
     recorder = RunLogger()
-    given = {"backend": "reference", "progress_every": 1} | options
-    protocol = given.pop("protocol", GENERIC)
-    trainer = Trainer(scene, recipe, protocol, on_event=recorder, **grouped(given))
+    values = {"backend": "reference", "progress_every": 1} | options
+    protocol = values.pop("protocol", GENERIC)
+    trainer = Trainer(scene, recipe, protocol, on_event=recorder, **grouped(values))
     recorder.trainer = trainer
     trainer.run()
     return trainer, recorder

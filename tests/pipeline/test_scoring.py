@@ -9,10 +9,7 @@ import torch
 from gs2d.core.camera import look_at
 from gs2d.core.splats import Splats
 from gs2d.data.scene import View
-from gs2d.pipeline.finish.scoring import (
-    mean_psnr,
-    score_views,
-)
+from gs2d.pipeline.finish.scoring import ScoreOptions, TransparentPixels, mean_psnr, score_views
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
 
@@ -47,3 +44,37 @@ def test_the_mean_psnr_of_the_curve_equals_that_of_the_full_scores() -> None:
     assert mean_psnr(splats, views, settings, backend) == pytest.approx(sum(v for v in values if v) / 2, abs=0)
     assert mean_psnr(splats, views[2:], settings, backend) is None
     assert mean_psnr(splats, [], settings, backend) is None
+
+
+def test_transparent_pixels_are_counted_where_training_photographs_are_opaque_and_unmasked() -> None:
+    wall = Splats(
+        means=torch.tensor([[-0.5, 0.0, 0.0]]),
+        quats=torch.tensor([[1.0, 0, 0, 0]]),
+        log_scales=torch.zeros(1, 2),
+        opacity_logits=torch.full((1,), 9.0),
+        sh0=torch.zeros(1, 1, 3),
+        shN=torch.zeros(1, 0, 3),
+    )
+    camera = look_at(np.array([0.0, 0, -3]), np.zeros(3), np.array([0.0, -1, 0]), width=12, height=12, fx=14.0)
+    grey, left = np.full((12, 12, 3), 90, np.uint8), np.arange(12)[None, :].repeat(12, axis=0) < 6
+    alpha = np.concatenate([grey, np.full((12, 12, 1), 255, np.uint8)], axis=2)
+    views = [
+        View.from_arrays("all", camera, grey),
+        View.from_arrays("left", camera, grey, mask=left),
+        View.from_arrays("nothing counts", camera, grey, mask=np.zeros((12, 12), bool)),
+        View.from_arrays("alpha", camera, alpha),
+    ]
+    settings, backend = RasterSettings(sh_degree=0), get_backend("reference")
+    clear = (backend.rasterize(wall, camera, settings).alpha < 0.9).double()
+    every, half = float(clear.mean()), float(clear[:, :6].mean())
+    assert 0 < half != every
+    for split in ("train", "test"):
+        counter = TransparentPixels()
+        options = ScoreOptions(split=split, visitors=[counter.visit])
+        score_views(wall, views, settings, backend, name="", on_event=lambda _: None, options=options)
+        if split == "test":
+            assert counter.entry() == {}
+            continue
+        worst, view = max((every, "all"), (half, "left"))
+        expected = {"part": pytest.approx((every + half) / 2), "view": view, "worst": pytest.approx(worst)}
+        assert counter.entry() == {"transparent": expected}

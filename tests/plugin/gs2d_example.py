@@ -117,6 +117,7 @@ class SelectNear(EntryAction):
 class Tint(gs2d.LearnedQuantity):
     """A gain of each channel of each photograph, whose mean over all photographs is 1."""
 
+    title = "Tint of the photographs"
     shape = (3,)
 
     def numbers(self, values, index):

@@ -168,6 +168,15 @@ def test_the_table_of_results_marks_the_best_and_has_no_empty_row() -> None:
     assert "LPIPS" not in table
 
 
+def test_transparent_pixels_are_named_if_they_are_more_than_one_percent() -> None:
+    for part, is_shown in ((0.0123, True), (0.0099, False)):
+        stage = {**stage_entry(2), "transparent": {"part": part, "view": "b.jpg", "worst": 0.2}}
+        text = " ".join(text_of(str(results_section(record(stages=(stage,))))).split())
+        assert ("in 1.2 % of the pixels of training views" in text) == is_shown
+        assert ("most in b.jpg (20.0 %)" in text) == is_shown
+    assert "ransparent" not in str(results_section(record()))  # not counted
+
+
 def test_surface_scores_are_shown_or_the_reason_why_there_are_none() -> None:
     row = {"threshold": 0.02, "precision": 0.91, "recall": 0.84, "f_score": 0.8736}
     surface = {"thresholds": [row], "chamfer": 0.0123, "truth_hidden": 0.4459, "novel": 3}

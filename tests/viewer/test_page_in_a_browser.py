@@ -18,7 +18,9 @@ from gs2d.core.camera import look_at
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.core.splats import Splats
 from gs2d.data.subject_box import Subject
+from gs2d.io.splat_ply import write_splats
 from gs2d.meshing.web_mesh import web_mesh
+from gs2d.pipeline.look.page import page_run
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
 from gs2d.viewer.scene_page import PageScene, PageView, write_page
@@ -297,3 +299,28 @@ def test_two_clicks_measure_a_distance_on_the_surface(page: Page) -> None:
     np.testing.assert_allclose([float(word) for word in words[4:]], [100, -199.7, 50, 100, -200.3, 50, 1.25], atol=3e-3)
     page.key("Escape")
     assert values(page, "ruler.on", "$('measurepanel').hidden") == [False, True]
+
+
+def test_splats_without_cameras_open_with_nearly_all_of_them_in_the_window(tmp_path: Path) -> None:
+    require_browser()
+    rng = np.random.default_rng(0)
+    means = (ORIGIN + rng.normal(0, (3.0, 0.5, 0.5), (2000, 3))).astype(np.float32)  # longer than wide
+    rows = torch.from_numpy(means), torch.zeros(2000, 4), torch.zeros(2000, 2), torch.zeros(2000)
+    splats = Splats(*rows, torch.zeros(2000, 1, 3), torch.zeros(2000, 0, 3))
+    write_splats(tmp_path / "cloud.ply", splats)
+    page_run(tmp_path / "cloud.ply")
+    with browser() as tab:
+        tab.size(640, 420)
+        tab.open(f"file://{tmp_path / 'cloud.html'}")
+        still(tab)
+        origin = np.array(values(tab, "facts.origin")[0])
+        within = f"{(means - origin).tolist()}.filter(isWithin).length"
+        tab.ask("window.isWithin = (point) => isInImage(camera, point) && "
+                "point.every((x, k) => x > facts.crop.low[k] && x < facts.crop.high[k])")  # fmt: skip
+        assert 0.97 * 2000 < values(tab, within)[0] <= 2000
+        before = np.array(values(tab, "camera.eye")[0])
+        tab.drag((100, 160), (400, 160), steps=3)  # 103 degrees: no photograph limits the directions
+        assert before @ np.array(values(tab, "camera.eye")[0]) < 0.5 * before @ before
+        still(tab)
+        assert values(tab, "$('note').hidden") == [True]
+        assert tab.errors == []

@@ -31,6 +31,7 @@ TRAINING_VIEWS = Limits(27.0, 22.0)  # dB: training views are about 2 dB better 
 FLOATERS = Limits(0.02, 0.3)  # of the sparse points: clean scenes hide up to 0.5 %, visible fog 5 to 20 %
 BEHIND = Limits(0.15, 0.3)  # if every new view is good: a reflecting table has 10 % of its points behind it
 OVERFIT = 3.0  # dB that training views exceed new views by, from which longer training does not help
+TRANSPARENT = 0.01  # of the pixels of training views: edges and gaps between leaves have less
 PLACED = 0.8  # of the photographs have a camera: with fewer, a side of the subject is missing
 
 

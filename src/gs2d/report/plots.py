@@ -181,6 +181,19 @@ def plot_by_image(height: float) -> tuple[Any, Any]:
     return figure, axes
 
 
+def lines_by_image(curves: Mapping[str, Sequence[float]]) -> str:
+    """Return an SVG of values of the training photographs, one line per entry; several lines get a legend."""
+    figure, axes = plot_by_image(2.4)
+    for k, (label, values) in enumerate(curves.items()):
+        style = line_style(k)
+        axes.plot(range(1, len(values) + 1), values, ".", ls=style["linestyle"], color=style["color"], label=label)
+    if len(curves) > 1:
+        axes.legend(frameon=False, labelcolor=INK, fontsize=8)
+    else:
+        axes.set_ylabel(next(iter(curves)), fontsize=8, color=INK)
+    return svg_text(figure)
+
+
 def svg_text(figure: Any) -> str:
     """Return a figure as SVG with reproducible bytes."""
     import matplotlib

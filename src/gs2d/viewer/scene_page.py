@@ -77,6 +77,8 @@ class PageScene:
         The page opens at the subject. None: it is guessed from the cameras.
     world : WorldScale or None
         If given, the page measures in metres, else in units of the capture.
+    is_photographed : bool
+        False: there are no photographs; ``views`` is the opening view only, and all directions are allowed.
     """
 
     title: str
@@ -87,6 +89,7 @@ class PageScene:
     up: np.ndarray
     subject: Subject | None = None
     world: WorldScale | None = None
+    is_photographed: bool = True
 
 
 @dataclass(frozen=True)
@@ -244,7 +247,7 @@ def _crop_row(axis: int) -> str:
 def _facts(scene: PageScene, subject: Subject) -> dict[str, Any]:
     """Return the values that the page needs; coordinates are relative to the focus."""
     cameras, settings, origin = [view.camera for view in scene.views], scene.settings, scene.focus
-    arc = photographed_arc(cameras, subject, scene.up)
+    arc = photographed_arc(cameras if scene.is_photographed else (), subject, scene.up)
     margin = 0.0 if subject.kind == OBJECT else SCENE_MARGIN * (subject.high - subject.low)
     return {
         "near": settings.near,
@@ -257,6 +260,7 @@ def _facts(scene: PageScene, subject: Subject) -> dict[str, Any]:
         "origin": origin.tolist(),
         "subject": {
             "isObject": subject.kind == OBJECT,
+            "isPhotographed": scene.is_photographed,
             "center": (subject.center - origin).tolist(),
             "radius": subject.radius,
             "home": opening_camera(cameras, subject, arc, scene.up),

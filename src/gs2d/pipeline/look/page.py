@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from gs2d.core.missing import path_hint
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import focus_point, up_direction
 from gs2d.data import View
-from gs2d.data.subject_box import Subject, read_subject
+from gs2d.data.subject_box import OBJECT, Subject, read_subject
 from gs2d.errors import DataError, RunError
 from gs2d.io.formats.splat_formats import read_splats
 from gs2d.io.meshes import read_mesh, read_textured
@@ -36,6 +36,9 @@ SUFFIXES = (".html", ".htm")
 EMBEDDED_SIDE = 320  # px, longer side of the photographs in a page
 EMBEDDED_FACES = 200_000  # of the mesh in a page
 EMBEDDED_TEXTURE = 2048  # px, side of its texture
+OPENING_DISTANCE = 3.2  # radii of the subject; an image of 4 x 3 with a focal length of 4 then shows all of it
+TAIL = 1.0  # per cent of the splats outside the opening box on each side of each axis
+MARGIN = 0.1  # of the longest side of that box, added on each side
 LARGE = 50_000_000  # bytes; slow on phones, too large for e-mail
 
 
@@ -156,7 +159,7 @@ def page_content(path: Path, on_event: OnEvent = ignore, loaded: LoadedRun | Non
         photographs,
         settings_without_run(splats) if loaded is None else loaded.settings,
         splats.means.cpu().numpy(),
-        subject=_subject(path, on_event) if run is not None and photographs else None,
+        subject=None if run is None else _subject(path, on_event),
         world=None if run is None else _world_of(run, on_event),
     )
     return PageContent(splats, scene, photographs, run)
@@ -171,15 +174,30 @@ def page_scene(
     subject: Subject | None = None,
     world: WorldScale | None = None,
 ) -> PageScene:
-    """Return cameras and focus of a page for splats at ``centers`` [N, 3]; by default a view from the side."""
+    """Return cameras and focus of a page for splats at ``centers`` [N, 3].
+
+    Without photographs the page opens on the whole subject from the side. The default subject is nearly all splats.
+    """
     cameras = [view.camera for view in photographs]
     focus, unit = _focus(cameras, centers)
-    up = up_direction(cameras) if cameras else np.array([0.0, 0.0, 1.0])
-    seen = [PageView(view.name, view.camera) for view in photographs]
-    if not seen:
-        eye = focus + np.array([2.0, -2.5, 1.5]) * unit
-        seen = [PageView("Opening view", look_at(eye, focus, up, width=4, height=3, fx=4.0))]
-    return PageScene(title, seen, settings, focus, unit, up, subject, world)
+    if photographs:
+        seen = [PageView(view.name, view.camera) for view in photographs]
+        return PageScene(title, seen, settings, focus, unit, up_direction(cameras), subject, world)
+    subject = replace(subject or _most_splats(centers), kind=OBJECT)
+    side = np.cross(subject.up, [1.0, 0.0, 0.0] if abs(subject.up[0]) < 0.9 else [0.0, 1.0, 0.0])
+    arm = side + np.cross(subject.up, side) + 0.7 * subject.up  # diagonally, from above
+    eye = subject.center + OPENING_DISTANCE * subject.radius * arm / np.linalg.norm(arm)
+    seen = [PageView("Opening view", look_at(eye, subject.center, subject.up, width=4, height=3, fx=4.0))]
+    return PageScene(title, seen, settings, focus, unit, subject.up, subject, world, is_photographed=False)
+
+
+def _most_splats(centers: np.ndarray) -> Subject:
+    """Return the box of nearly all splats, with the third axis up."""
+    finite = centers[np.isfinite(centers).all(axis=1)]
+    low, high = np.percentile(finite, (TAIL, 100 - TAIL), axis=0) if len(finite) else np.array([[-1.0] * 3, [1.0] * 3])
+    margin = np.maximum(MARGIN * (high - low).max(), 1e-6)
+    box = (low - margin, high + margin)
+    return Subject(OBJECT, *box, (low + high) / 2, np.array([0.0, 0.0, 1.0]), "nearly all splats; there are no cameras")
 
 
 def some_views(views: Sequence[View]) -> list[View]:

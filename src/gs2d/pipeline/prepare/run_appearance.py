@@ -17,6 +17,7 @@ from gs2d.io.run_dir import LEARNED, SPLATS, RunFolder
 from gs2d.render.exposure_transform import expose, fit_exposure
 from gs2d.training.events import Notice, OnEvent
 from gs2d.training.learned.appearance import numbers_of, shown, unshown
+from gs2d.training.learned.image_exposure import exposure_gain
 from gs2d.training.learned.quantity import ImagePoints
 
 ABOUT = (
@@ -37,11 +38,6 @@ def write_appearance(run: RunFolder, scene: Scene, on_event: OnEvent) -> None:
         gains = {name: exposure_gain(transform) for name, transform in exposures.items()}
         low, high = min(gains, key=gains.__getitem__), max(gains, key=gains.__getitem__)
         on_event(Notice(f"exposures: {gains[low]:.2f} ({low}) to {gains[high]:.2f} ({high}) times the mean: {LEARNED}"))
-
-
-def exposure_gain(transform: np.ndarray) -> float:
-    """Return the mean brightness of medium grey under an exposure [3, 4], relative to the scene."""
-    return float(np.mean(0.5 * transform[:, :3].sum(axis=1) + transform[:, 3]) / 0.5)
 
 
 def with_learned_appearance(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from types import MappingProxyType
 from typing import Any
 
+from gs2d.config.grades import TRANSPARENT
 from gs2d.config.recipe import Stage
 from gs2d.data import Scene, View
 from gs2d.evaluation.image_metrics import ImageMetrics
@@ -17,6 +18,7 @@ from gs2d.pipeline.finish.run_images import choose_views, draw_stage
 from gs2d.pipeline.finish.scoring import (
     RenderedPhotograph,
     ScoreOptions,
+    TransparentPixels,
     Visitor,
     evenly,
     is_partial,
@@ -31,7 +33,7 @@ from gs2d.pipeline.prepare.run_poses import write_poses
 from gs2d.pipeline.train.loss_reports import report_losses
 from gs2d.pipeline.train.resume import put_in_cache
 from gs2d.render.types import RenderOutput
-from gs2d.training.events import OnEvent, StageScored
+from gs2d.training.events import Notice, OnEvent, StageScored
 from gs2d.training.trainer import Trainer
 
 PROBE_VIEWS = 4
@@ -124,6 +126,7 @@ class StageResults:
         }
         shown = {view.name for _, view in self._shown}
         outputs: dict[str, RenderOutput] = {}
+        transparent = TransparentPixels()
 
         def keep(seen: RenderedPhotograph, scores: ImageMetrics) -> None:
             if seen.view.name in shown:
@@ -132,10 +135,15 @@ class StageResults:
         for split, views in self._scored(last=last):
             entry |= {split: None, f"{split}_reason": "its views could not be scored"}
             with attempted(f"scores of {split} views, stage {stage.name}", None, self._on_event):
-                visitors = [keep, *(self._visitors if last else ())]
+                visitors = [keep, transparent.visit, *(self._visitors if last else ())]
                 scores = self._score(split, views, f"scoring {split} views", visitors)
                 del entry[f"{split}_reason"]
                 entry |= split_metrics(scores, split, of=len(self._views(split)))
+        entry |= transparent.entry()
+        part = entry.get("transparent", {}).get("part", 0.0)
+        if last and part > TRANSPARENT:
+            text = f"{100 * part:.1f} % of the pixels of training views are transparent (alpha below 0.9)"
+            self._on_event(Notice(text, detail=True))
         with attempted(f"reports of the losses, stage {stage.name}", None, self._on_event):
             entry |= report_losses(self._run, self._trainer, self._loaded.scene.train)
         self._draw(stage.name, outputs)

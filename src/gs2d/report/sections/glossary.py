@@ -21,7 +21,7 @@ GENERAL = {
     "Normal consistency": "A loss: how much the orientation of the splats differs from the surface that they form. "
     "Lower is smoother.",
     "World unit": "The length unit of the capture. It is arbitrary unless the cameras were measured.",
-    "Transparent": "Pixels of training views where the background shows through. Near 0 is good.",
+    "Transparent": "Pixels of training views with an alpha below 0.9: the background shows through. Near 0 is good.",
     "Floater": "A splat in front of the camera or in the air that no photograph shows.",
     "Peak memory": "Largest amount of memory that the process used.",
 }

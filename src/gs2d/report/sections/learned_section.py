@@ -1,66 +1,41 @@
-"""Learned properties of photographs and cameras: exposure, poses and intrinsics."""
+"""Learned quantities of photographs and cameras: what each one reports, with a plot by photograph."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
+from markupsafe import Markup
 
-from gs2d.core.camera import Zoom
+from gs2d.config.quantities import QUANTITIES
 from gs2d.core.json_files import read_json
 from gs2d.io.run_dir import LEARNED, POSES
-from gs2d.report.html_parts import macro
-from gs2d.report.run_record import RunRecord, reading
+from gs2d.report.html_parts import render
+from gs2d.report.plots import lines_by_image
+from gs2d.report.run_record import RunRecord, name_of, reading
 from gs2d.report.sections.section_registry import register_section
 
 
-@register_section("learned", title="Learned exposures and cameras")
+@register_section("learned", title="Learned quantities")
 def learned_section(run: RunRecord) -> str | None:
-    """Return a paragraph for each file of learned properties; None if the run has none."""
-    paragraphs: list[str] = []
-    for name, describe in _FILES.items():
-        path = run.path / name
-        if not path.is_file():
-            continue
-        with reading(path):
-            paragraphs += filter(None, [describe(read_json(path))])
-    return macro("lists.html", "paragraphs", paragraphs) if paragraphs else None
+    """Return the report of each learned quantity of the recipe; None if nothing was learned."""
+    record = {"views": {}, "frames": []}
+    for file in filter(lambda file: (run.path / file).is_file(), (LEARNED, POSES)):
+        with reading(run.path / file):
+            found = read_json(run.path / file)
+            record |= {key: found[key] for key in record.keys() & found.keys()}
+    parts = [_part(run, name, record) for name in map(name_of, run.recipe.get("learned") or ())]
+    return Markup("\n").join(filter(None, parts)) if any(parts) else None
 
 
-def _appearance(data: Mapping[str, Any]) -> str:
-    grey = {
-        str(name): np.array([*[0.5] * 3, 1.0]) @ np.array(found["exposure"], np.float64).mean(axis=0)
-        for name, found in data["views"].items()
-        if "exposure" in found
-    }
-    gains = {name: float(value) / 0.5 for name, value in grey.items()}
-    if not gains:
-        return ""
-    dark, bright = min(gains, key=gains.__getitem__), max(gains, key=gains.__getitem__)
-    return (
-        f"Exposure: {dark} is the darkest photograph ({gains[dark]:.2f} times the mean brightness), {bright} the "
-        f"brightest ({gains[bright]:.2f} times). Training views are scored in the exposure of their photograph, "
-        "test views in a predicted one. The mesh and new renderings use the mean exposure."
-    )
-
-
-def _poses(data: Mapping[str, Any]) -> str:
-    moved = {str(entry["name"]): entry["moved"] for entry in data["frames"] if entry["split"] == "train"}
-    pixels = {name: float(motion["pixels"]) for name, motion in moved.items()}
-    degrees, farthest = np.mean([motion["degrees"] for motion in moved.values()]), max(pixels, key=pixels.__getitem__)
-    text = (
-        f"Poses: training cameras moved by {np.mean(list(pixels.values())):.2f} px on average ({degrees:.3f} degrees); "
-        f"{farthest} moved most ({pixels[farthest]:.2f} px). Test views keep the cameras of the capture."
-    )
-    zooms = {tuple(map(float, entry["zoom"])) for entry in data["frames"] if "zoom" in entry}
-    if zooms:
-        lenses = [Zoom(*zoom) for zoom in sorted(zooms)]
-        focal = ", ".join(f"{lens.scale:.4f}" for lens in lenses)
-        distortion = ", ".join(f"k1 {lens.k1:+.4f} k2 {lens.k2:+.4f}" for lens in lenses if lens.k1 or lens.k2)
-        text += f" Focal lengths changed by a factor of {focal}."
-        text += f" Distortion: {distortion}." if distortion else ""
-    return text
-
-
-_FILES: dict[str, Callable[[Mapping[str, Any]], str]] = {LEARNED: _appearance, POSES: _poses}
+def _part(run: RunRecord, name: str, record: Mapping[str, Any]) -> Markup | None:
+    if name not in QUANTITIES:
+        text = f"The package that adds this quantity is not installed; {LEARNED} has its numbers."
+        return render("learned.html", title=name, text=text, plot=None)
+    quantity = QUANTITIES.get(name)
+    with reading(run.path / LEARNED):
+        found = quantity.report(name, record)
+    if found is None:
+        return None
+    plot = lines_by_image(found.curves) if found.curves else None
+    return render("learned.html", title=quantity.title or name, text=found.text, plot=plot)

@@ -6,6 +6,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
+
+from gs2d.config.grades import TRANSPARENT
 from gs2d.report.html_parts import macro, missing
 from gs2d.report.run_record import RunRecord, number
 from gs2d.report.sections.glossary import titles_of
@@ -49,7 +52,18 @@ def results_section(run: RunRecord) -> str | None:
             rows.append([label, *(figure(value, digits) for value in values)])
     columns = ["", *(_stage_name(stage) for stage in run.stages)]
     titles = titles_of([row[0] for row in rows])
-    return macro("macros.html", "table", columns, rows, titles=titles, best=best)
+    return macro("macros.html", "table", columns, rows, titles=titles, best=best) + _transparent(run)
+
+
+def _transparent(run: RunRecord) -> Markup:
+    """Return a line about transparent pixels; empty if there are few, or they were not counted."""
+    counted = run.last.get("transparent")
+    if not counted or counted["part"] <= TRANSPARENT:
+        return Markup("")
+    return missing(
+        f"Transparent: in {100 * counted['part']:.1f} % of the pixels of training views the background shows through "
+        f"(alpha below 0.9), most in {counted['view']} ({100 * counted['worst']:.1f} %). The mesh may have holes there."
+    )
 
 
 def figure(value: float | None, digits: int) -> str:

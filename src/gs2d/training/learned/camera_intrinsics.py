@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,7 +15,7 @@ from gs2d.config.validate import require
 from gs2d.core.camera import Camera, Zoom
 from gs2d.core.residual_lens import straightened, through_lens
 from gs2d.data.scene import Scene
-from gs2d.training.learned.quantity import ImagePoints, LearnedQuantity
+from gs2d.training.learned.quantity import ImagePoints, LearnedQuantity, QuantityReport
 from gs2d.training.targets import Target
 
 _ALL = 0.999  # least weight of unmasked pixels in a sample that counts
@@ -33,6 +35,7 @@ class CameraIntrinsics(LearnedQuantity):
         k1 and k2, so that they have the same effect at every focal length.
     """
 
+    title = "Intrinsics"
     shape = (5,)
     per_camera = True
     changes_color = False
@@ -119,3 +122,14 @@ class CameraIntrinsics(LearnedQuantity):
         of_camera = {view.file_intrinsics(): self.zoom(values, k) for k, view in enumerate(scene.train)}
         known = {v.name: of_camera[v.file_intrinsics()] for v in scene.views if v.file_intrinsics() in of_camera}
         return scene.with_poses({}, known)
+
+    @classmethod
+    def report(cls, name: str, record: Mapping[str, Any]) -> QuantityReport | None:
+        """Return the changes of focal lengths and lenses."""
+        zooms = sorted({tuple(map(float, frame["zoom"])) for frame in record["frames"] if "zoom" in frame})
+        if not zooms:
+            return None
+        lenses = [Zoom(*zoom) for zoom in zooms]
+        text = f"Focal lengths changed by a factor of {', '.join(f'{lens.scale:.4f}' for lens in lenses)}."
+        distortion = ", ".join(f"k1 {lens.k1:+.4f} k2 {lens.k2:+.4f}" for lens in lenses if lens.k1 or lens.k2)
+        return QuantityReport(f"{text} Distortion: {distortion}." if distortion else text)

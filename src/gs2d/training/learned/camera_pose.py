@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -14,7 +15,7 @@ from gs2d.config.quantities import QUANTITIES, Quantity
 from gs2d.core.camera import Camera
 from gs2d.core.transforms import common_motion, se3_exp, similarity_motions
 from gs2d.data.scene import Scene
-from gs2d.training.learned.quantity import LearnedQuantity
+from gs2d.training.learned.quantity import LearnedQuantity, QuantityReport
 
 
 @QUANTITIES.register("poses")
@@ -26,6 +27,7 @@ class CameraPose(LearnedQuantity):
     rotation vector, rad, and a shift in scene extents, in the frame of the camera.
     """
 
+    title = "Camera poses"
     shape = (6,)
     changes_color = False
     needs_moving_splats = True
@@ -69,3 +71,18 @@ class CameraPose(LearnedQuantity):
     def place(self, values: Tensor, scene: Scene) -> Scene:
         """Return the scene with its training cameras at their poses."""
         return scene.with_poses({view.name: self.pose(values, k).numpy() for k, view in enumerate(scene.train)})
+
+    @classmethod
+    def report(cls, name: str, record: Mapping[str, Any]) -> QuantityReport | None:
+        """Return how far each training camera moved."""
+        moved = {str(frame["name"]): frame["moved"] for frame in record["frames"] if frame["split"] == "train"}
+        pixels = {view: float(motion["pixels"]) for view, motion in moved.items()}
+        if not pixels:
+            return None
+        degrees = np.mean([motion["degrees"] for motion in moved.values()])
+        farthest = max(pixels, key=pixels.__getitem__)
+        text = (
+            f"Training cameras moved by {np.mean(list(pixels.values())):.2f} px on average ({degrees:.3f} degrees); "
+            f"{farthest} moved most ({pixels[farthest]:.2f} px). Test views keep the cameras of the capture."
+        )
+        return QuantityReport(text, {"motion, px": list(pixels.values())})

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -11,7 +15,7 @@ from gs2d.data.scene import Scene
 from gs2d.errors import RecipeError
 from gs2d.render.exposure_transform import expose, identity
 from gs2d.training.learned.point_gains import point_gains
-from gs2d.training.learned.quantity import ImagePoints, LearnedQuantity
+from gs2d.training.learned.quantity import ImagePoints, LearnedQuantity, QuantityReport
 
 
 @QUANTITIES.register("exposure")
@@ -22,6 +26,7 @@ class ImageExposure(LearnedQuantity):
     the scene has the mean exposure of its images. Given transforms are I + theta_k, and are constant.
     """
 
+    title = "Exposure"
     shape = (3, 4)
     on_device = True
 
@@ -64,3 +69,23 @@ class ImageExposure(LearnedQuantity):
     def penalty(self, numbers: Tensor, index: int) -> Tensor:
         """Return the weighted squared difference of the transform from the identity."""
         return self.settings.prior * (numbers - identity(numbers)).square().sum()
+
+    @classmethod
+    def report(cls, name: str, record: Mapping[str, Any]) -> QuantityReport | None:
+        """Return the brightness of each photograph relative to the mean."""
+        transforms = {view: found[name] for view, found in record["views"].items() if name in found}
+        gains = {view: exposure_gain(np.array(transform, np.float64)) for view, transform in transforms.items()}
+        if not gains:
+            return None
+        dark, bright = min(gains, key=gains.__getitem__), max(gains, key=gains.__getitem__)
+        text = (
+            f"{dark} is the darkest photograph ({gains[dark]:.2f} times the mean brightness), {bright} the brightest "
+            f"({gains[bright]:.2f} times). Training views are scored in the exposure of their photograph, test views "
+            "in a predicted one. The mesh and new renderings use the mean exposure."
+        )
+        return QuantityReport(text, {"brightness, times the mean": list(gains.values())})
+
+
+def exposure_gain(transform: np.ndarray) -> float:
+    """Return the mean brightness of medium grey under an exposure [3, 4], relative to the scene."""
+    return float(np.mean(0.5 * transform[:, :3].sum(axis=1) + transform[:, 3]) / 0.5)

@@ -5,9 +5,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,6 +17,8 @@ from gs2d.config.quantities import Quantity
 from gs2d.core.camera import Camera
 from gs2d.data.scene import Scene, View
 from gs2d.training.targets import Target
+
+MOST_CURVES = 6  # more lines in one plot cannot be told apart
 
 
 @dataclass
@@ -41,6 +45,22 @@ class ImagePoints:
     inside: Tensor | None = None
 
 
+@dataclass(frozen=True)
+class QuantityReport:
+    """Report of a learned quantity, for ``report.html``.
+
+    Attributes
+    ----------
+    text : str
+        Sentences about the learned numbers.
+    curves : mapping of str to floats
+        Values by photograph, drawn in one plot; the keys are the legend.
+    """
+
+    text: str = ""
+    curves: Mapping[str, Sequence[float]] = field(default_factory=dict)
+
+
 class LearnedQuantity:
     """Base class of learned quantities: numbers of each training image, or of each camera.
 
@@ -56,6 +76,8 @@ class LearnedQuantity:
 
     Attributes
     ----------
+    title : str
+        Heading in the report; empty: the name of the quantity.
     shape : tuple of int
         Shape of a row.
     per_camera : bool
@@ -74,6 +96,7 @@ class LearnedQuantity:
         Row of each training view.
     """
 
+    title = ""
     shape: tuple[int, ...] = (1,)
     per_camera = False
     on_device = False
@@ -146,3 +169,28 @@ class LearnedQuantity:
     def place(self, values: Tensor, scene: Scene) -> Scene:
         """Return a scene with the learned numbers in its cameras."""
         return scene
+
+    @classmethod
+    def report(cls, name: str, record: Mapping[str, Any]) -> QuantityReport | None:
+        """Describe the learned numbers for the report; None where there is nothing to show.
+
+        Parameters
+        ----------
+        name : str
+            Name of the quantity.
+        record : mapping
+            ``views`` of ``learned.json`` and ``frames`` of ``poses.json``, each empty without the file.
+
+        Returns
+        -------
+        QuantityReport or None
+            Default: each number by photograph; the root mean square instead of more than ``MOST_CURVES`` numbers.
+        """
+        found = [np.ravel(numbers[name]) for numbers in record["views"].values() if name in numbers]
+        if not found:
+            return None
+        rows = np.array(found, np.float64)
+        text = f"Numbers of {len(rows)} photographs, from {rows.min():.3g} to {rows.max():.3g}."
+        if rows.shape[1] > MOST_CURVES:
+            return QuantityReport(text, {"root mean square": np.sqrt(np.square(rows).mean(axis=1)).tolist()})
+        return QuantityReport(text, {f"number {k + 1}": column.tolist() for k, column in enumerate(rows.T)})

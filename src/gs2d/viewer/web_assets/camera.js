@@ -23,7 +23,7 @@ function cameraOf(i) {
   return { right, down, ahead, eye, w: c.w, h: c.h, fx: c.fx, fy: c.fy, cx: c.cx, cy: c.cy };
 }
 
-const { center, radius, arc, isObject } = facts.subject;
+const { center, radius, arc, isObject, isPhotographed } = facts.subject;
 const eyes = facts.cameras.map((_, i) => cameraOf(i).eye);
 const farthest = Math.max(...eyes.map((eye) => norm(plus(eye, center, -1))));
 const limits = isObject
@@ -126,7 +126,7 @@ function zoom(factor) {
 
 function isUnseen() {
   // Whether no photograph was taken from near the camera.
-  if (atPhotograph) return false;
+  if (atPhotograph || !isPhotographed) return false;
   if (!isObject) return Math.min(...eyes.map((eye) => norm(plus(eye, camera.eye, -1)))) > 0.75 * facts.unit;
   const arm = plus(camera.eye, center, -1), distance = norm(arm);
   const angles = eyes.map((eye) => {
