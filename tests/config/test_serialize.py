@@ -118,6 +118,7 @@ def test_densification_can_be_switched_off() -> None:
         ),
         ("refine=3", "name a field of the stage: name, iterations"),
         ("refine.iteration=3", "no field 'iteration'; there is name, iterations"),
+        ("refine.lr.meens=1", "; did you mean means?"),
         ("refine.iterations=many", "stage 'refine'.iterations must be an integer, got 'many'"),
         ("refine.iterations=2.5", "must be an integer, got 2.5"),
         ("refine.densify.every=3", "nothing below it"),

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from functools import partial
 from typing import Any
 
@@ -28,7 +27,7 @@ from gs2d.config.recipe import (
     Stage,
 )
 from gs2d.config.recipe_files import is_recipe_file, made_recipe, read_recipe_file
-from gs2d.config.registry import Register, Registry
+from gs2d.config.registry import Register, Registry, did_you_mean
 from gs2d.config.robust import DenseStart, Removal
 from gs2d.config.schedule import LONGER
 from gs2d.errors import RecipeError
@@ -424,8 +423,8 @@ def get_recipe(name: str) -> Recipe:
     if is_recipe_file(name):
         return read_recipe_file(name)
     if name not in RECIPES:
-        near = get_close_matches(name, list(RECIPES), n=3) or list(RECIPES)
-        raise RecipeError(f"no recipe {name!r}; there is {', '.join(near)} (`gs2d recipes` lists all)")
+        near = did_you_mean(name, list(RECIPES))
+        raise RecipeError(f"no recipe {name!r}; `gs2d recipes --all` lists them{near}")
     found = RECIPES.get(name)
     return found() if isinstance(found, NamedRecipe) else made_recipe(found, f"recipe {name!r}")
 

@@ -17,7 +17,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from gs2d.config.densify import Densify
 from gs2d.config.recipe import GradDensify, Recipe, validate
-from gs2d.config.registry import absent_guests
+from gs2d.config.registry import absent_guests, did_you_mean
 from gs2d.errors import RecipeError
 
 
@@ -115,7 +115,8 @@ def _set(data: dict[str, Any], words: list[str], value: Any, override: str) -> N
                 node = node[word]
         else:
             known = ", ".join(node) if isinstance(node, dict) else "nothing below it (it is null or a plain value)"
-            raise RecipeError(f"override {override!r}: no field {word!r}; there is {known}")
+            near = did_you_mean(word, list(node)) if isinstance(node, dict) else ""
+            raise RecipeError(f"override {override!r}: no field {word!r}; there is {known}{near}")
 
 
 def _set_trained(train: dict[str, Any], attribute: str, rows: Any) -> None:
@@ -130,7 +131,9 @@ def _entry(entries: list[Any], word: str, override: str) -> Any:
     known = [entry if isinstance(entry, dict) else {} for entry in entries]
     tags = [str(entry.get("kind", entry.get("name", "?"))) for entry in known]
     if word not in tags:
-        raise RecipeError(f"override {override!r}: no entry {word!r}; there is {', '.join(tags) or 'none'}")
+        raise RecipeError(
+            f"override {override!r}: no entry {word!r}; there is {', '.join(tags) or 'none'}{did_you_mean(word, tags)}"
+        )
     return entries[tags.index(word)]
 
 
