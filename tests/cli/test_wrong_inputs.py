@@ -148,6 +148,16 @@ def test_captures_of_every_format_are_distinguished_from_photographs_by_name(tmp
     assert not holds_photographs(tmp_path / "some.zip")
 
 
+def test_a_folder_of_sog_splats_is_no_folder_of_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("means_l.webp", "means_u.webp", "meta.json"):
+        (tmp_path / name).touch()
+    for words in (["view", tmp_path], ["info", tmp_path], ["train", tmp_path, "--out", tmp_path / "run"]):
+        assert run(list(map(str, words))) == 2
+        assert f"; it holds splats: `gs2d view {tmp_path / 'meta.json'}` shows them" in one_line(
+            capsys.readouterr().err
+        )
+
+
 MISSPELT = (
     *([command, "photoz"] for command in ("info", "view", "mesh", "render", "evaluate", "survey")),
     *([command, "photoz", "--out", "new"] for command in ("train", "blocks", "poses", "reconstruct")),

@@ -18,6 +18,7 @@ _CAPTURES = (  # files and folders of captures
     *("transforms.json", "transforms_train.json", "cameras.npz", "cameras_sphere.npz", "sparse"),
     *("reconstruction.json", "opensfm", "cameras.xml", "*.sfm"),
 )
+_SOG = "means_l.webp"  # an image of splats in the SOG format, beside its meta.json
 
 
 def path_hint(path: Path) -> str:
@@ -54,6 +55,8 @@ def suggestion(path: Path, needed: str) -> str:
     needed : str
         "run", "capture" or "photographs".
     """
+    if _SOG in _names_in(path):
+        return f"; it holds splats: `gs2d view {_quoted(path / 'meta.json')}` shows them"
     here = [path, *list(path.parents)[:_UP]]
     run = next((folder for folder in here if (folder / "run.json").is_file()), None) or _run_in(path)
     tried = needed == "capture" and path.is_dir()
@@ -103,7 +106,7 @@ def _run_in(folder: Path) -> Path | None:
 def holds_photographs(path: Path) -> bool:
     """Whether a folder or a ZIP file contains images but no cameras, by file names."""
     names = _names_in(path)
-    return any(name.lower().endswith(_PHOTOS) for name in names) and not _holds_capture(path)
+    return any(name.lower().endswith(_PHOTOS) for name in names) and _SOG not in names and not _holds_capture(path)
 
 
 def _holds_capture(path: Path) -> bool:
