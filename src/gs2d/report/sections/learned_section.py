@@ -19,7 +19,7 @@ from gs2d.report.sections.section_registry import register_section
 @register_section("learned", title="Learned quantities")
 def learned_section(run: RunRecord) -> str | None:
     """Return the report of each learned quantity of the recipe; None if nothing was learned."""
-    record = {"views": {}, "frames": []}
+    record: dict[str, Any] = {"views": {}, "frames": []}
     for file in filter(lambda file: (run.path / file).is_file(), (LEARNED, POSES)):
         with reading(run.path / file):
             found = read_json(run.path / file)
