@@ -55,8 +55,8 @@ def test_a_run_is_served_with_its_stages_its_mesh_and_its_cameras(trained: Path,
         assert stages == ["surface", "appearance", "final"]
         for stage in stages:
             headers, data = fetch(server, "splats", stage=stage)
-            facts = json.loads(headers["X-Splats"])
-            assert len(data) == (32 + 16 * facts["texels"]) * facts["splats"] > 0
+            packed = json.loads(headers["X-Splats"])
+            assert len(data) == (32 + 16 * packed["texels"]) * packed["splats"] > 0
         assert fetch(server, "mesh")[1] == web_mesh(read_mesh(copy / "mesh.ply"))
         assert len(facts["cameras"]) == 3
         with Image.open(io.BytesIO(fetch(server, "photograph", view="2")[1])) as image:
