@@ -24,7 +24,7 @@ from gs2d.pipeline.prepare.resolve import with_fused_depth
 from gs2d.pipeline.prepare.resolved import check_same_run
 from gs2d.pipeline.train.train_run import train
 from gs2d.render.backends import Backend, get_backend
-from gs2d.training.events import Event, Notice
+from gs2d.training.events import Event, Notice, Phase, Step
 from tiny import RADIUS, write_capture
 
 
@@ -72,6 +72,31 @@ def test_training_with_little_memory_uses_larger_voxels(tmp_path: Path, monkeypa
                              overrides=overrides), heard.append)  # fmt: skip
     assert any("using voxels of this size" in event.text for event in heard if isinstance(event, Notice))
     assert run.metrics()["mesh"]["faces"] == len(read_mesh(run.file("mesh.ply")).faces) > 10
+
+
+def test_a_refined_mesh_has_fewer_faces_and_counts_its_work(run: Path, tmp_path: Path) -> None:
+    plain = mesh_run(run, MeshOptions(voxel=0.03), out=tmp_path / "plain.ply", threads=1)
+    heard: list[Event] = []
+    refined = mesh_run(run, MeshOptions(voxel=0.03, refine=True), heard.append, out=tmp_path / "refined.ply", threads=1)
+    assert 20 < refined["faces"] < plain["faces"] / 2
+    assert len(read_mesh(tmp_path / "refined.ply").faces) == refined["faces"]
+    begun = next(i for i, event in enumerate(heard) if isinstance(event, Phase) and event.name == "refining the mesh")
+    work = [event.done for event in heard[begun:] if isinstance(event, Step)]
+    assert work == sorted(work)
+    assert work[-1] == heard[begun].total  # type: ignore[union-attr]
+
+
+def test_interrupting_a_refinement_keeps_the_mesh(run: Path) -> None:
+    mesh_run(run, MeshOptions(voxel=0.1), threads=1)
+    before = (run / "mesh.ply").read_bytes()
+
+    def interrupt(event: Event) -> None:
+        if isinstance(event, Phase) and event.name == "refining the mesh":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        mesh_run(run, MeshOptions(voxel=0.1, refine=True), interrupt, threads=1)
+    assert (run / "mesh.ply").read_bytes() == before
 
 
 def test_a_run_fuses_the_depth_of_its_protocol(run: Path, tmp_path: Path) -> None:

@@ -92,7 +92,10 @@ class TrainCommand(TrainOptions, Common):
 
 
 @register_command(
-    "mesh", action="gs2d.cli.handlers:mesh", group=STEPS, first=("run", "out", "texture", "voxel", "bbox", "unbounded")
+    "mesh",
+    action="gs2d.cli.handlers:mesh",
+    group=STEPS,
+    first=("run", "out", "texture", "refine", "voxel", "bbox", "unbounded"),
 )
 @dataclass(frozen=True, kw_only=True)
 class MeshCommand(TextureOptions, MeshOptions, Common):

@@ -17,6 +17,7 @@ from gs2d.core.camera import Camera
 _PAIRS_PER_CHUNK = 60_000  # the temporaries of a chunk fit in the cache of a core
 NEAR = 1e-3  # world units
 _MARGIN = 1e-6  # samples around the box of a triangle, for rounding
+JUMP = 3.0  # pixel footprints; a larger bend of the depth between pixels is an outline
 _NO_HIT = np.uint64(0xFFFFFFFFFFFFFFFF)
 Size = tuple[int, int]  # rows, columns
 
@@ -93,6 +94,24 @@ def cast_camera(
     hits = _hits(nearest, edges, directions_x, directions_y)
     numbers = np.append(met, -1).astype(np.int32)  # -1 without a hit
     return Hits(numbers[hits.face], hits.depth, hits.weights)
+
+
+def outlines(depth: np.ndarray, focal: float) -> np.ndarray:
+    """Return the pixels at outlines, [H, W] bool: where 1 / depth, which is linear on a plane, bends.
+
+    Parameters
+    ----------
+    depth : ndarray [H, W] world units
+        0 without a surface.
+    focal : float, px
+    """
+    inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0)
+    bend = np.zeros_like(inverse)
+    middle = inverse[:, 1:-1]
+    bend[:, 1:-1] = np.abs(inverse[:, :-2] + inverse[:, 2:] - 2 * middle)
+    middle = inverse[1:-1]
+    bend[1:-1] = np.maximum(bend[1:-1], np.abs(inverse[:-2] + inverse[2:] - 2 * middle))
+    return np.asarray(bend * depth * focal > JUMP)
 
 
 def cast_down(vertices: np.ndarray, faces: np.ndarray, corner: tuple[float, float], step: float, size: Size) -> Hits:

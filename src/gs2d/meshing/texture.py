@@ -34,7 +34,7 @@ from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.errors import ProtocolError
 from gs2d.meshing.agreement import VOTE, Agreement, agree, corrected
 from gs2d.meshing.evidence import areas
-from gs2d.meshing.raycast import cast_camera
+from gs2d.meshing.raycast import cast_camera, outlines
 from gs2d.meshing.simplify import simplify
 
 # -- charts and texels -------------------------------------------------------------------------------------------------
@@ -175,7 +175,6 @@ BEST = 4  # images in the mean
 FEATHER = 4.0  # px
 MIN_FEATHER = 0.01
 GRAZING = 0.1  # cosine below which a surface is not visible
-JUMP = 3.0  # pixel footprints; a larger bend of the depth between pixels is an outline
 MAX_SIDE = 1600  # px; of the depth maps for occlusion
 MIN_SIZE, MAX_SIZE, MAX_AUTO_SIZE = 64, 8192, 4096
 _CHUNK = 1 << 17  # texels
@@ -519,16 +518,10 @@ def feather(depth: np.ndarray, focal: float, shown: np.ndarray) -> np.ndarray:
     """Return the feather factor of pixels, float32 [H, W]; 0 for unusable pixels.
 
     It is 1 at ``FEATHER`` pixels or more from outlines, the image border and pixels that are not ``shown``, and falls
-    to ``MIN_FEATHER`` beside them. An outline is a bend of 1 / depth, which is linear on a plane.
+    to ``MIN_FEATHER`` beside them.
     """
-    inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0)
-    bend = np.zeros_like(inverse)
-    middle = inverse[:, 1:-1]
-    bend[:, 1:-1] = np.abs(inverse[:, :-2] + inverse[:, 2:] - 2 * middle)
-    middle = inverse[1:-1]
-    bend[1:-1] = np.maximum(bend[1:-1], np.abs(inverse[:-2] + inverse[2:] - 2 * middle))
     usable = (depth > 0) & shown
-    clear = np.pad(usable & (bend * depth * focal <= JUMP), 1)  # pixels beyond the border are unknown
+    clear = np.pad(usable & ~outlines(depth, focal), 1)  # pixels beyond the border are unknown
     distance = distance_transform_edt(clear)[1:-1, 1:-1]
     return np.where(usable, np.clip(distance / FEATHER, MIN_FEATHER, 1), 0).astype(np.float32)
 

@@ -34,6 +34,7 @@ from gs2d.meshing.extract import Extraction, ExtractOptions, extract, extract_un
 from gs2d.meshing.slabs import SLAB_BYTES
 from gs2d.meshing.tsdf_volume import VolumeTooLargeError
 from gs2d.pipeline.attempts import again, attempted
+from gs2d.pipeline.finish.run_refine import refined
 from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.run_subject import OPAQUE, meshed_subject
 from gs2d.pipeline.finish.scoring import RenderedPhotograph
@@ -186,7 +187,7 @@ def fused(
                 f"{part} outside the fused box; --unbounded meshes everything, --bbox or --depth-limit extend the box"
             )
         on_event(Notice(line))
-    return result
+    return replace(result, mesh=refined(loaded, result.mesh, on_event)) if options.refine else result
 
 
 def check_mesh_options(options: MeshOptions) -> None:

@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from gs2d.core.atomic_files import check_writable
@@ -34,6 +33,7 @@ from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.finish.run_mesh import fused, mesh_run
 from gs2d.pipeline.finish.run_report import report_again
 from gs2d.pipeline.finish.run_subject import meshed_subject
+from gs2d.pipeline.finish.trusted_depth import usable_pixels
 from gs2d.pipeline.look.page import page_run
 from gs2d.pipeline.prepare.loaded import LoadedRun, open_finished
 from gs2d.pipeline.prepare.open_capture import read_scene
@@ -145,10 +145,3 @@ def photographs(loaded: LoadedRun, views: Sequence[View], on_event: OnEvent, fac
     """Yield photographs in the colours of the scene, smaller by ``factor``."""
     for view in counted(views, PASSES[factor > 1], len(views), on_event):
         yield ColorSource(view.camera, as_scene(view), usable_pixels(view, loaded)).shrunk(factor)
-
-
-def usable_pixels(view: View, loaded: LoadedRun) -> np.ndarray | None:
-    """Return the pixels that show the surface: not masked, and on the object if fusion used its mask."""
-    masks = [view.mask(), view.object_mask() if loaded.protocol.use_mask_in_fusion else None]
-    present = [mask for mask in masks if mask is not None]
-    return np.logical_and.reduce(present) if present else None

@@ -63,3 +63,10 @@ def sky_of(loaded: RenderedScene, view: View, up: np.ndarray) -> np.ndarray:
     rays = backproject(camera, np.ones(len(rows)), rows, columns) - camera.center
     above = (rays @ up > 0).reshape(camera.height, camera.width)
     return sky_pixels(view.target(loaded.settings.background), points, above, view.valid())
+
+
+def usable_pixels(view: View, loaded: RenderedScene) -> np.ndarray | None:
+    """Return the pixels that show the surface: not masked, and on the object if fusion used its mask."""
+    masks = [view.mask(), view.object_mask() if loaded.protocol.use_mask_in_fusion else None]
+    present = [mask for mask in masks if mask is not None]
+    return np.logical_and.reduce(present) if present else None

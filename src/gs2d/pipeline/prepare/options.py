@@ -300,6 +300,8 @@ class MeshOptions:
     """Mesh distant things too, in voxels that grow with distance."""
     error: Annotated[float | None, Arg(metavar="PIXELS")] = None
     """Merge faces while the surface moves less than this in the nearest image (default: 0.25; data sets: keep all)."""
+    refine: bool = False
+    """Move the surface until neighbouring photographs agree, with fewer triangles."""
     max_gib: Annotated[float | None, SETTING] = None
     """Limit of the volume in GiB (default: by --memory). The error for a larger one names a voxel size that fits."""
     depth: Annotated[Literal["mean", "median", "transmittance"] | None, SETTING] = None

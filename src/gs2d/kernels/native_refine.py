@@ -1,0 +1,113 @@
+"""Native kernels of mesh refinement: ``meshing/warped_ncc.py`` has the same in numpy and describes the arrays."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gs2d.core.camera import Camera
+
+if TYPE_CHECKING:
+    from gs2d.kernels.library import Library
+
+__all__ = ["GatherArguments", "MatchArguments", "RasterArguments", "draw_on_cpu", "gather_on_cpu", "lens_of"]
+
+PLANES = 7  # images in the workspace of a comparison
+
+
+class RasterArguments(ctypes.Structure):
+    """``RasterArguments`` of cpu/refine.cpp."""
+
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("vertices", "faces", "width", "height")),
+        ("lens", ctypes.c_double * 4),
+        ("pose", ctypes.c_double * 12),
+        ("near", ctypes.c_double),
+        *((name, ctypes.c_void_p) for name in ("positions", "corners", "flat", "face", "depth")),
+    )
+
+
+class MatchArguments(ctypes.Structure):
+    """``MatchArguments`` of cpu/refine.cpp."""
+
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("width", "height", "source_width", "source_height", "radius")),
+        *((name, ctypes.c_double * 4) for name in ("lens", "source_lens")),
+        ("motion", ctypes.c_double * 12),
+        *((name, ctypes.c_double) for name in ("texture", "poor", "good", "occluded")),
+        *((name, ctypes.c_void_p) for name in ("grey", "source", "usable", "source_usable")),
+        *((name, ctypes.c_void_p) for name in ("depth", "source_depth", "planes", "gradient", "curvature", "sums")),
+    )
+
+
+class GatherArguments(ctypes.Structure):
+    """``GatherArguments`` of cpu/refine.cpp."""
+
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("width", "height")),
+        ("lens", ctypes.c_double * 4),
+        ("grazing", ctypes.c_double),
+        *((name, ctypes.c_void_p) for name in ("local", "normals", "corners", "face", "gradient", "curvature")),
+        *((name, ctypes.c_void_p) for name in ("by_vertex", "bend_by_vertex")),
+    )
+
+
+def lens_of(camera: Camera) -> ctypes.Array[ctypes.c_double]:
+    """Return fx, fy, cx and cy."""
+    return (ctypes.c_double * 4)(camera.fx, camera.fy, camera.cx, camera.cy)
+
+
+def draw_on_cpu(
+    library: Library, vertices: np.ndarray, faces: np.ndarray, camera: Camera, near: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw a mesh; return the nearest face [H, W] and its depth [H, W].
+
+    Parameters
+    ----------
+    library : Library
+    vertices : ndarray [P, 3] float64 world units
+    faces : ndarray [F, 3] int32
+    camera : Camera
+    near : float, world units
+        Faces with a vertex nearer than this are left out.
+    """
+    vertices, faces = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int32)
+    size = (camera.height, camera.width)
+    flat = np.empty_like(vertices)
+    face, depth = np.empty(size, np.int32), np.empty(size, f"f{library.dtype.itemsize}")
+    arguments = RasterArguments(
+        vertices=len(vertices),
+        faces=len(faces),
+        width=camera.width,
+        height=camera.height,
+        lens=lens_of(camera),
+        pose=(ctypes.c_double * 12)(*camera.T_cam_world[:3].ravel()),
+        near=near,
+        positions=vertices.ctypes.data,
+        corners=faces.ctypes.data,
+        flat=flat.ctypes.data,
+        face=face.ctypes.data,
+        depth=depth.ctypes.data,
+    )
+    library.function("gs2d_raster_mesh", None, [ctypes.c_void_p])(ctypes.byref(arguments))
+    return face, depth
+
+
+def gather_on_cpu(library: Library, arguments: GatherArguments) -> None:
+    """Add derivatives by pixel depth to the vertices."""
+    library.function("gs2d_gather_vertices", None, [ctypes.c_void_p])(ctypes.byref(arguments))
+
+
+def match_on_cpu(library: Library, arguments: MatchArguments) -> None:
+    """Add the derivatives of one comparison to the pixels.
+
+    Raises
+    ------
+    MemoryError
+        If the rows of a window do not fit into memory.
+    """
+    call = library.function("gs2d_match_views", ctypes.c_int, [ctypes.c_void_p])
+    if call(ctypes.byref(arguments)) != 0:
+        raise MemoryError("gs2d_match_views could not allocate its rows")

@@ -1,0 +1,366 @@
+"""Refine a mesh photometrically: vertices move along their normals until neighbouring photographs agree.
+
+The idea is that of Vu et al. 2012, "High accuracy and visibility-consistent dense multi-view stereo". The energy is
+
+    sum over pairs of views of sum over pixels of w (1 - NCC)
+    + bending / 2 sum over vertices of A kappa^2 + tether / 2 sum over vertices of A m^2 / s^4
+
+plus a membrane term on each step. kappa is the mean curvature, kappa_0 a smooth version of
+that of the start, and A the area of a vertex, s the size of a pixel on the
+surface, m the distance that the vertex has moved. Each step solves the Gauss-Newton system of the distances along the
+normals, so surface without texture follows its surroundings. Formulas: docs/math.md, "Mesh refinement".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csr_array, diags_array
+from scipy.spatial import cKDTree
+
+from gs2d.core.camera import Camera
+from gs2d.core.memory_limit import cache_bytes
+from gs2d.core.mesh import Mesh
+from gs2d.kernels.library import Library
+from gs2d.meshing.bending import Curvature, solve, split_edges
+from gs2d.meshing.depth_maps import DepthMap
+from gs2d.meshing.evidence import Evidence, gather, pixels
+from gs2d.meshing.fusion_bounds import backproject
+from gs2d.meshing.simplify import simplify
+from gs2d.meshing.texture import vertex_normals
+from gs2d.meshing.warped_ncc import (
+    DrawnMesh,
+    GreyImage,
+    MatchSettings,
+    PixelPull,
+    Surface,
+    VertexPull,
+    draw_mesh,
+    gather_vertices,
+    match_views,
+)
+
+CACHE_BYTES = 1 << 29  # limit for images and depth maps in memory
+SMALL_SIDE = 100  # px, shorter side of the images in which neighbours are chosen
+SEEN_AGAIN = 0.05  # of the depth: tolerance of these coarse images
+POINTS = 600  # of a view that compare its neighbours
+SPREAD = 0.6  # standard deviation of the logarithm of good angles
+LEAST_GAIN = 0.02  # of the points: a neighbour must add as much
+REPEATED = 0.6  # a point that a perfect neighbour sees loses this fraction of its value for further ones
+
+ReadGrey = Callable[[int, int], GreyImage]
+"""Reads photograph ``index``, downscaled by an integer factor."""
+
+
+@dataclass(frozen=True)
+class RefineSettings:
+    """How a mesh is refined.
+
+    Attributes
+    ----------
+    factors : tuple of int
+        The photographs are downscaled by these factors, one after the other.
+    steps : int
+        Gauss-Newton steps at each of them.
+    neighbours : int
+        Views that each view is compared with, at most.
+    least_angle, best_angle, most_angle : float, degrees
+        Between the rays of two views to a surface point.
+    face_pixels : float
+        Mean number of pixels of a face after simplification.
+    split_pixels : float
+        Number of pixels of the largest faces.
+    bending, membrane, tether : float
+        Weights of the curvature, of differences between the steps of neighbouring vertices, and of the distance from
+        the start. Independent of the size of the scene and of the images.
+    longest_step : float, px
+        Of a vertex.
+    smooth : int
+        The curvature to keep is averaged over this number of rings of neighbours: bends and edges stay, noise does not.
+    solver_steps : int
+        Iterations of the solver in a step.
+    tolerance : float
+        Relative residual at which it stops.
+    match : MatchSettings
+    """
+
+    factors: tuple[int, ...] = (1,)
+    steps: int = 6
+    neighbours: int = 3
+    least_angle: float = 4.0
+    best_angle: float = 14.0
+    most_angle: float = 35.0
+    face_pixels: float = 4.0
+    split_pixels: float = 16.0
+    bending: float = 1.0
+    membrane: float = 0.01
+    tether: float = 0.01
+    longest_step: float = 1.0
+    solver_steps: int = 60
+    smooth: int = 3
+    tolerance: float = 1e-3
+    match: MatchSettings = field(default_factory=MatchSettings)
+
+
+class _Kept:
+    """Results of a function of an index; the last that fit in ``limit`` bytes are kept."""
+
+    def __init__(self, make: Callable[[int], Any], limit: int) -> None:
+        self._make, self._limit, self._kept = make, limit, dict[int, Any]()
+
+    def __call__(self, index: int) -> Any:
+        found = self._kept.pop(index, None)
+        if found is None:
+            found = self._make(index)
+            while self._kept and self._size(found) * (len(self._kept) + 1) > self._limit:
+                self._kept.pop(next(iter(self._kept)))
+        self._kept[index] = found
+        return found
+
+    @staticmethod
+    def _size(item: Any) -> int:
+        return sum(value.nbytes for value in vars(item).values() if isinstance(value, np.ndarray))
+
+
+@dataclass(frozen=True, eq=False)
+class _Moving:
+    """Vertices, and what moves with them.
+
+    Attributes
+    ----------
+    vertices, start : ndarray [P, 3] float64, world units
+        Where they are, and where they were.
+    faces : ndarray [F, 3] int32
+    size : ndarray [P] float64, world units
+        Size of a full pixel on the surface.
+    """
+
+    vertices: np.ndarray
+    start: np.ndarray
+    faces: np.ndarray
+    size: np.ndarray
+
+    def normals(self) -> np.ndarray:
+        """Return unit normals [P, 3]."""
+        return vertex_normals(Mesh(self.vertices, self.faces)).astype(np.float64)
+
+    def split(self, limit: np.ndarray) -> _Moving:
+        """Halve edges longer than ``limit`` [P]."""
+        values = np.concatenate([self.start, self.size[:, None]], axis=1)
+        vertices, faces, values = split_edges(self.vertices, self.faces, limit, values)
+        return _Moving(vertices, values[:, :3], faces, values[:, 3])
+
+
+class Refinement:
+    """A mesh under refinement.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Not changed.
+    cameras : sequence of Camera
+        Of the photographs at full size.
+    photographs : callable
+        Reads a photograph in grey.
+    settings : RefineSettings
+    library : Library or None
+        Native kernels; None: numpy.
+
+    Attributes
+    ----------
+    work : int
+        The last number that ``on_work`` receives.
+    """
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        cameras: Sequence[Camera],
+        photographs: ReadGrey,
+        settings: RefineSettings = RefineSettings(),
+        library: Library | None = None,
+    ) -> None:
+        self._mesh, self._cameras, self._photographs = mesh, list(cameras), photographs
+        self._settings, self._library = settings, library
+        self._room = cache_bytes(CACHE_BYTES) // 3  # for photographs, for their usable pixels and for depth maps
+        self._done = 0
+        self.work = settings.steps * len(self._cameras) * sum(self._cost(factor) for factor in settings.factors)
+
+    def _cost(self, factor: int) -> int:
+        """Return the cost of a view, in views of the smallest size."""
+        return (max(self._settings.factors) // factor) ** 2
+
+    def run(self, on_work: Callable[[int], None]) -> Mesh:
+        """Refine the mesh.
+
+        Parameters
+        ----------
+        on_work : callable
+            Receives the amount of work that is done.
+
+        Returns
+        -------
+        Mesh
+            With the colours of the nearest vertices of the input.
+        """
+        mesh = Mesh(self._mesh.vertices.astype(np.float64), self._mesh.faces)
+        settings, count = self._settings, pixels(mesh, self._seen(mesh))
+        mesh = simplify(mesh, faces=int(count / settings.face_pixels), cameras=self._cameras)
+        density = self._seen(mesh).density.astype(np.float64)
+        if not len(mesh.faces) or not (density > 0).any():
+            return self._mesh
+        density[density == 0] = np.median(density[density > 0])
+        neighbours = choose_neighbours(mesh, self._cameras, settings, self._library)
+        now = _Moving(mesh.vertices, mesh.vertices, mesh.faces, 1 / np.sqrt(density))
+        self._done = 0
+        for factor in settings.factors:
+            # of an equilateral face; halves of an edge are shorter by up to 2
+            now = now.split(factor * now.size * np.sqrt(2 * 4 / np.sqrt(3) * settings.split_pixels))
+            now = self._at_size(now, factor, neighbours, on_work)
+        vertices = now.vertices.astype(self._mesh.vertices.dtype)
+        colors = None
+        if self._mesh.colors is not None:
+            colors = self._mesh.colors[cKDTree(self._mesh.vertices).query(now.start)[1]]
+        return Mesh(vertices, now.faces, colors)
+
+    def _seen(self, mesh: Mesh) -> Evidence:
+        """Return which views see the vertices, and at how many pixels per unit of surface."""
+        depths: list[float] = []
+
+        def maps() -> Iterator[DepthMap]:
+            for camera in self._cameras:
+                yield DepthMap(camera, self._draw(mesh.vertices, mesh.faces, camera).depth, None, None)
+
+        for camera in self._cameras:
+            depth = camera.project(mesh.vertices[:: max(1, len(mesh.vertices) // POINTS)])[1]
+            depths.extend(depth[depth > 0])
+        return gather(mesh, maps(), self._settings.match.occluded * float(np.median(depths or [0.0])))
+
+    def _draw(self, vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> DrawnMesh:
+        return draw_mesh(vertices, faces, camera, library=self._library)
+
+    def _at_size(
+        self, now: _Moving, factor: int, neighbours: Sequence[Sequence[int]], on_work: Callable[[int], None]
+    ) -> _Moving:
+        """Take the steps at one size of the photographs."""
+        cameras = [camera.downscaled(factor) for camera in self._cameras]
+        photographs = _Kept(lambda index: self._photographs(index, factor), self._room)
+        bend = Curvature.of(now.vertices, now.faces, now.normals()).smooth(self._settings.smooth)
+        for _ in range(self._settings.steps):
+            surface = Surface(now.vertices, now.faces, now.normals())
+            pull = VertexPull.zeros(len(now.vertices))
+            for _ in self._compared(surface, cameras, photographs, neighbours, pull):
+                self._done += self._cost(factor)
+                on_work(self._done)
+            now = self._moved(now, factor, surface.normals, pull, bend)
+        return now
+
+    def _compared(
+        self,
+        surface: Surface,
+        cameras: Sequence[Camera],
+        photographs: Callable[[int], GreyImage],
+        neighbours: Sequence[Sequence[int]],
+        into: VertexPull,
+    ) -> Iterator[None]:
+        """Add the derivatives of all pairs to ``into``, view by view."""
+        drawn = _Kept(lambda index: self._draw(surface.vertices, surface.faces, cameras[index]), self._room)
+
+        def usable(index: int) -> GreyImage:
+            photograph, inner = photographs(index), drawn(index).inner(cameras[index].fx)
+            return replace(photograph, usable=inner if photograph.usable is None else inner & photograph.usable)
+
+        images, match = _Kept(usable, self._room), self._settings.match
+        for index, camera in enumerate(cameras):
+            by_pixel = PixelPull.zeros(camera, drawn(index).depth.dtype)
+            for other in neighbours[index]:
+                pair, depths = (images(index), images(other)), (drawn(index).depth, drawn(other).depth)
+                match_views(*pair, *depths, match, by_pixel, library=self._library)
+            gather_vertices(surface, camera, drawn(index).face, by_pixel, into, match, self._library)
+            yield
+
+    def _moved(self, now: _Moving, factor: int, normals: np.ndarray, pull: VertexPull, bend: np.ndarray) -> _Moving:
+        """Take one Gauss-Newton step; ``bend`` [P] is the curvature to keep."""
+        settings, size = self._settings, factor * now.size
+        curvature = Curvature.of(now.vertices, now.faces, normals)
+        stiff = csr_array(curvature.change.T @ diags_array(settings.bending * curvature.areas))
+        hold = settings.tether * curvature.areas / size**4
+        away = ((now.vertices - now.start) * normals).sum(axis=1)
+        joint = diags_array(np.sqrt(settings.membrane) / size)
+        matrix = stiff @ curvature.change + joint @ curvature.graph @ joint + diags_array(pull.curvature + hold)
+        right = -(pull.gradient + stiff @ (curvature.values - bend) + hold * away)
+        step = solve(csr_array(matrix), right, steps=settings.solver_steps, tolerance=settings.tolerance)
+        longest = settings.longest_step * size
+        return replace(now, vertices=now.vertices + normals * np.clip(step, -longest, longest)[:, None])
+
+
+# -- neighbours --------------------------------------------------------------------------------------------------------
+def choose_neighbours(
+    mesh: Mesh, cameras: Sequence[Camera], settings: RefineSettings, library: Library | None
+) -> list[tuple[int, ...]]:
+    """Return for each camera those that see its part of the mesh at good angles.
+
+    Each further neighbour is the one with the largest sum over points of angle x foreshortening x resolution, where
+    points that earlier neighbours see count less.
+    """
+    small = [camera.downscaled(max(1, min(camera.width, camera.height) // SMALL_SIDE)) for camera in cameras]
+    drawn = [draw_mesh(mesh.vertices, mesh.faces, camera, library=library) for camera in small]
+    found = []
+    for index, camera in enumerate(small):
+        points, normals = _sampled(mesh, camera, drawn[index])
+        rays = points - camera.center
+        distance = np.linalg.norm(rays, axis=1)
+        scores = np.zeros((len(small), len(points)))
+        for other, there in enumerate(small):
+            if other == index or not len(points):
+                continue
+            back = points - there.center
+            length = np.linalg.norm(back, axis=1)
+            cosine = (rays * back).sum(axis=1) / np.maximum(distance * length, 1e-300)
+            angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+            good = _visible(points, there, drawn[other].depth)
+            good &= (angle >= settings.least_angle) & (angle <= settings.most_angle)
+            facing = np.clip(-(normals * back).sum(axis=1) / np.maximum(length, 1e-300), 0, 1)
+            finer = distance * there.fx / np.maximum(length * camera.fx, 1e-300)
+            likely = np.exp(-0.5 * (np.log(np.maximum(angle, 1e-3) / settings.best_angle) / SPREAD) ** 2)
+            scores[other] = np.where(good, likely * facing * np.minimum(finer, 1 / np.maximum(finer, 1e-9)), 0)
+        found.append(_best(scores, settings.neighbours))
+    return found
+
+
+def _best(scores: np.ndarray, most: int) -> tuple[int, ...]:
+    """Choose rows of ``scores`` [V, n] one by one."""
+    chosen: list[int] = []
+    left = np.ones(scores.shape[1])
+    while len(chosen) < most:
+        gains = scores @ left
+        gains[chosen] = 0
+        best = int(np.argmax(gains))
+        if not gains[best] > LEAST_GAIN * scores.shape[1]:
+            break
+        chosen.append(best)
+        left = left * (1 - REPEATED * scores[best])
+    return tuple(chosen)
+
+
+def _sampled(mesh: Mesh, camera: Camera, drawn: DrawnMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Return surface points that a camera sees, and their unit normals, [n, 3] each."""
+    rows, columns = np.nonzero(drawn.face >= 0)
+    some = np.linspace(0, len(rows) - 1, min(POINTS, len(rows))).astype(np.int64)
+    rows, columns = rows[some], columns[some]
+    points = backproject(camera, drawn.depth[rows, columns].astype(np.float64), rows, columns)
+    a, b, c = (mesh.vertices[mesh.faces[drawn.face[rows, columns], k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    return points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+
+
+def _visible(points: np.ndarray, camera: Camera, depth: np.ndarray) -> np.ndarray:
+    """Return which points a camera sees, [n] bool."""
+    at, z = camera.project(points)
+    inside = (z > 0) & (at >= 0).all(axis=1) & (at < (camera.width, camera.height)).all(axis=1)
+    column, row = np.where(inside[:, None], at, 0).astype(np.int64).T
+    seen = depth[row, column]
+    return np.asarray(inside & (seen > 0) & (np.abs(seen - z) < SEEN_AGAIN * z))
