@@ -14,7 +14,7 @@ from gs2d.errors import BackendError
 from gs2d.kernels.library import Library, load
 from gs2d.meshing.bending import Curvature, solve, split_edges
 from gs2d.meshing.marching_cubes import components
-from gs2d.meshing.refine import Refinement, RefineSettings, choose_neighbours
+from gs2d.meshing.refine import Refinement, RefineSettings, choose_neighbours, coarse_to_fine
 from gs2d.meshing.warped_ncc import (
     DrawnMesh,
     GreyImage,
@@ -302,6 +302,12 @@ def test_work_is_counted_to_its_end(fast: Library) -> None:
     refinement.run(heard.append)
     assert heard == [1, 2, 3, 4, 5, 9, 13, 17, 21, 25]
     assert refinement.work == 25
+
+
+def test_photographs_are_halved_down_to_a_shorter_side() -> None:
+    assert coarse_to_fine([camera_at(0, 0, size=400)], 350) == (1,)
+    assert coarse_to_fine([camera_at(0, 0, size=size) for size in (300, 1600, 1600)], 350) == (4, 2, 1)
+    assert coarse_to_fine([], 350) == (1,)
 
 
 def test_neighbours_see_the_same_surface_at_good_angles(fast: Library) -> None:

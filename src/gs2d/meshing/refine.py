@@ -62,7 +62,9 @@ class RefineSettings:
     Attributes
     ----------
     factors : tuple of int
-        The photographs are downscaled by these factors, one after the other.
+        The photographs are downscaled by these factors, one after the other. Empty: down to a shorter side of
+        ``coarse_side``.
+    coarse_side : int, px
     steps : int
         Gauss-Newton steps at each of them.
     neighbours : int
@@ -87,20 +89,21 @@ class RefineSettings:
     match : MatchSettings
     """
 
-    factors: tuple[int, ...] = (1,)
+    factors: tuple[int, ...] = ()
+    coarse_side: int = 350
     steps: int = 6
     neighbours: int = 3
     least_angle: float = 4.0
     best_angle: float = 14.0
     most_angle: float = 35.0
-    face_pixels: float = 4.0
-    split_pixels: float = 16.0
-    bending: float = 1.0
+    face_pixels: float = 1.5
+    split_pixels: float = 6.0
+    bending: float = 12.0
     membrane: float = 0.01
-    tether: float = 0.01
+    tether: float = 0.03
     longest_step: float = 1.0
     solver_steps: int = 60
-    smooth: int = 3
+    smooth: int = 6
     tolerance: float = 1e-3
     match: MatchSettings = field(default_factory=MatchSettings)
 
@@ -185,13 +188,14 @@ class Refinement:
     ) -> None:
         self._mesh, self._cameras, self._photographs = mesh, list(cameras), photographs
         self._settings, self._library = settings, library
+        self._factors = settings.factors or coarse_to_fine(self._cameras, settings.coarse_side)
         self._room = cache_bytes(CACHE_BYTES) // 3  # for photographs, for their usable pixels and for depth maps
         self._done = 0
-        self.work = settings.steps * len(self._cameras) * sum(self._cost(factor) for factor in settings.factors)
+        self.work = settings.steps * len(self._cameras) * sum(self._cost(factor) for factor in self._factors)
 
     def _cost(self, factor: int) -> int:
         """Return the cost of a view, in views of the smallest size."""
-        return (max(self._settings.factors) // factor) ** 2
+        return (max(self._factors) // factor) ** 2
 
     def run(self, on_work: Callable[[int], None]) -> Mesh:
         """Refine the mesh.
@@ -216,7 +220,7 @@ class Refinement:
         neighbours = choose_neighbours(mesh, self._cameras, settings, self._library)
         now = _Moving(mesh.vertices, mesh.vertices, mesh.faces, 1 / np.sqrt(density))
         self._done = 0
-        for factor in settings.factors:
+        for factor in self._factors:
             # of an equilateral face; halves of an edge are shorter by up to 2
             now = now.split(factor * now.size * np.sqrt(2 * 4 / np.sqrt(3) * settings.split_pixels))
             now = self._at_size(now, factor, neighbours, on_work)
@@ -295,6 +299,12 @@ class Refinement:
         step = solve(csr_array(matrix), right, steps=settings.solver_steps, tolerance=settings.tolerance)
         longest = settings.longest_step * size
         return replace(now, vertices=now.vertices + normals * np.clip(step, -longest, longest)[:, None])
+
+
+def coarse_to_fine(cameras: Sequence[Camera], side: int) -> tuple[int, ...]:
+    """Return powers of two down to 1: the largest leaves the median photograph a shorter side of ``side`` px."""
+    shorter = float(np.median([min(camera.width, camera.height) for camera in cameras] or [side]))
+    return tuple(2**k for k in range(max(int(np.log2(max(shorter / side, 1.0))), 0), -1, -1))
 
 
 # -- neighbours --------------------------------------------------------------------------------------------------------

@@ -56,7 +56,7 @@ class MatchSettings:
         Cosine between ray and face below which a pixel moves nothing.
     """
 
-    radius: int = 3
+    radius: int = 2
     texture: float = 2e-4
     poor: float = 0.5
     good: float = 0.9
