@@ -145,8 +145,9 @@ def test_photographs_that_show_other_things_hardly_pull() -> None:
     pair, vertices = pair_and_start()
     rng = np.random.default_rng(1)
     noise = GreyImage(pair[1].camera, rng.random(pair[1].grey.shape))
-    pull = pulled(vertices, (pair[0], noise), MatchSettings(), None)[1]
-    assert pull.curvature.sum() < 0.05 * pulled(vertices, pair, MatchSettings(), None)[1].curvature.sum()
+    settings = MatchSettings(radius=3)
+    pull = pulled(vertices, (pair[0], noise), settings, None)[1]
+    assert pull.curvature.sum() < 0.05 * pulled(vertices, pair, settings, None)[1].curvature.sum()
 
 
 def test_outlines_are_not_compared() -> None:
@@ -224,7 +225,7 @@ def test_the_solver_solves() -> None:
 
 # -- refinement --------------------------------------------------------------------------------------------------------
 CAMERAS = [camera_at(x, y, size=96) for x, y in ((-0.6, -0.5), (0.6, -0.5), (0.6, 0.5), (-0.6, 0.5), (0.0, 0.0))]
-QUICK = RefineSettings(factors=(1,), steps=6, face_pixels=1.0, split_pixels=40.0)
+QUICK = RefineSettings(factors=(1,), steps=8, face_pixels=1.0, split_pixels=40.0)
 
 
 @cache
@@ -262,7 +263,7 @@ def test_refinement_moves_a_rough_sheet_to_the_surface(fast: Library) -> None:
     mesh = rough_sheet()
     before = mesh.vertices.copy()
     result = refined(mesh, library=fast)
-    assert error(result) < 0.3 * error(mesh)
+    assert error(result) < 0.4 * error(mesh)
     assert (mesh.vertices == before).all()
     assert result.colors is not None
     assert len(result.colors) == len(result.vertices)
