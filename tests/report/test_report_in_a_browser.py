@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from browser import Page, browser, require_browser
+from gs2d.core.mesh import TexturedMesh
+from gs2d.io.meshes import write_mesh
 from gs2d.report.report_page import write_report
 from report_runs import fabricate
 
@@ -81,6 +84,34 @@ def test_the_mesh_turns_by_mouse_and_keys_and_is_drawn(page: Page) -> None:
                    "return [b.x, b.y, b.right, b.bottom]})()")  # fmt: skip
     left, top, right, bottom = map(int, box)
     assert page.image()[top:bottom, left:right].std() > 0.02
+
+
+def test_a_textured_mesh_is_shown_with_its_texture(tmp_path: Path) -> None:
+    require_browser()
+    run = fabricate(tmp_path / "run", size=16)
+    corners = np.array([[-1.0, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]])
+    faces, uv = np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+    texture = np.zeros((16, 16, 3), np.uint8)
+    texture[:8, :, 0] = texture[8:, :, 1] = 250  # red above green
+    normals = np.tile(np.float32([0, -1, 0]), (4, 1))
+    write_mesh(run / "mesh.glb", TexturedMesh(corners, normals, faces, uv, texture))
+    write_report(run)
+    with browser() as tab:
+        tab.size(1000, 800)
+        tab.open(f"file://{run}/report.html")
+        tab.until("document.querySelector('.mesh').dataset.drawn")
+        assert tab.ask("document.querySelector('.mesh figcaption').textContent").startswith(
+            "Textured mesh, 2 triangles."
+        )
+        tab.middle(".mesh canvas")
+        box = tab.ask("(() => {const b = document.querySelector('.mesh canvas').getBoundingClientRect();"
+                      "return [b.x, b.y, b.right, b.bottom]})()")  # fmt: skip
+        left, top, right, bottom = map(int, box)
+        image = tab.image()[top:bottom, left:right]
+        assert tab.errors == []
+    red, green = ((image[..., k] > 0.6) & (image[..., 1 - k] < 0.3) & (image[..., 2] < 0.3) for k in (0, 1))
+    assert min(red.sum(), green.sum()) > 200
+    assert np.nonzero(red)[0].mean() > np.nonzero(green)[0].mean() + 10  # the upper half of the texture is at z < 0
 
 
 CUT_OFF = """[...document.querySelectorAll('main *')].filter((e) => {

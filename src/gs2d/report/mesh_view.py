@@ -13,16 +13,17 @@ from typing import Any
 import numpy as np
 
 from gs2d.core.camera import Camera
-from gs2d.core.mesh import Mesh
+from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.core.transforms import up_direction
 from gs2d.data.subject_box import read_subject
-from gs2d.io.meshes import read_mesh
-from gs2d.io.run_dir import MESH
+from gs2d.io.meshes import read_mesh, read_textured
+from gs2d.io.run_dir import MESH, TEXTURED
 from gs2d.meshing.simplify import simplify
 from gs2d.meshing.web_mesh import web_mesh
 
 MAX_FACES = 4_000_000  # larger meshes need gigabytes of memory to simplify
 SHOWN_FACES = 60_000  # about 0.6 MB in the page
+SHOWN_TEXTURE = 2048  # px, side of the texture in the page
 ABOVE = (0.4, -0.8, 0.45)  # direction of the first view of a run without cameras; the third axis is up
 
 
@@ -40,16 +41,18 @@ class MeshView:
         Faces of the whole mesh.
     shown : int
         Faces in ``data``.
+    is_textured : bool
     """
 
     orbit: str
     data: str
     faces: int
     shown: int
+    is_textured: bool = False
 
 
 def mesh_view(run: Path, cameras: Sequence[Camera]) -> MeshView | str:
-    """Return the mesh of a run for the page, or the reason why there is none.
+    """Return the mesh of a run for the page, textured if there is a texture, or the reason why there is none.
 
     Parameters
     ----------
@@ -66,17 +69,28 @@ def mesh_view(run: Path, cameras: Sequence[Camera]) -> MeshView | str:
     path = run / MESH
     if not path.is_file():
         return "There is no mesh.ply. `gs2d mesh RUN` writes it."
+    if (run / TEXTURED).is_file():
+        textured = read_textured(run / TEXTURED)
+        if 0 < len(textured.faces) <= SHOWN_FACES:
+            orbit, faces = json.dumps(_orbit(textured, run, cameras)), len(textured.faces)
+            return MeshView(
+                orbit, _packed(web_mesh(textured, max_texture=SHOWN_TEXTURE)), faces, faces, is_textured=True
+            )
     mesh = read_mesh(path)
     if not len(mesh.faces):
         return "mesh.ply has no faces: no surface was visible in enough photographs."
     if len(mesh.faces) > MAX_FACES:
         return f"mesh.ply has {len(mesh.faces):,} faces; the report shows at most {MAX_FACES:,}. Use `gs2d view RUN`."
     small = simplify(mesh, faces=SHOWN_FACES)
-    data = base64.b64encode(gzip.compress(web_mesh(small), mtime=0)).decode()
-    return MeshView(json.dumps(_orbit(mesh, run, cameras)), data, len(mesh.faces), len(small.faces))
+    orbit = json.dumps(_orbit(mesh, run, cameras))
+    return MeshView(orbit, _packed(web_mesh(small)), len(mesh.faces), len(small.faces))
 
 
-def _orbit(mesh: Mesh, run: Path, cameras: Sequence[Camera]) -> dict[str, Any]:
+def _packed(block: bytes) -> str:
+    return base64.b64encode(gzip.compress(block, mtime=0)).decode()
+
+
+def _orbit(mesh: Mesh | TexturedMesh, run: Path, cameras: Sequence[Camera]) -> dict[str, Any]:
     """Return centre, radius, up direction and first position of the eye."""
     low, high = np.percentile(mesh.vertices, [1, 99], axis=0)
     center, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-9)

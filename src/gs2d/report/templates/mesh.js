@@ -21,11 +21,13 @@ void main() {
 const FRAGMENT = `#version 300 es
 precision highp float;
 in vec3 at, color;
-uniform bool clay;
+uniform bool clay, isTextured;
+uniform sampler2D image;
 out vec4 shown;
 void main() {
   float facing = abs(dot(normalize(cross(dFdx(at), dFdy(at))), normalize(at)));
-  shown = vec4(clay ? vec3(0.84, 0.84, 0.87) * (0.25 + 0.75 * facing) : color * (0.8 + 0.2 * facing), 1.0);
+  vec3 base = isTextured ? texture(image, color.xy).rgb : color;
+  shown = vec4(clay ? vec3(0.84, 0.84, 0.87) * (0.25 + 0.75 * facing) : base * (0.8 + 0.2 * facing), 1.0);
 }`;
 
 async function unpacked(text) {
@@ -53,7 +55,8 @@ async function turnable(figure) {
   const data = await unpacked(figure.querySelector(".packed").textContent), used = program(gl);
   const length = new DataView(data).getUint32(0, true); // the format is that of meshing/web_mesh.py
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
-  const isPainted = header.paint === "color", places = 4 + length + 12 * header.faces, colors = places + 6 * header.vertices;
+  const isPainted = header.paint !== "none", isTextured = header.paint === "texture";
+  const places = 4 + length + 12 * header.faces, colors = places + 6 * header.vertices;
   const buffer = (target, begin, end) => {
     gl.bindBuffer(target, gl.createBuffer());
     gl.bufferData(target, new Uint8Array(data, begin, end - begin), gl.STATIC_DRAW);
@@ -63,12 +66,21 @@ async function turnable(figure) {
   gl.vertexAttribPointer(0, 3, gl.UNSIGNED_SHORT, true, 6, 0);
   gl.enableVertexAttribArray(0);
   if (isPainted) {
-    buffer(gl.ARRAY_BUFFER, colors, colors + 3 * header.vertices);
-    gl.vertexAttribPointer(1, 3, gl.UNSIGNED_BYTE, true, 3, 0);
+    const [numbers, type, bytes] = isTextured ? [2, gl.UNSIGNED_SHORT, 4] : [3, gl.UNSIGNED_BYTE, 3];
+    const end = colors + bytes * header.vertices;
+    buffer(gl.ARRAY_BUFFER, colors, end);
+    gl.vertexAttribPointer(1, numbers, type, true, bytes, 0);
     gl.enableVertexAttribArray(1);
+    if (isTextured) {
+      const image = await createImageBitmap(new Blob([new Uint8Array(data, end)], { type: "image/jpeg" }));
+      gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, image);
+      gl.generateMipmap(gl.TEXTURE_2D);
+    }
   }
   gl.useProgram(used);
   const uniform = (name) => gl.getUniformLocation(used, name);
+  gl.uniform1i(uniform("isTextured"), isTextured);
 
   // The eye in spherical coordinates about the centre.
   const up = unit(orbit.up), arm = minus(orbit.eye, orbit.center), distance = Math.hypot(...arm);
