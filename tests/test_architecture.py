@@ -70,6 +70,7 @@ INSIDE = {
         "formulas view_pair": 0,
     },
     "pipeline": {
+        "file_mesh": 7,
         "demo in_memory reconstruct": 6,
         "train": 5,
         "finish": 4,

@@ -12,7 +12,7 @@ import trimesh
 
 from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
-from gs2d.io.meshes import glb_bytes, read_mesh, triangulate, write_mesh
+from gs2d.io.meshes import glb_bytes, read_mesh, triangulate, write_mesh, write_pieces
 from gs2d.io.ply_format import write_ply
 from surface_shapes import tetrahedron
 
@@ -98,3 +98,30 @@ def test_a_glb_has_the_vertex_colours(tmp_path: Path) -> None:
     start = 28 + length + document["bufferViews"][accessor["bufferView"]]["byteOffset"]
     found = np.frombuffer(data, "<u2", 12, start).reshape(3, 4) / 65535
     np.testing.assert_allclose(found, [[1, 0, 0, 1], [0, 0.5029, 0, 1], [0.00364, 0, 1, 1]], atol=1e-4)
+
+
+def test_levels_of_detail_are_nodes_beside_the_scene(tmp_path: Path) -> None:
+    colors = np.full((4, 3), 99, np.uint8)
+    fine, coarse = tetrahedron(True, np.float32), Mesh(np.eye(4, 3, dtype=np.float32), np.array([[0, 1, 2]]), colors)
+    write_mesh(tmp_path / "a.glb", fine, up=np.array([0, 0, 1.0]), coarser=[coarse])
+    shown = trimesh.load(tmp_path / "a.glb", force="mesh", process=False)
+    assert len(shown.faces) == len(fine.faces)  # readers without the extension
+    data = (tmp_path / "a.glb").read_bytes()
+    document = json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
+    assert document["extensionsUsed"] == ["KHR_materials_unlit", "MSFT_lod"]
+    assert document["scenes"] == [{"nodes": [0]}]
+    assert document["nodes"][0]["extensions"]["MSFT_lod"]["ids"] == [1]
+    assert document["nodes"][0]["extras"]["MSFT_screencoverage"] == [1 / 16, 0]
+    assert document["nodes"][1]["rotation"] == document["nodes"][0]["rotation"]
+    (primitive,) = document["meshes"][document["nodes"][1]["mesh"]]["primitives"]
+    assert document["accessors"][primitive["indices"]]["count"] == 3
+
+
+def test_pieces_are_objects_of_one_obj(tmp_path: Path) -> None:
+    pieces = [tetrahedron(False, np.float64), tetrahedron(False, np.float64)]
+    write_pieces(tmp_path / "a.obj", pieces)
+    lines = (tmp_path / "a.obj").read_text().splitlines()
+    assert [line for line in lines if line.startswith("o ")] == ["o piece_000", "o piece_001"]
+    found = read_mesh(tmp_path / "a.obj")
+    np.testing.assert_array_equal(found.vertices, np.concatenate([piece.vertices for piece in pieces]))
+    np.testing.assert_array_equal(found.faces, np.concatenate([pieces[0].faces, pieces[1].faces + 4]))

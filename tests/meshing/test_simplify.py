@@ -115,6 +115,14 @@ def test_a_closed_surface_stays_closed() -> None:
     assert np.einsum("fi,fi->f", a, np.cross(b, c)).sum() / 6 == pytest.approx(4 / 3 * math.pi, rel=0.06)
 
 
+def test_a_closed_surface_is_a_manifold_for_another_program() -> None:
+    manifold3d = pytest.importorskip("manifold3d")
+    small = simplify(ball(), error=1.0, cameras=[camera(4.0)])
+    solid = manifold3d.Manifold(manifold3d.Mesh(np.float32(small.vertices), small.faces.astype(np.uint32)))
+    assert solid.status() == manifold3d.Error.NoError
+    assert solid.volume() == pytest.approx(4 / 3 * math.pi, rel=0.03)
+
+
 def test_an_open_surface_stays_a_manifold() -> None:
     holed = sheet(40)
     holed = dataclasses.replace(holed, faces=holed.faces[np.random.default_rng(2).random(len(holed.faces)) > 0.2])

@@ -99,14 +99,16 @@ class TrainCommand(TrainOptions, Common):
 )
 @dataclass(frozen=True, kw_only=True)
 class MeshCommand(TextureOptions, MeshOptions, Common):
-    """Extract the mesh of a run again, with other settings."""
+    """Extract the mesh of a run again, with other settings; or that of a file of splats."""
 
-    run: RunPath
-    """Run folder."""
+    run: Annotated[Path | None, Arg(metavar="RUN", positional=True)] = None
+    """Run folder. Not needed with --splats."""
     out: Path | None = None
     """Mesh file (default: mesh.ply in the run, or mesh.glb with --texture)."""
     splats: Annotated[Path | None, Arg(metavar="FILE")] = None
-    """Use the splats of this file, in the frame of the run. Needs --out."""
+    """Use the splats of this file, in the frame of the run if there is one. Needs --out."""
+    cameras: Annotated[Path | None, Arg(metavar="CAPTURE")] = None
+    """With --splats and no RUN: capture with the cameras of the splats (default: viewpoints around the subject)."""
     texture: bool = False
     """Write a textured mesh, as .glb or .obj, from the photographs. Without options that change the mesh, uses
     mesh.ply."""

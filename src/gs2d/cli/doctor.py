@@ -16,6 +16,7 @@ _EXTRAS = {  # extra -> (the commands that need it, its packages)
     "exr": ("float photographs, OpenEXR depth maps", ("OpenEXR", "tifffile")),
     "geo": ("maps (gs2d survey --gps, --orthophoto)", ("pyproj", "tifffile")),
     "markers": ("printed markers (gs2d survey --markers)", ("opencv-python-headless",)),
+    "collision": ("convex pieces (gs2d mesh --collision)", ("coacd",)),
     "texture": ("textured meshes (--texture)", ("xatlas",)),
     "spz4": ("SPZ of version 4 (gs2d export --format spz4)", ("zstandard",)),
     "usd": ("OpenUSD files (gs2d export --out x.usd)", ("usd-core",)),

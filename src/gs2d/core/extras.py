@@ -13,6 +13,7 @@ from gs2d.errors import BackendError
 EXTRAS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "cluster": ("ray>=2.60,<3",),
+        "collision": ("coacd>=1.0.5",),
         "cuda12": ("cuda-bindings>=12.8,<13", "nvidia-cuda-nvrtc-cu12>=12.4"),
         "cuda13": ("cuda-bindings>=13,<14", "nvidia-cuda-nvrtc>=13,<14"),
         "exr": ("OpenEXR>=3.5", "tifffile>=2024.1"),

@@ -10,7 +10,7 @@ import os
 import re
 import struct
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,13 @@ class Points:
     normals: np.ndarray | None = None  # [P, 3] float64
 
 
-def write_mesh(path: str | os.PathLike[str], mesh: Mesh | TexturedMesh, *, up: np.ndarray | None = None) -> None:
+def write_mesh(
+    path: str | os.PathLike[str],
+    mesh: Mesh | TexturedMesh,
+    *,
+    up: np.ndarray | None = None,
+    coarser: Sequence[Mesh] = (),
+) -> None:
     """Write a triangle mesh with vertex colours or a texture. The file is written completely or not at all.
 
     Parameters
@@ -56,6 +62,8 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh | TexturedMesh, *, up: n
     up : ndarray [3], optional
         Up direction of the mesh. The node of a .glb is rotated so that viewers, which expect y up, show it upright; the
         vertices do not change.
+    coarser : sequence of Mesh
+        Further levels of detail of a .glb, see ``glb_bytes``.
 
     Raises
     ------
@@ -73,7 +81,7 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh | TexturedMesh, *, up: n
         _write_obj(path, mesh)
     elif path.suffix.lower() == ".glb":
         with atomic_write(path) as file:
-            file.write(glb_bytes(mesh, up=up))
+            file.write(glb_bytes(mesh, up=up, coarser=coarser))
     elif path.suffix.lower() == ".ply" and isinstance(mesh, Mesh):
         _write_ply(path, mesh)
     else:
@@ -224,52 +232,57 @@ def written_files(path: Path) -> tuple[Path, ...]:
     return path, path.with_suffix(".mtl"), path.with_suffix(".png")
 
 
-def glb_bytes(mesh: Mesh | TexturedMesh, *, up: np.ndarray | None = None) -> bytes:
+def glb_bytes(mesh: Mesh | TexturedMesh, *, up: np.ndarray | None = None, coarser: Sequence[Mesh] = ()) -> bytes:
     """Return a mesh with its texture (PNG) or vertex colours as the bytes of a binary glTF 2.0 file.
 
     The material is unlit (KHR_materials_unlit), because the colours contain the light of the photographs. Viewers
     without the extension show a rough, non-metallic surface. Vertex colours are linear in glTF (3.7.2.1), 16 bits here.
+    ``coarser`` meshes without textures are levels of detail (MSFT_lod) of nodes beside the scene: viewers without the
+    extension show ``mesh``. Each is shown where the last one covers less than a sixteenth of the area.
     """
-    vertices = np.ascontiguousarray(mesh.vertices, "<f4")
-    count = len(vertices)
-    bounds = {"min": vertices.min(axis=0).tolist(), "max": vertices.max(axis=0).tolist()} if count else {}
-    parts: list[tuple[str, bytes, dict[str, Any]]] = [
-        ("POSITION", vertices.tobytes(), {"componentType": _FLOAT, "type": "VEC3", **bounds})
-    ]
     surface: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
     material: dict[str, Any] = {"pbrMetallicRoughness": surface, "extensions": {"KHR_materials_unlit": {}}}
     document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "gs2d"}, "materials": [material]}
-    png = b""
+    turned = {} if up is None else {"rotation": _rotation_to_y(up)}
+    blobs: list[tuple[bytes, dict[str, int]]] = []
+    accessors: list[dict[str, Any]] = []
+    meshes, nodes = [], []
+    for number, level in enumerate((mesh, *coarser)):
+        attributes = {}
+        for name, blob, kind in _glb_attributes(level):
+            attributes[name] = len(accessors)
+            accessors.append({"bufferView": len(blobs), "count": len(level.vertices), **kind})
+            blobs.append((blob, {"target": _VERTICES}))
+        primitive = {"attributes": attributes, "indices": len(accessors), "material": 0}
+        corners = {"componentType": _UINT, "count": level.faces.size, "type": "SCALAR"}
+        accessors.append({"bufferView": len(blobs), **corners})
+        blobs.append((np.ascontiguousarray(level.faces, "<u4").tobytes(), {"target": _INDICES}))
+        meshes.append({"primitives": [primitive]})
+        nodes.append({"mesh": number, **turned})
+    used = ["KHR_materials_unlit"]
+    if coarser:
+        used.append("MSFT_lod")
+        coverage = [16.0 ** -(number + 1) for number in range(len(coarser))]
+        nodes[0] |= {
+            "extensions": {"MSFT_lod": {"ids": list(range(1, len(nodes)))}},
+            "extras": {"MSFT_screencoverage": [*coverage, 0.0]},
+        }
     if isinstance(mesh, TexturedMesh):
-        normals, uv = np.ascontiguousarray(mesh.normals, "<f4"), np.ascontiguousarray(mesh.uv, "<f4")
-        parts.append(("NORMAL", normals.tobytes(), {"componentType": _FLOAT, "type": "VEC3"}))
-        parts.append(("TEXCOORD_0", uv.tobytes(), {"componentType": _FLOAT, "type": "VEC2"}))
         surface["baseColorTexture"] = {"index": 0}
         document["textures"] = [{"source": 0, "sampler": 0}]
-        document["images"] = [{"bufferView": len(parts) + 1, "mimeType": "image/png"}]
+        document["images"] = [{"bufferView": len(blobs), "mimeType": "image/png"}]
         document["samplers"] = [{"magFilter": _LINEAR, "minFilter": _MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}]
-        png = _png_bytes(mesh.texture)
-    elif mesh.colors is not None:
-        linear = np.ones((count, 4), "<u2")  # four channels: glTF requires alignment to 4 bytes
-        linear[:, :3], linear[:, 3] = LINEAR_U16[mesh.colors], 65535
-        parts.append(("COLOR_0", linear.tobytes(), {"componentType": _USHORT, "type": "VEC4", "normalized": True}))
-    indices = np.ascontiguousarray(mesh.faces, "<u4").tobytes()
-    blobs = [*(blob for _, blob, _ in parts), indices, *([png] if png else [])]
+        blobs.append((_png_bytes(mesh.texture), {}))
     views, offset = [], 0
-    for i, blob in enumerate(blobs):
-        view = {"buffer": 0, "byteOffset": offset, "byteLength": len(blob)}
-        target = _VERTICES if i < len(parts) else _INDICES
-        views.append(view if i > len(parts) else {**view, "target": target})
+    for blob, target in blobs:
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(blob), **target})
         offset += len(blob) + -len(blob) % 4
-    accessors = [{"bufferView": i, "count": count, **kind} for i, (_, _, kind) in enumerate(parts)]
-    accessors.append({"bufferView": len(parts), "componentType": _UINT, "count": mesh.faces.size, "type": "SCALAR"})
-    attributes = {name: i for i, (name, _, _) in enumerate(parts)}
     document |= {
-        "extensionsUsed": ["KHR_materials_unlit"],
+        "extensionsUsed": used,
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0} if up is None else {"mesh": 0, "rotation": _rotation_to_y(up)}],
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": len(parts), "material": 0}]}],
+        "nodes": nodes,
+        "meshes": meshes,
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": offset}],
@@ -277,8 +290,38 @@ def glb_bytes(mesh: Mesh | TexturedMesh, *, up: np.ndarray | None = None) -> byt
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     head = struct.pack("<IIIII", _MAGIC, 2, 12 + 8 + len(text) + 8 + offset, len(text), _JSON)
-    body = b"".join(blob + b"\0" * (-len(blob) % 4) for blob in blobs)
+    body = b"".join(blob + b"\0" * (-len(blob) % 4) for blob, _ in blobs)
     return head + text + struct.pack("<II", offset, _BIN) + body
+
+
+def _glb_attributes(mesh: Mesh | TexturedMesh) -> list[tuple[str, bytes, dict[str, Any]]]:
+    """Return the vertex attributes of a mesh: name, bytes, and type of the accessor."""
+    vertices = np.ascontiguousarray(mesh.vertices, "<f4")
+    bounds = {"min": vertices.min(axis=0).tolist(), "max": vertices.max(axis=0).tolist()} if len(vertices) else {}
+    parts: list[tuple[str, bytes, dict[str, Any]]] = [
+        ("POSITION", vertices.tobytes(), {"componentType": _FLOAT, "type": "VEC3", **bounds})
+    ]
+    if isinstance(mesh, TexturedMesh):
+        normals, uv = np.ascontiguousarray(mesh.normals, "<f4"), np.ascontiguousarray(mesh.uv, "<f4")
+        parts.append(("NORMAL", normals.tobytes(), {"componentType": _FLOAT, "type": "VEC3"}))
+        parts.append(("TEXCOORD_0", uv.tobytes(), {"componentType": _FLOAT, "type": "VEC2"}))
+    elif mesh.colors is not None:
+        linear = np.ones((len(vertices), 4), "<u2")  # four channels: glTF requires alignment to 4 bytes
+        linear[:, :3], linear[:, 3] = LINEAR_U16[mesh.colors], 65535
+        parts.append(("COLOR_0", linear.tobytes(), {"componentType": _USHORT, "type": "VEC4", "normalized": True}))
+    return parts
+
+
+def write_pieces(path: Path, pieces: Sequence[Mesh]) -> None:
+    """Write meshes as the objects of one OBJ file, atomically."""
+    lines, first = [], 1
+    for number, piece in enumerate(pieces):
+        lines.append(f"o piece_{number:03d}")
+        lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in piece.vertices.tolist()]
+        lines += [f"f {a} {b} {c}" for a, b, c in (piece.faces + first).tolist()]
+        first += len(piece.vertices)
+    with atomic_write(path) as file:
+        file.write(("\n".join(lines) + "\n").encode())
 
 
 def read_textured(path: str | Path) -> TexturedMesh:

@@ -16,12 +16,13 @@ import torch
 from gs2d.core.atomic_files import disk_error, is_full
 from gs2d.core.memory_limit import memory_budget
 from gs2d.core.splats import Splats
+from gs2d.core.transforms import up_direction
 from gs2d.data import View
 from gs2d.data.reach import Reach
 from gs2d.data.subject_box import LARGEST, Subject, checked_box
 from gs2d.errors import ProtocolError, RunError
 from gs2d.evaluation.image_metrics import ImageMetrics
-from gs2d.io.meshes import write_mesh
+from gs2d.io.meshes import write_mesh, write_pieces
 from gs2d.io.run_dir import (
     MESH,
     PAGE,
@@ -29,8 +30,10 @@ from gs2d.io.run_dir import (
     TEXTURED,
     RunFolder,
 )
+from gs2d.meshing.convex_pieces import convex_pieces, required
 from gs2d.meshing.depth_maps import RenderedView, Spool, depth_map
 from gs2d.meshing.extract import Extraction, ExtractOptions, extract, extract_unbounded
+from gs2d.meshing.simplify import simplify
 from gs2d.meshing.slabs import SLAB_BYTES
 from gs2d.meshing.tsdf_volume import VolumeTooLargeError
 from gs2d.pipeline.attempts import again, attempted
@@ -57,6 +60,7 @@ KEPT = (  # facts of a mesh in metrics.json
 VOLUME_BYTES = 4 << 30  # limit of the fused volume, if the memory of the machine is unknown
 LEAST_SLAB_BYTES = 32 << 20  # smaller slabs spend most of the time on preparing views again
 MOSTLY_CUT = 0.5  # fraction of the depth outside the mesh from which a notice is sent
+COARSER_ERROR = 4.0  # times that of the level of detail before: about a quarter of its faces
 COARSER = 3  # attempts with larger voxels: the first size is an estimate
 
 
@@ -120,10 +124,22 @@ def extract_mesh(
         raise disk_error(out, FileNotFoundError(2, "No such file or directory"))
     result = fused(loaded, splats, options, on_event, subject=subject, seen=seen)
     release_buffers()
-    write_mesh(out, result.mesh)
-    pixels: dict[str, Any] = {}
+    cameras, error = [view.camera for view in loaded.scene.train], _error(loaded, options) or ERROR
+    coarser = [result.mesh]
+    for _ in range(1, options.lods):
+        error *= COARSER_ERROR
+        coarser.append(simplify(coarser[-1], error=error, cameras=cameras))
+    write_mesh(out, result.mesh, up=up_direction(cameras), coarser=coarser[1:])
+    pixels: dict[str, Any] = {"lods": [len(mesh.faces) for mesh in coarser]} if options.lods > 1 else {}
+    if options.collision:
+        on_event(Phase("splitting the mesh into convex pieces", 0))
+        file = out.with_name(f"{out.stem}-collision.obj")
+        pieces = convex_pieces(result.mesh)
+        write_pieces(file, pieces)
+        on_event(Notice(f"{file}: {len(pieces)} convex pieces"))
+        pixels |= {"collision": str(file), "pieces": len(pieces)}
     if result.pixels is not None:
-        pixels = {"pixels": round(result.pixels), "faces_per_pixel": len(result.mesh.faces) / max(result.pixels, 1.0)}
+        pixels |= {"pixels": round(result.pixels), "faces_per_pixel": len(result.mesh.faces) / max(result.pixels, 1.0)}
     return {
         "file": str(out),
         "vertices": len(result.mesh.vertices),
@@ -201,6 +217,10 @@ def check_mesh_options(options: MeshOptions) -> None:
             raise ProtocolError(f"{option} must be between {1 / LARGEST:g} and {LARGEST:g} world units, got {value:g}")
     if options.error is not None and not (options.error >= 0 and math.isfinite(options.error)):
         raise ProtocolError(f"--error must be a number of pixels >= 0, got {options.error}; 0 keeps all faces")
+    if options.lods < 1:
+        raise ProtocolError(f"lods must be a whole number >= 1, got {options.lods}")
+    if options.collision:
+        required()  # before minutes are spent
     if options.bbox is not None:
         checked_box(options.bbox, "--bbox")
     if options.keep_components is not None and options.keep_components < 0:
@@ -230,7 +250,7 @@ def _extract(
         min_weight=SEVERAL if fusion.subject else 1.0,  # of one pixel
         keep=keep or None,
         by_evidence=fusion.subject,
-        error=(ERROR if fusion.subject else 0.0) if options.error is None else options.error,
+        error=_error(loaded, options),
         max_bytes=_volume_bytes(options),
         slab_bytes=SLAB_BYTES if budget is None else min(SLAB_BYTES, max(LEAST_SLAB_BYTES, budget // 32)),
     )
@@ -239,6 +259,13 @@ def _extract(
     if not len(result.mesh.faces):
         on_event(Notice("the mesh is empty: no surface is covered well enough"))
     return result
+
+
+def _error(loaded: RenderedScene, options: MeshOptions) -> float:
+    """Return the error of simplification, px; 0: none."""
+    if options.error is not None:
+        return options.error
+    return ERROR if loaded.protocol.fusion.subject else 0.0
 
 
 def _volume_bytes(options: MeshOptions) -> int:
@@ -312,6 +339,20 @@ def surface_color(output: RenderOutput, loaded: RenderedScene) -> torch.Tensor:
     return ((output.color - (1 - alpha) * background) / alpha.clamp(min=1e-3)).clamp(0, 1)
 
 
+def checked_mesh_file(path: Path, out: Path, options: MeshOptions) -> Path:
+    """Return the file of a mesh, .ply or .glb; ``path`` is the run or the folder of the splats.
+
+    Raises
+    ------
+    RunError, ProtocolError
+        If the name has another suffix, is that of the splats, or cannot hold levels of detail.
+    """
+    glb = Path(out).suffix.lower() == ".glb"
+    if options.lods > 1 and not glb:
+        raise ProtocolError(f"lods={options.lods} needs --out FILE.glb, got {out}; PLY files have one level of detail")
+    return checked_output(path, out, ".glb" if glb else ".ply", "a mesh (or .glb)")
+
+
 # -- gs2d mesh ---------------------------------------------------------------------------------------------------------
 def mesh_run(
     path: Path,
@@ -329,7 +370,8 @@ def mesh_run(
     splats_file : Path or None
         Mesh the splats of this file into ``out``.
     """
-    path, out = Path(path), None if out is None else checked_output(path, out)
+    path, out = Path(path), None if out is None else Path(out)
+    checked_mesh_file(path, path / MESH if out is None else out, options)
     run, loaded, splats = open_finished(path, threads, on_event, splats_file=splats_file, out=out)
     if out is not None and out.resolve() != run.file(MESH).resolve():
         subject = meshed_subject(run, loaded, splats, options, on_event)

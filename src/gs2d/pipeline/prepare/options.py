@@ -302,6 +302,10 @@ class MeshOptions:
     """Merge faces while the surface moves less than this in the nearest image (default: 0.25; data sets: keep all)."""
     refine: bool = False
     """Move the surface until neighbouring photographs agree, with fewer triangles."""
+    collision: bool = False
+    """Also write convex pieces for collision tests: NAME-collision.obj beside the mesh (extra `collision`)."""
+    lods: Annotated[int, SETTING] = 1
+    """With --out FILE.glb: number of levels of detail in the file, each with four times the error (MSFT_lod)."""
     max_gib: Annotated[float | None, SETTING] = None
     """Limit of the volume in GiB (default: by --memory). The error for a larger one names a voxel size that fits."""
     depth: Annotated[Literal["mean", "median", "transmittance"] | None, SETTING] = None
