@@ -61,23 +61,23 @@ def mesh(command: c.MeshCommand, console: Console) -> None:
     """``gs2d mesh``."""
     from gs2d.pipeline.finish.run_mesh import mesh_run
 
-    if command.run is None and (command.splats is None or command.texture):
-        raise RunError("expected the folder of a run, got none; name one, or give --splats FILE --out MESH")
     if command.cameras is not None and command.run is not None:
         raise RunError("--cameras is for --splats without a run, which has cameras of its own; leave one of them out")
     _keep_to(command.memory)
     options = MeshOptions(**values(MeshOptions, command))
-    if command.texture:
-        _textured_mesh(command, options, console)
+    if command.run is not None and command.texture:
+        _textured_mesh(command.run, command, options, console)
         return
     _refuse_texture_options(command)
-    settings = {"out": command.out, "threads": command.threads}
+    out, threads = command.out, command.threads
     if command.run is not None:
-        result = mesh_run(command.run, options, console.on_event, splats_file=command.splats, **settings)
-    else:
+        result = mesh_run(command.run, options, console.on_event, out=out, splats_file=command.splats, threads=threads)
+    elif command.splats is not None and not command.texture:
         from gs2d.pipeline.file_mesh import mesh_file
 
-        result = mesh_file(command.splats, options, console.on_event, cameras=command.cameras, **settings)
+        result = mesh_file(command.splats, options, console.on_event, out=out, cameras=command.cameras, threads=threads)
+    else:
+        raise RunError("expected the folder of a run, got none; name one, or give --splats FILE --out MESH")
     console.close()
     console.say(f"{result['file']}: {result['vertices']:,} vertices, {result['faces']:,} triangles")
     if "voxel" in result:
@@ -85,7 +85,7 @@ def mesh(command: c.MeshCommand, console: Console) -> None:
     console.result(result)
 
 
-def _textured_mesh(command: c.MeshCommand, mesh_options: Any, console: Console) -> None:
+def _textured_mesh(run: Path, command: c.MeshCommand, mesh_options: Any, console: Console) -> None:
     from gs2d.pipeline.finish.run_texture import texture_run
 
     if command.splats is not None:
@@ -93,7 +93,7 @@ def _textured_mesh(command: c.MeshCommand, mesh_options: Any, console: Console) 
     if command.collision or command.lods != 1:
         raise ProtocolError("--texture writes neither convex pieces nor lods; run `gs2d mesh` again without --texture")
     result = texture_run(
-        command.run,
+        run,
         command,
         mesh_options,
         console.on_event,

@@ -102,7 +102,7 @@ class MeshFrames:
 
 # -- extraction --------------------------------------------------------------------------------------------------------
 def extract_mesh(
-    loaded: LoadedRun,
+    loaded: RenderedScene,
     splats: Splats,
     options: MeshOptions,
     out: Path,
