@@ -95,7 +95,7 @@ class TrainCommand(TrainOptions, Common):
     "mesh",
     action="gs2d.cli.handlers:mesh",
     group=STEPS,
-    first=("run", "out", "texture", "refine", "voxel", "bbox", "unbounded"),
+    first=("run", "out", "texture", "method", "refine", "voxel", "bbox", "unbounded"),
 )
 @dataclass(frozen=True, kw_only=True)
 class MeshCommand(TextureOptions, MeshOptions, Common):

@@ -142,7 +142,7 @@ def pixels(mesh: Mesh, evidence: Evidence) -> float:
     return float(found.sum())
 
 
-def clean(mesh: Mesh, maps: Iterable[DepthMap], tolerance: float) -> tuple[Mesh, float]:
+def clean(mesh: Mesh, maps: Iterable[DepthMap], tolerance: float, *, small: float = SMALL) -> tuple[Mesh, float]:
     """Remove surface that the views contradict, and small components.
 
     Parameters
@@ -151,6 +151,8 @@ def clean(mesh: Mesh, maps: Iterable[DepthMap], tolerance: float) -> tuple[Mesh,
         The maps that the mesh was fused from.
     tolerance : float
         As for ``gather``.
+    small : float
+        Components with less than this fraction of the area of the largest one are removed.
 
     Returns
     -------
@@ -159,7 +161,7 @@ def clean(mesh: Mesh, maps: Iterable[DepthMap], tolerance: float) -> tuple[Mesh,
         Number of pixels that show the surface, see ``pixels``.
     """
     evidence = gather(mesh, maps, tolerance)
-    mesh, evidence = large_components(*supported(mesh, evidence))
+    mesh, evidence = large_components(*supported(mesh, evidence), small)
     return mesh, pixels(mesh, evidence)
 
 

@@ -58,6 +58,8 @@ class ExtractOptions:
         Keep only surface that more views see than see through (``evidence.clean``). Not for unbounded scenes.
     error : float, px
         Simplify with this error, see ``simplify``; 0 keeps all faces.
+    watertight : bool
+        Close the surface everywhere, also where no view shows it (``extract_delaunay`` alone).
     max_bytes : int
         Limit of the volume.
     slab_bytes : int
@@ -73,6 +75,7 @@ class ExtractOptions:
     keep: int | None = None
     by_evidence: bool = False
     error: float = 0.0
+    watertight: bool = False
     max_bytes: int = 4 << 30
     slab_bytes: int = SLAB_BYTES
 
@@ -118,18 +121,7 @@ def extract(
         if options.truncation is None:
             limits = widen_truncation(limits, depth_noise(spool, samples, limits))
         del samples
-        trim()  # returns 20 to 60 MB before the volume is allocated
-        blocks = find_blocks(spool, limits, max_bytes=options.max_bytes, threads=threads, backend=backend)
-        count, volume_bytes = len(spool), blocks.nbytes
-        mesh = fused_surface(
-            spool,
-            limits,
-            blocks,
-            min_weight=options.min_weight,
-            slab_bytes=options.slab_bytes,
-            threads=threads,
-            backend=backend,
-        )
+        mesh, volume_bytes = fused_depths(spool, limits, options, threads=threads, backend=backend)
         mesh = mesh if options.bbox is None else inside_box(mesh, options.bbox)
         trim()  # returns the volume of the last slab
         mesh = keep_components(mesh, keep=options.keep)
@@ -137,7 +129,25 @@ def extract(
         if options.by_evidence:
             mesh, pixels = clean(mesh, spool, limits.truncation)
         mesh = simplify(mesh, error=options.error, cameras=spool.cameras)
-        return Extraction(mesh, limits, count, volume_bytes, 1, backend.name, pixels)
+        return Extraction(mesh, limits, len(spool), volume_bytes, 1, backend.name, pixels)
+
+
+def fused_depths(
+    spool: Spool, limits: FusionBounds, options: ExtractOptions, *, threads: int | None, backend: Backend
+) -> tuple[Mesh, int]:
+    """Return the surface of all components in the fused volume, and the bytes of the volume."""
+    trim()  # returns 20 to 60 MB before the volume is allocated
+    blocks = find_blocks(spool, limits, max_bytes=options.max_bytes, threads=threads, backend=backend)
+    mesh = fused_surface(
+        spool,
+        limits,
+        blocks,
+        min_weight=options.min_weight,
+        slab_bytes=options.slab_bytes,
+        threads=threads,
+        backend=backend,
+    )
+    return mesh, blocks.nbytes
 
 
 def extract_unbounded(

@@ -31,6 +31,7 @@ from gs2d.io.run_dir import (
     RunFolder,
 )
 from gs2d.meshing.convex_pieces import convex_pieces, required
+from gs2d.meshing.delaunay import extract_delaunay
 from gs2d.meshing.depth_maps import RenderedView, Spool, depth_map
 from gs2d.meshing.extract import Extraction, ExtractOptions, extract, extract_unbounded
 from gs2d.meshing.simplify import simplify
@@ -54,7 +55,7 @@ ONE_SURFACE = 0.02  # of the depth; if mean and median differ by more, a pixel s
 SEVERAL = 0.25  # weight of such a pixel
 ERROR = 0.25  # px: half of a voxel on the surface; twice as much costs 3 % of the Chamfer distance
 KEPT = (  # facts of a mesh in metrics.json
-    *("vertices", "faces", "voxel", "truncation", "depth_limit", "depth", "unbounded"),
+    *("vertices", "faces", "method", "voxel", "truncation", "depth_limit", "depth", "unbounded"),
     *("pixels", "faces_per_pixel"),
 )
 VOLUME_BYTES = 4 << 30  # limit of the fused volume, if the memory of the machine is unknown
@@ -145,6 +146,7 @@ def extract_mesh(
         "vertices": len(result.mesh.vertices),
         "faces": len(result.mesh.faces),
         "depth": options.depth or loaded.protocol.fused_depth,
+        "method": "delaunay" if options.watertight else options.method,
         "unbounded": options.unbounded,
         "levels": result.levels,
         "fused_by": result.backend,
@@ -221,6 +223,8 @@ def check_mesh_options(options: MeshOptions) -> None:
         raise ProtocolError(f"lods must be a whole number >= 1, got {options.lods}")
     if options.collision:
         required()  # before minutes are spent
+    if options.unbounded and (options.watertight or options.method == "delaunay"):
+        raise ProtocolError("--unbounded fuses voxels; leave out --method delaunay and --watertight")
     if options.bbox is not None:
         checked_box(options.bbox, "--bbox")
     if options.keep_components is not None and options.keep_components < 0:
@@ -251,11 +255,13 @@ def _extract(
         keep=keep or None,
         by_evidence=fusion.subject,
         error=_error(loaded, options),
+        watertight=options.watertight,
         max_bytes=_volume_bytes(options),
         slab_bytes=SLAB_BYTES if budget is None else min(SLAB_BYTES, max(LEAST_SLAB_BYTES, budget // 32)),
     )
-    fuse_frames = extract_unbounded if options.unbounded else extract
-    result = fuse_frames(frames, chosen, threads=torch.get_num_threads(), backend=loaded.backend)
+    delaunay = options.watertight or options.method == "delaunay"
+    extraction = extract_unbounded if options.unbounded else extract_delaunay if delaunay else extract
+    result = extraction(frames, chosen, threads=torch.get_num_threads(), backend=loaded.backend)
     if not len(result.mesh.faces):
         on_event(Notice("the mesh is empty: no surface is covered well enough"))
     return result

@@ -284,6 +284,10 @@ class DemoOptions(HowItRuns):
 class MeshOptions:
     """How the surface is extracted. None: derived from the scene, or taken from the protocol of the run."""
 
+    method: Literal["tsdf", "delaunay"] = "tsdf"
+    """Fuse the depth maps in voxels, or cut Delaunay tetrahedra: fewer false pieces, but thin parts are lost."""
+    watertight: bool = False
+    """Close the surface where no photograph shows it, too. Implies --method delaunay."""
     voxel: float | None = None
     """Voxel size in world units (default: from the scene)."""
     truncation: Annotated[float | None, SETTING] = None

@@ -1,0 +1,112 @@
+"""Native Delaunay tetrahedra, votes of lines of sight, and minimum cut.
+
+``meshing/tetrahedra.py``, ``meshing/visibility_votes.py`` and ``meshing/minimum_cut.py`` have the same in numpy and
+SciPy.
+"""
+
+from __future__ import annotations
+
+import ctypes
+
+import numpy as np
+
+from gs2d.errors import ProtocolError
+from gs2d.kernels.library import Library
+
+__all__ = ["minimum_cut_on_cpu", "tetrahedra_on_cpu", "votes_on_cpu"]
+
+ROWS_A_POINT = 9  # tetrahedra; samples of a surface have six to seven
+
+
+class TetrahedraArguments(ctypes.Structure):
+    """``TetrahedraArguments`` of cpu/tetrahedra.cpp."""
+
+    _fields_ = (
+        ("points", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in ("xyz", "order")),
+        ("capacity", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in ("corners", "neighbours", "inserted")),
+        ("count", ctypes.c_int64),
+    )
+
+
+class VoteArguments(ctypes.Structure):
+    """``VoteArguments`` of cpu/visibility_votes.cpp."""
+
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("lines", "surfaces")),
+        *((name, ctypes.c_void_p) for name in ("xyz", "corners", "neighbours", "mirror", "first")),
+        *((name, ctypes.c_void_p) for name in ("ends", "starts", "sigma", "weight")),
+        *((name, ctypes.c_void_p) for name in ("facets", "full", "cameras")),
+    )
+
+
+class CutArguments(ctypes.Structure):
+    """``CutArguments`` of cpu/minimum_cut.cpp."""
+
+    _fields_ = (
+        ("nodes", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in ("neighbours", "mirror", "capacity", "terminal", "source_side")),
+        ("flow", ctypes.c_int64),
+    )
+
+
+def tetrahedra_on_cpu(library: Library, grid: np.ndarray, order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return corners and neighbours, [T, 4] int32, of the tetrahedra of grid points [P + 8, 3] int32.
+
+    The last eight points are the corners of a cube around the others, x fastest; ``order`` [P] int32 is that of
+    insertion.
+    """
+    count = ROWS_A_POINT
+    while True:
+        capacity = count * len(grid) + 1000
+        corners, neighbours = np.empty((capacity, 4), np.int32), np.empty((capacity, 4), np.int32)
+        inserted = np.zeros(len(grid), np.uint8)
+        arguments = TetrahedraArguments(
+            points=len(grid),
+            xyz=grid.ctypes.data,
+            order=order.ctypes.data,
+            capacity=capacity,
+            corners=corners.ctypes.data,
+            neighbours=neighbours.ctypes.data,
+            inserted=inserted.ctypes.data,
+        )
+        library.function("gs2d_tetrahedra", None, [ctypes.c_void_p])(ctypes.byref(arguments))
+        if arguments.count >= 0:
+            break
+        count *= 2
+    corners, neighbours = corners[: arguments.count], neighbours[: arguments.count]
+    used = corners[:, 0] >= 0
+    number = np.cumsum(used, dtype=np.int32) - 1
+    neighbours = neighbours[used]
+    return corners[used], np.where(neighbours >= 0, number[neighbours], -1).astype(np.int32)
+
+
+def votes_on_cpu(library: Library, arrays: dict[str, np.ndarray], surfaces: int) -> None:
+    """Add the votes of lines of sight, of which the first ``surfaces`` end on a surface.
+
+    ``arrays`` has the names and types of the fields of ``VoteArguments``; ``facets``, ``full`` and ``cameras`` change
+    in place.
+    """
+    addresses = {name: array.ctypes.data for name, array in arrays.items()}
+    arguments = VoteArguments(lines=len(arrays["ends"]), surfaces=surfaces, **addresses)
+    library.function("gs2d_votes", None, [ctypes.c_void_p])(ctypes.byref(arguments))
+
+
+def minimum_cut_on_cpu(
+    library: Library, neighbours: np.ndarray, mirror: np.ndarray, capacity: np.ndarray, terminal: np.ndarray
+) -> tuple[np.ndarray, int]:
+    """Return the source side [N] bool and the flow; ``capacity`` and ``terminal`` become what is left."""
+    side = np.zeros(len(neighbours), np.uint8)
+    arguments = CutArguments(
+        nodes=len(neighbours),
+        neighbours=neighbours.ctypes.data,
+        mirror=mirror.ctypes.data,
+        capacity=capacity.ctypes.data,
+        terminal=terminal.ctypes.data,
+        source_side=side.ctypes.data,
+    )
+    library.function("gs2d_minimum_cut", None, [ctypes.c_void_p])(ctypes.byref(arguments))
+    if arguments.flow < 0:
+        raise ProtocolError("the minimum cut needs more memory than there is; a lower --memory makes fewer points")
+    return side.astype(bool), int(arguments.flow)
