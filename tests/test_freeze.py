@@ -39,7 +39,7 @@ LIMITS = {
     "options of all commands": 304,
     "options by name": 75,
     "settings by name": 26,
-    "recipes": 24,
+    "recipes": 23,
     "fields of recipes": 103,
 }
 

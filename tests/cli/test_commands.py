@@ -19,7 +19,7 @@ from tiny import write_ball_mesh
 def test_recipes_lists_three_or_all_and_shows_one(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["recipes"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == ["best", "best-surface", "2dgs", str(len(RECIPES) - 3)]
+    assert [line.split()[0] for line in lines] == ["best", "best-fast", "2dgs", str(len(RECIPES) - 3)]
     assert run(["recipes", "--all"]) == 0
     listed = capsys.readouterr().out
     assert all(name in listed for name in RECIPES)

@@ -22,11 +22,11 @@ from gs2d.config.robust import DenseStart, Removal
 from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import from_json, to_json
 
-NAMES = ("best", "best-fast", "best-surface")
+NAMES = ("best", "best-fast")
 
 
 def test_the_default_is_listed_first() -> None:
-    assert list(RECIPES)[:3] == list(NAMES)
+    assert list(RECIPES)[:2] == list(NAMES)
     assert DEFAULT_RECIPE == "best"
 
 
@@ -69,26 +69,13 @@ def test_view_dependent_colours_learn_faster_except_with_few_images(name: str, s
     assert not any("SH beyond" in line for line in describe_recipe(with_few_views(recipe)))
 
 
-def test_best_surface_is_best_with_multiview_losses_and_no_fitted_start() -> None:
-    recipe, best = get_recipe("best-surface"), get_recipe("best")
-    stage = recipe.stages[0]
-    terms = {term.kind: (term.weight, term.start, term.every) for term in stage.losses if "multiview" in term.kind}
-    assert terms == {"multiview_photometric": (0.6, 16_000, 2), "multiview_geometric": (0.04, 16_000, 2)}
-    plain = tuple(term for term in stage.losses if "multiview" not in term.kind)
-    assert best.dense_start is not None
-    assert best.dense_start.fit
-    swept = replace(best, dense_start=replace(best.dense_start, fit=False))
-    assert replace(recipe, name="best", multiview=best.multiview, stages=(replace(stage, losses=plain),)) == swept
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_best_recipes_are_written_read_and_described(name: str) -> None:
     recipe = get_recipe(name)
     assert from_json(to_json(recipe)) == recipe
     said = "\n".join(describe_recipe(recipe))
     assert "mesh: from the transmittance depth" in said
-    fitted = "" if name == "best-surface" else ", fitted splats"
-    assert f"dense start: a plane sweep at about 256 px{fitted}, a sphere of splats around the scene; optional" in said
+    assert "dense start: a plane sweep at about 256 px, fitted splats, a sphere of splats around" in said
     assert "all rates but that of the means fall after iteration" in said
 
 

@@ -14,7 +14,7 @@ from gs2d.core.processes import process_rank
 from gs2d.errors import ProtocolError, RecipeError, RunError
 from gs2d.pipeline.prepare.options import MeshOptions, TextureOptions, values
 
-EVERYDAY = ("best", "best-surface", "2dgs")  # recipes that `gs2d recipes` shows without --all
+EVERYDAY = ("best", "best-fast", "2dgs")  # recipes that `gs2d recipes` shows without --all
 
 
 def _keep_to(gib: float | None) -> None:

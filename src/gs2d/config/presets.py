@@ -133,31 +133,23 @@ def with_exposure(recipe: Recipe) -> Recipe:
 
 
 def with_multiview(
-    recipe: Recipe,
-    photometric: float = MULTIVIEW_WEIGHT,
-    geometric: float = 0.0,
-    *,
-    every: int = 1,
-    last: float = 1.0,
-    multiview: MultiView = MultiView(),  # noqa: B008 (frozen)
-    name: str | None = None,
+    recipe: Recipe, photometric: float = MULTIVIEW_WEIGHT, geometric: float = 0.0, *, name: str | None = None
 ) -> Recipe:
     """Return the recipe with losses between two views, in stages with normal consistency, after densification.
 
-    They are active in the ``last`` fraction of a stage, in one of ``every`` iterations. Not in the paper. Reasons for
-    the weights, which differ from those of PGSR, and for the start: docs/notebook/multiview.md.
+    Not in the paper. Reasons for the weights, which differ from those of PGSR, and for the start:
+    docs/notebook/multiview.md.
     """
 
     def extended(stage: Stage) -> Stage:
         starts = [term.start for term in stage.losses if term.kind == "normal_consistency" and term.weight]
-        densified = 0 if stage.densify is None else stage.densify.stop
-        start = max([*starts, densified, round((1 - last) * stage.iterations)])
+        start = max([*starts, 0 if stage.densify is None else stage.densify.stop])
         weights = {"multiview_photometric": photometric, "multiview_geometric": geometric} if starts else {}
-        terms = (LossTerm(kind, weight, start, every=every) for kind, weight in weights.items() if weight > 0)
+        terms = (LossTerm(kind, weight, start) for kind, weight in weights.items() if weight > 0)
         return replace(stage, losses=(*stage.losses, *terms))
 
     stages = tuple(extended(stage) for stage in recipe.stages)
-    return replace(recipe, name=name or f"{recipe.name}-multiview", stages=stages, multiview=multiview)
+    return replace(recipe, name=name or f"{recipe.name}-multiview", stages=stages, multiview=MultiView())
 
 
 def with_depth_prior(recipe: Recipe, source: str = "auto", weight: float = DEPTH_WEIGHT) -> Recipe:
@@ -268,18 +260,6 @@ def with_few_views(recipe: Recipe) -> Recipe:
     return without_squares(replace(recipe, stages=tuple(map(slower, recipe.stages))))
 
 
-def best_surface(*, name: str = "best-surface") -> Recipe:
-    """Return ``best`` with multi-view losses in its last fifth, and a start that is not fitted.
-
-    It prefers an accurate surface: a fitted start has better colours, but more splats that are slightly off
-    (docs/notebook/best.md).
-    """
-    recipe = best()
-    assert recipe.dense_start is not None
-    swept = replace(recipe, dense_start=replace(recipe.dense_start, fit=False))
-    return with_multiview(swept, 0.6, 0.04, every=2, last=0.2, multiview=MultiView(depth_downscale=2), name=name)
-
-
 def _in_stages(recipe: Recipe, term: LossTerm) -> Recipe:
     """Add a loss to the stages that train the means of all splats; ``start`` applies to the first stage."""
 
@@ -345,7 +325,6 @@ def _registry() -> dict[str, NamedRecipe]:
 
     add("best", "The default: 2DGS from a fitted dense start; best images and surface for the time", best)
     add("best-fast", "best in a third of its iterations", partial(best, FAST_ITERATIONS))
-    add("best-surface", "best with multi-view losses at the end: more accurate surface, lower PSNR", best_surface)
     add("2dgs", "2DGS with normal consistency 0.05: the paper's baseline and its stage 1", two_dgs)
     add("2dgs-r", "2DGS-R: surface, appearance of the worst 1 %, clone in place and refine", two_dgs_r)
     about = "2dgs with multi-view losses, for better surfaces of textured objects"
