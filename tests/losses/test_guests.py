@@ -158,7 +158,7 @@ def test_a_loss_of_two_views_needs_a_recipe_that_compares_views() -> None:
 
 @pytest.mark.parametrize("needs", [["depth"], "silhouette"])
 def test_an_unknown_need_is_refused(needs: Sequence[str]) -> None:
-    with pytest.raises(RecipeError, match="needs of loss 'kept' must be a list of silhouette, distortion"):
+    with pytest.raises(RecipeError, match="needs of loss 'kept' must be a list of silhouette, flatness"):
         register_loss("kept", needs=needs)
 
 

@@ -163,6 +163,26 @@ def test_weights_multiply_the_part_of_each_pixel_and_the_count_stays() -> None:
         torch.testing.assert_close(loss(*images, mask, weights=torch.ones_like(whole)), loss(*images, mask))
 
 
+def test_flatness_is_high_without_texture_and_low_with_it() -> None:
+    """The variance is that of windows of 7 x 7, smaller at the border."""
+    generator = torch.Generator().manual_seed(2)
+    image = torch.full((12, 20, 3), 0.4, dtype=torch.float64)
+    image[:, 10:] += 0.05 * torch.rand(12, 10, 1, generator=generator, dtype=torch.float64)
+    found = reference.flatness(image)
+    assert found.dtype == torch.uint8
+    assert (found[:, :7] == 255).all()
+    grey = image[..., 0].numpy()
+    for y, x in ((0, 0), (5, 12), (11, 19), (3, 8)):
+        window = grey[max(y - 3, 0) : y + 4, max(x - 3, 0) : x + 4]
+        assert abs(int(found[y, x]) - 255 * np.exp(-window.var() / 0.02**2)) <= 0.5 + 1e-6
+    assert found[:, 13:].float().mean() < 220
+
+
+def test_flat_weights_go_from_one_to_the_factor() -> None:
+    weights = reference.flat_weights(torch.tensor([[0, 255]], dtype=torch.uint8), 6.0, torch.float32)
+    assert weights.tolist() == [[1.0, 6.0]]
+
+
 def test_object_weights_use_the_alpha_of_the_image_or_the_rendered_alpha() -> None:
     rendered, photographed = torch.tensor([[0.25, 0.75]], requires_grad=True), torch.tensor([[0.51, 0.5]])
     assert reference.object_weights(rendered, photographed).tolist() == [[1.0, 0.0]]

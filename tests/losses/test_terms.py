@@ -185,6 +185,25 @@ def test_the_edges_option_sets_normals_beside_empty_pixels(
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_normal_consistency_is_heavier_where_the_image_has_no_texture(
+    backend: str, request: pytest.FixtureRequest
+) -> None:
+    if backend == "cpu":
+        request.getfixturevalue("native")
+    output, camera = make_output(8, 24, dtype=torch.float32), make_camera(24, 8)
+    target = torch.full((8, 24, 3), 0.5)
+    target[:, 12:] = torch.rand(8, 12, 1, generator=torch.Generator().manual_seed(1))
+    gradients = []
+    for flat in (1.0, 6.0):
+        terms = [LossTerm("normal_consistency", 1.0, options={"flat": flat})]
+        value = compute_losses(output, LossView(target, camera), terms, backend=backend)["normal_consistency"]
+        gradients += torch.autograd.grad(value, output.normal)
+    plain, heavier = (gradient[1:-1, 1:-1] for gradient in gradients)
+    torch.testing.assert_close(heavier[:, :7], 6 * plain[:, :7])
+    torch.testing.assert_close(heavier[:, 14:], plain[:, 14:], rtol=0.05, atol=0.0)
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_object_weights_give_no_gradient_to_the_background(backend: str, request: pytest.FixtureRequest) -> None:
     if backend == "cpu":
         request.getfixturevalue("native")
@@ -256,6 +275,10 @@ def trained_with(*terms: LossTerm, **settings: Any) -> Recipe:
         (
             LossTerm("normal_consistency", 1.0, options={"edges": "centre"}),
             "loss 'normal_consistency': edges must be one of undefined, camera; got 'centre'",
+        ),
+        (
+            LossTerm("normal_consistency", 1.0, options={"flat": 0.0}),
+            "option flat of normal consistency must be a positive number, got 0.0",
         ),
         (
             LossTerm("normal_consistency_per_splat", 1.0, options={"where": "alpha"}),

@@ -15,7 +15,7 @@ MODULES = {
     ),
     "gs2d.losses.prior_terms": ("depth_prior", "normal_prior"),
 }
-NEEDS = ("silhouette", "distortion", "neighbour")
+NEEDS = ("silhouette", "flatness", "distortion", "neighbour")
 """Inputs of losses that are computed or loaded only on request."""
 LOSSES: Registry[Any] = Registry(
     "loss",
@@ -35,8 +35,9 @@ def register_loss(name: str, *, needs: Sequence[str] = ()) -> Callable[[Register
         Kind of the loss; must not be taken.
     needs : sequence of str
         Inputs that are computed or loaded only on request: "silhouette" (``view.silhouette``, the alpha channel of the
-        image), "distortion" (``output.distortion``) or "neighbour" (``view.neighbour``, in recipes with ``multiview``,
-        with the depth of the first term that names one).
+        image), "flatness" (``view.flatness``, where the image has no texture), "distortion" (``output.distortion``) or
+        "neighbour" (``view.neighbour``, in recipes with ``multiview``, with the depth of the first term that names
+        one).
 
     Returns
     -------

@@ -85,6 +85,8 @@ class LossView:
         Depth of the protocol; a loss sees the depth of its term: ``output.depth(view.depth_kind)``.
     silhouette : Tensor [H, W] or None
         Alpha of the image, in [0, 1], if it has an alpha channel and an active loss needs it.
+    flatness : Tensor [H, W] uint8 or None
+        ``formulas.flatness`` of the image, if an active loss needs it.
     neighbour : Neighbour or None
         The second view, for losses that need it.
     target_mean : Tensor [H, W, 3] or None
@@ -104,6 +106,7 @@ class LossView:
     index: int | None = None
     depth_kind: str = "mean"
     silhouette: Tensor | None = None
+    flatness: Tensor | None = None
     neighbour: Neighbour | None = None
     target_mean: Tensor | None = None
     weights: Mapping[str, float] = field(default_factory=dict)

@@ -20,6 +20,8 @@ WINDOW_RADIUS = 5  # px: 11 taps
 WINDOW_SIGMA = 1.5  # px
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
+FLAT_RADIUS = 3  # px: windows of 7 x 7, as those that views are compared by
+FLAT_CONTRAST = 0.02  # standard deviation in [0, 1]: three times the noise of a photograph in daylight
 
 
 def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
@@ -183,6 +185,29 @@ def object_weights(alpha: Tensor, silhouette: Tensor | None = None) -> Tensor:
     ``alpha``, as a constant.
     """
     return alpha.detach() if silhouette is None else (silhouette > 0.5).to(alpha.dtype)
+
+
+@torch.no_grad()
+def flatness(image: Tensor) -> Tensor:
+    """Return how little texture an image [H, W, 3] in [0, 1] has around each pixel, as bytes [H, W] uint8.
+
+    255 exp(-v / s^2), rounded, with v the variance of the grey image in a window of 7 x 7 px (smaller at the border)
+    and s ``FLAT_CONTRAST``. A byte per pixel can be kept for each image.
+    """
+    grey = image.mean(dim=-1)[None, None]
+
+    def mean(values: Tensor) -> Tensor:
+        side = 2 * FLAT_RADIUS + 1
+        values = F.avg_pool2d(values, (1, side), 1, (0, FLAT_RADIUS), count_include_pad=False)
+        return F.avg_pool2d(values, (side, 1), 1, (FLAT_RADIUS, 0), count_include_pad=False)
+
+    variance = (mean(grey * grey) - mean(grey).square()).clamp_min(0)[0, 0]
+    return (255 * torch.exp(-variance / FLAT_CONTRAST**2)).round().to(torch.uint8)
+
+
+def flat_weights(flat: Tensor, factor: float, dtype: torch.dtype) -> Tensor:
+    """Return pixel weights [H, W] from 1 (texture) to ``factor`` (none), from the bytes of :func:`flatness`."""
+    return 1 + (factor - 1) * (flat.to(dtype) / 255)
 
 
 def _weighted(values: Tensor, weights: Tensor | None) -> Tensor:

@@ -5,6 +5,7 @@ The reference forms are the formulas of ``losses.formulas`` and ``losses.view_pa
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -97,20 +98,30 @@ class NormalConsistency(Loss):
     where : "image" or "object"
         All pixels count, or those of the object alone, so that covering the empty background earns nothing. The object
         is where alpha of the image is above 1/2; in images without alpha, each pixel counts by the rendered alpha.
+    flat : float
+        Factor of the weight where the photograph has no texture (``formulas.flatness``): there colours alone do not
+        determine the surface, and highlights mislead it.
     """
 
     kind, per_splat = "normal_consistency", False
 
-    def __init__(self, edges: str = "undefined", where: str = "image") -> None:
+    def __init__(self, edges: str = "undefined", where: str = "image", flat: float = 1.0) -> None:
         one_of("edges", edges, EDGES)
         one_of("where", where, WHERE)
-        self.edges, self.where = edges, where
-        if where == "object":
-            self.needs = frozenset({"silhouette"})
+        if not (math.isfinite(flat) and flat > 0):
+            raise RecipeError(f"option flat of normal consistency must be a positive number, got {flat!r}")
+        self.edges, self.where, self.flat = edges, where, float(flat)
+        needs = {"silhouette": where == "object", "flatness": self.flat != 1}
+        self.needs = frozenset(name for name, needed in needs.items() if needed)
 
     def _weights(self, output: RenderOutput, view: LossView) -> Tensor | None:
         """Return the weights [H, W] of the pixels; None if all count alike."""
-        return None if self.where == "image" else formulas.object_weights(output.alpha, view.silhouette)
+        weights = None if self.where == "image" else formulas.object_weights(output.alpha, view.silhouette)
+        if self.flat == 1:
+            return weights
+        flatness = formulas.flatness(view.target) if view.flatness is None else view.flatness
+        factors = formulas.flat_weights(flatness, self.flat, output.alpha.dtype)
+        return factors if weights is None else weights * factors
 
     def _images(self, output: RenderOutput, view: LossView) -> tuple[Tensor, Tensor, Tensor]:
         """Return normals, depth and alpha."""
@@ -143,7 +154,7 @@ class NormalConsistency(Loss):
         if self.per_splat or term.depth not in ("mean", "median"):
             return None
         at_camera, of_object = self.edges == "camera", self.where == "object"
-        return {"normals": StepNormals(float(term.weight or 0.0), term.depth, at_camera, of_object)}
+        return {"normals": StepNormals(float(term.weight or 0.0), term.depth, at_camera, of_object, self.flat)}
 
 
 @register_loss("normal_consistency_per_splat")

@@ -374,6 +374,8 @@ class _Losses:
             assert wanted is not None
             normals.mask = mask
             normals.object = photograph if wanted.of_object and step.photograph.shape[2] == 4 else None
+            normals.flatness = None if step.flatness is None else step.flatness.data_ptr()
+            normals.flat_more = np.float32(wanted.flat - 1)
             normals.fx, normals.fy, normals.cx, normals.cy = view.fx, view.fy, view.cx, view.cy
             normals.rotation = view.R
             normals.scale = np.float32(wanted.weight) * np.float32(1 / max(step.valid, 1))

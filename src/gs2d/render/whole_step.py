@@ -48,12 +48,15 @@ class StepNormals(NamedTuple):
         Whether empty pixels lie at the camera centre (``losses.formulas.normals_from_depth``).
     of_object : bool
         Weight pixels by the alpha of the image, or by the rendered alpha if the image has none.
+    flat : float
+        Factor of the weight where the image has no texture (``losses.formulas.flatness``).
     """
 
     weight: float
     depth: str
     at_camera: bool
     of_object: bool
+    flat: float = 1.0
 
 
 class StepLosses(NamedTuple):
@@ -90,6 +93,8 @@ class WholeStep:
         Decoded image; a transparent one is composited over ``background``.
     mask : Tensor [H, W] bool or None
         False = ignore this pixel.
+    flatness : Tensor [H, W] uint8 or None
+        Of the image, if ``losses.normals.flat`` is not 1.
     valid : int
         Number of valid pixels.
     background : 3 floats
@@ -117,3 +122,4 @@ class WholeStep:
     learned: Mapping[str, Learned]
     betas: tuple[float, float, float]
     gathered: Mapping[str, Tensor]
+    flatness: Tensor | None = None

@@ -237,6 +237,7 @@ class FullRender:
             index=index,
             depth_kind=self.protocol.depth,
             silhouette=target.silhouette,
+            flatness=target.flatness,
         )
         reports = {name: loss.report(output, view) for name, loss in self.losses.reporters.items()}
         return {name: report for name, report in reports.items() if report is not None}
@@ -272,6 +273,7 @@ class FullRender:
             index=index,
             depth_kind=self.protocol.depth,
             silhouette=target.silhouette,
+            flatness=target.flatness,
             neighbour=neighbour,
             target_mean=target.mean,
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -13,6 +13,7 @@ from gs2d.config import protocols as config
 from gs2d.core.memory_limit import cache_bytes
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene, View
+from gs2d.losses.formulas import flatness
 from gs2d.render.backends import Backend
 
 TARGET_BYTES = 1 << 28  # enough for all images of a small capture
@@ -35,17 +36,20 @@ class Target:
         Local mean of the image for the native SSIM, of images that are kept.
     silhouette : Tensor [H, W] or None
         Alpha of the image in [0, 1], if it has an alpha channel and a loss needs it.
+    flatness : Tensor [H, W] uint8 or None
+        ``losses.formulas.flatness`` of the image, if a loss needs it.
     """
 
     image: Tensor
     mask: Tensor | None
     mean: Tensor | None
     silhouette: Tensor | None = None
+    flatness: Tensor | None = None
 
     @property
     def nbytes(self) -> int:
         """Bytes of all tensors."""
-        tensors = (self.image, self.mask, self.silhouette, self.mean)
+        tensors = (self.image, self.mask, self.silhouette, self.flatness, self.mean)
         return sum(tensor.nbytes for tensor in tensors if tensor is not None)
 
 
@@ -60,20 +64,25 @@ class ImageBytes:
         False = ignore this pixel.
     valid : int
         Number of pixels that count.
+    flatness : Tensor [H, W] uint8 or None
+        As of ``Target``.
     """
 
     image: Tensor
     mask: Tensor | None
     valid: int
+    flatness: Tensor | None = None
 
     def nbytes(self, place: str) -> int:
         """Return the bytes on the "device", or in "pinned" memory, where torch rounds up to powers of two."""
-        sizes = [self.image.nbytes, 0 if self.mask is None else self.mask.nbytes]
+        sizes = [0 if tensor is None else tensor.nbytes for tensor in (self.image, self.mask, self.flatness)]
         return sum(1 << (size - 1).bit_length() if place == "pinned" and size else size for size in sizes)
 
     def map(self, change: Callable[[Tensor], Tensor]) -> ImageBytes:
         """Return the image with a function applied to its tensors."""
-        return ImageBytes(change(self.image), None if self.mask is None else change(self.mask), self.valid)
+        image = change(self.image)
+        mask, flat = (None if tensor is None else change(tensor) for tensor in (self.mask, self.flatness))
+        return ImageBytes(image, mask, self.valid, flat)
 
 
 class TargetSource(Protocol):
@@ -95,16 +104,20 @@ def make_targets(
     protocol: config.Protocol,
     backend: Backend,
     splats: Splats,
-    with_silhouettes: bool,
+    needs: Collection[str],
     limit_bytes: int | None,
 ) -> TargetSource:
-    """Return the targets of the training views of a scene, on the device of the splats."""
+    """Return the targets of the training views of a scene, on the device of the splats.
+
+    ``needs`` has "silhouette" and "flatness" if a loss needs them.
+    """
     views, background, device = scene.train, protocol.background, splats.device
     use_masks = protocol.use_mask_in_training
     if is_async(device):
         limit = 1 << 31 if limit_bytes is None else limit_bytes
         pinned = 0 if scene.ahead else cache_bytes(PINNED_BYTES)
         options = {"dtype": splats.dtype, "limit_bytes": limit, "pinned_bytes": pinned}
+        options |= {"with_flatness": "flatness" in needs}
         return DeviceTargets(views, background, use_masks=use_masks, device=device, **options)  # type: ignore[arg-type]
     operations = backend.loss_operations(device)
     return Targets(
@@ -112,7 +125,8 @@ def make_targets(
         background,
         use_masks=use_masks,
         mean=None if operations is None or operations.blur is None else operations.blur,
-        with_silhouettes=with_silhouettes,
+        with_silhouettes="silhouette" in needs,
+        with_flatness="flatness" in needs,
         dtype=splats.dtype,
         device=device,
         limit_bytes=limit_bytes if limit_bytes is not None else 0 if scene.ahead else TARGET_BYTES,
@@ -131,7 +145,7 @@ class Targets:
     use_masks : bool
     mean : callable, optional
         Computes the local mean of an image, which is kept with it.
-    with_silhouettes : bool
+    with_silhouettes, with_flatness : bool
     dtype : torch.dtype
     device : torch.device
     limit_bytes : int
@@ -145,12 +159,13 @@ class Targets:
         use_masks: bool,
         mean: Callable[[Tensor], Tensor | None] | None = None,
         with_silhouettes: bool = False,
+        with_flatness: bool = False,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
         limit_bytes: int = TARGET_BYTES,
     ) -> None:
         self._views, self._background, self._use_masks = views, background, use_masks
-        self._mean, self._with_silhouettes = mean, with_silhouettes
+        self._mean, self._with_silhouettes, self._with_flatness = mean, with_silhouettes, with_flatness
         self._dtype, self._device = dtype, device
         pixels = sum(view.camera.width * view.camera.height for view in views)
         all_bytes = pixels * 3 * dtype.itemsize * (1 if mean is None else 2)
@@ -175,6 +190,7 @@ class Targets:
             None if mask is None else torch.as_tensor(mask).to(self._device),
             None,
             None if alpha is None else torch.as_tensor(alpha).to(self._device, self._dtype),
+            flatness(image) if self._with_flatness else None,
         )
         if target.nbytes + (0 if self._mean is None else image.nbytes) > self._room:
             return target
@@ -199,6 +215,7 @@ class DeviceTargets:
     device : torch.device
     dtype : torch.dtype
     limit_bytes, pinned_bytes : int
+    with_flatness : bool
     pin : callable
         Makes a copy in pinned memory.
     """
@@ -213,9 +230,10 @@ class DeviceTargets:
         dtype: torch.dtype = torch.float32,
         limit_bytes: int = 1 << 31,
         pinned_bytes: int = PINNED_BYTES,
+        with_flatness: bool = False,
         pin: Callable[[Tensor], Tensor] = torch.Tensor.pin_memory,
     ) -> None:
-        self._views, self._use_masks = views, use_masks
+        self._views, self._use_masks, self._with_flatness = views, use_masks, with_flatness
         self._background = torch.tensor(background, dtype=dtype, device=device)
         self._dtype, self._device, self._pin = dtype, device, pin
         self._room = {"device": limit_bytes, "pinned": pinned_bytes}
@@ -228,12 +246,17 @@ class DeviceTargets:
 
     def __getitem__(self, index: int) -> Target:
         there = self._decoded(index).map(lambda tensor: tensor.to(self._device, non_blocking=True))
-        color = there.image[..., :3].to(self._dtype) / 255
-        alpha = None
-        if there.image.shape[2] == 4:  # as images.composite
-            alpha = there.image[..., 3].to(self._dtype) / 255
-            color = (color - self._background) * alpha[..., None] + self._background
-        return Target(color, there.mask, None, alpha)
+        color, alpha = self._composited(there.image)
+        return Target(color, there.mask, None, alpha, there.flatness)
+
+    def _composited(self, image: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Return colours over the background, and alpha; as ``images.composite``."""
+        color = image[..., :3].to(self._dtype) / 255
+        if image.shape[2] == 3:
+            return color, None
+        alpha = image[..., 3].to(self._dtype) / 255
+        background = self._background.to(image.device)
+        return (color - background) * alpha[..., None] + background, alpha
 
     def _brought(self, tensor: Tensor) -> Tensor:
         """Return a tensor on the device; copies of one shape share a buffer."""
@@ -252,7 +275,8 @@ class DeviceTargets:
         mask = view.usable(masks=self._use_masks)
         pixels = torch.tensor(view.image())
         valid = pixels.shape[0] * pixels.shape[1] if mask is None else int(mask.sum())
-        image = ImageBytes(pixels, None if mask is None else torch.tensor(mask), valid)
+        flat = flatness(self._composited(pixels)[0]) if self._with_flatness else None
+        image = ImageBytes(pixels, None if mask is None else torch.tensor(mask), valid, flat)
         for place in ("device", "pinned"):
             if image.nbytes(place) > self._room[place]:
                 continue

@@ -172,10 +172,10 @@ class Trainer:
         self._objective: Objective | None = None  # of the current stage, from its first iteration on
         self._whole_steps: WholeSteps | None = None  # also of the current stage
         self._ahead = ReadAhead(lambda index: scene.train[index].image()) if scene.ahead else None
-        silhouettes = is_opaque(self.recipe) or self.learned.changes_color
-        silhouettes = silhouettes or any("silhouette" in loss.needs for _, loss in self._losses)
+        needs = {need for _, loss in self._losses for need in loss.needs}
+        needs |= {"silhouette"} if is_opaque(self.recipe) or self.learned.changes_color else set()
         self._targets: TargetSource = make_targets(
-            scene, protocol, self.backend, self.state.splats, silhouettes, options.target_bytes
+            scene, protocol, self.backend, self.state.splats, needs, options.target_bytes
         )
         frozen, learner = self._frozen, self._learner
         self._whole = FullRender(scene, self.recipe, protocol, learner, self._targets, frozen, self.learned)

@@ -98,7 +98,7 @@ def two_sizes(scene: Scene) -> Scene:
     return replace(scene, train=tuple(small))
 
 
-def with_options(recipe: Recipe, **options: str) -> Recipe:
+def with_options(recipe: Recipe, **options: str | float) -> Recipe:
     """Return the recipe with these options of normal consistency."""
     stages = []
     for stage in recipe.stages:
@@ -145,6 +145,8 @@ VARIANTS = {
     "plain": (lambda scene: scene, train_toys.short(), GENERIC),
     "absolute": (two_sizes, train_toys.short(absgs=True), replace(GENERIC, depth="median")),
     "object": (masked, of_object(train_toys.short()), replace(GENERIC, depth="median")),
+    "flat": (masked, with_options(train_toys.short(), where="object", flat=6.0), GENERIC),
+    "flat, opaque": (lambda scene: scene, with_options(train_toys.short(), where="object", flat=6.0), GENERIC),
     "silhouettes": (masked, with_silhouettes(of_object(train_toys.short())), GENERIC),
     "squares": (masked, with_squares(train_toys.short()), GENERIC),
     "masks": (masked, at_camera(train_toys.short()), replace(GENERIC, background=(0.2, 1.0, 0.7))),

@@ -76,4 +76,11 @@ __device__ __forceinline__ Record<float> record_of(const float4& a, const float4
     return {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w, c.x, c.y, c.z, c.w, d.x, d.y, d.z, d.w};
 }
 
+// Returns byte / 255, rounded like a division: a product plus its error.
+__device__ __forceinline__ float part_of_255(uchar byte) {
+    constexpr float PART = 1.f / 255.f;
+    const float x = float(byte), q = x * PART;
+    return fma(fma(-q, 255.f, x), PART, q);
+}
+
 }  // namespace gs2d

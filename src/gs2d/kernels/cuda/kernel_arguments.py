@@ -270,7 +270,8 @@ class NormalArguments(ctypes.Structure):
         *_pointers("normal", "depth", "alpha", "mask", "weights", "partials", "means", "cotangent"),
         *_pointers("g_normal", "g_depth", "g_alpha"),
         ("scale", ctypes.c_float),
-        *_pointers("object"),
+        *_pointers("object", "flatness"),
+        ("flat_more", ctypes.c_float),
     )
 
 

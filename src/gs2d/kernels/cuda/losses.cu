@@ -25,6 +25,8 @@ struct NormalArguments {
     float *g_normal, *g_depth, *g_alpha;  // null: not computed
     float scale;                          // cotangent / valid pixels
     const uchar* object;                  // instead of weights: photo bytes [H, W, 4]; 1 where alpha > 1/2
+    const uchar* flatness;                // [H, W], or null: weights times 1 + flat_more flatness / 255
+    float flat_more;
 };
 
 struct SilhouetteArguments {
@@ -61,8 +63,8 @@ __device__ __forceinline__ float depth_at(const NormalArguments& a, int64 x, int
 }
 
 __device__ __forceinline__ float weight_at(const NormalArguments& a, int64 at) {
-    if (a.object) return a.object[4 * at + 3] > 127 ? 1.f : 0.f;
-    return a.weights ? a.weights[at] : 1.f;
+    const float weight = a.object ? (a.object[4 * at + 3] > 127 ? 1.f : 0.f) : a.weights ? a.weights[at] : 1.f;
+    return a.flatness ? weight * (1.f + a.flat_more * part_of_255(a.flatness[at])) : weight;
 }
 
 // Computes the depth normal of a pixel and its rendered normal in the camera frame.

@@ -110,13 +110,6 @@ __device__ __forceinline__ bool is_valid(const uchar* mask, int64 y, int64 width
     return !mask || mask[y * width + column / 3];
 }
 
-// Returns byte / 255, rounded like a division: a product plus its error.
-__device__ __forceinline__ float part_of_255(uchar byte) {
-    constexpr float PART = 1.f / 255.f;
-    const float x = float(byte), q = x * PART;
-    return fma(fma(-q, 255.f, x), PART, q);
-}
-
 // Reads a real of the target: a float (CHANNELS = 0), or composited from CHANNELS bytes per pixel.
 template <int CHANNELS, class Arguments>
 __device__ __forceinline__ float target_of(const Arguments& a, int64 y, int64 column) {
