@@ -15,6 +15,7 @@ from gs2d.errors import BackendError
 from gs2d.kernels.library import load
 from gs2d.report import first_screen, plots
 from gs2d.synthetic import demo_capture
+from gs2d.synthetic.shapes import Patch
 
 PICTURES_MATTER = ("report", "contrib/lab/test_figures.py")
 DEMO_IS_TESTED = ("synthetic",)
@@ -40,7 +41,7 @@ def cheap_reports(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
-_light: dict[demo_capture.ToyScene, demo_capture.BakedLight] = {}
+_light: dict[Patch, demo_capture.BakedLight] = {}
 _demo_scene = functools.cache(demo_capture.build_scene)
 
 
@@ -49,10 +50,10 @@ def cheap_demo_captures(request: pytest.FixtureRequest) -> Iterator[None]:
     """Bake the light of the demo scene once per process: 4 s. Its own tests bake it each time."""
     bake = demo_capture.bake
 
-    def baked(scene: demo_capture.ToyScene, *, threads: int) -> demo_capture.BakedLight:
-        if scene not in _light:
-            _light[scene] = bake(scene.patch, threads=threads)
-        return _light[scene]
+    def baked(surface: Patch, *, threads: int) -> demo_capture.BakedLight:
+        if surface not in _light:
+            _light[surface] = bake(surface, threads=threads)
+        return _light[surface]
 
     with pytest.MonkeyPatch.context() as patch:
         if not _tests_of(request, DEMO_IS_TESTED):

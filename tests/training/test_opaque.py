@@ -47,7 +47,7 @@ def opacity_gradient(iterations: range, *, channels: int) -> float:
     pixels[..., 3:] = 255
     scene = replace(scene, train=(View.from_arrays("grey.png", camera, pixels),))
     state.splats.sh0[:], state.splats.shN[:] = rgb_to_sh0(torch.tensor([GREY])), 0
-    targets = Targets(scene.train, GREY, use_masks=False, with_silhouettes=True)
+    targets = Targets(scene.train, GREY, use_masks=False, needs={"silhouette"})
     backend = get_backend("reference")
     whole = FullRender(scene, recipe, replace(GENERIC, background=GREY), backend, targets)
     found = [whole.evaluate(state, stage, iteration, 0).gradients["opacity_logits"] for iteration in iterations]

@@ -7,7 +7,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from gs2d.kernels.library import Library
-from gs2d.kernels.tetrahedra import minimum_cut_on_cpu
+from gs2d.kernels.native_tetrahedra import minimum_cut_on_cpu
 from gs2d.meshing.tetrahedra import FACES, Tetrahedra
 from gs2d.meshing.visibility_votes import UNIT, Votes
 

@@ -231,7 +231,7 @@ def _finest(voxels: _Voxels, lower: np.ndarray, base: float) -> _Voxels:
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _Agreeing:
     """Points that a view sees, and weights of those that it sees through."""
 
     rows: np.ndarray  # [S] of points in front
@@ -243,7 +243,7 @@ class _Seen:
     against: np.ndarray  # [T] float32
 
 
-def _look(item: DepthMap, view: DepthSampler, points: OrientedPoints, reach: np.ndarray) -> _Seen:
+def _look(item: DepthMap, view: DepthSampler, points: OrientedPoints, reach: np.ndarray) -> _Agreeing:
     """Compare points with a view, which sees those within ``reach`` [P] of its depth, along their normals."""
     projected = points.xyz @ view.projection[:, :3].T + view.projection[:, 3]
     z = projected[:, 2].copy()
@@ -260,7 +260,7 @@ def _look(item: DepthMap, view: DepthSampler, points: OrientedPoints, reach: np.
     seen = np.flatnonzero(valid & (np.abs(move) <= reach[rows]) & (facing > GRAZING))
     endless = np.pad(np.isinf(item.depth), 1).ravel()[pixel]
     through = np.flatnonzero(endless | (valid & (residual * np.abs(facing) > 2 * reach[rows])))
-    return _Seen(
+    return _Agreeing(
         rows[seen],
         move[seen].astype(np.float32),
         weight[seen],

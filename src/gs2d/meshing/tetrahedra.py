@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 from gs2d.kernels.library import Library
-from gs2d.kernels.tetrahedra import tetrahedra_on_cpu
+from gs2d.kernels.native_tetrahedra import tetrahedra_on_cpu
 
 SIDE = 1 << 20  # steps of the grid along the longest side of the points
 CUBE = 4 * SIDE - 2  # side of the cube around them, in steps; predicates are exact below 2^22

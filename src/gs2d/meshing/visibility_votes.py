@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gs2d.kernels.library import Library
-from gs2d.kernels.tetrahedra import votes_on_cpu
+from gs2d.kernels.native_tetrahedra import votes_on_cpu
 from gs2d.meshing.tetrahedra import FACES, Tetrahedra
 
 UNIT = 128  # whole-number weight of a line with weight 1

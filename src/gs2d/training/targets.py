@@ -116,8 +116,7 @@ def make_targets(
     if is_async(device):
         limit = 1 << 31 if limit_bytes is None else limit_bytes
         pinned = 0 if scene.ahead else cache_bytes(PINNED_BYTES)
-        options = {"dtype": splats.dtype, "limit_bytes": limit, "pinned_bytes": pinned}
-        options |= {"with_flatness": "flatness" in needs}
+        options = {"limit_bytes": limit, "pinned_bytes": pinned, "needs": needs}
         return DeviceTargets(views, background, use_masks=use_masks, device=device, **options)  # type: ignore[arg-type]
     operations = backend.loss_operations(device)
     return Targets(
@@ -125,8 +124,7 @@ def make_targets(
         background,
         use_masks=use_masks,
         mean=None if operations is None or operations.blur is None else operations.blur,
-        with_silhouettes="silhouette" in needs,
-        with_flatness="flatness" in needs,
+        needs=needs,
         dtype=splats.dtype,
         device=device,
         limit_bytes=limit_bytes if limit_bytes is not None else 0 if scene.ahead else TARGET_BYTES,
@@ -145,7 +143,8 @@ class Targets:
     use_masks : bool
     mean : callable, optional
         Computes the local mean of an image, which is kept with it.
-    with_silhouettes, with_flatness : bool
+    needs : collection of str
+        "silhouette" and "flatness", if they are needed.
     dtype : torch.dtype
     device : torch.device
     limit_bytes : int
@@ -158,14 +157,13 @@ class Targets:
         *,
         use_masks: bool,
         mean: Callable[[Tensor], Tensor | None] | None = None,
-        with_silhouettes: bool = False,
-        with_flatness: bool = False,
+        needs: Collection[str] = (),
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
         limit_bytes: int = TARGET_BYTES,
     ) -> None:
         self._views, self._background, self._use_masks = views, background, use_masks
-        self._mean, self._with_silhouettes, self._with_flatness = mean, with_silhouettes, with_flatness
+        self._mean, self._needs = mean, frozenset(needs)
         self._dtype, self._device = dtype, device
         pixels = sum(view.camera.width * view.camera.height for view in views)
         all_bytes = pixels * 3 * dtype.itemsize * (1 if mean is None else 2)
@@ -184,13 +182,13 @@ class Targets:
         view = self._views[index]
         image = torch.as_tensor(view.target(self._background)).to(self._device, self._dtype)
         mask = view.usable(masks=self._use_masks)
-        alpha = view.alpha() if self._with_silhouettes else None
+        alpha = view.alpha() if "silhouette" in self._needs else None
         target = Target(
             image,
             None if mask is None else torch.as_tensor(mask).to(self._device),
             None,
             None if alpha is None else torch.as_tensor(alpha).to(self._device, self._dtype),
-            flatness(image) if self._with_flatness else None,
+            flatness(image) if "flatness" in self._needs else None,
         )
         if target.nbytes + (0 if self._mean is None else image.nbytes) > self._room:
             return target
@@ -202,7 +200,7 @@ class Targets:
 
 
 class DeviceTargets:
-    """Targets on a GPU, kept as bytes, 3 or 4 a pixel, and converted to floats on demand.
+    """Targets on a GPU, kept as bytes, 3 or 4 a pixel, and converted to float32 on demand.
 
     The first images that fit in ``limit_bytes`` stay on the device. The next ones, up to ``pinned_bytes`` or what the
     system allows, stay in pinned host memory, from which they are copied without waiting. Others are decoded each time.
@@ -213,9 +211,9 @@ class DeviceTargets:
     background : 3 floats in [0, 1]
     use_masks : bool
     device : torch.device
-    dtype : torch.dtype
     limit_bytes, pinned_bytes : int
-    with_flatness : bool
+    needs : collection of str
+        "flatness", if it is needed.
     pin : callable
         Makes a copy in pinned memory.
     """
@@ -227,15 +225,14 @@ class DeviceTargets:
         *,
         use_masks: bool,
         device: torch.device,
-        dtype: torch.dtype = torch.float32,
         limit_bytes: int = 1 << 31,
         pinned_bytes: int = PINNED_BYTES,
-        with_flatness: bool = False,
+        needs: Collection[str] = (),
         pin: Callable[[Tensor], Tensor] = torch.Tensor.pin_memory,
     ) -> None:
-        self._views, self._use_masks, self._with_flatness = views, use_masks, with_flatness
-        self._background = torch.tensor(background, dtype=dtype, device=device)
-        self._dtype, self._device, self._pin = dtype, device, pin
+        self._views, self._use_masks, self._needs = views, use_masks, frozenset(needs)
+        self._background = torch.tensor(background, dtype=torch.float32, device=device)
+        self._device, self._pin = device, pin
         self._room = {"device": limit_bytes, "pinned": pinned_bytes}
         self._kept: dict[int, ImageBytes] = {}
         self._buffers: dict[tuple[torch.Size, torch.dtype], Tensor] = {}  # for images from host memory
@@ -251,10 +248,10 @@ class DeviceTargets:
 
     def _composited(self, image: Tensor) -> tuple[Tensor, Tensor | None]:
         """Return colours over the background, and alpha; as ``images.composite``."""
-        color = image[..., :3].to(self._dtype) / 255
+        color = image[..., :3].float() / 255
         if image.shape[2] == 3:
             return color, None
-        alpha = image[..., 3].to(self._dtype) / 255
+        alpha = image[..., 3].float() / 255
         background = self._background.to(image.device)
         return (color - background) * alpha[..., None] + background, alpha
 
@@ -275,7 +272,7 @@ class DeviceTargets:
         mask = view.usable(masks=self._use_masks)
         pixels = torch.tensor(view.image())
         valid = pixels.shape[0] * pixels.shape[1] if mask is None else int(mask.sum())
-        flat = flatness(self._composited(pixels)[0]) if self._with_flatness else None
+        flat = flatness(self._composited(pixels)[0]) if "flatness" in self._needs else None
         image = ImageBytes(pixels, None if mask is None else torch.tensor(mask), valid, flat)
         for place in ("device", "pinned"):
             if image.nbytes(place) > self._room[place]:

@@ -36,7 +36,7 @@ LIMITS = {
         "surface": (14, 68, 128, 38),
         "appearance": (11, 52, 84, 29),
         "refine": (14, 55, 110, 36),
-        "best": (14, 70, 133, 40),  # with L2
+        "best": (14, 74, 138, 40),  # with L2, and weights of normal consistency by texture
     },
 }
 CHANGED = 11  # graph nodes that hold a camera, an image or learning rates
