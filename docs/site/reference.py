@@ -94,5 +94,7 @@ def python() -> str:
         for name in found:
             kind = "autofunction" if title == "Functions" else "autoclass"
             members = ["   :members:"] if kind == "autoclass" else []
+            fields = getattr(getattr(gs2d, name), "_fields", ())  # of a named tuple: its docstring has them
+            members += [f"   :exclude-members: {', '.join(fields)}"] if fields else []
             lines += [f"### {name}", "", "```{eval-rst}", f".. {kind}:: gs2d.{name}", *members, "```", ""]
     return "\n".join(lines)
