@@ -159,17 +159,20 @@ def ready_library() -> Library:
     return library
 
 
-def library_for(tensor: torch.Tensor) -> Library | None:
-    """Return :func:`ready_library` for a float32 tensor on the CPU; None for other tensors, or without the library.
+def optional_library() -> Library | None:
+    """Return :func:`ready_library`, or None if it was not built: for operations that also exist in numpy or torch.
 
-    For operations that also exist in torch.
+    A library that was built before a function was added is an error when that function is called.
     """
-    if not tensor.is_cpu or tensor.dtype != torch.float32:
-        return None
     try:
         return ready_library()
     except BackendError:
         return None
+
+
+def library_for(tensor: torch.Tensor) -> Library | None:
+    """Return :func:`optional_library` for a float32 tensor on the CPU; None for other tensors."""
+    return optional_library() if tensor.is_cpu and tensor.dtype == torch.float32 else None
 
 
 def describe_library() -> str:

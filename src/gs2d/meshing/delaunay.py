@@ -7,7 +7,6 @@ the fused volume, which are more accurate than single depth maps; the cut decide
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -18,8 +17,8 @@ from scipy.sparse.csgraph import connected_components
 
 from gs2d.core.memory import trim
 from gs2d.core.mesh import Mesh
-from gs2d.errors import BackendError, ProtocolError
-from gs2d.kernels.library import Library, ready_library
+from gs2d.errors import ProtocolError
+from gs2d.kernels.library import Library, optional_library
 from gs2d.meshing.consistency import depth_noise
 from gs2d.meshing.depth_maps import RenderedView, Spool
 from gs2d.meshing.evidence import clean
@@ -117,15 +116,8 @@ def extract_delaunay(
 
 
 def _library(backend: Backend) -> Library | None:
-    """Return the native library; None for a backend that fuses in numpy, or without a current library."""
-    if backend.fusion() is None:
-        return None
-    try:
-        library = ready_library()
-        library.function("gs2d_tetrahedra", None, [ctypes.c_void_p])
-    except BackendError:
-        return None
-    return library
+    """Return the native library; None for a backend that fuses in numpy, or if it was not built."""
+    return None if backend.fusion() is None else optional_library()
 
 
 def _points(fused: Mesh, spool: Spool, limits: FusionBounds, options: ExtractOptions) -> OrientedPoints:

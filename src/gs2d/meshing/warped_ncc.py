@@ -8,7 +8,7 @@ pixels of a window compares a and b, and the energy is
 
 where ``trust`` rises from 0 at ``poor`` to 1 at ``good`` (occlusions, reflections and moving things have none) and
 ``texture`` is v / (v + ``texture``), v the smaller variance. Weights are constant in the derivative. Formulas:
-docs/math.md, "Mesh refinement". The native version, ``kernels/cpu/refine.cpp``, is used if the library is built.
+docs/math.md, "Mesh refinement". The native version, ``kernels/cpu/refine.cpp``, is used if its library is passed.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from gs2d.core.camera import Camera
-from gs2d.errors import BackendError
-from gs2d.kernels.library import Library, ready_library
+from gs2d.kernels.library import Library
 from gs2d.kernels.native_refine import (
     PLANES,
     GatherArguments,
@@ -156,14 +155,6 @@ class VertexPull:
     def zeros(cls, count: int) -> VertexPull:
         """Return zeros for ``count`` vertices."""
         return cls(np.zeros(count), np.zeros(count))
-
-
-def kernels() -> Library | None:
-    """Return the native library, or None if it was not built."""
-    try:
-        return ready_library()
-    except BackendError:
-        return None
 
 
 def draw_mesh(
