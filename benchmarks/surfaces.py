@@ -36,7 +36,8 @@ from PIL import Image, ImageDraw
 from benchmarks.mesh_images import mesh_images
 from benchmarks.street_runs import Process, watch_process
 from benchmarks.surface_judge import PHOTOS, SCENE, TrueScene, read_scene, score_mesh
-from benchmarks.surface_scenes import REPORTED, SCENES, TUNING, write_scene
+from benchmarks.surface_photographs import write_scene
+from benchmarks.surface_scenes import REPORTED, SCENES, TUNING
 from benchmarks.timing import machine
 from gs2d.config.presets import get_recipe
 from gs2d.config.schedule import MAX_SCALE

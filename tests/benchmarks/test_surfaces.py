@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from benchmarks import surface_scenes, surfaces
+from benchmarks import surface_photographs, surface_scenes, surfaces
 from benchmarks.street_runs import Process
 from benchmarks.surface_judge import PADDING, TrueScene, face_normals, read_scene, score_mesh
 from benchmarks.surface_objects import Material, Noise, Part, block, plain, speckled
@@ -33,7 +33,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("scenes")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(surface_scenes.SCENES, "boxes", cube)
-        surface_scenes.write_scene("boxes", made / "boxes", size=SIZE)
+        surface_photographs.write_scene("boxes", made / "boxes", size=SIZE)
     return made
 
 
@@ -60,7 +60,7 @@ def test_a_scene_is_a_colmap_capture_with_test_views_and_points_near_the_truth(f
 
 def test_scenes_are_deterministic(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(surface_scenes.SCENES, "boxes", cube)
-    surface_scenes.write_scene("boxes", tmp_path, size=SIZE)
+    surface_photographs.write_scene("boxes", tmp_path, size=SIZE)
     for file in sorted(
         path for path in (folder / "boxes").rglob("*") if path.suffix in (".jpg", ".txt", ".json", ".ply")
     ):
