@@ -179,6 +179,7 @@ def test_the_crop_box_hides_splats_and_its_numbers_are_an_option(page: Page) -> 
     page.key("x")
     assert coloured(drawn(page), 0) > 50
     page.key("b")
+    still(page)  # the handles are placed with the next image
     handle = page.middle("circle[data-side=high][data-axis='2']")
     page.drag(handle, (handle[0], handle[1] + 30))
     high = float(page.ask("$('bbox').value").split()[-1])

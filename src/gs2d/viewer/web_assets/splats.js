@@ -87,11 +87,11 @@ const fit = () => Math.min(canvas.clientWidth / camera.w, canvas.clientHeight / 
 
 function moved() {
   lastMotion = performance.now();
-  document.body.dataset.drawn = "moving";
   redraw();
 }
 
 function redraw() {
+  document.body.dataset.drawn = "moving";
   if (!isScheduled) requestAnimationFrame(frame);
   isScheduled = true;
 }
